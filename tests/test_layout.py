@@ -64,7 +64,7 @@ def code_of(path):
 def functions(path):
     """Return the functions of one file as [(name, body, is it a kernel)]."""
     found, code = [], code_of(path)
-    for head in re.finditer(r"^(static inline|kernel) [^;{}#]*?\b(\w+)\(", code, re.M):
+    for head in re.finditer(r"^(inline|kernel) [^;{}#]*?\b(\w+)\(", code, re.M):
         begin = code.index("{", head.end())
         depth, end = 1, begin + 1
         while depth:

@@ -31,7 +31,7 @@
 #define WIDE R(2.5)
 #define SHAPE_WEIGHT R(0.3)
 
-static inline REAL gap_between(REAL2 a, REAL2 b)
+inline REAL gap_between(REAL2 a, REAL2 b)
 {
     const REAL2 d = a - b;
     return sqrt(dot(d, d));
@@ -81,13 +81,13 @@ kernel void find_seeds(const int size, global const int *cells, const int n, glo
     }
 }
 
-static inline bool is_at(REAL2 a, REAL2 b)
+inline bool is_at(REAL2 a, REAL2 b)
 {
     return a.s0 == b.s0 && a.s1 == b.s1;
 }
 
 /* x turned about the corner by an angle. */
-static inline REAL2 turned(REAL2 x, REAL2 corner, REAL angle)
+inline REAL2 turned(REAL2 x, REAL2 corner, REAL angle)
 {
     const REAL2 v = x - corner;
     const REAL c = cos(angle), s = sin(angle);
@@ -95,7 +95,7 @@ static inline REAL2 turned(REAL2 x, REAL2 corner, REAL angle)
 }
 
 /* Whether i is in the list. */
-static inline bool is_listed(int i, const int *list, int count)
+inline bool is_listed(int i, const int *list, int count)
 {
     bool found = false;
     for (int p = 0; p < count; ++p)
@@ -104,7 +104,7 @@ static inline bool is_listed(int i, const int *list, int count)
 }
 
 /* Whether candidate p shares one of the corners of the group. */
-static inline bool is_shared(int p, int corner_count, const int *masks, const int *near, const int *found)
+inline bool is_shared(int p, int corner_count, const int *masks, const int *near, const int *found)
 {
     bool shares = false;
     for (int c = 0; c < corner_count; ++c)
@@ -115,7 +115,7 @@ static inline bool is_shared(int p, int corner_count, const int *masks, const in
 
 /* Cost of a choice (bits of `mask`) among generators at distances d and angles a from the first wall, in the order of
    angles: squares of the displacements, and of the angles by which cells are too wide. */
-static inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL angle)
+inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL angle)
 {
     const REAL margin = fmin(MARGIN, (2 * PI - angle) / 4 + R(0.01)), widest = PI - margin;
     REAL r = 0;
@@ -154,8 +154,8 @@ static inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a
 /* Whether the generators that share corner b (bits of mask_b in list_b) and those that share corner c can have equal
    distances from both: at most two have the same distances from two points, one on each side of the line through them.
    */
-static inline bool may_share_both(int mask_b, const int *list_b, int count_b, REAL2 b, int mask_c, const int *list_c,
-                                  int count_c, REAL2 c, const int *cells, global const REAL2 *points)
+inline bool may_share_both(int mask_b, const int *list_b, int count_b, REAL2 b, int mask_c, const int *list_c,
+                           int count_c, REAL2 c, const int *cells, global const REAL2 *points)
 {
     int left = 0, right = 0;
     for (int p = 0; p < count_b; ++p)

@@ -41,8 +41,8 @@ kernel void evaluate_density(const int size, global const REAL *volumes, global 
 
    This is exact for rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell. Measured, quadrature of h inside
    the cells is not better. */
-static inline void weighted_offset(const int i, const REAL *gradient, global const REAL *offsets,
-                                   global const REAL *covariances, global REAL *lloyd)
+inline void weighted_offset(const int i, const REAL *gradient, global const REAL *offsets,
+                            global const REAL *covariances, global REAL *lloyd)
 {
     REAL g[DIM];
     EACH_AXIS(a)

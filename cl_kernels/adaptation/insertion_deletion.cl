@@ -16,7 +16,7 @@
 #endif
 
 #if DIM == 2
-static inline REAL2 difference(global const REAL *points, int from, int to PERIOD_ARGS)
+inline REAL2 difference(global const REAL *points, int from, int to PERIOD_ARGS)
 {
     return (REAL2)(DIFFERENCE(0, points[2 * from], points[2 * to]),
                    DIFFERENCE(1, points[2 * from + 1], points[2 * to + 1]));
@@ -117,7 +117,7 @@ kernel void score_pairs(const int size, global const int *starts, global const i
    correct the number: shift m of 0..SHIFTS-1 is (m - SHIFTS / 2) SHIFT_STEP. A pair with one cell at a wall ends there,
    unless the strain is strong: a wall cell of charge -1 is deleted, one of charge +1 is split along the wall. An inner
    cell of four sides is always deleted, one of eight always split. */
-static inline int count_change(REAL pull, int2 minus, int2 plus, REAL theta, REAL shift)
+inline int count_change(REAL pull, int2 minus, int2 plus, REAL theta, REAL shift)
 {
     if (minus.s0 < -1 && minus.s1 == 0)
         return -1;
@@ -243,14 +243,14 @@ kernel void score_log_ratio(const int size, global const int *starts, global con
 
 /* Unit vector along the longest axis of a cell, from its second moments. */
 #if DIM == 2
-static inline void longest_axis(global const REAL *moments, REAL *axis)
+inline void longest_axis(global const REAL *moments, REAL *axis)
 {
     const REAL angle = atan2(2 * moments[1], moments[0] - moments[2]) / 2;
     axis[0] = cos(angle);
     axis[1] = sin(angle);
 }
 #else
-static inline void longest_axis(global const REAL *moments, REAL *axis)
+inline void longest_axis(global const REAL *moments, REAL *axis)
 {
     /* Power iteration from the longest coordinate axis. The axis of a nearly round cell does not matter. */
     const REAL xx = moments[0], xy = moments[1], xz = moments[2], yy = moments[3], yz = moments[4], zz = moments[5];
@@ -267,8 +267,8 @@ static inline void longest_axis(global const REAL *moments, REAL *axis)
 #endif
 
 /* Split cell i across its longest axis. */
-static inline void split_cell(int i, global const REAL *offsets, global const REAL *covariances,
-                              global const REAL *volumes, global REAL *shifts, global int *born, global REAL *births)
+inline void split_cell(int i, global const REAL *offsets, global const REAL *covariances, global const REAL *volumes,
+                       global REAL *shifts, global int *born, global REAL *births)
 {
     REAL axis[DIM];
     longest_axis(covariances + DIM * (DIM + 1) / 2 * i, axis);

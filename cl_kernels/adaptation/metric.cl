@@ -45,7 +45,7 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
 }
 
 /* A hash of a neighbor. The sum of hashes does not depend on the order of the faces. */
-static inline ulong hash64(ulong v)
+inline ulong hash64(ulong v)
 {
     v += 0x9e3779b97f4a7c15UL;
     v = (v ^ (v >> 30)) * 0xbf58476d1ce4e5b9UL;

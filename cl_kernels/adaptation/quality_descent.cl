@@ -55,7 +55,7 @@ typedef struct {
     REAL4 forces;  /* of the neighbor */
 } Face;
 
-static inline REAL2 wall_tangent(int label OUTLINE_ARGS)
+inline REAL2 wall_tangent(int label OUTLINE_ARGS)
 {
 #ifdef POLYGON
     return BOUNDARY_TANGENT(label);
@@ -66,8 +66,8 @@ static inline REAL2 wall_tangent(int label OUTLINE_ARGS)
 #endif
 }
 
-static inline Face read_face(int k, REAL2 x, const rows_t *rows, global const REAL *points,
-                             global const REAL4 *forces OUTLINE_ARGS PERIOD_ARGS)
+inline Face read_face(int k, REAL2 x, const rows_t *rows, global const REAL *points,
+                      global const REAL4 *forces OUTLINE_ARGS PERIOD_ARGS)
 {
     Face f;
     const int label = f.label = rows->neighbors[k];
@@ -86,24 +86,24 @@ static inline Face read_face(int k, REAL2 x, const rows_t *rows, global const RE
 }
 
 /* Where face k begins (side = -1) or ends (side = 1), relative to its generator. */
-static inline REAL2 end_of_face(int k, int side, REAL2 tangent, const rows_t *rows)
+inline REAL2 end_of_face(int k, int side, REAL2 tangent, const rows_t *rows)
 {
     return (REAL2)(rows->centroids[2 * k], rows->centroids[2 * k + 1]) + side * rows->lengths[k] / 2 * tangent;
 }
 
-static inline bool is_same_vertex(REAL2 p, REAL2 q)
+inline bool is_same_vertex(REAL2 p, REAL2 q)
 {
     return !(dot(p - q, p - q) > R(1e-6) * dot(q, q));
 }
 
 /* dE/dl of an edge. */
-static inline REAL edge_tension(REAL length, REAL unit, const short_edges_t *s)
+inline REAL edge_tension(REAL length, REAL unit, const short_edges_t *s)
 {
     return -s->stiffness / unit * fmax(0, s->length - length / unit);
 }
 
 /* Length of the face between cells b and f, REAL_MAX if there is none. */
-static inline REAL face_between(int b, int f, const rows_t *rows)
+inline REAL face_between(int b, int f, const rows_t *rows)
 {
     for (int k = rows->starts[b]; k < rows->starts[b + 1]; ++k)
         if (rows->neighbors[k] == f)
@@ -114,7 +114,7 @@ static inline REAL face_between(int b, int f, const rows_t *rows)
 /* Length of the boundary of cell i from face k on, forwards (side = 1) or backwards (side = -1), up to a face between
    cells or to a convex corner. REAL_MAX if it ends in a re-entrant corner, which faces are meant to meet, or goes on
    elsewhere in the row. */
-static inline REAL boundary_length(int i, int k, int side, const rows_t *rows OUTLINE_ARGS)
+inline REAL boundary_length(int i, int k, int side, const rows_t *rows OUTLINE_ARGS)
 {
     const int begin = rows->starts[i], end = rows->starts[i + 1];
     REAL2 tangent = wall_tangent(rows->neighbors[k] OUTLINE);
@@ -137,8 +137,8 @@ static inline REAL boundary_length(int i, int k, int side, const rows_t *rows OU
 }
 
 /* dE/dl of the boundary of cell i beside its face with cell j, after it (side = 1) or before it (side = -1). */
-static inline REAL boundary_tension(int i, int j, int side, REAL4 force, const rows_t *rows,
-                                    const short_edges_t *s OUTLINE_ARGS)
+inline REAL boundary_tension(int i, int j, int side, REAL4 force, const rows_t *rows,
+                             const short_edges_t *s OUTLINE_ARGS)
 {
     const int begin = rows->starts[i], end = rows->starts[i + 1];
     if (force.s3 < s->length * force.s2)

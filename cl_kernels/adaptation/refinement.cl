@@ -5,22 +5,22 @@
 #include "adaptation/separation.h"
 
 /* Whether the edge from i to j gets a new generator. Each edge is counted at its lower index. */
-static inline bool has_midpoint(int i, int j, REAL measure, REAL volume)
+inline bool has_midpoint(int i, int j, REAL measure, REAL volume)
 {
     const REAL length = DIM == 2 ? sqrt(volume) : cbrt(volume);
     return j > i && measure > SHORT_FACE * (DIM == 2 ? length : length * length);
 }
 
 /* Whether an end of the edge is fixed (label below `fixed`): such edges get no new generators. */
-static inline bool is_fixed(int i, int j, global const int *labels, int fixed)
+inline bool is_fixed(int i, int j, global const int *labels, int fixed)
 {
     return fixed > 0 && (labels[i] < fixed || (j >= 0 && labels[j] < fixed));
 }
 
 #ifdef POLYGON
 /* Whether face k is the longest boundary edge of its cell (the first of equal ones), which gets the new generator. */
-static inline bool is_wall_side(int k, int begin, int end, global const int *neighbors,
-                                global const FACE *face_measures, REAL volume)
+inline bool is_wall_side(int k, int begin, int end, global const int *neighbors, global const FACE *face_measures,
+                         REAL volume)
 {
     bool longest = neighbors[k] < 0 && face_measures[k] > SHORT_FACE * sqrt(volume);
     for (int m = begin; m < end && longest; ++m)
@@ -34,8 +34,8 @@ static inline bool is_wall_side(int k, int begin, int end, global const int *nei
 
 /* Depth of cell i from a wall with the inward normal n, at most `most`; gap = distance of its generator from the wall.
    In a strip much thinner than h there are already generators from coarser levels. */
-static inline REAL free_depth(int i, REAL most, REAL gap, const REAL *n, global const int *starts,
-                              global const int *neighbors, global const REAL *points PERIOD_ARGS)
+inline REAL free_depth(int i, REAL most, REAL gap, const REAL *n, global const int *starts, global const int *neighbors,
+                       global const REAL *points PERIOD_ARGS)
 {
     REAL room = most;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {

@@ -7,8 +7,8 @@
 /* A position in the cell of x at a face, visible from x or not: the center x + m of the face, moved inwards by `way`
    for a boundary edge, but at most half-way to the opposite side. With layers (`fixed` > 0) it must be visible from x,
    unless x is on their edge, because hidden positions may belong to the layers. */
-static inline REAL2 place_at_face(const REAL *x, REAL2 m, int label, REAL way, int fixed, global const REAL2 *tangents,
-                                  DOMAIN_ARGS)
+inline REAL2 place_at_face(const REAL *x, REAL2 m, int label, REAL way, int fixed, global const REAL2 *tangents,
+                           DOMAIN_ARGS)
 {
     const REAL from[2] = {x[0] + m.s0, x[1] + m.s1};
     REAL y[2] = {from[0], from[1]};
@@ -27,7 +27,7 @@ static inline REAL2 place_at_face(const REAL *x, REAL2 m, int label, REAL way, i
     return (REAL2)(y[0], y[1]);
 }
 
-static inline REAL squared_gap(const REAL *x, REAL2 y)
+inline REAL squared_gap(const REAL *x, REAL2 y)
 {
     const REAL2 d = y - (REAL2)(x[0], x[1]);
     return dot(d, d);
@@ -35,7 +35,7 @@ static inline REAL squared_gap(const REAL *x, REAL2 y)
 
 /* Keep the new generator from x to y inside the domain. If it is then closer to x than `least`, it goes to `other`,
    unless that is closer still. */
-static inline void keep_separate(const REAL *x, REAL *y, REAL least, REAL2 other, DOMAIN_ARGS)
+inline void keep_separate(const REAL *x, REAL *y, REAL least, REAL2 other, DOMAIN_ARGS)
 {
     keep_inside(x, y, DOMAIN);
     const REAL gap2 = squared_gap(x, (REAL2)(y[0], y[1]));
@@ -48,9 +48,9 @@ static inline void keep_separate(const REAL *x, REAL *y, REAL least, REAL2 other
 /* The parent at x moves to y and the new generator to `child`, at a distance of |way|. If the boundary leaves at most
    an eighth of that, the parent stays at x, the new generator goes to the farthest face (from `begin` to `end`), and
    the result is true. */
-static inline bool separate_child(const REAL *x, REAL *y, REAL *child, REAL2 way, int fixed,
-                                  global const int *neighbors, global const FACE *face_centroids, int begin, int end,
-                                  global const REAL2 *tangents, DOMAIN_ARGS)
+inline bool separate_child(const REAL *x, REAL *y, REAL *child, REAL2 way, int fixed, global const int *neighbors,
+                           global const FACE *face_centroids, int begin, int end, global const REAL2 *tangents,
+                           DOMAIN_ARGS)
 {
     const REAL apart2 = dot(way, way);
     if (squared_gap(y, (REAL2)(child[0], child[1])) > apart2 / 64)

@@ -3,7 +3,7 @@
 #include "opencl/real.h"
 
 /* A key that orders sites by magnitude, then by index. 0 is not a site. */
-static inline ulong site_key(REAL magnitude, int i)
+inline ulong site_key(REAL magnitude, int i)
 {
     return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - i);
 }

@@ -10,7 +10,7 @@
 #define PARALLEL R(0.5)
 
 /* The image of y at the middle of the wall between x and y; false if no thin wall is between them. */
-static inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, DOMAIN_ARGS)
+inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, DOMAIN_ARGS)
 {
     const REAL here[2] = {x.s0, x.s1}, there[2] = {y.s0, y.s1};
     const REAL apart = sqrt(dot(y - x, y - x));

@@ -32,14 +32,14 @@
    periods are multiples of eps, so differences to any image are exact. */
 #define PERIOD(a) ((a) == 0 ? periods.s0 : (a) == 1 ? periods.s1 : periods.s2)
 
-static inline REAL nearest_image(REAL d, REAL period)
+inline REAL nearest_image(REAL d, REAL period)
 {
     const REAL half_period = period / 2;
     return period > 0 ? (d > half_period ? d - period : (d < -half_period ? d + period : d)) : d;
 }
 
 /* The image of y in [0, period), rounded to a multiple of eps. */
-static inline REAL wrapped(REAL y, REAL period)
+inline REAL wrapped(REAL y, REAL period)
 {
     y = (y - period * floor(y / period) + 1) - 1;
     return y >= period ? y - period : fmax(y, 0);
@@ -58,7 +58,7 @@ static inline REAL wrapped(REAL y, REAL period)
 
 #ifndef POLYGON
 /* Move the target y of a generator at x into the domain: to the nearest wall, or to its image along a period. */
-static inline void keep_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
+inline void keep_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
     EACH_AXIS(a)
@@ -67,7 +67,7 @@ static inline void keep_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 
 /* As keep_inside_box, but mirrors y at the wall, so that no two generators coincide on it. A step is at most as long as
    the box first, so that the mirror image is inside. */
-static inline void reflect_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
+inline void reflect_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
     EACH_AXIS(a)

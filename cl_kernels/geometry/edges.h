@@ -18,7 +18,7 @@
 
 /* Parameter t in [0, 1] at which the path from x to y leaves the domain first, and the edge that it crosses (a place in
    edge_ends); 2 if it stays inside. Both edges at a corner use the same numbers for it: no path passes between them. */
-static inline REAL exit_over_edge(const REAL *x, const REAL *y, int *edge, DOMAIN_ARGS)
+inline REAL exit_over_edge(const REAL *x, const REAL *y, int *edge, DOMAIN_ARGS)
 {
     const REAL2 from = (REAL2)(x[0], x[1]), path = (REAL2)(y[0], y[1]) - from;
     const REAL2 least = fmin(from, from + path), most = fmax(from, from + path);
@@ -64,14 +64,14 @@ static inline REAL exit_over_edge(const REAL *x, const REAL *y, int *edge, DOMAI
     return first;
 }
 
-static inline REAL exit_parameter(const REAL *x, const REAL *y, DOMAIN_ARGS)
+inline REAL exit_parameter(const REAL *x, const REAL *y, DOMAIN_ARGS)
 {
     int edge;
     return exit_over_edge(x, y, &edge, DOMAIN);
 }
 
 /* Moves the target y of a generator at x into the domain: if the path leaves it, half-way to the boundary. */
-static inline void keep_inside_polygon(const REAL *x, REAL *y, DOMAIN_ARGS)
+inline void keep_inside_polygon(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     const REAL t = exit_parameter(x, y, DOMAIN);
     if (t <= 1)
@@ -80,7 +80,7 @@ static inline void keep_inside_polygon(const REAL *x, REAL *y, DOMAIN_ARGS)
 }
 
 /* As keep_inside_polygon, but mirrors y at the edge, unless the path to the mirror image leaves the domain. */
-static inline void reflect_inside_polygon(const REAL *x, REAL *y, DOMAIN_ARGS)
+inline void reflect_inside_polygon(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     int edge;
     if (exit_over_edge(x, y, &edge, DOMAIN) > 1)

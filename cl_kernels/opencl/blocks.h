@@ -5,12 +5,12 @@
 #error "build with -DGROUP_SIZE=work-items per group"
 #endif
 
-static inline int block_begin(int n)
+inline int block_begin(int n)
 {
     return (int)(((long)n * get_group_id(0)) / get_num_groups(0));
 }
 
-static inline int block_end(int n)
+inline int block_end(int n)
 {
     return (int)(((long)n * (get_group_id(0) + 1)) / get_num_groups(0));
 }

@@ -4,27 +4,27 @@
 
 typedef REAL2 wide_t;
 
-static inline wide_t wide_sum(REAL a, REAL b)
+inline wide_t wide_sum(REAL a, REAL b)
 {
     const REAL s = a + b, t = s - a;
     return (wide_t)(s, (a - (s - t)) + (b - t));
 }
 
 /* The same for |a| >= |b|. */
-static inline wide_t wide_sum_ordered(REAL a, REAL b)
+inline wide_t wide_sum_ordered(REAL a, REAL b)
 {
     const REAL s = a + b;
     return (wide_t)(s, b - (s - a));
 }
 
-static inline wide_t wide_add(wide_t a, wide_t b)
+inline wide_t wide_add(wide_t a, wide_t b)
 {
     const wide_t s = wide_sum(a.s0, b.s0), t = wide_sum(a.s1, b.s1);
     const wide_t v = wide_sum_ordered(s.s0, s.s1 + t.s0);
     return wide_sum_ordered(v.s0, t.s1 + v.s1);
 }
 
-static inline wide_t wide_product(wide_t a, wide_t b)
+inline wide_t wide_product(wide_t a, wide_t b)
 {
     const REAL p = a.s0 * b.s0;
     const REAL rest = fma(a.s0, b.s0, -p) + fma(a.s1, b.s0, a.s0 * b.s1);

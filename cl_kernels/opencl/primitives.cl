@@ -3,7 +3,7 @@
 
 /* Exclusive prefix sums in two passes. Each work-item has one contiguous chunk of the array. */
 
-static inline int chunk_begin(int n, int w, int width)
+inline int chunk_begin(int n, int w, int width)
 {
     return (int)(((long)n * w) / width);
 }
@@ -65,7 +65,7 @@ typedef struct {
         (sum) = total_;                                                                                                \
     } while (0)
 
-static inline void merge_summary(summary_t *a, summary_t b)
+inline void merge_summary(summary_t *a, summary_t b)
 {
     ADD_COMPENSATED(REAL, a->sum, a->sum_low, b.sum);
     a->sum_low += b.sum_low;
@@ -75,7 +75,7 @@ static inline void merge_summary(summary_t *a, summary_t b)
     a->largest = fmax(a->largest, b.largest);
 }
 
-static inline void add_value(summary_t *a, REAL value)
+inline void add_value(summary_t *a, REAL value)
 {
     ADD_COMPENSATED(REAL, a->sum, a->sum_low, value);
     ADD_COMPENSATED(REAL, a->magnitude, a->magnitude_low, fabs(value));
@@ -87,7 +87,7 @@ static inline void add_value(summary_t *a, REAL value)
 #define REAL8 CLVORO_JOIN(REAL, 8)
 
 /* Items [begin, end), eight at a time, because one sum would wait for each addition. */
-static inline void add_run(summary_t *a, global const REAL *values, int begin, int end)
+inline void add_run(summary_t *a, global const REAL *values, int begin, int end)
 {
     REAL8 sum = 0, sum_low = 0, magnitude = 0, magnitude_low = 0, least = REAL_MAX, largest = -REAL_MAX;
     int i = begin;

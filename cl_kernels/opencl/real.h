@@ -46,7 +46,7 @@
     return
 
 /* a b - c d, with an error of 1 ulp even if the products cancel (Kahan): the determinant of two vectors. */
-static inline REAL difference_of_products(REAL a, REAL b, REAL c, REAL d)
+inline REAL difference_of_products(REAL a, REAL b, REAL c, REAL d)
 {
     const REAL cd = c * d;
     return fma(a, b, -cd) + fma(-c, d, cd);

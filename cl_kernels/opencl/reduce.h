@@ -24,7 +24,7 @@ typedef struct {
     }
 #endif
 
-static inline void sum_add(Sum *s, REAL x)
+inline void sum_add(Sum *s, REAL x)
 {
 #if IS_DOUBLE
     s->value += x;
@@ -37,7 +37,7 @@ static inline void sum_add(Sum *s, REAL x)
 }
 
 /* Sum (maximum) over the work-items of a group, returned to each; `scratch` has GROUP_SIZE entries. */
-static inline REAL group_sum(REAL x, local REAL *scratch)
+inline REAL group_sum(REAL x, local REAL *scratch)
 {
 #if GROUP_SIZE > 1
     const int me = get_local_id(0);
@@ -54,7 +54,7 @@ static inline REAL group_sum(REAL x, local REAL *scratch)
     return x;
 }
 
-static inline REAL group_max(REAL x, local REAL *scratch)
+inline REAL group_max(REAL x, local REAL *scratch)
 {
 #if GROUP_SIZE > 1
     const int me = get_local_id(0);
@@ -72,7 +72,7 @@ static inline REAL group_max(REAL x, local REAL *scratch)
 }
 
 /* Sum (maximum) of the partial values of a block-wise kernel, one per group. */
-static inline REAL total_sum(global const REAL *partial, local REAL *scratch)
+inline REAL total_sum(global const REAL *partial, local REAL *scratch)
 {
     REAL x = 0;
     for (int g = get_local_id(0); g < (int)get_num_groups(0); g += GROUP_SIZE)
@@ -80,7 +80,7 @@ static inline REAL total_sum(global const REAL *partial, local REAL *scratch)
     return group_sum(x, scratch);
 }
 
-static inline REAL total_max(global const REAL *partial, local REAL *scratch)
+inline REAL total_max(global const REAL *partial, local REAL *scratch)
 {
     REAL x = partial[0];
     for (int g = get_local_id(0); g < (int)get_num_groups(0); g += GROUP_SIZE)

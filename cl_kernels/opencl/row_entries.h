@@ -21,19 +21,19 @@
                   (array)[(j).s6 * (stride) + (a)], (array)[(j).s7 * (stride) + (a)]))
 
 #define AT_ONCE_FOR(TYPE)                                                                                              \
-    static inline MANY(TYPE) CLVORO_JOIN(take_, TYPE)(global const TYPE *array, int k, int size)                       \
+    inline MANY(TYPE) CLVORO_JOIN(take_, TYPE)(global const TYPE *array, int k, int size)                              \
     {                                                                                                                  \
         if (k + 8 <= size)                                                                                             \
             return vload8(0, array + k);                                                                               \
         const int8 at = min(k + (int8)(0, 1, 2, 3, 4, 5, 6, 7), (int8)(size - 1));                                     \
         return PICK(TYPE, array, at, 1, 0);                                                                            \
     }                                                                                                                  \
-    static inline MANY(TYPE) CLVORO_JOIN(take_rows_, TYPE)(global const TYPE *array, int a, int k, int size)           \
+    inline MANY(TYPE) CLVORO_JOIN(take_rows_, TYPE)(global const TYPE *array, int a, int k, int size)                  \
     {                                                                                                                  \
         const int8 at = min(k + (int8)(0, 1, 2, 3, 4, 5, 6, 7), (int8)(size - 1));                                     \
         return PICK(TYPE, array, at, DIM, a);                                                                          \
     }                                                                                                                  \
-    static inline TYPE CLVORO_JOIN(sum_, TYPE)(MANY(TYPE) x)                                                           \
+    inline TYPE CLVORO_JOIN(sum_, TYPE)(MANY(TYPE) x)                                                                  \
     {                                                                                                                  \
         const CLVORO_JOIN(TYPE, 4) x4 = x.lo + x.hi;                                                                   \
         const CLVORO_JOIN(TYPE, 2) x2 = x4.lo + x4.hi;                                                                 \
@@ -51,7 +51,7 @@ AT_ONCE_FOR(double)
 /* `x` where `chosen`, else `other`. */
 #define CHOOSE(TYPE, chosen, x, other) select((MANY(TYPE))(other), x, CLVORO_JOIN(mask_, TYPE)(chosen))
 
-static inline float least_float(float8 x)
+inline float least_float(float8 x)
 {
     const float4 x4 = fmin(x.lo, x.hi);
     const float2 x2 = fmin(x4.lo, x4.hi);
@@ -60,7 +60,7 @@ static inline float least_float(float8 x)
 
 /* Write entries k to the row's `end`. If rows are written in their order, the entries up to `until`, where the rows of
    another work-item begin, may be overwritten. */
-static inline void put_float(float8 x, global float *array, int k, int end, int until)
+inline void put_float(float8 x, global float *array, int k, int end, int until)
 {
     if (k + 8 <= until) {
         vstore8(x, 0, array + k);
@@ -73,7 +73,7 @@ static inline void put_float(float8 x, global float *array, int k, int end, int 
 
 /* As `nearest_image`. */
 #ifdef PERIODIC
-static inline MANY(REAL) nearest_images(MANY(REAL) d, REAL period)
+inline MANY(REAL) nearest_images(MANY(REAL) d, REAL period)
 {
     const REAL half_period = period / 2;
     return period > 0 ? select(select(d, d + period, d < -half_period), d - period, d > half_period) : d;

@@ -1,5 +1,5 @@
 /* Sort a short list in place, by Shell's method. */
-static inline void sort_list(global int *list, int count)
+inline void sort_list(global int *list, int count)
 {
     int gap = 1;
     while (gap < count / 9)

@@ -21,7 +21,7 @@
 
 #define NO_LABEL -1 /* the label of a face of the cell itself */
 
-static inline REAL4 load_vector(global const REAL *points, int i)
+inline REAL4 load_vector(global const REAL *points, int i)
 {
 #if DIM == 2
     return (REAL4)(points[2 * i], points[2 * i + 1], 0, 0);
@@ -30,7 +30,7 @@ static inline REAL4 load_vector(global const REAL *points, int i)
 #endif
 }
 
-static inline REAL dot_vectors(REAL4 a, REAL4 b)
+inline REAL dot_vectors(REAL4 a, REAL4 b)
 {
 #if DIM == 2
     return a.s0 * b.s0 + a.s1 * b.s1;
@@ -54,23 +54,23 @@ typedef struct {
     f < (piece)->n;                                                                                                    \
     ++f
 
-static inline int face_label(const piece_t *piece, int f)
+inline int face_label(const piece_t *piece, int f)
 {
     return piece->labels[f];
 }
 
-static inline REAL4 corner_of(const piece_t *piece, int k)
+inline REAL4 corner_of(const piece_t *piece, int k)
 {
     return (REAL4)(piece->x[k], piece->y[k], 0, 0);
 }
 
-static inline int corner_count(const piece_t *piece)
+inline int corner_count(const piece_t *piece)
 {
     return piece->n;
 }
 
-static inline int build_piece(piece_t *piece, int i, global const int *starts, global const int *neighbors,
-                              global const REAL *points, REAL4 box_lower, REAL4 box_upper)
+inline int build_piece(piece_t *piece, int i, global const int *starts, global const int *neighbors,
+                       global const REAL *points, REAL4 box_lower, REAL4 box_upper)
 {
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
@@ -100,7 +100,7 @@ static inline int build_piece(piece_t *piece, int i, global const int *starts, g
 
 /* Keep y.normal <= level. Vertices beyond the plane by no more than `depth` count as inside. The new face gets `label`.
  */
-static inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
+inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
 {
     const int n = piece->n;
     REAL s[CELL_CAPACITY];
@@ -144,7 +144,7 @@ static inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth
 }
 
 /* Sum over triangles that share corner 0, so that small pieces far from the generator keep their accuracy. */
-static inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
+inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
 {
     const REAL4 o = corner_of(piece, 0);
     REAL sum = 0;
@@ -168,23 +168,23 @@ typedef cell_t piece_t;
     f < FACE_CAPACITY;                                                                                                 \
     f = next_face((piece)->alive, f + 1)
 
-static inline int face_label(const piece_t *piece, int f)
+inline int face_label(const piece_t *piece, int f)
 {
     return piece->labels[f];
 }
 
-static inline REAL4 corner_of(const piece_t *piece, int k)
+inline REAL4 corner_of(const piece_t *piece, int k)
 {
     return (REAL4)(((const REAL *)piece->x)[k], ((const REAL *)piece->y)[k], ((const REAL *)piece->z)[k], 0);
 }
 
-static inline int corner_count(const piece_t *piece)
+inline int corner_count(const piece_t *piece)
 {
     return piece->n;
 }
 
-static inline int build_piece(piece_t *piece, int i, global const int *starts, global const int *neighbors,
-                              global const REAL *points, REAL4 box_lower, REAL4 box_upper)
+inline int build_piece(piece_t *piece, int i, global const int *starts, global const int *neighbors,
+                       global const REAL *points, REAL4 box_lower, REAL4 box_upper)
 {
     const REAL4 x = load_vector(points, i);
     start_polyhedron(piece, x, box_lower, box_upper);
@@ -199,7 +199,7 @@ static inline int build_piece(piece_t *piece, int i, global const int *starts, g
 /* Keep y.normal <= level. Vertices beyond the plane by no more than `depth` count as inside. The new face gets `label`.
    Unlike `clip_polyhedron` this takes any plane. New vertices are interpolated along edges, which is accurate since no
    edge is longer than the cell. */
-static inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
+inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
 {
     const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
     REAL *s = (REAL *)piece->beyond;
@@ -229,7 +229,7 @@ static inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth
 }
 
 /* Sum over tetrahedra that share vertex 0, so that small pieces far from the generator keep their accuracy. */
-static inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
+inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
 {
     const REAL4 o = corner_of(piece, 0);
     INDEX start[FACE_CAPACITY];

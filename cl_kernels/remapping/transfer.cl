@@ -35,7 +35,7 @@ typedef struct {
 } visited_t;
 
 /* Add j unless it is listed already. Returns false if the queue is full. */
-static inline bool visit(visited_t *seen, int j)
+inline bool visit(visited_t *seen, int j)
 {
     const int mask = 2 * seen->capacity - 1;
     int slot = (int)((uint)j * 2654435761u >> 7) & mask;
@@ -54,8 +54,7 @@ static inline bool visit(visited_t *seen, int j)
 /* The generator of `graph` nearest to x. Start at a generator in the bin of x, or near it, and move to a nearer
    neighbor until there is none. A point outside a generator's cell is nearer to one of its neighbors, so the walk
    cannot stop early. */
-static inline int nearest_generator(global const REAL *x, const graph_t *graph, int n, global const int *items,
-                                    BIN_ARGS)
+inline int nearest_generator(global const REAL *x, const graph_t *graph, int n, global const int *items, BIN_ARGS)
 {
     int bin = bin_in_grid(x, grid_frames[0], grid_shapes[0]);
     while (bins[bin].s1 != bins[bin + 1].s1) {
@@ -85,7 +84,7 @@ static inline int nearest_generator(global const REAL *x, const graph_t *graph, 
 
 /* Intersect a piece, relative to x, with old cell j: { y : |y - x_j| <= |y - x_k| for all neighbors k }. Both cells of
    a face compute its plane by the same operations, so that their pieces are complementary. Returns PIECE_*. */
-static inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, const graph_t *graph)
+inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, const graph_t *graph)
 {
     int what = PIECE_WHOLE;
     const REAL4 xj = load_vector(graph->points, j);
@@ -194,7 +193,7 @@ kernel void transfer_cell_data(const int size, const int first, global const int
 
 /* Solve M g = b for a symmetric positive semidefinite M by elimination with the largest pivot first. Overwrites M, and
    b with g. Returns false and leaves b unchanged if M is singular to round-off. */
-static inline bool solve_by_elimination(REAL m[DIM][DIM], REAL *b)
+inline bool solve_by_elimination(REAL m[DIM][DIM], REAL *b)
 {
     int order[DIM];
     REAL x[DIM], scale = 0;
@@ -234,7 +233,7 @@ static inline bool solve_by_elimination(REAL m[DIM][DIM], REAL *b)
 
 /* Solve the normal equations M g = b; overwrite b with g. If M is singular, as for a cell in a corner of the box with
    one neighbor, return the solution of least norm, accurate to the square root of the machine epsilon. */
-static inline void solve_normal_equations(REAL m[DIM][DIM], REAL *b)
+inline void solve_normal_equations(REAL m[DIM][DIM], REAL *b)
 {
     REAL copy[DIM][DIM], trace = 0;
     for (int a = 0; a < DIM; ++a) {

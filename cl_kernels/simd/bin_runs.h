@@ -12,7 +12,7 @@ typedef struct {
 } runs_t;
 
 /* Add the generators first .. end - 1. False if there is no room. */
-static inline bool add_bin_run(runs_t *runs, int first, int end)
+inline bool add_bin_run(runs_t *runs, int first, int end)
 {
     runs->total += end - first;
     if (runs->n > 0) {
@@ -37,7 +37,7 @@ typedef struct {
     double8 x, y, z, r;
 } balls_t;
 
-static inline double least_of(double8 v)
+inline double least_of(double8 v)
 {
     const double4 a = v.lo < v.hi ? v.lo : v.hi;
     const double2 b = a.lo < a.hi ? a.lo : a.hi;
@@ -45,7 +45,7 @@ static inline double least_of(double8 v)
 }
 
 /* Distance of rows of bins, from `begin` to `end` on one axis, from y. */
-static inline double8 gap_to_rows(double8 begin, double8 end, double y)
+inline double8 gap_to_rows(double8 begin, double8 end, double y)
 {
     const double8 below = begin - y, above = y - end, gap = below > above ? below : above;
     return gap > 0 ? gap : 0;
@@ -54,9 +54,9 @@ static inline double8 gap_to_rows(double8 begin, double8 end, double y)
 /* For eight rows of bins of a grid, restricted to the box [least, most]: the first and last bin that may touch the
    balls. The rows are numbers `pair` and following, layer by layer, with `across` rows per layer, from row low_y and
    layer low_z on. `noise` bounds the distance of positions from their bins. */
-static inline void span_rows(int *nexts, int *rights, int *offsets, int pair, int pairs, int across, int low_y,
-                             int low_z, FRAME frame, int4 shape, const double *xs, const double *ys, const double *zs,
-                             const double *rs, double4 least, double4 most, double noise)
+inline void span_rows(int *nexts, int *rights, int *offsets, int pair, int pairs, int across, int low_y, int low_z,
+                      FRAME frame, int4 shape, const double *xs, const double *ys, const double *zs, const double *rs,
+                      double4 least, double4 most, double noise)
 {
     const double inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
     /* A square root below is in single precision. */
@@ -89,7 +89,7 @@ static inline void span_rows(int *nexts, int *rights, int *offsets, int pair, in
 
 /* Collect all generators in the balls and in the box [least, most], and some others. False if there are more than
    `limit` generators, or too many ranges. */
-static inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, double4 most, int limit, BIN_ARGS)
+inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, double4 most, int limit, BIN_ARGS)
 {
     double xs[8], ys[8], zs[8], rs[8];
     const double8 r = balls->r;

@@ -19,7 +19,7 @@ typedef struct {
 
 /* Append one candidate per lane, at (dx, dy), NaN for none; the caller writes the items. The generator itself becomes
    NaN, as 0 times infinity. */
-static inline void put_candidates(list_t *list, double8 dx, double8 dy)
+inline void put_candidates(list_t *list, double8 dx, double8 dy)
 {
     const double8 square = fma(dx, dx, dy * dy);
     const double8 scale = 1 / square;
@@ -32,7 +32,7 @@ static inline void put_candidates(list_t *list, double8 dx, double8 dy)
 }
 
 /* Pad the lists to a multiple of CHAINS. */
-static inline void pad_list(list_t *list)
+inline void pad_list(list_t *list)
 {
     for (; list->length % CHAINS; ++list->length)
         list->x[list->length] = list->y[list->length] = NAN;

@@ -7,8 +7,8 @@
 #define ENOUGH 28
 
 /* Append the near generators selected by `bits` to the lists, at most `most` each. */
-static inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int most,
-                             global const double *binned, int own, double8 x, double8 y)
+inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int most, global const double *binned,
+                      int own, double8 x, double8 y)
 {
     double2 found[LIST_CAPACITY * LANES];
     const int length = list->length;
@@ -58,8 +58,8 @@ static inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bit
 /* Add the generators with squared distance in [from2, to2) to the lists of some lanes. Returns to2, reduced where a
    first list (from2 = 0) would be long. Lists that are full, and those of generators that coincide with another, are in
    doubt. */
-static inline double8 add_near(list_t *list, const near_t *near, global const double *binned, int own, double8 x,
-                               double8 y, long8 lanes, double8 from2, double8 to2, long8 *doubt)
+inline double8 add_near(list_t *list, const near_t *near, global const double *binned, int own, double8 x, double8 y,
+                        long8 lanes, double8 from2, double8 to2, long8 *doubt)
 {
     const int words = (near->count + 63) / 64;
     ulong8 bits[NEAR_CAPACITY / 64];
@@ -93,8 +93,8 @@ static inline double8 add_near(list_t *list, const near_t *near, global const do
 }
 
 /* Add the mirror images in the walls to the lists of some lanes, if there is room. */
-static inline void add_walls(list_t *list, double8 x, double8 y, long8 lanes, double4 box_lower, double4 box_upper,
-                             long8 *doubt)
+inline void add_walls(list_t *list, double8 x, double8 y, long8 lanes, double4 box_lower, double4 box_upper,
+                      long8 *doubt)
 {
     if (list->length > LIST_CAPACITY - 4) {
         *doubt |= lanes;

@@ -3,7 +3,7 @@
 #include "tessellation/face_rows.h"
 #include "simd/lanes.h"
 
-static inline double8 cross_in_plane(double8 a, double8 b, double8 c, double8 d)
+inline double8 cross_in_plane(double8 a, double8 b, double8 c, double8 d)
 {
     const double8 cd = c * d;
     return fma(a, b, -cd) + fma(-c, d, cd);
@@ -12,7 +12,7 @@ static inline double8 cross_in_plane(double8 a, double8 b, double8 c, double8 d)
 #ifdef FOLD_0
 /* Replace rows of points, up to number `most`, by their images nearest to the points (x, y), so that all differences
    are those of `corner`. */
-static inline void fold_eight_rows(double2 *behind, int most, double8 x, double8 y)
+inline void fold_eight_rows(double2 *behind, int most, double8 x, double8 y)
 {
     const double8 even = (double8)(x.s0, y.s0, x.s2, y.s2, x.s4, y.s4, x.s6, y.s6);
     const double8 odd = (double8)(x.s1, y.s1, x.s3, y.s3, x.s5, y.s5, x.s7, y.s7);
@@ -37,7 +37,7 @@ typedef struct {
 
 /* The first `most` corners of cells with generators at (x, y), corner k between faces k and k + 1, from the positions
    of the neighbors. */
-static inline void find_corners(outlines_t *corners, const double2 *behind, int most, double8 x, double8 y)
+inline void find_corners(outlines_t *corners, const double2 *behind, int most, double8 x, double8 y)
 {
     double8 ax, ay;
     load_row(behind, 0, &ax, &ay);

@@ -8,7 +8,7 @@
 #define CONVERT_FACE8 CLVORO_JOIN(convert_, FACE8)
 
 /* Whether the bits in `words` keep all n faces. */
-static inline bool keeps_all(global const uint *words, int n)
+inline bool keeps_all(global const uint *words, int n)
 {
     bool all = true;
     for (; n > 0; n -= 32, ++words)
@@ -17,9 +17,8 @@ static inline bool keeps_all(global const uint *words, int n)
 }
 
 /* Measure the cells of LANES generators from number `first` on. */
-static inline void measure_eight(const measures_t *to, int first, int size, const face_rows_t *rows,
-                                 global const uint *keep, global const double *points, const double *lower,
-                                 const double *upper)
+inline void measure_eight(const measures_t *to, int first, int size, const face_rows_t *rows, global const uint *keep,
+                          global const double *points, const double *lower, const double *upper)
 {
     double2 behind[(ROW_CAPACITY + 1) * LANES];
     double xs[LANES], ys[LANES];

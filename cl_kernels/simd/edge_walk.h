@@ -18,7 +18,7 @@ typedef struct {
 } stop_t;
 
 /* Cut a ray from `y` (given as -y) along `ray` by entry k. */
-static inline void cut_ray(stop_t *stop, const list_t *list, int k, vectors_t minus_y, vectors_t ray)
+inline void cut_ray(stop_t *stop, const list_t *list, int k, vectors_t minus_y, vectors_t ray)
 {
     const double8 x = list->planes[k].x, y = list->planes[k].y, z = list->planes[k].z;
     /* At least 0: round-off may put y beyond its own bisectors, which would then seem to cut a ray that leaves them. */
@@ -32,8 +32,7 @@ static inline void cut_ray(stop_t *stop, const list_t *list, int k, vectors_t mi
 }
 
 /* Go from y along `ray` to the next vertex, which is returned; `inverse` is 1 / speed. */
-static inline vectors_t walk_ray(stop_t *stop, double8 *inverse, const list_t *list, vectors_t y, vectors_t ray,
-                                 long8 active)
+inline vectors_t walk_ray(stop_t *stop, double8 *inverse, const list_t *list, vectors_t y, vectors_t ray, long8 active)
 {
     const vectors_t minus_y = {-y.x, -y.y, -y.z};
     /* Two independent chains of comparisons, which the processor overlaps. */
@@ -62,7 +61,7 @@ static inline vectors_t walk_ray(stop_t *stop, double8 *inverse, const list_t *l
 
 /* The face of entry k of the list of a lane, a new one if needed; HULL_CAPACITY if there is no room. Known data is
    written again, as mispredicted branches cost more. */
-static inline int face_of_entry(cells_t *cells, lane_walk_t *own, const list_t *list, int k, int lane)
+inline int face_of_entry(cells_t *cells, lane_walk_t *own, const list_t *list, int k, int lane)
 {
     const int known = own->face_of[k], next = cells->faces[lane];
     const bool is_new = known == NO_FACE;
@@ -76,7 +75,7 @@ static inline int face_of_entry(cells_t *cells, lane_walk_t *own, const list_t *
 }
 
 /* Record vertex number `corner` between faces a, b, c. False if this vertex exists already. */
-static inline bool put_corner(lane_walk_t *own, int a, int b, int c, int corner)
+inline bool put_corner(lane_walk_t *own, int a, int b, int c, int corner)
 {
     const ulong sides_a = own->sides[a] | 1UL << b, sides_b = own->sides[b], sides_c = own->sides[c];
     if (a == c || b == c || (((own->sides[a] >> b) | (sides_b >> c) | (sides_c >> a)) & 1) != 0)
@@ -96,7 +95,7 @@ static inline bool put_corner(lane_walk_t *own, int a, int b, int c, int corner)
 }
 
 /* Choose the next edge of a lane, if any. */
-static inline void next_edge(walk_t *walk, int lane)
+inline void next_edge(walk_t *walk, int lane)
 {
     lane_walk_t *own = &walk->lanes[lane];
     int open = own->open;
@@ -116,7 +115,7 @@ static inline void next_edge(walk_t *walk, int lane)
 }
 
 /* Trace the cells of the chosen lanes. */
-static inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 chosen)
+inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 chosen)
 {
     cells->reach2 = cells->square_x = cells->square_y = cells->square_z = 0;
     cells->mixed_x = cells->mixed_y = cells->mixed_z = 0;

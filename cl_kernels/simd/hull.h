@@ -36,7 +36,7 @@ typedef struct {
 } best_t;
 
 /* Take the candidate in direction (dx, dy) if it is to the right by more than round-off. */
-static inline void take_right(best_t *best, double8 dx, double8 dy, long8 at, double8 rounding)
+inline void take_right(best_t *best, double8 dx, double8 dy, long8 at, double8 rounding)
 {
     const long8 right = fma(dx, best->dy, -dy * best->dx) > rounding;
     best->at = right ? at : best->at;
@@ -45,7 +45,7 @@ static inline void take_right(best_t *best, double8 dx, double8 dy, long8 at, do
 }
 
 /* Wrap the hulls of the candidates in some lanes. */
-static inline void wrap_hulls(hull_t *hull, const list_t *list, long8 lanes)
+inline void wrap_hulls(hull_t *hull, const list_t *list, long8 lanes)
 {
     const double8 rounding = TURN_ROUNDING * list->largest2;
     const long8 start = list->nearest;
@@ -97,7 +97,7 @@ static inline void wrap_hulls(hull_t *hull, const list_t *list, long8 lanes)
    The face of the nearest generator, where hulls begin and end, needs no check. Other bisectors are not nearer; one at
    an angle t cuts the face at least a quarter of t times the distance of that generator from its foot. If the face is
    small, the turns there, of order t^3, are near round-off. */
-static inline void measure_hulls(hull_t *hull, const list_t *list, double8 *reach2, double8 *least)
+inline void measure_hulls(hull_t *hull, const list_t *list, double8 *reach2, double8 *least)
 {
     double8 x = 0, y = 0;
     long8 outside = 0;
@@ -122,14 +122,14 @@ static inline void measure_hulls(hull_t *hull, const list_t *list, double8 *reac
 }
 
 /* Whether any decision for the hulls is near round-off. A hull with x outside is useless, but certain. */
-static inline long8 is_uncertain(const hull_t *hull, const list_t *list, double8 reach2, double8 least)
+inline long8 is_uncertain(const hull_t *hull, const list_t *list, double8 reach2, double8 least)
 {
     return !(list->largest2 < 1 / CERTAIN_DISTANCE2) |
            (~hull->lost & (hull->doubt | !(least > CERTAIN_FACE2) | !(list->largest2 * reach2 < CERTAIN_RATIO2)));
 }
 
 /* Write the labels of the faces of a row, starting with the least. */
-static inline void write_labels(const int *labels, int count, global int *row)
+inline void write_labels(const int *labels, int count, global int *row)
 {
     /* Label and index in one number. */
     long least = LONG_MAX;

@@ -20,7 +20,7 @@
 
 /* Reduce the lists of the wrapped lanes to the corners of the hulls (to nothing if a hull is invalid), those of the
    others to the first `kept` candidates. Returns the new numbers. */
-static inline int keep_hulls(list_t *list, const hull_t *hull, long8 wrapped, int kept)
+inline int keep_hulls(list_t *list, const hull_t *hull, long8 wrapped, int kept)
 {
     const long8 sizes = wrapped ? (hull->lost ? 0 : hull->sizes) : kept;
     const int most = max_lane(sizes);
@@ -37,8 +37,7 @@ static inline int keep_hulls(list_t *list, const hull_t *hull, long8 wrapped, in
 }
 
 /* Choose the lanes near the first one; the rectangle holds everything within r of them. */
-static inline long8 choose_lanes(long8 todo, double8 x, double8 y, double8 r, double8 far_away, double2 *lower,
-                                 double2 *upper)
+inline long8 choose_lanes(long8 todo, double8 x, double8 y, double8 r, double8 far_away, double2 *lower, double2 *upper)
 {
     long wanted[LANES];
     double xs[LANES], ys[LANES], fars[LANES];
@@ -59,8 +58,8 @@ static inline long8 choose_lanes(long8 todo, double8 x, double8 y, double8 r, do
 }
 
 /* Write the rows of some lanes, from item `own` on; see `clip_polygons`. */
-static inline void write_rows(const hull_t *hull, long8 lanes, double8 need, int own, global const int *items,
-                              global float *reach, global int *rows, global int *row_counts)
+inline void write_rows(const hull_t *hull, long8 lanes, double8 need, int own, global const int *items,
+                       global float *reach, global int *rows, global int *row_counts)
 {
     long written[LANES], sizes[LANES];
     double radii[LANES];
@@ -87,7 +86,7 @@ typedef struct {
     double8 number, sum, squares;
 } needs_t;
 
-static inline void note_needs(needs_t *needs, long8 lanes, double8 need)
+inline void note_needs(needs_t *needs, long8 lanes, double8 need)
 {
     needs->number += lanes ? (double8)1 : 0;
     needs->sum += lanes ? need : 0;
@@ -95,7 +94,7 @@ static inline void note_needs(needs_t *needs, long8 lanes, double8 need)
 }
 
 /* The first search radius, at most `most`. */
-static inline double first_look(needs_t *needs, double most)
+inline double first_look(needs_t *needs, double most)
 {
     const double number = sum_lanes(needs->number);
     if (number < LANES / 2)

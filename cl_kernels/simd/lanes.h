@@ -8,28 +8,28 @@
 /* One lane of vector k of an array. */
 #define LANE(vectors, k, lane) ((vectors)[(k)*LANES + (lane)])
 
-static inline bool any_lane(long8 lanes)
+inline bool any_lane(long8 lanes)
 {
     const long4 four = lanes.lo | lanes.hi;
     const long2 two = four.lo | four.hi;
     return (two.lo | two.hi) < 0;
 }
 
-static inline long max_lane(long8 values)
+inline long max_lane(long8 values)
 {
     const long4 four = max(values.lo, values.hi);
     const long2 two = max(four.lo, four.hi);
     return max(two.lo, two.hi);
 }
 
-static inline double min_lane(double8 values)
+inline double min_lane(double8 values)
 {
     const double4 four = min(values.lo, values.hi);
     const double2 two = min(four.lo, four.hi);
     return min(two.lo, two.hi);
 }
 
-static inline double sum_lanes(double8 values)
+inline double sum_lanes(double8 values)
 {
     const double4 four = values.lo + values.hi;
     const double2 two = four.lo + four.hi;
@@ -37,7 +37,7 @@ static inline double sum_lanes(double8 values)
 }
 
 /* Gather: lane `lane` of vector k[lane] of an array. */
-static inline double8 pick(const double8 *vectors, long8 k)
+inline double8 pick(const double8 *vectors, long8 k)
 {
     const double *values = (const double *)vectors;
     return (double8)(LANE(values, k.s0, 0), LANE(values, k.s1, 1), LANE(values, k.s2, 2), LANE(values, k.s3, 3),
@@ -48,7 +48,7 @@ static inline double8 pick(const double8 *vectors, long8 k)
    instruction. */
 #define ROW_PLACE(k, lane) ((k)*LANES + (lane) / 2 + (lane) % 2 * (LANES / 2))
 
-static inline void load_row(const double2 *points, int k, double8 *x, double8 *y)
+inline void load_row(const double2 *points, int k, double8 *x, double8 *y)
 {
     const double8 even = vload8(2 * k, (const double *)points), odd = vload8(2 * k + 1, (const double *)points);
     *x = (double8)(even.s0, odd.s0, even.s2, odd.s2, even.s4, odd.s4, even.s6, odd.s6);

@@ -7,7 +7,7 @@
 #error "a list must hold all candidates, and a slot all faces of a hull"
 #endif
 
-static inline bool is_found(const int *found, int j)
+inline bool is_found(const int *found, int j)
 {
     const int16 same = (vload16(0, found) == j) | (vload16(1, found) == j);
     const int8 eight = same.lo | same.hi;
@@ -18,7 +18,7 @@ static inline bool is_found(const int *found, int j)
 
 /* The candidates of generator i: its neighbors and, for each two consecutive ones, the other cell that borders on both.
    These may be neighbors after one change of topology. Returns their number; 0 if there is a wall, or too many. */
-static inline int find_candidates(int *found, int i, const face_rows_t *rows)
+inline int find_candidates(int *found, int i, const face_rows_t *rows)
 {
     int n, m;
     global const int *row = face_row(rows, i, &n);
@@ -45,9 +45,9 @@ static inline int find_candidates(int *found, int i, const face_rows_t *rows)
 }
 
 /* Wrap the cells of LANES listed generators from number `first` on, of `size`; see `wrap_marked`. */
-static inline void wrap_eight(int first, int size, global const int *listed, const face_rows_t *rows,
-                              global const double *points, double4 box_lower, double4 box_upper, global int *slots,
-                              global int *slot_counts)
+inline void wrap_eight(int first, int size, global const int *listed, const face_rows_t *rows,
+                       global const double *points, double4 box_lower, double4 box_upper, global int *slots,
+                       global int *slot_counts)
 {
     int found[LANES][WRAPPED_CAPACITY], own[LANES], counts[LANES];
     double xs[LANES], ys[LANES];

@@ -11,7 +11,7 @@ typedef struct {
     int places[NEAR_CAPACITY + NEAR_STEP];
 } near_t;
 
-static inline bool add_near_run(near_t *near, int first, int end)
+inline bool add_near_run(near_t *near, int first, int end)
 {
     const int count = near->count + end - first;
     if (count > NEAR_CAPACITY)
@@ -24,7 +24,7 @@ static inline bool add_near_run(near_t *near, int first, int end)
 }
 
 /* Collect the generators in a rectangle, and some near it. False if there are too many. */
-static inline bool collect_near(near_t *near, double2 lower, double2 upper, BIN_ARGS)
+inline bool collect_near(near_t *near, double2 lower, double2 upper, BIN_ARGS)
 {
     descent_t way; /* position: row and bin */
     near->count = 0;

@@ -41,7 +41,7 @@ typedef struct {
     long8 nearest;          /* its entry */
 } list_t;
 
-static inline void put_plane(list_t *list, int k, int lane, double x, double y, double z, int place)
+inline void put_plane(list_t *list, int k, int lane, double x, double y, double z, int place)
 {
     PLANE_LANE(list->planes, k, 0, lane) = x;
     PLANE_LANE(list->planes, k, 1, lane) = y;
@@ -57,8 +57,8 @@ typedef struct {
 } near_t;
 
 /* Find the generators nearer than r, and their shells. */
-static inline void see_near(near_t *near, list_t *list, global const double *binned, double8 x, double8 y, double8 z,
-                            double8 r2)
+inline void see_near(near_t *near, list_t *list, global const double *binned, double8 x, double8 y, double8 z,
+                     double8 r2)
 {
     for (int shell = 0; shell < SHELLS; ++shell) {
         list->radii2[shell] = r2 * (SHELL_ENDS[shell] * SHELL_ENDS[shell]);
@@ -83,8 +83,8 @@ static inline void see_near(near_t *near, list_t *list, global const double *bin
 }
 
 /* Adjust the radius of one lane so that it holds about ENOUGH generators. */
-static inline void see_less(near_t *near, list_t *list, global const double *binned, int lane, const double *xs,
-                            const double *ys, const double *zs, double *radii)
+inline void see_less(near_t *near, list_t *list, global const double *binned, int lane, const double *xs,
+                     const double *ys, const double *zs, double *radii)
 {
     long *totals[SHELLS], *bits[SHELLS];
     double ends2[SHELLS];
@@ -118,8 +118,8 @@ static inline void see_less(near_t *near, list_t *list, global const double *bin
 }
 
 /* Append the generators of a shell, except items own[lane], to the lists with counts[lane] entries. */
-static inline void add_seen(list_t *list, const near_t *near, int shell, global const double *binned, const int *own,
-                            const double *xs, const double *ys, const double *zs, int *counts)
+inline void add_seen(list_t *list, const near_t *near, int shell, global const double *binned, const int *own,
+                     const double *xs, const double *ys, const double *zs, int *counts)
 {
     const ulong *bits = (const ulong *)near->bits[shell];
     for (int lane = 0; lane < LANES; ++lane) {
@@ -136,7 +136,7 @@ static inline void add_seen(list_t *list, const near_t *near, int shell, global 
 }
 
 /* Pad the lists with infinitely distant entries to a common, even length, which is returned. */
-static inline int pad_lists(list_t *list, int *counts)
+inline int pad_lists(list_t *list, int *counts)
 {
     int length = 2; /* there is always an entry */
     for (int lane = 0; lane < LANES; ++lane)
@@ -151,7 +151,7 @@ static inline int pad_lists(list_t *list, int *counts)
 }
 
 /* Add wall number `wall`, at signed distances. */
-static inline void add_wall(list_t *list, double8 distances, int wall, int *counts)
+inline void add_wall(list_t *list, double8 distances, int wall, int *counts)
 {
     double along[LANES];
     vstore8(2 * distances, 0, along);
@@ -162,9 +162,9 @@ static inline void add_wall(list_t *list, double8 distances, int wall, int *coun
 
 /* List the near generators, and the walls within `reach` of [lower, upper]. Lists that are too long stay empty; returns
    those lanes. */
-static inline long8 list_near(list_t *list, near_t *near, global const double *binned, const int *own, const double *xs,
-                              const double *ys, const double *zs, double4 lower, double4 upper, double reach,
-                              double4 box_lower, double4 box_upper)
+inline long8 list_near(list_t *list, near_t *near, global const double *binned, const int *own, const double *xs,
+                       const double *ys, const double *zs, double4 lower, double4 upper, double reach,
+                       double4 box_lower, double4 box_upper)
 {
     const double8 x = vload8(0, xs), y = vload8(0, ys), z = vload8(0, zs);
     long8 full = near->totals[0] > SHELL_CAPACITY;
@@ -222,8 +222,8 @@ typedef struct {
 } search_t;
 
 /* Choose the lanes near that of the least rank; the box holds them, r is their largest radius. */
-static inline long8 choose_planes(long8 todo, const int *ranks, const double *xs, const double *ys, const double *zs,
-                                  double8 radii, double spread, double4 *lower, double4 *upper, double *r)
+inline long8 choose_planes(long8 todo, const int *ranks, const double *xs, const double *ys, const double *zs,
+                           double8 radii, double spread, double4 *lower, double4 *upper, double *r)
 {
     long wanted[LANES], chosen[LANES];
     double rs[LANES];
@@ -248,9 +248,9 @@ static inline long8 choose_planes(long8 todo, const int *ranks, const double *xs
 
 /* Choose lanes and find the generators near them. A guessed radius that holds too many or too few generators is
    changed. False if too many are near the chosen lanes. */
-static inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, long8 fresh, const int *ranks,
-                              const double *xs, const double *ys, const double *zs, double8 *r, long8 *chosen,
-                              double4 *lower, double4 *upper, double *widest, const search_t *in)
+inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, long8 fresh, const int *ranks,
+                       const double *xs, const double *ys, const double *zs, double8 *r, long8 *chosen, double4 *lower,
+                       double4 *upper, double *widest, const search_t *in)
 {
     const double8 x = vload8(0, xs), y = vload8(0, ys), z = vload8(0, zs);
     double spread = SPREAD;

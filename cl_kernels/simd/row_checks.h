@@ -7,8 +7,7 @@
 #endif
 
 /* Whether the neighbors of generator i list it between the right two. */
-static inline bool fits_exactly(int i, global const int *row, int n, global const int *starts,
-                                global const int *neighbors)
+inline bool fits_exactly(int i, global const int *row, int n, global const int *starts, global const int *neighbors)
 {
     bool fit = true;
     for (int k = 0; k < n && fit; ++k) {
@@ -19,9 +18,9 @@ static inline bool fits_exactly(int i, global const int *row, int n, global cons
 }
 
 /* Check the rows of LANES generators from number `first` on; see `check_rows`. Returns the number of wrong rows. */
-static inline int check_eight(int first, int size, global const int *starts, global const int *neighbors,
-                              global const double *points, const double *lower, const double *upper, global int *fits,
-                              global int *marks)
+inline int check_eight(int first, int size, global const int *starts, global const int *neighbors,
+                       global const double *points, const double *lower, const double *upper, global int *fits,
+                       global int *marks)
 {
     double2 behind[(CHECKED_FACES + 1) * LANES];
     double xs[LANES], ys[LANES];

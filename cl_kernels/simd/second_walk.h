@@ -19,9 +19,8 @@ typedef struct {
 /* Among eight items first, first + 1, ... below `end`, append to the list, from entry `k` on, those at a distance
    between `from` and `to` from x that cut one of the `far` vertices. Returns the next entry; at most LIST_CAPACITY are
    written. */
-static inline int add_cutters(list_t *list, int k, int slot, global const double *binned, int first, int end, double4 x,
-                              double from2, double to2, int far, const double *far_x, const double *far_y,
-                              const double *far_z)
+inline int add_cutters(list_t *list, int k, int slot, global const double *binned, int first, int end, double4 x,
+                       double from2, double to2, int far, const double *far_x, const double *far_y, const double *far_z)
 {
     int places[LANES];
     for (int c = 0; c < LANES; ++c)
@@ -56,8 +55,8 @@ static inline int add_cutters(list_t *list, int k, int slot, global const double
 
 /* Balls that cover all points farther than `from` from x and nearer to one of the vertices than x. If there are many
    vertices, consecutive ones, which are usually close, share a ball. */
-static inline balls_t balls_about(double4 x, double from, int far, const double *far_x, const double *far_y,
-                                  const double *far_z)
+inline balls_t balls_about(double4 x, double from, int far, const double *far_x, const double *far_y,
+                           const double *far_z)
 {
     double4 centers[CORNER_CAPACITY];
     double radii[CORNER_CAPACITY], xs[LANES], ys[LANES], zs[LANES], rs[LANES];
@@ -92,8 +91,8 @@ static inline balls_t balls_about(double4 x, double from, int far, const double 
    `need`. If there are any, queue the cell. Returns their number; -1 if there are too many.
 
    A generator that cuts a vertex is nearer to it than x. For a long, thin cell only its ends are searched. */
-static inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const walk_t *walk, int lane, int place,
-                            double from, double need, const search_t *in)
+inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const walk_t *walk, int lane, int place,
+                     double from, double need, const search_t *in)
 {
     global const double *binned = in->binned;
     const double4 x = (double4)(binned[3 * place], binned[3 * place + 1], binned[3 * place + 2], 0);
@@ -165,7 +164,7 @@ static inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, 
 }
 
 /* Trace the queued cells; write them, or queue them again. */
-static inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const output_t *out)
+inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const output_t *out)
 {
     global const double *binned = in->binned;
     list_t *list = &later->list;

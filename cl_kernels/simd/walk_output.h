@@ -23,8 +23,8 @@ typedef struct {
 
 #ifdef HALO
 /* Test the ball around vertex v of the cell of one lane, of generator i at x. */
-static inline void check_corner_ball(const cells_t *cells, const walk_t *walk, int v, int lane, int i, const double *x,
-                                     const output_t *out)
+inline void check_corner_ball(const cells_t *cells, const walk_t *walk, int v, int lane, int i, const double *x,
+                              const output_t *out)
 {
     const uchar4 corner = walk->lanes[lane].corner_faces[v];
     const int faces[3] = {corner.s0, corner.s1, corner.s2};
@@ -41,8 +41,8 @@ static inline void check_corner_ball(const cells_t *cells, const walk_t *walk, i
 }
 
 /* Test the balls around the vertices of the cells of some lanes, for generators in the box. */
-static inline void check_walked_balls(const cells_t *cells, const walk_t *walk, long8 some, const int *places,
-                                      global const double *binned, const output_t *out)
+inline void check_walked_balls(const cells_t *cells, const walk_t *walk, long8 some, const int *places,
+                               global const double *binned, const output_t *out)
 {
     const halo_t *halo = &out->halo;
     double x[LANES][3];
@@ -83,8 +83,8 @@ static inline void check_walked_balls(const cells_t *cells, const walk_t *walk, 
 
 /* Write the cells of some lanes, of items `places`; return their number. `reach` is twice the distance of the farthest
    vertex. */
-static inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t *m, long8 done,
-                              const int *places, double8 reach, global const double *binned, const output_t *out)
+inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t *m, long8 done, const int *places,
+                       double8 reach, global const double *binned, const output_t *out)
 {
     long lanes[LANES];
     double reaches[LANES];
@@ -133,7 +133,7 @@ static inline int write_cells(const cells_t *cells, const walk_t *walk, const mo
 }
 
 /* Lanes whose cell, traced among all generators nearer than `reach`, is certain. */
-static inline long8 certain_cells(const cells_t *cells, const moments_t *m, const list_t *list)
+inline long8 certain_cells(const cells_t *cells, const moments_t *m, const list_t *list)
 {
     return (list->nearest2 > CERTAIN_NEAREST2 * cells->reach2) & (m->least > CERTAIN_AREA);
 }

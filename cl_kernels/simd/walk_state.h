@@ -11,19 +11,19 @@ typedef struct {
     double8 x, y, z;
 } vectors_t;
 
-static inline double8 dot8(vectors_t a, vectors_t b)
+inline double8 dot8(vectors_t a, vectors_t b)
 {
     return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z));
 }
 
-static inline vectors_t cross_in_space(vectors_t a, vectors_t b)
+inline vectors_t cross_in_space(vectors_t a, vectors_t b)
 {
     const vectors_t c = {fma(a.y, b.z, -a.z * b.y), fma(a.z, b.x, -a.x * b.z), fma(a.x, b.y, -a.y * b.x)};
     return c;
 }
 
 /* a + s b */
-static inline vectors_t along8(vectors_t a, double8 s, vectors_t b)
+inline vectors_t along8(vectors_t a, double8 s, vectors_t b)
 {
     const vectors_t c = {fma(s, b.x, a.x), fma(s, b.y, a.y), fma(s, b.z, a.z)};
     return c;
@@ -60,7 +60,7 @@ typedef struct {
     long active[LANES];
 } walk_t;
 
-static inline vectors_t planes_at(const planes_t *planes, const long *at)
+inline vectors_t planes_at(const planes_t *planes, const long *at)
 {
     const vectors_t p = {PLANE_LANES(planes, at, 0), PLANE_LANES(planes, at, 1), PLANE_LANES(planes, at, 2)};
     return p;
@@ -72,7 +72,7 @@ typedef struct {
     double8 g, part_p, part_q, both;
 } share_t;
 
-static inline share_t share_edge(double8 g, vectors_t p, vectors_t q, double8 p2, double8 q2, double8 inverses)
+inline share_t share_edge(double8 g, vectors_t p, vectors_t q, double8 p2, double8 q2, double8 inverses)
 {
     const double8 pq = dot8(p, q);
     const share_t share = {g, g * (p2 - pq), g * (q2 - pq), g * fma(-pq, inverses, 2)};
@@ -86,9 +86,9 @@ static inline share_t share_edge(double8 g, vectors_t p, vectors_t q, double8 p2
    with a negative volume if a foot lies outside: six at every vertex. For a face at p, the triangle of the feet and the
    vertex has the area g (p^2 - p.q) / (4 |p|), and the tetrahedron the volume g (p^2 - p.q) / (24 p^2). First moments
    follow from f + v. Second moments: here the terms without the foot on the face, v v + f f + (v + f) (v + f). */
-static inline void add_corner(cells_t *cells, long8 some, const long *at_a, const long *at_b, const long *at_c,
-                              vectors_t y, vectors_t a, vectors_t b, vectors_t c, vectors_t ab, vectors_t bc,
-                              vectors_t ca, double8 a2, double8 b2, double8 c2)
+inline void add_corner(cells_t *cells, long8 some, const long *at_a, const long *at_b, const long *at_c, vectors_t y,
+                       vectors_t a, vectors_t b, vectors_t c, vectors_t ab, vectors_t bc, vectors_t ca, double8 a2,
+                       double8 b2, double8 c2)
 {
     const double8 ia = PLANE_LANES(cells->planes, at_a, 3), ib = PLANE_LANES(cells->planes, at_b, 3);
     const double8 ic = PLANE_LANES(cells->planes, at_c, 3);
@@ -143,7 +143,7 @@ typedef struct {
     double8 volume, x, y, z, xx, yy, zz, yz, zx, xy, least;
 } moments_t;
 
-static inline double4 corner_at(const walk_t *walk, int v, int lane)
+inline double4 corner_at(const walk_t *walk, int v, int lane)
 {
     return (double4)(PLANE_LANE(walk->corners, v, 0, lane), PLANE_LANE(walk->corners, v, 1, lane),
                      PLANE_LANE(walk->corners, v, 2, lane), 0);
@@ -151,8 +151,7 @@ static inline double4 corner_at(const walk_t *walk, int v, int lane)
 
 /* Area and centroid of a face of a lane from triangles around its first vertex: as accurate as the vertices, also for
    small faces. `normal` has length 1; `far2` becomes the squared distance of the farthest vertex. */
-static inline double4 measure_small(const cells_t *cells, const walk_t *walk, int f, int lane, double4 normal,
-                                    double *far2)
+inline double4 measure_small(const cells_t *cells, const walk_t *walk, int f, int lane, double4 normal, double *far2)
 {
     /* For each vertex of the face, the faces before and after it. */
     uchar ins[HULL_CAPACITY], outs[HULL_CAPACITY], at[HULL_CAPACITY];
@@ -185,7 +184,7 @@ static inline double4 measure_small(const cells_t *cells, const walk_t *walk, in
 }
 
 /* Replace the sums of the faces by areas and centroids, and add up the contributions of faces to cells. */
-static inline moments_t finish_cells(cells_t *cells, const walk_t *walk, long8 closed)
+inline moments_t finish_cells(cells_t *cells, const walk_t *walk, long8 closed)
 {
     int most = 0;
     for (int lane = 0; lane < LANES; ++lane)

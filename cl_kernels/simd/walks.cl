@@ -24,7 +24,7 @@
 #endif
 
 /* The first bin, along each axis, of a cube of grid 0; cubes are counted along x first. */
-static inline int4 first_of_cube(int cube, int4 shape)
+inline int4 first_of_cube(int cube, int4 shape)
 {
     const int across = (shape.s1 + CUBE - 1) / CUBE, deep = (shape.s2 + CUBE - 1) / CUBE;
     return CUBE * (int4)(cube % across, cube / across % deep, cube / across / deep, 0);

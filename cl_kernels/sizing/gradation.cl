@@ -20,7 +20,7 @@
 
 /* u of the scheme from the smaller neighbors a (REAL_MAX: none) at distances d. Axes are used in the order of ascending
    a, as long as a is below the u from the previous axes. */
-static inline REAL upwind_value(REAL *a, REAL *d, REAL growth)
+inline REAL upwind_value(REAL *a, REAL *d, REAL growth)
 {
     for (int k = 1; k < DIM; ++k)
         for (int j = k; j > 0 && a[j] < a[j - 1]; --j) {

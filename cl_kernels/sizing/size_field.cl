@@ -8,7 +8,7 @@
 #error "build with -DMAX_SIZE=largest h' whose error and density are numbers"
 #endif
 
-static inline void record_invalid(REAL h, int i, global int *invalid)
+inline void record_invalid(REAL h, int i, global int *invalid)
 {
     if (!(h > 0 && h <= R(MAX_SIZE)))
         atomic_min(invalid, i);

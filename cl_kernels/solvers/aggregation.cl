@@ -45,7 +45,7 @@ kernel void invert_row_sums(int n, global const int *starts, global const int *c
 
 /* weight (1 + r), 0 <= r < 0.001, r a hash of the pair (i, j). It breaks ties on regular meshes, where all cells would
    otherwise choose in the same direction and few pairs would form. */
-static inline REAL break_tie(REAL weight, int i, int j)
+inline REAL break_tie(REAL weight, int i, int j)
 {
     uint key = (uint)min(i, j) * 0x9E3779B1u ^ (uint)max(i, j) * 0x85EBCA77u;
     key ^= key >> 15;
@@ -96,7 +96,7 @@ kernel void match_pairs(int n, global const int *choice, global int *mate)
 
 /* Root of the aggregate of cell i: the lower one of two mates. A cell without a mate belongs to the aggregate of its
    choice; without a choice it is its own root. */
-static inline int root_of(int i, global const int *mate, global const int *choice)
+inline int root_of(int i, global const int *mate, global const int *choice)
 {
     const int to = mate[i] != NONE ? i : choice[i];
     return to == NONE ? i : min(to, mate[to]);
@@ -124,7 +124,7 @@ kernel void number_aggregates(int n, global const int *mate, global const int *c
 }
 
 /* Whether entry k is the first of row i with its column. In a periodic box two cells may share several faces. */
-static inline int is_first_entry(int i, int k, global const int *starts, global const int *columns)
+inline int is_first_entry(int i, int k, global const int *starts, global const int *columns)
 {
     int l = starts[i];
     while (columns[l] != columns[k])
@@ -169,8 +169,8 @@ kernel void list_members(int n_aggregates, int fill, global const int *starts, g
 }
 
 /* Whether an entry of the aggregate before entry `last` of its member `until` connects it to aggregate h, too. */
-static inline int is_counted(int h, int first, int until, int last, global const int *starts, global const int *columns,
-                             global const REAL *weights, global const int *aggregate, global const int *members)
+inline int is_counted(int h, int first, int until, int last, global const int *starts, global const int *columns,
+                      global const REAL *weights, global const int *aggregate, global const int *members)
 {
     for (int s = first; s <= until; ++s) {
         const int end = s == until ? last : starts[members[s] + 1];

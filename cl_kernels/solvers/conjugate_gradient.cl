@@ -38,8 +38,8 @@
 #define START 10
 
 /* The sums and the maximum that center and scale r = b - w; r = b if the start is zero (`from_zero`). */
-static inline void add_right_sides(int n, int from_zero, global const REAL *b, global const STORE *w,
-                                   global REAL *partial, local REAL *scratch)
+inline void add_right_sides(int n, int from_zero, global const REAL *b, global const STORE *w, global REAL *partial,
+                            local REAL *scratch)
 {
     Sum sum_b = SUM_ZERO, sum_r = SUM_ZERO;
     REAL max_b = 0;
@@ -64,9 +64,9 @@ kernel void sum_right_sides(int n, int from_zero, global const REAL *b, global c
 
 /* r = 2^e (r - mean r) with `center`, else r = 2^e r; p = 0; x = 0 with `from_zero`. NORM_B, NORM_R = |b|^2, |r|^2
    after the same scaling and centering. state[1] = 2^-e, state[2] = the part of |b|^2 that centering has removed. */
-static inline void set_residual(int n, int from_zero, int center, global const REAL *b, global const STORE *w,
-                                global REAL *x, global STORE *r, global STORE *p, global REAL *partial,
-                                global REAL *state, local REAL *scratch)
+inline void set_residual(int n, int from_zero, int center, global const REAL *b, global const STORE *w, global REAL *x,
+                         global STORE *r, global STORE *p, global REAL *partial, global REAL *state,
+                         local REAL *scratch)
 {
     const REAL mean_b = center ? total_sum(ROW(SUM_B), scratch) / n : 0;
     const REAL mean_r = center ? total_sum(ROW(START), scratch) / n : 0;
@@ -102,7 +102,7 @@ kernel void start_residual(int n, int from_zero, int center, global const REAL *
 }
 
 /* Sum of row q over `groups` work-groups, in a kernel of one work-group: the same bits as `total_sum`. */
-static inline REAL total_of_row(global const REAL *partial, int q, int groups, local REAL *scratch)
+inline REAL total_of_row(global const REAL *partial, int q, int groups, local REAL *scratch)
 {
     REAL sum = 0;
     for (int g = get_local_id(0); g < groups; g += GROUP_SIZE)
@@ -123,8 +123,8 @@ kernel void read_norms(global const REAL *partial, global REAL *state, const int
 }
 
 /* u = D^-1 r and gamma = (r, u), for the first iteration. */
-static inline void apply_jacobi(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
-                                global REAL *partial, local REAL *scratch)
+inline void apply_jacobi(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
+                         global REAL *partial, local REAL *scratch)
 {
     Sum gamma = SUM_ZERO;
     for (BLOCK_LOOP(i, n)) {
@@ -154,9 +154,8 @@ kernel void dot_product(int n, int q, global const STORE *a, global const STORE 
 
 /* p = u + beta p. record[k].running becomes 0 if |r| is within the tolerance, or if a value is not positive or not
    finite. */
-static inline void step_direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p,
-                                  global const REAL *partial, global REAL *state, global REAL *record,
-                                  local REAL *scratch)
+inline void step_direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p,
+                           global const REAL *partial, global REAL *state, global REAL *record, local REAL *scratch)
 {
     const int first = get_global_id(0) == 0;
     global REAL *now = record + 4 * k;
@@ -194,8 +193,8 @@ typedef struct {
     REAL alpha, alpha_x, mean;
 } Step;
 
-static inline Step step_length(int k, int n, int center, global const REAL *partial, global REAL *state,
-                               global REAL *record, local REAL *scratch)
+inline Step step_length(int k, int n, int center, global const REAL *partial, global REAL *state, global REAL *record,
+                        local REAL *scratch)
 {
     global REAL *now = record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;
@@ -247,9 +246,9 @@ kernel void update_solution(int k, int n, int center, global const STORE *p, glo
 }
 
 /* x += alpha p, r -= alpha q, u = D^-1 r, and gamma of the next iteration. */
-static inline void step_jacobi(int k, int n, int center, global const STORE *inverse_diagonal, global const STORE *p,
-                               global const STORE *q, global REAL *x, global STORE *r, global STORE *u,
-                               global REAL *partial, global REAL *state, global REAL *record, local REAL *scratch)
+inline void step_jacobi(int k, int n, int center, global const STORE *inverse_diagonal, global const STORE *p,
+                        global const STORE *q, global REAL *x, global STORE *r, global STORE *u, global REAL *partial,
+                        global REAL *state, global REAL *record, local REAL *scratch)
 {
     const Step s = step_length(k, n, center, partial, state, record, scratch);
     Sum norm = SUM_ZERO, gamma = SUM_ZERO, sum = SUM_ZERO;

@@ -11,8 +11,8 @@
 #include "solvers/sparse_rows.h"
 
 /* (B^-1 r)_i: B holds the diagonal of A and its 2 x 2 blocks for pairs. */
-static inline REAL apply_pair_inverse(int i, global const int *partner, global const REAL *own, global const REAL *both,
-                                      global const REAL *r)
+inline REAL apply_pair_inverse(int i, global const int *partner, global const REAL *own, global const REAL *both,
+                               global const REAL *r)
 {
     return own[i] * r[i] + both[i] * (r[i] + r[partner[i]]);
 }
@@ -66,7 +66,7 @@ kernel void smooth_into(int n, REAL omega, global const int *partner, global con
 }
 
 /* Sum of t over the members of aggregate g. */
-static inline REAL sum_members(int g, global const int *member_starts, global const int *members, global const REAL *t)
+inline REAL sum_members(int g, global const int *member_starts, global const int *members, global const REAL *t)
 {
     REAL sum = 0;
     for (int s = member_starts[g]; s < member_starts[g + 1]; ++s)
@@ -92,9 +92,8 @@ kernel void prolong(int n, global const int *aggregate, global const REAL *e, gl
 }
 
 /* t = b - A x, by one work-group. */
-static inline void defect_by_group(int n, global const int *starts, global const int *columns,
-                                   global const REAL *weights, global const REAL *b, global const REAL *x,
-                                   global REAL *t)
+inline void defect_by_group(int n, global const int *starts, global const int *columns, global const REAL *weights,
+                            global const REAL *b, global const REAL *x, global REAL *t)
 {
     barrier(CLK_GLOBAL_MEM_FENCE);
     for (BLOCK_LOOP(i, n))
@@ -103,9 +102,9 @@ static inline void defect_by_group(int n, global const int *starts, global const
 }
 
 /* x += omega B^-1 (b - A x), by one work-group. */
-static inline void smooth_by_group(int n, REAL omega, global const int *starts, global const int *columns,
-                                   global const REAL *weights, global const int *partner, global const REAL *own,
-                                   global const REAL *both, global const REAL *b, global REAL *x, global REAL *t)
+inline void smooth_by_group(int n, REAL omega, global const int *starts, global const int *columns,
+                            global const REAL *weights, global const int *partner, global const REAL *own,
+                            global const REAL *both, global const REAL *b, global REAL *x, global REAL *t)
 {
     defect_by_group(n, starts, columns, weights, b, x, t);
     for (BLOCK_LOOP(i, n))

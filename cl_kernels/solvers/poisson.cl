@@ -19,7 +19,7 @@
 #endif
 
 /* The first entry of row j with column i, or -1. `last`: no entry behind it may be read eight at a time. */
-static inline int find_entry(int i, int j, int last, global const int *starts, global const int *neighbors)
+inline int find_entry(int i, int j, int last, global const int *starts, global const int *neighbors)
 {
     const int end = starts[j + 1];
     int k = starts[j];
@@ -41,7 +41,7 @@ static inline int find_entry(int i, int j, int last, global const int *starts, g
 }
 
 /* Sum of the measures of face k and of the later faces of its row, up to `end`, that lead to the same cell. */
-static inline REAL sum_measures(int k, int end, global const int *neighbors, global const FACE *face_measures)
+inline REAL sum_measures(int k, int end, global const int *neighbors, global const FACE *face_measures)
 {
     REAL measure = face_measures[k];
     for (int l = k + 1; SEVERAL && l < end; ++l)

@@ -16,8 +16,8 @@
    On a CPU eight entries at a time; entries behind the end of the row get weight 0. Rows are short and of different
    lengths, so that a plain loop mispredicts branches (measured: 2.7 times as long). The last eight entries of the
    arrays are left to the plain loop. */
-static inline STORE row_difference(int i, int n, global const int *starts, global const int *columns,
-                                   global const STORE *weights, global const STORE *x)
+inline STORE row_difference(int i, int n, global const int *starts, global const int *columns,
+                            global const STORE *weights, global const STORE *x)
 {
     const STORE xi = x[i];
     const int end = starts[i + 1];

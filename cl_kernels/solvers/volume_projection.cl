@@ -35,8 +35,7 @@
    Q is the least quality of the cell and its neighbors; q is close to -log Q, without a logarithm. Bad cells and their
    neighbors may miss their size a little, since they limit the quality. Cells far from their size may not, which bounds
    the largest error. A scale of 0 leaves its factor out. */
-static inline float penalty_of(float penalty, float quality_scale, float least_quality, float log_ratio_scale,
-                               float log_ratio)
+inline float penalty_of(float penalty, float quality_scale, float least_quality, float log_ratio_scale, float log_ratio)
 {
     float e = penalty;
     if (quality_scale > 0) {
@@ -168,7 +167,7 @@ typedef struct {
 
 /* p = z + beta p, s = B^T z + beta s. record[k].running becomes 0 if |r| is within the tolerance, if `max_iterations`
    are done, or if a value is not positive or not finite. */
-static inline void step_projection_direction(int k, const iteration_t *it, local REAL *scratch)
+inline void step_projection_direction(int k, const iteration_t *it, local REAL *scratch)
 {
     global REAL *partial = it->partial, *now = it->record + 4 * k;
     global const REAL *last = now - 4;
@@ -212,7 +211,7 @@ static inline void step_projection_direction(int k, const iteration_t *it, local
 }
 
 /* y += alpha p, u -= alpha s, r -= alpha (B s + eps p), z = D^-1 r. */
-static inline void step_projection(int k, const iteration_t *it, local REAL *scratch)
+inline void step_projection(int k, const iteration_t *it, local REAL *scratch)
 {
     global REAL *partial = it->partial, *now = it->record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;

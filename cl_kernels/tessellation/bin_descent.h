@@ -11,7 +11,7 @@ typedef struct {
     int4 places[MAX_DEPTH]; /* position at which each grid continues */
 } descent_t;
 
-static inline void begin_descent(descent_t *way, int4 start)
+inline void begin_descent(descent_t *way, int4 start)
 {
     way->depth = 0;
     way->grids[0] = 0;
@@ -19,7 +19,7 @@ static inline void begin_descent(descent_t *way, int4 start)
 }
 
 /* Push the grid `child` of one of the bins, to continue at `place` afterwards; pop the open grid if child < 0. */
-static inline void leave_grid(descent_t *way, int child, int4 place, int4 start)
+inline void leave_grid(descent_t *way, int child, int4 place, int4 start)
 {
     if (child < 0) {
         --way->depth;
@@ -34,7 +34,7 @@ static inline void leave_grid(descent_t *way, int child, int4 place, int4 start)
 /* The next range of items in the bins from `*next` to `right` of a row; `*next` moves behind it. It spans all these
    bins if none is divided or they hold at most `whole` items, for which opening divided bins does not pay. Otherwise it
    is one bin; if that bin is divided and holds more, the range is empty and `*child` is its grid. */
-static inline int2 next_run(global const int2 *row_bins, int *next, int right, int whole, int *child)
+inline int2 next_run(global const int2 *row_bins, int *next, int right, int whole, int *child)
 {
     const int2 first = row_bins[*next];
     int2 end = row_bins[right + 1];

@@ -15,7 +15,7 @@ kernel void count_root(const int size, global const REAL *points, const FRAME fr
 }
 
 /* Bins per axis of the grid that divides a bin of `count` generators; 0 keeps the bin whole. In 3D a power of two. */
-static inline int child_side(int count)
+inline int child_side(int count)
 {
     if (count <= SPLIT_COUNT)
         return 0;
@@ -110,7 +110,7 @@ kernel void place_items(const int size, global const int *keys, global const int
 
 /* The edge of a bin with OCCUPANCY generators, estimated from a block of bins around bin b in its grid: 3 along each
    axis, or more until they hold SPACING_COUNT generators. The few generators of one leaf are a poor estimate. */
-static inline REAL local_spacing(int b, REAL edge, int4 shape, global const int2 *bins)
+inline REAL local_spacing(int b, REAL edge, int4 shape, global const int2 *bins)
 {
     const int place = b - shape.s0, rows = place / shape.s1, column = place - rows * shape.s1;
     const int layer = DIM == 2 ? 0 : rows / shape.s2, row = rows - layer * shape.s2;

@@ -14,7 +14,7 @@
 
 /* Bin index along one axis. It is monotone in x, also after rounding: a range of x covers its bins. A NaN goes to bin
    0, so that no index leaves the grid. */
-static inline int axis_bin(REAL x, REAL origin, REAL inverse, int side)
+inline int axis_bin(REAL x, REAL origin, REAL inverse, int side)
 {
     const REAL t = (x - origin) * inverse;
     /* The comparison in REAL keeps far-away x from overflowing the int. */
@@ -24,7 +24,7 @@ static inline int axis_bin(REAL x, REAL origin, REAL inverse, int side)
 /* Bound of the distance of a generator from its bin, along one axis, for x near the bin and the first grid starting at
    `start`. Positions are binned with round-off, and each level adds one rounding to the origin of its grid: at most 10
    in all. */
-static inline REAL bin_noise(REAL x, REAL start)
+inline REAL bin_noise(REAL x, REAL start)
 {
     return 16 * REAL_EPS * (fabs(x) + fabs(start));
 }
@@ -33,7 +33,7 @@ static inline REAL bin_noise(REAL x, REAL start)
 #define BIN_SHARE (64 * REAL_EPS + R(1e-6))
 
 /* Lower bound of the distance of a row of bins from y, less `slack`. */
-static inline REAL row_distance(REAL y, REAL origin, REAL edge, int row, REAL slack)
+inline REAL row_distance(REAL y, REAL origin, REAL edge, int row, REAL slack)
 {
     const REAL below = origin + row * edge - y;
     const REAL distance = (below > 0 ? below : -below - edge) - slack;
@@ -41,7 +41,7 @@ static inline REAL row_distance(REAL y, REAL origin, REAL edge, int row, REAL sl
 }
 
 /* Bin of generator x in one grid. */
-static inline int bin_in_grid(global const REAL *x, FRAME frame, int4 shape)
+inline int bin_in_grid(global const REAL *x, FRAME frame, int4 shape)
 {
     const REAL inverse = FRAME_INVERSE(frame);
     const int ix = axis_bin(x[0], frame.s0, inverse, shape.s1);

@@ -48,8 +48,7 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
 }
 
 /* Twice the area of the cell of generator j, from its listed faces. */
-static inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *points, const REAL *lower,
-                               const REAL *upper)
+inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *points, const REAL *lower, const REAL *upper)
 {
     const REAL x[2] = {points[2 * j], points[2 * j + 1]};
     int n;
@@ -211,8 +210,8 @@ kernel void measure_faces(const int size, global const int *starts, global const
 
 /* Whether many cells around corner c of cell i, at v, compute positions for it that are too far apart. Checked by the
    cell with the smallest angle there, at most 45 degrees. */
-static inline bool is_spread(const int size, global const int *starts, global const int *neighbors, int i, int c,
-                             REAL2 v, const REAL *x, global const REAL *points, const REAL *lower, const REAL *upper)
+inline bool is_spread(const int size, global const int *starts, global const int *neighbors, int i, int c, REAL2 v,
+                      const REAL *x, global const REAL *points, const REAL *lower, const REAL *upper)
 {
     const int last = starts[i + 1] - 1, most = starts[size];
     const REAL2 one = face_direction(neighbors[c], x, points);

@@ -14,7 +14,7 @@
    cell. */
 #define NEAR_EACH_OTHER R(1e-3)
 
-static inline REAL4 cross_product(REAL4 a, REAL4 b)
+inline REAL4 cross_product(REAL4 a, REAL4 b)
 {
     return (REAL4)(difference_of_products(a.s1, b.s2, a.s2, b.s1), difference_of_products(a.s2, b.s0, a.s0, b.s2),
                    difference_of_products(a.s0, b.s1, a.s1, b.s0), 0);
@@ -22,7 +22,7 @@ static inline REAL4 cross_product(REAL4 a, REAL4 b)
 
 /* The plane for generator q, or instead the bisector of p and q: if these are near each other and far from the cell,
    their planes are nearly parallel, but the difference of the planes is accurate. */
-static inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const REAL *points)
+inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const REAL *points)
 {
     if (label_p < 0 || label_q < 0)
         return q;
@@ -36,7 +36,7 @@ static inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, globa
 }
 
 /* The intersection of three planes. */
-static inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const REAL *points)
+inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const REAL *points)
 {
     const REAL4 p = cell->planes[a];
     const REAL4 q = better_row(cell->planes[b], p, cell->labels[b], cell->labels[a], points);
@@ -53,7 +53,7 @@ static inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, globa
    farthest first. If it does not reach all vertices farther beyond than `doubt`, it grows through the nearest other
    vertices. The distances of vertices that change sides are corrected. False if a vertex stays out of reach, such as
    the wrong end of a slit, which is not removed. */
-static inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
+inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
 {
     REAL *s = (REAL *)cell->beyond;
     bool inside[VERTEX_CAPACITY], on[FACE_CAPACITY]; /* whether a vertex, a face belongs to the disc */
@@ -103,7 +103,7 @@ typedef struct {
 } rim_t;
 
 /* Find the rim; false if it is not one simple cycle. */
-static inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
+inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
 {
     const REAL *s = (const REAL *)cell->beyond;
     int gone = 0, n = 0;
@@ -174,7 +174,7 @@ static inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
 }
 
 /* Remove the faces inside the rim and add the new face; FACE_CAPACITY if there is no room. */
-static inline int replace_faces(cell_t *cell, const rim_t *rim, int label)
+inline int replace_faces(cell_t *cell, const rim_t *rim, int label)
 {
     for (int w = 0; w < FACE_WORDS; ++w)
         cell->alive[w] &= ~rim->dead[w];
@@ -187,7 +187,7 @@ static inline int replace_faces(cell_t *cell, const rim_t *rim, int label)
 }
 
 /* New vertices: intersections of the plane with the edges of the rim, by interpolation. */
-static inline void cut_edges(const cell_t *cell, const rim_t *rim, REAL *nx, REAL *ny, REAL *nz)
+inline void cut_edges(const cell_t *cell, const rim_t *rim, REAL *nx, REAL *ny, REAL *nz)
 {
     const REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = (const REAL *)cell->beyond;
     SHORT_LOOP
@@ -203,7 +203,7 @@ static inline void cut_edges(const cell_t *cell, const rim_t *rim, REAL *nx, REA
 
 /* Join the rim to the new face by the new vertices. They replace the removed vertices, and then follow the last one;
    remaining gaps are filled from the end. */
-static inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REAL *nx, const REAL *ny, const REAL *nz)
+inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REAL *nx, const REAL *ny, const REAL *nz)
 {
     REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
     SHORT_LOOP
@@ -236,8 +236,7 @@ static inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REA
 
 /* Clip the cell by the bisector with the neighbor at x + d: remove the points y with y.d > d.d / 2; returns CLIP_*.
    With `seen_before` the cell may already have a face with this neighbor. */
-static inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before,
-                                  global const REAL *points)
+inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
 {
     const REAL level = d2 / 2;
     const int blocks = (cell->n + 7) / 8;
@@ -302,8 +301,8 @@ static inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, boo
 }
 
 /* Clip by the generators in row i of a graph; returns CLIP_*. */
-static inline int clip_polyhedron_by_row(cell_t *cell, int i, REAL4 x, global const int *starts,
-                                         global const int *neighbors, global const REAL *points)
+inline int clip_polyhedron_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbors,
+                                  global const REAL *points)
 {
     const int end = starts[i + 1];
     for (int k = starts[i]; k < end; ++k) {

@@ -9,7 +9,7 @@
 #define FINEST R(2e-5)
 #endif
 
-static inline REAL noise_length(REAL distance)
+inline REAL noise_length(REAL distance)
 {
     return 4 * REAL_EPS * distance + fmin(4 * REAL_EPS, FINEST * distance);
 }

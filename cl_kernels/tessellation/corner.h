@@ -4,7 +4,7 @@
    ghost_images.cl), in which a neighbor is the nearest image of its generator; 0 along an axis with walls. */
 #ifdef FOLD_0
 #define FOLD(a) ((a) == 0 ? R(FOLD_0) : R(FOLD_1))
-static inline REAL fold_period(REAL d, REAL period)
+inline REAL fold_period(REAL d, REAL period)
 {
     /* Faster than rint, which PoCL calls. */
     return d > period / 2 ? d - period : (d < -period / 2 ? d + period : d);
@@ -20,13 +20,13 @@ static inline REAL fold_period(REAL d, REAL period)
 #endif
 
 /* From a position x to generator j. */
-static inline REAL2 direction_of(const REAL *x, int j, global const REAL *points)
+inline REAL2 direction_of(const REAL *x, int j, global const REAL *points)
 {
     return (REAL2)(BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1]));
 }
 
 /* The circumcenter of 0, u and v; u2 and v2 are the squares of u and v. */
-static inline REAL2 circumcenter(REAL2 u, REAL2 v, REAL u2, REAL v2)
+inline REAL2 circumcenter(REAL2 u, REAL2 v, REAL u2, REAL v2)
 {
     const REAL inverse = R(0.5) / difference_of_products(u.s0, v.s1, u.s1, v.s0);
     return (REAL2)(difference_of_products(u2, v.s1, v2, u.s1) * inverse,
@@ -35,8 +35,7 @@ static inline REAL2 circumcenter(REAL2 u, REAL2 v, REAL u2, REAL v2)
 
 /* Corner between the faces a and b (in this order) of generator i, relative to x_i, from the generators, so that
    all cells that share the corner get the same point up to one rounding. */
-static inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *points, const REAL *lower,
-                           const REAL *upper)
+inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *points, const REAL *lower, const REAL *upper)
 {
     if (a >= 0 && b >= 0) {
         const REAL2 u = direction_of(x, a, points), v = direction_of(x, b, points);
@@ -70,8 +69,8 @@ static inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL
 }
 
 /* From the corner of cell j between its faces p and q to the same corner of cell i, relative to x_i. */
-static inline REAL2 corner_gap(REAL2 mine, int i, int j, int p, int q, global const REAL *points, const REAL *lower,
-                               const REAL *upper)
+inline REAL2 corner_gap(REAL2 mine, int i, int j, int p, int q, global const REAL *points, const REAL *lower,
+                        const REAL *upper)
 {
     const REAL x[2] = {points[2 * j], points[2 * j + 1]};
     const REAL2 from = direction_of(x, i, points);
@@ -79,7 +78,7 @@ static inline REAL2 corner_gap(REAL2 mine, int i, int j, int p, int q, global co
 }
 
 /* Index of j in a row of n; n if it is missing. */
-static inline int place_in_row(global const int *row, int n, int j)
+inline int place_in_row(global const int *row, int n, int j)
 {
     int q = 0;
     while (q < n && row[q] != j)

@@ -25,15 +25,15 @@ typedef struct {
     global const int *places, *slots, *counts, *old_starts, *old_neighbors;
 } face_rows_t;
 
-static inline face_rows_t face_rows(global const int *places, global const int *slots, global const int *counts,
-                                    global const int *old_starts, global const int *old_neighbors)
+inline face_rows_t face_rows(global const int *places, global const int *slots, global const int *counts,
+                             global const int *old_starts, global const int *old_neighbors)
 {
     face_rows_t rows = {places, slots, counts, old_starts, old_neighbors};
     return rows;
 }
 
 /* Row i and the number of its faces. */
-static inline global const int *face_row(const face_rows_t *rows, int i, int *n)
+inline global const int *face_row(const face_rows_t *rows, int i, int *n)
 {
     const int place = rows->places[i];
     if (place < 0) {
@@ -46,7 +46,7 @@ static inline global const int *face_row(const face_rows_t *rows, int i, int *n)
 }
 
 /* Whether row i is new and its cell doubtful. */
-static inline bool is_doubtful_row(const face_rows_t *rows, int i)
+inline bool is_doubtful_row(const face_rows_t *rows, int i)
 {
     const int place = rows->places[i];
     return place >= 0 && rows->counts[place] < 0;
@@ -55,8 +55,8 @@ static inline bool is_doubtful_row(const face_rows_t *rows, int i)
 /* Write the faces of a clipped cell to its slot, or to spare slots, starting with the least label: the row does not
    depend on the order of clipping. The count is negative if round-off might give a neighbor other faces. Returns the
    first slot. */
-static inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *points, int place,
-                             global int *slots, global int *counts, global int *flags)
+inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *points, int place, global int *slots,
+                      global int *counts, global int *flags)
 {
     bool doubtful = false;
     int to = place;

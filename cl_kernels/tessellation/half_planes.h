@@ -19,14 +19,14 @@ typedef struct {
     wide_t x, y, level;
 } wide_half_plane_t;
 
-static inline wide_t wide_cross(wide_half_plane_t a, wide_half_plane_t b)
+inline wide_t wide_cross(wide_half_plane_t a, wide_half_plane_t b)
 {
     return wide_add(wide_product(a.x, b.y), -wide_product(a.y, b.x));
 }
 
 /* The points nearer to a generator at x than to that of `label`, or inside a wall of the box; relative to x. */
-static inline wide_half_plane_t half_plane_of(const REAL *x, int label, global const REAL *points, const REAL *lower,
-                                              const REAL *upper)
+inline wide_half_plane_t half_plane_of(const REAL *x, int label, global const REAL *points, const REAL *lower,
+                                       const REAL *upper)
 {
     wide_half_plane_t h = {0, 0, 0};
     if (label >= 0) {
@@ -47,7 +47,7 @@ static inline wide_half_plane_t half_plane_of(const REAL *x, int label, global c
 
 /* The difference of the half-planes of two generators: the points nearer to b than to a. The three lines share a point.
  */
-static inline wide_half_plane_t between_half_planes(wide_half_plane_t a, wide_half_plane_t b)
+inline wide_half_plane_t between_half_planes(wide_half_plane_t a, wide_half_plane_t b)
 {
     const wide_t x = wide_add(a.x, -b.x), y = wide_add(a.y, -b.y);
     const wide_t twice = wide_add(wide_product(x, wide_add(a.x, b.x)), wide_product(y, wide_add(a.y, b.y)));
@@ -56,13 +56,13 @@ static inline wide_half_plane_t between_half_planes(wide_half_plane_t a, wide_ha
 }
 
 /* Squared distance of the generators of two half-planes, and of one from x. */
-static inline REAL squared_distance_between(wide_half_plane_t a, wide_half_plane_t b)
+inline REAL squared_distance_between(wide_half_plane_t a, wide_half_plane_t b)
 {
     const REAL x = b.x.s0 - a.x.s0, y = b.y.s0 - a.y.s0;
     return x * x + y * y;
 }
 
-static inline REAL squared_distance_of(wide_half_plane_t h)
+inline REAL squared_distance_of(wide_half_plane_t h)
 {
     return h.x.s0 * h.x.s0 + h.y.s0 * h.y.s0;
 }
@@ -93,7 +93,7 @@ OUT_OF_LINE REAL beyond_corner(const REAL *x, int a, int b, int j, global const 
 
 /* The half-plane that the line a + t e leaves first. Negative: u. 0: double words cannot decide, or the line does not
    leave both. All coordinates are relative to one point. */
-static inline REAL leaves_later(wide_half_plane_t u, wide_half_plane_t v, wide_t a_x, wide_t a_y, REAL2 e)
+inline REAL leaves_later(wide_half_plane_t u, wide_half_plane_t v, wide_t a_x, wide_t a_y, REAL2 e)
 {
     const wide_t e_x = (wide_t)(e.s0, 0), e_y = (wide_t)(e.s1, 0);
     const wide_t u_x = wide_product(u.x, a_x), u_y = wide_product(u.y, a_y);

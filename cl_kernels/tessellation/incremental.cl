@@ -19,13 +19,13 @@
 /* Whether a gap between corners, given by its square, is within their round-off. d2 is the squared distance of the
    generators across the face. In single precision a spacing may be only a thousand roundings of a position, and a
    corner is less accurate. */
-static inline bool is_rounding(REAL gap2, REAL d2)
+inline bool is_rounding(REAL gap2, REAL d2)
 {
     return gap2 <= 16 * POSITION_NOISE * POSITION_NOISE && gap2 <= (IS_DOUBLE ? R(1e-6) : R(1e-4)) * d2;
 }
 
 /* Whether i stands between `before` and `after` in a row of n. */
-static inline bool stands_between(int i, int before, int after, global const int *row, int n)
+inline bool stands_between(int i, int before, int after, global const int *row, int n)
 {
     const int q = place_in_row(row, n, i);
     return q < n && row[q == 0 ? n - 1 : q - 1] == before && row[q == n - 1 ? 0 : q + 1] == after;
@@ -34,8 +34,8 @@ static inline bool stands_between(int i, int before, int after, global const int
 /* Whether cells i and j have their common face between the same two corners. In the row of i, j stands between `before`
    and `after`, at corners u and v. So in the row of j, i must stand between `after` and `before`, or between faces that
    meet it at the same corners up to round-off. */
-static inline bool fits_neighbor(int i, int j, int before, int after, REAL2 u, REAL2 v, REAL d2, global const int *row,
-                                 int n, global const REAL *points, const REAL *lower, const REAL *upper)
+inline bool fits_neighbor(int i, int j, int before, int after, REAL2 u, REAL2 v, REAL d2, global const int *row, int n,
+                          global const REAL *points, const REAL *lower, const REAL *upper)
 {
     const int q = place_in_row(row, n, i);
     if (q == n) {
@@ -59,8 +59,8 @@ static inline bool fits_neighbor(int i, int j, int before, int after, REAL2 u, R
 
 /* The corner of cell i between the faces a and b (in this order) with the directions u and v. The same as `corner`, but
    uses the known directions where both faces belong to generators. */
-static inline REAL2 row_corner(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, global const REAL *points,
-                               const REAL *lower, const REAL *upper)
+inline REAL2 row_corner(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, global const REAL *points,
+                        const REAL *lower, const REAL *upper)
 {
     if (a < 0 || b < 0)
         return corner(i, x, a, b, points, lower, upper);
@@ -70,8 +70,8 @@ static inline REAL2 row_corner(int i, const REAL *x, int a, int b, REAL2 u, REAL
 }
 
 /* Check the row of generator i; see `check_rows`. True if it is wrong. */
-static inline bool check_row(int i, global const int *starts, global const int *neighbors, global const REAL *points,
-                             const REAL *lower, const REAL *upper, global int *fits, global int *marks)
+inline bool check_row(int i, global const int *starts, global const int *neighbors, global const REAL *points,
+                      const REAL *lower, const REAL *upper, global int *fits, global int *marks)
 {
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const int start = starts[i], n = starts[i + 1] - start;
@@ -173,8 +173,7 @@ kernel void list_marked(const int size, global const int *marks, global const in
 }
 
 /* Clip by those generators of row i that are near enough. */
-static inline int clip_polygon_by_row(cell_t *cell, const REAL *x, global const int *row, int n,
-                                      global const REAL *points)
+inline int clip_polygon_by_row(cell_t *cell, const REAL *x, global const int *row, int n, global const REAL *points)
 {
     for (int k = 0; k < n; ++k) {
         const int j = row[k];
@@ -258,7 +257,7 @@ kernel void place_clipped(const int size, global const int *listed, const int ba
     fits[listed[w]] = 1;
 }
 
-static inline void mark_both(int i, int j, global int *marks)
+inline void mark_both(int i, int j, global int *marks)
 {
     atomic_or(marks + i, 1);
     atomic_or(marks + j, 1);

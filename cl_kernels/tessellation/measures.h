@@ -11,7 +11,7 @@ typedef struct {
 } measures_t;
 
 /* The faces of generator i that are kept. Returns their number. */
-static inline int kept_faces(int *faces, const face_rows_t *rows, global const uint *keep, int i)
+inline int kept_faces(int *faces, const face_rows_t *rows, global const uint *keep, int i)
 {
     int n = 0, listed;
     const int place = rows->places[i];
@@ -22,7 +22,7 @@ static inline int kept_faces(int *faces, const face_rows_t *rows, global const u
     return n;
 }
 
-static inline void put_face(const measures_t *to, int at, int neighbor, REAL measure, REAL x, REAL y)
+inline void put_face(const measures_t *to, int at, int neighbor, REAL measure, REAL x, REAL y)
 {
     to->neighbors[at] = neighbor;
     to->face_measures[at] = measure;
@@ -31,8 +31,8 @@ static inline void put_face(const measures_t *to, int at, int neighbor, REAL mea
 }
 
 /* Measure the cell of generator i from its n faces. */
-static inline void measure_cell(const measures_t *to, int i, const int *faces, int n, global const REAL *points,
-                                const REAL *lower, const REAL *upper)
+inline void measure_cell(const measures_t *to, int i, const int *faces, int n, global const REAL *points,
+                         const REAL *lower, const REAL *upper)
 {
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const int start = to->starts[i];

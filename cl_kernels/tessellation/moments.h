@@ -6,7 +6,7 @@ typedef struct {
     REAL area, cx, cy, xx, xy, yy;
 } moments_t;
 
-static inline void add_triangle(moments_t *m, REAL2 v, REAL2 w)
+inline void add_triangle(moments_t *m, REAL2 v, REAL2 w)
 {
     const REAL2 sum = v + w;
     const REAL cross = difference_of_products(v.s0, w.s1, v.s1, w.s0);
@@ -19,8 +19,8 @@ static inline void add_triangle(moments_t *m, REAL2 v, REAL2 w)
 }
 
 /* Area, centroid - generator, and second moments about the centroid per unit area (xx, xy, yy) of cell i. */
-static inline void write_moments(const moments_t *m, int i, global REAL *volumes, global REAL *offsets,
-                                 global REAL *covariances)
+inline void write_moments(const moments_t *m, int i, global REAL *volumes, global REAL *offsets,
+                          global REAL *covariances)
 {
     REAL cx = m->cx, cy = m->cy, xx = m->xx, xy = m->xy, yy = m->yy;
     const REAL area = m->area;

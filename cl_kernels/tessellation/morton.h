@@ -1,7 +1,7 @@
 /* Morton's curve: an order in which what follows each other is near each other. */
 
 /* Bits 0, 3, 6, ... of a number, up to 27, side by side: of a place on the curve its x. */
-static inline int gather_bits(uint x)
+inline int gather_bits(uint x)
 {
     x &= 0x09249249;
     x = (x | x >> 2) & 0x030C30C3;

@@ -25,13 +25,13 @@ typedef struct {
 
 /* Square of the distance beyond which no generator cuts the cell: twice the reach. Corners of nearly parallel faces
    have an error of eps over the angle, and so has the reach. */
-static inline REAL cutting_distance2(const cell_t *cell)
+inline REAL cutting_distance2(const cell_t *cell)
 {
     return 4 * cell->reach2 * R(1.01);
 }
 
 /* Start with the whole box around generator x. */
-static inline void start_polygon(cell_t *cell, int i, const REAL *x, const REAL *lower, const REAL *upper)
+inline void start_polygon(cell_t *cell, int i, const REAL *x, const REAL *lower, const REAL *upper)
 {
     cell->generator = i;
     for (int a = 0; a < 2; ++a) {
@@ -57,8 +57,8 @@ static inline void start_polygon(cell_t *cell, int i, const REAL *x, const REAL 
    s_in <= 0 < s_out. Interpolation has an error of eps times the length of the face, more if the two are nearly
    parallel. Where this is large, also compared with the distance of the generators (near-duplicates; in single
    precision a ten-thousandth), the corner is computed from the generators instead. */
-static inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out, int face, int neighbor,
-                             REAL d2, global const REAL *points)
+inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out, int face, int neighbor, REAL d2,
+                      global const REAL *points)
 {
     const REAL2 a = (REAL2)(cell->x[in], cell->y[in]);
     const REAL2 ab = (REAL2)(cell->x[out], cell->y[out]) - a;
@@ -75,8 +75,8 @@ static inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REA
 
 /* Signed distance, times |d|, of corner k from the bisector with the neighbor at x + d. Computed from the positions of
    the generators if round-off may have moved the corner to the other side. */
-static inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL d2, REAL doubt, int neighbor,
-                          global const REAL *points)
+inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL d2, REAL doubt, int neighbor,
+                   global const REAL *points)
 {
     const REAL s = cell->x[k] * d[0] + cell->y[k] * d[1] - d2 / 2;
     if (fabs(s) > doubt)
@@ -96,7 +96,7 @@ OUT_OF_LINE int first_beyond(const cell_t *cell, const REAL *d, REAL d2, REAL do
     return k;
 }
 
-static inline void copy_corner(cell_t *cell, int to, int from)
+inline void copy_corner(cell_t *cell, int to, int from)
 {
     cell->x[to] = cell->x[from];
     cell->y[to] = cell->y[from];
@@ -105,8 +105,8 @@ static inline void copy_corner(cell_t *cell, int to, int from)
 
 /* Clip the cell by the bisector with the neighbor at x + d: remove the points y with y.d > d.d / 2. False if the cell
    is full. */
-static inline bool clip_polygon(cell_t *cell, const REAL *d, REAL d2, int neighbor, bool seen_before,
-                                global const REAL *points)
+inline bool clip_polygon(cell_t *cell, const REAL *d, REAL d2, int neighbor, bool seen_before,
+                         global const REAL *points)
 {
     const int n = cell->n;
     const REAL doubt = IN_DOUBT * sqrt(d2 * fmax(d2, cell->reach2));

@@ -6,7 +6,7 @@
 /* Share of the volume of a cell by which its faces may differ from those of neighbors. */
 #define EVEN_SHARE R(1e-3)
 
-static inline REAL distance_between(global const REAL *points, int i, int j)
+inline REAL distance_between(global const REAL *points, int i, int j)
 {
     const REAL dx = points[3 * j] - points[3 * i];
     const REAL dy = points[3 * j + 1] - points[3 * i + 1];
@@ -14,24 +14,24 @@ static inline REAL distance_between(global const REAL *points, int i, int j)
     return sqrt(dx * dx + dy * dy + dz * dz);
 }
 
-static inline REAL4 vertex_at(const cell_t *cell, int v)
+inline REAL4 vertex_at(const cell_t *cell, int v)
 {
     return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
 }
 
-static inline REAL dot3(REAL4 a, REAL4 b)
+inline REAL dot3(REAL4 a, REAL4 b)
 {
     return a.s0 * b.s0 + a.s1 * b.s1 + a.s2 * b.s2;
 }
 
-static inline REAL4 cross3(REAL4 a, REAL4 b)
+inline REAL4 cross3(REAL4 a, REAL4 b)
 {
     return a.yzxw * b.zxyw - a.zxyw * b.yzxw;
 }
 
 #ifdef HALO
 /* Test the balls around the vertices of the cell of generator i. */
-static inline void check_cell_balls(const cell_t *cell, int i, REAL4 place, const halo_t *halo)
+inline void check_cell_balls(const cell_t *cell, int i, REAL4 place, const halo_t *halo)
 {
     const REAL x[3] = {place.s0, place.s1, place.s2};
     const REAL reach = sqrt(cell->reach2);
@@ -197,8 +197,8 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
    the distance R. Two bisectors with generators at the least distance d meet at an angle of about d / R, as in a ring.
    Their edge is off by eps R^2 / d^2 of R, and the area of a face along it by as much of R^2. The area of all faces
    replaces R^2. */
-static inline REAL rounded_area(int i, int begin, int count, global const int *labels, global const REAL *measures,
-                                global const REAL *points)
+inline REAL rounded_area(int i, int begin, int count, global const int *labels, global const REAL *measures,
+                         global const REAL *points)
 {
     REAL surface = 0, least = INFINITY;
     for (int k = begin; k < begin + count; ++k) {

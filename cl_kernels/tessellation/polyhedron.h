@@ -29,13 +29,13 @@
 #define FACE_WORDS (FACE_CAPACITY / 64)
 #define WORD_OF(f) (FACE_WORDS == 1 ? 0 : (f) >> 6)
 
-static inline void add_polyhedron_face(ulong *set, int f)
+inline void add_polyhedron_face(ulong *set, int f)
 {
     set[WORD_OF(f)] |= (ulong)1 << (f & 63);
 }
 
 /* The first face that is not in the set, or FACE_CAPACITY. */
-static inline int first_spare(const ulong *set)
+inline int first_spare(const ulong *set)
 {
     for (int w = 0; w < FACE_WORDS; ++w) {
         const ulong spare = ~set[w];
@@ -46,7 +46,7 @@ static inline int first_spare(const ulong *set)
 }
 
 /* The first face of the set from f on, or FACE_CAPACITY. */
-static inline int next_face(const ulong *set, int f)
+inline int next_face(const ulong *set, int f)
 {
     while (f < FACE_CAPACITY) {
         const ulong rest = set[WORD_OF(f)] >> (f & 63);
@@ -76,7 +76,7 @@ typedef struct {
 #define Z(cell) ((REAL *)(cell)->z)
 
 /* Record vertex v between its faces. */
-static inline void link_vertex(cell_t *cell, int v)
+inline void link_vertex(cell_t *cell, int v)
 {
     const INDEX4 f = cell->faces[v];
     cell->at[f.s0 * FACE_CAPACITY + f.s1] = v;
@@ -84,7 +84,7 @@ static inline void link_vertex(cell_t *cell, int v)
     cell->at[f.s2 * FACE_CAPACITY + f.s0] = v;
 }
 
-static inline void find_reach(cell_t *cell)
+inline void find_reach(cell_t *cell)
 {
     const int blocks = (cell->n + 7) / 8;
     REAL8 far = fma(cell->x[0], cell->x[0], fma(cell->y[0], cell->y[0], cell->z[0] * cell->z[0]));
@@ -98,7 +98,7 @@ static inline void find_reach(cell_t *cell)
 }
 
 /* Start with the whole box around generator x. Face w is wall w. */
-static inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
+inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
 {
     cell->n = 8;
     cell->torn = false;
@@ -129,7 +129,7 @@ static inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 up
 }
 
 /* The vertex that follows v counter-clockwise around face f. */
-static inline int vertex_after(const cell_t *cell, int v, int f)
+inline int vertex_after(const cell_t *cell, int v, int f)
 {
     const INDEX4 g = cell->faces[v];
     const int next = g.s0 == f ? g.s2 : (g.s1 == f ? g.s0 : g.s1);

@@ -16,13 +16,13 @@ constant REAL ROUNDNESS[12] = {0,
                                R(12.996787849316252),
                                R(12.919565689288136)};
 
-static inline REAL regular_roundness(int n)
+inline REAL regular_roundness(int n)
 {
     return n < 12 ? ROUNDNESS[n] : 4 * n * tan(R(3.14159265358979324) / n);
 }
 
 /* Q = 4 A n tan(pi / n) / P^2 of a polygon of n sides (the paper's 4.1). */
-static inline REAL polygon_quality(int n, REAL area, REAL perimeter)
+inline REAL polygon_quality(int n, REAL area, REAL perimeter)
 {
     return regular_roundness(max(n, 3)) * area / (perimeter * perimeter);
 }

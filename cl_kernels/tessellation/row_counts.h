@@ -16,7 +16,7 @@
 
 /* Reserve a range in the arrays of faces. Its position depends on the order of work-items, its content does not.
    report[0]: error bits; report[1]: number of faces. */
-static inline int take_places(global int *report, int count)
+inline int take_places(global int *report, int count)
 {
     return atomic_add(report + 1, count);
 }

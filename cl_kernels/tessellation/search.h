@@ -18,7 +18,7 @@
 #define SHELLS 32
 
 /* The flag for an outcome of clip_polyhedron or clip_polyhedron_by_row, or 0. */
-static inline int flag_of(int what)
+inline int flag_of(int what)
 {
     return what < CLIP_FULL
                ? 0
@@ -43,7 +43,7 @@ typedef struct {
 
 /* Clip the cell by a batch of generators, roughly the nearest first: in shells of squared distance 1 / `per_shell`.
    Returns FLAG_* or 0. */
-static inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, bool warm, const search_t *in)
+inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, bool warm, const search_t *in)
 {
     ushort ends[SHELLS], order[BATCH];
     uchar shell[BATCH];
@@ -79,15 +79,15 @@ static inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_
 }
 
 /* Bins along one axis that [x - w, x + w] touches. */
-static inline int2 bin_range(REAL x, REAL w, REAL origin, REAL inverse, int side)
+inline int2 bin_range(REAL x, REAL w, REAL origin, REAL inverse, int side)
 {
     return (int2)(axis_bin(x - w, origin, inverse, side), axis_bin(x + w, origin, inverse, side));
 }
 
 /* Add those of the items begin .. end - 1 that may cut the cell to the batch; clip when it is full.
    Returns FLAG_* or 0. */
-static inline int take_items(cell_t *cell, REAL4 x, int own, int begin, int end, batch_t *batch, REAL per_shell,
-                             bool warm, const search_t *in)
+inline int take_items(cell_t *cell, REAL4 x, int own, int begin, int end, batch_t *batch, REAL per_shell, bool warm,
+                      const search_t *in)
 {
     while (begin < end) {
         const int stop = min(end, begin + BATCH - batch->n);
@@ -124,8 +124,7 @@ typedef struct {
 /* Clip the cell of item `own` by all generators in the bins within the cube of half-width w but outside the cube of
    half-width `inner` (inner < 0: no bin has been searched), except those farther than twice the farthest vertex.
    Returns FLAG_* or 0. */
-static inline int clip_polyhedron_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool warm,
-                                          const search_t *in)
+inline int clip_polyhedron_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
 {
     open_grid_t open[MAX_DEPTH]; /* from the root down */
     const REAL per_shell = SHELLS / (6 * w * w);

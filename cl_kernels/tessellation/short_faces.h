@@ -2,7 +2,7 @@
 #include "tessellation/polygon.h"
 
 /* A vector normal to the face of `label`, out of the cell at x. For a wall its length has no meaning. */
-static inline REAL2 face_direction(int label, const REAL *x, global const REAL *points)
+inline REAL2 face_direction(int label, const REAL *x, global const REAL *points)
 {
     if (label >= 0)
         return direction_of(x, label, points);
@@ -16,7 +16,7 @@ static inline REAL2 face_direction(int label, const REAL *x, global const REAL *
 
 /* Whether a face of squared length e2, between generators at squared distance d2, is no longer than the round-off of
    positions. A face that is long compared with d is real: in a cluster all lengths are tiny. */
-static inline bool is_short(REAL e2, REAL d2)
+inline bool is_short(REAL e2, REAL d2)
 {
     return e2 <= POSITION_NOISE * POSITION_NOISE && e2 <= R(1e-6) * d2;
 }
@@ -24,7 +24,7 @@ static inline bool is_short(REAL e2, REAL d2)
 /* Whether this cell might drop a face that its neighbor keeps, or might be inaccurate. This needs a short face, or a
    generator that is near compared with the size of the cell (far corners are then ill-conditioned) or with the
    round-off of positions. */
-static inline bool is_doubtful(const cell_t *cell, const REAL *x, global const REAL *points)
+inline bool is_doubtful(const cell_t *cell, const REAL *x, global const REAL *points)
 {
     bool doubtful = false;
     const REAL near2 =
@@ -48,7 +48,7 @@ static inline bool is_doubtful(const cell_t *cell, const REAL *x, global const R
 /* Whether the face of generators i and j, from its corner at a to that at b, counter-clockwise around i, is within
    round-off and its corners stay in place without it. Both cells get the same answer: it is computed from one of them.
  */
-static inline bool is_nothing(int i, int j, int a, int b, const cell_t *cell, global const REAL *points)
+inline bool is_nothing(int i, int j, int a, int b, const cell_t *cell, global const REAL *points)
 {
     const int o = min(i, j), q = max(i, j), from = i < j ? a : b, to = i < j ? b : a;
     const REAL x[2] = {points[2 * o], points[2 * o + 1]};
@@ -64,7 +64,7 @@ static inline bool is_nothing(int i, int j, int a, int b, const cell_t *cell, gl
 }
 
 /* Drop faces within round-off: they arise where more than three cells share a vertex, as in a lattice. */
-static inline void drop_short_faces(cell_t *cell, global const REAL *points)
+inline void drop_short_faces(cell_t *cell, global const REAL *points)
 {
     const int n = cell->n, first = cell->faces[0];
     int kept = 0, before = cell->faces[n - 1];

@@ -4,8 +4,7 @@
 /* Move from the corner before face *at of *cell to the corner of the next cell around the vertex: clockwise, across
    that face, or with `back` across the face before it. False, without a move, at a wall, at a cell without a row (an
    index of `size` or more), or, in an asymmetric graph, at a cell that does not list this one. */
-static inline bool walk(const int size, global const int *starts, global const int *neighbors, int *cell, int *at,
-                        bool back)
+inline bool walk(const int size, global const int *starts, global const int *neighbors, int *cell, int *at, bool back)
 {
     const int first = starts[*cell], last = starts[*cell + 1] - 1;
     const int next = neighbors[!back ? *at : *at == first ? last : *at - 1];
@@ -22,8 +21,8 @@ static inline bool walk(const int size, global const int *starts, global const i
 
 /* The next corner of a walk from corner c of cell i around their vertex: clockwise and, after a wall, from c
    counter-clockwise. False at the end: at a wall or, in a symmetric graph, at the start. */
-static inline bool walk_on(const int size, global const int *starts, global const int *neighbors, int i, int c,
-                           int *cell, int *at, bool *back)
+inline bool walk_on(const int size, global const int *starts, global const int *neighbors, int i, int c, int *cell,
+                    int *at, bool *back)
 {
     if (!*back) {
         if (walk(size, starts, neighbors, cell, at, false))
@@ -37,7 +36,7 @@ static inline bool walk_on(const int size, global const int *starts, global cons
 
 /* Whether the walk around one end of face k of cell i passes its other end. In a diagram this happens only if two faces
    cross: with round-off, both pairs of four nearly cocircular generators may become neighbors. */
-static inline bool is_loop(const int size, global const int *starts, global const int *neighbors, int i, int k)
+inline bool is_loop(const int size, global const int *starts, global const int *neighbors, int i, int k)
 {
     const int other = k + 1 < starts[i + 1] ? k + 1 : starts[i];
     const int most = starts[size]; /* bound of the steps: with round-off the graph may be asymmetric */

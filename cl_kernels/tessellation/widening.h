@@ -7,7 +7,7 @@
 
 /* Range of x, relative to the generator, in which a row of bins may hold generators that cut the cell: the circles
    around the corners through the generator, widened by the round-off. */
-static inline REAL2 row_extent(const cell_t *cell, REAL below, REAL above)
+inline REAL2 row_extent(const cell_t *cell, REAL below, REAL above)
 {
     REAL2 extent = (REAL2)(REAL_MAX, -REAL_MAX);
     for (int k = 0; k < cell->n; ++k) {
@@ -25,9 +25,8 @@ static inline REAL2 row_extent(const cell_t *cell, REAL below, REAL above)
 /* Clip the cell of item `own` by all generators in the bins within the square of half-width w but outside the square of
    half-width `inner` (inner < 0: no bin has been searched), except those farther than twice the farthest corner. Rows
    are searched from x outwards, as near generators cut most. Returns FLAG_* or 0. */
-static inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner,
-                                       global const REAL *points, global const REAL *binned, global const int *items,
-                                       BIN_ARGS)
+inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner, global const REAL *points,
+                                global const REAL *binned, global const int *items, BIN_ARGS)
 {
     /* Through rows in outward order, parts of rows, bins; and whether the grid's own bin was opened for the inner
        square. */

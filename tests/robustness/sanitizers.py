@@ -41,7 +41,7 @@ SANITIZERS = {
 }
 COMMON = ["-O0", "-g1", "-w", "-ffp-contract=off", "-fno-omit-frame-pointer"]
 KERNEL = [
-    "-x", "cl", "-cl-std=CL1.2", "-Xclang", "-cl-ext=+all", "-include", "opencl-c-base.h",
+    "-x", "cl", "-cl-std=CL1.2", "-Xclang", "-cl-ext=+all", "-fgnu89-inline", "-include", "opencl-c-base.h",
 ]  # fmt: skip
 
 

@@ -29,23 +29,23 @@ typedef struct {
     }
 
 /* Whether the chord begins, or ends, inside its cell, at a corner of the polygon; otherwise on a face of the cell. */
-static inline bool begins_inside(const chords_t *c, int chord)
+inline bool begins_inside(const chords_t *c, int chord)
 {
     return chord == c->firsts[c->edges[chord]];
 }
 
-static inline bool ends_inside(const chords_t *c, int chord)
+inline bool ends_inside(const chords_t *c, int chord)
 {
     return chord + 1 == c->firsts[c->edges[chord] + 1];
 }
 
-static inline int chord_after(const chords_t *c, int chord)
+inline int chord_after(const chords_t *c, int chord)
 {
     return ends_inside(c, chord) ? c->firsts[c->next_vertex[c->edges[chord]]] : chord + 1;
 }
 
 /* The end point of a chord, with the same bits for both cells. */
-static inline REAL2 chord_end(const chords_t *c, int chord)
+inline REAL2 chord_end(const chords_t *c, int chord)
 {
     const int edge = c->edges[chord];
     const REAL2 a = c->vertices[edge], b = c->vertices[c->next_vertex[edge]];
@@ -53,7 +53,7 @@ static inline REAL2 chord_end(const chords_t *c, int chord)
     return t <= 0 ? a : (t >= 1 ? b : a + t * (b - a));
 }
 
-static inline REAL2 chord_begin(const chords_t *c, int chord)
+inline REAL2 chord_begin(const chords_t *c, int chord)
 {
     return begins_inside(c, chord) ? c->vertices[c->edges[chord]] : chord_end(c, chord - 1);
 }
@@ -61,14 +61,14 @@ static inline REAL2 chord_begin(const chords_t *c, int chord)
 /* Points closer to a face than this are on it. */
 #define ON_FACE (4 * REAL_EPS)
 
-static inline bool is_on_face(REAL beyond, REAL d2)
+inline bool is_on_face(REAL beyond, REAL d2)
 {
     return beyond * beyond <= ON_FACE * ON_FACE * d2;
 }
 
 /* Whether a crossing at parameter t of an edge of squared length e2 coincides with the corner of the edge, if that lies
    on the face. */
-static inline bool is_at_corner(REAL t, REAL e2)
+inline bool is_at_corner(REAL t, REAL e2)
 {
     return t * t * e2 <= 16 * ON_FACE * ON_FACE;
 }

@@ -10,7 +10,7 @@
 
 #define MOST_STEPS 64 /* among generators at the same distance up to round-off */
 
-static inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
+inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
 {
     const REAL2 d = (REAL2)(points[2 * i], points[2 * i + 1]) - y;
     return dot(d, d);
@@ -18,7 +18,7 @@ static inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
 
 /* Signed distance of y beyond the bisector of i and j, on the side of j, times the distance of i and j; antisymmetric
    in i and j. Exact also where the distances from y differ by less than their round-off. */
-static inline REAL beyond_bisector(REAL2 y, int i, int j, global const REAL *points)
+inline REAL beyond_bisector(REAL2 y, int i, int j, global const REAL *points)
 {
     const int o = min(i, j), q = max(i, j);
     const REAL2 x = (REAL2)(points[2 * o], points[2 * o + 1]);
@@ -67,7 +67,7 @@ kernel void find_boundary_owners(const int size, global const REAL2 *inner, glob
 }
 
 /* Parameter t at which the line a + t e meets the bisector of two generators; symmetric in the two. */
-static inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *points)
+inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *points)
 {
     const int o = min(i, j), q = max(i, j);
     const REAL2 x = (REAL2)(points[2 * o], points[2 * o + 1]);
@@ -77,7 +77,7 @@ static inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *p
 
 /* The side of the face between generators at x and x + d to which a polygon corner v on that face belongs. If v is a
    point of the cell of x: the side of its own generator, at `own`. Otherwise: the left of edge e. Positive: x + d. */
-static inline REAL side_of(REAL2 v, REAL2 own, REAL2 x, REAL2 d, REAL2 e)
+inline REAL side_of(REAL2 v, REAL2 own, REAL2 x, REAL2 d, REAL2 e)
 {
     const REAL2 between = x - own;
     const bool touches = is_on_face(dot(v - own - between / 2, between), dot(between, between));
@@ -94,7 +94,7 @@ typedef struct {
 
 /* Whether an edge leaves the cell of x by exit `a` before exit `b`. In doubt double words decide; if they cannot, the
    nearer of the two generators behind comes first. */
-static inline bool leaves_before(exit_t a, exit_t b, REAL2 x, REAL2 start, REAL2 e, global const REAL *points)
+inline bool leaves_before(exit_t a, exit_t b, REAL2 x, REAL2 start, REAL2 e, global const REAL *points)
 {
     if (fabs(a.at - b.at) <= a.doubt + b.doubt) {
         if (a.rank == 0 && b.rank == 0) {
@@ -122,8 +122,8 @@ static inline bool leaves_before(exit_t a, exit_t b, REAL2 x, REAL2 start, REAL2
    Round-off must not produce an order of crossings that is geometrically impossible. An end of the edge on a face is
    treated as slightly inside its cell, towards the generator; faces there are crossed in that order (rank). An edge
    along a face belongs to the side of its ends: to the cell on its left, as ends are moved inwards. */
-static inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global const int *starts,
-                             global const int *neighbors, global const REAL *points, REAL *t)
+inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global const int *starts,
+                      global const int *neighbors, global const REAL *points, REAL *t)
 {
     const REAL2 x = (REAL2)(points[2 * cell], points[2 * cell + 1]);
     const REAL2 start = (REAL2)(points[2 * origin], points[2 * origin + 1]);

@@ -18,13 +18,13 @@ typedef struct {
         segment_starts, segment_labels, segment_from, segment_to, segment_places, segment_p, segment_q                 \
     }
 
-static inline bool is_empty(const segments_t *s, int k)
+inline bool is_empty(const segments_t *s, int k)
 {
     return s->labels[k] < 0 ? s->from[k] < 0 : s->from[k] == s->to[k];
 }
 
 /* The segment of cell j, crossed cell number u, that is the other side of segment k of cell i; -1 if there is none. */
-static inline int other_side(const segments_t *s, int k, int i, int u)
+inline int other_side(const segments_t *s, int k, int i, int u)
 {
     for (int m = s->starts[u]; m < s->starts[u + 1]; ++m) {
         if (s->labels[m] != i || is_empty(s, m))
@@ -38,7 +38,7 @@ static inline int other_side(const segments_t *s, int k, int i, int u)
 }
 
 /* The generator that gets the piece on the other side of segment k of cell i, -1 if unknown. */
-static inline int other_root(const segments_t *s, int k, int i, global const int *slots, global const int *roots)
+inline int other_root(const segments_t *s, int k, int i, global const int *slots, global const int *roots)
 {
     const int j = s->labels[k], u = slots[j];
     return u == UNTOUCHED ? j : roots[s->places[other_side(s, k, i, u)]];
@@ -46,8 +46,8 @@ static inline int other_root(const segments_t *s, int k, int i, global const int
 
 /* Whether segment k of cell i, in a piece of generator `root`, is a face of the cell of `root`; *other: its neighbor.
  */
-static inline bool is_face(const segments_t *s, int k, int i, int root, global const int *slots,
-                           global const int *roots, int *other)
+inline bool is_face(const segments_t *s, int k, int i, int root, global const int *slots, global const int *roots,
+                    int *other)
 {
     const int label = s->labels[k];
     if (is_empty(s, k)) {

@@ -16,7 +16,7 @@
 
 /* Whether a segment on a face, between a corner of the cell and the end of a chord, leaves the domain across the edge
    of that chord. Edges miss corners narrower than round-off. */
-static inline bool leads_out(const segment_t *s, const chords_t *c)
+inline bool leads_out(const segment_t *s, const chords_t *c)
 {
     if ((s->from < 0) == (s->to < 0))
         return false;

@@ -19,7 +19,7 @@ typedef struct {
     global const int *starts, global const int *neighbors, global const REAL *points, const REAL4 box_lower,           \
         const REAL4 box_upper, global const int *touched, global const int *list_starts, global const int *listed
 
-static inline convex_t convex_cell(int u, CONVEX_ARGS)
+inline convex_t convex_cell(int u, CONVEX_ARGS)
 {
     convex_t cell;
     cell.i = touched[u];
@@ -47,7 +47,7 @@ typedef struct {
     bool empty;
 } segment_t;
 
-static inline bool same_place(REAL2 p, REAL2 q)
+inline bool same_place(REAL2 p, REAL2 q)
 {
     return p.s0 == q.s0 && p.s1 == q.s1;
 }
@@ -62,7 +62,7 @@ typedef struct {
 
 /* The position of the crossing at the end of `chord`, between this cell and that of generator j; the same numbers for
    both cells, except for the sign. */
-static inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord, int j)
+inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord, int j)
 {
     const int edge = c->edges[chord], o = min(cell->i, j), q = max(cell->i, j);
     const REAL2 x = (REAL2)(cell->points[2 * o], cell->points[2 * o + 1]);
@@ -95,7 +95,7 @@ static inline place_t crossing_place(const convex_t *cell, const chords_t *c, in
     return place;
 }
 
-static inline bool is_after(place_t a, place_t b)
+inline bool is_after(place_t a, place_t b)
 {
     if (a.face != b.face)
         return a.face > b.face;
@@ -111,19 +111,19 @@ typedef struct {
     place_t left, entered; /* positions where the faces are entered and left */
 } cursor_t;
 
-static inline cursor_t along_chord(int chord)
+inline cursor_t along_chord(int chord)
 {
     cursor_t cursor = {chord, 0, -1, -1, {0, 0, 0}, {0, 0, 0}};
     return cursor;
 }
 
-static inline cursor_t around_cell()
+inline cursor_t around_cell()
 {
     return along_chord(-1);
 }
 
 /* Leave chord `chord` for the faces; find the chord that enters next. */
-static inline void leave_chord(cursor_t *cursor, const convex_t *cell, const chords_t *c, int chord)
+inline void leave_chord(cursor_t *cursor, const convex_t *cell, const chords_t *c, int chord)
 {
     cursor->left = crossing_place(cell, c, chord, c->cells[chord + 1]);
     cursor->entry = -1;
@@ -145,13 +145,13 @@ static inline void leave_chord(cursor_t *cursor, const convex_t *cell, const cho
     cursor->from = chord;
 }
 
-static inline REAL2 cell_corner(const convex_t *cell, int k)
+inline REAL2 cell_corner(const convex_t *cell, int k)
 {
     return corner(cell->i, cell->x, cell->row[k == 0 ? cell->n - 1 : k - 1], cell->row[k], cell->points, cell->lower,
                   cell->upper);
 }
 
-static inline segment_t next_segment(cursor_t *cursor, const convex_t *cell, const chords_t *c)
+inline segment_t next_segment(cursor_t *cursor, const convex_t *cell, const chords_t *c)
 {
     const REAL2 x = (REAL2)(cell->x[0], cell->x[1]);
     segment_t s;
@@ -189,13 +189,13 @@ static inline segment_t next_segment(cursor_t *cursor, const convex_t *cell, con
 }
 
 /* Whether the loop that began with `chord` (-1: around the cell) is complete. */
-static inline bool is_complete(const cursor_t *cursor, int chord)
+inline bool is_complete(const cursor_t *cursor, int chord)
 {
     return chord >= 0 ? cursor->chord == chord : cursor->face == 0;
 }
 
 /* Contribution of a segment to the winding number around y: +1 or -1 if it crosses the ray from y to the right. */
-static inline int winding(segment_t s, REAL2 y)
+inline int winding(segment_t s, REAL2 y)
 {
     const REAL2 p = s.p - y, q = s.q - y;
     const REAL side = p.s0 * q.s1 - p.s1 * q.s0;
@@ -206,7 +206,7 @@ static inline int winding(segment_t s, REAL2 y)
     return 0;
 }
 
-static inline REAL squared_distance_to(segment_t s, REAL2 y)
+inline REAL squared_distance_to(segment_t s, REAL2 y)
 {
     const REAL2 p = s.p - y, e = s.q - s.p;
     const REAL e2 = dot(e, e);
@@ -216,14 +216,14 @@ static inline REAL squared_distance_to(segment_t s, REAL2 y)
 }
 
 /* Start the loop that begins with `chord`; -1: around the cell. */
-static inline cursor_t loop_begin(int chord)
+inline cursor_t loop_begin(int chord)
 {
     return chord >= 0 ? along_chord(chord) : around_cell();
 }
 
 /* Whether the hole with the loop from `hole` lies inside the loop from `chord`. Tested with a corner or an edge
    midpoint of the hole that is not on the loop: the hole may touch it. */
-static inline bool lies_within(const convex_t *cell, const chords_t *c, int chord, int hole)
+inline bool lies_within(const convex_t *cell, const chords_t *c, int chord, int hole)
 {
     const REAL2 x = (REAL2)(cell->x[0], cell->x[1]);
     for (int middles = 0; middles < 2; ++middles) {
@@ -247,7 +247,7 @@ static inline bool lies_within(const convex_t *cell, const chords_t *c, int chor
 }
 
 /* Whether a loop leaves the boundary for faces of the cell. */
-static inline bool is_open(const convex_t *cell, const chords_t *c, int chord)
+inline bool is_open(const convex_t *cell, const chords_t *c, int chord)
 {
     cursor_t cursor = loop_begin(chord);
     do {

@@ -33,13 +33,13 @@ typedef struct {
         CHORDS, chord_owners, edges_before, turns                                                                      \
     }
 
-static inline outline_t no_outline(void)
+inline outline_t no_outline(void)
 {
     outline_t o = {0, 0, 0, 0};
     return o;
 }
 
-static inline void add_straight(outline_t *o, REAL2 p, REAL2 q)
+inline void add_straight(outline_t *o, REAL2 p, REAL2 q)
 {
     const REAL2 e = q - p;
     o->perimeter += sqrt(dot(e, e));
@@ -47,14 +47,14 @@ static inline void add_straight(outline_t *o, REAL2 p, REAL2 q)
 }
 
 /* A face between cells. */
-static inline void add_wall_face(outline_t *o, REAL2 p, REAL2 q)
+inline void add_wall_face(outline_t *o, REAL2 p, REAL2 q)
 {
     o->sides += 1;
     add_straight(o, p, q);
 }
 
 /* The next chord of nonzero length, and the turning angle up to it. */
-static inline int chord_past(const shore_t *s, int chord, REAL *turned)
+inline int chord_past(const shore_t *s, int chord, REAL *turned)
 {
     do {
         chord = chord_after(&s->c, chord);
@@ -65,7 +65,7 @@ static inline int chord_past(const shore_t *s, int chord, REAL *turned)
 }
 
 /* Whether all chords of the ring bound generator i. */
-static inline bool is_ring(const shore_t *s, int chord, int i)
+inline bool is_ring(const shore_t *s, int chord, int i)
 {
     REAL turned = 0;
     int other = chord;
@@ -76,7 +76,7 @@ static inline bool is_ring(const shore_t *s, int chord, int i)
 }
 
 /* Whether a run of generator i begins with the chord. */
-static inline bool begins_run(const shore_t *s, int chord, int i)
+inline bool begins_run(const shore_t *s, int chord, int i)
 {
     bool sharpest = false;
     int other = chord;
@@ -92,7 +92,7 @@ static inline bool begins_run(const shore_t *s, int chord, int i)
 }
 
 /* Add the run of generator i, at x, that begins with chord `first`. */
-static inline void add_wall_sides(outline_t *o, const shore_t *s, int first, int i, REAL2 x)
+inline void add_wall_sides(outline_t *o, const shore_t *s, int first, int i, REAL2 x)
 {
     const bool is_hole = s->c.shells[s->c.edges[first]] >= 0 && is_ring(s, first, i);
     REAL2 begin = chord_begin(&s->c, first) - x;

@@ -26,7 +26,7 @@
 #define FLAG_FAR 2     /* a neighbor is not the nearest image; report[2] is the least generator with such a neighbor */
 #define FLAG_COLLAPSED 4 /* a face that only one of its cells has is larger than round-off; report[2] likewise */
 
-static inline int step_of(int code, int a)
+inline int step_of(int code, int a)
 {
     return (a == 0 ? code : a == 1 ? code / 3 : code / 9) % 3 - 1;
 }
@@ -36,7 +36,7 @@ static inline int step_of(int code, int a)
 #define BACK(a) ((a) == 0 ? 0x1249249 : (a) == 1 ? 0x1c0e07 : 0x1ff)
 
 /* Bits of the codes whose images of x lie within the largest depth along each axis. Most generators have none. */
-static inline int codes_near(const REAL *x, global const int *extremes PERIOD_ARGS)
+inline int codes_near(const REAL *x, global const int *extremes PERIOD_ARGS)
 {
     int codes = (1 << CODES) - 1;
     EACH_AXIS(a)
@@ -49,7 +49,7 @@ static inline int codes_near(const REAL *x, global const int *extremes PERIOD_AR
 }
 
 /* Remove the lowest code from the set and return it. */
-static inline int take_code(int *codes)
+inline int take_code(int *codes)
 {
     const int code = 31 - (int)clz(*codes & -*codes);
     *codes &= *codes - 1;
@@ -57,8 +57,7 @@ static inline int take_code(int *codes)
 }
 
 /* Compute the image y of x with this code. Returns whether it lies in the halo. */
-static inline bool make_image(const REAL *x, int code, global const float *depths, const blocks_t *blocks,
-                              REAL *y PERIOD_ARGS)
+inline bool make_image(const REAL *x, int code, global const float *depths, const blocks_t *blocks, REAL *y PERIOD_ARGS)
 {
     EACH_AXIS(a)
     y[a] = x[a] + step_of(code, a) * PERIOD(a);
@@ -78,7 +77,7 @@ static inline bool make_image(const REAL *x, int code, global const float *depth
 
 /* Distance along an axis between the centers of block k of `count` and block j of `was` blocks, less half the
    difference of their lengths: 0 if one lies in the other. */
-static inline float block_spacing(int k, int j, int count, int was, REAL length)
+inline float block_spacing(int k, int j, int count, int was, REAL length)
 {
     const float one = (float)length, other = one * (float)count / (float)was;
     return fmax(fabs(one * ((float)k + 0.5f) - other * ((float)j + 0.5f)) - fabs(one - other) / 2, 0.0f);
@@ -222,7 +221,7 @@ kernel void store_required_depths(const int size, global const float *depths, co
 }
 
 /* Row in the extended diagram of generator j's image with this code; -1 if there is none. */
-static inline int find_image(int j, int code, int size, global const int *firsts, global const int *codes)
+inline int find_image(int j, int code, int size, global const int *firsts, global const int *codes)
 {
     for (int g = firsts[j]; g < firsts[j + 1]; ++g)
         if (codes[g] == code)

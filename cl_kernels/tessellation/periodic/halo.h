@@ -53,7 +53,7 @@ typedef struct {
  */
 #define EXTREMES_LEAST 4
 
-static inline void find_limits(halo_t *in, global const int *extremes)
+inline void find_limits(halo_t *in, global const int *extremes)
 {
     const REAL periods[3] = {in->period.s0, in->period.s1, in->period.s2};
     for (int side = 0; side < 2 * DIM; ++side) {
@@ -63,27 +63,27 @@ static inline void find_limits(halo_t *in, global const int *extremes)
     }
 }
 
-static inline int count_along(const blocks_t *blocks, int a)
+inline int count_along(const blocks_t *blocks, int a)
 {
     const int counts[4] = {blocks->count.s0, blocks->count.s1, blocks->count.s2, blocks->count.s3};
     return counts[a];
 }
 
-static inline REAL length_along(const blocks_t *blocks, int a)
+inline REAL length_along(const blocks_t *blocks, int a)
 {
     const REAL lengths[4] = {blocks->length.s0, blocks->length.s1, blocks->length.s2, blocks->length.s3};
     return lengths[a];
 }
 
 /* Block of coordinate y along an axis. The outermost blocks are unbounded. */
-static inline int block_of(REAL y, int a, const blocks_t *blocks)
+inline int block_of(REAL y, int a, const blocks_t *blocks)
 {
     const REAL starts[4] = {blocks->from.s0, blocks->from.s1, blocks->from.s2, blocks->from.s3};
     return (int)clamp(floor((y - starts[a]) / length_along(blocks, a)), R(0), (REAL)(count_along(blocks, a) - 1));
 }
 
 /* Index of a block of the boundary at the lower (side 0) or upper end (1) of axis a. */
-static inline int block_place(int a, int side, int first, int second)
+inline int block_place(int a, int side, int first, int second)
 {
     const int along = DIM == 2 ? first : first * BLOCKS + second;
     return (2 * a + side) * (DIM == 2 ? BLOCKS : BLOCKS * BLOCKS) + along;
@@ -91,7 +91,7 @@ static inline int block_place(int a, int side, int first, int second)
 
 /* Squared distance of x from a block along an axis, reduced by the round-off with which positions are sorted into
  * blocks. */
-static inline REAL block_distance2(REAL x, int a, int block, const blocks_t *blocks)
+inline REAL block_distance2(REAL x, int a, int block, const blocks_t *blocks)
 {
     const REAL starts[4] = {blocks->from.s0, blocks->from.s1, blocks->from.s2, blocks->from.s3};
     const REAL length = length_along(blocks, a);
@@ -105,7 +105,7 @@ static inline REAL block_distance2(REAL x, int a, int block, const blocks_t *blo
    with room for its motion: by up to `sideways` along the boundary, by as much outwards until that generator is on the
    boundary, and by `outwards` beyond. Returns whether it requires more than the next halo has anyway. Requests are
    written only if `record`. */
-static inline bool check_ball(const REAL *x, REAL radius, REAL sideways, REAL outwards, bool record, const halo_t *in)
+inline bool check_ball(const REAL *x, REAL radius, REAL sideways, REAL outwards, bool record, const halo_t *in)
 {
     const blocks_t *blocks = &in->blocks;
     const REAL periods[4] = {in->period.s0, in->period.s1, in->period.s2, 0};
@@ -164,7 +164,7 @@ static inline bool check_ball(const REAL *x, REAL radius, REAL sideways, REAL ou
 #define WIDEST_WAY R(1.633)
 
 /* Does a ball of radius `wide` around y reach deeper than the limits? */
-static inline bool reaches_beyond(const REAL *y, REAL wide, const halo_t *in)
+inline bool reaches_beyond(const REAL *y, REAL wide, const halo_t *in)
 {
     const REAL periods[3] = {in->period.s0, in->period.s1, in->period.s2};
     bool beyond = false;
@@ -174,7 +174,7 @@ static inline bool reaches_beyond(const REAL *y, REAL wide, const halo_t *in)
 }
 
 /* Radius that contains a ball of radius 1 with its room for motion. */
-static inline REAL widest_ball(const halo_t *in)
+inline REAL widest_ball(const halo_t *in)
 {
     return 1 + BALL_NOISE + (in->sideways + in->outwards) * WIDEST_WAY;
 }
@@ -183,8 +183,7 @@ static inline REAL widest_ball(const halo_t *in)
    these is at ways[k] from x, unless labels[k] is a wall. All cells at the vertex test whether the halo is deep enough.
    Only the one with the least generator adds room for motion, as all compute the same. `sideways` and `outwards` are
    shares of the shortest distance between two of the generators. */
-static inline void check_vertex_ball(const REAL *x, int i, REAL4 at, const REAL4 *ways, const int *labels,
-                                     const halo_t *in)
+inline void check_vertex_ball(const REAL *x, int i, REAL4 at, const REAL4 *ways, const int *labels, const halo_t *in)
 {
     const REAL radius = sqrt(at.s0 * at.s0 + at.s1 * at.s1 + at.s2 * at.s2);
     REAL way = 0;

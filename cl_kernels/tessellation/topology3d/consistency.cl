@@ -23,7 +23,7 @@
 
 /* Note that corners u and w belong to one vertex. Labels are read from `old` and written to `new`, which begins as its
    copy. */
-static inline bool join_labels(global const int *old, global int *new, int u, int w)
+inline bool join_labels(global const int *old, global int *new, int u, int w)
 {
     const int a = old[u], b = old[w];
     if (a == b)
@@ -168,18 +168,18 @@ typedef struct {
         points, corners, owners, corner_faces, labels, best_corners, lower, upper, origin                              \
     }
 
-static inline REAL4 way_between(int i, int j, global const REAL *points)
+inline REAL4 way_between(int i, int j, global const REAL *points)
 {
     return (REAL4)(points[3 * j] - points[3 * i], points[3 * j + 1] - points[3 * i + 1],
                    points[3 * j + 2] - points[3 * i + 2], 0);
 }
 
-static inline REAL inner_product(REAL4 a, REAL4 b)
+inline REAL inner_product(REAL4 a, REAL4 b)
 {
     return a.s0 * b.s0 + a.s1 * b.s1 + a.s2 * b.s2;
 }
 
-static inline REAL4 vertex_position(int label, const vertices_t *in)
+inline REAL4 vertex_position(int label, const vertices_t *in)
 {
     const int u = in->best_corners[label];
     return way_between(in->origin, in->owners[u], in->points) +
@@ -187,7 +187,7 @@ static inline REAL4 vertex_position(int label, const vertices_t *in)
 }
 
 /* Does the position y lie on the three planes that corner u lies on, within `tolerance`? */
-static inline bool is_on_planes(int u, REAL4 y, REAL tolerance, const vertices_t *in)
+inline bool is_on_planes(int u, REAL4 y, REAL tolerance, const vertices_t *in)
 {
     const int i = in->owners[u];
     const REAL4 x = way_between(in->origin, i, in->points), from = y - x;
@@ -210,7 +210,7 @@ static inline bool is_on_planes(int u, REAL4 y, REAL tolerance, const vertices_t
 }
 
 /* The tolerance at a distance from a generator, after it has doubled so often. */
-static inline REAL tolerance_at(REAL distance, int doublings)
+inline REAL tolerance_at(REAL distance, int doublings)
 {
     return ldexp(4 * noise_length(distance), doublings);
 }

@@ -15,15 +15,15 @@
    loops (3 c,)                corners, counter-clockwise from outside */
 
 /* The cell of generator i; false if there is not enough room. */
-static inline bool make_cell(cell_t *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper,
-                             global const int *starts, global const int *neighbors)
+inline bool make_cell(cell_t *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper,
+                      global const int *starts, global const int *neighbors)
 {
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
     start_polyhedron(cell, x, lower, upper);
     return clip_polyhedron_by_row(cell, i, x, starts, neighbors, points) != CLIP_FULL;
 }
 
-static inline bool is_in_row(int label, int begin, int end, global const int *labels)
+inline bool is_in_row(int label, int begin, int end, global const int *labels)
 {
     for (int k = begin; k < end; ++k)
         if (labels[k] == label)
@@ -53,7 +53,7 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
 
 /* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each
    face, because the round-off of a bisector grows as r / d, with d the distance of its generators and r that of v. */
-static inline REAL sharpness_of(const cell_t *cell, int v)
+inline REAL sharpness_of(const cell_t *cell, int v)
 {
     const INDEX4 f = cell->faces[v];
     const int faces[3] = {f.s0, f.s1, f.s2};
@@ -73,8 +73,8 @@ static inline REAL sharpness_of(const cell_t *cell, int v)
 }
 
 /* Write the loops of a cell's half-faces, from `half_face` up to `end`. */
-static inline void list_loops(const cell_t *cell, int base, int half_face, int end, global const int *half_face_labels,
-                              global int *loop_starts, global int *loops)
+inline void list_loops(const cell_t *cell, int base, int half_face, int end, global const int *half_face_labels,
+                       global int *loop_starts, global int *loops)
 {
     INDEX start[FACE_CAPACITY];
     for (int v = 0; v < cell->n; ++v) {
@@ -163,7 +163,7 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
 }
 
 /* Is label one of the three faces of corner u? */
-static inline bool has_label(global const int *corner_faces, int u, int label)
+inline bool has_label(global const int *corner_faces, int u, int label)
 {
     return corner_faces[3 * u] == label || corner_faces[3 * u + 1] == label || corner_faces[3 * u + 2] == label;
 }
