@@ -9,8 +9,10 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from ..mesh.connectivity import following, take_rows
-from .geometry import face_geometry, sum_rows
-from .merging import Cells, Limits, Merges, pack, ranges, smaller_size, unpack
+from .defects import Limits
+from .geometry import face_geometry, smaller_size, sum_rows
+from .merging import Cells, Merges
+from .offsets import pack, unpack
 from .solver_mesh import SolverMesh
 
 SHORT_EDGE = 0.02
@@ -138,11 +140,9 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
     place[upper] = np.arange(len(upper))
     lower = place[left] < 0
     source = place[np.where(lower, mesh.twin[left], left)]
-    counts = cells.count[source]
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    where = ranges(cells.begin[source], counts)
+    starts, where = cells.face_corners(source)
     _, where = take_rows(starts, where, np.arange(len(left)), lower)
-    shift = np.repeat(np.where(lower, cells.face_codes[source], 0), counts)
+    shift = np.repeat(np.where(lower, cells.face_codes[source], 0), np.diff(starts))
     vertices, codes = cells.corners[where], cells.codes[where] - shift
     corners, points = vertices, cells.points
     if codes.any():

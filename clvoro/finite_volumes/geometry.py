@@ -133,3 +133,8 @@ def turns(corners: np.ndarray, after: np.ndarray) -> np.ndarray:
 def sum_rows(places: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Return for each place the sum of its `values` (k, d): (count, d)."""
     return np.stack([np.bincount(places, column, count) for column in values.T], axis=1)
+
+
+def smaller_size(owner: np.ndarray, neighbor: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return the smaller of the `sizes` (n,) of both cells of each face, (f,)."""
+    return np.minimum(sizes[owner], sizes[np.where(neighbor >= 0, neighbor, owner)])

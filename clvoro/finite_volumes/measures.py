@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mesh.connectivity import following, take_rows
-from .geometry import Geometry, cell_geometry, face_geometry, polygon_areas, sum_rows
+from .geometry import Geometry, cell_geometry, face_geometry, polygon_areas, smaller_size, sum_rows
 from .prisms import Polyhedra, polyhedra
 
 if TYPE_CHECKING:
@@ -321,10 +321,8 @@ class SolverMeasures:
     @cached_property
     def _face_sizes(self) -> np.ndarray:
         """Smaller size of the cells at each face of the solver mesh, (f,)."""
-        owner, neighbor = self.mesh.owner, self.mesh.neighbor
-        here = self.sizes[owner]
-        there = np.where(neighbor >= 0, self.sizes[np.maximum(neighbor, 0)], here)
-        return np.maximum(np.minimum(here, there), _TINY)
+        smaller = smaller_size(self.mesh.owner, self.mesh.neighbor, self.sizes)
+        return np.maximum(smaller, _TINY)
 
     def _least(self, values: np.ndarray) -> np.ndarray:
         """Return the least of `values` (f,) among the faces of each cell, (n,)."""

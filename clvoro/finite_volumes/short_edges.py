@@ -9,7 +9,7 @@ import numpy as np
 from ..mesh.connectivity import following, take_rows
 from ..mesh.straightening import cross
 from .geometry import turns
-from .merging import independent
+from .independent import independent
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh
 
