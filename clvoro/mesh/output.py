@@ -45,25 +45,69 @@ class MeshOutput:
     ) -> None:
         """Write the mesh to `path`; the suffix selects the format.
 
+        The file of a diagram has no sizes, errors and history.
+
+        ``.npz``
+            Everything; `clvoro.load` reads it.
+        ``.vtu``
+            For ParaView and other VTK programs, and for `clvoro.load`: polygons or polyhedra with size, error, quality,
+            boundary and more as cell data; row i is cell i of the mesh. VTK's `vtkCellSizeFilter` (PyVista's
+            `compute_cell_sizes`) is wrong for cells that are not convex, as there are along the boundary of a polygon:
+            use the cell data `volume`. meshio 5.3 reads a mesh in 2D as one block of cells for each run of cells with
+            equally many corners; a ``.vtk`` file has one block for each number of corners. In 3D it refuses most files,
+            as its reader assigns cell data to the wrong blocks of polyhedra.
+        ``.../constant/polyMesh`` or ``CASE/name.foam``
+            A folder for OpenFOAM, alone or within a case that ParaView opens, too. In 2D one layer of prisms between
+            patches of type `empty`. Each periodic direction is one pair of cyclic patches;
+            with several of them, these are for OpenFOAM of openfoam.com.
+        ``.nc``
+            Meshes in 2D as netCDF, for models of oceans and atmospheres, QGIS, ParaView and xarray.
+        ``.vtk``, ``.ply``, ``.obj``
+            Meshes in 2D, written by meshio (``pip install "clvoro[formats]"``); the latter two without cell data. Cells
+            are sorted by their number of corners; in ``.vtk`` the cell data `label` is the row in the mesh.
+
         Parameters
         ----------
         path : str or path
-            ``.npz`` (for `clvoro.load`), ``.vtu``, netCDF (``.nc``), OpenFOAM's ``polyMesh``, ...
         cell_data : mapping, optional
-            Data of your own by name, one number or row of numbers per cell.
-        patches, types, thickness, walls, convention, units : optional
-            Of single formats; see `clvoro.io.save`.
+            Data of your own by name, (n,) or (n, k) arrays of real numbers: cell data in ``.vtu`` and ``.vtk``,
+            variables in ``.nc``, members ``cell_data.<name>`` in ``.npz``, which `clvoro.load` leaves out. Other
+            formats hold none.
+        patches : mapping, optional
+            For OpenFOAM: names of patches, each with its walls: numbers, names of the domain, or a sequence of them.
+            Walls that are not mentioned keep the name that the domain gives them.
+        types : mapping, optional
+            For OpenFOAM: type of each patch by name, "wall" (the default), "patch", "symmetry" or "symmetryPlane".
+            Inlets, outlets and far fields need "patch": ``types={"inlet": "patch"}``.
+        thickness : float, optional
+            For OpenFOAM and a mesh in 2D: height of the layer of prisms. By default the mean width of a cell.
+        walls : {"straight", "exact"}, optional
+            For OpenFOAM and ``.vtu``. With "straight", the default for OpenFOAM, the file has the cells of
+            `Diagram.solver_mesh`: the faces of a cell on the boundary become one straight face where they turn by at
+            most 30 degrees in sum, face ends near a corner of the domain move into it, and short edges are collapsed.
+            Solvers reject cells that are not convex. `clvoro.load` does not read such a ``.vtu`` file. With "exact",
+            the default for ``.vtu``, all faces are those of the diagram, as in all other formats.
+        convention : {"ugrid", "mpas"}, optional
+            For netCDF. With "ugrid", the default: cells as polygons with size, error, quality and area, and for each
+            edge the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas": cells, edges and
+            vertices with all variables of the MPAS mesh specification for C grids; cells at seams are connected.
+        units : str, optional
+            For netCDF: unit of the coordinates, as UDUNITS writes it. By default "m". In UGRID, "degrees" stands for
+            longitudes and latitudes.
 
         Raises
         ------
         InputError, InputTypeError
-            As `clvoro.io.save`.
+            If the format is unknown or cannot hold the cells, an argument is wrong or for another format, or the file
+            cannot be written. An existing file is then unchanged.
         """
-        from ..io import save
+        from ..io import write_mesh
 
-        save(
-            self._self, path, cell_data=cell_data, patches=patches, types=types, thickness=thickness, walls=walls,
-            convention=convention, units=units,
+        # Not `_self`: `clvoro.io.save` may get an object that is no mesh, which `write_mesh` refuses.
+        write_mesh(
+            cast("Result | Diagram", self), path, cell_data, walls,
+            for_foam={"patches": patches, "types": types, "thickness": thickness},
+            for_netcdf={"convention": convention, "units": units},
         )  # fmt: skip
 
     def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> SolverMesh:
@@ -135,10 +179,26 @@ class MeshOutput:
             default "error" for a result, "quality" for a diagram.
         label : str, optional
             Text at the color bar.
-        view : "slices", "slice" or "cutaway", optional
-            For 3D; "slices" by default.
-        ax, limits, window, normal, through, cut, angles, edges, key, title : optional
-            See `clvoro.plotting.plot_mesh`.
+        view : {"slices", "slice", "cutaway"}, optional
+            For 3D: planes along the axes and a cut-away view (the default), one plane, or a cut-away view.
+        ax : matplotlib axes, optional
+            Axes to draw into; not for "slices", which has several.
+        limits : (low, high), optional
+            Ends of the color scale; by default limits that hold 99 % of the cells.
+        window : (lower, upper), optional
+            For 2D and "slice": corners of the part to show; by default all of it.
+        normal : {"x", "y", "z"} or 3 floats
+            For "slice": direction at right angles to the plane.
+        through : 3 floats, optional
+            For 3D: a point of the planes or of the cut.
+        cut, angles : optional
+            For "cutaway": the removed part, and azimuth and elevation of the viewer in degrees; see
+            `clvoro.plotting.plot_cutaway`.
+        edges : bool
+            Draw the faces; not for "slices", which always has them.
+        key : bool
+            Add the color bar (for "sides" the legend with the shares); not for "slices".
+        title : str, optional
 
         Returns
         -------
@@ -151,13 +211,12 @@ class MeshOutput:
         ClvoroError
             If Matplotlib is not installed.
         """
-        from ..plotting import plot_mesh
+        from ..plotting.solids import draw_mesh
 
         chosen = self.default_color if isinstance(color, str) and color == "default" else color
-        return plot_mesh(
-            self._self, chosen, label=label, view=view, ax=ax,
-            limits=limits, window=window, normal=normal, through=through, cut=cut, angles=angles, edges=edges, key=key,
-            title=title,
+        return draw_mesh(
+            cast("Result | Diagram", self), chosen, view, label=label, ax=ax, limits=limits,
+            window=window, normal=normal, through=through, cut=cut, angles=angles, edges=edges, key=key, title=title,
         )  # fmt: skip
 
     def to_pyvista(
@@ -168,7 +227,7 @@ class MeshOutput:
         Parameters
         ----------
         cell_data : mapping, optional
-            Data of your own by name, one number or row of numbers per cell.
+            As for `save`.
 
         Returns
         -------
@@ -193,7 +252,7 @@ class MeshOutput:
         Parameters
         ----------
         cell_data : mapping, optional
-            Data of your own by name, one number or row of numbers per cell.
+            As for `save`.
 
         Returns
         -------
@@ -206,7 +265,7 @@ class MeshOutput:
         ClvoroError
             If meshio is not installed (``pip install "clvoro[formats]"``).
         InputError, InputTypeError
-            If `cell_data` does not fit the cells.
+            As for `to_pyvista`.
         """
         from ..io import to_meshio
 

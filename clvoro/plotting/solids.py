@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..mesh.diagram import Diagram
+from ..mesh.output import MeshOutput
 from ..mesh.results import Result
 from .cells import plot_cells
 from .colors import Color, cell_norm, coloring, coloring_of, picture_of
@@ -23,60 +25,17 @@ from .style import WIDTH, interactive_figure, styled
 __all__ = ["plot_cutaway", "plot_distributions", "plot_mesh", "plot_slice", "plot_slices"]
 
 View = Literal["slices", "slice", "cutaway"]
-_USED = {
-    "2D": ("ax", "window", "edges", "key"),
-    "slices": ("through",),
-    "slice": ("ax", "window", "normal", "through", "edges", "key"),
-    "cutaway": ("ax", "through", "cut", "angles", "edges", "key"),
-}
-"""Options of `plot_mesh` that a kind of picture uses."""
 
 
-def plot_mesh(
-    mesh: Result | Diagram,
-    color: Color | ArrayLike = "error",
-    *,
-    label: str | None = None,
-    view: View | None = None,
-    ax: Any = None,
-    limits: tuple[float, float] | None = None,
-    window: tuple[ArrayLike, ArrayLike] | None = None,
-    normal: str | ArrayLike = "z",
-    through: ArrayLike | None = None,
-    cut: str | ArrayLike | None = "octant",
-    angles: tuple[float, float] | None = None,
-    edges: bool = True,
-    key: bool = True,
-    title: str | None = None,
-) -> Any:
-    """Draw a mesh: 2D by `plot_cells`, 3D by `plot_slices`, `plot_slice` or `plot_cutaway`.
+def plot_mesh(mesh: Result | Diagram, color: Color | ArrayLike = "error", **options: Any) -> Any:
+    """Draw a mesh. The options are those of `Diagram.plot`."""
+    return MeshOutput.plot(mesh, color, **options)
 
-    Parameters
-    ----------
-    mesh : Result or Diagram
-    color, label, limits, title
-        As for `plot_cells`.
-    view : {"slices", "slice", "cutaway"}, optional
-        For meshes in 3D: planes along the axes and a cut-away view (the default), one plane, or a cut-away view.
-    ax : matplotlib axes, optional
-        Axes to draw into; not for "slices", which has several.
-    window, edges, key
-        As for `plot_cells`; window for 2D and "slice", edges and key not for "slices".
-    normal : {"x", "y", "z"} or 3 floats
-        For "slice": direction at right angles to the plane.
-    through : 3 floats, optional
-        For 3D: a point of the planes or of the cut.
-    cut, angles
-        For "cutaway": the removed part, and azimuth and elevation of the viewer in degrees; see `plot_cutaway`.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
+def draw_mesh(mesh: Result | Diagram, color: Color | ArrayLike, view: Any, **options: Any) -> Any:
+    """Draw a mesh as a picture of the kind `view`; refuse options that only other kinds of pictures have.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If a color does not exist, an array has another shape, or an option is for other pictures.
+    The options are all those of `Diagram.plot`. Those with their default value are not refused.
     """
     flat = picture_of(mesh).diagram.domain.dim == 2
     if flat and view is not None:
@@ -84,24 +43,18 @@ def plot_mesh(
     if view is not None and view not in get_args(View):
         raise InputError(f"view is {view!r}, expected one of {', '.join(get_args(View))}")
     kind = "2D" if flat else view or "slices"
-    draw = {"2D": plot_cells, "slices": plot_slices, "slice": plot_slice, "cutaway": plot_cutaway}[
-        kind
-    ]
-    given = {
-        "ax": (ax, None), "window": (window, None), "normal": (normal, "z"), "through": (through, None),
-        "cut": (cut, "octant"), "angles": (angles, None), "edges": (edges, True), "key": (key, True),
-    }  # fmt: skip
-    options: dict[str, Any] = {}
-    for name, (value, default) in given.items():
+    pictures = {"2D": plot_cells, "slices": plot_slices, "slice": plot_slice, "cutaway": plot_cutaway}  # fmt: skip
+    known = {name: signature(draw).parameters for name, draw in pictures.items()}
+    given = {}
+    for name, value in options.items():
+        default = signature(MeshOutput.plot).parameters[name].default
         if value is default or (isinstance(value, str) and value == default):
             continue
-        if name not in _USED[kind]:
-            known = [k for k, names in _USED.items() if name in names]
-            raise InputError(
-                f"{name} is for {', '.join(known)}, and this picture is {kind}; leave it out"
-            )
-        options[name] = value
-    return draw(mesh, color, label=label, limits=limits, title=title, **options)
+        if name not in known[kind]:
+            fitting = ", ".join(k for k, names in known.items() if name in names)
+            raise InputError(f"{name} is for {fitting}, and this picture is {kind}; leave it out")
+        given[name] = value
+    return pictures[kind](mesh, color, **given)
 
 
 def plot_cutaway(
