@@ -10,11 +10,9 @@ import numpy as np
 
 from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
-from .curves import CLOSE, Curve
+from .curves.curve import CLOSE, Curve
 
-_GAP = (
-    1e-6  # of a ring's extent: a gap between a curve and the next item that is probably a mistake
-)
+_GAP = 1e-6  # of a ring's extent: a smaller gap between a curve and the next item is a mistake
 _OFF = 1e-6  # of a curve's extent: its largest distance from its vertices in a file
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .angles import angles
 from .polygon import Polygon
 
 _SHARP = math.radians(50)  # turn of the boundary at which one row ends and another one begins
@@ -47,10 +48,7 @@ def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
     """Join the `chosen` edges of `polygon.oriented`, (k,) bool, to chains."""
     vertices, following = polygon.oriented.vertices, polygon.oriented.next_vertex
     along = vertices[following] - vertices
-    after = along[following]
-    turn = np.arctan2(
-        along[:, 0] * after[:, 1] - along[:, 1] * after[:, 0], (along * after).sum(axis=1)
-    )
+    turn = angles(along, along[following])
     # Whether edge e continues in the next one without a sharp turn.
     onward = chosen & chosen[following] & (np.abs(turn) < _SHARP)
     starts = chosen.copy()
@@ -158,10 +156,7 @@ def _bounds(
 ) -> np.ndarray:
     """Return the largest width of columns at each corner of the chain, (k + 1,)."""
     long = lengths >= _LONG * width
-    turn = np.arctan2(
-        along[:-1, 0] * along[1:, 1] - along[:-1, 1] * along[1:, 0],
-        (along[:-1] * along[1:]).sum(axis=1),
-    )
+    turn = angles(along[:-1], along[1:])
     turn[long[:-1] & long[1:]] = 0  # such a corner is one of cells
     # The direction of the wall, linear between the middles of edges; its change over a part of a width.
     direction = np.concatenate([[0], np.cumsum(turn)])

@@ -30,9 +30,8 @@ if TYPE_CHECKING:
     from ..opencl.engine import Engine
     from ..opencl.workspace import Workspace
 
-_MARGIN = (
-    1 / 64
-)  # of the bounding box's longest edge, between the domain and the box that clips cells
+_MARGIN = 1 / 64
+"""Distance from the domain to the box that clips cells, as a share of the bounding box's longest edge."""
 _BEHIND = 16
 """Tolerance for generators on an edge, in units of round-off on the device."""
 

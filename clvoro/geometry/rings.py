@@ -18,14 +18,14 @@ import shapely
 
 from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
+from .angles import angles
 from .box import LARGEST_EDGE
 from .curved_edges import CurvedEdges, has_curves, unroll
 
 SHORTEST_EDGE = 1e-12
 """Shortest edge, as a share of the bounding box's longest edge."""
-_RESOLUTION = (
-    2.0**-40
-)  # smallest extent, as a share of the largest coordinate: 12 bits are left of float64's 52
+_RESOLUTION = 2.0**-40
+"""Smallest extent, as a share of the largest coordinate: 12 bits are left of float64's 52."""
 _SPLIT = 2.0**27 + 1
 _NAMED = 4  # rings at one place that an error lists
 
@@ -110,9 +110,7 @@ class OrientedRings:
         ahead /= np.hypot(*ahead.T)[:, None]
         after = ahead[self.next_vertex]
         found = np.empty(len(ahead))
-        found[self.next_vertex] = np.arctan2(
-            ahead[:, 0] * after[:, 1] - ahead[:, 1] * after[:, 0], (ahead * after).sum(axis=1)
-        )
+        found[self.next_vertex] = angles(ahead, after)
         return found
 
     @cached_property
