@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..mesh.connectivity import following, take_rows
-from ..mesh.straightening import cross
-from .geometry import turns
+from ..mesh.straightening import WALL_CORNER, cross
+from .geometry import polygon_areas, smaller_size, turns
 from .independent import independent
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh
@@ -17,8 +17,6 @@ SHORT = 0.02
 """A face is short if it is shorter than this, over the width of the thinner of its cells."""
 SHORT_ON_WALL = 0.05
 """The same for a face on a wall: OpenFOAM divides the skewness of such a face by its length."""
-_SHARP = np.pi / 6
-"""Turn of a wall that is a corner: its point does not move."""
 _STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell; OpenFOAM counts cells with less than about 1e-6 as concave."""
 _ROUNDS = 12
@@ -41,93 +39,153 @@ def collapse_short_edges(mesh: SolverMesh, parts: np.ndarray) -> SolverMesh:
     """
     failed = np.empty(0, np.int64)
     for _ in range(_ROUNDS):
-        made, failures = _collapse_some(mesh, parts, failed)
-        if made is None:
+        current = _Round(mesh, parts, failed)
+        if not current.faces.size:
             break
-        failed = np.empty(0, np.int64) if made is not mesh else np.concatenate([failed, failures])
-        mesh = made
+        target, done = current.find_targets()
+        if done.any():
+            mesh, failed = current.collapsed(target, done), np.empty(0, np.int64)
+        else:
+            failed = np.concatenate([failed, current.faces])
     return mesh
 
 
-def _collapse_some(
-    mesh: SolverMesh, parts: np.ndarray, failed: np.ndarray
-) -> tuple[SolverMesh | None, np.ndarray]:
-    """Collapse short faces that share no cell; return the mesh, the same if none could be, and the faces that failed.
+class _Round:
+    """Short faces that share no cell, and the points that move if they collapse.
 
-    Without any face to try the mesh is None.
+    Attributes
+    ----------
+    mesh : SolverMesh
+    starts, loop, cell : int
+        Points around each cell as ragged rows, and the cell of each item.
+    images : (v,) int
+        Class of each point; points of a class are periodic images of one another.
+    kind : (v,) int
+        Free, on a wall, or in a corner.
+    faces : (e,) int
+        The shortest first.
+    a, b : (e,) int
+        Their ends.
+    face_of : (v,) int
+        Index in `faces` of the face that the point, or an image of it, is an end of; -1 for other points.
+    shift : (v, 2) int
+        By how many periods the point is away from that end.
+    into : (v,) int
+        The point that takes its place: where two ends of a face merge, one of them.
     """
-    starts, loop, broken = simple_loops(mesh)
-    n, counts = len(mesh), np.diff(starts)
-    images = mesh.images if any(mesh.domain.periodic) else np.arange(len(mesh.points))
-    kind = _kinds(mesh, parts, images)
-    cell = np.repeat(np.arange(n), counts)
-    a, b = mesh.corners.reshape(-1, 2).T
-    lengths = np.linalg.norm(mesh.points[b] - mesh.points[a], axis=1)
-    k = mesh.inner
-    both = np.concatenate([mesh.owner, mesh.neighbor[:k]])
-    here = mesh.points[loop]
-    there = here[following(starts)]
-    base = here[np.minimum(starts[:-1], len(here) - 1)][cell]
-    area = np.bincount(cell, cross(here - base, there - base), n) / 2
-    perimeter = np.bincount(both, np.concatenate([lengths, lengths[:k]]), n)
-    width = 4 * area / np.maximum(perimeter, 1e-300)
+
+    def __init__(self, mesh: SolverMesh, parts: np.ndarray, failed: np.ndarray) -> None:
+        """Choose among the short faces of `mesh` without those of `failed`."""
+        self.mesh, v = mesh, len(mesh.points)
+        self.starts, self.loop, broken = simple_loops(mesh)
+        self.cell = np.repeat(np.arange(len(mesh)), np.diff(self.starts))
+        self.images = mesh.images if any(mesh.domain.periodic) else np.arange(v)
+        self.kind = _kinds(mesh, parts, self.images)
+        ratio = _lengths_over_limits(mesh, broken)
+        ends = mesh.corners.reshape(-1, 2)
+        first, second = self.images[ends].T
+        # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
+        tried = (ratio < 1) & (mesh.twin < np.arange(len(ends))) & (first != second)
+        tried &= self.kind[ends].min(axis=1) == np.where(mesh.neighbor >= 0, _FREE, _WALL)
+        tried[failed] = False
+        faces = np.flatnonzero(tried)
+        self.faces = self._independent(faces[np.argsort(ratio[faces], kind="stable")])
+        self.a, self.b = ends[self.faces].T
+        face_of = np.full(self.images.max(initial=-1) + 1, -1)  # of each class
+        face_of[first[self.faces]] = face_of[second[self.faces]] = np.arange(len(self.faces))
+        self.face_of = face_of[self.images]
+        self.shift, self.into = self._follow_images()
+
+    def _independent(self, faces: np.ndarray) -> np.ndarray:
+        """Return those of `faces`, the first ones preferred, whose points and their images touch no common cell."""
+        if not faces.size:
+            return faces
+        n, classes = len(self.mesh), self.images.max() + 1
+        ends = self.images[self.mesh.corners.reshape(-1, 2)[faces]].T.ravel()
+        moving = np.zeros(classes, bool)
+        moving[ends] = True
+        rows = np.flatnonzero(moving[self.images[self.loop]])
+        of_class, cells = np.divmod(
+            np.unique(self.images[self.loop[rows]] * n + self.cell[rows]), n
+        )
+        starts, touched = take_rows(np.searchsorted(of_class, np.arange(classes + 1)), cells, ends)
+        ranks = np.repeat(np.tile(np.arange(len(faces)), 2), np.diff(starts))
+        return faces[independent(ranks, touched, np.arange(len(faces)), n)]
+
+    def _follow_images(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return `shift` and `into`."""
+        points, v = self.mesh.points, len(self.mesh.points)
+        moving = np.flatnonzero(self.face_of >= 0)
+        face = self.face_of[moving]
+        at_a = self.images[moving] == self.images[self.a[face]]
+        end = np.where(at_a, self.a[face], self.b[face])
+        period = np.where(self.mesh.domain.periodic, self.mesh.domain.extent, np.inf)
+        shift, into = np.zeros((v, 2), np.int64), np.arange(v)
+        shift[moving] = np.rint((points[moving] - points[end]) / period)
+        key = np.column_stack([face, shift[moving]])
+        _, first, which = np.unique(key, axis=0, return_index=True, return_inverse=True)
+        into[moving] = moving[first][which.ravel()]
+        return shift, into
+
+    def find_targets(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return to which place both ends of each face can move, (e, 2), and whether they can, (e,) bool."""
+        touched = np.unique(self.cell[self.face_of[self.loop] >= 0])
+        before, corners = take_rows(self.starts, self.loop, touched)
+        row = np.repeat(np.arange(len(touched)), np.diff(before))
+        face = np.full(len(touched), -1)
+        np.maximum.at(face, row, self.face_of[corners])
+        least = _least_turns(self.mesh.points[corners], before)
+        kept = self.into[corners] != self.into[corners[following(before)]]
+        left = np.bincount(row, kept, len(touched)).astype(int)
+        after, corners = np.concatenate([[0], np.cumsum(left)]), self.into[corners[kept]]
+        p, q = self.mesh.points[self.a], self.mesh.points[self.b]
+        kind, other = self.kind[self.a], self.kind[self.b]
+        done, target = np.zeros(len(self.faces), bool), p.copy()
+        for choice, allowed in (
+            # The middle of two points on a wall may be off a curve.
+            ((p + q) / 2, (kind == _FREE) & (other == _FREE)),
+            (p, kind >= other),
+            (q, kind <= other),
+        ):
+            turn = _least_turns(self._moved(choice)[corners], after)
+            good = (left >= 3) & (turn >= np.minimum(least, _STRAIGHT))
+            accepted = allowed & ~done & (np.bincount(face, ~good, len(done)) == 0)
+            target[accepted] = choice[accepted]
+            done |= accepted
+        return target, done
+
+    def _moved(self, target: np.ndarray, done: np.ndarray | None = None) -> np.ndarray:
+        """Return the points, (v, 2), where both ends of the faces `done` (all by default) go to `target` (e, 2)."""
+        moving = self.face_of >= 0
+        if done is not None:
+            moving &= done[self.face_of]
+        points, face = self.mesh.points.copy(), self.face_of[moving]
+        points[moving] = target[face] + self.shift[moving] * np.array(self.mesh.domain.extent)
+        return points
+
+    def collapsed(self, target: np.ndarray, done: np.ndarray) -> SolverMesh:
+        """Return the mesh in which both ends of the faces `done` (e,) are at `target` (e, 2)."""
+        into = np.where(
+            (self.face_of >= 0) & done[self.face_of], self.into, np.arange(len(self.into))
+        )
+        ends = into[self.mesh.corners].reshape(-1, 2)
+        made = replace(self.mesh, points=self._moved(target, done), corners=ends.ravel())
+        return made.take_faces(ends[:, 0] != ends[:, 1])
+
+
+def _lengths_over_limits(mesh: SolverMesh, broken: np.ndarray) -> np.ndarray:
+    """Return the length of each face over that below which it is short, (f,).
+
+    The width of a cell is 4 times its area over its perimeter; `broken` are cells that are no simple polygons.
+    """
+    a, b = mesh.points[mesh.corners.reshape(-1, 2)].swapaxes(0, 1)
+    lengths = np.linalg.norm(b - a, axis=1)
+    both = np.concatenate([mesh.owner, mesh.neighbor[: mesh.inner]])
+    perimeter = np.bincount(both, np.concatenate([lengths, lengths[: mesh.inner]]), len(mesh))
+    width = 4 * polygon_areas(mesh) / np.maximum(perimeter, 1e-300)
     width[broken] = 0
-    thinner = width[mesh.owner]
-    coupled = mesh.neighbor >= 0
-    thinner[coupled] = np.minimum(thinner[coupled], width[mesh.neighbor[coupled]])
-    ratio = lengths / np.maximum(thinner, 1e-300) / np.where(coupled, SHORT, SHORT_ON_WALL)
-    # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
-    tried = (ratio < 1) & (mesh.twin < np.arange(len(a))) & (images[a] != images[b])
-    tried &= np.minimum(kind[a], kind[b]) == np.where(coupled, _FREE, _WALL)
-    tried[failed] = False
-    faces = np.flatnonzero(tried)
-    if not faces.size:
-        return None, faces
-    faces = _independent(
-        faces[np.argsort(ratio[faces], kind="stable")], a, b, images, loop, cell, n
-    )
-    edge_of = np.full(images.max() + 1, -1)  # of each class of points
-    edge_of[images[a[faces]]] = edge_of[images[b[faces]]] = np.arange(len(faces))
-    p, q = mesh.points[a[faces]], mesh.points[b[faces]]
-    touched = np.unique(cell[edge_of[images[loop]] >= 0])
-    rows, corners = take_rows(starts, loop, touched)
-    row = np.repeat(np.arange(len(touched)), np.diff(rows))
-    edge = np.full(len(touched), -1)
-    np.maximum.at(edge, row, edge_of[images[corners]])
-    before = _least_turns(mesh.points[corners], rows)
-    merged = _representatives(mesh, images, edge_of, a[faces], b[faces])
-    done = np.full(len(faces), False)
-    target = p.copy()
-    choices = [(p + q) / 2, p, q]
-    equal = kind[a[faces]] == kind[b[faces]]
-    # The middle of two points on a wall may be off a curve.
-    free = equal & (kind[a[faces]] == _FREE)
-    allowed = [
-        free,
-        equal | (kind[a[faces]] > kind[b[faces]]),
-        equal | (kind[a[faces]] < kind[b[faces]]),
-    ]
-    kept = merged[corners] != merged[corners[following(rows)]]
-    left = np.bincount(row, kept, len(touched)).astype(int)
-    new_rows = np.concatenate([[0], np.cumsum(left)])
-    for choice, fits in zip(choices, allowed, strict=True):
-        open_ = fits & ~done
-        trial = np.where(done[:, None], target, choice)
-        moved = _moved(mesh, images, edge_of, a[faces], b[faces], trial, merged)
-        after = _least_turns(moved[merged[corners[kept]]], new_rows)
-        good = (left >= 3) & (after >= np.minimum(before, _STRAIGHT))
-        accepted = open_ & (np.bincount(edge, ~good, len(faces)) == 0)
-        target[accepted] = choice[accepted]
-        done |= accepted
-    if not done.any():
-        return mesh, faces
-    # Classes of edges that failed do not move.
-    edge_of[edge_of >= 0] = np.where(done[edge_of[edge_of >= 0]], edge_of[edge_of >= 0], -1)
-    merged = _representatives(mesh, images, edge_of, a[faces], b[faces])
-    points = _moved(mesh, images, edge_of, a[faces], b[faces], target, merged)
-    ends = merged[mesh.corners].reshape(-1, 2)
-    made = replace(mesh, points=points, corners=ends.ravel())
-    return made.take_faces(ends[:, 0] != ends[:, 1]), faces[~done]
+    thinner = np.maximum(smaller_size(mesh.owner, mesh.neighbor, width), 1e-300)
+    return lengths / thinner / np.where(mesh.neighbor >= 0, SHORT, SHORT_ON_WALL)
 
 
 def _kinds(mesh: SolverMesh, parts: np.ndarray, images: np.ndarray) -> np.ndarray:
@@ -145,72 +203,8 @@ def _kinds(mesh: SolverMesh, parts: np.ndarray, images: np.ndarray) -> np.ndarra
     turn = np.abs(
         np.arctan2(cross(behind[:, :2], ahead[:, :2]), (behind[:, :2] * ahead[:, :2]).sum(axis=1))
     )
-    smooth = (met == 2) & (turn < _SHARP) & (ahead[:, 2] == behind[:, 2])
+    smooth = (met == 2) & (turn < WALL_CORNER) & (ahead[:, 2] == behind[:, 2])
     return np.where(met == 0, _FREE, np.where(smooth, _WALL, _CORNER))[images]
-
-
-def _independent(
-    faces: np.ndarray,
-    a: np.ndarray,
-    b: np.ndarray,
-    images: np.ndarray,
-    loop: np.ndarray,
-    cell: np.ndarray,
-    n: int,
-) -> np.ndarray:
-    """Return those of `faces`, the first ones preferred, whose points and their images touch no common cell."""
-    moving = np.zeros(images.max() + 1, bool)
-    moving[images[a[faces]]] = moving[images[b[faces]]] = True
-    rows = np.flatnonzero(moving[images[loop]])
-    pairs = np.unique(images[loop[rows]] * n + cell[rows])
-    of_class, cells = pairs // n, pairs % n
-    first = np.searchsorted(of_class, np.arange(images.max() + 2))
-    ends = np.concatenate([images[a[faces]], images[b[faces]]])
-    rank = np.tile(np.arange(len(faces)), 2)
-    starts, touched = take_rows(first, cells, ends)
-    ranks = np.repeat(rank, np.diff(starts))
-    return faces[independent(ranks, touched, np.arange(len(faces)), n)]
-
-
-def _shifts(mesh: SolverMesh, points: np.ndarray, origins: np.ndarray) -> np.ndarray:
-    """Return by how many periods `points` are away from `origins`, (k, 2) int."""
-    extent = np.array(mesh.domain.extent)
-    period = np.where(mesh.domain.periodic, extent, np.inf)
-    return np.rint((points - origins) / period).astype(np.int64)
-
-
-def _representatives(
-    mesh: SolverMesh, images: np.ndarray, edge_of: np.ndarray, a: np.ndarray, b: np.ndarray
-) -> np.ndarray:
-    """Return for each point the one that takes its place, (v,): where two ends of a face merge, one of them."""
-    merged = np.arange(len(mesh.points))
-    moving = np.flatnonzero(edge_of[images] >= 0)
-    edge = edge_of[images[moving]]
-    origin = np.where(images[moving] == images[a[edge]], a[edge], b[edge])
-    shift = _shifts(mesh, mesh.points[moving], mesh.points[origin])
-    key = np.column_stack([edge, shift])
-    _, first, which = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    merged[moving] = moving[first][which.ravel()]
-    return merged
-
-
-def _moved(
-    mesh: SolverMesh,
-    images: np.ndarray,
-    edge_of: np.ndarray,
-    a: np.ndarray,
-    b: np.ndarray,
-    target: np.ndarray,
-    merged: np.ndarray,
-) -> np.ndarray:
-    """Return the points, (v, 2), where the ends `a` and `b` of each face go to `target` (k, 2)."""
-    points = mesh.points.copy()
-    moving = np.flatnonzero((edge_of[images] >= 0) & (merged == np.arange(len(points))))
-    edge = edge_of[images[moving]]
-    origin = np.where(images[moving] == images[a[edge]], a[edge], b[edge])
-    shift = _shifts(mesh, points[moving], points[origin])
-    points[moving] = target[edge] + shift * np.array(mesh.domain.extent)
-    return points
 
 
 def _least_turns(corners: np.ndarray, starts: np.ndarray) -> np.ndarray:

@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 
     from .diagram import Diagram
 
-SIDE_TURN = np.pi / 6 * (1 + 2.0**-10)
-"""Largest turn of a side on the boundary: 30 degrees and a little more.
+WALL_CORNER = np.pi / 6
+"""Turn of the boundary, 30 degrees, beyond which it has a corner."""
+SIDE_TURN = WALL_CORNER * (1 + 2.0**-10)
+"""Largest turn of a side on the boundary: `WALL_CORNER` and a little more.
 
 Sums of turns have round-off, but an arc of 2 x 15 degrees is one side in any precision. The margin is smaller than the
 difference to the next possible sum in regular rings, whose turns are 360 degrees over their number of edges.
