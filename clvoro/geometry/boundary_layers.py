@@ -13,7 +13,7 @@ from ..arguments import check_integer, check_number
 from ..errors import InputError, InputTypeError
 from .boundary_names import Walls
 from .box import Box, Domain
-from .layer_columns import count_columns, count_fan, find_chains, place_columns, place_fan
+from .layer_columns import Chain, count_columns, count_fan, find_chains, place_columns, place_fan
 from .polygon import Polygon
 
 _NEAR = 0.6  # of a cell: of two generators that are nearer to each other than this, one is dropped
@@ -137,7 +137,7 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     polygon, _ = as_polygon(domain)
     found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
     for layer in layers:
-        for chain in find_chains(polygon, _chosen(domain, layer)):
+        for chain in _chains(domain, layer):
             feet, normals = place_columns(chain, layer.width, layer.height)
             near = min(layer.width, layer.heights.min())
             for y in layer.rows:
@@ -151,12 +151,8 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
                 walls.append(np.full(len(feet) + len(fan), y))
     points, limit, wall = (np.concatenate(x) for x in (found, limits, walls))
     kept = polygon.contains(points)
-    walls_of_all = np.concatenate([chosen_segments(domain, layer) for layer in layers])
-    tree = shapely.STRtree(np.asarray(shapely.linestrings(walls_of_all)))
-    _, nearest = tree.query_nearest(
-        shapely.points(points[kept]), return_distance=True, all_matches=False
-    )
-    kept[kept] = nearest >= _OWN * wall[kept]
+    segments = np.concatenate([chosen_segments(domain, layer) for layer in layers])
+    kept[kept] = _distances(points[kept], segments) >= _OWN * wall[kept]
     points, limit = points[kept], limit[kept]
     # In every chain the nearest rows to the wall come first. Of two generators too near, drop the later one.
     close = (
@@ -189,10 +185,9 @@ def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
     InputTypeError
         If an item is not `Layers`, or the domain is neither a `Box` nor a `Polygon` in 2D.
     """
-    polygon, _ = as_polygon(domain)
     total = 0
     for layer in layers:
-        chains = find_chains(polygon, _chosen(domain, layer))
+        chains = _chains(domain, layer)
         if not layer.thickness + _APART * layer.width < np.linalg.norm(domain.extent):
             raise InputError(_NO_ROOM)
         columns = sum(count_columns(chain, layer.width, layer.height) for chain in chains)
@@ -233,11 +228,21 @@ def _chosen(domain: Domain, layer: Layers) -> np.ndarray:
     return chosen
 
 
+def _chains(domain: Domain, layer: Layers) -> list[Chain]:
+    """Return the chains of edges that have the layer."""
+    polygon, _ = as_polygon(domain)
+    return find_chains(polygon, _chosen(domain, layer))
+
+
+def _distances(points: np.ndarray, segments: np.ndarray) -> np.ndarray:
+    """Return the distance of each of the points (n, 2) from the nearest segment, (k, 2, 2)."""
+    tree = shapely.STRtree(np.asarray(shapely.linestrings(segments)))
+    return tree.query_nearest(shapely.points(points), return_distance=True, all_matches=False)[1]
+
+
 def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
     """Return feet (c, 2) on the walls and unit normals (c, 2) of all columns of `layer`."""
-    polygon, _ = as_polygon(domain)
-    chains = find_chains(polygon, _chosen(domain, layer))
-    made = [place_columns(chain, layer.width, layer.height) for chain in chains]
+    made = [place_columns(chain, layer.width, layer.height) for chain in _chains(domain, layer)]
     feet, normals = zip(*made, strict=True)
     return np.concatenate(feet), np.concatenate(normals)
 
@@ -249,7 +254,7 @@ def outer_segments(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarra
     """
     polygon, _ = as_polygon(domain)
     y, found = float(layer.rows[-1]), [np.empty((0, 2, 2))]
-    for chain in find_chains(polygon, _chosen(domain, layer)):
+    for chain in _chains(domain, layer):
         feet, normals = place_columns(chain, layer.width, layer.height)
         row = feet + y * normals
         for part in (row, place_fan(chain, layer.width, y)):
@@ -259,9 +264,7 @@ def outer_segments(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarra
     segments = np.concatenate(found)
     middles = segments.mean(axis=1)
     kept = polygon.contains(middles)
-    walls = shapely.multilinestrings(chosen_segments(domain, layer))
-    shapely.prepare(walls)
-    kept[kept] = shapely.distance(shapely.points(middles[kept]), walls) >= _OWN * y
+    kept[kept] = _distances(middles[kept], chosen_segments(domain, layer)) >= _OWN * y
     segments = segments[kept]
     return segments, np.hypot(*(segments[:, 1] - segments[:, 0]).T)
 

@@ -15,10 +15,18 @@ _STEP = math.radians(36)  # largest angle between generators of a row around a c
 _MOST = 2.0**62  # columns, more than fit on any device: keeps their number finite
 _LONG = 1.5  # widths: an edge of this length has columns that no other edge shares
 _EQUAL = 1e-6  # of their length: tolerance for edges of regular polygons
-_BULGE = 0.25  # of the first layer's height: largest distance between a curved wall and the chord of a cell
-_WINDOW = 0.2  # of a width: part of the wall over which its curvature is a mean
-_FLAT = 8  # heights of the first layer: width of columns beside a corner with a fan, whose first cell is as small
-_WIDENING = 0.3  # change of the width of columns per length along the wall
+_BULGE = 0.25
+"""Largest distance between a curved wall and the chord of a cell, as a share of the first layer's height. The chord is
+the wall face of solvers, so the cell is at most this share higher or lower there."""
+_WINDOW = 0.2
+"""Part of the wall, in widths, over which its curvature is a mean. The number of columns hardly depends on it."""
+_FLAT = 8
+"""Width of columns beside a corner with a fan, in heights of the first layer. With 16, checks for OpenFOAM refuse a
+NACA 0012 section with a first layer of 2e-4 chord."""
+_WIDENING = 0.3
+"""Largest change of the width of columns per length along the wall, so the share by which neighboring columns differ.
+With 1.2, the same section is refused."""
+_RATIO = 1.4  # of widths at neighboring places, between which the width is linear
 _FINEST = 1e-6  # of the width: the narrowest columns
 
 
@@ -78,7 +86,7 @@ def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
 
 def count_columns(chain: Chain, width: float, height: float) -> int:
     """Return the number of columns along the chain, at most `width` wide; `height` is that of the first layer."""
-    _, counts = _runs(_Wall.of(chain, width, height).lengths, width, chain)
+    _, counts = _runs(_Wall.of(chain, width, height).stretched_lengths(), width, chain)
     return sum(map(int, counts.tolist()))
 
 
@@ -108,7 +116,7 @@ def place_fan(chain: Chain, width: float, distance: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Wall:
-    """The edges of a chain, and lengths along it in which all columns are equally wide.
+    """The edges of a chain, and lengths along it in which all columns are equally wide: stretched lengths.
 
     Columns are narrower where the wall is curved, so that the wall within a cell is flat beside the height of the first
     layer: a cell of width w bulges by w^2 / (8 r) on a wall of radius r. They are narrower beside corners with a fan,
@@ -119,55 +127,72 @@ class _Wall:
     corners : (k + 1, 2) float
     joined : bool
         Whether the chain is closed and begins between two long edges.
+    along : (k, 2) float
+        The edges as vectors.
     lengths : (k,) float
-        Lengths of the edges, stretched: integrals of ``width / w``.
-    reached, stretched : (m,) float
-        Lengths along the chain, and the same stretched.
+        Lengths of the edges.
+    reached : (k + 1,) float
+        Lengths along the chain up to each corner.
+    grading : ((m,) float, (m,) float) or None
+        Lengths along the chain and the stretched lengths there, linear between them. None if all columns have the
+        largest width.
     """
 
     corners: np.ndarray
     joined: bool
+    along: np.ndarray
     lengths: np.ndarray
     reached: np.ndarray
-    stretched: np.ndarray
+    grading: tuple[np.ndarray, np.ndarray] | None
 
     @classmethod
     def of(cls, chain: Chain, width: float, height: float) -> _Wall:
+        """Return the wall of `chain`, for columns of at most `width` and a first layer of `height`."""
         corners, joined = _begun(chain, width)
         along = np.diff(corners, axis=0)
         lengths = np.hypot(*along.T)
-        ends = np.concatenate([[0], np.cumsum(lengths)])
-        widths = _bounds(chain, along, lengths, width, height)
-        if (widths == width).all():
-            return cls(corners, joined, lengths, ends, ends)
-        places, widths = _widened(ends, widths, width, chain.closed)
-        # 1 / w integrated over a linear w.
-        ratio = np.log(widths[1:] / widths[:-1])
-        slight = np.abs(ratio) < 1e-3
-        mean = (widths[1:] + widths[:-1]) / 2
-        np.divide(np.diff(widths), ratio, out=mean, where=~slight)
-        stretched = np.concatenate([[0], np.cumsum(np.diff(places) * width / mean)])
-        lengths = np.diff(np.interp(ends, places, stretched))
-        return cls(corners, joined, lengths, places, stretched)
+        reached = np.concatenate([[0], np.cumsum(lengths)])
+        bounds = _largest_widths(chain, along, lengths, reached, width, height)
+        grading = None
+        if (bounds < width).any():
+            places, widths = _graded_widths(reached, bounds, width, chain.closed)
+            grading = places, _stretch(places, widths, width)
+        return cls(corners, joined, along, lengths, reached, grading)
+
+    def stretched_lengths(self) -> np.ndarray:
+        """Return the stretched lengths of the edges, (k,)."""
+        return (
+            self.lengths
+            if self.grading is None
+            else np.diff(np.interp(self.reached, *self.grading))
+        )
+
+    def unstretch(self, at: np.ndarray) -> np.ndarray:
+        """Return the lengths along the chain, (n,), of places `at` (n,) in stretched lengths."""
+        return at if self.grading is None else np.interp(at, *self.grading[::-1])
 
 
-def _bounds(
-    chain: Chain, along: np.ndarray, lengths: np.ndarray, width: float, height: float
+def _largest_widths(
+    chain: Chain,
+    along: np.ndarray,
+    lengths: np.ndarray,
+    reached: np.ndarray,
+    width: float,
+    height: float,
 ) -> np.ndarray:
-    """Return the largest width of columns at each corner of the chain, (k + 1,)."""
+    """Return the largest width of columns at each corner of the chain, (k + 1,), whatever it is at the others."""
     long = lengths >= _LONG * width
     turn = angles(along[:-1], along[1:])
     turn[long[:-1] & long[1:]] = 0  # such a corner is one of cells
     # The direction of the wall, linear between the middles of edges; its change over a part of a width.
     direction = np.concatenate([[0], np.cumsum(turn)])
-    ends = np.concatenate([[0], np.cumsum(lengths)])
-    middles = (ends[1:] + ends[:-1]) / 2
+    middles = (reached[1:] + reached[:-1]) / 2
     if chain.closed:
         closing = 2 * np.pi * round(direction[-1] / (2 * np.pi)) or direction[-1]
         direction = np.concatenate([direction + c for c in (-closing, 0, closing)])
-        middles = np.concatenate([middles + c for c in (-ends[-1], 0, ends[-1])])
+        middles = np.concatenate([middles + c for c in (-reached[-1], 0, reached[-1])])
     window = np.array([[-_WINDOW], [_WINDOW]]) / 2 * width
-    before, after = np.interp(ends + window, middles, direction)
+    before, after = np.interp(reached + window, middles, direction)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         radius = _WINDOW * width / np.abs(after - before)
         bounds = np.fmin(width, np.sqrt(8 * _BULGE * height * radius))
@@ -179,21 +204,25 @@ def _bounds(
     return np.maximum(bounds, _FINEST * width)
 
 
-def _widened(
-    ends: np.ndarray, bounds: np.ndarray, width: float, closed: bool
+def _graded_widths(
+    reached: np.ndarray, bounds: np.ndarray, width: float, closed: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return places along the chain, and the widths there: they grow from their bounds by `_WIDENING`."""
+    """Return places along the chain and the widths of columns there, (m,) each, linear between them.
+
+    They are the largest widths that exceed neither the `bounds` at the corners, nor `width`, nor change by more than
+    `_WIDENING` per length.
+    """
     narrow = bounds < width
-    growth = 1.4 ** np.arange(1, 1 + math.ceil(math.log(width / bounds.min(), 1.4)))
-    reach = (bounds[narrow] / _WIDENING)[:, None] * (growth - 1)
-    around = np.concatenate([ends[narrow, None] - reach, ends[narrow, None] + reach]).ravel()
-    length = ends[-1]
+    ratios = _RATIO ** np.arange(1, 1 + math.ceil(math.log(width / bounds.min(), _RATIO)))
+    reach = (bounds[narrow] / _WIDENING)[:, None] * (ratios - 1)
+    around = np.concatenate([reached[narrow, None] - reach, reached[narrow, None] + reach]).ravel()
+    length = reached[-1]
     if closed:
         around %= length
-    places = np.unique(np.concatenate([ends, around[(around > 0) & (around < length)]]))
-    known, given = ends, bounds
+    places = np.unique(np.concatenate([reached, around[(around > 0) & (around < length)]]))
+    known, given = reached, bounds
     if closed:
-        known = np.concatenate([ends + c for c in (-length, 0, length)])
+        known = np.concatenate([reached + c for c in (-length, 0, length)])
         given = np.tile(bounds, 3)
     after = np.minimum.accumulate(given - _WIDENING * known)
     before = np.minimum.accumulate((given + _WIDENING * known)[::-1])[::-1]
@@ -201,6 +230,15 @@ def _widened(
     right = np.clip(np.searchsorted(known, places, side="left"), 0, len(known) - 1)
     widths = np.minimum(after[left] + _WIDENING * places, before[right] - _WIDENING * places)
     return places, np.minimum(widths, width)
+
+
+def _stretch(places: np.ndarray, widths: np.ndarray, width: float) -> np.ndarray:
+    """Return the integrals of ``width / w`` up to each place, (m,); w is linear between the `widths` (m,)."""
+    ratio = np.log(widths[1:] / widths[:-1])
+    # The logarithmic mean of both ends; where they are nearly equal, the arithmetic mean.
+    mean = (widths[1:] + widths[:-1]) / 2
+    np.divide(np.diff(widths), ratio, out=mean, where=np.abs(ratio) >= 1e-3)
+    return np.concatenate([[0], np.cumsum(np.diff(places) * width / mean)])
 
 
 def _begun(chain: Chain, width: float) -> tuple[np.ndarray, bool]:
@@ -268,13 +306,8 @@ def _places(lengths: np.ndarray, width: float, joined: bool, chain: Chain) -> np
 def place_columns(chain: Chain, width: float, height: float) -> tuple[np.ndarray, np.ndarray]:
     """Return feet (c, 2) on the wall, about `width` apart or less, and unit normals (c, 2) into the domain."""
     wall = _Wall.of(chain, width, height)
-    corners = wall.corners
-    along = np.diff(corners, axis=0)
-    lengths = np.hypot(*along.T)
-    reached = np.concatenate([[0], np.cumsum(lengths)])
-    at = _places(wall.lengths, width, wall.joined, chain)
-    if wall.stretched is not wall.reached:
-        at = np.interp(at, wall.stretched, wall.reached)
+    along, lengths, reached = wall.along, wall.lengths, wall.reached
+    at = wall.unstretch(_places(wall.stretched_lengths(), width, wall.joined, chain))
     edge = np.minimum(np.searchsorted(reached, at, side="right") - 1, len(lengths) - 1)
     share = ((at - reached[edge]) / lengths[edge])[:, None]
     normal = np.column_stack([-along[:, 1], along[:, 0]]) / lengths[:, None]
@@ -290,4 +323,4 @@ def place_columns(chain: Chain, width: float, height: float) -> tuple[np.ndarray
         + to_first * (at_corners[edge] - normal[edge])
         + to_last * (at_corners[edge + 1] - normal[edge])
     )
-    return corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]
+    return wall.corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]
