@@ -6,7 +6,9 @@
 
    corners[c]  position
    shapes[c]   direction of the wall that begins in c, interior angle, h, extent of the corner
-   Group g has the corners group_starts[g] .. group_starts[g + 1]; only they may share generators. */
+   Group g has the corners group_starts[g] .. group_starts[g + 1]; only they may share generators.
+
+   CANDIDATE_REACH  largest distance over h of a generator from a corner that it may share */
 #include "geometry/edges.h"
 
 #define PI R(3.14159265358979323846)
@@ -17,12 +19,12 @@
 /* Least distance of the others over that of the generators that share the corner, and their largest step over h. */
 #define OTHERS R(1.3)
 #define OTHERS_STEP R(0.15)
-/* Least distance over h of a generator from its corner, and largest distance over h of candidates. */
+/* Least distance over h of a generator from its corner. */
 #define LEAST_RADIUS R(0.3)
-#define REACH R(2.2)
 /* Least distance over h of a generator that moves from the others. */
 #define SEPARATION R(0.1)
-/* Margin to straight angles; angle above which three cells share the corner at least; largest turn in one step. */
+/* Margin to straight angles; interior angle above which at least three cells share the corner; largest turn in one
+   step. */
 #define MARGIN R(0.15)
 #define THREE R(5.8)
 #define MOST_TURN R(0.15)
@@ -37,12 +39,13 @@ inline REAL gap_between(REAL2 a, REAL2 b)
     return sqrt(dot(d, d));
 }
 
-/* Least distance of a cell at the wall from each corner nearby, as the bits of a float. `cells` are those that the
+/* Without find_cells: nearest[c] = least distance of a cell at the wall from corner c, as the bits of a float. With it:
+   seeds[c] = the first cell at that distance; the search for candidates starts there. `cells` are those that the
    boundary crosses. */
-kernel void find_nearest_at_wall(const int size, global const int *cells, const int n, global const int *starts,
-                                 global const int *neighbors, global const REAL2 *points,
-                                 global const int2 *wall_corners, global const REAL2 *corners, global int *nearest,
-                                 global int *seeds)
+kernel void find_seeds(const int size, const int find_cells, global const int *cells, const int n,
+                       global const int *starts, global const int *neighbors, global const REAL2 *points,
+                       global const int2 *wall_corners, global const REAL2 *corners, global int *nearest,
+                       global int *seeds)
 {
     WORK_ITEM(p);
     const int i = cells[p];
@@ -54,28 +57,12 @@ kernel void find_nearest_at_wall(const int size, global const int *cells, const 
         const int2 near = wall_corners[-1 - neighbors[k]];
         for (int side = 0; side < 2; ++side) {
             const int c = side ? near.s1 : near.s0;
-            if (c >= 0)
-                atomic_min(nearest + c, as_int((float)gap_between(points[i], corners[c])));
-        }
-    }
-}
-
-/* The cell at that distance, the first of equal ones: the search for candidates starts there. */
-kernel void find_seeds(const int size, global const int *cells, const int n, global const int *starts,
-                       global const int *neighbors, global const REAL2 *points, global const int2 *wall_corners,
-                       global const REAL2 *corners, global int *nearest, global int *seeds)
-{
-    WORK_ITEM(p);
-    const int i = cells[p];
-    if (i >= n)
-        return;
-    for (int k = starts[i]; k < starts[i + 1]; ++k) {
-        if (neighbors[k] >= 0)
-            continue;
-        const int2 near = wall_corners[-1 - neighbors[k]];
-        for (int side = 0; side < 2; ++side) {
-            const int c = side ? near.s1 : near.s0;
-            if (c >= 0 && nearest[c] == as_int((float)gap_between(points[i], corners[c])))
+            if (c < 0)
+                continue;
+            const int gap = as_int((float)gap_between(points[i], corners[c]));
+            if (!find_cells)
+                atomic_min(nearest + c, gap);
+            else if (nearest[c] == gap)
                 atomic_min(seeds + c, i);
         }
     }
@@ -196,7 +183,7 @@ kernel void share_corners(const int size, global const int *starts, global const
             const int j = neighbors[k];
             bool near = false;
             for (int c = first; c < first + corner_count && j >= 0; ++c)
-                near = near || gap_between(points[j], corners[c]) < REACH * shapes[c].s2;
+                near = near || gap_between(points[j], corners[c]) < R(CANDIDATE_REACH) * shapes[c].s2;
             if (near && count < MOST_CANDIDATES && !is_listed(j, cells, count))
                 cells[count++] = j;
         }
@@ -229,7 +216,7 @@ kernel void share_corners(const int size, global const int *starts, global const
         REAL last = -1;
         int last_place = -1;
         while (seen < NEAREST) {
-            /* The next one by distance, equal ones by place. */
+            /* The next one by distance; of equal ones the first in the list. */
             REAL best = REAL_MAX;
             int next = -1;
             for (int p = 0; p < count; ++p) {
@@ -239,7 +226,7 @@ kernel void share_corners(const int size, global const int *starts, global const
                     next = p;
                 }
             }
-            if (next < 0 || best > REACH * shape.s2)
+            if (next < 0 || best > R(CANDIDATE_REACH) * shape.s2)
                 break;
             last = best;
             last_place = next;
@@ -247,7 +234,7 @@ kernel void share_corners(const int size, global const int *starts, global const
             const REAL from[2] = {x.s0, x.s1}, to[2] = {corner.s0, corner.s1};
             int edge;
             const REAL t = exit_over_edge(from, to, &edge, DOMAIN);
-            /* The walls that meet in the corner hide it from nothing, but round-off may find them crossed. */
+            /* The two walls of the corner do not hide it, but by round-off the path may cross them. */
             const bool ends_here = t <= 1 && (is_at(edge_ends[edge].s01, corner) || is_at(edge_ends[edge].s23, corner));
             if (!ends_here && (1 - t) * best > R(1.01) * shape.s3 + 64 * REAL_EPS)
                 continue;
@@ -291,7 +278,7 @@ kernel void share_corners(const int size, global const int *starts, global const
         }
     }
 
-    /* First with mean distances. If that moves a generator outside, with the least ones. */
+    /* First with mean distances. If that moves a generator outside or too close to another, with the least ones. */
     bool inside = false;
     for (int attempt = 0; attempt < 2 && !inside; ++attempt) {
         for (int p = 0; p < count; ++p)
@@ -382,7 +369,7 @@ kernel void share_corners(const int size, global const int *starts, global const
         inside = true;
         for (int p = 0; p < count; ++p) {
             const REAL2 x = points[cells[p]];
-            if (x.s0 == at[p].s0 && x.s1 == at[p].s1)
+            if (is_at(x, at[p]))
                 continue;
             const REAL from[2] = {x.s0, x.s1}, to[2] = {at[p].s0, at[p].s1};
             int edge;
@@ -397,8 +384,7 @@ kernel void share_corners(const int size, global const int *starts, global const
     }
     int written = 0;
     for (int p = 0; p < count; ++p) {
-        const REAL2 x = points[cells[p]];
-        if ((x.s0 != at[p].s0 || x.s1 != at[p].s1) && written < MOST_MOVED) {
+        if (!is_at(points[cells[p]], at[p]) && written < MOST_MOVED) {
             moved[g * MOST_MOVED + written] = cells[p];
             targets[g * MOST_MOVED + written] = at[p];
             ++written;

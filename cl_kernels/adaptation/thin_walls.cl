@@ -1,11 +1,12 @@
-/* Pairs of generators on both sides of a wall that is thinner than a cell. The diagram knows no walls: beside a thin
-   one a generator owns a part of the other side, which is then cut off, unless the generators on both sides are mirror
-   images of each other. */
+/* Pairs of generators on both sides of a wall that is thinner than a cell. The diagram is computed without walls: the
+   cell of a generator beside a thin wall extends to the other side, and that part is then cut off. This does not happen
+   if the generators on both sides are mirror images of each other.
+
+   THIN  largest thickness of a thin wall over h */
 #include "geometry/edges.h"
 
-/* Largest thickness of the wall over h, largest distance over h from the image of the other generator, and largest turn
-   of one side of the wall against the other, as a sine. */
-#define THIN R(0.3)
+/* Largest distance over h of a generator from the image of the other one, and sine of the largest angle between the two
+   sides of the wall. */
 #define PAIRED R(0.45)
 #define PARALLEL R(0.5)
 
@@ -19,7 +20,7 @@ inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, DOMAIN_ARGS)
     if (t > 1)
         return false;
     const REAL s = exit_over_edge(there, here, &other, DOMAIN);
-    if (s > 1 || (1 - t - s) * apart > THIN * h)
+    if (s > 1 || (1 - t - s) * apart > R(THIN) * h)
         return false;
     REAL2 a = edge_ends[edge].s23 - edge_ends[edge].s01, b = edge_ends[other].s23 - edge_ends[other].s01;
     a /= sqrt(dot(a, a));
@@ -33,8 +34,8 @@ inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, DOMAIN_ARGS)
     return true;
 }
 
-/* partners[p] = the generator whose image is nearest to that of cell p of those at the wall, -1 if there is none. In
-   the diagram without walls it is a neighbor; in the diagram it is none. */
+/* partners[p] = the generator whose image is nearest to that of cell p of those at the wall, -1 if there is none.
+   Both are neighbors in the diagram without walls, but not in the diagram. */
 kernel void find_partners(const int size, global const int *cells, const int n, global const int *convex_starts,
                           global const int *convex_neighbors, global const int *starts, global const int *neighbors,
                           global const REAL2 *points, global const REAL *h, global const int *labels, const int fixed,

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import pyopencl.array as cla
 from scipy.spatial import KDTree
 
 from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
+from .motion import Moving
 
 SHARP_REACH, REACH = 0.05, 0.35
 """Distances over h along the boundary from a corner: over the first its turns are added, over the second the boundary
@@ -28,13 +28,15 @@ SPACING, LEAST_SPACING, FAN = 1.1, 0.15, 0.5
 Cells fan out around a corner, so sharp corners may be close to each other."""
 JOINED = 1.6
 """Distance over h up to which two corners may share a generator. They belong to the same group then."""
-NEAR = 4.4
-"""Distance over h up to which a group has to know the corners of other groups: twice REACH in the kernel, so that no
-two groups move the same generator."""
+CANDIDATE_REACH = 2.2
+"""Largest distance over h of a generator from a corner that it may share."""
+NEAR = 2 * CANDIDATE_REACH
+"""Distance over h up to which a group has to know the corners of other groups, so that no two groups move the same
+generator."""
 WALL_REACH = 0.5
 """Distance over h along the boundary from a corner up to which cells at the wall are candidates."""
 GROUP = 4
-"""Work-items per work-group: they are few and each has much to do."""
+"""Work-items per work-group. There are few work-items, and each does much."""
 MOST_IN_GROUP, MOST_MOVED = 8, 48
 """Corners of a group, and generators that it moves at once."""
 
@@ -93,7 +95,7 @@ def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) ->
     if free is not None and free is not domain and len(sharp):
         edge = free.nearest_edge(x[sharp])[1]
         sharp = sharp[np.hypot(*(edge - x[sharp]).T) < 1e-6 * float(domain.extent.max())]
-    # The vertex that turns most stands for its neighbors.
+    # The sharpest first: `_spaced` leaves out vertices that are too close to an earlier one.
     order = sharp[np.lexsort((sharp, turns[sharp].round(9), -bend[sharp].round(9)))]
     kept = np.sort(_spaced(x, bend, h, order))
     directions, angles, slack = _walls(domain, kept, h)
@@ -280,8 +282,9 @@ class Corners:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels = engine.kernels(
-            "adaptation/corners", {"MOST_IN_GROUP": MOST_IN_GROUP, "MOST_MOVED": MOST_MOVED}
-        )
+            "adaptation/corners",
+            {"MOST_IN_GROUP": MOST_IN_GROUP, "MOST_MOVED": MOST_MOVED, "CANDIDATE_REACH": CANDIDATE_REACH},
+        )  # fmt: skip
 
     def place(
         self, domain: Polygon, h: np.ndarray, free: Polygon | None = None
@@ -290,41 +293,29 @@ class Corners:
         groups = find_corners(domain, h, free)
         return PlacedCorners(self.engine, domain, groups) if len(groups) else None
 
-    def share(
-        self,
-        placed: PlacedCorners,
-        t: Tessellation,
-        points: cla.Array,
-        velocity: cla.Array,
-        labels: cla.Array,
-        fixed: int,
-    ) -> None:
+    def share(self, placed: PlacedCorners, t: Tessellation, moving: Moving) -> None:
         """Move generators so that a face ends in every corner.
 
         Parameters
         ----------
         t : Tessellation
             Diagram of the same generators before their last displacement.
-        points, velocity : (n, 2) real
-            Both change by the same displacement.
-        labels, fixed : (n,) int32, int
-            Generators with labels below `fixed` do not move.
         """
         engine, k, p = self.engine, self._kernels, placed
         assert t.trimmed is not None
         chords = t.trimmed.chords
         p.nearest.fill(0x7FFFFFFF)
         p.seeds.fill(0x7FFFFFFF)
-        for find in (k.find_nearest_at_wall, k.find_seeds):
+        for find_cells in (False, True):
             engine.run_each(
-                find, chords.touched_count, chords.touched, np.int32(t.n), t.starts, t.neighbors, t.points,
-                p.wall_corners, p.corners, p.nearest, p.seeds,
+                k.find_seeds, chords.touched_count, np.int32(find_cells), chords.touched, np.int32(t.n), t.starts,
+                t.neighbors, t.points, p.wall_corners, p.corners, p.nearest, p.seeds,
             )  # fmt: skip
         engine.run_each(
-            k.share_corners, p.groups, t.starts, t.neighbors, np.int32(t.n), points, labels, np.int32(fixed),
-            p.starts, p.corners, p.shapes, p.other_starts, p.others, p.seeds, *p.domain.device_args(engine),
-            p.moved, p.targets, group=GROUP,
+            k.share_corners, p.groups, t.starts, t.neighbors, np.int32(t.n), moving.points, moving.labels,
+            np.int32(moving.fixed), p.starts, p.corners, p.shapes, p.other_starts, p.others, p.seeds,
+            *p.domain.device_args(engine), p.moved, p.targets, group=GROUP,
         )  # fmt: skip
         engine.run_each(
-            k.move_to_corners, p.groups * MOST_MOVED, p.moved, p.targets, points, velocity
-        )
+            k.move_to_corners, p.groups * MOST_MOVED, p.moved, p.targets, moving.points, moving.velocity
+        )  # fmt: skip

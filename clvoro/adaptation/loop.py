@@ -179,7 +179,7 @@ class Loop:
         self.correct_count()
         if not self.is_recorded():
             if self.steps:
-                self.mesh.settle_at_walls()
+                self.mesh.walls.settle(self.mesh)
             self.solution = None
             self.add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
         return self.result(reason in (COMPLETED, STALLED), reason, settings)
@@ -199,7 +199,7 @@ class Loop:
             if self.position == self.last_step:
                 self.final = self.displacements()
             action.method.move(self.mesh)
-            self.mesh.adjust_at_walls()
+            self.mesh.walls.adjust(self.mesh)
         # The next row of the history checks the sizes, too, unless they are scaled before.
         self.mesh.update(check=self.fixed_count is not None)
         if self.fixed_count is not None:

@@ -221,7 +221,7 @@ class ProjectedMethod:
             stages.motion.add_momentum(self.relaxation, mesh.lloyd, mesh.velocity, self.momentum)
             mesh.zero_fixed(mesh.lloyd)
             if self.descent == "quality":
-                mesh.constrain(mesh.lloyd)
+                mesh.walls.constrain(mesh, mesh.lloyd)
             if not self.correct_mean:
                 stages.density.subtract_mean_log_ratio(w)
         warm = mesh.multipliers is not None

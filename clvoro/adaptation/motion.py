@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyopencl.array as cla
 
@@ -9,6 +11,24 @@ from ..geometry.box import Domain
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..tessellation.device_diagram import Tessellation
+
+
+@dataclass(frozen=True)
+class Moving:
+    """Generators that a stage moves.
+
+    Attributes
+    ----------
+    points, velocity : (n, d) real
+        Both change by the same displacement.
+    labels, fixed : (n,) int32, int
+        Generators with labels below `fixed` do not move.
+    """
+
+    points: cla.Array
+    velocity: cla.Array
+    labels: cla.Array
+    fixed: int
 
 
 class Motion:

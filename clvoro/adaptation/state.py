@@ -9,11 +9,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 
 from ..geometry.box import Domain
-from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
+from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries, Summary
 from ..sizing import Sizing
@@ -21,14 +22,12 @@ from ..tessellation.bins import BinnedPoints
 from ..tessellation.device_diagram import Tessellation
 from ..tessellation.readback.diagram import fetch_diagram
 from ..tessellation.tessellator import Tessellator
-from .corners import PlacedCorners
 from .density import CellWeights, LloydWeights
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
+from .motion import Moving
 from .stages import Stages
-from .thin_walls import has_thin_walls
+from .walls import Walls
 
-SETTLING = 3
-"""Projections at corners if a run does not end with a step: each turns generators by a small angle only."""
 SUMMARIES = (
     "error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio",
     "weight",
@@ -98,12 +97,6 @@ class Setup:
     free: Domain
     fixed: int = 0
     factor: float = 1.0
-
-    @cached_property
-    def corner_sizes(self) -> np.ndarray:
-        """Target size on the finest level at the vertices of a polygon, (k,)."""
-        assert isinstance(self.domain, Polygon)
-        return self.factor * np.asarray(self.sizing(self.domain.oriented.vertices), float)
 
 
 class MeshState:
@@ -248,55 +241,14 @@ class MeshState:
         self._data.multipliers = array
 
     @cached_property
-    def corners(self) -> PlacedCorners | None:
-        """Re-entrant corners in which faces have to end on this level; None if there are none."""
-        domain = self.domain
-        if not isinstance(domain, Polygon) or not (domain.oriented.turns < 0).any():
-            return None
-        free = self.free if isinstance(self.free, Polygon) else None
-        return self.stages.corners.place(domain, self._sizes_at_vertices, free)
-
-    @cached_property
-    def _has_thin_walls(self) -> bool:
-        return self.corners is not None and has_thin_walls(
-            self.corners.domain, self._sizes_at_vertices
-        )
+    def walls(self) -> Walls:
+        """Corners and thin walls of the domain, for the cells of this level."""
+        return Walls(self.setup, self.size_factor)
 
     @property
-    def _sizes_at_vertices(self) -> np.ndarray:
-        """Target size on this level at the vertices of a polygon, (k,)."""
-        # `normalize_sizes` changes the factor by little: all of a level, also resumed, has the same corners.
-        level = round(math.log2(self.size_factor / self.setup.factor))
-        return 2.0**level * self.setup.corner_sizes
-
-    def adjust_at_walls(self) -> None:
-        """Pair generators across thin walls, and let faces end in corners. The diagram is then out of date."""
-        if self.corners is None:
-            return
-        if self._has_thin_walls:
-            self.stages.thin_walls.pair(
-                self.corners.domain, self.t, self.h, self.points, self.velocity, self.labels, self.fixed
-            )  # fmt: skip
-        self.stages.corners.share(
-            self.corners, self.t, self.points, self.velocity, self.labels, self.fixed
-        )  # fmt: skip
-
-    def settle_at_walls(self) -> None:
-        """Let faces end in re-entrant corners without another step, and update the mesh."""
-        for _ in range(SETTLING if self.corners is not None else 0):
-            self.adjust_at_walls()
-            self.update()
-
-    def constrain(self, displacement: cla.Array) -> None:
-        """Change `displacement` (n, d) so that faces end in re-entrant corners after it."""
-        if self.corners is not None:
-            with self.engine.workspace.frame():
-                ahead = self.engine.scratch(self.points.shape)
-                ahead[:] = self.points
-                self.stages.motion.add_momentum(1.0, ahead, displacement, 1.0)
-                self.stages.corners.share(
-                    self.corners, self.t, ahead, displacement, self.labels, self.fixed
-                )  # fmt: skip
+    def moving(self) -> Moving:
+        """The generators, to be moved."""
+        return Moving(self.points, self.velocity, self.labels, self.fixed)
 
     def _target_sizes(self, points: np.ndarray) -> np.ndarray:
         """Return the target size at `points` (k, d) on this level, (k,)."""
@@ -509,7 +461,9 @@ class MeshState:
         start, n = {"points": finer}, len(finer)
         del finer
         start["labels"] = self.engine.upload(self.next_label + np.arange(n) - self.n, np.int32)
-        start["labels"][: self.n] = self.labels
+        cl.enqueue_copy(
+            self.engine.queue, buffer_of(start["labels"]), buffer_of(self.labels), byte_count=self.labels.nbytes
+        )  # fmt: skip
         # Free the other arrays. After an interruption `update` computes them again.
         self._data = _Data(self._data.generators)
         mesh = MeshState(self.setup, self.size_factor / 2, start, self.tessellator)

@@ -8,9 +8,10 @@ import pyopencl.array as cla
 from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
+from .motion import Moving
 
-THICKNESS = (0.1, 0.2, 0.3)
-"""Depths over h at which the domain is looked for behind its walls; the last is THIN in the kernels."""
+DEPTHS = (0.1, 0.2, 0.3)
+"""Depths over h behind a wall. If one of them is in the domain again, the wall is thin."""
 MOST_SAMPLES = 64
 
 
@@ -29,7 +30,7 @@ def has_thin_walls(domain: Polygon, h: np.ndarray) -> bool:
     share = ((place + 0.5) / counts[rows])[:, None]
     at = begin[rows] + share * edge[rows]
     outward = np.column_stack([edge[:, 1], -edge[:, 0]])[rows] * (least / length)[rows, None]
-    return any(domain.contains(at + depth * outward).any() for depth in THICKNESS)
+    return any(domain.contains(at + depth * outward).any() for depth in DEPTHS)
 
 
 class ThinWalls:
@@ -37,18 +38,9 @@ class ThinWalls:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._kernels = engine.kernels("adaptation/thin_walls")
+        self._kernels = engine.kernels("adaptation/thin_walls", {"THIN": DEPTHS[-1]})
 
-    def pair(
-        self,
-        domain: Polygon,
-        t: Tessellation,
-        h: cla.Array,
-        points: cla.Array,
-        velocity: cla.Array,
-        labels: cla.Array,
-        fixed: int,
-    ) -> None:
+    def pair(self, domain: Polygon, t: Tessellation, h: cla.Array, moving: Moving) -> None:
         """Move generators on both sides of thin walls to be mirror images of each other.
 
         Parameters
@@ -56,10 +48,6 @@ class ThinWalls:
         t : Tessellation
             Diagram of the same generators before their last displacement.
         h : (n,) real
-        points, velocity : (n, 2) real
-            Both change by the same displacement.
-        labels, fixed : (n,) int32, int
-            Generators with labels below `fixed` do not move.
         """
         engine, k = self.engine, self._kernels
         assert t.trimmed is not None
@@ -68,10 +56,12 @@ class ThinWalls:
         with engine.workspace.frame():
             partners, targets = engine.scratch(u, np.int32), engine.scratch((u, 2))
             engine.run_each(
-                k.find_partners, u, chords.touched, n, convex.starts, convex.neighbors, t.starts, t.neighbors, points,
-                h, labels, np.int32(fixed), *args, partners,
+                k.find_partners, u, chords.touched, n, convex.starts, convex.neighbors, t.starts, t.neighbors,
+                moving.points, h, moving.labels, np.int32(moving.fixed), *args, partners,
             )  # fmt: skip
             engine.run_each(
-                k.place_pairs, u, chords.touched, n, chords.slots, partners, points, h, *args, targets
+                k.place_pairs, u, chords.touched, n, chords.slots, partners, moving.points, h, *args, targets
             )  # fmt: skip
-            engine.run_each(k.move_pairs, u, chords.touched, n, targets, points, velocity)
+            engine.run_each(
+                k.move_pairs, u, chords.touched, n, targets, moving.points, moving.velocity
+            )

@@ -162,10 +162,8 @@ def lattice(domain, seed):
 
 def project(ctx, domain, points, real="float64", fixed=0):
     mesh = make_mesh(ctx, domain, points, real, fixed)
-    assert mesh.corners is not None
-    mesh.stages.corners.share(
-        mesh.corners, mesh.t, mesh.points, mesh.velocity, mesh.labels, mesh.fixed
-    )
+    assert mesh.walls.corners is not None
+    mesh.stages.corners.share(mesh.walls.corners, mesh.t, mesh.moving)
     origin, scale = domain.frame
     return origin + mesh.to_host(mesh.points, scale), mesh.to_host(mesh.velocity, scale)
 
@@ -217,10 +215,8 @@ def test_no_two_groups_move_the_same_generator(ctx):
         holes.append(middle + 0.035 * np.column_stack([np.cos(angle), np.sin(angle)]))
     domain, points = clvoro.Polygon(SQUARE, holes), rng.random((250, 2))
     mesh = make_mesh(ctx, domain, points[domain.contains_well(points, 0.003)], "float64", h=h)
-    mesh.stages.corners.share(
-        mesh.corners, mesh.t, mesh.points, mesh.velocity, mesh.labels, mesh.fixed
-    )
-    moved = mesh.corners.moved.get()
+    mesh.stages.corners.share(mesh.walls.corners, mesh.t, mesh.moving)
+    moved = mesh.walls.corners.moved.get()
     moved = moved[moved >= 0]
     assert len(moved) > 50
     assert len(np.unique(moved)) == len(moved)
@@ -229,7 +225,7 @@ def test_no_two_groups_move_the_same_generator(ctx):
 def test_domains_without_corners_have_no_kernel(ctx):
     for domain in (clvoro.Polygon(SQUARE), clvoro.Box((0, 0), (1, 1))):
         mesh = make_mesh(ctx, domain, lattice(L, 3), "float64")
-        assert mesh.corners is None
+        assert mesh.walls.corners is None
         assert "corners" not in mesh.stages.__dict__
 
 

@@ -61,9 +61,7 @@ def test_pairs(ctx, real):
     rows = [rows_of(t, order) for t in (mesh.t.trimmed.convex, mesh.t)]
     chords = mesh.t.trimmed.chords
     at_wall = order[chords.touched.get()[: chords.touched_count]]
-    mesh.stages.thin_walls.pair(
-        SLIT, mesh.t, mesh.h, mesh.points, mesh.velocity, mesh.labels, mesh.fixed
-    )
+    mesh.stages.thin_walls.pair(SLIT, mesh.t, mesh.h, mesh.moving)
     partners, expected = nearest_images(x, *rows, at_wall), x.copy()
     for i, j in enumerate(partners):
         if j >= 0 and partners[j] == i:
