@@ -1,10 +1,10 @@
 """Straight walls in 2D: along the boundary each cell gets one face where the boundary turns by little.
 
-A run is what a cell has of a ring of the domain, from one face end to the next. Its faces become chords (`_kept`).
-Before that, a face end may move along the wall into a vertex of the domain: into a re-entrant corner, so that both
-cells are convex, or into another kink that a chord would cut off. Each move must lower a cost: the area between the
-boundary and the chords, and prices for their distance, for corners that are not convex, for slivers and skew faces, and
-for the way of the face end. A cell with little of the wall may leave it: both ends of its run move into one point.
+A run is the part of a ring of the domain that belongs to one cell, from one face end to the next. Its faces become
+chords; see `chord_points`. Before that, a face end may move along the wall into a vertex of the domain: into a
+re-entrant corner, so that both cells are convex, or into another kink that a chord would cut off. Each move must lower
+a cost: that of the chords, for corners that are not convex, for skew faces, and for the way of the face end. A cell
+with a short run may leave the wall: both ends of the run move into one point.
 
 Where the boundary is a curve, all points on walls lie on the curve itself.
 """
@@ -14,33 +14,25 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from math import atan2, hypot, inf
+from math import atan2, hypot
 
 import numpy as np
 
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
-from ..mesh.straightening import SIDE_TURN, along_rings, cross
-from .geometry import polygon_sides, sum_rows
+from ..mesh.straightening import along_rings, cross
+from .chords import Point, chord_cost, chord_points, concave_price, skewness
+from .geometry import polygon_centroids, polygon_sides
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh
 
 REACH = 0.4
 """Farthest way of a face end into a vertex of the domain, over the smaller size of its two cells."""
-_FILLED = 0.25
-"""A kink into the cell is cut off if it is nearer than this to the chord, over the size of the cell."""
-_CUT = 0.03
-"""The same for a kink out of the cell."""
-_SLIVER, _SHORT = 0.1, 0.03
-"""Lengths over the size of the cell: wall faces below the first are slivers; faces below the second may be bad."""
-_SHARP, _CONVEX = np.pi / 3, 1e-4
-"""Turn into the cell beyond which a chord cuts off a sharp corner; least turn in a corner of a convex cell."""
-_CONCAVE_PRICE, _SHARP_PRICE, _OFF_PRICE, _SKEW_PRICE = 0.5, 0.1, 0.2, 0.03
-_SLIVER_PRICE, _WAY_PRICE, _TILT_PRICE = 0.02, 0.02, 0.1
-"""Prices in squares of the size of the cell. Concave corners cost by their angle in radians, chords by their distance
-from the boundary, face ends by their way, both over the size; skew and turned faces by the square."""
-
-Point = tuple[float, float]
+_SHORT = 0.03
+"""Faces shorter than this over the size of the cell may be bad."""
+_SKEW_PRICE, _WAY_PRICE, _TILT_PRICE = 0.03, 0.02, 0.1
+"""Prices in squares of the size of the cell: for the square of the skewness above 1, for the way of a face end over the
+size, and for the square of the angle by which its face turns, in radians."""
 
 
 @dataclass(eq=False)
@@ -112,7 +104,7 @@ class _Work:
         self.points: list[Point] = list(map(tuple, mesh.points.tolist()))
         self.ends = mesh.corners.reshape(-1, 2)
         self.begin, self.final = (c.tolist() for c in self.ends[self.walls].T)
-        areas, centroids = _centroids(mesh)
+        areas, centroids = polygon_centroids(mesh)
         self.sizes = np.sqrt(np.maximum(areas, 0)).tolist()
         self.centroids: list[Point] = list(map(tuple, centroids.tolist()))
         self.part = parts[-1 - mesh.neighbor[self.walls]].tolist()
@@ -212,7 +204,7 @@ class _Work:
         """Return which points of a run remain."""
         if self.spared[run.cell] == 2:
             return list(range(len(run.faces) + 1))
-        return _kept(self.line(run.faces), self.fixed(run.faces), self.sizes[run.cell])
+        return chord_points(self.line(run.faces), self.fixed(run.faces), self.sizes[run.cell])
 
     def cost(self, run: _Run, faces: Sequence[int], point: int) -> float:
         """Return the cost of a run if it had these faces, or only this point if there are none."""
@@ -225,14 +217,14 @@ class _Work:
         size = self.sizes[run.cell]
         if faces:
             line, fixed = self.line(faces), self.fixed(faces)
-            kept = _kept(line, fixed, size)
-            total, left = _cost(line, kept, size), [line[i] for i in kept]
+            kept = chord_points(line, fixed, size)
+            total, left = chord_cost(line, kept, size), [line[i] for i in kept]
             for a, b in pairwise(left):
-                skewness = _skewness(a, b, self.centroids[run.cell])
-                total += _SKEW_PRICE * (max(skewness - 1, 0) * size) ** 2
+                skew = skewness(a, b, self.centroids[run.cell])
+                total += _SKEW_PRICE * (max(skew - 1, 0) * size) ** 2
         else:
             total, left = 0.0, [self.points[point]]
-        return total + _concave_price([*run.behind, *left, *run.ahead]) * size * size
+        return total + concave_price([*run.behind, *left, *run.ahead]) * size * size
 
     # Face ends that move.
 
@@ -356,137 +348,11 @@ class _Work:
         )
 
 
-def _centroids(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return area and centroid of each cell, (n,) and (n, 2)."""
-    cell, p, q, origins = polygon_sides(mesh)
-    n, twice = len(mesh), cross(p, q)
-    area = np.bincount(cell, twice, n)
-    safe = np.where(area > 0, area, np.inf)
-    middle = sum_rows(cell, twice[:, None] * (p + q), n) / (3 * safe)[:, None]
-    return area / 2, origins + middle
-
-
 def _starlike(mesh: SolverMesh) -> np.ndarray:
     """Return whether each cell's centroid sees all of its faces from inside, (n,); short faces do not count."""
     cell, p, q, origins = polygon_sides(mesh)
-    areas, centroids = _centroids(mesh)
+    areas, centroids = polygon_centroids(mesh)
     middle = (centroids - origins)[cell]
     seen = cross(p - middle, q - middle) > 0
     seen |= ((q - p) ** 2).sum(axis=1) < 2 * _SHORT**2 * areas[cell]
     return (areas > 0) & (np.bincount(cell, ~seen, len(mesh)) == 0)
-
-
-def _turn(a: Point, b: Point, c: Point) -> float:
-    """Return the angle by which the way from a over b to c turns to the left."""
-    x, y, u, v = b[0] - a[0], b[1] - a[1], c[0] - b[0], c[1] - b[1]
-    return atan2(x * v - y * u, x * u + y * v)
-
-
-def _offset(a: Point, b: Point, c: Point) -> float:
-    """Return the distance of b from the straight line between a and c."""
-    x, y, u, v = c[0] - a[0], c[1] - a[1], b[0] - a[0], b[1] - a[1]
-    square = x * x + y * y
-    t = min(max((x * u + y * v) / square, 0.0), 1.0) if square > 0 else 0.0
-    return hypot(u - t * x, v - t * y)
-
-
-def _kept(line: list[Point], fixed: list[bool], size: float) -> list[int]:
-    """Return which points of a run remain, the first and the last included.
-
-    A stretch that turns by at most 30 degrees in sum becomes straight. Then kinks near the chord are dropped.
-    """
-    last = len(line) - 1
-    kept, turned = [0], 0.0
-    for i in range(1, last):
-        turned += _turn(line[i - 1], line[i], line[i + 1])
-        if fixed[i - 1] or abs(turned) > SIDE_TURN:
-            kept.append(i)
-            turned = 0.0
-    kept.append(last)
-    if len(kept) == 2:
-        return kept
-
-    def offset(k: int) -> float:
-        """Return the distance of a kink from the chord, or infinity if it stays."""
-        a, b, c = line[kept[k - 1]], line[kept[k]], line[kept[k + 1]]
-        far = _offset(a, b, c)
-        limit = _FILLED if _turn(a, b, c) < 0 else _CUT
-        return inf if fixed[kept[k] - 1] or far >= limit * size else far
-
-    offsets = [inf, *map(offset, range(1, len(kept) - 1)), inf]
-    while (least := min(offsets)) < inf:
-        k = offsets.index(least)
-        del kept[k], offsets[k]
-        for j in (k - 1, k):
-            if 0 < j < len(kept) - 1:
-                offsets[j] = offset(j)
-    _drop_for_area(line, fixed, kept, _FILLED * size)
-    return kept
-
-
-def _drop_for_area(line: list[Point], fixed: list[bool], kept: list[int], limit: float) -> None:
-    """Drop kinks nearer than `limit` without which the area is nearer to the exact one: rough walls have such."""
-    if len(kept) == 2:
-        return
-    lost = _area(line) - _area([line[i] for i in kept])
-    while True:
-        best, where, saved = abs(lost), -1, 0.0
-        for k in range(1, len(kept) - 1):
-            three = [line[i] for i in kept[k - 1 : k + 2]]
-            area = _area(three)
-            if fixed[kept[k] - 1] or _offset(*three) > limit:
-                continue
-            if abs(lost + area) < best:
-                best, where, saved = abs(lost + area), k, area
-        if where < 0:
-            return
-        lost += saved
-        del kept[where]
-
-
-def _area(line: list[Point]) -> float:
-    """Return the area to the left of a line and to the right of its chord."""
-    (x, y), area = line[0], 0.0
-    for (u, v), (s, t) in pairwise(line[1:]):
-        area += (u - x) * (t - y) - (v - y) * (s - x)
-    return area / 2
-
-
-def _cost(line: list[Point], kept: list[int], size: float) -> float:
-    """Return the cost of a run with the points `kept`, apart from corners that are not convex."""
-    total = 0.0
-    for first, last in pairwise(kept):
-        total += abs(_area(line[first : last + 1]))
-        off, farthest = 0.0, first
-        for i in range(first + 1, last):
-            here = _offset(line[first], line[i], line[last])
-            if here > off:
-                off, farthest = here, i
-        total += _OFF_PRICE * off * size
-        if farthest > first and _turn(line[first], line[farthest], line[last]) < -_SHARP:
-            total += _SHARP_PRICE * size * size
-        (x, y), (u, v) = line[first], line[last]
-        if hypot(u - x, v - y) < _SLIVER * size:
-            total += _SLIVER_PRICE * size * size
-    return total
-
-
-def _skewness(a: Point, b: Point, centroid: Point) -> float:
-    """Return OpenFOAM's skewness of a wall face from a to b."""
-    x, y = b[0] - a[0], b[1] - a[1]
-    length = hypot(x, y)
-    u, v = (a[0] + b[0]) / 2 - centroid[0], (a[1] + b[1]) / 2 - centroid[1]
-    if length == 0:
-        return 0.0
-    off, height = abs(x * u + y * v) / length, abs(x * v - y * u) / length
-    return off / max(length / 2, 0.4 * height)
-
-
-def _concave_price(line: list[Point]) -> float:
-    """Return the price for corners on a line, without its ends, that are not convex."""
-    price = 0.0
-    for k in range(1, len(line) - 1):
-        turn = _turn(*line[k - 1 : k + 2])
-        if turn < _CONVEX:
-            price += _CONCAVE_PRICE * (0.1 + min(-turn, 1.0))
-    return price
