@@ -68,6 +68,15 @@ kernel void find_seeds(const int size, const int find_cells, global const int *c
     }
 }
 
+/* A corner of a group, and its nearest candidates that see it, in the order of their angles from the first wall. */
+typedef struct {
+    REAL2 x;
+    REAL angle, h, extent, first_wall;
+    int count, mask;   /* mask: bits of those that share the corner; 0 if none do */
+    int list[NEAREST]; /* their places among the candidates of the group */
+    REAL distances[NEAREST], angles[NEAREST];
+} Corner;
+
 inline bool is_at(REAL2 a, REAL2 b)
 {
     return a.s0 == b.s0 && a.s1 == b.s1;
@@ -90,20 +99,121 @@ inline bool is_listed(int i, const int *list, int count)
     return found;
 }
 
-/* Whether candidate p shares one of the corners of the group. */
-inline bool is_shared(int p, int corner_count, const int *masks, const int *near, const int *found)
+inline bool shares(const Corner *corner, int k)
 {
-    bool shares = false;
-    for (int c = 0; c < corner_count; ++c)
-        for (int k = 0; k < found[c]; ++k)
-            shares = shares || ((masks[c] >> k & 1) && near[c * NEAREST + k] == p);
-    return shares;
+    return corner->mask >> k & 1;
 }
 
-/* Cost of a choice (bits of `mask`) among generators at distances d and angles a from the first wall, in the order of
-   angles: squares of the displacements, and of the angles by which cells are too wide. */
-inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL angle)
+/* Whether candidate p shares one of the corners of the group. */
+inline bool is_shared(int p, const Corner *group, int corner_count)
 {
+    bool shared = false;
+    for (int c = 0; c < corner_count; ++c)
+        for (int k = 0; k < group[c].count; ++k)
+            shared = shared || (shares(group + c, k) && group[c].list[k] == p);
+    return shared;
+}
+
+/* Whether candidate i belongs to the group: to that of its nearest corner. Corners before `first`, and those after the
+   group, are of other groups. */
+inline bool is_own(int i, const Corner *group, int corner_count, int first, global const int *others, int other_count,
+                   global const REAL2 *corners, global const REAL2 *points)
+{
+    REAL own = REAL_MAX;
+    for (int c = 0; c < corner_count; ++c)
+        own = fmin(own, gap_between(points[i], group[c].x));
+    bool mine = true;
+    for (int k = 0; k < other_count; ++k) {
+        const REAL d = gap_between(points[i], corners[others[k]]);
+        mine = mine && !(d < own || (d == own && others[k] < first));
+    }
+    return mine;
+}
+
+/* Collects the generators near the corners of a group: the seeds, and neighbor by neighbor. Returns their number. */
+inline int collect_candidates(int *cells, const Corner *group, int corner_count, global const int *seeds, int n,
+                              global const int *starts, global const int *neighbors, global const REAL2 *points)
+{
+    int count = 0;
+    for (int c = 0; c < corner_count; ++c)
+        if (seeds[c] < n && !is_listed(seeds[c], cells, count))
+            cells[count++] = seeds[c];
+    for (int p = 0; p < count; ++p)
+        for (int k = starts[cells[p]]; k < starts[cells[p] + 1]; ++k) {
+            const int j = neighbors[k];
+            bool near = false;
+            for (int c = 0; c < corner_count && j >= 0; ++c)
+                near = near || gap_between(points[j], group[c].x) < R(CANDIDATE_REACH) * group[c].h;
+            if (near && count < MOST_CANDIDATES && !is_listed(j, cells, count))
+                cells[count++] = j;
+        }
+    return count;
+}
+
+/* Whether a wall hides the corner from x, at a distance. The two walls of the corner do not, but by round-off the path
+   may cross them. */
+inline bool is_hidden(const Corner *corner, REAL2 x, REAL distance, DOMAIN_ARGS)
+{
+    const REAL from[2] = {x.s0, x.s1}, to[2] = {corner->x.s0, corner->x.s1};
+    int edge;
+    const REAL t = exit_over_edge(from, to, &edge, DOMAIN);
+    const bool ends_here = t <= 1 && (is_at(edge_ends[edge].s01, corner->x) || is_at(edge_ends[edge].s23, corner->x));
+    return !ends_here && (1 - t) * distance > R(1.01) * corner->extent + 64 * REAL_EPS;
+}
+
+/* Angle of x about the corner from the first wall; round-off, and the extent of the corner, may put it outside. */
+inline REAL angle_at(const Corner *corner, REAL2 x)
+{
+    REAL angle = atan2(x.s1 - corner->x.s1, x.s0 - corner->x.s0) - corner->first_wall;
+    angle -= 2 * PI * floor(angle / (2 * PI));
+    if (angle > corner->angle)
+        angle = angle > (corner->angle + 2 * PI) / 2 ? 0 : corner->angle;
+    return angle;
+}
+
+/* Lists the nearest candidates that see the corner, by angle. */
+inline void list_nearest(Corner *corner, const int *cells, int count, global const REAL2 *points, DOMAIN_ARGS)
+{
+    REAL last = -1;
+    int last_place = -1;
+    corner->count = 0;
+    while (corner->count < NEAREST) {
+        /* The next one by distance; of equal ones the first in the list. */
+        REAL best = REAL_MAX;
+        int next = -1;
+        for (int p = 0; p < count; ++p) {
+            const REAL far = gap_between(points[cells[p]], corner->x);
+            if ((far > last || (far == last && p > last_place)) && far < best) {
+                best = far;
+                next = p;
+            }
+        }
+        if (next < 0 || best > R(CANDIDATE_REACH) * corner->h)
+            break;
+        last = best;
+        last_place = next;
+        const REAL2 x = points[cells[next]];
+        if (is_hidden(corner, x, best, DOMAIN))
+            continue;
+        const REAL angle = angle_at(corner, x);
+        int place = corner->count++;
+        for (; place > 0 && corner->angles[place - 1] > angle; --place) {
+            corner->angles[place] = corner->angles[place - 1];
+            corner->distances[place] = corner->distances[place - 1];
+            corner->list[place] = corner->list[place - 1];
+        }
+        corner->angles[place] = angle;
+        corner->distances[place] = best;
+        corner->list[place] = next;
+    }
+}
+
+/* Cost of a choice (bits of `mask`) among the listed generators: squares of the displacements, and of the angles by
+   which cells are too wide. */
+inline REAL choice_cost(int mask, const Corner *corner)
+{
+    const int count = corner->count;
+    const REAL *d = corner->distances, *a = corner->angles, angle = corner->angle;
     const REAL margin = fmin(MARGIN, (2 * PI - angle) / 4 + R(0.01)), widest = PI - margin;
     REAL r = 0;
     int sharing = 0;
@@ -138,17 +248,15 @@ inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL 
     return cost + 4 * r * r * over * over;
 }
 
-/* Whether the generators that share corner b (bits of mask_b in list_b) and those that share corner c can have equal
-   distances from both: at most two have the same distances from two points, one on each side of the line through them.
-   */
-inline bool may_share_both(int mask_b, const int *list_b, int count_b, REAL2 b, int mask_c, const int *list_c,
-                           int count_c, REAL2 c, const int *cells, global const REAL2 *points)
+/* Whether the generators that share corner b and those of `mask` at corner c can have equal distances from both: at
+   most two have the same distances from two points, one on each side of the line through them. */
+inline bool may_share_both(const Corner *b, const Corner *c, int mask, const int *cells, global const REAL2 *points)
 {
     int left = 0, right = 0;
-    for (int p = 0; p < count_b; ++p)
-        for (int q = 0; q < count_c; ++q)
-            if ((mask_b >> p & 1) && (mask_c >> q & 1) && list_b[p] == list_c[q]) {
-                const REAL2 e = c - b, v = points[cells[list_c[q]]] - b;
+    for (int p = 0; p < b->count; ++p)
+        for (int q = 0; q < c->count; ++q)
+            if (shares(b, p) && (mask >> q & 1) && b->list[p] == c->list[q]) {
+                const REAL2 e = c->x - b->x, v = points[cells[c->list[q]]] - b->x;
                 if (e.s0 * v.s1 - e.s1 * v.s0 > 0)
                     ++left;
                 else
@@ -157,9 +265,141 @@ inline bool may_share_both(int mask_b, const int *list_b, int count_b, REAL2 b, 
     return left < 2 && right < 2;
 }
 
+/* Bits of the generators that share corner c of a group: the nearest one and others, at the least cost; 0 for none.
+   The corners before c have chosen. */
+inline int choose_shared(const Corner *group, int c, const int *cells, global const REAL2 *points)
+{
+    const Corner *corner = group + c;
+    int closest = 0, chosen = 0;
+    for (int p = 1; p < corner->count; ++p)
+        closest = corner->distances[p] < corner->distances[closest] ? p : closest;
+    const int fewest = corner->angle > THREE ? 3 : 2;
+    REAL least = REAL_MAX;
+    for (int mask = 3; mask < 1 << corner->count; ++mask) {
+        const int sharing = popcount(mask);
+        if (!(mask >> closest & 1) || sharing < fewest || sharing > fewest + 1)
+            continue;
+        bool possible = true;
+        for (int b = 0; b < c; ++b)
+            possible = possible && may_share_both(group + b, corner, mask, cells, points);
+        if (!possible)
+            continue;
+        const REAL cost = choice_cost(mask, corner);
+        if (cost < least) {
+            least = cost;
+            chosen = mask;
+        }
+    }
+    return chosen;
+}
+
+/* Turns the generators that share a corner about it. First all, so that the bisector of the first and the last one lies
+   behind the walls: neither has a part of its cell on the other side of a sharp corner. Then those of the first and of
+   the last face, so that cells beside the walls are convex. */
+inline void turn_shared(Corner *corner, REAL2 *at)
+{
+    const REAL angle = corner->angle, margin = fmin(MARGIN, (2 * PI - angle) / 4);
+    REAL *angles = corner->angles;
+    int first = -1, last = -1;
+    for (int p = 0; p < corner->count; ++p)
+        if (shares(corner, p)) {
+            first = first < 0 ? p : first;
+            last = p;
+        }
+    const REAL mean = (angles[first] + angles[last]) / 2;
+    const REAL back = clamp(mean, angle - PI + margin, PI - margin) - mean;
+    if (back != 0)
+        for (int p = first; p <= last; ++p)
+            if (shares(corner, p)) {
+                const REAL turn = clamp(back, -MOST_TURN, MOST_TURN);
+                angles[p] += turn;
+                at[corner->list[p]] = turned(at[corner->list[p]], corner->x, turn);
+            }
+    for (int side = 0; side < 2; ++side) {
+        int pair[2], picked = 0;
+        for (int p = 0; p < corner->count && picked < 2; ++p) {
+            const int q = side ? corner->count - 1 - p : p;
+            if (shares(corner, q))
+                pair[picked++] = q;
+        }
+        const REAL face = (angles[pair[0]] + angles[pair[1]]) / 2;
+        const REAL width = side ? angle - face : face;
+        REAL turn = fmin(fmax(width - (PI - margin), R(0)), MOST_TURN);
+        if (turn == 0)
+            continue;
+        turn = side ? turn : -turn;
+        for (int k = 0; k < 2; ++k) {
+            const int q = corner->list[pair[k]];
+            at[q] = turned(at[q], corner->x, turn);
+            angles[pair[k]] += turn;
+        }
+    }
+}
+
+/* Moves the generators that share a corner to their mean, or least, distance from it; returns the largest difference.
+ */
+inline REAL equalize_distances(const Corner *corner, bool to_least, REAL2 *at)
+{
+    REAL r = 0, least = REAL_MAX, change = 0;
+    for (int p = 0; p < corner->count; ++p)
+        if (shares(corner, p)) {
+            const REAL d = gap_between(at[corner->list[p]], corner->x);
+            r += d;
+            least = fmin(least, d);
+        }
+    r = fmax(to_least ? least : r / popcount(corner->mask), LEAST_RADIUS * corner->h);
+    for (int p = 0; p < corner->count; ++p)
+        if (shares(corner, p)) {
+            const int q = corner->list[p];
+            const REAL d = gap_between(at[q], corner->x);
+            if (fabs(d - r) > REAL_EPS / 2 && d > R(0.1) * r)
+                at[q] = corner->x + (at[q] - corner->x) * (r / d);
+            change = fmax(change, fabs(d - r));
+        }
+    return change;
+}
+
+/* Moves generators that share no corner of the group away from corner c. */
+inline void move_others_away(const Corner *group, int corner_count, int c, REAL2 *at)
+{
+    const Corner *corner = group + c;
+    REAL r = 0;
+    for (int p = 0; p < corner->count; ++p)
+        if (shares(corner, p))
+            r = fmax(r, gap_between(at[corner->list[p]], corner->x));
+    for (int p = 0; p < corner->count; ++p) {
+        const int q = corner->list[p];
+        const REAL d = gap_between(at[q], corner->x);
+        if (!is_shared(q, group, corner_count) && d < OTHERS * r && d > 0)
+            at[q] = corner->x + (at[q] - corner->x) * (fmin(OTHERS * r, d + OTHERS_STEP * corner->h) / d);
+    }
+}
+
+/* Puts back the generators that have moved outside, or too close to another; returns whether none of them shares a
+   corner. */
+inline bool put_back(const Corner *group, int corner_count, const int *cells, int count, global const REAL2 *points,
+                     REAL2 *at, DOMAIN_ARGS)
+{
+    bool all_good = true;
+    for (int p = 0; p < count; ++p) {
+        const REAL2 x = points[cells[p]];
+        if (is_at(x, at[p]))
+            continue;
+        const REAL from[2] = {x.s0, x.s1}, to[2] = {at[p].s0, at[p].s1};
+        bool good = exit_parameter(from, to, DOMAIN) > 1;
+        for (int q = 0; q < count; ++q)
+            good = good && (q == p || gap_between(at[p], at[q]) > SEPARATION * group[0].h);
+        if (!good) {
+            all_good = all_good && !is_shared(p, group, corner_count);
+            at[p] = x;
+        }
+    }
+    return all_good;
+}
+
 /* Per group: choose the generators that share each corner, the nearest one that sees it and others, and move them to
-   their mean distance from it; move others away. A generator belongs to the group of its nearest corner. moved[] and
-   targets[] are the generators of the group that move, -1 for none, and their positions. */
+   their mean distance from it; move others away. moved[] and targets[] are the generators of the group that move, -1
+   for none, and their positions. */
 kernel void share_corners(const int size, global const int *starts, global const int *neighbors, const int n,
                           global const REAL2 *points, global const int *labels, const int fixed,
                           global const int *group_starts, global const REAL2 *corners, global const REAL4 *shapes,
@@ -168,219 +408,49 @@ kernel void share_corners(const int size, global const int *starts, global const
 {
     WORK_ITEM(g);
     const int first = group_starts[g], corner_count = group_starts[g + 1] - first;
+    Corner group[MOST_IN_GROUP];
     int cells[MOST_CANDIDATES];
     REAL2 at[MOST_CANDIDATES];
-    int count = 0;
     for (int p = 0; p < MOST_MOVED; ++p)
         moved[g * MOST_MOVED + p] = -1;
     for (int c = 0; c < corner_count; ++c) {
-        const int i = seeds[first + c];
-        if (i < n && !is_listed(i, cells, count))
-            cells[count++] = i;
-    }
-    for (int p = 0; p < count; ++p)
-        for (int k = starts[cells[p]]; k < starts[cells[p] + 1]; ++k) {
-            const int j = neighbors[k];
-            bool near = false;
-            for (int c = first; c < first + corner_count && j >= 0; ++c)
-                near = near || gap_between(points[j], corners[c]) < R(CANDIDATE_REACH) * shapes[c].s2;
-            if (near && count < MOST_CANDIDATES && !is_listed(j, cells, count))
-                cells[count++] = j;
-        }
-    /* Keep those that belong to this group and may move. */
-    int kept = 0;
-    for (int p = 0; p < count; ++p) {
-        const int i = cells[p];
-        REAL own = REAL_MAX;
-        for (int c = first; c < first + corner_count; ++c)
-            own = fmin(own, gap_between(points[i], corners[c]));
-        bool mine = labels[i] >= fixed;
-        for (int k = other_starts[g]; k < other_starts[g + 1]; ++k) {
-            const REAL d = gap_between(points[i], corners[others[k]]);
-            mine = mine && !(d < own || (d == own && others[k] < first));
-        }
-        if (mine)
-            cells[kept++] = i;
-    }
-    count = kept;
-
-    int near[MOST_IN_GROUP * NEAREST], found[MOST_IN_GROUP], masks[MOST_IN_GROUP];
-    REAL angles[MOST_IN_GROUP * NEAREST];
-    for (int c = 0; c < corner_count; ++c) {
-        const REAL2 corner = corners[first + c];
         const REAL4 shape = shapes[first + c];
-        int *list = near + c * NEAREST;
-        REAL *a = angles + c * NEAREST;
-        REAL d[NEAREST];
-        int seen = 0;
-        REAL last = -1;
-        int last_place = -1;
-        while (seen < NEAREST) {
-            /* The next one by distance; of equal ones the first in the list. */
-            REAL best = REAL_MAX;
-            int next = -1;
-            for (int p = 0; p < count; ++p) {
-                const REAL far = gap_between(points[cells[p]], corner);
-                if ((far > last || (far == last && p > last_place)) && far < best) {
-                    best = far;
-                    next = p;
-                }
-            }
-            if (next < 0 || best > R(CANDIDATE_REACH) * shape.s2)
-                break;
-            last = best;
-            last_place = next;
-            const REAL2 x = points[cells[next]];
-            const REAL from[2] = {x.s0, x.s1}, to[2] = {corner.s0, corner.s1};
-            int edge;
-            const REAL t = exit_over_edge(from, to, &edge, DOMAIN);
-            /* The two walls of the corner do not hide it, but by round-off the path may cross them. */
-            const bool ends_here = t <= 1 && (is_at(edge_ends[edge].s01, corner) || is_at(edge_ends[edge].s23, corner));
-            if (!ends_here && (1 - t) * best > R(1.01) * shape.s3 + 64 * REAL_EPS)
-                continue;
-            /* Angle from the first wall; round-off, and the extent of the corner, may put it outside. */
-            REAL angle = atan2(x.s1 - corner.s1, x.s0 - corner.s0) - shape.s0;
-            angle -= 2 * PI * floor(angle / (2 * PI));
-            if (angle > shape.s1)
-                angle = angle > (shape.s1 + 2 * PI) / 2 ? 0 : shape.s1;
-            /* Sort by angle. */
-            int place = seen++;
-            for (; place > 0 && a[place - 1] > angle; --place) {
-                a[place] = a[place - 1];
-                d[place] = d[place - 1];
-                list[place] = list[place - 1];
-            }
-            a[place] = angle;
-            d[place] = best;
-            list[place] = next;
-        }
-        found[c] = seen;
-        masks[c] = 0;
-        int closest = 0;
-        for (int p = 1; p < seen; ++p)
-            closest = d[p] < d[closest] ? p : closest;
-        REAL least = REAL_MAX;
-        for (int mask = 3; mask < 1 << seen; ++mask) {
-            const int sharing = popcount(mask);
-            if (!(mask >> closest & 1) || sharing < (shape.s1 > THREE ? 3 : 2) || sharing > (shape.s1 > THREE ? 4 : 3))
-                continue;
-            bool possible = true;
-            for (int b = 0; b < c; ++b)
-                possible = possible && may_share_both(masks[b], near + b * NEAREST, found[b], corners[first + b], mask,
-                                                      list, seen, corner, cells, points);
-            if (!possible)
-                continue;
-            const REAL cost = choice_cost(mask, seen, d, a, shape.s1);
-            if (cost < least) {
-                least = cost;
-                masks[c] = mask;
-            }
-        }
+        group[c].x = corners[first + c];
+        group[c].first_wall = shape.s0;
+        group[c].angle = shape.s1;
+        group[c].h = shape.s2;
+        group[c].extent = shape.s3;
     }
-
+    const int found = collect_candidates(cells, group, corner_count, seeds + first, n, starts, neighbors, points);
+    /* Keep those that belong to this group and may move. */
+    int count = 0;
+    for (int p = 0; p < found; ++p)
+        if (labels[cells[p]] >= fixed && is_own(cells[p], group, corner_count, first, others + other_starts[g],
+                                                other_starts[g + 1] - other_starts[g], corners, points))
+            cells[count++] = cells[p];
+    for (int c = 0; c < corner_count; ++c) {
+        list_nearest(group + c, cells, count, points, DOMAIN);
+        group[c].mask = choose_shared(group, c, cells, points);
+    }
     /* First with mean distances. If that moves a generator outside or too close to another, with the least ones. */
-    bool inside = false;
-    for (int attempt = 0; attempt < 2 && !inside; ++attempt) {
+    bool done = false;
+    for (int attempt = 0; attempt < 2 && !done; ++attempt) {
         for (int p = 0; p < count; ++p)
             at[p] = points[cells[p]];
-        for (int c = 0; c < corner_count && attempt == 0; ++c) {
-            const REAL2 corner = corners[first + c];
-            const REAL angle = shapes[first + c].s1;
-            const REAL margin = fmin(MARGIN, (2 * PI - angle) / 4);
-            if (masks[c] == 0)
-                continue;
-            /* Turn all, so that the bisector of the first and the last one lies behind the walls: neither has a part of
-               its cell on the other side of a sharp corner. */
-            int outer[2] = {-1, -1};
-            for (int p = 0; p < found[c]; ++p)
-                if (masks[c] >> p & 1) {
-                    outer[0] = outer[0] < 0 ? c * NEAREST + p : outer[0];
-                    outer[1] = c * NEAREST + p;
-                }
-            const REAL mean = (angles[outer[0]] + angles[outer[1]]) / 2;
-            const REAL back = clamp(mean, angle - PI + margin, PI - margin) - mean;
-            if (back != 0)
-                for (int p = outer[0]; p <= outer[1]; ++p)
-                    if (masks[c] >> (p - c * NEAREST) & 1) {
-                        angles[p] += clamp(back, -MOST_TURN, MOST_TURN);
-                        at[near[p]] = turned(at[near[p]], corner, clamp(back, -MOST_TURN, MOST_TURN));
-                    }
-            /* Turn the generators of the first and the last face, so that cells beside the walls are convex. */
-            for (int side = 0; side < 2; ++side) {
-                int pair[2], picked = 0;
-                for (int p = 0; p < found[c] && picked < 2; ++p) {
-                    const int q = side ? found[c] - 1 - p : p;
-                    if (masks[c] >> q & 1)
-                        pair[picked++] = c * NEAREST + q;
-                }
-                const REAL face = (angles[pair[0]] + angles[pair[1]]) / 2;
-                const REAL width = side ? angle - face : face;
-                REAL turn = fmin(fmax(width - (PI - margin), R(0)), MOST_TURN);
-                if (turn == 0)
-                    continue;
-                turn = side ? turn : -turn;
-                for (int k = 0; k < 2; ++k) {
-                    at[near[pair[k]]] = turned(at[near[pair[k]]], corner, turn);
-                    angles[pair[k]] += turn;
-                }
-            }
-        }
+        for (int c = 0; c < corner_count && attempt == 0; ++c)
+            if (group[c].mask)
+                turn_shared(group + c, at);
         REAL change = REAL_MAX;
         for (int sweep = 0; sweep < SWEEPS && change > 2 * REAL_EPS; ++sweep) {
             change = 0;
-            for (int c = 0; c < corner_count; ++c) {
-                if (masks[c] == 0)
-                    continue;
-                const REAL2 corner = corners[first + c];
-                REAL r = 0, least = REAL_MAX;
-                for (int p = 0; p < found[c]; ++p)
-                    if (masks[c] >> p & 1) {
-                        const REAL d = gap_between(at[near[c * NEAREST + p]], corner);
-                        r += d;
-                        least = fmin(least, d);
-                    }
-                r = fmax(attempt ? least : r / popcount(masks[c]), LEAST_RADIUS * shapes[first + c].s2);
-                for (int p = 0; p < found[c]; ++p)
-                    if (masks[c] >> p & 1) {
-                        const int q = near[c * NEAREST + p];
-                        const REAL d = gap_between(at[q], corner);
-                        if (fabs(d - r) > REAL_EPS / 2 && d > R(0.1) * r)
-                            at[q] = corner + (at[q] - corner) * (r / d);
-                        change = fmax(change, fabs(d - r));
-                    }
-            }
+            for (int c = 0; c < corner_count; ++c)
+                if (group[c].mask)
+                    change = fmax(change, equalize_distances(group + c, attempt > 0, at));
         }
-        /* Generators that share no corner of the group stay away from its corners. */
-        for (int c = 0; c < corner_count; ++c) {
-            if (masks[c] == 0)
-                continue;
-            const REAL2 corner = corners[first + c];
-            REAL r = 0;
-            for (int p = 0; p < found[c]; ++p)
-                if (masks[c] >> p & 1)
-                    r = fmax(r, gap_between(at[near[c * NEAREST + p]], corner));
-            for (int p = 0; p < found[c]; ++p) {
-                const int q = near[c * NEAREST + p];
-                const REAL d = gap_between(at[q], corner);
-                if (!is_shared(q, corner_count, masks, near, found) && d < OTHERS * r && d > 0)
-                    at[q] = corner + (at[q] - corner) * (fmin(OTHERS * r, d + OTHERS_STEP * shapes[first + c].s2) / d);
-            }
-        }
-        inside = true;
-        for (int p = 0; p < count; ++p) {
-            const REAL2 x = points[cells[p]];
-            if (is_at(x, at[p]))
-                continue;
-            const REAL from[2] = {x.s0, x.s1}, to[2] = {at[p].s0, at[p].s1};
-            int edge;
-            bool good = exit_over_edge(from, to, &edge, DOMAIN) > 1;
-            for (int q = 0; q < count; ++q)
-                good = good && (q == p || gap_between(at[p], at[q]) > SEPARATION * shapes[first].s2);
-            if (!good) {
-                inside = inside && !is_shared(p, corner_count, masks, near, found);
-                at[p] = x;
-            }
-        }
+        for (int c = 0; c < corner_count; ++c)
+            if (group[c].mask)
+                move_others_away(group, corner_count, c, at);
+        done = put_back(group, corner_count, cells, count, points, at, DOMAIN);
     }
     int written = 0;
     for (int p = 0; p < count; ++p) {
