@@ -91,7 +91,8 @@ class Result(Sealed, MeshOutput):
         Why the run ended.
     initial, final : Displacements or None
         Lloyd and Poisson displacements of the first and of the last step. If the last step is not known beforehand
-        (methods that repeat one kind of step, a callback that stops the run), `final` is those of the next step.
+        (methods that repeat one kind of step, a callback that stops the run), `final` is those of
+        one more step of the same method.
     size_factor : float
         With `n_cells` of methods "adaptive" and "exact", `target_size` is the size field times this common factor;
         else 1.

@@ -495,11 +495,11 @@ def test_figures_of_adaptive_runs(
 
 
 def test_final_displacements_are_those_of_the_last_step(adapter):
-    """Those of the next step, if the run was stopped."""
-    whole = adapter.run(BOX, F1, seed=9, effort="fast")
+    """Those of one more step of the same method, if the run was stopped."""
+    whole = adapter.run(BOX, F1, seed=9, effort="default")
     steps = whole.history["step"][-1]
     stopped = adapter.run(
-        BOX, F1, seed=9, effort="fast", callback=lambda row: row["step"] == steps - 1
+        BOX, F1, seed=9, effort="default", callback=lambda row: row["step"] == steps - 1
     )
     for result, other in ((whole, stopped), (stopped, stopped)):
         assert np.array_equal(result.final.points, other.points)
