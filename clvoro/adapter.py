@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from .adaptation.diagnostics import warn_of_errors
-from .adaptation.estimates import check_memory, estimate_memory
+from .adaptation.estimates import check_memory
 from .adaptation.loop import INTERRUPTED
 from .adaptation.options import (
     Checkpoint,
@@ -226,7 +226,7 @@ class Adapter:
         stages = self._stages_for(domain)
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
-        check_memory(engine, n, estimate_memory(engine, n, domain, run=False))
+        check_memory(engine, n, domain, run=False)
         binned = stages.bins.build(domain, engine.upload(domain.place(host, self.dtype)), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
         with Naming(host, domain, self.dtype):

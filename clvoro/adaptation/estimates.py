@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pyopencl as cl
 
 from ..errors import MemoryLimitError
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
+from ..opencl import memory_limits
 from ..opencl.engine import Engine
-from ..opencl.host_memory import host_memory
+from ..opencl.memory_limits import available_memory, in_bytes
 from ..opencl.primitives import scan_width
 from ..solvers.poisson import max_jacobi_iterations
 from ..tessellation.periodic.halo import block_count
@@ -41,6 +41,10 @@ FOLDED = {2: (9, 57), 3: (40, 25)}
 """Reals and integers per cell (not per image) in addition in periodic boxes."""
 FOLDED_DIAGRAM = {2: {8: 360, 4: 340}, 3: {8: 2000, 4: 1900}}
 """Bytes per cell in addition for one diagram in periodic boxes."""
+LARGEST = {2: {8: 105, 4: 90}, 3: {8: 610, 4: 310}}
+"""Bytes per cell or image of the largest array, of a run or of one diagram."""
+TRIMMED_LARGEST = {8: 130, 4: 90}
+"""The same in polygons."""
 PARTIAL_SUMS, SCANS, ARRAYS = 80, 8, 64
 """Independent of the number of cells: reals per work-group for sums, scans, and arrays in the workspace, each of which
 wastes up to one unit."""
@@ -134,6 +138,20 @@ def estimate_memory(
     return max(peak + fixed_bytes(engine, n), output) + extras.field_bytes
 
 
+def largest_array(
+    engine: Engine, n: float, domain: Domain | None = None, extras: Extras | None = None
+) -> float:
+    """Return the size of the largest array of a run of `n` cells, or of one diagram, in bytes."""
+    extras = Extras() if extras is None else extras
+    n, real = n * (1 + extras.surplus), engine.real.itemsize
+    if isinstance(domain, Polygon):
+        return n * TRIMMED_LARGEST[real]
+    if domain is not None and any(domain.periodic):
+        images = _images_of_equal_cells(domain, n) if extras.images is None else extras.images
+        n *= 1 + images
+    return n * LARGEST[engine.dim][real]
+
+
 def _images_of_equal_cells(domain: Domain, n: float) -> float:
     """Return the ghost images per generator of `n` equal cells in a periodic box."""
     depth = IMAGE_REACH[domain.dim] * (domain.measure / max(n, 1.0)) ** (1 / domain.dim)
@@ -141,37 +159,47 @@ def _images_of_equal_cells(domain: Domain, n: float) -> float:
     return float(np.prod(1 + np.array(shares))) - 1
 
 
-def in_bytes(amount: float) -> str:
-    """Return a number of bytes as text: 258 KiB, 1.47 GiB."""
-    power = 0 if amount < 2**10 else 1 if amount < 2**20 else 2 if amount < 2**30 else 3
-    return f"{amount / 2 ** (10 * power):.3g} {('bytes', 'KiB', 'MiB', 'GiB')[power]}"
-
-
-def available_memory(device: cl.Device) -> float:
-    """Return the memory of `device` in bytes; for a CPU at most the limit of this process."""
-    own = device.global_mem_size
-    return min(own, host_memory()) if device.type & cl.device_type.CPU else own
-
-
-def check_memory(engine: Engine, n: float, needed: float) -> float:
-    """Check that the device has `needed` bytes for `n` cells (see `estimate_memory`), and return `needed`.
+def check_memory(
+    engine: Engine,
+    n: float,
+    domain: Domain | None = None,
+    extras: Extras | None = None,
+    *,
+    run: bool = True,
+) -> float:
+    """Check that the device has memory for `n` cells, and return the bytes needed (see `estimate_memory`).
 
     Raises
     ------
     MemoryLimitError
-        If `n` or `needed` is too large. The message has the number of cells, and the bytes needed and available.
+        If `n`, all arrays or the largest array are too large. The message has the number of cells, and the bytes needed
+        and available.
     """
-    available = available_memory(engine.queue.device)
+    device = engine.queue.device
+    name, available = device.name.strip(), available_memory(device)
+    needed = estimate_memory(engine, n, domain, extras, run=run)
     if n > MAX_CELLS:
         raise MemoryLimitError(
             f"the run has {n:.3g} cells, expected at most {MAX_CELLS:.3g}, the limit of 32-bit indices (they need "
             f"{in_bytes(needed)}, and the device has {in_bytes(available)}). Do h and the domain have the same unit "
             "of length? If so, use a larger size or a smaller n_cells"
         )
+    largest, most = (
+        largest_array(engine, n, domain, extras),
+        memory_limits.largest_allocation(device),
+    )
+    remedy = (
+        "Do h and the domain have the same unit of length? If so, use a larger size, n_cells, dtype='float32' or "
+        "another device"
+    )
     if needed > available:
         raise MemoryLimitError(
-            f"the size field requires {n:.3g} cells, which need {in_bytes(needed)} on the device; "
-            f"{engine.queue.device.name.strip()} has {in_bytes(available)}. Do h and the domain have the same "
-            "unit of length? If so, use a larger size, n_cells, dtype='float32' or another device"
+            f"the size field requires {n:.3g} cells, which need {in_bytes(needed)} on the device; {name} has "
+            f"{in_bytes(available)}. {remedy}"
+        )
+    if largest > most:
+        raise MemoryLimitError(
+            f"the size field requires {n:.3g} cells, whose largest array needs {in_bytes(largest)}; {name} allocates "
+            f"at most {in_bytes(most)} for one array. {remedy}"
         )
     return needed

@@ -16,7 +16,7 @@ from ..sizing import Sizing, as_field
 from ..sizing.field import Field
 from ..sizing.layers import limit_beside_layers
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
-from .estimates import Extras, check_memory, estimate_memory
+from .estimates import Extras, check_memory
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import Relaxation, make_method
 from .options import Options
@@ -188,9 +188,7 @@ class Preparation:
 
     def _check_memory(self, n: float, extras: Extras | None = None) -> float:
         """Return the bytes that a run of `n` cells needs; raise if the device has less."""
-        engine = self.stages.engine
-        needed = estimate_memory(engine, n, self.domain, extras)
-        return check_memory(engine, n, needed)
+        return check_memory(self.stages.engine, n, self.domain, extras)
 
     def generators(self) -> np.ndarray:
         """Return the initial generators (n, d): those of layers, then those of the caller or a random sample.

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from ..adaptation.estimates import available_memory, in_bytes
 from ..adaptation.loop import INTERRUPTED
 from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, warn_of_unused
 from ..errors import Aborted, ClvoroError, InputError, SolverWarning
@@ -27,6 +26,7 @@ from ..io import save, write_history
 from ..io.check_mesh import run_check_mesh
 from ..mesh.results import Result
 from ..mesh.summary import boundary_line, summary
+from ..opencl.memory_limits import available_memory, in_bytes
 from ..opencl.profile import Profile
 from .cases import Case
 from .formats import MESH_FILES, PLANE

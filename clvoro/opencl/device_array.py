@@ -16,6 +16,8 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from .memory_limits import check_allocation
+
 _QUICK = "_fast" in inspect.signature(cla.Array.__init__).parameters
 """Whether PyOpenCL's constructor has a private option that skips checks."""
 _PATTERN = 64
@@ -115,8 +117,16 @@ def make_array(
     data: cl.Buffer | None = None,
     offset: int = 0,
 ) -> DeviceArray:
-    """Return an array of `shape` at byte `offset` of `data`, or in a new buffer with arbitrary content."""
+    """Return an array of `shape` at byte `offset` of `data`, or in a new buffer with arbitrary content.
+
+    Raises
+    ------
+    MemoryLimitError
+        If the device does not allocate so large a buffer.
+    """
     shape = shape if isinstance(shape, tuple) else (int(shape),)
+    if data is None:
+        check_allocation(queue.device, math.prod(shape) * dtype.itemsize)
     if not _QUICK:
         return DeviceArray(queue, shape, dtype, data=data, offset=offset)
     strides, step = [], dtype.itemsize

@@ -11,7 +11,7 @@ import pyopencl.array as cla
 
 from . import program
 from .device_array import make_array
-from .kernels import KernelPool, Kernels, bind
+from .kernels import KernelPool, Kernels, bind, fit_group
 from .workspace import Workspace
 
 if TYPE_CHECKING:
@@ -159,8 +159,9 @@ class Engine:
         name, full = f"{stage}.cl", self.all_defines(stage, defines or {})
         # Called through the module, because tests replace the function.
         return Kernels(
-            lambda: program.build_program(self.ctx, name, full, prelude), stage, self.pool
-        )
+            lambda size: program.build_program(self.ctx, name, {**full, "GROUP_SIZE": size}, prelude),
+            stage, self.pool, self.group_size,
+        )  # fmt: skip
 
     def all_defines(self, stage: str, defines: Mapping[str, object]) -> dict[str, object]:
         """Return `defines` and those macros of the engine that `cl_kernels/<stage>.cl` names."""
@@ -177,9 +178,10 @@ class Engine:
     ) -> cl.Event:
         """Enqueue `kernel` over at least `size` work-items; arrays are passed as their buffers.
 
-        `size` is rounded up to whole work-groups of `group` items. The kernel must skip the items beyond `size`.
+        `size` is rounded up to whole work-groups of `group` items, or fewer if the device requires it. The kernel must
+        skip the items beyond `size`.
         """
-        group = ITEM_GROUP if group is None else group
+        group = fit_group(kernel, ITEM_GROUP if group is None else group)
         bind(kernel, args)
         whole = -(-max(int(size), 1) // group) * group
         return cl.enqueue_nd_range_kernel(self.queue, kernel, (whole,), (group,))
@@ -192,9 +194,17 @@ class Engine:
 
     def run_blocks(self, kernel: cl.Kernel, *args: object) -> cl.Event:
         """Enqueue a block-wise `kernel` over `groups` work-groups of `group_size` items (see opencl/blocks.h)."""
+        return self.run_groups(kernel, self.groups, *args)
+
+    def run_groups(self, kernel: cl.Kernel, groups: int, *args: object) -> cl.Event:
+        """Enqueue a block-wise `kernel` over `groups` work-groups."""
         bind(kernel, args)
-        size = (self.groups * self.group_size,)
-        return cl.enqueue_nd_range_kernel(self.queue, kernel, size, (self.group_size,))
+        group = self.block_of(kernel)
+        return cl.enqueue_nd_range_kernel(self.queue, kernel, (groups * group,), (group,))
+
+    def block_of(self, kernel: cl.Kernel) -> int:
+        """Return the number of work-items per group for which a block-wise `kernel` has been built."""
+        return getattr(kernel, "block", self.group_size)
 
     def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
         """Return an uninitialized device array; `dtype` defaults to the engine's precision."""

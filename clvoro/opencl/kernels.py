@@ -19,6 +19,25 @@ _UNTYPED_CALLS = 3
 """Calls of a kernel before PyOpenCL gets the types of its arguments."""
 
 
+def group_limit(kernel: cl.Kernel) -> int:
+    """Return the largest work-group that `kernel` can be launched in, which depends on the registers that it needs."""
+    device = kernel.context.devices[0]
+    return kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device)
+
+
+def power_of_two(limit: int) -> int:
+    """Return the largest power of two that is not larger than `limit`."""
+    return 1 << (max(limit, 1).bit_length() - 1)
+
+
+def fit_group(kernel: cl.Kernel, group: int) -> int:
+    """Return `group`, or the largest power of two that `kernel` can be launched in if that is smaller."""
+    limit = getattr(kernel, "limit", None)
+    if limit is None:
+        limit = kernel.limit = group_limit(kernel)  # type: ignore[attr-defined]
+    return group if group <= limit else power_of_two(limit)
+
+
 class KernelPool:
     """Kernel objects that are used again.
 
@@ -54,27 +73,50 @@ class KernelPool:
 class Kernels(SimpleNamespace):
     """The kernels of a program as attributes. The program is built when the first of them is used.
 
-    Each kernel keeps its own arguments. Its attribute `stage` is the name of the program, for profiles.
+    Each kernel keeps its own arguments. Its attribute `stage` is the name of the program, for profiles, and `block` the
+    number of work-items per group for which it has been built (GROUP_SIZE, see opencl/blocks.h).
+
+    Parameters
+    ----------
+    build : callable
+        Builds the program for a number of work-items per group.
+    stage : str
+        Name of the program.
+    pool : KernelPool
+    group_size : int
+        Work-items per group of block-wise kernels. For a kernel that cannot be launched in such groups, the program is
+        built again for smaller ones.
     """
 
-    def __init__(self, build: Callable[[], cl.Program], stage: str, pool: KernelPool) -> None:
-        super().__init__(_build=build, _stage=stage, _pool=pool)
+    def __init__(
+        self, build: Callable[[int], cl.Program], stage: str, pool: KernelPool, group_size: int = 1
+    ) -> None:
+        super().__init__(_build=build, _stage=stage, _pool=pool, _group_size=group_size)
 
     def __getattr__(self, name: str) -> cl.Kernel:
         if name.startswith("_"):
             raise AttributeError(name)
-        program = self._build()
+        size = self._group_size
+        kernel = self._take(name, size)
+        while fit_group(kernel, size) < size and "GROUP_SIZE" in source_text(f"{self._stage}.cl"):
+            size = fit_group(kernel, size)
+            kernel = self._take(name, size)
+        kernel.block = size  # type: ignore[attr-defined]
+        kernel.stage = self._stage.rpartition("/")[2]  # type: ignore[attr-defined]
+        setattr(self, name, kernel)
+        return kernel
+
+    def _take(self, name: str, size: int) -> cl.Kernel:
+        """Return a kernel of the program for groups of `size`."""
+        program = self._build(size)
         try:
-            kernel = self._pool.take(program, name)
+            return self._pool.take(program, name)
         except cl.LogicError as error:
             if f"void {name}(" in source_text(f"{self._stage}.cl"):
                 raise BuildError(
                     f"cl_kernels/{self._stage}.cl was built without its kernel {name}. {cache_remedy()}"
                 ) from error
             raise AttributeError(f"cl_kernels/{self._stage}.cl has no kernel {name}") from error
-        kernel.stage = self._stage.rpartition("/")[2]  # type: ignore[attr-defined]
-        setattr(self, name, kernel)
-        return kernel
 
 
 def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:

@@ -40,8 +40,9 @@ class Launch:
         self._given: list[object] = []
         self._kernel = kernel
         self._queue = engine.queue
-        self._size = ((engine.groups if groups is None else groups) * engine.group_size,)
-        self._group = (engine.group_size,)
+        group = engine.block_of(kernel)
+        self._size = ((engine.groups if groups is None else groups) * group,)
+        self._group = (group,)
 
     def set_first(self, value: int) -> None:
         """Set the kernel's first argument, an int."""

@@ -21,6 +21,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from . import memory_limits
 from .device_array import make_array
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -42,8 +43,8 @@ def framed(method: Method) -> Method:
 class Workspace:
     """A stack of device arrays.
 
-    The memory grows when a frame needs more than all before, and is kept in one piece. So repeated steps allocate
-    nothing.
+    The memory grows when a frame needs more than all before, and is kept in one piece, unless this is larger than the
+    device's largest buffer. So repeated steps allocate nothing.
 
     Parameters
     ----------
@@ -54,6 +55,7 @@ class Workspace:
         self._queue = queue
         # Sub-buffers must begin at multiples of this. No two arrays share a cache line.
         self._unit = max(64, queue.device.mem_base_addr_align // 8)
+        self._limit = memory_limits.largest_allocation(queue.device)
         # For each open frame, the bytes in use of each piece when it began.
         self._before: list[list[int]] = []
         self.clear()
@@ -73,7 +75,7 @@ class Workspace:
         return self
 
     def __enter__(self) -> None:
-        if not self._before and len(self._pieces) > 1:
+        if not self._before and len(self._pieces) > 1 and self._most <= self._limit:
             # The size is known now: one piece replaces the others.
             self._pieces, self._taken, self._views = [], [], {}
             self._add(self._most)
@@ -113,5 +115,6 @@ class Workspace:
         return array
 
     def _add(self, size: int) -> None:
+        memory_limits.check_allocation(self._queue.device, size)
         self._pieces.append(cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size))
         self._taken.append(0)

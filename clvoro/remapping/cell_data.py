@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyopencl as cl
 
-from ..adaptation.estimates import available_memory, in_bytes
 from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..opencl.devices import create_context
 from ..opencl.engine import Engine
+from ..opencl.memory_limits import available_memory, in_bytes
 from ..tessellation.bins import Bins
 from .device_transfer import CellData, CellGraph, ConservativeTransfer, transfer_bytes
 from .host_transfer import transfer_on_host

@@ -429,5 +429,4 @@ class _System:
         self._engine.run_blocks(kernel, *args)
 
     def _launch_one_group(self, kernel: cl.Kernel, *args: object) -> None:
-        group = self._engine.group_size
-        self._engine.run(kernel, group, *args, group=group)
+        self._engine.run_groups(kernel, 1, *args)

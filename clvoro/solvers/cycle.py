@@ -11,7 +11,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..opencl.engine import Engine
-from ..opencl.kernels import bind, comparison_key
+from ..opencl.kernels import bind, comparison_key, fit_group
 from ..opencl.launch import one_group_limit
 from ..opencl.primitives import NamedArrays
 from .aggregation import WORK_GROUP, Aggregates, Graph, PairInverse, round_to_work_group
@@ -102,9 +102,12 @@ class Cycle:
         if key not in self._kernels:
             defines = {"SOURCE": self.engine.name_of(self._source)}
             self._kernels[key] = getattr(self.engine.kernels("solvers/multigrid", defines), name)
-        kernel, one = self._kernels[key], self.engine.group_size
+        kernel = self._kernels[key]
         bind(kernel, (np.int32(size), *args))
-        whole, group = (one, one) if name in _ONE_GROUP else (round_to_work_group(size), WORK_GROUP)
+        if name in _ONE_GROUP:
+            whole = group = self.engine.block_of(kernel)
+        else:
+            whole, group = round_to_work_group(size), fit_group(kernel, WORK_GROUP)
         self._launches.append((kernel, (whole,), (group,)))
 
     def _is_small(self, depth: int) -> bool:

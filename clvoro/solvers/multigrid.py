@@ -228,10 +228,10 @@ class Multigrid:
 
     def _factorize(self, graph: Graph) -> None:
         """Factorize the coarsest level."""
-        n, group = len(graph), self._single.group_size
+        n = len(graph)
         self._factor = self._room("factor", size=_factor_size(n))
         kernel = self._kernels.factorize_coarsest
-        self._single.run(kernel, group, np.int32(n), *graph.rows, self._factor, group=group)
+        self._single.run_groups(kernel, 1, np.int32(n), *graph.rows, self._factor)
 
     def apply(self, r: cla.Array, u: cla.Array, work: cla.Array | None = None) -> None:
         """Enqueue u = M^-1 r: one cycle.

@@ -18,10 +18,10 @@ from clvoro.adaptation.estimates import (
     PEAK,
     TRIMMED_PEAK,
     Extras,
-    available_memory,
     check_memory,
     estimate_memory,
     fixed_bytes,
+    largest_array,
 )
 from clvoro.adaptation.forecast import (
     IMAGE_REACH,
@@ -36,7 +36,10 @@ from clvoro.adaptation.schedule import MOST_SURPLUS
 from clvoro.cli import command as cli
 from clvoro.cli import jobs
 from clvoro.errors import MemoryLimitError, SizeErrorWarning
+from clvoro.opencl import device_array, memory_limits, workspace
+from clvoro.opencl import engine as engine_module
 from clvoro.opencl.engine import Engine
+from clvoro.opencl.memory_limits import available_memory
 from clvoro.remapping import cell_data
 from clvoro.remapping.cell_data import transfer_values
 from clvoro.remapping.device_transfer import transfer_bytes
@@ -528,10 +531,59 @@ def test_what_does_not_fit_is_refused(ctx, dim, real):
     reals, integers = PEAK[dim]
     most = max(reals * size + 4 * integers, OUTPUT[dim][size])
     fits = min(room / most, MAX_CELLS)
-    check_memory(engine, 0.99 * fits, estimate_memory(engine, 0.99 * fits))
+    check_memory(engine, 0.99 * fits)
     with pytest.raises(MemoryLimitError, match="GiB"):
-        check_memory(engine, 1.01 * fits, estimate_memory(engine, 1.01 * fits))
+        check_memory(engine, 1.01 * fits)
     with pytest.raises(MemoryLimitError, match="GiB"):
         clvoro.Adapter(ctx, real).run(
             clvoro.Box((0,) * dim, (1,) * dim), 0.1, n_cells=int(1.01 * fits)
         )
+
+
+@pytest.fixture
+def largest(monkeypatch):
+    """The bytes of the largest array so far, in a list."""
+    found, plain = [0], device_array.make_array
+
+    def noted(*args):
+        array = plain(*args)
+        found[0] = max(found[0], array.nbytes)
+        return array
+
+    for module in (engine_module, workspace):
+        monkeypatch.setattr(module, "make_array", noted)
+    return found
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize(
+    ("domain", "size"),
+    [
+        (SQUARE, 0.016),
+        (lake(), 0.012),
+        (clvoro.Box((0, 0, 0), (1, 1, 1)), 0.07),
+        pytest.param(clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), 0.1, marks=pytest.mark.slow),
+    ],
+    ids=["square", "lake", "cube", "torus"],
+)
+def test_largest_array_fits_its_estimate(ctx, largest, domain, size, real):
+    """A run, and the reading of its diagram with vertices."""
+    adapter = clvoro.Adapter(ctx, real)
+    mesh = adapter.run(domain, size, seed=1, effort="fast").diagram
+    _ = mesh.vertices
+    engine = adapter._stages_for(domain).engine
+    assert 0.7 <= largest[0] / largest_array(engine, len(mesh), domain) <= 1.1
+
+
+def test_largest_array_fits_the_device(ctx, monkeypatch):
+    """GPUs have memory for four of their largest arrays."""
+    monkeypatch.setattr(memory_limits, "largest_allocation", lambda _: 1_050_000)
+    adapter = clvoro.Adapter(ctx)
+    run = {"effort": "fast", "seed": 1, "max_steps": 1}
+    assert len(adapter.run(SQUARE, 0.1, n_cells=9_900, **run).diagram) == 9_900
+    expected = "10100 cells, whose largest array needs 1.01 MiB; .* at most 1 MiB for one"
+    with pytest.raises(MemoryLimitError, match=expected.replace("10100", r"1\.01e\+04")):
+        adapter.run(SQUARE, 0.1, n_cells=10_100, **run)
+    points = np.random.default_rng(1).random((10_100, 2))
+    with pytest.raises(MemoryLimitError, match=r"at most 1 MiB"):
+        adapter.diagram(SQUARE, points)

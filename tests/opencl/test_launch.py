@@ -6,9 +6,14 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+import clvoro
+from clvoro.opencl import engine as engines
+from clvoro.opencl import kernels
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.kernels import bind
 from clvoro.opencl.launch import Launch
+from clvoro.opencl.primitives import Gather, Summaries
+from clvoro.solvers import poisson
 
 SOURCE = """
 kernel void put(const int n, const double x, const int2 shift, global const double *from, global double *to)
@@ -106,3 +111,52 @@ def test_launch_alternates_with_other_launches(engine):
         bind(kernel, (np.int32(7), to))
         engine.run_blocks(kernel, np.int32(7), to)
         assert (to.get() == 7).all()
+
+
+def test_groups_are_as_small_as_the_device_requires(ctx, monkeypatch):
+    """A block-wise kernel that needs too many registers is built for smaller groups; its sum stays right."""
+    monkeypatch.setattr(engines, "group_sizes", lambda _: engines.GroupSizes(5, 32))
+    limits = {"summarize_blocks": 13, "combine_blocks": 1, "gather_rows": 24}
+    monkeypatch.setattr(kernels, "group_limit", lambda k: limits.get(k.function_name, 4096))
+    launched, plain = {}, cl.enqueue_nd_range_kernel
+
+    def noted(queue, kernel, size, group, *args, **options):
+        launched[kernel.function_name] = size[0], group[0]
+        return plain(queue, kernel, size, group, *args, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", noted)
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
+    values = np.arange(1.0, 1001.0)
+    summaries, array = Summaries(engine, ["x"]), engine.upload(values)
+    summaries.collect("x", array, 1000)
+    summary = summaries.read_one("x")
+    assert (summary.sum, summary.least, summary.largest) == (500500.0, 1.0, 1000.0)
+    order = np.arange(999, -1, -3, dtype=np.int32)
+    rows = Gather(engine).rows(engine.upload(order, np.int32), array)
+    assert (rows.get() == values[order]).all()
+    assert launched["summarize_blocks"] == (5 * 8, 8)
+    assert launched["combine_blocks"][1] == 1
+    assert launched["gather_rows"] == (336, 16)
+
+
+def test_coarse_levels_take_smaller_groups(ctx, monkeypatch):
+    """Multigrid does coarse levels in one group each; some of its kernels are limited to groups of 8."""
+    monkeypatch.setattr(engines, "group_sizes", lambda _: engines.GroupSizes(5, 32))
+    monkeypatch.setattr(kernels, "group_limit", lambda k: 8 if len(k.function_name) % 2 else 4096)
+    monkeypatch.setattr(poisson, "expected_costs", lambda *_: (1.0, 0.5))
+    launched, plain = {}, cl.enqueue_nd_range_kernel
+
+    def noted(queue, kernel, size, group, *args, **options):
+        launched[kernel.function_name] = kernel.stage, size[0], group[0]
+        return plain(queue, kernel, size, group, *args, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", noted)
+    adapter = clvoro.Adapter(ctx)
+    method = {"method": "coupled", "max_steps": 2, "options": clvoro.PaperOptions(tol=0)}
+    result = adapter.run(clvoro.Box((0, 0), (1, 1)), 0.02, seed=1, **method)
+    assert result.diagram.volumes.sum() == pytest.approx(1)
+    assert np.abs(result.size_error).max() < 1
+    of_one_group = {
+        group for stage, size, group in launched.values() if stage == "multigrid" and size == group
+    }
+    assert of_one_group == {8, 32}

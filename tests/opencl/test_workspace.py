@@ -11,6 +11,8 @@ from clvoro import sizing
 from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
+from clvoro.errors import MemoryLimitError
+from clvoro.opencl import memory_limits
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.workspace import MOST_VIEWS
 from tests.reference import patch
@@ -218,3 +220,25 @@ def test_kernels_are_not_shared_until_released(engine):
     assert fourth.scan_few.int_ptr not in held  # another program
     with pytest.raises(AttributeError, match="has no kernel nothing"):
         _ = third.nothing
+
+
+def test_memory_is_in_several_pieces_where_buffers_are_limited(engine, made, monkeypatch):
+    """The workspace is not joined to a buffer that the device does not allocate, and stops to grow."""
+    monkeypatch.setattr(memory_limits, "largest_allocation", lambda _: 40_000)
+    engine = Engine(engine.ctx, engine.queue, 2, engine.real)
+    for _ in range(4):
+        count = len(made)
+        with engine.workspace.frame():
+            arrays = take(engine)
+            with engine.workspace.frame():
+                check(take(engine))
+            check(arrays)
+    assert len(made) == count
+    assert max(made) <= 40_000 < sum(made)
+    with pytest.raises(
+        MemoryLimitError, match=r"needs 39\.1 KiB, and .* at most 39\.1 KiB for one"
+    ):
+        engine.empty(40_001, np.uint8)
+    with engine.workspace.frame(), pytest.raises(MemoryLimitError, match="at most"):
+        engine.scratch(5001)
+    assert max(made) <= 40_000

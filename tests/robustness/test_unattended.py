@@ -19,7 +19,6 @@ import pytest
 
 import clvoro
 from clvoro.adaptation import checkpoint
-from clvoro.adaptation.estimates import in_bytes
 from clvoro.adaptation.resume import Saved
 from clvoro.cli import command as cli
 from clvoro.cli import outputs, progress
@@ -36,6 +35,7 @@ from clvoro.io import npz
 from clvoro.opencl import host_memory as _host_memory
 from clvoro.opencl import runtimes as _runtimes
 from clvoro.opencl.kernels import KernelPool, Kernels
+from clvoro.opencl.memory_limits import in_bytes
 
 ROOT = Path(__file__).parents[2]
 BOX = clvoro.Box((0, 0), (1, 1))
@@ -457,7 +457,7 @@ def test_caches_go_where_there_is_room(tmp_path, monkeypatch):
 def test_kernels_lost_from_a_cache(ctx, monkeypatch):
     monkeypatch.delenv("POCL_CACHE_DIR", raising=False)
     program = cl.Program(ctx, "kernel void other(global int *x) { x[0] = 0; }").build()
-    lost = Kernels(lambda: program, "sizing/size_field", KernelPool())
+    lost = Kernels(lambda _: program, "sizing/size_field", KernelPool())
     with pytest.raises(BuildError, match=r"without its kernel evaluate_size\. If .* remove .*pocl"):
         _ = lost.evaluate_size
     with pytest.raises(AttributeError, match="has no kernel evalate"):
