@@ -13,6 +13,7 @@ import pytest
 from clvoro.errors import DeviceError, InputTypeError
 from clvoro.opencl import devices as device
 from clvoro.opencl import probe as _probe
+from clvoro.opencl import program
 from clvoro.opencl import runtimes as _runtimes
 
 ROOT = Path(__file__).parents[2]
@@ -205,6 +206,12 @@ def test_real_devices_are_listed_with_their_verdict(ctx):
     [
         ("x * x", "x * undeclared", "cannot build and run"),
         ("sqrt(x * x)", "0 * sqrt(x * x)", "wrong results"),
+        (
+            "#if PROBE_FP64",
+            "#define fma(a, b, c) ((a)*(b) + (c))\n#if PROBE_FP64",
+            "rounds the product",
+        ),
+        ("return a * b;", "return fma(a, b, (T)1e-7);", "contracts"),
     ],
 )
 def test_probe_detects_broken_runtimes(ctx, monkeypatch, good, bad, verdict):
@@ -217,6 +224,38 @@ def test_probe_detects_broken_runtimes(ctx, monkeypatch, good, bad, verdict):
     monkeypatch.setattr(_probe, "_verdicts", {})
     with pytest.raises(DeviceError, match=verdict):
         device.create_context(ctx.devices[0])
+
+
+def test_probe_detects_contraction(ctx, monkeypatch):
+    """PoCL contracts by default where the processor has fma."""
+    cpu = Path("/proc/cpuinfo")
+    if ctx.devices[0].platform.name.strip() != program.POCL or " fma " not in (
+        cpu.read_text() if cpu.exists() else ""
+    ):
+        pytest.skip("needs a device that contracts by default")
+    monkeypatch.setattr(
+        _probe, "_PROBE", _probe._PROBE.replace("FP_CONTRACT OFF", "FP_CONTRACT ON")
+    )
+    assert _probe.CONTRACT_OFF in _probe.probe(ctx.devices[0])
+    assert _probe.CONTRACT_OFF in program.source_text("opencl/real.h")
+
+
+def test_quotients_are_rounded_where_the_device_can(monkeypatch):
+    """On GPUs that have the option, all programs get it; it is an error elsewhere."""
+    plain, rounding = 0x3F, 0xBF
+    for single_fp_config, options in ((plain, ()), (rounding, (program.ROUNDED_QUOTIENTS,))):
+        monkeypatch.setattr(FakeDevice, "single_fp_config", single_fp_config, raising=False)
+        assert program.device_options(BIG_GPU) == options
+        assert program.device_options(POCL) == ()
+
+
+def test_options_of_the_device_are_built_with(ctx, monkeypatch):
+    monkeypatch.setattr(program, "device_options", lambda _: ("-DFROM_DEVICE=7",))
+    built = program.compile_text(ctx, "kernel void put(global int *x) { x[0] = FROM_DEVICE; }", ())
+    assert (
+        built.get_build_info(ctx.devices[0], cl.program_build_info.OPTIONS).count("FROM_DEVICE=7")
+        == 1
+    )
 
 
 def test_runtime_that_crashes_is_listed(ctx, tmp_path, monkeypatch):
