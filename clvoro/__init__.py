@@ -22,7 +22,7 @@ Ctrl-C raises `Interrupted`, which carries the mesh so far. Errors and warnings 
 
 from . import curves, sizing
 from .adaptation.options import Checkpoint, MultilevelOptions, PaperOptions
-from .adapter import Adapter, adapt, voronoi
+from .adapter import Adapter
 from .errors import ClvoroError, Interrupted
 from .geometry.boundary_layers import Layers
 from .geometry.box import Box
@@ -32,6 +32,7 @@ from .mesh.diagram import Diagram
 from .mesh.results import Displacements, Result
 from .opencl import profile
 from .opencl.devices import create_context, list_devices
+from .shared import adapt, voronoi
 
 __version__ = "0.1.0"
 

@@ -22,7 +22,8 @@ CLANG_FORMAT = "14"
 """The version whose style is the kernels': others break some lines elsewhere."""
 ORDER = (
     "errors", "arguments", "files", "opencl", "geometry", "curves", "mesh", "finite_volumes", "io", "sizing",
-    "tessellation", "solvers", "adaptation", "remapping", "plotting", "adapter", "__init__", "cli", "__main__",
+    "tessellation", "solvers", "adaptation", "remapping", "plotting", "adapter", "shared", "__init__", "cli",
+    "__main__",
 )  # fmt: skip
 """Packages and root modules: each imports only from those before it."""
 UPWARD = {

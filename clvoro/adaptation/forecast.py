@@ -11,7 +11,6 @@ from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 from ..tessellation.periodic.halo import block_counts
 from .sampling.quadrature import DensityTree
-from .schedule import MOST_SURPLUS
 
 IMAGE_REACH = {2: 1.55, 3: 1.75}
 """Depth of the halo of equal cells over their size."""
@@ -25,8 +24,11 @@ IMAGE_SAMPLE = 16384
 """Sample of cells for the number of images."""
 STEEP_FROM, STEEP_TO = 1.4, 2.4
 """Ratios of sizes around a cell between which its steepness increases from 0 to 1."""
+MOST_SURPLUS = 0.4
+"""Largest number of cells over the integral of h^-d, as a share of it. Steep slopes require up to 0.35 more for a
+while, and 0.15 at the end. Jumps would require any number, without a better mesh."""
 SURPLUS_RATE = 8.0
-"""Rate at which the surplus approaches its limit (`schedule.MOST_SURPLUS`) with the mean steepness.
+"""Rate at which the surplus approaches its limit (`MOST_SURPLUS`) with the mean steepness.
 Measured on jumps of 1 : 5 to 1 : 40, strips, rings, checkers and kinks, 1500 to 20,000 cells: 0.83 to 1.05 of this
 estimate of all cells."""
 SAMPLE = 1024

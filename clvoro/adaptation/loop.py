@@ -15,14 +15,14 @@ from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from ..opencl.primitives import Summary
 from ..solvers.conjugate_gradient import Solution
 from .checkpoint import Checkpointer
+from .efforts import RepairCells
+from .forecast import MOST_SURPLUS
 from .methods import Method
 from .schedule import (
-    MOST_SURPLUS,
     Action,
     CorrectCount,
     InsertDelete,
     Refine,
-    RepairCells,
     ResetMomentum,
     Step,
     work_of,

@@ -16,13 +16,14 @@ from ..sizing import Sizing, as_field
 from ..sizing.field import Field
 from ..sizing.layers import limit_beside_layers
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
+from .efforts import is_near
 from .estimates import Extras, check_memory
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import Relaxation, make_method
 from .options import Options
 from .sampling.quadrature import DensityTree
 from .sampling.start import density_tree, sample_density, sample_uniform
-from .schedule import Action, adaptive_schedule, auto_levels, is_near, repeated_schedule
+from .schedule import Action, adaptive_schedule, auto_levels, repeated_schedule
 from .stages import Stages
 from .state import MeshState, Setup
 

@@ -25,6 +25,7 @@ from clvoro.adaptation.estimates import (
 )
 from clvoro.adaptation.forecast import (
     IMAGE_REACH,
+    MOST_SURPLUS,
     STEEP_FROM,
     STEEP_TO,
     SURPLUS_RATE,
@@ -32,7 +33,6 @@ from clvoro.adaptation.forecast import (
     expected_surplus,
 )
 from clvoro.adaptation.sampling.start import count_cells, density_tree
-from clvoro.adaptation.schedule import MOST_SURPLUS
 from clvoro.cli import command as cli
 from clvoro.cli import jobs
 from clvoro.errors import MemoryLimitError, SizeErrorWarning

@@ -8,8 +8,8 @@ import shapely
 
 import clvoro
 from clvoro import sizing
+from clvoro.adaptation.efforts import EFFORTS
 from clvoro.adaptation.options import METHODS
-from clvoro.adaptation.schedule import EFFORTS
 from clvoro.errors import (
     ClvoroError,
     CoarseSizeWarning,

@@ -12,6 +12,7 @@ import numpy as np
 
 import clvoro
 from clvoro.adaptation import preparation
+from clvoro.adaptation.efforts import RepairCells
 from clvoro.adaptation.insertion_deletion import InsertionDeletion
 from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
 from clvoro.adaptation.schedule import (
@@ -19,7 +20,6 @@ from clvoro.adaptation.schedule import (
     CorrectCount,
     InsertDelete,
     Refine,
-    RepairCells,
     ResetMomentum,
     Step,
 )

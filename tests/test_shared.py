@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro import adapter as module
+from clvoro import shared as module
 from clvoro.errors import DeviceError, InputError
 
 BOX = clvoro.Box((0, 0), (1, 1))

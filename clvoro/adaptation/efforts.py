@@ -1,0 +1,134 @@
+"""Efforts: the amount of work of a run, and the quality of meshes that have had it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+NEAR_ERROR, NEAR_COUNT = 0.15, 0.02
+"""Mean |e|, and share of missing cells, up to which a given mesh is only corrected. Measured on F2 (see
+bench/restart.py): beyond them cells lose quality that only insertion and deletion restore."""
+DEFICIT_3D = 0.36
+"""1 - mean Q in 3D up to which a mesh counts as smoothed: a random one has 0.47, one of any effort at most 0.33."""
+WALL_DEFICIT = 0.45
+"""1 - mean Q that walls and unrelieved strain cost in 2D, times the square root of the number of cells."""
+
+
+@dataclass(frozen=True)
+class RepairCells:
+    """Delete or split the worst cells, with 1 - Q above `deficit`; see `InsertionDeletion.repair_cells`."""
+
+    deficit: float
+    split: bool = False
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Amount of work of a run.
+
+    Attributes
+    ----------
+    start, couple, couple_finest : int
+        Coupled steps on the coarsest level, on the levels between, and on the finest.
+    sweeps : tuple of int
+        Sweeps (insert/delete, then glide) on the finest level, on the next coarser one, and so on. The last number
+        holds for all coarser levels.
+    glide : int
+        Steps of a sweep.
+    polish : int
+        Steps of polishing.
+    error_target : float
+        Mean |log(L / h)| that polishing aims at.
+    relaxation, momentum : float
+        Parameters of gliding.
+    penalty : float
+        Initial penalty of polishing.
+    nuclei : float
+        Share of the cells where dislocations may be nucleated, in every third sweep.
+    first : int
+        Largest number of sweeps on the coarsest of several levels.
+    bad_cell_weight, quality_scale, log_ratio_scale : float
+        Parameters of polishing: see `ProjectedMethod`. The last one is relative to the error target.
+    repairs : tuple of (int, RepairCells)
+        Repairs of the worst cells, each before this step of polishing. Some steps follow the last one.
+    deficit : float
+        1 - mean Q of meshes of this effort in 2D, without walls.
+    separate : int
+        Steps of separating, in 2D. Measured on eleven fields, four starts each: after one no edge is shorter than
+        0.07 h, after two 0.09 h.
+    """
+
+    start: int
+    couple: int
+    couple_finest: int
+    sweeps: tuple[int, ...]
+    glide: int
+    polish: int
+    error_target: float
+    relaxation: float = 1.3
+    momentum: float = 0.7
+    penalty: float = 0.3
+    nuclei: float = 0.0
+    first: int = 99
+    bad_cell_weight: float = 20.0
+    quality_scale: float = 0.03
+    log_ratio_scale: float = 12.0
+    repairs: tuple[tuple[int, RepairCells], ...] = ()
+    deficit: float = 0.012
+    separate: int = 2
+
+
+EFFORTS = {
+    "fast": Effort(
+        8, 2, 3, (0, 1, 4, 8), glide=6, first=4, polish=5, error_target=0.0035, relaxation=1.0,
+        deficit=0.022, separate=1,
+    ),
+    "default": Effort(
+        30, 5, 3, (4, 18, 20, 20), glide=7, polish=21, error_target=0.0025, quality_scale=0.02,
+        log_ratio_scale=11.0,
+        repairs=((5, RepairCells(0.06)), (9, RepairCells(0.06)), (13, RepairCells(0.07))),
+    ),
+    "best": Effort(
+        60, 5, 10, (100, 40, 30, 30), glide=7, polish=90, error_target=0.0039, relaxation=1.5, momentum=0.8,
+        penalty=0.7, nuclei=0.0018, bad_cell_weight=80.0, quality_scale=0.02, log_ratio_scale=16.0,
+        repairs=(
+            (30, RepairCells(0.037)), (50, RepairCells(0.037, split=True)), (70, RepairCells(0.037)),
+            (80, RepairCells(0.037)),
+        ),
+        deficit=0.006,
+    ),
+}  # fmt: skip
+
+EFFORTS_3D = {
+    "fast": Effort(
+        30, 4, 2, (), glide=4, polish=0, error_target=0.004, relaxation=1.5, momentum=0.7
+    ),
+    "default": Effort(
+        40, 8, 2, (), glide=8, polish=0, error_target=0.0025, relaxation=1.5, momentum=0.8
+    ),
+    "best": Effort(
+        80, 30, 3, (), glide=60, polish=0, error_target=0.003, relaxation=1.5, momentum=0.8
+    ),
+}
+"""The same in 3D. On a coarser level `couple` steps follow each of three numbers of cells, on the finest
+`couple_finest` each of two."""
+
+
+def is_near(
+    dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float
+) -> bool:
+    """Tell whether a given mesh of `n` cells only needs a correction to reach the quality of `effort`.
+
+    Parameters
+    ----------
+    missing : float
+        Number of missing cells; negative if there are too many.
+    mean_error : float
+        Mean of |e|.
+    mean_quality : float
+        Mean of Q.
+    """
+    deficit = EFFORTS[effort].deficit + WALL_DEFICIT / math.sqrt(n) if dim == 2 else DEFICIT_3D
+    return (
+        mean_error <= NEAR_ERROR and abs(missing) <= NEAR_COUNT * n and 1 - mean_quality <= deficit
+    )

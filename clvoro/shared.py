@@ -1,0 +1,137 @@
+"""`adapt` and `voronoi`: what most callers need, with one adapter for all of them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .adaptation.options import EffortName, MethodName, Start
+from .adapter import Adapter
+from .errors import DeviceError
+from .geometry.boundary_layers import Layers
+from .geometry.box import Domain
+from .mesh.diagram import Diagram
+from .mesh.results import Result
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+_shared: Adapter | None = None
+_sharing = threading.Lock()
+
+
+def shared_adapter() -> Adapter:
+    """Return the adapter of `adapt` and `voronoi`, on the best device; it is created by the first call.
+
+    It computes in float64, or in float32 if no device computes in float64.
+
+    Raises
+    ------
+    DeviceError
+        If no device works.
+    """
+    global _shared
+    with _sharing:
+        if _shared is None:
+            try:
+                _shared = Adapter()
+            except DeviceError:
+                _shared = Adapter(dtype="float32")
+        return _shared
+
+
+def adapt(
+    domain: Domain,
+    size: object,
+    effort: EffortName = "default",
+    *,
+    points: ArrayLike | Start = "density",
+    method: MethodName = "adaptive",
+    n_cells: int | None = None,
+    layers: Layers | Sequence[Layers] = (),
+    seed: int = 0,
+    callback: Callable[[np.void], object] | None = None,
+) -> Result:
+    """Mesh `domain` by Voronoi cells of the target size, on the best device.
+
+    All calls share one adapter, in float64 where a device has it. Calls from several threads wait for each other. For
+    a device, a precision or further options of your own use ``clvoro.Adapter(ctx, dtype).run(...)``.
+
+    Parameters
+    ----------
+    domain : Box or Polygon
+    size : number, callable or clvoro.sizing field
+        Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d.
+    effort : "fast", "default" or "best"
+        Amount of work.
+    points : (n, d) array of float, "density" or "uniform"
+        Generators to start from: those of the array, random ones with density h^-d, or uniform random ones.
+    method : str
+        "adaptive" for good cells of the right size, "exact" for cells that have it to about 1e-4; for the others see
+        `Adapter.run`.
+    n_cells : int, optional
+        Number of cells; by default the number that the size field requires.
+    layers : Layers or sequence of Layers
+        Boundary layers, in 2D.
+    seed : int
+        Seed of the random start.
+    callback : callable, optional
+        Called with each new row of the history; the run stops if it returns True.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    DeviceError
+        If no device works.
+    Interrupted
+        On Ctrl-C: a `KeyboardInterrupt` with the result so far.
+    InputError, InputTypeError, SizeFieldError, MemoryLimitError, SolverError
+        As `Adapter.run`.
+
+    Examples
+    --------
+    >>> mesh = clvoro.adapt(clvoro.Box((0, 0), (2, 1)), lambda p: 0.05 + 0.1 * p[:, 0], "fast")
+    >>> bool(abs(mesh.diagram.volumes.sum() - 2) < 1e-12), bool(abs(mesh.size_error).mean() < 0.05)
+    (True, True)
+    """
+    return shared_adapter().run(
+        domain, size, points, method, n_cells, effort=effort, layers=layers, seed=seed, callback=callback
+    )  # fmt: skip
+
+
+def voronoi(domain: Domain, points: ArrayLike) -> Diagram:
+    """Return the Voronoi diagram of `points` in `domain`, computed on the best device.
+
+    Parameters
+    ----------
+    domain : Box or Polygon
+    points : (n, d) array of float
+        Distinct generators inside the domain, walls included, in the domain's unit of length.
+
+    Returns
+    -------
+    Diagram
+        Row i belongs to ``points[i]``.
+
+    Raises
+    ------
+    DeviceError
+        If no device works.
+    InputError, InputTypeError
+        If the points are not as expected, or too close together for the precision.
+    MemoryLimitError
+        If the device has not enough memory.
+
+    Examples
+    --------
+    >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)]
+    >>> clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), points).volumes.round(3).tolist()
+    [0.391, 0.275, 0.334]
+    """
+    return shared_adapter().diagram(domain, points)
