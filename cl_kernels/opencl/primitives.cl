@@ -1,55 +1,85 @@
 #include "opencl/real.h"
 #include "opencl/blocks.h"
 
-/* Exclusive prefix sums in two passes. Each work-item has one contiguous chunk of the array. */
+/* Exclusive prefix sums in two passes: sums of the groups' blocks, then each block tile by tile. With one group the
+   second pass is enough. A work-item takes four numbers of a tile. Kernels must not return before a barrier (see reduce.h). */
 
-inline int chunk_begin(int n, int w, int width)
-{
-    return (int)(((long)n * w) / width);
-}
+#if GROUP_SIZE > 1
+#define GROUP_INTS(name) local int name[GROUP_SIZE]
+#else
+#define GROUP_INTS(name) local int *const name = 0
+#endif
 
-/* sums[w] = sum of chunk w. */
-kernel void chunk_sums(const int size, global const int *values, const int first, global int *sums, const int n)
+/* The sum of x over the work-items before this one; *total is that over the group. */
+inline int group_scan(int x, local int *scratch, int *total)
 {
-    WORK_ITEM(w);
-    const int end = chunk_begin(n, w + 1, size);
-    int sum = 0;
-    for (int i = chunk_begin(n, w, size); i < end; ++i)
-        sum += values[first + i];
-    sums[w] = sum;
-}
-
-/* out[i] = values[first] + ... + values[first + i - 1]; out[n] is the total. `values` may be `out` if first is 0. Each
-   work-item adds up the sums of the chunks before its own. */
-kernel void scan_chunks(const int size, global const int *values, const int first, global const int *sums,
-                        global int *out, const int n)
-{
-    WORK_ITEM(w);
-    const int end = chunk_begin(n, w + 1, size);
-    int total = 0;
-    for (int v = 0; v < w; ++v)
-        total += sums[v];
-    for (int i = chunk_begin(n, w, size); i < end; ++i) {
-        const int value = values[first + i];
-        out[i] = total;
-        total += value;
+#if GROUP_SIZE > 1
+    const int me = get_local_id(0);
+    int sum = x;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    scratch[me] = x;
+    for (int step = 1; step < GROUP_SIZE; step *= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        const int before = me >= step ? scratch[me - step] : 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        sum += before;
+        scratch[me] = sum;
     }
-    if (end == n && w == size - 1)
+    barrier(CLK_LOCAL_MEM_FENCE);
+    *total = scratch[GROUP_SIZE - 1];
+    return sum - x;
+#else
+    *total = x;
+    return 0;
+#endif
+}
+
+/* sums[group] = sum of the group's block of values[first ...]. */
+kernel void sum_scan_blocks(global const int *values, const int first, const int n, global int *sums)
+{
+    GROUP_INTS(scratch);
+    int mine = 0, sum;
+    for (BLOCK_LOOP(i, n))
+        mine += values[first + i];
+    group_scan(mine, scratch, &sum);
+    if (get_local_id(0) == 0)
+        sums[get_group_id(0)] = sum;
+}
+
+/* out[i] = values[first] + ... + values[first + i - 1]; out[n] is the total. `values` may be `out` if first is 0. */
+kernel void scan_blocks(global const int *values, const int first, const int n, global const int *sums, global int *out)
+{
+    GROUP_INTS(scratch);
+    const int t = get_local_id(0), end = block_end(n);
+    int before = 0, total;
+    for (int g = t; g < (int)get_group_id(0); g += GROUP_SIZE)
+        before += sums[g];
+    group_scan(before, scratch, &total);
+    for (int tile = block_begin(n); tile < end; tile += 4 * GROUP_SIZE) {
+        const int mine = tile + 4 * t, count = end - mine;
+        int4 value = 0;
+        if (count >= 4)
+            value = vload4(0, values + first + mine);
+        else if (count > 0)
+            value = (int4)(values[first + mine], count > 1 ? values[first + mine + 1] : 0,
+                           count > 2 ? values[first + mine + 2] : 0, 0);
+        const int2 pair = value.s02 + value.s13;
+        int of_tile;
+        const int place = total + group_scan(pair.s0 + pair.s1, scratch, &of_tile);
+        const int4 sums_before = place + (int4)(0, value.s0, pair.s0, pair.s0 + value.s2);
+        if (count >= 4)
+            vstore4(sums_before, 0, out + mine);
+        else if (count > 0) {
+            out[mine] = sums_before.s0;
+            if (count > 1)
+                out[mine + 1] = sums_before.s1;
+            if (count > 2)
+                out[mine + 2] = sums_before.s2;
+        }
+        total += of_tile;
+    }
+    if (end == n && t == 0 && get_group_id(0) == get_num_groups(0) - 1)
         out[n] = total;
-}
-
-/* The same in one pass, by one work-item. */
-kernel void scan_few(const int size, global const int *values, const int first, global int *out, const int n)
-{
-    WORK_ITEM(only);
-    (void)only;
-    int total = 0;
-    for (int i = 0; i < n; ++i) {
-        const int value = values[first + i];
-        out[i] = total;
-        total += value;
-    }
-    out[n] = total;
 }
 
 /* Sum, sum of magnitudes, minimum and maximum of an array. Sums are compensated (Neumaier, with Knuth's exact
@@ -74,6 +104,29 @@ inline void merge_summary(summary_t *a, summary_t b)
     a->least = fmin(a->least, b.least);
     a->largest = fmax(a->largest, b.largest);
 }
+
+/* The summary of all work-items of a group, for the first of them: a tree. `shares` has GROUP_SIZE entries. */
+inline void merge_group(summary_t *mine, local summary_t *shares)
+{
+#if GROUP_SIZE > 1
+    const int me = get_local_id(0);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    shares[me] = *mine;
+    for (int half_ = GROUP_SIZE / 2; half_ > 0; half_ /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (me < half_) {
+            merge_summary(mine, shares[me + half_]);
+            shares[me] = *mine;
+        }
+    }
+#endif
+}
+
+#if GROUP_SIZE > 1
+#define GROUP_SUMMARIES(name) local summary_t name[GROUP_SIZE]
+#else
+#define GROUP_SUMMARIES(name) local summary_t *const name = 0
+#endif
 
 inline void add_value(summary_t *a, REAL value)
 {
@@ -121,9 +174,7 @@ kernel void summarize_blocks(global const REAL *a0, global const REAL *a1, globa
                              const int count, const int n, const int8 slots, global summary_t *partials)
 {
     const int slot_of[8] = {slots.s0, slots.s1, slots.s2, slots.s3, slots.s4, slots.s5, slots.s6, slots.s7};
-#if GROUP_SIZE > 1
-    local summary_t shares[GROUP_SIZE];
-#endif
+    GROUP_SUMMARIES(shares);
     for (int a = 0; a < count; ++a) {
         global const REAL *values =
             a < 4 ? (a < 2 ? (a < 1 ? a0 : a1) : (a < 3 ? a2 : a3)) : (a < 6 ? (a < 5 ? a4 : a5) : (a < 7 ? a6 : a7));
@@ -131,41 +182,39 @@ kernel void summarize_blocks(global const REAL *a0, global const REAL *a1, globa
         summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
 #if GROUP_SIZE == 1
         add_run(&mine, values, block_begin(n), block_end(n));
-        *out = mine;
 #else
-        const int t = get_local_id(0);
         for (BLOCK_LOOP(i, n))
             add_value(&mine, values[i]);
-        barrier(CLK_LOCAL_MEM_FENCE);
-        shares[t] = mine;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (t == 0) {
-            for (int s = 1; s < GROUP_SIZE; ++s)
-                merge_summary(&mine, shares[s]);
-            *out = mine;
-        }
 #endif
+        merge_group(&mine, shares);
+        if (get_local_id(0) == 0)
+            *out = mine;
     }
 }
 
-/* One work-item per slot. If bit `slot` of `which` is set, out[4 slot ...] = sum, sum of magnitudes, minimum, maximum.
+/* One work-group per slot. If bit `slot` of `which` is set, out[4 slot ...] = sum, sum of magnitudes, minimum, maximum.
    If `noted`, the first number of `note` follows the last slot: the host reads all in one transfer. */
-kernel void combine_blocks(const int size, global const summary_t *partials, const int groups, const int which,
-                           const int noted, global const int *note, global REAL *out, global int *behind)
+kernel void combine_blocks(global const summary_t *partials, const int groups, const int which, const int noted,
+                           global const int *note, global REAL *out, global int *behind)
 {
-    WORK_ITEM(slot);
-    if (noted && slot == 0)
-        behind[4 * size * (int)(sizeof(REAL) / sizeof(int))] = note[0];
-    if (!(which >> slot & 1))
-        return;
-    summary_t all = partials[groups * slot];
-    for (int g = 1; g < groups; ++g)
+    GROUP_SUMMARIES(shares);
+    const int slot = get_group_id(0), t = get_local_id(0), size = get_num_groups(0);
+    const int end = which >> slot & 1 ? groups : 0;
+    summary_t all = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
+    if (t < end)
+        all = partials[groups * slot + t];
+    for (int g = t + GROUP_SIZE; g < end; g += GROUP_SIZE)
         merge_summary(&all, partials[groups * slot + g]);
-    global REAL *put = out + 4 * slot;
-    put[0] = all.sum + all.sum_low;
-    put[1] = all.magnitude + all.magnitude_low;
-    put[2] = all.least;
-    put[3] = all.largest;
+    merge_group(&all, shares);
+    if (t == 0 && end > 0) {
+        global REAL *put = out + 4 * slot;
+        put[0] = all.sum + all.sum_low;
+        put[1] = all.magnitude + all.magnitude_low;
+        put[2] = all.least;
+        put[3] = all.largest;
+    }
+    if (noted && t == 0 && slot == 0)
+        behind[4 * size * (int)(sizeof(REAL) / sizeof(int))] = note[0];
 }
 
 /* Row p of `out` is row items[p] of `rows`; a row has `words` 32-bit words of any type. */

@@ -12,7 +12,6 @@ from ..geometry.polygon import Polygon
 from ..opencl import memory_limits
 from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
-from ..opencl.primitives import scan_width
 from ..solvers.poisson import max_jacobi_iterations
 from ..tessellation.periodic.halo import block_count
 from .forecast import IMAGE_REACH, expected_boundary_cells
@@ -86,7 +85,7 @@ def workspace_bytes(engine: Engine) -> float:
     unit = max(64, engine.queue.device.mem_base_addr_align // 8)
     periodic = engine.domain_kind.periodic
     halo = 3 * 4 * block_count(engine.dim) if periodic else 0
-    return ARRAYS * unit + SCANS * 4 * scan_width(engine) + halo
+    return ARRAYS * unit + SCANS * 4 * engine.groups + halo
 
 
 def estimate_memory(

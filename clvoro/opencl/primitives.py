@@ -1,7 +1,7 @@
 """Deterministic scans and reductions on the device.
 
-PyOpenCL's scan takes 3.4 ms for 10^6 integers on PoCL with two cores, and 1.7 s to compile. The loops of
-`primitives.cl` take 0.5 ms.
+Each is done by work-groups (see opencl/blocks.h): on CPUs groups of one work-item, on GPUs larger ones. PyOpenCL's scan
+takes 3.4 ms for 10^6 integers on PoCL with two cores, and 1.7 s to compile. The kernels of `primitives.cl` take 0.5 ms.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pyopencl as cl
 import pyopencl.array as cla
 from numpy.typing import DTypeLike
 
@@ -21,10 +20,8 @@ AT_ONCE = 8
 """Largest number of arrays that one launch summarizes."""
 
 
-def scan_width(engine: Engine) -> int:
-    """Return the number of chunks whose sums a scan keeps."""
-    cpu = bool(engine.queue.device.type & cl.device_type.CPU)
-    return engine.queue.device.max_compute_units * 4 if cpu else 4096
+FEW = 8192
+"""Up to this many numbers one work-group scans in the time of two launches."""
 
 
 class Scan:
@@ -32,25 +29,21 @@ class Scan:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        cpu = bool(engine.queue.device.type & cl.device_type.CPU)
-        self.width = scan_width(engine)
-        # On a CPU one work-item sums so many numbers in the time of two launches.
-        self._few = 8192 if cpu else 0
         self._kernels = engine.kernels("opencl/primitives")
-        self._sums = engine.empty(self.width, np.int32)
+        self._sums = engine.empty(engine.groups, np.int32)
 
     def exclusive(self, values: cla.Array, out: cla.Array, n: int, first: int = 0) -> None:
         """Write the n + 1 exclusive prefix sums of ``values[first : first + n]`` to ``out[: n + 1]``.
 
         `out` may be `values` if it has room and `first` is 0.
         """
-        k, engine = self._kernels, self.engine
-        begin, count = np.int32(first), np.int32(n)
-        if n <= self._few:
-            engine.run_each(k.scan_few, 1, values, begin, out, count, group=1)
+        k, engine, given = self._kernels, self.engine, (values, np.int32(first), np.int32(n))
+        if n <= FEW:
+            size = engine.group_size
+            engine.run(k.scan_blocks, size, *given, self._sums, out, group=size)
             return
-        engine.run_each(k.chunk_sums, self.width, values, begin, self._sums, count, group=1)
-        engine.run_each(k.scan_chunks, self.width, values, begin, self._sums, out, count, group=1)
+        engine.run_blocks(k.sum_scan_blocks, *given, self._sums)
+        engine.run_blocks(k.scan_blocks, *given, self._sums, out)
 
 
 @dataclass(frozen=True)
@@ -119,10 +112,11 @@ class Summaries:
 
     def _combine(self, note: cla.Array | None) -> None:
         """Combine the partial summaries, and write the first number of `note` after them."""
-        self.engine.run_each(
-            self._kernels.combine_blocks, len(self.slots), self._partials, np.int32(self.engine.groups),
+        size = self.engine.group_size
+        self.engine.run(
+            self._kernels.combine_blocks, len(self.slots) * size, self._partials, np.int32(self.engine.groups),
             np.int32(self._pending), np.int32(note is not None), self._record if note is None else note,
-            self._values, self._record, group=1,
+            self._values, self._record, group=size,
         )  # fmt: skip
         self._pending = 0
 

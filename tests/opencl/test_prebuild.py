@@ -63,7 +63,10 @@ def test_record_has_the_kernels_of_a_run(engine, kind):
 def test_workers_build_recorded_kernels_once(engine, tmp_path):
     record = {
         "programs": [["opencl/primitives", {}], ["adaptation/motion", {}]],
-        "launches": [[0, "gather_rows", 64, [4, 0, 0, 4, 0]], [0, "scan_few", 1, [4, 0, 4, 0, 4]]],
+        "launches": [
+            [0, "gather_rows", 64, [4, 0, 0, 4, 0]],
+            [0, "scan_blocks", 1, [0, 4, 4, 0, 0]],
+        ],
     }
     env = {
         **os.environ,
@@ -83,7 +86,7 @@ def test_workers_build_recorded_kernels_once(engine, tmp_path):
     workers = min(len(os.sched_getaffinity(0)) - 1, prebuild.MOST_WORKERS)
     assert len(codes) == workers
     built = {path.stem for path in tmp_path.rglob("*.so")}
-    assert built >= ({"gather_rows", "scan_few"} if workers else set())
+    assert built >= ({"gather_rows", "scan_blocks"} if workers else set())
 
 
 def test_workers_share_whole_programs_last_ones_first():
@@ -133,7 +136,7 @@ def test_callback_replaces_the_line(engine, monkeypatch):
     told = []
     with noticed_builds(engine, lambda built, total: told.append((built, total))):
         kernels = engine.kernels("opencl/primitives")
-        _ = kernels.gather_rows, kernels.gather_rows, kernels.scan_few, kernels.combine_blocks
+        _ = kernels.gather_rows, kernels.gather_rows, kernels.scan_blocks, kernels.combine_blocks
     _ = kernels.summarize_blocks
     assert told == [(1, 2), (2, 2), (2, 2)]
     assert sys.stderr.getvalue() == ""

@@ -19,12 +19,12 @@ def engine(ctx, request, group_size):
     return patch.make_engine(ctx, request.param, group_size=group_size)
 
 
-@pytest.fixture(scope="module")
-def scan(ctx):
-    return Scan(patch.make_engine(ctx))
+@pytest.fixture(scope="module", params=[1, 32, 64, 128, 256])
+def scan(ctx, request):
+    return Scan(patch.make_engine(ctx, group_size=request.param))
 
 
-@pytest.mark.parametrize("n", [0, 1, 2, 7, 8, 9, 1000, 8192, 8193, 100003])
+@pytest.mark.parametrize("n", [0, 1, 2, 7, 8, 9, 1000, 8192, 8193, 8200, 100003])
 @pytest.mark.parametrize("first", [0, 5])
 def test_scan(scan, n, first):
     values = np.random.default_rng(n + 31).integers(-50, 90, n + first + 3).astype(np.int32)
@@ -36,7 +36,7 @@ def test_scan(scan, n, first):
     assert np.array_equal(device.get(), values)
 
 
-@pytest.mark.parametrize("n", [1, 3, 4096, 50001])
+@pytest.mark.parametrize("n", [1, 3, 1025, 4096, 50001])
 def test_scan_in_place(scan, n):
     values = np.random.default_rng(n).integers(0, 5, n + 1).astype(np.int32)
     device = scan.engine.upload(values, np.int32)

@@ -208,16 +208,16 @@ def test_released_stages_leave_no_memory(engine, monkeypatch):
 
 def test_kernels_are_not_shared_until_released(engine):
     first, second = engine.kernels("opencl/primitives"), engine.kernels("opencl/primitives")
-    held = {kernels.scan_few.int_ptr for kernels in (first, second)}
-    assert first.scan_few is first.scan_few
+    held = {kernels.scan_blocks.int_ptr for kernels in (first, second)}
+    assert first.scan_blocks is first.scan_blocks
     assert len(held) == 2
     engine.pool.release()
     third, fourth = (
         engine.kernels("opencl/primitives"),
         engine.single().kernels("opencl/primitives"),
     )
-    assert third.scan_few.int_ptr in held
-    assert fourth.scan_few.int_ptr not in held  # another program
+    assert third.scan_blocks.int_ptr in held
+    assert fourth.scan_blocks.int_ptr not in held  # another program
     with pytest.raises(AttributeError, match="has no kernel nothing"):
         _ = third.nothing
 
