@@ -2,7 +2,8 @@
 #include "opencl/blocks.h"
 
 /* Exclusive prefix sums in two passes: sums of the groups' blocks, then each block tile by tile. With one group the
-   second pass is enough. A work-item takes four numbers of a tile. Kernels must not return before a barrier (see reduce.h). */
+   second pass is enough. A work-item takes four numbers of a tile. Kernels must not return before a barrier (see
+   reduce.h). */
 
 #if GROUP_SIZE > 1
 #define GROUP_INTS(name) local int name[GROUP_SIZE]

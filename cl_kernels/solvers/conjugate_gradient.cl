@@ -212,18 +212,21 @@ inline Step step_length(int k, int n, int center, global const REAL *partial, gl
     return s;
 }
 
-/* Record |r| before iteration k, for the host, and whether k is needed. One work-group. `update_direction` of iteration
-   k overwrites the row. */
+/* Record |r| before iteration k, for the host, and whether k is needed. The next row gets state[2] and |b|^2. One
+   work-group. Iteration k overwrites both rows. */
 kernel void record_norm(int k, global const REAL *partial, global const REAL *state, global REAL *record,
                         const int groups)
 {
     local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
     const REAL norm = total_of_row(partial, NORM_R(k), groups, scratch);
+    const REAL norm_b = total_of_row(partial, NORM_B, groups, scratch);
     if (get_local_id(0) == 0) {
         now[RECORD_NORM] = norm;
         now[RECORD_RUNNING] = !(norm <= state[0]);
         now[RECORD_CURVATURE] = 1;
+        now[4] = state[2];
+        now[5] = norm_b;
     }
 }
 

@@ -107,7 +107,8 @@ class Limits:
         Relative residual in the 2-norm.
     max_iterations : int
     lookahead : int
-        Iterations to enqueue at most before the host reads the record. The first read is after that many, or 8.
+        Iterations to enqueue at most before the host reads the record. The first read is after as many as the last
+        solve took, but at least 8, if that is less.
     verify : bool
         Evaluate the true residual at the end. Otherwise that of the recurrence is trusted.
     """
@@ -123,7 +124,8 @@ class ConjugateGradient:
 
     All vectors and scalars stay on the device. The host enqueues as many iterations as it expects from the
     convergence so far, and then reads one row of scalars per iteration. The iterate is frozen on the device when the
-    tolerance is met, so the result does not depend on when the host reads.
+    tolerance is met, so the result does not depend on when the host reads. From zero the first read also fetches the
+    norm of the right side.
 
     Parameters
     ----------
@@ -132,6 +134,7 @@ class ConjugateGradient:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
+        self._ahead = 8
         self._kernels: dict[np.dtype, Kernels] = {}
         self.partial = engine.zeros(_ROWS * engine.groups)
         """Partial sums, one row per quantity."""
@@ -189,7 +192,7 @@ class ConjugateGradient:
         store = self.engine.real if store is None else np.dtype(store)
         if limits.max_iterations > self._record_capacity:
             self._record_capacity = limits.max_iterations
-            self.record = self.engine.zeros(4 * (limits.max_iterations + 1))
+            self.record = self.engine.zeros(4 * (limits.max_iterations + 2))
             self._group_state = self.engine.zeros(_STATE + 4 * (limits.max_iterations + 1))
         if operator.rows is not None and isinstance(precondition, cla.Array):
             if len(rhs) <= self._one_group_limit:
@@ -198,17 +201,27 @@ class ConjugateGradient:
                 )
         system = _System(self, operator, rhs, x, precondition, limits.tolerance, store)
         iterations, history, reason = 0, [], "max_iterations"
-        residual = system.measure(from_zero)
-        if residual < 0:
-            x.fill(0)
-            return Solution.zero()
+        # From zero the relative residual is 1; the host reads the norm of b with the first iterations.
+        begun = from_zero and 0 < limits.max_iterations and limits.tolerance < 1
+        if begun:
+            system.start(from_zero)
+            residual = 1.0
+        else:
+            residual = system.measure(from_zero)
         while True:
+            if residual < 0:
+                x.fill(0)
+                return Solution.zero()
             if residual <= limits.tolerance:
                 reason = "converged"
                 break
             if iterations >= limits.max_iterations:
                 break
-            iterations += self._iterate(system, iterations, limits, residual, history)
+            done = self._iterate(system, iterations, limits, residual, history, unknown=begun)
+            if done is None:
+                residual = -1.0
+                continue
+            iterations, begun = iterations + done, False
             if not limits.verify and self._final <= limits.tolerance:
                 residual, reason = self._final, "converged"
                 break
@@ -250,7 +263,7 @@ class ConjugateGradient:
                 real(tolerance), real(min(stagnated, float(np.finfo(real).max))), *given, groups=1,
             )()  # fmt: skip
             host = self._group_state[: _STATE + 4 * min(left, _FIRST_READ)].get()
-            residual = self.relative_residual(*host[2:6])
+            residual = self.relative_residual(host[2], *host[4:6])
             if residual < 0:
                 x.fill(0)
                 return Solution.zero()
@@ -270,8 +283,8 @@ class ConjugateGradient:
             from_zero, stagnated = False, max(tolerance, 0.5 * residual)
         return Solution(done, residual, np.array([*history, residual]), converged, reason)
 
-    def relative_residual(self, removed: float, _: float, norm_b: float, norm_r: float) -> float:
-        """Return the relative residual from words 2 to 5 of the device's state; negative if b is zero."""
+    def relative_residual(self, removed: float, norm_b: float, norm_r: float) -> float:
+        """Return the relative residual; negative if b is zero but for the part of |b|^2 that centering has removed."""
         if not (math.isfinite(norm_b) and math.isfinite(norm_r)):
             raise SolverError(
                 "the linear solve got a right side, start or operator that is not finite: |b|^2 = "
@@ -284,23 +297,36 @@ class ConjugateGradient:
         return math.sqrt(norm_r / norm_b)
 
     def _iterate(
-        self, system: _System, begun: int, limits: Limits, residual: float, history: list[float]
-    ) -> int:
+        self,
+        system: _System,
+        begun: int,
+        limits: Limits,
+        residual: float,
+        history: list[float],
+        unknown: bool,
+    ) -> int | None:
         """Iterate from the present residual until a stop, or up to `max_iterations`; return the number of iterations.
 
-        `begun` iterations have been done before.
+        `begun` iterations have been done before. With `unknown` the norm of the right side has not been read; None if
+        it is zero.
         """
         most, tolerance = limits.max_iterations - begun, limits.tolerance
-        done, ahead, first = 0, min(8, limits.lookahead), residual
+        done, ahead, first = 0, min(self._ahead, limits.lookahead), residual
         system.begin()
         while done < most:
             end = min(done + ahead, most)
             for k in range(done, end):
                 system.iterate(k)
             system.record_norm(end)
-            rows = self.record[4 * done : 4 * (end + 1)].get()
-            stop = self._read_record(rows, done, tolerance, history)
+            *rows, (removed, norm_b, *_) = (
+                self.record[4 * done : 4 * (end + 2)].get().reshape(-1, 4)
+            )
+            if unknown and self.relative_residual(removed, norm_b, rows[0][RECORD_NORM]) < 0:
+                return None
+            unknown = False
+            stop = self._read_record(np.array(rows), done, tolerance, history)
             if stop is not None:
+                self._ahead = max(stop + 1, 8)
                 return stop
             residual = history.pop()  # the next iteration records it again
             done = end
@@ -379,7 +405,17 @@ class _System:
             )  # fmt: skip
 
     def measure(self, from_zero: bool = False) -> float:
-        """Set r to the true residual, of x or of zero, and return its relative norm; negative if b is zero."""
+        """Do the same as `start`, and return the relative norm of r; negative if b is zero."""
+        self.start(from_zero)
+        partial, state, _ = self._tail
+        self._launch_one_group(
+            self._kernels.read_norms, partial, state, np.int32(self._engine.groups)
+        )
+        _, _, removed, _, *norms = state.get()
+        return self._solver.relative_residual(removed, *norms)
+
+    def start(self, from_zero: bool) -> None:
+        """Set r to the true residual, of x or of zero."""
         if not from_zero:
             self._operator.apply(self._x, self._q)
         k, anew = self._kernels, np.int32(from_zero)
@@ -389,8 +425,6 @@ class _System:
             k.start_residual, self._size, anew, self._center, self._rhs, self._q, self._x, self._r, self._p, partial,
             state,
         )  # fmt: skip
-        self._launch_one_group(k.read_norms, partial, state, np.int32(self._engine.groups))
-        return self._solver.relative_residual(*state.get()[2:])
 
     def begin(self) -> None:
         """Precondition the first residual."""
