@@ -202,6 +202,11 @@ def spread(values: Sequence[float], form: str) -> str:
     return shown[1] if shown[0] == shown[2] else f"{shown[1]} ({shown[0]} .. {shown[2]})"
 
 
+def shown(figure: str, form: str, scale: float = 1) -> Callable[[dict[str, Any]], str]:
+    """Return the text of a column: a figure of the record times `scale`, or nothing if it has none."""
+    return lambda r: format(r[figure] * scale, form) if r.get(figure) is not None else ""
+
+
 def markdown(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Return a Markdown table; bars in the text are escaped."""
 

@@ -22,7 +22,6 @@ import io
 import json
 import statistics
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,7 @@ from _common import (
     heading,
     make_adapter,
     parser,
+    shown,
     test_field,
     work,
 )
@@ -246,10 +246,6 @@ def draw_defects(results: dict[str, clvoro.Result], path: Path) -> None:
         image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE).save(
             path, optimize=True, dpi=(300, 300)
         )
-
-
-def shown(figure: str, form: str) -> Callable[[dict[str, Any]], str]:
-    return lambda r: format(r[figure], form) if r.get(figure) is not None else ""
 
 
 COLUMNS = {

@@ -32,7 +32,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import FIRST_SEED, Report, counts, heading, make_adapter, names, parser
+from _common import FIRST_SEED, Report, counts, heading, make_adapter, names, parser, shown
 from scipy.spatial import Delaunay
 
 import clvoro
@@ -96,10 +96,6 @@ def adapted_size(
     values = u(np.stack(np.meshgrid(along, along), axis=-1))
     size = sizing.hessian_size(values, BOX.lower, BOX.upper, n_cells=n, p=p, h_max=h_max)
     return sizing.Graded(size, growth=growth)
-
-
-def shown(figure: str, form: str) -> Callable[[dict[str, Any]], str]:
-    return lambda r: format(r[figure], form) if r.get(figure) is not None else ""
 
 
 COLUMNS = {

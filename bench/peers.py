@@ -32,7 +32,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 # A peer that is serial stays so: BLAS brings no threads of its own.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -52,6 +51,7 @@ from _common import (
     names,
     off_walls,
     parser,
+    shown,
     test_field,
 )
 from diagram import BOX as SQUARE
@@ -234,10 +234,6 @@ def judge(adapter: clvoro.Adapter, points: np.ndarray, factor: float) -> dict[st
     length = np.sqrt(diagram.volumes)
     common = float(np.exp(np.log(length / h)[off_walls(diagram)].mean()))
     return {**figures(diagram, h * common, cell_quality(diagram)), "factor": common}
-
-
-def shown(figure: str, form: str, scale: float = 1) -> Callable[[dict[str, Any]], str]:
-    return lambda r: format(r[figure] * scale, form) if figure in r else ""
 
 
 DIAGRAM_COLUMNS = {

@@ -19,7 +19,6 @@ import argparse
 import statistics
 import sys
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -34,6 +33,7 @@ from _common import (
     markdown,
     names,
     parser,
+    shown,
     test_field,
     work,
 )
@@ -99,10 +99,6 @@ def measure(
             },
         }
     return record
-
-
-def shown(figure: str, form: str, scale: float = 1) -> Callable[[dict[str, Any]], str]:
-    return lambda r: format(r[figure] * scale, form) if figure in r else ""
 
 
 COLUMNS = {

@@ -23,7 +23,9 @@ from _common import CUBE, FIRST_SEED, Report, heading, make_adapter, names, pars
 
 import clvoro
 from clvoro import sizing
-from clvoro.finite_volumes.collapse import collapse_short, find_short
+from clvoro.finite_volumes.collapse import SHORT_EDGE, SMALL_FACE, collapse_short
+from clvoro.finite_volumes.geometry import smaller_size
+from clvoro.finite_volumes.solver_mesh import SolverMesh
 
 ROWS: dict[str, dict[str, Any]] = {
     "fast": {"effort": "fast"}, "default": {}, "best": {"effort": "best"}, "exact": {"method": "exact"},
@@ -47,19 +49,29 @@ def setup(name: str) -> tuple[clvoro.Box, Any]:
 FIELDS = ("S1", "S2", "S3", "spheres", "ridge", "periodic")
 
 
+def count_short(mesh: SolverMesh, sizes: np.ndarray) -> tuple[int, int]:
+    """Return the numbers of short edges and of small faces; at seams each image counts."""
+    h = smaller_size(mesh.owner, mesh.neighbor, sizes)
+    m = mesh.measures
+    limit = np.zeros(len(m.edges))  # of an edge: that of its largest face
+    np.maximum.at(limit, m.edge_of_corner, np.repeat(SHORT_EDGE * h, np.diff(m.cells.starts)))
+    areas = np.linalg.norm(m.geometry.areas, axis=1)
+    return int((m.edge_spans < limit).sum()), int((areas < SMALL_FACE * h**2).sum())
+
+
 def measure(diagram: clvoro.Diagram) -> dict[str, Any]:
     """Collapse the short edges of a diagram; return the figures."""
     before, h = diagram.solver_mesh(collapse=False), np.cbrt(diagram.volumes)
     begin = time.perf_counter()
     after = collapse_short(before, h, diagram.centroids)
     seconds = time.perf_counter() - begin
-    was, left = find_short(before, h), find_short(after, h)
+    (edges, faces), left = count_short(before, h), count_short(after, h)
     volumes = after.measures.geometry.volumes
-    edges = len(before.corners) / 3  # nearly all have three faces
+    all_edges = len(before.corners) / 3  # nearly all have three faces
     return {
-        "cells": len(diagram), "seconds": seconds, "edges": len(was.edges) / edges,
-        "faces": len(was.faces) / len(before.owner),
-        "edges_left": len(left.edges), "faces_left": len(left.faces),
+        "cells": len(diagram), "seconds": seconds, "edges": edges / all_edges,
+        "faces": faces / len(before.owner),
+        "edges_left": left[0], "faces_left": left[1],
         "flatness": float(after.measures.flatness.min()),
         "change": float(np.abs(volumes / diagram.volumes - 1).max()),
         "total": float(abs(volumes.sum() / diagram.domain.measure - 1)),

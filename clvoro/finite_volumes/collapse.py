@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
 from ..mesh.connectivity import following, take_rows
 from .defects import Limits
-from .geometry import face_geometry, smaller_size, sum_rows
+from .geometry import smaller_size, sum_rows
 from .merging import Cells, Merges
 from .offsets import pack, unpack
 from .solver_mesh import SolverMesh
@@ -31,37 +29,6 @@ LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, s
 """Tried in turn, the later ones where short edges or small faces are left."""
 _CHUNK = 1 << 16
 """Faces that are scanned at a time."""
-
-
-@dataclass(frozen=True)
-class Shortness:
-    """Short edges and small faces of a mesh: pairs of points (e, 2), and indices of faces (f,)."""
-
-    edges: np.ndarray
-    faces: np.ndarray
-
-
-def find_short(mesh: SolverMesh, sizes: np.ndarray) -> Shortness:
-    """Return the edges shorter than 0.02 h and the faces smaller than 0.001 h^2.
-
-    h is that of the smaller cell of a face; for an edge any face with that edge counts. At seams the images of an edge
-    or face count once each.
-
-    Parameters
-    ----------
-    mesh : SolverMesh
-        In 3D.
-    sizes : (n,) float
-        h of each cell, in the domain's unit of length.
-    """
-    face = np.repeat(np.arange(len(mesh.owner)), np.diff(mesh.starts))
-    h = smaller_size(mesh.owner, mesh.neighbor, sizes)
-    x = mesh.points[mesh.corners]
-    after = following(mesh.starts)
-    short = np.linalg.norm(x[after] - x, axis=1) < SHORT_EDGE * h[face]
-    ends = np.sort(np.stack([mesh.corners, mesh.corners[after]], axis=1)[short], axis=1)
-    areas = np.linalg.norm(face_geometry(mesh.points, mesh.starts, mesh.corners)[1], axis=1)
-    return Shortness(np.unique(ends, axis=0), np.flatnonzero(areas < SMALL_FACE * h**2))
 
 
 def collapse_short(
@@ -152,18 +119,7 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
         corners = np.empty(len(order), np.int64)
         corners[order] = np.cumsum(new) - 1
         points = cells.positions(vertices[order][new], codes[order][new])
-    faces = np.full(len(mesh.owner) + 1, -1)
-    faces[left] = np.arange(len(left))
-    return mesh.changed(
-        points=points,
-        starts=starts,
-        corners=corners,
-        owner=mesh.owner[left],
-        neighbor=mesh.neighbor[left],
-        twin=faces[mesh.twin[left]],
-        shift=mesh.shift[left],
-        half_face=mesh.half_face[left],
-    )
+    return mesh.take_faces(left, points=points, starts=starts, corners=corners)
 
 
 def _flagged(cells: Cells, faces: np.ndarray) -> np.ndarray:

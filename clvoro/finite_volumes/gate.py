@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from ..arguments import check_choice
-from ..mesh.check.findings import CheckError
+from ..mesh.check.findings import Verdict
 from ..mesh.diagram import Diagram
 from .measures import SolverMeasures
 from .prisms import simple_loops
@@ -68,7 +68,7 @@ class Criterion:
 
 
 @dataclass(frozen=True)
-class SolverReport:
+class SolverReport(Verdict):
     """The verdict on a mesh; it is true if the solver accepts it.
 
     Attributes
@@ -91,9 +91,6 @@ class SolverReport:
         """Whether the solver accepts the mesh."""
         return all(c.ok for c in self.criteria if c.demanded)
 
-    def __bool__(self) -> bool:
-        return self.ok
-
     def __getitem__(self, name: str) -> Criterion:
         """Return a criterion by its name."""
         return next(c for c in self.criteria if c.name == name)
@@ -107,20 +104,6 @@ class SolverReport:
         head = f"{self.solver}: {verdict}; {self.cells} cells, {self.faces} faces{changed}"
         columns = f"{'criterion':28}{'worst':>12}  {'limit':<12}{'verdict':<12}where"
         return "\n  ".join([head, columns, *map(str, self.criteria)])
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain values."""
-        return {"ok": self.ok, **asdict(self)}
-
-    def demand(self) -> None:
-        """Raise an error if the solver rejects the mesh.
-
-        Raises
-        ------
-        CheckError
-        """
-        if not self.ok:
-            raise CheckError(str(self))
 
 
 def check_for_solver(

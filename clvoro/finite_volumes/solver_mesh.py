@@ -109,25 +109,25 @@ class SolverMesh(Sealed):
         change = total / measure - 1
         return change if abs(change) > 1e-12 else 0.0
 
-    def changed(self, **arrays: Any) -> SolverMesh:
-        """Return a mesh with some other arrays; points without a face are dropped."""
-        return compact(replace(self, **arrays))
+    def take_faces(self, kept: np.ndarray, **arrays: Any) -> SolverMesh:
+        """Return the mesh with the faces `kept` (ascending indices or a mask) only, and with some other `arrays`.
 
-    def take_faces(self, kept: np.ndarray) -> SolverMesh:
-        """Return the mesh with the faces `kept` (ascending indices or a mask) only."""
+        Points without a face are dropped.
+        """
         rows = np.flatnonzero(kept) if kept.dtype == bool else kept
         place = np.full(len(self.owner) + 1, -1)
         place[rows] = np.arange(len(rows))
         starts, corners = take_rows(self.starts, self.corners, rows)
-        return self.changed(
-            starts=starts,
-            corners=corners,
-            owner=self.owner[rows],
-            neighbor=self.neighbor[rows],
-            twin=place[self.twin[rows]],
-            shift=self.shift[rows],
-            half_face=self.half_face[rows],
-        )
+        taken = {
+            "starts": starts,
+            "corners": corners,
+            "owner": self.owner[rows],
+            "neighbor": self.neighbor[rows],
+            "twin": place[self.twin[rows]],
+            "shift": self.shift[rows],
+            "half_face": self.half_face[rows],
+        }
+        return compact(replace(self, **{**taken, **arrays}))
 
     @cached_property
     def measures(self) -> SolverMeasures:

@@ -169,7 +169,10 @@ class _Wall:
 
     def unstretch(self, at: np.ndarray) -> np.ndarray:
         """Return the lengths along the chain, (n,), of places `at` (n,) in stretched lengths."""
-        return at if self.grading is None else np.interp(at, *self.grading[::-1])
+        if self.grading is None:
+            return at
+        place, stretched = self.grading
+        return np.interp(at, stretched, place)
 
 
 def _largest_widths(

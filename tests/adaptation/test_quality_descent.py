@@ -35,16 +35,13 @@ def energy(points, omega):
     return float((omega * (2 * np.log(perimeter) - np.log(area))).sum())
 
 
-def descend(
-    engine, points, h, bad_cell_weight, rate=0.1, max_displacement=0.2, quality=None, stiffness=0.0
-):
-    t = patch.tessellate(engine, points)
-    quality = engine.upload(qualities(points)[:, 0] if quality is None else quality)
-    out = engine.empty((len(points), 2))
+def descend_from(engine, t, h, bad_cell_weight, rate, max_displacement, quality, stiffness=0.0):
+    """Displacements from the diagram `t`."""
+    out = engine.empty((t.n, 2))
     QualityDescent(engine).descend(
         t,
         engine.upload(h),
-        quality,
+        engine.upload(quality),
         out,
         bad_cell_weight=bad_cell_weight,
         rate=rate,
@@ -52,6 +49,15 @@ def descend(
         edge_stiffness=stiffness,
     )
     return out.get()
+
+
+def descend(
+    engine, points, h, bad_cell_weight, rate=0.1, max_displacement=0.2, quality=None, stiffness=0.0
+):
+    """Displacements from points, with the quality of their cells by default."""
+    quality = qualities(points)[:, 0] if quality is None else quality
+    t = patch.tessellate(engine, points)
+    return descend_from(engine, t, h, bad_cell_weight, rate, max_displacement, quality, stiffness)
 
 
 def gradient_of(energy, points, some=None, step=1e-5):
@@ -97,17 +103,7 @@ def test_gradient_in_a_polygon(ctx):
     placed = domain.place(points, real)
     t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
     q, h = rng.uniform(0.5, 1, n), rng.uniform(0.05, 0.2, n)
-    out = engine.empty((n, 2))
-    QualityDescent(engine).descend(
-        t,
-        engine.upload(h),
-        engine.upload(q),
-        out,
-        bad_cell_weight=5.0,
-        rate=0.3,
-        max_displacement=1e9,
-        edge_stiffness=0,
-    )
+    u = descend_from(engine, t, h, 5.0, rate=0.3, max_displacement=1e9, quality=q)
     # E is the same in any unit.
     unit = np.linalg.norm(points[1] - points[0]) / np.linalg.norm(placed[1] - placed[0])
     omega = 1 - 5 * np.log(q)
@@ -121,7 +117,7 @@ def test_gradient_in_a_polygon(ctx):
 
     expected = -0.3 * h[:, None] ** 2 * gradient_of(energy, points) * unit
     # As above.
-    assert out.get() == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+    assert u == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("periodic", [True, (False, True)])
@@ -136,17 +132,8 @@ def test_gradient_across_seams(ctx, periodic):
     assert (points[some] < 0.1).any(axis=0).all()
     engine = patch.make_engine(ctx, box=box)
     placed = engine.upload(box.place(points, engine.real))
-    t, out = Tessellator(Stages(engine), box).tessellate(placed, n), engine.empty((n, 2))
-    QualityDescent(engine).descend(
-        t,
-        engine.upload(h),
-        engine.upload(q),
-        out,
-        bad_cell_weight=5.0,
-        rate=0.3,
-        max_displacement=1e9,
-        edge_stiffness=0,
-    )
+    t = Tessellator(Stages(engine), box).tessellate(placed, n)
+    u = descend_from(engine, t, h, 5.0, rate=0.3, max_displacement=1e9, quality=q)
     omega = 1 - 5 * np.log(q)
 
     def energy(points):
@@ -157,7 +144,7 @@ def test_gradient_across_seams(ctx, periodic):
     expected = -0.3 * h[:, None] ** 2 * gradient_of(energy, points, some)
     # As above; what is known of faces while generators move is in single precision.
     scale = np.abs(expected).max()
-    assert out.get()[some] == pytest.approx(expected[some], rel=1e-5, abs=2e-6 * scale)
+    assert u[some] == pytest.approx(expected[some], rel=1e-5, abs=2e-6 * scale)
 
 
 DOMAINS = {

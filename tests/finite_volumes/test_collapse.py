@@ -7,7 +7,7 @@ import pytest
 
 import clvoro
 from clvoro.finite_volumes import collapse
-from clvoro.finite_volumes.collapse import collapse_short, find_short
+from clvoro.finite_volumes.collapse import collapse_short
 from clvoro.finite_volumes.defects import Limits
 from clvoro.finite_volumes.merging import Merges
 from clvoro.finite_volumes.offsets import pack, unpack
@@ -57,11 +57,12 @@ def meshes(request, ctx):
 
 
 def test_short_edges_and_small_faces_are_gone(meshes):
-    diagram, before, after = meshes
-    h = np.cbrt(diagram.volumes)
-    was, left = find_short(before, h), find_short(after, h)
-    assert len(left.edges) <= 0.03 * len(was.edges)
-    assert len(left.faces) <= 0.03 * len(was.faces)
+    """Cells with edges shorter than 0.02 h, and with faces smaller than 0.001 h^2."""
+    _, *both = meshes
+    edges = [np.count_nonzero(mesh.measures.shortest_edge < 0.02) for mesh in both]
+    faces = [np.count_nonzero(mesh.measures.smallest_face < 1e-3) for mesh in both]
+    assert edges[1] <= 0.03 * edges[0]
+    assert faces[1] <= 0.03 * faces[0]
 
 
 def test_skewed_faces_are_rarer(meshes):

@@ -42,8 +42,34 @@ class Finding:
         return f"{self.name}: {self.message}"
 
 
+class Verdict:
+    """What a dataclass that reports on a mesh has in common with others: it is true if the mesh is good."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the mesh is good."""
+        raise NotImplementedError
+
+    def __bool__(self) -> bool:
+        return self.ok
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as a dictionary, for example for JSON: its fields and ``"ok"``."""
+        return {"ok": self.ok, **asdict(self)}  # type: ignore[call-overload]
+
+    def demand(self) -> None:
+        """Raise an error with the report as its message if the mesh is not good.
+
+        Raises
+        ------
+        CheckError
+        """
+        if not self.ok:
+            raise CheckError(str(self))
+
+
 @dataclass(frozen=True)
-class Report:
+class Report(Verdict):
     """The result of a check; it is true if every property holds.
 
     Attributes
@@ -67,29 +93,12 @@ class Report:
         """Whether every property holds."""
         return not self.findings
 
-    def __bool__(self) -> bool:
-        return self.ok
-
     def __str__(self) -> str:
         head = f"{self.cells} cells, {self.faces} faces, {self.precision}"
         if self.ok:
             return f"{head}: {len(self.checked)} properties hold"
         return "\n".join([f"{head}: {len(self.findings)} of {len(self.checked)} properties do not hold",
                           *(f"  {finding}" for finding in self.findings)])  # fmt: skip
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain values."""
-        return {"ok": self.ok, **asdict(self)}
-
-    def demand(self) -> None:
-        """Raise an error if a property does not hold.
-
-        Raises
-        ------
-        CheckError
-        """
-        if self.findings:
-            raise CheckError(str(self))
 
 
 class CheckError(ClvoroError):
