@@ -8,7 +8,10 @@
    shapes[c]   direction of the wall that begins in c, interior angle, h, extent of the corner
    Group g has the corners group_starts[g] .. group_starts[g + 1]; only they may share generators.
 
-   CANDIDATE_REACH  largest distance over h of a generator from a corner that it may share */
+   In a tip, a convex corner or a narrow bay, the second and the third nearest generator have the same distance from it.
+
+   CANDIDATE_REACH  largest distance over h of a generator from a corner that it may share
+   WIDEST_TIP       angle of a tip above which its first generator may have several neighbors without help */
 #include "geometry/edges.h"
 
 #define PI R(3.14159265358979323846)
@@ -32,6 +35,8 @@
 #define NARROW R(1.3)
 #define WIDE R(2.5)
 #define SHAPE_WEIGHT R(0.3)
+/* Least angle over that of a tip between the two generators behind it. */
+#define APART R(0.4)
 
 inline REAL gap_between(REAL2 a, REAL2 b)
 {
@@ -265,6 +270,54 @@ inline bool may_share_both(const Corner *b, const Corner *c, int mask, const int
     return left < 2 && right < 2;
 }
 
+/* Whether the domain ends in a sharp convex corner here, or in a narrow bay. */
+inline bool is_tip(const Corner *corner)
+{
+    return corner->angle < PI;
+}
+
+/* Bits of the second and the third nearest generator, which lie side by side in a tip behind the first one; 0 if there
+   are fewer, or if the tip is wide and the first one has several neighbors without help. */
+inline int choose_behind(const Corner *tip, const int *cells, global const int *starts, global const int *neighbors)
+{
+    int order[3] = {-1, -1, -1};
+    for (int p = 0; p < tip->count; ++p)
+        for (int k = 0, q = p; k < 3; ++k)
+            if (order[k] < 0 || tip->distances[q] < tip->distances[order[k]]) {
+                const int next = order[k];
+                order[k] = q;
+                q = next;
+                if (q < 0)
+                    break;
+            }
+    if (order[2] < 0)
+        return 0;
+    if (tip->angle > R(WIDEST_TIP)) {
+        const int i = cells[tip->list[order[0]]];
+        int inner = 0;
+        for (int k = starts[i]; k < starts[i + 1]; ++k)
+            inner += neighbors[k] >= 0;
+        if (inner > 1)
+            return 0;
+    }
+    return 1 << order[1] | 1 << order[2];
+}
+
+/* Turns the two generators behind a tip apart, if they are one behind the other. */
+inline void turn_apart(Corner *tip, REAL2 *at)
+{
+    int pair[2], picked = 0;
+    for (int p = 0; p < tip->count; ++p)
+        if (shares(tip, p))
+            pair[picked++] = p;
+    const REAL width = tip->angles[pair[1]] - tip->angles[pair[0]];
+    const REAL turn = clamp((APART * tip->angle - width) / 2, R(0), MOST_TURN / 2);
+    for (int k = 0; k < 2; ++k) {
+        const int q = tip->list[pair[k]];
+        at[q] = turned(at[q], tip->x, k ? turn : -turn);
+    }
+}
+
 /* Bits of the generators that share corner c of a group: the nearest one and others, at the least cost; 0 for none.
    The corners before c have chosen. */
 inline int choose_shared(const Corner *group, int c, const int *cells, global const REAL2 *points)
@@ -298,6 +351,10 @@ inline int choose_shared(const Corner *group, int c, const int *cells, global co
    the last face, so that cells beside the walls are convex. */
 inline void turn_shared(Corner *corner, REAL2 *at)
 {
+    if (is_tip(corner)) {
+        turn_apart(corner, at);
+        return;
+    }
     const REAL angle = corner->angle, margin = fmin(MARGIN, (2 * PI - angle) / 4);
     REAL *angles = corner->angles;
     int first = -1, last = -1;
@@ -363,6 +420,8 @@ inline REAL equalize_distances(const Corner *corner, bool to_least, REAL2 *at)
 inline void move_others_away(const Corner *group, int corner_count, int c, REAL2 *at)
 {
     const Corner *corner = group + c;
+    if (is_tip(corner))
+        return;
     REAL r = 0;
     for (int p = 0; p < corner->count; ++p)
         if (shares(corner, p))
@@ -430,7 +489,8 @@ kernel void share_corners(const int size, global const int *starts, global const
             cells[count++] = cells[p];
     for (int c = 0; c < corner_count; ++c) {
         list_nearest(group + c, cells, count, points, DOMAIN);
-        group[c].mask = choose_shared(group, c, cells, points);
+        group[c].mask = is_tip(group + c) ? choose_behind(group + c, cells, starts, neighbors)
+                                          : choose_shared(group, c, cells, points);
     }
     /* First with mean distances. If that moves a generator outside or too close to another, with the least ones. */
     bool done = false;

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..geometry.polygon import Polygon
+from ..geometry.tips import WIDEST, find_tips
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 from .motion import Moving
@@ -92,23 +93,38 @@ def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) ->
         turned[a:b] = _turned(x[a:b], turns[a:b], SHARP_REACH * h[a:b])
         bend[a:b] = _bend(x[a:b], turned[a:b], REACH * h[a:b])
     sharp = np.flatnonzero((turned < -SHARP_TURN) & (turns < 0) & (bend > LEAST_TURN))
-    if free is not None and free is not domain and len(sharp):
-        edge = free.nearest_edge(x[sharp])[1]
-        sharp = sharp[np.hypot(*(edge - x[sharp]).T) < 1e-6 * float(domain.extent.max())]
+    sharp = sharp[_is_free(domain, free, x[sharp])]
     # The sharpest first: `_spaced` leaves out vertices that are too close to an earlier one.
     order = sharp[np.lexsort((sharp, turns[sharp].round(9), -bend[sharp].round(9)))]
     kept = np.sort(_spaced(x, bend, h, order))
     directions, angles, slack = _walls(domain, kept, h)
-    groups = _grouped(x[kept], h[kept])
+    tips, *shape = find_tips(domain, h, kept)
+    bare = _is_free(domain, free, x[tips])
+    tips, shape = tips[bare], [values[bare] for values in shape]
+    kept = np.concatenate([tips, kept])  # in each group the tips come first
+    directions, angles = (
+        np.concatenate(pair) for pair in zip(shape[:2], (directions, angles), strict=True)
+    )
+    slack = np.concatenate([np.zeros(len(tips)), slack])
+    size = np.concatenate([shape[2], h[kept[len(tips) :]]])
+    groups = _grouped(x[kept], size, len(tips))
     sizes = [len(g) for g in groups]
     order = np.concatenate([np.empty(0, int), *groups]).astype(int)
     starts = np.cumsum([0, *sizes]).astype(np.int32)
     vertices = kept[order]
-    other_starts, others = _others(x[vertices], h[vertices], starts)
+    other_starts, others = _others(x[vertices], size[order], starts)
     return CornerGroups(
-        vertices, starts, directions[order], angles[order], slack[order], h[vertices], other_starts, others,
+        vertices, starts, directions[order], angles[order], slack[order], size[order], other_starts, others,
         _wall_corners(domain, vertices, WALL_REACH * h),
     )  # fmt: skip
+
+
+def _is_free(domain: Polygon, free: Polygon | None, points: np.ndarray) -> np.ndarray:
+    """Return whether `points` (n, 2) on the boundary of the domain are on that of its part without layers, too."""
+    if free is None or free is domain or not len(points):
+        return np.ones(len(points), bool)
+    edge = free.nearest_edge(points)[1]
+    return np.hypot(*(edge - points).T) < 1e-6 * float(domain.extent.max())
 
 
 def _lengths(ring: np.ndarray) -> np.ndarray:
@@ -198,14 +214,16 @@ def _walls(
     return found[0], found[1], found[2]
 
 
-def _grouped(x: np.ndarray, h: np.ndarray) -> list[list[int]]:
-    """Return groups of at most `MOST_IN_GROUP` points; near points are joined first."""
+def _grouped(x: np.ndarray, h: np.ndarray, tips: int) -> list[list[int]]:
+    """Return groups of at most `MOST_IN_GROUP` points, of which the first are `tips`; near points are joined first."""
     group: list[list[int]] = [[k] for k in range(len(x))]
     if len(x) < 2:
         return group
     pairs = KDTree(x).query_pairs(JOINED * float(h.max()), output_type="ndarray")
     gaps = np.hypot(*(x[pairs[:, 0]] - x[pairs[:, 1]]).T)
-    close = gaps < JOINED * np.minimum(h[pairs[:, 0]], h[pairs[:, 1]])
+    of_tip = pairs.min(axis=1) < tips
+    sizes = np.where(of_tip, h[pairs].max(axis=1), h[pairs].min(axis=1))
+    close = gaps < JOINED * sizes
     pairs, gaps = pairs[close], gaps[close]
     for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0], gaps.round(12)))].tolist():
         a, b = group[i], group[j]
@@ -222,9 +240,15 @@ def _others(x: np.ndarray, h: np.ndarray, starts: np.ndarray) -> tuple[np.ndarra
     found: list[np.ndarray] = []
     if len(x):
         near = KDTree(x).query_ball_point(x, NEAR * h)
-        for a, b in pairwise(starts.tolist()):
-            rows = np.unique(np.concatenate(near[a:b])).astype(int)
-            found.append(rows[(rows < a) | (rows >= b)])
+        row = np.repeat(np.arange(len(x)), [len(rows) for rows in near])
+        pair = np.concatenate([np.array(rows, int) for rows in near])
+        # Each of two corners knows the other one if one of them is large enough.
+        row, pair = np.concatenate([row, pair]), np.concatenate([pair, row])
+        group = np.searchsorted(starts, row, side="right") - 1
+        key = np.unique(group * len(x) + pair)
+        group, pair = np.divmod(key, len(x))
+        away = (pair < starts[group]) | (pair >= starts[group + 1])
+        found = np.split(pair[away], np.searchsorted(group[away], np.arange(1, len(starts) - 1)))
     counts = [len(f) for f in found]
     return (
         np.cumsum([0, *counts]).astype(np.int32),
@@ -283,15 +307,11 @@ class Corners:
         self.engine = engine
         self._kernels = engine.kernels(
             "adaptation/corners",
-            {"MOST_IN_GROUP": MOST_IN_GROUP, "MOST_MOVED": MOST_MOVED, "CANDIDATE_REACH": CANDIDATE_REACH},
+            {
+                "MOST_IN_GROUP": MOST_IN_GROUP, "MOST_MOVED": MOST_MOVED, "CANDIDATE_REACH": CANDIDATE_REACH,
+                "WIDEST_TIP": float(WIDEST),
+            },
         )  # fmt: skip
-
-    def place(
-        self, domain: Polygon, h: np.ndarray, free: Polygon | None = None
-    ) -> PlacedCorners | None:
-        """Return the corners of `domain` for cells of size `h` (k,) at its vertices; None if there are none."""
-        groups = find_corners(domain, h, free)
-        return PlacedCorners(self.engine, domain, groups) if len(groups) else None
 
     def share(self, placed: PlacedCorners, t: Tessellation, moving: Moving) -> None:
         """Move generators so that a face ends in every corner.

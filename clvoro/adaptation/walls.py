@@ -11,7 +11,7 @@ import pyopencl.array as cla
 
 from ..geometry.polygon import Polygon
 from ..opencl.device_array import buffer_of
-from .corners import PlacedCorners
+from .corners import PlacedCorners, find_corners
 from .motion import Moving
 from .thin_walls import has_thin_walls
 
@@ -43,13 +43,15 @@ class Walls:
         self.corners: PlacedCorners | None = None
         self.thin = False
         domain = setup.domain
-        if not isinstance(domain, Polygon) or not (domain.oriented.turns < 0).any():
+        if not isinstance(domain, Polygon):
             return
         # `normalize_sizes` changes the factor by little: all of a level, also resumed, has the same corners.
         level = round(math.log2(size_factor / setup.factor))
         h = 2.0**level * setup.factor * np.asarray(setup.sizing(domain.oriented.vertices), float)
         free = setup.free if isinstance(setup.free, Polygon) else None
-        self.corners = setup.stages.corners.place(domain, h, free)
+        groups = find_corners(domain, h, free)
+        if len(groups):
+            self.corners = PlacedCorners(setup.stages.engine, domain, groups)
         self.thin = self.corners is not None and has_thin_walls(domain, h)
 
     def adjust(self, mesh: MeshState) -> None:

@@ -1,4 +1,4 @@
-"""Faces that end in re-entrant corners: which corners, the projection against NumPy, and whole runs."""
+"""Faces that end in re-entrant corners, cells in tips; the projection against NumPy, and whole runs."""
 
 from itertools import combinations
 
@@ -192,6 +192,81 @@ def test_generators_that_sit_still_stay(ctx):
     still, _ = project(ctx, L, points, fixed=len(points))
     assert still == pytest.approx(points, abs=1e-15)
     assert not np.allclose(once, points)
+
+
+# Tips.
+
+
+def wedge(degrees):
+    """Return a triangle with its tip in (0, 0.5)."""
+    t = np.radians(degrees) / 2
+    return clvoro.Polygon([(0, 0.5), (np.cos(t), 0.5 - np.sin(t)), (np.cos(t), 0.5 + np.sin(t))])
+
+
+# A bay whose end is a wedge of 60 degrees, between two capes.
+BAY = clvoro.Polygon([(0, 0), (0.42, 0), (0.5, -0.14), (0.58, 0), (1, 0), (1, 1), (0, 1)])
+
+
+@pytest.mark.parametrize(
+    ("domain", "h", "expected"),
+    [
+        (wedge(30), H, [(0, 0.5)]),
+        (wedge(60), H, []),
+        (clvoro.Polygon(SQUARE), H, []),
+        (clvoro.Polygon(SQUARE, [[(0.4, 0.5), (0.9, 0.45), (0.9, 0.55)]]), H, []),
+        (BAY, H, [(0.5, -0.14)]),
+        (BAY, H / 4, []),
+    ],
+)
+def test_tips_that_matter(domain, h, expected):
+    groups, found = corners_of(domain, h)
+    assert sorted(map(tuple, found[groups.angles < np.pi].tolist())) == expected
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_projection_at_a_tip(ctx, real):
+    """The second and the third generator get their mean distance, and turn apart until 0.4 of the angle is between."""
+    domain, rng = wedge(30), np.random.default_rng(3)
+    for _ in range(4):
+        x = np.cumsum(rng.uniform(0.08, 0.12, 4)) + 0.02
+        points = np.column_stack([x, 0.5 + 0.1 * x * rng.uniform(-1, 1, 4)])
+        expected = points.copy()
+        (groups, (tip,)), v = corners_of(domain), points - (0, 0.5)
+        away, angle = np.hypot(*v.T), np.arctan2(v[:, 1], v[:, 0])
+        assert groups.directions[0] == pytest.approx(-np.radians(15))
+        _, j, k = np.argsort(away)[:3]
+        j, k = (j, k) if angle[j] < angle[k] else (k, j)
+        turn = min(max((0.4 * np.radians(30) - (angle[k] - angle[j])) / 2, 0), MOST_TURN / 2)
+        for p, way in ((j, -turn), (k, turn)):
+            on = turn_all(points[p], tip, way) - tip
+            expected[p] = tip + on * (away[[j, k]].mean() / away[p])
+        found, _ = project(ctx, domain, points, real)
+        assert found == pytest.approx(expected, abs=60 * float(np.finfo(real).eps))
+
+
+def test_wide_tips(ctx):
+    """In the bay two generators get the same distance from its end only if the first one has a single neighbor."""
+    others = [(0.2, 0.2), (0.8, 0.2), (0.5, 0.7)]
+    for behind, equal in (
+        ([(0.44, 0.06), (0.55, 0.07)], False),
+        ([(0.5, 0.05), (0.52, 0.12)], True),
+    ):
+        moved, _ = project(ctx, BAY, np.array([(0.5, -0.07), *behind, *others]))
+        away = np.hypot(*(moved[1:3] - (0.5, -0.14)).T)
+        assert (np.ptp(away) < 1e-9) == equal
+
+
+@pytest.mark.parametrize("degrees", [12, 20, 30, 42])
+@pytest.mark.parametrize(
+    ("method", "effort"), [("adaptive", "fast"), ("adaptive", "default"), ("exact", "default")]
+)
+def test_cells_in_tips_have_two_neighbors(degrees, method, effort, adapter):
+    domain = wedge(degrees)
+    result = adapter.run(
+        domain, np.sqrt(domain.measure / 150), method=method, effort=effort, seed=2
+    )
+    assert result.check(solver="openfoam")
+    assert (np.bincount(result.diagram.adjacency.nonzero()[0]) > 1).all()
 
 
 def test_shared_by_two_corners(ctx):
