@@ -57,6 +57,11 @@ if "CLVORO_TEST_GROUPS" in os.environ:
 
     use_groups(int(os.environ["CLVORO_TEST_GROUPS"]))
 
+if "CLVORO_TEST_DIVISION" in os.environ:
+    from tests.robustness.rough_division import use_rough_division
+
+    use_rough_division()
+
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
