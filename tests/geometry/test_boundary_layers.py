@@ -194,6 +194,19 @@ def test_columns_are_narrow_where_the_wall_is_curved_and_beside_sharp_edges():
     assert domain.contains(segments.reshape(-1, 2)).all()
 
 
+@pytest.mark.parametrize("start", [0, 14, 90])
+def test_widths_of_columns_change_gradually_where_a_closed_wall_begins(start):
+    """An ellipse, narrow at its tips, begins in a tip, beside it and on its flat side."""
+    body = clvoro.curves.ellipse((0, 0), (1, 0.03), start=start, end=start + 360, name="body")
+    domain = clvoro.Polygon(clvoro.curves.circle((0, 0), 6), [body])
+    feet, _ = columns_of(domain, Layers(1e-3, count=3, spacing=0.1, edges="body"))
+    gaps = np.hypot(*(np.roll(feet, -1, axis=0) - feet).T)
+    assert gaps.min() < 0.004
+    assert gaps.max() == pytest.approx(0.1, rel=0.02)
+    ratio = gaps / np.roll(gaps, 1)
+    assert 1 / 1.4 < ratio.min() < ratio.max() < 1.4
+
+
 def test_wings_with_thin_layers_are_accepted_by_solvers(adapter):
     wing = clvoro.curves.naca("0012", name="wing")
     domain = clvoro.Polygon([(-1, -1), (2, -1), (2, 1), (-1, 1)], [wing])
