@@ -47,8 +47,10 @@ kernel void sum_scan_blocks(global const int *values, const int first, const int
         sums[get_group_id(0)] = sum;
 }
 
-/* out[i] = values[first] + ... + values[first + i - 1]; out[n] is the total. `values` may be `out` if first is 0. */
-kernel void scan_blocks(global const int *values, const int first, const int n, global const int *sums, global int *out)
+/* out[i] = values[first] + ... + values[first + i - 1]; out[n] and all[place] are the total. `values` may be `out` if
+   first is 0. */
+kernel void scan_blocks(global const int *values, const int first, const int n, global const int *sums, global int *out,
+                        global int *all, const int place)
 {
     GROUP_INTS(scratch);
     const int t = get_local_id(0), end = block_end(n);
@@ -79,8 +81,10 @@ kernel void scan_blocks(global const int *values, const int first, const int n, 
         }
         total += of_tile;
     }
-    if (end == n && t == 0 && get_group_id(0) == get_num_groups(0) - 1)
+    if (end == n && t == 0 && get_group_id(0) == get_num_groups(0) - 1) {
         out[n] = total;
+        all[place] = total;
+    }
 }
 
 /* Sum, sum of magnitudes, minimum and maximum of an array. Sums are compensated (Neumaier, with Knuth's exact

@@ -9,8 +9,12 @@
 #error "build with -DSLOT=faces that have room in a slot, whose bits in a word"
 #endif
 
-/* flags[0]: error bits, below. flags[1]: not 0 if there are doubtful cells. flags[3]: next spare slot. flags[4]: number
-   of slots. flags[5]: faces no longer than round-off stay. */
+/* flags[0]: error bits, below. flags[1]: not 0 if there are doubtful cells. flags[2]: wrong rows of a sample. flags[3]:
+   next spare slot. flags[4]: number of slots. flags[5]: faces no longer than round-off stay. flags[6]: number of
+   half-faces. flags[7]: number of marked cells; while there are any, rows are not matched. flags[8 + r]: number of
+   cells clipped before round r of an update. */
+#define FLAG_MARKED 7
+#define FLAG_CLIPPED 8
 #define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than the spare slots hold */
 #define FLAG_COINCIDE 2  /* two generators at the same place */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */

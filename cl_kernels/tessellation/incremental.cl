@@ -142,13 +142,15 @@ inline bool check_row(int i, global const int *starts, global const int *neighbo
    looked up.
 
    With LANES a work-item checks LANES generators. Only one work-item in `stride` runs and counts wrong rows in
-   flags[2]; with `rest`, the others run. */
-kernel void check_rows(const int size, const int stride, const int rest, global const int *starts,
+   flags[2]; with `rest`, the others run unless these were more than `most_wrong`. */
+kernel void check_rows(const int size, const int stride, const int rest, const int most_wrong, global const int *starts,
                        global const int *neighbors, global const REAL *points, const REAL4 box_lower,
                        const REAL4 box_upper, global int *fits, global int *marks, global int *flags)
 {
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    if (rest && flags[2] > most_wrong)
+        return;
     const int id = get_global_id(0);
     const int item = rest ? id + id / (stride - 1) + 1 : id * stride;
 #if IN_LANES
@@ -164,11 +166,35 @@ kernel void check_rows(const int size, const int stride, const int rest, global 
         atomic_add(flags + 2, found);
 }
 
-/* Per generator i: list it if it is marked; slots are the exclusive prefix sums of the marks. */
-kernel void list_marked(const int size, global const int *marks, global const int *sums, global int *listed)
+/* Per generator i: an empty mark, and no new row. */
+kernel void begin_update(const int size, global int *marks, global int *places)
 {
     WORK_ITEM(i);
-    if (marks[i])
+    marks[i] = 0;
+    places[i] = -1;
+}
+
+/* Rounds are enqueued before the host knows how many cells are marked. The number of cells clipped in a round is 0 if
+   no cell is marked, or if more are than have been launched or may be clipped. */
+inline int count_of_round(int round, global const int *flags)
+{
+    return flags[FLAG_CLIPPED + round + 1] - flags[FLAG_CLIPPED + round];
+}
+
+/* Per generator i: list it if it is marked; sums are the exclusive prefix sums of the marks. `most` is the largest
+   number of cells to clip in this round, `most_in_all` in all rounds; nothing is done if a sample has more than
+   `most_wrong` wrong rows. */
+kernel void list_marked(const int size, const int round, const int most, const int most_in_all, const int most_wrong,
+                        global const int *marks, global const int *sums, global int *listed, global int *flags)
+{
+    WORK_ITEM(i);
+    if (i > 0 && !marks[i])
+        return;
+    const int base = flags[FLAG_CLIPPED + round], count = sums[size];
+    const bool over = count > most || base + count > most_in_all || flags[2] > most_wrong;
+    if (i == 0)
+        flags[FLAG_CLIPPED + round + 1] = over ? base : base + count;
+    if (!over && marks[i])
         listed[sums[i]] = i;
 }
 
@@ -192,29 +218,35 @@ inline int clip_polygon_by_row(cell_t *cell, const REAL *x, global const int *ro
 }
 
 #if IN_LANES
-/* Per LANES listed generators of the first round: their cells from a few candidates, in slots from 0 on;
-   slot_counts[w] = 0 where a cell remains to be clipped. */
-kernel void wrap_marked(const int size, const int count, global const int *listed, global const int *places,
-                        global int *slots, global int *slot_counts, global const int *old_starts,
-                        global const int *old_neighbors, global const REAL *points, const REAL4 box_lower,
-                        const REAL4 box_upper)
+/* Per LANES listed generators of the first round, if there are at least `few`: their cells from a few candidates, in
+   slots from 0 on; slot_counts[w] = 0 where a cell remains to be clipped. */
+kernel void wrap_marked(const int size, const int few, global const int *flags, global const int *listed,
+                        global const int *places, global int *slots, global int *slot_counts,
+                        global const int *old_starts, global const int *old_neighbors, global const REAL *points,
+                        const REAL4 box_lower, const REAL4 box_upper)
 {
     WORK_ITEM(group);
+    const int count = count_of_round(0, flags);
+    if (count < few || group * LANES >= count)
+        return;
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
     wrap_eight(group * LANES, count, listed, &rows, points, box_lower, box_upper, slots, slot_counts);
 }
 #endif
 
-/* Per listed generator w: its cell, clipped by its neighbors and their neighbors, in slot base + w. If `wrapped`, rows
-   with faces are complete. */
-kernel void clip_marked(const int size, global const int *listed, const int base, const int wrapped,
+/* Per listed generator w: its cell, clipped by its neighbors and their neighbors, in slot base + w. With at least
+   `wrapped_from` generators rows with faces are complete. */
+kernel void clip_marked(const int size, global const int *listed, const int round, const int wrapped_from,
                         global const int *places, global int *slots, global int *slot_counts,
                         global const int *old_starts, global const int *old_neighbors, global const REAL *points,
                         const REAL4 box_lower, const REAL4 box_upper, global int *fits, global int *flags)
 {
     WORK_ITEM(w);
-    const int i = listed[w];
-    if (wrapped && slot_counts[base + w] > 0)
+    const int count = count_of_round(round, flags);
+    if (w >= count)
+        return;
+    const int i = listed[w], base = flags[FLAG_CLIPPED + round];
+    if (count >= wrapped_from && slot_counts[base + w] > 0)
         return;
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
@@ -237,21 +269,24 @@ kernel void clip_marked(const int size, global const int *listed, const int base
             flag = FLAG_FULL;
 #endif
     const int to = store_cell(&cell, flag, x, points, base + w, slots, slot_counts, flags),
-              count = abs(slot_counts[to]);
+              faces = abs(slot_counts[to]);
     if (places[i] < 0)
         return;
     /* A cell that is clipped again may lose neighbors that were consistent with it. */
     for (int k = 0; k < n; ++k)
-        if (row[k] >= 0 && place_in_row(slots + to * SLOT, count, row[k]) == count)
+        if (row[k] >= 0 && place_in_row(slots + to * SLOT, faces, row[k]) == faces)
             atomic_and(fits + row[k], 0);
 }
 
 /* Per listed generator: replace its old row by the new one, which is consistent until a neighbor finds otherwise. */
-kernel void place_clipped(const int size, global const int *listed, const int base, global const int *slots,
-                          global const int *slot_counts, global int *places, global int *marks, global int *fits)
+kernel void place_clipped(const int size, global const int *listed, const int round, global const int *flags,
+                          global const int *slots, global const int *slot_counts, global int *places, global int *marks,
+                          global int *fits)
 {
     WORK_ITEM(w);
-    const int place = base + w;
+    if (w >= count_of_round(round, flags))
+        return;
+    const int place = flags[FLAG_CLIPPED + round] + w;
     places[listed[w]] = slot_counts[place] == ELSEWHERE ? slots[place * SLOT] : place;
     marks[listed[w]] = 0;
     fits[listed[w]] = 1;
@@ -265,12 +300,14 @@ inline void mark_both(int i, int j, global int *marks)
 
 /* Per listed generator: mark it and its neighbors where they are inconsistent. Cells that were not clipped have been
    checked against each other before. */
-kernel void check_clipped(const int size, global const int *listed, global const int *places, global const int *slots,
-                          global const int *slot_counts, global const int *old_starts, global const int *old_neighbors,
-                          global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *marks,
-                          global int *fits)
+kernel void check_clipped(const int size, global const int *listed, const int round, global const int *flags,
+                          global const int *places, global const int *slots, global const int *slot_counts,
+                          global const int *old_starts, global const int *old_neighbors, global const REAL *points,
+                          const REAL4 box_lower, const REAL4 box_upper, global int *marks, global int *fits)
 {
     WORK_ITEM(w);
+    if (w >= count_of_round(round, flags))
+        return;
     const int i = listed[w];
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};

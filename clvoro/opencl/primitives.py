@@ -32,18 +32,27 @@ class Scan:
         self._kernels = engine.kernels("opencl/primitives")
         self._sums = engine.empty(engine.groups, np.int32)
 
-    def exclusive(self, values: cla.Array, out: cla.Array, n: int, first: int = 0) -> None:
+    def exclusive(
+        self,
+        values: cla.Array,
+        out: cla.Array,
+        n: int,
+        first: int = 0,
+        total: tuple[cla.Array, int] | None = None,
+    ) -> None:
         """Write the n + 1 exclusive prefix sums of ``values[first : first + n]`` to ``out[: n + 1]``.
 
-        `out` may be `values` if it has room and `first` is 0.
+        `out` may be `values` if it has room and `first` is 0. The last sum is also written to ``array[place]`` if
+        `total`, (array, place), is given.
         """
         k, engine, given = self._kernels, self.engine, (values, np.int32(first), np.int32(n))
+        array, place = (out, n) if total is None else total
+        to = self._sums, out, array, np.int32(place)
         if n <= FEW:
-            size = engine.group_size
-            engine.run(k.scan_blocks, size, *given, self._sums, out, group=size)
+            engine.run_groups(k.scan_blocks, 1, *given, *to)
             return
         engine.run_blocks(k.sum_scan_blocks, *given, self._sums)
-        engine.run_blocks(k.scan_blocks, *given, self._sums, out)
+        engine.run_blocks(k.scan_blocks, *given, *to)
 
 
 @dataclass(frozen=True)
@@ -112,11 +121,10 @@ class Summaries:
 
     def _combine(self, note: cla.Array | None) -> None:
         """Combine the partial summaries, and write the first number of `note` after them."""
-        size = self.engine.group_size
-        self.engine.run(
-            self._kernels.combine_blocks, len(self.slots) * size, self._partials, np.int32(self.engine.groups),
+        self.engine.run_groups(
+            self._kernels.combine_blocks, len(self.slots), self._partials, np.int32(self.engine.groups),
             np.int32(self._pending), np.int32(note is not None), self._record if note is None else note,
-            self._values, self._record, group=size,
+            self._values, self._record,
         )  # fmt: skip
         self._pending = 0
 

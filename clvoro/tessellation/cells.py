@@ -37,6 +37,8 @@ ROW_CAPACITY = SLOT
 LARGEST_ROW, LARGEST_ELSEWHERE = 4096, 512
 """Largest row capacity: on CPUs in boxes, and elsewhere. On a GPU every work-item has private memory of that size; in a
 polygon, clipping such a cell by as many edges takes minutes."""
+FLAGS, FACES, MARKED, CLIPPED = 16, 6, 7, 8
+"""Number of flags, and those that `face_rows.h` calls half-faces, marked cells and clipped cells."""
 LANES, EIGHTS = 8, 16
 """Cells that one work-item of a CPU builds at once in vector lanes, and number of such batches in `hulls.cl`."""
 FIRST_REACH = 1.9
@@ -61,7 +63,7 @@ class Cells:
         self.engine = engine
         self._scan = Scan(engine)
         self._capacity = self._room = self._n = self._enlarged_for = 0
-        self._flags = engine.empty(6, np.int32)
+        self._flags = engine.empty(FLAGS, np.int32)
         self._no_flags: dict[tuple[int, int, bool], cla.Array] = {}
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
@@ -222,21 +224,33 @@ class Cells:
             some = True
             self._reset_flags(n, len(rows.counts), byte_count=4)
 
-    def complete(
+    def match_update(
         self,
         rows: FaceRows,
         box: ClipBox,
         points: cla.Array,
         previous: Tessellation,
         fits: cla.Array,
-    ) -> Tessellation | None:
-        """Return the diagram of `points` from the rows of `previous`, replaced by `rows` where these have a slot.
+    ) -> np.ndarray:
+        """Match the rows of `previous`, replaced by `rows` where these have a slot; return the flags.
 
-        None if the rows are not consistent. `fits` (n,) is 1 for a row if every neighbor lists the generator between
+        While cells are marked nothing is done. `fits` (n,) is 1 for a row if every neighbor lists the generator between
         the correct two neighbors; it becomes 0 where a face due to round-off is dropped.
         """
-        n, old = previous.n, (previous.starts, previous.neighbors)
-        flags, m = self._match(rows, box, points, n, *old, exact=False, fits=fits)
+        old = previous.starts, previous.neighbors
+        self._enqueue_match(rows, box, points, previous.n, *old, exact=False, fits=fits)
+        return self._flags.get()
+
+    def complete(
+        self,
+        rows: FaceRows,
+        box: ClipBox,
+        points: cla.Array,
+        previous: Tessellation,
+        found: np.ndarray,
+    ) -> Tessellation | None:
+        """Return the diagram of the rows matched by `match_update` with the flags `found`; None if they are wrong."""
+        n, old, (flags, m) = previous.n, (previous.starts, previous.neighbors), _verdict(found)
         if flags & ~DOUBT:
             return None
         return self._measure(rows, box, points, n, *old, m, flags, exact=False)
@@ -258,9 +272,7 @@ class Cells:
 
         `DOUBT`: some cells are doubtful. `CROWDED`: there were too few spare slots.
         """
-        wrong, doubtful, m, spare, slots, _ = (int(v) for v in self._flags.get())
-        wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)
-        return wrong, m
+        return _verdict(self._flags.get())
 
     def _match(
         self,
@@ -274,6 +286,20 @@ class Cells:
         fits: cla.Array | None = None,
     ) -> tuple[int, int]:
         """Make the rows symmetric; return the flags and the number of half-faces."""
+        self._enqueue_match(rows, box, points, n, old_starts, old_neighbors, exact, fits)
+        return self._read_flags()
+
+    def _enqueue_match(
+        self,
+        rows: FaceRows,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        old_starts: cla.Array,
+        old_neighbors: cla.Array,
+        exact: bool,
+        fits: cla.Array | None,
+    ) -> None:
         engine, starts = self.engine, rows.starts
         engine.run_each(
             self._kernels.match_polygon_faces, n, rows.places, rows.slots, rows.counts, old_starts,
@@ -281,18 +307,11 @@ class Cells:
             np.int32(fits is not None), self._share(exact), rows.places if fits is None else fits,
             rows.keep, starts, rows.flags,
         )  # fmt: skip
-        return self._count(rows, starts, n)
+        self._count(rows, starts, n)
 
-    def _count(self, rows: FaceRows, counts: cla.Array, n: int) -> tuple[int, int]:
-        """Set `rows.starts` from the lengths of `n` rows; return the flags and the number of half-faces."""
-        self._scan.exclusive(counts, rows.starts, n)
-        # One read fetches all.
-        word = rows.starts.dtype.itemsize
-        cl.enqueue_copy(
-            self.engine.queue, buffer_of(rows.flags), buffer_of(rows.starts), byte_count=word, src_offset=n * word,
-            dst_offset=2 * word,
-        )  # fmt: skip
-        return self._read_flags()
+    def _count(self, rows: FaceRows, counts: cla.Array, n: int) -> None:
+        """Set `rows.starts` and the number of half-faces from the lengths of `n` rows."""
+        self._scan.exclusive(counts, rows.starts, n, total=(rows.flags, FACES))
 
     def _measure(
         self,
@@ -356,7 +375,8 @@ class Cells:
             self._kernels.drop_loops, n, rows.places, rows.counts, rows.starts, neighbors, rows.keep, counts,
             rows.flags,
         )  # fmt: skip
-        flags, m = self._count(rows, counts, n)
+        self._count(rows, counts, n)
+        flags, m = self._read_flags()
         if flags & ~DOUBT:
             return None
         return self._measure(rows, box, points, n, rows.places, rows.places, m, flags, exact)
@@ -391,7 +411,9 @@ class Cells:
             if len(self._no_flags) >= 4:
                 self._no_flags.clear()
             # A copy on the device avoids a blocking transfer.
-            start = self.engine.upload([0, 0, 0, first, slots, whole], np.int32)
+            flags = np.zeros(FLAGS, np.int32)
+            flags[3:6] = first, slots, whole
+            start = self.engine.upload(flags, np.int32)
             self._no_flags[first, slots, whole] = start
         start = self._no_flags[first, slots, whole]
         cl.enqueue_copy(self.engine.queue, buffer_of(self._flags), buffer_of(start), **part)
@@ -406,3 +428,10 @@ class Cells:
             )
         self._build(2 * self.cell_capacity, 2 * self.row_capacity)
         self._enlarged_for = n
+
+
+def _verdict(flags: np.ndarray) -> tuple[int, int]:
+    """Return the error bits and the number of half-faces."""
+    wrong, doubtful, _, spare, slots = (int(v) for v in flags[:5])
+    wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)
+    return wrong, int(flags[FACES])

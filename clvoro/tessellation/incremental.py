@@ -10,10 +10,9 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..geometry.box import ClipBox
-from ..opencl.device_array import read_number
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from .cells import Cells
+from .cells import CLIPPED, MARKED, Cells
 from .device_diagram import Tessellation
 from .face_rows import spare_slots
 
@@ -42,6 +41,7 @@ class IncrementalUpdate:
         self._scan = Scan(engine)
         self._kernels: dict[tuple[object, ...], SimpleNamespace] = {}
         self._n = -1
+        self._expected: list[int] | None = None
         # A weak reference, so that this stage does not keep the diagram of another mesh in memory.
         self._last: ReferenceType[Tessellation] | None = None
 
@@ -49,6 +49,8 @@ class IncrementalUpdate:
         self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, d), the new positions of the generators of `previous`.
+
+        The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the flags.
 
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
         """
@@ -70,7 +72,7 @@ class IncrementalUpdate:
         k = self._kernels[key]
         if n != self._n:
             self._n, self._fits = n, engine.empty(n, np.int32)
-            self._last = None
+            self._last = self._expected = None
         if self._last is None or self._last() is not previous:
             self._fits.fill(0)
         first_most, most = int(MAX_SHARE * n), int((MAX_SHARE + AGAIN_SHARE) * n)
@@ -79,52 +81,61 @@ class IncrementalUpdate:
         sums = engine.scratch(n + 1, np.int32)
         corners = box.device_corners(engine.real)
         old = (previous.starts, previous.neighbors)
-        marks.fill(0)
-        rows.places.fill(-1)
-        check = *old, points, *corners, self._fits, marks, rows.flags
-        if not self._check(k.check_rows, -(-n // cells.lanes), n, check, rows.flags):
-            return None
-        base = 0
-        for _ in range(MAX_ROUNDS):
-            self._scan.exclusive(marks, sums, n)
-            count = read_number(sums, n)
-            if count == 0:
-                return cells.complete(rows, box, points, previous, self._fits)
-            if base + count > (most if base else first_most):
-                return None
-            engine.run_each(k.list_marked, n, marks, sums, listed)
-            wrapped = cells.lanes > 1 and base == 0 and count >= FEW
-            if wrapped:
+        most_wrong = int(WRONG_SHARE * n / SAMPLE) if n >= SAMPLED_FROM else n
+        engine.run_each(k.begin_update, n, marks, rows.places)
+        check = np.int32(most_wrong), *old, points, *corners, self._fits, marks, rows.flags
+        self._check(k.check_rows, -(-n // cells.lanes), n, check)
+        done, expected = 0, [first_most] if self._expected is None else self._expected
+        while True:
+            for number, size in enumerate(expected, done):
+                in_all = most if number else first_most
+                limits = np.int32(size), np.int32(in_all), np.int32(most_wrong)
+                self._scan.exclusive(marks, sums, n)
                 engine.run_each(
-                    k.wrap_marked, -(-count // cells.lanes), np.int32(count), listed, rows.places, rows.slots,
-                    rows.counts, *old, points, *corners, group=1,
+                    k.list_marked, n, np.int32(number), *limits, marks, sums, listed, rows.flags
+                )
+                few = np.int32(FEW if cells.lanes > 1 and number == 0 else n + 1)
+                if few <= size:
+                    engine.run_each(
+                        k.wrap_marked, -(-size // cells.lanes), few, rows.flags, listed, rows.places, rows.slots,
+                        rows.counts, *old, points, *corners, group=1,
+                    )  # fmt: skip
+                this = listed, np.int32(number)
+                engine.run_each(
+                    k.clip_marked, size, *this, few, rows.places, rows.slots, rows.counts, *old, points, *corners,
+                    self._fits, rows.flags,
                 )  # fmt: skip
-            engine.run_each(
-                k.clip_marked, count, listed, np.int32(base), np.int32(wrapped), rows.places, rows.slots,
-                rows.counts, *old, points, *corners, self._fits, rows.flags,
-            )  # fmt: skip
-            engine.run_each(
-                k.place_clipped, count, listed, np.int32(base), rows.slots, rows.counts, rows.places,
-                marks, self._fits,
-            )  # fmt: skip
-            engine.run_each(
-                k.check_clipped, count, listed, rows.places, rows.slots, rows.counts, *old,
-                points, *corners, marks, self._fits,
-            )  # fmt: skip
-            base += count
-        return None
+                engine.run_each(
+                    k.place_clipped, size, *this, rows.flags, rows.slots, rows.counts, rows.places, marks, self._fits,
+                )  # fmt: skip
+                engine.run_each(
+                    k.check_clipped, size, *this, rows.flags, rows.places, rows.slots, rows.counts, *old, points,
+                    *corners, marks, self._fits,
+                )  # fmt: skip
+            self._scan.exclusive(marks, sums, n, total=(rows.flags, MARKED))
+            found = cells.match_update(rows, box, points, previous, self._fits)
+            clipped = np.diff(found[CLIPPED : CLIPPED + done + len(expected) + 1])
+            done, left = int(np.count_nonzero(clipped)), int(found[MARKED])
+            if left == 0:
+                self._expected = _with_room(clipped[:done], first_most)
+                return cells.complete(rows, box, points, previous, found)
+            in_all = most if done else first_most
+            if found[2] > most_wrong or clipped.sum() + left > in_all or done >= MAX_ROUNDS - 1:
+                return None
+            expected = [left]
 
-    def _check(
-        self, kernel: cl.Kernel, items: int, n: int, args: tuple[object, ...], flags: cla.Array
-    ) -> bool:
-        """Check all rows with `items` work-items. Return False early if a sample shows that too many have changed."""
+    def _check(self, kernel: cl.Kernel, items: int, n: int, args: tuple[object, ...]) -> None:
+        """Check all rows with `items` work-items, or only a sample if it shows that too many have changed."""
         one, part = np.int32(1), -(-items // SAMPLE)
         if n < SAMPLED_FROM:
             self.engine.run(kernel, items, np.int32(n), one, np.int32(0), *args)
-            return True
+            return
         stride = np.int32(SAMPLE)
         self.engine.run(kernel, part, np.int32(n), stride, np.int32(0), *args)
-        if int(flags.get()[2]) > WRONG_SHARE * n / SAMPLE:
-            return False
         self.engine.run(kernel, items - part, np.int32(n), stride, one, *args)
-        return True
+
+
+def _with_room(clipped: np.ndarray, most: int) -> list[int]:
+    """Return the sizes of the launches of the next update, if this one has `clipped` so many cells in each round."""
+    sizes = np.minimum(clipped + clipped // 2 + 256, most)
+    return np.minimum.accumulate(sizes).tolist()

@@ -65,7 +65,7 @@ def test_workers_build_recorded_kernels_once(engine, tmp_path):
         "programs": [["opencl/primitives", {}], ["adaptation/motion", {}]],
         "launches": [
             [0, "gather_rows", 64, [4, 0, 0, 4, 0]],
-            [0, "scan_blocks", 1, [0, 4, 4, 0, 0]],
+            [0, "scan_blocks", 1, [0, 4, 4, 0, 0, 0, 4]],
         ],
     }
     env = {

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import clvoro
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
-from clvoro.tessellation.cells import ROW_CAPACITY, Cells
+from clvoro.tessellation.cells import FLAGS, ROW_CAPACITY, Cells
 from clvoro.tessellation.device_diagram import DOUBT
 from clvoro.tessellation.face_rows import SLOT
 from tests.reference import diagrams as reference
@@ -331,7 +331,7 @@ def test_cells_with_two_faces_are_rejected(ctx, doubtful):
         # A doubtful cell has all rows compared, and all agree.
         sign = -1 if doubtful else 1
         rows.counts.set(np.array([sign * len(labels) for labels in lists], np.int32))
-        rows.flags.set(np.array([0, doubtful, 0, n, n, 0], np.int32))
+        rows.flags.set(np.array([0, doubtful, 0, n, n] + [0] * (FLAGS - 5), np.int32))
         old = rows.places, rows.places
         flags, m = cells._match(rows, BOX, points, n, *old, exact=True)
         assert m == 9 - two

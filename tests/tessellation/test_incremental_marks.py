@@ -40,9 +40,10 @@ def test_a_former_neighbor_of_a_clipped_cell_loses_its_mark(ctx, again):
     fits = engine.upload(np.ones(n), np.int32)
     slots = engine.upload(slots, np.int32)
     counts = engine.upload([len(wrong), 0], np.int32)
-    flags = engine.upload([0, 0, 0, 2, 2], np.int32)
+    # In the second round, after one clipped cell.
+    flags = engine.upload([0, 0, 0, 2, 2, 0, 0, 1, 0, 1, 2], np.int32)
     engine.run_each(
-        kernels.clip_marked, 1, engine.upload([i], np.int32), np.int32(1), np.int32(0),
+        kernels.clip_marked, 1, engine.upload([i], np.int32), np.int32(1), np.int32(n),
         engine.upload(places, np.int32), slots, counts, *old, x, *patch.BOX.device_corners(engine.real), fits, flags,
     )  # fmt: skip
     assert np.array_equal(slots.get()[SLOT:][: len(rows[i])], rows[i])
