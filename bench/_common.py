@@ -131,7 +131,7 @@ def heading(adapter: clvoro.Adapter, what: str) -> str:
 
 
 def off_walls(diagram: clvoro.Diagram) -> np.ndarray:
-    """Tell for each cell whether it has no face on a wall, (n,) bool."""
+    """Return for each cell whether it has no face on a wall, (n,) bool."""
     on_wall = np.logical_or.reduceat(diagram.neighbors < 0, diagram.neighbor_starts[:-1])
     return ~on_wall
 

@@ -113,7 +113,7 @@ ROWS = (
 
 
 def is_solid(name: str) -> bool:
-    """Tell whether the field of that name is in three dimensions."""
+    """Return whether the field of that name is in three dimensions."""
     return domain_of(name).dim == 3
 
 

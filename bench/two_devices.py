@@ -96,7 +96,7 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
 
 
 def good(record: dict[str, Any]) -> bool:
-    """Tell whether the devices agree."""
+    """Return whether the devices agree."""
     real = record["dtype"]
     if record["what"] == "diagram":
         return record["graph"] and record["off"] <= ROUNDINGS * np.finfo(real).eps

@@ -117,7 +117,7 @@ EFFORTS_3D = {
 def is_near(
     dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float
 ) -> bool:
-    """Tell whether a given mesh of `n` cells only needs a correction to reach the quality of `effort`.
+    """Return whether a given mesh of `n` cells only needs a correction to reach the quality of `effort`.
 
     Parameters
     ----------

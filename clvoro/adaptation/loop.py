@@ -315,7 +315,7 @@ class Loop:
             ) from error
 
     def is_recorded(self) -> bool:
-        """Tell whether the last row of the history describes the present mesh."""
+        """Return whether the last row of the history describes the present mesh."""
         if not self.rows:
             return False
         row, mesh = self.rows[-1][0], self.mesh
@@ -364,7 +364,7 @@ class Loop:
         return "max_steps reached" if over or used_up else ""
 
     def stalled(self) -> bool:
-        """Tell whether both mean error and mean quality have improved by less than `tol` over the last steps."""
+        """Return whether both mean error and mean quality have improved by less than `tol` over the last steps."""
         if not self.tol or len(self.rows) <= 2 * WINDOW:
             return False
         history = np.concatenate(self.rows[-2 * WINDOW :])

@@ -274,7 +274,7 @@ def arguments_of_run(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def uses(method: str, option: str) -> bool:
-    """Tell whether `method` uses an option of a run."""
+    """Return whether `method` uses an option of a run."""
     return method in _USERS.get(option, METHODS)
 
 

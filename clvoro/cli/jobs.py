@@ -346,7 +346,7 @@ class Job:
     def _initial(self, adapter: Any, size: Any, main: Result) -> Result | None:
         """Return the mesh before the first step."""
         if main.initial is None or main.history["level"][0] > 0:
-            return None  # no step, or a first one on a coarser level
+            return None  # there was no step, or the first level was not the finest
         points = np.clip(main.initial.points, self.case.domain.lower, self.case.domain.upper)
         return adapter.run(self.case.domain, size, points=points, method="lloyd", max_steps=0)
 

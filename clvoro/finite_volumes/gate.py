@@ -198,7 +198,7 @@ class _Rows:
         strict: bool = True,
         failing: np.ndarray | None = None,
     ) -> Criterion:
-        """Return the criterion for some values, (k,)."""
+        """Return a criterion: the worst of `values` (k,), the limit, and the cell with the worst one."""
         if not len(values):
             return Criterion(name, 0.0 if above else np.inf, limit, above, demanded, 0)
         bad = failing
@@ -216,7 +216,7 @@ class _Rows:
 
 
 def _cells_of_edges(m: SolverMeasures) -> np.ndarray:
-    """Return a cell at each edge of the polyhedra, (e,)."""
+    """Return for each edge of the polyhedra the index of one of its cells, (e,)."""
     found = np.zeros(len(m.edges), np.int64)
     found[m.edge_of_corner] = np.repeat(m.cells.owner, np.diff(m.cells.starts))
     return found

@@ -113,7 +113,7 @@ class Domain(ABC):
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Return the domain as plain values for files."""
+        """Return the domain as a dictionary of numbers, strings and lists, for files."""
 
     @abstractmethod
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -291,7 +291,7 @@ class Box(Domain):
         return float(np.prod(self.extent))
 
     def describe(self) -> dict[str, Any]:
-        """Return the arguments of this box as plain values."""
+        """Return the arguments of this box as numbers, strings and lists."""
         corners = {"lower": self.lower, "upper": self.upper, "periodic": self.periodic}
         return corners | ({"names": dict(self.names)} if self.names else {})
 

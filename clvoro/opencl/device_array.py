@@ -33,7 +33,7 @@ class DeviceArray(cla.Array):
 
     @cached_property
     def mark(self) -> int:
-        """Number that identifies this array and its views of the first rows. No other array has it.
+        """Unique number of this array. Views of its first rows have the same number, and no other array ever has it.
 
         An address does not identify an array, because freed memory is used again.
         """

@@ -165,7 +165,7 @@ class Engine:
 
     def all_defines(self, stage: str, defines: Mapping[str, object]) -> dict[str, object]:
         """Return `defines` and those macros of the engine that `cl_kernels/<stage>.cl` names."""
-        # Macros that the text does not name would only make equal programs be built once per kind of domain.
+        # A macro that the text does not use changes nothing but the cache key: the same program would be built again.
         text = program.source_text(f"{stage}.cl")
         optional = {"FACE": self.name_of(self.face), **self.domain_kind.defines}
         named = {name: value for name, value in optional.items() if name in text}

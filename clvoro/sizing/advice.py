@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..geometry.box import Domain
 
 _MAX_CELLS = 1e6
-"""Cells of the domain, at most, if its size is the proposed lower bound everywhere."""
+"""A proposed lower bound of h leads to at most so many cells, even if h has that value everywhere."""
 _LEAST_COVERED = 0.5
 """Share of the domain that the box of a field covers at least without a warning."""
 

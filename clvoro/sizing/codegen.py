@@ -87,7 +87,7 @@ class DeviceCode(NamedTuple):
     data : (m,) real
         The argument `data` of `size_at`.
     peak_bytes : int
-        Device memory that the computation took at most.
+        Peak device memory of the computation.
     """
 
     prelude: str

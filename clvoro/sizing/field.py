@@ -21,9 +21,9 @@ _MAX_PARTS = 256  # kernels of 200 parts take 3 s to build, kernels of 400 parts
 
 
 class Field:
-    """A size field h(x): called with points it gives sizes.
+    """A size field h(x): a call with points returns the sizes there.
 
-    Calling a field evaluates it on the host in float64, which is slow and the reference. Fields with ``on_device`` are
+    A call evaluates the field on the host in float64, as a reference. Fields with ``on_device`` are
     also evaluated on the device, as OpenCL from `generate_code`. Fields combine with each other, with positive numbers
     and with callables: ``f + g``, ``f * g``, ``f / g``, ``2 * f``, ``1 / f``, `minimum`, `maximum`. A combination is
     one function on the device. Values are multiplied and divided in the unit of the coordinates: one factor of a

@@ -111,7 +111,7 @@ class Cycle:
         self._launches.append((kernel, (whole,), (group,)))
 
     def _is_small(self, depth: int) -> bool:
-        """Tell whether one work-group does all steps of a level."""
+        """Return whether one work-group does all steps of a level."""
         level = self._levels[depth]
         return depth > 0 and level.aggregates is not None and len(level) <= self._one_group_limit
 

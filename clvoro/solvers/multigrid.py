@@ -77,13 +77,13 @@ def _require(condition: bool) -> None:
 
 
 def _is_within(array: np.ndarray, length: int, end: int) -> bool:
-    """Tell whether `array` holds `length` integers from 0 to below `end`."""
+    """Return whether `array` holds `length` integers from 0 to below `end`."""
     fits = array.shape == (length,) and array.dtype == np.int32
     return fits and (length == 0 or (array.min() >= 0 and array.max() < end))
 
 
 def _are_starts(starts: np.ndarray, rows: int, length: int) -> bool:
-    """Tell whether `starts` divides `length` entries into `rows` rows."""
+    """Return whether `starts` divides `length` entries into `rows` rows."""
     fits = starts.shape == (rows + 1,) and starts.dtype == np.int32
     return fits and starts[0] == 0 and starts[-1] == length and bool((np.diff(starts) >= 0).all())
 

@@ -261,7 +261,7 @@ class Poisson:
         self._first_iterations, self._last_iterations, self._ordering = first, last, ordering
 
     def _can_reuse(self, ordering: object) -> bool:
-        """Tell whether the coarse levels of the last multigrid serve for cells in this ordering."""
+        """Return whether the coarse levels of the last multigrid serve for cells in this ordering."""
         same = ordering is not None and ordering is self._ordering
         most = self._first_iterations + _MAX_EXTRA_ITERATIONS
         return same and 0 < self._last_iterations <= most

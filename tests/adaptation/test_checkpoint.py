@@ -222,7 +222,7 @@ def test_resume_at_the_end_of_the_run(ctx, tmp_path):
 @pytest.mark.parametrize("before", ["diagram", "failed run"])
 @pytest.mark.parametrize("square", [clvoro.Box((0, 0), (1, 1)), clvoro.Box((0,) * 3, (1,) * 3)])
 def test_after_something_larger(ctx, tmp_path, square, before):
-    """What an adapter has done before is no part of a run's state."""
+    """A run and its checkpoint do not depend on what the adapter did before."""
     path, size = tmp_path / "state", 0.29 if square.dim == 2 else 0.4
     options = {"method": "coupled", "max_steps": 6, "options": clvoro.PaperOptions(tol=0.0)}
     adapter = clvoro.Adapter(ctx)
@@ -407,7 +407,7 @@ def test_damaged_checkpoints_are_rejected(ctx, saved, tmp_path, name):
 
 
 def flipped(data):
-    """One bit of the middle, where an array is."""
+    """Return `data` with one bit changed in the middle, which is in an array."""
     place = len(data) // 2
     return data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :]
 

@@ -427,7 +427,7 @@ def test_coincident_generators_are_reported_with_their_place(ctx, periodic, real
 
 
 def test_closest_generators_are_reported(ctx):
-    """In space a cell far from a lattice of some roundings' width may be the first that cannot be cut by it."""
+    """The error names the two closest generators. In 3D clipping may fail first in a cell far from them."""
     lattice = np.stack(np.meshgrid(*[range(5)] * 3), axis=-1).reshape(-1, 3)
     cluster = 0.6875 + 2.0**-52 * lattice
     points = np.concatenate([cluster, np.random.default_rng(4).random((40, 3))])

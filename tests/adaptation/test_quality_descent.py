@@ -96,7 +96,7 @@ def test_gradient_in_a_polygon(ctx):
     points = points[domain.contains_well(points, 0.02)]
     n, cells = len(points), polygon_voronoi(domain, points)
     assert any({(i, -7), (i, -8), (i, -9)} <= set(cells.lengths) for i in range(n))
-    # Where a piece changes cells, where it goes is no smooth function.
+    # A piece that goes to another cell would make the energy not differentiable.
     assert all(piece.root == piece.home for piece in cells.pieces)
     real = np.dtype("float64")
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.kind(real))

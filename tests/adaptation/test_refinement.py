@@ -133,7 +133,7 @@ def test_count_is_four_times(ctx):
 
 
 def test_a_lattice_is_carried_over(ctx):
-    """Half the spacing, all cells alike: inside, the new mesh is the lattice of half the spacing."""
+    """A hexagonal lattice is refined to that of half the spacing, away from walls."""
     a = 1 / 16
     points = patch.hexagons(a)
     engine = patch.make_engine(ctx)

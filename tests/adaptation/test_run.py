@@ -401,7 +401,7 @@ def test_levels(adapter, levels):
 
 
 def test_levels_from_the_callers_points(adapter):
-    """A coarse mesh is refined as often as it takes, a mesh that fits is not."""
+    """A coarse mesh is refined as often as necessary, one with the right number of cells is not."""
     for n, level in ((40, 2), (150, 1), (590, 0)):
         result = adapter.run(BOX, F1, random_points(n, 17), effort="fast")
         assert result.history["level"][0] == level

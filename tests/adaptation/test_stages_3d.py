@@ -314,7 +314,7 @@ def test_cells_are_split_along_their_longest_axis(double):
 @pytest.mark.parametrize("n", [1, 2, 3])
 @pytest.mark.parametrize("total", [-50.0, 50.0])
 def test_few_cells(engine, n, total):
-    """The last generator stays."""
+    """The last generator is not deleted."""
     sweep = Sweep(engine, random_points(n, n, engine.real), 0.6, total)
     if n == 1 and total < 0:
         assert sweep.new is None

@@ -414,7 +414,7 @@ def test_line_of_a_run_of_unknown_length():
 
 
 def test_the_time_left_is_told_by_the_pace_of_the_latter_half():
-    """Kernels are built before the first step, in it and in the next: then, four steps do not tell the pace."""
+    """Kernels are built before and in the first two steps, so the first four steps are not representative."""
     shown = progress.Progress("paper", None, io.StringIO())
     seconds = [90, 100, 110, 111, 112, 113, 114, 115, *range(116, 300)]
     lines = []

@@ -107,7 +107,7 @@ def test_one_face_after_the_other(diagram):
 
 
 def test_faces_are_at_right_angles_to_the_lines_of_the_generators(diagram):
-    """Non-orthogonality between generators is nothing but rounding: so `Measures` does not hold it."""
+    """Up to round-off, so `Measures` has no angle between face and generators."""
     d = diagram
     starts, corners = face_corners(d)
     owner = face_owners(d)

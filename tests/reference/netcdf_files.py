@@ -56,7 +56,7 @@ MESHES = {
         clvoro.Polygon.from_pieces([[star(9)], [star(7, center=(3, 0))]]), 80
     ),
 }
-"""Domains and generators; on the "shore" and at the "slit" pieces of cells that are cut off are with others."""
+"""Domains and generators. In "shore" and "slit" the boundary divides cells; their far pieces belong to other cells."""
 
 
 def around_an_island() -> tuple[clvoro.Polygon, np.ndarray]:
@@ -76,7 +76,7 @@ def result_of(diagram: Diagram) -> Result:
 
 
 def made(ctx, name: str, dtype: str = "float64") -> Result:
-    """The mesh that MESHES has by this name."""
+    """Return the mesh of `MESHES` with this name."""
     return result_of(clvoro.Adapter(ctx, dtype).diagram(*MESHES[name]()))
 
 

@@ -75,7 +75,7 @@ def clusters(rng, n, dim):
 
 
 def ulps(rng, n, dim):
-    """Steps of one ulp from a few places."""
+    """Groups of four points that are a few ulps apart."""
     x = np.repeat(rng.random((max(1, n // 4), dim)), 4, axis=0)
     steps = rng.integers(-2, 3, x.shape)
     return np.clip(x + steps * np.spacing(x), 0, 1)

@@ -222,7 +222,7 @@ def try_moved(rng: np.random.Generator) -> str:
     ) + rng.choice([0, 1])
     got = first.transfer(values, onto=second, order=int(rng.choice([1, 2])))
     before, after = first.diagram.volumes @ values, second.diagram.volumes @ got
-    # In single precision volumes sum to others, and bounds come first.
+    # In single precision the sums of volumes differ, and bounds have priority over conservation.
     off = abs(first.diagram.volumes.sum() - second.diagram.volumes.sum())
     slack = 1e-11 * (first.diagram.volumes @ np.abs(values)) + off * np.abs(values).max(axis=0)
     if not (np.abs(after - before) <= slack).all():

@@ -31,7 +31,7 @@ def test_the_table_counts_what_there_was():
 
 
 def test_refusals_have_to_be_true():
-    """Of edges or generators that are said to be too close to each other, some are."""
+    """The judge checks an error that edges or generators are too close to each other: some must be."""
     error = InputError(
         "edges of it are too close to each other, or generators are, for the precision"
     )

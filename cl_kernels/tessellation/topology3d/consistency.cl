@@ -49,8 +49,8 @@ kernel void spread_labels(const int size, global const int *same, global const i
         atomic_or(changed, 1);
 }
 
-/* Per corner u: the greatest sharpness at its vertex, in best[label], which begins as 0. Bits of floats >= 0 are in
-   their order. */
+/* Per corner u: the greatest sharpness at its vertex, in best[label], which begins as 0. The bits of
+   floats >= 0, as integers, have the same order. */
 kernel void rate_corners(const int size, global const int *labels, global const float *sharpness, global uint *best)
 {
     WORK_ITEM(u);

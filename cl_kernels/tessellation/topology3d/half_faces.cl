@@ -87,7 +87,7 @@ inline void list_loops(const cell_t *cell, int base, int half_face, int end, glo
         int f = next_face(cell->alive, 0);
         while (f < FACE_CAPACITY && cell->labels[f] != half_face_labels[half_face])
             f = next_face(cell->alive, f + 1);
-        if (f == FACE_CAPACITY) /* the graph has it, but clipping sharply leaves nothing */
+        if (f == FACE_CAPACITY) /* the graph has this face, but the clipped cell does not */
             continue;
         const int first = start[f];
         int v = first;

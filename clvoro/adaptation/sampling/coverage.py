@@ -33,7 +33,7 @@ class FullCoverage:
 
     @property
     def occupied(self) -> np.ndarray:
-        """Tell for each box whether a part of it is inside the domain, (m,) bool."""
+        """Return for each box whether a part of it is inside the domain, (m,) bool."""
         return np.ones(len(self.boxes), bool)
 
     def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +49,7 @@ class FullCoverage:
         return points
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell for each of `points` (n, d) in the boxes whether it is inside the domain, (n,) bool."""
+        """Return for each of `points` (n, d) in the boxes whether it is inside the domain, (n,) bool."""
         return np.ones(len(points), bool)
 
     def draw(self, at: np.ndarray, box: np.ndarray, attempt: int) -> np.ndarray:
@@ -87,7 +87,7 @@ class PolygonCoverage(FullCoverage):
 
     @property
     def occupied(self) -> np.ndarray:
-        """Tell for each box whether a part of it is inside the domain, (m,) bool."""
+        """Return for each box whether a part of it is inside the domain, (m,) bool."""
         return self.share > 0
 
     def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -138,7 +138,7 @@ class PolygonCoverage(FullCoverage):
         return points
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell for each of `points` (n, 2) in the boxes whether it is inside the domain, (n,) bool."""
+        """Return for each of `points` (n, 2) in the boxes whether it is inside the domain, (n,) bool."""
         return self.domain.covers(points)
 
     def draw(self, at: np.ndarray, box: np.ndarray, attempt: int) -> np.ndarray:

@@ -246,7 +246,7 @@ def _distinct(
 
 
 def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) -> np.ndarray:
-    """Tell for each of `points` (n, d) whether it is inside and off the boundary, also after rounding.
+    """Return for each of `points` (n, d) whether it is inside and off the boundary, also after rounding.
 
     `working` are the points in the domain's frame.
     """
@@ -310,7 +310,7 @@ def _uniform_in(domain: Domain, rng: np.random.Generator) -> Callable[[int], np.
 
 
 def _repeated(points: np.ndarray) -> np.ndarray:
-    """Tell for each of `points` (n, d) whether it equals an earlier one."""
+    """Return for each of `points` (n, d) whether it equals an earlier one."""
     repeated = np.zeros(len(points), bool)
     # Only points whose first coordinate occurs twice can coincide.
     order = np.argsort(points[:, 0], kind="stable")

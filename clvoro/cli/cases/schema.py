@@ -168,7 +168,7 @@ _CURVE = Kinds(
 
 
 def ring(value: object, place: str) -> Any:
-    """Check for a closed curve, or a list of points and curves."""
+    """Check and return a ring: a closed curve, or a list of points and curves."""
     if isinstance(value, Mapping):
         return _CURVE(value, place)
     items = value if isinstance(value, (list, tuple)) else []

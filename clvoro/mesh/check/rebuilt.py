@@ -104,7 +104,7 @@ class Rebuilt:
         """Set areas and middles of faces, and the corners of cells, in 2D."""
         at = d.points[
             self.owner
-        ]  # relative to the generator small cells far from the origin keep their digits
+        ]  # relative to it, small cells far from the origin keep their digits
         first, last = face_ends(d).T
         a, b = d.vertices[first] - at, d.vertices[last] - at
         edge = b - a

@@ -137,7 +137,7 @@ class _DiagramReader:
         return faces
 
     def needs_check(self) -> bool:
-        """Tell whether round-off may have spoiled the result."""
+        """Return whether round-off may have spoiled the result."""
         if self.faces.needs_check or self.whole.round_off & UNEVEN:
             return True
         lost = 0 if self.kept is None else self._gaps(self.kept)

@@ -1,11 +1,11 @@
-"""A diagram in 3D in, vertices and faces that are the same from both cells of every face out (`consistency.cl`).
+"""Make both half-faces of every face identical in 3D, and give the vertices their numbers (`consistency.cl`).
 
 This is the one place for round-off in 3D. Cells are clipped one by one. Where more than four cells meet in a point, or
 where generators lie on a circle or a sphere, round-off decides which faces each of them has. `share_faces` makes both
 cells of every face agree, or raises.
 
-Generators may be as near each other as `LEAST_SEPARATION`, a share of the longest edge of the domain. Nearer ones may
-work, but may as well raise an error. What is returned is right either way.
+The least distance of generators is `LEAST_SEPARATION`, a share of the longest edge of the domain. Nearer ones may raise
+an error. A diagram that is returned is correct in any case.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ coarse = sizing.Distance(sizing.Circle(place, radius=1), h_min=20, slope=0.1, h_
 
 
 def drawdown(diagram, well, steps):
-    """March from rest; short steps first."""
+    """Return the drawdown s(T) by implicit Euler steps from s = 0. The first steps are the shortest."""
     flow = flow_matrix(diagram, transmissivity)
     s, source = np.zeros(len(diagram)), rate * (np.arange(len(diagram)) == well)
     for dt in np.diff(end * np.linspace(0, 1, steps + 1) ** 3):

@@ -249,7 +249,7 @@ def test_samples_follow_the_density_along_an_axis():
 
 
 def test_position_inside_a_box_follows_the_slope():
-    """With one point per sample its box is the whole domain, and the slope determines the distribution."""
+    """A sample of one point has one box, the domain. The slope of h in it then determines the distribution."""
     domain = Box((0, 0), (1, 1))
     field = sizing.Expression("exp(-x)")
     x = np.array([sample_density(field, domain, 1, seed)[0, 0] for seed in range(100, 250)])
