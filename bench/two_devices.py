@@ -41,7 +41,7 @@ STEPPED = {"float64": 1e-6, "float32": 1e-2}
 16 roundings of it for a displacement of up to h. In float32 a residual that rounds to the other side of the solve's
 tolerance, 1e-2, takes an iteration more."""
 COUNTS = 3e-3
-"""Number of cells of a whole run, relative: some inserted and deleted ones, of thousands."""
+"""Relative difference of the numbers of cells after a whole run: a few cells of thousands."""
 FIGURES = {"mean_error": 1e-3, "mean_quality": 5e-3}
 """Of whole runs. The default aims at a mean error of 2.5e-3; a cell with a defect has Q lower by 0.05 to 0.1, and one
 cell in twenty may have it here and not there."""

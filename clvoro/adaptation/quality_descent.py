@@ -11,9 +11,9 @@ from ..tessellation.device_diagram import Tessellation
 SHORT_EDGE, EDGE_STIFFNESS = 0.2, 2.0
 """Length over h below which edges are pushed apart, and the stiffness of their energy.
 
-The length of an edge between four cells on a square changes by up to 4 rate stiffness of what is missing per step.
-Measured on seven fields and domains, three to five starts each: 0.15 to 0.25 and 1.75 to 5 give the same sizes and
-quality.
+In a step the length of an edge between four cells on a square changes by up to 4 rate stiffness times the length that
+is missing. Measured on seven fields and domains, three to five starts each: 0.15 to 0.25 and 1.75 to 5 give the same
+sizes and quality.
 """
 
 

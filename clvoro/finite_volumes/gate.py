@@ -223,7 +223,7 @@ def _cells_of_edges(m: SolverMeasures) -> np.ndarray:
 
 
 def _regions(mesh: SolverMesh) -> int:
-    """Return the number of parts of the mesh that no face joins."""
+    """Return the number of connected parts of the mesh."""
     import scipy.sparse
 
     joined = np.flatnonzero(mesh.neighbor >= 0)

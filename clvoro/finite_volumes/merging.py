@@ -322,7 +322,7 @@ class Cells:
 
 
 def _inverse(items: np.ndarray, rows: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return starts and rows of each item."""
+    """Return for each of `size` items the rows that have it: starts, and rows item by item."""
     pairs = scipy.sparse.coo_array(
         (np.ones(len(items), np.int8), (items, rows)), (size, int(rows.max(initial=-1)) + 1)
     ).tocsr()

@@ -232,9 +232,8 @@ def largest_boundary(diagram: Diagram) -> np.ndarray:
     """Return the index in `boundary_names` of the boundary with the largest face of each cell, (n,) int32; -1: none."""
     found = np.full(len(diagram), -1, np.int32)
     walls = np.flatnonzero(diagram.neighbors < 0)
-    walls = walls[
-        np.argsort(diagram.face_measures[walls], kind="stable")
-    ]  # the largest comes last and stays
+    # Of several entries for a cell the last one remains: that of its largest wall face.
+    walls = walls[np.argsort(diagram.face_measures[walls], kind="stable")]
     found[face_owners(diagram)[walls]] = diagram.domain.boundary_index[
         -1 - diagram.neighbors[walls]
     ]

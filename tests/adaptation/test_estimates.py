@@ -424,8 +424,8 @@ def test_transfers_hold_what_is_told(bench, ctx, monkeypatch, dim, old, new, ord
 
 
 def test_no_surplus_where_sizes_change_slowly():
-    """None in a field of slope 0.08, many where each cell is twice as large as the next, and beside a jump
-    as it has cells."""
+    """No additional cells with a slope of 0.08, many if each cell is twice as large as the next, and beside a jump in
+    proportion to the cells there."""
     field = sizing.Distance(sizing.Circle((0.45, 0.5), 0.2), h_min=0.004, slope=0.08)
     assert expected_surplus(SQUARE, field, density_tree(field, SQUARE), 2.0) == 0
     # Of slope 0.6, so that two cells on sizes are 2.2 times as large; towards the walls there is nothing beyond.

@@ -72,7 +72,7 @@ def test_options_are_used_or_warned_of(adapter, method):
     """An option changes the result, its history, or causes a warning."""
 
     def made(**options):
-        # From start to end: some options are for the last steps, and a tolerance is looked at after twenty.
+        # Runs to the end, as some options are for the last steps; the tolerance counts from step 20 on.
         few = {"effort": "fast", "max_steps": 70} if uses(method, "effort") else {"max_steps": 30}
         run = adapter.run(BOX, SIZE, method=method, seed=4, **arguments_of_run({**few, **options}))
         history = [run.history[name] for name in run.history.dtype.names if name != "seconds"]

@@ -1,4 +1,4 @@
-"""Files that disagree with themselves are refused, and the array is named."""
+"""Files with inconsistent arrays are refused; the error names the array."""
 
 import numpy as np
 import pytest

@@ -59,7 +59,7 @@ def test_slits_that_are_no_wider_than_some_roundings_hide_what_is_behind_them(ad
             assert report, report
             checked += 1
     assert checked > 15
-    # Narrower than a rounding of the coordinate along it, which is far larger than that across.
+    # A spike: its width in x is less than the round-off of y, because y is much larger than x.
     x = 68.53 + 1.28e-13 * np.arange(2)
     sides = [(x[1], 37913.1), ((x[0] + x[1]) / 2, 37909.5), (x[0], 37913.1)]
     far = [(68.52, 37908.0), (68.54, 37908), (68.54, 37913.1), *sides, (68.52, 37913.1)]

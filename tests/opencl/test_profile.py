@@ -89,7 +89,7 @@ def test_all_kinds_of_commands_are_counted(run):
     tessellations = len(result.history)
     assert calls["cells", "measure_cells"] >= tessellations
     assert calls["motion", "move_generators"] == 5
-    # The solver enqueues its kernels itself: one a solve, or two, where cells are so few.
+    # With few cells a solve takes one or two launches, which the solver enqueues itself.
     assert tessellations <= calls["conjugate_gradient", "solve_by_group"] <= 2 * tessellations
     assert ("poisson", "apply_laplacian") not in calls
     assert calls[_hooks.MEMORY, "read"] > 0

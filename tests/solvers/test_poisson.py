@@ -55,7 +55,7 @@ def as_matrix(laplacian):
 
 
 def singular(poisson, laplacian):
-    """The operator as any other one: neither fused nor by rows."""
+    """The Laplacian as a general operator, without the fused kernels."""
     return Operator(lambda p, q: poisson.apply(laplacian, p, q), singular=True)
 
 

@@ -291,7 +291,9 @@ def test_the_face_that_a_line_leaves_by(ctx, kind, real):
     signs = []
     for places, later in zip(x, found.get().tolist(), strict=True):
         truth, terms = exactly_later(*places)
-        if later == 0:  # below what is taken for noise, and what that may be off by
+        if (
+            later == 0
+        ):  # the value is below the limit for round-off, including the error of that limit
             assert abs(truth) <= 80 * eps2 * terms
         else:  # a few eps^2 for each of eight operations, and one rounding of the sum
             assert abs(Fraction(later) - truth) <= 16 * eps2 * terms + abs(truth) / 2**20

@@ -163,7 +163,7 @@ def test_the_least_separation(adapter, kind, periodic):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_nearer_generators(adapter, kind):
-    """A right mesh or an error that names the two; at a few units of round-off always an error."""
+    """The result is a correct mesh, or an error that names the two. A few units of round-off apart it is the error."""
     eps, errors = float(np.finfo(adapter.dtype).eps), []
     for gap in (1e3 * eps, 30 * eps, 4 * eps):
         points = near_each_other(gap)[kind].astype(adapter.dtype)
