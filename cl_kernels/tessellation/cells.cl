@@ -216,7 +216,7 @@ kernel void measure_faces(const int size, global const int *starts, global const
 inline bool is_spread(const int size, global const int *starts, global const int *neighbors, int i, int c, REAL2 v,
                       const REAL *x, global const REAL *points, const REAL *lower, const REAL *upper)
 {
-    const int last = starts[i + 1] - 1, most = starts[size];
+    const int last = starts[i + 1] - 1, most = min(starts[size], MOST_AROUND);
     const REAL2 one = face_direction(neighbors[c], x, points);
     const REAL2 other = face_direction(neighbors[c > starts[i] ? c - 1 : last], x, points);
     const REAL turn = dot(one, other);

@@ -1,6 +1,9 @@
 /* Walks around a vertex of a planar graph, from the corner of one cell to that of the next, by the graph alone.
    Corner k of a cell lies between its faces k - 1 and k. */
 
+/* Largest number of steps of a walk. In a graph that is not that of a diagram a walk may never return to its start. */
+#define MOST_AROUND 10000
+
 /* Move from the corner before face *at of *cell to the corner of the next cell around the vertex: clockwise, across
    that face, or with `back` across the face before it. False, without a move, at a wall, at a cell without a row (an
    index of `size` or more), or, in an asymmetric graph, at a cell that does not list this one. */
@@ -39,7 +42,7 @@ inline bool walk_on(const int size, global const int *starts, global const int *
 inline bool is_loop(const int size, global const int *starts, global const int *neighbors, int i, int k)
 {
     const int other = k + 1 < starts[i + 1] ? k + 1 : starts[i];
-    const int most = starts[size]; /* bound of the steps: with round-off the graph may be asymmetric */
+    const int most = min(starts[size], MOST_AROUND);
     int cell = i, at = k, steps = 0;
     bool back = false;
     while (steps++ < most && walk_on(size, starts, neighbors, i, k, &cell, &at, &back))

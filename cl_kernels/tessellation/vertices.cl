@@ -6,17 +6,19 @@
    its faces k - 1 and k. A walk from cell to cell visits all corners of one vertex; the least of them owns it. The walk
    uses the graph alone: it needs no tolerance and works for any number of cells at a vertex. */
 
-/* Per generator i: owners[c] for each of its corners c. */
+/* Per generator i: owners[c] for each of its corners c. A walk that does not end sets `endless` to i + 1. */
 kernel void find_vertex_owners(const int size, global const int *starts, global const int *neighbors,
-                               global int *owners, global int *is_owner)
+                               global int *owners, global int *is_owner, global int *endless)
 {
     WORK_ITEM(i);
-    const int begin = starts[i], end = starts[i + 1], most = starts[size];
+    const int begin = starts[i], end = starts[i + 1], most = min(starts[size], MOST_AROUND);
     for (int c = begin; c < end; ++c) {
         int owner = c, cell = i, at = c, steps = 0;
         bool back = false;
         while (++steps < most && walk_on(size, starts, neighbors, i, c, &cell, &at, &back))
             owner = min(owner, at);
+        if (steps == most && walk_on(size, starts, neighbors, i, c, &cell, &at, &back))
+            atomic_max(endless, i + 1);
         owners[c] = owner;
         is_owner[c] = owner == c;
     }

@@ -7,10 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
+from ..errors import ClvoroError
 from ..geometry.box import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 from .device_diagram import Tessellation
+
+MOST_AROUND = 10_000
+"""Largest number of cells at a vertex (see tessellation/vertex_walk.h)."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +44,26 @@ class VertexNumbering:
         self._kernels = engine.kernels("tessellation/vertices")
 
     def number(self, box: ClipBox, t: Tessellation) -> Vertices:
-        """Return the vertices of `t`, ordered by the least index of their corners."""
+        """Return the vertices of `t`, ordered by the least index of their corners.
+
+        Raises
+        ------
+        ClvoroError
+            If the walk around a vertex does not end.
+        """
         engine, k = self.engine, self._kernels
         m = int(t.starts[t.n].get())
         owners, ids = engine.empty(m, np.int32), engine.empty(m + 1, np.int32)
-        engine.run_each(k.find_vertex_owners, t.n, t.starts, t.neighbors, owners, ids)
+        endless = engine.zeros(1, np.int32)
+        engine.run_each(k.find_vertex_owners, t.n, t.starts, t.neighbors, owners, ids, endless)
         self._scan.exclusive(ids, ids, m)
-        count = int(ids[m].get())
+        count, cell = int(ids[m].get()), int(endless.get()[0]) - 1
+        if cell >= 0:
+            raise ClvoroError(
+                f"more than {MOST_AROUND} cells meet at a vertex of the cell of {t.points[cell].get()} (in the "
+                "device's coordinates), or the neighbors of cells contradict each other; perturb generators that lie "
+                "on a common circle"
+            )
         cell_vertices, positions = engine.empty(m, np.int32), engine.empty((count, 2))
         engine.run_each(
             k.place_polygon_vertices, t.n, t.points, *box.device_corners(engine.real), t.starts,
