@@ -9,9 +9,10 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from . import program
+from . import program, ranges
 from .device_array import make_array
-from .kernels import KernelPool, Kernels, bind, fit_group
+from .kernels import KernelPool, Kernels, bind, fit_group, range_of
+from .ranges import enqueue_ranges
 from .workspace import Workspace
 
 if TYPE_CHECKING:
@@ -112,6 +113,7 @@ class Engine:
         self.ctx, self.queue = ctx, queue
         self.dim, self.real, self.domain_kind = dim, real, domain_kind
         self.groups, self.group_size = group_sizes(queue.device)
+        self._divides = ranges.may_be_interrupted(queue.device)
         self.period_args: tuple[np.ndarray, ...] = ()
         if domain_kind.periodic:
             vector = np.array([*domain_kind.periods, 0], real)
@@ -183,8 +185,16 @@ class Engine:
         """
         group = fit_group(kernel, ITEM_GROUP if group is None else group)
         bind(kernel, args)
-        whole = -(-max(int(size), 1) // group) * group
-        return cl.enqueue_nd_range_kernel(self.queue, kernel, (whole,), (group,))
+        return self.enqueue(kernel, -(-max(int(size), 1) // group) * group, group)
+
+    def enqueue(self, kernel: cl.Kernel, items: int, group: int) -> cl.Event:
+        """Enqueue `kernel`, with its arguments set, over `items` work-items: whole work-groups of `group` items.
+
+        On GPUs a launch of many items is divided into ranges. So `kernel` must not depend on the number of a group.
+        """
+        if self._divides:
+            return enqueue_ranges(self.queue, kernel, items, group, range_of(kernel))
+        return cl.enqueue_nd_range_kernel(self.queue, kernel, (items,), (group,))
 
     def run_each(
         self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None

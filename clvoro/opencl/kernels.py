@@ -13,6 +13,7 @@ import pyopencl.array as cla
 from ..errors import BuildError
 from .device_array import DeviceArray
 from .program import source_text
+from .ranges import Range
 from .runtimes import cache_remedy
 
 _UNTYPED_CALLS = 3
@@ -38,6 +39,13 @@ def fit_group(kernel: cl.Kernel, group: int) -> int:
     return group if group <= limit else power_of_two(limit)
 
 
+def range_of(kernel: cl.Kernel) -> Range:
+    """Return the size of ranges in which `kernel` is launched; see `ranges`."""
+    if not hasattr(kernel, "range"):
+        kernel.range = Range()  # type: ignore[attr-defined]
+    return kernel.range
+
+
 class KernelPool:
     """Kernel objects that are used again.
 
@@ -48,6 +56,7 @@ class KernelPool:
     def __init__(self) -> None:
         self._free: dict[tuple[int, str], list[cl.Kernel]] = {}
         self._taken: list[tuple[tuple[int, str], cl.Kernel]] = []
+        self._ranges: dict[tuple[int, str], Range] = {}
         self.on_kernel: Callable[[int], object] | None = None
         """Called with the number of kernels that have been taken, when there is a new one."""
 
@@ -60,6 +69,8 @@ class KernelPool:
                 self.on_kernel(len(self._free))
         free = self._free[key]
         kernel = free.pop() if free else cl.Kernel(program, name)
+        if not hasattr(kernel, "range"):
+            kernel.range = self._ranges.setdefault(key, Range())  # type: ignore[attr-defined]
         self._taken.append((key, kernel))
         return kernel
 

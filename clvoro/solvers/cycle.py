@@ -74,8 +74,8 @@ class Cycle:
             self._key, self._launches = None, []
             self._set_launches(r, u, work)
             self._key = key
-        for kernel, size, group in self._launches:
-            cl.enqueue_nd_range_kernel(self.engine.queue, kernel, size, group)
+        for launch in self._launches:
+            self.engine.enqueue(*launch)
 
     def _set_launches(self, r: cla.Array, u: cla.Array, work: cla.Array | None) -> None:
         levels = self._levels
@@ -108,7 +108,7 @@ class Cycle:
             whole = group = self.engine.block_of(kernel)
         else:
             whole, group = round_to_work_group(size), fit_group(kernel, WORK_GROUP)
-        self._launches.append((kernel, (whole,), (group,)))
+        self._launches.append((kernel, whole, group))
 
     def _is_small(self, depth: int) -> bool:
         """Return whether one work-group does all steps of a level."""
