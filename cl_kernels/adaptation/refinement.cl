@@ -8,7 +8,7 @@
 inline bool has_midpoint(int i, int j, REAL measure, REAL volume)
 {
     const REAL length = DIM == 2 ? sqrt(volume) : cbrt(volume);
-    return j > i && measure > SHORT_FACE * (DIM == 2 ? length : length * length);
+    return j > i && measure > R(SHORT_FACE) * (DIM == 2 ? length : length * length);
 }
 
 /* Whether an end of the edge is fixed (label below `fixed`): such edges get no new generators. */
@@ -22,7 +22,7 @@ inline bool is_fixed(int i, int j, global const int *labels, int fixed)
 inline bool is_wall_side(int k, int begin, int end, global const int *neighbors, global const FACE *face_measures,
                          REAL volume)
 {
-    bool longest = neighbors[k] < 0 && face_measures[k] > SHORT_FACE * sqrt(volume);
+    bool longest = neighbors[k] < 0 && face_measures[k] > R(SHORT_FACE) * sqrt(volume);
     for (int m = begin; m < end && longest; ++m)
         longest = neighbors[m] >= 0 || m == k || face_measures[m] < face_measures[k] ||
                   (face_measures[m] == face_measures[k] && m > k);

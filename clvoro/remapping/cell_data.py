@@ -13,6 +13,7 @@ from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
+from ..opencl import probe
 from ..opencl.devices import create_context
 from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
@@ -133,7 +134,7 @@ def _transfer_on_device(
     """Return means over the new cells and bounds of the old data in them, (n, width) float64 each."""
     queue = cl.CommandQueue(ctx)
     # Double precision where the device has it, whatever the precision of the meshes: intersections lose digits.
-    real = np.dtype(np.float64 if queue.device.double_fp_config else np.float32)
+    real = np.dtype(np.float64 if probe.has_fp64(queue.device) else np.float32)
     engine, box = Engine(ctx, queue, source.domain.dim, real), source.domain
     before, after = ((len(mesh), len(mesh.neighbors)) for mesh in (source, target))
     needed = transfer_bytes(engine, before, after, columns.shape[1], order)

@@ -1,0 +1,80 @@
+"""Devices without double precision: float32 programs contain no double, and meshes need none."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.opencl import devices, probe
+from clvoro.remapping import cell_data
+from tests.robustness import oclgrind_work
+from tests.robustness.test_portability import programs_of_all_kinds
+
+HARMLESS = "warning: double precision constant requires cl_khr_fp64, casting to single precision"
+needs_clang = pytest.mark.skipif(shutil.which("clang") is None, reason="needs clang")
+
+
+def complaints(text, options, fp64):
+    """Return what clang reports on a program for a device with or without double precision."""
+    extension = [] if fp64 else ["-Xclang", "-cl-ext=-cl_khr_fp64,-__opencl_c_fp64"]
+    done = subprocess.run(
+        ["clang", "-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header", *extension, "-fsyntax-only",
+         "-target", "spir64", "-Wall", "-Wdouble-promotion", "-Wno-unused", *options, "-"],
+        input=text, text=True, capture_output=True,
+    )  # fmt: skip
+    found = [line for line in done.stderr.splitlines() if "warning:" in line or "error:" in line]
+    return [line for line in found if HARMLESS not in line]
+
+
+def check(programs):
+    assert len(programs) > 15
+    for (text, options), name in programs.items():
+        assert not any("double" in option for option in options), (name, options)
+        for fp64 in (False, True):  # with it, no number may become a double silently
+            assert not complaints(text, options, fp64), name
+
+
+@needs_clang
+def test_float32_programs_need_no_double(ctx, monkeypatch):
+    """Those of runs in 2D and 3D."""
+    works = {
+        name: work
+        for name, work in oclgrind_work.WORK.items()
+        if name in ("adaptive", "coupled", "solid-run")
+    }
+    monkeypatch.setattr(oclgrind_work, "WORK", works)
+    check(programs_of_all_kinds(ctx, "float32", monkeypatch))
+
+
+@needs_clang
+@pytest.mark.slow
+def test_all_float32_programs_need_no_double(ctx, monkeypatch):
+    """Also those of transfers, surfaces and size fields, on a device that reports no double precision."""
+    monkeypatch.setattr(probe, "has_fp64", lambda _: False)
+    monkeypatch.setattr(devices, "has_fp64", lambda _: False)
+    check(programs_of_all_kinds(ctx, "float32", monkeypatch))
+
+
+@needs_clang
+@pytest.mark.parametrize("line", ["double y = x[0];", "x[0] = x[0] * 0.1;"])
+def test_doubles_are_found(line):
+    text = f"kernel void put(global float *x) {{ {line} }}"
+    assert complaints(text, (), False) or complaints(text, (), True)
+
+
+def test_transfer_without_double_precision(ctx, monkeypatch):
+    """Integrals are kept in float32, too, up to its round-off."""
+    monkeypatch.setattr(probe, "has_fp64", lambda _: False)
+    monkeypatch.setattr(devices, "has_fp64", lambda _: False)
+    adapter, rng = clvoro.Adapter(ctx, "float32"), np.random.default_rng(9)
+    box = clvoro.Box((0, 0), (1, 1))
+    old, new = (adapter.diagram(box, rng.random((n, 2))) for n in (300, 200))
+    reals, plain = set(), cell_data.Engine
+    with monkeypatch.context() as patch:
+        patch.setattr(cell_data, "Engine", lambda *args: reals.add(args[3]) or plain(*args))
+        values = old.transfer(1 + old.points[:, 0], new)
+    assert reals == {np.dtype(np.float32)}
+    before, after = (1 + old.points[:, 0]) @ old.volumes, values @ new.volumes
+    assert after == pytest.approx(before, rel=1e-5)
