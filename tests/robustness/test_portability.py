@@ -1,33 +1,45 @@
 """What other devices need, as far as it shows without them: work-groups, and other compilers."""
 
-import re
-import shutil
-import subprocess
+from functools import partial
 
 import numpy as np
 import pytest
 
 import clvoro
-from clvoro.opencl import engine
 from clvoro.opencl import program as _program
-from tests.robustness import oclgrind_work
-from tests.robustness.gpu_like import use_groups
+from tests.robustness import gpu_programs
+from tests.robustness.gpu_like import groups
+from tests.robustness.gpu_programs import compile_for, undefined_functions
+from tests.robustness.gpu_programs import for_each as each
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
-TARGETS = {
-    "NVIDIA": ["nvptx64-nvidia-nvcl"],
-    "AMD": ["amdgcn-amd-amdhsa", "-mcpu=gfx906", "-nogpulib"],
-    "SPIR": ["spir64", "-emit-llvm"],
+MAIN = {
+    2: [
+        "tessellation/cells", "tessellation/incremental", "solvers/volume_projection", "solvers/poisson",
+        "adaptation/quality_descent",
+    ],
+    3: ["tessellation/polyhedra", "solvers/volume_projection"],
+}  # fmt: skip
+"""Programs whose kernels take most of the time of a step."""
+COMMON_LIMITS = 128, 512
+"""Registers, and bytes of private memory, that a work-item of a kernel may take, by NVIDIA's and AMD's compilers."""
+LIMITS = {
+    "clip_polygons": (272, 1400),
+    "clip_marked": (224, 720),
+    "clip_polyhedra": (352, 24000),
+    "count_corners": (208, 15500),
+    "list_corners": (208, 15500),
+    "share_corners": (144, 4000),
+    "find_loops": (176, 256),
+    "walk_edges": (176, 64),
+    "fit_slopes": (224, 15500),
+    "transfer_cell_data": (224, 30500),
 }
-MOST_STACK = 32 * 1024
-"""Bytes of private memory that a work-item may take: with a GPU's 270,000 in flight that is 8 GiB."""
-
-
-@pytest.fixture
-def gpu_like(monkeypatch):
-    monkeypatch.setattr(engine, "group_sizes", engine.group_sizes)
-    use_groups(32)
+"""The same for kernels that take more. No variant of any kernel spills registers."""
+STATIC = "static inline" in _program.source_text("opencl/real.h")
+"""Whether device functions have a body where a compiler does not inline them."""
+needs_clang = pytest.mark.skipif(gpu_programs.clang() is None, reason="needs clang")
 
 
 @pytest.mark.parametrize(
@@ -39,7 +51,7 @@ def gpu_like(monkeypatch):
         pytest.param("float32", CUBE, 0.2, marks=pytest.mark.slow),
     ],
 )
-def test_groups_change_nothing_but_rounding(ctx, dtype, domain, size, monkeypatch):
+def test_groups_change_nothing_but_rounding(ctx, dtype, domain, size):
     """Sums are added in another order, which the linear solve sees to its tolerance of 1e-4."""
 
     def run():
@@ -49,77 +61,76 @@ def test_groups_change_nothing_but_rounding(ctx, dtype, domain, size, monkeypatc
         )
 
     plain = run()
-    monkeypatch.setattr(engine, "group_sizes", engine.group_sizes)
-    use_groups(32)
-    other = run()
+    with groups(32):
+        other = run()
     assert np.abs(plain.points - other.points).max() < 1e-3 * plain.target_size.min()
     assert abs(plain.size_error - other.size_error).max() < 1e-2
 
 
-def programs_of_all_kinds(ctx, dtype, monkeypatch):
-    """Every program that small work of all kinds builds: (text, options) and the name of its file."""
-    programs = {}
-    build = _program.build_program
-
-    def noted(context, name, defines, prelude):
-        options = tuple(f"-D{key}={value}" for key, value in sorted(defines.items()))
-        programs[prelude + "\n" + _program.source_text(name), options] = name
-        return build(context, name, defines, prelude)
-
-    monkeypatch.setattr(_program, "build_program", noted)
-    adapter = clvoro.Adapter(ctx, dtype)
-    for name, work in oclgrind_work.WORK.items():
-        if not name.startswith("broken"):
-            work(adapter)
-    return programs
-
-
-def compile_for(target, source, out, defines):
-    """What clang says of `source`."""
-    done = subprocess.run(
-        [
-            "clang", "-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header", "-O1", "-Wall",
-            "-Wno-unused", "-target", *TARGETS[target], *defines, "-S", "-o", str(out), str(source),
-        ],
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0 or done.stderr
-    return done.stderr
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("clang") is None, reason="needs clang")
-def test_kernels_of_cpus_compile_without_a_warning(ctx, monkeypatch, tmp_path):
+@needs_clang
+def test_kernels_of_cpus_compile_without_a_warning(ctx, tmp_path):
     """What is built in lanes of vectors, too. A warning is a line on the terminal of whoever runs them first."""
-    programs = programs_of_all_kinds(ctx, "float64", monkeypatch)
-    assert {"simd/hulls.cl", "simd/walks.cl", "tessellation/incremental.cl"} <= set(
-        programs.values()
-    )
-    source, out = tmp_path / "program.cl", tmp_path / "program.s"
-    for (text, defines), name in programs.items():
-        source.write_text(text)
-        said = compile_for("SPIR", source, out, defines)
-        assert not said, f"{name}: {said[:2000]}"
+    sources = gpu_programs.programs_of_all_kinds(ctx, "float64", group=None)
+    names = {source.name for source in sources}
+    assert {*gpu_programs.CPU_ONLY, "tessellation/incremental.cl"} <= names
+    for source, (_, said) in each(partial(compile_for, "SPIR", folder=tmp_path), sources):
+        assert not said, f"{source.name}: {said[:2000]}"
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("clang") is None, reason="needs clang")
+@needs_clang
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_kernels_compile_for_gpus(ctx, dtype, gpu_like, monkeypatch, tmp_path):
-    """Every program that small work of all kinds builds, for three kinds of GPU, without a warning."""
-    programs = programs_of_all_kinds(ctx, dtype, monkeypatch)
-    names = set(programs.values())
+def test_kernels_compile_for_gpus(ctx, dtype, tmp_path):
+    """Every program that small work of all kinds builds, for three kinds of GPU: no warning, all calls have a body."""
+    sources = gpu_programs.programs_of_all_kinds(ctx, dtype)
     folder = _program.kernel_folder()
-    cpu_only = {"simd/hulls.cl", "simd/walks.cl"}
-    assert (
-        names == {name.relative_to(folder).as_posix() for name in folder.rglob("*.cl")} - cpu_only
+    every = {path.relative_to(folder).as_posix() for path in folder.rglob("*.cl")}
+    assert {source.name for source in sources} == every - set(gpu_programs.CPU_ONLY)
+    for target in gpu_programs.TARGETS:
+        for source, (_, said) in each(partial(compile_for, target, folder=tmp_path), sources):
+            assert not said, f"{source.name} for {target}: {said[:2000]}"
+        if STATIC:
+            for source, missing in each(
+                partial(undefined_functions, target, folder=tmp_path), sources
+            ):
+                assert not missing, f"{source.name} for {target} calls {missing} without a body"
+
+
+def test_a_function_without_a_body_is_found(tmp_path):
+    text = (
+        "inline int two(int i) { return 2 * i; } kernel void k(global int *a) { a[0] = two(a[1]); }"
     )
-    source, out = tmp_path / "program.cl", tmp_path / "program.s"
-    for (text, defines), name in programs.items():
-        source.write_text(text)
-        for target in TARGETS:
-            said = compile_for(target, source, out, defines)
-            assert not said, f"{name} for {target}: {said[:2000]}"
-            if target == "NVIDIA":
-                stacks = map(int, re.findall(r"__local_depot\d+\[(\d+)\]", out.read_text()))
-                assert max(stacks, default=0) <= MOST_STACK, name
+    source = gpu_programs.Source("k.cl", (), text)
+    assert undefined_functions("NVIDIA", source, tmp_path) == ["two"]
+    assert undefined_functions("NVIDIA", source._replace(text=f"static {text}"), tmp_path) == []
+
+
+def check_figures(vendor, sources, folder):
+    """Compare what a work-item takes with the limits of its kernel."""
+    for source, figures in each(partial(gpu_programs.FIGURES[vendor], folder=folder), sources):
+        assert figures, source.name
+        for kernel, found in figures.items():
+            registers, private = LIMITS.get(kernel, COMMON_LIMITS)
+            what = f"{kernel} of {source.name} {source.options}: {found}"
+            assert found.private <= private, what
+            assert found.registers <= registers, what
+            assert not found.spills, what
+
+
+@pytest.mark.skipif(not gpu_programs.can_measure("AMD"), reason="needs clang and libclc")
+@pytest.mark.parametrize("dim", [2, 3])
+def test_main_kernels_take_few_registers_and_little_private_memory(ctx, dim, tmp_path):
+    sources = gpu_programs.programs_of_a_first_run(ctx, dim, "float64")
+    by_name = {source.name: source for source in sources}
+    main = [by_name[f"{name}.cl"] for name in MAIN[dim]]
+    check_figures("AMD", main, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("vendor", ["NVIDIA", "AMD"])
+def test_kernels_take_few_registers_and_little_private_memory(ctx, vendor, dtype, tmp_path):
+    if not gpu_programs.can_measure(vendor):
+        pytest.skip("needs clang, libclc and, for NVIDIA, ptxas: see bench/gpu_model.py --help")
+    check_figures(vendor, gpu_programs.programs_of_all_kinds(ctx, dtype), tmp_path)
