@@ -1,6 +1,5 @@
 """Devices without double precision: float32 programs contain no double, and meshes need none."""
 
-import shutil
 import subprocess
 
 import numpy as np
@@ -9,18 +8,17 @@ import pytest
 import clvoro
 from clvoro.opencl import devices, probe
 from clvoro.remapping import cell_data
-from tests.robustness import oclgrind_work
-from tests.robustness.test_portability import programs_of_all_kinds
+from tests.robustness import gpu_programs, oclgrind_work
 
 HARMLESS = "warning: double precision constant requires cl_khr_fp64, casting to single precision"
-needs_clang = pytest.mark.skipif(shutil.which("clang") is None, reason="needs clang")
+needs_clang = pytest.mark.skipif(gpu_programs.clang() is None, reason="needs clang")
 
 
 def complaints(text, options, fp64):
     """Return what clang reports on a program for a device with or without double precision."""
     extension = [] if fp64 else ["-Xclang", "-cl-ext=-cl_khr_fp64,-__opencl_c_fp64"]
     done = subprocess.run(
-        ["clang", "-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header", *extension, "-fsyntax-only",
+        [gpu_programs.clang(), "-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header", *extension, "-fsyntax-only",
          "-target", "spir64", "-Wall", "-Wdouble-promotion", "-Wno-unused", *options, "-"],
         input=text, text=True, capture_output=True,
     )  # fmt: skip
@@ -28,12 +26,12 @@ def complaints(text, options, fp64):
     return [line for line in found if HARMLESS not in line]
 
 
-def check(programs):
-    assert len(programs) > 15
-    for (text, options), name in programs.items():
-        assert not any("double" in option for option in options), (name, options)
+def check(sources):
+    assert len(sources) > 15
+    for source in sources:
+        assert not any("double" in option for option in source.options), source[:2]
         for fp64 in (False, True):  # with it, no number may become a double silently
-            assert not complaints(text, options, fp64), name
+            assert not complaints(source.text, source.options, fp64), source.name
 
 
 @needs_clang
@@ -45,7 +43,7 @@ def test_float32_programs_need_no_double(ctx, monkeypatch):
         if name in ("adaptive", "coupled", "solid-run")
     }
     monkeypatch.setattr(oclgrind_work, "WORK", works)
-    check(programs_of_all_kinds(ctx, "float32", monkeypatch))
+    check(gpu_programs.programs_of_all_kinds(ctx, "float32", group=None))
 
 
 @needs_clang
@@ -54,7 +52,7 @@ def test_all_float32_programs_need_no_double(ctx, monkeypatch):
     """Also those of transfers, surfaces and size fields, on a device that reports no double precision."""
     monkeypatch.setattr(probe, "has_fp64", lambda _: False)
     monkeypatch.setattr(devices, "has_fp64", lambda _: False)
-    check(programs_of_all_kinds(ctx, "float32", monkeypatch))
+    check(gpu_programs.programs_of_all_kinds(ctx, "float32", group=None))
 
 
 @needs_clang
