@@ -48,13 +48,13 @@ def test_pocl_reads_short_declarations(ctx, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_short_declarations_are_enough_for_all_programs(ctx, dtype, monkeypatch):
-    from tests.robustness.test_portability import programs_of_all_kinds
+    from tests.robustness.gpu_programs import programs_of_all_kinds
 
     if not program.has_short_declarations(ctx):
         pytest.skip("for some versions of PoCL only")
     built, plain = [], cl.Program
     monkeypatch.setattr(program.cl, "Program", lambda *a: built.append(a[1]) or plain(*a))
-    programs_of_all_kinds(ctx, dtype, monkeypatch)
+    programs_of_all_kinds(ctx, dtype, group=None)
     full = [text for text in built if "DECLARE_REALS" not in text]
     assert all("size_at" in text for text in full)
 
