@@ -164,9 +164,9 @@ inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
 typedef cell_t piece_t;
 
 #define EACH_FACE(piece, f)                                                                                            \
-    int f = next_face((piece)->alive, 0);                                                                              \
+    int f = next_face(piece, 0);                                                                                       \
     f < FACE_CAPACITY;                                                                                                 \
-    f = next_face((piece)->alive, f + 1)
+    f = next_face(piece, f + 1)
 
 inline int face_label(const piece_t *piece, int f)
 {
@@ -212,31 +212,25 @@ inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int l
         return PIECE_WHOLE;
     if (beyond == piece->n)
         return PIECE_EMPTY;
-    rim_t rim;
-    if (!find_rim(piece, depth, &rim)) {
-        if (!keep_disc(piece, depth, 64 * depth) || !find_rim(piece, depth, &rim))
+    if (!find_rim(piece, depth)) {
+        if (!keep_disc(piece, depth, 64 * depth) || !find_rim(piece, depth))
             return PIECE_BROKEN;
-        if (rim.gone == piece->n)
+        if (piece->rim.gone == piece->n)
             return PIECE_EMPTY;
     }
-    const int face = replace_faces(piece, &rim, label);
+    const int face = replace_faces(piece, label);
     if (face == FACE_CAPACITY)
         return PIECE_FULL;
-    REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
-    cut_edges(piece, &rim, nx, ny, nz);
-    close_rim(piece, &rim, face, nx, ny, nz);
+    cut_edges(piece);
+    close_rim(piece, face);
     return PIECE_CUT;
 }
 
 /* Sum over tetrahedra that share vertex 0, so that small pieces far from the generator keep their accuracy. */
-inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
+inline REAL measure_piece(piece_t *piece, REAL4 *centroid)
 {
     const REAL4 o = corner_of(piece, 0);
-    INDEX start[FACE_CAPACITY];
-    for (int v = 0; v < piece->n; ++v) {
-        const INDEX4 f = piece->faces[v];
-        start[f.s0] = start[f.s1] = start[f.s2] = v;
-    }
+    const INDEX *start = face_starts(piece);
     REAL sum = 0;
     REAL4 first = 0;
     for (EACH_FACE(piece, f)) {

@@ -36,7 +36,7 @@ inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const
 }
 
 /* The intersection of three planes. */
-inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const REAL *points)
+inline REAL4 meeting_point(const CELL *cell, int a, int b, int c, global const REAL *points)
 {
     const REAL4 p = cell->planes[a];
     const REAL4 q = better_row(cell->planes[b], p, cell->labels[b], cell->labels[a], points);
@@ -53,180 +53,232 @@ inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const
    farthest first. If it does not reach all vertices farther beyond than `doubt`, it grows through the nearest other
    vertices. The distances of vertices that change sides are corrected. False if a vertex stays out of reach, such as
    the wrong end of a slit, which is not removed. */
-inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
+inline bool keep_disc(CELL *cell, REAL depth, REAL doubt)
 {
-    REAL *s = (REAL *)cell->beyond;
-    bool inside[VERTEX_CAPACITY], on[FACE_CAPACITY]; /* whether a vertex, a face belongs to the disc */
-    int added = 0, left = 0;                         /* left: vertices surely beyond that are not in the disc */
+    CELL_SPACE REAL *s = BEYOND(cell);
+    ulong inside[VERTEX_WORDS]; /* the vertices of the disc */
+    uint on[FACE_WORDS];        /* the faces around it */
+    int added = 0, left = 0;    /* left: vertices surely beyond that are not in the disc */
+    for (int w = 0; w < VERTEX_WORDS; ++w)
+        inside[w] = 0;
+    for (int w = 0; w < FACE_WORDS; ++w)
+        on[w] = 0;
     for (int v = 0; v < cell->n; ++v) {
-        inside[v] = false;
         added = s[v] > s[added] ? v : added;
         left += s[v] > doubt;
     }
-    for (int f = 0; f < FACE_CAPACITY; ++f)
-        on[f] = false;
     while (added >= 0) {
         const INDEX4 f = cell->faces[added];
-        inside[added] = on[f.s0] = on[f.s1] = on[f.s2] = true;
+        ADD_VERTEX(inside, added);
+        ADD_FACE(on, f.s0);
+        ADD_FACE(on, f.s1);
+        ADD_FACE(on, f.s2);
         left -= s[added] > doubt;
         const REAL least = left > 0 ? -64 * doubt : depth;
         added = -1;
         for (int v = 0; v < cell->n; ++v) {
-            if (inside[v] || !(s[v] > least) || (added >= 0 && !(s[v] > s[added])))
+            if (HAS_VERTEX(inside, v) || !(s[v] > least) || (added >= 0 && !(s[v] > s[added])))
                 continue;
-            const INDEX4 g = cell->faces[v];
-            const bool ab = inside[cell->at[g.s1 * FACE_CAPACITY + g.s0]];
-            const bool bc = inside[cell->at[g.s2 * FACE_CAPACITY + g.s1]];
-            const bool ca = inside[cell->at[g.s0 * FACE_CAPACITY + g.s2]];
-            const int shared = ab + bc + ca;
-            if (shared == 2 || (shared == 1 && !on[ab ? g.s2 : (bc ? g.s0 : g.s1)]))
+            const INDEX4 g = cell->faces[v], links = cell->links[v];
+            const int ab = HAS_VERTEX(inside, links.s0), bc = HAS_VERTEX(inside, links.s1),
+                      ca = HAS_VERTEX(inside, links.s2);
+            const int shared = ab + bc + ca, apart = ab ? g.s2 : (bc ? g.s0 : g.s1);
+            if (shared == 2 || (shared == 1 && !HAS_FACE(on, apart)))
                 added = v;
         }
     }
     for (int v = 0; v < cell->n; ++v) {
-        if (inside[v] && !(s[v] > depth))
+        const bool removed = HAS_VERTEX(inside, v);
+        if (removed && !(s[v] > depth))
             s[v] = 2 * depth;
-        if (!inside[v] && s[v] > depth)
+        if (!removed && s[v] > depth)
             s[v] = 0;
     }
     return left == 0;
 }
 
-/* The edges of the cell that a bisector cuts. */
-typedef struct {
-    int gone;                                                  /* vertices beyond the bisector */
-    int n;                                                     /* edges */
-    ulong dead[FACE_WORDS];                                    /* faces entirely beyond */
-    INDEX vertices[VERTEX_CAPACITY + 1];                       /* vertices beyond, ascending */
-    INDEX before[FACE_CAPACITY + 4], after[FACE_CAPACITY + 4]; /* faces of an edge, along the rim */
-    INDEX in[FACE_CAPACITY + 4], out[FACE_CAPACITY + 4];       /* its ends, kept and removed */
-} rim_t;
-
 /* Find the rim; false if it is not one simple cycle. */
-inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
+inline bool find_rim(CELL *cell, REAL depth)
 {
-    const REAL *s = (const REAL *)cell->beyond;
+    CELL_SPACE const REAL *s = BEYOND(cell);
+    CELL_SPACE rim_t *rim = &cell->rim;
     int gone = 0, n = 0;
-    SHORT_LOOP
-    for (int v = 0; v < cell->n; ++v) {
-        rim->vertices[gone] = v;
-        gone += s[v] > depth;
-    }
-    rim->gone = gone;
-    ulong touched[FACE_WORDS], around[FACE_WORDS];
+    ulong beyond[VERTEX_WORDS];
+    uint touched[FACE_WORDS], around[FACE_WORDS];
+    for (int w = 0; w < VERTEX_WORDS; ++w)
+        beyond[w] = 0;
     for (int w = 0; w < FACE_WORDS; ++w)
         touched[w] = around[w] = 0;
     SHORT_LOOP
-    for (int k = 0; k < gone; ++k) {
-        const int v = rim->vertices[k];
-        const INDEX4 f = cell->faces[v];
-        const int a = f.s0, b = f.s1, c = f.s2;
-        add_polyhedron_face(touched, a);
-        add_polyhedron_face(touched, b);
-        add_polyhedron_face(touched, c);
-        const int ab = cell->at[b * FACE_CAPACITY + a];
-        rim->before[n] = a;
-        rim->after[n] = b;
-        rim->in[n] = ab;
-        rim->out[n] = v;
-        n += !(s[ab] > depth);
-        const int bc = cell->at[c * FACE_CAPACITY + b];
-        rim->before[n] = b;
-        rim->after[n] = c;
-        rim->in[n] = bc;
-        rim->out[n] = v;
-        n += !(s[bc] > depth);
-        const int ca = cell->at[a * FACE_CAPACITY + c];
-        rim->before[n] = c;
-        rim->after[n] = a;
-        rim->in[n] = ca;
-        rim->out[n] = v;
-        n += !(s[ca] > depth);
-        if (n > FACE_CAPACITY)
-            return false;
+    for (int v = 0; v < cell->n; ++v)
+        beyond[VERTEX_WORD(v)] |= (ulong)(s[v] > depth) << (v & 63);
+    for (int w = 0; w < VERTEX_WORDS; ++w) {
+        rim->beyond[w] = beyond[w];
+        gone += (int)popcount(beyond[w]);
+    }
+    rim->gone = gone;
+    for (int w = 0; w < VERTEX_WORDS; ++w) {
+        SHORT_LOOP
+        for (ulong rest = beyond[w]; rest != 0; rest &= rest - 1) {
+            const int v = 64 * w + 63 - (int)clz(rest & -rest);
+            const INDEX4 f = cell->faces[v], links = cell->links[v];
+            ADD_FACE(touched, f.s0);
+            ADD_FACE(touched, f.s1);
+            ADD_FACE(touched, f.s2);
+            rim->edges[n] = (INDEX4)(f.s0, f.s1, links.s0, v);
+            n += !HAS_VERTEX(beyond, links.s0);
+            rim->edges[n] = (INDEX4)(f.s1, f.s2, links.s1, v);
+            n += !HAS_VERTEX(beyond, links.s1);
+            rim->edges[n] = (INDEX4)(f.s2, f.s0, links.s2, v);
+            n += !HAS_VERTEX(beyond, links.s2);
+            if (n > FACE_CAPACITY)
+                return false;
+        }
     }
     rim->n = n;
     SHORT_LOOP
-    for (int k = 0; k < n; ++k)
-        add_polyhedron_face(around, rim->before[k]);
+    for (int k = 0; k < n; ++k) {
+        const int face = rim->edges[k].s0;
+        ADD_FACE(around, face);
+        rim->edge_after[face] = k;
+    }
     int faces = 0, dead = 0;
     for (int w = 0; w < FACE_WORDS; ++w) {
-        rim->dead[w] = touched[w] & ~around[w];
+        const uint inner = touched[w] & ~around[w];
+        rim->dead[w] = inner;
         faces += (int)popcount(around[w]);
-        dead += (int)popcount(rim->dead[w]);
+        dead += (int)popcount(inner);
     }
     /* Simple cycles and Euler's formula prove a disc of up to six triangles. More may be a ring and a disc. */
     if (faces != n || n != gone + 2 - 2 * dead)
         return false;
     if (gone > 6) {
-        INDEX next[FACE_CAPACITY];
-        SHORT_LOOP
-        for (int k = 0; k < n; ++k)
-            next[rim->before[k]] = rim->after[k];
-        int face = next[rim->before[0]], steps = 1;
-        while (face != rim->before[0]) {
-            face = next[face];
+        int k = 0, steps = 0;
+        do {
+            k = rim->edge_after[rim->edges[k].s1];
             ++steps;
-        }
+        } while (k != 0);
         return steps == n;
     }
     return true;
 }
 
 /* Remove the faces inside the rim and add the new face; FACE_CAPACITY if there is no room. */
-inline int replace_faces(cell_t *cell, const rim_t *rim, int label)
+inline int replace_faces(CELL *cell, int label)
 {
+    if (cell->n + cell->rim.n > VERTEX_CAPACITY)
+        return FACE_CAPACITY;
     for (int w = 0; w < FACE_WORDS; ++w)
-        cell->alive[w] &= ~rim->dead[w];
-    const int face = first_spare(cell->alive);
+        cell->alive[w] &= ~cell->rim.dead[w];
+    const int face = first_spare(cell);
     if (face < FACE_CAPACITY) {
-        add_polyhedron_face(cell->alive, face);
+        ADD_FACE(cell->alive, face);
         cell->labels[face] = label;
     }
     return face;
 }
 
-/* New vertices: intersections of the plane with the edges of the rim, by interpolation. */
-inline void cut_edges(const cell_t *cell, const rim_t *rim, REAL *nx, REAL *ny, REAL *nz)
+/* New vertices, after the others: intersections of the plane with the edges of the rim, by interpolation. */
+inline void cut_edges(CELL *cell)
 {
-    const REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = (const REAL *)cell->beyond;
+    CELL_SPACE REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = BEYOND(cell);
+    CELL_SPACE const rim_t *rim = &cell->rim;
     SHORT_LOOP
     for (int k = 0; k < rim->n; ++k) {
-        const int in = rim->in[k], out = rim->out[k];
+        const INDEX4 edge = rim->edges[k];
+        const int in = edge.s2, out = edge.s3, v = cell->n + k;
         const REAL s_in = s[in] < 0 ? s[in] : 0;
         const REAL t = s_in / (s_in - s[out]);
-        nx[k] = x[in] + t * (x[out] - x[in]);
-        ny[k] = y[in] + t * (y[out] - y[in]);
-        nz[k] = z[in] + t * (z[out] - z[in]);
+        x[v] = x[in] + t * (x[out] - x[in]);
+        y[v] = y[in] + t * (y[out] - y[in]);
+        z[v] = z[in] + t * (z[out] - z[in]);
     }
 }
 
-/* Join the rim to the new face by the new vertices. They replace the removed vertices, and then follow the last one;
-   remaining gaps are filled from the end. */
-inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REAL *nx, const REAL *ny, const REAL *nz)
+/* New vertices: intersections of the planes of their faces instead, where these determine them. */
+inline void meet_planes(CELL *cell, int face, REAL distance, global const REAL *points)
 {
-    REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
+    CELL_SPACE REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = BEYOND(cell);
+    const REAL reach = distance * sqrt(cell->reach2);
+    for (int k = 0; k < cell->rim.n; ++k) {
+        const INDEX4 ends = cell->rim.edges[k];
+        const int in = ends.s2, out = ends.s3, v = cell->n + k;
+        const REAL4 corner = meeting_point(cell, ends.s0, ends.s1, face, points);
+        /* But not if the plane is nearly parallel to the edge: only interpolation stays on the edge. */
+        const REAL slack = 1 + reach / (s[out] - s[in]);
+        const REAL off = fabs(corner.s0 - x[v]) + fabs(corner.s1 - y[v]) + fabs(corner.s2 - z[v]);
+        const REAL edge = fabs(x[out] - x[in]) + fabs(y[out] - y[in]) + fabs(z[out] - z[in]);
+        if (slack < 1024 && off < 1024 * REAL_EPS * (edge + sqrt(cell->reach2)) * slack) {
+            x[v] = corner.s0;
+            y[v] = corner.s1;
+            z[v] = corner.s2;
+        }
+    }
+}
+
+/* Move vertex `from` to the free place `to`. */
+inline void move_vertex(CELL *cell, int from, int to)
+{
+    const INDEX4 f = cell->faces[from], links = cell->links[from];
+    X(cell)[to] = X(cell)[from];
+    Y(cell)[to] = Y(cell)[from];
+    Z(cell)[to] = Z(cell)[from];
+    cell->faces[to] = f;
+    cell->links[to] = links;
+    link_vertex(cell, links.s0, f.s1, to);
+    link_vertex(cell, links.s1, f.s2, to);
+    link_vertex(cell, links.s2, f.s0, to);
+}
+
+/* Join the rim to the new face by the new vertices. They move to the places of the removed vertices, or else follow the
+   last one; remaining gaps are filled from the end. */
+inline void close_rim(CELL *cell, int face)
+{
+    CELL_SPACE REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
+    CELL_SPACE rim_t *rim = &cell->rim;
+    ulong gaps[VERTEX_WORDS]; /* removed vertices that have not been replaced */
+    for (int w = 0; w < VERTEX_WORDS; ++w)
+        gaps[w] = rim->beyond[w];
+    const int first = cell->n;
+    int w = 0, end = first;
     SHORT_LOOP
     for (int k = 0; k < rim->n; ++k) {
-        const int v = k < rim->gone ? rim->vertices[k] : cell->n++;
-        x[v] = nx[k];
-        y[v] = ny[k];
-        z[v] = nz[k];
-        cell->faces[v] = (INDEX4)(rim->before[k], rim->after[k], face, 0);
-        link_vertex(cell, v);
+        const INDEX4 edge = rim->edges[k];
+        while (w < VERTEX_WORDS - 1 && gaps[w] == 0)
+            ++w;
+        const ulong left = gaps[w];
+        const int v = left != 0 ? 64 * w + 63 - (int)clz(left & -left) : end++;
+        gaps[w] = left & (left - 1);
+        x[v] = x[first + k];
+        y[v] = y[first + k];
+        z[v] = z[first + k];
+        rim->edges[k].s3 = v; /* instead of the removed end */
+        cell->faces[v] = (INDEX4)(edge.s0, edge.s1, face, 0);
+        link_vertex(cell, edge.s2, edge.s1, v);
     }
     SHORT_LOOP
-    for (int k = rim->gone - 1; k >= rim->n; --k) {
-        const int v = rim->vertices[k], last = --cell->n;
-        if (v != last) {
-            x[v] = x[last];
-            y[v] = y[last];
-            z[v] = z[last];
-            cell->faces[v] = cell->faces[last];
-            link_vertex(cell, v);
-        }
+    for (int k = 0; k < rim->n; ++k) {
+        const INDEX4 edge = rim->edges[k];
+        const int v = edge.s3, next = rim->edges[rim->edge_after[edge.s1]].s3;
+        cell->links[v].s0 = edge.s2;
+        cell->links[v].s1 = next;
+        cell->links[next].s2 = v;
+    }
+    SHORT_LOOP
+    for (int v = end; v < first + rim->n; ++v)
+        x[v] = y[v] = z[v] = 0;
+    w = VERTEX_WORDS - 1;
+    SHORT_LOOP
+    for (int k = rim->gone; k > rim->n; --k) {
+        while (w > 0 && gaps[w] == 0)
+            --w;
+        const int v = 64 * w + 63 - (int)clz(gaps[w]), last = --end;
+        gaps[w] ^= (ulong)1 << (v & 63);
+        if (v != last)
+            move_vertex(cell, last, v);
         x[last] = y[last] = z[last] = 0;
     }
+    cell->n = end;
 }
 
 /* -DCLIP_SHARPLY=1: smaller parts are cut, too, as all given neighbors are known to have a face. */
@@ -236,7 +288,7 @@ inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REAL *nx, 
 
 /* Clip the cell by the bisector with the neighbor at x + d: remove the points y with y.d > d.d / 2; returns CLIP_*.
    With `seen_before` the cell may already have a face with this neighbor. */
-inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
+inline int clip_polyhedron(CELL *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
 {
     const REAL level = d2 / 2;
     const int blocks = (cell->n + 7) / 8;
@@ -256,52 +308,35 @@ inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_
     if (!(farthest > depth))
         return CLIP_MISSED;
     if (seen_before)
-        for (int f = next_face(cell->alive, 0); f < FACE_CAPACITY; f = next_face(cell->alive, f + 1))
+        for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
             if (cell->labels[f] == label)
                 return CLIP_MISSED;
 
-    rim_t rim;
-    if (!find_rim(cell, depth, &rim)) {
-        if (rim.gone == cell->n)
+    if (!find_rim(cell, depth)) {
+        if (cell->rim.gone == cell->n)
             return CLIP_COLLAPSED;
         const REAL doubt = 64 * distance * (noise_length(distance) + REAL_EPS * sqrt(cell->reach2));
         cell->torn |= !keep_disc(cell, depth, doubt);
-        if (!find_rim(cell, depth, &rim))
+        if (!find_rim(cell, depth))
             return CLIP_COLLAPSED;
     }
-    const int face = replace_faces(cell, &rim, label);
+    const int face = replace_faces(cell, label);
     if (face == FACE_CAPACITY)
         return CLIP_FULL;
     cell->planes[face] = (REAL4)(d.s0, d.s1, d.s2, level);
 
     /* Interpolation has an error of eps times the length of the edge. If this is large compared with the distance of
        the generators (an open cell, or near-duplicates), the planes are intersected instead. */
-    REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
-    cut_edges(cell, &rim, nx, ny, nz);
-    if (cell->reach2 > 16 * d2) {
-        const REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = (const REAL *)cell->beyond;
-        const REAL reach = distance * sqrt(cell->reach2);
-        for (int k = 0; k < rim.n; ++k) {
-            const int in = rim.in[k], out = rim.out[k];
-            const REAL4 v = meeting_point(cell, rim.before[k], rim.after[k], face, points);
-            /* But not if the plane is nearly parallel to the edge: only interpolation stays on the edge. */
-            const REAL slack = 1 + reach / (s[out] - s[in]);
-            const REAL off = fabs(v.s0 - nx[k]) + fabs(v.s1 - ny[k]) + fabs(v.s2 - nz[k]);
-            const REAL edge = fabs(x[out] - x[in]) + fabs(y[out] - y[in]) + fabs(z[out] - z[in]);
-            if (slack < 1024 && off < 1024 * REAL_EPS * (edge + sqrt(cell->reach2)) * slack) {
-                nx[k] = v.s0;
-                ny[k] = v.s1;
-                nz[k] = v.s2;
-            }
-        }
-    }
-    close_rim(cell, &rim, face, nx, ny, nz);
+    cut_edges(cell);
+    if (cell->reach2 > 16 * d2)
+        meet_planes(cell, face, distance, points);
+    close_rim(cell, face);
     find_reach(cell);
     return CLIP_CUT;
 }
 
 /* Clip by the generators in row i of a graph; returns CLIP_*. */
-inline int clip_polyhedron_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbors,
+inline int clip_polyhedron_by_row(CELL *cell, int i, REAL4 x, global const int *starts, global const int *neighbors,
                                   global const REAL *points)
 {
     const int end = starts[i + 1];

@@ -14,7 +14,7 @@ inline REAL distance_between(global const REAL *points, int i, int j)
     return sqrt(dx * dx + dy * dy + dz * dz);
 }
 
-inline REAL4 vertex_at(const cell_t *cell, int v)
+inline REAL4 vertex_at(const CELL *cell, int v)
 {
     return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
 }
@@ -31,7 +31,7 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
 
 #ifdef HALO
 /* Test the balls around the vertices of the cell of generator i. */
-inline void check_cell_balls(const cell_t *cell, int i, REAL4 place, const halo_t *halo)
+inline void check_cell_balls(const CELL *cell, int i, REAL4 place, const halo_t *halo)
 {
     const REAL x[3] = {place.s0, place.s1, place.s2};
     const REAL reach = sqrt(cell->reach2);
@@ -59,138 +59,134 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
                            global float *reach, BIN_ARGS, global const REAL *points, const REAL4 box_lower,
                            const REAL4 box_upper, const int warm, global const int *old_starts,
                            global const int *old_neighbors, const int again, const int room, const REAL share,
-                           CELL_OUTPUT_ARGS HALO_ARGS)
+                           CELL_OUTPUT_ARGS CELL_ARG HALO_ARGS)
 {
-    WORK_ITEM(p);
-    const int i = items[p];
-    if (i >= rows || (again && row_counts[i] != UNFINISHED))
-        return;
-    const REAL4 x = (REAL4)(binned[3 * p], binned[3 * p + 1], binned[3 * p + 2], 0);
+    TAKE_CELL(cell);
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
-    cell_t cell;
-    start_polyhedron(&cell, x, box_lower, box_upper);
-    int flag = 0;
-    REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* a radius of 0 would never widen */
-    if (warm) {
-        flag = flag_of(clip_polyhedron_by_row(&cell, i, x, old_starts, old_neighbors, points));
-        w = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
-    }
-    while (flag == 0) {
-        flag = clip_polyhedron_by_bins(&cell, x, p, w, inner, warm, &in);
-        const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
-        if (!(need > w)) /* a NaN ends the loop, too */
-            break;
-        inner = w;
-        w = need < 4 * w ? need : 2 * w;
-    }
-    if (flag != 0) {
-        atomic_or(report, flag);
-        row_counts[i] = flag == FLAG_FULL ? UNFINISHED : 0;
-        return;
-    }
+    EACH_WORK_ITEM(p)
+    {
+        const int i = items[p];
+        if (i >= rows || (again && row_counts[i] != UNFINISHED))
+            continue;
+        const REAL4 x = (REAL4)(binned[3 * p], binned[3 * p + 1], binned[3 * p + 2], 0);
+        start_polyhedron(cell, x, box_lower, box_upper);
+        int flag = 0;
+        REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* a radius of 0 would never widen */
+        if (warm) {
+            flag = flag_of(clip_polyhedron_by_row(cell, i, x, old_starts, old_neighbors, points));
+            w = 2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS);
+        }
+        while (flag == 0) {
+            flag = clip_polyhedron_by_bins(cell, x, p, w, inner, warm, &in);
+            const REAL need = 2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS);
+            if (!(need > w)) /* a NaN ends the loop, too */
+                break;
+            inner = w;
+            w = need < 4 * w ? need : 2 * w;
+        }
+        if (flag != 0) {
+            atomic_or(report, flag);
+            row_counts[i] = flag == FLAG_FULL ? UNFINISHED : 0;
+            continue;
+        }
 
-    reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
+        reach[p] = (float)(2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS));
 #ifdef HALO
-    MAKE_HALO;
-    if (i < halo.own)
-        check_cell_balls(&cell, i, x, &halo);
+        MAKE_HALO;
+        if (i < halo.own)
+            check_cell_balls(cell, i, x, &halo);
 #endif
 
-    /* A vertex of every face. */
-    INDEX start[FACE_CAPACITY];
-    SHORT_LOOP
-    for (int v = 0; v < cell.n; ++v) {
-        const INDEX4 f = cell.faces[v];
-        start[f.s0] = start[f.s1] = start[f.s2] = v;
-    }
-    const int face_count = cell.n / 2 + 2; /* Euler's formula */
-    const int place = take_places(report, face_count);
-    const bool fits = place + face_count <= room;
-    const REAL reach_length = sqrt(cell.reach2), near2 = sqrt(REAL_EPS) * cell.reach2;
-    const REAL slim = 512 * noise_length(reach_length);
-    int count = 0;
-    bool doubtful = cell.torn, narrow = false;
-    REAL volume = 0, lost = 0;
-    REAL4 first = 0, square = 0, mixed = 0; /* moments: x, y, z; xx, yy, zz; yz, zx, xy */
-    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1)) {
-        const REAL4 plane = cell.planes[f];
-        const REAL d2 = plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2;
-        const REAL inverse = 1 / sqrt(d2);
-        const REAL4 normal = plane * inverse; /* and its distance */
-        const int first_vertex = start[f];
-        const REAL4 a = vertex_at(&cell, first_vertex);
-        int v = vertex_after(&cell, first_vertex, f);
-        REAL4 b = vertex_at(&cell, v);
-        REAL4 ab = b - a;
-        REAL area = 0;
-        REAL4 face_first = 0, face_square = 0, face_mixed = 0;
-        for (v = vertex_after(&cell, v, f); v != first_vertex; v = vertex_after(&cell, v, f)) {
-            const REAL4 c = vertex_at(&cell, v);
-            const REAL4 ac = c - a;
-            const REAL weight = dot3(cross3(ab, ac), normal);
-            const REAL4 s = a + b + c;
-            area += weight;
-            face_first += weight * s;
-            face_square += weight * (a * a + b * b + c * c + s * s);
-            face_mixed += weight * (a.yzxw * a.zxyw + b.yzxw * b.zxyw + c.yzxw * c.zxyw + s.yzxw * s.zxyw);
-            b = c;
-            ab = ac;
-        }
-        volume += normal.s3 * area;
-        first += normal.s3 * face_first;
-        square += normal.s3 * face_square;
-        mixed += normal.s3 * face_mixed;
-        const int label = cell.labels[f];
-        /* Faces below round-off are dropped. Faces so small that a neighbor might drop them are doubtful. */
-        const REAL across2 = label >= 0 ? d2 : cell.reach2;
-        const bool small = !(area > sqrt(REAL_EPS) * across2);
-        if (small || !(area > slim * reach_length)) {
-            REAL width2 = 0;
-            for (v = vertex_after(&cell, first_vertex, f); v != first_vertex; v = vertex_after(&cell, v, f)) {
-                const REAL4 e = vertex_at(&cell, v) - a;
-                width2 = fmax(width2, dot3(e, e));
+        CELL_SPACE const INDEX *start = face_starts(cell);
+        const int face_count = cell->n / 2 + 2; /* Euler's formula */
+        const int place = take_places(report, face_count);
+        const bool fits = place + face_count <= room;
+        const REAL reach_length = sqrt(cell->reach2), near2 = sqrt(REAL_EPS) * cell->reach2;
+        const REAL slim = 512 * noise_length(reach_length);
+        int count = 0;
+        bool doubtful = cell->torn, narrow = false;
+        REAL volume = 0, lost = 0;
+        REAL4 first = 0, square = 0, mixed = 0; /* moments: x, y, z; xx, yy, zz; yz, zx, xy */
+        for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1)) {
+            const REAL4 plane = cell->planes[f];
+            const REAL d2 = plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2;
+            const REAL inverse = 1 / sqrt(d2);
+            const REAL4 normal = plane * inverse; /* and its distance */
+            const int first_vertex = start[f];
+            const REAL4 a = vertex_at(cell, first_vertex);
+            int v = vertex_after(cell, first_vertex, f);
+            REAL4 b = vertex_at(cell, v);
+            REAL4 ab = b - a;
+            REAL area = 0;
+            REAL4 face_first = 0, face_square = 0, face_mixed = 0;
+            for (v = vertex_after(cell, v, f); v != first_vertex; v = vertex_after(cell, v, f)) {
+                const REAL4 c = vertex_at(cell, v);
+                const REAL4 ac = c - a;
+                const REAL weight = dot3(cross3(ab, ac), normal);
+                const REAL4 s = a + b + c;
+                area += weight;
+                face_first += weight * s;
+                face_square += weight * (a * a + b * b + c * c + s * s);
+                face_mixed += weight * (a.yzxw * a.zxyw + b.yzxw * b.zxyw + c.yzxw * c.zxyw + s.yzxw * s.zxyw);
+                b = c;
+                ab = ac;
             }
-            doubtful |= small && label >= 0;
-            if (!(area > 16 * noise_length(sqrt(across2)) * sqrt(width2))) {
-                lost += fabs(normal.s3 * area);
-                continue;
+            volume += normal.s3 * area;
+            first += normal.s3 * face_first;
+            square += normal.s3 * face_square;
+            mixed += normal.s3 * face_mixed;
+            const int label = cell->labels[f];
+            /* Faces below round-off are dropped. Faces so small that a neighbor might drop them are doubtful. */
+            const REAL across2 = label >= 0 ? d2 : cell->reach2;
+            const bool small = !(area > sqrt(REAL_EPS) * across2);
+            if (small || !(area > slim * reach_length)) {
+                REAL width2 = 0;
+                for (v = vertex_after(cell, first_vertex, f); v != first_vertex; v = vertex_after(cell, v, f)) {
+                    const REAL4 e = vertex_at(cell, v) - a;
+                    width2 = fmax(width2, dot3(e, e));
+                }
+                doubtful |= small && label >= 0;
+                if (!(area > 16 * noise_length(sqrt(across2)) * sqrt(width2))) {
+                    lost += fabs(normal.s3 * area);
+                    continue;
+                }
+                narrow |= !(area > slim / 2 * sqrt(width2));
             }
-            narrow |= !(area > slim / 2 * sqrt(width2));
+            doubtful |= across2 < near2;
+            if (fits) {
+                const REAL third = area > 0 ? 1 / (3 * area) : 0;
+                labels[place + count] = label;
+                measures[place + count] = area / 2;
+                centroids[3 * (place + count)] = face_first.s0 * third;
+                centroids[3 * (place + count) + 1] = face_first.s1 * third;
+                centroids[3 * (place + count) + 2] = face_first.s2 * third;
+            }
+            ++count;
         }
-        doubtful |= across2 < near2;
-        if (fits) {
-            const REAL third = area > 0 ? 1 / (3 * area) : 0;
-            labels[place + count] = label;
-            measures[place + count] = area / 2;
-            centroids[3 * (place + count)] = face_first.s0 * third;
-            centroids[3 * (place + count) + 1] = face_first.s1 * third;
-            centroids[3 * (place + count) + 2] = face_first.s2 * third;
-        }
-        ++count;
+        row_places[i] = place;
+        row_counts[i] = count;
+        if (doubtful || narrow)
+            atomic_or(report, (doubtful ? FLAG_DOUBT : 0) | (narrow ? FLAG_NARROW : 0));
+        /* In a box as thin as round-off all faces are below it. */
+        if (count < 4 || !(volume > 0 && lost <= share * volume))
+            atomic_or(report, FLAG_COLLAPSED);
+        else if (lost > EVEN_SHARE * volume)
+            atomic_or(report, FLAG_UNEVEN);
+        const REAL inverse = 1 / volume;
+        first *= inverse / 4;
+        square = square * (inverse / 20) - first * first;
+        mixed = mixed * (inverse / 20) - first.yzxw * first.zxyw;
+        volumes[i] = volume / 6;
+        offsets[3 * i] = first.s0;
+        offsets[3 * i + 1] = first.s1;
+        offsets[3 * i + 2] = first.s2;
+        covariances[6 * i] = square.s0;
+        covariances[6 * i + 1] = mixed.s2;
+        covariances[6 * i + 2] = mixed.s1;
+        covariances[6 * i + 3] = square.s1;
+        covariances[6 * i + 4] = mixed.s0;
+        covariances[6 * i + 5] = square.s2;
     }
-    row_places[i] = place;
-    row_counts[i] = count;
-    if (doubtful || narrow)
-        atomic_or(report, (doubtful ? FLAG_DOUBT : 0) | (narrow ? FLAG_NARROW : 0));
-    /* In a box as thin as round-off all faces are below it. */
-    if (count < 4 || !(volume > 0 && lost <= share * volume))
-        atomic_or(report, FLAG_COLLAPSED);
-    else if (lost > EVEN_SHARE * volume)
-        atomic_or(report, FLAG_UNEVEN);
-    const REAL inverse = 1 / volume;
-    first *= inverse / 4;
-    square = square * (inverse / 20) - first * first;
-    mixed = mixed * (inverse / 20) - first.yzxw * first.zxyw;
-    volumes[i] = volume / 6;
-    offsets[3 * i] = first.s0;
-    offsets[3 * i + 1] = first.s1;
-    offsets[3 * i + 2] = first.s2;
-    covariances[6 * i] = square.s0;
-    covariances[6 * i + 1] = mixed.s2;
-    covariances[6 * i + 2] = mixed.s1;
-    covariances[6 * i + 3] = square.s1;
-    covariances[6 * i + 4] = mixed.s0;
-    covariances[6 * i + 5] = square.s2;
 }
 
 /* The area that a face of cell i may have by round-off alone. The bisector of generators d apart is off by eps R / d at

@@ -6,7 +6,7 @@
 #include "opencl/real.h"
 
 #ifndef FACE_CAPACITY
-#error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 64"
+#error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 32"
 #endif
 /* Usually short loops: vectorization would not pay. */
 #ifdef __clang__
@@ -16,7 +16,13 @@
 #endif
 
 #define REAL8 CLVORO_JOIN(REAL, 8)
-#define VERTEX_CAPACITY (2 * FACE_CAPACITY) /* 2 F - 4, rounded up to whole vectors */
+/* F faces have 2 F - 4 vertices, and up to F new ones beside them while they are clipped. In private memory there is
+   room for few new ones: a cell that needs more counts as full. */
+#ifdef CELL_BYTES
+#define VERTEX_CAPACITY (3 * FACE_CAPACITY)
+#else
+#define VERTEX_CAPACITY (2 * FACE_CAPACITY)
+#endif
 #if VERTEX_CAPACITY <= 256
 #define INDEX uchar
 #define INDEX4 uchar4
@@ -25,66 +31,110 @@
 #define INDEX4 ushort4
 #endif
 
-/* Sets of faces. */
-#define FACE_WORDS (FACE_CAPACITY / 64)
-#define WORD_OF(f) (FACE_WORDS == 1 ? 0 : (f) >> 6)
+/* Sets of faces are words of 32 bits, sets of vertices words of 64 bits. */
+#define FACE_WORDS (FACE_CAPACITY / 32)
+#define FACE_WORD(f) (FACE_WORDS == 1 ? 0 : (f) >> 5)
+#define ADD_FACE(set, f) ((set)[FACE_WORD(f)] |= (uint)1 << ((f)&31))
+#define HAS_FACE(set, f) (((set)[FACE_WORD(f)] >> ((f)&31)) & 1)
+#define VERTEX_WORDS (VERTEX_CAPACITY / 64)
+#define VERTEX_WORD(v) (VERTEX_WORDS == 1 ? 0 : (v) >> 6)
+#define ADD_VERTEX(set, v) ((set)[VERTEX_WORD(v)] |= (ulong)1 << ((v)&63))
+#define HAS_VERTEX(set, v) (((set)[VERTEX_WORD(v)] >> ((v)&63)) & 1)
 
-inline void add_polyhedron_face(ulong *set, int f)
-{
-    set[WORD_OF(f)] |= (ulong)1 << (f & 63);
-}
+/* Cells lie in private memory, or, with -DCELL_BYTES=bytes of one cell, in global memory: drivers of GPUs reserve
+   private memory for all work-items that fit on the device at once. */
+#ifdef CELL_BYTES
+#define CELL_SPACE global
+#define CELL_ARG , global uchar *cell_memory
+#define TAKE_CELL(cell) global cell_t *cell = (global cell_t *)(cell_memory + (size_t)CELL_BYTES * get_global_id(0))
+#else
+#define CELL_SPACE private
+#define CELL_ARG
+#define TAKE_CELL(cell)                                                                                                \
+    cell_t own_cell;                                                                                                   \
+  private                                                                                                              \
+    cell_t *cell = &own_cell
+#endif
+#define CELL CELL_SPACE cell_t
 
-/* The first face that is not in the set, or FACE_CAPACITY. */
-inline int first_spare(const ulong *set)
-{
-    for (int w = 0; w < FACE_WORDS; ++w) {
-        const ulong spare = ~set[w];
-        if (spare != 0)
-            return 64 * w + 63 - (int)clz(spare & -spare);
-    }
-    return FACE_CAPACITY;
-}
-
-/* The first face of the set from f on, or FACE_CAPACITY. */
-inline int next_face(const ulong *set, int f)
-{
-    while (f < FACE_CAPACITY) {
-        const ulong rest = set[WORD_OF(f)] >> (f & 63);
-        if (rest != 0)
-            return f + 63 - (int)clz(rest & -rest);
-        f = (f | 63) + 1;
-    }
-    return FACE_CAPACITY;
-}
+/* The edges of the cell that a bisector cuts. */
+typedef struct {
+    int gone;                        /* vertices beyond the bisector */
+    int n;                           /* edges */
+    ulong beyond[VERTEX_WORDS];      /* set of the vertices beyond */
+    uint dead[FACE_WORDS];           /* set of the faces entirely beyond */
+    INDEX4 edges[FACE_CAPACITY + 4]; /* the two faces of an edge, along the rim; its ends, kept and removed */
+    INDEX edge_after[FACE_CAPACITY]; /* the edge that follows a face along the rim */
+} rim_t;
 
 /* Arrays of vertices are padded to whole vectors by zeros: the generator itself, which no bisector cuts off. */
 typedef struct {
-    int n;                   /* vertices */
-    bool torn;               /* whether a clip kept something that it should have removed; see clip.h */
-    REAL reach2;             /* largest squared distance of a vertex from the generator */
-    ulong alive[FACE_WORDS]; /* set of the existing faces */
     REAL8 x[VERTEX_CAPACITY / 8], y[VERTEX_CAPACITY / 8], z[VERTEX_CAPACITY / 8];
-    REAL8 beyond[VERTEX_CAPACITY / 8];       /* signed distances from a bisector, times |d| */
-    INDEX4 faces[VERTEX_CAPACITY];           /* of a vertex, counter-clockwise */
-    INDEX at[FACE_CAPACITY * FACE_CAPACITY]; /* [a][b]: the vertex whose faces are a, b, in this order, and another */
-    int labels[FACE_CAPACITY];               /* of a face: a generator, or -1 - wall */
-    REAL4 planes[FACE_CAPACITY];             /* of a face: d, level; the plane is y.d = level */
+    REAL8 beyond[VERTEX_CAPACITY / 8]; /* signed distances from a bisector, times |d| */
+    REAL4 planes[FACE_CAPACITY];       /* of a face: d, level; the plane is y.d = level */
+    int labels[FACE_CAPACITY];         /* of a face: a generator, or -1 - wall */
+    INDEX4 faces[VERTEX_CAPACITY];     /* of a vertex, counter-clockwise: a, b, c */
+    INDEX4 links[VERTEX_CAPACITY];     /* of a vertex: the other ends of the edges between a and b, b and c, c and a */
+    int n;                             /* vertices */
+    bool torn;                         /* whether a clip kept something that it should have removed; see clip.h */
+    REAL reach2;                       /* largest squared distance of a vertex from the generator */
+    uint alive[FACE_WORDS];            /* set of the existing faces */
+    rim_t rim;
 } cell_t;
 
-#define X(cell) ((REAL *)(cell)->x)
-#define Y(cell) ((REAL *)(cell)->y)
-#define Z(cell) ((REAL *)(cell)->z)
+#ifdef CELL_BYTES
+typedef char CELL_BYTES_suffice[sizeof(cell_t) <= CELL_BYTES ? 1 : -1];
+#endif
 
-/* Record vertex v between its faces. */
-inline void link_vertex(cell_t *cell, int v)
+#define X(cell) ((CELL_SPACE REAL *)(cell)->x)
+#define Y(cell) ((CELL_SPACE REAL *)(cell)->y)
+#define Z(cell) ((CELL_SPACE REAL *)(cell)->z)
+#define BEYOND(cell) ((CELL_SPACE REAL *)(cell)->beyond)
+
+/* The first face that does not exist, or FACE_CAPACITY. */
+inline int first_spare(const CELL *cell)
 {
-    const INDEX4 f = cell->faces[v];
-    cell->at[f.s0 * FACE_CAPACITY + f.s1] = v;
-    cell->at[f.s1 * FACE_CAPACITY + f.s2] = v;
-    cell->at[f.s2 * FACE_CAPACITY + f.s0] = v;
+    for (int w = 0; w < FACE_WORDS; ++w) {
+        const uint spare = ~cell->alive[w];
+        if (spare != 0)
+            return 32 * w + 31 - (int)clz(spare & -spare);
+    }
+    return FACE_CAPACITY;
 }
 
-inline void find_reach(cell_t *cell)
+/* The first face from f on, or FACE_CAPACITY. */
+inline int next_face(const CELL *cell, int f)
+{
+    while (f < FACE_CAPACITY) {
+        const uint rest = cell->alive[FACE_WORD(f)] >> (f & 31);
+        if (rest != 0)
+            return f + 31 - (int)clz(rest & -rest);
+        f = (f | 31) + 1;
+    }
+    return FACE_CAPACITY;
+}
+
+/* A vertex of every face, in the memory of the rim. */
+inline CELL_SPACE INDEX *face_starts(CELL *cell)
+{
+    CELL_SPACE INDEX *start = cell->rim.edge_after;
+    SHORT_LOOP
+    for (int v = 0; v < cell->n; ++v) {
+        const INDEX4 f = cell->faces[v];
+        start[f.s0] = start[f.s1] = start[f.s2] = v;
+    }
+    return start;
+}
+
+/* Let vertex v be the other end of the edge of vertex w between its face `first` and the following one. */
+inline void link_vertex(CELL *cell, int w, int first, int v)
+{
+    const INDEX4 f = cell->faces[w];
+    const int k = f.s0 == first ? 0 : (f.s1 == first ? 1 : 2);
+    ((CELL_SPACE INDEX *)(cell->links + w))[k] = v;
+}
+
+inline void find_reach(CELL *cell)
 {
     const int blocks = (cell->n + 7) / 8;
     REAL8 far = fma(cell->x[0], cell->x[0], fma(cell->y[0], cell->y[0], cell->z[0] * cell->z[0]));
@@ -98,7 +148,7 @@ inline void find_reach(cell_t *cell)
 }
 
 /* Start with the whole box around generator x. Face w is wall w. */
-inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
+inline void start_polyhedron(CELL *cell, REAL4 x, REAL4 lower, REAL4 upper)
 {
     cell->n = 8;
     cell->torn = false;
@@ -115,7 +165,8 @@ inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
         /* Counter-clockwise for an even number of lower walls. */
         const bool turned = ((v & 1) + ((v >> 1) & 1) + (v >> 2)) % 2 == 0;
         cell->faces[v] = turned ? (INDEX4)(fx, fz, fy, 0) : (INDEX4)(fx, fy, fz, 0);
-        link_vertex(cell, v);
+        const int along_x = v ^ 1, along_y = v ^ 2, along_z = v ^ 4;
+        cell->links[v] = turned ? (INDEX4)(along_y, along_x, along_z, 0) : (INDEX4)(along_z, along_x, along_y, 0);
     }
     for (int w = 0; w < 6; ++w)
         cell->labels[w] = -1 - w;
@@ -129,9 +180,8 @@ inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
 }
 
 /* The vertex that follows v counter-clockwise around face f. */
-inline int vertex_after(const cell_t *cell, int v, int f)
+inline int vertex_after(const CELL *cell, int v, int f)
 {
-    const INDEX4 g = cell->faces[v];
-    const int next = g.s0 == f ? g.s2 : (g.s1 == f ? g.s0 : g.s1);
-    return cell->at[f * FACE_CAPACITY + next];
+    const INDEX4 g = cell->faces[v], links = cell->links[v];
+    return g.s0 == f ? links.s2 : (g.s1 == f ? links.s0 : links.s1);
 }

@@ -14,8 +14,8 @@
 #error "build with -DMAX_DEPTH=levels that the bins may have"
 #endif
 
-#define BATCH 256 /* generators that are sorted by distance at a time */
-#define SHELLS 32
+#define BATCH 256 /* generators that are sorted by distance at a time, at most 256 */
+#define SHELLS 32 /* bits of a word */
 
 /* The flag for an outcome of clip_polyhedron or clip_polyhedron_by_row, or 0. */
 inline int flag_of(int what)
@@ -34,47 +34,54 @@ typedef struct {
     global const int4 *grid_shapes;
 } search_t;
 
-/* Generators that may cut a cell, as items in bin order. */
+/* Generators that may cut a cell, as items in bin order; and shells, lists of those at similar distances. */
 typedef struct {
     int n;
     int places[BATCH];
-    REAL d2[BATCH];
+    uchar next[BATCH]; /* in the same shell */
+    uchar first[SHELLS], last[SHELLS];
 } batch_t;
+
+/* The vector from x to the generator of item q, and its squared length. */
+inline REAL4 vector_to_item(int q, REAL4 x, const search_t *in)
+{
+    const REAL dx = in->binned[3 * q] - x.s0, dy = in->binned[3 * q + 1] - x.s1, dz = in->binned[3 * q + 2] - x.s2;
+    return (REAL4)(dx, dy, dz, dx * dx + dy * dy + dz * dz);
+}
 
 /* Clip the cell by a batch of generators, roughly the nearest first: in shells of squared distance 1 / `per_shell`.
    Returns FLAG_* or 0. */
-inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, bool warm, const search_t *in)
+inline int clip_by_batch(CELL *cell, REAL4 x, batch_t *batch, REAL per_shell, bool warm, const search_t *in)
 {
-    ushort ends[SHELLS], order[BATCH];
-    uchar shell[BATCH];
-    for (int k = 0; k < SHELLS; ++k)
-        ends[k] = 0;
+    uint shells = 0; /* those with generators */
+    SHORT_LOOP
     for (int k = 0; k < batch->n; ++k) {
-        const REAL place = batch->d2[k] * per_shell;
-        shell[k] = place < SHELLS - 1 ? (uchar)place : (uchar)(SHELLS - 1);
-        ++ends[shell[k]];
-    }
-    for (int k = 0, sum = 0; k < SHELLS; ++k) {
-        const int count = ends[k];
-        ends[k] = sum;
-        sum += count;
-    }
-    for (int k = 0; k < batch->n; ++k)
-        order[ends[shell[k]]++] = k;
-    for (int k = 0; k < batch->n; ++k) {
-        const REAL d2 = batch->d2[order[k]];
-        if (!(d2 < 4 * cell->reach2))
-            continue;
-        const int q = batch->places[order[k]];
-        if (d2 == 0)
-            return FLAG_COINCIDE;
-        const REAL4 d =
-            (REAL4)(in->binned[3 * q] - x.s0, in->binned[3 * q + 1] - x.s1, in->binned[3 * q + 2] - x.s2, 0);
-        const int what = clip_polyhedron(cell, d, d2, in->items[q], warm, in->points);
-        if (what >= CLIP_FULL)
-            return flag_of(what);
+        const REAL place = vector_to_item(batch->places[k], x, in).s3 * per_shell;
+        const int shell = place < SHELLS - 1 ? (int)place : SHELLS - 1;
+        const uint known = (shells >> shell) & 1;
+        batch->next[known ? batch->last[shell] : k] = k;
+        batch->first[shell] = known ? batch->first[shell] : k;
+        batch->last[shell] = k;
+        shells |= (uint)1 << shell;
     }
     batch->n = 0;
+    for (; shells != 0; shells &= shells - 1) {
+        const int shell = 31 - (int)clz(shells & -shells);
+        const int last = batch->last[shell];
+        for (int k = batch->first[shell];; k = batch->next[k]) {
+            const int q = batch->places[k];
+            const REAL4 d = vector_to_item(q, x, in);
+            if (d.s3 < 4 * cell->reach2) {
+                if (d.s3 == 0)
+                    return FLAG_COINCIDE;
+                const int what = clip_polyhedron(cell, d, d.s3, in->items[q], warm, in->points);
+                if (what >= CLIP_FULL)
+                    return flag_of(what);
+            }
+            if (k == last)
+                break;
+        }
+    }
     return 0;
 }
 
@@ -86,7 +93,7 @@ inline int2 bin_range(REAL x, REAL w, REAL origin, REAL inverse, int side)
 
 /* Add those of the items begin .. end - 1 that may cut the cell to the batch; clip when it is full.
    Returns FLAG_* or 0. */
-inline int take_items(cell_t *cell, REAL4 x, int own, int begin, int end, batch_t *batch, REAL per_shell, bool warm,
+inline int take_items(CELL *cell, REAL4 x, int own, int begin, int end, batch_t *batch, REAL per_shell, bool warm,
                       const search_t *in)
 {
     while (begin < end) {
@@ -95,13 +102,8 @@ inline int take_items(cell_t *cell, REAL4 x, int own, int begin, int end, batch_
         int n = batch->n;
         SHORT_LOOP
         for (int q = begin; q < stop; ++q) {
-            const REAL dx = in->binned[3 * q] - x.s0;
-            const REAL dy = in->binned[3 * q + 1] - x.s1;
-            const REAL dz = in->binned[3 * q + 2] - x.s2;
-            const REAL d2 = dx * dx + dy * dy + dz * dz;
             batch->places[n] = q;
-            batch->d2[n] = d2;
-            n += d2 < limit && q != own;
+            n += vector_to_item(q, x, in).s3 < limit && q != own;
         }
         batch->n = n;
         begin = stop;
@@ -124,7 +126,7 @@ typedef struct {
 /* Clip the cell of item `own` by all generators in the bins within the cube of half-width w but outside the cube of
    half-width `inner` (inner < 0: no bin has been searched), except those farther than twice the farthest vertex.
    Returns FLAG_* or 0. */
-inline int clip_polyhedron_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
+inline int clip_polyhedron_by_bins(CELL *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
 {
     open_grid_t open[MAX_DEPTH]; /* from the root down */
     const REAL per_shell = SHELLS / (6 * w * w);

@@ -14,6 +14,7 @@ from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..solvers.poisson import max_jacobi_iterations
 from ..tessellation.periodic.halo import block_count
+from ..tessellation.polyhedra import clipping_space
 from .forecast import IMAGE_REACH, expected_boundary_cells
 
 MAX_CELLS = 100_000_000
@@ -77,15 +78,16 @@ def fixed_bytes(engine: Engine, n: float) -> float:
     """Return the bytes of a run that are almost independent of its number of cells `n`."""
     real = engine.real.itemsize
     records = 8 * real * max_jacobi_iterations(int(min(n, FEW)))
-    return records + PARTIAL_SUMS * engine.groups * real + workspace_bytes(engine)
+    return records + PARTIAL_SUMS * engine.groups * real + workspace_bytes(engine, n)
 
 
-def workspace_bytes(engine: Engine) -> float:
+def workspace_bytes(engine: Engine, n: float) -> float:
     """Return the part of these bytes that one diagram needs, too."""
     unit = max(64, engine.queue.device.mem_base_addr_align // 8)
     periodic = engine.domain_kind.periodic
     halo = 3 * 4 * block_count(engine.dim) if periodic else 0
-    return ARRAYS * unit + SCANS * 4 * engine.groups + halo
+    space = clipping_space(n) if engine.dim == 3 else 0
+    return ARRAYS * unit + SCANS * 4 * engine.groups + halo + space
 
 
 def estimate_memory(
@@ -126,7 +128,10 @@ def estimate_memory(
         per_cell = (TRIMMED_DIAGRAM, BOUNDARY_DIAGRAM, EDGE_DIAGRAM)
         made = in_polygon(*(f[real] for f in per_cell)) if trimmed else cells * DIAGRAM[d][real]
         return (
-            made + folded * FOLDED_DIAGRAM[d][real] + extras.field_bytes + workspace_bytes(engine)
+            made
+            + folded * FOLDED_DIAGRAM[d][real]
+            + extras.field_bytes
+            + workspace_bytes(engine, n)
         )
     if trimmed:
         peak = in_polygon(*map(bytes_of, (TRIMMED_PEAK, BOUNDARY_PEAK, EDGE_PEAK)))

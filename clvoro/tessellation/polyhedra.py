@@ -34,10 +34,12 @@ from .periodic.halo import halo_defines
 
 HARMLESS = DOUBT | NARROW | UNEVEN
 """Flags of a diagram that is not rejected."""
-FACE_CAPACITY = 64
-"""Most faces of a cell while it is clipped. It is doubled for cells with more."""
-MOST_FACES = 512
-"""Largest capacity."""
+FACE_CAPACITY = 32
+"""Most faces of a cell while it is clipped in private memory."""
+GROWTH, MOST_FACES = 4, 512
+"""Factor to the next capacity for cells with more, and the largest one."""
+LEAST_SPACE, SPACE_PER_CELL, MOST_SPACE = 2**20, 64, 2**26
+"""Bytes of global memory for cells with more than `FACE_CAPACITY` faces while they are clipped, a few at a time."""
 FACES_PER_CELL = 16.5
 """First guess of the half-faces per cell. Random cells have 15.54 on average; walls add some."""
 STRETCH = 128
@@ -46,6 +48,17 @@ CUBE = 8
 """Number of bins along each axis of the cubes that order these generators."""
 FIRST_REACH = 2.0
 """First search radius of `walks.cl`, in units of the local spacing of the bins."""
+
+
+def clipping_space(n: float) -> float:
+    """Return the most bytes that cells with many faces take in global memory while `n` cells are clipped."""
+    return min(max(LEAST_SPACE, SPACE_PER_CELL * n), MOST_SPACE)
+
+
+def cell_bytes(capacity: int, real: np.dtype) -> int:
+    """Return an upper bound of the size of `cell_t` (polyhedron.h), which the kernels check."""
+    index = 1 if 3 * capacity <= 256 else 2
+    return capacity * (16 * real.itemsize + 29 * index + 5) + 320
 
 
 @dataclass(frozen=True)
@@ -98,9 +111,12 @@ class Polyhedra:
 
     def _kernels(self, capacity: int) -> SimpleNamespace:
         if capacity not in self._programs:
+            engine = self.engine
             defines = {
-                "FACE_CAPACITY": capacity, "MAX_DEPTH": MAX_LEVELS, **halo_defines(self.engine),
+                "FACE_CAPACITY": capacity, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine),
             }  # fmt: skip
+            if capacity > FACE_CAPACITY:
+                defines["CELL_BYTES"] = cell_bytes(capacity, engine.real)
             self._programs[capacity] = self.engine.kernels("tessellation/polyhedra", defines)
         return self._programs[capacity]
 
@@ -251,12 +267,19 @@ class Polyhedra:
                         *written, *halo_args, group=1,
                     )  # fmt: skip
             some = np.int32(again or walk is not None)
-            engine.run_each(
-                self._kernels(capacity).clip_polyhedra, n, np.int32(rows), binned.points, binned.items,
-                *search, points, lower, upper, np.int32(warm), *old, some, room, share, *written, *halo_args,
-                # On a CPU the private arrays of a whole group lie on the stack of one thread.
-                group=1 if again else None,
+            clip = self._kernels(capacity).clip_polyhedra
+            cell_args = (
+                np.int32(n), np.int32(rows), binned.points, binned.items, *search, points, lower,
+                upper, np.int32(warm), *old, some, room, share, *written,
             )  # fmt: skip
+            if again:
+                with engine.workspace.frame():
+                    bytes_ = cell_bytes(capacity, engine.real)
+                    slots = min(rows, int(clipping_space(rows)) // bytes_)
+                    space = engine.scratch(slots * bytes_, np.uint8)
+                    engine.run(clip, slots, *cell_args, space, *halo_args, group=1)
+            else:
+                engine.run(clip, n, *cell_args, *halo_args)
             flags, m = (int(v) for v in self._report.get())
             if flags & ~(FULL | HARMLESS):
                 return None
@@ -268,7 +291,7 @@ class Polyhedra:
                 self._report.set(np.zeros(2, np.int32))
             elif flags & FULL:
                 # Clip only the cells with too many faces, with a larger capacity.
-                capacity, again = 2 * capacity, True
+                capacity, again = GROWTH * capacity, True
                 if capacity > MOST_FACES:
                     raise ClvoroError(
                         f"a cell has more than {MOST_FACES} faces, expected fewer; remove or perturb generators "

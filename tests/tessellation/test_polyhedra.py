@@ -7,6 +7,7 @@ import pytest
 
 import clvoro
 from clvoro.opencl.engine import Engine
+from clvoro.tessellation import polyhedra
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.reference import diagrams3d as reference3d
@@ -305,6 +306,28 @@ def test_too_many_neighbors_are_rejected(adapter64):
     points = np.concatenate([center + 0.4 * directions(900, np.random.default_rng(31)), [center]])
     with pytest.raises(clvoro.ClvoroError, match="more than 512 faces"):
         adapter64.diagram(BOX, points)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_where_cells_are_clipped_changes_no_bit(ctx, real, monkeypatch):
+    """In private memory, or in turns in few places of global memory."""
+    rng = np.random.default_rng(97)
+    center = np.array([1.0, 0.75, 0.5])
+    rings = [center + r * directions(50, rng) for r in (0.3, 0.305)]
+    points = np.concatenate([center + 0.01 * directions(9, rng), *rings, POINTS["random"]])
+
+    def arrays():
+        diagram = clvoro.Adapter(ctx, real).diagram(BOX, points)
+        return diagram.volumes, diagram.centroids, diagram.neighbors, diagram.face_centroids
+
+    expected = arrays()
+    assert np.diff(clvoro.Adapter(ctx, real).diagram(BOX, points).neighbor_starts).max() > 32
+    monkeypatch.setattr(polyhedra, "LEAST_SPACE", 3 * polyhedra.cell_bytes(128, np.dtype(real)))
+    few = arrays()
+    monkeypatch.setattr(polyhedra, "FACE_CAPACITY", 64)
+    for one, two, three in zip(expected, few, arrays(), strict=True):
+        assert np.array_equal(one, two)
+        assert np.array_equal(one, three)
 
 
 def test_duplicates_are_named(adapter):

@@ -2,9 +2,9 @@
 #include "tessellation/clip.h"
 
 /* The faces of a diagram in 3D as each cell has them by itself. Each cell is clipped once more, by its neighbors alone.
-   Its vertices are the corners, numbered cell by cell. A face that two cells share has a half-face in each. Two corners
-   surely belong to one vertex where the same four generators or walls meet, and where an edge of zero length joins
-   them. consistency.cl does the rest.
+   Its vertices are the corners, numbered cell by cell. A face that two cells share has a half-face in each. Two
+   corners surely belong to one vertex where the same four generators or walls meet, and where an edge of zero length
+   joins them. consistency.cl does the rest.
 
    starts, neighbors           the graph
    half_face_starts (n + 1,)   rows of half-faces: the faces of the graph in its order, then walls that the cell touches
@@ -15,8 +15,8 @@
    loops (3 c,)                corners, counter-clockwise from outside */
 
 /* The cell of generator i; false if there is not enough room. */
-inline bool make_cell(cell_t *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper,
-                      global const int *starts, global const int *neighbors)
+inline bool make_cell(CELL *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper, global const int *starts,
+                      global const int *neighbors)
 {
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
     start_polyhedron(cell, x, lower, upper);
@@ -38,22 +38,22 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
                           global int *half_face_counts, global int *full)
 {
     WORK_ITEM(i);
-    cell_t cell;
-    if (!make_cell(&cell, i, points, box_lower, box_upper, starts, neighbors)) {
+    TAKE_CELL(cell);
+    if (!make_cell(cell, i, points, box_lower, box_upper, starts, neighbors)) {
         atomic_or(full, 1);
         return;
     }
     const int begin = starts[i], end = starts[i + 1];
     int count = end - begin;
-    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1))
-        count += !is_in_row(cell.labels[f], begin, end, neighbors);
-    corner_counts[i] = cell.n;
+    for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
+        count += !is_in_row(cell->labels[f], begin, end, neighbors);
+    corner_counts[i] = cell->n;
     half_face_counts[i] = count;
 }
 
 /* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each
    face, because the round-off of a bisector grows as r / d, with d the distance of its generators and r that of v. */
-inline REAL sharpness_of(const cell_t *cell, int v)
+inline REAL sharpness_of(const CELL *cell, int v)
 {
     const INDEX4 f = cell->faces[v];
     const int faces[3] = {f.s0, f.s1, f.s2};
@@ -73,20 +73,16 @@ inline REAL sharpness_of(const cell_t *cell, int v)
 }
 
 /* Write the loops of a cell's half-faces, from `half_face` up to `end`. */
-inline void list_loops(const cell_t *cell, int base, int half_face, int end, global const int *half_face_labels,
+inline void list_loops(CELL *cell, int base, int half_face, int end, global const int *half_face_labels,
                        global int *loop_starts, global int *loops)
 {
-    INDEX start[FACE_CAPACITY];
-    for (int v = 0; v < cell->n; ++v) {
-        const INDEX4 f = cell->faces[v];
-        start[f.s0] = start[f.s1] = start[f.s2] = v;
-    }
+    CELL_SPACE const INDEX *start = face_starts(cell);
     int t = 3 * base;
     for (; half_face < end; ++half_face) {
         loop_starts[half_face] = t;
-        int f = next_face(cell->alive, 0);
+        int f = next_face(cell, 0);
         while (f < FACE_CAPACITY && cell->labels[f] != half_face_labels[half_face])
-            f = next_face(cell->alive, f + 1);
+            f = next_face(cell, f + 1);
         if (f == FACE_CAPACITY) /* the graph has this face, but the clipped cell does not */
             continue;
         const int first = start[f];
@@ -108,39 +104,38 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
                          global int *loop_starts, global int *loops)
 {
     WORK_ITEM(i);
-    cell_t cell;
-    make_cell(&cell, i, points, box_lower, box_upper, starts, neighbors);
+    TAKE_CELL(cell);
+    make_cell(cell, i, points, box_lower, box_upper, starts, neighbors);
     const int base = corner_starts[i];
-    REAL least = 4 * noise_length(sqrt(cell.reach2));
-    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1))
-        if (cell.labels[f] >= 0)
-            least = fmin(least, sqrt(2 * cell.planes[f].s3) / 64);
+    REAL least = 4 * noise_length(sqrt(cell->reach2));
+    for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
+        if (cell->labels[f] >= 0)
+            least = fmin(least, sqrt(2 * cell->planes[f].s3) / 64);
     INDEX joined[VERTEX_CAPACITY];
-    for (int v = 0; v < cell.n; ++v) {
+    for (int v = 0; v < cell->n; ++v) {
         const int u = base + v;
-        corners[3 * u] = X(&cell)[v];
-        corners[3 * u + 1] = Y(&cell)[v];
-        corners[3 * u + 2] = Z(&cell)[v];
-        const INDEX4 f = cell.faces[v];
-        corner_faces[3 * u] = cell.labels[f.s0];
-        corner_faces[3 * u + 1] = cell.labels[f.s1];
-        corner_faces[3 * u + 2] = cell.labels[f.s2];
-        sharpness[u] = (float)sharpness_of(&cell, v);
+        corners[3 * u] = X(cell)[v];
+        corners[3 * u + 1] = Y(cell)[v];
+        corners[3 * u + 2] = Z(cell)[v];
+        const INDEX4 f = cell->faces[v];
+        corner_faces[3 * u] = cell->labels[f.s0];
+        corner_faces[3 * u + 1] = cell->labels[f.s1];
+        corner_faces[3 * u + 2] = cell->labels[f.s2];
+        sharpness[u] = (float)sharpness_of(cell, v);
         owners[u] = i;
         joined[v] = v;
     }
     bool changed = true;
     while (changed) {
         changed = false;
-        for (int v = 0; v < cell.n; ++v) {
-            const INDEX4 f = cell.faces[v];
-            const int a[4] = {f.s0, f.s1, f.s2, f.s0};
+        for (int v = 0; v < cell->n; ++v) {
+            const INDEX4 links = cell->links[v];
+            const int ends[3] = {links.s0, links.s1, links.s2};
             for (int e = 0; e < 3; ++e) {
-                const int w = cell.at[a[e + 1] * FACE_CAPACITY + a[e]];
+                const int w = ends[e];
                 if (joined[w] >= joined[v])
                     continue;
-                const REAL dx = X(&cell)[w] - X(&cell)[v], dy = Y(&cell)[w] - Y(&cell)[v],
-                           dz = Z(&cell)[w] - Z(&cell)[v];
+                const REAL dx = X(cell)[w] - X(cell)[v], dy = Y(cell)[w] - Y(cell)[v], dz = Z(cell)[w] - Z(cell)[v];
                 if (dx * dx + dy * dy + dz * dz < least * least) {
                     joined[v] = joined[w];
                     changed = true;
@@ -148,18 +143,18 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
             }
         }
     }
-    for (int v = 0; v < cell.n; ++v)
+    for (int v = 0; v < cell->n; ++v)
         same[base + v] = base + joined[v];
     const int begin = starts[i], end = starts[i + 1], half_face = half_face_starts[i];
     int to = half_face;
     for (int k = begin; k < end; ++k)
         half_face_labels[to++] = neighbors[k];
-    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1))
-        if (!is_in_row(cell.labels[f], begin, end, neighbors))
-            half_face_labels[to++] = cell.labels[f];
-    list_loops(&cell, base, half_face, to, half_face_labels, loop_starts, loops);
+    for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
+        if (!is_in_row(cell->labels[f], begin, end, neighbors))
+            half_face_labels[to++] = cell->labels[f];
+    list_loops(cell, base, half_face, to, half_face_labels, loop_starts, loops);
     if (i == size - 1)
-        loop_starts[to] = 3 * (base + cell.n);
+        loop_starts[to] = 3 * (base + cell->n);
 }
 
 /* Is label one of the three faces of corner u? */
