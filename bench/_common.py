@@ -84,7 +84,7 @@ def counts(text: str) -> list[int]:
 
 
 def make_adapter(options: argparse.Namespace) -> clvoro.Adapter:
-    """Return the adapter that the options ask for, or end the script with a plain message."""
+    """Return an adapter as the options say, or end the script with a message."""
     try:
         return clvoro.Adapter(clvoro.create_context(options.device), dtype=options.dtype)
     except clvoro.ClvoroError as error:
@@ -94,10 +94,10 @@ def make_adapter(options: argparse.Namespace) -> clvoro.Adapter:
 def clock_of(
     options: argparse.Namespace, adapter: clvoro.Adapter | None = None
 ) -> Callable[[], float]:
-    """Return the clock; with `--processor-time` the time that this process has had of the processors.
+    """Return the clock: the wall clock, or with `--processor-time` the processor time of this process.
 
-    That is divided by the compute units of the adapter's device, as if all of them had worked: of one that is quiet
-    both are the same.
+    Processor time is divided by the compute units of the adapter's device. On an idle machine both are equal if all
+    units work all the time.
     """
     if not options.processor_time:
         return time.perf_counter
@@ -177,9 +177,9 @@ def cell_quality(diagram: clvoro.Diagram) -> np.ndarray:
 
 
 def work(history: np.ndarray) -> dict[str, float]:
-    """Return what a run has cost, in steps of its finest level: a step costs as it has cells.
+    """Return the cost of a run in steps of its finest level. The cost of a step is proportional to its cells.
 
-    "work" counts steps; "tessellations" adds the start and those after generators came or went.
+    "work" counts steps; "tessellations" adds those of the start and after insertions and deletions.
     """
     cells = history["cells"] / history["cells"][-1]
     anew = history["inserted"] + history["deleted"] > 0
@@ -233,7 +233,7 @@ class Report:
         self.records: list[dict[str, Any]] = []
 
     def add(self, record: dict[str, Any], note: str = "") -> None:
-        """Take one record; while a table is being made, `note` shows on stderr that it goes on."""
+        """Add one record. Without --json, `note` on stderr shows the progress."""
         self.records.append(record)
         if self.as_json:
             print(json.dumps(record), flush=True)

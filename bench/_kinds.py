@@ -31,18 +31,18 @@ LAKE, COAST = blob(), blob(1500)
 
 
 def even(domain: Any, **options: Any) -> Callable[[int], Kind]:
-    """Of cells that are all alike."""
+    """Return runs with cells of equal size."""
     return lambda n: (domain, (domain.measure / n) ** (1 / domain.dim), options)
 
 
 def of(domain: Any, field: Any, **options: Any) -> Callable[[int], Kind]:
-    """Of a field, or a formula, scaled to the number of cells."""
+    """Return runs of a field, or a formula, scaled to the number of cells."""
     field = sizing.Expression(field) if isinstance(field, str) else field
     return lambda n: (domain, field * (count_cells(field, domain) / n) ** (1 / domain.dim), options)
 
 
 def layered(domain: Any) -> Callable[[int], Kind]:
-    """Of rows of cells along the boundary, finer than the others."""
+    """Return runs with boundary layers on all walls, finer than the other cells."""
 
     def kind(n: int) -> Kind:
         size = (domain.measure / n) ** 0.5
@@ -52,7 +52,7 @@ def layered(domain: Any) -> Callable[[int], Kind]:
 
 
 def from_points(factor: float, **options: Any) -> Callable[[int], Kind]:
-    """From random points, `factor` times as many as the mesh shall have cells."""
+    """Return runs from random points, `factor` times as many as cells."""
 
     def kind(n: int) -> Kind:
         points = np.random.default_rng(1).random((round(factor * n), 2))
@@ -62,13 +62,13 @@ def from_points(factor: float, **options: Any) -> Callable[[int], Kind]:
 
 
 def of_callable(n: int) -> Kind:
-    """Of a function on the host, one with a raster on the device."""
+    """Return a run of a function on the host, combined with a raster on the device."""
     raster = sizing.Raster(1 + RANDOM.random((200, 200)), (0, 0), (1, 1)) * n**-0.5
     return SQUARE, sizing.minimum(raster, lambda p: np.full(len(p), 2 * n**-0.5)), {}
 
 
 def graded(domain: Any, formula: str) -> Callable[[int], Kind]:
-    """Of a jump that is made a ramp."""
+    """Return runs of a jump with limited growth."""
     plain = of(domain, formula)
     return lambda n: (domain, sizing.Graded(plain(n)[1], 1.2), {})
 
@@ -85,7 +85,7 @@ STRIPS = {
     "ring": "fabs(hypot(x - 0.5, y - 0.5) - 0.3) < 0.01 ? 1.0 : 23.0",
     "many strips": "sin(60 * x) > 0.95 ? 1.0 : 16.0", "a row": "fabs(x - 0.5) < 0.00016 ? 1.0 : 250.0",
 }  # fmt: skip
-"""Narrow parts of fine cells, at walls or seams and across them, in a unit square."""
+"""Narrow strips of fine cells in a unit square, along walls or seams, and across them."""
 SLAB = "x < 0.1 ? 1.0 : 6.7"
 
 KINDS: dict[str, Callable[[int], Kind]] = {

@@ -27,7 +27,7 @@ import clvoro
 
 PLACE = 0.6875
 SHOWN = 3
-"""Refusals of a kind of set that are printed."""
+"""Number of errors that are printed for each kind of set."""
 
 
 def on_circle(rng: np.random.Generator, angle: float) -> np.ndarray:
@@ -60,7 +60,7 @@ def arcs(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
 
 
 def lines(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
-    """Return a line of generators, and 40 anywhere."""
+    """Return a line of generators, and 40 random ones."""
     count, way = int(rng.integers(20, 150)), rng.uniform(0, 2 * np.pi)
     along = (np.arange(count) - count / 2) * rng.choice([1e-4, 2.5e-4, 5e-4])
     middle = 0.5 + 0.2 * rng.uniform(-1, 1, 2)
@@ -69,7 +69,7 @@ def lines(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
 
 
 def one_rounding(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
-    """Return generators a rounding apart, and 300 anywhere; places of a periodic box are those beside 1."""
+    """Return generators one unit of round-off apart, and 300 random ones."""
     step = 2 * float(np.spacing(np.asarray(PLACE, real)))
     square = np.stack(np.meshgrid(range(9), range(9)), axis=-1).reshape(-1, 2)
     chosen = square[rng.permutation(81)[: int(rng.integers(3, 82))]]
@@ -104,7 +104,7 @@ def spheres(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
 
 
 def rings(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
-    """Return a circle of generators in space, turned anyhow."""
+    """Return a circle of generators in space, in a random plane."""
     radius, t = 10 ** rng.uniform(-3, -0.5), rng.uniform(0, 2 * np.pi, 60)
     plane = np.linalg.qr(rng.standard_normal((3, 3)))[0][:2]
     circle = np.column_stack([np.cos(t), np.sin(t)]) @ plane
@@ -112,7 +112,7 @@ def rings(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
 
 
 def lines_in_space(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
-    """Return a line of generators, and 40 anywhere."""
+    """Return a line of generators, and 40 random ones."""
     count = int(rng.integers(20, 150))
     along = (np.arange(count) - count / 2) * rng.choice([1e-4, 2.5e-4, 5e-4])
     line = 0.5 + 0.2 * rng.uniform(-1, 1, 3) + np.outer(along, directions(rng, 1)[0])

@@ -42,12 +42,12 @@ from clvoro.adaptation.schedule import EXACT_STEPS, EXACT_STEPS_3D
 
 LARGE = ("F4",)
 AT_LEAST = ("mean_quality", "min_quality", "mean_quality_all")
-"""Figures that are the better the larger; all others the smaller."""
+"""Figures that should be large. All others should be small."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What is run, and what it must reach.
+    """A run, and its targets.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ def meets(name: str, value: float, bound: float) -> bool:
 
 
 def show(figure: str, form: str) -> Any:
-    """Return what writes `figure` of a record, its target beside it, bold where missed."""
+    """Return the function that writes `figure` of a record and its target, in bold if it is missed."""
 
     def text(record: dict[str, Any]) -> str:
         values = [run[figure] for run in record["runs"] if figure in run]
@@ -197,7 +197,7 @@ SOLID_COLUMNS = {
 
 
 def no_more_steps(records: list[dict[str, Any]]) -> None:
-    """Let a row on S3 fail that took more of the finest level's steps than the same on S2."""
+    """Mark a row on S3 as failed if it took more steps of the finest level than on S2."""
     most = {
         r["row"]: max(run["finest_steps"] for run in r["runs"])
         for r in records
@@ -211,7 +211,7 @@ def no_more_steps(records: list[dict[str, Any]]) -> None:
 
 
 def judge(row: Row, name: str, runs: list[dict[str, float]]) -> dict[str, Any]:
-    """Return the record of one row: its runs, its targets, and what missed them how often."""
+    """Return the record of one row: its runs, its targets, and how often each was missed."""
     missed = []
     for figure, bound in row.targets.items():
         bad = sum(not meets(figure, run[figure], bound) for run in runs)
@@ -241,7 +241,7 @@ def main() -> int:
 
     adapter = make_adapter(options)
     flat, solid = Report(options.json, COLUMNS), Report(options.json, SOLID_COLUMNS)
-    # Kernels are built here, so that no row's time holds it.
+    # Build the kernels, so that the times of rows do not include it.
     for name in {"S1" if is_solid(name) else "F1" for name in options.fields}:
         adapter.run(domain_of(name), test_field(name), method="exact", effort="fast")
     for row in ROWS:

@@ -45,7 +45,7 @@ Size = Callable[[np.ndarray], np.ndarray]
 
 
 class MissingPeerError(Exception):
-    """A mesher is not there; says what to install."""
+    """A mesher is not installed. The message says what to install."""
 
 
 # Sizes.

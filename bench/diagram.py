@@ -142,7 +142,7 @@ KERNELS = {
     "match": ("match",),
     "measure": ("measure",),
 }
-"""How the names of the kernels begin that make up a column."""
+"""Columns, each with the beginnings of the names of its kernels."""
 
 
 Clock = Callable[[], float]
@@ -189,7 +189,7 @@ class Tessellator:
         self.reach = None
 
     def diagram(self) -> Any:
-        """Tessellate from nothing, with the radii to begin with as the binning has left them."""
+        """Tessellate without a previous diagram, with the initial radii of the binning."""
         if self.reach is None:
             self.reach = self.binned.reach.copy()
         else:
@@ -209,7 +209,7 @@ class Tessellator:
         moved = host + WARM_MOVE * nearest[:, None] * (rng.random(host.shape) - 0.5) * math.sqrt(2)
         moved = np.clip(moved, 0, 1)
         self.places = [self.points, self.engine.upload(moved)]
-        # Capacities grow where a mesh is made anew, not where one is repaired.
+        # Capacities grow in a new diagram, not in an update.
         self.cells.tessellate(
             self.box, self.places[1], self.n, self.bins.build(self.box, self.places[1], self.n)
         )
@@ -218,7 +218,7 @@ class Tessellator:
         )
 
     def diagram_warm(self) -> None:
-        """Tessellate where the generators moved to, from where they were, to and fro."""
+        """Update the diagram to the moved generators, back, and so on."""
         self.turn = 1 - self.turn
         if isinstance(self.cells, Polyhedra) or self.incremental is None:
             points = self.places[self.turn]
@@ -226,7 +226,7 @@ class Tessellator:
             self.t = self.cells.tessellate(self.box, points, self.n, binned, self.t)
             return
         t = self.incremental.update(self.cells, self.box, self.places[self.turn], self.t)
-        if t is None:  # as a run does where too much has changed
+        if t is None:  # as a run does if too much has changed
             binned = self.bins.build(self.box, self.places[self.turn], self.n)
             t = self.cells.tessellate(self.box, self.places[self.turn], self.n, binned)
         self.t = t

@@ -22,12 +22,12 @@ import clvoro
 from clvoro import sizing
 
 LIMITS = (0.008, 0.12)
-"""Ends of the scale of colors; the lower one leaves room under the smallest cells, for faces to show on them."""
+"""Ends of the color scale. The lower one is below the smallest cells, so that their faces can be seen."""
 
 
 @dataclass
 class Example:
-    """A domain, a size field, and what more a run takes."""
+    """A domain, a size field, and further options of a run."""
 
     title: str
     domain: clvoro.Polygon | clvoro.Box

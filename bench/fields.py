@@ -22,7 +22,7 @@ from clvoro import sizing
 
 BOX = clvoro.Box((0, 0), (1.5, 1))
 LIMITS = (0.008, 0.12)
-"""Ends of the scale of colors; the lower one leaves room under the smallest cells, for faces to show on them."""
+"""Ends of the color scale. The lower one is below the smallest cells, so that their faces can be seen."""
 LINE = "#D55E00"
 
 

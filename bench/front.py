@@ -59,7 +59,7 @@ ERROR_TARGETS = {
     "default": (None, 0.0005, 0.001, 0.0035, 0.007, 0.014),
     "best": (None, 0.0005, 0.0012, 0.002, 0.008, 0.016),
 }
-"""Error targets per effort, None for its own."""
+"""Error targets per effort; None is the effort's own."""
 
 DEFECTS = (
     ("weighted", f"weighted, {REPEATED} steps"),

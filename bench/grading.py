@@ -72,7 +72,7 @@ def measure(adapter: clvoro.Adapter, dim: int, n: int, repeat: int) -> list[dict
     for name, times in seconds.items():
         record = {"dim": dim, "set": name, "cells": n}
         for figure, of in (("median", statistics.median), ("least", min)):
-            # The first of each builds kernels and makes room.
+            # The first of each builds kernels and allocates memory.
             record[figure] = of(times[1:]) / n
             record[f"{figure}_ratio"] = of(times[1:]) / of(seconds["uniform"][1:])
         records.append(record)

@@ -42,7 +42,7 @@ BOX = clvoro.Box((0, 0), (1, 1))
 RASTER = 1001
 WANTED, FROM_CELLS = 5.0, 4000
 NODES = ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3))
-"""Of a quadrature of degree 2, in the unit triangle."""
+"""Nodes of a quadrature of degree 2 in the unit triangle."""
 BATCH = 2_000_000
 
 

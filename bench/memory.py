@@ -57,21 +57,21 @@ STEEP = {
     "chequers": (SQUARE, "sin(20 * x) * sin(20 * y) < 0 ? 1.0 : 8.0"),
     "wall": (CUBE, "x < 0.5 ? 1.0 : 8.0"),
 }
-"""Fields that sizes at generators tell badly, by name: domain and formula."""
+"""Fields that are hard to estimate from sizes at generators, by name: domain and formula."""
 PACKAGE = Path(clvoro.__file__).parent
 PLUMBING = {"_program", "_arrays", "_device_array", "_primitives"}
-"""Modules that make buffers for others."""
+"""Modules that allocate buffers for others."""
 
 
 class Ledger:
-    """Bytes of live buffers by stage, and what they were when their sum was largest."""
+    """Bytes of live buffers by stage, now and at the peak of their sum."""
 
     def __init__(self) -> None:
         self.live: Counter[str] = Counter()
         self.begin()
 
     def begin(self) -> None:
-        """Look for a new peak from here on."""
+        """Begin a new search for the peak."""
         self.peak, self.at_peak = sum(self.live.values()), self.live.copy()
 
     def add(self, stage: str, size: int) -> None:
@@ -82,12 +82,12 @@ class Ledger:
             self.peak, self.at_peak = total, self.live.copy()
 
     def free(self, stage: str, size: int) -> None:
-        """Count a buffer no more."""
+        """Remove a freed buffer."""
         self.live[stage] -= size
 
 
 def asking_module() -> str:
-    """Name the module of clvoro that asks for a buffer."""
+    """Return the name of the module of clvoro that allocates a buffer."""
     for frame, _ in traceback.walk_stack(sys._getframe(2)):
         path = Path(frame.f_code.co_filename)
         if path.is_relative_to(PACKAGE) and path.stem not in PLUMBING:
@@ -117,9 +117,9 @@ def counted_buffers(ledger: Ledger) -> Iterator[None]:
 def peaks(
     options: Any, work: Callable[[clvoro.Adapter], clvoro.Diagram]
 ) -> tuple[clvoro.Diagram, dict[str, int], int]:
-    """Return the diagram that `work` has a new adapter make, and two peaks in bytes.
+    """Do `work` with a new adapter; return its diagram and two peaks in bytes.
 
-    That until it is made, by stage, and that while all its arrays are read.
+    The first is that of `work`, by stage, the second that of reading all arrays.
     """
     ledger = Ledger()
     with counted_buffers(ledger):
@@ -132,7 +132,7 @@ def peaks(
 
 
 def case_of(name: str, n: int) -> tuple[clvoro.Box, sizing.Field]:
-    """Return domain and size field, which asks for `n` cells."""
+    """Return domain and size field for `n` cells."""
     if name in STEEP:
         domain, field = STEEP[name][0], sizing.Expression(STEEP[name][1])
     else:
@@ -180,7 +180,7 @@ def measure_kind(options: Any, kind: Kind) -> dict[str, Any]:
 
 
 def resumed(options: Any, n: int) -> dict[str, Any]:
-    """Measure a run that goes on from the middle of its finest level."""
+    """Measure a run that is resumed in the middle of its finest level."""
     with tempfile.TemporaryDirectory() as folder:
         file, size = Path(folder) / "state", n**-0.5
         make_adapter(options).run(

@@ -102,7 +102,7 @@ int main(int, char **arguments)
 
 
 class MissingPeerError(Exception):
-    """A peer is not there; says what to install."""
+    """A peer is not installed. The message says what to install."""
 
 
 # Diagrams.
@@ -182,7 +182,7 @@ def mesh_clvoro(effort: str) -> Callable[[clvoro.Adapter, float], tuple[np.ndarr
 
 
 def mesh_gmsh(_: clvoro.Adapter, factor: float) -> tuple[np.ndarray, float]:
-    """Mesh the box with Gmsh; its vertices."""
+    """Mesh the box with Gmsh; return the vertices."""
     try:
         import gmsh
     except (ModuleNotFoundError, OSError) as error:

@@ -93,7 +93,7 @@ def channel(adapter: clvoro.Adapter, dim: int, n: int) -> dict:
     stages = adapter._stages_for(box)
     x = stages.engine.upload(box.place(points, adapter.dtype))
     tessellator = Tessellator(stages, box)
-    for _ in range(2):  # the second has margins by what the first needed
+    for _ in range(2):  # the second uses the margins that the first one required
         tessellator.tessellate(x, n, exact=True)
     images = tessellator.extended.images  # type: ignore[union-attr]
     wide = (images.box.upper - images.box.lower - 1) / 2
@@ -111,7 +111,7 @@ def channel(adapter: clvoro.Adapter, dim: int, n: int) -> dict:
 def measure(
     adapter: clvoro.Adapter, box: clvoro.Box, n: int, repeat: int, runs: bool
 ) -> tuple[dict[str, float], float]:
-    """Return seconds of the processors by what they were spent on, and images over generators."""
+    """Return processor seconds of each part of the work, and the ratio of images to generators."""
     stages = adapter._stages_for(box)
     engine, dim = stages.engine, box.dim
     rng = np.random.default_rng(7919)

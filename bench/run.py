@@ -51,7 +51,7 @@ CELLS_OF_F2 = 22972
 
 
 BEFORE = 40_000
-"""Cells of the run before: enough for levels, multigrid and all other parts of larger runs."""
+"""Cells of a first run, which builds kernels: enough for levels, multigrid and all parts of larger runs."""
 
 
 def run_once(

@@ -431,7 +431,7 @@ def record_of(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def difference(new: np.ndarray, old: np.ndarray) -> str:
-    """Say how an array differs from the one of the file."""
+    """Return how an array differs from that of the file."""
     if new.shape != old.shape:
         return f"shape {new.shape}, was {old.shape}"
     number = np.count_nonzero(new != old)

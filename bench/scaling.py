@@ -34,11 +34,11 @@ PEERS = ("SciPy's Voronoi", "pyamg")
 
 
 Points = list[tuple[str, float]]
-"""Names of curves, and seconds."""
+"""Points of a record: the curve of each, and its seconds."""
 
 
 def of_diagram(record: dict[str, Any]) -> Points:
-    """Random cells made anew, and a finished mesh's next diagram."""
+    """Return the times of a diagram of random generators, or of the next diagram of a finished mesh."""
     if record["start"] == "warm":
         return [("next diagram", record["diagram"])] if record["set"] == "hexagonal" else []
     if record["set"] != "uniform":

@@ -57,7 +57,7 @@ WARM_UP = 4
 
 
 def kinds() -> dict[str, Callable[[], Method]]:
-    """Return what makes a method anew, for the kinds of steps that a default run takes on its finest level."""
+    """Return functions that create the methods of the steps of a default run on its finest level."""
     steps = [
         a.method for a in adaptive_schedule(2, "default", 1, exact=False) if isinstance(a, Step)
     ]
@@ -84,10 +84,10 @@ NEEDS = {
     "volume_projection.update_projection_direction": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
     "volume_projection.update_projection": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
 }
-"""What each kernel must read or write, and compute. Faces and the projection's vectors are single: integers here."""
+"""What each kernel must at least transfer and compute. Numbers in single precision count as integers."""
 
 ITERATED = ("update_projection_direction", "update_projection")
-"""Kernels that are enqueued ahead, and find nothing to do once the iteration is over: only its calls count."""
+"""Kernels that are enqueued for more iterations than are needed. Only calls of the needed ones count."""
 
 PEAK = """
 kernel void multiply_add(const int size, const REAL a, const REAL b, global REAL *out)
@@ -239,7 +239,7 @@ COLUMNS = {
 
 
 def limits(records: list[dict[str, Any]], peak: float, real: int) -> list[list[str]]:
-    """Each kernel's time per cell, and what of it the least memory traffic and arithmetic would take."""
+    """Time of each kernel per cell, and the times of its least memory traffic and arithmetic."""
     rows = []
     last = {r["kind"]: r for r in records}
     for name, (reals, integers, operations) in NEEDS.items():

@@ -24,7 +24,7 @@ _FLAT = 8
 """Width of columns beside a corner with a fan, in heights of the first layer. With 16, checks for OpenFOAM refuse a
 NACA 0012 section with a first layer of 2e-4 chord."""
 _WIDENING = 0.3
-"""Largest change of the width of columns per length along the wall, so the share by which neighboring columns differ.
+"""Largest change of the width of columns per length along the wall: the relative difference of neighboring columns.
 With 1.2, the same section is refused."""
 _RATIO = 1.4  # of widths at neighboring places, between which the width is linear
 _FINEST = 1e-6  # of the width: the narrowest columns

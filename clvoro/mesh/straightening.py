@@ -175,7 +175,7 @@ def _beginnings(
     divided = np.zeros(len(oriented.sharpest), bool)
     divided[ring[begins]] = True
     is_outer = np.diff(domain.piece_of_ring, prepend=-1) > 0
-    # In rings that one cell has as a whole: the first face behind the sharpest corner.
+    # A ring that belongs to one cell begins with the first face after its sharpest corner.
     firsts = rows[(edges[before[rows]] != edges[rows]) & (is_outer & ~divided)[ring[rows]]]
     size = np.diff(oriented.ring_starts)[ring[firsts]]
     away = (edges[firsts] - oriented.sharpest[ring[firsts]]) % size

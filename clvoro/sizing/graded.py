@@ -104,7 +104,7 @@ class Graded(Field):
         Raises
         ------
         InputError
-            If there is neither.
+            If there is neither a box nor a domain.
         """
         box = self.box or domain or self._latest
         if box is None:

@@ -53,7 +53,7 @@ class TessellationStages:
                 getattr(self, name).clear()
 
     def release(self) -> None:
-        """Free all stages and their buffers; a stage that is used again is made again."""
+        """Free all stages and their buffers; a stage that is used again is created anew."""
         for name in self.CLASSES:
             self.__dict__.pop(name, None)
         self.engine.workspace.clear()

@@ -147,7 +147,7 @@ def test_writing_checkpoints_changes_nothing(ctx, tmp_path):
         BOX, SIZE, checkpoint=clvoro.Checkpoint(path, every=0), **options
     )
     assert_same(plain, written)
-    # The last one is the end of the plan: nothing is left to do but to fetch.
+    # The last one is at the end of the plan: only the arrays must be read.
     assert_same(
         clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options),
         plain,
@@ -178,7 +178,7 @@ def test_own_points_and_callables(ctx, tmp_path):
 
 
 def test_resume_with_far_fewer_cells_than_at_the_start(ctx, tmp_path):
-    """Rows keep the room that the first mesh took."""
+    """Rows keep the capacity of the first mesh."""
     points, path = np.random.default_rng(12).random((3000, 2)), tmp_path / "state"
     square, options = clvoro.Box((0, 0), (1, 1)), {"points": points, "effort": "fast"}
     whole = clvoro.Adapter(ctx).run(square, 0.25, **options)
@@ -203,7 +203,7 @@ def test_stopped_before_the_first_step(ctx, tmp_path, kind):
 
 
 def test_resume_at_the_end_of_the_run(ctx, tmp_path):
-    """By the callback, in the row that ends a run whose error no longer improves: it ends there, resumed, too."""
+    """A callback stops in the row that would end the run as stalled. Resumed, the run ends there, too."""
     path, options = (
         tmp_path / "state",
         {"method": "coupled", "options": clvoro.PaperOptions(tol=0.5)},

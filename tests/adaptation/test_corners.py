@@ -44,7 +44,7 @@ def corners_of(domain, h=H):
         (WEDGE, [(0.5, 0.5)]),
         (POST, [(0.45, 0.3), (0.53, 0.3), (0.53, 0.7), (0.45, 0.7)]),
         (clvoro.Polygon(SQUARE, [ring(180, 0.2)]), []),
-        # A turn of 6 degrees is none.
+        # A turn of 6 degrees is no corner.
         (clvoro.Polygon([(0, 0), (0.5, 0.05), (1, 0), (1, 1), (0, 1)]), []),
     ],
 )
@@ -69,7 +69,7 @@ def test_shape_of_a_corner():
 
 
 def test_crowded_corners():
-    """Of corners that are nearer than cells fit between them, the sharper ones remain."""
+    """Of corners with less distance than a cell between them, the sharper ones remain."""
     k = np.arange(40)
     saw = np.column_stack([1 - k / 40, 0.8 + 0.01 * (k % 2)])
     domain = clvoro.Polygon([(0, 0), (1, 0), *saw, (0, 0.8)])
@@ -184,7 +184,7 @@ def test_projection(ctx, domain, real):
 
 
 def test_generators_that_sit_still_stay(ctx):
-    """What is shared already, and generators of layers, do not move."""
+    """Generators that already share the corner do not move, nor do those of layers."""
     points = lattice(L, 1)
     once, _ = project(ctx, L, points)
     twice, _ = project(ctx, L, once)

@@ -46,13 +46,13 @@ def test_gradient_of_an_exponential(engine):
     host = patch.fetch(t)
     told = np.bincount(host.owners[host.neighbors >= 0], minlength=N) > 1
     assert told.sum() == N - 1, "one cell fills a corner alone"
-    # log h rounds by a few eps of its size, 5, over distances of 0.003 and more.
+    # log h, about 5, has a round-off of a few eps, over distances of at least 0.003.
     assert np.abs(gradient[told] - slope).max() < 8000 * np.finfo(engine.real).eps
     assert not gradient[~told].any()
 
 
 def test_gradient_is_that_of_least_squares(engine):
-    """Of any values, each neighbor counts, by 1 / distance^2, and walls do not."""
+    """The fit weights each neighbor by 1 / distance^2 and ignores walls, for any values."""
     points = patch.random_points(N, 114)
     h = np.random.default_rng(7).uniform(0.02, 0.2, N)
     t = patch.tessellate(engine, points)

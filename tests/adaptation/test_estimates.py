@@ -428,23 +428,23 @@ def test_no_surplus_where_sizes_change_slowly():
     proportion to the cells there."""
     field = sizing.Distance(sizing.Circle((0.45, 0.5), 0.2), h_min=0.004, slope=0.08)
     assert expected_surplus(SQUARE, field, density_tree(field, SQUARE), 2.0) == 0
-    # Of slope 0.6, so that two cells on sizes are 2.2 times as large; towards the walls there is nothing beyond.
+    # A slope of 0.6: two cells farther sizes are 2.2 times as large. There are no cells beyond the walls.
     steep = sizing.Expression("0.0005 + 0.6 * fabs(x - 0.5)")
     most = expected_surplus(SQUARE, steep, density_tree(steep, SQUARE), 2.0)
     assert most == pytest.approx(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * 0.8)), rel=0.05)
     jump = sizing.Expression("x < 0.5 ? 0.01 : 0.1")
     found = expected_surplus(SQUARE, jump, density_tree(jump, SQUARE), 2.0)
-    # 2 h deep of the half that is fine, which has all but a hundredth of the cells; the sample may be off by a fifth.
+    # Cells within 2 h of the jump, in the fine half, which has 99 % of all cells. The sample is accurate to a fifth.
     share = 2 * 0.01 / 0.5
     assert found == pytest.approx(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * share)), rel=0.2)
 
 
 def test_what_is_told_before_a_run(ctx, tmp_path, monkeypatch, capsys):
-    """By the adapter, and on the command line if it is much."""
+    """The adapter reports it, and the command line does if it is much."""
     adapter = clvoro.Adapter(ctx)
     plain, each = adapter.memory_needed(SQUARE, 0.01), PEAK[2][0] * 8 + PEAK[2][1] * 4
     fixed = plain - 1e4 * each
-    # What iterations leave on record, mostly: 8 numbers for each.
+    # Mostly the record of iterations: 8 numbers for each.
     assert 1 <= fixed / (64 * (500 + 30 * 77)) < 1.5
     assert adapter.memory_needed(SQUARE, 0.01, n_cells=20000) == pytest.approx(
         2e4 * each + fixed, rel=2e-3
@@ -497,7 +497,7 @@ PERIODIC = {
     ],
 )
 def test_estimate_of_periodic_boxes(bench, monkeypatch, ctx, dim, n, field):
-    """As many images as are expected from the size field; output may take a quarter less."""
+    """The estimate of images follows from the size field. Output may need a quarter less."""
     box = clvoro.Box((0,) * dim, (1,) * dim, periodic=True)
     monkeypatch.setattr(bench, "domain_of", lambda _: box)
     monkeypatch.setattr(bench, "test_field", lambda _: field)
@@ -515,7 +515,7 @@ def test_estimate_of_periodic_boxes(bench, monkeypatch, ctx, dim, n, field):
     expected = max(run + fixed, output)
     assert estimate_memory(engine, cells, box, Extras(images)) == pytest.approx(expected * cells)
     run += fixed
-    # Where large cells are few, balls are not as deep along all of a seam.
+    # With few large cells, the halo is not equally deep along a seam.
     assert (0.9 if dim == 2 else 0.85) <= found["run"] / run <= 1.1
     assert 0.75 <= found["output"] / output <= 1.1 or found["output"] < found["run"]
     assert run > 1.5 * estimate_memory(engine, cells) / cells or dim == 3

@@ -49,7 +49,7 @@ def test_diagram_is_computed_again_at_the_end(ctx, dtype):
     [(kind, 0, 0) for kind in DOMAINS] + [("flat", 0, 1), ("flat", 1, 0), ("flat", 1, 1)],
 )
 def test_sizes_are_scaled_after_the_last_row(adapter, kind, levels, stopped):
-    """Before the first step, and on coarser levels, they are not yet."""
+    """Before the first step, and on coarser levels, sizes are not scaled yet."""
     count = 600 if kind == "solid" else 300
     by_callback = {"callback": lambda row: row["step"] == stopped}
     for options in ({"max_steps": stopped}, by_callback):
@@ -72,7 +72,7 @@ def test_sizes_are_scaled_after_the_last_row(adapter, kind, levels, stopped):
 
 
 def test_insertions_and_deletions_match_the_labels(adapter):
-    """What is inserted and deleted between two rows adds up to the cells of both, and to the generators at the end."""
+    """Insertions and deletions explain the numbers of cells of all rows, and the generators at the end."""
     result = adapter.run(FLAT, SIZE, options=clvoro.MultilevelOptions(levels=1), seed=5)
     h, origin = result.history, result.origin
     assert h["inserted"].sum() > 0
@@ -85,14 +85,14 @@ def test_insertions_and_deletions_match_the_labels(adapter):
     assert "deleted" in str(dataclasses.replace(result, history=changed).check())
 
 
-# Interruptions, wherever they come.
+# Interruptions at any line.
 
 
 OWN = ("loop.py", "state.py", "periodic_tessellator.py", "methods.py", "tessellator.py")
 
 
 class Pressed:
-    """Ctrl-C at the nth line of clvoro's `OWN` that is executed while this is at work; all are counted."""
+    """Raise Ctrl-C at the nth executed line of clvoro's modules `OWN`, and count all executed lines."""
 
     def __init__(self, nth=None):
         self.nth, self.lines = nth, 0
@@ -137,13 +137,13 @@ RUNS = {
 
 
 def press_anywhere(adapter, kind, times):
-    """Amid a step, a refinement or a change of the count: the mesh is whole, and its history ends with it."""
+    """During a step, a refinement or a correction of the count: the mesh is valid, and its history ends with it."""
     domain, options = RUNS[kind]
     options = {"effort": "fast", "seed": 9, **options}
     with Pressed() as counted:
         adapter.run(domain, SIZE, **options)
     came = 0
-    # Seldom before the run has begun, or in what it does once it has ended: those interruptions are the caller's.
+    # A few come before the run has begun or after it has ended: the caller gets those unchanged.
     for nth in np.random.default_rng(31).integers(counted.lines, size=times):
         with contextlib.suppress(KeyboardInterrupt), Pressed(int(nth) + 1):
             result = adapter.run(domain, SIZE, on_interrupt="return", **options)

@@ -64,7 +64,7 @@ class Sweep:
             self.account()
 
     def account(self):
-        """Every generator that was is there, but those that are counted as deleted; the new ones are counted too."""
+        """Check by labels that as many generators are new, and as many are gone, as are counted."""
         new = self.new.generators
         self.new_points, labels = new.points.get(), new.labels.get()
         assert len(labels) == self.n + self.new.inserted - self.new.deleted
@@ -77,7 +77,7 @@ class Sweep:
         row = {label: i for i, label in enumerate(self.labels)}
         self.rows = np.array(
             [row[label] for label in labels[old]], int
-        )  # the row before, of each that was
+        )  # the row of each old generator before
         self.deleted = np.setdiff1d(np.arange(self.n), self.rows)
         assert len(self.deleted) == self.new.deleted
         moved = (self.new_points[old] != self.points[self.rows]).any(axis=1)
@@ -121,7 +121,7 @@ def dislocated(a, stretch):
 
 
 def the_pair(sweep):
-    """The 5-sided and the 7-sided cell in the middle."""
+    """Return the 5-sided and the 7-sided cell in the middle."""
     sides = np.diff(sweep.host.starts)
     middle = (np.abs(sweep.points - [0.5, 0.375]) < 0.2).all(axis=1)
     (five,), (seven,) = (np.flatnonzero(middle & (sides == n)) for n in (5, 7))
@@ -130,7 +130,7 @@ def the_pair(sweep):
 
 
 def test_kinds_and_strain(engine):
-    """Charges, walls, and the strain over one ring and over two, of cells of all sorts: sums over neighbors."""
+    """Charges, walls, and strain over one and two rings are sums over neighbors, for cells of all kinds."""
     n = 80
     points, h = patch.random_points(n, 41), np.random.default_rng(42).uniform(0.05, 0.2, n)
     t = patch.tessellate(engine, points)
@@ -188,12 +188,12 @@ def test_five_sided_cell_is_deleted_under_compression(engine):
 
 
 def test_unstrained_pair_stays(engine):
-    """Without strain, and with the count right, there is nothing to do."""
+    """Without strain and with the correct count nothing is done."""
     assert Sweep(engine, dislocated(A, 0.0), H, 0.0, climb_strain=QUIET).new is None
 
 
 def test_count_overrules_strain(engine):
-    """One pair cannot climb where the count is right; where it is not, the pair gives way first."""
+    """A single pair cannot climb if the count is correct. If it is not, the pair is used first."""
     assert Sweep(engine, dislocated(A, 0.06), H, 0.0, climb_strain=QUIET).new is None
     against = Sweep(engine, dislocated(A, 0.0), H, 1.0, climb_strain=QUIET)
     assert against.moved.tolist() == [the_pair(against)[1]]
@@ -229,7 +229,7 @@ def test_two_pairs_of_opposite_strain_both_climb(engine):
 
 @pytest.mark.parametrize("total", [-30.0, -9.4, -1.0, 1.0, 6.0, 30.0])
 def test_number_is_corrected_exactly(engine, total):
-    """Without climbing: exactly so many, the strongest first, far enough apart, at most a share in one call."""
+    """Without climbing: the exact number, the strongest first, with a least distance, at most a share in one call."""
     n = 500
     points = patch.relaxed_points(n, 61, steps=2)
     sweep = Sweep(engine, points, np.sqrt(0.75 / n), total, climb=False)
@@ -283,7 +283,7 @@ def test_alike_cells_are_told_apart(engine):
 
 
 def test_limit_keeps_the_strongest(engine):
-    """Keys from far apart to an ulp apart and equal but for the index."""
+    """Keys that are far apart, an ulp apart, and equal except for the index."""
     control, rng = InsertionDeletion(engine), np.random.default_rng(3)
     spans = [10**6, 300, 40, 1]
     for trial in range(24):
@@ -444,7 +444,7 @@ class TestMend:
         )
 
     def test_four_and_eight_sided_cells_are_always_repaired(self, engine):
-        """Those that are far from all others; every other one has such a one within a few rings."""
+        """Chosen sites are far from each other. All others have a chosen one within a few rings."""
         points = patch.relaxed_points(600, 71, steps=1)
         sweep = Sweep(engine, points, 0.04, 0.0, quality=np.ones(600), deficit=0.5, share=1.0)
         sides = np.diff(sweep.host.starts)

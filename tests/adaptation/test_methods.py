@@ -122,7 +122,7 @@ def test_weighted_displacements(stages):
 @pytest.mark.parametrize("cautious", [True, False])
 @pytest.mark.parametrize("poisson", [True, False])
 def test_weighted_moves_at_most_k(stages, poisson, cautious):
-    """Each generator is clipped on its own, at k h or, if cautious, at k times the lesser of h and L."""
+    """Each displacement is clipped separately, at k h or, if cautious, at k min(h, L)."""
     mesh, host = make_mesh(stages, patch.random_points(N, 11))
     method = WeightedMethod(k=0.25, poisson=poisson, cautious=cautious)
     method.displace(mesh)
@@ -140,7 +140,7 @@ def test_weighted_moves_at_most_k(stages, poisson, cautious):
 
 @pytest.mark.parametrize("name", [*PUBLISHED, "glide", "polish"])
 def test_perfect_mesh_does_not_change(stages, name):
-    """Squares of the target size: centroids, sizes and shapes leave nothing to do, walls included."""
+    """A square lattice of the target size is at rest, also at walls."""
     xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
     points = (xy + 0.5) / 8
     mesh, host = make_mesh(stages, points, sizing.Constant(0.125))
@@ -163,7 +163,7 @@ def test_perfect_mesh_does_not_change(stages, name):
 
 
 def test_projected_displacements(stages):
-    """Lloyd's displacement times the relaxation, with a share of the last one, is what gets projected."""
+    """The projection gets Lloyd's displacement times the relaxation, plus a share of the last displacement."""
     mesh, _ = make_mesh(stages)
     velocity = np.random.default_rng(9).normal(0, 0.003, (N, 2))
     mesh.velocity.set(velocity)
@@ -186,7 +186,7 @@ def test_projected_displacements(stages):
 
 
 def test_penalty_is_controlled_to_the_error_target(stages):
-    """Lower while the error is above the aim, higher below it, by a bounded factor, within bounds."""
+    """The penalty falls while the error exceeds the target, and grows below it: by a bounded factor, within bounds."""
     mesh, host = make_mesh(stages)
     h = FIELD(host.points)
     error = np.abs(np.log(np.sqrt(host.volumes) / h)).mean()
@@ -211,7 +211,7 @@ def test_penalty_is_controlled_to_the_error_target(stages):
 
 
 def test_mean_log_ratio_error_of_perfect_cells(stages):
-    """No division by an error of nothing."""
+    """An error of 0 is no divisor."""
     mesh, _ = make_mesh(stages, np.array([[0.5, 0.375]]), sizing.Constant(np.sqrt(0.75)))
     method = ProjectedMethod("quality", error_target=0.002)
     for _ in range(6):
@@ -221,7 +221,7 @@ def test_mean_log_ratio_error_of_perfect_cells(stages):
 
 @pytest.mark.parametrize("value", ["-0.02", "0.0", "0.0/0.0"])
 def test_invalid_size_is_reported_as_in_the_field(stages, value):
-    """Also on a coarse level, where h is a multiple of the field's."""
+    """On a coarse level h is a multiple of the field."""
     field = sizing.Expression(f"x > 0.7 && y > 0.5 ? {value} : 0.05")
     points = np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.1]])
     engine = stages.engine

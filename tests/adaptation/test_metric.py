@@ -41,7 +41,7 @@ def test_definitions(engine):
     _, rough, *_ = evaluate(engine, t, h)
     t = Cells(engine).measure_faces(patch.BOX, t)
     error, quality, energy, reach = evaluate(engine, t, h)
-    # The sum of faces in single precision is right to half an eps, at work.
+    # The sum of faces in single precision, in the device's precision, is accurate to half an eps.
     assert rough == pytest.approx(quality, rel=2 * float(np.finfo(np.float32).eps))
     cells = reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)
     # Areas and lengths of cells of 0.05 carry eps of the unit box, and relative errors so 20 to 400 eps.
@@ -142,7 +142,7 @@ def test_compare_neighbors(ctx):
 
 
 def test_neighbor_changes_ignore_order_and_numbering(ctx):
-    """The same cells in another order, and so with other indices, keep their names and so their neighbors."""
+    """In another order the same cells have other indices, but the same labels, and so the same neighbors."""
     engine = patch.make_engine(ctx)
     metric, order = Metric(engine), np.random.default_rng(3).permutation(N)
     points, labels = patch.random_points(N, 31), np.arange(N) + 7

@@ -39,7 +39,7 @@ class Foreign:
 
 
 class Geographic:
-    """What can be written as GeoJSON, as geopandas and its kin have it."""
+    """An object with `__geo_interface__`, as in geopandas."""
 
     @property
     def __geo_interface__(self):
@@ -137,7 +137,7 @@ def test_errors_of_size_functions_have_their_cause(adapter):
     with pytest.raises(InputTypeError) as caught:
         adapter.run(BOX, lambda p: float(p[:, 0]))
     assert isinstance(caught.value.__cause__, TypeError)
-    # What says nothing of shapes is not ours to judge.
+    # An error that is not about shapes or types passes through.
     with pytest.raises(KeyError):
         adapter.run(BOX, lambda p: {}["h"])
 
@@ -321,7 +321,7 @@ def test_names_of_arrays(adapter, result):
 
 
 def test_arrays_are_read_only(result, tmp_path):
-    """One assignment would spoil the points of result and diagram, beside which the others stay as they were."""
+    """An assignment to points would make all other arrays wrong."""
     result.save(tmp_path / "a.npz")
     result.save(tmp_path / "a.vtu")
     assert result.points is result.diagram.points
@@ -408,8 +408,8 @@ def test_no_method(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("periodic", [False, True], ids=["walls", "seams"])
 def test_coincident_generators_are_reported_with_their_place(ctx, periodic, real):
-    """In the domain's units; two roundings apart they have the same bisector with those far away. In the plane they are
-    distinct all the same."""
+    """The place is in the domain's units. In 3D generators two ulps apart count as coincident, because their bisectors
+    with far generators are the same. In 2D they are distinct."""
     box = clvoro.Box((0,) * 3, (4,) * 3, periodic=periodic)
     points = np.random.default_rng(4).random((300, 3)) * 4
     step = 2 * float(np.spacing(np.asarray(2.75, real)))

@@ -38,8 +38,8 @@ def test_gradient_of_a_linear_potential(engine, t):
     u = follow(engine, t, 5 + host.points.astype(float) @ slope)
     closed = ~at_walls(host)
     assert 100 < closed.sum() < N
-    # Differences of psi (about 5) over distances that go down to 0.003; what a face adds, a few times the gradient in a
-    # cell that is not round, rounds as measures and centroids do.
+    # Differences of psi (about 5) are divided by distances of at least 0.003. The contribution of a face, a few times
+    # the gradient in a cell that is not round, has the round-off of measures and centroids.
     rounding = 4000 * np.finfo(engine.real).eps + 8 * np.finfo(engine.face).eps
     assert np.abs(u[closed] - slope).max() < rounding
     assert np.abs(u[~closed] - slope).max() > 0.1, "a wall lets no flux through"

@@ -142,7 +142,7 @@ def test_levels(adapter, tmp_path, capsys):
         MultilevelOptions(levels="2")
     with pytest.raises(InputError, match="levels is -1, expected at least 0"):
         MultilevelOptions(levels=-1)
-    # Sizes may ask for more cells than 64 bits can count.
+    # Sizes may require more cells than 64 bits can count.
     with pytest.raises(InputError, match=r"levels is 50, expected at most 36 for \d{22} cells"):
         adapter.run(BOX, 1e-11, options=MultilevelOptions(levels=50))
     (tmp_path / "c.toml").write_text(CASE)
@@ -177,7 +177,7 @@ def test_cases(tmp_path, capsys, run_table, options, warned):
     assert len(lines) == len(warned), lines
     for name, line in zip(warned, lines, strict=True):
         assert line.startswith(f"clvoro: warning: {name} is ")
-    # What is written has only what is of use.
+    # Only used options are written.
     written = Case.from_toml((tmp_path / "out" / "case.toml").read_text(), "written")
     assert not set(warned) & set(written.run)
     demand_use(written)

@@ -34,7 +34,7 @@ def test_mean_ratio_of_spacing_to_h(ctx, real):
 
 
 def test_warnings_and_errors_at_the_bounds(ctx, real):
-    """Warns from a mean of 1e-3 / 0.1 and a least of 1 / 16 spacings, refuses from 1; silent below."""
+    """A spacing of 1 / 16 of the least size, or 1e-2 of most sizes, causes a warning, one of the least size an error."""
     unit, points = SPACING[real], np.array([[1.5, 0.5]] * 99 + [[2.5, 0.5]])
 
     def check(size, size_beyond_2=1.0):
@@ -88,7 +88,7 @@ def test_runs_say_it_before_they_begin(ctx):
 
 
 def test_single_precision_with_sizes_1_to_1000(ctx):
-    """As well as double precision, to 1e-3 in the mean, and silently; `bench/diagnostics.py` has it for 1e6 cells."""
+    """The mean error is that of double precision to 1e-3, without a warning. `bench/diagnostics.py` does 1e6 cells."""
     box = clvoro.Box((0, 0), (2.5, 1.5))
     field = Distance([Circle((0.9, 0.75), 0.0)], 1.5e-4, slope=999 * 1.5e-4 / 1.767)
     mean = {}

@@ -142,7 +142,7 @@ def test_gradient_across_seams(ctx, periodic):
         return float((omega * (2 * np.log(perimeter) - np.log(d.volumes))).sum())
 
     expected = -0.3 * h[:, None] ** 2 * gradient_of(energy, points, some)
-    # As above; what is known of faces while generators move is in single precision.
+    # As above; faces are in single precision while generators move.
     scale = np.abs(expected).max()
     assert u[some] == pytest.approx(expected[some], rel=1e-5, abs=2e-6 * scale)
 
@@ -232,7 +232,7 @@ def test_gradient_of_short_edges(ctx, name):
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_short_edges_grow(ctx, real):
-    """Four generators on a square, nearly: the edge between them grows, whichever way it lies."""
+    """Four generators nearly on a square: the edge between them grows in both directions."""
     points = np.array([[0.4, 0.375], [0.6, 0.375], [0.5, 0.273], [0.5, 0.477]])
     engine = patch.make_engine(ctx, real)
     adapter = clvoro.Adapter(ctx, dtype=real)

@@ -59,7 +59,7 @@ def children_in(shape, tangents, host, h, labels, fixed):
 
     def apart(x, y, other, least):
         y = kept(x, y)
-        # What is out of sight may belong to the layers, if there are any.
+        # Places that the parents do not see may belong to layers.
         other = kept(x, other) if fixed else other
         gap, another = np.hypot(*(y - x)), np.hypot(*(other - x))
         return other if gap < least and another > gap else y
@@ -159,11 +159,11 @@ def test_squares_get_no_point_twice(ctx):
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("share", [0, 1e-4, 0.99, 1.01])
 def test_new_generators_keep_a_distance_at_walls(ctx, real, share):
-    """Between a generator and the wall that it all but stands on there is no room, in thin boxes neither."""
+    """There is no new generator between a wall and a generator very near it, nor in thin boxes."""
     h = 0.08
     for thin in (0.75, 0.0625):
         room = min(h, thin / 2)
-        gap = share * room / 8  # about where there is enough
+        gap = share * room / 8  # around the least gap that has room
         box = patch.Box((0, 0), (1, thin))
         engine = patch.make_engine(ctx, real, box=box)
         points = np.array([(0.3, gap), (0.7, thin - gap)], real)
@@ -171,7 +171,7 @@ def test_new_generators_keep_a_distance_at_walls(ctx, real, share):
         finer = Refinement(engine).refine(box, t, engine.upload(np.full(2, h))).get()
         assert box.contains(finer).all()
         apart, _ = cKDTree(finer).query(finer, k=2)
-        assert apart[:, 1].min() > 0.06 * room  # half of the gap where there is enough: a sixteenth
+        assert apart[:, 1].min() > 0.06 * room  # half of the least gap: a sixteenth
 
 
 @pytest.mark.parametrize("real", ["float64", "float32"])

@@ -61,7 +61,7 @@ def test_moved_again_and_again(adapter, first, method):
         result = adapter.run(BOXES[2], field(2, 0.012 * k), points, method=method)
         points = result.points
         assert steps_to_tolerance(result.history) <= 5
-    # The exact projection costs some 0.002 in itself (default and exact in bench/convergence.py).
+    # The exact projection alone costs about 0.002 (compare default and exact in bench/convergence.py).
     lost = 0.004 if method == "adaptive" else 0.006
     assert result.quality.mean() > first[2].quality.mean() - lost
     if method == "exact":
@@ -77,7 +77,7 @@ def test_same_field_again_keeps_the_mesh(adapter, first):
 
 
 def test_other_points_take_the_full_schedule(adapter, first):
-    """Random ones, and a good mesh of another count."""
+    """Random points, and a good mesh with another number of cells."""
     n = len(first[2].points)
     box = BOXES[2]
     random = box.lower + box.extent * np.random.default_rng(553).random((n, 2))
@@ -113,7 +113,7 @@ def test_near_by_every_measure():
     for name, value in (("missing", -300.0), ("mean_error", 0.2), ("mean_quality", 0.95)):
         assert not is_near(2, "default", **{**near, name: value})
     assert not is_near(3, "default", **{**near, "mean_quality": 0.55})
-    # A mesh of the least effort is near for that, not for the best.
+    # A mesh of effort fast is good enough for fast, not for best.
     assert is_near(2, "fast", **{**near, "mean_quality": 0.98})
     assert not is_near(2, "best", **{**near, "mean_quality": 0.98})
     assert set(EFFORTS) == {"fast", "default", "best"}

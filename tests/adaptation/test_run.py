@@ -64,7 +64,7 @@ def test_no_steps(adapter, method):
 
 @pytest.mark.parametrize("method", ["lloyd", "weighted-lloyd"])
 def test_warm_start(adapter, method):
-    """Five steps and five more from where they led are ten."""
+    """Five steps, and five more from their result, are the same as ten."""
     options = {"method": method, "options": clvoro.PaperOptions(tol=0)}
     points = random_points(500, 7)
     ten = adapter.run(BOX, F1, points, max_steps=10, **options)
@@ -102,7 +102,7 @@ def test_origin_of_methods_that_keep_all(adapter):
 
 
 def test_one_call_at_a_time(adapter):
-    """A callback that uses the adapter would overwrite the mesh at work."""
+    """A callback that used the adapter would overwrite the mesh of the run."""
     with pytest.raises(InputError, match="another Adapter"):
         adapter.run(BOX, F1, callback=lambda row: adapter.diagram(BOX, random_points(50, 1)))
     other = clvoro.Adapter()
@@ -200,7 +200,7 @@ def test_history_of_the_published_method(adapter):
     # Energy, the paper's 2.3, in physical units.
     energy = sum(map(second_moment, runs.polygons(result.diagram), result.points))
     assert h["energy"][-1] == pytest.approx(energy, rel=1e-9)
-    # A row's displacements are those that led to it.
+    # The displacements in a row are those of the step before.
     size = F1(result.initial.points)
     for name in ("lloyd", "poisson"):
         length = np.linalg.norm(getattr(result.initial, name), axis=1)
@@ -349,7 +349,7 @@ def test_n_cells_is_held(adapter, method, n):
 
 @pytest.mark.parametrize("n_cells", [400, 1000])
 def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
-    """As good a mesh as with the field's own count."""
+    """The mesh is as good as with the count of the field."""
     result = adapter.run(BOX, F1, n_cells=n_cells, method="exact", seed=15)
     assert len(result.points) == n_cells
     assert result.size_factor == pytest.approx(np.sqrt(588 / n_cells), rel=0.05)
@@ -410,7 +410,7 @@ def test_levels_from_the_callers_points(adapter):
 
 
 def test_far_too_many_points(adapter):
-    """They are thinned out to what the size field asks for."""
+    """They are reduced to the number that the size field requires."""
     result = adapter.run(BOX, F1, random_points(3000, 17), effort="fast")
     assert len(result.points) == pytest.approx(600, rel=0.1)
 
@@ -442,7 +442,7 @@ def figures(result):
     ],
 )
 def test_figures_of_repeated_steps(adapter, options, error, quality):
-    """From two random starts the better one: some have a defect more than others."""
+    """The better of two random starts: some end with one defect more than others."""
     options = {"options": clvoro.PaperOptions(tol=0), **options}
     results = [adapter.run(BOX, F1, seed=seed, **options) for seed in (11, 13)]
     for result in results:
@@ -482,7 +482,7 @@ def test_published_ordering(adapter):
 def test_figures_of_adaptive_runs(
     adapter, adapter32, dtype, options, mean, largest, quality, least
 ):
-    """The median of five starts: the largest error of one start hangs on a cell or two, and so on rounding."""
+    """The median of five starts: the largest error of one start depends on one or two cells, and so on round-off."""
     run = (adapter if dtype == "float64" else adapter32).run
     results = [run(BOX, F1, seed=seed, **options) for seed in range(1, 6)]
     for result in results:
@@ -511,7 +511,7 @@ def test_final_displacements_are_those_of_the_last_step(adapter):
 
 
 def test_error_target_trades_sizes_for_quality(adapter):
-    """The larger the error that is allowed, the better the cells."""
+    """A larger error target gives better cells."""
     tight, loose = (
         figures(
             adapter.run(

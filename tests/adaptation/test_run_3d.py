@@ -107,7 +107,7 @@ def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, larg
     assert e_max <= largest
     assert q_mean >= quality
     assert q_min >= 0.35
-    # The integral of h^-3 asks for 1778; sampled at generators, so coarse a mesh asks for a few more.
+    # The integral of h^-3 is 1778. Sums over the generators of so coarse a mesh are a little larger.
     assert 1778 < len(result.points) < 2000
     assert (result.converged, result.stop_reason) == (True, "plan completed")
 
@@ -142,7 +142,7 @@ def test_no_steps(adapter, method):
 
 @pytest.mark.parametrize("method", ["lloyd", "weighted-lloyd"])
 def test_warm_start(adapter, method):
-    """Four steps and four more from where they led are eight."""
+    """Four steps, and four more from their result, are the same as eight."""
     options = {"method": method, "options": clvoro.PaperOptions(tol=0)}
     points = random_points(300, 7)
     eight = adapter.run(BOX, SMALL, points, max_steps=8, **options)
@@ -392,7 +392,7 @@ def test_points_on_walls_edges_and_corners(adapter):
 
 
 def test_lattices_are_left_alone(adapter):
-    """All cells alike, many vertices of degree eight: nothing pushes anything anywhere."""
+    """A cubic lattice, with vertices of degree eight, is an equilibrium of every method."""
     line = (np.arange(5) + 0.5) / 5
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
     for method in ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"):

@@ -126,7 +126,7 @@ def test_weighted_centroids(double):
     lloyd, offsets = w.lloyd.get(), t.offsets.get()
     for i in range(40):
         own = samples[owner == i]
-        # The shift away from the centroid: the noise of the sampling is in both.
+        # The difference of both centroids: the noise of the sampling cancels.
         shift = weighted_centroid(own, slope) - own.mean(axis=0)
         assert np.linalg.norm(lloyd[i] - offsets[i] - shift) < 0.1 * np.linalg.norm(shift)
 

@@ -34,7 +34,7 @@ def inner_faces(host):
 
 
 def test_gradient_of_log_h(engine, box, t):
-    """By least squares over neighbors, of any values, weighted by 1 / distance^2; and what that does to centroids."""
+    """The gradient is a least-squares fit with weights 1 / distance^2. Weighted centroids follow from it."""
     h = np.random.default_rng(5602).uniform(0.02, 0.2, N)
     w = Density(engine).lloyd_weights(t, engine.upload(h))
     host, dim = patch.fetch(t), box.dim

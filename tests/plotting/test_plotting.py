@@ -175,7 +175,7 @@ def test_arrows_are_about_a_spacing_long(result):
     arrows = np.where(held[:, None], 0, [1.0, 0.0])
     for length, factor in ((30.0, 0.02), (0.9, 1.0), (0.013, 50.0)):
         field = clvoro.Displacements(grid, length * arrows, length * arrows)
-        # Six nearest: between one and the root of two away, at the edge a little more.
+        # The six nearest points are at distances 1 to sqrt(2), at the edge at slightly more.
         assert 0.5 <= length * _magnifications(field)[0] <= 2
         assert _magnifications(field) == (factor, factor)
 

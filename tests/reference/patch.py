@@ -23,7 +23,7 @@ BOXES = {
     "torus": Box((0, 0), (1, 0.75), periodic=True),
     "slab": Box((0, 0, 0), (1, 0.75, 0.9), periodic=(True, False, True)),
 }
-"""Of all kinds, each with the frame of the unit square or cube."""
+"""Boxes of all kinds. The frame of each is the unit square or cube."""
 
 
 def make_engine(ctx, real="float64", dim=2, group_size=None, box=BOX):

@@ -1,4 +1,4 @@
-"""Diagrams in three dimensions from SciPy, face by face in plain Python: for what only reads a diagram."""
+"""Diagrams in three dimensions from SciPy, face by face in plain Python: for tests that only read a diagram."""
 
 from __future__ import annotations
 

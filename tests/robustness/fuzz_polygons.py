@@ -118,11 +118,11 @@ def some_seed(rng: np.random.Generator) -> int:
     return int(rng.integers(2**31))
 
 
-# Rings as they come from anywhere.
+# Valid and damaged rings of all sources.
 
 
 def some_rings(rng: np.random.Generator) -> list[list[Any]]:
-    """Rings of one to three pieces, right or spoilt, of any kind and in any order."""
+    """Rings of one to three pieces, valid or damaged, of any kind and in any order."""
     pieces = []
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
         outer, holes = some_ring(rng), []

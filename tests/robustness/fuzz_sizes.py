@@ -128,7 +128,7 @@ def scattered(rng, domain, h, depth):
 
 
 def expression(rng, domain, h, depth):
-    """A wave, which goes on across seams or not."""
+    """A wave, continuous across seams or not."""
     low, extent, share = domain.lower, domain.extent, 1 - 1 / ratio(rng, domain)
     waves = [
         2 * np.pi * (int(rng.integers(0, 3)) if rng.random() < 0.7 else rng.uniform(0, 3)) / e

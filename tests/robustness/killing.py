@@ -49,7 +49,7 @@ def work(folder: Path) -> None:
 
 
 def place_of(state: Path) -> int | None:
-    """Where in the plan the checkpoint is, if there is one, which must load."""
+    """Return the position of the checkpoint in the plan, or None if there is no file. A file must load."""
     return Saved(state).state["position"] if state.exists() else None
 
 

@@ -44,7 +44,7 @@ def as_for_many() -> Iterator[None]:
 
 
 def large(work: Work) -> Work:
-    """Return `work` that is done as for large meshes."""
+    """Return `work` with the kernels that large meshes use."""
 
     def as_large(adapter: clvoro.Adapter) -> None:
         with as_for_many():

@@ -391,7 +391,7 @@ def multigrid(adapter: clvoro.Adapter) -> None:
 
 
 def nuclei(adapter: clvoro.Adapter) -> None:
-    """Pairs of dislocations made where the lattice is strained, and cells that are mended: runs get there late."""
+    """Nucleation of dislocations, and repair of the worst cells. Runs do both late."""
     engine, stretch = stages_of(adapter).engine, 1.15
     x = hexagons(0.08, clvoro.Box((-1, -1), (2, 2))) * (stretch, 1 / stretch) + 0.1
     t = tessellate(engine, x := x[PATCH.contains(x)])

@@ -120,7 +120,7 @@ class Recorder:
         name = kernel.function_name
         which = (number, name)
         self.launches[which] += 1
-        # The first, the second, the fourth, ...: what comes late in a run is another thing than what comes early.
+        # Launches 1, 2, 4, ...: late launches of a run have other input than early ones.
         count, taken = self.launches[which], self.taken[which]
         if taken >= self.most or count < 2**taken:
             return self._plain[2](queue, kernel, size, group, *rest, **more)

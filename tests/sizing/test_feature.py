@@ -226,7 +226,7 @@ def test_graded_fields_are_evaluated_inside_only() -> None:
     graded.raster(domain)
     x = inner(domain)
     h = graded(x)
-    # From no place on the left is it nearer than straight across; the scheme is off by a spacing's growth.
+    # The shortest way from the left is perpendicular to the jump. The error of the scheme is the growth over a spacing.
     exact = np.minimum(np.where(x[:, 0] < 0.3, 0.02, 0.02 + 0.4 * (x[:, 0] - 0.3)), 0.4)
     spacing = domain.extent.max() / 800
     assert (h >= exact - 2 * 0.4 * spacing).all()

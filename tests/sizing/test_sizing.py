@@ -129,7 +129,7 @@ def test_device_agrees_with_numpy(make_engine, domain, field):
     h = engine.zeros(N + 5)
     stage.evaluate(points, N, h)
     stage.check(points, h)
-    # The reference gets the rounded points, so that it tells the kernel's error alone.
+    # The reference is evaluated at the rounded points, so the difference is the error of the kernel.
     origin, scale = domain.frame
     exact = field(points.get().astype(float) * scale + origin)
     assert np.all(exact > 0)
@@ -554,7 +554,7 @@ def test_sizes_beyond_the_domain_and_the_precision(make_engine):
     else:
         with pytest.raises(SizeFieldError):
             tiny(points)
-    # Also where float64 holds it, yet not (L - h) / L or h^-2; numbers beyond float32 are not clipped to it.
+    # Sizes that float64 holds, but not (L - h) / L or h^-2. Numbers beyond float32 are not clipped.
     for huge in (
         3e9,
         1e39,

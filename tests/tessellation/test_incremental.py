@@ -328,7 +328,7 @@ def around(row, j):
 
 
 def checked(before, after, listed, fits):
-    """Return who is to be marked after `listed` were clipped, and who is known to fit."""
+    """Return which cells must be marked after `listed` have been clipped, and which are known to be correct."""
     marks, fits = np.zeros(len(fits), int), fits.copy()
     for i in listed:
         if before.places[i] >= 0:  # clipped once more: whom it leaves may have been found to fit it

@@ -43,7 +43,7 @@ class Finding:
 
 
 class Verdict:
-    """What a dataclass that reports on a mesh has in common with others: it is true if the mesh is good."""
+    """Base of the dataclasses that report on a mesh. A report is true if the mesh is good."""
 
     @property
     def ok(self) -> bool:

@@ -141,7 +141,7 @@ class Rebuilt:
         self._tails, self._edge, self._before = a, b - a, np.argsort(following)
 
     def _find_adopted(self, d: Diagram) -> None:
-        """Set `adopted`, and the directions of such faces."""
+        """Set `adopted`, and the directions of adopted faces."""
         self.adopted = np.zeros(len(self.owner), bool)
         if not isinstance(d.domain, Polygon):
             return

@@ -127,7 +127,7 @@ class FaceSharing:
         engine.run_each(k.choose_corners, self.c, self.labels, f.sharpness, best, self.best_corners)
 
     def compare(self) -> bool:
-        """Reduce all loops; tell whether any half-face differs from its twin."""
+        """Reduce all loops; return whether any half-face differs from its twin."""
         f, k, any_ = self.half_faces, self._kernels, self.engine.zeros(1, np.int32)
         self.engine.run_each(
             k.reduce_loops, self.h, f.loop_starts, f.loops, self.labels, self.reduced, self.counts
@@ -146,7 +146,7 @@ class FaceSharing:
         )  # fmt: skip
 
     def merge(self, doublings: int) -> bool:
-        """Merge vertices of half-faces that differ, within a tolerance; tell whether there were any to merge."""
+        """Merge vertices of half-faces that differ, within a tolerance; return whether there were any to merge."""
         engine, f, k, c = self.engine, self.half_faces, self._kernels, self.c
         distances = engine.empty(c, np.uint32).fill(2**32 - 1)
         targets = engine.empty(c, np.int32).fill(_LARGEST)

@@ -48,7 +48,7 @@ for name in ("hot", "pipe", "sides"):
     print(f"heat through {name}: {flux[cells.physicalFaces[name].value].sum():+.4f}")
 
 # %%
-# With a known temperature u and the source that it needs, the errors of FiPy fall by four when cells become half as large. On the
+# With a known temperature u and the source that it needs, the errors of FiPy fall by a factor of four if cells are half as large. On the
 # walls u is given at `faceCenters`, which are the feet of the perpendiculars from the cell centers.
 
 

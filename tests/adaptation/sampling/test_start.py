@@ -53,13 +53,13 @@ INTEGRALS = {
         sizing.Expression("x < 1.00001 ? 0.005 : 0.5"),
         1.500015 * 40000 + 2.249985 * 4,
     ),
-    # The dip is 1/170 of the domain wide: only the landmarks on the line show it.
+    # The width of the dip is 1/170 of the domain: only the landmarks on the line find it.
     "thin dip at a line": (
         BOX,
         sizing.Distance(sizing.Segment((-1, 0.7331), (3, 0.7331)), 0.001, slope=2, h_max=0.01),
         _line_dip(0.001, 2, 0.01, 2.5, 3.75),
     ),
-    # In a formula a sample here and there hits the dip, and the tree follows it from box to box.
+    # A formula has no landmarks. Some samples hit the dip, and the tree follows it from box to box.
     "thin dip in a formula": (
         BOX,
         sizing.Expression("min(0.001 + 2*fabs(y - 0.7 - 0.01*x)/sqrt(1.0001), 0.01)"),
@@ -71,13 +71,13 @@ INTEGRALS = {
 @pytest.mark.parametrize("case", INTEGRALS)
 def test_count_of_known_integrals(case):
     domain, field, expected = INTEGRALS[case]
-    # The oblique dip, with dh/dx = 2, ends at the bound of the work.
+    # The tree of the oblique dip, with dh/dx = 2, reaches the limit of its work.
     relative = 1e-3 if case == "thin dip in a formula" else 1.5e-4
     assert count_cells(field, domain) == pytest.approx(expected, rel=relative)
 
 
 def test_small_minimum_of_a_raster_is_found():
-    """Nine low values among 1000 x 600: their landmark shows them."""
+    """Nine low values among 1000 x 600 are found by their landmark."""
     values = np.full((601, 1001), 0.1)
     values[232:235, 776:779] = 1e-3
     field = sizing.Raster(values, BOX.lower, BOX.upper)
@@ -117,7 +117,7 @@ def test_work_is_bounded_for_hard_fields(text):
     tree = DensityTree(counting, BOX)
     assert np.isfinite(tree.integral)
     assert len(tree.boxes) <= 1 << 17
-    assert samples < 9 * 1.4 * (1 << 17)  # each split box is looked at once, its children too
+    assert samples < 9 * 1.4 * (1 << 17)  # each split box is examined once, its children too
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_samples_follow_the_density_along_an_axis():
     points = sample_density(sizing.Expression("exp(-2*x)"), BOX, n, 3141)
     x = np.sort(points[:, 0])
     exact = np.expm1(4 * x) / math.expm1(10)
-    # Independent samples would stay within 1.36 / sqrt(n) = 0.021 (95 %); dealt-out ones do better.
+    # Independent samples would stay within 1.36 / sqrt(n) = 0.021 (95 %); systematic ones do better.
     assert np.abs(exact - (np.arange(n) + 0.5) / n).max() < 0.007
     y = np.sort(points[:, 1]) / 1.5
     assert np.abs(y - (np.arange(n) + 0.5) / n).max() < 0.015
@@ -280,7 +280,7 @@ def test_uniform_is_plain_uniform():
 @pytest.mark.parametrize("real", [np.float64, np.float32, np.float16])
 @pytest.mark.parametrize("start", ["density", "uniform"])
 def test_points_are_distinct_and_inside(real, start):
-    """Also where rounding makes many coincide: 4000 points in float16 have thousands of twins."""
+    """Points are distinct also if rounding makes many coincide: 4000 points in float16 have thousands of duplicates."""
     domain = Box((-3, 5), (-1.9, 5.7))
     n = 4000 if real is np.float16 else 30000
     field = sizing.Expression("0.001 + 0.2*hypot(x+2.2, y-5.1)")
@@ -298,7 +298,7 @@ def test_points_are_distinct_and_inside(real, start):
 
 
 def test_more_points_than_the_precision_has():
-    """Of h = 1e-10 + 0.3 r two fifths of the cells lie within one float32 rounding of the tip."""
+    """With h = 1e-10 + 0.3 r two fifths of the cells lie within one unit of float32 round-off of the tip."""
     field = sizing.Distance(sizing.Circle((0.7, 0.7), 0), 1e-10, slope=0.3)
     box = Box((0, 0), (1, 1))
     assert len(sample_density(field, box, 1500, 99)) == 1500
@@ -319,7 +319,7 @@ def test_device_and_host_agree(ctx, dtype):
     working = (points / BOX.frame[1]).astype(dtype)
     assert len(np.unique(working, axis=0)) == 588
     if dtype == "float64":
-        # The same boxes and shares but for rounding: the points agree but for a rare swap.
+        # Boxes and shares are the same up to round-off. The points are the same, except for rare swaps.
         host = sample_density(F1, BOX, 588, 4711)
         assert np.mean(np.abs(host - points).max(axis=1) < 1e-6) > 0.9
 

@@ -29,7 +29,7 @@ STAR = clvoro.Polygon(ragged(50), [ragged(11, 5, (0.05, 0.0), 0.2)])
 
 
 def guarded(domain: clvoro.Polygon, field):
-    """`field`, but it is an error to ask for it outside of `domain`."""
+    """Return `field` that raises an error for a point outside of `domain`."""
 
     def size(points: np.ndarray) -> np.ndarray:
         assert domain.contains(points).all()
@@ -44,13 +44,13 @@ def guarded(domain: clvoro.Polygon, field):
 def test_constant_sizes_count_the_area(name: str) -> None:
     domain = DOMAINS[name]
     h = np.sqrt(domain.measure / 1000)
-    # Shares are areas of intersections, each rounded by 1e-16 of its box, of which there are some thousands.
+    # Shares are areas of some thousand intersections, each with a round-off of 1e-16 of its box.
     assert count_cells(guarded(domain, h), domain) == pytest.approx(1000, rel=1e-10)
 
 
 @pytest.mark.parametrize("field", [GROWING, DIP], ids=["growing", "dip"])
 def test_counts_of_varying_sizes(field) -> None:
-    """Against midpoints of a raster of 1200 x 1200: of its pixels, one in 200 is cut by the boundary, at random."""
+    """The reference is a sum over the midpoints of 1200 x 1200 pixels, of which the boundary cuts one in 200."""
     n = 1200
     x = (np.arange(n) + 0.5) / n * 2 - 1
     grid = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
@@ -103,13 +103,13 @@ def test_points_are_distinct_and_strictly_inside(name: str, start: str, real: st
     assert len(np.unique(working, axis=0)) == n
     back = working.astype(float) * scale + origin
     assert domain.covers(back).all()
-    # Rounding moves a point by up to half a number; four numbers are kept free.
+    # Rounding moves a point by up to half an ulp; four ulps are kept free.
     assert domain.boundary_distance(back).min() > 3 * np.finfo(real).eps * scale
     assert (np.bincount(domain.piece_of(points), minlength=domain.n_pieces) > 0).all()
 
 
 def test_samples_follow_the_density() -> None:
-    """Systematic samples: what a part gets differs by less than one for each stay of the curve in it."""
+    """Systematic samples: the number in a part is off by less than one for each visit of the curve."""
     n = 3000
     tree = DensityTree(GROWING, ANNULUS, tolerance=1e-3)  # as that of the samples
     points = sample_density(GROWING, ANNULUS, n, 3)
@@ -181,14 +181,14 @@ def test_two_common_faces_bring_two_generators(ctx) -> None:
 
 @pytest.mark.parametrize("method", ["coupled", "adaptive"])
 def test_sources_are_balanced_per_component(ctx, method: str) -> None:
-    """The Poisson equation of a graph in two parts has a solution only if each part's sources sum up to 0."""
+    """The Poisson equation on a graph of two parts has a solution only if the sources of each part sum up to 0."""
     corner = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
     domain = clvoro.Polygon.from_pieces([[corner], [corner * 2 + np.array([3, 0])]])
     options = {"method": method, "max_steps": 60} if method == "coupled" else {"effort": "fast"}
     result = clvoro.Adapter(ctx).run(domain, 0.1, seed=1, **options)
     assert result.check().ok
     assert np.isin(result.history["iterations"], np.arange(1, 100)).any()
-    # A tenth of the cells' size at most: what rounding the number of cells of a piece leaves is a twentieth.
+    # At most a tenth of the size of a cell. Rounding the number of cells of a piece costs a twentieth.
     assert np.abs(result.size_error).mean() < 0.1
 
 
