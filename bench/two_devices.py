@@ -34,8 +34,8 @@ from clvoro.adaptation.sampling.start import count_cells
 
 STEPS = 3
 ROUNDINGS = 1e4
-"""Largest difference of a volume over the mean volume, in eps: corners are quotients of differences of squares, and random
-generators may be 1e-2 of a cell apart."""
+"""Largest difference of a volume over the mean volume, in eps: corners are quotients of differences of squares, and
+random generators may be 1e-2 of a cell apart."""
 STEPPED = {"float64": 1e-6, "float32": 1e-2}
 """Largest distance of a generator over h after some steps. In float64 the devices differ by rough solves, whose vectors
 are in float32: by 16 roundings for a displacement of up to h. In float32 one device may take one more iteration, if a
@@ -43,8 +43,8 @@ residual is within round-off of the tolerance, 1e-2."""
 COUNTS = 3e-3
 """Relative difference of the numbers of cells after a whole run: a few cells of thousands."""
 FIGURES = {"mean_error": 1e-3, "mean_quality": 5e-3}
-"""Largest differences of figures of whole runs. The default aims at a mean error of 2.5e-3. A defect lowers Q of a cell by
-0.05 to 0.1, and one cell in twenty may have a defect on one device only."""
+"""Largest differences of figures of whole runs. The default aims at a mean error of 2.5e-3. A defect lowers Q of a cell
+by 0.05 to 0.1, and one cell in twenty may have a defect on one device only."""
 
 
 def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 settings.register_profile("clvoro", derandomize=True, deadline=None, database=None)
 settings.load_profile("clvoro")
 
-# A shell has its background jobs ignore Ctrl-C, nohup lost terminals; tests that send such signals want them heard.
+# Background jobs of a shell ignore Ctrl-C, and under nohup lost terminals. Tests send such signals.
 for number, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
     if hasattr(signal, number) and signal.getsignal(getattr(signal, number)) is signal.SIG_IGN:
         signal.signal(getattr(signal, number), handler)

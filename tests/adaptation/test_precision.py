@@ -34,7 +34,7 @@ def test_mean_ratio_of_spacing_to_h(ctx, real):
 
 
 def test_warnings_and_errors_at_the_bounds(ctx, real):
-    """A spacing of 1 / 16 of the least size, or 1e-2 of most sizes, causes a warning, one of the least size an error."""
+    """A spacing of 1 / 16 of the least size, or 1e-2 of most sizes, gives a warning, one of the least size an error."""
     unit, points = SPACING[real], np.array([[1.5, 0.5]] * 99 + [[2.5, 0.5]])
 
     def check(size, size_beyond_2=1.0):

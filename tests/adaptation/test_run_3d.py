@@ -256,7 +256,7 @@ def test_n_cells_is_held(adapter, method, n):
 def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
     result = adapter.run(BOX, SMALL, n_cells=n_cells, method="exact", seed=15)
     assert len(result.points) == n_cells
-    # Sizes count where generators come to lie: of twelve starts on two devices the factor is 0.990 to 1.024 times that.
+    # Sizes are evaluated at generators. With twelve starts on two devices the factor is 0.990 to 1.024 times that.
     assert result.size_factor == pytest.approx(np.cbrt(269 / n_cells), rel=0.04)
     length = np.cbrt(result.diagram.volumes)
     # Three steps; at so few cells h changes by a third from one to the next.
@@ -324,7 +324,7 @@ FIELDS = {
 INFEASIBLE = ("jump", "jump of 100", "steep", "peak")
 """No mesh can follow h that grows by a cell's length within the cell."""
 SIMILAR = ("smaller of two", "segment", "jump", "corner", "wall", "about the domain")
-"""Fields of which others stand for the kind."""
+"""Fields that are similar to others of these."""
 
 
 @pytest.mark.filterwarnings(

@@ -1,4 +1,4 @@
-"""Who is a site where generators are inserted or deleted, and what is marked there: kernel by kernel in NumPy."""
+"""Sites of insertion and deletion, and the marks there: each kernel against NumPy."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def keys_of(magnitudes, indices):
 
 
 def assert_keys(keys, magnitudes):
-    """Magnitudes may differ by the rounding of what they are made of, and are rounded to single precision."""
+    """Magnitudes may differ by the round-off of their terms. They are rounded to single precision."""
     sites = np.flatnonzero(keys)
     assert np.array_equal(sites, np.flatnonzero(magnitudes))
     found = (keys[sites] >> np.uint64(32)).astype(np.uint32).view(np.float32)
@@ -33,7 +33,7 @@ def assert_keys(keys, magnitudes):
 
 
 class Mesh:
-    """Random cells, with charges, walls and strains that have nothing to do with them: all there can be."""
+    """Random cells with random charges, walls and strains, so that all combinations occur."""
 
     def __init__(self, engine):
         self.engine, rng = engine, np.random.default_rng(2401)
@@ -222,7 +222,7 @@ def test_nuclei_are_sites_in_a_strained_lattice(mesh):
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_cells_too_large_or_too_small_are_sites(mesh, sign):
-    """By their log ratio and their faces; far beyond, all are alike. The last of its piece of a domain does not go."""
+    """By log ratio and number of faces, with bounds. The only generator of a piece of the domain is not deleted."""
     engine = mesh.engine
     log_ratio, keys = mesh.rng.uniform(-5, 5, N), engine.empty(N, np.uint64)
     alone = mesh.rng.random(N) < 0.1

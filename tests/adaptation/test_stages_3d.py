@@ -168,7 +168,9 @@ def test_potential_solves_the_equation(double):
     flux /= np.linalg.norm(points[i] - points[j], axis=1)
     net = np.bincount(i, flux, minlength=N)
     wanted = host.volumes * (r - np.average(r, weights=host.volumes))
-    off = min(np.abs(net - wanted).max(), np.abs(net + wanted).max())  # of either sign's convention
+    off = min(
+        np.abs(net - wanted).max(), np.abs(net + wanted).max()
+    )  # whatever the convention for the sign
     assert off < 1e-8 * np.abs(wanted).max()
 
 
@@ -188,7 +190,7 @@ def test_projection_uses_the_derivative_of_the_volumes(double):
     base = excess_of(points)
     t = tessellate(double, points)
     for size in (0.02, 0.01):
-        # What the volumes should change by; its mean is what moving along grad h can give.
+        # Required changes of the volumes. Their mean needs motion along grad h.
         ask = size * np.random.default_rng(3).normal(size=60)
         u = double.empty((60, 3))
         solution = VolumeProjection(double).project(
@@ -288,7 +290,7 @@ def test_number_is_corrected_exactly(engine, total):
     assert change == total if abs(total) < 3 else abs(change) <= min(abs(total), most)
     sites = sweep.moved if total > 0 else sweep.deleted
     assert len(sites) == abs(change)
-    # Among those that are most too large, or too small; one near a stronger one has to wait.
+    # Among the largest, or smallest, over h; a cell near a more extreme one is left for later.
     rank = np.argsort(np.argsort(-np.sign(total) * sweep.log_ratio))
     assert np.median(rank[sites]) < n / 10
 

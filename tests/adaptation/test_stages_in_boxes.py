@@ -1,4 +1,4 @@
-"""What stages make of a diagram, by NumPy from its faces: in the plane and in space, between walls and across seams."""
+"""Stages against NumPy, from the faces of diagrams: in 2D and 3D, at walls and across seams."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_gradient_of_log_h(engine, box, t):
     for cell in range(N):
         own = i == cell
         expected, _, _, singular = np.linalg.lstsq(scaled[own], rises[own], rcond=None)
-        # Squares of the matrix, of its condition number.
+        # Normal equations: round-off grows with the square of the condition number.
         rel = 64 * np.finfo(float).eps * (singular[0] / singular[-1]) ** 2
         size = np.abs(rises[own]).max()
         assert gradient[cell] == pytest.approx(expected, rel=0, abs=rel * size)
@@ -71,7 +71,7 @@ def test_gradient_of_a_potential(engine, box, t):
 
 @pytest.mark.parametrize("clip", [0.0, 0.7])
 def test_moves(engine, box, clip):
-    """Walls reflect, periods go round, and h bounds the way; who is not to move stays, wherever it is."""
+    """Walls reflect, seams are crossed, and h limits the displacement. Fixed generators do not move."""
     rng = np.random.default_rng(5604)
     points = box.place(patch.random_points(N, 5605, box), engine.real)
     lloyd, correction = rng.normal(0, 0.05, (2, N, box.dim))

@@ -440,7 +440,7 @@ def test_terminal_without_rich_gets_one_changing_line(monkeypatch):
             shown(row(step, step))
     text = stream.getvalue()
     assert "\n" not in text
-    # That it prepares, three steps, and the line is cleared in the end.
+    # The preparation, three steps, and the final clearing of the line.
     assert text.startswith("\rx: preparing")
     assert text.count("\r") == 5
 

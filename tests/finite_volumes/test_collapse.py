@@ -167,7 +167,7 @@ def one_edge(cells, a, b):
 
 
 def test_merges_are_those_of_a_slow_reference():
-    """One pair of vertices at a time, near or far, beside each other or not: valid as the reference has it."""
+    """Merge one pair of vertices, near or far, connected or not: it is valid exactly if the reference says so."""
     rng = np.random.default_rng(12)
     diagram = solid_diagram((0, 0, 0), (1, 1, 1), rng.random((25, 3)))
     mesh, h = diagram.solver_mesh(collapse=False), np.cbrt(diagram.volumes)

@@ -1,4 +1,4 @@
-"""A right mesh passes the check; whatever is done to it is found, and called by its name."""
+"""A correct mesh passes the check. Each kind of damage is found and named."""
 
 import dataclasses
 import json
@@ -36,7 +36,7 @@ def arrays_of(diagram):
 
 
 def spoilt(result, **changes):
-    """The diagram, of a result or by itself, with functions applied to its arrays."""
+    """Return the diagram, or the result with it, after functions are applied to its arrays."""
     diagram = result if isinstance(result, Diagram) else result.diagram
     arrays = arrays_of(diagram)
     for name, change in changes.items():
@@ -145,7 +145,7 @@ def test_vertex_that_is_stored_twice_is_found(kind, request):
 
 
 def test_face_whose_two_ends_have_one_number_is_found(ctx):
-    """Where it is shorter than rounding nothing else tells."""
+    """If the face is shorter than round-off, no other check fails."""
     points = np.array([[1.0, 0.3], [0.0, 1.3], [-1.0, 0.3], [0.0, -0.7]])
     points[0, 0] += 4e-14
     adapter = clvoro.Adapter(ctx)
@@ -269,7 +269,7 @@ def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_periods_round_on_the_device(ctx, dtype):
-    """By half a step, which is much of a thin box: faces across its seams do not close their cells any better."""
+    """By half an ulp, much in a thin box: its cells close across seams only up to that round-off."""
     adapter, step = clvoro.Adapter(ctx, dtype), float(np.finfo(dtype).eps)
     for seed in (9, 14, 17):
         box = clvoro.Box((0, 0), (0.7, (2000.5 + 100 * seed) * step), periodic=True)
@@ -311,7 +311,7 @@ def test_clockwise_cell_is_found(flat):
 
 
 def test_cells_of_a_polygon_that_look_back_are_found(ctx):
-    """Of faces between the same two cells some may do so there, but not all together."""
+    """Of several faces between two cells some may point inward, but their sum may not."""
     square = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1)])
     points = np.random.default_rng(7).uniform(0.02, 0.98, (60, 2))
     diagram = clvoro.Adapter(ctx).diagram(square, points)

@@ -1,4 +1,4 @@
-"""Right diagrams of hard polygons pass the check: what was refused once, and what must be refused still."""
+"""Correct diagrams of hard polygons pass the check; wrong ones fail."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def adapters(ctx):
 
 @pytest.mark.parametrize("real", REALS)
 def test_faces_of_pieces_that_went_to_other_cells(adapters, real):
-    """Two pieces in a prong come from beside it: their common face is upright, its middle on another bisector."""
+    """Two pieces in a prong belong to cells beside it. The middle of their common face is on another bisector."""
     gaps = [
         (0.57, 1),
         (0.57, 0.1),
@@ -68,7 +68,7 @@ def test_slits_that_are_no_wider_than_some_roundings_hide_what_is_behind_them(ad
     others = [(68.535, 37913.1), (68.525, 37910.0), (68.532, 37912.0)]
     report = adapters["float64"].diagram(domain, np.array([sides[2], *others])).check()
     assert report, report
-    # And what is not hidden is found: two generators beside the slit, exchanged.
+    # Two exchanged generators beside the slit are found.
     domain = clvoro.Polygon(slit(1e-6))
     points = np.array([(0.3, 0.8), (0.7, 0.6), (0.8, 0.9)])
     diagram = adapters["float32"].diagram(domain, points)
@@ -79,7 +79,7 @@ def test_slits_that_are_no_wider_than_some_roundings_hide_what_is_behind_them(ad
 
 
 def test_one_generator_on_the_boundary_has_its_precision(adapters):
-    """It is put back into the polygon in float64: lengths show what it was made in."""
+    """Positions are moved into the polygon in float64. The lengths show the precision of the mesh."""
     for angle in (0.1, 0.2, 0.3):
         turned = UNIT @ np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
         domain = clvoro.Polygon(turned)
@@ -92,7 +92,7 @@ def test_one_generator_on_the_boundary_has_its_precision(adapters):
 
 @pytest.mark.parametrize("method", ["coupled", "weighted", "exact"])
 def test_pieces_of_one_cell_each_have_no_potential(adapters, method):
-    """Their source is the mean of itself: what is left of it but rounding would find no way to anyone."""
+    """The source of an isolated cell minus its mean is 0 up to round-off."""
     corner, rng = np.array([(0, 0), (1, 0), (0.3, 0.7)]), np.random.default_rng(5)
     domain = clvoro.Polygon.from_pieces(
         [[corner * rng.uniform(0.1, 0.9) + (k % 4, k // 4)] for k in range(12)]

@@ -54,7 +54,7 @@ def test_squares_of_a_lattice_are_cut_in_two(adapter):
     triangles = adapter.diagram(clvoro.Box((0, 0), (8, 5)), points).triangles()
     assert len(triangles) == 2 * 7 * 4
     assert areas(points, triangles) == pytest.approx(np.full(len(triangles), 0.5))
-    # Together they cover what lies between the generators, each square by two.
+    # Together they cover the area between the generators, each square by two triangles.
     squares = np.floor(points[triangles].mean(axis=1) - 0.5) @ [1, 100]
     assert (np.unique(squares, return_counts=True)[1] == 2).all()
 
@@ -70,7 +70,7 @@ def test_around_a_hole(adapter):
     diagram = adapter.diagram(domain, points)
     found = diagram.triangles()
     wanted = Delaunay(points).simplices
-    # Far from the hole nothing hides the generators from the circumcenter.
+    # Far from the hole the circumcenter sees the generators.
     centers = circumcenters(points, wanted)
     clear = domain.contains(centers) & (np.abs(centers - 1).max(axis=1) > 0.6)
     assert clear.sum() > 500

@@ -1,4 +1,4 @@
-"""What a diagram says of its cells and faces, against loops over half-faces, brute force and shapely."""
+"""Methods of diagrams for cells and faces, against loops over half-faces, brute force and shapely."""
 
 import pickle
 
@@ -38,7 +38,7 @@ KINDS = [(name, real) for name in DOMAINS for real in ("float64", "float32")]
 
 @pytest.fixture(scope="module", params=KINDS, ids="-".join)
 def case(request, ctx):
-    """A diagram, and how much its numbers round."""
+    """Return a diagram, and the round-off of its numbers."""
     name, real = request.param
     domain, n = DOMAINS[name]
     diagram = clvoro.Adapter(ctx, real).diagram(domain, random_points(domain, n))
@@ -61,7 +61,7 @@ def test_every_face_is_there_once(case):
     assert len(f) == f.n_inner + np.count_nonzero(f.neighbor < 0)
     assert (f.neighbor[: f.n_inner] >= f.owner[: f.n_inner]).all()
     assert sorted(f.half_face[f.n_inner :]) == walls
-    # Faces of next to no measure may be seen from one side alone.
+    # A face with almost no measure may exist in one of its cells only.
     assert abs(2 * f.n_inner - (len(rows) - len(walls))) <= np.count_nonzero(
         diagram.face_measures < noise
     )

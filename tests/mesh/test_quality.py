@@ -116,14 +116,14 @@ def test_faces_are_at_right_angles_to_the_lines_of_the_generators(diagram):
         loop = d.vertices[corners[starts[k] : starts[k + 1]]]
         size = d.face_measures[k] ** (1 / (d.domain.dim - 1))
         if size < 1e-3:
-            continue  # of the smallest the vertices' rounding turns the normal
+            continue  # the round-off of vertices turns the normals of the smallest faces
         line = d.points[d.neighbors[k]] - d.points[owner[k]]
         if d.domain.dim == 2:
             normal = np.array([loop[1, 1] - loop[0, 1], loop[0, 0] - loop[1, 0]])
         else:
             normal = solids.loop_area(loop)
         cosine = normal @ line / np.sqrt((normal @ normal) * (line @ line))
-        # Vertices are good to some 1e-12 here (Qhull; in 2D the helper joins those nearer than 1e-9).
+        # Vertices of Qhull are accurate to about 1e-12; in 2D the helper joins those nearer than 1e-9.
         assert cosine == pytest.approx(1, abs=1e-9)
         checked += 1
     assert checked > 100
@@ -149,7 +149,7 @@ def test_cells_of_many_sides(ctx, real):
         ring = 0.2 * np.column_stack([np.cos(turn), np.sin(turn)])
         points = 0.5 + np.concatenate([np.zeros((1, 2)), ring])
         result = adapter.run(box, 1.0, points=points, method="lloyd", max_steps=0)
-        # Corners, a tenth from the generator, are known to some roundings of positions.
+        # Corners, 0.1 from the generator, have a round-off of some ulps of positions.
         allowed = 64 * float(np.finfo(real).eps)
         assert np.diff(result.diagram.neighbor_starts)[0] == n
         assert result.quality[0] == pytest.approx(1, abs=allowed)

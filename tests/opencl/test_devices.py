@@ -82,11 +82,11 @@ def test_platform_matches_before_the_device_name(machine, query):
     assert device.create_context(query) == [INTEL]
     assert device.create_context("pocl") == device.create_context("xeon") == [ON_INTEL]
     assert device.create_context("cpu") == [ON_INTEL]
-    # Not another's in the place of a runtime that does not work.
+    # A runtime that does not work is not replaced by another one.
     machine(ON_INTEL, INTEL, broken=[INTEL])
     with pytest.raises(DeviceError, match="it cannot build"):
         device.create_context(query)
-    # Without such a runtime it is the processor that is meant, or its maker.
+    # Without such a runtime the name is that of the processor or its vendor.
     machine(POCL, ON_INTEL, BIG_GPU)
     assert device.create_context(query) == device.create_context("genuine") == [ON_INTEL]
 
@@ -127,7 +127,7 @@ def test_choice_by_name_kind_and_index(machine, query, expected):
         ([INTEL, POCL], "nvidia", f"leave the device out to use {POCL.platform.name} / {POCL.name}, or install the "),
         ([POCL, BIG_GPU], "amd", f"leave the device out to use {BIG_GPU.platform.name} / {BIG_GPU.name}, or install "),
         ([POCL], "gpu", "install the OpenCL driver of the one that you want"),
-        # Indices ask one platform alone, beside which there may be better ones.
+        # Indices select one platform, though others may have better devices.
         ([POCL, BIG_GPU], "0:7", "use device='1:0' to use "),
         ([GRIND], "gpu", "pocl-opencl-icd"),
         ([POCL], "pocl", "pocl-opencl-icd"),  # and it does not work

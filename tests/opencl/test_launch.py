@@ -107,7 +107,7 @@ def test_launch_alternates_with_other_launches(engine):
             launch.set_first(k)
             launch()
             assert (to.get() == k).all()
-        # The same arguments as those of the launch before its first one was changed.
+        # The arguments are those of the launch before the first one was changed.
         bind(kernel, (np.int32(7), to))
         engine.run_blocks(kernel, np.int32(7), to)
         assert (to.get() == 7).all()

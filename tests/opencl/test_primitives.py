@@ -48,9 +48,7 @@ def test_scan_in_place(scan, n):
 def test_summaries(engine, n):
     values = np.random.default_rng(n + 5).normal(0.01, 1, n).astype(engine.real)
     summaries = Summaries(engine, ("a", "b"))
-    array = engine.upload(
-        np.concatenate([values, [1e9]])
-    )  # what lies behind the n is not looked at
+    array = engine.upload(np.concatenate([values, [1e9]]))  # items after the first n are not read
     summaries.collect("b", array, n)
     summaries.collect("a", engine.upload(-values), n)
     a, b = (summaries.read()[name] for name in "ab")
@@ -94,7 +92,7 @@ def test_summaries_are_read_together_with_an_integer(engine):
         assert found[name].least == factor * arrays[name].min()
         assert found[name].largest == factor * arrays[name].max()
     assert np.array_equal(values, [list(vars(found[name]).values()) for name in "zabc"])
-    # Put back, they are what they were, whatever has been collected since.
+    # Restored slots have their old values, also after later collections.
     summaries.collect("c", engine.upload(np.full(n, 9.0)), n)
     summaries.values.set(values)
     assert summaries.read() == found

@@ -60,7 +60,7 @@ def test_numbers_add_up(run):
     assert sum(sum(s.stages.values()) for s in taken.spans) == pytest.approx(kernels, **close)
     assert taken.of(*stages) == pytest.approx(kernels, **close)
     assert taken.device + taken.host == pytest.approx(taken.wall, **close)
-    # The device works at one thing at a time, and between opening and closing.
+    # The device executes one command at a time, between opening and closing.
     assert 0 < taken.device < taken.wall
     # Spans follow each other without a gap, from opening to closing.
     assert sum(s.wall for s in taken.spans) == pytest.approx(taken.wall, rel=1e-9)

@@ -57,7 +57,7 @@ def check(arrays):
 
 
 def test_arrays_of_open_frames_do_not_overlap(engine):
-    """Also in nested frames, while the memory grows, and after it is in one piece."""
+    """In nested frames, too: while the memory grows, and when it is in one piece."""
     for _ in range(3):
         with engine.workspace.frame():
             outer = take(engine)
@@ -223,7 +223,7 @@ def test_kernels_are_not_shared_until_released(engine):
 
 
 def test_memory_is_in_several_pieces_where_buffers_are_limited(engine, made, monkeypatch):
-    """The workspace is not joined to a buffer that the device does not allocate, and stops to grow."""
+    """If the device cannot allocate one buffer for all, the workspace keeps its pieces and does not grow."""
     monkeypatch.setattr(memory_limits, "largest_allocation", lambda _: 40_000)
     engine = Engine(engine.ctx, engine.queue, 2, engine.real)
     for _ in range(4):

@@ -1,4 +1,4 @@
-"""Pictures and the report: what is drawn is what was computed, and nothing is left out."""
+"""Pictures and the report show what was computed, completely."""
 
 import base64
 import dataclasses
@@ -107,7 +107,7 @@ def test_faces_are_as_thin_as_their_cells_are_small(result):
     sizes = np.sqrt(result.diagram.volumes)
     assert widths.max() <= 0.7
     assert widths.max() / widths.min() > 0.5 * sizes.max() / sizes.min()
-    # Both in the unit of the paper: a face takes a twentieth of its cell's size at most.
+    # The line of a face is at most as wide as a twentieth of its cell.
     assert widths.max() <= 0.05 * sizes.max() * 72 / BOX.extent[0]
 
 
@@ -199,7 +199,7 @@ def test_side_shares_are_complete(result):
 
 
 def test_infinite_values_have_the_color_beyond_the_scale(adapter):
-    # The generator on the wall is not amid its face there.
+    # The generator on the wall is not in the middle of its wall face.
     points = np.array([[0.3, 2.0], [-0.8, 2.2], [0.0, 2.7], [0.7, 2.5]])
     result = adapter.run(BOX, 0.5, points=points, method="lloyd", max_steps=0)
     assert np.isinf(result.measures.worst_of_cell("skewness")).tolist() == [True] + 3 * [False]

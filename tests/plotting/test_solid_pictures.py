@@ -1,4 +1,4 @@
-"""Pictures of three-dimensional meshes: what is drawn is what a plane cuts, or what a viewer sees."""
+"""Pictures of 3D meshes show the cells that a plane cuts, or that a viewer sees."""
 
 import dataclasses
 
@@ -122,14 +122,14 @@ def test_every_side_of_a_slice_is_drawn_once(result):
     section = cut_cells(result.diagram, (0, 0, 1), (0, 0, 2.7))
     lengths = np.linalg.norm(section.edges[:, 1] - section.edges[:, 0], axis=1)
     walls = result.diagram.neighbors[section.rows] < 0
-    # Lines of cells too small to be seen are left out: of these cells none is.
+    # Edges of cells that are too small to be seen are left out. These cells are all large enough.
     assert drawn == pytest.approx(lengths[walls].sum() + lengths[~walls].sum() / 2)
     assert lengths[walls].sum() == pytest.approx(6)
 
 
 @pytest.mark.parametrize("cut", ["octant", (0.0, -1.0, 0.0), None])
 def test_what_is_drawn_last_is_what_the_viewer_sees(result, cut):
-    """Along lines of sight, the first cell that was kept is that of the last polygon drawn there."""
+    """The first kept cell on a line of sight is that of the last polygon drawn there."""
     d = result.diagram
     right, up, towards = view_axes(VIEW)
     through = np.array([0.1, 0.5, 2.7])

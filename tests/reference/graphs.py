@@ -27,7 +27,7 @@ def polygon_area(corners):
 def voronoi_graph(points):
     """CSR graph of the diagram of `points` (n, d): starts, neighbors, face measures, volumes.
 
-    Neighbors -1 - b are walls: every generator is mirrored at every wall, for Qhull to make them.
+    Neighbors -1 - b are walls, which Qhull makes as every generator is mirrored at every wall.
     """
     n, dim = points.shape
     mirrored = [points]

@@ -62,7 +62,7 @@ def fetch(t):
 
 
 def ways(host, box):
-    """Return the way from each face's generator to the nearest image of its neighbor, (m, d); of walls nothing."""
+    """Return the vector from each face's generator to the nearest image of its neighbor, (m, d); walls are left out."""
     across = host.points[np.maximum(host.neighbors, 0)].astype(float) - host.points[host.owners]
     across[host.neighbors < 0] = 0
     periods = np.where(box.periodic, box.extent, 1)
@@ -79,7 +79,7 @@ def free_depth(ways, inwards, gap, most):
 def children(host, box, h, held=None):
     """Middles of all edges across faces of some size, and one point between each wall and its cells; see refinement.cl.
 
-    Nothing of cells that are `held` (n,), or across their faces.
+    Cells that are `held` (n,), and their faces, are left out.
     """
     made, across = [], ways(host, box)
     held = np.zeros(len(host.points), bool) if held is None else held

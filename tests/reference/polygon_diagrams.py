@@ -14,12 +14,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 ROUNDS = 6
-"""Cells away that the one may be that takes a piece, as in clvoro/tessellation/clipped/trim.py."""
+"""Largest number of cells between a piece and the cell that takes it, as in clvoro/tessellation/clipped/trim.py."""
 
 
 @dataclass
 class Piece:
-    """A part of a Voronoi region within the domain: whose region, and whose cell it goes to."""
+    """A part of a Voronoi region within the domain: the generator of the region, and the cell that gets the part."""
 
     home: int
     shape: shapely.Polygon
@@ -99,7 +99,7 @@ def polygon_voronoi(domain, points) -> PolygonCells:
     mine: list[list[int]] = []
     close = np.zeros(n, bool)
     for i, (corners, _) in enumerate(cells):
-        cell = shapely.MultiPoint(corners).convex_hull  # whatever rounding makes of short faces
+        cell = shapely.MultiPoint(corners).convex_hull  # short faces may be lost to round-off
         touched = not shapely.contains_properly(whole, cell)
         parts = shapely.get_parts(shapely.intersection(whole, cell)) if touched else [cell]
         parts = [p for p in parts if p.geom_type == "Polygon" and p.area > 0]
@@ -108,7 +108,7 @@ def polygon_voronoi(domain, points) -> PolygonCells:
         close[i] = sum(a < small for a in away) > 1
         mine.append(list(range(len(pieces), len(pieces) + len(parts))))
         pieces += [Piece(i, p, i if k == own else -1, touched) for k, p in enumerate(parts)]
-    # Faces between pieces: what lies in the domain of those between regions.
+    # Faces between pieces: the parts of faces between regions that lie in the domain.
     faces: list[tuple[int, int, float]] = []
     for i, (corners, labels) in enumerate(cells):
         for k, j in enumerate(labels):
@@ -138,7 +138,7 @@ def polygon_voronoi(domain, points) -> PolygonCells:
     ends = rings.vertices[rings.next_vertex]
     for e, a, b in zip(rings.edge_numbers.tolist(), rings.vertices, ends, strict=True):
         for home in {pieces[p].home for p in tree.query(shapely.LineString([a, b]).buffer(small))}:
-            # What lies on a face counts to the cell on the left.
+            # An edge that lies on a face counts to the cell on the left.
             left = small / 1000 * np.array([a[1] - b[1], b[0] - a[0]]) / math.dist(a, b)
             t = _within(a + left, b + left, points[home], points)
             exact = _within(a, b, points[home], points)
@@ -166,7 +166,7 @@ def _measures(shape) -> tuple[float, np.ndarray]:
 
 
 def _within(a, b, x, points) -> tuple[float, float] | None:
-    """What part of the edge from a to b is nearer to x than to all other points."""
+    """Return the part of the edge from a to b that is nearer to x than to all other points."""
     d = points - x
     level = (d * (points + x)).sum(axis=1) / 2
     s, e = level - d @ a, d @ (b - a)
@@ -208,7 +208,7 @@ def faults(diagram, real: str = "float64") -> list[str]:
     eps = float(np.finfo(real).eps)
     size, n = float(domain.extent.max()), len(d.points)
     far = max(map(abs, (*domain.lower, *domain.upper)))
-    # What corners of cells that are repaired may be off by (is_rounding in repair.cl), in units of the device.
+    # Tolerance of corners of updated cells, in units of the device.
     slack = 64 * (eps * domain.frame[1] + 2.3e-16 * far)
     found = []
 

@@ -139,7 +139,7 @@ TOUCHING = {
     "pieces": lambda: clvoro.Polygon.from_pieces([[UNIT * 0.5], [UNIT * 0.5 + 0.5]]),
     "blocks": lambda: clvoro.Polygon.from_shapely(blocks(np.random.default_rng(5), 6)),
 }
-"""Rings that touch in vertices: whether the cells there are connected is a matter of taste."""
+"""Rings that touch in vertices, where cells may count as connected or not."""
 
 
 def scattered(domain: clvoro.Polygon, n: int, seed: int = 0) -> np.ndarray:

@@ -113,7 +113,7 @@ def solid_result(diagram, size=None, seed=7741):
 
 
 def relaxed_points(lower, upper, n, seed, steps=3, keep=None):
-    """Return random generators after a few of Lloyd's steps; `keep` thins them out by a probability."""
+    """Return random generators, each kept with the probability `keep` (n, 3) -> (n,), after a few of Lloyd's steps."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(lower, upper, (n, 3))
     if keep is not None:

@@ -350,7 +350,7 @@ def test_cells_of_many_faces(adapter, dim):
     assert np.diff(old.neighbor_starts).max() == 90
     got = old.transfer(old.centroids[:, 1], new, 2, limited=False, adapter=adapter)
     np.testing.assert_allclose(got, new.centroids[:, 1], rtol=0, atol=1e-11)
-    # The new cell lies within one old cell, whose pieces need the room for its 90 faces.
+    # The new cell lies within one old cell. Their intersection needs room for 90 faces.
     wide = adapter.diagram(
         box, np.array([0.5] * dim) + np.array([[-0.49], [-0.41]]) * np.eye(dim)[0]
     )

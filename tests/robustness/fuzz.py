@@ -52,7 +52,7 @@ WORK = {
     "command": (commands.try_command, 0.06),
     "file": (commands.try_file, 0.1),
 }
-"""What is tried by kind of input, and how often."""
+"""The work on each kind of input, and its frequency."""
 
 SLOWEST = 180
 """Seconds after which an input counts as one that hangs."""

@@ -1,4 +1,4 @@
-"""What `fuzz.py` does with polygons, and with rings of which some make one."""
+"""The work of `fuzz.py` on polygons, and on rings that may be invalid."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def try_polygon(rng: np.random.Generator) -> str:
 
 
 def diagram(domain: clvoro.Polygon, points: np.ndarray, real: str) -> str:
-    """Make a diagram by those of `points` that do not coincide: boxes show what becomes of such."""
+    """Make a diagram of those of `points` that do not coincide. Coincident ones are tested in boxes."""
     first = np.unique(domain.place(points, np.dtype(real)), axis=0, return_index=True)[1]
     points = points[np.sort(first)]
     try:
@@ -35,9 +35,9 @@ def try_polygon_run(rng: np.random.Generator) -> str:
 
 
 def try_hard(rng: np.random.Generator) -> str:
-    """Diagrams and short runs of few generators or many, or none that are given, in polygons that are hard to cut."""
+    """Diagrams and short runs from few, many or no given generators, in hard polygons."""
     domain, real, kind = hard_polygon(rng), some_real(rng), rng.random()
-    if kind < 0.3:  # cells larger than most of what they are cut by
+    if kind < 0.3:  # cells larger than most edges
         points = domain.lower + rng.random((int(rng.integers(1, 6)), 2)) * domain.extent
         points = points[domain.contains(points)]
         points = points if len(points) else domain.inner_point(0)[None]
@@ -53,7 +53,9 @@ def try_hard(rng: np.random.Generator) -> str:
     if method in ("adaptive", "exact"):
         options["effort"] = "fast"
     cells = 10 ** rng.uniform(0.5, 2.7)
-    if len(points) > 20 * cells:  # of very many, on lines, few can go at a time: minutes
+    if (
+        len(points) > 20 * cells
+    ):  # of very many on lines few are deleted at a time, which takes minutes
         return diagram(domain, points, real)
     size = float(np.sqrt(domain.measure / cells))
     steps = int(rng.integers(0, 6))

@@ -107,7 +107,7 @@ def some_case(rng: np.random.Generator, folder: Path, real: str, wild: bool) -> 
     (folder / "s.stl").write_bytes(files.surfaces()["s.stl"])
     size, run = some_field(rng, domain), some_run(rng, d, real)
     case: dict[str, Any] = {"name": "fuzz", "domain": domain, "size": size, "run": run}
-    if "periodic" in domain:  # few cells are too few across a period
+    if "periodic" in domain:  # a period needs a least number of cells
         run.pop("points", None)
     walls = not np.all(domain.get("periodic", False))
     if d == 2 and walls and rng.random() < 0.2:

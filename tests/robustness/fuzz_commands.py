@@ -1,4 +1,4 @@
-"""What `fuzz.py` does from outside: cases, the command, and files of every kind that are damaged."""
+"""The work of `fuzz.py` on cases, the command, and damaged files of every kind."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _files: dict[str, bytes] = {}
 
 
 def try_case(rng: np.random.Generator) -> str:
-    """A case file with what it may hold, from the text to the files written."""
+    """A valid or invalid case file, from the text to the written files."""
     with tempfile.TemporaryDirectory() as folder:
         wild = rng.random() < WILD
         text = toml.write(some_case(rng, Path(folder), some_real(rng), wild))
@@ -89,7 +89,7 @@ def command(*words: str) -> int:
     with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(shown):
         try:
             code = cli.main(words)
-        except SystemExit as end:  # of words that nobody knows
+        except SystemExit as end:  # an unknown word
             code = int(end.code or 0)
     if code not in (cli.OK, cli.FAILED, cli.BAD_INPUT):
         raise Wrong(f"{' '.join(words)} ends with {code}: {shown.getvalue()[-300:]}")
@@ -101,7 +101,7 @@ def use(rng: np.random.Generator, result: clvoro.Result, folder: Path) -> None:
     diagram, patches = result.diagram, None
     if isinstance(diagram.domain, clvoro.Polygon) and rng.random() < 0.5:
         patches = {"inlet": [0], "wall": [1, 2]}
-    with contextlib.suppress(InputError):  # which has no room for cells around holes
+    with contextlib.suppress(InputError):  # which cannot hold cells around holes
         result.save(folder / "case" / "a.foam", patches=patches)
     if diagram.domain.dim == 2 and not any(diagram.domain.periodic):
         corners = diagram.triangles()
@@ -115,7 +115,7 @@ def use(rng: np.random.Generator, result: clvoro.Result, folder: Path) -> None:
 
 
 def try_file(rng: np.random.Generator) -> str:
-    """A file with some bits changed, bytes lost, doubled or exchanged is refused, or no harm is done."""
+    """A file with changed bits, or lost, doubled or exchanged bytes, is refused, or the damage has no effect."""
     if not _files:
         _files.update(files.valid_files(adapter("float64")))
     name = str(rng.choice(list(_files)))

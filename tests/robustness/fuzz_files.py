@@ -1,4 +1,4 @@
-"""Right files of every kind that clvoro reads, how they are damaged, and how they are read."""
+"""Valid files of every kind that clvoro reads; how they are damaged and read."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ GEOJSON = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "pr
 WKT = b"MULTIPOLYGON (((0 0, 3 -0.3, 4 1, 1 2, 0 0), (1 0.8, 1.5 1.2, 1.6 0.7, 1 0.8)), ((5 0, 6 0, 6 1, 5 0)))\n"
 BOX = clvoro.Box((0, 0), (1, 1))
 RUN = {"method": "coupled", "max_steps": 2, "seed": 5}
-"""What made the checkpoint: a run of `BOX` with a size of 0.2."""
+"""Options of the run that wrote the checkpoint."""
 
 
 def surfaces() -> dict[str, bytes]:
@@ -61,7 +61,7 @@ def surfaces() -> dict[str, bytes]:
 
 
 def valid_files(adapter: clvoro.Adapter) -> dict[str, bytes]:
-    """A right file of each kind by name."""
+    """A valid file of each kind by name."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         checkpoint = clvoro.Checkpoint(folder / "state", every=0)
@@ -83,7 +83,7 @@ def damaged(rng: np.random.Generator, data: bytes) -> bytes:
     """Return `data` with some bits changed, bytes lost, doubled or exchanged, or numbers put in."""
     changed = bytearray(data)
     for _ in range(rng.integers(1, 6)):
-        # As often as anywhere at the beginning and the end, where formats keep what they are about.
+        # A third of the damage each: anywhere, at the beginning, and at the end, where formats have headers.
         size = max(len(changed), 1)
         at = int([rng.integers(size), rng.integers(600), size - rng.integers(600)][rng.integers(3)])
         at = min(max(at, 0), size - 1)
@@ -106,7 +106,7 @@ def damaged(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def read(path: Path) -> object:
-    """Read a file as its name says, and use what is in it as far as can be done without a device."""
+    """Read a file as its name says, and use its contents as far as possible without a device."""
     if path.suffix in (".npz", ".vtu"):
         result = (clvoro.load if path.suffix == ".npz" else load_vtu)(path)
         str(result.check())

@@ -1,4 +1,4 @@
-"""What `fuzz.py` throws: boxes, polygons, generators and layers of all kinds, absurd ones among them."""
+"""Input of `fuzz.py`: boxes, polygons, generators and layers of all kinds, also absurd ones."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def ulps(rng, n, dim):
 
 
 def lattice(rng, n, dim):
-    """A lattice, also up to the walls, sheared, or disturbed by some roundings."""
+    """A lattice, also up to the walls, sheared, or disturbed by round-off."""
     side = max(1, round(n ** (1 / dim)))
     line = (
         np.arange(side) / max(side - 1, 1) if rng.random() < 0.4 else (np.arange(side) + 0.5) / side
@@ -115,7 +115,7 @@ def line(rng, n, dim):
 
 
 def walls(rng, n, dim):
-    """On walls, in corners, and a rounding off them."""
+    """Generators on walls, in corners, and one ulp beside them."""
     x = rng.random((n, dim))
     put = rng.random((n, dim)) < 0.6
     x[put] = rng.choice(
@@ -164,7 +164,7 @@ def around(rng: np.random.Generator, dim: int) -> np.ndarray:
 def placed(
     rng: np.random.Generator, box: clvoro.Box, real: str = "float64", wild: bool = True
 ) -> np.ndarray:
-    """Some points in `box`, apart from each other in the precision `real`; `wild`: also some that are not."""
+    """Return points in `box` that are distinct in the precision `real`; `wild`: also coincident ones."""
     if wild and rng.random() < 0.1:
         return NONSENSE[rng.integers(len(NONSENSE))]
     x = some_points(rng, box.dim) * box.extent + np.array(box.lower)
@@ -232,7 +232,7 @@ def some_polygon(rng: np.random.Generator) -> clvoro.Polygon:
 
 
 def placed_in_polygon(rng: np.random.Generator, domain: clvoro.Polygon) -> np.ndarray:
-    """Points of the unit square's kinds, on the boundary and off it."""
+    """Points of the same kinds as in the unit square, on the boundary and beside it."""
     low, extent = np.array(domain.lower), domain.extent
     kind = rng.random()
     if kind < 0.3:
@@ -254,7 +254,7 @@ def placed_in_polygon(rng: np.random.Generator, domain: clvoro.Polygon) -> np.nd
 def some_layers(
     rng: np.random.Generator, domain: clvoro.Box | clvoro.Polygon, wild: bool = True
 ) -> list[clvoro.Layers]:
-    """One to three layers, as a rule of up to some thousand generators; `wild`: also too thick or thin, or nowhere."""
+    """One to three layers, mostly of up to some thousand generators; `wild`: also too thick, thin, or without walls."""
     if isinstance(domain, clvoro.Polygon):
         walls = np.arange(len(domain.vertices))
         edges = shapely.boundary(domain.geometry).length

@@ -1,4 +1,4 @@
-"""Whether what an input led to is right: a mesh, or an error that is true."""
+"""Judge the result of an input: a valid mesh, or a true error."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _adapters: dict[str, clvoro.Adapter] = {}
 
 
 class TooLarge(Exception):  # noqa: N818
-    """What an input asks for is a benchmark, not a test."""
+    """The input requires too much work for a test."""
 
 
 class Wrong(Exception):  # noqa: N818
-    """An input led to something other than a right mesh or a clear error."""
+    """The result is neither a valid mesh nor a clear error."""
 
 
 def adapter(dtype: str) -> clvoro.Adapter:
@@ -43,7 +43,7 @@ def some_real(rng: np.random.Generator) -> str:
 
 
 def demand(mesh: clvoro.Result | clvoro.Diagram, real: str) -> None:
-    """Raise unless `mesh` is right."""
+    """Raise unless `mesh` is valid."""
     report = mesh.check()
     if not report:
         raise Wrong(str(report))
@@ -55,7 +55,7 @@ def demand(mesh: clvoro.Result | clvoro.Diagram, real: str) -> None:
 
 
 def run_by(made_by: clvoro.Adapter, domain: Any, *arguments: Any, **options: Any) -> clvoro.Result:
-    """Run; what comes too close to each other by itself is not the caller's fault."""
+    """Run. Generators of the caller that are far apart must not come too close to each other in the run."""
     made_by.on_memory = refuse_large
     try:
         return made_by.run(domain, *arguments, **options)
@@ -103,7 +103,7 @@ def demand_telling_apart(error: InputError, domain: Any, real: str) -> None:
 
 
 def diagram_by(made_by: clvoro.Adapter, box: clvoro.Box, points: Any) -> clvoro.Diagram:
-    """Return the diagram of a box, if it is right."""
+    """Return the diagram of a box; raise unless it is valid."""
     try:
         diagram = made_by.diagram(box, points)
     except InputError as error:
@@ -114,6 +114,6 @@ def diagram_by(made_by: clvoro.Adapter, box: clvoro.Box, points: Any) -> clvoro.
 
 
 def clearance(domain: clvoro.Polygon, real: str) -> float:
-    """How near to each other edges are that have no corner in common, in roundings of positions."""
+    """Return the least distance of edges without a common corner, in units of the round-off of positions."""
     unit = domain.frame[1] * np.finfo(real).eps
     return float(shapely.minimum_clearance(domain.geometry)) / unit

@@ -18,7 +18,7 @@ CALLBACKS: list[Any] = [
 
 
 def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -> dict[str, Any]:
-    """Options of a run; `wild`: such as are refused, or mean little."""
+    """Options of a run; `wild`: also invalid or pointless ones."""
     d = domain.dim
     methods = ["adaptive", "exact", "coupled", "lloyd", "poisson", "weighted", "weighted-lloyd"]
     options: dict[str, Any] = {
@@ -26,11 +26,11 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
         "effort": str(rng.choice(["fast", "default", "best"], p=[0.6, 0.3, 0.1])),
         "seed": int(rng.integers(0, 2**31)), "start": str(rng.choice(["density", "uniform"])),
     }  # fmt: skip
-    # Most runs in boxes go on to their end.
+    # Most runs in boxes are complete.
     if rng.random() < (0.7 if isinstance(domain, clvoro.Polygon) else 0.4):
         options["max_steps"] = int(rng.integers(0, 15 if d == 2 else 6))
     periods = domain.extent[list(domain.periodic)]
-    most = domain.measure / fine_size(rng, domain) ** d  # cells that fit into periods, too
+    most = domain.measure / fine_size(rng, domain) ** d  # cells must fit into periods, too
     optional = {
         "n_cells": lambda: int(most * rng.uniform(1, 1.5)) + (1 if periods.size else 12),
         "k": lambda: float(rng.choice([0.1, 1.0, 2.0])),
@@ -58,8 +58,8 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
     options |= {name: make() for name, make in optional.items() if rng.random() < 0.12}
     if "points" in options and not wild:
         if options["method"] not in ("adaptive", "exact"):
-            options.pop("n_cells", None)  # which these methods keep
-        elif periods.size:  # few generators are too few across a period, and many levels below
+            options.pop("n_cells", None)  # these methods keep the number
+        elif periods.size:  # a period needs a least number of cells, on coarser levels, too
             options.pop("points")
     return arguments_of_run(options)
 
@@ -69,10 +69,10 @@ def some_generators(rng: np.random.Generator, domain: Any, real: str, wild: bool
         return placed_in_polygon(rng, domain)
     if not any(domain.periodic) or wild:
         return placed(rng, domain, real, wild)
-    # As dense as the periods want it.
+    # As dense as the periods require.
     counts = np.maximum(np.ceil(domain.extent / fine_size(rng, domain)).astype(int), 1)
     x = np.stack(np.meshgrid(*[(np.arange(c) + 0.5) / c for c in counts], indexing="ij"), axis=-1)
-    # Also a lattice, but for some roundings.
+    # Or a lattice, up to some round-off.
     noise = rng.choice([0.3, 1e-6, 1e-15]) * rng.uniform(-1, 1, (counts.prod(), domain.dim))
     x = x.reshape(-1, domain.dim) + noise / counts
     return domain.lower + x * domain.extent

@@ -1,4 +1,4 @@
-"""Polygons that are harder to cut than those of `fuzz_inputs.py`, and rings of which some make a polygon."""
+"""Polygons that are harder than those of `fuzz_inputs.py`, and valid and invalid rings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def fjords(rng: np.random.Generator) -> Any:
 
 
 def needles(rng: np.random.Generator) -> Any:
-    """A star with needles put on it and taken from it, as narrow as edges may be short."""
+    """A star with needles outward and inward, as narrow as the shortest valid edge."""
     shape = shapely.Polygon(shores.star(int(rng.integers(3, 30)), some_seed(rng)))
     for _ in range(rng.integers(1, 8)):
         a, width = rng.uniform(0, 6.3), 10 ** rng.uniform(-12, -3)
@@ -53,7 +53,7 @@ def needles(rng: np.random.Generator) -> Any:
 
 
 def touching(rng: np.random.Generator) -> Any:
-    """Holes in a lattice that touch each other in corners: what is left may be in many pieces."""
+    """Holes in a lattice that touch each other in corners: the rest may have many pieces."""
     n, flat = int(rng.integers(2, 8)), np.array([(0, 0.5), (0.5, 0.3), (1, 0.5), (0.5, 0.7)])
     holes = [
         shapely.Polygon(((shores.DIAMOND if rng.random() < 0.7 else flat) + (i, j)) / n)
@@ -65,7 +65,7 @@ def touching(rng: np.random.Generator) -> Any:
 
 
 def fans(rng: np.random.Generator) -> Any:
-    """Triangles taken out, all with a corner in one place."""
+    """Triangular holes that share one corner."""
     center, shape = rng.uniform(0.25, 0.75, 2), shapely.box(0, 0, 1, 1)
     angles = np.sort(rng.uniform(0, 6.28, (int(rng.integers(2, 12)), 2)).ravel()).reshape(-1, 2)
     for pair in angles:
@@ -159,7 +159,7 @@ def some_ring(rng: np.random.Generator) -> np.ndarray:
 
 
 def spoilt(rng: np.random.Generator, ring: np.ndarray) -> Any:
-    """`ring` with up to three changes, harmless or not; or something that is no ring."""
+    """Return `ring` with up to three changes, harmless or not, or an object that is no ring."""
     r = ring
     for _ in range(rng.integers(0, 4)):
         if len(r) < 2:
@@ -197,11 +197,11 @@ CHANGES = [
     lambda rng, r, i, j: np.insert(r, i, (r[i] + r[i - 1]) / 2, axis=0),
     lambda rng, r, i, j: put(r, i, np.nextafter(r[j], r[i])),
 ]
-"""What may become of a ring (k, 2), at places i and j."""
+"""Return possible changes of a ring (k, 2), at the places i and j."""
 
 
 def polygon_of(rng: np.random.Generator, pieces: list[list[Any]]) -> clvoro.Polygon:
-    """The domain by one of the ways that lead to it."""
+    """Make the domain by one of the constructors."""
     way = rng.integers(3)
     if way == 0 and len(pieces) == 1:
         return clvoro.Polygon(pieces[0][0], pieces[0][1:])

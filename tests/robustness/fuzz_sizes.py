@@ -1,4 +1,4 @@
-"""Size fields of all kinds for `fuzz.py`: of up to a thousand cells or so that may be had, and absurd ones."""
+"""Size fields of all kinds for `fuzz.py`: valid ones of up to a thousand cells or so, and absurd ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Domain = clvoro.Box | clvoro.Polygon
 
 
 class OwnError(Exception):
-    """Raised by a caller's size field: it is the caller's to see."""
+    """Raised by a caller's size field. The caller must get it."""
 
 
 def fail():
@@ -27,14 +27,14 @@ ABSURD = [
 
 
 def some_size(rng: np.random.Generator, domain: Domain, wild: bool):
-    """A size field that a run of `domain` can meet, or (`wild`) one of whatever kind."""
+    """A size field that a run in `domain` can meet, or (`wild`) any size field."""
     h = fine_size(rng, domain)
     if wild:
         h *= 10 ** rng.uniform(0, 0.5)  # may be too coarse for a period
         if rng.random() < 0.3:
             return ABSURD[rng.integers(len(ABSURD))]
         if rng.random() < 0.3:
-            # Too many cells for any device, or one; what lies between is a benchmark, not a test.
+            # Too many cells for any device, or one cell. Numbers between take too long for a test.
             return h * 10.0 ** (rng.uniform(-12, -6) if rng.random() < 0.5 else rng.uniform(0, 12))
         if rng.random() < 0.5:
             return some_graded(rng, domain, field_of(rng, domain, h), wild=True)
@@ -54,7 +54,7 @@ def fine_size(rng: np.random.Generator, domain: Domain) -> float:
 
 
 def field_of(rng: np.random.Generator, domain: Domain, h: float, depth: int = 0):
-    """A field of sizes up to `h`, and not far below it."""
+    """A field with sizes up to `h`, and not much smaller ones."""
     names = [n for n in FIELDS if n != "feature" or isinstance(domain, clvoro.Polygon)]
     if depth > 1:
         names = [name for name in names if name not in ("graded", "combined")]
@@ -80,7 +80,7 @@ def distance(rng, domain, h, depth):
 
 
 def some_shape(rng: np.random.Generator, domain: Domain):
-    """A shape around the domain's place, now and then beside it."""
+    """A shape in the domain, sometimes beside it."""
     d, low, high = domain.dim, np.array(domain.lower), np.array(domain.upper)
     middle, reach = (low + high) / 2, rng.choice([0.4, 0.5, 0.6])
     corners = middle + rng.uniform(-reach, reach, (int(rng.integers(3, 9)), d)) * (high - low)
@@ -141,12 +141,12 @@ def expression(rng, domain, h, depth):
 
 
 def jump(rng, domain, h, depth):
-    """Two sizes on either side of a line; or some far finer cells in a strip, which nothing grows away from."""
+    """Two sizes on the sides of a line, or a strip of much finer cells, without growth beside it."""
     middle = float(rng.uniform(domain.lower[0], domain.upper[0]))
     if rng.random() < 0.5:
         return sizing.Expression(f"x < {middle!r} ? {h!r} : {h / ratio(rng, domain)!r}")
     fine = h / 10 ** rng.uniform(0.5, 2 if domain.dim == 2 else 0.8)
-    if depth:  # what is made of it may be as fine everywhere: of a million cells it would be a benchmark, not a test
+    if depth:  # combined with others it may be as fine everywhere, with a million cells: too long for a test
         fine = max(fine, h / 5)
     place = float(rng.choice([middle, domain.lower[0], domain.upper[0]]))
     return sizing.Expression(
@@ -232,7 +232,7 @@ def some_graded(rng: np.random.Generator, domain: Domain, field, wild: bool) -> 
             rng.integers(5)
         ]
     if wild and rng.random() < 0.4:
-        # More nodes than any grid may have; what lies between is a benchmark, not a test.
+        # More nodes than any grid may have. Numbers between take too long for a test.
         options["resolution"] = [10**7, 2.5, 1, (10**7,) * domain.dim][rng.integers(4)]
     if rng.random() < 0.3:
         # Around the domain, or around a part of it; `wild`: anywhere.

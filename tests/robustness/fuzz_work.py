@@ -1,4 +1,4 @@
-"""What `fuzz.py` does with its inputs: meshes of every kind, made, made again, carried on, written and read."""
+"""The work of `fuzz.py`: meshes of every kind are made, repeated, resumed, written and read."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.robustness.fuzz_sizes import fine_size, some_size
 WILD = 0.25
 """Share of inputs that need not end in a mesh, of kinds where most should."""
 MOST_ROWS = 5000
-"""Generators of layers, of inputs that are tried."""
+"""Largest number of generators in layers."""
 
 # Boxes that are tried: for diagrams and for runs.
 
@@ -92,12 +92,12 @@ def written_and_read(result: clvoro.Result, real: str) -> None:
         for suffix, reader in ((".npz", clvoro.load), (".vtu", load_vtu)):
             result.save(Path(folder) / f"m{suffix}")
             demand(reader(Path(folder) / f"m{suffix}"), real)
-        with contextlib.suppress(InputError):  # which has no room for cells around holes
+        with contextlib.suppress(InputError):  # which cannot hold cells around holes
             result.save(Path(folder) / "polyMesh")
 
 
 def few_layers(rng: np.random.Generator, domain: Any, wild: bool) -> list[clvoro.Layers]:
-    """Layers; unless `wild`, of not too many rows, and such as leave room, which is tried some times."""
+    """Layers; unless `wild`, with few rows and room between them, after some attempts."""
     for _ in range(30):
         layers = some_layers(rng, domain, wild)
         if wild:
@@ -118,7 +118,7 @@ def try_layers(rng: np.random.Generator) -> str:
         if not wild and all(domain.periodic):  # layers go along walls
             domain = clvoro.Box(domain.lower, domain.upper, periodic=(True, False))
     layers, real = few_layers(rng, domain, wild), some_real(rng)
-    if MOST_ROWS < count_rows(domain, layers) < 1e9:  # a benchmark, not a test
+    if MOST_ROWS < count_rows(domain, layers) < 1e9:  # too long for a test
         return "left out"
     options = some_options(rng, domain, real, wild)
     options["effort"] = "fast"
@@ -164,7 +164,7 @@ def some_domain(rng: np.random.Generator) -> clvoro.Box | clvoro.Polygon:
 
 
 def try_resumed(rng: np.random.Generator) -> str:
-    """A run that is interrupted and goes on ends with the same bits."""
+    """A run that is interrupted and resumed ends with the same bits."""
     domain, real = some_domain(rng), some_real(rng)
     arguments = (domain, some_size(rng, domain, wild=False))
     options = some_options(rng, domain, real, wild=False)
@@ -215,7 +215,7 @@ def try_moved(rng: np.random.Generator) -> str:
         domain, some_size(rng, domain, wild=False), points=first.points, **options
     )
     demand(second, real)
-    if domain.dim == 3 and any(domain.periodic):  # where nothing is carried over yet
+    if domain.dim == 3 and any(domain.periodic):  # where transfer is not implemented
         return "mesh"
     values = rng.choice([1.0, 1e-200, 1e200]) * rng.standard_normal(
         (len(first.points), 2)
@@ -237,7 +237,7 @@ def try_moved(rng: np.random.Generator) -> str:
 
 
 def try_turns(rng: np.random.Generator) -> str:
-    """What else an adapter does, of whatever size, changes nothing of a run that is carried on in it."""
+    """Other work of an adapter, of any size, does not change a run that is resumed in it."""
     domain, real = some_domain(rng), some_real(rng)
     arguments = (domain, some_size(rng, domain, wild=False))
     options = some_options(rng, domain, real, wild=False) | {"effort": "fast"}

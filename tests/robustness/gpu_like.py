@@ -9,7 +9,7 @@ from clvoro.opencl import engine
 
 
 def use_groups(size: int, count: int = 16) -> None:
-    """Let every engine made from now on work in `count` groups of `size`, where a CPU takes groups of one."""
+    """Make all later engines use `count` groups of `size`, also on a CPU. By default its groups have one work-item."""
     engine.group_sizes = lambda _: engine.GroupSizes(count, size)
 
 

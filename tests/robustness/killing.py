@@ -30,7 +30,7 @@ BOX = clvoro.Box((0, 0), (2.5, 1.5))
 
 
 def work(folder: Path) -> None:
-    """What the child does: run on, from the checkpoint if there is one; save a mesh again and again."""
+    """Script of the child: continue from the checkpoint, if there is one, then save a mesh repeatedly."""
     state = folder / "state"
     adapter = clvoro.Adapter()
     mesh = adapter.run(BOX, 0.1, method="coupled", max_steps=1)
@@ -62,7 +62,7 @@ def main(times: int, seed: int, patience: float) -> int:
             before, killed = place_of(folder / "state"), False
             command = [sys.executable, "-m", "tests.robustness.killing", "--work", name]
             child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-            # Once all kills are done, the last run is let through.
+            # After all kills the last run may end.
             given = rng.uniform(0, patience) if kills < times else 600.0
             try:
                 while child.poll() is None and not (folder / "begun").exists():

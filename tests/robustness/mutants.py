@@ -24,7 +24,7 @@ from pathlib import Path
 
 import pytest
 
-# What tests import is imported once, before processes fork; nothing of it opens a device.
+# Modules of tests are imported once, before processes fork. None of them opens a device.
 import clvoro  # noqa: F401
 import clvoro.opencl.program as program
 
@@ -118,7 +118,7 @@ def mutants(file: str) -> list[Mutant]:
 
 
 def unchanged(file: str) -> Mutant:
-    """Return what is not found among the kernels that a driver keeps, yet changes nothing."""
+    """Return a mutant that only adds a comment, so that no cache has its kernels."""
     text = (program.kernel_folder() / file).read_text()
     return Mutant(file, 1, 1, len(text), len(text), f"/* {os.getpid()} */\n", text)
 
@@ -131,7 +131,7 @@ def mutate(mutant: Mutant, folder: Path) -> None:
 
 
 def outcome(mutant: Mutant, tests: list[str], seconds: int) -> tuple[str, float]:
-    """Run tests with a mutant; return what came of it, and the processor time."""
+    """Run tests with a mutant; return the outcome and the processor time."""
     with tempfile.TemporaryDirectory() as name:
         folder, log = Path(name), Path(name) / "log"
         mutate(mutant, folder / "kernels")

@@ -34,7 +34,7 @@ SHARE = 0.1
 
 @contextmanager
 def as_for_many() -> Iterator[None]:
-    """Do what is done for large meshes: iterations take their launches, repaired cells are found in lanes."""
+    """Use the kernels of large meshes: launches for iterations, and lanes to find cells to clip."""
     with ExitStack() as patches:
         for name, module in list(sys.modules.items()):
             if name.startswith("clvoro.") and hasattr(module, "one_group_limit"):
@@ -134,4 +134,4 @@ RUNS: dict[str, Work] = {
     "polygon-run": every_step(NOTCHED, "0.1 + 0.05*x", 110),
     "layered-run": every_step(clvoro.Box((0, 0), (2.5, 1.5)), "0.2 + 0.05*x", 60, 0, layers=LAYERS),
 }
-"""Counts are such that cells come, or go, after refinement."""
+"""The numbers are chosen so that cells are inserted, or deleted, after refinement."""

@@ -77,7 +77,7 @@ def diagrams(adapter: clvoro.Adapter) -> None:
 
 
 def hulls(adapter: clvoro.Adapter) -> None:
-    """Sets on which wrapping gives up: too many near, or too few; spread over scales; along walls and lines."""
+    """Sets for which gift wrapping fails: too many or too few near ones, many scales, walls, lines."""
     square = clvoro.Box((0, 0), (1, 1))
     spots = [0.4 + scale * (points(30) - 0.5) for scale in (1e-2, 1e-4, 1e-6)]
     if adapter.dtype == np.float32:
@@ -100,7 +100,7 @@ def lattice(side: int, dim: int) -> np.ndarray:
 
 
 def almost_cubes(adapter: clvoro.Adapter) -> np.ndarray:
-    """Return a lattice in space that is off by so little that its cells differ about their faces."""
+    """Return a 3D lattice with deviations so small that cells disagree about their common faces."""
     noise = np.random.default_rng(0).standard_normal((8, 3))
     return lattice(2, 3) + (1e-14 if adapter.dtype == np.float64 else 3e-6) * noise
 
@@ -153,7 +153,7 @@ def repaired(adapter: clvoro.Adapter) -> None:
 
 
 def drop_faces(adapter: clvoro.Adapter) -> None:
-    """Close rows that have lost faces, which roundings hardly ever bring about."""
+    """Close rows that have lost faces, which round-off hardly ever causes."""
     from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
     for dim in (2, 3):
@@ -196,7 +196,7 @@ def drop_loops(adapter: clvoro.Adapter) -> None:
     rows = [list(row) for row in expected]
 
     def join(i: int, j: int, before_i: int, before_j: int) -> None:
-        """Let i and j see each other, after the neighbors that are named, counter-clockwise."""
+        """Make i and j neighbors, each after the given neighbor, counter-clockwise."""
         for cell, other, before in ((i, j, before_i), (j, i, before_j)):
             rows[cell].insert(rows[cell].index(before) + 1, other)
 
@@ -255,7 +255,7 @@ def polygon(adapter: clvoro.Adapter) -> None:
             assert len(diagram.vertices) > 3
     adapter.run(domain, 0.3, method="exact", effort="fast", max_steps=8, seed=911)
     layers = clvoro.Layers(0.05, count=2, spacing=0.2, edges=[0])
-    # As many steps as it takes until cells come and go, but not those of layers.
+    # Steps until cells are inserted and deleted, other than those of layers.
     adapter.run(
         domain,
         0.4,
@@ -269,7 +269,7 @@ def polygon(adapter: clvoro.Adapter) -> None:
 
 
 def comb(adapter: clvoro.Adapter) -> None:
-    """Pieces of cells that change hands, islands in lakes within a cell, edges on faces."""
+    """Pieces that belong to other cells, islands in lakes within a cell, edges on faces."""
     teeth = [
         (k + side, 1 - 0.8 * (side in (0.4, 0.6)))
         for k in range(4)
@@ -317,7 +317,7 @@ def periodic(adapter: clvoro.Adapter) -> None:
 
 
 def copy(adapter: clvoro.Adapter) -> None:
-    """What a profile measures the bandwidth by, on little memory."""
+    """The kernel with which a profile measures the bandwidth, on little memory."""
     source, target = (stages_of(adapter).engine.zeros(256, np.uint8) for _ in range(2))
     kernel = _program.build_program(adapter.ctx, "opencl/copy.cl", {}, "").all_kernels()[0]
     kernel.stage = "copy"
@@ -355,11 +355,11 @@ def fields(adapter: clvoro.Adapter) -> None:
 
 
 def multigrid(adapter: clvoro.Adapter) -> None:
-    """The preconditioner, which runs would only take for larger meshes; a solve in two precisions."""
+    """The preconditioner, which runs use for larger meshes only, and a solve in two precisions."""
     from clvoro.solvers import cycle
     from clvoro.solvers.poisson import SINGLE_PRECISION_TOLERANCE, Poisson
 
-    n = 300  # the fewest that take every kernel of it
+    n = 300  # the smallest number that needs all its kernels
     stages = stages_of(adapter)
     engine, (origin, scale) = stages.engine, BOX.frame
     on_device = engine.upload((points(n) - origin) / scale)
@@ -381,7 +381,7 @@ def multigrid(adapter: clvoro.Adapter) -> None:
             laplacian, rhs, potential, tolerance=1e-3, preconditioner=kind
         )
         assert alone.converged
-    # One that starts from something else than zero.
+    # A solve whose initial guess is not zero.
     rough = stage.assemble(
         t.starts, t.neighbors, t.face_measures, t.points, tolerance=SINGLE_PRECISION_TOLERANCE
     )
@@ -427,7 +427,7 @@ def stages_of(adapter: clvoro.Adapter, dim: int = 2) -> Stages:
 
 
 def broken(kernel: str) -> Callable[[clvoro.Adapter], None]:
-    """A kernel that is wrong on purpose: what finds nothing here finds nothing anywhere."""
+    """A kernel with deliberate errors: a simulator that misses them is of no use."""
 
     def work(adapter: clvoro.Adapter) -> None:
         text = {
@@ -453,7 +453,7 @@ def broken(kernel: str) -> Callable[[clvoro.Adapter], None]:
 
 
 def transfer(adapter: clvoro.Adapter) -> None:
-    """Cell data from mesh to mesh: few cells to many, the other way, many faces."""
+    """Transfer of cell data: from few cells to many, from many to few, and cells of many faces."""
     for dim in (2, 3):
         box = clvoro.Box((0,) * dim, (1,) * dim)
         one, other = (adapter.diagram(box, points(n, dim, n)) for n in (3, 50))
@@ -530,7 +530,7 @@ def domain_of(engine: Engine) -> str:
 
 
 def name_domains() -> None:
-    """Have kernels know the kind of `domain` that they work for; those of no engine are "none"."""
+    """Record for each kernel the kind of `domain` of its engine; "none" for kernels without one."""
     made = Engine.__init__
 
     def told(self: Engine, *args: object, **options: object) -> None:

@@ -112,7 +112,7 @@ LARGE = {
     "space": (CUBE, "0.045 + 0.02*x", FAST, "float64"),
     "periodic space": (clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), "0.053", FAST, "float64"),
 }  # fmt: skip
-"""Runs of 5,000 to 15,000 cells: by many work-groups, unlike the small ones'."""
+"""Runs of 5,000 to 15,000 cells need many work-groups, unlike small ones."""
 
 
 def run_large(name):
@@ -169,11 +169,11 @@ GROWS = {
     "adaptive in space": (CUBE, 0.2, {"effort": "fast", "max_steps": 3}),
     "resumed": (BOX, 0.06, {"method": "weighted", "max_steps": 3}),
 }  # fmt: skip
-"""Domain, a mean size which makes some hundred cells, and how they are run."""
+"""Domain, a mean size for some hundred cells, and options of the run."""
 
 
 def buffers_left(work):
-    """Bytes of buffers of the device that `work` has had made and that are there after it, by runs."""
+    """Return the bytes of device buffers that `work` has allocated and that remain, after each run."""
     left, alive = [], {}
     plain = cl.Buffer
 
@@ -197,7 +197,7 @@ def buffers_left(work):
 
 RUNS = 200
 NOISE = 10
-"""MiB by which the process may be larger in the end: what the allocator keeps, and fragments."""
+"""MiB by which the process may grow: memory that the allocator keeps, and fragments."""
 
 
 def grown(work):
@@ -228,7 +228,7 @@ def runs_of(ctx, name, folder):
 
     def work(k):
         adapter = clvoro.Adapter(ctx) if k % 2 else kept
-        # The last size of twenty is each time the same, whose buffers the adapter keeps.
+        # Every twentieth size is the same. The adapter keeps the buffers of the last run.
         factor = 1 if name == "resumed" else 1 + 0.01 * (k % 20)
         result = adapter.run(domain, size * factor, **{"seed": k, **options})
         for array in result.diagram._NAMES:

@@ -121,10 +121,10 @@ def test_generators_that_were_told_to_coincide_once(kind, seed):
 
 @pytest.mark.parametrize("seed", [pytest.param(5, marks=pytest.mark.slow), 300])
 def test_parts_that_were_cut_off_pass_the_check(seed):
-    """Around corners of holes, and in a cell with two faces towards one neighbor: both were refused once."""
+    """Around corners of holes, and in a cell with two faces to one neighbor. Earlier versions refused both."""
     assert fuzz.attempt("layers", seed)[0] == "mesh"
 
 
 def test_run_that_stops_early_among_layers_alone_ends_on_its_finest_level():
-    """Where all generators are of layers, refinement adds none: the history had no row of what it came to."""
+    """If all generators are of layers, refinement adds none. The history lacked the last row."""
     assert fuzz.attempt("layers", 910000469)[0] == "mesh"

@@ -1,4 +1,4 @@
-"""Files that mean harm - cut off, huge, with code in them - are refused with a clear error, and no harm is done."""
+"""Hostile files (truncated, huge, with code) are refused with a clear error, and do no harm."""
 
 import io
 import json
@@ -33,7 +33,7 @@ BOX = clvoro.Box((0, 0), (1, 1))
 
 
 class Bomb:
-    """Unpickling it makes a folder: so would any program."""
+    """Unpickling it makes a folder, as it could run any program."""
 
     def __init__(self, path):
         self.path = path
@@ -57,7 +57,7 @@ def member(array, pickled=False):
 
 
 def header(description):
-    """A `.npy` file's head that says what it likes."""
+    """The head of a `.npy` file, with arbitrary entries."""
     text = description.encode() + b" " * (64 - len(description) % 64) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
 
@@ -188,7 +188,7 @@ def test_vtu_bombs_and_lies_are_refused(tmp_path):
 
 
 def peak(work):
-    """Return the most bytes that Python and NumPy hold at once during `work`, which is refused."""
+    """Return the peak of the memory of Python and NumPy during `work`, which raises an error."""
     tracemalloc.start()
     try:
         with pytest.raises(InputError):
@@ -200,7 +200,7 @@ def peak(work):
 
 @pytest.mark.parametrize("compress", [False, True])
 def test_many_arrays_in_the_same_bytes_are_refused(tmp_path, compress):
-    """Those that nobody uses are not read; those that are may neither come twice nor lie in each other."""
+    """Unused members are not read. Used ones must neither be repeated nor overlap."""
     path, rows = tmp_path / "m.vtu", 1 << 16
     raw = np.random.default_rng(5).random(rows).tobytes()
     block = zlib.compress(raw, 1)
@@ -249,7 +249,7 @@ def test_results_that_expand_more_than_honest_ones_are_refused(tmp_path):
     assert peak(lambda: clvoro.load(path)) < 3 * path.stat().st_size
     with pytest.raises(InputError, match="more than 16 times"):
         clvoro.load(path)
-    # What the archive says of its members' packed sizes changes nothing.
+    # The packed sizes in the archive's directory do not matter.
     data, said = path.read_bytes(), struct.pack("<L", 1 << 30)
     at = data.rindex(b"PK\x01\x02")
     (tmp_path / "m.npz").write_bytes(data[: at + 20] + said + data[at + 24 :])
@@ -308,7 +308,7 @@ PLAIN = b"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\nkind='constant'\nvalue=0.3
 @pytest.mark.parametrize("part", ["a", "'a'", '"a"', '"a\\""', "a ", " a", "a\t"])
 @pytest.mark.parametrize("line", ["{}=1", "[{}]", "[[{}]]", "x={{{}=1}}"])
 def test_keys_of_very_many_parts_are_refused(tmp_path, part, line):
-    """The parser would make tables of all that stands before each part."""
+    """The parser would make tables of all text before each part."""
     path = tmp_path / "c.toml"
     path.write_text("\n\n" + line.format(".".join([part] * 50_000)))
     with pytest.raises(InputError, match=r"c\.toml: .* more than 16 parts \(at line 3"):
@@ -316,7 +316,7 @@ def test_keys_of_very_many_parts_are_refused(tmp_path, part, line):
 
 
 def test_the_search_for_long_keys_goes_over_the_text_once():
-    """To go back from each of so many characters to the first would take many minutes."""
+    """A search from each of so many characters back to the first would take minutes."""
     for piece in (
         "a",
         "a.",
@@ -405,7 +405,7 @@ def test_names_of_cases_are_folders_in_out(tmp_path, name):
     ids=["deep", "deeper", "nan", "nan within", "huge", "long", "zero byte", "no text"],
 )
 def test_well_known_text_that_is_none_is_refused(text, message):
-    """Without a warning, and before GEOS's stack is at its end."""
+    """Without a warning, and before GEOS overflows the stack."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(InputError, match=message) as refused:
@@ -481,7 +481,7 @@ def read_damaged(folder, name, data, seeds):
             ends["refused"] += 1
         else:
             ends["read"] += 1
-            if isinstance(found, Saved):  # from which a run would go on
+            if isinstance(found, Saved):  # the state of a run
                 assert files.same(found, Saved(folder / "right")), seed
         assert time.monotonic() - began < 20, seed
     return ends
@@ -506,7 +506,7 @@ def test_coordinates_that_are_no_numbers_are_refused_without_a_warning(valid, tm
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes among the files")
 @pytest.mark.parametrize("name", [*FORMATS, "case of geojson", "case of wkt", "case of raster"])
 def test_pipes_and_devices_are_refused(tmp_path, name):
-    """None waits for somebody to write, or reads what has no end."""
+    """No reader waits for a writer, or reads an endless file."""
     for made in (os.mkfifo, lambda path: os.symlink("/dev/zero", path), os.mkdir):
         folder = tmp_path / made.__name__.strip("<>")
         folder.mkdir()
@@ -568,7 +568,7 @@ def test_a_thousand_damaged_files_are_refused_or_read(valid, tmp_path, name):
 )
 @pytest.mark.parametrize("name", ["state", "m.npz"])
 def test_a_changed_bit_is_found_or_harmless(valid, tmp_path, name, count):
-    """Every bit of what counts is under a checksum: what is read in spite of one changed is the same."""
+    """Checksums cover every bit of the data: a file that can be read after a change has the same data."""
     data, rng = valid[name], np.random.default_rng(17)
     (tmp_path / "right").write_bytes(data)
     read = read_state if name == "state" else read_result

@@ -37,7 +37,7 @@ LANES = {
     "hulls.wrap_all_hulls", "incremental.wrap_marked", "walks.count_cubes", "walks.order_places",
     "walks.walk_all_cells",
 }  # fmt: skip
-"""Kernels that find eight cells at a time in the vector lanes of a CPU, in float64, or choose the eight."""
+"""Kernels that find eight cells at a time in vector lanes of a CPU, in float64, or choose these cells."""
 NOT_IN = {
     "float64": set(),
     # These are between float32 and the precision of the mesh.
@@ -47,13 +47,13 @@ NOT_IN = {
     },
     "work-groups": LANES,
 }  # fmt: skip
-"""Kernels that have no place in a variant; all others run in it."""
+"""Kernels that do not exist in a variant. All others run in it."""
 ALIKE = {
     "aggregation", "conjugate_gradient", "copy", "gradation", "multigrid", "primitives", "transfer",
     "bins.count_in_child_bins", "bins.make_grids", "cells.drop_loops", "poisson.apply_laplacian",
     "poisson.apply_laplacian_full", "volume_projection.project_by_group",
 }  # fmt: skip
-"""Files, and kernels of others, that work alike whatever the domain: that they run in any is enough."""
+"""Files, and kernels of other files, that do not depend on the kind of domain. A run in one kind is enough."""
 IN_PLANE = {
     "cells", "hulls", "incremental", "quality_descent", "vertices", "insertion_deletion.average_strain",
     "insertion_deletion.flag_sites", "insertion_deletion.mark_bad_cells", "insertion_deletion.mark_nuclei",
@@ -78,7 +78,7 @@ NOT_FOR = {
     "space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"ghost_images"},
     "periodic space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"ghost_images.measure_required_depths"},
 }
-"""Files and kernels that a kind of domain does not take; all others but those `ALIKE` run in it, in every variant."""
+"""Files and kernels that a kind of domain does not need. All others except `ALIKE` run in it, in every variant."""
 PATIENCE = 20
 """Seconds without a word."""
 
@@ -159,7 +159,7 @@ def simulate(name, *options):
                 *options,
             ],
             cwd=ROOT,
-            # Writing the same is a race, too, by OpenCL's memory model: flags are raised by atomic_or.
+            # Two writes of the same value are a race, too, in OpenCL's memory model: atomic_or sets flags.
             env={
                 **os.environ,
                 "OCLGRIND_DATA_RACES": "1",
@@ -203,7 +203,7 @@ def simulator(request):
 
 @pytest.fixture(scope="module")
 def trusted(simulator):
-    """The simulator, if it finds what is wrong on purpose."""
+    """The simulator, provided that it finds the deliberate errors."""
     for trap, words in TRAPS.items():
         if words not in simulator.log(f"broken-{trap}")[0]:
             pytest.fail(f"Oclgrind does not find the trap {trap!r}: nothing that it passes counts")

@@ -1,4 +1,4 @@
-"""What other devices need, as far as it shows without them: work-groups, and other compilers."""
+"""Requirements of other devices that can be tested without them: work-groups, and other compilers."""
 
 from functools import partial
 
@@ -70,7 +70,7 @@ def test_groups_change_nothing_but_rounding(ctx, dtype, domain, size):
 @pytest.mark.slow
 @needs_clang
 def test_kernels_of_cpus_compile_without_a_warning(ctx, tmp_path):
-    """What is built in lanes of vectors, too. A warning is a line on the terminal of whoever runs them first."""
+    """Kernels in vector lanes are included. The first user of a kernel would see its warnings."""
     sources = gpu_programs.programs_of_all_kinds(ctx, "float64", group=None)
     names = {source.name for source in sources}
     assert {*gpu_programs.CPU_ONLY, "tessellation/incremental.cl"} <= names

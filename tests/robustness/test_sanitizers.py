@@ -50,7 +50,7 @@ def built(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def harmless(ctx, tmp_path_factory):
-    """A recorded launch of a kernel that is right, the source of which is then exchanged."""
+    """A recorded launch of a correct kernel, whose source is then exchanged."""
     folder = tmp_path_factory.mktemp("trap")
     (folder / "trap.cl").write_text(KERNEL.format("a[i] = n;"))
     with pytest.MonkeyPatch.context() as patch, sanitized.Recorder(folder) as recorder:
@@ -95,14 +95,14 @@ FUNCTIONS = {
 }  # fmt: skip
 """Kernels with functions that OpenCL does not ask to be rounded correctly (log, pow, cbrt, hypot): libraries differ."""
 ROUNDINGS = 64
-"""Of the largest number of an array: errors of sizes that are met, and slopes, are differences of numbers so near."""
+"""Over the largest number of an array: small size errors, and slopes, are differences of nearly equal numbers."""
 IN_SINGLE = {"volume_projection.assemble_projection"}
-"""Of these kernels those that work in single precision whatever the generators are in."""
+"""Of these kernels, those that compute in single precision for generators of any precision."""
 ORDERED = {
     "bins.count_root", "bins.count_in_child_bins", "boundary_crossings.count_chords", "polyhedra.clip_polyhedra",
     "walks.walk_all_cells",
 }  # fmt: skip
-"""Kernels whose work-items take places in the order in which they come; what follows sorts."""
+"""Kernels whose work-items take places in the order of their execution. A later kernel sorts."""
 
 
 @pytest.fixture

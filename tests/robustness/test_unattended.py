@@ -1,4 +1,4 @@
-"""Runs that nobody watches: streams that break, signals, full disks, forks; they go on, or say what to do."""
+"""Unattended runs with broken streams, signals, full disks and forks: they continue, or name the remedy."""
 
 import contextlib
 import copy
@@ -71,7 +71,7 @@ def call(*arguments):
 
 
 class Breaking(io.StringIO):
-    """A stream that fails whenever something is written, or only when it is handed on."""
+    """A stream that fails at every write, or only at a flush."""
 
     def __init__(self, number, late):
         super().__init__()
@@ -124,7 +124,7 @@ def test_characters_that_a_stream_does_not_know(here, monkeypatch):
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
 def test_the_process_ends_by_its_exit_code_and_a_message():
-    """And not by Python's own when it fails once more to write what is left."""
+    """Nor by Python's own, when it fails again to write the rest."""
     with open("/dev/full", "w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "clvoro", "cases"], stdout=full, stderr=subprocess.PIPE, text=True,
@@ -274,7 +274,7 @@ def test_results_replace_neither_checkpoints_nor_what_a_run_begins_with(here, ca
     assert cli.main([*again, "a"]) == cli.BAD_INPUT
     assert "mesh.npz', which the run's results would replace" in capsys.readouterr().err
     assert (here / "a/mesh.npz").read_bytes() == before
-    # Elsewhere, the copy of what it began with is not put in the place of its result.
+    # In another folder, the copy of the input does not replace the result.
     assert cli.main([*again, "b"]) == cli.OK
     assert (here / "b/other-mesh.npz").read_bytes() == before
     assert len(clvoro.load(here / "b/mesh.npz").history) == 1
@@ -357,7 +357,7 @@ def test_forked_processes_are_told_that_they_cannot_work(ctx):
     end, begin = os.pipe()
     child = os.fork()
     if child == 0:
-        signal.alarm(60)  # what is not refused would wait for ever
+        signal.alarm(60)  # without an error the child would wait forever
         for attempt in attempts:
             try:
                 attempt()
@@ -402,7 +402,7 @@ def test_the_hosts_memory_ends(here, monkeypatch, capsys):
 def test_limits_of_containers_and_batch_systems_hold(
     adapter, tmp_path, monkeypatch, own, limits, least
 ):
-    """What would not fit is refused: beyond such a limit a process is killed without a word."""
+    """Work beyond the limit is refused, because the system would kill the process without a message."""
     whole = _host_memory.host_memory()
     for name, text in limits.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

@@ -77,7 +77,7 @@ def test_facing_tips_form_a_gap() -> None:
     assert size(np.array([(5, 0.5), (5, 0.45)])) == pytest.approx(0.02, rel=1e-6)
     # A tip in front of a wall, and one piece in front of another.
     hole = clvoro.Polygon(np.array(SQUARE), [[(2, 0.1), (2.2, 1), (1.8, 1)]])
-    # Corners look around in steps of 7.5 degrees: the chord is off the vertical through the tip by a quarter of it.
+    # Directions at corners are 7.5 degrees apart: the chord deviates from the vertical by a quarter of that.
     size = sizing.FeatureSize(hole, 5)
     aside = 0.05 * math.tan(math.radians(7.5 / 4))
     found = size(np.array([(2, 0.05)]))[0]
@@ -273,7 +273,7 @@ def test_graded_fields_resolve_narrow_straits() -> None:
     )
     graded.raster(domain)
     h = graded(np.array([(1.5, 0.5035), (0.5, 0.5035), (0.5, 0.9)]))
-    # Off by the growth over a spacing of 0.02, and some way across the corner.
+    # The error is the growth over a spacing of 0.02, and over some distance across the corner.
     assert h == pytest.approx(
         [0.01, 0.01 + 0.2 * 0.5, 0.01 + 0.2 * math.hypot(0.5, 0.3965)], abs=2 * 0.2 * 0.02
     )

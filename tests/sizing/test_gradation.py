@@ -71,17 +71,17 @@ def test_scheme_is_solved(make_engine, shape):
     spacing = (0.02, 0.03, 0.025)[: len(shape)]
     values = rng.uniform(0.01, 0.2, shape) * 10 ** rng.uniform(-1, 1, shape)
     found = limit(engine, values, spacing, 0.4)
-    # Falls below 8 units in the last place are passed over, up to one per node on the way.
+    # Decreases below 8 ulps are ignored, up to one at each node on the way.
     allowed = 16 * float(np.finfo(engine.real).eps) * max(shape)
     assert found == pytest.approx(jacobi(values, spacing, 0.4), rel=allowed)
     assert (found <= values.astype(engine.real)).all()
-    # At rest: once more changes no more than that.
+    # Converged: another sweep changes no more than that.
     assert limit(engine, found, spacing, 0.4) == pytest.approx(found, rel=allowed)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_minima_of_tiles(make_engine, shape):
-    """What tiles wait for; were it wrong, they would be swept too early, or too late, to the same end."""
+    """They determine the order in which tiles are swept. Wrong minima would cost time, not accuracy."""
     engine = make_engine(len(shape))
     stage, counts = Gradation(engine), (*shape[::-1], 1)[:3]
     values = np.random.default_rng(sum(shape)).random(shape).astype(engine.real)
@@ -125,7 +125,7 @@ def test_error_falls_with_the_spacing(make_engine):
         r = np.hypot(x[None, :] - 0.5, x[:, None] - 0.5)
         exact = 0.05 + 0.2 * np.maximum(r - 0.2, 0)
         values = np.where(r <= 0.2, 0.05, 1.0)
-        # Nodes beside the disc are given, so that its staircase is not what is measured.
+        # Nodes beside the disc have exact values, so that its staircase adds no error.
         values = np.where(r < 0.2 + 2.5 / 32, exact, values)
         errors.append(np.abs(limit(engine, values, (1 / (n - 1),) * 2, 0.2) - exact).max())
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
@@ -342,7 +342,7 @@ def test_too_many_nodes_are_rejected_before_allocation(make_engine, monkeypatch)
     n = 200 * 101
     engine = make_engine(2)
     monkeypatch.setattr("clvoro.sizing.graded.host_memory", lambda: 48 * n - 1)
-    monkeypatch.setattr(sizing.Graded, "_at_nodes", None)  # is not come to
+    monkeypatch.setattr(sizing.Graded, "_at_nodes", None)  # is not reached
     with pytest.raises(
         MemoryLimitError, match=r"resolution is 200, .* 2.02e\+04 nodes .* the host has"
     ):

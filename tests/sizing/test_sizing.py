@@ -301,7 +301,7 @@ def test_gradient_of_a_product(double):
 
 
 def test_distance_to_simple_shapes():
-    """Figures that can be checked in the head."""
+    """Numbers that can be verified by mental arithmetic."""
     points = [(0, 0), (3, 4), (5, 0), (-1, 2)]
     ring = sizing.Distance(sizing.Circle((0, 0), 2), 1, slope=1)
     assert ring(points).tolist() == pytest.approx([3, 4, 4, math.sqrt(5) - 1])
@@ -515,7 +515,7 @@ def test_invalid_sizes_are_reported_with_their_place(make_engine, case, gradient
     field, value = BAD_VALUES[case]
     engine = make_engine(2)
     domain = Box((0, 0), (2, 1))
-    # Off x = 1 by half, as the gradient's samples of a callable are refused as well.
+    # Half a size beside x = 1, because samples for the gradient of a callable are refused, too.
     points = np.array([(0.1, 0.5), (0.3, 0.5), (1.75, 0.25), (1.9, 0.5), (0.2, 0.2)])
     stage = sizing.Sizing(engine, domain, field)
     x, h, slope = _device_points(engine, domain, points), engine.empty(5), engine.empty((5, 2))
