@@ -25,6 +25,7 @@ from .geojson import pieces_of_geojson, pieces_of_shape, pieces_of_wkt
 from .region import Region
 from .rings import OrientedRings, make_rings, signed_area
 from .shapes import Edges
+from .simplification import simplify
 
 if TYPE_CHECKING:
     from ..opencl.engine import Engine
@@ -259,6 +260,48 @@ class Polygon(Region):
             )
         after = self._next_given[edges]
         return self.curved.nearest(points, edges, self.vertices[edges], self.vertices[after])
+
+    def simplified(self, size: object, tolerance: float = 0.1) -> Polygon:
+        """Return the domain without what is smaller than a cell.
+
+        - Bays, channels and straits that are narrower than the size are filled. Pieces of fewer than four cells are
+          dropped.
+        - Islands and capes that are smaller than the size in all directions are dropped. Thin walls that are longer
+          than that stay, and so does land between two bays.
+        - Of corners of less than 70 degrees, of water and of land, the tip is cut off.
+        - Vertices are dropped where the boundary then moves by less than `tolerance` times the size.
+
+        A coast that is finer than the cells gives better cells then; see :doc:`/guide/domains`.
+
+        Parameters
+        ----------
+        size : float or callable
+            The size of the cells: a number or a size field. A callable gets points (n, 2) and returns sizes (n,).
+        tolerance : float
+            From 0, which keeps all vertices, to 0.5.
+
+        Returns
+        -------
+        Polygon
+            A domain of straight edges, of one or several pieces. Edges have the name of the nearest edge of this one;
+            rings are numbered anew. Curves become polylines.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If a number is out of range, or nothing is left of the domain.
+
+        Examples
+        --------
+        A creek of width 0.1 is filled, and a rock is dropped:
+
+        >>> square = [(0, 0), (1, 0), (1, 0.4), (1.5, 0.45), (1, 0.5), (1, 1), (0, 1)]
+        >>> lake = clvoro.Polygon(square, [[(0.4, 0.4), (0.45, 0.4), (0.4, 0.45)]])
+        >>> lake.simplified(0.2)
+        Polygon(4 edges within (0, 0) and (1, 1))
+        """
+        pieces, names = simplify(self, size, tolerance)
+        return Polygon.from_pieces(pieces, names or None)
 
     @cached_property
     def _next_given(self) -> np.ndarray:

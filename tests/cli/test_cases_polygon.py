@@ -42,6 +42,15 @@ def test_domains_from_files_and_from_rings(tmp_path) -> None:
         assert again.table() == case.table()
 
 
+def test_simplified_domains(tmp_path) -> None:
+    creek = "[domain]\nouter = [[0, 0], [1, 0], [1, 0.5], [2, 0.52], [1, 0.54], [1, 1], [0, 1]]\nsimplified = 0.1\n"
+    case = Case.from_toml(creek + SIZE, "my.toml", tmp_path)
+    assert case.domain.upper[0] < 1.1
+    assert load_case(case.write(tmp_path)).domain == case.domain
+    with pytest.raises(InputError, match=r"simplified"):
+        Case.from_toml(creek.replace("0.1\n", "0\n") + SIZE, "my.toml")
+
+
 def test_curves_as_rings() -> None:
     text = (
         "[domain]\nouter = { kind = 'circle', center = [1, 2], radius = 3, name = 'far' }\n"

@@ -27,6 +27,11 @@ def build_domain(node: Mapping[str, Any], folder: Path) -> Domain:
     rest = {key: value for key, value in node.items() if key != "kind"}
     if node["kind"] == "box":
         return Box(**rest)
+    domain = _polygon(node, folder)
+    return domain.simplified(node["simplified"]) if "simplified" in node else domain
+
+
+def _polygon(node: Mapping[str, Any], folder: Path) -> Polygon:
     names = node.get("names")
     if "file" not in node:
         return Polygon(_ring(node["outer"]), [_ring(hole) for hole in node.get("holes", [])], names)

@@ -196,7 +196,13 @@ _DOMAINS = Kinds(
         ),
         "polygon": Table(
             {},
-            {"file": text, "outer": ring, "holes": list_of(ring), "names": names},
+            {
+                "file": text,
+                "outer": ring,
+                "holes": list_of(ring),
+                "names": names,
+                "simplified": positive,
+            },
             choice=("file", "outer"),
         ),
     },

@@ -1,0 +1,147 @@
+"""Domains without what is smaller than a cell."""
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro.errors import InputError, InputTypeError
+
+BOX = [(0, 0), (1, 0), (1, 1), (0, 1)]
+H = 0.1
+
+
+def rectangle(x, y, a, b):
+    return [(x, y), (x + a, y), (x + a, y + b), (x, y + b)]
+
+
+def rough(k, seed):
+    """Return a ring of radius 1 with noise."""
+    angle = np.arange(k) * (2 * np.pi / k)
+    r = 1 + 0.03 * np.random.default_rng(seed).standard_normal(k)
+    return np.column_stack([r * np.cos(angle), r * np.sin(angle)])
+
+
+def joined(*rings):
+    return shapely.union_all([shapely.Polygon(ring) for ring in rings])
+
+
+def with_bay(width, depth):
+    return clvoro.Polygon.from_shapely(
+        joined(BOX, rectangle(0.9, 0.5 - width / 2, 0.1 + depth, width))
+    )
+
+
+def test_wide_domains_stay():
+    for domain in (
+        clvoro.Polygon(BOX, [rectangle(0.4, 0.4, 0.2, 0.15)]),
+        clvoro.Polygon([(0, 0), (1, 0), (0.8, 0.7), (0.3, 0.8)]),
+        with_bay(0.15, 0.5),
+    ):
+        same = domain.simplified(H)
+        assert same.geometry.symmetric_difference(domain.geometry).area < 1e-12
+        assert len(same.vertices) == len(domain.vertices)
+
+
+@pytest.mark.parametrize("depth", [0.15, 0.6])
+def test_narrow_bays_are_filled(depth):
+    found = with_bay(0.07, depth).simplified(H)
+    assert found.measure == pytest.approx(1, abs=2e-3)
+    assert found.upper[0] < 1 + H / 2
+
+
+def test_channels_divide_the_domain():
+    channel, lake = rectangle(0.9, 0.5, 0.7, 0.05), rectangle(1.5, 0, 0.7, 1)
+    lakes = clvoro.Polygon.from_shapely(joined(BOX, channel, lake))
+    left = np.flatnonzero(lakes.edge_ends(np.arange(len(lakes.vertices)))[0][:, 0] < 0.5)
+    found = clvoro.Polygon(lakes.rings[0], names={"left": left}).simplified(H)
+    assert found.n_pieces == 2
+    assert found.measure == pytest.approx(1.7, abs=0.01)
+    assert found.boundary_names[0] == "left"
+    # A pond of two cells is dropped.
+    pond = joined(BOX, channel, rectangle(1.5, 0.45, 0.15, 0.15))
+    assert clvoro.Polygon.from_shapely(pond).simplified(H).n_pieces == 1
+
+
+def test_islands():
+    """Those that are small in all directions are dropped. Thin walls, and land between two bays, stay."""
+    rock, large = rectangle(0.2, 0.2, 0.05, 0.08), rectangle(0.6, 0.2, 0.15, 0.15)
+    wall = rectangle(0.2, 0.7, 0.6, 0.01)
+    found = clvoro.Polygon(BOX, [rock, large, wall]).simplified(H)
+    assert found.measure == pytest.approx(1 - 0.15**2 - 0.006, abs=1e-12)
+    dam = [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0.52), (0.8, 0.52), (0.8, 0.48), (0, 0.48)]
+    found = clvoro.Polygon(dam).simplified(H)
+    assert found.measure == pytest.approx(clvoro.Polygon(dam).measure, abs=2e-3)
+    cape = [(0, 0), (0.5, 0), (0.51, 0.08), (0.54, 0.08), (0.55, 0), (1, 0), (1, 1), (0, 1)]
+    assert clvoro.Polygon(cape).simplified(H).measure == pytest.approx(1, abs=2e-3)
+
+
+def test_vertices_are_thinned():
+    domain = clvoro.Polygon(rough(1000, 1))
+    fine = domain.simplified(H, 0)
+    for tolerance in (0.05, 0.2):
+        found = domain.simplified(H, tolerance)
+        assert found.geometry.is_valid
+        assert found.boundary_distance(fine.vertices).max() <= tolerance * H * (1 + 1e-9)
+    assert len(found.vertices) < len(domain.simplified(H).vertices) < 500
+
+
+def test_names():
+    domain = clvoro.Polygon(rough(600, 2), [rectangle(0, 0, 0.3, 0.3), rectangle(-0.5, 0, 0.02, 0.02)],
+                            names={"open": range(200), "rock": range(604, 608), "house": range(600, 604)})  # fmt: skip
+    found = domain.simplified(0.06)
+    assert found.boundary_names == ("open", "house", "outer")
+    middles = np.mean(found.edge_ends(np.arange(len(found.vertices))), axis=0)
+    edges, _ = domain.nearest_edge(middles)
+    wanted = np.array(domain.boundary_names)[domain.boundary_index[edges]]
+    same = np.array(found.boundary_names)[found.boundary_index] == wanted
+    assert same.mean() > 0.98
+    # Curves become polylines with their names.
+    disc = clvoro.Polygon(clvoro.curves.circle((0, 0), 1, name="rim")).simplified(0.1)
+    assert disc.boundary_names == ("rim",)
+    assert not disc.curves
+    assert 8 < len(disc.vertices) < 80
+
+
+def test_sizes_that_vary():
+    """Bays of width 0.06 at both ends: cells are smaller than that at one of them."""
+    bays = joined(rectangle(0, 0, 2, 1), rectangle(-0.5, 0.47, 3, 0.06))
+    domain = clvoro.Polygon.from_shapely(bays)
+    for size in (
+        clvoro.sizing.Expression("x < 1 ? 0.02 : 0.1"),
+        lambda p: np.where(p[:, 0] < 1, 0.02, 0.1),
+    ):
+        found = domain.simplified(size)
+        assert found.lower[0] == pytest.approx(-0.5)
+        assert found.upper[0] < 2.05
+    graded = clvoro.sizing.Distance(
+        clvoro.sizing.Circle((-0.5, 0.5), 0.05), h_min=0.02, slope=0.05, h_max=0.2
+    )
+    found = domain.simplified(graded)
+    assert found.lower[0] == pytest.approx(-0.5)
+    assert found.upper[0] < 2.1
+
+
+def test_meshes_of_simplified_domains():
+    """The boundary has spikes that are a third of a cell wide."""
+    domain = clvoro.Polygon(rough(400, 4)).simplified(0.1)
+    result = clvoro.adapt(domain, 0.05, seed=1)
+    assert result.check(solver="openfoam")
+    assert result.quality.min() > 0.7
+
+
+def test_bad_input():
+    domain = clvoro.Polygon(BOX)
+    with pytest.raises(InputError, match="nothing is left"):
+        domain.simplified(1.5)
+    for bad in (0, -1, float("nan")):
+        with pytest.raises(InputError, match="size is"):
+            domain.simplified(bad)
+    with pytest.raises(InputTypeError, match="size is 'h'"):
+        domain.simplified("h")
+    with pytest.raises(InputError, match="tolerance"):
+        domain.simplified(H, 0.7)
+    with pytest.raises(InputError, match=r"size is 0 at"):
+        domain.simplified(lambda p: np.zeros(len(p)))
+    with pytest.raises(InputTypeError, match="shape"):
+        domain.simplified(lambda p: p)
