@@ -81,7 +81,7 @@ def random_points(domain: clvoro.Polygon | clvoro.Box, n: int) -> np.ndarray:
 
 
 class Sets:
-    """Generators of one domain, in the order of their bins, and what tessellates them."""
+    """Generators of one domain, in the order of their bins, and their tessellator."""
 
     def __init__(self, adapter: clvoro.Adapter, domain: Any, n: int) -> None:
         engine = Engine(adapter.ctx, adapter.queue, 2, adapter.dtype, domain.kind(adapter.dtype))

@@ -361,9 +361,8 @@ class SolverMeasures:
     def summary(self) -> dict[str, float]:
         """Return the extremes, the means and for edges and faces the percentiles, by name."""
         c = self.coupled
-        angle = self.non_orthogonality[
-            c[self.mesh.twin[c] < c]
-        ]  # one side of each seam: not the upper
+        # Of the two faces at a seam only one counts, the lower one.
+        angle = self.non_orthogonality[c[self.mesh.twin[c] < c]]
         found = {
             "max_non_orthogonality": float(angle.max(initial=0)),
             "mean_non_orthogonality": _mean_angle(angle),

@@ -222,7 +222,7 @@ JUMP = sizing.Expression("x < 0.95 ? 0.05 : 0.01")
     ],
 )
 def test_warnings_of_coarse_sizes(ctx, size, n_cells, category, advice):
-    """Nothing grows there: a bound of the growth would not help, and it is not advised."""
+    """Sizes do not grow there, so the message does not advise a bound of the growth."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         clvoro.Adapter(ctx).run(clvoro.Box((0, 0), (1, 1)), size, n_cells=n_cells, effort="fast")

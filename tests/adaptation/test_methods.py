@@ -1,4 +1,4 @@
-"""What one step does, against the same formulas in dense NumPy algebra."""
+"""One step of each method, against the same formulas in dense NumPy algebra."""
 
 import numpy as np
 import pytest

@@ -14,7 +14,7 @@ from clvoro.sizing import Circle, Distance, Expression, Sizing
 
 BOX = clvoro.Box((1, 0), (3, 1))
 SPACING = {"float32": 2.0**-24 * 2, "float64": 2.0**-53 * 2}
-"""Of positions in the box above, whose frame's unit is 2."""
+"""Round-off of positions in the box above, whose frame has the unit 2."""
 
 
 @pytest.fixture(params=list(SPACING))

@@ -129,7 +129,7 @@ def read(path: Path) -> object:
 
 
 def same(a: Saved, b: Saved) -> bool:
-    """Whether two checkpoints hold the same."""
+    """Return whether two checkpoints have the same content."""
     return set(a.arrays) == set(b.arrays) and all(
         _bytes(a.arrays[name]) == _bytes(b.arrays[name]) for name in a.arrays
     )

@@ -103,7 +103,7 @@ class Simulator:
     Parameters
     ----------
     say : callable
-        Takes a line of text for who waits.
+        Takes a line of text that shows the progress.
     """
 
     def __init__(self, say):

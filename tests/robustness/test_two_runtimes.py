@@ -1,4 +1,4 @@
-"""Two implementations of OpenCL agree: PoCL and Intel's runtime, where both are (`pip install '.[cpu]'`)."""
+"""Two implementations of OpenCL agree: PoCL and Intel's runtime, if both are installed (`pip install '.[cpu]'`)."""
 
 import importlib
 import sys

@@ -91,7 +91,7 @@ def test_aggregates_and_coarse_graph(make, name):
     starts, members = groups.starts.get(), groups.members.get()
     assert sorted(members) == list(range(n))
     assert np.array_equal(group[members], np.repeat(np.arange(count), np.diff(starts)))
-    # Two passes at least halve twice, but for a star, where all wait for the hub.
+    # Each of two passes leaves at most half of the cells, except for a star, where all wait for the hub.
     assert count <= 0.3 * n
     P = sp.csr_matrix((np.ones(n), (np.arange(n), group)), (n, count))
     expected = sp.csr_matrix(P.T @ W @ P).toarray() * (count / n) ** (1 / engine.dim)
@@ -110,7 +110,7 @@ def test_aggregates_and_coarse_graph(make, name):
 def test_pair_inverse(make):
     engine, W = make(2, np.float32), random_weights(400)
     n = W.shape[0]
-    # What groups weigh within themselves, as rows of coarse graphs have it, counts for nothing.
+    # Weights within a group, which rows of coarse graphs contain, are ignored.
     within = sp.diags(np.random.default_rng(17).uniform(0.5, 2, n) * W.max())
     blocks = Aggregation(engine).match_pairs(Graph(*upload(engine, sp.csr_matrix(W + within))), 0)
     partner, own, both = (a.get() for a in (blocks.partner, blocks.own, blocks.both))
@@ -361,7 +361,7 @@ def test_coarsest_level_of_any_weights(make, decades):
                 expected += r[p] ** 2 / d
                 r[p + 1 :] += w[p, p + 1 :] * r[p] / d
                 w[p + 1 :, p + 1 :] += np.outer(w[p, p + 1 :], w[p, p + 1 :]) / d
-        # Two neighbors tied ever so much: their difference is below float32's rounding.
+        # Two neighbors with so large a weight that their difference is below the round-off of float32.
         if (i, j) != heaviest or decades == 8:
             assert energy == pytest.approx(expected, rel=1e-3)
 
@@ -374,8 +374,8 @@ def solve(engine, W, seed=17, tolerance=1e-8):
     laplacian = Laplacian(graph.starts, graph.columns, graph.weights)
     b = np.random.default_rng(seed).standard_normal(n)
     if engine.real == np.float32:
-        # Of a rough solution: where a smooth one hides under weights of many decades, all that is
-        # left of heavy cells' differences is rounding.
+        # For a rough solution. With weights over many decades, the differences of a smooth one between heavy cells
+        # are below round-off.
         b = (sp.diags(D) - W) @ b
     phi = engine.zeros(n)
     solution = poisson.solve(
@@ -487,7 +487,7 @@ def test_jacobi_continues_after_a_failure(make, monkeypatch, fault):
 
 
 def test_disconnected_graphs_end(make):
-    """Two meshes side by side, and cells without neighbors: no solution, but an end."""
+    """Two meshes side by side, and cells without neighbors: there is no solution, but the solve ends."""
     two = sp.block_diag([random_weights(200), random_weights(150)]).tocsr()
     lonely = sp.block_diag([random_weights(200), sp.csr_matrix((100, 100))]).tocsr()
     for W in (two, lonely, sp.csr_matrix((90, 90))):
@@ -575,7 +575,7 @@ def test_updated_cycle(make):
 
 @pytest.mark.parametrize("amount", [0.05, 0.5, 3.0])
 def test_updated_cycle_is_positive_definite(make, amount):
-    """However little the coarse levels have to do with the new graph."""
+    """Even if the coarse levels do not fit the new graph."""
     engine, n = make(), 400
     before, after = neighboring_weights(n, amount)
     multigrid = Multigrid(engine)

@@ -286,7 +286,7 @@ def test_one_and_two_cells(make, real):
 
 
 def test_auto_takes_the_cheaper_preconditioner(make):
-    """Jacobi on few cells; from some thousand on, sooner for more digits, multigrid."""
+    """Jacobi for few cells, multigrid from some thousand on, from fewer for smaller tolerances."""
     for dim in (2, 3):
         for tolerance in (1e-1, 1e-2, 1e-5, 1e-8):
             costs = [expected_costs(n, dim, tolerance) for n in (200, 10**5, 10**7)]
@@ -417,7 +417,7 @@ def test_preconditioner_is_applied_once_per_iteration(make):
     ids=["cpu", "gpu"],
 )
 def test_one_work_group_solves_alike(n, group_size, monkeypatch):
-    """It does what many launches do, but for the order of sums; also of many work-items."""
+    """It does the same as many launches, except for the order of sums, also with many work-items."""
     ctx, results = create_context(), []
     b = np.random.default_rng(59).standard_normal(n)
     for few in (0, n):
@@ -476,7 +476,7 @@ def test_breakdown_is_reported(make):
 
 
 def test_disconnected_graph_ends(make):
-    """Two parts whose sources do not cancel each for itself: no solution, and no endless loop."""
+    """Two parts, in each of which the sources do not cancel: no solution, and no endless loop."""
     engine = make()
     points = np.array([[0.1, 0.1], [0.2, 0.1], [0.8, 0.9], [0.9, 0.9]])
     graph = (points, np.arange(5), np.array([1, 0, 3, 2]), np.ones(4), None)

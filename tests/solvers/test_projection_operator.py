@@ -94,7 +94,7 @@ def test_correction(kind, share, monkeypatch):
         assert u == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
         assert start == pytest.approx(y, abs=1e-5 * np.abs(y).max())
         assert not u[given.held].any()
-        # Single precision; across a face to a held generator there is nothing.
+        # Single precision; faces to fixed generators contribute nothing.
         assert v.inverse.get() == pytest.approx(1 / ((B**2).sum(axis=1) + eps), rel=1e-5)
         beyond = host.neighbors >= 0
         beyond[beyond] = given.held[host.neighbors[beyond]]

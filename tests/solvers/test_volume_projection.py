@@ -190,7 +190,7 @@ def test_tolerance(engine, points, tolerance):
     )  # fmt: skip
     assert solution.converged
     assert solution.residual <= tolerance < solution.residuals[-2]
-    # u = -W J^T y of some y, whose residual it is: the least one that u admits comes close to it.
+    # u = -W J^T y for some y. The residual of the best y for this u is nearly the reported one.
     B, scaled = made.B.reshape(N, -1), (u / h[:, None]).ravel()
     y = -np.linalg.lstsq(B.T, scaled, rcond=None)[0]
     left = np.linalg.norm(r - (B @ B.T + np.diag(made.eps)) @ y) / np.linalg.norm(r)

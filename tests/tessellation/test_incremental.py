@@ -102,7 +102,7 @@ def check(t, eps):
     assert pairs == {(j, i) for i, j in pairs}
     inner = t.neighbors >= 0
     x = t.points
-    # A face's centroid is as far from either generator; the bisector is where rounding of positions puts it.
+    # The centroid of a face has equal distances from both generators, up to the round-off of positions.
     near = np.linalg.norm(t.face_centroids[inner], axis=1)
     across = x[t.owners[inner]] - x[t.neighbors[inner]] + t.face_centroids[inner]
     assert np.allclose(near, np.linalg.norm(across, axis=1), rtol=1e-6, atol=32 * eps)
@@ -146,7 +146,7 @@ def test_update_gives_the_diagram_made_anew(engine, name, share, monkeypatch):
 
 
 def fitting(t):
-    """Tell of each row whether all its neighbors name the generator between the right two, (n,) bool."""
+    """Return for each row whether all its neighbors list the generator between the correct two, (n,) bool."""
     rows = np.split(t.neighbors, t.starts[1:-1])
 
     def turned(row, j):
@@ -178,7 +178,7 @@ def test_rows_marked_as_fitting_fit(engine, name, share):
         fits = carried.incremental._fits.get() == 1
         assert not (fits & ~fitting(t)).any()
         if name in ("random", "graded", "hexagons") and engine.real == np.float64:
-            # Not all: who was clipped once more has had to be doubted.
+            # Not all: cells that are clipped again were doubtful.
             assert fits.mean() > 0.7
     if name == "random" and share > 0:
         assert changed > 3
@@ -226,7 +226,7 @@ def test_most_cells_are_made_in_lanes(ctx, monkeypatch):
     inner = (abs(points[listed] - [0.5, 0.375]) < [0.44, 0.315]).all(axis=1)
     assert (counts[inner] > 0).mean() > 0.95
     assert sum(rounds[1:]) < 0.1 * rounds[0]
-    # Those that have changed but once are right at once.
+    # Cells with a single change are correct at once.
     rows = np.split(t.neighbors, t.starts[1:-1])
     right = [
         np.array_equal(rows[i], slots[w * SLOT :][:n])
@@ -242,7 +242,7 @@ def clipped_in(flags, number):
 
 
 def no_longer_convex(t, points):
-    """Who is to be marked: around which face the rows of `t` make no convex cells of `points`."""
+    """Return the cells to mark: those for which the rows of `t` give no convex cell of `points`, and at which face."""
     after = np.arange(len(t.neighbors)) + 1
     after[t.starts[1:] - 1] = t.starts[:-1]
     before = np.argsort(after)
@@ -300,7 +300,7 @@ def test_mostly_changed_cells_are_clipped(ctx, group_size, monkeypatch):
 
 
 class Rows:
-    """Rows while a diagram is repaired, as NumPy's; `marks` and `fits` as a round of clipping has to leave them."""
+    """Rows during an update, as NumPy arrays, with the expected `marks` and `fits` after a round of clipping."""
 
     def __init__(self, places, slots, counts, starts, neighbors):
         self.places, self.slots, self.counts = places.get(), slots.get(), counts.get()
@@ -331,7 +331,7 @@ def checked(before, after, listed, fits):
     """Return which cells must be marked after `listed` have been clipped, and which are known to be correct."""
     marks, fits = np.zeros(len(fits), int), fits.copy()
     for i in listed:
-        if before.places[i] >= 0:  # clipped once more: whom it leaves may have been found to fit it
+        if before.places[i] >= 0:  # clipped again: a neighbor that it loses may count as correct
             fits[[j for j in before.row(i) if j >= 0 and j not in after.row(i)]] = 0
     fits[listed] = 1
     for i in listed:
@@ -348,7 +348,7 @@ def checked(before, after, listed, fits):
 
 
 def test_marks_after_each_round_of_clipping(ctx, monkeypatch):
-    """Who is marked after each round, and who is known to fit, of many small sets that change much, row by row."""
+    """After each round, the marks and the cells known to be correct, row by row, for small sets with large changes."""
     engine, rng = patch.make_engine(ctx), np.random.default_rng(40973)
     run, rounds, state = Engine.run_each, [], {}
 

@@ -12,9 +12,9 @@ from tests.reference import patch
 
 @pytest.mark.parametrize("again", [False, True], ids=["at first", "again"])
 def test_a_former_neighbor_of_a_clipped_cell_loses_its_mark(ctx, again):
-    """A row that names too many: the one who is no neighbor may have been found to fit, by the row as it was.
+    """A row lists a generator that is no neighbor, and that may count as correct by the old row.
 
-    When all cells of a round have been clipped, the old row learns which generators leave it elsewhere.
+    After all cells of a round are clipped, former neighbors in old rows lose their marks.
     """
     engine, n, i = patch.make_engine(ctx), 40, 17
     points = patch.relaxed_points(n, 2501)
@@ -24,7 +24,7 @@ def test_a_former_neighbor_of_a_clipped_cell_loses_its_mark(ctx, again):
     (kernels,) = incremental._kernels.values()
     host = patch.fetch(t)
     rows = np.split(host.neighbors, host.starts[1:-1])
-    # All inside, so that nobody is a wall; the stranger is the farthest.
+    # All inside, so that none is a wall; the surplus one is the farthest.
     stranger = int(np.linalg.norm(points - points[i], axis=1).argmax())
     assert stranger not in rows[i]
     wrong = np.append(rows[i], stranger).astype(np.int32)

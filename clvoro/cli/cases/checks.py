@@ -99,7 +99,7 @@ def whole(least: int) -> Check:
 
 
 def auto_or_whole(value: object, place: str) -> str | int:
-    """Check for "auto" or a whole number."""
+    """Check that a value is "auto" or a whole number."""
     if value == "auto":
         return "auto"
     try:

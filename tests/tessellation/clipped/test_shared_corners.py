@@ -41,10 +41,7 @@ def test_runs_from_shared_corners(ctx, name, method):
         report = result.check()
         assert report, report
         assert len(result.points) >= len(points)
-        if method in (
-            "exact",
-            "adaptive",
-        ):  # which choose their number: some domain.measure / 0.1^2
+        if method in ("exact", "adaptive"):  # these choose the number
             assert len(result.points) * 0.01 == pytest.approx(domain.measure, rel=0.2)
 
 
@@ -75,7 +72,7 @@ def test_generators_from_a_split_are_distinct(ctx, name):
     found = new.generators.points.get() * scale + origin
     assert found[0] == pytest.approx(corner[0], abs=1e-15)
     farthest = np.hypot(*(expected - corner).T)
-    at = expected[farthest >= farthest.max() - 1e-12]  # of some alike, rounding chooses
+    at = expected[farthest >= farthest.max() - 1e-12]  # round-off chooses between equal ones
     assert np.abs(at - found[1]).max(axis=1).min() < 1e-12
 
 

@@ -34,7 +34,7 @@ def adapters(ctx):
 
 
 def compare(adapters, domain, points, length=1024, euler=False):
-    """In roundings of the domain's size; edges cross faces at angles down to a hundredth."""
+    """In units of the round-off of the domain. Edges cross faces at angles down to 0.01."""
     cells = polygon_voronoi(domain, points)
     sure = ~cells.close
     assert sure.any()
@@ -85,7 +85,7 @@ def test_no_cell_is_better_than_a_regular_polygon(adapters, name):
         for n in (1, 3, 25, 120):
             points = scattered(domain, n, n)
             result = adapter.run(domain, 1.0, points=points, method="lloyd", max_steps=0)
-            # Areas of cells round as coordinates do, some hundred roundings of a cell in single precision.
+            # Areas have the round-off of coordinates: some hundred eps of a cell in single precision.
             assert 0 <= result.quality.min()
             assert result.quality.max() <= 1 + 1024 * float(np.finfo(real).eps)
             report = result.check()
@@ -203,7 +203,7 @@ def test_an_island_whose_shore_belongs_to_another_cell(adapters, order):
 
 
 def test_holes_that_touch_the_boundary_of_their_piece(adapters):
-    """A generator on a piece beside it, of whose cell both are: by the corners of the hole its piece is not known."""
+    """The cell of a generator beside the piece contains both. The corners of the hole do not show whose piece it is."""
     land = [(0, 0), (2, 0), (4, 0), (4, 1), (0, 1)]
     beside = [(1.8, -0.6), (2.2, -0.6), (2.2, -0.2), (1.8, -0.2)]
     hole = [(2, 0), (1.75, 0.25), (2.25, 0.25)]

@@ -330,8 +330,8 @@ def test_runs(adapter, options):
         result.points
     )
     if not options:
-        # The count is right to two cells and less than a third of one asks for none: pairs of defects weigh
-        # more (`Population.reorganize`). Each cell too many makes all smaller by 1 / 2n, most of the error of so few.
+        # The count is correct to two cells, and less than a third of a cell changes nothing: pairs of defects have
+        # priority. Each surplus cell makes all smaller by 1 / 2n, which is most of the error of so few cells.
         n, fitting = len(result.points), (result.diagram.volumes / result.target_size**2).sum()
         assert abs(n - fitting) < 2.7
         assert np.abs(result.size_error).mean() < abs(n - fitting) / (2 * n) + 0.003
