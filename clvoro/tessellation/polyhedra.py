@@ -61,6 +61,37 @@ def cell_bytes(capacity: int, real: np.dtype) -> int:
     return capacity * (16 * real.itemsize + 29 * index + 5) + 320
 
 
+def capacity_defines(engine: Engine, capacity: int) -> dict[str, object]:
+    """Return the defines of kernels that clip cells of up to `capacity` faces."""
+    defines: dict[str, object] = {"FACE_CAPACITY": capacity}
+    if capacity > FACE_CAPACITY:
+        defines["CELL_BYTES"] = cell_bytes(capacity, engine.real)
+    return defines
+
+
+def clip_each(
+    engine: Engine,
+    kernel: cl.Kernel,
+    capacity: int,
+    size: int,
+    args: tuple[object, ...],
+    more_args: tuple[object, ...] = (),
+) -> None:
+    """Enqueue `kernel`, which clips `size` cells of up to `capacity` faces.
+
+    Its arguments are `size`, `args` and `more_args`. Cells with more than `FACE_CAPACITY` faces are clipped in global
+    memory, which it takes after `args`, with one work-item for each cell that fits there.
+    """
+    if capacity <= FACE_CAPACITY:
+        engine.run_each(kernel, size, *args, *more_args)
+        return
+    bytes_ = cell_bytes(capacity, engine.real)
+    count = min(size, int(clipping_space(size)) // bytes_)
+    with engine.workspace.frame():
+        memory = engine.scratch(count * bytes_, np.uint8)
+        engine.run(kernel, count, np.int32(size), *args, memory, *more_args, group=1)
+
+
 @dataclass(frozen=True)
 class _CutCells:
     """Cells clipped independently of each other, on the device; see `clip_polyhedra` in `polyhedra.cl`.
@@ -111,12 +142,9 @@ class Polyhedra:
 
     def _kernels(self, capacity: int) -> SimpleNamespace:
         if capacity not in self._programs:
-            engine = self.engine
             defines = {
-                "FACE_CAPACITY": capacity, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine),
+                "MAX_DEPTH": MAX_LEVELS, **capacity_defines(self.engine, capacity), **halo_defines(self.engine),
             }  # fmt: skip
-            if capacity > FACE_CAPACITY:
-                defines["CELL_BYTES"] = cell_bytes(capacity, engine.real)
             self._programs[capacity] = self.engine.kernels("tessellation/polyhedra", defines)
         return self._programs[capacity]
 
@@ -267,19 +295,13 @@ class Polyhedra:
                         *written, *halo_args, group=1,
                     )  # fmt: skip
             some = np.int32(again or walk is not None)
-            clip = self._kernels(capacity).clip_polyhedra
             cell_args = (
-                np.int32(n), np.int32(rows), binned.points, binned.items, *search, points, lower,
-                upper, np.int32(warm), *old, some, room, share, *written,
+                np.int32(rows), binned.points, binned.items, *search, points, lower, upper,
+                np.int32(warm), *old, some, room, share, *written,
             )  # fmt: skip
-            if again:
-                with engine.workspace.frame():
-                    bytes_ = cell_bytes(capacity, engine.real)
-                    slots = min(rows, int(clipping_space(rows)) // bytes_)
-                    space = engine.scratch(slots * bytes_, np.uint8)
-                    engine.run(clip, slots, *cell_args, space, *halo_args, group=1)
-            else:
-                engine.run(clip, n, *cell_args, *halo_args)
+            clip_each(
+                engine, self._kernels(capacity).clip_polyhedra, capacity, n, cell_args, halo_args
+            )
             flags, m = (int(v) for v in self._report.get())
             if flags & ~(FULL | HARMLESS):
                 return None

@@ -31,24 +31,29 @@ inline bool is_in_row(int label, int begin, int end, global const int *labels)
     return false;
 }
 
-/* Per generator i: how many corners and half-faces its cell has. full[0] is set if a cell has more than
-   FACE_CAPACITY faces. */
+/* Per generator i with capacities[i] = 0: how many corners and half-faces its cell has; then capacities[i] is
+   FACE_CAPACITY. full[0] is set if a cell needs more room. */
 kernel void count_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
-                          global const int *starts, global const int *neighbors, global int *corner_counts,
-                          global int *half_face_counts, global int *full)
+                          global const int *starts, global const int *neighbors, global int *capacities,
+                          global int *corner_counts, global int *half_face_counts, global int *full CELL_ARG)
 {
-    WORK_ITEM(i);
     TAKE_CELL(cell);
-    if (!make_cell(cell, i, points, box_lower, box_upper, starts, neighbors)) {
-        atomic_or(full, 1);
-        return;
+    EACH_WORK_ITEM(i)
+    {
+        if (capacities[i] != 0)
+            continue;
+        if (!make_cell(cell, i, points, box_lower, box_upper, starts, neighbors)) {
+            atomic_or(full, 1);
+            continue;
+        }
+        const int begin = starts[i], end = starts[i + 1];
+        int count = end - begin;
+        for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
+            count += !is_in_row(cell->labels[f], begin, end, neighbors);
+        capacities[i] = FACE_CAPACITY;
+        corner_counts[i] = cell->n;
+        half_face_counts[i] = count;
     }
-    const int begin = starts[i], end = starts[i + 1];
-    int count = end - begin;
-    for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
-        count += !is_in_row(cell->labels[f], begin, end, neighbors);
-    corner_counts[i] = cell->n;
-    half_face_counts[i] = count;
 }
 
 /* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each
@@ -94,67 +99,71 @@ inline void list_loops(CELL *cell, int base, int half_face, int end, global cons
     }
 }
 
-/* Per generator i: its corners (c, 3), relative to x_i, how sharp each is, the labels of their faces (c, 3),
-   counter-clockwise, their owner, and its half-faces. same[u] is the least corner of the cell that lies where corner u
-   does, joined to it by edges of zero length. */
+/* Per generator i with capacities[i] = FACE_CAPACITY: its corners (c, 3), relative to x_i, how sharp each is, the
+   labels of their faces (c, 3), counter-clockwise, their owner, and its half-faces. same[u] is the least corner of the
+   cell that lies where corner u does, joined to it by edges of zero length. */
 kernel void list_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
-                         global const int *starts, global const int *neighbors, global const int *corner_starts,
-                         global const int *half_face_starts, global REAL *corners, global float *sharpness,
-                         global int *corner_faces, global int *owners, global int *same, global int *half_face_labels,
-                         global int *loop_starts, global int *loops)
+                         global const int *starts, global const int *neighbors, global const int *capacities,
+                         global const int *corner_starts, global const int *half_face_starts, global REAL *corners,
+                         global float *sharpness, global int *corner_faces, global int *owners, global int *same,
+                         global int *half_face_labels, global int *loop_starts, global int *loops CELL_ARG)
 {
-    WORK_ITEM(i);
     TAKE_CELL(cell);
-    make_cell(cell, i, points, box_lower, box_upper, starts, neighbors);
-    const int base = corner_starts[i];
-    REAL least = 4 * noise_length(sqrt(cell->reach2));
-    for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
-        if (cell->labels[f] >= 0)
-            least = fmin(least, sqrt(2 * cell->planes[f].s3) / 64);
-    INDEX joined[VERTEX_CAPACITY];
-    for (int v = 0; v < cell->n; ++v) {
-        const int u = base + v;
-        corners[3 * u] = X(cell)[v];
-        corners[3 * u + 1] = Y(cell)[v];
-        corners[3 * u + 2] = Z(cell)[v];
-        const INDEX4 f = cell->faces[v];
-        corner_faces[3 * u] = cell->labels[f.s0];
-        corner_faces[3 * u + 1] = cell->labels[f.s1];
-        corner_faces[3 * u + 2] = cell->labels[f.s2];
-        sharpness[u] = (float)sharpness_of(cell, v);
-        owners[u] = i;
-        joined[v] = v;
-    }
-    bool changed = true;
-    while (changed) {
-        changed = false;
+    EACH_WORK_ITEM(i)
+    {
+        if (capacities[i] != FACE_CAPACITY)
+            continue;
+        make_cell(cell, i, points, box_lower, box_upper, starts, neighbors);
+        const int base = corner_starts[i];
+        REAL least = 4 * noise_length(sqrt(cell->reach2));
+        for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
+            if (cell->labels[f] >= 0)
+                least = fmin(least, sqrt(2 * cell->planes[f].s3) / 64);
+        CELL_SPACE INDEX *joined = (CELL_SPACE INDEX *)cell->rim.edges; /* of no more use */
         for (int v = 0; v < cell->n; ++v) {
-            const INDEX4 links = cell->links[v];
-            const int ends[3] = {links.s0, links.s1, links.s2};
-            for (int e = 0; e < 3; ++e) {
-                const int w = ends[e];
-                if (joined[w] >= joined[v])
-                    continue;
-                const REAL dx = X(cell)[w] - X(cell)[v], dy = Y(cell)[w] - Y(cell)[v], dz = Z(cell)[w] - Z(cell)[v];
-                if (dx * dx + dy * dy + dz * dz < least * least) {
-                    joined[v] = joined[w];
-                    changed = true;
+            const int u = base + v;
+            corners[3 * u] = X(cell)[v];
+            corners[3 * u + 1] = Y(cell)[v];
+            corners[3 * u + 2] = Z(cell)[v];
+            const INDEX4 f = cell->faces[v];
+            corner_faces[3 * u] = cell->labels[f.s0];
+            corner_faces[3 * u + 1] = cell->labels[f.s1];
+            corner_faces[3 * u + 2] = cell->labels[f.s2];
+            sharpness[u] = (float)sharpness_of(cell, v);
+            owners[u] = i;
+            joined[v] = v;
+        }
+        bool changed = true;
+        while (changed) {
+            changed = false;
+            for (int v = 0; v < cell->n; ++v) {
+                const INDEX4 links = cell->links[v];
+                const int ends[3] = {links.s0, links.s1, links.s2};
+                for (int e = 0; e < 3; ++e) {
+                    const int w = ends[e];
+                    if (joined[w] >= joined[v])
+                        continue;
+                    const REAL dx = X(cell)[w] - X(cell)[v], dy = Y(cell)[w] - Y(cell)[v], dz = Z(cell)[w] - Z(cell)[v];
+                    if (dx * dx + dy * dy + dz * dz < least * least) {
+                        joined[v] = joined[w];
+                        changed = true;
+                    }
                 }
             }
         }
+        for (int v = 0; v < cell->n; ++v)
+            same[base + v] = base + joined[v];
+        const int begin = starts[i], end = starts[i + 1], half_face = half_face_starts[i];
+        int to = half_face;
+        for (int k = begin; k < end; ++k)
+            half_face_labels[to++] = neighbors[k];
+        for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
+            if (!is_in_row(cell->labels[f], begin, end, neighbors))
+                half_face_labels[to++] = cell->labels[f];
+        list_loops(cell, base, half_face, to, half_face_labels, loop_starts, loops);
+        if (i == size - 1)
+            loop_starts[to] = 3 * (base + cell->n);
     }
-    for (int v = 0; v < cell->n; ++v)
-        same[base + v] = base + joined[v];
-    const int begin = starts[i], end = starts[i + 1], half_face = half_face_starts[i];
-    int to = half_face;
-    for (int k = begin; k < end; ++k)
-        half_face_labels[to++] = neighbors[k];
-    for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
-        if (!is_in_row(cell->labels[f], begin, end, neighbors))
-            half_face_labels[to++] = cell->labels[f];
-    list_loops(cell, base, half_face, to, half_face_labels, loop_starts, loops);
-    if (i == size - 1)
-        loop_starts[to] = 3 * (base + cell->n);
 }
 
 /* Is label one of the three faces of corner u? */

@@ -10,10 +10,11 @@ import pyopencl.array as cla
 from ...errors import MemoryLimitError
 from ...geometry.box import ClipBox
 from ...opencl.engine import Engine
+from ...opencl.kernels import Kernels
 from ...opencl.primitives import Scan
 from ..device_diagram import Tessellation
+from ..polyhedra import FACE_CAPACITY, GROWTH, capacity_defines, clip_each
 
-FACE_CAPACITY = 64
 MOST_LOOP_ENTRIES = 2**31 - 1
 
 
@@ -52,6 +53,10 @@ class HalfFaces:
     loops: cla.Array
 
 
+def _kernels(engine: Engine, capacity: int) -> Kernels:
+    return engine.kernels("tessellation/topology3d/half_faces", capacity_defines(engine, capacity))
+
+
 def list_half_faces(engine: Engine, box: ClipBox, t: Tessellation) -> HalfFaces:
     """Clip each cell of `t` by its neighbors, and return its faces.
 
@@ -63,15 +68,14 @@ def list_half_faces(engine: Engine, box: ClipBox, t: Tessellation) -> HalfFaces:
     n, scan = t.n, Scan(engine)
     corner_starts, starts = engine.empty(n + 1, np.int32), engine.empty(n + 1, np.int32)
     cell = (t.points, *box.device_corners(engine.real), t.starts, t.neighbors)
-    capacity, full = FACE_CAPACITY, engine.zeros(1, np.int32)
+    capacities, full = engine.zeros(n, np.int32), engine.zeros(1, np.int32)
+    counts, used = (capacities, corner_starts, starts, full), [FACE_CAPACITY]
     while True:
-        k = engine.kernels("tessellation/topology3d/half_faces", {"FACE_CAPACITY": capacity})
-        # Private arrays of a whole group lie on the stack of a CPU's thread.
-        group = None if capacity == FACE_CAPACITY else 1
-        engine.run_each(k.count_corners, n, *cell, corner_starts, starts, full, group=group)
+        k = _kernels(engine, used[-1])
+        clip_each(engine, k.count_corners, used[-1], n, (*cell, *counts))
         if not int(full[0].get()):
             break
-        capacity *= 2
+        used.append(GROWTH * used[-1])
         full.fill(0)
     scan.exclusive(corner_starts, corner_starts, n)
     scan.exclusive(starts, starts, n)
@@ -84,10 +88,12 @@ def list_half_faces(engine: Engine, box: ClipBox, t: Tessellation) -> HalfFaces:
     corners, sharpness = engine.empty((c, 3)), engine.empty(c, np.float32)
     corner_faces, loops = engine.empty((c, 3), np.int32), engine.empty(3 * c, np.int32)
     labels, loop_starts = engine.empty(h, np.int32), engine.empty(h + 1, np.int32)
-    engine.run_each(
-        k.list_corners, n, *cell, corner_starts, starts, corners, sharpness, corner_faces, owners,
-        same, labels, loop_starts, loops, group=group,
+    lists = (
+        capacities, corner_starts, starts, corners, sharpness, corner_faces, owners, same, labels, loop_starts, loops,
     )  # fmt: skip
+    for capacity in used:
+        kernel = _kernels(engine, capacity).list_corners
+        clip_each(engine, kernel, capacity, n, (*cell, *lists))
     engine.run_each(k.match_corners, c, owners, corner_starts, corner_faces, twin_corners)
     return HalfFaces(
         corners, owners, sharpness, corner_faces, same, twin_corners, starts, labels, loop_starts, loops
