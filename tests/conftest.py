@@ -53,9 +53,10 @@ def meshio_for_vtu():
 
 
 if "CLVORO_TEST_GROUPS" in os.environ:
-    from tests.robustness.gpu_like import use_groups
+    from tests.robustness.gpu_like import use_groups, use_ranges
 
     use_groups(int(os.environ["CLVORO_TEST_GROUPS"]))
+    use_ranges()
 
 if "CLVORO_TEST_DIVISION" in os.environ:
     from tests.robustness.rough_division import use_rough_division

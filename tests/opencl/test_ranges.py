@@ -23,10 +23,17 @@ kernel void count(const int size, global int *times, global int *last)
 """
 
 
+@pytest.fixture(autouse=True)
+def limits(monkeypatch):
+    """The limits of devices, where the whole suite runs with others."""
+    monkeypatch.setattr(ranges, "FIRST", 1 << 16)
+    monkeypatch.setattr(ranges, "LONGEST", 0.2)
+
+
 @pytest.fixture
 def clock(monkeypatch):
     """A clock whose ranges take 1 ms for each thousand items, and the launches: begin and size."""
-    monkeypatch.setattr(ranges, "may_be_interrupted", lambda _: True)
+    monkeypatch.setattr(engine.ranges, "may_be_interrupted", lambda _: True)
     launches, now, plain = [], [0.0], cl.enqueue_nd_range_kernel
 
     def noted(queue, kernel, size, group, offset=(0,)):
@@ -41,9 +48,9 @@ def clock(monkeypatch):
 
 def test_ranges_cover_all_items_once(ctx, clock):
     """The first range is small. The next ones take 0.2 s, and later launches are not divided if they take less."""
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
+    on_device = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
     kernel = cl.Kernel(cl.Program(ctx, SOURCE).build(), "count")
-    times, last = engine.zeros(700_000, np.int32), engine.zeros(1, np.int32)
+    times, last = on_device.zeros(700_000, np.int32), on_device.zeros(1, np.int32)
     for n, expected in (
         (65_536, [(0, 65_536)]),
         (650_001, [(0, 65_536), (65_536, 200_000), (265_536, 200_000), (465_536, 184_512)]),
@@ -51,7 +58,7 @@ def test_ranges_cover_all_items_once(ctx, clock):
     ):
         clock.clear()
         times.fill(0)
-        engine.run_each(kernel, n, times, last)
+        on_device.run_each(kernel, n, times, last)
         assert (times.get()[:n] == 1).all()
         assert int(last.get()[0]) == n - 1
         assert clock == expected
@@ -103,7 +110,7 @@ def test_ranges_change_no_bit(ctx, monkeypatch, name):
         count[0] += 1
         return plain(queue, kernel, items, group, limit)
 
-    monkeypatch.setattr(ranges, "may_be_interrupted", lambda _: True)
+    monkeypatch.setattr(engine.ranges, "may_be_interrupted", lambda _: True)
     monkeypatch.setattr(engine, "enqueue_ranges", few)
     assert digest(clvoro.Adapter(ctx, real).run(domain, size, **options)) == whole
     assert count[0] > 500

@@ -1,16 +1,26 @@
-"""Work-groups as a GPU has them, on any device: of many work-items, with local memory and barriers."""
+"""The path that GPUs take, on any device: scalar kernels, groups of many work-items, launches in ranges."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 
-from clvoro.opencl import engine
+from clvoro.opencl import engine, ranges
+
+LONGEST = 2e-3
+"""Seconds after which a launch is divided in tests, so that those of small meshes are, too."""
 
 
 def use_groups(size: int, count: int = 16) -> None:
     """Make all later engines use `count` groups of `size`, also on a CPU. By default its groups have one work-item."""
     engine.group_sizes = lambda _: engine.GroupSizes(count, size)
+
+
+def use_ranges() -> None:
+    """Divide launches of every engine made from now on as on a device that may interrupt long ones."""
+    engine.ranges = SimpleNamespace(may_be_interrupted=lambda _: True)
+    ranges.FIRST, ranges.LONGEST = 256, LONGEST
 
 
 @contextmanager
