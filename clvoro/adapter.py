@@ -321,7 +321,7 @@ class Adapter:
             checkpoint is kept.
         MismatchWarning, CoarseSizeWarning
             If a part of the input barely overlaps the domain, for example because it has another unit of length, or the
-            domain is narrower than half a cell somewhere; says where.
+            domain is narrower than half a cell somewhere, or has a dead end narrower than a cell; says where.
         PrecisionWarning
             If `dtype` is too coarse for the sizes.
         SizeErrorWarning

@@ -15,7 +15,7 @@ from ..geometry.polygon import Polygon
 from ..mesh.results import Result
 from ..sizing import Sizing
 from ..sizing.field import Field
-from ..sizing.gaps import NARROW, find_narrowest
+from ..sizing.gaps import NARROW, NarrowPart, find_narrow_parts
 
 COARSER, FINER = 2.0, 1e-3
 """Ratios of the sizes of layers and of the field beside them that indicate a mistake."""
@@ -55,7 +55,7 @@ def warn_of_mismatches(field: Field, domain: Domain, layers: Sequence[Layers]) -
 
 
 def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Warn if cells of the target size do not fit between the walls of `domain` somewhere.
+    """Warn if cells of the target size do not fit between the walls of `domain` somewhere, or into a dead end.
 
     Parameters
     ----------
@@ -68,22 +68,27 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
     MismatchWarning
     """
     if isinstance(domain, Polygon):
-        found = find_narrowest(domain, size)
+        strait, dead_end = find_narrow_parts(domain, size)
+        remedy = ", or fill it: domain.simplified(size) does"
     else:
         center = (np.array(domain.lower) + domain.upper) / 2
         widths = np.where(domain.periodic, np.inf, domain.extent)
-        found = center, float(widths.min()), float(size(center[None])[0])
-    if found is None or found[1] >= NARROW * found[2]:
+        strait, dead_end = (
+            NarrowPart(center, float(widths.min()), float(size(center[None])[0])),
+            None,
+        )
+        strait = strait if strait.width < NARROW * strait.size else None
+        remedy = ""
+    found = strait or dead_end
+    if found is None:
         return
-    place, width, wanted = found
-    where = ", ".join(f"{x:.6g}" for x in place)
-    warn(
-        f"the domain is narrower than half a cell: {width:.3g} wide at ({where}), where the size field is "
-        f"{wanted:.3g}; "
-        "cells there are long and reach from wall to wall. Use smaller sizes there, as sizing.FeatureSize does"
-        f"{', or close the gap' if isinstance(domain, Polygon) else ''}",
-        MismatchWarning,
-    )
+    where = ", ".join(f"{x:.6g}" for x in found.place)
+    here = f"{found.width:.3g} wide at ({where}), where the size field is {found.size:.3g}; "
+    if strait is not None:
+        text = f"the domain is narrower than half a cell: {here}cells there are long and reach from wall to wall"
+    else:
+        text = f"the domain has a dead end that is narrower than a cell: {here}cells there have poor shapes"
+    warn(f"{text}. Use smaller sizes there, as sizing.FeatureSize does{remedy}", MismatchWarning)
 
 
 def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:

@@ -8,7 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..arguments import check_choice
+from ..arguments import check_choice, warn
+from ..errors import MismatchWarning
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 from ..mesh.connectivity import following, take_rows
@@ -17,6 +18,9 @@ from ..mesh.read_only import Sealed
 from .geometry import face_geometry
 from .measures import SolverMeasures
 from .seams import faces_with_seams
+
+_LARGE_CHANGE = 0.01
+"""Change of the domain's area, as a share of it, beyond which there is a warning."""
 
 WallShape = Literal["straight", "exact"]
 """What the wall faces of one cell become: one straight face, or as many as the domain has edges there."""
@@ -190,7 +194,14 @@ def make_solver_mesh(
         mesh = move_concave_points(mesh)
     if collapse and mesh.dim == 3:
         mesh = collapse_short(mesh, np.cbrt(diagram.volumes), diagram.centroids)
-    return compact(mesh)
+    mesh = compact(mesh)
+    if straight and abs(mesh.area_change) > _LARGE_CHANGE:
+        warn(
+            f"straight walls change the area of the domain by {mesh.area_change:+.2g} of it: its boundary has features "
+            "as large as the cells. Use smaller cells there, or keep the exact walls with walls='exact'",
+            MismatchWarning,
+        )
+    return mesh
 
 
 def compact(mesh: SolverMesh) -> SolverMesh:

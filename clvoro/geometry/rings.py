@@ -43,7 +43,7 @@ class Ring:
     numbers : (k,) int64
         Number of each edge in `given`: edge i goes from vertex i to the next.
     name : str
-        Name in errors: "outer ring", "hole 2 of piece 0".
+        Name in errors: "outer ring", "hole-2"; with several pieces "outer-1" and so on, as its boundary is named.
     curved : CurvedEdges
         The curves that edges of `given` stand for.
     """
@@ -142,12 +142,14 @@ def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
         raise InputError("Polygon got no rings, expected an outer ring of at least 3 vertices")
     several = len(pieces) > 1
     rings: list[list[Ring]] = []
+    holes = 0
     known: dict[tuple[bool, bytes], str] = {}
     for p, piece in enumerate(pieces):
         if not len(piece):
-            raise InputError(f"Polygon got no rings for piece {p}, expected an outer ring")
-        of = f" of piece {p}" if several else ""
-        names = [f"outer ring{of}", *(f"hole {h}{of}" for h in range(len(piece) - 1))]
+            raise InputError(f"Polygon got no rings for piece {p + 1}, expected an outer ring")
+        first = f"outer-{p + 1}" if several else "outer ring"
+        names = [first, *(f"hole-{holes + h}" for h in range(1, len(piece)))]
+        holes += len(piece) - 1
         rings.append([])
         for k, (ring, name) in enumerate(zip(piece, names, strict=True)):
             rings[-1].append(_cleaned(ring, name))

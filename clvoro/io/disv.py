@@ -53,6 +53,15 @@ class DisvBoundary(Sealed):
         return transmissivity * self.lengths / self.distances
 
 
+class DisvBoundaries(dict[str, DisvBoundary]):
+    """Faces on each boundary of the domain, by its name."""
+
+    def __missing__(self, name: object) -> DisvBoundary:
+        raise InputError(
+            f"boundaries has no {name!r:.60}, expected the name of a boundary: {', '.join(self)}"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Disv(Sealed):
     """A grid for MODFLOW 6's DISV package; see `Diagram.to_disv`.
@@ -66,14 +75,14 @@ class Disv(Sealed):
     centers : (n, 2) float64
         Centers of the cells: the generators.
     boundaries : dict of DisvBoundary
-        Faces on each boundary of the domain, by its name.
+        Faces on each boundary of the domain, by its name. Another name raises InputError.
     """
 
     vertices: np.ndarray
     cell_vertex_starts: np.ndarray
     cell_vertices: np.ndarray
     centers: np.ndarray
-    boundaries: dict[str, DisvBoundary]
+    boundaries: DisvBoundaries
 
     @property
     def gridprops(self) -> dict[str, Any]:
@@ -108,7 +117,7 @@ def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
     starts, loops = cell_loops(mesh)
     cells = np.arange(len(mesh))
     faces = two_point_faces(mesh, diagram.points)
-    found = {}
+    found = DisvBoundaries()
     for k, name in enumerate(domain.boundary_names):
         rows = np.flatnonzero(faces.boundary == k)
         rows = rows[np.argsort(faces.owner[rows], kind="stable")]

@@ -141,6 +141,11 @@ class MeshOutput:
         InputError
             If `walls` is something else.
 
+        Warns
+        -----
+        MismatchWarning
+            If straight walls change the area by more than 1 % of the domain.
+
         Examples
         --------
         >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8), (0.3, 0.7)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,6 +23,10 @@ _PER_RADIUS = 4  # samples of an edge per radius of the balls at it
 _MAX_SAMPLES = 2048  # of one edge
 _ROUNDS = 40
 _TIP = 6.0  # sizes of boundary between the walls of a tip or a bay, at most
+_DEAD_END, _LONGEST = (
+    4.0,
+    12.0,
+)  # sizes of boundary between the walls of a dead end: at least, and at most
 _PARTS = 256  # of the domain, in which the size hardly changes
 _MOST_WALL_SAMPLES = 20_000
 _CLOSE = 1e-9
@@ -74,13 +79,23 @@ def find_gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, n
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))  # type: ignore[return-value]
 
 
-def find_narrowest(
-    domain: Polygon, size: Callable[[np.ndarray], np.ndarray]
-) -> tuple[np.ndarray, float, float] | None:
-    """Return where the domain is narrower than half a cell of the target size: the place, the width and the size there.
+@dataclass(frozen=True)
+class NarrowPart:
+    """A part of a domain that is narrow for its cells: a place (2,), the width and the target size there."""
 
-    The narrowest place in units of the size is returned, or None. The tips of corners and short bays do not count:
-    places whose walls are connected by less than `_TIP` sizes of boundary.
+    place: np.ndarray
+    width: float
+    size: float
+
+
+def find_narrow_parts(
+    domain: Polygon, size: Callable[[np.ndarray], np.ndarray]
+) -> tuple[NarrowPart | None, NarrowPart | None]:
+    """Return where the domain is narrower than half a cell, and a dead end that is narrower than a cell.
+
+    Each is the narrowest in units of the size, or None. The tips of corners and short bays do not count for the first:
+    places whose walls are connected by less than `_TIP` sizes of boundary. For the second, these are
+    `_DEAD_END` sizes at least, which is a bay of depth 2, or a corner of 28 degrees.
 
     Parameters
     ----------
@@ -92,13 +107,13 @@ def find_narrowest(
     begin, end, radius = _balls(domain, points, normals, 2 * h)
     rows = np.flatnonzero(np.isfinite(radius))
     if not rows.size:
-        return None
+        return None, None
     middle = 0.5 * (begin[rows] + end[rows])
     width, wanted = np.hypot(*(end[rows] - begin[rows]).T), size(middle)
-    thin = width < NARROW * wanted
+    thin = width < wanted
     rows, middle, width, wanted = rows[thin], middle[thin], width[thin], wanted[thin]
     if not rows.size:
-        return None
+        return None, None
     starts = domain.oriented.ring_starts
     lengths, reached = _ring_lengths(domain)
     edge, _ = domain.nearest_edge(end[rows])
@@ -108,11 +123,15 @@ def find_narrowest(
     own = np.searchsorted(reached[starts[:-1]], along[rows], side="right") - 1
     way = np.abs(there - along[rows])
     way = np.where(ring == own, np.minimum(way, lengths[ring] - way), math.inf)
-    apart = np.flatnonzero(way > _TIP * wanted)
-    if not apart.size:
-        return None
-    k = apart[np.argmin((width / wanted)[apart])]
-    return middle[k], float(width[k]), float(wanted[k])
+
+    def narrowest(chosen: np.ndarray) -> NarrowPart | None:
+        if not chosen.any():
+            return None
+        k = np.flatnonzero(chosen)[np.argmin((width / wanted)[chosen])]
+        return NarrowPart(middle[k], float(width[k]), float(wanted[k]))
+
+    turned_back = (way > _DEAD_END * wanted) & (way < _LONGEST * wanted)
+    return narrowest((width < NARROW * wanted) & (way > _TIP * wanted)), narrowest(turned_back)
 
 
 def _ring_lengths(domain: Polygon) -> tuple[np.ndarray, np.ndarray]:

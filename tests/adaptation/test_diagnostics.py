@@ -279,6 +279,20 @@ STRAIT = [
     (1, 1),
     (0, 1),
 ]
+
+
+def bay(width, depth):
+    """Return a square with a bay above."""
+    return [
+        *SQUARE[:3],
+        (0.5 + width, 1),
+        (0.5 + width, 1 + depth),
+        (0.5, 1 + depth),
+        (0.5, 1),
+        (0, 1),
+    ]
+
+
 ISLAND = [(0.01, 0.3), (0.3, 0.3), (0.3, 0.7), (0.02, 0.7)]
 NARROW = {
     # name: (domain, h, width, a place on the line from - to); no place where nothing is narrow
@@ -293,6 +307,8 @@ NARROW = {
     "short bay": (
         clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.52, 1), (0.52, 1.1), (0.5, 1.1), (0.5, 1), (0, 1)]),
         0.1, None, None),
+    "bay of depth 1.5": (clvoro.Polygon(bay(0.08, 0.15)), 0.1, None, None),
+    "wide bay": (clvoro.Polygon(bay(0.12, 0.5)), 0.1, None, None),
     "thin hole": (clvoro.Polygon(SQUARE, [[(0.3, 0.5), (0.7, 0.499), (0.7, 0.501)]]), 0.1, None, None),
     "square": (clvoro.Polygon(SQUARE), 0.1, None, None),
     "box": (clvoro.Box((0, 0), (8, 0.1)), 0.4, 0.1, ((4, 0.05), (4, 0.05))),
@@ -319,6 +335,24 @@ def test_narrow_parts(domain, h, width, line):
     slack = 0.01 if isinstance(domain, clvoro.Polygon) else 1e-9
     assert (place >= low - slack).all()
     assert (place <= high + slack).all()
+
+
+@pytest.mark.parametrize(
+    ("domain", "width"),
+    [
+        (clvoro.Polygon(bay(0.07, 0.3)), 0.07),
+        (clvoro.Polygon([(0, 0), (1, 0), (1, math.tan(math.radians(20)))]), None),
+    ],
+    ids=["bay", "corner of 20 degrees"],
+)
+def test_dead_ends(domain, width):
+    with pytest.warns(MismatchWarning, match=r"dead end .*simplified") as caught:
+        warn_of_narrow_parts(domain, lambda x: np.full(len(x), 0.1))
+    (message,) = [str(w.message) for w in caught]
+    found, place = re.search(r"a cell: (\S+) wide at \((.*)\), where", message).groups()
+    assert width is None or float(found) == pytest.approx(width, rel=0.01)
+    assert domain.contains(np.array([place.split(", ")], float))
+    warn_of_narrow_parts(domain.simplified(0.1), lambda x: np.full(len(x), 0.1))  # no warning
 
 
 def test_narrow_parts_are_those_of_the_size_field():

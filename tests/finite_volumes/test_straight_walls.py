@@ -234,3 +234,16 @@ def test_other_formats_have_exact_walls(ring, tmp_path):
     with pytest.raises(InputError, match="walls is 'round', expected one of straight, exact"):
         ring.save(tmp_path / "mesh.vtu", walls="round")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_large_change_of_the_area_gives_a_warning():
+    """Six cells in a disc."""
+    disc = clvoro.Polygon(clvoro.curves.circle((0, 0), 1))
+    angle = np.arange(6) * (np.pi / 3)
+    cells = clvoro.voronoi(disc, 0.5 * np.column_stack([np.cos(angle), np.sin(angle)]))
+    with pytest.warns(
+        clvoro.errors.MismatchWarning, match=r"change the area of the domain by -0\.04"
+    ):
+        mesh = cells.solver_mesh()
+    assert mesh.area_change < -0.04
+    cells.solver_mesh(walls="exact")  # no warning

@@ -378,15 +378,15 @@ FIGURE_EIGHT = [(0, 0), (1, 1), (2, 0), (1, 0.2), (0, 1), (-1, 0.5)]
     ("outer", "holes", "says"),
     [
         (spline(FIGURE_EIGHT, closed=True), [], r"Self-intersection at \(.*\), edge \d+ of the outer ring on spline"),
-        (BOX, [circle((0, 0), 1), circle((1, 0), 1)], r"edge .* hole 0 on circle.* and edge .* hole 1 on circle"),
+        (BOX, [circle((0, 0), 1), circle((1, 0), 1)], r"edge .* hole-1 on circle.* and edge .* hole-2 on circle"),
         (BOX, [circle((4, 0), 1)], "Polygon is not valid"),
         (arc((0, 0), 1, 0, 90), [], r"outer ring is open: arc\(.*\[curve\]"),
-        (BOX, [spline([(0, 0), (1, 1), (2, 0)])], "hole 0 is open"),
+        (BOX, [spline([(0, 0), (1, 1), (2, 0)])], "hole-1 is open"),
         ([(0, 0), circle((1, 0), 1)], [], "beside other items"),
         ([(0, 0), (1.0000001, 0), arc((0, 0), 1, 0, 90)], [], r"open at \(1.0000001, 0\): items 1 and 2 are 1e-07"),
         ([(0, 0), "x", arc((0, 0), 1, 0, 90)], [], "has item 1, expected a point"),
         ([(0, 0), (1, 0, 0), arc((0, 0), 1, 0, 90)], [], "has item 1, expected a point"),
-        (BOX, [circle((0, 0), 1), circle((0, 0), 1)], "repeats the hole 0"),
+        (BOX, [circle((0, 0), 1), circle((0, 0), 1)], "repeats the hole-1"),
         ([(-1e7, -1e7), (1e7, -1e7), (0, 1e7)], [circle((0, 0), 1e-4)], "edge of length .* on circle"),
     ],
 )  # fmt: skip

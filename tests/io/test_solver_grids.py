@@ -116,6 +116,10 @@ def test_boundaries_have_names_cells_and_lengths(lake):
         assert set(b.cells) <= set(d.faces.owner[faces].tolist()), name
         assert np.array_equal(b.cells, np.sort(b.cells))
         assert b.conductance(2.0) == pytest.approx(2 * b.lengths / b.distances)
+    with pytest.raises(
+        InputError, match="boundaries has no 'inlt', expected the name of a boundary: inlet, "
+    ):
+        disv.boundaries["inlt"]
     feet = disv.boundaries["inlet"].feet
     assert (
         np.abs(feet[:, 0] * 1 + feet[:, 1] * 0.1).max() < 1e-12
