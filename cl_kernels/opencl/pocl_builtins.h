@@ -126,7 +126,6 @@ DECLARE_ATOMICS(local, int);
 DECLARE_ATOMICS(local, uint);
 
 size_t CONST_FUNCTION get_global_id(uint);
-size_t CONST_FUNCTION get_global_size(uint);
 size_t CONST_FUNCTION get_local_id(uint);
 size_t CONST_FUNCTION get_group_id(uint);
 size_t CONST_FUNCTION get_num_groups(uint);

@@ -45,9 +45,6 @@
     if (i >= size)                                                                                                     \
     return
 
-/* The same for a kernel that may be launched with fewer work-items than `size`: each takes every so many. */
-#define EACH_WORK_ITEM(i) for (int i = get_global_id(0); i < size; i += get_global_size(0))
-
 /* a b - c d, with an error of 1 ulp even if the products cancel (Kahan): the determinant of two vectors. */
 inline REAL difference_of_products(REAL a, REAL b, REAL c, REAL d)
 {

@@ -59,11 +59,11 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
                            global float *reach, BIN_ARGS, global const REAL *points, const REAL4 box_lower,
                            const REAL4 box_upper, const int warm, global const int *old_starts,
                            global const int *old_neighbors, const int again, const int room, const REAL share,
-                           CELL_OUTPUT_ARGS CELL_ARG HALO_ARGS)
+                           CELL_OUTPUT_ARGS CELL_ARGS HALO_ARGS)
 {
     TAKE_CELL(cell);
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
-    EACH_WORK_ITEM(p)
+    EACH_CELL(p)
     {
         const int i = items[p];
         if (i >= rows || (again && row_counts[i] != UNFINISHED))

@@ -41,15 +41,18 @@
 #define ADD_VERTEX(set, v) ((set)[VERTEX_WORD(v)] |= (ulong)1 << ((v)&63))
 #define HAS_VERTEX(set, v) (((set)[VERTEX_WORD(v)] >> ((v)&63)) & 1)
 
-/* Cells lie in private memory, or, with -DCELL_BYTES=bytes of one cell, in global memory: drivers of GPUs reserve
-   private memory for all work-items that fit on the device at once. */
+/* Cells lie in private memory, or, with -DCELL_BYTES=bytes of one cell, in `cell_places` places in global memory, where
+   work-item k clips each `cell_places`-th cell from the k-th on: drivers of GPUs reserve private memory for all
+   work-items that fit on the device at once. */
 #ifdef CELL_BYTES
 #define CELL_SPACE global
-#define CELL_ARG , global uchar *cell_memory
+#define CELL_ARGS , global uchar *cell_memory, const int cell_places
+#define EACH_CELL(i) for (int i = get_global_id(0); i < size; i += cell_places)
 #define TAKE_CELL(cell) global cell_t *cell = (global cell_t *)(cell_memory + (size_t)CELL_BYTES * get_global_id(0))
 #else
 #define CELL_SPACE private
-#define CELL_ARG
+#define CELL_ARGS
+#define EACH_CELL(i) for (int i = get_global_id(0); i < size; i = size)
 #define TAKE_CELL(cell)                                                                                                \
     cell_t own_cell;                                                                                                   \
   private                                                                                                              \

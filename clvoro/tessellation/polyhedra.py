@@ -80,7 +80,7 @@ def clip_each(
     """Enqueue `kernel`, which clips `size` cells of up to `capacity` faces.
 
     Its arguments are `size`, `args` and `more_args`. Cells with more than `FACE_CAPACITY` faces are clipped in global
-    memory, which it takes after `args`, with one work-item for each cell that fits there.
+    memory, which it takes after `args`, by one work-item for each cell that fits there.
     """
     if capacity <= FACE_CAPACITY:
         engine.run_each(kernel, size, *args, *more_args)
@@ -89,7 +89,8 @@ def clip_each(
     count = min(size, int(clipping_space(size)) // bytes_)
     with engine.workspace.frame():
         memory = engine.scratch(count * bytes_, np.uint8)
-        engine.run(kernel, count, np.int32(size), *args, memory, *more_args, group=1)
+        more_args = (memory, np.int32(count), *more_args)
+        engine.run(kernel, count, np.int32(size), *args, *more_args, group=1)
 
 
 @dataclass(frozen=True)

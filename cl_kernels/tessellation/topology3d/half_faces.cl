@@ -35,10 +35,10 @@ inline bool is_in_row(int label, int begin, int end, global const int *labels)
    FACE_CAPACITY. full[0] is set if a cell needs more room. */
 kernel void count_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
                           global const int *starts, global const int *neighbors, global int *capacities,
-                          global int *corner_counts, global int *half_face_counts, global int *full CELL_ARG)
+                          global int *corner_counts, global int *half_face_counts, global int *full CELL_ARGS)
 {
     TAKE_CELL(cell);
-    EACH_WORK_ITEM(i)
+    EACH_CELL(i)
     {
         if (capacities[i] != 0)
             continue;
@@ -106,10 +106,10 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
                          global const int *starts, global const int *neighbors, global const int *capacities,
                          global const int *corner_starts, global const int *half_face_starts, global REAL *corners,
                          global float *sharpness, global int *corner_faces, global int *owners, global int *same,
-                         global int *half_face_labels, global int *loop_starts, global int *loops CELL_ARG)
+                         global int *half_face_labels, global int *loop_starts, global int *loops CELL_ARGS)
 {
     TAKE_CELL(cell);
-    EACH_WORK_ITEM(i)
+    EACH_CELL(i)
     {
         if (capacities[i] != FACE_CAPACITY)
             continue;
