@@ -122,7 +122,9 @@ class Bins:
         grown = self.engine.zeros(size, dtype)
         old = getattr(self, name, None)
         if old is not None:
-            grown[: old.size] = old
+            cl.enqueue_copy(
+                self.engine.queue, buffer_of(grown), buffer_of(old), byte_count=old.nbytes
+            )
         return grown
 
     def _clear(self, array: cla.Array, first: int, count: int) -> None:

@@ -27,14 +27,14 @@ COMMON_LIMITS = 128, 512
 LIMITS = {
     "clip_polygons": (272, 1400),
     "clip_marked": (224, 720),
-    "clip_polyhedra": (352, 24000),
-    "count_corners": (208, 15500),
-    "list_corners": (208, 15500),
+    "clip_polyhedra": (320, 6144),
+    "count_corners": (288, 4608),
+    "list_corners": (288, 4608),
     "share_corners": (144, 4000),
     "find_loops": (176, 256),
     "walk_edges": (176, 64),
-    "fit_slopes": (224, 15500),
-    "transfer_cell_data": (224, 30500),
+    "fit_slopes": (224, 8704),
+    "transfer_cell_data": (224, 16384),
 }
 """The same for kernels that take more. No variant of any kernel spills registers."""
 STATIC = "static inline" in _program.source_text("opencl/real.h")
