@@ -42,6 +42,7 @@ PARTS = {
     "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
     "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
     "tessellation.incremental": {"tessellation.cells"},
+    "tessellation.polyhedra_update": {"tessellation.polyhedra"},
 }
 """Modules with kernels that use the kernels of others."""
 

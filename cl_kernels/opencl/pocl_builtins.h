@@ -107,6 +107,7 @@
 #define DECLARE_ATOMICS(SPACE, S)                                                                                      \
     S WRITING_FUNCTION atomic_add(volatile SPACE S *, S);                                                              \
     S WRITING_FUNCTION atomic_inc(volatile SPACE S *);                                                                 \
+    S WRITING_FUNCTION atomic_cmpxchg(volatile SPACE S *, S, S);                                                       \
     S WRITING_FUNCTION atomic_min(volatile SPACE S *, S);                                                              \
     S WRITING_FUNCTION atomic_max(volatile SPACE S *, S);                                                              \
     S WRITING_FUNCTION atomic_or(volatile SPACE S *, S);                                                               \

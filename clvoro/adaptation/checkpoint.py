@@ -28,7 +28,7 @@ from .stages import Stages
 if TYPE_CHECKING:
     from .loop import Loop
 
-FORMAT, VERSION = "clvoro-checkpoint", 7
+FORMAT, VERSION = "clvoro-checkpoint", 8
 MESH = ("points", "labels", "velocity", "signatures", "ever_changed", "h", "potential")
 PER_FACE = ("neighbors", "face_measures", "face_centroids")
 DIAGRAM = (
@@ -100,6 +100,8 @@ class Checkpointer:
         for name in DIAGRAM:
             array = getattr(t, name)
             arrays[f"diagram.{name}"] = (array[:m] if name in PER_FACE else array).get()
+        for name, array in mesh.tessellator.save_vertices(t).items():
+            arrays[f"vertices.{name}"] = array
         for name, array in mesh.stages.poisson.save(mesh.labels).items():
             arrays[f"multigrid.{name}"] = array
         periodic = mesh.tessellator.periodic

@@ -19,7 +19,7 @@ from .forecast import IMAGE_REACH, expected_boundary_cells
 
 MAX_CELLS = 100_000_000
 """Limit of the 32-bit indices into rows of neighbors."""
-PEAK = {2: (21, 73), 3: (151, 102)}
+PEAK = {2: (21, 73), 3: (156, 211)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, of all stages (bench/memory.py)."""
 TRIMMED_PEAK = (62, 75)
 """The same in polygons, where the boundary trims cells and faces are in full precision."""

@@ -15,6 +15,7 @@ from ..geometry.polygon import Polygon
 from ..mesh.results import HISTORY_DTYPE, Displacements
 from ..tessellation.cells import Cells
 from ..tessellation.periodic.halo import block_count
+from ..tessellation.polyhedra_update import are_triples
 from .checkpoint import (
     DIAGRAM,
     FORMAT,
@@ -117,6 +118,9 @@ class Saved:
         }  # fmt: skip
         if "multipliers" in a:
             shapes["multipliers"] = ((n,), np.float32)
+        if d == 3 and "vertices.triples" in a:
+            shapes["vertices.triples"] = (2 * m,), np.uint32
+            shapes["vertices.keys"] = (m,), np.uint32
         for name, (shape, dtype) in shapes.items():
             if a[name].shape != shape or a[name].dtype != dtype:
                 raise ValueError(f"{name} is {a[name].dtype} {a[name].shape}, expected {shape}")
@@ -125,6 +129,8 @@ class Saved:
             raise ValueError("starts")
         if not (-walls <= neighbors.min() and neighbors.max() < n):
             raise ValueError("neighbors")
+        if d == 3 and "vertices.triples" in a and not are_triples(starts, a["vertices.triples"]):
+            raise ValueError("triples")
         known = labels.min() >= 0 and labels.max() < self.state["next_label"]
         if not known or len(np.unique(labels)) < n:
             raise ValueError("labels")
@@ -202,7 +208,10 @@ class Saved:
         if not isinstance(domain, Polygon) and faces != engine.face:
             raise InputError(f"cannot resume from {self.name}: it is damaged (faces are {faces})")
         diagram = {name: a[f"diagram.{name}"] for name in DIAGRAM}
-        mesh.tessellation = mesh.tessellator.restore(points, diagram, state["spare"])
+        vertices = {
+            k.removeprefix("vertices."): v for k, v in a.items() if k.startswith("vertices.")
+        }
+        mesh.tessellation = mesh.tessellator.restore(points, diagram, state["spare"], vertices)
         mesh.next_label = state["next_label"]
         periodic = mesh.tessellator.periodic
         if periodic is not None:

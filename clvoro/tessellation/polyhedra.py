@@ -13,7 +13,7 @@ import pyopencl.array as cla
 
 from ..errors import ClvoroError, MemoryLimitError
 from ..geometry.box import ClipBox
-from ..opencl.device_array import buffer_of
+from ..opencl.device_array import buffer_of, read_number
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
@@ -94,7 +94,7 @@ def clip_each(
 
 
 @dataclass(frozen=True)
-class _CutCells:
+class CutCells:
     """Cells clipped independently of each other, on the device; see `clip_polyhedra` in `polyhedra.cl`.
 
     Attributes
@@ -117,6 +117,11 @@ class _CutCells:
     cells: dict[str, cla.Array]
     m: int
     doubtful: bool
+
+    def output(self, report: cla.Array) -> tuple[cla.Array, ...]:
+        """Return the CELL_OUTPUT_ARGS of kernels (tessellation/row_counts.h)."""
+        cells = self.cells["volumes"], self.cells["offsets"], self.cells["covariances"]
+        return self.places, self.counts, self.labels, self.measures, self.centroids, *cells, report
 
 
 class Polyhedra:
@@ -240,7 +245,7 @@ class Polyhedra:
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
         with engine.workspace.frame():
             cut = self._cut(box, points, n, binned, first, previous, rows, share, halo_args)
-            t = None if cut is None else self._match(cut, points, share)
+            t = None if cut is None else self.match(cut, self._report, points, share)
         if t is None:
             raise CloseError(points, n)
         return t
@@ -262,7 +267,7 @@ class Polyhedra:
         rows: int,
         share: np.floating,
         halo_args: tuple[object, ...],
-    ) -> _CutCells | None:
+    ) -> CutCells | None:
         """Clip the first `rows` cells; repeat with larger capacities if needed. None if a cell collapses.
 
         `first` (n,) float32 is a copy of the original `binned.reach`.
@@ -322,10 +327,49 @@ class Polyhedra:
                     )
                 self._report.set(np.array([flags & HARMLESS, m], np.int32))
             else:
-                return _CutCells(places, counts, *faces, cells, m, bool(flags & DOUBT))
+                return CutCells(places, counts, *faces, cells, m, bool(flags & DOUBT))
 
-    def _match(self, cut: _CutCells, points: cla.Array, share: np.floating) -> Tessellation | None:
-        """Keep the faces that both cells have, and sort them by rows. None if cells differ by too much."""
+    def take_cells(self, n: int, m: int) -> CutCells:
+        """Return arrays for `n` cells with `m` half-faces in any order, to be matched."""
+        self._reserve_cells(n)
+        cells = {name: a[:n] for name, a in self._of_cells.items() if name != "starts"}
+        scratch = self.engine.scratch
+        places, counts, labels = (scratch(size, np.int32) for size in (n, n, m))
+        return CutCells(places, counts, labels, scratch(m), scratch((m, 3)), cells, m, False)
+
+    def clip_rest(
+        self,
+        cut: CutCells,
+        report: cla.Array,
+        box: ClipBox,
+        points: cla.Array,
+        binned: BinnedPoints,
+        previous: Tessellation,
+    ) -> bool:
+        """Clip the unfinished cells of `cut` by all generators near them. False if that fails."""
+        engine, rows = self.engine, len(cut.counts)
+        search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
+        share, old = engine.real.type(ROUGH_SHARE), (previous.starts, previous.neighbors)
+        engine.run_each(
+            self._kernels(FACE_CAPACITY).clip_polyhedra, rows, np.int32(rows), binned.points, binned.items, *search,
+            points, *box.device_corners(engine.real), np.int32(1), *old, np.int32(1), np.int32(len(cut.labels)), share,
+            *cut.output(report),
+        )  # fmt: skip
+        flags, m = (int(v) for v in report.get()[:2])
+        return m <= len(cut.labels) and not flags & ~HARMLESS
+
+    def match(
+        self,
+        cut: CutCells,
+        report: cla.Array,
+        points: cla.Array,
+        share: np.floating,
+        sparse: bool = False,
+    ) -> Tessellation | None:
+        """Keep the faces that both cells have, and sort them by rows. None if cells differ by too much.
+
+        With `sparse`, the arrays of faces have gaps, and the rows are counted.
+        """
         engine, k, m = self.engine, self._kernels(FACE_CAPACITY), cut.m
         rows, cells, doubt = len(cut.counts), cut.cells, np.int32(cut.doubtful)
         # The previous graph stays valid until the end.
@@ -333,12 +377,14 @@ class Polyhedra:
         kept = engine.scratch(m, np.uint8)
         engine.run_each(
             k.match_polyhedron_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cells["volumes"],
-            points, share, doubt, kept, starts, self._report,
+            points, share, doubt, kept, starts, report,
         )  # fmt: skip
-        flags = int(self._report.get()[0])
+        flags = int(report.get()[0])
         if flags & ~HARMLESS:
             return None
         self._scan.exclusive(starts, starts, rows)
+        if sparse:
+            m = read_number(starts, rows)
         faces, of_rows = self._faces(m), self._of_cells["starts"][: rows + 1]
         engine.run_each(
             k.place_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cut.centroids,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import ClassVar
 
 import pyopencl.array as cla
@@ -17,6 +18,7 @@ from .incremental import IncrementalUpdate
 from .periodic.folded import FoldedCells
 from .periodic.ghost_images import GhostImages
 from .polyhedra import Polyhedra
+from .polyhedra_update import PolyhedraUpdate
 
 
 class TessellationStages:
@@ -25,13 +27,15 @@ class TessellationStages:
     bins: Bins
     cells: Cells | Polyhedra
     incremental: IncrementalUpdate
+    polyhedra_update: PolyhedraUpdate
     ghost_images: GhostImages
     folded_cells: FoldedCells
     trim: Trim
     gather: Gather
 
     CLASSES: ClassVar[dict[str, type]] = {
-        "bins": Bins, "cells": Cells, "incremental": IncrementalUpdate, "ghost_images": GhostImages,
+        "bins": Bins, "cells": Cells, "incremental": IncrementalUpdate,
+        "polyhedra_update": PolyhedraUpdate, "ghost_images": GhostImages,
         "folded_cells": FoldedCells, "trim": Trim, "gather": Gather,
     }  # fmt: skip
 
@@ -71,7 +75,12 @@ def tessellate_box(
 ) -> Tessellation:
     """Tessellate the clip box of `domain`; see `Tessellator.tessellate`."""
     if isinstance(stages.cells, Polyhedra):
-        binned = stages.bins.build(domain, points, n) if binned is None else binned
+        bins = cache(lambda: stages.bins.build(domain, points, n) if binned is None else binned)
+        if previous is not None and not exact:
+            t = stages.polyhedra_update.update(stages.cells, domain, points, previous, bins)
+            if t is not None:
+                return t
+        binned = bins()
         return stages.cells.tessellate(domain, points, n, binned, previous, exact)
     if previous is not None and not exact:
         t = stages.incremental.update(stages.cells, domain, points, previous)

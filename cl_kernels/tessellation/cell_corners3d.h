@@ -1,0 +1,231 @@
+/* A cell in 3D as the vertices of its planes: a vertex is a triple of faces, counter-clockwise seen from outside. All
+   positions are relative to the generator. The plane of a neighbor at d is y.p = 1/2 with p = d / d^2. */
+#include "opencl/real.h"
+
+#define REAL8 CLVORO_JOIN(REAL, 8)
+#define MOST_FACES 32 /* most candidates of a cell: one bit each */
+#define MOST_CORNERS (2 * MOST_FACES)
+#define NO_CORNER 255
+
+/* Largest product y.p - 1/2 of a vertex that lies in its cell up to round-off; least squared volume spanned by the
+   directions of its three faces; least squared area spanned by those of two, as measures have errors of eps over their
+   angle; least squared distance of a neighbor, as a share of that of the farthest vertex; least area of a face, as a
+   share of the squared distance of its farthest vertex. */
+#if IS_DOUBLE
+#define BEYOND_NOISE R(1e-12)
+#define LEAST_SINE2 R(1e-10)
+#define LEAST_ANGLE2 R(1e-12)
+#define LEAST_NEAREST2 R(1e-7)
+#define LEAST_AREA R(1e-12)
+#else
+#define BEYOND_NOISE R(1e-5)
+#define LEAST_SINE2 R(1e-6)
+#define LEAST_ANGLE2 R(1e-4)
+#define LEAST_NEAREST2 R(1e-3)
+#define LEAST_AREA R(1e-6)
+#endif
+/* Areas below this share of the squared distance of the farthest vertex are computed again in a more accurate way: sums
+   over points far from a face lose digits. */
+#define FLAT_AREA R(3e-3)
+
+typedef struct {
+    int faces, corners;
+    int labels[MOST_FACES];
+    REAL px[MOST_FACES], py[MOST_FACES], pz[MOST_FACES], d2[MOST_FACES];
+    uchar4 at[MOST_CORNERS];                                             /* faces of a vertex */
+    REAL8 x[MOST_CORNERS / 8], y[MOST_CORNERS / 8], z[MOST_CORNERS / 8]; /* its position */
+    REAL8 beyond[MOST_CORNERS / 8];                                      /* its largest y.p - 1/2 */
+    REAL reach2;
+} corners_t;
+
+/* Where two faces are consecutive at a vertex: its number, [a][b]. */
+typedef struct {
+    uchar at[MOST_FACES * MOST_FACES];
+} links_t;
+
+inline REAL4 face_plane(const corners_t *cell, int f)
+{
+    return (REAL4)(cell->px[f], cell->py[f], cell->pz[f], 0);
+}
+
+inline REAL4 corner_place(const corners_t *cell, int v)
+{
+    return (REAL4)(((const REAL *)cell->x)[v], ((const REAL *)cell->y)[v], ((const REAL *)cell->z)[v], 0);
+}
+
+inline REAL largest_of_eight(REAL8 v)
+{
+    const REAL4 a = v.lo > v.hi ? v.lo : v.hi;
+    const REAL2 b = a.lo > a.hi ? a.lo : a.hi;
+    return b.s0 > b.s1 ? b.s0 : b.s1;
+}
+
+/* Pad the planes to whole vectors by those of no neighbor, p = 0. */
+inline void pad_planes(corners_t *cell)
+{
+    const int end = (cell->faces + 7) / 8 * 8;
+    for (int f = cell->faces; f < end; ++f)
+        cell->px[f] = cell->py[f] = cell->pz[f] = cell->d2[f] = 0;
+}
+
+typedef struct {
+    REAL8 x, y, z;
+} space8_t;
+
+inline REAL8 product8(space8_t a, space8_t b)
+{
+    return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z));
+}
+
+inline space8_t cross8(space8_t a, space8_t b)
+{
+    const space8_t c = {fma(a.y, b.z, -a.z * b.y), fma(a.z, b.x, -a.x * b.z), fma(a.x, b.y, -a.y * b.x)};
+    return c;
+}
+
+/* a + s b */
+inline space8_t add_along(space8_t a, REAL8 s, space8_t b)
+{
+    const space8_t c = {fma(s, b.x, a.x), fma(s, b.y, a.y), fma(s, b.z, a.z)};
+    return c;
+}
+
+#define GATHER8(values, k)                                                                                             \
+    (REAL8)((values)[(k)[0]], (values)[(k)[1]], (values)[(k)[2]], (values)[(k)[3]], (values)[(k)[4]],                  \
+            (values)[(k)[5]], (values)[(k)[6]], (values)[(k)[7]])
+
+inline space8_t gather_planes(const corners_t *cell, const int *k)
+{
+    const space8_t p = {GATHER8(cell->px, k), GATHER8(cell->py, k), GATHER8(cell->pz, k)};
+    return p;
+}
+
+/* Sums over the vertices: of each face (area, first moments), and second moments of the cell; see `add_corner` in
+   simd/walk_state.h. */
+typedef struct {
+    REAL4 faces[MOST_FACES];
+    REAL8 xx, yy, zz, yz, zx, xy;
+} sums_t;
+
+/* Contributions of a vertex at the end of the common edge of faces p and q; see `share_edge` in simd/walk_state.h. */
+typedef struct {
+    REAL8 g, part_p, part_q, both;
+} part_t;
+
+inline part_t part_of_edge(REAL8 g, space8_t p, space8_t q, REAL8 p2, REAL8 q2, REAL8 inverses)
+{
+    const REAL8 pq = product8(p, q);
+    const part_t part = {g, g * (p2 - pq), g * (q2 - pq), g * fma(-pq, inverses, (REAL8)2)};
+    return part;
+}
+
+/* Find the vertices and sum them up. False if faces at a vertex are nearly parallel or not counter-clockwise, or a
+   neighbor is very near. `reach2` and `beyond` are set. The sums are incomplete if a vertex lies beyond another face.
+ */
+inline bool place_corners(corners_t *cell, sums_t *sums)
+{
+    const int blocks = (cell->corners + 7) / 8;
+    for (int v = cell->corners; v < 8 * blocks; ++v)
+        cell->at[v] = cell->at[0];
+    for (int f = 0; f < cell->faces; ++f)
+        sums->faces[f] = 0;
+    sums->xx = sums->yy = sums->zz = sums->yz = sums->zx = sums->xy = 0;
+    REAL8 far2 = 0, good = 1;
+    bool fits = true;
+    for (int block = 0; block < blocks; ++block) {
+        int at_a[8], at_b[8], at_c[8];
+        for (int lane = 0; lane < 8; ++lane) {
+            const uchar4 at = cell->at[8 * block + lane];
+            at_a[lane] = at.s0;
+            at_b[lane] = at.s1;
+            at_c[lane] = at.s2;
+        }
+        const space8_t a = gather_planes(cell, at_a), b = gather_planes(cell, at_b), c = gather_planes(cell, at_c);
+        const space8_t ab = cross8(a, b), bc = cross8(b, c), ca = cross8(c, a);
+        const REAL8 a2 = product8(a, a), b2 = product8(b, b), c2 = product8(c, c), det = product8(a, bc);
+        const REAL8 over = 1 / det;
+        space8_t y = {(ab.x + bc.x + ca.x) * over / 2, (ab.y + bc.y + ca.y) * over / 2,
+                      (ab.z + bc.z + ca.z) * over / 2};
+        const REAL8 off_a = (R(0.5) - product8(a, y)) * over, off_b = (R(0.5) - product8(b, y)) * over;
+        const REAL8 off_c = (R(0.5) - product8(c, y)) * over;
+        y = add_along(add_along(add_along(y, off_a, bc), off_b, ca), off_c, ab);
+        cell->x[block] = y.x;
+        cell->y[block] = y.y;
+        cell->z[block] = y.z;
+        const REAL8 y2 = product8(y, y), sine2 = det * det - LEAST_SINE2 * a2 * b2 * c2;
+        far2 = y2 > far2 ? y2 : far2;
+        const REAL8 ab2 = product8(ab, ab), bc2 = product8(bc, bc), ca2 = product8(ca, ca);
+        good = ((det > 0) & (sine2 > 0) & (ab2 > LEAST_ANGLE2 * a2 * b2) & (bc2 > LEAST_ANGLE2 * b2 * c2) &
+                (ca2 > LEAST_ANGLE2 * c2 * a2))
+                   ? good
+                   : 0;
+        /* Two independent chains of comparisons, which the processor overlaps. */
+        REAL8 beyond = -1, others = -1;
+        for (int f = 0; f < cell->faces; f += 2) {
+            const REAL8 s = fma(cell->px[f], y.x, fma(cell->py[f], y.y, cell->pz[f] * y.z));
+            const int g = min(f + 1, cell->faces - 1);
+            const REAL8 t = fma(cell->px[g], y.x, fma(cell->py[g], y.y, cell->pz[g] * y.z));
+            beyond = s > beyond ? s : beyond;
+            others = t > others ? t : others;
+        }
+        beyond = others > beyond ? others : beyond;
+        cell->beyond[block] = beyond - R(0.5);
+        fits = fits && !(largest_of_eight(beyond) > R(0.5) + BEYOND_NOISE);
+        if (!fits)
+            continue;
+
+        const REAL8 ia = GATHER8(cell->d2, at_a), ib = GATHER8(cell->d2, at_b), ic = GATHER8(cell->d2, at_c);
+        const REAL8 inverse = 1 / (ab2 * bc2 * ca2);
+        const part_t of_ab = part_of_edge(product8(y, ab) * bc2 * ca2 * inverse, a, b, a2, b2, ia + ib);
+        const part_t of_bc = part_of_edge(product8(y, bc) * ca2 * ab2 * inverse, b, c, b2, c2, ib + ic);
+        const part_t of_ca = part_of_edge(product8(y, ca) * ab2 * bc2 * inverse, c, a, c2, a2, ic + ia);
+        const space8_t twice = {2 * y.x, 2 * y.y, 2 * y.z}, none = {0, 0, 0};
+        const space8_t to_ab = add_along(twice, -of_ab.g, ab), to_bc = add_along(twice, -of_bc.g, bc);
+        const space8_t to_ca = add_along(twice, -of_ca.g, ca);
+        const space8_t first_a = add_along(add_along(none, of_ab.part_p, to_ab), of_ca.part_q, to_ca);
+        const space8_t first_b = add_along(add_along(none, of_bc.part_p, to_bc), of_ab.part_q, to_ab);
+        const space8_t first_c = add_along(add_along(none, of_ca.part_p, to_ca), of_bc.part_q, to_bc);
+        REAL parts[12][8];
+        vstore8(of_ab.part_p + of_ca.part_q, 0, parts[0]);
+        vstore8(first_a.x, 0, parts[1]);
+        vstore8(first_a.y, 0, parts[2]);
+        vstore8(first_a.z, 0, parts[3]);
+        vstore8(of_bc.part_p + of_ab.part_q, 0, parts[4]);
+        vstore8(first_b.x, 0, parts[5]);
+        vstore8(first_b.y, 0, parts[6]);
+        vstore8(first_b.z, 0, parts[7]);
+        vstore8(of_ca.part_p + of_bc.part_q, 0, parts[8]);
+        vstore8(first_c.x, 0, parts[9]);
+        vstore8(first_c.y, 0, parts[10]);
+        vstore8(first_c.z, 0, parts[11]);
+        const int lanes = min(8, cell->corners - 8 * block);
+        for (int lane = 0; lane < lanes; ++lane) {
+            sums->faces[at_a[lane]] += (REAL4)(parts[0][lane], parts[1][lane], parts[2][lane], parts[3][lane]);
+            sums->faces[at_b[lane]] += (REAL4)(parts[4][lane], parts[5][lane], parts[6][lane], parts[7][lane]);
+            sums->faces[at_c[lane]] += (REAL4)(parts[8][lane], parts[9][lane], parts[10][lane], parts[11][lane]);
+        }
+        /* Lanes behind the last vertex count nothing. */
+        REAL here[8];
+        for (int lane = 0; lane < 8; ++lane)
+            here[lane] = lane < lanes;
+        const REAL8 once = vload8(0, here);
+        const REAL8 t_ab = once * of_ab.both, t_bc = once * of_bc.both, t_ca = once * of_ca.both;
+        const REAL8 t = t_ab + t_bc + t_ca;
+        const REAL8 u_ab = t_ab * of_ab.g, u_bc = t_bc * of_bc.g, u_ca = t_ca * of_ca.g;
+        const REAL8 uu_ab = 2 * u_ab * of_ab.g, uu_bc = 2 * u_bc * of_bc.g, uu_ca = 2 * u_ca * of_ca.g;
+        const REAL8 zx = 3 * (t * y.x - fma(u_ab, ab.x, fma(u_bc, bc.x, u_ca * ca.x)));
+        const REAL8 zy = 3 * (t * y.y - fma(u_ab, ab.y, fma(u_bc, bc.y, u_ca * ca.y)));
+        const REAL8 zz = 3 * (t * y.z - fma(u_ab, ab.z, fma(u_bc, bc.z, u_ca * ca.z)));
+        sums->xx += fma(2 * zx, y.x, fma(uu_ab, ab.x * ab.x, fma(uu_bc, bc.x * bc.x, uu_ca * ca.x * ca.x)));
+        sums->yy += fma(2 * zy, y.y, fma(uu_ab, ab.y * ab.y, fma(uu_bc, bc.y * bc.y, uu_ca * ca.y * ca.y)));
+        sums->zz += fma(2 * zz, y.z, fma(uu_ab, ab.z * ab.z, fma(uu_bc, bc.z * bc.z, uu_ca * ca.z * ca.z)));
+        sums->yz += fma(zy, y.z, zz * y.y) + fma(uu_ab, ab.y * ab.z, fma(uu_bc, bc.y * bc.z, uu_ca * ca.y * ca.z));
+        sums->zx += fma(zz, y.x, zx * y.z) + fma(uu_ab, ab.z * ab.x, fma(uu_bc, bc.z * bc.x, uu_ca * ca.z * ca.x));
+        sums->xy += fma(zx, y.y, zy * y.x) + fma(uu_ab, ab.x * ab.y, fma(uu_bc, bc.x * bc.y, uu_ca * ca.x * ca.y));
+    }
+    cell->reach2 = largest_of_eight(far2);
+    REAL nearest2 = INFINITY;
+    for (int f = 0; f < cell->faces; ++f)
+        nearest2 = fmin(nearest2, cell->d2[f]);
+    return largest_of_eight(-good) < 0 && nearest2 > LEAST_NEAREST2 * cell->reach2; /* a NaN is not good */
+}

@@ -1,0 +1,311 @@
+/* The vertices of a cell in 3D after its generator and neighbors have moved: by flips from its earlier vertices, or by
+   a walk along its edges. */
+#include "tessellation/cell_corners3d.h"
+
+#define MOST_FLIPS 24
+
+#define LINK(links, a, b) ((links)->at[(a)*MOST_FACES + (b)])
+
+inline void clear_links(links_t *links, int faces)
+{
+    for (int k = 0; k < faces * MOST_FACES; ++k)
+        links->at[k] = NO_CORNER;
+}
+
+inline void link_corner(corners_t *cell, links_t *links, int v, int a, int b, int c)
+{
+    cell->at[v] = (uchar4)(a, b, c, 0);
+    LINK(links, a, b) = LINK(links, b, c) = LINK(links, c, a) = v;
+}
+
+/* The face of vertex v that follows b, where b follows a. */
+inline int third_face(const corners_t *cell, int v, int a, int b)
+{
+    const uchar4 at = cell->at[v];
+    return at.s0 != a && at.s0 != b ? at.s0 : (at.s1 != a && at.s1 != b ? at.s1 : at.s2);
+}
+
+/* The product y.p - 1/2 of a position and the plane of face f: positive beyond the plane. */
+inline REAL beyond_plane(const corners_t *cell, int f, REAL4 y)
+{
+    return fma(cell->px[f], y.s0, fma(cell->py[f], y.s1, cell->pz[f] * y.s2)) - R(0.5);
+}
+
+/* The same for eight faces. */
+inline REAL8 beyond_planes(const corners_t *cell, int block, REAL4 y)
+{
+    return fma(vload8(block, cell->px), y.s0, fma(vload8(block, cell->py), y.s1, vload8(block, cell->pz) * y.s2)) -
+           R(0.5);
+}
+
+/* Find vertex v, and its largest product y.p - 1/2. False if its faces are not counter-clockwise. */
+inline bool place_corner(corners_t *cell, int v)
+{
+    const uchar4 at = cell->at[v];
+    const REAL4 a = face_plane(cell, at.s0), b = face_plane(cell, at.s1), c = face_plane(cell, at.s2);
+    const REAL4 ab = cross(a, b), bc = cross(b, c), ca = cross(c, a);
+    const REAL det = dot(a, bc);
+    if (!(det > 0))
+        return false;
+    const REAL4 y = (ab + bc + ca) / (2 * det);
+    ((REAL *)cell->x)[v] = y.s0;
+    ((REAL *)cell->y)[v] = y.s1;
+    ((REAL *)cell->z)[v] = y.s2;
+    REAL8 beyond = -1;
+    for (int block = 0; 8 * block < cell->faces; ++block) {
+        const REAL8 s = beyond_planes(cell, block, y);
+        beyond = s > beyond ? s : beyond;
+    }
+    ((REAL *)cell->beyond)[v] = largest_of_eight(beyond);
+    return true;
+}
+
+/* Move the last vertex to the place of vertex v, which is removed. */
+inline void remove_corner(corners_t *cell, links_t *links, int v)
+{
+    const int last = --cell->corners;
+    if (v == last)
+        return;
+    const uchar4 at = cell->at[last];
+    link_corner(cell, links, v, at.s0, at.s1, at.s2);
+    ((REAL *)cell->x)[v] = ((REAL *)cell->x)[last];
+    ((REAL *)cell->y)[v] = ((REAL *)cell->y)[last];
+    ((REAL *)cell->z)[v] = ((REAL *)cell->z)[last];
+    ((REAL *)cell->beyond)[v] = ((REAL *)cell->beyond)[last];
+}
+
+/* Replace the edge between faces a and b, at vertices v = (a, b, c) and (b, a, e), by one between c and e; or remove
+   face a or b if it is a triangle. False if that is impossible. */
+inline bool flip_edge(corners_t *cell, links_t *links, int v, int a, int b, int c)
+{
+    const int w = LINK(links, b, a), e = third_face(cell, w, b, a);
+    if (LINK(links, c, e) == NO_CORNER && LINK(links, e, c) == NO_CORNER) {
+        LINK(links, a, b) = LINK(links, b, a) = NO_CORNER;
+        link_corner(cell, links, v, c, a, e);
+        link_corner(cell, links, w, e, b, c);
+        return place_corner(cell, v) && place_corner(cell, w);
+    }
+    /* The third vertex (a, c, e) of a triangle a, or (b, e, c) of a triangle b. */
+    const bool first = LINK(links, a, c) != NO_CORNER && LINK(links, a, c) == LINK(links, c, e);
+    const int gone = first ? a : b, u = first ? LINK(links, a, c) : LINK(links, b, e);
+    if (!first && (u == NO_CORNER || u != LINK(links, e, c)))
+        return false;
+    const int other = first ? b : a;
+    LINK(links, gone, c) = LINK(links, c, gone) = LINK(links, gone, e) = LINK(links, e, gone) = NO_CORNER;
+    LINK(links, a, b) = LINK(links, b, a) = NO_CORNER;
+    if (first)
+        link_corner(cell, links, v, other, c, e);
+    else
+        link_corner(cell, links, v, other, e, c);
+    cell->px[gone] = cell->py[gone] = cell->pz[gone] = 0;
+    const int high = max(u, w), low = min(u, w);
+    int place = v == cell->corners - 1 ? high : v;
+    remove_corner(cell, links, high);
+    place = place == cell->corners - 1 ? low : place;
+    remove_corner(cell, links, low);
+    return place_corner(cell, place);
+}
+
+/* Flip edges until all vertices lie in the cell. False if the cell remains wrong. */
+inline bool flip_corners(corners_t *cell, links_t *links)
+{
+    for (int flips = 0; flips < MOST_FLIPS; ++flips) {
+        int worst = 0;
+        const REAL *beyond = (const REAL *)cell->beyond;
+        for (int v = 1; v < cell->corners; ++v)
+            worst = beyond[v] > beyond[worst] ? v : worst;
+        if (!(beyond[worst] > BEYOND_NOISE))
+            return true;
+        const REAL4 y = corner_place(cell, worst);
+        const uchar4 at = cell->at[worst];
+        int a = at.s0, b = at.s1, c = at.s2, best_a = -1, best_b = 0, best_c = 0;
+        REAL most = BEYOND_NOISE;
+        for (int edge = 0; edge < 3; ++edge) {
+            const int other = LINK(links, b, a);
+            const REAL s = beyond_plane(cell, third_face(cell, other, b, a), y);
+            if (s > most) {
+                most = s;
+                best_a = a;
+                best_b = b;
+                best_c = c;
+            }
+            const int first = a;
+            a = b;
+            b = c;
+            c = first;
+        }
+        if (best_a < 0 || !flip_edge(cell, links, worst, best_a, best_b, best_c))
+            return false;
+    }
+    return false;
+}
+
+/* Flip edges, then cut the cell by the planes from number `known` on, one after the other: the vertex farthest beyond a
+   plane is replaced by three, and edges are flipped. False if the cell remains wrong. */
+inline bool repair_corners(corners_t *cell, links_t *links, int known)
+{
+    const int end = cell->faces;
+    clear_links(links, end);
+    for (int v = 0; v < cell->corners; ++v) {
+        const uchar4 at = cell->at[v];
+        link_corner(cell, links, v, at.s0, at.s1, at.s2);
+    }
+    REAL p[MOST_FACES][3];
+    for (int f = known; f < end; ++f) {
+        p[f][0] = cell->px[f];
+        p[f][1] = cell->py[f];
+        p[f][2] = cell->pz[f];
+        cell->px[f] = cell->py[f] = cell->pz[f] = 0;
+    }
+    bool right = flip_corners(cell, links);
+    for (int f = known; f < end && right; ++f) {
+        cell->px[f] = p[f][0];
+        cell->py[f] = p[f][1];
+        cell->pz[f] = p[f][2];
+        REAL *beyond = (REAL *)cell->beyond, most = BEYOND_NOISE;
+        int worst = -1;
+        for (int v = 0; v < cell->corners; ++v) {
+            const REAL s = beyond_plane(cell, f, corner_place(cell, v));
+            beyond[v] = fmax(beyond[v], s);
+            worst = s > most ? v : worst;
+            most = fmax(most, s);
+        }
+        if (worst < 0)
+            continue;
+        const uchar4 at = cell->at[worst];
+        const int next = cell->corners;
+        cell->corners += 2;
+        link_corner(cell, links, worst, at.s0, at.s1, f);
+        link_corner(cell, links, next, at.s1, at.s2, f);
+        link_corner(cell, links, next + 1, at.s2, at.s0, f);
+        right = place_corner(cell, worst) && place_corner(cell, next) && place_corner(cell, next + 1) &&
+                flip_corners(cell, links);
+    }
+    return right;
+}
+
+/* The face that cuts a ray from y along `ray` first, except a and b; -1 if there is none. */
+inline int first_cut(const corners_t *cell, REAL4 y, REAL4 ray, int a, int b)
+{
+    const REAL8 lanes = (REAL8)(0, 1, 2, 3, 4, 5, 6, 7);
+    REAL8 least = INFINITY, faces = -1;
+    for (int block = 0; 8 * block < cell->faces; ++block) {
+        const REAL8 slack = fmax(-beyond_planes(cell, block, y), (REAL8)0), face = 8 * block + lanes;
+        const REAL8 speed = beyond_planes(cell, block, ray) + R(0.5), way = slack / speed;
+        const REAL8 allowed = ((speed > 0) & (face != a) & (face != b)) ? way : (REAL8)INFINITY;
+        faces = allowed < least ? face : faces;
+        least = fmin(allowed, least);
+    }
+    REAL ways[8], numbers[8];
+    vstore8(least, 0, ways);
+    vstore8(faces, 0, numbers);
+    int first = -1;
+    REAL way = INFINITY;
+    for (int lane = 0; lane < 8; ++lane) {
+        first = ways[lane] < way ? (int)numbers[lane] : first;
+        way = fmin(ways[lane], way);
+    }
+    return first;
+}
+
+/* Find all vertices by a walk along the edges. False if the cell is open, or round-off leaves it so. */
+inline bool walk_corners(corners_t *cell, links_t *links)
+{
+    clear_links(links, cell->faces);
+    cell->corners = 0;
+    int nearest = 0;
+    for (int f = 1; f < cell->faces; ++f)
+        nearest = cell->d2[f] < cell->d2[nearest] ? f : nearest;
+    if (!(cell->d2[nearest] > 0))
+        return false;
+    int a = nearest;
+    const REAL4 p = face_plane(cell, a);
+    const REAL4 size = fabs(p);
+    const bool flat_x = size.s0 <= size.s1 && size.s0 <= size.s2, flat_y = !flat_x && size.s1 <= size.s2;
+    const REAL4 axis = (REAL4)(flat_x, flat_y, !(flat_x || flat_y), 0);
+    REAL4 y = p * (cell->d2[a] / 2), ray = cross(p, axis);
+    int b = first_cut(cell, y, ray, a, a);
+    if (b < 0)
+        return false;
+    const REAL4 q = face_plane(cell, b);
+    y += ray * (-beyond_plane(cell, b, y) / dot(q, ray));
+    uchar4 edges[MOST_CORNERS + 4]; /* to be walked: two consecutive faces at a vertex, and the vertex */
+    int open = 0;
+    for (;;) {
+        ray = cross(face_plane(cell, a), face_plane(cell, b));
+        const int c = first_cut(cell, y, ray, a, b), v = cell->corners;
+        if (c < 0 || v == MOST_CORNERS - 1 || LINK(links, a, b) != NO_CORNER || LINK(links, b, c) != NO_CORNER ||
+            LINK(links, c, a) != NO_CORNER)
+            return false;
+        ++cell->corners;
+        link_corner(cell, links, v, a, b, c);
+        if (!place_corner(cell, v))
+            return false;
+        edges[open++] = (uchar4)(b, c, v, 0);
+        edges[open++] = (uchar4)(c, a, v, 0);
+        if (v == 0)
+            edges[open++] = (uchar4)(a, b, v, 0);
+        do {
+            if (open == 0)
+                return true;
+            const uchar4 edge = edges[--open];
+            /* At the other end the faces are in the opposite order. */
+            a = edge.s1;
+            b = edge.s0;
+            y = corner_place(cell, edge.s2);
+        } while (LINK(links, a, b) != NO_CORNER);
+        if (open > MOST_CORNERS)
+            return false;
+    }
+}
+
+/* Bit b of next[a]: face b follows a at a vertex. */
+inline void find_edges(const corners_t *cell, uint *next)
+{
+    for (int f = 0; f < MOST_FACES; ++f)
+        next[f] = 0;
+    for (int v = 0; v < cell->corners; ++v) {
+        const uchar4 at = cell->at[v];
+        next[at.s0] |= 1u << at.s1;
+        next[at.s1] |= 1u << at.s2;
+        next[at.s2] |= 1u << at.s0;
+    }
+}
+
+/* Number the faces that have vertices anew, and bring the vertices into the one order that depends only on the order of
+   the faces, so that sums have the same bits however the vertices were found. False if they form no closed surface. */
+inline bool order_corners(corners_t *cell, const links_t *links, const uint *next)
+{
+    uchar number[MOST_FACES];
+    int faces = 0;
+    for (int f = 0; f < cell->faces; ++f) {
+        number[f] = faces;
+        faces += next[f] != 0;
+    }
+    if (faces < 4 || cell->corners != 2 * faces - 4)
+        return false;
+    uchar4 ordered[MOST_CORNERS];
+    int n = 0;
+    for (int a = 0; a < cell->faces; ++a)
+        for (uint rest = a < 31 ? next[a] & (~0u << (a + 1)) : 0; rest; rest &= rest - 1) {
+            const int b = popcount(~rest & (rest - 1)), c = third_face(cell, LINK(links, a, b), a, b);
+            if (c > a && n < MOST_CORNERS)
+                ordered[n++] = (uchar4)(number[a], number[b], number[c], 0);
+        }
+    if (n != cell->corners)
+        return false;
+    for (int v = 0; v < n; ++v)
+        cell->at[v] = ordered[v];
+    for (int f = 0; f < cell->faces; ++f)
+        if (next[f] != 0) {
+            const int to = number[f];
+            cell->labels[to] = cell->labels[f];
+            cell->px[to] = cell->px[f];
+            cell->py[to] = cell->py[f];
+            cell->pz[to] = cell->pz[f];
+            cell->d2[to] = cell->d2[f];
+        }
+    cell->faces = faces;
+    pad_planes(cell);
+    return true;
+}

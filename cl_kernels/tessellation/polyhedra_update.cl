@@ -1,0 +1,426 @@
+#include "tessellation/corner_flips.h"
+#include "tessellation/row_counts.h"
+
+/* Update of a diagram in 3D: the cells of generators that moved a little, from those that they had before.
+
+   The intersection C_i of the box and the half-spaces of *some* generators contains the Voronoi cell V_i. If any two
+   cells have the same vertices on their common face, each between the same generators, the C_i fit together without gap
+   or overlap, hence cover the box once, and C_i = V_i for all i.
+
+   C_i among the previous neighbors: each vertex is a triple of faces. The triples of the previous cell are kept while
+   they stay counter-clockwise and no vertex lies beyond another face; they form a closed surface (Euler's formula), so
+   they are the vertices of C_i. Else edges are flipped; if that fails, the cell is walked along its edges.
+
+   Agreement: cells that keep their triples agree as before. A face (p, q) appears where an edge between cells a, b, c
+   vanishes. In these, an edge is flipped to one between p and q, which are made neighbors (`update_cells`). All faces
+   of changed cells are compared by sums of hashes over their vertices (`check_cells`); where they differ, both cells
+   are clipped by all generators near them (`clip_polyhedra`), and never wrong. If round-off may decide about the faces
+   of such a cell, areas are compared, and `match_polyhedron_faces` handles the rest. */
+
+#define MORE 8 /* room for further neighbors of a cell */
+#define NO_NEIGHBOR INT_MIN
+
+/* Marks of a cell: it must be updated again with further neighbors, or clipped. */
+#define UPDATE_AGAIN 1
+#define CLIP_ANEW 2
+
+/* In the first triple of a cell with triples. */
+#define KNOWN_CORNERS 1
+
+/* Largest difference of the areas of two half-faces, as a share of the area of the cell, where one is from a cell that
+   was clipped. */
+#define AREA_NOISE (IS_DOUBLE ? R(1e-9) : R(1e-4))
+
+/* A hash of the other cell or wall at a face. */
+inline uint hash_of_label(int label)
+{
+    uint h = as_uint(label) * 2654435761u;
+    h = (h ^ (h >> 15)) * 2246822519u;
+    return (h ^ (h >> 13)) | 1;
+}
+
+typedef struct {
+    global const int *starts, *neighbors;
+    global int *more; /* MORE further neighbors per generator */
+    global const REAL *points;
+    REAL4 box_lower, box_upper;
+} rows_t;
+
+/* Add the plane of a neighbor or wall to the cell of a generator at x. */
+inline void add_plane(corners_t *cell, int label, REAL4 x, const rows_t *in)
+{
+    REAL4 d = 0;
+    if (label >= 0) {
+        d = (REAL4)(in->points[3 * label], in->points[3 * label + 1], in->points[3 * label + 2], 0) - x;
+    } else {
+        const int wall = -1 - label;
+        const REAL4 across = 2 * ((wall & 1 ? in->box_upper : in->box_lower) - x);
+        d = (REAL4)(wall < 2 ? across.s0 : 0, wall >> 1 == 1 ? across.s1 : 0, wall > 3 ? across.s2 : 0, 0);
+    }
+    const int f = cell->faces++;
+    const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2, inverse = 1 / d2;
+    cell->labels[f] = label;
+    cell->px[f] = d.s0 * inverse;
+    cell->py[f] = d.s1 * inverse;
+    cell->pz[f] = d.s2 * inverse;
+    cell->d2[f] = d2;
+}
+
+/* Start with the planes of the previous neighbors of generator i at x, and of further ones in ascending order. Returns
+   the number of the former; -1 if there is no room. */
+inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *further, const rows_t *in)
+{
+    const int start = in->starts[i], n = in->starts[i + 1] - start;
+    cell->faces = 0;
+    if (n > MOST_FACES)
+        return -1;
+    for (int k = 0; k < n; ++k)
+        add_plane(cell, in->neighbors[start + k], x, in);
+    for (int last = NO_NEIGHBOR; further;) {
+        int next = INT_MAX;
+        for (int m = 0; m < MORE; ++m) {
+            const int label = further[m];
+            next = label > last ? min(next, label) : next;
+        }
+        if (next == INT_MAX)
+            break;
+        if (cell->faces == MOST_FACES)
+            return -1;
+        add_plane(cell, next, x, in);
+        last = next;
+    }
+    pad_planes(cell);
+    return n;
+}
+
+inline bool names_neighbor(int label, int i, const rows_t *in)
+{
+    bool found = false;
+    const int end = in->starts[i + 1];
+    for (int k = in->starts[i]; k < end; ++k)
+        found |= in->neighbors[k] == label;
+    return found;
+}
+
+/* Make `label` a further neighbor of i, unless it was one; i is clipped if there is no room. */
+inline void add_neighbor(int i, int label, const rows_t *in, global int *marks)
+{
+    if (i < 0 || names_neighbor(label, i, in))
+        return;
+    for (int k = 0; k < MORE; ++k) {
+        const int known = atomic_cmpxchg(in->more + MORE * i + k, NO_NEIGHBOR, label);
+        if (known == label)
+            return;
+        if (known == NO_NEIGHBOR) {
+            atomic_or(marks + i, UPDATE_AGAIN);
+            return;
+        }
+    }
+    atomic_or(marks + i, CLIP_ANEW);
+}
+
+/* Keep the cell of generator i at x within the walls: those that it does not have become further neighbors. True if
+   there is none. */
+inline bool keep_in_box(const corners_t *cell, int i, REAL4 x, const rows_t *in, global int *marks)
+{
+    const REAL reach = sqrt(cell->reach2), noise = 64 * REAL_EPS * (1 + reach);
+    const REAL4 low = x - in->box_lower, high = in->box_upper - x;
+    const REAL rooms[6] = {low.s0, high.s0, low.s1, high.s1, low.s2, high.s2};
+    bool inside = true;
+    for (int wall = 0; wall < 6; ++wall) {
+        if (reach <= rooms[wall] + noise)
+            continue;
+        const REAL *places = (const REAL *)(wall < 2 ? cell->x : (wall < 4 ? cell->y : cell->z));
+        REAL farthest = 0;
+        for (int v = 0; v < cell->corners; ++v)
+            farthest = fmax(farthest, wall & 1 ? places[v] : -places[v]);
+        if (farthest <= rooms[wall] + noise)
+            continue;
+        inside = false;
+        add_neighbor(i, -1 - wall, in, marks);
+    }
+    return inside;
+}
+
+/* Area and centroid of a face from triangles around its first vertex: as accurate as the vertices, also for small
+   faces. `far2` becomes the squared distance of the farthest vertex. */
+inline REAL4 measure_flat(const corners_t *cell, int f, REAL4 normal, REAL *far2)
+{
+    /* For each vertex of the face, the faces before and after it. */
+    uchar ins[MOST_FACES], outs[MOST_FACES], at[MOST_FACES];
+    int n = 0;
+    for (int v = 0; v < cell->corners && n < MOST_FACES; ++v) {
+        const uchar4 faces = cell->at[v];
+        ins[n] = faces.s0 == f ? faces.s1 : (faces.s1 == f ? faces.s2 : faces.s0);
+        outs[n] = faces.s0 == f ? faces.s2 : (faces.s1 == f ? faces.s0 : faces.s1);
+        at[n] = v;
+        n += faces.s0 == f || faces.s1 == f || faces.s2 == f;
+    }
+    const REAL4 first = corner_place(cell, at[0]);
+    REAL4 before = 0, sum = 0;
+    REAL twice = 0;
+    *far2 = dot(first, first);
+    for (int k = 0, steps = 1; steps < n; ++steps) {
+        int next = 0;
+        while (next < n - 1 && ins[next] != outs[k])
+            ++next;
+        const REAL4 y = corner_place(cell, at[next]), after = y - first;
+        *far2 = fmax(*far2, dot(y, y));
+        const REAL weight = dot(normal, cross(before, after));
+        twice += weight;
+        sum += weight * (before + after);
+        before = after;
+        k = next;
+    }
+    const REAL4 centroid = first + sum / (3 * twice);
+    return (REAL4)(twice / 2, centroid.s0, centroid.s1, centroid.s2);
+}
+
+inline REAL sum_of_eight(REAL8 v)
+{
+    const REAL4 a = v.lo + v.hi;
+    return (a.s0 + a.s2) + (a.s1 + a.s3);
+}
+
+/* The output arrays, see `clip_polyhedra`. */
+typedef struct {
+    global int *labels;
+    global REAL *measures, *centroids, *volumes, *offsets, *covariances;
+} measured_t;
+
+/* Write the faces from `place` on, and the moments of the cell of generator i, from its sums. False if a face has no
+   more area than round-off. */
+inline bool write_measures(const corners_t *cell, const sums_t *sums, int i, int place, const measured_t *out)
+{
+    REAL volume = 0, xx = sum_of_eight(sums->xx), yy = sum_of_eight(sums->yy), zz = sum_of_eight(sums->zz);
+    REAL yz = sum_of_eight(sums->yz), zx = sum_of_eight(sums->zx), xy = sum_of_eight(sums->xy);
+    REAL4 first = 0;
+    bool good = true;
+    for (int f = 0; f < cell->faces; ++f, ++place) {
+        const REAL4 p = face_plane(cell, f), sum = sums->faces[f];
+        const REAL d2 = cell->d2[f], length = sqrt(d2);
+        const REAL4 foot = p * (d2 / 2), moment = (REAL4)(sum.s1, sum.s2, sum.s3, 0);
+        REAL area = sum.s0 * length / 4;
+        /* The centroid, projected to the plane. */
+        REAL4 centroid = (moment / sum.s0 + foot) / 3;
+        centroid += (1 - 2 * dot(centroid, p)) * foot;
+        if (!(area > FLAT_AREA * cell->reach2)) {
+            REAL far2;
+            const REAL4 flat = measure_flat(cell, f, p * length, &far2);
+            area = flat.s0;
+            centroid = (REAL4)(flat.s1, flat.s2, flat.s3, 0);
+            good &= area > LEAST_AREA * far2;
+        }
+        out->labels[place] = cell->labels[f];
+        out->measures[place] = area;
+        out->centroids[3 * place] = centroid.s0;
+        out->centroids[3 * place + 1] = centroid.s1;
+        out->centroids[3 * place + 2] = centroid.s2;
+        const REAL4 m = d2 * (sum.s0 * foot + moment);
+        volume += d2 * sum.s0;
+        first += m;
+        /* The terms that `place_corners` omits: twice the square of the foot, and its products with f and v. */
+        xx += 2 * foot.s0 * m.s0;
+        yy += 2 * foot.s1 * m.s1;
+        zz += 2 * foot.s2 * m.s2;
+        yz += foot.s1 * m.s2 + foot.s2 * m.s1;
+        zx += foot.s2 * m.s0 + foot.s0 * m.s2;
+        xy += foot.s0 * m.s1 + foot.s1 * m.s0;
+    }
+    const REAL inverse = 1 / volume;
+    first *= inverse / 4;
+    out->volumes[i] = volume / 24;
+    out->offsets[3 * i] = first.s0;
+    out->offsets[3 * i + 1] = first.s1;
+    out->offsets[3 * i + 2] = first.s2;
+    out->covariances[6 * i] = xx * inverse / 20 - first.s0 * first.s0;
+    out->covariances[6 * i + 1] = xy * inverse / 20 - first.s0 * first.s1;
+    out->covariances[6 * i + 2] = zx * inverse / 20 - first.s2 * first.s0;
+    out->covariances[6 * i + 3] = yy * inverse / 20 - first.s1 * first.s1;
+    out->covariances[6 * i + 4] = yz * inverse / 20 - first.s1 * first.s2;
+    out->covariances[6 * i + 5] = zz * inverse / 20 - first.s2 * first.s2;
+    return good && volume > 0;
+}
+
+/* Write the keys that neighbors are compared with: for each face the sum, over its vertices, of the products of the
+   hashes of the two other faces there. */
+inline void write_keys(const corners_t *cell, int place, global uint *keys)
+{
+    uint hashes[MOST_FACES], sums[MOST_FACES];
+    for (int f = 0; f < cell->faces; ++f) {
+        hashes[f] = hash_of_label(cell->labels[f]);
+        sums[f] = 0;
+    }
+    for (int v = 0; v < cell->corners; ++v) {
+        const uchar4 at = cell->at[v];
+        const uint a = hashes[at.s0], b = hashes[at.s1], c = hashes[at.s2];
+        sums[at.s0] += b * c;
+        sums[at.s1] += c * a;
+        sums[at.s2] += a * b;
+    }
+    for (int f = 0; f < cell->faces; ++f)
+        keys[place + f] = sums[f];
+}
+
+/* Make the faces with a new edge between them neighbors. Bit b of old[a], next[a]: there was, is an edge between faces
+   a and b. */
+inline void join_new_edges(const corners_t *cell, const uint *old, const uint *next, const rows_t *in,
+                           global int *marks)
+{
+    for (int a = 0; a < cell->faces; ++a)
+        for (uint rest = next[a] & ~old[a]; rest; rest &= rest - 1)
+            add_neighbor(cell->labels[a], cell->labels[popcount(~rest & (rest - 1))], in, marks);
+}
+
+inline bool fits_corners(const corners_t *cell)
+{
+    REAL8 beyond = cell->beyond[0];
+    for (int block = 1; 8 * block < cell->corners; ++block)
+        beyond = cell->beyond[block] > beyond ? cell->beyond[block] : beyond;
+    return !(largest_of_eight(beyond) > BEYOND_NOISE);
+}
+
+/* Per generator i, the first ones or, with `some`, those `listed` (as ~i to be clipped) with `further` neighbors: its
+   cell among its previous neighbors and these, with the measures of `clip_polyhedra`; or row_counts[i] = UNFINISHED
+   where the cell is open, has many faces, is near round-off, or is to be clipped.
+
+   `old_corners` and `old_keys`: the triples, from 2 old_starts[i] on, and keys of the previous cells; none if not
+   `known`. Cells are written to their previous places, and those with more faces behind all these, from report[1] on.
+   changed[i]: the cell has new triples. report[2] counts unfinished cells. */
+kernel void update_cells(const int size, const int some, global const int *listed, global const int *further,
+                         global const int *old_starts, global const int *old_neighbors, const int known,
+                         global const uchar4 *old_corners, global const uint *old_keys, global const REAL *points,
+                         const REAL4 box_lower, const REAL4 box_upper, const int room, CELL_OUTPUT_ARGS,
+                         global uchar4 *corners, global uint *keys, global int *changed, global int *more,
+                         global int *marks)
+{
+    WORK_ITEM(item);
+    const int what = some ? listed[item] : item, i = max(what, ~what);
+    const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper};
+    const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
+    global const int *added = some ? further + MORE * item : 0;
+    corners_t cell;
+    sums_t sums;
+    const int start = old_starts[i], listed_before = what < 0 ? -1 : list_planes(&cell, i, x, added, &in);
+    const bool has_corners = listed_before >= 4 && known && old_corners[2 * start].s3 == KNOWN_CORNERS;
+    bool done = listed_before >= 4, kept = false, flips = false;
+    row_counts[i] = UNFINISHED;
+    if (has_corners) {
+        cell.corners = 2 * listed_before - 4;
+        for (int v = 0; v < cell.corners; ++v)
+            cell.at[v] = old_corners[2 * start + v];
+        const int faces = cell.faces;
+        cell.faces = listed_before;
+        flips = place_corners(&cell, &sums);
+        cell.faces = faces;
+        kept = flips && faces == listed_before && fits_corners(&cell);
+    }
+    if (done && !kept) {
+        links_t links;
+        uint old[MOST_FACES], next[MOST_FACES];
+        cell.corners = has_corners ? cell.corners : 0;
+        find_edges(&cell, old);
+        if (!(flips && repair_corners(&cell, &links, listed_before))) {
+            list_planes(&cell, i, x, added, &in); /* flips may have removed faces */
+            done = walk_corners(&cell, &links);
+        }
+        if (done) {
+            find_edges(&cell, next);
+            join_new_edges(&cell, old, next, &in, marks);
+            done = order_corners(&cell, &links, next) && place_corners(&cell, &sums) && fits_corners(&cell);
+        }
+    }
+    changed[i] = !(done && kept);
+    if (done && keep_in_box(&cell, i, x, &in, marks)) {
+        const bool longer = cell.faces > old_starts[i + 1] - start;
+        const int place = longer ? take_places(report, cell.faces) : start;
+        const measured_t out = {labels, measures, centroids, volumes, offsets, covariances};
+        if (place + cell.faces <= room && write_measures(&cell, &sums, i, place, &out)) {
+            row_places[i] = place;
+            row_counts[i] = cell.faces | CERTAIN;
+            for (int v = 0; v < cell.corners; ++v)
+                corners[2 * place + v] = cell.at[v];
+            if (!kept)
+                write_keys(&cell, place, keys);
+            for (int f = 0; kept && f < cell.faces; ++f)
+                keys[place + f] = old_keys[start + f];
+            return;
+        }
+    }
+    atomic_inc(report + 2);
+}
+
+/* Per generator i with a changed cell: compare its faces with those of its neighbors. Cells that differ are marked. */
+kernel void check_cells(const int size, global const int *row_places, global const int *row_counts,
+                        global const int *labels, global const REAL *measures, global const uint *keys,
+                        global int *changed, global int *marks)
+{
+    WORK_ITEM(i);
+    if (!changed[i])
+        return;
+    changed[i] = 0;
+    const int n = COUNT_OF(row_counts[i]), begin = row_places[i];
+    const bool certain = (row_counts[i] & CERTAIN) != 0;
+    REAL area = 0;
+    for (int k = 0; k < n; ++k)
+        area += measures[begin + k];
+    for (int k = begin; k < begin + n; ++k) {
+        const int j = labels[k];
+        const bool other_certain = j >= 0 && (row_counts[j] & CERTAIN) != 0;
+        if (j < 0 || !(certain || other_certain))
+            continue;
+        const int place = row_places[j], m = COUNT_OF(row_counts[j]);
+        const bool by_keys = certain && other_certain;
+        bool same = false;
+        for (int q = place; by_keys && q < place + m; ++q)
+            same |= labels[q] == i && keys[q] == keys[k];
+        for (int q = place; !by_keys && q < place + m; ++q)
+            same |= labels[q] == i && fabs(measures[q] - measures[k]) <= AREA_NOISE * area;
+        /* A cell that will be updated again is compared then. */
+        if (same || ((marks[i] | marks[j]) & UPDATE_AGAIN))
+            continue;
+        if (certain)
+            atomic_or(marks + i, CLIP_ANEW);
+        if (other_certain)
+            atomic_or(marks + j, CLIP_ANEW);
+    }
+}
+
+/* Per generator i: whether it is marked. report[3] counts the marked ones. */
+kernel void flag_marked_cells(const int size, global const int *marks, global int *flags, global int *report)
+{
+    WORK_ITEM(i);
+    flags[i] = marks[i] != 0;
+    if (marks[i])
+        atomic_inc(report + 3);
+}
+
+/* Per generator i: list it with its further neighbors if it is marked, as ~i if it is to be clipped, and remove the
+   mark; `sums` are the exclusive prefix sums of the flags. */
+kernel void list_marked_cells(const int size, global const int *sums, global const int *more, global int *marks,
+                              global int *listed, global int *further)
+{
+    WORK_ITEM(i);
+    if (!marks[i])
+        return;
+    const int to = sums[i];
+    listed[to] = marks[i] & CLIP_ANEW ? ~i : i;
+    for (int k = 0; k < MORE; ++k)
+        further[MORE * to + k] = more[MORE * i + k];
+    marks[i] = 0;
+}
+
+/* Per generator i: its triples and keys as row i of the graph. Cells whose faces have been dropped have none. */
+kernel void place_cell_corners(const int size, global const int *row_places, global const int *row_counts,
+                               global const uchar4 *corners, global const uint *keys, global const int *starts,
+                               global uchar4 *new_corners, global uint *new_keys)
+{
+    WORK_ITEM(i);
+    const int from = row_places[i], to = starts[i], n = starts[i + 1] - to;
+    const bool known = (row_counts[i] & CERTAIN) != 0 && COUNT_OF(row_counts[i]) == n;
+    for (int v = 0; known && v < 2 * n - 4; ++v)
+        new_corners[2 * to + v] = corners[2 * from + v];
+    for (int f = 0; known && f < n; ++f)
+        new_keys[to + f] = keys[from + f];
+    new_corners[2 * to].s3 = known ? KNOWN_CORNERS : 0;
+}
