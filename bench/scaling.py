@@ -28,7 +28,7 @@ from _common import PICTURES, Report, heading, make_adapter, parser
 
 HERE = Path(__file__).resolve().parent
 LARGE = 1e5
-"""Cells from which on slopes are taken."""
+"""Least number of cells of the points that determine the slopes."""
 OURS = ("diagram", "next diagram", "3D diagram", "Poisson", "fast run", "default run")
 PEERS = ("SciPy's Voronoi", "pyamg")
 
