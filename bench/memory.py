@@ -97,7 +97,7 @@ def asking_module() -> str:
 
 @contextmanager
 def counted_buffers(ledger: Ledger) -> Iterator[None]:
-    """Count every buffer that PyOpenCL makes meanwhile."""
+    """Count the buffers that PyOpenCL makes while the context is open."""
     plain = cl.Buffer
 
     class CountedBuffer(plain):  # type: ignore[misc, valid-type]

@@ -113,7 +113,7 @@ def move_concave_points(mesh: SolverMesh) -> SolverMesh:
 
 
 def _onto_line(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the place of p on the line from a to b, a little to the right of it."""
+    """Return the projection of p onto the line from a to b, moved a little to its right."""
     along = b - a
     square = along @ along
     share = np.clip((p - a) @ along / square, 0.1, 0.9)

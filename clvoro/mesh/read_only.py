@@ -17,7 +17,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def seal(array: object) -> None:
-    """Make an array read-only that nobody else holds, as after unpickling."""
+    """Make an array read-only to which there is no other reference, as after unpickling."""
     if isinstance(array, np.ndarray):
         array.flags.writeable = False
 

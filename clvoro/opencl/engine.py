@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, DTypeLike
 
 ITEM_GROUP = 64
-"""Work-items per group of a kernel that does one item each."""
+"""Work-items per group of a kernel in which each work-item does one item."""
 
 
 class DomainKind(NamedTuple):

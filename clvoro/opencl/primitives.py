@@ -171,7 +171,7 @@ class NamedArrays:
     ----------
     engine : Engine
     spare : float
-        Share of the size that a new array has more.
+        Additional room of a new array, as a share of its size.
     """
 
     def __init__(self, engine: Engine, spare: float = 0.0) -> None:

@@ -64,7 +64,7 @@ def test_views_agree_with_numpy(queue, shape, index):
     array.set(host)
     view = array[index]
     assert view.shape == host[index].shape
-    if view.flags.forc:  # what is not contiguous, PyOpenCL cannot fetch
+    if view.flags.forc:  # PyOpenCL fetches contiguous arrays only
         assert np.array_equal(view.get(), host[index])
     # Of a view that begins within the array, too.
     tail, host_tail = array[2:], host[2:]

@@ -66,7 +66,7 @@ class _PolygonReader(_DiagramReader):
         Positions that are equal on the device count as one. The device has no segments between them.
         """
         found = []
-        # Measures are those of where the boundary was.
+        # The device measured with the shifted boundary.
         for vertices in (self.device_vertices, self.domain.oriented.vertices + self.shift):
             a = vertices[self.chord_edges]
             b = vertices[self.domain.oriented.next_vertex[self.chord_edges]]
