@@ -246,7 +246,7 @@ def test_other_arguments(adapter):
         (lambda: clvoro.Polygon(SQUARE, TRIANGLE), ("[ring]",)),
         (lambda: clvoro.Polygon(np.ma.masked_equal(np.array(SQUARE), 1)), ("masked",)),
         (lambda: clvoro.Polygon.from_shapely([shapely.Polygon(SQUARE)]), ("union_all",)),
-        (lambda: clvoro.Polygon.from_pieces([[SQUARE], [SQUARE]]), ("piece 1", "repeats")),
+        (lambda: clvoro.Polygon.from_pieces([[SQUARE], [SQUARE]]), ("outer-2", "repeats")),
         (lambda: clvoro.Polygon(SQUARE).boundary([]), ("at least one",)),
         (lambda: clvoro.Polygon.from_geojson({"type": "Point"}), ("leave others out",)),
     ],
