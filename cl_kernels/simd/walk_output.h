@@ -16,6 +16,8 @@ typedef struct {
     global float *reach;
     global int *row_places, *row_counts, *labels, *report;
     global double *measures, *centroids, *volumes, *offsets, *covariances;
+    int with_corners;
+    global uchar4 *corners;
 #ifdef HALO
     halo_t halo;
 #endif
@@ -109,6 +111,11 @@ inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t
         out->reach[places[lane]] = (float)reaches[lane];
         out->row_places[i] = place;
         out->row_counts[i] = count | CERTAIN;
+        if (fits && out->with_corners) {
+            for (int v = 0; v < cells->corners[lane]; ++v)
+                out->corners[2 * place + v] = walk->lanes[lane].corner_faces[v];
+            out->corners[2 * place].s3 = count <= MOST_FACES ? NEW_CORNERS : NO_CORNERS;
+        }
         for (int f = 0; f < count && fits; ++f, ++place) {
             const int other = LANE(cells->places, f, lane);
             out->labels[place] = other < 0 ? other : out->items[other];

@@ -89,8 +89,8 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
                            CELL_OUTPUT_ARGS HALO_ARGS)
 {
     WORK_ITEM(stretch);
-    output_t out = {room,   items,    reach,     row_places, row_counts, labels,
-                    report, measures, centroids, volumes,    offsets,    covariances};
+    output_t out = {room,     items,     reach,   row_places, row_counts,  labels,       report,
+                    measures, centroids, volumes, offsets,    covariances, with_corners, corners};
 #ifdef HALO
     MAKE_HALO;
     out.halo = halo;

@@ -1,9 +1,9 @@
 /* A cell in 3D as the vertices of its planes: a vertex is a triple of faces, counter-clockwise seen from outside. All
    positions are relative to the generator. The plane of a neighbor at d is y.p = 1/2 with p = d / d^2. */
 #include "opencl/real.h"
+#include "tessellation/row_counts.h"
 
 #define REAL8 CLVORO_JOIN(REAL, 8)
-#define MOST_FACES 32 /* most candidates of a cell: one bit each */
 #define MOST_CORNERS (2 * MOST_FACES)
 #define NO_CORNER 255
 

@@ -272,9 +272,8 @@ inline void find_edges(const corners_t *cell, uint *next)
     }
 }
 
-/* Number the faces that have vertices anew, and bring the vertices into the one order that depends only on the order of
-   the faces, so that sums have the same bits however the vertices were found. False if they form no closed surface. */
-inline bool order_corners(corners_t *cell, const links_t *links, const uint *next)
+/* Number the faces that have vertices anew. False if the vertices form no closed surface. */
+inline bool number_faces(corners_t *cell, const uint *next)
 {
     uchar number[MOST_FACES];
     int faces = 0;
@@ -284,18 +283,12 @@ inline bool order_corners(corners_t *cell, const links_t *links, const uint *nex
     }
     if (faces < 4 || cell->corners != 2 * faces - 4)
         return false;
-    uchar4 ordered[MOST_CORNERS];
-    int n = 0;
-    for (int a = 0; a < cell->faces; ++a)
-        for (uint rest = a < 31 ? next[a] & (~0u << (a + 1)) : 0; rest; rest &= rest - 1) {
-            const int b = popcount(~rest & (rest - 1)), c = third_face(cell, LINK(links, a, b), a, b);
-            if (c > a && n < MOST_CORNERS)
-                ordered[n++] = (uchar4)(number[a], number[b], number[c], 0);
-        }
-    if (n != cell->corners)
-        return false;
-    for (int v = 0; v < n; ++v)
-        cell->at[v] = ordered[v];
+    if (faces == cell->faces)
+        return true;
+    for (int v = 0; v < cell->corners; ++v) {
+        const uchar4 at = cell->at[v];
+        cell->at[v] = (uchar4)(number[at.s0], number[at.s1], number[at.s2], 0);
+    }
     for (int f = 0; f < cell->faces; ++f)
         if (next[f] != 0) {
             const int to = number[f];

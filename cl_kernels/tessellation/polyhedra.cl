@@ -29,6 +29,15 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
     return a.yzxw * b.zxyw - a.zxyw * b.yzxw;
 }
 
+/* Write the vertices as triples of the faces, which are numbered in the order of their places. */
+inline void write_corners(const CELL *cell, global uchar4 *corners)
+{
+    for (int v = 0; v < cell->n; ++v) {
+        const INDEX4 f = cell->faces[v];
+        corners[v] = (uchar4)(face_number(cell, f.s0), face_number(cell, f.s1), face_number(cell, f.s2), 0);
+    }
+}
+
 #ifdef HALO
 /* Test the balls around the vertices of the cell of generator i. */
 inline void check_cell_balls(const CELL *cell, int i, REAL4 place, const halo_t *halo)
@@ -165,6 +174,12 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         }
         row_places[i] = place;
         row_counts[i] = count;
+        if (with_corners && fits) {
+            const bool clear = !doubtful && !narrow && count == face_count && count <= MOST_FACES;
+            if (clear)
+                write_corners(cell, corners + 2 * place);
+            corners[2 * place].s3 = clear ? NEW_CORNERS : NO_CORNERS;
+        }
         if (doubtful || narrow)
             atomic_or(report, (doubtful ? FLAG_DOUBT : 0) | (narrow ? FLAG_NARROW : 0));
         /* In a box as thin as round-off all faces are below it. */
@@ -270,4 +285,20 @@ kernel void place_faces(const int size, global const int *row_places, global con
             face_centroids[3 * to + axis] = centroids[3 * k + axis];
         ++to;
     }
+}
+
+/* Per generator i: its triples and keys as row i of the graph. There are none if faces were dropped. `keys` are those
+   of KNOWN_CORNERS. */
+kernel void place_cell_corners(const int size, global const int *row_places, global const int *row_counts,
+                               global const uchar4 *corners, global const uint *keys, global const int *starts,
+                               global uchar4 *new_corners, global uint *new_keys)
+{
+    WORK_ITEM(i);
+    const int from = row_places[i], to = starts[i], n = starts[i + 1] - to;
+    const int state = COUNT_OF(row_counts[i]) == n ? corners[2 * from].s3 : NO_CORNERS;
+    for (int v = 0; state != NO_CORNERS && v < 2 * n - 4; ++v)
+        new_corners[2 * to + v] = corners[2 * from + v];
+    for (int f = 0; state == KNOWN_CORNERS && f < n; ++f)
+        new_keys[to + f] = keys[from + f];
+    new_corners[2 * to].s3 = state;
 }

@@ -1,5 +1,4 @@
 #include "tessellation/corner_flips.h"
-#include "tessellation/row_counts.h"
 
 /* Update of a diagram in 3D: the cells of generators that moved a little, from those that they had before.
 
@@ -23,9 +22,6 @@
 /* Marks of a cell: it must be updated again with further neighbors, or clipped. */
 #define UPDATE_AGAIN 1
 #define CLIP_ANEW 2
-
-/* In the first triple of a cell with triples. */
-#define KNOWN_CORNERS 1
 
 /* Largest difference of the areas of two half-faces, as a share of the area of the cell, where one is from a cell that
    was clipped. */
@@ -291,8 +287,7 @@ kernel void update_cells(const int size, const int some, global const int *liste
                          global const int *old_starts, global const int *old_neighbors, const int known,
                          global const uchar4 *old_corners, global const uint *old_keys, global const REAL *points,
                          const REAL4 box_lower, const REAL4 box_upper, const int room, CELL_OUTPUT_ARGS,
-                         global uchar4 *corners, global uint *keys, global int *changed, global int *more,
-                         global int *marks)
+                         global uint *keys, global int *changed, global int *more, global int *marks)
 {
     WORK_ITEM(item);
     const int what = some ? listed[item] : item, i = max(what, ~what);
@@ -302,7 +297,8 @@ kernel void update_cells(const int size, const int some, global const int *liste
     corners_t cell;
     sums_t sums;
     const int start = old_starts[i], listed_before = what < 0 ? -1 : list_planes(&cell, i, x, added, &in);
-    const bool has_corners = listed_before >= 4 && known && old_corners[2 * start].s3 == KNOWN_CORNERS;
+    const int state = listed_before >= 4 && known ? old_corners[2 * start].s3 : NO_CORNERS;
+    const bool has_corners = state != NO_CORNERS;
     bool done = listed_before >= 4, kept = false, flips = false;
     row_counts[i] = UNFINISHED;
     if (has_corners) {
@@ -327,9 +323,10 @@ kernel void update_cells(const int size, const int some, global const int *liste
         if (done) {
             find_edges(&cell, next);
             join_new_edges(&cell, old, next, &in, marks);
-            done = order_corners(&cell, &links, next) && place_corners(&cell, &sums) && fits_corners(&cell);
+            done = number_faces(&cell, next) && place_corners(&cell, &sums) && fits_corners(&cell);
         }
     }
+    kept = kept && state == KNOWN_CORNERS;
     changed[i] = !(done && kept);
     if (done && keep_in_box(&cell, i, x, &in, marks)) {
         const bool longer = cell.faces > old_starts[i + 1] - start;
@@ -340,6 +337,7 @@ kernel void update_cells(const int size, const int some, global const int *liste
             row_counts[i] = cell.faces | CERTAIN;
             for (int v = 0; v < cell.corners; ++v)
                 corners[2 * place + v] = cell.at[v];
+            corners[2 * place].s3 = KNOWN_CORNERS;
             if (!kept)
                 write_keys(&cell, place, keys);
             for (int f = 0; kept && f < cell.faces; ++f)
@@ -350,15 +348,15 @@ kernel void update_cells(const int size, const int some, global const int *liste
     atomic_inc(report + 2);
 }
 
-/* Per generator i with a changed cell: compare its faces with those of its neighbors. Cells that differ are marked. */
+/* Per generator i with a changed cell: compare its faces with those of its neighbors. Cells that differ are marked. Two
+   changed cells are compared once. */
 kernel void check_cells(const int size, global const int *row_places, global const int *row_counts,
                         global const int *labels, global const REAL *measures, global const uint *keys,
-                        global int *changed, global int *marks)
+                        global const int *changed, global int *marks)
 {
     WORK_ITEM(i);
     if (!changed[i])
         return;
-    changed[i] = 0;
     const int n = COUNT_OF(row_counts[i]), begin = row_places[i];
     const bool certain = (row_counts[i] & CERTAIN) != 0;
     REAL area = 0;
@@ -367,7 +365,7 @@ kernel void check_cells(const int size, global const int *row_places, global con
     for (int k = begin; k < begin + n; ++k) {
         const int j = labels[k];
         const bool other_certain = j >= 0 && (row_counts[j] & CERTAIN) != 0;
-        if (j < 0 || !(certain || other_certain))
+        if (j < 0 || !(certain || other_certain) || (j < i && changed[j]))
             continue;
         const int place = row_places[j], m = COUNT_OF(row_counts[j]);
         const bool by_keys = certain && other_certain;
@@ -396,11 +394,12 @@ kernel void flag_marked_cells(const int size, global const int *marks, global in
 }
 
 /* Per generator i: list it with its further neighbors if it is marked, as ~i if it is to be clipped, and remove the
-   mark; `sums` are the exclusive prefix sums of the flags. */
+   mark; `sums` are the exclusive prefix sums of the flags. No cell is changed now. */
 kernel void list_marked_cells(const int size, global const int *sums, global const int *more, global int *marks,
-                              global int *listed, global int *further)
+                              global int *changed, global int *listed, global int *further)
 {
     WORK_ITEM(i);
+    changed[i] = 0;
     if (!marks[i])
         return;
     const int to = sums[i];
@@ -408,19 +407,4 @@ kernel void list_marked_cells(const int size, global const int *sums, global con
     for (int k = 0; k < MORE; ++k)
         further[MORE * to + k] = more[MORE * i + k];
     marks[i] = 0;
-}
-
-/* Per generator i: its triples and keys as row i of the graph. Cells whose faces have been dropped have none. */
-kernel void place_cell_corners(const int size, global const int *row_places, global const int *row_counts,
-                               global const uchar4 *corners, global const uint *keys, global const int *starts,
-                               global uchar4 *new_corners, global uint *new_keys)
-{
-    WORK_ITEM(i);
-    const int from = row_places[i], to = starts[i], n = starts[i + 1] - to;
-    const bool known = (row_counts[i] & CERTAIN) != 0 && COUNT_OF(row_counts[i]) == n;
-    for (int v = 0; known && v < 2 * n - 4; ++v)
-        new_corners[2 * to + v] = corners[2 * from + v];
-    for (int f = 0; known && f < n; ++f)
-        new_keys[to + f] = keys[from + f];
-    new_corners[2 * to].s3 = known ? KNOWN_CORNERS : 0;
 }

@@ -117,6 +117,15 @@ inline int next_face(const CELL *cell, int f)
     return FACE_CAPACITY;
 }
 
+/* The number of faces before face f. */
+inline int face_number(const CELL *cell, int f)
+{
+    int number = popcount(cell->alive[FACE_WORD(f)] & (((uint)1 << (f & 31)) - 1));
+    for (int w = 0; w < FACE_WORD(f); ++w)
+        number += popcount(cell->alive[w]);
+    return number;
+}
+
 /* A vertex of every face, in the memory of the rim. */
 inline CELL_SPACE INDEX *face_starts(CELL *cell)
 {

@@ -9,10 +9,19 @@
                                  any order, later kernels sort them
    labels, measures, centroids   of the faces
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl
-   report (2,)                   error bits; number of faces */
+   report (2,)                   error bits; number of faces
+   corners                       if `with_corners`: the vertices of a cell from twice its first entry on, as triples of
+                                 its faces, counter-clockwise seen from outside. The fourth number of the first one is
+                                 one of those below */
 #define CELL_OUTPUT_ARGS                                                                                               \
     global int *row_places, global int *row_counts, global int *labels, global REAL *measures, global REAL *centroids, \
-        global REAL *volumes, global REAL *offsets, global REAL *covariances, global int *report
+        global REAL *volumes, global REAL *offsets, global REAL *covariances, global int *report,                      \
+        const int with_corners, global uchar4 *corners
+
+#define NO_CORNERS 0    /* the vertices are not known */
+#define NEW_CORNERS 1   /* they are those of a new cell */
+#define KNOWN_CORNERS 2 /* they agree with those of the neighbors, and have keys; see polyhedra_update.cl */
+#define MOST_FACES 32   /* most faces of a cell with triples: one bit each */
 
 /* Reserve a range in the arrays of faces. Its position depends on the order of work-items, its content does not.
    report[0]: error bits; report[1]: number of faces. */

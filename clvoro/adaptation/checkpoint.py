@@ -34,6 +34,8 @@ PER_FACE = ("neighbors", "face_measures", "face_centroids")
 DIAGRAM = (
     "starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances",
 )  # fmt: skip
+VERTICES = ("triples", "keys")
+"""Of a diagram in 3D that will be updated."""
 
 
 class Checkpointer:
@@ -100,8 +102,8 @@ class Checkpointer:
         for name in DIAGRAM:
             array = getattr(t, name)
             arrays[f"diagram.{name}"] = (array[:m] if name in PER_FACE else array).get()
-        for name, array in mesh.tessellator.save_vertices(t).items():
-            arrays[f"vertices.{name}"] = array
+        for name, array in zip(VERTICES, t.vertices, strict=False):
+            arrays[f"vertices.{name}"] = array[: m * len(array) // len(t.neighbors)].get()
         for name, array in mesh.stages.poisson.save(mesh.labels).items():
             arrays[f"multigrid.{name}"] = array
         periodic = mesh.tessellator.periodic

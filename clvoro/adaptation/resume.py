@@ -21,6 +21,7 @@ from .checkpoint import (
     FORMAT,
     MESH,
     VERSION,
+    VERTICES,
     capacities_of,
     methods_of,
     state_of,
@@ -208,9 +209,7 @@ class Saved:
         if not isinstance(domain, Polygon) and faces != engine.face:
             raise InputError(f"cannot resume from {self.name}: it is damaged (faces are {faces})")
         diagram = {name: a[f"diagram.{name}"] for name in DIAGRAM}
-        vertices = {
-            k.removeprefix("vertices."): v for k, v in a.items() if k.startswith("vertices.")
-        }
+        vertices = [a[f"vertices.{name}"] for name in VERTICES if f"vertices.{name}" in a]
         mesh.tessellation = mesh.tessellator.restore(points, diagram, state["spare"], vertices)
         mesh.next_label = state["next_label"]
         periodic = mesh.tessellator.periodic

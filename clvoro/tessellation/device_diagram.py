@@ -103,6 +103,9 @@ class Tessellation:
         Second moments about the centroid per unit volume: xx, xy, yy in 2D.
     outlines : tuple of arrays
         The OUTLINE_ARGS of a diagram trimmed by a boundary (tessellation/clipped/outline.h); else empty.
+    vertices : tuple of arrays
+        In 3D, if it will be updated: the vertices as triples of faces, (2 m,) uint32, and the keys of the faces, (m,)
+        uint32 (tessellation/polyhedra_update.cl); else empty.
     trimmed : Trimmed, optional
         How the boundary cut such a diagram.
     round_off : int
@@ -120,6 +123,7 @@ class Tessellation:
     offsets: cla.Array
     covariances: cla.Array
     outlines: tuple[cla.Array, ...] = ()
+    vertices: tuple[cla.Array, ...] = ()
     trimmed: Trimmed | None = None
     round_off: int = 0
 

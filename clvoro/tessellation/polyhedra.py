@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -107,6 +107,8 @@ class CutCells:
         Volumes, offsets and covariances.
     doubtful : bool
         With round-off two cells might disagree about a face.
+    corners, keys : arrays, optional
+        Triples of faces and keys; see `Tessellation.vertices`.
     """
 
     places: cla.Array
@@ -117,11 +119,17 @@ class CutCells:
     cells: dict[str, cla.Array]
     m: int
     doubtful: bool
+    corners: cla.Array | None = None
+    keys: cla.Array | None = None
 
-    def output(self, report: cla.Array) -> tuple[cla.Array, ...]:
+    def output(self, report: cla.Array) -> tuple[object, ...]:
         """Return the CELL_OUTPUT_ARGS of kernels (tessellation/row_counts.h)."""
         cells = self.cells["volumes"], self.cells["offsets"], self.cells["covariances"]
-        return self.places, self.counts, self.labels, self.measures, self.centroids, *cells, report
+        keep, corners = self.corners is not None, report if self.corners is None else self.corners
+        return (
+            self.places, self.counts, self.labels, self.measures, self.centroids, *cells, report,
+            np.int32(keep), corners,
+        )  # fmt: skip
 
 
 class Polyhedra:
@@ -145,6 +153,7 @@ class Polyhedra:
             self._wrap = self._walks.walk_all_cells
         self._report = engine.empty(2, np.int32)
         self._capacity = self._room = self._n = 0
+        self._of_vertices: tuple[cla.Array, cla.Array] | None = None
 
     def _kernels(self, capacity: int) -> SimpleNamespace:
         if capacity not in self._programs:
@@ -190,8 +199,21 @@ class Polyhedra:
             faces["face_centroids"] = engine.empty((m, 3))
         return faces
 
+    def _vertices(self, m: int) -> tuple[cla.Array, cla.Array]:
+        """Return arrays for the vertices of a diagram with `m` half-faces; see `Tessellation.vertices`."""
+        if self._of_vertices is None or len(self._of_vertices[1]) < m:
+            self._of_vertices = None
+            self._of_vertices = (
+                self.engine.empty(2 * m, np.uint32), self.engine.empty(m, np.uint32),
+            )  # fmt: skip
+        return self._of_vertices
+
     def restore(
-        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
+        self,
+        points: cla.Array,
+        saved: Mapping[str, np.ndarray],
+        spare: int,
+        vertices: Sequence[np.ndarray] = (),
     ) -> Tessellation:
         """Return the `saved` diagram of `points` (n, 3), with room for `spare` more half-faces."""
         n, m = len(points), len(saved["neighbors"]) + spare
@@ -200,7 +222,12 @@ class Polyhedra:
             name: a[: n + 1] if name == "starts" else a[:n] for name, a in self._of_cells.items()
         }
         faces = {name: array[:m] for name, array in self._faces(m).items()}
-        return restored(points, {**cells, **faces}, saved)
+        t = restored(points, {**cells, **faces}, saved)
+        if vertices:
+            t = replace(t, vertices=self._vertices(m))
+            for array, values in zip(t.vertices, vertices, strict=True):
+                array[: len(values)].set(values)
+        return t
 
     @framed
     def tessellate(
@@ -244,7 +271,9 @@ class Polyhedra:
         first = engine.scratch(n, np.float32)
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
         with engine.workspace.frame():
-            cut = self._cut(box, points, n, binned, first, previous, rows, share, halo_args)
+            # Diagrams that will be updated need their vertices.
+            keep = not exact and not halo_args and rows == n
+            cut = self._cut(box, points, n, binned, first, previous, rows, share, halo_args, keep)
             t = None if cut is None else self.match(cut, self._report, points, share)
         if t is None:
             raise CloseError(points, n)
@@ -267,10 +296,11 @@ class Polyhedra:
         rows: int,
         share: np.floating,
         halo_args: tuple[object, ...],
+        keep: bool,
     ) -> CutCells | None:
         """Clip the first `rows` cells; repeat with larger capacities if needed. None if a cell collapses.
 
-        `first` (n,) float32 is a copy of the original `binned.reach`.
+        `first` (n,) float32 is a copy of the original `binned.reach`. `keep` the vertices.
         """
         engine = self.engine
         most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
@@ -279,7 +309,6 @@ class Polyhedra:
         places, counts = engine.scratch(rows, np.int32), engine.scratch(rows, np.int32)
         lower, upper = box.device_corners(engine.real)
         cells = {name: a[:rows] for name, a in self._of_cells.items() if name != "starts"}
-        of_cells = cells["volumes"], cells["offsets"], cells["covariances"], self._report
         warm = previous is not None and previous.n == rows
         old = (
             (previous.starts, previous.neighbors)
@@ -291,7 +320,9 @@ class Polyhedra:
         self._report.set(np.zeros(2, np.int32))
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         while True:
-            room, written = np.int32(self._room), (places, counts, *faces, *of_cells)
+            corners = engine.scratch(2 * self._room, np.uint32) if keep else None
+            cut = CutCells(places, counts, *faces, cells, self._room, False, corners, faces[0])
+            room, written = np.int32(self._room), cut.output(self._report)
             if walk is not None and not again:
                 with engine.workspace.frame():
                     order = self._ordered(binned, rows)
@@ -327,7 +358,7 @@ class Polyhedra:
                     )
                 self._report.set(np.array([flags & HARMLESS, m], np.int32))
             else:
-                return CutCells(places, counts, *faces, cells, m, bool(flags & DOUBT))
+                return replace(cut, m=m, doubtful=bool(flags & DOUBT))
 
     def take_cells(self, n: int, m: int) -> CutCells:
         """Return arrays for `n` cells with `m` half-faces in any order, to be matched."""
@@ -335,7 +366,10 @@ class Polyhedra:
         cells = {name: a[:n] for name, a in self._of_cells.items() if name != "starts"}
         scratch = self.engine.scratch
         places, counts, labels = (scratch(size, np.int32) for size in (n, n, m))
-        return CutCells(places, counts, labels, scratch(m), scratch((m, 3)), cells, m, False)
+        corners, keys = scratch(2 * m, np.uint32), scratch(m, np.uint32)
+        return CutCells(
+            places, counts, labels, scratch(m), scratch((m, 3)), cells, m, False, corners, keys
+        )
 
     def clip_rest(
         self,
@@ -391,10 +425,24 @@ class Polyhedra:
             kept, doubt, starts, neighbors, faces["face_measures"], faces["face_centroids"],
         )  # fmt: skip
         engine.run_each(k.put_graph, rows, starts, neighbors, of_rows, faces["neighbors"])
+        vertices: tuple[cla.Array, ...] = ()
+        if cut.corners is not None:
+            vertices = self._vertices(len(faces["neighbors"]))
+            engine.run_each(
+                k.place_cell_corners,
+                rows,
+                cut.places,
+                cut.counts,
+                cut.corners,
+                cut.keys,
+                of_rows,
+                *vertices,
+            )
         return Tessellation(
             n=rows, points=points, starts=of_rows, neighbors=faces["neighbors"],
             face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=cells["volumes"],
-            offsets=cells["offsets"], covariances=cells["covariances"], round_off=flags & (NARROW | UNEVEN),
+            offsets=cells["offsets"], covariances=cells["covariances"], vertices=vertices,
+            round_off=flags & (NARROW | UNEVEN),
         )  # fmt: skip
 
     def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:

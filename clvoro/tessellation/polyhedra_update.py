@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from weakref import ReferenceType, ref
 
 import numpy as np
 import pyopencl.array as cla
@@ -12,12 +11,15 @@ import pyopencl.array as cla
 from ..geometry.box import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
+from ..opencl.workspace import framed
 from .bins import BinnedPoints
 from .device_diagram import DOUBT, ROUGH_SHARE, Tessellation
-from .polyhedra import CutCells, Polyhedra
+from .polyhedra import Polyhedra
 
 MORE = 8
 """Room for further neighbors of a cell, as in `tessellation/polyhedra_update.cl`."""
+NO_CORNERS = 0
+"""The fourth number of the first triple of a cell without triples."""
 NO_NEIGHBOR = np.iinfo(np.int32).min
 MAX_ROUNDS = 8
 """Most rounds of making cells again; after that the diagram is built from scratch."""
@@ -31,7 +33,7 @@ def are_triples(starts: np.ndarray, saved: np.ndarray) -> bool:
     """Return whether `saved` triples (2 m,) uint32 name only faces of their rows, given by `starts` (n + 1,)."""
     triples = saved.view(np.uint8).reshape(-1, 4)
     counts = np.diff(starts)
-    known = triples[2 * starts[:-1], 3] == 1
+    known = triples[2 * starts[:-1], 3] != NO_CORNERS
     used = np.arange(len(triples)) - np.repeat(2 * starts[:-1], 2 * counts) < np.repeat(
         2 * counts - 4, 2 * counts
     )
@@ -51,29 +53,8 @@ class PolyhedraUpdate:
         self._kernels = engine.kernels("tessellation/polyhedra_update")
         self._report = engine.empty(4, np.int32)
         self._share = engine.real.type(ROUGH_SHARE)
-        # Triples and keys of the latest diagram, by rows of its graph.
-        self._corners, self._keys = engine.empty(1, np.uint32), engine.empty(1, np.uint32)
-        # A weak reference, so that this stage does not keep the diagram of another mesh in memory.
-        self._last: ReferenceType[Tessellation] | None = None
 
-    def save(self, t: Tessellation) -> dict[str, np.ndarray]:
-        """Return the triples and keys of `t`, if it is the latest diagram of this stage."""
-        if self._last is None or self._last() is not t:
-            return {}
-        m = int(t.starts[t.n].get())
-        return {"triples": self._corners[: 2 * m].get(), "keys": self._keys[:m].get()}
-
-    def restore(self, t: Tessellation, saved: Mapping[str, np.ndarray]) -> None:
-        """Continue from the diagram `t` with the `saved` triples and keys."""
-        m = len(t.neighbors)
-        self._corners, self._keys = (
-            self.engine.zeros(2 * m, np.uint32),
-            self.engine.zeros(m, np.uint32),
-        )
-        self._corners[: len(saved["triples"])].set(saved["triples"])
-        self._keys[: len(saved["keys"])].set(saved["keys"])
-        self._last = ref(t)
-
+    @framed
     def update(
         self,
         cells: Polyhedra,
@@ -87,42 +68,28 @@ class PolyhedraUpdate:
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
         `bins` sorts the generators into bins; it is called if cells must be clipped.
         """
-        with self.engine.workspace.frame():
-            t = self._update(cells, box, points, previous, bins)
-        self._last = None if t is None else ref(t)
-        return t
-
-    def _update(
-        self,
-        cells: Polyhedra,
-        box: ClipBox,
-        points: cla.Array,
-        previous: Tessellation,
-        bins: Callable[[], BinnedPoints],
-    ) -> Tessellation | None:
         engine, k, n = self.engine, self._kernels, previous.n
         before = len(previous.neighbors)
         room = int((1 + SPARE) * before) + 64
         cut = cells.take_cells(n, room)
-        corners, keys = engine.scratch(2 * room, np.uint32), engine.scratch(room, np.uint32)
         changed, marks, listed = (engine.scratch(n, np.int32) for _ in range(3))
         sums = engine.scratch(n + 1, np.int32)
         more, most = engine.scratch(n * MORE, np.int32), int(MAX_SHARE * n)
         further = engine.scratch(max(most, 1) * MORE, np.int32)
         more.fill(NO_NEIGHBOR)
         marks.fill(0)
-        known = self._last is not None and self._last() is previous
+        old = previous.vertices or (listed, sums)
         fixed = (
-            previous.starts, previous.neighbors, np.int32(known), self._corners, self._keys, points,
+            previous.starts, previous.neighbors, np.int32(bool(previous.vertices)), *old, points,
             *box.device_corners(engine.real), np.int32(room),
         )  # fmt: skip
         binned: BinnedPoints | None = None
-        count, some, used = n, False, before
+        count, some, flags, used = n, False, 0, before
         for _ in range(MAX_ROUNDS):
-            self._report.set(np.array([0, used, 0, 0], np.int32))
+            self._report.set(np.array([flags, used, 0, 0], np.int32))
             engine.run_each(
-                k.update_cells, count, np.int32(some), listed, further, *fixed, *cut.output(self._report), corners,
-                keys, changed, more, marks,
+                k.update_cells, count, np.int32(some), listed, further, *fixed, *cut.output(self._report),
+                cut.keys, changed, more, marks,
             )  # fmt: skip
             flags, used, left, _ = (int(v) for v in self._report.get())
             if used > room or left > most:
@@ -138,7 +105,7 @@ class PolyhedraUpdate:
                 cut.counts,
                 cut.labels,
                 cut.measures,
-                keys,
+                cut.keys,
                 changed,
                 marks,
             )
@@ -147,31 +114,9 @@ class PolyhedraUpdate:
             if count > most:
                 return None
             if count == 0:
-                cut = replace(cut, m=used, doubtful=bool(flags & DOUBT))
-                return self._complete(cells, cut, points, corners, keys)
+                cut = replace(cut, doubtful=bool(flags & DOUBT))
+                return cells.match(cut, self._report, points, self._share, sparse=True)
             some = True
             self._scan.exclusive(sums, sums, n)
-            engine.run_each(k.list_marked_cells, n, sums, more, marks, listed, further)
+            engine.run_each(k.list_marked_cells, n, sums, more, marks, changed, listed, further)
         return None
-
-    def _complete(
-        self,
-        cells: Polyhedra,
-        cut: CutCells,
-        points: cla.Array,
-        corners: cla.Array,
-        keys: cla.Array,
-    ) -> Tessellation | None:
-        """Match the faces, and keep the triples and keys by rows of the graph."""
-        engine = self.engine
-        t = cells.match(cut, self._report, points, self._share, sparse=True)
-        if t is None:
-            return None
-        if len(self._keys) < len(t.neighbors):
-            m = len(t.neighbors)
-            self._corners, self._keys = engine.empty(2 * m, np.uint32), engine.empty(m, np.uint32)
-        engine.run_each(
-            self._kernels.place_cell_corners, t.n, cut.places, cut.counts, corners, keys, t.starts, self._corners,
-            self._keys,
-        )  # fmt: skip
-        return t

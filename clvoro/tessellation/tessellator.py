@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -75,22 +75,17 @@ class Tessellator:
             t = self.stages.cells.measure_faces(self.domain, t)
         return t, None
 
-    def save_vertices(self, t: Tessellation) -> dict[str, np.ndarray]:
-        """Return the vertices that the next update of `t`, the latest diagram, starts from, in 3D."""
-        stages = self.stages
-        return stages.polyhedra_update.save(t) if "polyhedra_update" in vars(stages) else {}
-
     def restore(
         self,
         points: cla.Array,
         saved: Mapping[str, np.ndarray],
         spare: int,
-        vertices: Mapping[str, np.ndarray],
+        vertices: Sequence[np.ndarray] = (),
     ) -> Tessellation:
         """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces.
 
         It uses the arrays of the stage that makes the next diagram, to save memory. `vertices` are those of
-        `save_vertices`.
+        the diagram, if it had any.
         """
         stages = self.stages
         if self._polygon is not None:
@@ -100,12 +95,14 @@ class Tessellator:
             return t
         if self.periodic is not None and stages.engine.dim == 2:
             return stages.folded_cells.restore(points, saved, spare)
-        t = stages.cells.restore(points, saved, spare)
+        t = (
+            stages.cells.restore(points, saved, spare, vertices)
+            if isinstance(stages.cells, Polyhedra)
+            else stages.cells.restore(points, saved, spare)
+        )
         if self.periodic is not None:
             # The next diagram may take several attempts that all start from this graph.
             t = replace(t, starts=t.starts.copy(), neighbors=t.neighbors.copy())
-        if vertices:
-            stages.polyhedra_update.restore(t, vertices)
         return t
 
     def tessellate(

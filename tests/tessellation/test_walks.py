@@ -96,7 +96,7 @@ def walked(engine, points, rows=None):
         cells._wrap, -(-rows // STRETCH), np.int32(rows), cells._ordered(b, rows), b.points, b.items,
         b.spacing, b.reach, b.bins, b.grid_frames, b.grid_shapes, *CUBE.device_corners(engine.real),
         engine.real.type(FIRST_REACH), np.int32(40 * n), places, counts, labels,
-        *(engine.empty(size) for size in sizes), report, group=1,
+        *(engine.empty(size) for size in sizes), report, np.int32(0), report, group=1,
     )  # fmt: skip
     counts = counts.get()
     counts[counts > 0] -= CERTAIN
