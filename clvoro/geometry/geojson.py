@@ -1,4 +1,4 @@
-"""Read polygons from GeoJSON, well-known text and shapely: rings, piece by piece."""
+"""Read polygons from GeoJSON, well-known text, shapely and descriptions: rings, piece by piece."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from os import PathLike
 from typing import Any
 
@@ -104,6 +105,35 @@ def pieces_of_geojson(
         raise InputError(f"{name} has no Polygon, expected at least one")
     _warn_of_degrees(found, pieces, name)
     return pieces, names or None
+
+
+def pieces_of_description(values: Mapping[str, Any]) -> list[list[np.ndarray]]:
+    """Return the rings in the values that `Polygon.describe` returns, piece by piece."""
+    if "edge_numbers" in values:
+        raise InputError(
+            "the Polygon was written by an earlier version of clvoro, which numbered its edges in another order; "
+            "make the mesh again"
+        )
+    try:
+        starts = np.array(values["ring_starts"], np.int32)
+        pieces = np.array(values["piece_of_ring"], np.int32)
+        vertices = np.array(values["vertices"], float)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"the description of a Polygon is damaged ({error})") from error
+    steps = np.diff(pieces, prepend=-1)
+    if not (
+        starts.shape == (len(pieces) + 1,)
+        and pieces.size
+        and (np.diff(starts, prepend=0) >= 0).all()
+        and (steps * (steps - 1) == 0).all()
+        and pieces[0] == 0
+        and vertices.shape == (starts[-1], 2)
+    ):
+        raise InputError("the description of a Polygon is damaged: its arrays do not match")
+    # Close the rings: a last vertex equal to the first one would be dropped as the closing one.
+    rings = [np.concatenate([vertices[a:b], vertices[a : a + 1]]) for a, b in pairwise(starts)]
+    firsts = [*np.flatnonzero(steps), len(rings)]
+    return [rings[a:b] for a, b in pairwise(firsts)]
 
 
 def may_be_degrees(lower: Sequence[float], upper: Sequence[float]) -> bool:

@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from itertools import pairwise
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -21,7 +20,7 @@ from .boundary_names import BoundaryNames, Walls
 from .curved_edges import CurvedEdges
 from .curves import Curve
 from .edge_grid import bin_edges
-from .geojson import pieces_of_geojson, pieces_of_shape, pieces_of_wkt
+from .geojson import pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt
 from .region import Region
 from .rings import OrientedRings, make_rings, signed_area
 from .shapes import Edges
@@ -362,34 +361,8 @@ class Polygon(Region):
         InputError, InputTypeError
             If the values do not describe a domain.
         """
-        if "edge_numbers" in values:
-            raise InputError(
-                "the Polygon was written by an earlier version of clvoro, which numbered its edges in another order; "
-                "make the mesh again"
-            )
-        try:
-            starts = np.array(values["ring_starts"], np.int32)
-            pieces = np.array(values["piece_of_ring"], np.int32)
-            vertices = np.array(values["vertices"], float)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"the description of a Polygon is damaged ({error})") from error
-        steps = np.diff(pieces, prepend=-1)
-        if not (
-            starts.shape == (len(pieces) + 1,)
-            and pieces.size
-            and (np.diff(starts, prepend=0) >= 0).all()
-            and (steps * (steps - 1) == 0).all()
-            and pieces[0] == 0
-            and vertices.shape == (starts[-1], 2)
-        ):
-            raise InputError("the description of a Polygon is damaged: its arrays do not match")
-        # Close the rings: a last vertex equal to the first one would be dropped as the closing one.
-        rings = [np.concatenate([vertices[a:b], vertices[a : a + 1]]) for a, b in pairwise(starts)]
-        firsts = [*np.flatnonzero(steps), len(rings)]
         made = cls.__new__(cls)
-        made._build(
-            [rings[a:b] for a, b in pairwise(firsts)], values.get("names"), values.get("curves")
-        )
+        made._build(pieces_of_description(values), values.get("names"), values.get("curves"))
         return made
 
     @property
