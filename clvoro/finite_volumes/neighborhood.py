@@ -125,7 +125,7 @@ class Neighborhood:
         return self.new[rows[twice]]
 
     def _pinched(self) -> np.ndarray:
-        """Return the groups with two faces that share more than one path, or without a ball of cells around the vertex."""
+        """Return the groups of which two faces share several paths, or whose vertex is not inside a ball of cells."""
         rows = np.flatnonzero(self.new >= 0)
         groups, faces = self.new[rows], self.face[rows]
         # Corners of these faces, relative to the vertex, and the sides that begin there.

@@ -94,7 +94,7 @@ def _zones(domain: Polygon, sizes: Sizes, constant: bool) -> list[tuple[float, A
         return [(float(sizes(domain.vertices[:1])[0]), None)]
     side = float(domain.extent.max()) / 8
     counts = np.maximum(np.ceil(domain.extent / side), 1).astype(int)
-    center = domain.lower + (np.indices(counts).reshape(2, -1).T + 0.5) * side
+    center = domain.lower + (np.indices(tuple(counts)).reshape(2, -1).T + 0.5) * side
     found: list[tuple[np.ndarray, float, np.ndarray]] = []
     corners = np.array([(0, 0), (-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
     total = 0
@@ -209,6 +209,7 @@ def _thinned(
     for piece in _polygons(shapely.remove_repeated_points(water, least)):
         rings = [np.asarray(ring.coords)[:-1] for ring in (piece.exterior, *piece.interiors)]
         pieces.append([_Ring(domain, x, sizes(x)) for x in rings])
+    rows: list[list[np.ndarray]] = []
     for k in range(_TRIES):
         share = tolerance / 2**k if k < _TRIES - 1 else 0.0
         rows = [[ring.kept(share) for ring in piece] for piece in pieces]

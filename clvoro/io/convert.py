@@ -64,7 +64,7 @@ def to_pyvista(contents: Contents) -> pyvista.UnstructuredGrid:
     return grid
 
 
-def _polygons(diagram: Diagram) -> tuple[list[tuple[str, Any]], list[np.ndarray]]:
+def _polygons(diagram: Diagram) -> tuple[list[Any], list[np.ndarray]]:
     """Return meshio's blocks in 2D, one per number of corners, and the cells in each."""
     starts = diagram.cell_vertex_starts
     corners = np.diff(starts)
@@ -80,7 +80,7 @@ def _polygons(diagram: Diagram) -> tuple[list[tuple[str, Any]], list[np.ndarray]
 
 def _polyhedra(
     diagram: Diagram,
-) -> tuple[list[tuple[str, Any]], list[np.ndarray]]:
+) -> tuple[list[Any], list[np.ndarray]]:
     """Return meshio's blocks in 3D, one per number of corners, and the cells in each."""
     starts = diagram.face_vertex_starts
     faces = np.split(diagram.face_vertices, starts[1:-1])

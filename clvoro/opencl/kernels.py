@@ -43,7 +43,7 @@ def range_of(kernel: cl.Kernel) -> Range:
     """Return the size of ranges in which `kernel` is launched; see `ranges`."""
     if not hasattr(kernel, "range"):
         kernel.range = Range()  # type: ignore[attr-defined]
-    return kernel.range
+    return kernel.range  # type: ignore[attr-defined]
 
 
 class KernelPool:
