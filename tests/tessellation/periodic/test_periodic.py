@@ -641,7 +641,7 @@ def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, resto
         saved |= {
             name: saved[name][:m] for name in ("neighbors", "face_measures", "face_centroids")
         }
-        previous = tessellator.restore(x, saved, 0)
+        previous = tessellator.restore(x, saved, 0, ())
     rows = previous.starts.get(), previous.neighbors.get()[: previous.starts.get()[-1]]
     extend, unfold = GhostImages.extend, GhostImages.unfold
 
