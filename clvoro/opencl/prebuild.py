@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .engine import Engine
 
 MOST_WORKERS = 3
-"""Processes beside this one."""
+"""Largest number of processes that build kernels beside this one."""
 _RECORD = Path(__file__).with_name("first_kernels.json")
 _workers: list[subprocess.Popen[bytes]] = []
 _waiting: list[subprocess.Popen[bytes]] = []

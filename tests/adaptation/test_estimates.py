@@ -105,7 +105,7 @@ def test_steep_sizes_are_allowed_for(bench, name, real):
 @needs_bench
 @pytest.mark.parametrize("extent", [(1, 1e-5), (1, 1, 1e-5)], ids=["thread", "sheet"])
 def test_thin_boxes_take_no_more(bench, extent):
-    """Bins of a sheet were squares as thin as it is, once: a quarter more than the estimate."""
+    """Earlier, bins were as wide as a sheet is thin, and runs needed a quarter more than the estimate."""
     box = clvoro.Box((0,) * len(extent), extent)
     size = (box.measure / 5000) ** (1 / box.dim)
     options = Namespace(device=None, dtype="float64")

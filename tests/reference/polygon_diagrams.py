@@ -31,7 +31,7 @@ class Piece:
 class PolygonCells:
     """Areas (n,), centroids (n, 2), and the length of the common faces of i and j (or edge -1 - e), lengths[i, j].
 
-    `close` tells cells (n,) bool for which another rounding might choose otherwise: which piece is whose. `regions` are
+    `close` (n,) bool marks cells where round-off decides which generator gets a piece. `regions` are
     the connected parts of cells.
     """
 

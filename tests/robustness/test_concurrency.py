@@ -88,8 +88,7 @@ def test_processes_find_the_same_bits(ctx, alone):
     program += "from tests.robustness import test_concurrency as t\n"
     program += "a = clvoro.Adapter()\nprint(a.queue.device.max_compute_units)\n"
     program += "for k in (0, 3, 1): print(t.run(a, t.WORK[k]))"
-    # Another seed of Python's hashes: no order of a set may matter. Nor may the number of cores,
-    # which a variable sets for PoCL.
+    # Another seed of Python's hashes, because no order of a set may matter, and another number of cores for PoCL.
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=Path(__file__).parents[2], text=True, check=True,
         capture_output=True, env={**os.environ, "PYTHONHASHSEED": "12345", "POCL_MAX_PTHREAD_COUNT": "1"},

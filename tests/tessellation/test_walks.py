@@ -141,8 +141,8 @@ def test_cells_are_those_of_clipping(engine, name):
     (a, reach_a), (b, reach_b) = tessellations(engine, POINTS[name])
     assert np.array_equal(a.starts, b.starts)
     assert np.array_equal(a.neighbors, b.neighbors)
-    # Vertices round by eps of their distance over the volume that the normals of their faces span: 1e-5 at least where
-    # cells are walked, much more as a rule. Areas and moments change by as much of what that distance allows for.
+    # The round-off of a vertex is eps times its distance over the volume that the normals of its faces span. Where
+    # cells are walked, that volume is at least 1e-5, mostly much more. Areas and moments have the same relative error.
     reach = reach_b / 2
     eps = 1e-10
     assert (np.abs(a.areas - b.areas) <= eps * reach[a.cell] ** 2).all()

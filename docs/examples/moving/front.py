@@ -38,7 +38,7 @@ frames = [(mesh, values)]
 
 # %%
 # All others start from the mesh before. The bubble moves by two cells at a time, so that a few steps are enough. A solver would
-# advance the temperature in between. Here it is carried along, and the formula gives the next one.
+# advance the temperature in between. Here it is transferred to the new mesh, and the formula gives the next one.
 
 steps, lost = [], []
 for x in places[1:]:
