@@ -1,4 +1,7 @@
-"""Build kernels of a first run in other processes.
+"""Build kernels of a first run in other processes, or in threads.
+
+Drivers other than PoCL build whole programs and keep the binaries, or PyOpenCL keeps them: see
+`pyopencl.characterize.has_src_build_cache`. So threads begin to build the programs of a run when it begins.
 
 A process builds one PoCL program or kernel at a time, whatever the number of threads. So, before a first run with PoCL,
 worker processes (`build_worker`) build kernels into PoCL's cache. `first_kernels.json` lists the kernels of each kind
@@ -21,9 +24,10 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import pyopencl as cl
 
-from .program import POCL, has_short_declarations, program_text, shorten
+from .program import build_in_threads, has_short_declarations, on_pocl, program_text, shorten
 from .runtimes import cache_home
 
 if TYPE_CHECKING:
@@ -31,6 +35,8 @@ if TYPE_CHECKING:
 
 MOST_WORKERS = 3
 """Largest number of processes that build kernels beside this one."""
+MOST_THREADS = 8
+"""Largest number of threads that build programs."""
 _RECORD = Path(__file__).with_name("first_kernels.json")
 _workers: list[subprocess.Popen[bytes]] = []
 _waiting: list[subprocess.Popen[bytes]] = []
@@ -57,7 +63,7 @@ class Work(NamedTuple):
 
 def start_workers(device: cl.Device) -> None:
     """Start workers for `device` if no kernel has been built for it. They load the compiler and wait for work."""
-    if _is_new("device", device):
+    if on_pocl(device) and _is_new("device", device):
         _start(device)
 
 
@@ -70,13 +76,18 @@ def build_ahead(engine: Engine) -> int:
         Number of recorded kernels of such a run; 0 if it is not the first, or nothing is recorded.
     """
     kind, device = kind_of(engine), engine.queue.device
-    recorded = _record().get(kind)
+    in_processes = on_pocl(device)
+    recorded = _record().get(kind if in_processes else kind.replace("float32", "float64"))
     if recorded is None or (kind, device.int_ptr) in _known:
         return 0
     _known.add((kind, device.int_ptr))
     work = _work(engine, recorded)
-    if not _is_new(repr(work.programs), device):
-        return 0
+    is_new = _is_new(repr(work.programs), device)
+    if not in_processes:
+        # Also if they are in the driver's cache: to load them takes time, too.
+        build_in_threads(engine.ctx, work.programs, min(_other_cores(), MOST_THREADS))
+    if not is_new or not in_processes:
+        return len(work.launches) if is_new else 0
     if not _waiting:
         _start(device)
     for index, worker in enumerate(_waiting):
@@ -98,15 +109,29 @@ def _record() -> dict[str, dict]:
 
 
 def _work(engine: Engine, recorded: dict) -> Work:
-    """Return the programs and launches that were `recorded`, as they are on `engine`."""
-    programs = []
-    for stage, defines in recorded["programs"]:
+    """Return the programs and launches that were `recorded`, as they are on `engine`.
+
+    The record is from PoCL in float64, where some programs work in the lanes of vectors.
+    """
+    programs, places = [], {}
+    lanes = engine.group_size == 1 and engine.real == np.float64
+    for index, (stage, defines) in enumerate(recorded["programs"]):
+        if not lanes:
+            if stage.startswith("simd/"):
+                continue
+            reals = {"double": engine.name_of(engine.real)}
+            defines = {k: reals.get(v, v) for k, v in defines.items()}
+            defines |= {"IN_LANES": "0"} if "IN_LANES" in defines else {}
+        places[index] = len(programs)
         text, options = program_text(f"{stage}.cl", engine.all_defines(stage, defines), "")
-        if has_short_declarations(engine.ctx):
+        if on_pocl(engine.queue.device) and has_short_declarations(engine.ctx):
             text, more = shorten(text)
             options = (*options, *more)
         programs.append((text, options))
-    return Work(programs, [Launch(*launch) for launch in recorded["launches"]])
+    launches = [
+        Launch(places[index], *rest) for index, *rest in recorded["launches"] if index in places
+    ]
+    return Work(programs, launches)
 
 
 def _share(launches: list[Launch], index: int, count: int) -> list[Launch]:
@@ -118,10 +143,12 @@ def _share(launches: list[Launch], index: int, count: int) -> list[Launch]:
 
 def _is_new(what: str, device: cl.Device) -> bool:
     """Return whether the cache has no marker for `what` on `device`, and add the marker."""
-    if device.platform.name.strip() != POCL or os.environ.get("POCL_KERNEL_CACHE") == "0":
+    if on_pocl(device) and os.environ.get("POCL_KERNEL_CACHE") == "0":
         return False
     with contextlib.suppress(OSError, RuntimeError):
-        folder = Path(os.environ.get("POCL_CACHE_DIR") or cache_home() / "pocl" / "kcache")
+        folder = cache_home()
+        if on_pocl(device):
+            folder = Path(os.environ.get("POCL_CACHE_DIR") or folder / "pocl" / "kcache")
         version = device.version, device.driver_version, device.name, what
         name = hashlib.sha256(repr(version).encode()).hexdigest()[:16]
         marker = folder / "clvoro" / name
@@ -137,10 +164,9 @@ def _start(device: cl.Device) -> None:
     name = Path(sys.executable or "").name
     if not name.startswith(("python", "pypy")):  # Python is embedded in an application
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     index = _index_of(device)
     code = f"import runpy; runpy.run_path({str(Path(__file__).with_name('build_worker.py'))!r}, run_name='__main__')"
-    for _ in range(min((cores or 1) - 1, MOST_WORKERS)):
+    for _ in range(min(_other_cores(), MOST_WORKERS)):
         with contextlib.suppress(OSError, ValueError):
             worker = subprocess.Popen(
                 [sys.executable, "-c", code, *map(str, index)],
@@ -151,6 +177,12 @@ def _start(device: cl.Device) -> None:
     if _workers:
         atexit.unregister(_stop_workers)
         atexit.register(_stop_workers)
+
+
+def _other_cores() -> int:
+    """Return the number of cores beside that of this thread."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return (cores or 1) - 1
 
 
 def _index_of(device: cl.Device) -> tuple[int, int]:

@@ -6,12 +6,15 @@ with `#line` directives. So the driver gets the complete text, which is also the
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import re
 import threading
 import time
 import warnings
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
 
@@ -21,8 +24,13 @@ from ..errors import BuildError
 
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 _lock = threading.Lock()
-_programs: dict[tuple, cl.Program] = {}
+_one_at_a_time = threading.Lock()
+_programs: dict[tuple, Future[cl.Program]] = {}
 _building = 0.0
+_threads: list[threading.Thread] = []
+_ending = threading.Event()
+_silent = 0
+_IGNORED = ("ignore", None, cl.CompilerWarning, None, 0)
 ROUNDED_QUOTIENTS = "-cl-fp32-correctly-rounded-divide-sqrt"
 POCL = "Portable Computing Language"
 """Name of PoCL's platform."""
@@ -65,18 +73,85 @@ def build_program(
     BuildError
         With the compiler's log, if the source does not compile.
     """
+    try:
+        return _build_once(ctx, *program_text(name, defines, prelude), short=not prelude)
+    except cl.Error as error:
+        raise BuildError(f"cl_kernels/{name} does not compile: {error}") from error
+
+
+def _build_once(
+    ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True
+) -> cl.Program:
+    """Build a program, or wait for the thread that builds it. Whoever comes first builds it."""
     global _building
-    text, options = program_text(name, defines, prelude)
     key = (ctx.int_ptr, text, options)
+    began = time.perf_counter()
     with _lock:
-        if key not in _programs:
-            began = time.perf_counter()
-            try:
-                _programs[key] = compile_text(ctx, text, options, short=not prelude)
-            except cl.Error as error:
-                raise BuildError(f"cl_kernels/{name} does not compile: {error}") from error
-            _building += time.perf_counter() - began
-        return _programs[key]
+        known = _programs.get(key)
+        result = _programs[key] = Future() if known is None else known
+        waits = not result.done()
+    if known is None:
+        try:
+            with _one_at_a_time if on_pocl(ctx.devices[0]) else contextlib.nullcontext():
+                result.set_result(compile_text(ctx, text, options, short))
+        except BaseException as error:
+            del _programs[key]
+            result.set_exception(error)
+    program = result.result()
+    if waits and threading.current_thread() is threading.main_thread():
+        _building += time.perf_counter() - began
+    return program
+
+
+def build_in_threads(
+    ctx: cl.Context, programs: Iterable[tuple[str, tuple[str, ...]]], threads: int
+) -> None:
+    """Begin to build `programs`, (text, options), in their order.
+
+    `build_program` waits for a program that a thread builds, and builds others itself.
+    """
+    waiting = deque(programs)
+
+    def work() -> None:
+        while not _ending.is_set():
+            with contextlib.suppress(cl.Error):  # `build_program` raises it again
+                try:
+                    text, options = waiting.popleft()
+                except IndexError:
+                    return
+                _build_once(ctx, text, options)
+
+    if not _threads:
+        atexit.register(_end_threads)
+    _threads[:] = [thread for thread in _threads if thread.is_alive()]
+    for _ in range(min(threads, len(waiting))):
+        _threads.append(threading.Thread(target=work, daemon=True))
+        _threads[-1].start()
+
+
+def _end_threads() -> None:
+    """Wait for the builds that have begun: the interpreter must not end meanwhile."""
+    _ending.set()
+    for thread in _threads:
+        thread.join()
+
+
+@contextlib.contextmanager
+def _silenced() -> Iterator[None]:
+    """Ignore what compilers print. `warnings.catch_warnings` must not be used in several threads at a time."""
+    global _silent
+    with _lock:
+        if _silent == 0:
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+        _silent += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _silent -= 1
+            if _silent == 0:
+                with contextlib.suppress(ValueError):
+                    warnings.filters.remove(_IGNORED)  # type: ignore[attr-defined]
 
 
 def program_text(
@@ -92,8 +167,7 @@ def compile_text(
 ) -> cl.Program:
     """Build `text`; if `short`, with the declarations of `shorten`."""
     options = (*options, *device_options(ctx.devices[0]))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", cl.CompilerWarning)
+    with _silenced():
         if short and has_short_declarations(ctx):
             with contextlib.suppress(cl.Error):  # a function that they lack
                 short_text, more = shorten(text)
@@ -107,13 +181,18 @@ def device_options(device: cl.Device) -> tuple[str, ...]:
     Without it they may be off by 2.5 and 3 ulp. A device may lack the option. PoCL does not need it.
     """
     rounds = device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
-    return (ROUNDED_QUOTIENTS,) if rounds and device.platform.name.strip() != POCL else ()
+    return (ROUNDED_QUOTIENTS,) if rounds and not on_pocl(device) else ()
+
+
+def on_pocl(device: cl.Device) -> bool:
+    """Return whether `device` is one of PoCL's, which builds one program at a time, whatever the number of threads."""
+    return device.platform.name.strip() == POCL
 
 
 def has_short_declarations(ctx: cl.Context) -> bool:
     """Return whether the driver is a version of PoCL for which `shorten` has been tested."""
-    platform = ctx.devices[0].platform
-    return platform.name.strip() == POCL and "PoCL 3." in platform.version
+    device = ctx.devices[0]
+    return on_pocl(device) and "PoCL 3." in device.platform.version
 
 
 def shorten(text: str) -> tuple[str, tuple[str, ...]]:

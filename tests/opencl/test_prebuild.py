@@ -5,6 +5,8 @@ import json
 import os
 import subprocess
 import sys
+import threading
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,8 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.opencl import build_notice, prebuild
+from clvoro.opencl import build_notice, prebuild, program
+from clvoro.opencl import engine as engines
 from clvoro.opencl.build_notice import BuildNotice, noticed_builds
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.program import POCL
@@ -140,3 +143,88 @@ def test_callback_replaces_the_line(engine, monkeypatch):
     _ = kernels.summarize_blocks
     assert told == [(1, 2), (2, 2), (2, 2)]
     assert sys.stderr.getvalue() == ""
+
+
+def test_threads_build_programs_once(ctx, monkeypatch):
+    """The main thread builds, too. It waits for a program that a thread builds, and finds its error."""
+    built, started, go_on = [], threading.Event(), threading.Event()
+
+    def slow(ctx, text, options, short=True):
+        built.append((text, threading.current_thread() is threading.main_thread()))
+        if text == "first":
+            started.set()
+            go_on.wait(30)
+        if text == "wrong":
+            raise cl.RuntimeError("wrong")
+        return text.upper()
+
+    monkeypatch.setattr(program, "compile_text", slow)
+    monkeypatch.setattr(program, "_programs", {})
+    monkeypatch.setattr(program, "_threads", [])
+    monkeypatch.setattr(program, "on_pocl", lambda _: False)
+    texts = ["first", "second", "wrong", "last"]
+    program.build_in_threads(ctx, [(text, ()) for text in texts], 1)
+    assert started.wait(30)
+    assert program._build_once(ctx, "second", ()) == "SECOND"
+    go_on.set()
+    assert program._build_once(ctx, "first", ()) == "FIRST"
+    for thread in program._threads:
+        thread.join(30)
+    with pytest.raises(cl.RuntimeError, match="wrong"):
+        program._build_once(ctx, "wrong", ())
+    assert program._build_once(ctx, "last", ()) == "LAST"
+    assert built == [
+        ("first", False),
+        ("second", True),
+        ("wrong", False),
+        ("last", False),
+        ("wrong", True),
+    ]
+
+
+def test_warnings_of_compilers_are_ignored_in_all_threads(recwarn):
+    def warn():
+        with program._silenced():
+            barrier.wait(30)
+            warnings.warn("a compiler's", cl.CompilerWarning, stacklevel=1)
+            barrier.wait(30)
+
+    barrier, before = threading.Barrier(3), list(warnings.filters)
+    threads = [threading.Thread(target=warn) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    assert not recwarn.list
+    assert list(warnings.filters) == before
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize(
+    "kind", ["2D box", *(pytest.param(k, marks=pytest.mark.slow) for k in ("3D box", "2D polygon"))]
+)
+def test_threads_know_the_programs_of_gpus(ctx, monkeypatch, real, kind):
+    """The record is from PoCL in float64; all but a few programs of a run are built ahead on other devices, too."""
+    monkeypatch.setattr(engines, "group_sizes", lambda _: engines.GroupSizes(5, 32))
+    monkeypatch.setattr(prebuild, "on_pocl", lambda _: False)
+    monkeypatch.setattr(prebuild, "_is_new", lambda *_: True)
+    monkeypatch.setattr(prebuild, "_known", set())
+    ahead, built, plain = [], set(), program.program_text
+    monkeypatch.setattr(
+        prebuild, "build_in_threads", lambda _, programs, threads: ahead.extend(programs)
+    )
+
+    def noted(name, defines, prelude):
+        text = plain(name, defines, prelude)
+        built.add(text)
+        return text
+
+    monkeypatch.setattr(program, "program_text", noted)
+    domain, size = first_run.RECORDED[kind]
+    adapter, counts = clvoro.Adapter(ctx, real), []
+    adapter.on_build = lambda *count: counts.append(count)
+    adapter.run(eval(domain), 2 * size)
+    missed = built - {(text, tuple(options)) for text, options in ahead}
+    assert len(missed) <= 2, [o for _, o in missed]
+    assert len(ahead) >= 10
+    assert counts[-1][0] > 20
