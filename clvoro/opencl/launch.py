@@ -2,11 +2,42 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pyopencl as cl
 
 from .engine import Engine
 from .kernels import bind, set_args, with_buffers
+
+
+class CostFactors(NamedTuple):
+    """Costs on a device, relative to PoCL on two cores.
+
+    Attributes
+    ----------
+    launches : float
+        Of a launch, or of a read of some numbers by the host.
+    cells : float
+        Of a pass over the cells and their faces, which moves memory.
+    """
+
+    launches: float
+    cells: float
+
+
+COSTS_ON_CPU = CostFactors(1.0, 1.0)
+COSTS_ON_GPU = CostFactors(0.4, 0.02)
+"""Estimates: launches of 5 us, and memory at 1000 GB/s."""
+COSTS_ON_SHARED_MEMORY = CostFactors(0.4, 0.4)
+"""Those of a GPU that uses the memory of the host."""
+
+
+def cost_factors(device: cl.Device) -> CostFactors:
+    """Return the costs on `device` by its kind. They are not measured: a choice must not change from run to run."""
+    if device.type & cl.device_type.CPU:
+        return COSTS_ON_CPU
+    return COSTS_ON_SHARED_MEMORY if device.host_unified_memory else COSTS_ON_GPU
 
 
 def one_group_limit(engine: Engine) -> int:

@@ -16,7 +16,7 @@ import pyopencl.array as cla
 from ..errors import InputError
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
-from ..opencl.launch import Launch, one_group_limit
+from ..opencl.launch import COSTS_ON_CPU, CostFactors, Launch, cost_factors, one_group_limit
 from .conjugate_gradient import (
     CURVATURE,
     BreakdownError,
@@ -40,19 +40,27 @@ _PRECONDITIONERS = ("auto", "jacobi", "multigrid")
 
 
 def expected_costs(
-    n: int, dim: int, tolerance: float, one_group: bool = False
+    n: int,
+    dim: int,
+    tolerance: float,
+    one_group: bool = False,
+    factors: CostFactors = COSTS_ON_CPU,
 ) -> tuple[float, float]:
     """Return the expected costs of a solve with Jacobi's preconditioner and with multigrid, set-up included.
 
-    The costs are milliseconds of processor time with PoCL on two cores, from fits to random and adapted meshes of 500
-    to 10^6 cells. On other devices the parts (enqueueing, cells) change by similar factors. Jacobi's iterations grow
-    with the number of cells across the mesh, multigrid's do not. With `one_group` one work-group does all Jacobi
-    iterations, which then cost little per launch.
+    The costs are milliseconds. A part is for launches, and a part for cells. Both come from fits to random and adapted
+    meshes of 500 to 10^6 cells with PoCL on two cores. On other devices the parts change by `factors`. Jacobi's
+    iterations grow with the number of cells across the mesh, multigrid's do not. With `one_group` one work-group does
+    all Jacobi iterations, which then cost little per launch.
     """
     digits, thousands = max(-math.log10(tolerance), 0.0), n / 1000
-    iteration = 0.001 + 0.0105 * thousands if one_group else 0.04 + 0.0085 * thousands
+    launches, cells = factors
+    iteration = launches * 0.04 + cells * 0.0085 * thousands
+    if one_group:
+        iteration = 0.001 + 0.0105 * thousands
     jacobi = n ** (1 / dim) * (1.2 + 0.7 * digits) * iteration
-    multigrid = 6 + 0.5 * thousands + (2 + 1.8 * digits) * (0.3 + 0.05 * thousands)
+    cycle = launches * 0.3 + cells * 0.05 * thousands
+    multigrid = launches * 6 + cells * 0.5 * thousands + (2 + 1.8 * digits) * cycle
     return jacobi, multigrid
 
 
@@ -293,8 +301,8 @@ class Poisson:
         max_iterations : int, optional
         preconditioner : ``"auto"``, ``"jacobi"`` or ``"multigrid"``
             Multigrid takes 15 to 22 iterations for any size; its set-up costs about as much as ten. ``"auto"`` takes
-            the cheaper one by `expected_costs`: at tolerances of 1e-8 and 1e-2 multigrid from about 2000 and 3400
-            cells on in 2D, from 18,000 and 56,000 in 3D. If multigrid breaks down, stagnates early, or does not
+            the cheaper one by `expected_costs`: on CPUs, at tolerances of 1e-8 and 1e-2, multigrid from about 2000 and
+            3400 cells on in 2D, from 18,000 and 56,000 in 3D. If multigrid breaks down, stagnates early, or does not
             converge in 200 iterations without `max_iterations`, Jacobi's preconditioner continues; `Solution.reason`
             says so.
         ordering : object, optional
@@ -329,7 +337,8 @@ class Poisson:
         system = _System(laplacian, operator, rhs, potential, tolerance)
         if preconditioner == "auto":
             one_group = n <= one_group_limit(self.engine)
-            jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance, one_group)
+            factors = cost_factors(self.engine.queue.device)
+            jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance, one_group, factors)
             preconditioner = "multigrid" if multigrid < jacobi else "jacobi"
         if preconditioner == "jacobi":
             most = max_jacobi_iterations(n) if max_iterations is None else max_iterations

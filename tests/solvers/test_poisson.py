@@ -9,6 +9,7 @@ import scipy.sparse.linalg as sla
 from clvoro import Box, create_context
 from clvoro.errors import InputError, SolverError
 from clvoro.opencl.engine import Engine
+from clvoro.opencl.launch import COSTS_ON_CPU, COSTS_ON_GPU, COSTS_ON_SHARED_MEMORY, cost_factors
 from clvoro.solvers import conjugate_gradient
 from clvoro.solvers.conjugate_gradient import ConjugateGradient, Limits, Operator
 from clvoro.solvers.poisson import Poisson, expected_costs
@@ -517,3 +518,33 @@ def test_from_zero_and_unverified(make):
         assert left == pytest.approx(solution.residual, rel=1e-9)
         results.append(phi.get())
     assert np.array_equal(*results)
+
+
+def crossover(dim, tolerance, factors):
+    """The number of cells from which on multigrid is chosen."""
+    sizes = np.unique(np.geomspace(100, 1e7, 2000).astype(int))
+    better = [
+        b < a for a, b in (expected_costs(int(n), dim, tolerance, False, factors) for n in sizes)
+    ]
+    first = better.index(True)
+    assert all(better[first:])
+    return sizes[first]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_choice_of_the_preconditioner_by_kind_of_device(dim):
+    """On GPUs the many small launches of coarse levels cost more than cells, so Jacobi pays for larger meshes."""
+
+    class Device:
+        type = cl.device_type.GPU
+        host_unified_memory = False
+
+    assert cost_factors(Device) == COSTS_ON_GPU
+    Device.host_unified_memory = True
+    assert cost_factors(Device) == COSTS_ON_SHARED_MEMORY
+    Device.type |= cl.device_type.CPU
+    assert cost_factors(Device) == COSTS_ON_CPU
+    for tolerance in (1e-2, 1e-8):
+        kinds = COSTS_ON_CPU, COSTS_ON_SHARED_MEMORY, COSTS_ON_GPU
+        cpu, shared, gpu = (crossover(dim, tolerance, factors) for factors in kinds)
+        assert cpu == shared < gpu < 50 * cpu
