@@ -34,18 +34,13 @@ inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, DOMAIN_ARGS)
     return true;
 }
 
-/* partners[p] = the generator whose image is nearest to that of cell p of those at the wall, -1 if there is none.
-   Both are neighbors in the diagram without walls, but not in the diagram. */
-kernel void find_partners(const int size, global const int *cells, const int n, global const int *convex_starts,
-                          global const int *convex_neighbors, global const int *starts, global const int *neighbors,
-                          global const REAL2 *points, global const REAL *h, global const int *labels, const int fixed,
-                          DOMAIN_ARGS, global int *partners)
+/* The generator whose image is nearest to generator i, -1 if there is none. Both are neighbors in the diagram without
+   walls, but not in the diagram. */
+inline int nearest_image(int i, int n, global const int *convex_starts, global const int *convex_neighbors,
+                         global const int *starts, global const int *neighbors, global const REAL2 *points,
+                         global const REAL *h, global const int *labels, int fixed, DOMAIN_ARGS)
 {
-    WORK_ITEM(p);
-    const int i = cells[p];
-    partners[p] = -1;
-    if (i >= n || labels[i] < fixed)
-        return;
+    int partner = -1;
     REAL least = PAIRED * h[i];
     for (int k = convex_starts[i]; k < convex_starts[i + 1]; ++k) {
         const int j = convex_neighbors[k];
@@ -60,41 +55,71 @@ kernel void find_partners(const int size, global const int *cells, const int n, 
         const REAL away = sqrt(dot(image - points[i], image - points[i]));
         if (away < least) {
             least = away;
-            partners[p] = j;
+            partner = j;
         }
     }
+    return partner;
 }
 
-/* targets[p] = halfway to the image of the partner, if both are partners of each other. slots[i] is the place of cell i
-   among those at the wall. */
-kernel void place_pairs(const int size, global const int *cells, const int n, global const int *slots,
-                        global const int *partners, global const REAL2 *points, global const REAL *h, DOMAIN_ARGS,
-                        global REAL2 *targets)
-{
-    WORK_ITEM(p);
-    const int i = cells[p], j = partners[p];
-    if (i >= n)
-        return;
-    REAL2 image = points[i];
-    targets[p] = image;
-    if (j < 0 || slots[j] >= size || partners[slots[j]] != i ||
-        !image_across(points[i], points[j], fmin(h[i], h[j]), &image, DOMAIN))
-        return;
-    const REAL2 goal = (points[i] + image) / 2;
-    const REAL from[2] = {points[i].s0, points[i].s1}, to[2] = {goal.s0, goal.s1};
-    int edge;
-    if (exit_over_edge(from, to, &edge, DOMAIN) > 1)
-        targets[p] = goal;
-}
-
-/* Move the generators of pairs. */
-kernel void move_pairs(const int size, global const int *cells, const int n, global const REAL2 *targets,
-                       global REAL2 *points, global REAL2 *velocity)
+/* partners[p] = the generator with the nearest image to cell p of those at the wall, if that holds in turn; -1 for
+   none. The partner may be a cell that is not at the wall, because the other one reaches through. */
+kernel void find_partners(const int size, global const int *cells, const int n, global const int *convex_starts,
+                          global const int *convex_neighbors, global const int *starts, global const int *neighbors,
+                          global const REAL2 *points, global const REAL *h, global const int *labels, const int fixed,
+                          DOMAIN_ARGS, global int *partners)
 {
     WORK_ITEM(p);
     const int i = cells[p];
-    if (i >= n)
+    partners[p] = -1;
+    if (i >= n || labels[i] < fixed)
         return;
-    velocity[i] += targets[p] - points[i];
-    points[i] = targets[p];
+    const int j = nearest_image(i, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed,
+                                DOMAIN);
+    if (j >= 0 && nearest_image(j, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed,
+                                DOMAIN) == i)
+        partners[p] = j;
+}
+
+/* Halfway from generator i to the image of j; its position if a wall is in the way. */
+inline REAL2 halfway(int i, int j, global const REAL2 *points, global const REAL *h, DOMAIN_ARGS)
+{
+    REAL2 image;
+    if (!image_across(points[i], points[j], fmin(h[i], h[j]), &image, DOMAIN))
+        return points[i];
+    const REAL2 goal = (points[i] + image) / 2;
+    const REAL from[2] = {points[i].s0, points[i].s1}, to[2] = {goal.s0, goal.s1};
+    return exit_parameter(from, to, DOMAIN) > 1 ? goal : points[i];
+}
+
+/* targets[2 p], [2 p + 1] = where cell p of those at the wall and its partner go. */
+kernel void place_pairs(const int size, global const int *cells, const int n, global const int *partners,
+                        global const REAL2 *points, global const REAL *h, DOMAIN_ARGS, global REAL2 *targets)
+{
+    WORK_ITEM(p);
+    const int i = cells[p], j = partners[p];
+    if (i >= n || j < 0)
+        return;
+    targets[2 * p] = halfway(i, j, points, h, DOMAIN);
+    targets[2 * p + 1] = halfway(j, i, points, h, DOMAIN);
+}
+
+inline void move_generator(int i, REAL2 target, global REAL2 *points, global REAL2 *velocity)
+{
+    velocity[i] += target - points[i];
+    points[i] = target;
+}
+
+/* Move the generators of pairs. Cell p moves its partner if that is not at the wall itself; slots[i] is the place of
+   cell i among those at the wall. */
+kernel void move_pairs(const int size, global const int *cells, const int n, global const int *slots,
+                       global const int *partners, global const REAL2 *targets, global REAL2 *points,
+                       global REAL2 *velocity)
+{
+    WORK_ITEM(p);
+    const int i = cells[p], j = partners[p];
+    if (i >= n || j < 0)
+        return;
+    move_generator(i, targets[2 * p], points, velocity);
+    if (slots[j] >= size)
+        move_generator(j, targets[2 * p + 1], points, velocity);
 }

@@ -54,14 +54,14 @@ class ThinWalls:
         chords, convex = t.trimmed.chords, t.trimmed.convex
         u, n, args = chords.touched_count, np.int32(t.n), domain.device_args(engine)
         with engine.workspace.frame():
-            partners, targets = engine.scratch(u, np.int32), engine.scratch((u, 2))
+            partners, targets = engine.scratch(u, np.int32), engine.scratch((2 * u, 2))
             engine.run_each(
                 k.find_partners, u, chords.touched, n, convex.starts, convex.neighbors, t.starts, t.neighbors,
                 moving.points, h, moving.labels, np.int32(moving.fixed), *args, partners,
             )  # fmt: skip
             engine.run_each(
-                k.place_pairs, u, chords.touched, n, chords.slots, partners, moving.points, h, *args, targets
-            )  # fmt: skip
-            engine.run_each(
-                k.move_pairs, u, chords.touched, n, targets, moving.points, moving.velocity
+                k.place_pairs, u, chords.touched, n, partners, moving.points, h, *args, targets
             )
+            engine.run_each(
+                k.move_pairs, u, chords.touched, n, chords.slots, partners, targets, moving.points, moving.velocity
+            )  # fmt: skip
