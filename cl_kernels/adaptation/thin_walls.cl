@@ -9,6 +9,7 @@
    sides of the wall. */
 #define PAIRED R(0.45)
 #define PARALLEL R(0.5)
+#define PUSH R(0.1)
 
 /* The image of y at the middle of the wall between x and y; false if no thin wall is between them. */
 inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, DOMAIN_ARGS)
@@ -91,14 +92,45 @@ inline REAL2 halfway(int i, int j, global const REAL2 *points, global const REAL
     return exit_parameter(from, to, DOMAIN) > 1 ? goal : points[i];
 }
 
+/* Where generator i goes that has no partner, and lies between two pairs: away from the wall. */
+inline REAL2 pushed_away(int i, int n, int size, global const int *slots, global const int *partners,
+                         global const int *convex_starts, global const int *convex_neighbors,
+                         global const REAL2 *points, global const REAL *h, DOMAIN_ARGS)
+{
+    REAL2 away = 0;
+    int pairs = 0;
+    for (int k = convex_starts[i]; k < convex_starts[i + 1]; ++k) {
+        const int j = convex_neighbors[k];
+        REAL2 image;
+        if (j < 0 || j >= n || slots[j] >= size || partners[slots[j]] < 0 ||
+            !image_across(points[i], points[j], fmin(h[i], h[j]), &image, DOMAIN))
+            continue;
+        away += (image - points[j]) / sqrt(dot(image - points[j], image - points[j]));
+        ++pairs;
+    }
+    if (pairs < 2)
+        return points[i];
+    const REAL2 goal = points[i] + PUSH * h[i] / pairs * away;
+    const REAL from[2] = {points[i].s0, points[i].s1}, to[2] = {goal.s0, goal.s1};
+    return exit_parameter(from, to, DOMAIN) > 1 ? goal : points[i];
+}
+
 /* targets[2 p], [2 p + 1] = where cell p of those at the wall and its partner go. */
-kernel void place_pairs(const int size, global const int *cells, const int n, global const int *partners,
-                        global const REAL2 *points, global const REAL *h, DOMAIN_ARGS, global REAL2 *targets)
+kernel void place_pairs(const int size, global const int *cells, const int n, global const int *slots,
+                        global const int *partners, global const int *convex_starts,
+                        global const int *convex_neighbors, global const REAL2 *points, global const REAL *h,
+                        global const int *labels, const int fixed, DOMAIN_ARGS, global REAL2 *targets)
 {
     WORK_ITEM(p);
     const int i = cells[p], j = partners[p];
-    if (i >= n || j < 0)
+    if (i >= n)
         return;
+    if (j < 0) {
+        targets[2 * p] = labels[i] < fixed ? points[i]
+                                           : pushed_away(i, n, size, slots, partners, convex_starts, convex_neighbors,
+                                                         points, h, DOMAIN);
+        return;
+    }
     targets[2 * p] = halfway(i, j, points, h, DOMAIN);
     targets[2 * p + 1] = halfway(j, i, points, h, DOMAIN);
 }
@@ -117,9 +149,9 @@ kernel void move_pairs(const int size, global const int *cells, const int n, glo
 {
     WORK_ITEM(p);
     const int i = cells[p], j = partners[p];
-    if (i >= n || j < 0)
+    if (i >= n)
         return;
     move_generator(i, targets[2 * p], points, velocity);
-    if (slots[j] >= size)
+    if (j >= 0 && slots[j] >= size)
         move_generator(j, targets[2 * p + 1], points, velocity);
 }
