@@ -9,6 +9,7 @@
    sides of the wall. */
 #define PAIRED R(0.45)
 #define PARALLEL R(0.5)
+/* Step over h of a generator without a partner. */
 #define PUSH R(0.1)
 
 /* The image of y at the middle of the wall between x and y; false if no thin wall is between them. */

@@ -60,8 +60,20 @@ class ThinWalls:
                 moving.points, h, moving.labels, np.int32(moving.fixed), *args, partners,
             )  # fmt: skip
             engine.run_each(
-                k.place_pairs, u, chords.touched, n, chords.slots, partners, convex.starts, convex.neighbors,
-                moving.points, h, moving.labels, np.int32(moving.fixed), *args, targets,
+                k.place_pairs,
+                u,
+                chords.touched,
+                n,
+                chords.slots,
+                partners,
+                convex.starts,
+                convex.neighbors,
+                moving.points,
+                h,
+                moving.labels,
+                np.int32(moving.fixed),
+                *args,
+                targets,
             )
             engine.run_each(
                 k.move_pairs, u, chords.touched, n, chords.slots, partners, targets, moving.points, moving.velocity

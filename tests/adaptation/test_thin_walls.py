@@ -30,19 +30,24 @@ def rows_of(t, order):
     return rows
 
 
+def across(points, i, rows):
+    """Return those of the generators `rows` that the slit separates from generator i."""
+    x, found = points[i], []
+    for j in sorted(rows):
+        y = points[j]
+        if (x[0] < 0.5) != (y[0] < 0.5):
+            share = (0.5 - x[0]) / (y[0] - x[0])
+            found += [j] if x[1] + share * (y[1] - x[1]) <= TOP else []
+    return found
+
+
 def nearest_images(points, convex, neighbors):
     """Return the generator beyond the slit whose mirror image is nearest to each point; -1 for none."""
     partners = np.full(len(points), -1)
-    for i in range(len(points)):
-        x, least = points[i], 0.45 * H
-        for j in sorted(convex[i] - neighbors[i]):
-            y = points[j]
-            if (x[0] < 0.5) == (y[0] < 0.5):
-                continue
-            share = (0.5 - x[0]) / (y[0] - x[0])
-            if x[1] + share * (y[1] - x[1]) > TOP:
-                continue
-            away = np.hypot(1 - y[0] - x[0], y[1] - x[1])
+    for i, x in enumerate(points):
+        least = 0.45 * H
+        for j in across(points, i, convex[i] - neighbors[i]):
+            away = np.hypot(1 - points[j, 0] - x[0], points[j, 1] - x[1])
             if away < least:
                 least, partners[i] = away, j
     return partners
@@ -50,7 +55,7 @@ def nearest_images(points, convex, neighbors):
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_pairs(ctx, real):
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(7)
     x = (np.indices((10, 10)).reshape(2, -1).T + 0.5) / 10 + rng.uniform(-0.03, 0.03, (100, 2))
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), SLIT.kind(np.dtype(real)))
     mesh = MeshState.create(
@@ -63,9 +68,18 @@ def test_pairs(ctx, real):
     at_wall = order[chords.touched.get()[: chords.touched_count]]
     mesh.stages.thin_walls.pair(SLIT, mesh.t, mesh.h, mesh.moving)
     partners, expected = nearest_images(x, *rows), x.copy()
-    for i, j in enumerate(partners):
-        if j >= 0 and partners[j] == i and (i in at_wall or j in at_wall):
-            expected[i] = (x[i] + (1 - x[j, 0], x[j, 1])) / 2
+    paired = {
+        i for i, j in enumerate(partners)
+        if j >= 0 and partners[j] == i and (i in at_wall or j in at_wall)
+    }  # fmt: skip
+    pushed = 0
+    for i in set(at_wall.tolist()) | paired:
+        if i in paired:
+            expected[i] = (x[i] + (1 - x[partners[i], 0], x[partners[i], 1])) / 2
+        elif sum(j in paired and j in at_wall for j in across(x, i, rows[0][i])) > 1:
+            expected[i, 0] += 0.1 * H * np.sign(x[i, 0] - 0.5)
+            pushed += 1
+    assert pushed > 0
     moved = (expected != x).any(axis=1)
     assert moved.sum() >= 8
     tolerance = 200 * float(np.finfo(real).eps)
