@@ -75,10 +75,10 @@ kernel void find_partners(const int size, global const int *cells, const int n, 
     partners[p] = -1;
     if (i >= n || labels[i] < fixed)
         return;
-    const int j = nearest_image(i, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed,
-                                DOMAIN);
-    if (j >= 0 && nearest_image(j, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed,
-                                DOMAIN) == i)
+    const int j =
+        nearest_image(i, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed, DOMAIN);
+    if (j >= 0 &&
+        nearest_image(j, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed, DOMAIN) == i)
         partners[p] = j;
 }
 
@@ -118,9 +118,9 @@ inline REAL2 pushed_away(int i, int n, int size, global const int *slots, global
 
 /* targets[2 p], [2 p + 1] = where cell p of those at the wall and its partner go. */
 kernel void place_pairs(const int size, global const int *cells, const int n, global const int *slots,
-                        global const int *partners, global const int *convex_starts,
-                        global const int *convex_neighbors, global const REAL2 *points, global const REAL *h,
-                        global const int *labels, const int fixed, DOMAIN_ARGS, global REAL2 *targets)
+                        global const int *partners, global const int *convex_starts, global const int *convex_neighbors,
+                        global const REAL2 *points, global const REAL *h, global const int *labels, const int fixed,
+                        DOMAIN_ARGS, global REAL2 *targets)
 {
     WORK_ITEM(p);
     const int i = cells[p], j = partners[p];
