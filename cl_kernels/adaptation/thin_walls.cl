@@ -83,7 +83,7 @@ kernel void find_partners(const int size, global const int *cells, const int n, 
 }
 
 /* Halfway from generator i to the image of j; its position if a wall is in the way. */
-inline REAL2 halfway(int i, int j, global const REAL2 *points, global const REAL *h, DOMAIN_ARGS)
+inline REAL2 halfway_to_image(int i, int j, global const REAL2 *points, global const REAL *h, DOMAIN_ARGS)
 {
     REAL2 image;
     if (!image_across(points[i], points[j], fmin(h[i], h[j]), &image, DOMAIN))
@@ -132,11 +132,11 @@ kernel void place_pairs(const int size, global const int *cells, const int n, gl
                                                          points, h, DOMAIN);
         return;
     }
-    targets[2 * p] = halfway(i, j, points, h, DOMAIN);
-    targets[2 * p + 1] = halfway(j, i, points, h, DOMAIN);
+    targets[2 * p] = halfway_to_image(i, j, points, h, DOMAIN);
+    targets[2 * p + 1] = halfway_to_image(j, i, points, h, DOMAIN);
 }
 
-inline void move_generator(int i, REAL2 target, global REAL2 *points, global REAL2 *velocity)
+inline void move_paired(int i, REAL2 target, global REAL2 *points, global REAL2 *velocity)
 {
     velocity[i] += target - points[i];
     points[i] = target;
@@ -152,7 +152,7 @@ kernel void move_pairs(const int size, global const int *cells, const int n, glo
     const int i = cells[p], j = partners[p];
     if (i >= n)
         return;
-    move_generator(i, targets[2 * p], points, velocity);
+    move_paired(i, targets[2 * p], points, velocity);
     if (j >= 0 && slots[j] >= size)
-        move_generator(j, targets[2 * p + 1], points, velocity);
+        move_paired(j, targets[2 * p + 1], points, velocity);
 }
