@@ -38,7 +38,7 @@ inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, DOMAIN_ARGS)
 
 /* The generator whose image is nearest to generator i, -1 if there is none. Both are neighbors in the diagram without
    walls, but not in the diagram. */
-inline int nearest_image(int i, int n, global const int *convex_starts, global const int *convex_neighbors,
+inline int image_partner(int i, int n, global const int *convex_starts, global const int *convex_neighbors,
                          global const int *starts, global const int *neighbors, global const REAL2 *points,
                          global const REAL *h, global const int *labels, int fixed, DOMAIN_ARGS)
 {
@@ -76,9 +76,9 @@ kernel void find_partners(const int size, global const int *cells, const int n, 
     if (i >= n || labels[i] < fixed)
         return;
     const int j =
-        nearest_image(i, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed, DOMAIN);
+        image_partner(i, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed, DOMAIN);
     if (j >= 0 &&
-        nearest_image(j, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed, DOMAIN) == i)
+        image_partner(j, n, convex_starts, convex_neighbors, starts, neighbors, points, h, labels, fixed, DOMAIN) == i)
         partners[p] = j;
 }
 
