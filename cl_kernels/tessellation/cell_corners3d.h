@@ -3,7 +3,25 @@
 #include "opencl/real.h"
 #include "tessellation/row_counts.h"
 
-#define REAL8 CLVORO_JOIN(REAL, 8)
+/* Eight vertices or faces at a time in the lanes of a vector on CPUs; one on other devices, which have few registers.
+ */
+#if GROUP_SIZE == 1
+#define WIDTH 8
+#define WIDE CLVORO_JOIN(REAL, 8)
+#define LOAD_WIDE(k, values) vload8(k, values)
+#define STORE_WIDE(v, k, values) vstore8(v, k, values)
+#define GATHER_WIDE(values, k)                                                                                         \
+    (WIDE)((values)[(k)[0]], (values)[(k)[1]], (values)[(k)[2]], (values)[(k)[3]], (values)[(k)[4]], (values)[(k)[5]], \
+           (values)[(k)[6]], (values)[(k)[7]])
+#define LANE_NUMBERS (WIDE)(0, 1, 2, 3, 4, 5, 6, 7)
+#else
+#define WIDTH 1
+#define WIDE REAL
+#define LOAD_WIDE(k, values) (values)[k]
+#define STORE_WIDE(v, k, values) (values)[k] = (v)
+#define GATHER_WIDE(values, k) (values)[(k)[0]]
+#define LANE_NUMBERS (WIDE)(0)
+#endif
 #define MOST_CORNERS (2 * MOST_FACES)
 #define NO_CORNER 255
 
@@ -32,9 +50,9 @@ typedef struct {
     int faces, corners;
     int labels[MOST_FACES];
     REAL px[MOST_FACES], py[MOST_FACES], pz[MOST_FACES], d2[MOST_FACES];
-    uchar4 at[MOST_CORNERS];                                             /* faces of a vertex */
-    REAL8 x[MOST_CORNERS / 8], y[MOST_CORNERS / 8], z[MOST_CORNERS / 8]; /* its position */
-    REAL8 beyond[MOST_CORNERS / 8];                                      /* its largest y.p - 1/2 */
+    uchar4 at[MOST_CORNERS];                                                        /* faces of a vertex */
+    WIDE x[MOST_CORNERS / WIDTH], y[MOST_CORNERS / WIDTH], z[MOST_CORNERS / WIDTH]; /* its position */
+    WIDE beyond[MOST_CORNERS / WIDTH];                                              /* its largest y.p - 1/2 */
     REAL reach2;
 } corners_t;
 
@@ -53,50 +71,60 @@ inline REAL4 corner_place(const corners_t *cell, int v)
     return (REAL4)(((const REAL *)cell->x)[v], ((const REAL *)cell->y)[v], ((const REAL *)cell->z)[v], 0);
 }
 
-inline REAL largest_of_eight(REAL8 v)
+inline REAL largest_lane(WIDE v)
 {
+#if WIDTH == 1
+    return v;
+#else
     const REAL4 a = v.lo > v.hi ? v.lo : v.hi;
     const REAL2 b = a.lo > a.hi ? a.lo : a.hi;
     return b.s0 > b.s1 ? b.s0 : b.s1;
+#endif
+}
+
+inline REAL sum_of_lanes(WIDE v)
+{
+#if WIDTH == 1
+    return v;
+#else
+    const REAL4 a = v.lo + v.hi;
+    return (a.s0 + a.s2) + (a.s1 + a.s3);
+#endif
 }
 
 /* Pad the planes to whole vectors by those of no neighbor, p = 0. */
 inline void pad_planes(corners_t *cell)
 {
-    const int end = (cell->faces + 7) / 8 * 8;
+    const int end = (cell->faces + WIDTH - 1) / WIDTH * WIDTH;
     for (int f = cell->faces; f < end; ++f)
         cell->px[f] = cell->py[f] = cell->pz[f] = cell->d2[f] = 0;
 }
 
 typedef struct {
-    REAL8 x, y, z;
-} space8_t;
+    WIDE x, y, z;
+} places_t;
 
-inline REAL8 product8(space8_t a, space8_t b)
+inline WIDE product_of(places_t a, places_t b)
 {
     return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z));
 }
 
-inline space8_t cross8(space8_t a, space8_t b)
+inline places_t cross_of(places_t a, places_t b)
 {
-    const space8_t c = {fma(a.y, b.z, -a.z * b.y), fma(a.z, b.x, -a.x * b.z), fma(a.x, b.y, -a.y * b.x)};
+    const places_t c = {fma(a.y, b.z, -a.z * b.y), fma(a.z, b.x, -a.x * b.z), fma(a.x, b.y, -a.y * b.x)};
     return c;
 }
 
 /* a + s b */
-inline space8_t add_along(space8_t a, REAL8 s, space8_t b)
+inline places_t add_along(places_t a, WIDE s, places_t b)
 {
-    const space8_t c = {fma(s, b.x, a.x), fma(s, b.y, a.y), fma(s, b.z, a.z)};
+    const places_t c = {fma(s, b.x, a.x), fma(s, b.y, a.y), fma(s, b.z, a.z)};
     return c;
 }
 
-#define GATHER8(values, k)                                                                                             \
-    (REAL8)((values)[(k)[0]], (values)[(k)[1]], (values)[(k)[2]], (values)[(k)[3]], (values)[(k)[4]],                  \
-            (values)[(k)[5]], (values)[(k)[6]], (values)[(k)[7]])
-
-inline space8_t gather_planes(const corners_t *cell, const int *k)
+inline places_t gather_planes(const corners_t *cell, const int *k)
 {
-    const space8_t p = {GATHER8(cell->px, k), GATHER8(cell->py, k), GATHER8(cell->pz, k)};
+    const places_t p = {GATHER_WIDE(cell->px, k), GATHER_WIDE(cell->py, k), GATHER_WIDE(cell->pz, k)};
     return p;
 }
 
@@ -104,18 +132,18 @@ inline space8_t gather_planes(const corners_t *cell, const int *k)
    simd/walk_state.h. */
 typedef struct {
     REAL4 faces[MOST_FACES];
-    REAL8 xx, yy, zz, yz, zx, xy;
+    WIDE xx, yy, zz, yz, zx, xy;
 } sums_t;
 
 /* Contributions of a vertex at the end of the common edge of faces p and q; see `share_edge` in simd/walk_state.h. */
 typedef struct {
-    REAL8 g, part_p, part_q, both;
+    WIDE g, part_p, part_q, both;
 } part_t;
 
-inline part_t part_of_edge(REAL8 g, space8_t p, space8_t q, REAL8 p2, REAL8 q2, REAL8 inverses)
+inline part_t part_of_edge(WIDE g, places_t p, places_t q, WIDE p2, WIDE q2, WIDE inverses)
 {
-    const REAL8 pq = product8(p, q);
-    const part_t part = {g, g * (p2 - pq), g * (q2 - pq), g * fma(-pq, inverses, (REAL8)2)};
+    const WIDE pq = product_of(p, q);
+    const part_t part = {g, g * (p2 - pq), g * (q2 - pq), g * fma(-pq, inverses, (WIDE)2)};
     return part;
 }
 
@@ -124,98 +152,98 @@ inline part_t part_of_edge(REAL8 g, space8_t p, space8_t q, REAL8 p2, REAL8 q2, 
  */
 inline bool place_corners(corners_t *cell, sums_t *sums)
 {
-    const int blocks = (cell->corners + 7) / 8;
-    for (int v = cell->corners; v < 8 * blocks; ++v)
+    const int blocks = (cell->corners + WIDTH - 1) / WIDTH;
+    for (int v = cell->corners; v < WIDTH * blocks; ++v)
         cell->at[v] = cell->at[0];
     for (int f = 0; f < cell->faces; ++f)
         sums->faces[f] = 0;
     sums->xx = sums->yy = sums->zz = sums->yz = sums->zx = sums->xy = 0;
-    REAL8 far2 = 0, good = 1;
+    WIDE far2 = 0, good = 1;
     bool fits = true;
     for (int block = 0; block < blocks; ++block) {
-        int at_a[8], at_b[8], at_c[8];
-        for (int lane = 0; lane < 8; ++lane) {
-            const uchar4 at = cell->at[8 * block + lane];
+        int at_a[WIDTH], at_b[WIDTH], at_c[WIDTH];
+        for (int lane = 0; lane < WIDTH; ++lane) {
+            const uchar4 at = cell->at[WIDTH * block + lane];
             at_a[lane] = at.s0;
             at_b[lane] = at.s1;
             at_c[lane] = at.s2;
         }
-        const space8_t a = gather_planes(cell, at_a), b = gather_planes(cell, at_b), c = gather_planes(cell, at_c);
-        const space8_t ab = cross8(a, b), bc = cross8(b, c), ca = cross8(c, a);
-        const REAL8 a2 = product8(a, a), b2 = product8(b, b), c2 = product8(c, c), det = product8(a, bc);
-        const REAL8 over = 1 / det;
-        space8_t y = {(ab.x + bc.x + ca.x) * over / 2, (ab.y + bc.y + ca.y) * over / 2,
+        const places_t a = gather_planes(cell, at_a), b = gather_planes(cell, at_b), c = gather_planes(cell, at_c);
+        const places_t ab = cross_of(a, b), bc = cross_of(b, c), ca = cross_of(c, a);
+        const WIDE a2 = product_of(a, a), b2 = product_of(b, b), c2 = product_of(c, c), det = product_of(a, bc);
+        const WIDE over = 1 / det;
+        places_t y = {(ab.x + bc.x + ca.x) * over / 2, (ab.y + bc.y + ca.y) * over / 2,
                       (ab.z + bc.z + ca.z) * over / 2};
-        const REAL8 off_a = (R(0.5) - product8(a, y)) * over, off_b = (R(0.5) - product8(b, y)) * over;
-        const REAL8 off_c = (R(0.5) - product8(c, y)) * over;
+        const WIDE off_a = (R(0.5) - product_of(a, y)) * over, off_b = (R(0.5) - product_of(b, y)) * over;
+        const WIDE off_c = (R(0.5) - product_of(c, y)) * over;
         y = add_along(add_along(add_along(y, off_a, bc), off_b, ca), off_c, ab);
         cell->x[block] = y.x;
         cell->y[block] = y.y;
         cell->z[block] = y.z;
-        const REAL8 y2 = product8(y, y), sine2 = det * det - LEAST_SINE2 * a2 * b2 * c2;
+        const WIDE y2 = product_of(y, y), sine2 = det * det - LEAST_SINE2 * a2 * b2 * c2;
         far2 = y2 > far2 ? y2 : far2;
-        const REAL8 ab2 = product8(ab, ab), bc2 = product8(bc, bc), ca2 = product8(ca, ca);
+        const WIDE ab2 = product_of(ab, ab), bc2 = product_of(bc, bc), ca2 = product_of(ca, ca);
         good = ((det > 0) & (sine2 > 0) & (ab2 > LEAST_ANGLE2 * a2 * b2) & (bc2 > LEAST_ANGLE2 * b2 * c2) &
                 (ca2 > LEAST_ANGLE2 * c2 * a2))
                    ? good
                    : 0;
         /* Two independent chains of comparisons, which the processor overlaps. */
-        REAL8 beyond = -1, others = -1;
+        WIDE beyond = -1, others = -1;
         for (int f = 0; f < cell->faces; f += 2) {
-            const REAL8 s = fma(cell->px[f], y.x, fma(cell->py[f], y.y, cell->pz[f] * y.z));
+            const WIDE s = fma(cell->px[f], y.x, fma(cell->py[f], y.y, cell->pz[f] * y.z));
             const int g = min(f + 1, cell->faces - 1);
-            const REAL8 t = fma(cell->px[g], y.x, fma(cell->py[g], y.y, cell->pz[g] * y.z));
+            const WIDE t = fma(cell->px[g], y.x, fma(cell->py[g], y.y, cell->pz[g] * y.z));
             beyond = s > beyond ? s : beyond;
             others = t > others ? t : others;
         }
         beyond = others > beyond ? others : beyond;
         cell->beyond[block] = beyond - R(0.5);
-        fits = fits && !(largest_of_eight(beyond) > R(0.5) + BEYOND_NOISE);
+        fits = fits && !(largest_lane(beyond) > R(0.5) + BEYOND_NOISE);
         if (!fits)
             continue;
 
-        const REAL8 ia = GATHER8(cell->d2, at_a), ib = GATHER8(cell->d2, at_b), ic = GATHER8(cell->d2, at_c);
-        const REAL8 inverse = 1 / (ab2 * bc2 * ca2);
-        const part_t of_ab = part_of_edge(product8(y, ab) * bc2 * ca2 * inverse, a, b, a2, b2, ia + ib);
-        const part_t of_bc = part_of_edge(product8(y, bc) * ca2 * ab2 * inverse, b, c, b2, c2, ib + ic);
-        const part_t of_ca = part_of_edge(product8(y, ca) * ab2 * bc2 * inverse, c, a, c2, a2, ic + ia);
-        const space8_t twice = {2 * y.x, 2 * y.y, 2 * y.z}, none = {0, 0, 0};
-        const space8_t to_ab = add_along(twice, -of_ab.g, ab), to_bc = add_along(twice, -of_bc.g, bc);
-        const space8_t to_ca = add_along(twice, -of_ca.g, ca);
-        const space8_t first_a = add_along(add_along(none, of_ab.part_p, to_ab), of_ca.part_q, to_ca);
-        const space8_t first_b = add_along(add_along(none, of_bc.part_p, to_bc), of_ab.part_q, to_ab);
-        const space8_t first_c = add_along(add_along(none, of_ca.part_p, to_ca), of_bc.part_q, to_bc);
-        REAL parts[12][8];
-        vstore8(of_ab.part_p + of_ca.part_q, 0, parts[0]);
-        vstore8(first_a.x, 0, parts[1]);
-        vstore8(first_a.y, 0, parts[2]);
-        vstore8(first_a.z, 0, parts[3]);
-        vstore8(of_bc.part_p + of_ab.part_q, 0, parts[4]);
-        vstore8(first_b.x, 0, parts[5]);
-        vstore8(first_b.y, 0, parts[6]);
-        vstore8(first_b.z, 0, parts[7]);
-        vstore8(of_ca.part_p + of_bc.part_q, 0, parts[8]);
-        vstore8(first_c.x, 0, parts[9]);
-        vstore8(first_c.y, 0, parts[10]);
-        vstore8(first_c.z, 0, parts[11]);
-        const int lanes = min(8, cell->corners - 8 * block);
+        const WIDE ia = GATHER_WIDE(cell->d2, at_a), ib = GATHER_WIDE(cell->d2, at_b), ic = GATHER_WIDE(cell->d2, at_c);
+        const WIDE inverse = 1 / (ab2 * bc2 * ca2);
+        const part_t of_ab = part_of_edge(product_of(y, ab) * bc2 * ca2 * inverse, a, b, a2, b2, ia + ib);
+        const part_t of_bc = part_of_edge(product_of(y, bc) * ca2 * ab2 * inverse, b, c, b2, c2, ib + ic);
+        const part_t of_ca = part_of_edge(product_of(y, ca) * ab2 * bc2 * inverse, c, a, c2, a2, ic + ia);
+        const places_t twice = {2 * y.x, 2 * y.y, 2 * y.z}, none = {0, 0, 0};
+        const places_t to_ab = add_along(twice, -of_ab.g, ab), to_bc = add_along(twice, -of_bc.g, bc);
+        const places_t to_ca = add_along(twice, -of_ca.g, ca);
+        const places_t first_a = add_along(add_along(none, of_ab.part_p, to_ab), of_ca.part_q, to_ca);
+        const places_t first_b = add_along(add_along(none, of_bc.part_p, to_bc), of_ab.part_q, to_ab);
+        const places_t first_c = add_along(add_along(none, of_ca.part_p, to_ca), of_bc.part_q, to_bc);
+        REAL parts[12][WIDTH];
+        STORE_WIDE(of_ab.part_p + of_ca.part_q, 0, parts[0]);
+        STORE_WIDE(first_a.x, 0, parts[1]);
+        STORE_WIDE(first_a.y, 0, parts[2]);
+        STORE_WIDE(first_a.z, 0, parts[3]);
+        STORE_WIDE(of_bc.part_p + of_ab.part_q, 0, parts[4]);
+        STORE_WIDE(first_b.x, 0, parts[5]);
+        STORE_WIDE(first_b.y, 0, parts[6]);
+        STORE_WIDE(first_b.z, 0, parts[7]);
+        STORE_WIDE(of_ca.part_p + of_bc.part_q, 0, parts[8]);
+        STORE_WIDE(first_c.x, 0, parts[9]);
+        STORE_WIDE(first_c.y, 0, parts[10]);
+        STORE_WIDE(first_c.z, 0, parts[11]);
+        const int lanes = min(WIDTH, cell->corners - WIDTH * block);
         for (int lane = 0; lane < lanes; ++lane) {
             sums->faces[at_a[lane]] += (REAL4)(parts[0][lane], parts[1][lane], parts[2][lane], parts[3][lane]);
             sums->faces[at_b[lane]] += (REAL4)(parts[4][lane], parts[5][lane], parts[6][lane], parts[7][lane]);
             sums->faces[at_c[lane]] += (REAL4)(parts[8][lane], parts[9][lane], parts[10][lane], parts[11][lane]);
         }
         /* Lanes behind the last vertex count nothing. */
-        REAL here[8];
-        for (int lane = 0; lane < 8; ++lane)
+        REAL here[WIDTH];
+        for (int lane = 0; lane < WIDTH; ++lane)
             here[lane] = lane < lanes;
-        const REAL8 once = vload8(0, here);
-        const REAL8 t_ab = once * of_ab.both, t_bc = once * of_bc.both, t_ca = once * of_ca.both;
-        const REAL8 t = t_ab + t_bc + t_ca;
-        const REAL8 u_ab = t_ab * of_ab.g, u_bc = t_bc * of_bc.g, u_ca = t_ca * of_ca.g;
-        const REAL8 uu_ab = 2 * u_ab * of_ab.g, uu_bc = 2 * u_bc * of_bc.g, uu_ca = 2 * u_ca * of_ca.g;
-        const REAL8 zx = 3 * (t * y.x - fma(u_ab, ab.x, fma(u_bc, bc.x, u_ca * ca.x)));
-        const REAL8 zy = 3 * (t * y.y - fma(u_ab, ab.y, fma(u_bc, bc.y, u_ca * ca.y)));
-        const REAL8 zz = 3 * (t * y.z - fma(u_ab, ab.z, fma(u_bc, bc.z, u_ca * ca.z)));
+        const WIDE once = LOAD_WIDE(0, here);
+        const WIDE t_ab = once * of_ab.both, t_bc = once * of_bc.both, t_ca = once * of_ca.both;
+        const WIDE t = t_ab + t_bc + t_ca;
+        const WIDE u_ab = t_ab * of_ab.g, u_bc = t_bc * of_bc.g, u_ca = t_ca * of_ca.g;
+        const WIDE uu_ab = 2 * u_ab * of_ab.g, uu_bc = 2 * u_bc * of_bc.g, uu_ca = 2 * u_ca * of_ca.g;
+        const WIDE zx = 3 * (t * y.x - fma(u_ab, ab.x, fma(u_bc, bc.x, u_ca * ca.x)));
+        const WIDE zy = 3 * (t * y.y - fma(u_ab, ab.y, fma(u_bc, bc.y, u_ca * ca.y)));
+        const WIDE zz = 3 * (t * y.z - fma(u_ab, ab.z, fma(u_bc, bc.z, u_ca * ca.z)));
         sums->xx += fma(2 * zx, y.x, fma(uu_ab, ab.x * ab.x, fma(uu_bc, bc.x * bc.x, uu_ca * ca.x * ca.x)));
         sums->yy += fma(2 * zy, y.y, fma(uu_ab, ab.y * ab.y, fma(uu_bc, bc.y * bc.y, uu_ca * ca.y * ca.y)));
         sums->zz += fma(2 * zz, y.z, fma(uu_ab, ab.z * ab.z, fma(uu_bc, bc.z * bc.z, uu_ca * ca.z * ca.z)));
@@ -223,9 +251,9 @@ inline bool place_corners(corners_t *cell, sums_t *sums)
         sums->zx += fma(zz, y.x, zx * y.z) + fma(uu_ab, ab.z * ab.x, fma(uu_bc, bc.z * bc.x, uu_ca * ca.z * ca.x));
         sums->xy += fma(zx, y.y, zy * y.x) + fma(uu_ab, ab.x * ab.y, fma(uu_bc, bc.x * bc.y, uu_ca * ca.x * ca.y));
     }
-    cell->reach2 = largest_of_eight(far2);
+    cell->reach2 = largest_lane(far2);
     REAL nearest2 = INFINITY;
     for (int f = 0; f < cell->faces; ++f)
         nearest2 = fmin(nearest2, cell->d2[f]);
-    return largest_of_eight(-good) < 0 && nearest2 > LEAST_NEAREST2 * cell->reach2; /* a NaN is not good */
+    return largest_lane(-good) < 0 && nearest2 > LEAST_NEAREST2 * cell->reach2; /* a NaN is not good */
 }

@@ -3,6 +3,7 @@
 #include "tessellation/cell_corners3d.h"
 
 #define MOST_FLIPS 24
+#define MORE 8 /* room for further neighbors of a cell */
 
 #define LINK(links, a, b) ((links)->at[(a)*MOST_FACES + (b)])
 
@@ -31,10 +32,11 @@ inline REAL beyond_plane(const corners_t *cell, int f, REAL4 y)
     return fma(cell->px[f], y.s0, fma(cell->py[f], y.s1, cell->pz[f] * y.s2)) - R(0.5);
 }
 
-/* The same for eight faces. */
-inline REAL8 beyond_planes(const corners_t *cell, int block, REAL4 y)
+/* The same for WIDTH faces. */
+inline WIDE beyond_planes(const corners_t *cell, int block, REAL4 y)
 {
-    return fma(vload8(block, cell->px), y.s0, fma(vload8(block, cell->py), y.s1, vload8(block, cell->pz) * y.s2)) -
+    return fma(LOAD_WIDE(block, cell->px), y.s0,
+               fma(LOAD_WIDE(block, cell->py), y.s1, LOAD_WIDE(block, cell->pz) * y.s2)) -
            R(0.5);
 }
 
@@ -51,12 +53,12 @@ inline bool place_corner(corners_t *cell, int v)
     ((REAL *)cell->x)[v] = y.s0;
     ((REAL *)cell->y)[v] = y.s1;
     ((REAL *)cell->z)[v] = y.s2;
-    REAL8 beyond = -1;
-    for (int block = 0; 8 * block < cell->faces; ++block) {
-        const REAL8 s = beyond_planes(cell, block, y);
+    WIDE beyond = -1;
+    for (int block = 0; WIDTH * block < cell->faces; ++block) {
+        const WIDE s = beyond_planes(cell, block, y);
         beyond = s > beyond ? s : beyond;
     }
-    ((REAL *)cell->beyond)[v] = largest_of_eight(beyond);
+    ((REAL *)cell->beyond)[v] = largest_lane(beyond);
     return true;
 }
 
@@ -150,18 +152,17 @@ inline bool repair_corners(corners_t *cell, links_t *links, int known)
         const uchar4 at = cell->at[v];
         link_corner(cell, links, v, at.s0, at.s1, at.s2);
     }
-    REAL p[MOST_FACES][3];
+    REAL4 planes[MORE];
     for (int f = known; f < end; ++f) {
-        p[f][0] = cell->px[f];
-        p[f][1] = cell->py[f];
-        p[f][2] = cell->pz[f];
+        planes[f - known] = face_plane(cell, f);
         cell->px[f] = cell->py[f] = cell->pz[f] = 0;
     }
     bool right = flip_corners(cell, links);
     for (int f = known; f < end && right; ++f) {
-        cell->px[f] = p[f][0];
-        cell->py[f] = p[f][1];
-        cell->pz[f] = p[f][2];
+        const REAL4 plane = planes[f - known];
+        cell->px[f] = plane.s0;
+        cell->py[f] = plane.s1;
+        cell->pz[f] = plane.s2;
         REAL *beyond = (REAL *)cell->beyond, most = BEYOND_NOISE;
         int worst = -1;
         for (int v = 0; v < cell->corners; ++v) {
@@ -187,21 +188,20 @@ inline bool repair_corners(corners_t *cell, links_t *links, int known)
 /* The face that cuts a ray from y along `ray` first, except a and b; -1 if there is none. */
 inline int first_cut(const corners_t *cell, REAL4 y, REAL4 ray, int a, int b)
 {
-    const REAL8 lanes = (REAL8)(0, 1, 2, 3, 4, 5, 6, 7);
-    REAL8 least = INFINITY, faces = -1;
-    for (int block = 0; 8 * block < cell->faces; ++block) {
-        const REAL8 slack = fmax(-beyond_planes(cell, block, y), (REAL8)0), face = 8 * block + lanes;
-        const REAL8 speed = beyond_planes(cell, block, ray) + R(0.5), way = slack / speed;
-        const REAL8 allowed = ((speed > 0) & (face != a) & (face != b)) ? way : (REAL8)INFINITY;
+    WIDE least = INFINITY, faces = -1;
+    for (int block = 0; WIDTH * block < cell->faces; ++block) {
+        const WIDE slack = fmax(-beyond_planes(cell, block, y), (WIDE)0), face = WIDTH * block + LANE_NUMBERS;
+        const WIDE speed = beyond_planes(cell, block, ray) + R(0.5), way = slack / speed;
+        const WIDE allowed = ((speed > 0) & (face != a) & (face != b)) ? way : (WIDE)INFINITY;
         faces = allowed < least ? face : faces;
         least = fmin(allowed, least);
     }
-    REAL ways[8], numbers[8];
-    vstore8(least, 0, ways);
-    vstore8(faces, 0, numbers);
+    REAL ways[WIDTH], numbers[WIDTH];
+    STORE_WIDE(least, 0, ways);
+    STORE_WIDE(faces, 0, numbers);
     int first = -1;
     REAL way = INFINITY;
-    for (int lane = 0; lane < 8; ++lane) {
+    for (int lane = 0; lane < WIDTH; ++lane) {
         first = ways[lane] < way ? (int)numbers[lane] : first;
         way = fmin(ways[lane], way);
     }

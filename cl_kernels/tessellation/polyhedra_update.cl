@@ -16,7 +16,6 @@
    are clipped by all generators near them (`clip_polyhedra`), and never wrong. If round-off may decide about the faces
    of such a cell, areas are compared, and `match_polyhedron_faces` handles the rest. */
 
-#define MORE 8 /* room for further neighbors of a cell */
 #define NO_NEIGHBOR INT_MIN
 
 /* Marks of a cell: it must be updated again with further neighbors, or clipped. */
@@ -172,12 +171,6 @@ inline REAL4 measure_flat(const corners_t *cell, int f, REAL4 normal, REAL *far2
     return (REAL4)(twice / 2, centroid.s0, centroid.s1, centroid.s2);
 }
 
-inline REAL sum_of_eight(REAL8 v)
-{
-    const REAL4 a = v.lo + v.hi;
-    return (a.s0 + a.s2) + (a.s1 + a.s3);
-}
-
 /* The output arrays, see `clip_polyhedra`. */
 typedef struct {
     global int *labels;
@@ -188,8 +181,8 @@ typedef struct {
    more area than round-off. */
 inline bool write_measures(const corners_t *cell, const sums_t *sums, int i, int place, const measured_t *out)
 {
-    REAL volume = 0, xx = sum_of_eight(sums->xx), yy = sum_of_eight(sums->yy), zz = sum_of_eight(sums->zz);
-    REAL yz = sum_of_eight(sums->yz), zx = sum_of_eight(sums->zx), xy = sum_of_eight(sums->xy);
+    REAL volume = 0, xx = sum_of_lanes(sums->xx), yy = sum_of_lanes(sums->yy), zz = sum_of_lanes(sums->zz);
+    REAL yz = sum_of_lanes(sums->yz), zx = sum_of_lanes(sums->zx), xy = sum_of_lanes(sums->xy);
     REAL4 first = 0;
     bool good = true;
     for (int f = 0; f < cell->faces; ++f, ++place) {
@@ -270,10 +263,10 @@ inline void join_new_edges(const corners_t *cell, const uint *old, const uint *n
 
 inline bool fits_corners(const corners_t *cell)
 {
-    REAL8 beyond = cell->beyond[0];
-    for (int block = 1; 8 * block < cell->corners; ++block)
+    WIDE beyond = cell->beyond[0];
+    for (int block = 1; WIDTH * block < cell->corners; ++block)
         beyond = cell->beyond[block] > beyond ? cell->beyond[block] : beyond;
-    return !(largest_of_eight(beyond) > BEYOND_NOISE);
+    return !(largest_lane(beyond) > BEYOND_NOISE);
 }
 
 /* Per generator i, the first ones or, with `some`, those `listed` (as ~i to be clipped) with `further` neighbors: its

@@ -60,7 +60,7 @@ IN_PLANE = {
     "insertion_deletion.mark_pairs", "insertion_deletion.measure_strain", "insertion_deletion.score_bad_cells",
     "insertion_deletion.score_pairs", "insertion_deletion.score_strain", "insertion_deletion.count_pair_changes",
 }  # fmt: skip
-IN_SPACE = {"consistency", "half_faces", "polyhedra", "walks"}
+IN_SPACE = {"consistency", "half_faces", "polyhedra", "polyhedra_update", "walks"}
 AT_POLYGONS = {"boundary_crossings", "trim"}
 AT_LAYERS = {
     "metric.set_fixed_sizes",
@@ -76,7 +76,10 @@ NOT_FOR = {
     | AT_LAYERS
     | {"incremental.wrap_marked", "ghost_images.unfold_rows"},
     "space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"ghost_images"},
-    "periodic space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"ghost_images.measure_required_depths"},
+    "periodic space": IN_PLANE
+    | AT_POLYGONS
+    | AT_LAYERS
+    | {"ghost_images.measure_required_depths", "polyhedra.place_cell_corners", "polyhedra_update"},
 }
 """Files and kernels that a kind of domain does not need. All others except `ALIKE` run in it, in every variant."""
 PATIENCE = 20

@@ -19,7 +19,7 @@ MAIN = {
         "tessellation/cells", "tessellation/incremental", "solvers/volume_projection", "solvers/poisson",
         "adaptation/quality_descent",
     ],
-    3: ["tessellation/polyhedra", "solvers/volume_projection"],
+    3: ["tessellation/polyhedra", "tessellation/polyhedra_update", "solvers/volume_projection"],
 }  # fmt: skip
 """Programs whose kernels take most of the time of a step."""
 COMMON_LIMITS = 128, 512
@@ -28,6 +28,7 @@ LIMITS = {
     "clip_polygons": (272, 1400),
     "clip_marked": (224, 720),
     "clip_polyhedra": (320, 6144),
+    "update_cells": (160, 6144),
     "count_corners": (288, 4608),
     "list_corners": (288, 4608),
     "share_corners": (144, 4000),

@@ -100,7 +100,7 @@ IN_SINGLE = {"volume_projection.assemble_projection"}
 """Of these kernels, those that compute in single precision for generators of any precision."""
 ORDERED = {
     "bins.count_root", "bins.count_in_child_bins", "boundary_crossings.count_chords", "polyhedra.clip_polyhedra",
-    "walks.walk_all_cells",
+    "polyhedra_update.update_cells", "walks.walk_all_cells",
 }  # fmt: skip
 """Kernels whose work-items take places in the order of their execution. A later kernel sorts."""
 
