@@ -66,7 +66,7 @@ kernel void choose_corners(const int size, global const int *labels, global cons
         atomic_min(best_corners + labels[u], u);
 }
 
-/* Per generator i: the twins of its half-faces. */
+/* Per generator i: the twins of its half-faces, -1 for half-faces that the graph or the neighbor does not have. */
 kernel void find_twins(const int size, global const int *starts, global const int *half_face_starts,
                        global const int *half_face_labels, global int *twins)
 {
@@ -75,9 +75,13 @@ kernel void find_twins(const int size, global const int *starts, global const in
     for (int h = begin; h < end; ++h) {
         const int j = half_face_labels[h];
         int twin = h - begin < listed ? h : -1;
-        if (j >= 0)
-            for (twin = half_face_starts[j]; half_face_labels[twin] != i;)
+        if (j >= 0) {
+            const int last = half_face_starts[j + 1];
+            for (twin = half_face_starts[j]; twin < last && half_face_labels[twin] != i;)
                 ++twin;
+            if (twin == last)
+                twin = -1;
+        }
         twins[h] = twin;
     }
 }

@@ -30,6 +30,16 @@ def rows(engine, loops, behind=None):
     return engine.upload(starts, np.int32), engine.upload(np.concatenate(whole), np.int32)
 
 
+def test_twins_of_half_faces(engine, kernels):
+    """Two cells with a common face; a face with a neighbor that does not have it has no twin."""
+    starts, half_face_starts = [0, 2, 4, 5], [0, 2, 5, 6]
+    labels = [1, -1, -3, 0, 2, -1]
+    given = (engine.upload(a, np.int32) for a in (starts, half_face_starts, labels))
+    twins = engine.empty(6, np.int32)
+    engine.run_each(kernels.find_twins, 3, *given, twins)
+    assert twins.get().tolist() == [3, 1, 2, 0, -1, 5]
+
+
 def without_spurs(loop):
     """Leave out, one by one, what is passed twice in a row, and steps there and back."""
     loop, k = list(loop), 0
