@@ -34,7 +34,7 @@ COUNTS = Path(__file__).with_name("gpu_counts.json")
 COUNTED = (2, "weighted"), (2, "glide"), (2, "polish"), (3, "weighted"), (3, "glide")
 WARM_UP = 3
 """Steps before those that count: cells then keep most neighbors from step to step."""
-COUNTED_AT = {2: (800, 1600), 3: (300, 600)}
+COUNTED_AT = {2: (800, 3000), 3: (500, 2000)}
 """Numbers of cells at which Oclgrind counts; work is linear in the number of cells."""
 COUNTED_GROUP, COUNTED_ITEMS = 128, 16 * 128
 """Work-items of a group, and of all groups of a block-wise kernel, where Oclgrind counts."""

@@ -1,6 +1,6 @@
 """What the kernels take of a GPU, by its compilers, and a model of a step on an H200. No GPU is needed.
 
-    python bench/gpu_model.py [--parts kernels,steps] [--dtypes float64,float32] [--all] [--sizes 1e6,1e7]
+    python bench/gpu_model.py [--parts kernels,steps,path] [--dtypes float64,float32] [--all] [--sizes 1e6,1e7]
 
 "kernels" compiles every program that small work of all kinds builds, in all variants, with groups of 128 work-items as
 on a GPU, for NVIDIA by ``ptxas -v -arch=sm_90`` (PTX of clang -O3) and for AMD by clang -O3 (gfx90a). Needed are clang,
@@ -20,14 +20,19 @@ at 70 % of the bandwidth, or all at that of the level-2 cache; and "depth", one 
 reduce the rates. Each launch adds 5 us, each blocking read 20 us. The constants of this file are the assumptions. The
 model does not know how accesses of neighboring work-items coalesce, what the caches hold, how far lanes diverge, and
 what NVIDIA's own compiler for OpenCL does.
+
+"path" times steps and diagrams on this device as it works, and on the path that GPUs take (scalar kernels, groups of 32
+to 256 work-items, scans and sums by groups), by turns; medians of three.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import statistics
 import sys
 import tempfile
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,8 +43,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import _gpu_steps as gpu_steps
 
 from tests.robustness import gpu_programs
+from tests.robustness.gpu_like import groups
 
 DTYPES = ("float64", "float32")
+GROUPS = (32, 64, 128, 256)
+"""Work-items of a group with which the path of GPUs runs on this device."""
 
 
 class Device(NamedTuple):
@@ -343,6 +351,36 @@ def step_records(
     return records
 
 
+def path_records(
+    adapter: Any, measured_at: dict[int, int], repeat: int = 3
+) -> list[dict[str, Any]]:
+    """Return the seconds of steps and new diagrams on this device, as it works and in a GPU's groups, by turns."""
+    records = []
+    for dim, kind in gpu_steps.COUNTED:
+        runs, n = {}, measured_at[dim]
+        runs["own"] = gpu_steps.Run(adapter, dim, kind, n)
+        for size in GROUPS:
+            with groups(size):
+                runs[size] = gpu_steps.Run(adapter, dim, kind, n)
+        for part in runs["own"].parts:
+            if part == "diagram" and kind != "weighted":
+                continue
+            seconds: dict[Any, list[float]] = {name: [] for name in runs}
+            for _ in range(repeat):
+                for name, run in runs.items():
+                    queue = run.mesh.engine.queue
+                    queue.finish()
+                    start = time.perf_counter()
+                    run.parts[part]()
+                    queue.finish()
+                    seconds[name].append(time.perf_counter() - start)
+            records.append({
+                "dim": dim, "part": kind if part == "step" else "new diagram", "cells": runs["own"].n,
+                **{str(name): statistics.median(each) for name, each in seconds.items()},
+            })  # fmt: skip
+    return records
+
+
 def step_tables(records: list[dict[str, Any]]) -> str:
     """Return the table of times, and that of the longest kernels at the largest size."""
     rows = [
@@ -410,8 +448,28 @@ def main() -> None:
             print(heading(adapter, f"{len(records)} kernels of all variants for GPUs") + "\n")
             print(kernel_table(rows, options.registers, options.private, options.all))
 
+    at = dict(zip((2, 3), options.measured_at, strict=True))
+    if "path" in options.parts:
+        records = path_records(adapter, at)
+        if options.json:
+            print(*map(json.dumps, records), sep="\n")
+        else:
+            print(
+                "\n"
+                + heading(adapter, "Milliseconds on this device, and in the groups of a GPU")
+                + "\n"
+            )
+            columns = ["own", *map(str, GROUPS)]
+            lines = [
+                [
+                    f"{r['part']}, {r['dim']}D",
+                    f"{r['cells']:,}",
+                    *(f"{1e3 * r[c]:.0f}" for c in columns),
+                ]
+                for r in records
+            ]
+            print(markdown(["part", "cells", "own groups", *(f"{g} items" for g in GROUPS)], lines))
     if "steps" in options.parts:
-        at = dict(zip((2, 3), options.measured_at, strict=True))
         records = step_records(adapter, options.sizes, at)
         if options.json:
             print(*map(json.dumps, records), sep="\n")

@@ -6,15 +6,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 
-from clvoro.opencl import engine, ranges
+from clvoro.opencl import engine, launch, ranges
+from clvoro.solvers import poisson
 
 LONGEST = 2e-3
 """Seconds after which a launch is divided in tests, so that those of small meshes are, too."""
 
 
 def use_groups(size: int, count: int = 16) -> None:
-    """Make all later engines use `count` groups of `size`, also on a CPU. By default its groups have one work-item."""
+    """Make all later engines use `count` groups of `size`, also on a CPU. By default its groups have one work-item.
+
+    Solvers choose their preconditioners as on a GPU.
+    """
     engine.group_sizes = lambda _: engine.GroupSizes(count, size)
+    poisson.cost_factors = lambda _: launch.COSTS_ON_GPU
 
 
 def use_ranges() -> None:
@@ -26,9 +31,9 @@ def use_ranges() -> None:
 @contextmanager
 def groups(size: int, count: int = 16) -> Iterator[None]:
     """Let engines made inside the ``with`` block work in groups; see `use_groups`."""
-    before = engine.group_sizes
+    before = engine.group_sizes, poisson.cost_factors
     use_groups(size, count)
     try:
         yield
     finally:
-        engine.group_sizes = before
+        engine.group_sizes, poisson.cost_factors = before
