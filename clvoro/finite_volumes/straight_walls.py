@@ -30,7 +30,7 @@ REACH = 0.4
 """Farthest way of a face end into a vertex of the domain, over the smaller size of its two cells."""
 _SHORT = 0.03
 """Faces shorter than this over the size of the cell may be bad."""
-_SKEW_PRICE, _WAY_PRICE, _TILT_PRICE = 0.03, 0.02, 0.6
+_SKEW_PRICE, _WAY_PRICE, _TILT_PRICE = 0.1, 0.02, 0.6
 """Prices in squares of the size of the cell: for the square of the skewness above 1, for the way of a face end over the
 size, and for the square of the angle by which its face turns, in radians."""
 
