@@ -1,11 +1,11 @@
 /* One V-cycle of multigrid on graphs of aggregated cells (see solvers/aggregation.cl).
 
    Vectors are in REAL, the multigrid's own precision. SOURCE is the caller's: the residual is read and the correction
-   written in it. One work-item per cell or aggregate, or one work-group for a whole level where cells are few (kernels
-   *_by_group).
+   written in it.
 
    The smoother is Chebyshev's polynomial of degree 2 in B^-1 A on [0.35, 2], applied as two damped pairwise-Jacobi
-   steps. */
+   steps. There are kernels for each step, kernels for several steps at once, and `cycle_by_group`, which does all
+   coarse levels by one work-group. */
 #include "opencl/real.h"
 #include "opencl/blocks.h"
 #include "solvers/sparse_rows.h"
@@ -91,6 +91,121 @@ kernel void prolong(int n, global const int *aggregate, global const REAL *e, gl
         x[i] += e[aggregate[i]];
 }
 
+/* Several steps at once, for GPUs, on which a launch costs more than the steps of most levels. They evaluate values of
+   neighbors anew instead of storing them first. One work-item does both cells of a pair. The bits are the same. */
+
+/* The pair of cells i <= j of a work-item; it returns where there is none. */
+#define PAIR(i, j)                                                                                                     \
+    const int i = get_global_id(0);                                                                                    \
+    if (i >= n || partner[i] < i)                                                                                      \
+        return;                                                                                                        \
+    const int j = partner[i]
+
+/* (B^-1 t)_i from t_i and t of its partner. */
+inline REAL pair_inverse(REAL own, REAL both, REAL ti, REAL tj)
+{
+    return own * ti + both * (ti + tj);
+}
+
+/* x after the first step from x = 0, omega B^-1 b. */
+#define FIRST_STEP(j) (omega * apply_pair_inverse(j, partner, own, both, b))
+ROW_DIFFERENCE(first_step_difference, FIRST_STEP, REAL omega, global const int *partner, global const REAL *own,
+               global const REAL *both, global const REAL *b)
+
+/* The same of r, in the caller's precision, rounded to REAL. */
+#define ROUNDED(j) ((REAL)r[j])
+#define FIRST_ROUNDED_STEP(j) (omega * pair_inverse(own[j], both[j], ROUNDED(j), ROUNDED(partner[j])))
+ROW_DIFFERENCE(first_rounded_step_difference, FIRST_ROUNDED_STEP, REAL omega, global const int *partner,
+               global const REAL *own, global const REAL *both, global const SOURCE *r)
+
+/* Two steps from x = 0. */
+kernel void smooth_pairs_from_zero(int n, REAL omega, REAL next, global const int *starts, global const int *columns,
+                                   global const REAL *weights, global const int *partner, global const REAL *own,
+                                   global const REAL *both, global const REAL *b, global REAL *x)
+{
+    PAIR(i, j);
+    const REAL ti = b[i] - first_step_difference(i, n, starts, columns, weights, omega, partner, own, both, b);
+    const REAL tj =
+        i == j ? ti : b[j] - first_step_difference(j, n, starts, columns, weights, omega, partner, own, both, b);
+    x[i] = FIRST_STEP(i) + next * pair_inverse(own[i], both[i], ti, tj);
+    if (i != j)
+        x[j] = FIRST_STEP(j) + next * pair_inverse(own[j], both[j], tj, ti);
+}
+
+/* The same on the finest level: b = r rounded to REAL. */
+kernel void smooth_pairs_from_zero_rounded(int n, REAL omega, REAL next, global const int *starts,
+                                           global const int *columns, global const REAL *weights,
+                                           global const int *partner, global const REAL *own, global const REAL *both,
+                                           global const SOURCE *r, global REAL *b, global REAL *x)
+{
+    PAIR(i, j);
+    const REAL bi = ROUNDED(i), bj = ROUNDED(j);
+    const REAL ti = bi - first_rounded_step_difference(i, n, starts, columns, weights, omega, partner, own, both, r);
+    const REAL tj =
+        i == j ? ti : bj - first_rounded_step_difference(j, n, starts, columns, weights, omega, partner, own, both, r);
+    b[i] = bi;
+    x[i] = FIRST_ROUNDED_STEP(i) + next * pair_inverse(own[i], both[i], ti, tj);
+    if (i != j) {
+        b[j] = bj;
+        x[j] = FIRST_ROUNDED_STEP(j) + next * pair_inverse(own[j], both[j], tj, ti);
+    }
+}
+
+/* to = x + omega B^-1 (b - A x), for the pair of the work-item. */
+#define SMOOTH_PAIR(VALUE, DIFFERENCE, to, ...)                                                                        \
+    PAIR(i, j);                                                                                                        \
+    const REAL ti = b[i] - DIFFERENCE(i, n, starts, columns, weights, __VA_ARGS__);                                    \
+    const REAL tj = i == j ? ti : b[j] - DIFFERENCE(j, n, starts, columns, weights, __VA_ARGS__);                      \
+    to[i] = VALUE(i) + omega * pair_inverse(own[i], both[i], ti, tj);                                                  \
+    if (i != j)                                                                                                        \
+    to[j] = VALUE(j) + omega * pair_inverse(own[j], both[j], tj, ti)
+
+/* One step, to another array. */
+kernel void smooth_pairs(int n, REAL omega, global const int *starts, global const int *columns,
+                         global const REAL *weights, global const int *partner, global const REAL *own,
+                         global const REAL *both, global const REAL *b, global const REAL *x, global REAL *to)
+{
+    SMOOTH_PAIR(ENTRY_OF_X, row_difference, to, x);
+}
+
+/* The same to the caller's array: the last step of the cycle. */
+kernel void smooth_pairs_into(int n, REAL omega, global const int *starts, global const int *columns,
+                              global const REAL *weights, global const int *partner, global const REAL *own,
+                              global const REAL *both, global const REAL *b, global const REAL *x, global SOURCE *u)
+{
+    SMOOTH_PAIR(ENTRY_OF_X, row_difference, u, x);
+}
+
+/* x + the correction of the aggregate. */
+#define CORRECTED(j) (x[j] + e[aggregate[j]])
+ROW_DIFFERENCE(corrected_difference, CORRECTED, global const REAL *x, global const int *aggregate, global const REAL *e)
+
+/* Prolongation, x_i += correction of the aggregate of i, and one step, to another array. */
+kernel void prolong_and_smooth_pairs(int n, REAL omega, global const int *starts, global const int *columns,
+                                     global const REAL *weights, global const int *partner, global const REAL *own,
+                                     global const REAL *both, global const REAL *b, global const REAL *x,
+                                     global const int *aggregate, global const REAL *e, global REAL *to)
+{
+    SMOOTH_PAIR(CORRECTED, corrected_difference, to, x, aggregate, e);
+}
+
+/* Restriction: b of an aggregate = sum of the defects b - A x of its members. */
+kernel void restrict_new_defect(int n_aggregates, int n, global const int *starts, global const int *columns,
+                                global const REAL *weights, global const REAL *b, global const REAL *x,
+                                global const int *member_starts, global const int *members, global REAL *coarse_b)
+{
+    const int g = get_global_id(0);
+    if (g >= n_aggregates)
+        return;
+    REAL sum = 0;
+    for (int s = member_starts[g]; s < member_starts[g + 1]; ++s) {
+        const int i = members[s];
+        const REAL defect = b[i] - row_difference(i, n, starts, columns, weights, x);
+        sum += defect;
+    }
+    coarse_b[g] = sum;
+}
+
 /* t = b - A x, by one work-group. */
 inline void defect_by_group(int n, global const int *starts, global const int *columns, global const REAL *weights,
                             global const REAL *b, global const REAL *x, global REAL *t)
@@ -109,33 +224,6 @@ inline void smooth_by_group(int n, REAL omega, global const int *starts, global 
     defect_by_group(n, starts, columns, weights, b, x, t);
     for (BLOCK_LOOP(i, n))
         x[i] += omega * apply_pair_inverse(i, partner, own, both, t);
-}
-
-/* All steps of a level on the way down, by one work-group: the same bits as with one kernel per step. */
-kernel void descend_by_group(int n, REAL late, REAL early, global const int *starts, global const int *columns,
-                             global const REAL *weights, global const int *partner, global const REAL *own,
-                             global const REAL *both, global const REAL *b, global REAL *x, global REAL *t,
-                             int n_aggregates, global const int *member_starts, global const int *members,
-                             global REAL *coarse_b)
-{
-    for (BLOCK_LOOP(i, n))
-        x[i] = late * apply_pair_inverse(i, partner, own, both, b);
-    smooth_by_group(n, early, starts, columns, weights, partner, own, both, b, x, t);
-    defect_by_group(n, starts, columns, weights, b, x, t);
-    for (BLOCK_LOOP(g, n_aggregates))
-        coarse_b[g] = sum_members(g, member_starts, members, t);
-}
-
-/* All steps of a level on the way up, by one work-group: the same bits as with one kernel per step. */
-kernel void ascend_by_group(int n, REAL late, REAL early, global const int *starts, global const int *columns,
-                            global const REAL *weights, global const int *partner, global const REAL *own,
-                            global const REAL *both, global const REAL *b, global REAL *x, global REAL *t,
-                            global const int *aggregate, global const REAL *e)
-{
-    for (BLOCK_LOOP(i, n))
-        x[i] += e[aggregate[i]];
-    smooth_by_group(n, early, starts, columns, weights, partner, own, both, b, x, t);
-    smooth_by_group(n, late, starts, columns, weights, partner, own, both, b, x, t);
 }
 
 /* A = L D L^T on the coarsest level, by one work-group. Eliminating cell i leaves a graph of the remaining cells,
@@ -194,7 +282,7 @@ kernel void factorize_coarsest(int n, global const int *starts, global const int
    This product is positive semidefinite in spite of round-off, which an explicit inverse matrix is not. Without the
    means the last cell would be zero, and the round-off of the constant that all others have in common would enter the
    scalar products of the iteration. */
-kernel void solve_coarsest(int n, global const REAL *factor, global const REAL *b, global REAL *t, global REAL *x)
+inline void solve_coarsest(int n, global const REAL *factor, global const REAL *b, global REAL *t, global REAL *x)
 {
     global const REAL *inverse = factor + 2 * n * n, *means = inverse + n;
     REAL mean_b = 0, mean_x = 0;
@@ -216,4 +304,57 @@ kernel void solve_coarsest(int n, global const REAL *factor, global const REAL *
             sum += factor[i * n + j] * t[i];
         x[j] = sum - mean_x;
     }
+}
+
+/* Where the arrays of a level begin in `ints` and `reals`, in a row of the table of levels. */
+#define LEVEL_ENTRIES 14
+typedef struct {
+    int n, n_aggregates, starts, columns, partner, aggregate, member_starts, members, weights, own, both, b, x, t;
+} level_t;
+
+inline level_t read_level(global const int *table, int depth)
+{
+    global const int *row = table + LEVEL_ENTRIES * depth;
+    const level_t level = {row[0], row[1], row[2], row[3],  row[4],  row[5],  row[6],
+                           row[7], row[8], row[9], row[10], row[11], row[12], row[13]};
+    return level;
+}
+
+/* The cycle from a coarse level on, by one work-group: x = correction for b. The last level is solved exactly. */
+kernel void cycle_by_group(int levels, REAL late, REAL early, global const int *table, global const int *ints,
+                           global REAL *reals, global const REAL *factor, global const REAL *b, global REAL *x)
+{
+    const level_t top = read_level(table, 0);
+    for (BLOCK_LOOP(i, top.n))
+        reals[top.b + i] = b[i];
+    for (int depth = 0; depth < levels - 1; ++depth) {
+        const level_t fine = read_level(table, depth), coarse = read_level(table, depth + 1);
+        global const int *partner = ints + fine.partner, *starts = ints + fine.starts, *columns = ints + fine.columns;
+        global const REAL *own = reals + fine.own, *both = reals + fine.both, *weights = reals + fine.weights;
+        global REAL *bs = reals + fine.b, *xs = reals + fine.x, *ts = reals + fine.t;
+        barrier(CLK_GLOBAL_MEM_FENCE);
+        for (BLOCK_LOOP(i, fine.n))
+            xs[i] = late * apply_pair_inverse(i, partner, own, both, bs);
+        smooth_by_group(fine.n, early, starts, columns, weights, partner, own, both, bs, xs, ts);
+        defect_by_group(fine.n, starts, columns, weights, bs, xs, ts);
+        for (BLOCK_LOOP(g, fine.n_aggregates))
+            reals[coarse.b + g] = sum_members(g, ints + fine.member_starts, ints + fine.members, ts);
+    }
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    const level_t last = read_level(table, levels - 1);
+    solve_coarsest(last.n, factor, reals + last.b, reals + last.t, reals + last.x);
+    for (int depth = levels - 2; depth >= 0; --depth) {
+        const level_t fine = read_level(table, depth), coarse = read_level(table, depth + 1);
+        global const int *partner = ints + fine.partner, *starts = ints + fine.starts, *columns = ints + fine.columns;
+        global const REAL *own = reals + fine.own, *both = reals + fine.both, *weights = reals + fine.weights;
+        global REAL *bs = reals + fine.b, *xs = reals + fine.x, *ts = reals + fine.t;
+        barrier(CLK_GLOBAL_MEM_FENCE);
+        for (BLOCK_LOOP(i, fine.n))
+            xs[i] += reals[coarse.x + ints[fine.aggregate + i]];
+        smooth_by_group(fine.n, early, starts, columns, weights, partner, own, both, bs, xs, ts);
+        smooth_by_group(fine.n, late, starts, columns, weights, partner, own, both, bs, xs, ts);
+    }
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    for (BLOCK_LOOP(j, top.n))
+        x[j] = reals[top.x + j];
 }

@@ -23,8 +23,8 @@ _CENTER, _RADIUS = (2 + _LOWEST) / 2, (2 - _LOWEST) / 2
 _EARLY = np.float32(1 / (_CENTER - _RADIUS * math.sqrt(0.5)))
 _LATE = np.float32(1 / (_CENTER + _RADIUS * math.sqrt(0.5)))
 _NO_DAMPING = np.float32(0)
-_ONE_GROUP = ("descend_by_group", "ascend_by_group", "solve_coarsest")
-"""Kernels of one work-group."""
+_COARSE = "cycle_by_group"
+"""Kernel of one work-group."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +42,25 @@ class Level:
 class Cycle:
     """Enqueues cycles: from the finest level down to the coarsest, and up again.
 
-    Coarse levels of few cells take one launch of one work-group each, with the same bits.
+    All coarse levels of few cells take one launch of one work-group. On GPUs a finer level takes four: two steps
+    of smoothing from zero; restriction of the defect; prolongation and a step; the last step. On CPUs it takes ten,
+    because evaluating values several times costs more there than storing them. All have the same bits.
 
     Parameters
     ----------
     engine : Engine
         In the precision of the multigrid.
+
+    Attributes
+    ----------
+    merged : bool
+        Whether a launch does several steps.
     """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._one_group_limit = one_group_limit(engine)
+        self.merged = engine.group_size > 1
         self._room = NamedArrays(engine)
         self._kernels: dict[tuple[object, ...], cl.Kernel] = {}
         self.clear()
@@ -60,6 +68,7 @@ class Cycle:
     def clear(self) -> None:
         """Free all buffers."""
         self._room.clear()
+        self._packed: tuple[list[Level], tuple[cla.Array, ...]] = [], ()
         self.set_levels([], None)
 
     def set_levels(self, levels: Sequence[Level], factor: cla.Array | None) -> None:
@@ -84,13 +93,24 @@ class Cycle:
         in_place = work is not None and r.dtype == np.float32
         finest = [r, u, work] if in_place else self._make_vectors(0)
         self._vectors = [finest, *(self._make_vectors(depth) for depth in range(1, len(levels)))]
-        smoothed = len(levels) - (self._factor is not None)
-        for depth in range(smoothed):
+        # Levels that are smoothed by launches of their own.
+        count = self._first_coarse()
+        for depth in range(count):
             self._descend(depth, None if depth or in_place else r)
-        if self._factor is not None:
-            self._solve_coarsest(smoothed, *(None, None) if smoothed or in_place else (r, u))
-        for depth in reversed(range(smoothed)):
+        if count < len(levels):
+            self._solve_coarse(count, *(None, None) if count or in_place else (r, u))
+        for depth in reversed(range(count)):
             self._ascend(depth, None if depth or in_place else u)
+
+    def _first_coarse(self) -> int:
+        """Return the number of levels before those that one work-group does."""
+        levels = self._levels
+        if self._factor is None:
+            return len(levels)
+        count = len(levels) - 1
+        while count > 1 and len(levels[count - 1]) <= self._one_group_limit:
+            count -= 1
+        return count
 
     def _make_vectors(self, depth: int) -> list[cla.Array]:
         """Return the right side, solution and defect of a level."""
@@ -104,61 +124,103 @@ class Cycle:
             self._kernels[key] = getattr(self.engine.kernels("solvers/multigrid", defines), name)
         kernel = self._kernels[key]
         bind(kernel, (np.int32(size), *args))
-        if name in _ONE_GROUP:
+        if name == _COARSE:
             whole = group = self.engine.block_of(kernel)
         else:
             whole, group = round_to_work_group(size), fit_group(kernel, WORK_GROUP)
         self._launches.append((kernel, whole, group))
 
-    def _is_small(self, depth: int) -> bool:
-        """Return whether one work-group does all steps of a level."""
-        level = self._levels[depth]
-        return depth > 0 and level.aggregates is not None and len(level) <= self._one_group_limit
-
     def _descend(self, depth: int, r: cla.Array | None) -> None:
         """Smooth from zero and restrict the defect. The right side is rounded from `r`, if given."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
-        blocks, lists, count = level.pairs.blocks, (), 0
-        if level.aggregates is not None:
-            coarse_b = self._vectors[depth + 1][0]
-            lists = (level.aggregates.starts, level.aggregates.members, coarse_b)
-            count = len(level.aggregates)
-        if self._is_small(depth):
-            given = (_LATE, _EARLY, *level.graph.rows, *blocks, b, x, t, np.int32(count), *lists)
-            self._add(depth, "descend_by_group", n, *given)
-            return
-        if r is None:
-            self._add(depth, "smooth_from_zero", n, _LATE, *blocks, b, x)
+        rows, blocks = level.graph.rows, level.pairs.blocks
+        rounded, right = ("", (b,)) if r is None else ("_rounded", (r, b))
+        if self.merged:
+            name = "smooth_pairs_from_zero" + rounded
+            self._add(depth, name, n, _LATE, _EARLY, *rows, *blocks, *right, x)
         else:
-            self._add(depth, "smooth_from_zero_rounded", n, _LATE, *blocks, r, b, x)
-        self._smooth(depth, _EARLY)
-        if lists:
-            self._add(depth, "compute_defect", n, *level.graph.rows, b, x, t)
+            self._add(depth, "smooth_from_zero" + rounded, n, _LATE, *blocks, *right, x)
+            self._smooth(depth, _EARLY)
+        if level.aggregates is None:
+            return
+        lists = level.aggregates.starts, level.aggregates.members, self._vectors[depth + 1][0]
+        count = len(level.aggregates)
+        if self.merged:
+            self._add(depth, "restrict_new_defect", count, np.int32(n), *rows, b, x, *lists)
+        else:
+            self._add(depth, "compute_defect", n, *rows, b, x, t)
             self._add(depth, "restrict_defect", count, t, *lists)
 
-    def _solve_coarsest(self, depth: int, r: cla.Array | None, u: cla.Array | None) -> None:
-        """Solve on the coarsest level, from `r` and into `u`, if given."""
-        level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
-        blocks = level.pairs.blocks
+    def _solve_coarse(self, depth: int, r: cla.Array | None, u: cla.Array | None) -> None:
+        """Do the cycle from `depth` on by one work-group, from `r` and into `u`, if given."""
+        levels, (b, x, _), n = self._levels[depth:], self._vectors[depth], len(self._levels[depth])
+        blocks = self._levels[depth].pairs.blocks
         if r is not None:
             self._add(depth, "smooth_from_zero_rounded", n, _NO_DAMPING, *blocks, r, b, x)
-        self._add(depth, "solve_coarsest", n, self._factor, b, t, x)
+        self._add(
+            depth, _COARSE, len(levels), _LATE, _EARLY, *self._pack(levels), self._factor, b, x
+        )
         if u is not None:
             self._add(depth, "smooth_into", n, _NO_DAMPING, *blocks, b, x, u)
+
+    def _pack(self, levels: Sequence[Level]) -> tuple[cla.Array, ...]:
+        """Return the table of `levels`, their integers and their reals; see multigrid.cl."""
+        kept, packed = self._packed
+        if len(kept) == len(levels) and all(a is b for a, b in zip(kept, levels, strict=True)):
+            return packed
+        sizes, rows, parts = {np.int32: 0, np.float32: 0}, [], []
+
+        def place(array: cla.Array | None, dtype: type, size: int = 0) -> int:
+            start = sizes[dtype]
+            if array is not None and len(array):
+                parts.append((dtype, start, array))
+            sizes[dtype] += size if array is None else len(array)
+            return start
+
+        for level in levels:
+            n, groups = len(level), level.aggregates
+            starts, columns, weights = level.graph.rows
+            partner, own, both = level.pairs.blocks
+            lists = (
+                (None,) * 3 if groups is None else (groups.aggregate, groups.starts, groups.members)
+            )
+            ints = [place(array, np.int32) for array in (starts, columns, partner, *lists)]
+            reals = [place(array, np.float32) for array in (weights, own, both)]
+            reals += [place(None, np.float32, n) for _ in range(3)]
+            rows.append([n, 0 if groups is None else len(groups), *ints, *reals])
+        engine = self.engine
+        table = engine.upload(rows, np.int32)
+        to = {
+            dtype: self._room("packed", dtype, size=size, dtype=dtype)
+            for dtype, size in sizes.items()
+        }
+        for dtype, start, array in parts:
+            cl.enqueue_copy(
+                engine.queue, to[dtype].base_data, array.base_data, byte_count=array.nbytes,
+                src_offset=array.offset, dst_offset=4 * start,
+            )  # fmt: skip
+        self._packed = list(levels), (table, *to.values())
+        return self._packed[1]
 
     def _ascend(self, depth: int, u: cla.Array | None) -> None:
         """Add the correction of the coarser level and smooth. The last step writes to `u`, if given."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
+        correction: tuple[cla.Array, ...] = ()
         if level.aggregates is not None:
             correction = level.aggregates.aggregate, self._vectors[depth + 1][1]
-            if self._is_small(depth):
-                rows, blocks = level.graph.rows, level.pairs.blocks
-                given = (_LATE, _EARLY, *rows, *blocks, b, x, t, *correction)
-                self._add(depth, "ascend_by_group", n, *given)
-                return
-            self._add(depth, "prolong", n, *correction, x)
-        self._smooth(depth, _EARLY)
-        self._smooth(depth, _LATE, u)
+        if not self.merged:
+            if correction:
+                self._add(depth, "prolong", n, *correction, x)
+            self._smooth(depth, _EARLY)
+            self._smooth(depth, _LATE, u)
+            return
+        given = *level.graph.rows, *level.pairs.blocks, b
+        name = "prolong_and_smooth_pairs" if correction else "smooth_pairs"
+        self._add(depth, name, n, _EARLY, *given, x, *correction, t)
+        if u is None:
+            self._add(depth, "smooth_pairs", n, _LATE, *given, t, x, turn=1)
+        else:
+            self._add(depth, "smooth_pairs_into", n, _LATE, *given, t, u)
 
     def _smooth(self, depth: int, damping: np.float32, u: cla.Array | None = None) -> None:
         """Do one step of smoothing in place, or into `u`."""

@@ -381,6 +381,12 @@ def multigrid(adapter: clvoro.Adapter) -> None:
             laplacian, rhs, potential, tolerance=1e-3, preconditioner=kind
         )
         assert alone.converged
+    # Steps of smoothing merged, or apart: what this device does not do by itself.
+    other = Poisson(engine)
+    cycles = other.set_up_multigrid(laplacian)._cycle
+    cycles.merged = not cycles.merged
+    potential.fill(0)
+    assert other.solve(laplacian, rhs, potential, tolerance=1e-3, preconditioner=kind).converged
     # A solve whose initial guess is not zero.
     rough = stage.assemble(
         t.starts, t.neighbors, t.face_measures, t.points, tolerance=SINGLE_PRECISION_TOLERANCE

@@ -43,7 +43,8 @@ NOT_IN = {
     # These are between float32 and the precision of the mesh.
     "float32": LANES | {
         "cells.measure_faces", "aggregation.scale_weights", "multigrid.smooth_into",
-        "multigrid.smooth_from_zero_rounded", "poisson.apply_laplacian_full",
+        "multigrid.smooth_from_zero_rounded", "multigrid.smooth_pairs_into", "multigrid.smooth_pairs_from_zero_rounded",
+        "poisson.apply_laplacian_full",
     },
     "work-groups": LANES,
 }  # fmt: skip

@@ -187,14 +187,15 @@ def test_cycle_in_place(make, n):
 @pytest.mark.sparse
 @pytest.mark.parametrize("group_size", [None, 16], ids=["cpu", "gpu"])
 @pytest.mark.parametrize("name", ["random", "random 3D", "star"])
-def test_levels_of_one_work_group_give_the_same_bits(make, monkeypatch, name, group_size):
+def test_merged_steps_and_levels_give_the_same_bits(make, monkeypatch, name, group_size):
     """Against launches of their own for each step of each level, whose cells then fill several work-groups."""
     W, found, plain = GRAPHS[name](), [], cl.enqueue_nd_range_kernel
     right = np.random.default_rng(6).standard_normal(W.shape[0])
     engine = patch.make_engine(make().ctx, group_size=group_size)
-    for most in (0, 10**6):
+    for most, merged in ((0, False), (0, True), (10**6, False), (300, True)):
         monkeypatch.setattr(cycle, "one_group_limit", lambda _, most=most: most)
         multigrid = Multigrid(engine)
+        multigrid._cycle.merged = merged
         multigrid.set_up(*upload(engine, W))
         assert len(multigrid.sizes) > 2 or name == "star"
         r, u = engine.upload(right), engine.empty(len(right))
@@ -205,9 +206,12 @@ def test_levels_of_one_work_group_give_the_same_bits(make, monkeypatch, name, gr
                 lambda *args, into=launched: into.append(args[1].function_name) or plain(*args),
             )  # fmt: skip
             multigrid.apply(r, u)
-        assert ("descend_by_group" in launched) == (most > 0 and len(multigrid.sizes) > 2)
+        deep = len(multigrid.sizes) > 2
+        assert ("smooth_from_zero" in launched) == (most == 0 and not merged and deep)
+        assert ("smooth_pairs_from_zero_rounded" in launched) == merged
+        assert launched.count("cycle_by_group") == 1
         found.append(u.get())
-    assert np.array_equal(*found)
+    assert all(np.array_equal(u, found[0]) for u in found)
 
 
 def test_walls_are_ignored(make):
