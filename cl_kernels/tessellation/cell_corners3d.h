@@ -104,28 +104,32 @@ typedef struct {
     WIDE x, y, z;
 } places_t;
 
-inline WIDE product_of(places_t a, places_t b)
+/* Results are written through pointers: a structure returned by value would be an alias for some compilers. */
+inline WIDE product_of(const places_t *a, const places_t *b)
 {
-    return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z));
+    return fma(a->x, b->x, fma(a->y, b->y, a->z * b->z));
 }
 
-inline places_t cross_of(places_t a, places_t b)
+inline void cross_of(places_t *c, const places_t *a, const places_t *b)
 {
-    const places_t c = {fma(a.y, b.z, -a.z * b.y), fma(a.z, b.x, -a.x * b.z), fma(a.x, b.y, -a.y * b.x)};
-    return c;
+    c->x = fma(a->y, b->z, -a->z * b->y);
+    c->y = fma(a->z, b->x, -a->x * b->z);
+    c->z = fma(a->x, b->y, -a->y * b->x);
 }
 
-/* a + s b */
-inline places_t add_along(places_t a, WIDE s, places_t b)
+/* c += s a */
+inline void add_along(places_t *c, WIDE s, const places_t *a)
 {
-    const places_t c = {fma(s, b.x, a.x), fma(s, b.y, a.y), fma(s, b.z, a.z)};
-    return c;
+    c->x = fma(s, a->x, c->x);
+    c->y = fma(s, a->y, c->y);
+    c->z = fma(s, a->z, c->z);
 }
 
-inline places_t gather_planes(const corners_t *cell, const int *k)
+inline void gather_planes(places_t *p, const corners_t *cell, const int *k)
 {
-    const places_t p = {GATHER_WIDE(cell->px, k), GATHER_WIDE(cell->py, k), GATHER_WIDE(cell->pz, k)};
-    return p;
+    p->x = GATHER_WIDE(cell->px, k);
+    p->y = GATHER_WIDE(cell->py, k);
+    p->z = GATHER_WIDE(cell->pz, k);
 }
 
 /* Sums over the vertices: of each face (area, first moments), and second moments of the cell; see `add_corner` in
@@ -140,11 +144,21 @@ typedef struct {
     WIDE g, part_p, part_q, both;
 } part_t;
 
-inline part_t part_of_edge(WIDE g, places_t p, places_t q, WIDE p2, WIDE q2, WIDE inverses)
+inline void part_of_edge(part_t *part, WIDE g, const places_t *p, const places_t *q, WIDE p2, WIDE q2, WIDE inverses)
 {
     const WIDE pq = product_of(p, q);
-    const part_t part = {g, g * (p2 - pq), g * (q2 - pq), g * fma(-pq, inverses, (WIDE)2)};
-    return part;
+    part->g = g;
+    part->part_p = g * (p2 - pq);
+    part->part_q = g * (q2 - pq);
+    part->both = g * fma(-pq, inverses, (WIDE)2);
+}
+
+/* The first moments of the parts of a face at its edges `in` and `out` of a vertex. */
+inline void first_moments(places_t *first, WIDE part_in, const places_t *in, WIDE part_out, const places_t *out)
+{
+    first->x = fma(part_out, out->x, part_in * in->x);
+    first->y = fma(part_out, out->y, part_in * in->y);
+    first->z = fma(part_out, out->z, part_in * in->z);
 }
 
 /* Find the vertices and sum them up. False if faces at a vertex are nearly parallel or not counter-clockwise, or a
@@ -168,21 +182,29 @@ inline bool place_corners(corners_t *cell, sums_t *sums)
             at_b[lane] = at.s1;
             at_c[lane] = at.s2;
         }
-        const places_t a = gather_planes(cell, at_a), b = gather_planes(cell, at_b), c = gather_planes(cell, at_c);
-        const places_t ab = cross_of(a, b), bc = cross_of(b, c), ca = cross_of(c, a);
-        const WIDE a2 = product_of(a, a), b2 = product_of(b, b), c2 = product_of(c, c), det = product_of(a, bc);
+        places_t a, b, c, ab, bc, ca;
+        gather_planes(&a, cell, at_a);
+        gather_planes(&b, cell, at_b);
+        gather_planes(&c, cell, at_c);
+        cross_of(&ab, &a, &b);
+        cross_of(&bc, &b, &c);
+        cross_of(&ca, &c, &a);
+        const WIDE a2 = product_of(&a, &a), b2 = product_of(&b, &b), c2 = product_of(&c, &c);
+        const WIDE det = product_of(&a, &bc);
         const WIDE over = 1 / det;
         places_t y = {(ab.x + bc.x + ca.x) * over / 2, (ab.y + bc.y + ca.y) * over / 2,
                       (ab.z + bc.z + ca.z) * over / 2};
-        const WIDE off_a = (R(0.5) - product_of(a, y)) * over, off_b = (R(0.5) - product_of(b, y)) * over;
-        const WIDE off_c = (R(0.5) - product_of(c, y)) * over;
-        y = add_along(add_along(add_along(y, off_a, bc), off_b, ca), off_c, ab);
+        const WIDE off_a = (R(0.5) - product_of(&a, &y)) * over, off_b = (R(0.5) - product_of(&b, &y)) * over;
+        const WIDE off_c = (R(0.5) - product_of(&c, &y)) * over;
+        add_along(&y, off_a, &bc);
+        add_along(&y, off_b, &ca);
+        add_along(&y, off_c, &ab);
         cell->x[block] = y.x;
         cell->y[block] = y.y;
         cell->z[block] = y.z;
-        const WIDE y2 = product_of(y, y), sine2 = det * det - LEAST_SINE2 * a2 * b2 * c2;
+        const WIDE y2 = product_of(&y, &y), sine2 = det * det - LEAST_SINE2 * a2 * b2 * c2;
         far2 = y2 > far2 ? y2 : far2;
-        const WIDE ab2 = product_of(ab, ab), bc2 = product_of(bc, bc), ca2 = product_of(ca, ca);
+        const WIDE ab2 = product_of(&ab, &ab), bc2 = product_of(&bc, &bc), ca2 = product_of(&ca, &ca);
         good = ((det > 0) & (sine2 > 0) & (ab2 > LEAST_ANGLE2 * a2 * b2) & (bc2 > LEAST_ANGLE2 * b2 * c2) &
                 (ca2 > LEAST_ANGLE2 * c2 * a2))
                    ? good
@@ -204,15 +226,18 @@ inline bool place_corners(corners_t *cell, sums_t *sums)
 
         const WIDE ia = GATHER_WIDE(cell->d2, at_a), ib = GATHER_WIDE(cell->d2, at_b), ic = GATHER_WIDE(cell->d2, at_c);
         const WIDE inverse = 1 / (ab2 * bc2 * ca2);
-        const part_t of_ab = part_of_edge(product_of(y, ab) * bc2 * ca2 * inverse, a, b, a2, b2, ia + ib);
-        const part_t of_bc = part_of_edge(product_of(y, bc) * ca2 * ab2 * inverse, b, c, b2, c2, ib + ic);
-        const part_t of_ca = part_of_edge(product_of(y, ca) * ab2 * bc2 * inverse, c, a, c2, a2, ic + ia);
-        const places_t twice = {2 * y.x, 2 * y.y, 2 * y.z}, none = {0, 0, 0};
-        const places_t to_ab = add_along(twice, -of_ab.g, ab), to_bc = add_along(twice, -of_bc.g, bc);
-        const places_t to_ca = add_along(twice, -of_ca.g, ca);
-        const places_t first_a = add_along(add_along(none, of_ab.part_p, to_ab), of_ca.part_q, to_ca);
-        const places_t first_b = add_along(add_along(none, of_bc.part_p, to_bc), of_ab.part_q, to_ab);
-        const places_t first_c = add_along(add_along(none, of_ca.part_p, to_ca), of_bc.part_q, to_bc);
+        part_t of_ab, of_bc, of_ca;
+        part_of_edge(&of_ab, product_of(&y, &ab) * bc2 * ca2 * inverse, &a, &b, a2, b2, ia + ib);
+        part_of_edge(&of_bc, product_of(&y, &bc) * ca2 * ab2 * inverse, &b, &c, b2, c2, ib + ic);
+        part_of_edge(&of_ca, product_of(&y, &ca) * ab2 * bc2 * inverse, &c, &a, c2, a2, ic + ia);
+        const places_t twice = {2 * y.x, 2 * y.y, 2 * y.z};
+        places_t to_ab = twice, to_bc = twice, to_ca = twice, first_a, first_b, first_c;
+        add_along(&to_ab, -of_ab.g, &ab);
+        add_along(&to_bc, -of_bc.g, &bc);
+        add_along(&to_ca, -of_ca.g, &ca);
+        first_moments(&first_a, of_ab.part_p, &to_ab, of_ca.part_q, &to_ca);
+        first_moments(&first_b, of_bc.part_p, &to_bc, of_ab.part_q, &to_ab);
+        first_moments(&first_c, of_ca.part_p, &to_ca, of_bc.part_q, &to_bc);
         REAL parts[12][WIDTH];
         STORE_WIDE(of_ab.part_p + of_ca.part_q, 0, parts[0]);
         STORE_WIDE(first_a.x, 0, parts[1]);
