@@ -134,12 +134,13 @@ class Cycle:
         """Smooth from zero and restrict the defect. The right side is rounded from `r`, if given."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
         rows, blocks = level.graph.rows, level.pairs.blocks
-        rounded, right = ("", (b,)) if r is None else ("_rounded", (r, b))
+        right = (b,) if r is None else (r, b)
         if self.merged:
-            name = "smooth_pairs_from_zero" + rounded
+            name = "smooth_pairs_from_zero" if r is None else "smooth_pairs_from_zero_rounded"
             self._add(depth, name, n, _LATE, _EARLY, *rows, *blocks, *right, x)
         else:
-            self._add(depth, "smooth_from_zero" + rounded, n, _LATE, *blocks, *right, x)
+            name = "smooth_from_zero" if r is None else "smooth_from_zero_rounded"
+            self._add(depth, name, n, _LATE, *blocks, *right, x)
             self._smooth(depth, _EARLY)
         if level.aggregates is None:
             return
