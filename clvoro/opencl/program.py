@@ -32,6 +32,8 @@ _ending = threading.Event()
 _silent = 0
 _IGNORED = ("ignore", None, cl.CompilerWarning, None, 0)
 ROUNDED_QUOTIENTS = "-cl-fp32-correctly-rounded-divide-sqrt"
+STATIC_FUNCTIONS = "#define inline static inline\n"
+"""Put before programs; see `needs_static_functions`."""
 POCL = "Portable Computing Language"
 """Name of PoCL's platform."""
 
@@ -166,7 +168,10 @@ def compile_text(
     ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True
 ) -> cl.Program:
     """Build `text`; if `short`, with the declarations of `shorten`."""
-    options = (*options, *device_options(ctx.devices[0]))
+    device = ctx.devices[0]
+    options = (*options, *device_options(device))
+    if needs_static_functions(device):
+        text = STATIC_FUNCTIONS + text
     with _silenced():
         if short and has_short_declarations(ctx):
             with contextlib.suppress(cl.Error):  # a function that they lack
@@ -182,6 +187,15 @@ def device_options(device: cl.Device) -> tuple[str, ...]:
     """
     rounds = device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
     return (ROUNDED_QUOTIENTS,) if rounds and not on_pocl(device) else ()
+
+
+def needs_static_functions(device: cl.Device) -> bool:
+    """Return whether device functions must be static on `device`: on all but CPUs.
+
+    In C99 an inline function has no body where a call is not inlined, unless it is static. PoCL inlines all calls of
+    functions that are not static. Of static ones it does not, and large cells then overflow the stack of a thread.
+    """
+    return bool(device.type & (cl.device_type.GPU | cl.device_type.ACCELERATOR))
 
 
 def on_pocl(device: cl.Device) -> bool:

@@ -180,7 +180,7 @@ def linking(bitcode: Path) -> list[str]:
 
 def static(source: Source) -> Source:
     """Return `source` with static functions: those that are not inlined keep a body."""
-    return source._replace(text=re.sub(r"^inline ", "static inline ", source.text, flags=re.M))
+    return source._replace(text=_program.STATIC_FUNCTIONS + source.text)
 
 
 def can_measure(vendor: str) -> bool:

@@ -3,13 +3,14 @@
 from functools import partial
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 import clvoro
 from clvoro.opencl import program as _program
 from tests.robustness import gpu_programs
 from tests.robustness.gpu_like import groups
-from tests.robustness.gpu_programs import compile_for, undefined_functions
+from tests.robustness.gpu_programs import compile_for, static, undefined_functions
 from tests.robustness.gpu_programs import for_each as each
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
@@ -38,8 +39,6 @@ LIMITS = {
     "transfer_cell_data": (224, 16384),
 }
 """The same for kernels that take more. No variant of any kernel spills registers."""
-STATIC = "static inline" in _program.source_text("opencl/real.h")
-"""Whether device functions have a body where a compiler does not inline them."""
 needs_clang = pytest.mark.skipif(gpu_programs.clang() is None, reason="needs clang")
 
 
@@ -91,11 +90,33 @@ def test_kernels_compile_for_gpus(ctx, dtype, tmp_path):
     for target in gpu_programs.TARGETS:
         for source, (_, said) in each(partial(compile_for, target, folder=tmp_path), sources):
             assert not said, f"{source.name} for {target}: {said[:2000]}"
-        if STATIC:
-            for source, missing in each(
-                partial(undefined_functions, target, folder=tmp_path), sources
-            ):
-                assert not missing, f"{source.name} for {target} calls {missing} without a body"
+        for source, missing in each(
+            partial(undefined_functions, target, folder=tmp_path), map(static, sources)
+        ):
+            assert not missing, f"{source.name} for {target} calls {missing} without a body"
+
+
+def test_functions_are_static_on_gpus(ctx, monkeypatch):
+    """PoCL inlines all functions only if they are not static."""
+    texts, plain = [], cl.Program
+    monkeypatch.setattr(
+        _program.cl, "Program", lambda ctx, text: texts.append(text) or plain(ctx, text)
+    )
+    for gpu in (False, True):
+        monkeypatch.setattr(_program, "needs_static_functions", lambda _, gpu=gpu: gpu)
+        text = "inline int two(int i) { return 2 * i; } kernel void k(global int *a) { a[0] = two(a[1]); }"
+        _program.compile_text(ctx, text, (), short=False)
+        assert texts.pop().startswith(_program.STATIC_FUNCTIONS) == gpu
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("CPU", False), ("GPU", True), ("ACCELERATOR", True)]
+)
+def test_kinds_of_devices_with_static_functions(kind, expected):
+    class Device:
+        type = getattr(cl.device_type, kind)
+
+    assert _program.needs_static_functions(Device) == expected
 
 
 def test_a_function_without_a_body_is_found(tmp_path):
