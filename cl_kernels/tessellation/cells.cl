@@ -72,8 +72,8 @@ inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *point
    cells, the generators are too close (from far away, two generators one ulp apart have the same bisector): a flag is
    set. Faces with generators without a row are not checked.
 
-   If `repaired`, fits[i] is 1 for rows that are consistent with all neighbors; otherwise it is not read. Nothing is
-   done while cells are marked. */
+   If `repaired`, fits[i] is 1 for rows that are consistent with all neighbors; otherwise it is not read. While
+   cells are marked, all rows are empty. */
 kernel void match_polygon_faces(const int size, global const int *places, global const int *slots,
                                 global const int *slot_counts, global const int *old_starts,
                                 global const int *old_neighbors, global const REAL *points, const REAL4 box_lower,
@@ -81,6 +81,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
                                 global uint *keep, global int *counts, global int *flags)
 {
     WORK_ITEM(i);
+    counts[i] = 0;
     if (flags[FLAG_MARKED])
         return;
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);

@@ -363,6 +363,11 @@ OVERLOADED int convert_int_rte(double a)
     ATOMIC(atomic_and, __atomic_fetch_and, T, SPACE)                                                                   \
     ATOMIC(atomic_min, __atomic_fetch_min, T, SPACE)                                                                   \
     ATOMIC(atomic_max, __atomic_fetch_max, T, SPACE)                                                                   \
+    OVERLOADED T atomic_cmpxchg(volatile SPACE T *a, T expected, T desired)                                            \
+    {                                                                                                                  \
+        __atomic_compare_exchange_n(a, &expected, desired, 0, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST);                     \
+        return expected;                                                                                               \
+    }                                                                                                                  \
     OVERLOADED T atomic_inc(volatile SPACE T *a)                                                                       \
     {                                                                                                                  \
         return atomic_add(a, (T)1);                                                                                    \
