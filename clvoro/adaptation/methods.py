@@ -147,6 +147,11 @@ class WeightedMethod:
         )  # fmt: skip
 
 
+PENALTY_PER_ERROR = 750.0
+"""Largest penalty over the error target, for targets above 0.004. With a penalty of 3 no mean error above 0.024 is
+reached; with 30 to 60 the shape hardly improves any more."""
+
+
 @dataclass
 class ProjectedMethod:
     """Lloyd or quality descent with momentum, projected so that every cell keeps or gets its volume.
@@ -240,7 +245,8 @@ class ProjectedMethod:
     def _control_penalty(self, error: float) -> None:
         """Change the penalty towards the one that gives the error target."""
         change = self.error_target / max(error, 1e-9)  # the error may be 0
-        self.penalty = min(3.0, max(1e-3, self.penalty * min(1.33, max(0.75, change))))
+        largest = max(3.0, PENALTY_PER_ERROR * self.error_target)
+        self.penalty = min(largest, max(1e-3, self.penalty * min(1.33, max(0.75, change))))
 
     def move(self, mesh: MeshState) -> None:
         """Move by both, at most by k h."""

@@ -70,7 +70,8 @@ class MultilevelOptions:
         the number of refinements that lead from them to the finest level.
     error_target : float, optional
         Mean |log(L / h)| that the last steps aim at; a larger one gives cells of a better shape. The default is .0025
-        (effort "fast": .0035, "best": .0039).
+        (effort "fast": .0035, "best": .0039). Above about .04 the shape no longer improves, and errors stay below the
+        target; in 2D the largest error is bounded to about .25.
 
     Raises
     ------

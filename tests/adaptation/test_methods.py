@@ -5,6 +5,7 @@ import pytest
 
 from clvoro import sizing
 from clvoro.adaptation.methods import (
+    PENALTY_PER_ERROR,
     PUBLISHED,
     ProjectedMethod,
     PublishedMethod,
@@ -207,7 +208,12 @@ def test_penalty_is_controlled_to_the_error_target(stages):
         assert method.penalty == pytest.approx(0.1 * factor, rel=1e-6)
         for _ in range(40):
             method.displace(mesh)
-        assert method.penalty == pytest.approx({True: 3.0, False: 1e-3}[aim > error])
+        largest = max(3.0, PENALTY_PER_ERROR * aim)
+        assert method.penalty == pytest.approx(np.clip(0.1 * factor**41, 1e-3, largest))
+    assert largest > 3.0, "penalties are larger for loose targets"
+    close = ProjectedMethod(penalty=2.9, error_target=0.003)
+    close._control_penalty(1e-9)
+    assert close.penalty == 3.0
 
 
 def test_mean_log_ratio_error_of_perfect_cells(stages):
