@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import KDTree
 
+from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.tips import WIDEST, find_tips
 from ..opencl.engine import Engine
@@ -283,7 +284,6 @@ class PlacedCorners:
     """Corner groups on the device, in the frame of a domain."""
 
     def __init__(self, engine: Engine, domain: Polygon, groups: CornerGroups) -> None:
-        self.domain = domain
         origin, scale = domain.frame
         at = (domain.oriented.vertices[groups.vertices] - origin) / scale
         measures = (groups.directions, groups.angles, groups.sizes / scale, groups.slack / scale)
@@ -313,11 +313,13 @@ class Corners:
             },
         )  # fmt: skip
 
-    def share(self, placed: PlacedCorners, t: Tessellation, moving: Moving) -> None:
+    def share(self, placed: PlacedCorners, free: Domain, t: Tessellation, moving: Moving) -> None:
         """Move generators so that a face ends in every corner.
 
         Parameters
         ----------
+        free : Domain
+            The part of the polygon without layers, in its frame. Generators outside it do not see the corners.
         t : Tessellation
             Diagram of the same generators before their last displacement.
         """
@@ -334,7 +336,7 @@ class Corners:
         engine.run_each(
             k.share_corners, p.groups, t.starts, t.neighbors, np.int32(t.n), moving.points, moving.labels,
             np.int32(moving.fixed), p.starts, p.corners, p.shapes, p.other_starts, p.others, p.seeds,
-            *p.domain.device_args(engine), p.moved, p.targets, group=GROUP,
+            *free.device_args(engine), p.moved, p.targets, group=GROUP,
         )  # fmt: skip
         engine.run_each(
             k.move_to_corners, p.groups * MOST_MOVED, p.moved, p.targets, moving.points, moving.velocity

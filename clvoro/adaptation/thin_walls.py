@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyopencl.array as cla
 
+from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
@@ -40,11 +41,13 @@ class ThinWalls:
         self.engine = engine
         self._kernels = engine.kernels("adaptation/thin_walls", {"THIN": DEPTHS[-1]})
 
-    def pair(self, domain: Polygon, t: Tessellation, h: cla.Array, moving: Moving) -> None:
+    def pair(self, free: Domain, t: Tessellation, h: cla.Array, moving: Moving) -> None:
         """Move generators on both sides of thin walls to be mirror images of each other.
 
         Parameters
         ----------
+        free : Domain
+            The part of the polygon without layers, in its frame. Generators do not leave it.
         t : Tessellation
             Diagram of the same generators before their last displacement.
         h : (n,) real
@@ -52,7 +55,7 @@ class ThinWalls:
         engine, k = self.engine, self._kernels
         assert t.trimmed is not None
         chords, convex = t.trimmed.chords, t.trimmed.convex
-        u, n, args = chords.touched_count, np.int32(t.n), domain.device_args(engine)
+        u, n, args = chords.touched_count, np.int32(t.n), free.device_args(engine)
         with engine.workspace.frame():
             partners, targets = engine.scratch(u, np.int32), engine.scratch((2 * u, 2))
             engine.run_each(

@@ -37,11 +37,14 @@ class Walls:
         Re-entrant corners in which faces have to end; None if there are none. Then walls change nothing.
     thin : bool
         Whether walls between corners are thinner than a cell.
+    free : Domain
+        The part of the domain without layers; generators do not leave it.
     """
 
     def __init__(self, setup: Setup, size_factor: float) -> None:
         self.corners: PlacedCorners | None = None
         self.thin = False
+        self.free = setup.free
         domain = setup.domain
         if not isinstance(domain, Polygon):
             return
@@ -59,8 +62,8 @@ class Walls:
         if self.corners is None:
             return
         if self.thin:
-            mesh.stages.thin_walls.pair(self.corners.domain, mesh.t, mesh.h, mesh.moving)
-        mesh.stages.corners.share(self.corners, mesh.t, mesh.moving)
+            mesh.stages.thin_walls.pair(self.free, mesh.t, mesh.h, mesh.moving)
+        mesh.stages.corners.share(self.corners, self.free, mesh.t, mesh.moving)
 
     def settle(self, mesh: MeshState) -> None:
         """Let faces end in corners without another step, and update the mesh."""
@@ -80,4 +83,4 @@ class Walls:
             )
             mesh.stages.motion.add_momentum(1.0, ahead, displacement, 1.0)
             moving = Moving(ahead, displacement, mesh.labels, mesh.fixed)
-            mesh.stages.corners.share(self.corners, mesh.t, moving)
+            mesh.stages.corners.share(self.corners, self.free, mesh.t, moving)

@@ -146,11 +146,11 @@ def shared(domain, points, h):
     return new, own
 
 
-def make_mesh(ctx, domain, points, real, fixed=0, h=H):
+def make_mesh(ctx, domain, points, real, fixed=0, h=H, free=None):
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.kind(np.dtype(real)))
     sizing = Sizing(engine, domain, as_field(h))
     on_device = engine.upload(domain.place(points, engine.real))
-    return MeshState.create(Stages(engine), domain, sizing, on_device, fixed=fixed)
+    return MeshState.create(Stages(engine), domain, sizing, on_device, free=free, fixed=fixed)
 
 
 def lattice(domain, seed):
@@ -163,7 +163,7 @@ def lattice(domain, seed):
 def project(ctx, domain, points, real="float64", fixed=0):
     mesh = make_mesh(ctx, domain, points, real, fixed)
     assert mesh.walls.corners is not None
-    mesh.stages.corners.share(mesh.walls.corners, mesh.t, mesh.moving)
+    mesh.stages.corners.share(mesh.walls.corners, mesh.free, mesh.t, mesh.moving)
     origin, scale = domain.frame
     return origin + mesh.to_host(mesh.points, scale), mesh.to_host(mesh.velocity, scale)
 
@@ -192,6 +192,29 @@ def test_generators_that_sit_still_stay(ctx):
     still, _ = project(ctx, L, points, fixed=len(points))
     assert still == pytest.approx(points, abs=1e-15)
     assert not np.allclose(once, points)
+
+
+def test_generators_stay_out_of_layers(ctx):
+    """Layers fill the L below y = 0.47, where its corner at y = 0.5 would have some of the others."""
+    below = 0.47
+    free = clvoro.Polygon([(0, below), (1, below), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
+    free.framed_by = L
+    left = moved = 0
+    for seed in range(12):
+        points = lattice(L, seed)
+        points = points[np.argsort(points[:, 1] > below, kind="stable")]
+        fixed = int((points[:, 1] <= below).sum())
+        found = []
+        for part in (L, free):
+            mesh = make_mesh(ctx, L, points, "float64", fixed, free=part)
+            mesh.walls.adjust(mesh)
+            origin, scale = L.frame
+            found.append((origin + mesh.to_host(mesh.points, scale))[fixed:])
+        left += (found[0][:, 1] < below).sum()
+        assert found[1][:, 1].min() > below
+        moved += not np.allclose(found[1], points[fixed:])
+    assert left > 0
+    assert moved > 0
 
 
 # Tips.
@@ -290,7 +313,7 @@ def test_no_two_groups_move_the_same_generator(ctx):
         holes.append(middle + 0.035 * np.column_stack([np.cos(angle), np.sin(angle)]))
     domain, points = clvoro.Polygon(SQUARE, holes), rng.random((250, 2))
     mesh = make_mesh(ctx, domain, points[domain.contains_well(points, 0.003)], "float64", h=h)
-    mesh.stages.corners.share(mesh.walls.corners, mesh.t, mesh.moving)
+    mesh.stages.corners.share(mesh.walls.corners, mesh.free, mesh.t, mesh.moving)
     moved = mesh.walls.corners.moved.get()
     moved = moved[moved >= 0]
     assert len(moved) > 50

@@ -66,7 +66,7 @@ def test_pairs(ctx, real):
     rows = [rows_of(t, order) for t in (mesh.t.trimmed.convex, mesh.t)]
     chords = mesh.t.trimmed.chords
     at_wall = order[chords.touched.get()[: chords.touched_count]]
-    mesh.stages.thin_walls.pair(SLIT, mesh.t, mesh.h, mesh.moving)
+    mesh.stages.thin_walls.pair(mesh.free, mesh.t, mesh.h, mesh.moving)
     partners, expected = nearest_images(x, *rows), x.copy()
     paired = {
         i for i, j in enumerate(partners)

@@ -51,17 +51,15 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
     rounding = ROUNDINGS * g.unit * counts * (1 if dim == 2 else g.reach) / perimeter
     off = np.abs(q - quality) - 64 * eps * (1 + quality)
     if not g.remade:
-        loose = np.zeros(n, bool)
+        # A face as short as round-off may have the direction of the round-off.
+        slivers = d.face_measures < ROUNDINGS * g.unit * (1 if dim == 2 else g.reach[g.owner])
+        loose = np.bincount(g.owner, slivers, minlength=n) > 0
         if isinstance(d.domain, Polygon):
-            loose = np.bincount(g.owner, d.neighbors < 0, minlength=n) > 0
+            loose |= np.bincount(g.owner, d.neighbors < 0, minlength=n) > 0
         elif dim == 3:
-            # The device includes faces that the diagram leaves out as narrow as round-off.
+            # The device includes faces that the diagram leaves out as narrow as round-off; slivers lie among these.
             doubtful = np.flatnonzero(off > 0)
             loose[doubtful[borders_on_lost_faces(d, g, doubtful)]] = True
-            slivers = (
-                d.face_measures < ROUNDINGS * g.unit * g.reach[g.owner]
-            )  # lost faces lie among these
-            loose[doubtful] |= np.bincount(g.owner, slivers, minlength=n)[doubtful] > 0
         rounding *= loose
     check.note(
         "quality", np.maximum(off - 3 * rounding, 0),
