@@ -50,7 +50,7 @@ def test_field(name: str) -> sizing.Field:
     if name == "ridge":
         return sizing.Expression("0.007 + 0.12 * fabs(y - 0.75 - 0.3 * sin(1.6 * pi * x))")
     if name in ("S1", "S2", "S3"):
-        sphere = sizing.Sphere((0.5, 0.5, 0.4), 0.25)
+        sphere = sizing.Ball((0.5, 0.5, 0.4), 0.25)
         return sizing.Distance(sphere, h_min=0.04, slope=0.3) * 0.5 ** (int(name[1]) - 1)
     circle = sizing.Circle((0.9, 0.75), 0.3)
     if name == "F1":

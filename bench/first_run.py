@@ -32,6 +32,7 @@ RECORDED = {
     ),
     "2D periodic": ("clvoro.Box((0, 0), (1, 1), periodic=True)", 0.04),
     "3D periodic": ("clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)", 0.1),
+    "sphere": ("clvoro.Sphere(1.0)", 0.08),
 }
 RUN = """
 import json, resource, time

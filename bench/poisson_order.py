@@ -77,7 +77,7 @@ def circle() -> Problem:
 
 def cube() -> Problem:
     """Return a cube."""
-    size = sizing.Distance(sizing.Sphere((0.5, 0.5, 0.4), 0.25), h_min=0.12, slope=0.3)
+    size = sizing.Distance(sizing.Ball((0.5, 0.5, 0.4), 0.25), h_min=0.12, slope=0.3)
     return Problem(clvoro.Box((0, 0, 0), (1, 1, 1)), size)
 
 

@@ -46,7 +46,7 @@ from clvoro.errors import PrecisionWarning
 SHAPES = {
     "circle": (BOX, sizing.Circle((0.9, 0.75), 0.3), 1.4671),
     "point": (BOX, sizing.Circle((0.9, 0.75), 0.0), 1.7671),
-    "sphere": (CUBE, sizing.Sphere((0.5, 0.5, 0.4), 0.25), 0.6772),
+    "sphere": (CUBE, sizing.Ball((0.5, 0.5, 0.4), 0.25), 0.6772),
 }
 """Domain, shape, and the largest distance from it."""
 

@@ -166,7 +166,7 @@ def circle(h_min: float, x: float = 0.9, **options: Any) -> sizing.Field:
 
 def sphere(h_min: float, x: float = 0.5) -> sizing.Field:
     """Return sizes that grow from a sphere in `CUBE`."""
-    return sizing.Distance(sizing.Sphere((x, 0.5, 0.4), 0.25), h_min=h_min, slope=0.3)
+    return sizing.Distance(sizing.Ball((x, 0.5, 0.4), 0.25), h_min=h_min, slope=0.3)
 
 
 def ring(edges: int, radius: float = 0.4, lobes: float = 0.08) -> np.ndarray:
@@ -227,7 +227,7 @@ def box_cases() -> Iterator[Case]:
 
 def periodic_cases() -> Iterator[Case]:
     spot = sizing.Distance(sizing.Circle((0.05, 0.9), 0.1), h_min=0.02, slope=0.3, h_max=0.05)
-    ball = sizing.Distance(sizing.Sphere((0.1, 0.9, 0.5), 0.2), h_min=0.08, slope=0.3, h_max=0.12)
+    ball = sizing.Distance(sizing.Ball((0.1, 0.9, 0.5), 0.2), h_min=0.08, slope=0.3, h_max=0.12)
     for dtype in ("float64", "float32"):
         yield Case("2D periodic", adapted(PERIODIC, spot, effort="fast"), dtype)
         yield Case("3D periodic", adapted(PERIODIC_CUBE, ball, effort="fast"), dtype)

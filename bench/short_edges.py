@@ -36,7 +36,7 @@ def setup(name: str) -> tuple[clvoro.Box, Any]:
     """Return domain and size field."""
     if name == "spheres":
         centers = (0.3, 0.3, 0.5), (0.7, 0.6, 0.5)
-        both = [sizing.Distance(sizing.Sphere(c, 0.2), h_min=0.04, slope=0.3) for c in centers]
+        both = [sizing.Distance(sizing.Ball(c, 0.2), h_min=0.04, slope=0.3) for c in centers]
         return CUBE, sizing.minimum(*both)
     if name == "ridge":
         return CUBE, sizing.Expression("0.035 + 0.2 * fabs(x + 0.3 * y - 0.6)")

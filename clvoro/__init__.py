@@ -11,22 +11,24 @@ diagram are moved, inserted and deleted until its cells have that size and are n
 >>> bool(abs(mesh.diagram.volumes.sum() - domain.measure) < 1e-12)
 True
 
-Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shapely), with `Layers` along walls. `curves`
-has circles, ellipses, wing sections and splines for their boundaries. Sizes:
-numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`. `adapt` returns a `Result`, `voronoi` a `Diagram`
-of given generators; both have arrays, `save`, `plot`, `check` and `transfer`, and `load` reads a saved result.
-`Adapter` is the full interface, on a device of your choice, with `MultilevelOptions`, `PaperOptions` and `Checkpoint`;
-Ctrl-C raises `Interrupted`, which carries the mesh so far. Errors and warnings are in `clvoro.errors`, pictures in
-`clvoro.plotting`, times of kernels in `clvoro.profile`. The command is ``clvoro``; begin with ``clvoro --help``.
+Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shapely), with `Layers` along walls, and
+`Sphere`, for global models; `regions` finds the cells of oceans and limited areas. `curves` has circles, ellipses, wing
+sections and splines for their boundaries. Sizes: numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`.
+`adapt` returns a `Result`, `voronoi` a `Diagram` of given generators; both have arrays, `save`, `plot`, `check` and
+`transfer`, and `load` reads a saved result. `Adapter` is the full interface, on a device of your choice, with
+`MultilevelOptions`, `PaperOptions` and `Checkpoint`; Ctrl-C raises `Interrupted`, which carries the mesh so far. Errors
+and warnings are in `clvoro.errors`, pictures in `clvoro.plotting`, times of kernels in `clvoro.profile`. The command is
+``clvoro``; begin with ``clvoro --help``.
 """
 
-from . import curves, sizing
+from . import curves, regions, sizing
 from .adaptation.options import Checkpoint, MultilevelOptions, PaperOptions
 from .adapter import Adapter
 from .errors import ClvoroError, Interrupted
 from .geometry.boundary_layers import Layers
 from .geometry.box import Box
 from .geometry.polygon import Polygon
+from .geometry.sphere import Sphere
 from .io import load
 from .mesh.diagram import Diagram
 from .mesh.results import Displacements, Result
@@ -49,12 +51,14 @@ __all__ = [
     "PaperOptions",
     "Polygon",
     "Result",
+    "Sphere",
     "adapt",
     "create_context",
     "curves",
     "list_devices",
     "load",
     "profile",
+    "regions",
     "sizing",
     "voronoi",
 ]

@@ -106,7 +106,7 @@ class Adapter:
         if real == np.float64:
             device.require_fp64(self.ctx)
         self.queue = cl.CommandQueue(self.ctx)
-        self._stages: dict[tuple[int, bool, bool], Stages] = {}
+        self._stages: dict[tuple[int, bool, bool, bool], Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None
         self._watch: Callable[[np.void], None] | None = None
@@ -178,10 +178,10 @@ class Adapter:
             shapely = type(domain).__module__.startswith("shapely")
             hint = "; write clvoro.Polygon.from_shapely(domain)" if shapely else ""
             raise InputTypeError(
-                f"domain is a {type(domain).__name__}, expected a clvoro.Box or a clvoro.Polygon{hint}"
+                f"domain is a {type(domain).__name__}, expected a clvoro.Box, a clvoro.Polygon or a clvoro.Sphere{hint}"
             )
         kind = domain.kind(self.dtype)
-        key = domain.dim, kind.periodic, kind.polygonal
+        key = domain.dim, kind.periodic, kind.polygonal, kind.spherical
         stages = self._stages.get(key)
         if stages is None or stages.engine.domain_kind != kind:
             # Stages of other periods are dropped. The programs are cached elsewhere and serve these, too.

@@ -36,7 +36,7 @@ def check_points(points: object, domain: Domain) -> np.ndarray:
     InputError
         If its shape is not (n, d) with n >= 1, or a value is not finite or outside; names the first.
     """
-    array = check_rows("points", points, domain.dim)
+    array = domain.check_rows("points", points)
     if len(array) == 0:
         raise InputError(f"points has shape {array.shape}, expected at least one generator")
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))

@@ -21,7 +21,7 @@ HOUSE = PACKAGE.parent
 CLANG_FORMAT = "14"
 """The version whose style is the kernels': others break some lines elsewhere."""
 ORDER = (
-    "errors", "arguments", "files", "opencl", "geometry", "curves", "mesh", "finite_volumes", "io", "sizing",
+    "errors", "arguments", "files", "opencl", "geometry", "curves", "mesh", "regions", "finite_volumes", "io", "sizing",
     "tessellation", "solvers", "adaptation", "remapping", "plotting", "adapter", "shared", "__init__", "cli",
     "__main__",
 )  # fmt: skip

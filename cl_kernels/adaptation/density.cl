@@ -17,7 +17,7 @@ kernel void evaluate_density(const int size, global const REAL *volumes, global 
         return;
     if (begin + 4 <= size) {
         const REAL4 target = vload4(0, h + begin), volume = vload4(0, volumes + begin);
-        const REAL4 rho = 1 / (DIM == 2 ? target * target : target * target * target), v = volume * rho;
+        const REAL4 rho = 1 / (CELL_DIM == 2 ? target * target : target * target * target), v = volume * rho;
         vstore4(rho, 0, density + begin);
         vstore4(v, 0, weight + begin);
         vstore4(log(v), 0, log_ratio + begin);
@@ -26,7 +26,7 @@ kernel void evaluate_density(const int size, global const REAL *volumes, global 
     }
     for (int i = begin; i < size; ++i) {
         const REAL target = h[i];
-        const REAL rho = 1 / (DIM == 2 ? target * target : target * target * target);
+        const REAL rho = 1 / (CELL_DIM == 2 ? target * target : target * target * target);
         density[i] = rho;
         weight[i] = volumes[i] * rho;
         log_ratio[i] = log(volumes[i] * rho);
@@ -46,7 +46,7 @@ inline void weighted_offset(const int i, const REAL *gradient, global const REAL
 {
     REAL g[DIM];
     EACH_AXIS(a)
-    g[a] = -(DIM + 2) * gradient[a];
+    g[a] = -(CELL_DIM + 2) * gradient[a];
 #if DIM == 2
     const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
     lloyd[2 * i] = offsets[2 * i] + xx * g[0] + xy * g[1];
@@ -102,6 +102,13 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
         if (q >= p)
             m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
     }
+#ifdef SPHERE
+    /* No gradient along the normal. */
+    const REAL tangential = m[0][0] + m[1][1] + m[2][2];
+    EACH_AXIS(p)
+    EACH_AXIS(q)
+    m[p][q] += tangential * points[3 * i + p] * points[3 * i + q];
+#endif
     /* The gradient is 0 if neighbors are too few or collinear. Division by infinity, because PoCL 6 with LLVM 18
        crashes on a branch here. */
     const REAL trace = m[0][0] + m[1][1] + (DIM == 3 ? m[DIM - 1][DIM - 1] : 0);

@@ -7,7 +7,7 @@
 #include "adaptation/separation.h"
 #include "adaptation/site_selection.h"
 
-#if DIM == 2
+#if CELL_DIM == 2
 #define REGULAR_FACES 6
 #define FACE_WEIGHT R(0.2)
 #else
@@ -15,11 +15,27 @@
 #define FACE_WEIGHT R(0.05)
 #endif
 
-#if DIM == 2
+#if CELL_DIM == 2
 inline REAL2 difference(global const REAL *points, int from, int to PERIOD_ARGS)
 {
-    return (REAL2)(DIFFERENCE(0, points[2 * from], points[2 * to]),
-                   DIFFERENCE(1, points[2 * from + 1], points[2 * to + 1]));
+    SITE(x, from, points);
+    return VECTOR_TO(x, to, points);
+}
+
+/* The strain of cell j in the axes of cell i. */
+inline float4 strain_from(int i, int j, global const float4 *strain, global const REAL *points)
+{
+    float4 s = strain[j];
+#ifdef SPHERE
+    SITE(own, i, points);
+    SITE(other, j, points);
+    const REAL2 e = along_tangents(own, other + 3), f = along_tangents(own, other + 6);
+    const float a = (float)e.s0, b = (float)e.s1, c = (float)f.s0, d = (float)f.s1;
+    s.s012 =
+        (float3)(a * a * s.s0 + 2 * a * c * s.s1 + c * c * s.s2, a * b * s.s0 + (a * d + b * c) * s.s1 + c * d * s.s2,
+                 b * b * s.s0 + 2 * b * d * s.s1 + d * d * s.s2);
+#endif
+    return s;
 }
 
 #define LATTICE_2 R(1.1547005383792515) /* (neighbor distance / h)^2 of a regular hexagonal mesh: 2 / sqrt 3 */
@@ -59,7 +75,7 @@ kernel void measure_strain(const int size, global const int *starts, global cons
 
 /* mean[i] = weighted mean of the strain over i and its neighbors, and the sum of the weights. */
 kernel void average_strain(const int size, global const int *starts, global const int *neighbors,
-                           global const float4 *strain, global float4 *mean)
+                           global const REAL *points, global const float4 *strain, global float4 *mean)
 {
     WORK_ITEM(i);
     const float4 own = strain[i];
@@ -69,7 +85,7 @@ kernel void average_strain(const int size, global const int *starts, global cons
         const int j = neighbors[k];
         if (j < 0)
             continue;
-        const float4 other = strain[j];
+        const float4 other = strain_from(i, j, strain, points);
         sum += other * other.s3;
         weight += other.s3;
     }
@@ -96,7 +112,7 @@ kernel void score_pairs(const int size, global const int *starts, global const i
             if ((kind.s1 > 0 && kinds[j].s1 > 0) || (one_wall && !at_walls))
                 continue;
             const REAL2 d = difference(points, i, j PERIODS);
-            const float4 s = (strain[i] + strain[j]) / 2;
+            const float4 s = (strain[i] + strain_from(i, j, strain, points)) / 2;
             const REAL along = s.s0 * d.s0 * d.s0 + 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s1 * d.s1;
             const REAL across = s.s0 * d.s1 * d.s1 - 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s0 * d.s0;
             const REAL value = (across - along) / dot(d, d);
@@ -152,8 +168,8 @@ kernel void count_pair_changes(const int size, global const ulong *chosen, globa
    marks the sites that change. */
 kernel void mark_pairs(const int size, global const ulong *chosen, global const REAL *pull, global const int2 *kinds,
                        global const int *partners, const REAL theta, const REAL shift, global const REAL *points,
-                       global const REAL *local_length, global int *kept, global REAL2 *shifts, global int *born,
-                       global REAL2 *births, global ulong *busy PERIOD_ARGS)
+                       global const REAL *local_length, global int *kept, global REAL *shifts, global int *born,
+                       global REAL *births, global ulong *busy PERIOD_ARGS)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -170,8 +186,10 @@ kernel void mark_pairs(const int size, global const ulong *chosen, global const 
     const REAL2 d = difference(points, i, j PERIODS);
     const REAL2 across = (REAL2)(-d.s1, d.s0) / sqrt(dot(d, d));
     born[j] = 1;
-    shifts[j] = R(SPLIT_DISTANCE) * local_length[j] * across;
-    births[j] = -shifts[j];
+    const REAL2 way = R(SPLIT_DISTANCE) * local_length[j] * across;
+    SITE(x, i, points);
+    put_vector(x, way, j, shifts);
+    put_vector(x, -way, j, births);
 }
 
 /* Sites of nucleation: six-sided cells among six-sided cells with an anisotropy of the strain, the difference of its
@@ -192,8 +210,8 @@ kernel void score_strain(const int size, global const int *starts, global const 
 /* Per chosen site, alternating by rank: insert a generator at the midpoint of its longest edge, or merge it with its
    nearest neighbor. */
 kernel void mark_nuclei(const int size, global const ulong *chosen, global const int *ranks, global const int *starts,
-                        global const int *neighbors, global const REAL *points, global int *kept, global REAL2 *shifts,
-                        global int *born, global REAL2 *births, global ulong *busy PERIOD_ARGS)
+                        global const int *neighbors, global const REAL *points, global int *kept, global REAL *shifts,
+                        global int *born, global REAL *births, global ulong *busy PERIOD_ARGS)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -210,11 +228,12 @@ kernel void mark_nuclei(const int size, global const ulong *chosen, global const
         }
     }
     const REAL2 half_way = difference(points, i, partner PERIODS) / 2;
+    SITE(x, i, points);
     if (insert) {
         born[i] = 1;
-        births[i] = half_way;
+        put_vector(x, half_way, i, births);
     } else {
-        shifts[i] = half_way;
+        put_vector(x, half_way, i, shifts);
         kept[partner] = 0;
     }
     busy[i] = 1;
@@ -272,7 +291,7 @@ inline void split_cell(int i, global const REAL *offsets, global const REAL *cov
 {
     REAL axis[DIM];
     longest_axis(covariances + DIM * (DIM + 1) / 2 * i, axis);
-    const REAL quarter = (DIM == 2 ? sqrt(volumes[i]) : cbrt(volumes[i])) / 4;
+    const REAL quarter = (CELL_DIM == 2 ? sqrt(volumes[i]) : cbrt(volumes[i])) / 4;
     born[i] = 1;
     for (int a = 0; a < DIM; ++a) {
         shifts[DIM * i + a] = offsets[DIM * i + a] + quarter * axis[a];
@@ -294,7 +313,7 @@ kernel void mark_split_delete(const int size, global const ulong *chosen, const 
         split_cell(i, offsets, covariances, volumes, shifts, born, births);
 }
 
-#if DIM == 2
+#if CELL_DIM == 2
 /* Sites to repair: inner cells with 1 - Q above `deficit`. Cells of at most four or at least eight sides come first,
    at any Q: they have a generator too many or too few around them. */
 kernel void score_bad_cells(const int size, global const int *starts, global const int *neighbors,

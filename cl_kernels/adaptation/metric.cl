@@ -15,7 +15,7 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
 {
     WORK_ITEM(i);
     const REAL volume = volumes[i];
-#if DIM == 2
+#if CELL_DIM == 2
     const REAL length = sqrt(volume);
 #else
     const REAL length = cbrt(volume);
@@ -27,7 +27,7 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
     REAL surface = 0;
     for (int k = begin; k < end; ++k)
         surface += face_measures[k];
-#if DIM == 2
+#if CELL_DIM == 2
     quality[i] = polygon_quality(end - begin, volume, surface);
 #else
     quality[i] = R(113.09733552923255) * volume * volume / (surface * surface * surface);
@@ -78,7 +78,7 @@ kernel void set_fixed_sizes(const int size, global const int *labels, const int 
                             global REAL *h)
 {
     WORK_ITEM(i);
-    const REAL length = DIM == 2 ? sqrt(volumes[i]) : cbrt(volumes[i]);
+    const REAL length = CELL_DIM == 2 ? sqrt(volumes[i]) : cbrt(volumes[i]);
     if (labels[i] < fixed && length <= (REAL)1.5 * h[i])
         h[i] = length;
 }

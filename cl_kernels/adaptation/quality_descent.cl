@@ -66,7 +66,7 @@ inline REAL2 wall_tangent(int label OUTLINE_ARGS)
 #endif
 }
 
-inline Face read_face(int k, REAL2 x, const rows_t *rows, global const REAL *points,
+inline Face read_face(int k, const REAL *x, const rows_t *rows, global const REAL *points,
                       global const REAL4 *forces OUTLINE_ARGS PERIOD_ARGS)
 {
     Face f;
@@ -76,7 +76,7 @@ inline Face read_face(int k, REAL2 x, const rows_t *rows, global const REAL *poi
     f.inverse = 0;
     f.forces = 0;
     if (label >= 0) {
-        f.away = (REAL2)(DIFFERENCE(0, x.s0, points[2 * label]), DIFFERENCE(1, x.s1, points[2 * label + 1]));
+        f.away = VECTOR_TO(x, label, points);
         f.inverse = 1 / sqrt(dot(f.away, f.away));
         f.tangent = f.inverse * (REAL2)(-f.away.s1, f.away.s0);
         f.forces = forces[label];
@@ -86,9 +86,9 @@ inline Face read_face(int k, REAL2 x, const rows_t *rows, global const REAL *poi
 }
 
 /* Where face k begins (side = -1) or ends (side = 1), relative to its generator. */
-inline REAL2 end_of_face(int k, int side, REAL2 tangent, const rows_t *rows)
+inline REAL2 end_of_face(int k, int side, REAL2 tangent, const REAL *x, const rows_t *rows)
 {
-    return (REAL2)(rows->centroids[2 * k], rows->centroids[2 * k + 1]) + side * rows->lengths[k] / 2 * tangent;
+    return VECTOR_OF(x, rows->centroids, k) + side * rows->lengths[k] / 2 * tangent;
 }
 
 inline bool is_same_vertex(REAL2 p, REAL2 q)
@@ -116,17 +116,18 @@ inline REAL face_between(int b, int f, const rows_t *rows)
    elsewhere in the row. */
 inline REAL boundary_length(int i, int k, int side, const rows_t *rows OUTLINE_ARGS)
 {
+    const REAL x[SITE_SIZE] = {0}; /* its faces are relative to it */
     const int begin = rows->starts[i], end = rows->starts[i + 1];
     REAL2 tangent = wall_tangent(rows->neighbors[k] OUTLINE);
     REAL length = rows->lengths[k];
     for (int count = begin + 1; count < end; ++count) {
-        const REAL2 here = end_of_face(k, side, tangent, rows);
+        const REAL2 here = end_of_face(k, side, tangent, x, rows);
         k += side;
         k = k == end ? begin : (k < begin ? end - 1 : k);
         if (rows->neighbors[k] >= 0)
             return length;
         const REAL2 next = wall_tangent(rows->neighbors[k] OUTLINE);
-        if (!is_same_vertex(end_of_face(k, -side, next, rows), here))
+        if (!is_same_vertex(end_of_face(k, -side, next, x, rows), here))
             return REAL_MAX;
         if (dot(tangent, next) < R(0.866))
             return side * (tangent.s0 * next.s1 - tangent.s1 * next.s0) > 0 ? length : REAL_MAX;
@@ -164,7 +165,7 @@ kernel void descend_quality(const int size, global const int *starts, global con
     WORK_ITEM(i);
     const rows_t rows = {starts, neighbors, face_measures, face_centroids};
     const short_edges_t edges = {short_edge, stiffness};
-    const REAL2 x = (REAL2)(points[2 * i], points[2 * i + 1]);
+    SITE(x, i, points);
     const int begin = starts[i], end = starts[i + 1];
     const REAL4 own = forces[i];
     const REAL h = own.s2;
@@ -172,17 +173,17 @@ kernel void descend_quality(const int size, global const int *starts, global con
     Face before = read_face(end - 1, x, &rows, points, forces OUTLINE PERIODS);
     for (int k = begin; k < end; ++k) {
         const Face face = read_face(k, x, &rows, points, forces OUTLINE PERIODS);
-        const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]);
-        const REAL2 r = end_of_face(k, -1, face.tangent, &rows); /* corner k */
+        const REAL2 m = VECTOR_OF(x, face_centroids, k);
+        const REAL2 r = end_of_face(k, -1, face.tangent, x, &rows); /* corner k */
         REAL s = 0;
         bool apart = false;
 #ifdef POLYGON
         /* A cell may have several loops. The first face of a loop follows its last one. Where no face ends, the cell
            continues in a piece that was added to it. */
-        apart = !is_same_vertex(end_of_face(before.place, 1, before.tangent, &rows), r);
+        apart = !is_same_vertex(end_of_face(before.place, 1, before.tangent, x, &rows), r);
         for (int other = begin; other < end && apart; ++other) {
             const Face ending = read_face(other, x, &rows, points, forces OUTLINE PERIODS);
-            if (is_same_vertex(end_of_face(other, 1, ending.tangent, &rows), r)) {
+            if (is_same_vertex(end_of_face(other, 1, ending.tangent, x, &rows), r)) {
                 before = ending;
                 apart = false;
             }
@@ -232,6 +233,43 @@ kernel void descend_quality(const int size, global const int *starts, global con
     /* A degenerate vertex has no gradient. */
     if (!(length < REAL_MAX))
         u = 0;
-    lloyd[2 * i] = u.s0;
-    lloyd[2 * i + 1] = u.s1;
+    put_vector(x, u, i, lloyd);
+}
+
+/* Distance of a generator from the middle of the opposite side over half that side, after it has moved: 1 is a right
+   angle (Thales). */
+#define OPENED R(1.01)
+
+/* Per generator i: displacement[i], away from the opposite sides of the Delaunay triangles that have an obtuse angle at
+   i; counts[i] is the number of these triangles. Two neighbors in a row and i are a triangle. */
+kernel void open_obtuse_triangles(const int size, global const int *starts, global const int *neighbors,
+                                  global const REAL *points, global REAL *displacement, global int *counts PERIOD_ARGS)
+{
+    WORK_ITEM(i);
+    const int begin = starts[i], end = starts[i + 1];
+    REAL away[DIM] = {0};
+    int count = 0;
+    for (int k = begin; k < end; ++k) {
+        const int j = neighbors[k], l = neighbors[k + 1 < end ? k + 1 : begin];
+        if (j < 0 || l < 0)
+            continue;
+        REAL middle[DIM], middle2 = 0, half2 = 0;
+        EACH_AXIS(a)
+        {
+            const REAL u = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
+            const REAL v = DIFFERENCE(a, points[DIM * i + a], points[DIM * l + a]);
+            middle[a] = (u + v) / 2;
+            middle2 += middle[a] * middle[a];
+            half2 += (u - v) * (u - v) / 4;
+        }
+        if (middle2 >= half2)
+            continue;
+        const REAL length = sqrt(middle2), way = length > 0 ? (OPENED * sqrt(half2) - length) / length : 0;
+        EACH_AXIS(a)
+        away[a] -= way * middle[a];
+        ++count;
+    }
+    EACH_AXIS(a)
+    displacement[DIM * i + a] = away[a];
+    counts[i] = count;
 }

@@ -7,8 +7,8 @@
 /* Whether the edge from i to j gets a new generator. Each edge is counted at its lower index. */
 inline bool has_midpoint(int i, int j, REAL measure, REAL volume)
 {
-    const REAL length = DIM == 2 ? sqrt(volume) : cbrt(volume);
-    return j > i && measure > R(SHORT_FACE) * (DIM == 2 ? length : length * length);
+    const REAL length = CELL_DIM == 2 ? sqrt(volume) : cbrt(volume);
+    return j > i && measure > R(SHORT_FACE) * (CELL_DIM == 2 ? length : length * length);
 }
 
 /* Whether an end of the edge is fixed (label below `fixed`): such edges get no new generators. */
@@ -118,8 +118,17 @@ kernel void place_new_generators(const int size, global const int *starts, globa
             child[axis] = level + (wall % 2 ? -way : way);
 #endif
         } else if (has_midpoint(i, j, face_measures[k], volumes[i])) {
+#ifdef SPHERE
+            REAL middle[3];
+            EACH_AXIS(a)
+            middle[a] = points[3 * i + a] + points[3 * j + a];
+            onto_sphere(middle);
+            EACH_AXIS(a)
+            child[a] = middle[a];
+#else
             for (int a = 0; a < DIM; ++a)
                 child[a] = PLACED(a, points[DIM * i + a] + DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2);
+#endif
 #ifdef POLYGON
             /* Around a corner of the boundary the midpoint of the common face is visible from both generators. Of
                several common faces, all but the longest one (the first of equal ones) get their own new generator. */

@@ -1,7 +1,7 @@
 /* The domain, for kernels that move generators: DOMAIN_ARGS in a signature, DOMAIN in a call. A kernel that needs only
    differences of positions has PERIOD_ARGS at the end of its signature and passes PERIODS on. Periods are arguments, so
    one program serves all periodic boxes. */
-#include "opencl/real.h"
+#include "geometry/site.h"
 
 #ifdef PERIODIC
 #define PERIOD_ARGS , const REAL4 periods
@@ -15,6 +15,11 @@
 #include "geometry/edges.h"
 #define keep_inside keep_inside_polygon
 #define reflect_inside reflect_inside_polygon
+#elif defined(SPHERE)
+#define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper
+#define DOMAIN box_lower, box_upper
+#define keep_inside(x, y, ...) onto_sphere(y)
+#define reflect_inside(x, y, ...) onto_sphere(y)
 #else
 #define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper PERIOD_ARGS
 #define DOMAIN box_lower, box_upper PERIODS
@@ -56,7 +61,44 @@ inline REAL wrapped(REAL y, REAL period)
 /* The difference between two positions along axis a, to the nearest image if the axis is periodic. */
 #define DIFFERENCE(a, from, to) nearest_image((to) - (from), PERIOD(a))
 
-#ifndef POLYGON
+#if CELL_DIM == 2
+/* Vectors in the plane of the cell at x: to generator j; row k of an array of vectors; and back, into an array. */
+#ifdef SPHERE
+#define VECTOR_TO(x, j, points) direction_of(x, j, points)
+inline REAL2 vector_in_plane(const REAL *x, REAL d0, REAL d1, REAL d2)
+{
+    const REAL d[3] = {d0, d1, d2};
+    return along_tangents(x, d);
+}
+#define VECTOR_OF(x, array, k) vector_in_plane(x, (array)[3 * (k)], (array)[3 * (k) + 1], (array)[3 * (k) + 2])
+inline void put_vector(const REAL *x, REAL2 v, int k, global REAL *array)
+{
+    REAL d[3];
+    in_space(x, v, d);
+    EACH_AXIS(a)
+    array[3 * k + a] = d[a];
+}
+#else
+#define VECTOR_TO(x, j, points)                                                                                        \
+    ((REAL2)(DIFFERENCE(0, x[0], points[2 * (j)]), DIFFERENCE(1, x[1], points[2 * (j) + 1])))
+#define VECTOR_OF(x, array, k) ((REAL2)((array)[2 * (k)], (array)[2 * (k) + 1]))
+inline void put_vector(const REAL *x, REAL2 v, int k, global REAL *array)
+{
+    array[2 * k] = v.s0;
+    array[2 * k + 1] = v.s1;
+}
+#endif
+#endif
+
+#ifdef SPHERE
+/* The point of the unit sphere above or below y. */
+inline void onto_sphere(REAL *y)
+{
+    const REAL length = sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2]);
+    EACH_AXIS(a)
+    y[a] /= length;
+}
+#elif !defined(POLYGON)
 /* Move the target y of a generator at x into the domain: to the nearest wall, or to its image along a period. */
 inline void keep_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 {

@@ -28,7 +28,9 @@
     T CONST_FUNCTION sin(T);                                                                                           \
     T CONST_FUNCTION cos(T);                                                                                           \
     T CONST_FUNCTION tan(T);                                                                                           \
+    T CONST_FUNCTION atan(T);                                                                                          \
     T CONST_FUNCTION atan2(T, T);                                                                                      \
+    T CONST_FUNCTION copysign(T, T);                                                                                   \
     T CONST_FUNCTION fmin(T, T);                                                                                       \
     T CONST_FUNCTION fmax(T, T);                                                                                       \
     T CONST_FUNCTION fma(T, T, T);                                                                                     \

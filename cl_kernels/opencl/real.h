@@ -5,6 +5,12 @@
 #ifndef REAL
 #error "build with -DREAL=double or -DREAL=float"
 #endif
+/* Dimension of the cells. On a sphere positions have three coordinates, and cells are polygons. */
+#ifdef SPHERE
+#define CELL_DIM 2
+#else
+#define CELL_DIM DIM
+#endif
 /* Geometry relies on the rounding of each operation. fma() is the only contraction. */
 #pragma OPENCL FP_CONTRACT OFF
 
@@ -37,6 +43,16 @@
 #define EACH_AXIS(a) _Pragma("unroll") for (int a = 0; a < DIM; ++a)
 /* A literal in the working precision: R(0.5). */
 #define R(x) ((REAL)(x))
+
+/* Rare code is kept out of line. */
+#define OUT_OF_LINE __attribute__((noinline))
+
+/* Before a loop that is usually short: vectorization would not pay. */
+#ifdef __clang__
+#define SHORT_LOOP _Pragma("clang loop vectorize(disable) interleave(disable) unroll(disable)")
+#else
+#define SHORT_LOOP
+#endif
 
 /* The index of a work-item below `size`, the kernel's first argument. Launches are rounded up to whole groups of one
    size, because PoCL compiles a kernel for every group size; the other items of the last group return. */

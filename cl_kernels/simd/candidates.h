@@ -1,5 +1,6 @@
 /* Candidates for the neighbors of eight generators at a time; see `hulls.cl`. */
 #include "simd/candidate_lists.h"
+#include "simd/eight_sites.h"
 #include "simd/near_rectangle.h"
 
 /* A first list of more than MANY candidates is cut to about ENOUGH of the nearest ones. */
@@ -8,30 +9,32 @@
 
 /* Append the near generators selected by `bits` to the lists, at most `most` each. */
 inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int most, global const double *binned,
-                      int own, double8 x, double8 y)
+                      int own, const eight_t *sites)
 {
-    double2 found[LIST_CAPACITY * LANES];
+    ROWS_BEHIND(found, LIST_CAPACITY);
     const int length = list->length;
-    const double16 self =
-        (double16)(x.s0, y.s0, x.s2, y.s2, x.s4, y.s4, x.s6, y.s6, x.s1, y.s1, x.s3, y.s3, x.s5, y.s5, x.s7, y.s7);
     const int8 own_places = own + (int8)(0, 1, 2, 3, 4, 5, 6, 7);
     for (int k = 0; k < most; ++k) {
-        vstore16(self, k, (double *)found);
+        put_self(found, k, sites);
         list->places[length + k] = own_places;
     }
     for (int lane = 0; lane < LANES; ++lane) {
         int *to = (int *)(list->places + length) + lane;
-        double2 *to_found = found + ROW_PLACE(0, lane);
+        int k = 0;
         const int *places = near->places;
         for (int word = 0; 64 * word < near->count; ++word, places += 64)
             for (ulong left = LANE((const ulong *)bits, word, lane); left; left &= left - 1) {
                 const int q = places[popcount(~left & (left - 1))];
                 *to = q;
-                *to_found = vload2(q, binned);
+                put_behind(found, k, lane, q, binned);
                 to += LANES;
-                to_found += LANES;
+                ++k;
             }
     }
+#ifdef SPHERE
+    project_rows(found, most - 1, sites);
+#endif
+    const double8 x = origin_x(sites), y = origin_y(sites);
     double8 largest2 = list->largest2;
     long8 nearest = list->nearest, same = 0;
     for (int k = 0; k < most; ++k) {
@@ -58,7 +61,7 @@ inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int 
 /* Add the generators with squared distance in [from2, to2) to the lists of some lanes. Returns to2, reduced where a
    first list (from2 = 0) would be long. Lists that are full, and those of generators that coincide with another, are in
    doubt. */
-inline double8 add_near(list_t *list, const near_t *near, global const double *binned, int own, double8 x, double8 y,
+inline double8 add_near(list_t *list, const near_t *near, global const double *binned, int own, const eight_t *sites,
                         long8 lanes, double8 from2, double8 to2, long8 *doubt)
 {
     const int words = (near->count + 63) / 64;
@@ -73,8 +76,7 @@ inline double8 add_near(list_t *list, const near_t *near, global const double *b
             ulong8 seen = 0;
             for (int c = 0; c < end; ++c) {
                 const long q = places[c];
-                const double8 dx = binned[2 * q] - x, dy = binned[2 * q + 1] - y;
-                const double8 d2 = fma(dx, dx, dy * dy);
+                const double8 d2 = squared_distances(sites, q, binned);
                 seen |= as_ulong8((d2 < to2) & (d2 >= from2) & (1L << c));
             }
             bits[word] = seen;
@@ -88,7 +90,7 @@ inline double8 add_near(list_t *list, const near_t *near, global const double *b
     const long8 fits = counts <= LIST_CAPACITY - list->length;
     for (int word = 0; word < words; ++word)
         bits[word] = fits ? bits[word] : 0;
-    *doubt |= ~fits | put_near(list, near, bits, max_lane(fits ? counts : 0), binned, own, x, y);
+    *doubt |= ~fits | put_near(list, near, bits, max_lane(fits ? counts : 0), binned, own, sites);
     return to2;
 }
 

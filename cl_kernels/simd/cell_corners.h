@@ -1,6 +1,7 @@
 /* The corners of eight cells at a time, one per vector lane, with the same bits as `corner` (tessellation/corner.h)
    where no wall is involved. */
 #include "tessellation/face_rows.h"
+#include "simd/eight_sites.h"
 #include "simd/lanes.h"
 
 inline double8 cross_in_plane(double8 a, double8 b, double8 c, double8 d)
@@ -8,27 +9,6 @@ inline double8 cross_in_plane(double8 a, double8 b, double8 c, double8 d)
     const double8 cd = c * d;
     return fma(a, b, -cd) + fma(-c, d, cd);
 }
-
-#ifdef FOLD_0
-/* Replace rows of points, up to number `most`, by their images nearest to the points (x, y), so that all differences
-   are those of `corner`. */
-inline void fold_eight_rows(double2 *behind, int most, double8 x, double8 y)
-{
-    const double8 even = (double8)(x.s0, y.s0, x.s2, y.s2, x.s4, y.s4, x.s6, y.s6);
-    const double8 odd = (double8)(x.s1, y.s1, x.s3, y.s3, x.s5, y.s5, x.s7, y.s7);
-    const double8 periods =
-        (double8)((double4)(FOLD(0), FOLD(1), FOLD(0), FOLD(1)), (double4)(FOLD(0), FOLD(1), FOLD(0), FOLD(1)));
-    const double8 half_way = periods > 0 ? periods / 2 : INFINITY;
-    for (int k = 0; k <= most; ++k)
-        for (int side = 0; side < 2; ++side) {
-            const double8 at = vload8(2 * k + side, (const double *)behind), d = at - (side ? odd : even);
-            const double8 nearer = d > half_way ? at - periods : at;
-            vstore8(d < -half_way ? at + periods : nearer, 2 * k + side, (double *)behind);
-        }
-}
-#else
-#define fold_eight_rows(behind, most, x, y)
-#endif
 
 /* Points along outlines, relative to the generators. */
 typedef struct {

@@ -36,24 +36,45 @@ inline int keep_hulls(list_t *list, const hull_t *hull, long8 wrapped, int kept)
     return most;
 }
 
-/* Choose the lanes near the first one; the rectangle holds everything within r of them. */
-inline long8 choose_lanes(long8 todo, double8 x, double8 y, double8 r, double8 far_away, double2 *lower, double2 *upper)
+/* Lanes whose coordinate x is within `far` of that of lane `first`. */
+inline long8 near_lane(double8 x, int first, double far)
+{
+    double xs[LANES];
+    vstore8(x, 0, xs);
+    return fabs(x - xs[first]) <= far;
+}
+
+/* The least x - slack of the chosen lanes. */
+inline double least_beyond(long8 chosen, double8 x, double8 slack)
+{
+    return min_lane(chosen ? x - slack : DBL_MAX);
+}
+
+/* Choose the lanes near the first one; the rectangle, or box, holds everything within r of them. */
+inline long8 choose_lanes(long8 todo, const eight_t *sites, double8 r, double8 far_away, double4 *lower, double4 *upper)
 {
     long wanted[LANES];
-    double xs[LANES], ys[LANES], fars[LANES];
+    double fars[LANES];
     vstore8(todo, 0, wanted);
-    vstore8(x, 0, xs);
-    vstore8(y, 0, ys);
     vstore8(far_away, 0, fars);
     int first = 0;
     while (!wanted[first])
         ++first;
     const double far = fars[first];
     const long8 lanes = (long8)(0, 1, 2, 3, 4, 5, 6, 7);
-    const long8 chosen = todo & ((lanes == first) | ((fabs(x - xs[first]) <= far) & (fabs(y - ys[first]) <= far)));
-    const double8 slack = r * (1 + 1e-6);
-    *lower = (double2)(min_lane(chosen ? x - slack : DBL_MAX), min_lane(chosen ? y - slack : DBL_MAX));
-    *upper = -(double2)(min_lane(chosen ? -x - slack : DBL_MAX), min_lane(chosen ? -y - slack : DBL_MAX));
+    const double8 x = sites->x, y = sites->y, slack = r * (1 + 1e-6);
+    long8 near = near_lane(x, first, far) & near_lane(y, first, far);
+#ifdef SPHERE
+    const double8 z = sites->z;
+    near &= near_lane(z, first, far);
+#else
+    const double8 z = 0;
+#endif
+    const long8 chosen = todo & ((lanes == first) | near);
+    *lower =
+        (double4)(least_beyond(chosen, x, slack), least_beyond(chosen, y, slack), least_beyond(chosen, z, slack), 0);
+    *upper = -(double4)(least_beyond(chosen, -x, slack), least_beyond(chosen, -y, slack),
+                        least_beyond(chosen, -z, slack), 0);
     return chosen;
 }
 
@@ -118,21 +139,19 @@ kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, g
     WORK_ITEM(group);
     needs_t needs = {0, 0, 0};
     for (int own = group * EIGHTS * LANES; own < min((group + 1) * EIGHTS * LANES, n); own += LANES) {
-        double xs[LANES], ys[LANES], spacings[LANES];
+        double spacings[LANES];
         long wanted[LANES];
         for (int lane = 0; lane < LANES; ++lane) {
             const int p = min(own + lane, n - 1), i = items[p];
             const bool is_wanted = own + lane < n && i < rows_wanted;
             wanted[lane] = is_wanted ? -1 : 0;
-            xs[lane] = binned[2 * p];
-            ys[lane] = binned[2 * p + 1];
             spacings[lane] = spacing[p];
             if (is_wanted) {
                 row_counts[i] = 0;
                 places[i] = i;
             }
         }
-        const double8 x = vload8(0, xs), y = vload8(0, ys);
+        const eight_t sites = load_sites(own, n, binned);
         near_t near;
         list_t list;
         hull_t hull;
@@ -145,11 +164,11 @@ kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, g
         double8 done2 = 0, r = first_look(&needs, first_reach) * unit;
         long8 todo = vload8(0, wanted), walled = 0;
         for (int round = 0; any_lane(todo) && round < MAX_ROUNDS; ++round) {
-            double2 lower, upper;
-            long8 lanes = choose_lanes(todo, x, y, r, SPREAD * unit, &lower, &upper), doubt = 0;
+            double4 lower, upper;
+            long8 lanes = choose_lanes(todo, &sites, r, SPREAD * unit, &lower, &upper), doubt = 0;
             bool fits = collect_near(&near, lower, upper, bins, grid_frames, grid_shapes);
             for (int attempt = 0; !fits && attempt < 4; ++attempt) {
-                lanes = choose_lanes(todo, x, y, r, attempt == 0 ? 2 * unit : 0, &lower, &upper);
+                lanes = choose_lanes(todo, &sites, r, attempt == 0 ? 2 * unit : 0, &lower, &upper);
                 r = (lanes & (done2 == 0) & (attempt > 1 ? -1L : 0L)) ? r / 2 : r;
                 fits = collect_near(&near, lower, upper, bins, grid_frames, grid_shapes);
             }
@@ -157,11 +176,13 @@ kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, g
                 todo &= ~lanes;
                 continue;
             }
-            if (any(lower < box_lower.s01) || any(upper > box_upper.s01)) {
-                add_walls(&list, x, y, lanes & ~walled, box_lower, box_upper, &doubt);
+#ifndef SPHERE
+            if (any(lower.s01 < box_lower.s01) || any(upper.s01 > box_upper.s01)) {
+                add_walls(&list, sites.x, sites.y, lanes & ~walled, box_lower, box_upper, &doubt);
                 walled |= lanes;
             }
-            const double8 to2 = add_near(&list, &near, binned, own, x, y, lanes, done2, r * r, &doubt);
+#endif
+            const double8 to2 = add_near(&list, &near, binned, own, &sites, lanes, done2, r * r, &doubt);
             r = (lanes & (to2 < r * r)) ? sqrt(to2) : r;
             pad_list(&list);
             wrap_hulls(&hull, &list, lanes);

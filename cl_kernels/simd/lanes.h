@@ -54,3 +54,9 @@ inline void load_row(const double2 *points, int k, double8 *x, double8 *y)
     *x = (double8)(even.s0, odd.s0, even.s2, odd.s2, even.s4, odd.s4, even.s6, odd.s6);
     *y = (double8)(even.s1, odd.s1, even.s3, odd.s3, even.s5, odd.s5, even.s7, odd.s7);
 }
+
+inline void store_row(double2 *points, int k, double8 x, double8 y)
+{
+    vstore8((double8)(x.s0, y.s0, x.s2, y.s2, x.s4, y.s4, x.s6, y.s6), 2 * k, (double *)points);
+    vstore8((double8)(x.s1, y.s1, x.s3, y.s3, x.s5, y.s5, x.s7, y.s7), 2 * k + 1, (double *)points);
+}

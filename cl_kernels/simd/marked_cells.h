@@ -50,7 +50,6 @@ inline void wrap_eight(int first, int size, global const int *listed, const face
                        global int *slot_counts)
 {
     int found[LANES][WRAPPED_CAPACITY], own[LANES], counts[LANES];
-    double xs[LANES], ys[LANES];
     long wanted[LANES];
     int most = 0;
     for (int lane = 0; lane < LANES; ++lane) {
@@ -58,21 +57,20 @@ inline void wrap_eight(int first, int size, global const int *listed, const face
         counts[lane] = find_candidates(found[lane], own[lane], rows);
         most = max(most, counts[lane]);
         wanted[lane] = counts[lane] > 0 && first + lane < size ? -1 : 0;
-        xs[lane] = points[2 * own[lane]];
-        ys[lane] = points[2 * own[lane] + 1];
     }
-    double2 near[WRAPPED_CAPACITY * LANES];
+    ROWS_BEHIND(near, WRAPPED_CAPACITY);
     list_t list;
     for (int lane = 0; lane < LANES; ++lane)
         for (int k = 0; k < most; ++k) {
             /* Skip the generator itself. */
             const int j = k < counts[lane] ? found[lane][k] : own[lane];
-            near[ROW_PLACE(k, lane)] = vload2(j, points);
+            put_behind(near, k, lane, j, points);
             LANE((int *)list.places, k, lane) = j;
         }
-    const double8 x = vload8(0, xs), y = vload8(0, ys);
+    const eight_t sites = load_listed_sites(own, points);
+    const double8 x = origin_x(&sites), y = origin_y(&sites);
     const long8 lanes = vload8(0, wanted), known = convert_long8(vload8(0, counts));
-    fold_eight_rows(near, most - 1, x, y);
+    project_rows(near, most - 1, &sites);
     list.length = 0;
     list.largest2 = 0;
     list.nearest = 0;
@@ -91,9 +89,14 @@ inline void wrap_eight(int first, int size, global const int *listed, const face
     wrap_hulls(&hull, &list, lanes);
     measure_hulls(&hull, &list, &reach2, &least);
     doubt |= hull.lost | is_uncertain(&hull, &list, reach2, least);
+#ifdef SPHERE
+    /* Far generators are not among the candidates: they cannot cut cells that are small. */
+    doubt |= !(reach2 < 1);
+#else
     /* Walls are not among the candidates, so they must be out of reach. */
     const double8 away = min(min(x - box_lower.s0, box_upper.s0 - x), min(y - box_lower.s1, box_upper.s1 - y));
     doubt |= !(away > 0) | !(reach2 < away * away);
+#endif
     long written[LANES], sizes[LANES];
     vstore8(lanes & ~doubt, 0, written);
     vstore8(hull.sizes, 0, sizes);

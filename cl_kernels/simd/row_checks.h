@@ -22,8 +22,7 @@ inline int check_eight(int first, int size, global const int *starts, global con
                        global const double *points, const double *lower, const double *upper, global int *fits,
                        global int *marks)
 {
-    double2 behind[(CHECKED_FACES + 1) * LANES];
-    double xs[LANES], ys[LANES];
+    ROWS_BEHIND(behind, CHECKED_FACES + 1);
     long counts[LANES], bits[LANES], turned[LANES], close[LANES];
     bool walled[LANES];
     int most = 0;
@@ -31,8 +30,6 @@ inline int check_eight(int first, int size, global const int *starts, global con
         const int i = min(first + lane, size - 1), n = starts[i + 1] - starts[i];
         counts[lane] = n <= CHECKED_FACES ? n : 0;
         most = max(most, (int)counts[lane]);
-        xs[lane] = points[2 * i];
-        ys[lane] = points[2 * i + 1];
     }
     /* All rows are read up to the length of the longest, as branches on different lengths would be mispredicted. Behind
        its last face a row repeats its first. */
@@ -43,13 +40,14 @@ inline int check_eight(int first, int size, global const int *starts, global con
         for (int k = 0; k <= most; ++k) {
             const int face = row[k < n ? k : 0];
             least = min(least, face);
-            behind[ROW_PLACE(k, lane)] = vload2(max(face, 0), points);
+            put_behind(behind, k, lane, max(face, 0), points);
         }
         walled[lane] = least < 0;
     }
     outlines_t corners;
-    const double8 x = vload8(0, xs), y = vload8(0, ys);
-    fold_eight_rows(behind, most, x, y);
+    eight_t sites = load_sites(first, size, points);
+    project_rows(behind, most, &sites);
+    const double8 x = origin_x(&sites), y = origin_y(&sites);
     find_corners(&corners, behind, most, x, y);
 
     const long8 ends = vload8(0, counts), last = max(ends - 1, (long8)(0));

@@ -221,3 +221,22 @@ REAL size_nearest_tree(const REAL *x, __global const REAL *data, int n, int leve
         node = waiting[top];
     }
 }
+
+#if DIM == 3
+/* Round regions on the unit sphere. data: h_max, slope, then per region its center (3), radius and size. */
+REAL size_of_caps(const REAL *x, __global const REAL *data, int count)
+{
+    REAL h = data[0];
+    for (int k = 0; k < count; ++k) {
+        __global const REAL *cap = data + 2 + 5 * k;
+        REAL chord2 = 0;
+        for (int a = 0; a < 3; ++a) {
+            const REAL d = x[a] - cap[a];
+            chord2 += d * d;
+        }
+        const REAL away = 2 * asin(fmin(sqrt(chord2) / 2, (REAL)1));
+        h = size_min(h, cap[4] + data[1] * fmax(away - cap[3], (REAL)0));
+    }
+    return h;
+}
+#endif

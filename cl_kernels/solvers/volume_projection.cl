@@ -70,8 +70,8 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
     for (BLOCK_LOOP(i, n)) {
         REAL x[DIM];
         float self[DIM], change = 0;
-        const REAL hi = h[i], unit = 1 / hi, content = DIM == 2 ? hi * hi : hi * hi * hi;
-        const REAL per_face = DIM == 2 ? unit : unit * unit;
+        const REAL hi = h[i], unit = 1 / hi, content = CELL_DIM == 2 ? hi * hi : hi * hi * hi;
+        const REAL per_face = CELL_DIM == 2 ? unit : unit * unit;
         const float shrink = content / volumes[i];
         float diagonal = 0, least_quality = quality[i];
         const bool is_fixed = fixed > 0 && labels[i] < fixed;

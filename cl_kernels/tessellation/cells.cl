@@ -1,8 +1,13 @@
 #include "tessellation/corner.h"
 
 #include "tessellation/vertex_walk.h"
+#include "tessellation/bins.h"
 #include "tessellation/measures.h"
+#ifdef SPHERE
+#include "tessellation/sphere_search.h"
+#else
 #include "tessellation/widening.h"
+#endif
 #if IN_LANES
 #include "simd/cell_measures.h"
 #endif
@@ -27,15 +32,22 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
     const int i = items[p];
     if (i >= rows_wanted || (some && row_counts[i]))
         return;
-    const REAL x[2] = {binned[2 * p], binned[2 * p + 1]};
+    SITE(x, p, binned);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
+#ifdef SPHERE
+    const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
+#endif
     cell_t cell;
     start_polygon(&cell, i, x, lower, upper);
     int flag = 0;
     REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* a radius of 0 would never widen */
     while (flag == 0) {
+#ifdef SPHERE
+        flag = clip_cell_by_bins(&cell, (REAL4)(x[0], x[1], x[2], 0), p, w, inner, false, &in);
+#else
         flag = clip_polygon_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
+#endif
         const REAL need = sqrt(cutting_distance2(&cell));
         if (!(need > w)) /* a NaN ends the loop, too */
             break;
@@ -50,7 +62,7 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
 /* Twice the area of the cell of generator j, from its listed faces. */
 inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *points, const REAL *lower, const REAL *upper)
 {
-    const REAL x[2] = {points[2 * j], points[2 * j + 1]};
+    SITE(x, j, points);
     int n;
     global const int *row = face_row(rows, j, &n);
     REAL area = 0;
@@ -120,7 +132,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
         } else if (!doubtful) {
             atomic_or(flags, FLAG_COLLAPSED);
         } else {
-            const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+            SITE(x, i, points);
             const REAL lower[2] = {box_lower.s0, box_lower.s1};
             const REAL upper[2] = {box_upper.s0, box_upper.s1};
             const int a = row[k == 0 ? n - 1 : k - 1];
@@ -190,7 +202,7 @@ kernel void measure_faces(const int size, global const int *starts, global const
                           global REAL *measures, global REAL *centroids)
 {
     WORK_ITEM(i);
-    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    SITE(x, i, points);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     const int begin = starts[i], end = starts[i + 1];
@@ -198,11 +210,10 @@ kernel void measure_faces(const int size, global const int *starts, global const
     REAL2 v = origin;
     for (int k = begin; k < end; ++k) {
         const REAL2 w = k == end - 1 ? origin : corner(i, x, neighbors[k], neighbors[k + 1], points, lower, upper);
-        const REAL2 e = w - v;
-        const REAL2 sum = v + w;
-        measures[k] = sqrt(dot(e, e));
-        centroids[2 * k] = sum.s0 / 2;
-        centroids[2 * k + 1] = sum.s1 / 2;
+        REAL middle[DIM];
+        measures[k] = measure_face(x, v, w, middle);
+        EACH_AXIS(a)
+        centroids[DIM * k + a] = middle[a];
         v = w;
     }
 }
@@ -253,7 +264,7 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     WORK_ITEM(i);
     if (places[i] < 0)
         return;
-    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    SITE(x, i, points);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     global const int *row = neighbors + starts[i];

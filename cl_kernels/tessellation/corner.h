@@ -1,5 +1,14 @@
-#include "opencl/real.h"
+#include "geometry/site.h"
 
+#ifdef SPHERE
+#define FOLD(a) 0
+#define APART(a, to_one, to_other, one, other) ((to_other) - (to_one))
+/* Sides of what a cell is cut from, relative to the site x. */
+#define LOWER_SIDE(axis) (-SQUARE)
+#define UPPER_SIDE(axis) SQUARE
+#else
+#define LOWER_SIDE(axis) (lower[axis] - x[axis])
+#define UPPER_SIDE(axis) (upper[axis] - x[axis])
 /* The difference along axis a from one generator to another. -DFOLD_0, -DFOLD_1: periods of a folded graph (see
    ghost_images.cl), in which a neighbor is the nearest image of its generator; 0 along an axis with walls. */
 #ifdef FOLD_0
@@ -20,10 +29,13 @@ inline REAL fold_period(REAL d, REAL period)
 #endif
 
 /* From a position x to generator j. */
-inline REAL2 direction_of(const REAL *x, int j, global const REAL *points)
+#define direction_of direction_in_plane
+inline REAL2 direction_in_plane(const REAL *x, int j, global const REAL *points)
 {
     return (REAL2)(BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1]));
 }
+
+#endif
 
 /* The circumcenter of 0, u and v; u2 and v2 are the squares of u and v. */
 inline REAL2 circumcenter(REAL2 u, REAL2 v, REAL u2, REAL v2)
@@ -32,6 +44,23 @@ inline REAL2 circumcenter(REAL2 u, REAL2 v, REAL u2, REAL v2)
     return (REAL2)(difference_of_products(u2, v.s1, v2, u.s1) * inverse,
                    difference_of_products(v2, u.s0, u2, v.s0) * inverse);
 }
+
+#ifdef SPHERE
+/* As `corner`, where one face or both are on the square that the cell is cut from. */
+inline REAL2 corner_at_square(const REAL *x, int a, int b, global const REAL *points)
+{
+    const int wall = -1 - min(a, b), axis = wall / 2;
+    const REAL level = wall % 2 ? SQUARE : -SQUARE;
+    REAL other;
+    if (a < 0 && b < 0) {
+        other = (-1 - max(a, b)) % 2 ? SQUARE : -SQUARE;
+    } else {
+        const REAL2 d = direction_of(x, max(a, b), points);
+        other = (dot(d, d) / 2 - level * (axis == 0 ? d.s0 : d.s1)) / (axis == 0 ? d.s1 : d.s0);
+    }
+    return axis == 0 ? (REAL2)(level, other) : (REAL2)(other, level);
+}
+#endif
 
 /* Corner between the faces a and b (in this order) of generator i, relative to x_i, from the generators, so that
    all cells that share the corner get the same point up to one rounding. */
@@ -48,6 +77,9 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
             return circumcenter(u, v, u2, v2);
         return circumcenter(w, -u, w2, u2) + u;
     }
+#ifdef SPHERE
+    return corner_at_square(x, a, b, points);
+#else
     if (a < 0 && b < 0) {
         /* Two walls: a corner of the box, one wall across each axis. */
         const int wa = -1 - a, wb = -1 - b;
@@ -66,15 +98,21 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
     const REAL along = difference_of_products(R(0.5), d2, d_across, across) / d_along +
                        BETWEEN(1 - axis, x[1 - axis], points[2 * o + 1 - axis]);
     return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
+#endif
 }
 
 /* From the corner of cell j between its faces p and q to the same corner of cell i, relative to x_i. */
 inline REAL2 corner_gap(REAL2 mine, int i, int j, int p, int q, global const REAL *points, const REAL *lower,
                         const REAL *upper)
 {
-    const REAL x[2] = {points[2 * j], points[2 * j + 1]};
+    SITE(x, j, points);
+#ifdef SPHERE
+    SITE(own, i, points);
+    return mine - seen_from(own, x, corner(j, x, p, q, points, lower, upper));
+#else
     const REAL2 from = direction_of(x, i, points);
     return mine + from - corner(j, x, p, q, points, lower, upper);
+#endif
 }
 
 /* Index of j in a row of n; n if it is missing. */

@@ -19,6 +19,7 @@
 #define FLAG_COINCIDE 2  /* two generators at the same place */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */
 #define FLAG_LOOPED 32   /* faces cross */
+#define FLAG_OPEN 64     /* a cell on the sphere is not enclosed by generators */
 
 #define ELSEWHERE INT_MAX
 
@@ -64,6 +65,11 @@ inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *
 {
     bool doubtful = false;
     int to = place;
+#ifdef SPHERE
+    for (int k = 0; k < cell->n; ++k)
+        if (cell->faces[k] < 0)
+            flag |= FLAG_OPEN;
+#endif
     if (flag == 0) {
         doubtful = is_doubtful(cell, x, points);
         if (doubtful && !flags[5])

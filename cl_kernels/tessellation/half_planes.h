@@ -8,9 +8,6 @@
 /* Relative error bound of double words in `beyond_corner`, as a share of the terms of its sum. */
 #define WIDE_NOISE (64 * REAL_EPS * REAL_EPS)
 
-/* Rare code is kept out of line. */
-#define OUT_OF_LINE __attribute__((noinline))
-
 /* BETWEEN without round-off; along a periodic axis it is exact (see corner.h). */
 #define BETWEEN_WIDE(a, from, to) (FOLD(a) > 0 ? (wide_t)(BETWEEN(a, from, to), 0) : wide_sum(to, -(from)))
 

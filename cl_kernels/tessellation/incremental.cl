@@ -11,7 +11,8 @@
    consistent.
 
    In a periodic box, with the periods -DFOLD_0 and -DFOLD_1, neighbors are nearest images. Cells without
-   gaps might cover the box more than once; then the sum of their volumes is too large. */
+   gaps might cover the box more than once; then the sum of their volumes is too large. A sphere is simply connected:
+   connected cells without gaps cover it once. */
 
 /* Cells with more faces are clipped again in each step: they are rare and would delay their work-group. */
 #define CHECKED_FACES 16
@@ -73,7 +74,7 @@ inline REAL2 row_corner(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, gl
 inline bool check_row(int i, global const int *starts, global const int *neighbors, global const REAL *points,
                       const REAL *lower, const REAL *upper, global int *fits, global int *marks)
 {
-    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    SITE(x, i, points);
     const int start = starts[i], n = starts[i + 1] - start;
     global const int *row = neighbors + start;
     if (n > CHECKED_FACES) {
@@ -205,7 +206,8 @@ inline int clip_polygon_by_row(cell_t *cell, const REAL *x, global const int *ro
         const int j = row[k];
         if (j < 0 || j == cell->generator)
             continue;
-        const REAL d[2] = {BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1])};
+        const REAL2 way = direction_of(x, j, points);
+        const REAL d[2] = {way.s0, way.s1};
         const REAL d2 = d[0] * d[0] + d[1] * d[1];
         if (d2 >= cutting_distance2(cell))
             continue;
@@ -248,7 +250,7 @@ kernel void clip_marked(const int size, global const int *listed, const int roun
     const int i = listed[w], base = flags[FLAG_CLIPPED + round];
     if (count >= wrapped_from && slot_counts[base + w] > 0)
         return;
-    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    SITE(x, i, points);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
@@ -309,7 +311,7 @@ kernel void check_clipped(const int size, global const int *listed, const int ro
     if (w >= count_of_round(round, flags))
         return;
     const int i = listed[w];
-    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    SITE(x, i, points);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);

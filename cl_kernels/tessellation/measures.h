@@ -1,5 +1,4 @@
 /* A cell's row of the graph and its measures, from its faces; see `measure_cells` in cells.cl. */
-#include "tessellation/corner.h"
 #include "tessellation/face_rows.h"
 #include "tessellation/moments.h"
 
@@ -22,19 +21,27 @@ inline int kept_faces(int *faces, const face_rows_t *rows, global const uint *ke
     return n;
 }
 
-inline void put_face(const measures_t *to, int at, int neighbor, REAL measure, REAL x, REAL y)
+#ifdef SPHERE
+#include "tessellation/sphere_measures.h"
+#else
+#define measure_face measure_straight_face
+#define measure_cell measure_plane_cell
+
+/* Length and middle of the face from v to w of the cell at x. */
+inline REAL measure_straight_face(const REAL *x, REAL2 v, REAL2 w, REAL *middle)
 {
-    to->neighbors[at] = neighbor;
-    to->face_measures[at] = measure;
-    to->face_centroids[2 * at] = x;
-    to->face_centroids[2 * at + 1] = y;
+    const REAL2 e = w - v;
+    const REAL2 sum = v + w;
+    middle[0] = sum.s0 / 2;
+    middle[1] = sum.s1 / 2;
+    return sqrt(dot(e, e));
 }
 
 /* Measure the cell of generator i from its n faces. */
-inline void measure_cell(const measures_t *to, int i, const int *faces, int n, global const REAL *points,
-                         const REAL *lower, const REAL *upper)
+inline void measure_plane_cell(const measures_t *to, int i, const int *faces, int n, global const REAL *points,
+                               const REAL *lower, const REAL *upper)
 {
-    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    SITE(x, i, points);
     const int start = to->starts[i];
     moments_t moments = {0, 0, 0, 0, 0, 0};
     if (n >= 3) {
@@ -42,12 +49,15 @@ inline void measure_cell(const measures_t *to, int i, const int *faces, int n, g
         REAL2 v = origin;
         for (int k = 0; k < n; ++k) {
             const REAL2 w = k == n - 1 ? origin : corner(i, x, faces[k], faces[k + 1], points, lower, upper);
-            const REAL2 e = w - v;
-            const REAL2 sum = v + w;
+            REAL middle[2];
             add_triangle(&moments, v, w);
-            put_face(to, start + k, faces[k], sqrt(dot(e, e)), sum.s0 / 2, sum.s1 / 2);
+            to->neighbors[start + k] = faces[k];
+            to->face_measures[start + k] = measure_face(x, v, w, middle);
+            to->face_centroids[2 * (start + k)] = middle[0];
+            to->face_centroids[2 * (start + k) + 1] = middle[1];
             v = w;
         }
     }
     write_moments(&moments, i, to->volumes, to->offsets, to->covariances);
 }
+#endif

@@ -38,3 +38,12 @@ inline void write_moments(const moments_t *m, int i, global REAL *volumes, globa
     covariances[3 * i + 1] = xy;
     covariances[3 * i + 2] = yy;
 }
+
+/* Second moments about the centroid per unit area: xx, xy, yy. */
+inline REAL3 second_moments(const moments_t *m)
+{
+    if (!(m->area > 0))
+        return 0;
+    const REAL cx = m->cx / (3 * m->area), cy = m->cy / (3 * m->area), scale = 1 / (12 * m->area);
+    return (REAL3)(m->xx * scale - cx * cx, m->xy * scale - cx * cy, m->yy * scale - cy * cy);
+}

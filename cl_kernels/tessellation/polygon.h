@@ -1,8 +1,12 @@
 /* A convex polygon around its generator, and its clipping by the bisector with a neighbor.
    Coordinates are relative to the generator: differences of close positions are exact, so cells of any size are
    accurate. */
+#include "tessellation/corner.h"
+#ifdef SPHERE
+#include "tessellation/sphere_circles.h"
+#else
 #include "tessellation/half_planes.h"
-#include "opencl/real.h"
+#endif
 
 #ifndef CELL_CAPACITY
 #error "build with -DCELL_CAPACITY=faces that a cell may have while it is clipped"
@@ -20,7 +24,7 @@ typedef struct {
     REAL reach2; /* largest squared distance of a corner from the generator */
     /* The generator and its position. */
     int generator;
-    REAL position[2], lower[2], upper[2];
+    REAL position[SITE_SIZE], lower[2], upper[2];
 } cell_t;
 
 /* Square of the distance beyond which no generator cuts the cell: twice the reach. Corners of nearly parallel faces
@@ -30,20 +34,21 @@ inline REAL cutting_distance2(const cell_t *cell)
     return 4 * cell->reach2 * R(1.01);
 }
 
-/* Start with the whole box around generator x. */
+/* Start with the whole box around generator x; on a sphere, with a square in the tangent plane. */
 inline void start_polygon(cell_t *cell, int i, const REAL *x, const REAL *lower, const REAL *upper)
 {
     cell->generator = i;
-    for (int a = 0; a < 2; ++a) {
+    for (int a = 0; a < SITE_SIZE; ++a)
         cell->position[a] = x[a];
+    for (int a = 0; a < 2; ++a) {
         cell->lower[a] = lower[a];
         cell->upper[a] = upper[a];
     }
     cell->n = 4;
-    cell->x[0] = cell->x[3] = lower[0] - x[0];
-    cell->x[1] = cell->x[2] = upper[0] - x[0];
-    cell->y[0] = cell->y[1] = lower[1] - x[1];
-    cell->y[2] = cell->y[3] = upper[1] - x[1];
+    cell->x[0] = cell->x[3] = LOWER_SIDE(0);
+    cell->x[1] = cell->x[2] = UPPER_SIDE(0);
+    cell->y[0] = cell->y[1] = LOWER_SIDE(1);
+    cell->y[2] = cell->y[3] = UPPER_SIDE(1);
     cell->faces[0] = -1 - 2;
     cell->faces[1] = -1 - 1;
     cell->faces[2] = -1 - 3;
@@ -82,8 +87,15 @@ inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL d2, REAL doubt
     if (fabs(s) > doubt)
         return s;
     const int before = k == 0 ? cell->n - 1 : k - 1;
+#ifdef SPHERE
+    if (cell->faces[before] < 0 || cell->faces[k] < 0)
+        return s;
+    const REAL side = beyond_circle(cell->generator, cell->faces[before], cell->faces[k], neighbor, points);
+    return side == 0 ? 0 : copysign(fabs(s) + REAL_EPS * doubt, side);
+#else
     return beyond_corner(cell->position, cell->faces[before], cell->faces[k], neighbor, points, cell->lower,
                          cell->upper);
+#endif
 }
 
 /* The first corner beyond the bisector, if some are in doubt; n if there is none. */

@@ -1,7 +1,7 @@
 #include "tessellation/row_copy.h"
 #include "tessellation/row_counts.h"
 #include "tessellation/periodic/halo.h"
-#include "tessellation/search.h"
+#include "tessellation/polyhedron_search.h"
 
 /* Share of the volume of a cell by which its faces may differ from those of neighbors. */
 #define EVEN_SHARE R(1e-3)
@@ -86,7 +86,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
             w = 2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS);
         }
         while (flag == 0) {
-            flag = clip_polyhedron_by_bins(cell, x, p, w, inner, warm, &in);
+            flag = clip_cell_by_bins(cell, x, p, w, inner, warm, &in);
             const REAL need = 2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS);
             if (!(need > w)) /* a NaN ends the loop, too */
                 break;

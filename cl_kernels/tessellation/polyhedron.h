@@ -8,13 +8,6 @@
 #ifndef FACE_CAPACITY
 #error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 32"
 #endif
-/* Usually short loops: vectorization would not pay. */
-#ifdef __clang__
-#define SHORT_LOOP _Pragma("clang loop vectorize(disable) interleave(disable) unroll(disable)")
-#else
-#define SHORT_LOOP
-#endif
-
 #define REAL8 CLVORO_JOIN(REAL, 8)
 /* F faces have 2 F - 4 vertices, and up to F new ones beside them while they are clipped. In private memory there is
    room for few new ones: a cell that needs more counts as full. */

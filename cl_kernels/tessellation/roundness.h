@@ -1,6 +1,6 @@
 #include "opencl/real.h"
 
-#if DIM == 2
+#if CELL_DIM == 2
 /* 4 n tan(pi / n): perimeter^2 / area of a regular polygon. Tabulated for the numbers of sides that
    nearly all cells have. */
 constant REAL ROUNDNESS[12] = {0,

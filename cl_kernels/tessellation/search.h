@@ -1,14 +1,7 @@
-/* The search for generators that may cut a cell in 3D, through the bins around it. */
+/* The search for generators that may cut a cell, through the bins around it in space. The file that includes this one
+   has defined CELL, FLAG_COINCIDE, and CLIP_BY_ITEM(cell, d, j, warm, points): clip the cell by generator j at x + d,
+   whose squared distance is d.s3, and return FLAG_* or 0. */
 #include "tessellation/bins.h"
-#include "tessellation/clip.h"
-
-/* Bits of the error word of kernels. */
-#define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */
-#define FLAG_COINCIDE 2  /* two generators at the same place */
-#define FLAG_COLLAPSED 4 /* generators too close for the precision */
-#define FLAG_DOUBT 8     /* no error: there are doubtful cells, whose faces must be matched */
-#define FLAG_NARROW 16   /* no error: some faces may be no wider than round-off; see consistency.cl */
-#define FLAG_UNEVEN 64   /* no error: two cells differ about their common face by more than a small share of one */
 
 #ifndef MAX_DEPTH
 #error "build with -DMAX_DEPTH=levels that the bins may have"
@@ -16,14 +9,6 @@
 
 #define BATCH 256 /* generators that are sorted by distance at a time, at most 256 */
 #define SHELLS 32 /* bits of a word */
-
-/* The flag for an outcome of clip_polyhedron or clip_polyhedron_by_row, or 0. */
-inline int flag_of(int what)
-{
-    return what < CLIP_FULL
-               ? 0
-               : (what == CLIP_FULL ? FLAG_FULL : (what == CLIP_COINCIDE ? FLAG_COINCIDE : FLAG_COLLAPSED));
-}
 
 /* The arrays to search for neighbors. */
 typedef struct {
@@ -74,9 +59,9 @@ inline int clip_by_batch(CELL *cell, REAL4 x, batch_t *batch, REAL per_shell, bo
             if (d.s3 < 4 * cell->reach2) {
                 if (d.s3 == 0)
                     return FLAG_COINCIDE;
-                const int what = clip_polyhedron(cell, d, d.s3, in->items[q], warm, in->points);
-                if (what >= CLIP_FULL)
-                    return flag_of(what);
+                const int flag = CLIP_BY_ITEM(cell, d, in->items[q], warm, in->points);
+                if (flag != 0)
+                    return flag;
             }
             if (k == last)
                 break;
@@ -126,7 +111,7 @@ typedef struct {
 /* Clip the cell of item `own` by all generators in the bins within the cube of half-width w but outside the cube of
    half-width `inner` (inner < 0: no bin has been searched), except those farther than twice the farthest vertex.
    Returns FLAG_* or 0. */
-inline int clip_polyhedron_by_bins(CELL *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
+inline int clip_cell_by_bins(CELL *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
 {
     open_grid_t open[MAX_DEPTH]; /* from the root down */
     const REAL per_shell = SHELLS / (6 * w * w);

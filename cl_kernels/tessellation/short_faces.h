@@ -51,7 +51,7 @@ inline bool is_doubtful(const cell_t *cell, const REAL *x, global const REAL *po
 inline bool is_nothing(int i, int j, int a, int b, const cell_t *cell, global const REAL *points)
 {
     const int o = min(i, j), q = max(i, j), from = i < j ? a : b, to = i < j ? b : a;
-    const REAL x[2] = {points[2 * o], points[2 * o + 1]};
+    SITE(x, o, points);
     const REAL2 d = direction_of(x, q, points);
     const REAL2 begin = corner(o, x, from, q, points, cell->lower, cell->upper);
     const REAL2 e = corner(o, x, q, to, points, cell->lower, cell->upper) - begin;

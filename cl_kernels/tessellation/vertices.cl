@@ -32,7 +32,7 @@ kernel void place_polygon_vertices(const int size, global const REAL *points, co
                                    global REAL *vertices)
 {
     WORK_ITEM(i);
-    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    SITE(x, i, points);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     const int begin = starts[i], end = starts[i + 1];
@@ -42,8 +42,15 @@ kernel void place_polygon_vertices(const int size, global const REAL *points, co
         if (owners[c] == c) {
             const int previous = neighbors[c == begin ? end - 1 : c - 1];
             const REAL2 y = corner(i, x, previous, neighbors[c], points, lower, upper);
+#ifdef SPHERE
+            REAL d[3];
+            on_sphere(x, y, d);
+            EACH_AXIS(a)
+            vertices[3 * v + a] = x[a] + d[a];
+#else
             vertices[2 * v] = clamp(x[0] + y.s0, lower[0], upper[0]);
             vertices[2 * v + 1] = clamp(x[1] + y.s1, lower[1], upper[1]);
+#endif
         }
     }
 }

@@ -130,8 +130,11 @@ def warn_of_errors(result: Result) -> None:
     if mean < MEAN_ERROR and largest < LARGEST_ERROR:
         return
     diagram, sizes = result.diagram, result.target_size
-    wanted, made = float(sizes[worst]), float(diagram.volumes[worst]) ** (1 / diagram.domain.dim)
-    if len(diagram) == 1 and 2 * made**diagram.domain.dim < wanted**diagram.domain.dim:
+    wanted, made = (
+        float(sizes[worst]),
+        float(diagram.volumes[worst]) ** (1 / diagram.domain.cell_dim),
+    )
+    if len(diagram) == 1 and 2 * made**diagram.domain.cell_dim < wanted**diagram.domain.cell_dim:
         return  # `CoarseSizeWarning` says it before the run
     place = ", ".join(f"{x:.6g}" for x in result.points[worst])
     row = diagram.neighbors[diagram.neighbor_starts[worst] : diagram.neighbor_starts[worst + 1]]

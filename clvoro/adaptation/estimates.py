@@ -19,17 +19,22 @@ from .forecast import IMAGE_REACH, expected_boundary_cells
 
 MAX_CELLS = 100_000_000
 """Limit of the 32-bit indices into rows of neighbors."""
-PEAK = {2: (21, 73), 3: (156, 211)}
-"""Reals and 32-bit integers per cell at the peak of a run by dimension, of all stages (bench/memory.py)."""
+SPHERE = "sphere"
+PEAK: dict[int | str, tuple[int, int]] = {2: (21, 73), 3: (156, 211), SPHERE: (33, 90)}
+"""Reals and 32-bit integers per cell at the peak of a run by dimension, and on a sphere (bench/memory.py)."""
 TRIMMED_PEAK = (62, 75)
 """The same in polygons, where the boundary trims cells and faces are in full precision."""
 BOUNDARY_PEAK, EDGE_PEAK = (100, 187), (22, 20)
 """The same in addition per cell at the boundary, with its ghost generators, and per edge of the boundary."""
-OUTPUT = {2: {8: 340, 4: 220}, 3: {8: 3600, 4: 2850}}
+OUTPUT: dict[int | str, dict[int, int]] = {
+    2: {8: 340, 4: 220}, 3: {8: 3600, 4: 2850}, SPHERE: {8: 450, 4: 275},
+}  # fmt: skip
 """Bytes per cell while the final diagram is read, with vertices, by dimension and size of a real."""
 TRIMMED_OUTPUT, BOUNDARY_OUTPUT, EDGE_OUTPUT = {8: 535, 4: 330}, {8: 1200, 4: 780}, {8: 65, 4: 38}
 """The same in polygons: per cell, and in addition per cell at the boundary and per edge."""
-DIAGRAM = {2: {8: 700, 4: 440}, 3: {8: 4700, 4: 3400}}
+DIAGRAM: dict[int | str, dict[int, int]] = {
+    2: {8: 700, 4: 440}, 3: {8: 4700, 4: 3400}, SPHERE: {8: 890, 4: 610},
+}  # fmt: skip
 """Bytes per cell of one diagram of random generators, until it is computed and read."""
 TRIMMED_DIAGRAM, BOUNDARY_DIAGRAM, EDGE_DIAGRAM = (
     {8: 1110, 4: 735},
@@ -41,7 +46,9 @@ FOLDED = {2: (9, 57), 3: (40, 25)}
 """Reals and integers per cell (not per image) in addition in periodic boxes."""
 FOLDED_DIAGRAM = {2: {8: 360, 4: 340}, 3: {8: 2000, 4: 1900}}
 """Bytes per cell in addition for one diagram in periodic boxes."""
-LARGEST = {2: {8: 105, 4: 90}, 3: {8: 610, 4: 310}}
+LARGEST: dict[int | str, dict[int, int]] = {
+    2: {8: 105, 4: 90}, 3: {8: 610, 4: 310}, SPHERE: {8: 150, 4: 90},
+}  # fmt: skip
 """Bytes per cell or image of the largest array, of a run or of one diagram."""
 TRIMMED_LARGEST = {8: 130, 4: 90}
 """The same in polygons."""
@@ -74,6 +81,11 @@ class Extras:
     boundary: float | None = None
 
 
+def _kind_of(engine: Engine) -> int | str:
+    """Return the key of the figures for `engine`."""
+    return SPHERE if engine.domain_kind.spherical else engine.dim
+
+
 def fixed_bytes(engine: Engine, n: float) -> float:
     """Return the bytes of a run that are almost independent of its number of cells `n`."""
     real = engine.real.itemsize
@@ -86,7 +98,7 @@ def workspace_bytes(engine: Engine, n: float) -> float:
     unit = max(64, engine.queue.device.mem_base_addr_align // 8)
     periodic = engine.domain_kind.periodic
     halo = 3 * 4 * block_count(engine.dim) if periodic else 0
-    space = clipping_space(n) if engine.dim == 3 else 0
+    space = clipping_space(n) if engine.cell_dim == 3 else 0
     return ARRAYS * unit + SCANS * 4 * engine.groups + halo + space
 
 
@@ -116,7 +128,7 @@ def estimate_memory(
             boundary = expected_boundary_cells(domain, lambda p: np.full(len(p), spacing))
         boundary = min(boundary, n)
 
-    d, real = engine.dim, engine.real.itemsize
+    kind, real = _kind_of(engine), engine.real.itemsize
 
     def bytes_of(figures: tuple[int, int]) -> int:
         return figures[0] * real + figures[1] * 4
@@ -126,10 +138,10 @@ def estimate_memory(
 
     if not run:
         per_cell = (TRIMMED_DIAGRAM, BOUNDARY_DIAGRAM, EDGE_DIAGRAM)
-        made = in_polygon(*(f[real] for f in per_cell)) if trimmed else cells * DIAGRAM[d][real]
+        made = in_polygon(*(f[real] for f in per_cell)) if trimmed else cells * DIAGRAM[kind][real]
         return (
             made
-            + folded * FOLDED_DIAGRAM[d][real]
+            + folded * FOLDED_DIAGRAM[engine.dim][real]
             + extras.field_bytes
             + workspace_bytes(engine, n)
         )
@@ -137,8 +149,8 @@ def estimate_memory(
         peak = in_polygon(*map(bytes_of, (TRIMMED_PEAK, BOUNDARY_PEAK, EDGE_PEAK)))
         output = in_polygon(*(f[real] for f in (TRIMMED_OUTPUT, BOUNDARY_OUTPUT, EDGE_OUTPUT)))
     else:
-        peak = cells * bytes_of(PEAK[d]) + folded * bytes_of(FOLDED[d])
-        output = cells * OUTPUT[d][real]
+        peak = cells * bytes_of(PEAK[kind]) + folded * bytes_of(FOLDED[engine.dim])
+        output = cells * OUTPUT[kind][real]
     return max(peak + fixed_bytes(engine, n), output) + extras.field_bytes
 
 
@@ -153,7 +165,7 @@ def largest_array(
     if domain is not None and any(domain.periodic):
         images = _images_of_equal_cells(domain, n) if extras.images is None else extras.images
         n *= 1 + images
-    return n * LARGEST[engine.dim][real]
+    return n * LARGEST[_kind_of(engine)][real]
 
 
 def _images_of_equal_cells(domain: Domain, n: float) -> float:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..geometry.box import Domain
-from ..geometry.polygon import Polygon
 
 
 def run_fingerprint(
@@ -35,7 +34,7 @@ def domain_fingerprint(domain: Domain) -> dict[str, Any]:
         "lower": list(domain.lower),
         "upper": list(domain.upper),
         "periodic": list(domain.periodic),
-        "walls": len(domain.oriented.vertices) if isinstance(domain, Polygon) else 2 * domain.dim,
+        "walls": len(domain.boundary_index),
         "digest": hashlib.sha256(described.encode()).hexdigest(),
     }
 

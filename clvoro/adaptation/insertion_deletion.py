@@ -226,8 +226,8 @@ class InsertionDeletion:
             k.measure_strain, n, t.starts, t.neighbors, t.points, h, kinds, raw, *t.outlines,
             *engine.period_args,
         )  # fmt: skip
-        engine.run_each(k.average_strain, n, t.starts, t.neighbors, raw, once)
-        engine.run_each(k.average_strain, n, t.starts, t.neighbors, once, raw)
+        engine.run_each(k.average_strain, n, t.starts, t.neighbors, t.points, raw, once)
+        engine.run_each(k.average_strain, n, t.starts, t.neighbors, t.points, once, raw)
         return kinds, once, raw
 
     def _nucleate(

@@ -145,7 +145,7 @@ class Loop:
             stop = not self.rows and self.record(0.0)
             if stop and self.checkpoint is not None:
                 self.checkpoint.offer(self, stop)
-            done = work_of(self.schedule, self.levels, self.mesh.engine.dim, required)
+            done = work_of(self.schedule, self.levels, self.mesh.engine.cell_dim, required)
             ahead = list(zip(self.schedule, [*done[1:], 1.0], strict=False))
             for action, progress in ahead[self.position :]:
                 # A resumed run may have been stopped when it was about to end.
@@ -202,6 +202,9 @@ class Loop:
             self.mesh.walls.adjust(self.mesh)
         # The next row of the history checks the sizes, too, unless they are scaled before.
         self.mesh.update(check=self.fixed_count is not None)
+        for _ in range(action.openings):
+            if not self.mesh.open_triangles():
+                break
         if self.fixed_count is not None:
             self.mesh.normalize_sizes()
         self.last = action.method
@@ -236,7 +239,7 @@ class Loop:
         Sizes are evaluated at the generators. A small cell beside a jump of h covers a part of the coarse side and
         requires more cells there, which require more in turn. Where h is smooth the number is close to the integral.
         """
-        factor = 2.0 ** (self.mesh.engine.dim * self.level)
+        factor = 2.0 ** (self.mesh.engine.cell_dim * self.level)
         return self.mesh.fixed + (1 + MOST_SURPLUS) * self.required / factor
 
     def missing_for_next_level(self) -> float:
@@ -247,7 +250,7 @@ class Loop:
         walls have fewer neighbors; their share halves with each level.
         """
         mesh = self.mesh
-        factor = 2.0**mesh.engine.dim
+        factor = 2.0**mesh.engine.cell_dim
         # The number of cells on this level according to the integral.
         exact = self.required / factor**self.level
         bias = min((mesh.n + mesh.missing_cells()) / exact - 1, MOST_SURPLUS)
@@ -350,7 +353,7 @@ class Loop:
         mesh, n = self.mesh, self.mesh.n
         row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak
         row["mean_quality"], row["min_quality"] = s["quality"].sum / n, s["quality"].least
-        row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.dim + 2)
+        row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.cell_dim + 2)
 
     def end_reason(self, stop: bool, over: bool = False) -> str:
         """Return why the run ends, or "" if it continues. `over`: the schedule has ended."""

@@ -82,7 +82,7 @@ class PublishedMethod:
         mesh.measure_displacements()
         mesh.zero_fixed(mesh.correction)
         mesh.summaries.collect("correction", mesh.correction_speed, mesh.n)
-        alpha = mesh.engine.dim if r.alpha is None else r.alpha
+        alpha = mesh.engine.cell_dim if r.alpha is None else r.alpha
         motion.relax_correction(
             mesh.summaries, "correction", alpha, r.k, mesh.correction, mesh.correction_speed
         )

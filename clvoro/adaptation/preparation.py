@@ -12,15 +12,19 @@ from ..geometry.boundary_layers import apart_from, count_rows, free_domain, plac
 from ..geometry.box import Domain
 from ..geometry.geojson import may_be_degrees
 from ..geometry.polygon import Polygon
+from ..geometry.sphere import Sphere
 from ..sizing import Sizing, as_field
 from ..sizing.field import Field
 from ..sizing.layers import limit_beside_layers
+from ..sizing.lonlat import on_domain
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
 from .efforts import is_near
 from .estimates import Extras, check_memory
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import Relaxation, make_method
 from .options import Options
+from .quality_descent import OPENINGS
+from .sampling.charts import charted
 from .sampling.quadrature import DensityTree
 from .sampling.start import density_tree, sample_density, sample_uniform
 from .schedule import Action, adaptive_schedule, auto_levels, repeated_schedule
@@ -29,6 +33,10 @@ from .state import MeshState, Setup
 
 GRADIENT_STEP = 0.2
 """Step over h of the differences for the gradient of the size field in exact projections."""
+LEAST_ON_SPHERE = 4
+"""Least number of cells on a sphere: fewer generators leave a half of it free."""
+EVEN_ON_SPHERE = 200
+"""Random generators that are fewer may leave a half of a sphere free. The start is an even spiral then."""
 STEPS = 100
 """Default number of steps of a method that repeats one kind of step."""
 
@@ -87,7 +95,7 @@ class Preparation:
                 "keeps their number; leave n_cells out, or use method='adaptive'"
             )
         self.rows, self.free = np.empty((0, domain.dim)), domain
-        field = given_field = as_field(size)
+        field = given_field = on_domain(as_field(size), domain)
         if options.layers:
             field = self._place_layers(given_field)
         self.sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
@@ -99,11 +107,21 @@ class Preparation:
             required = self._tree.integral + len(self.rows)
         warn_of_mismatches(given_field, domain, options.layers)
         self.target = n_cells if n_cells is not None else max(1, round(required))
+        if isinstance(domain, Sphere) and self.target < LEAST_ON_SPHERE:
+            given = (
+                f"n_cells is {n_cells}"
+                if n_cells
+                else f"the size field requires {required:.2g} cells on {domain}"
+            )
+            raise InputError(
+                f"{given}, expected at least {LEAST_ON_SPHERE} cells, on all sides of the sphere; use smaller sizes, "
+                "in the unit of the radius"
+            )
         if n_cells is None and required < 0.5:
             self._warn_of_coarse_size(required)
         scaled = options.multilevel and n_cells is not None
-        self.factor = (required / self.target) ** (1 / domain.dim) if scaled else 1.0
-        if self._tree is not None and required * self.factor**-domain.dim >= 0.5:
+        self.factor = (required / self.target) ** (1 / domain.cell_dim) if scaled else 1.0
+        if self._tree is not None and required * self.factor**-domain.cell_dim >= 0.5:
             warn_of_narrow_parts(domain, lambda x: self.factor * self.sizing(x))
         self.levels = 0
         if options.multilevel:
@@ -134,8 +152,8 @@ class Preparation:
         domain = self.domain
         message = (
             f"h is larger than the domain: the size field requires {required:.2g} cells in a domain of "
-            f"{'area' if domain.dim == 2 else 'volume'} {domain.measure:.6g}, and the mesh has a single cell; do h and "
-            "the domain have the same unit of length?"
+            f"{'area' if domain.cell_dim == 2 else 'volume'} {domain.measure:.6g}, and the mesh has a single cell; do "
+            "h and the domain have the same unit of length?"
         )
         if isinstance(domain, Polygon) and may_be_degrees(domain.lower, domain.upper):
             message += " (Coordinates that are longitudes and latitudes must be projected first.)"
@@ -154,8 +172,8 @@ class Preparation:
         if self.options.multilevel and tree is not None:
             # Coarser levels have steeper sizes and pass their cells on to the next level. In 2D without coarser levels
             # as many additional cells appear on the finest one.
-            reach = self.factor * (2 if self.levels or domain.dim == 2 else 1)
-            surplus = expected_surplus(domain, sizing, tree, reach)
+            reach = self.factor * (2 if self.levels or domain.cell_dim == 2 else 1)
+            surplus = expected_surplus(*charted(domain, sizing), tree, reach)
         if any(domain.periodic) and tree is not None:
             free = most * tree.integral / required
             images = expected_images(domain, sizing, free, tree)
@@ -171,7 +189,7 @@ class Preparation:
 
     def _count_levels(self) -> int:
         """Return the number of coarser levels, from the points of the caller or from a random sample."""
-        d, levels, points = self.domain.dim, self.options.levels, self.points
+        d, levels, points = self.domain.cell_dim, self.options.levels, self.points
         if levels == "auto":
             if points is None:
                 return auto_levels(self.target, d)
@@ -203,9 +221,13 @@ class Preparation:
         host = self.points
         if host is None:
             least = self.free.n_pieces if self.levels else 1
-            cells = (self.target - len(self.rows)) / 2 ** (self.domain.dim * self.levels)
+            if isinstance(self.domain, Sphere):
+                least = LEAST_ON_SPHERE
+            cells = (self.target - len(self.rows)) / 2 ** (self.domain.cell_dim * self.levels)
             n = max(least, round(cells))
-            if options.start == "uniform":
+            if isinstance(self.domain, Sphere) and n < EVEN_ON_SPHERE:
+                host = self.domain.spiral_points(n)
+            elif options.start == "uniform":
                 host = sample_uniform(self.free, n, options.seed, real)
             else:
                 host = sample_density(self.sizing, self.free, n, options.seed, real, self._tree)
@@ -240,9 +262,11 @@ class Preparation:
             steps = STEPS if options.max_steps is None else options.max_steps
             return repeated_schedule(make_method(options.method, relaxation), steps)
         near = self.may_need_correction_only and mesh is not None and self._is_near(mesh)
+        # Models on spheres have C grids. The exact sizes would be lost.
+        open_triangles = isinstance(self.domain, Sphere) and options.method != "exact"
         return adaptive_schedule(
-            self.domain.dim, options.effort, self.levels, options.method == "exact", options.error_target,
-            warm=self.points is not None, near=near,
+            self.domain.cell_dim, options.effort, self.levels, options.method == "exact", options.error_target,
+            warm=self.points is not None, near=near, openings=OPENINGS if open_triangles else 0,
         )  # fmt: skip
 
     def _is_near(self, mesh: MeshState) -> bool:
@@ -250,5 +274,5 @@ class Preparation:
         missing = mesh.missing_cells() if n_cells is None else float(n_cells - n)
         s = mesh.read_summaries()
         return is_near(
-            self.domain.dim, self.options.effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n
+            self.domain.cell_dim, self.options.effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n
         )  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from ..arguments import check_path
 from ..errors import InputError
 from ..geometry.polygon import Polygon
+from ..geometry.sphere import Sphere
 from ..mesh.results import HISTORY_DTYPE, Displacements
 from ..tessellation.cells import Cells
 from ..tessellation.periodic.halo import block_count
@@ -86,7 +87,9 @@ class Saved:
                 raise ValueError("levels")
             domain = self.fingerprint["domain"]
             d = len(domain["lower"])
-            self._check(d, int(domain["walls"]), np.dtype(self.fingerprint["dtype"]))
+            spherical = domain["kind"] == Sphere.__name__
+            real = np.dtype(self.fingerprint["dtype"])
+            self._check(d, int(domain["walls"]), real, spherical)
             if any(domain["periodic"]):
                 self._check_seams(d)
         except (
@@ -101,7 +104,7 @@ class Saved:
                 f"cannot resume from {self.name}: it is damaged ({error!r:.200})"
             ) from error
 
-    def _check(self, d: int, walls: int, real: np.dtype) -> None:
+    def _check(self, d: int, walls: int, real: np.dtype, spherical: bool) -> None:
         """Check everything that the device uses as an index or divides by."""
         a = self.arrays
         n, m = len(a["mesh.points"]), len(a["diagram.neighbors"])
@@ -126,7 +129,12 @@ class Saved:
             if a[name].shape != shape or a[name].dtype != dtype:
                 raise ValueError(f"{name} is {a[name].dtype} {a[name].shape}, expected {shape}")
         starts, neighbors, labels = a["diagram.starts"], a["diagram.neighbors"], a["mesh.labels"]
-        if n == 0 or starts[0] != 0 or starts[-1] != m or (np.diff(starts) < d + 1).any():
+        if (
+            n == 0
+            or starts[0] != 0
+            or starts[-1] != m
+            or (np.diff(starts) < (3 if spherical else d + 1)).any()
+        ):
             raise ValueError("starts")
         if not (-walls <= neighbors.min() and neighbors.max() < n):
             raise ValueError("neighbors")
@@ -136,7 +144,8 @@ class Saved:
         if not known or len(np.unique(labels)) < n:
             raise ValueError("labels")
         x, h = a["mesh.points"], a["mesh.h"]
-        if not (np.isfinite(x).all() and x.min() >= 0 and x.max() <= 1):
+        inside = np.abs(np.linalg.norm(x, axis=1) - 1).max() < 1e-3 if spherical else x.min() >= 0
+        if not (np.isfinite(x).all() and inside and x.max() <= 1):
             raise ValueError("points")
         if not ((h > 0).all() and np.isfinite(h).all()):
             raise ValueError("sizes")

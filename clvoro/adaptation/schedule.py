@@ -89,9 +89,10 @@ NEAR_PENALTY = 0.03
 
 @dataclass(frozen=True)
 class Step:
-    """Displace and move all generators, and tessellate them."""
+    """Displace and move all generators, and tessellate them; then open obtuse triangles, at most `openings` times."""
 
     method: Method
+    openings: int = 0
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,7 @@ def adaptive_schedule(
     error_target: float | None = None,
     warm: bool = False,
     near: bool = False,
+    openings: int = 0,
 ) -> list[Action]:
     """Return the schedule of the methods "adaptive" and "exact", with `levels` coarser levels.
 
@@ -165,7 +167,24 @@ def adaptive_schedule(
         The start is a mesh, not a random sample.
     near : bool
         It only needs a correction (see `is_near`). There are no coarser levels then.
+    openings : int
+        How often the last step opens obtuse triangles, at most.
     """
+    schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
+    if openings and schedule and isinstance(schedule[-1], Step):
+        schedule[-1] = replace(schedule[-1], openings=openings)
+    return schedule
+
+
+def _several_kinds(
+    dim: int,
+    effort: str,
+    levels: int,
+    exact: bool,
+    error_target: float | None,
+    warm: bool,
+    near: bool,
+) -> list[Action]:
     settings = (EFFORTS if dim == 2 else EFFORTS_3D)[effort]
     if near:
         return list(_correction(dim, settings, exact, error_target or settings.error_target))

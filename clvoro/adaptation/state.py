@@ -327,7 +327,7 @@ class MeshState:
         data.tessellation = self.tessellator.tessellate(
             self.points, self.n, data.tessellation, binned=binned
         )
-        if self.engine.dim == 2:
+        if self.engine.cell_dim == 2:
             # The next diagrams are usually updated from this one.
             stages.bins.clear()
         self.sizing.evaluate(self.points, self.n, self.h, self.size_factor)
@@ -370,7 +370,7 @@ class MeshState:
 
     def mean_log_ratio_error(self, w: CellWeights) -> float:
         """Return the mean of |log(L / h)|."""
-        return self._summarize_log_ratio(w).magnitude / self.n / self.engine.dim
+        return self._summarize_log_ratio(w).magnitude / self.n / self.engine.cell_dim
 
     def missing_cells(self, w: CellWeights | None = None) -> float:
         """Return how many more cells the size field requires; negative if there are too many.
@@ -386,7 +386,7 @@ class MeshState:
         """Scale the size field by the factor that makes the mean of log(L / h) zero."""
         with self.engine.workspace.frame():
             w = self.stages.density.cell_weights(self.t, self.h)
-            factor = math.exp(self._summarize_log_ratio(w).sum / self.n / self.engine.dim)
+            factor = math.exp(self._summarize_log_ratio(w).sum / self.n / self.engine.cell_dim)
         self.size_factor *= factor
         self.stages.metric.scale_sizes(factor, self.h)
         self.evaluate_metric()
@@ -437,6 +437,21 @@ class MeshState:
             self.next_label += counts[0]
             self.set_generators(rows)
         return counts
+
+    def open_triangles(self) -> bool:
+        """Move generators away from the opposite sides of obtuse triangles, and update the mesh.
+
+        Returns False, without a change, if there are none.
+        """
+        with self.engine.workspace.frame():
+            displacement = self.engine.scratch(self.points.shape)
+            if not self.stages.quality_descent.open_triangles(self.t, displacement):
+                return False
+            self.stages.motion.move_generators(
+                self.free, self.points, displacement, 1.0, displacement, 0.0, self.local_length, self.velocity, clip=0.5
+            )  # fmt: skip
+        self.update()
+        return True
 
     def read_summaries(self) -> dict[str, Summary]:
         """Read the summaries of the mesh and of the last step: the scalars that the host needs.

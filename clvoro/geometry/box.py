@@ -57,8 +57,13 @@ class Domain(ABC):
 
     @property
     def dim(self) -> int:
-        """2 or 3."""
+        """Number of coordinates, 2 or 3."""
         return len(self.lower)
+
+    @property
+    def cell_dim(self) -> int:
+        """Dimension of the cells: 2 on a sphere in 3D."""
+        return self.dim
 
     @property
     def extent(self) -> np.ndarray:
@@ -124,6 +129,10 @@ class Domain(ABC):
         InputError, InputTypeError
             If `points` is not an array of numbers of that shape.
         """
+
+    def check_rows(self, name: str, points: object) -> np.ndarray:
+        """Return `points`, an array_like of real numbers, as a float64 array (n, d); see `arguments.check_rows`."""
+        return check_rows(name, points, self.dim)
 
     def wrap(self, points: np.ndarray) -> np.ndarray:
         """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""

@@ -66,9 +66,9 @@ def pieces_of_wkt(text: str) -> list[list[np.ndarray]]:
 
 
 def pieces_of_geojson(
-    source: str | PathLike[str] | Mapping[str, Any],
+    source: str | PathLike[str] | Mapping[str, Any], planar: bool = True
 ) -> tuple[list[list[object]], dict[str, list[int]] | None]:
-    """Read the polygons in a GeoJSON file, text or object.
+    """Read the polygons in a GeoJSON file, text or object. With `planar`, warn of longitudes and latitudes.
 
     Returns
     -------
@@ -77,34 +77,39 @@ def pieces_of_geojson(
     names : dict or None
         Names of boundaries and the numbers of their edges, from the property "boundaries" of Features.
     """
-    name = "GeoJSON"
-    # Geometries of shapely, geopandas and other libraries.
-    source = getattr(source, "__geo_interface__", source)
-    if isinstance(source, Mapping):
-        found: Any = source
-    else:
-        if not isinstance(source, (str, PathLike)):
-            raise InputTypeError(
-                f"source is a {type(source).__name__}, expected a path, a text or a dict of GeoJSON"
-            )
-        text = source if isinstance(source, str) and source.lstrip().startswith("{") else None
-        if text is None:
-            name = str(source)
-            try:
-                text = read_text(source, LONGEST_GEOMETRY)
-            except (OSError, UnicodeDecodeError) as error:
-                raise InputError(f"cannot read {name} ({error}), expected GeoJSON") from error
-        try:
-            found = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{name} is not JSON ({error}), expected GeoJSON") from error
+    found, name = read_geojson(source)
     names: dict[str, list[int]] = {}
     pieces: list[list[object]] = []
     _collect(found, name, pieces, names)
     if not pieces:
         raise InputError(f"{name} has no Polygon, expected at least one")
-    _warn_of_degrees(found, pieces, name)
+    if planar:
+        _warn_of_degrees(found, pieces, name)
     return pieces, names or None
+
+
+def read_geojson(source: Any) -> tuple[Any, str]:
+    """Return the object in a GeoJSON file, text or object, and its name for error messages."""
+    # Geometries of shapely, geopandas and other libraries.
+    source = getattr(source, "__geo_interface__", source)
+    if isinstance(source, Mapping):
+        return source, "GeoJSON"
+    if not isinstance(source, (str, PathLike)):
+        raise InputTypeError(
+            f"source is a {type(source).__name__}, expected a path, a text or a dict of GeoJSON"
+        )
+    name = "GeoJSON"
+    text = source if isinstance(source, str) and source.lstrip().startswith("{") else None
+    if text is None:
+        name = str(source)
+        try:
+            text = read_text(source, LONGEST_GEOMETRY)
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"cannot read {name} ({error}), expected GeoJSON") from error
+    try:
+        return json.loads(text), name
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{name} is not JSON ({error}), expected GeoJSON") from error
 
 
 def pieces_of_description(values: Mapping[str, Any]) -> list[list[np.ndarray]]:

@@ -59,7 +59,7 @@ class Circle:
         return self.center[None], self.center[None], np.array([float(self.radius)])
 
 
-Sphere = Circle
+Ball = Circle
 """The name of `Circle` in 3D."""
 
 

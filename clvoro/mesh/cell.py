@@ -80,7 +80,7 @@ def make_cell(diagram: Diagram, i: int) -> Cell:
 
 def _face_corners(diagram: Diagram, i: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the faces of cell `i` as ragged rows: starts (k + 1,) and vertices."""
-    if diagram.domain.dim == 2 and not isinstance(diagram.domain, Polygon):
+    if diagram.domain.cell_dim == 2 and not isinstance(diagram.domain, Polygon):
         begin = diagram.cell_vertices[slice(*diagram.cell_vertex_starts[i : i + 2])]
         ends = np.stack([begin, np.roll(begin, -1)], axis=1)
         return 2 * np.arange(len(begin) + 1), ends.ravel()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.polygon import Polygon
+from ..geometry.sphere_region import SphereRegion
 from .diagram import Diagram
 
 
@@ -17,9 +18,16 @@ def face_owners(diagram: Diagram) -> np.ndarray:
 
 
 def neighbor_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
-    """Return the generators, or their images, behind the half-faces `faces` (k,) between two cells: (k, d)."""
-    shifts = diagram.shifts[faces] * diagram.domain.extent
-    return diagram.points[diagram.neighbors[faces]] + shifts
+    """Return the generators, or their images, behind the half-faces `faces` (k,): (k, d).
+
+    The half-faces are between two cells, or on the boundary of a `SphereRegion`, behind which a cell was removed.
+    """
+    domain, neighbors = diagram.domain, diagram.neighbors[faces]
+    if isinstance(domain, SphereRegion):
+        beyond = np.asarray(domain.beyond)[np.maximum(-1 - neighbors, 0)]
+        inner = diagram.points[np.maximum(neighbors, 0)]
+        return np.where((neighbors < 0)[:, None], beyond, inner)
+    return diagram.points[neighbors] + diagram.shifts[faces] * domain.extent
 
 
 def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +108,7 @@ def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
     as seen from outside of the cell. A repeated corner is given once. A face that then has no measure (fewer than 2
     corners in 2D, 3 in 3D) has an empty row.
     """
-    if diagram.domain.dim == 2:
+    if diagram.domain.cell_dim == 2:
         ends = face_ends(diagram)
         least, starts, corners = 2, 2 * np.arange(len(ends) + 1), ends.ravel()
     else:

@@ -1,18 +1,19 @@
-"""The dual of a Voronoi diagram in the plane: the Delaunay triangles of its generators."""
+"""The dual of a Voronoi diagram in the plane or on a sphere: the Delaunay triangles of its generators."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ..errors import InputError
+from ..geometry.sphere import Sphere
 from .diagram import Diagram
 
 
 def dual_triangles(diagram: Diagram) -> np.ndarray:
     """Return the triples of generators whose cells meet in a vertex (t, 3) int32; see `Diagram.triangles`."""
-    if diagram.domain.dim != 2 or any(diagram.domain.periodic):
+    if diagram.domain.cell_dim != 2 or any(diagram.domain.periodic):
         raise InputError(
-            f"triangles are for meshes in the plane without seams, not for {diagram.domain}; use "
+            f"triangles are for meshes in the plane without seams and on spheres, not for {diagram.domain}; use "
             "neighbors and shifts, which every diagram has"
         )
     n, starts = len(diagram), diagram.cell_vertex_starts
@@ -21,6 +22,9 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
     pairs = np.unique(diagram.cell_vertices * np.int64(n) + cells)
     vertices, cells = pairs // n, pairs % n
     arms = diagram.points[cells] - diagram.vertices[vertices]
+    if isinstance(diagram.domain, Sphere):
+        axes = diagram.domain.tangents(diagram.vertices)
+        arms = np.column_stack([(arms * axis[vertices]).sum(axis=1) for axis in axes])
     # Around each vertex counter-clockwise.
     order = np.lexsort((np.arctan2(arms[:, 1], arms[:, 0]), vertices))
     cells = cells[order]

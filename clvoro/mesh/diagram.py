@@ -306,12 +306,13 @@ class Diagram(MeshOutput):
 
         Parameters
         ----------
-        solver : {"openfoam"}, optional
+        solver : {"openfoam", "mpas"}, optional
             Check the mesh that a solver gets instead, by that solver's criteria. "openfoam": those of `checkMesh
             -allGeometry -allTopology` of OpenFOAM v1912, by its formulas, for the mesh that `save` writes. OpenFOAM
-            need not be installed.
+            need not be installed. "mpas", on a sphere and in a box in 2D: what models on C grids need, such as vertices
+            inside of their Delaunay triangles; see `Measures.c_grid`.
         walls : {"straight", "exact"}, optional
-            With `solver`: as for `save`.
+            With solver "openfoam": as for `save`.
 
         Returns
         -------
@@ -322,7 +323,8 @@ class Diagram(MeshOutput):
         Raises
         ------
         InputError
-            If the solver or `walls` is something else, or `walls` is given without a solver.
+            If the solver or `walls` is something else, or `walls` is given without that solver, or the solver has no
+            meshes of such a domain: "openfoam" on a sphere, "mpas" in 3D and in a polygonal domain.
 
         Examples
         --------
@@ -341,7 +343,7 @@ class Diagram(MeshOutput):
             return check_diagram(self)
         from ..finite_volumes.gate import check_for_solver
 
-        return check_for_solver(self, solver, "straight" if walls is None else walls)
+        return check_for_solver(self, solver, walls)
 
     def transfer(
         self,
@@ -357,7 +359,8 @@ class Diagram(MeshOutput):
         A new cell gets the mean over its intersections with the old cells. With `order` 1 a value is constant in an old
         cell. With `order` 2 it is a linear function about the centroid. Its slope fits the values of the neighbors by
         least squares, and is limited by Barth and Jespersen (AIAA 89-0366, 1989): at no corner of the cell does the
-        function exceed the values of cell and neighbors.
+        function exceed the values of cell and neighbors. On a sphere cells are intersected along great circles, and the
+        function is linear in the position.
 
         Parameters
         ----------
@@ -368,10 +371,12 @@ class Diagram(MeshOutput):
         order : 1 or 2
         limited : bool
             Whether slopes are limited. Without limits linear functions are exact up to round-off, at walls and extrema,
-            too, where a cell has d neighbors in different directions, but new values may exceed the old ones.
+            too, where a cell has d neighbors in different directions, but new values may exceed the old ones. On a
+            sphere they are then exact to the second order.
         adapter : Adapter, optional
             The adapter whose device does the work; by default that of `create_context()`. In float64 where the device
-            has it. Between meshes of a polygonal domain, whose cells need not be convex, the host does it.
+            has it. Between meshes of a polygonal domain, whose cells need not be convex, and on a sphere, the host does
+            it.
 
         Returns
         -------
@@ -407,7 +412,7 @@ class Diagram(MeshOutput):
         Raises
         ------
         InputError
-            In 3D.
+            In 3D, and on a sphere.
 
         Examples
         --------
@@ -416,8 +421,9 @@ class Diagram(MeshOutput):
         [(0.0, 0.0, 1.0, 1.0), (1.0, 0.0, 2.0, 1.0)]
         """
         if self.domain.dim != 2:
+            where = "in 3D" if self.domain.cell_dim == 3 else f"on {self.domain}"
             raise InputError(
-                "shapely has polygons in the plane, and this diagram is in 3D; use to_pyvista() or to_meshio()"
+                f"shapely has polygons in the plane, and this diagram is {where}; use to_pyvista() or to_meshio()"
             )
         return self._shapes.copy()
 

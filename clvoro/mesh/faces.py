@@ -9,7 +9,9 @@ import numpy as np
 
 from ..geometry.boundary import wall_planes
 from ..geometry.polygon import Polygon
-from .connectivity import face_topology
+from ..geometry.sphere import Sphere
+from ..geometry.sphere_region import SphereRegion
+from .connectivity import face_topology, neighbor_points
 from .read_only import Sealed
 
 if TYPE_CHECKING:
@@ -46,9 +48,9 @@ class Faces(Sealed):
     center : (f, d) float64
         Centroid of the face. In a periodic box it lies beside the owner, possibly outside of the box.
     distance : (f,) float64
-        Distance between the two generators, or of the owner's generator from the plane of the wall. On a wall it is 0
-        or negative where the generator lies on that plane or behind it, as can happen at re-entrant corners of
-        polygons.
+        Distance between the two generators (on a sphere along a great circle), or of the owner's generator from the
+        plane of the wall (on a sphere from the arc towards a removed cell). On a wall it is 0 or negative where the
+        generator lies on that plane or behind it, as can happen at re-entrant corners of polygons.
     shift : (f, d) int8
         The neighbor lies at ``points[neighbor] + shift * domain.extent``: not 0 only at seams.
     half_face : (f,) int64
@@ -88,25 +90,36 @@ def make_faces(diagram: Diagram) -> Faces:
     t = face_topology(diagram)
     domain, d = diagram.domain, diagram.domain.dim
     inner = t.neighbor >= 0
-    wall = np.where(inner, 0, -1 - t.neighbor)
+    walls = -1 - t.neighbor[~inner]
+    boundary = np.full(len(inner), -1, np.int32)
+    boundary[~inner] = domain.boundary_index[walls]
     shift = diagram.shifts[t.rows]
     center = diagram.face_centroids[t.rows].astype(float)
     if t.flipped.any():  # only the neighbor has the face, so its position is beside the neighbor
         shift = np.where(t.flipped[:, None], -shift, shift)
         center = center + np.where(t.flipped[:, None], shift * domain.extent, 0.0)
-    normal, distance = np.empty((len(wall), d)), np.empty(len(wall))
+    normal, distance = np.empty((len(inner), d)), np.empty(len(inner))
     across = diagram.points[t.neighbor[inner]] + shift[inner] * domain.extent
     between = across - diagram.points[t.owner[inner]]
     distance[inner] = np.linalg.norm(between, axis=1)
     normal[inner] = between / distance[inner, None]
-    normal[~inner], anchors = wall_planes(domain, wall[~inner])
-    distance[~inner] = ((anchors - diagram.points[t.owner[~inner]]) * normal[~inner]).sum(axis=1)
+    if isinstance(domain, SphereRegion):
+        outward = neighbor_points(diagram, t.rows[~inner]) - diagram.points[t.owner[~inner]]
+        distance[~inner] = np.linalg.norm(outward, axis=1)
+        normal[~inner] = outward / distance[~inner, None]
+    else:
+        normal[~inner], anchors = wall_planes(domain, walls)
+        apart = anchors - diagram.points[t.owner[~inner]]
+        distance[~inner] = (apart * normal[~inner]).sum(axis=1)
+    if isinstance(domain, Sphere):
+        distance = domain.arcs(distance)
+        distance[~inner] /= 2  # the face is halfway to the removed cell
     if isinstance(domain, Polygon):
         _correct_cut_faces(diagram, t, normal, distance, center)
     return Faces(
         owner=t.owner,
         neighbor=t.neighbor,
-        boundary=np.where(inner, -1, domain.boundary_index[wall]).astype(np.int32),
+        boundary=boundary,
         area=diagram.face_measures[t.rows],
         normal=normal,
         center=center,

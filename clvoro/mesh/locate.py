@@ -8,7 +8,6 @@ import numpy as np
 import shapely
 from scipy.spatial import KDTree
 
-from ..arguments import check_rows
 from ..geometry.polygon import Polygon
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ class Locator:
 
     def find(self, points: object) -> np.ndarray:
         """Return the cell that holds each of `points` (k, d), (k,) int32; -1 outside."""
-        x = check_rows("points", points, self.domain.dim)
+        x = self.domain.check_rows("points", points)
         found = np.full(len(x), -1, np.int32)
         inside = np.flatnonzero(self.domain.contains(x))
         x = x[inside]

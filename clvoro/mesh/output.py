@@ -1,10 +1,10 @@
-"""Files, pictures and other libraries: the methods that `Diagram` and `Result` share."""
+"""Files, pictures, other libraries and parts of meshes: the methods that `Diagram` and `Result` share."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from os import PathLike
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, cast
 
 if TYPE_CHECKING:
     import meshio
@@ -17,19 +17,60 @@ if TYPE_CHECKING:
     from ..io.fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
     from ..io.polymesh import PatchType
     from ..plotting.colors import Color
+    from ..plotting.globe import Projection
     from ..plotting.solids import View
     from .diagram import Diagram
     from .results import Result
 
 
+Mesh = TypeVar("Mesh", bound="MeshOutput")
+
+
 class MeshOutput:
-    """Base of `Diagram` and `Result`: save, plot and convert the cells."""
+    """Base of `Diagram` and `Result`: save, plot, select and convert the cells."""
 
     default_color: ClassVar[Color] = "error"
 
     @property
     def _self(self) -> Result | Diagram:
         return cast("Result | Diagram", self)
+
+    def subset(self: Mesh, keep: ArrayLike, boundary: str = "coast") -> Mesh:
+        """Return the mesh without some of its cells, on a sphere.
+
+        The cells that are left do not change. Their faces towards removed cells become faces on a boundary. The domain
+        of the new mesh is a `clvoro.geometry.sphere_region.SphereRegion`. `clvoro.regions` finds the cells of oceans
+        and of limited areas.
+
+        Parameters
+        ----------
+        keep : (n,) array of bool
+            Which cells are left; they keep their order.
+        boundary : str
+            Name of the new boundary. A mesh that has a boundary already keeps the name of that one.
+
+        Returns
+        -------
+        Diagram or Result
+            That of a result has sizes, errors and quality of the cells that are left, and no history. The same mesh if
+            all cells are left.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If the mesh is not on a sphere, `keep` is not one bool per cell or has no True, or `boundary` is not a word.
+
+        Examples
+        --------
+        >>> earth = clvoro.Sphere()
+        >>> globe = clvoro.voronoi(earth, earth.icosahedral_points(2))
+        >>> north = globe.subset(earth.lonlat(globe.points)[:, 1] > 10, "open")
+        >>> len(globe), len(north), north.domain.boundary_names
+        (162, 65, ('open',))
+        """
+        from .subset import take_subset
+
+        return cast("Mesh", take_subset(cast("Diagram", self), keep, boundary))
 
     def save(
         self,
@@ -45,7 +86,8 @@ class MeshOutput:
     ) -> None:
         """Write the mesh to `path`; the suffix selects the format.
 
-        The file of a diagram has no sizes, errors and history.
+        The file of a diagram has no sizes, errors and history. Meshes on spheres are written in all formats but that
+        of OpenFOAM.
 
         ``.npz``
             Everything; `clvoro.load` reads it.
@@ -61,10 +103,14 @@ class MeshOutput:
             patches of type `empty`. Each periodic direction is one pair of cyclic patches;
             with several of them, these are for OpenFOAM of openfoam.com.
         ``.nc``
-            Meshes in 2D as netCDF, for models of oceans and atmospheres, QGIS, ParaView and xarray.
+            Meshes in 2D and on spheres as netCDF, for models of oceans and atmospheres, QGIS, ParaView and xarray.
+        ``.info``, ``.graph``
+            The neighbors of each cell as a graph for METIS, which divides it among the ranks of a parallel run; MPAS
+            reads the parts of ``graph.info``.
         ``.vtk``, ``.ply``, ``.obj``
-            Meshes in 2D, written by meshio (``pip install "clvoro[formats]"``); the latter two without cell data. Cells
-            are sorted by their number of corners; in ``.vtk`` the cell data `label` is the row in the mesh.
+            Meshes in 2D and on spheres, written by meshio (``pip install "clvoro[formats]"``); the latter two without
+            cell data. Cells are sorted by their number of corners; in ``.vtk`` the cell data `label` is the row in the
+            mesh.
 
         Parameters
         ----------
@@ -90,10 +136,11 @@ class MeshOutput:
         convention : {"ugrid", "mpas"}, optional
             For netCDF. With "ugrid", the default: cells as polygons with size, error, quality and area, and for each
             edge the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas": cells, edges and
-            vertices with all variables of the MPAS mesh specification for C grids; cells at seams are connected.
+            vertices with all variables of the MPAS mesh specification for C grids; cells at seams are connected. On a
+            sphere UGRID has longitudes and latitudes in degrees; MPAS has positions, and both in radians.
         units : str, optional
             For netCDF: unit of the coordinates, as UDUNITS writes it. By default "m". In UGRID, "degrees" stands for
-            longitudes and latitudes.
+            longitudes and latitudes. On a sphere: unit of the radius.
 
         Raises
         ------
@@ -139,7 +186,7 @@ class MeshOutput:
         Raises
         ------
         InputError
-            If `walls` is something else.
+            If `walls` is something else, or the diagram is on a sphere.
 
         Warns
         -----
@@ -171,6 +218,10 @@ class MeshOutput:
         through: ArrayLike | None = None,
         cut: str | ArrayLike | None = "octant",
         angles: tuple[float, float] | None = None,
+        projection: Projection = "orthographic",
+        center: ArrayLike | None = None,
+        across: float | None = None,
+        coasts: bool | None = None,
         edges: bool = True,
         key: bool = True,
         title: str | None = None,
@@ -191,7 +242,8 @@ class MeshOutput:
         limits : (low, high), optional
             Ends of the color scale; by default limits that hold 99 % of the cells.
         window : (lower, upper), optional
-            For 2D and "slice": corners of the part to show; by default all of it.
+            For 2D and "slice": corners of the part to show; by default all of it. For the projection "plate" longitudes
+            and latitudes.
         normal : {"x", "y", "z"} or 3 floats
             For "slice": direction at right angles to the plane.
         through : 3 floats, optional
@@ -199,6 +251,11 @@ class MeshOutput:
         cut, angles : optional
             For "cutaway": the removed part, and azimuth and elevation of the viewer in degrees; see
             `clvoro.plotting.plot_cutaway`.
+        projection : {"orthographic", "plate"}
+            For a sphere: the globe from far away, or longitudes and latitudes as coordinates.
+        center, across, coasts : optional
+            For a sphere: longitude and latitude in the middle, the angle that the picture spans in degrees, and whether
+            to draw coastlines; see `clvoro.plotting.plot_globe`.
         edges : bool
             Draw the faces; not for "slices", which always has them.
         key : bool
@@ -221,7 +278,8 @@ class MeshOutput:
         chosen = self.default_color if isinstance(color, str) and color == "default" else color
         return draw_mesh(
             cast("Result | Diagram", self), chosen, view, label=label, ax=ax, limits=limits,
-            window=window, normal=normal, through=through, cut=cut, angles=angles, edges=edges, key=key, title=title,
+            window=window, normal=normal, through=through, cut=cut, angles=angles, projection=projection,
+            center=center, across=across, coasts=coasts, edges=edges, key=key, title=title,
         )  # fmt: skip
 
     def to_pyvista(
@@ -296,7 +354,7 @@ class MeshOutput:
         Raises
         ------
         InputError
-            In 3D, in a periodic box, and for a cell around an island.
+            In 3D, on a sphere, in a periodic box, and for a cell around an island.
 
         Examples
         --------
@@ -335,7 +393,7 @@ class MeshOutput:
         ClvoroError
             If FiPy is not installed (``pip install "clvoro[solvers]"``).
         InputError
-            For a cell that borders on its own periodic image, and in 2D for a cell around an island.
+            On a sphere, for a cell that borders on its own periodic image, and in 2D for a cell around an island.
         """
         from ..io import to_fipy
 

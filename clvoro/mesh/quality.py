@@ -10,17 +10,19 @@ import numpy as np
 
 from ..geometry.boundary import wall_planes
 from ..geometry.polygon import Polygon
-from .connectivity import face_owners
+from ..geometry.sphere import Sphere
+from .connectivity import face_owners, neighbor_points
 from .diagram import Diagram
 from .straightening import straighten
 
 if TYPE_CHECKING:
     from ..finite_volumes.measures import SolverMeasures
+    from .c_grid import CGridMeasures
 
 
 @dataclass(frozen=True, repr=False)
 class Measures:
-    """Measures of a mesh, one per cell (n,) or one per half-face (m,).
+    """Measures of a mesh, one per cell (n,) or one per half-face (m,). Further ones for C grids: `c_grid`.
 
     The line between the generators x_i and x_j crosses the plane of their face at a right angle, in (x_i + x_j) / 2, by
     the definition of a Voronoi diagram: with the unknowns at the generators a mesh has no non-orthogonality. At a wall
@@ -36,7 +38,7 @@ class Measures:
     skewness : (m,) float
         Distance from the centroid of the face to the point where the line between the generators crosses its plane,
         over the distance of the generators: the offset of linear interpolation along the line. It is infinite for a
-        generator on a wall or behind it (a cell may reach around a corner of a polygon).
+        generator on a wall or behind it (a cell may reach around a corner of a polygon). On a sphere both are arcs.
     centroid_angle : (m,) float
         Angle in degrees between the normal of the face and the line from centroid to centroid: the
         non-orthogonality of solvers that keep their unknowns at the centroids. 0 on walls.
@@ -78,6 +80,17 @@ class Measures:
         assert self.diagram is not None
         return self.diagram.solver_mesh().measures
 
+    @cached_property
+    def c_grid(self) -> CGridMeasures:
+        """Measures for C grids, as of ocean and atmosphere models: angles of Delaunay triangles, kites and offsets.
+
+        On spheres, and in boxes in 2D; `InputError` in other domains.
+        """
+        from .c_grid import measure_c_grid
+
+        assert self.diagram is not None
+        return measure_c_grid(self.diagram)
+
     def __repr__(self) -> str:
         return f"Measures({self.line()})"
 
@@ -103,8 +116,11 @@ class Measures:
         """Return the mean and the worst of every measure, by name.
 
         Means of `centroid_angle` and `volume_ratio` are over the faces between cells, and so are mean and maximum of
-        `skewness` in a polygonal domain, whose walls may have generators behind them.
+        `skewness` in a polygonal domain, whose walls may have generators behind them. On a sphere those of `c_grid`
+        follow.
         """
+        spherical = self.diagram is not None and isinstance(self.diagram.domain, Sphere)
+        of_c_grid = self.c_grid.summary() if spherical else {}
         angle, ratio = (
             values[self.inner] if self.inner.any() else values
             for values in (self.centroid_angle, self.volume_ratio)
@@ -124,13 +140,15 @@ class Measures:
             "min_face_ratio": float(self.face_ratio.min()),
             "mean_volume_ratio": float(ratio.mean()),
             "max_volume_ratio": float(ratio.max()),
+            **of_c_grid,
         }
 
 
 def measure_mesh(diagram: Diagram) -> Measures:
     """Measure the cells and half-faces of a diagram in 2D or 3D.
 
-    A wall counts as an infinite plane, through a side of a box or an edge of a polygon.
+    A wall counts as an infinite plane, through a side of a box or an edge of a polygon. On a sphere the generator of
+    the removed cell is behind it.
     """
     owner, neighbor = face_owners(diagram), diagram.neighbors
     points, centroids, volumes = diagram.points, diagram.centroids, diagram.volumes
@@ -138,26 +156,41 @@ def measure_mesh(diagram: Diagram) -> Measures:
     starts = diagram.neighbor_starts
     inner = neighbor >= 0
     other = np.where(inner, neighbor, 0)
-    line = points[other] + diagram.shifts * diagram.domain.extent - points[owner]
-    walls = np.flatnonzero(~inner)
-    normals, anchors = wall_planes(diagram.domain, -1 - neighbor[walls])
-    gaps = ((anchors - points[owner[walls]]) * normals).sum(axis=1)
-    line[walls] = 2 * gaps[:, None] * normals
-    distance = np.linalg.norm(line, axis=1)
-    distance[walls[gaps <= 0]] = 0
+    domain = diagram.domain
+    if isinstance(domain, Sphere):
+        line = neighbor_points(diagram, np.arange(len(neighbor))) - points[owner]
+        distance = np.linalg.norm(line, axis=1)
+    else:
+        line = points[other] + diagram.shifts * domain.extent - points[owner]
+        walls = np.flatnonzero(~inner)
+        normals, anchors = wall_planes(domain, -1 - neighbor[walls])
+        gaps = ((anchors - points[owner[walls]]) * normals).sum(axis=1)
+        line[walls] = 2 * gaps[:, None] * normals
+        distance = np.linalg.norm(line, axis=1)
+        distance[walls[gaps <= 0]] = 0
     crossing = points[owner] + 0.5 * line
+    if isinstance(domain, Sphere):
+        crossing = domain.wrap(crossing)
     offset = np.linalg.norm(middles - crossing, axis=1)
+    if isinstance(domain, Sphere):
+        offset, distance = domain.arcs(offset), domain.arcs(distance)
     skewness = np.where(offset > 0, np.inf, 0.0)  # remains where the distance is 0
     np.divide(offset, distance, out=skewness, where=distance > 0)
 
     angle = np.zeros(len(line))
     between = centroids[other] + diagram.shifts * diagram.domain.extent - centroids[owner]
+    if isinstance(domain, Sphere):
+        # The part in the plane that touches the sphere where the arcs cross.
+        up = crossing / domain.radius
+        between -= (between * up).sum(axis=1)[:, None] * up
     angle[inner] = _angles(line[inner], between[inner])
 
     counts = np.diff(starts)
     surface = np.add.reduceat(areas, starts[:-1])
     largest, smallest = (f.reduceat(areas, starts[:-1]) for f in (np.maximum, np.minimum))
-    if diagram.domain.dim == 2:
+    if isinstance(domain, Sphere):
+        quality = 4 * counts * np.tan(np.pi / counts) * volumes / surface**2
+    elif diagram.domain.dim == 2:
         quality = straighten(diagram).quality()
     else:
         quality = 36 * np.pi * volumes**2 / surface**3

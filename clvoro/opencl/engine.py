@@ -27,8 +27,8 @@ class DomainKind(NamedTuple):
 
     Attributes
     ----------
-    periodic, polygonal : bool
-        Whether it is a periodic box, or a polygon.
+    periodic, polygonal, spherical : bool
+        Whether it is a periodic box, a polygon, or a sphere.
     periods : tuple of 3 floats
         In the device's coordinates; 0 where there are walls.
     """
@@ -36,11 +36,12 @@ class DomainKind(NamedTuple):
     periodic: bool = False
     polygonal: bool = False
     periods: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spherical: bool = False
 
     @property
     def defines(self) -> dict[str, object]:
         """Macros for kernels; see geometry/domain.h."""
-        macros = {"PERIODIC": self.periodic, "POLYGON": self.polygonal}
+        macros = {"PERIODIC": self.periodic, "POLYGON": self.polygonal, "SPHERE": self.spherical}
         return {name: 1 for name, is_set in macros.items() if is_set}
 
 
@@ -130,6 +131,11 @@ class Engine:
         )  # fmt: skip
 
     @property
+    def cell_dim(self) -> int:
+        """Dimension of the cells: 2 on a sphere in 3D."""
+        return 2 if self.domain_kind.spherical else self.dim
+
+    @property
     def face(self) -> np.dtype:
         """Precision of the measures and centroids of faces during a run.
 
@@ -137,7 +143,7 @@ class Engine:
         memory of a diagram in 2D. Cells in polygons and in 3D are measured only while they are clipped: there the
         precision is `real`.
         """
-        full = self.dim == 3 or self.domain_kind.polygonal
+        full = self.cell_dim == 3 or self.domain_kind.polygonal
         return self.real if full else np.dtype(np.float32)
 
     @staticmethod

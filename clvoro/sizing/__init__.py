@@ -9,7 +9,7 @@ How to add a size field:
 3. Export the class below and test both forms against each other, as in tests/sizing/test_sizing.py.
 """
 
-from ..geometry.shapes import Circle, ClosedPolyline, Edges, Polyline, Segment, Sphere
+from ..geometry.shapes import Ball, Circle, ClosedPolyline, Edges, Polyline, Segment
 from ..geometry.surface import Surface
 from .codegen import generate_code
 from .distance import Distance
@@ -18,10 +18,13 @@ from .expression import Expression
 from .feature import FeatureSize
 from .field import Constant, Field, Function, as_field, maximum, minimum
 from .graded import Graded
+from .lonlat import Caps, LonLat
 from .raster import Raster, Scattered
 from .solution import gradient_size, hessian_size
 
 __all__ = [
+    "Ball",
+    "Caps",
     "Circle",
     "ClosedPolyline",
     "Constant",
@@ -32,12 +35,12 @@ __all__ = [
     "Field",
     "Function",
     "Graded",
+    "LonLat",
     "Polyline",
     "Raster",
     "Scattered",
     "Segment",
     "Sizing",
-    "Sphere",
     "Surface",
     "as_field",
     "generate_code",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -41,16 +42,38 @@ class CodeWriter:
         self.real = np.dtype(real)
         self.peak_bytes = 0
         self.statements: list[str] = []
+        self.functions: list[str] = []
         self._numbers: list[np.ndarray] = []
         self._stored = 0
         self._names = 0
+        self._whole: CodeWriter | None = None
 
     def normalize(self, points: np.ndarray) -> np.ndarray:
         """Return physical `points` (..., d) in the device's coordinates, still in float64."""
         return (points - self.origin) / self.scale
 
+    def in_plane(self, domain: Domain) -> CodeWriter:
+        """Return a writer for a part of the field in another, plane domain, whose coordinates are not normalized.
+
+        Its numbers are stored here; its statements become a function by `function`.
+        """
+        inner = CodeWriter(domain, self.real, self.engine)
+        inner.origin, inner.scale, inner._whole = np.zeros(domain.dim), 1.0, self
+        return inner
+
+    def function(self, statements: list[str], result: str) -> str:
+        """Add a function of `statements` of a plane part, and return its name."""
+        name = f"plane_part_{self.name()}"
+        body = "\n".join(f"    {line}" for line in statements)
+        self.functions.append(
+            f"REAL {name}(const REAL *x, __global const REAL *data)\n{{\n{body}\n    return {result};\n}}\n"
+        )
+        return name
+
     def store(self, *numbers: object) -> int:
         """Append `numbers` (scalars and arrays, flattened) to the data; return the index of the first one."""
+        if self._whole is not None:
+            return self._whole.store(*numbers)
         begin = self._stored
         for part in numbers:
             flat = np.ravel(np.asarray(part, dtype=float))
@@ -126,9 +149,17 @@ def generate_code(
             "use a coarser Raster"
         )
     body = "\n".join(f"    {line}" for line in writer.statements)
+    plane = _plane_text(writer.functions, writer.dim) if writer.functions else ""
     prelude = (
-        f'{source_text("sizing/size_fields.h")}\n#line 1 "size_at"\n'
+        f'{source_text("sizing/size_fields.h")}\n{plane}#line 1 "size_at"\n'
         "REAL size_at(const REAL *x, __global const REAL *data)\n"
         f"{{\n{body}\n    return {result};\n}}\n"
     )
     return DeviceCode(prelude, writer.data(), writer.peak_bytes)
+
+
+def _plane_text(functions: list[str], dim: int) -> str:
+    """Return `functions` of plane parts, with the building blocks of size fields for two dimensions before them."""
+    text = source_text("sizing/size_fields.h")
+    plane = re.sub(r"\bsize_", "plane_size_", "\n".join([text, *functions]))
+    return f"#undef DIM\n#define DIM 2\n{plane}#undef DIM\n#define DIM {dim}\n"

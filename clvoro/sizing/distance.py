@@ -39,7 +39,7 @@ class Distance(Field):
     Parameters
     ----------
     shapes : shape or iterable of shapes
-        `Circle`, `Segment`, `Polyline`, `ClosedPolyline`; in 3D `Sphere`, `Segment`, `Polyline`, `ClosedPolyline`,
+        `Circle`, `Segment`, `Polyline`, `ClosedPolyline`; in 3D `Ball`, `Segment`, `Polyline`, `ClosedPolyline`,
         `Surface`; in both a `clvoro.Box`, which stands for its sides, and a `clvoro.Polygon`, which stands for its
         edges (``domain.boundary("island")`` for some of them); in 2D a curve of `clvoro.curves`. The distance is to
         the curve or surface, from both sides.
@@ -86,7 +86,7 @@ class Distance(Field):
             if not isinstance(shape, Shape):
                 raise InputTypeError(
                     f"Distance got a shape of type {type(shape).__name__}, expected Circle, "
-                    "Sphere, Segment, Polyline, ClosedPolyline, Edges, Surface, Box, clvoro.Polygon or a curve of "
+                    "Ball, Segment, Polyline, ClosedPolyline, Edges, Surface, Box, clvoro.Polygon or a curve of "
                     "clvoro.curves"
                 )
         if not self.shapes:
@@ -219,6 +219,10 @@ class Distance(Field):
                     f"size_nearest_tree(x, data + {at}, {tree.n}, {tree.levels}, {kind}, {best2})"
                 )
             best2 = writer.variable(call)
+        return self._finish(writer, best2, law)
+
+    def _finish(self, writer: CodeWriter, best2: str, law: int) -> str:
+        """Add the size at the squared distance `best2`; return the name of its variable."""
         return writer.variable(f"size_of_distance({best2}, data + {law})")
 
     def _packed_curves(self, writer: CodeWriter) -> tuple[int, np.ndarray, Tree]:

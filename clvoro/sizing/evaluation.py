@@ -10,6 +10,7 @@ from ..errors import SizeFieldError
 from .advice import advice_for_size
 from .codegen import generate_code
 from .field import Constant, Field, as_field
+from .lonlat import on_domain
 
 if TYPE_CHECKING:
     import pyopencl.array as cla
@@ -65,7 +66,7 @@ class Sizing:
     def __init__(
         self, engine: Engine, domain: Domain, field: object, gradient_step: float | None = None
     ):
-        self.engine, self.domain, self.field = engine, domain, as_field(field)
+        self.engine, self.domain, self.field = engine, domain, on_domain(as_field(field), domain)
         self.field.check_dim(domain.dim)
         self._origin, self._scale = domain.frame
         self._walls = (np.array([domain.lower, domain.upper]) - self._origin) / self._scale

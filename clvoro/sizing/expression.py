@@ -27,7 +27,8 @@ _TOKEN = re.compile(
 )
 
 _CONSTANTS = {"pi": math.pi, "M_PI": math.pi}
-_AXES = {"x": 0, "y": 1, "z": 2}
+_AXES = {"x": 0, "y": 1, "z": 2, "lon": 0, "lat": 1}
+_DEGREES = {"lon", "lat"}
 
 
 class _Function(NamedTuple):
@@ -99,14 +100,15 @@ class Expression(Field):
         sum     = products joined by  + -
         product = factors joined by  * /
         factor  = { + - ! } value
-        value   = number | x | y | z | pi | "(" formula ")" | name "(" formula { "," formula } ")"
+        value   = number | x | y | z | lon | lat | pi | "(" formula ")" | name "(" formula { "," formula } ")"
 
     Functions: abs fabs sqrt cbrt exp exp2 log log2 log10 sin cos tan asin acos atan atan2 sinh cosh
     tanh floor ceil pow hypot fmod min fmin max fmax clamp mix step smoothstep. Precedence is that
     of C.
 
     *All numbers are real*: ``1/2`` is 0.5. A comparison is 1 or 0; any number but 0 is true. Both sides of ``?:``,
-    ``&&`` and ``||`` are evaluated. x, y, z are physical coordinates; in float32 they have 7 digits, so the origin
+    ``&&`` and ``||`` are evaluated. x, y, z are physical coordinates. lon and lat are
+    degrees on a `clvoro.Sphere`, and otherwise other names of x and y. In float32 they have 7 digits, so the origin
     should be near the domain.
 
     The text is parsed into a list of operations, and the OpenCL code is generated from that list, never from the text.
@@ -121,9 +123,15 @@ class Expression(Field):
         if not isinstance(text, str):
             raise InputTypeError(f"Expression got {type(text).__name__}, expected a string")
         self.text = text
-        self._nodes = _Parser(text).parse()
+        parser = _Parser(text)
+        self._nodes = parser.parse()
         self._axes = 1 + max((n.value for n in self._nodes if n.kind == "axis"), default=-1)
-        self.dim = 3 if self._axes == 3 else None
+        used = {word for kind, word, _ in parser.tokens if kind == "name" and word in _AXES}
+        if used & _DEGREES and used - _DEGREES:
+            raise InputError(
+                f"Expression {text!r} has {', '.join(sorted(used))}, expected lon and lat, or x, y and z"
+            )
+        self.dim = 2 if used & _DEGREES else 3 if self._axes == 3 else None
         self.parts = 1 + len(self._nodes) // _OPERATIONS
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
@@ -235,7 +243,7 @@ class _Parser:
         near = self.text[begin : column + 20]
         raise InputError(
             f"Expression, column {column + 1}, near {near!r}: {what}. Allowed are numbers, "
-            "x, y, z, pi, + - * / ( ), comparisons, && || !, ?: and the functions "
+            "x, y, z, lon, lat, pi, + - * / ( ), comparisons, && || !, ?: and the functions "
             "listed in clvoro.sizing.Expression"
         )
 

@@ -37,11 +37,14 @@ class Field:
         Whether the field has a device form.
     parts : int
         Number of fields in the combination, itself included; long formulas count more than once.
+    on_sphere : bool
+        Whether the field is one of a sphere, where fields of longitude and latitude may be combined with it.
     """
 
     dim: int | None = None
     on_device: bool = True
     parts: int = 1
+    on_sphere: bool = False
 
     def __call__(self, points: object) -> np.ndarray:
         """Return h at `points`.
@@ -267,7 +270,7 @@ class Scaled(Field):
 
     def __init__(self, field: Field, factor: float):
         self.field, self.factor = field, check_positive("a factor of a size field", factor)
-        self.dim, self.on_device = field.dim, field.on_device
+        self.dim, self.on_device, self.on_sphere = field.dim, field.on_device, field.on_sphere
         self.parts = count_parts(field)
 
     def check_dim(self, dim: int) -> None:  # noqa: D102
@@ -308,13 +311,14 @@ class Combined(Field):
 
     def __init__(self, operation: str, *fields: Field):
         dims = {f.dim for f in fields if f.dim is not None}
-        if len(dims) > 1:
+        self.on_sphere = any(f.on_sphere for f in fields)
+        if len(dims) > 1 and not self.on_sphere:
             raise InputError(
                 f"a size field was combined from fields of {sorted(dims)} dimensions, expected "
                 "fields of the same dimension"
             )
         self.operation, self.fields = operation, fields
-        self.dim = dims.pop() if dims else None
+        self.dim = max(dims, default=None)
         self.on_device = all(f.on_device for f in fields)
         self.parts = count_parts(*fields)
 

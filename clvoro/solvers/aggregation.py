@@ -160,7 +160,7 @@ class Aggregation:
         A coarse weight is the sum of the weights between the members of two aggregates, times the ratio of lengths
         (aggregates / cells)^(1/d), because aggregates are that much farther apart than cells.
         """
-        n, dim = len(graph), self.engine.dim
+        n, dim = len(graph), self.engine.cell_dim
         with self.engine.workspace.frame():
             inverse, first = self._aggregate(graph, level)
             middle = self._coarse_graph(graph, first, 1.0)

@@ -338,7 +338,9 @@ class Poisson:
         if preconditioner == "auto":
             one_group = n <= one_group_limit(self.engine)
             factors = cost_factors(self.engine.queue.device)
-            jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance, one_group, factors)
+            jacobi, multigrid = expected_costs(
+                n, self.engine.cell_dim, tolerance, one_group, factors
+            )
             preconditioner = "multigrid" if multigrid < jacobi else "jacobi"
         if preconditioner == "jacobi":
             most = max_jacobi_iterations(n) if max_iterations is None else max_iterations

@@ -10,7 +10,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ..errors import ClvoroError, MemoryLimitError
+from ..errors import ClvoroError, InputError, MemoryLimitError
 from ..geometry.box import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
@@ -23,6 +23,7 @@ from .device_diagram import (
     EXACT_SHARE,
     FULL,
     LOOPED,
+    OPEN,
     ROUGH_SHARE,
     CloseError,
     Tessellation,
@@ -45,8 +46,18 @@ FIRST_REACH = 1.9
 """Largest first search radius of `hulls.cl`, in units of the local spacing of the bins."""
 
 
+class OpenCellError(InputError):
+    """Generators on a sphere leave a half of it free."""
+
+    def __init__(self, n: int) -> None:
+        super().__init__(
+            f"the {n} generators on the sphere leave a half of it free; expected at least four, on all sides of the "
+            "sphere (in a run: more cells, or sizes that change less from cell to cell)"
+        )
+
+
 class Cells:
-    """Tessellate a box in 2D.
+    """Tessellate a box in 2D, or a sphere.
 
     Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
     one is complete.
@@ -184,6 +195,8 @@ class Cells:
                     t = self._measure(rows, box, points, n, *old, m, flags, exact)
                 if t is not None:
                     return t
+                if flags & OPEN:
+                    raise OpenCellError(total)
                 if whole or flags & COINCIDE:
                     raise CloseError(points, total)
                 # Too many short faces may have been dropped: keep all.

@@ -45,7 +45,7 @@ class TessellationStages:
     def __getattr__(self, name: str) -> object:
         if name not in self.CLASSES:
             raise AttributeError(name)
-        in_space = name == "cells" and self.engine.dim == 3
+        in_space = name == "cells" and self.engine.cell_dim == 3
         stage = (Polyhedra if in_space else self.CLASSES[name])(self.engine)
         setattr(self, name, stage)
         return stage

@@ -24,7 +24,7 @@ class Vertices:
     Attributes
     ----------
     count : int
-    positions : (count, 2) real
+    positions : (count, d) real
         In normalized coordinates.
     cell_vertices : (m,) int32
         Vertex at the beginning of each face of the graph. Faces of a cell run counter-clockwise.
@@ -64,7 +64,7 @@ class VertexNumbering:
                 "device's coordinates), or the neighbors of cells contradict each other; perturb generators that lie "
                 "on a common circle"
             )
-        cell_vertices, positions = engine.empty(m, np.int32), engine.empty((count, 2))
+        cell_vertices, positions = engine.empty(m, np.int32), engine.empty((count, engine.dim))
         engine.run_each(
             k.place_polygon_vertices, t.n, t.points, *box.device_corners(engine.real), t.starts,
             t.neighbors, owners, ids, cell_vertices, positions,

@@ -136,7 +136,7 @@ KINDS = {
     "refined": (SQUARE, 0.018, refined),
     "body": (
         clvoro.Box((0, 0, 0), (1, 1, 1)),
-        sizing.Distance(sizing.Sphere((0.5, 0.5, 0.4), 0.25), h_min=0.045, slope=0.2),
+        sizing.Distance(sizing.Ball((0.5, 0.5, 0.4), 0.25), h_min=0.045, slope=0.2),
         lambda *_: {},
     ),
 }

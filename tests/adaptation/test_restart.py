@@ -25,8 +25,7 @@ def field(dim, moved=0.0, factor=1.0):
             sizing.Distance(sizing.Circle((0.4 + moved, 0.4), 0.2), h_min=0.006, slope=0.1) * factor
         )
     return (
-        sizing.Distance(sizing.Sphere((0.4 + moved, 0.4, 0.35), 0.2), h_min=0.05, slope=0.15)
-        * factor
+        sizing.Distance(sizing.Ball((0.4 + moved, 0.4, 0.35), 0.2), h_min=0.05, slope=0.15) * factor
     )
 
 

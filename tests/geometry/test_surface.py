@@ -117,7 +117,7 @@ def test_distance_to_shapes_of_all_kinds(engine):
     """The minimum over spheres, curves, a box and two surfaces, with a common upper bound."""
     rng = np.random.default_rng(4711)
     shapes = [
-        sizing.Sphere((3.5, 0.5, 10.4), 0.2),
+        sizing.Ball((3.5, 0.5, 10.4), 0.2),
         sizing.Segment((3, -1, 10), (4, 0, 11)),
         sizing.Polyline(rng.uniform(DOMAIN.lower, DOMAIN.upper, (20, 3))),
         sizing.Surface(*MESHES["torus"]),
@@ -180,7 +180,7 @@ def test_a_triangulated_ball_needs_as_many_cells_as_a_sphere(engine):
     law = {"h_min": 0.02, "slope": 0.5, "h_max": 0.2}
     counts = [
         DensityTree(sizing.Sizing(engine, DOMAIN, sizing.Distance(s, **law)), DOMAIN, 1e-3).integral
-        for s in (surface, sizing.Sphere(center, 0.5))
+        for s in (surface, sizing.Ball(center, 0.5))
     ]
     # The area of the facets is 0.7 % less than that of the sphere; the number of cells differs a little more.
     assert counts[0] == pytest.approx(counts[1], rel=8e-3)

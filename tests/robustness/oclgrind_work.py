@@ -25,6 +25,7 @@ from clvoro.opencl import program as _program
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.primitives import Scan
 from clvoro.sizing import (
+    Ball,
     Circle,
     ClosedPolyline,
     Distance,
@@ -32,7 +33,6 @@ from clvoro.sizing import (
     Graded,
     Raster,
     Sizing,
-    Sphere,
     Surface,
     minimum,
 )
@@ -337,7 +337,7 @@ def fields(adapter: clvoro.Adapter) -> None:
     flat = minimum(few, raster), Distance([many], 0.2, slope=0.3), Expression(GRADED)
     solid = (
         Distance(body, 0.1, slope=0.3),
-        Distance(Sphere((0.5, 0.5, 0.4), 0.2), 0.1, slope=0.3) + cube,
+        Distance(Ball((0.5, 0.5, 0.4), 0.2), 0.1, slope=0.3) + cube,
     )
     for box, size in (*((BOX, size) for size in flat), *((CUBE, size) for size in solid)):
         n, d = 40, box.dim

@@ -247,8 +247,8 @@ def test_result_is_below_the_field_and_idempotent(ctx, nx, ny, slope, seed):
 def test_3d_and_combined_fields(make_engine):
     engine = make_engine(3)
     domain = Box((0, 0, 0), (1, 1, 0.5))
-    ball = sizing.Distance(sizing.Sphere((0.5, 0.5, 0.2), 0.2), 0.02, slope=4, h_max=0.3)
-    plain = sizing.Distance(sizing.Sphere((0.5, 0.5, 0.2), 0.2), 0.02, slope=0.3, h_max=0.3)
+    ball = sizing.Distance(sizing.Ball((0.5, 0.5, 0.2), 0.2), 0.02, slope=4, h_max=0.3)
+    plain = sizing.Distance(sizing.Ball((0.5, 0.5, 0.2), 0.2), 0.02, slope=0.3, h_max=0.3)
     stage = sizing.Sizing(engine, domain, 2 * sizing.minimum(sizing.Graded(ball, slope=0.3), 0.2))
     x = np.random.default_rng(12).uniform(domain.lower, domain.upper, (1000, 3))
     expected = 2 * np.minimum(plain(x), 0.2)

@@ -82,7 +82,7 @@ PLANE_FIELDS = {
 }
 SPACE_FIELDS = {
     "constant": sizing.Constant(0.05),
-    "sphere": sizing.Distance(sizing.Sphere((1, -1.6, 3.5), 0.25), 0.04, slope=0.3),
+    "sphere": sizing.Distance(sizing.Ball((1, -1.6, 3.5), 0.25), 0.04, slope=0.3),
     "helix": sizing.Distance(sizing.Polyline(_HELIX), 0.004, growth=1.2),
     "raster": sizing.Raster(_rng.uniform(1, 2, (5, 6, 7)), (0.5, -2.0, 3.0), (1.5, -1.2, 4.4)),
     "raster slab": sizing.Raster(_rng.uniform(1, 2, (5, 1, 7)), (0.5, -2.0, 3.0), (1.5, -1.2, 4)),
@@ -90,7 +90,7 @@ SPACE_FIELDS = {
     "minimum": sizing.minimum(sizing.Expression("0.1*z"), 0.35) * 2,
     "segment": sizing.Distance(sizing.Segment((0.6, -2, 3), (1.4, -1.3, 4)), 0.02, slope=0.3),
     "product": sizing.Expression("1 + 0.1*x*z")
-    * sizing.Distance(sizing.Sphere((1, -1.6, 3.5), 0.25), 0.04, slope=0.3),
+    * sizing.Distance(sizing.Ball((1, -1.6, 3.5), 0.25), 0.04, slope=0.3),
     "quotient": 0.3 / (sizing.Expression("2 + sin(5*y)") / 2 + 1),
     "box": sizing.Distance(Box((0.7, -1.9, 3.2), (1.4, -1.4, 4.1)), 0.01, growth=1.2),
 }

@@ -12,8 +12,10 @@ from numpy.typing import DTypeLike
 from ...errors import InputError, InputTypeError
 from ...geometry.box import Domain
 from ...geometry.polygon import Polygon
+from ...geometry.sphere import Sphere
 from ...sizing import as_field
 from .box_tree import BoxTree
+from .charts import charted, from_chart
 from .coverage import PolygonCoverage, coverage_of
 from .quadrature import DensityTree
 
@@ -49,7 +51,8 @@ def count_cells(
     """
     if not isinstance(tolerance, Real) or not 0 < tolerance < 1:
         raise InputError(f"tolerance is {tolerance!r}, expected a number between 0 and 1")
-    return DensityTree(_evaluator(field), domain, float(tolerance)).integral
+    chart, plane_field = charted(domain, _evaluator(field))
+    return DensityTree(plane_field, chart, float(tolerance)).integral
 
 
 def density_tree(field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain) -> DensityTree:
@@ -60,7 +63,8 @@ def density_tree(field: Callable[[np.ndarray], np.ndarray] | float, domain: Doma
     SizeFieldError
         If h is not positive and finite somewhere; names the place.
     """
-    return DensityTree(_evaluator(field), domain, tolerance=_TOLERANCE)
+    chart, plane_field = charted(domain, _evaluator(field))
+    return DensityTree(plane_field, chart, tolerance=_TOLERANCE)
 
 
 def sample_density(
@@ -106,6 +110,9 @@ def sample_density(
     n, seed = _check_arguments(n, seed)
     field = _evaluator(field)
     tree = density_tree(field, domain) if tree is None else tree
+    if isinstance(domain, Sphere):
+        chart, field = charted(domain, field)
+        return from_chart(domain, sample_density(field, chart, n, seed, real, tree))
     boxes, coverage, slopes = tree.boxes, tree.coverage, tree.slopes
     share = tree.cells * (n / tree.integral)
     while (chosen := (share > _MAX_EXPECTED) & (boxes.level < 45)).any():
@@ -148,6 +155,9 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
         If the precision has not `n` distinct points.
     """
     n, seed = _check_arguments(n, seed)
+    if isinstance(domain, Sphere):
+        chart, _ = charted(domain, as_field(1.0))
+        return from_chart(domain, sample_uniform(chart, n, seed, real))
     rng = np.random.Generator(np.random.PCG64(seed))
     place = _uniform_in(domain, rng)
 

@@ -48,7 +48,7 @@ def fetch_diagram(
     from .periodic import _PeriodicReader
     from .polygon import _PolygonReader
 
-    others = ["face_vert" if engine.dim == 2 else "cell_vert"]
+    others = ["face_vert" if engine.cell_dim == 2 else "cell_vert"]
     if extended is None:
         others.append("shifts")
     if isinstance(domain, Polygon):
@@ -216,7 +216,7 @@ class _DiagramReader:
         return np.clip(positions, self.domain.lower, self.domain.upper)
 
     def volumes(self) -> np.ndarray:
-        return self._read(self.t.volumes, self.order, self.engine.dim)
+        return self._read(self.t.volumes, self.order, self.engine.cell_dim)
 
     def centroids(self) -> np.ndarray:
         return self._read(self.t.offsets, self.order, 1) + self.points()
@@ -229,7 +229,7 @@ class _DiagramReader:
         return np.where(j >= 0, self.ranks[np.maximum(j, 0)], j).astype(np.int32)
 
     def face_measures(self) -> np.ndarray:
-        measures = self._read(self.t.face_measures, self.slots, self.engine.dim - 1)
+        measures = self._read(self.t.face_measures, self.slots, self.engine.cell_dim - 1)
         if self.kept is not None and self.faces.merged:
             # Of a small face the vertices may have been merged along a line.
             small = measures < SMALL_FACE * measures.mean()
@@ -252,7 +252,7 @@ class _DiagramReader:
         return self._read(self.t.face_centroids, self.slots, 1) + own
 
     def vertices(self) -> np.ndarray:
-        shared = self.shared if self.engine.dim == 2 else self.faces
+        shared = self.shared if self.engine.cell_dim == 2 else self.faces
         positions = shared.positions.get().astype(np.float64) * self.scale + self.origin
         # Round-off must not move a vertex out of the domain.
         return np.clip(positions, self.domain.lower, self.domain.upper)

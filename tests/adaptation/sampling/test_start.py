@@ -185,7 +185,7 @@ def test_hilbert_tables_are_permutations(dim):
 def tree(request):
     if request.param == "F2":
         return DensityTree(F2, BOX, 1e-3)
-    field = sizing.Distance(sizing.Sphere((1.5, 1.5, 1.4), 0.25), 0.04, slope=0.3)
+    field = sizing.Distance(sizing.Ball((1.5, 1.5, 1.4), 0.25), 0.04, slope=0.3)
     return DensityTree(field, CUBE, 1e-2)
 
 

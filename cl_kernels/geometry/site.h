@@ -1,0 +1,85 @@
+/* The position of a generator as the origin of the plane in which its cell is cut. */
+#include "opencl/real.h"
+
+#ifdef SPHERE
+/* A generator on the unit sphere as the origin of a plane: its tangent plane, onto which the sphere is projected from
+   its center. Great circles become straight lines, so cells become convex polygons. A site holds the position of the
+   generator and two tangent unit vectors; seen from outside, the second is counter-clockwise from the first. */
+#define SITE_SIZE 9
+#define SITE(x, i, points)                                                                                             \
+    REAL x[SITE_SIZE];                                                                                                 \
+    place_site(x, i, points)
+
+/* Half the edge of the square that cells are cut from, in a tangent plane: 89.4 degrees of a great circle. */
+#define SQUARE R(100)
+/* Square of the distance, 179.2 degrees of a great circle, from which on bisectors do not cut the square. There
+   generators seem to be far away, in any direction. */
+#define OPPOSITE R(3.9998)
+
+inline void place_site(REAL *x, int i, global const REAL *points)
+{
+    EACH_AXIS(a)
+    x[a] = points[3 * i + a];
+    /* Without a branch and without cancellation (Duff et al. 2017, Building an orthonormal basis, revisited). */
+    const REAL sign = x[2] < 0 ? -1 : 1, s = -1 / (sign + x[2]), t = x[0] * x[1] * s;
+    x[3] = 1 + sign * x[0] * x[0] * s;
+    x[4] = sign * t;
+    x[5] = -sign * x[0];
+    x[6] = t;
+    x[7] = sign + x[1] * x[1] * s;
+    x[8] = -x[1];
+}
+
+/* Components along the two tangents. */
+inline REAL2 along_tangents(const REAL *x, const REAL *d)
+{
+    return (REAL2)(x[3] * d[0] + x[4] * d[1] + x[5] * d[2], x[6] * d[0] + x[7] * d[1] + x[8] * d[2]);
+}
+
+/* The vector in space of p in the tangent plane. */
+inline void in_space(const REAL *x, REAL2 p, REAL *d)
+{
+    EACH_AXIS(a)
+    d[a] = x[3 + a] * p.s0 + x[6 + a] * p.s1;
+}
+
+/* From the site to generator j in its stereographic projection from the antipode, whose scale is 1 at the site. The
+   bisector with j is { p : p.d = d.d / 2 } in the tangent plane, as between points of a plane: with the difference D of
+   both positions, (x + p).D = 0 is p.D = -x.D = D.D / 2. */
+#define direction_of direction_on_sphere
+inline REAL2 direction_on_sphere(const REAL *x, int j, global const REAL *points)
+{
+    const REAL d[3] = {points[3 * j] - x[0], points[3 * j + 1] - x[1], points[3 * j + 2] - x[2]};
+    const REAL d2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+    return d2 < OPPOSITE ? along_tangents(x, d) / (1 - d2 / 4) : (REAL2)(1 / REAL_EPS, 0);
+}
+
+/* A point of the tangent plane of `from` in that of `to`. */
+inline REAL2 seen_from(const REAL *to, const REAL *from, REAL2 p)
+{
+    REAL y[3], d[3];
+    in_space(from, p, y);
+    REAL height = 1, gap2 = 0;
+    /* The difference of the positions is exact, their product is not. */
+    EACH_AXIS(a)
+    {
+        const REAL apart = from[a] - to[a];
+        gap2 += apart * apart;
+        d[a] = y[a] + apart;
+        height += y[a] * to[a];
+    }
+    return along_tangents(to, d) / (height - gap2 / 2);
+}
+
+/* The vector from the site to the point of the sphere above p. */
+inline void on_sphere(const REAL *x, REAL2 p, REAL *d)
+{
+    const REAL p2 = dot(p, p), l = sqrt(1 + p2), sink = p2 / (l * (1 + l)); /* 1 - 1 / l */
+    in_space(x, p / l, d);
+    EACH_AXIS(a)
+    d[a] -= sink * x[a];
+}
+#else
+#define SITE_SIZE 2
+#define SITE(x, i, points) const REAL x[SITE_SIZE] = {points[2 * (i)], points[2 * (i) + 1]}
+#endif

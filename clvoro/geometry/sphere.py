@@ -1,0 +1,226 @@
+"""The surface of a sphere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from ..arguments import check_integer, check_number, check_rows
+from ..errors import InputError
+from ..opencl.engine import DomainKind
+from .boundary_names import BoundaryNames, Walls
+from .box import LARGEST_EDGE, Domain
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+EARTH_RADIUS = 6371229.0
+"""Radius of the Earth in meters as ocean and atmosphere models have it."""
+
+
+@dataclass(frozen=True)
+class Sphere(Domain):
+    """The surface of a sphere around the origin.
+
+    Positions are vectors (x, y, z) of the length `radius`; the z axis goes through the north pole, and the x axis
+    through the equator at longitude 0. Functions that take positions also take longitudes and latitudes, arrays
+    (n, 2) in degrees. Lengths are those of great circles, and areas those of the sphere.
+
+    Parameters
+    ----------
+    radius : float
+        By default that of the Earth in meters.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If the radius is not a positive number.
+
+    Examples
+    --------
+    >>> earth = clvoro.Sphere()
+    >>> earth.radius, round(earth.measure / 1e12)
+    (6371229.0, 510)
+    >>> clvoro.Sphere(1).positions([(0, 0), (90, 0), (0, 90)]).round(15).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+
+    radius: float = EARTH_RADIUS
+
+    def __post_init__(self) -> None:
+        check_number("Sphere radius", self.radius, above=0)
+        if not 1 / LARGEST_EDGE <= self.radius <= LARGEST_EDGE:
+            raise InputError(
+                f"Sphere radius is {self.radius:g}, expected {1 / LARGEST_EDGE:g} to {LARGEST_EDGE:g}, so that areas "
+                "and moments of cells do not overflow; choose another unit of length"
+            )
+        object.__setattr__(self, "radius", float(self.radius))
+
+    @property
+    def lower(self) -> tuple[float, ...]:  # type: ignore[override]
+        """Lower corner of the bounding box."""
+        return (-self.radius,) * 3
+
+    @property
+    def upper(self) -> tuple[float, ...]:  # type: ignore[override]
+        """Upper corner of the bounding box."""
+        return (self.radius,) * 3
+
+    @property
+    def names(self) -> Mapping[str, Walls] | None:  # type: ignore[override]
+        """None: a sphere has no boundary."""
+        return None
+
+    @property
+    def cell_dim(self) -> int:
+        """2: cells have areas."""
+        return 2
+
+    @property
+    def measure(self) -> float:
+        """Area."""
+        return 4 * np.pi * self.radius**2
+
+    @cached_property
+    def boundaries(self) -> BoundaryNames:  # type: ignore[override]
+        """No parts."""
+        return self._default_names()
+
+    def _default_names(self) -> BoundaryNames:
+        return BoundaryNames((), np.empty(0, np.int32), "side")
+
+    def boundary(self, walls: Walls | None = None) -> NoReturn:
+        """Raise an error, because a sphere has no boundary."""
+        del walls
+        raise InputError("a Sphere has no boundary; expected a Box or a Polygon")
+
+    def describe(self) -> dict[str, Any]:
+        """Return the arguments of this sphere."""
+        return {"radius": self.radius}
+
+    def positions(self, lonlat: ArrayLike) -> np.ndarray:
+        """Return the positions (n, 3) of longitudes and latitudes (n, 2) in degrees.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If `lonlat` is not an array of finite numbers of that shape, or a latitude is beyond 90 degrees.
+        """
+        return self._positions("lonlat", lonlat)
+
+    def _positions(self, name: str, lonlat: object) -> np.ndarray:
+        given = check_rows(name, lonlat, 2)
+        bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
+        if bad.size:
+            raise InputError(f"{name}[{bad[0]}] is {given[bad[0]]}, expected finite numbers")
+        far = np.flatnonzero((np.abs(given[:, 1]) > 90) | (np.abs(given[:, 0]) > 720))
+        if far.size:
+            raise InputError(
+                f"{name}[{far[0]}] is {given[far[0]]}, expected a longitude and a latitude (-90 to 90) in degrees"
+            )
+        lon, lat = np.radians(given).T
+        # Exact at the poles and on the axes.
+        quarter = np.abs(given[:, 1]) == 90
+        c, s = np.where(quarter, 0, np.cos(lat)), np.where(quarter, np.sign(lat), np.sin(lat))
+        return self.radius * np.column_stack([c * np.cos(lon), c * np.sin(lon), s])
+
+    def icosahedral_points(self, bisections: int) -> np.ndarray:
+        """Return the vertices of an icosahedron whose edges are bisected repeatedly, 10 * 4^k + 2 positions (n, 3).
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If `bisections` is not an integer from 0 to 11.
+        """
+        k = check_integer("bisections", bisections, 0)
+        if k > 11:
+            raise InputError(f"bisections is {k}, expected at most 11, which are 42 million points")
+        golden = (1 + np.sqrt(5)) / 2
+        one = np.array([(a, b * golden, 0.0) for a in (1, -1) for b in (1, -1)])
+        x = np.concatenate([one, np.roll(one, 1, axis=1), np.roll(one, 2, axis=1)])
+        x /= np.linalg.norm(x[0])
+        triangles = ConvexHull(x).simplices
+        for _ in range(k):
+            pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+            edges, of = np.unique(pairs, axis=0, return_inverse=True)
+            a, b, c = (len(x) + of.reshape(-1, 3)).T
+            p, q, r = triangles.T
+            triangles = np.concatenate(
+                [np.column_stack(t) for t in ((p, a, c), (q, b, a), (r, c, b), (a, b, c))]
+            )
+            middle = x[edges].sum(axis=1)
+            x = np.concatenate([x, middle / np.linalg.norm(middle, axis=1)[:, None]])
+        return self.radius * x
+
+    def spiral_points(self, n: int) -> np.ndarray:
+        """Return `n` evenly spread positions (n, 3), on a spiral in golden angles (Fibonacci lattice)."""
+        z = 1 - (2 * np.arange(n) + 1) / n
+        turn, r = np.pi * (3 - np.sqrt(5)) * np.arange(n), np.sqrt(1 - z * z)
+        return self.radius * np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+
+    def lonlat(self, points: ArrayLike) -> np.ndarray:
+        """Return longitudes in [-180, 180] and latitudes of positions (n, 3), in degrees, (n, 2)."""
+        x, y, z = np.asarray(points, float).T
+        return np.degrees(np.column_stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]))
+
+    def arcs(self, chords: ArrayLike) -> np.ndarray:
+        """Return the lengths of the arcs of great circles over chords, (n,)."""
+        return 2 * self.radius * np.arcsin(np.minimum(np.asarray(chords) / (2 * self.radius), 1))
+
+    def tangents(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return two unit vectors tangential to the sphere at positions (n, 3), each (n, 3).
+
+        The second one is counter-clockwise from the first as seen from outside. They do not depend continuously on the
+        position (Duff et al. 2017, Building an orthonormal basis, revisited).
+        """
+        x, y, z = (np.asarray(points, float) / self.radius).T
+        sign = np.where(z < 0, -1.0, 1.0)
+        s = -1 / (sign + z)
+        t = x * y * s
+        one = np.column_stack([1 + sign * x * x * s, sign * t, -sign * x])
+        return one, np.column_stack([t, sign + y * y * s, -y])
+
+    def check_rows(self, name: str, points: object) -> np.ndarray:
+        """Return positions of any length (n, 3), or longitudes and latitudes (n, 2), as positions on the sphere (n, 3).
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If `points` is not an array of real numbers of such a shape, or a row is zero or not finite.
+        """
+        shape = np.shape(points) if isinstance(points, list | tuple | np.ndarray) else ()
+        if len(shape) == 2 and shape[1] == 2:
+            return self._positions(name, points)
+        x = check_rows(name, points, 3)
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = np.hypot(np.hypot(x[:, 0], x[:, 1]), x[:, 2])
+            bad = np.flatnonzero(~(np.isfinite(length) & (length > 0)))
+        if bad.size:
+            raise InputError(
+                f"{name}[{bad[0]}] is {x[bad[0]]}, expected a position on the sphere, or a vector towards one"
+            )
+        return self.radius * (x / length[:, None])
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return True for each of `points`, (n, 3) or longitudes and latitudes (n, 2): (n,) bool."""
+        return np.ones(len(self.check_rows("points", points)), bool)
+
+    def wrap(self, points: np.ndarray) -> np.ndarray:
+        """Return the positions on the sphere, (n, 3), in the direction of `points`."""
+        x = np.asarray(points, float)
+        return self.radius * (x / np.linalg.norm(x, axis=1, keepdims=True))
+
+    @property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Origin and scale of the device's coordinates: unit vectors."""
+        return np.zeros(3), self.radius
+
+    def kind(self, real: np.dtype) -> DomainKind:
+        """Return the kind of domain, for which kernels are built."""
+        del real
+        return DomainKind(spherical=True)

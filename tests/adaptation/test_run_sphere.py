@@ -1,0 +1,149 @@
+"""Runs on the sphere: every method, both precisions, sizes, repeatability, checkpoints."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clvoro
+from clvoro import sizing
+from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.state import MeshState
+from clvoro.opencl.engine import Engine
+from tests.reference.spheres import SphericalDiagram
+
+EARTH = clvoro.Sphere()
+SIZE = sizing.Caps([((-45, 45), 3e6, 3e5)], h_max=8e5, growth=1.2)
+
+
+def angles_of_triangles(diagram):
+    x = diagram.points[diagram.triangles()]
+    e = [x[:, (k + 1) % 3] - x[:, k] for k in range(3)]
+    cosines = [-(e[k] * e[k - 1]).sum(axis=1) / np.prod([np.linalg.norm(v, axis=1) for v in (e[k], e[k - 1])], axis=0)
+               for k in range(3)]  # fmt: skip
+    return np.degrees(np.arccos(cosines))
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize(
+    ("method", "most", "widest"), [("adaptive", 0.0025, 90), ("exact", 3e-4, 95)]
+)
+def test_sizes_and_shapes(ctx, method, most, widest, real):
+    result = clvoro.Adapter(ctx, real).run(EARTH, SIZE, method=method)
+    assert np.abs(result.size_error).mean() < most
+    assert np.abs(result.size_error).max() < 20 * most
+    assert result.quality.mean() > 0.985
+    assert result.quality.min() > 0.9
+    assert angles_of_triangles(result.diagram).max() < widest
+    h = SIZE(result.points)
+    assert result.target_size / result.size_factor == pytest.approx(
+        h, rel=1e-5 if real == "float32" else 1e-12
+    )
+    assert result.size_error == pytest.approx(
+        np.sqrt(result.diagram.volumes) / result.target_size - 1, abs=0.01
+    )
+    x = result.points / EARTH.radius
+    expected = SphericalDiagram(x)
+    rounding = 1e-3 if real == "float32" else 1e-10
+    areas = result.diagram.volumes / EARTH.radius**2
+    assert areas == pytest.approx(expected.areas, rel=rounding)
+
+
+@pytest.mark.parametrize("method", ["lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"])
+def test_methods_of_the_paper(ctx, method):
+    result = clvoro.Adapter(ctx).run(EARTH, SIZE, method=method, points="uniform", max_steps=40)
+    errors, energy = result.history["mean_error"], result.history["energy"]
+    assert errors[-1] < 0.8 * errors[0]
+    assert energy[-1] < energy[0]
+    assert result.diagram.volumes.sum() == pytest.approx(EARTH.measure, rel=1e-12)
+
+
+def test_number_of_cells(ctx):
+    result = clvoro.Adapter(ctx).run(EARTH, SIZE, n_cells=1000, effort="fast")
+    assert len(result.diagram) == 1000
+    assert clvoro.Adapter(ctx).run(EARTH, 1e6, effort="fast").size_factor == 1
+
+
+def test_same_input_same_bits(ctx):
+    runs = [clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast") for _ in range(2)]
+    assert np.array_equal(runs[0].points, runs[1].points)
+    assert np.array_equal(runs[0].diagram.volumes, runs[1].diagram.volumes)
+
+
+def test_diagram_of_the_result(ctx):
+    """What steps updated is the diagram of the generators."""
+    result = clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast")
+    again = clvoro.Adapter(ctx).diagram(EARTH, result.points)
+    assert (again.adjacency != 0).nnz == (result.diagram.adjacency != 0).nnz
+    assert abs(again.adjacency - result.diagram.adjacency).max() < 1e-9 * EARTH.radius
+    assert again.volumes == pytest.approx(result.diagram.volumes, rel=1e-10)
+
+
+def test_icosahedral_start(ctx):
+    """Lloyd's method keeps the twelve pentagons and makes the cells equal."""
+    start = EARTH.icosahedral_points(4)
+    result = clvoro.Adapter(ctx).run(EARTH, 1e6, points=start, method="lloyd", max_steps=50)
+    assert np.bincount(np.diff(result.diagram.neighbor_starts)).tolist() == [
+        0,
+        0,
+        0,
+        0,
+        0,
+        12,
+        2550,
+    ]
+    before = clvoro.Adapter(ctx).diagram(EARTH, start)
+    moved = [
+        np.linalg.norm(d.centroids - d.points, axis=1).mean() for d in (before, result.diagram)
+    ]
+    assert moved[1] < 0.3 * moved[0]
+
+
+def test_warm_start(ctx):
+    adapter = clvoro.Adapter(ctx)
+    first = adapter.run(EARTH, SIZE)
+    again = adapter.run(EARTH, 1.01 * SIZE, points=first.points)
+    assert len(again.history) < len(first.history)
+    assert np.abs(again.size_error).mean() < 0.0025
+
+
+def test_checkpoint(ctx, tmp_path):
+    """An interrupted run goes on to the same bits."""
+    whole, path = clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast"), tmp_path / "state"
+    part = clvoro.Adapter(ctx).run(
+        EARTH, SIZE, effort="fast", checkpoint=clvoro.Checkpoint(path, every=0),
+        callback=lambda row: row["step"] >= 20,
+    )  # fmt: skip
+    assert len(part.history) < len(whole.history)
+    rest = clvoro.Adapter(ctx).run(
+        EARTH, SIZE, effort="fast", checkpoint=clvoro.Checkpoint(path, resume=True)
+    )
+    assert np.array_equal(rest.points, whole.points)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_obtuse_triangles_are_opened(ctx, real):
+    """Random cells have many. Generators move until the opposite side looks a little smaller than a right angle."""
+    points = EARTH.wrap(np.random.default_rng(8).normal(size=(500, 3)))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(real), EARTH.kind(np.dtype(real)))
+    on_device = engine.upload(EARTH.place(points, engine.real))
+    field = sizing.Sizing(engine, EARTH, sizing.as_field(1e6))
+    mesh = MeshState.create(Stages(engine), EARTH, field, on_device)
+    d = clvoro.Adapter(ctx).diagram(EARTH, points)
+    x, expected = points / EARTH.radius, np.zeros((500, 3))
+    count = 0
+    for corners in d.triangles():
+        for i, j, k in (np.roll(corners, turn) for turn in range(3)):
+            middle, half = (x[j] + x[k]) / 2 - x[i], np.linalg.norm(x[j] - x[k]) / 2
+            if np.linalg.norm(middle) < half:
+                expected[i] -= (1.01 * half / np.linalg.norm(middle) - 1) * middle
+                count += 1
+    displacement = engine.zeros((500, 3))
+    assert mesh.stages.quality_descent.open_triangles(mesh.t, displacement) == count > 100
+    found = mesh.to_host(displacement)
+    assert found == pytest.approx(expected, abs=1e4 * float(np.finfo(real).eps))
+
+
+def test_no_obtuse_triangles_with_little_effort(ctx):
+    result = clvoro.Adapter(ctx).run(EARTH, 0.25 * SIZE, effort="fast")
+    assert angles_of_triangles(result.diagram).max() < 90
+    assert result.check()
