@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..arguments import check_choice, check_path
 from ..errors import InputError, InputTypeError
-from ..finite_volumes.solver_mesh import WallShape
+from ..finite_volumes.solver_mesh import WallShape, check_not_sphere
+from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
 from ..mesh.output import MeshOutput
 from ..mesh.results import Result
@@ -20,8 +21,9 @@ from .atomic import check_writable, make_folder
 from .contents import Contents
 from .disv import Disv, DisvBoundary, make_disv
 from .foam import write_foam
-from .formats import check_plane, write_foreign
+from .formats import check_polygons, write_foreign
 from .history import write_history
+from .metis import write_metis
 from .mpas import write_mpas
 from .npz import load as load_npz
 from .npz import write_npz
@@ -50,7 +52,7 @@ __all__ = [
     "write_history",
 ]
 
-_WRITERS = {".npz": write_npz}
+_WRITERS = {".npz": write_npz, ".info": write_metis, ".graph": write_metis}
 _CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas}
 
 
@@ -119,18 +121,28 @@ def write_mesh(
                 f"cannot write {path} with walls, which is for OpenFOAM and .vtu; save as .foam or leave it out"
             )
     if is_foam:
+        check_not_sphere(
+            contents.diagram,
+            f"cannot write {path}: OpenFOAM's cells are polyhedra",
+            "save as .nc with convention='mpas', or as .vtu",
+        )
         if contents.extra:
             raise InputError(
                 f"cannot write cell_data to {path}: OpenFOAM's polyMesh holds none; save as .vtu or leave it out"
             )
         write_foam(contents, path, **for_foam, walls=walls)
     elif suffix == ".nc":
-        check_plane(contents, path)
+        check_polygons(contents, path)
         convention, units = for_netcdf["convention"], for_netcdf["units"]
         unit = "m" if units is None else units
         if not isinstance(unit, str) or not unit.isascii() or not unit.strip():
             raise InputTypeError(
                 f"units is {unit!r:.60}, expected a unit of length, such as 'm' or 'km'"
+            )
+        if unit.startswith("degree") and isinstance(contents.diagram.domain, Sphere):
+            raise InputError(
+                f"units is {unit!r:.60}, expected on a sphere the unit of its radius, such as 'm' or 'km'; UGRID has "
+                "degrees there anyway"
             )
         _chosen(convention)(contents, path, unit)
     elif suffix == ".vtu":
@@ -147,6 +159,11 @@ def to_disv(mesh: Result | Diagram, walls: WallShape = "straight") -> Disv:
 def to_fipy(mesh: Result | Diagram, walls: WallShape = "straight") -> VoronoiMesh2D | VoronoiMesh3D:
     """Return a mesh of FiPy; see `Diagram.to_fipy`."""
     diagram = Contents.of(mesh).diagram
+    check_not_sphere(
+        diagram,
+        "FiPy has cells in the plane and polyhedra",
+        "save as .nc, or use diagram.faces, which has arcs of great circles",
+    )
     try:
         from .fipy_mesh import make_fipy_mesh
     except ModuleNotFoundError as error:

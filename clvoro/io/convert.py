@@ -33,7 +33,7 @@ def to_meshio(contents: Contents, with_data: bool = True) -> meshio.Mesh:
     except ModuleNotFoundError as error:
         raise missing("meshio", "formats", "to_meshio()") from error
     diagram = contents.diagram
-    blocks, rows = _polygons(diagram) if diagram.domain.dim == 2 else _polyhedra(diagram)
+    blocks, rows = _polygons(diagram) if diagram.domain.cell_dim == 2 else _polyhedra(diagram)
     data = cell_data(contents) if with_data else {}
     return meshio.Mesh(
         in_space(diagram.vertices),
@@ -50,7 +50,7 @@ def to_pyvista(contents: Contents) -> pyvista.UnstructuredGrid:
         raise missing("PyVista", "pyvista", "to_pyvista()") from error
     diagram = contents.diagram
     n = len(diagram)
-    if diagram.domain.dim == 2:
+    if diagram.domain.cell_dim == 2:
         kind, starts, items = _VTK_POLYGON, diagram.cell_vertex_starts, diagram.cell_vertices
     else:
         described = polyhedra(diagram)

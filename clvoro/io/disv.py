@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
+from ..finite_volumes.solver_mesh import check_not_sphere
 from ..finite_volumes.two_point import two_point_faces
 from ..mesh.connectivity import take_rows
 from ..mesh.read_only import Sealed
@@ -105,6 +106,11 @@ class Disv(Sealed):
 def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
     """Return the DISV grid of `diagram`; see `Diagram.to_disv`."""
     domain = diagram.domain
+    check_not_sphere(
+        diagram,
+        "DISV grids are layers of cells in the plane",
+        "project the region and mesh it as a clvoro.Polygon, or save as .nc",
+    )
     if domain.dim != 2:
         raise InputError(
             "DISV grids are layers of 2D cells, and this diagram is in 3D; mesh the plane and give MODFLOW the layers"

@@ -15,9 +15,7 @@ from .convert import to_meshio
 # value says whether it writes cell data, too.
 _POLYGONS = {".vtk": True, ".ply": False, ".obj": False}
 
-_SAFE = (
-    ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .nc (UGRID, MPAS), .vtk, .ply or .obj"
-)
+_SAFE = ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .nc (UGRID, MPAS), .info (METIS), .vtk, .ply or .obj"
 
 
 def write_foreign(contents: Contents, path: Path) -> None:
@@ -26,7 +24,7 @@ def write_foreign(contents: Contents, path: Path) -> None:
     if suffix not in _POLYGONS:
         why = f"{suffix} is unknown or cannot hold polygons" if suffix else "it has no suffix"
         raise InputError(f"cannot write {path}: {why}; use {_SAFE}")
-    check_plane(contents, path)
+    check_polygons(contents, path)
     with_data = _POLYGONS[suffix]
     if contents.extra and not with_data:
         raise InputError(
@@ -44,10 +42,10 @@ def write_foreign(contents: Contents, path: Path) -> None:
         mesh.write(temporary)
 
 
-def check_plane(contents: Contents, path: Path) -> None:
-    """Refuse a mesh in three dimensions."""
-    if contents.diagram.domain.dim != 2:
+def check_polygons(contents: Contents, path: Path) -> None:
+    """Refuse a mesh whose cells are no polygons."""
+    if contents.diagram.domain.cell_dim != 2:
         raise InputError(
-            f"cannot write {path}: the mesh has {contents.diagram.domain.dim} dimensions, and only 2 "
-            f"are written to {path.suffix.lower()}; save it as .vtu, .foam or .npz"
+            f"cannot write {path}: the mesh has 3 dimensions, and {path.suffix.lower()} is for polygons in the plane "
+            "or on a sphere; save it as .vtu, .foam or .npz"
         )

@@ -1,8 +1,7 @@
-"""Write meshes in 2D by the MPAS mesh specification 1.0, for models on C grids of Voronoi cells and their dual.
+"""Write meshes by the MPAS mesh specification 1.0, for models on C grids of Voronoi cells and their dual.
 
-Cells, edges and vertices are numbered from 1; 0 stands for a missing item. The place of an edge on the boundary is its
-middle, and its `dcEdge` is sqrt(3) times its length, as in the tools of MPAS. `vertexDegree` is 3 unless more edges
-meet at a vertex, as between cocircular generators.
+Cells, edges and vertices are numbered from 1; 0 stands for a missing item. `vertexDegree` is 3 unless more edges meet
+at a vertex, as between cocircular generators. `mpas_shape` has the geometry, in the plane and on a sphere.
 """
 
 from __future__ import annotations
@@ -15,12 +14,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError
-from ..mesh.connectivity import neighbor_points
-from ..mesh.diagram import Diagram
 from .contents import Contents
 from .half_edges import HalfEdges, half_edges
+from .mpas_shape import Shape, coordinates, describe, measure
 from .netcdf import NetCDF, squared
 from .trisk import find_weights
+
+ZONES = "bdyMaskCell"
+"""Cell data from which those of edges and vertices follow; see `clvoro.regions.rings`."""
 
 
 def write_mpas(contents: Contents, path: Path, unit: str = "m") -> None:
@@ -38,12 +39,12 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     diagram, domain = contents.diagram, contents.diagram.domain
     halves = half_edges(diagram, glued=True)
     _check_loops(halves, path)
-    shape = _measure(diagram, halves)
-    _check_reach(shape, np.array(domain.periodic) * domain.extent, path)
+    shape = measure(diagram, halves)
+    periods = np.where(domain.periodic, domain.extent, 0.0)
+    _check_reach(shape.reach, periods, path)
     around = _walk_around(halves)
     n, e, v = len(diagram), len(halves.first), len(around.corners)
     width, degree = int(halves.counts.max()), around.edges.shape[1]
-    periods = np.where(domain.periodic, domain.extent, 0.0)
     file = NetCDF(
         path,
         contents,
@@ -51,23 +52,17 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
             "nCells": n, "nEdges": e, "nVertices": v, "maxEdges": width, "maxEdges2": 2 * width, "TWO": 2,
             "vertexDegree": degree,
         },
-        {
-            "on_a_sphere": "NO", "sphere_radius": np.float64(0), "is_periodic": "YES" if periods.any() else "NO",
-            "x_period": periods[0], "y_period": periods[1], "mesh_spec": "1.0", "Conventions": "MPAS",
-        },
+        {**describe(domain), "mesh_spec": "1.0", "Conventions": "MPAS"},
     )  # fmt: skip
-    first = halves.first
     places = {
-        "Cell": diagram.points,
-        "Edge": domain.wrap(diagram.points[halves.cell[first]] + shape.foot[first]),
+        "Cell": domain.wrap(diagram.points),
+        "Edge": shape.edges,
         "Vertex": domain.wrap(diagram.vertices[halves.begin[around.corners[:, 0]]]),
     }
     for name, points in places.items():
         plural = ("nVertices" if name == "Vertex" else f"n{name}s",)
-        for axis, values in zip("xy", points.T, strict=True):
-            file.add(f"{axis}{name}", plural, values, units=unit)
-        for unused, of in (("z", unit), ("lat", "rad"), ("lon", "rad")):
-            file.add(f"{unused}{name}", plural, np.zeros(len(points)), units=of)
+        for axis, values in coordinates(domain, points).items():
+            file.add(f"{axis}{name}", plural, values, units="rad" if len(axis) > 1 else unit)
         file.add(f"indexTo{name}ID", plural, np.arange(1, len(points) + 1))
     _add_graph(file, halves, around)
     _add_measures(file, around, shape, unit)
@@ -82,7 +77,23 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     size = np.sqrt(diagram.volumes) if run is None else run.target_size
     file.add("meshDensity", ("nCells",), (size.min() / size) ** 4)
     file.add_extra("nCells")
+    _add_zones(file, contents.extra.get(ZONES), halves, around)
     return file
+
+
+def _add_zones(file: NetCDF, zones: np.ndarray | None, halves: HalfEdges, around: _Around) -> None:
+    """Add the zones at the boundary of a limited area for edges and vertices: the lowest one of their cells.
+
+    MPAS-Atmosphere reads all three. It computes 0, relaxes 1 to 5, and is given 6 and 7.
+    """
+    if zones is None or zones.ndim != 1:
+        return
+    here = zones[halves.cell]
+    beside = np.where(halves.twin >= 0, here[halves.twin], here)
+    file.add("bdyMaskEdge", ("nEdges",), np.minimum(here, beside)[halves.first])
+    most = zones.max()
+    at_vertex = np.where(around.corners >= 0, here[around.corners], most).min(axis=1)
+    file.add("bdyMaskVertex", ("nVertices",), at_vertex)
 
 
 def _add_graph(file: NetCDF, halves: HalfEdges, around: _Around) -> None:
@@ -105,7 +116,7 @@ def _add_graph(file: NetCDF, halves: HalfEdges, around: _Around) -> None:
         file.add(f"{name}OnVertex", ("nVertices", "vertexDegree"), table)
 
 
-def _add_measures(file: NetCDF, around: _Around, shape: _Shape, unit: str) -> None:
+def _add_measures(file: NetCDF, around: _Around, shape: Shape, unit: str) -> None:
     area = squared(unit)
     kites = np.where(around.corners >= 0, shape.kites[around.corners], 0.0)
     file.add("kiteAreasOnVertex", ("nVertices", "vertexDegree"), kites, units=area)
@@ -114,74 +125,6 @@ def _add_measures(file: NetCDF, around: _Around, shape: _Shape, unit: str) -> No
     file.add("dvEdge", ("nEdges",), shape.lengths, units=unit)
     file.add("dcEdge", ("nEdges",), shape.distances, units=unit)
     file.add("angleEdge", ("nEdges",), shape.angles, units="rad")
-
-
-@dataclass(frozen=True)
-class _Shape:
-    """Geometry of half-edges relative to the generators of their cells, and measures of cells and edges.
-
-    Attributes
-    ----------
-    corner : (h, 2) float
-        Begin of each half-edge.
-    foot : (h, 2) float
-        Place of the edge, where the line between its generators crosses it.
-    line : (h, 2) float
-        Vector to the generator across; 0 on walls.
-    kites : (h,) float
-        Signed area of the kite of generator, foot, begin of the half-edge, and foot of the previous one.
-    areas : (n,) float
-        Areas of cells as sums of their kites, so that both add up to the same total.
-    lengths, distances, angles : (e,) float
-        Length of each edge, distance of its generators, and angle between its normal and the x axis.
-    """
-
-    corner: np.ndarray
-    foot: np.ndarray
-    line: np.ndarray
-    kites: np.ndarray
-    areas: np.ndarray
-    lengths: np.ndarray
-    distances: np.ndarray
-    angles: np.ndarray
-
-
-def _measure(diagram: Diagram, halves: HalfEdges) -> _Shape:
-    own, first, edge = diagram.points[halves.cell], halves.first, halves.edge
-    begin, end = (diagram.vertices[v] - own for v in (halves.begin, halves.end))
-    inner = halves.twin >= 0
-    line, middle = np.zeros_like(own), (begin + end) / 2
-    line[inner] = neighbor_points(diagram, halves.rows[inner]) - own[inner]
-    lengths = diagram.face_measures[halves.rows[first]]
-    distances = np.where(inner[first], np.hypot(*line[first].T), np.sqrt(3) * lengths)
-    # In polygons a cell may include a part of another region, whose edges lie on no bisector of its generator.
-    off = np.abs(((middle - line / 2) * line).sum(axis=1))[first] / distances
-    on_bisector = inner[first] & (off <= _roundings(diagram, distances))
-    foot = np.where(on_bisector[edge][:, None], line / 2, middle)
-    kites = (_cross(begin, foot) + _cross(foot[halves.previous], begin)) / 2
-    along = (end - begin)[first]
-    outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
-    normals = np.where(inner[first][:, None], line[first], outward)
-    return _Shape(
-        begin, foot, line, kites, np.bincount(halves.cell, kites, len(diagram)), lengths, distances,
-        np.arctan2(normals[:, 1], normals[:, 0]),
-    )  # fmt: skip
-
-
-def _roundings(diagram: Diagram, distances: np.ndarray) -> np.ndarray:
-    """Return the tolerance for the distance of edges to bisectors, for generators `distances` (e,) apart; (e,)."""
-    domain = diagram.domain
-    single, double = (domain.place(diagram.points, np.dtype(t)) for t in (np.float32, np.float64))
-    # Positions that single precision represents exactly were computed in it.
-    eps = np.finfo(np.float32 if np.array_equal(single, double) else np.float64).eps
-    places = eps * domain.extent.max() + np.finfo(np.float64).eps * np.abs(diagram.vertices).max()
-    # The smaller the angle between two bisectors, the larger the round-off of their corner, and its distance from the
-    # third bisector.
-    return np.sqrt(eps) * distances + 64 * places
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 @dataclass(frozen=True)
@@ -246,9 +189,8 @@ def _check_loops(halves: HalfEdges, path: Path) -> None:
         )
 
 
-def _check_reach(shape: _Shape, periods: np.ndarray, path: Path) -> None:
+def _check_reach(reach: np.ndarray, periods: np.ndarray, path: Path) -> None:
     """Refuse cells that reach half a period, because readers of the file assume nearest images."""
-    reach = np.abs([shape.corner, shape.line]).max(axis=(0, 1))
     far = np.flatnonzero((periods > 0) & (reach > 0.499 * periods))
     if far.size:
         raise InputError(

@@ -21,6 +21,8 @@ import numpy as np
 from ..files import open_plain
 from ..geometry.box import Box, Domain
 from ..geometry.polygon import Polygon
+from ..geometry.sphere import Sphere
+from ..geometry.sphere_region import SphereRegion
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from .arrays import FileError, explained, list_members, read_member, write_arrays
@@ -28,7 +30,12 @@ from .contents import Contents
 
 FORMAT, VERSION = "clvoro-result", 2
 
-_DOMAINS = {"Box": Box, "Polygon": Polygon.described}
+_DOMAINS = {
+    "Box": Box,
+    "Polygon": Polygon.described,
+    "Sphere": Sphere,
+    "SphereRegion": SphereRegion,
+}
 _NEEDED = ("about", "points", "target_size", "size_error", "quality", "history", "diagram.points")
 _FIELDS = tuple(field.name for field in dataclasses.fields(Result))
 _FORMER = {"size": "target_size", "error": "size_error"}
@@ -197,7 +204,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
 def _not_in(domain: Domain) -> tuple[str, ...]:
     """Return prefixes of the arrays that a diagram of `domain` does not have."""
     others = [] if any(domain.periodic) else ["shifts"]
-    if domain.dim == 3:
+    if domain.cell_dim == 3:
         others.append("cell_vert")
     elif not isinstance(domain, Polygon):
         others.append("face_vert")

@@ -1,8 +1,10 @@
-"""Write meshes in 2D by the UGRID conventions, for QGIS, ParaView, xarray and similar programs.
+"""Write meshes of polygons by the UGRID conventions, for QGIS, ParaView, xarray and similar programs.
 
 See https://ugrid-conventions.github.io/ugrid-conventions. Vertices are nodes and cells are faces. Indices begin with 0;
 -1 stands for a missing item. As in VTK files, cells are not cut at seams: each side of a seam has separate nodes
 and edges. The loops of a cell around an island are joined by bridges, edges that are passed in both directions.
+
+On a sphere coordinates are longitudes and latitudes in degrees, and edges are arcs of great circles.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..geometry.sphere import Sphere
 from ..mesh.connectivity import cell_corners
 from ..mesh.diagram import Diagram
 from .contents import Contents
@@ -38,8 +41,8 @@ def write_ugrid(contents: Contents, path: Path, unit: str = "m") -> None:
     """Write the cells with size, error, quality and area, and the number and name of the wall at each edge.
 
     The coordinates of faces are the generators, those of edges their middles, all in `unit`. With "degrees" they are
-    longitudes and latitudes, otherwise coordinates of a projection. Names of boundaries are the flags of the
-    variable `boundary`.
+    longitudes and latitudes, otherwise coordinates of a projection. On a sphere they are always longitudes and
+    latitudes, and `unit` is that of the radius. Names of boundaries are the flags of the variable `boundary`.
     """
     _describe(contents, path, unit).write()
 
@@ -68,6 +71,9 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     _add_coordinates(file, diagram, ends, unit)
     _add_connectivity(file, halves, ends, np.diff(starts), corners)
     of_faces = {"mesh": "mesh", "location": "face", "coordinates": "mesh_face_x mesh_face_y"}
+    if isinstance(diagram.domain, Sphere):
+        _add_globe(file, diagram.domain, unit)
+        of_faces["grid_mapping"] = "globe"
     units = {"size": unit, "area": squared(unit)}
     for name, values in {**contents.of_run, "area": diagram.volumes}.items():
         about = {"long_name": _FACE_DATA[name], "units": units.get(name, "1")}
@@ -83,12 +89,22 @@ def _add_coordinates(file: NetCDF, diagram: Diagram, ends: np.ndarray, unit: str
         "edge": ("middles of the edges", diagram.vertices[ends].mean(axis=1)),
         "face": ("generators of the cells", diagram.points),
     }
+    domain = diagram.domain
+    if isinstance(domain, Sphere):
+        unit = "degrees"
+        places = {place: (what, domain.lonlat(x)) for place, (what, x) in places.items()}
     for place, (what, points) in places.items():
         for axis, values in zip("xy", points.T, strict=True):
             file.add(
                 f"mesh_{place}_{axis}", (f"mesh_{place}s",), values,
                 **_coordinate(axis, unit), long_name=f"{axis} of the {what}", axis=axis.upper(),
             )  # fmt: skip
+
+
+def _add_globe(file: NetCDF, sphere: Sphere, unit: str) -> None:
+    """Add the radius of the sphere by the CF conventions, which have it in meters."""
+    radius = {"earth_radius": np.float64(sphere.radius)} if unit == "m" else {}
+    file.add("globe", (), np.zeros((), np.int32), grid_mapping_name="latitude_longitude", **radius)
 
 
 def _add_connectivity(

@@ -20,6 +20,8 @@ from ..finite_volumes.prisms import cell_loops
 from ..finite_volumes.solver_mesh import SolverMesh, WallShape, make_solver_mesh
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
+from ..geometry.sphere import Sphere
+from ..geometry.sphere_region import SphereRegion
 from ..mesh.connectivity import face_corners, face_owners, next_faces, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.straightening import count_sides
@@ -43,7 +45,8 @@ def write_vtu(
     `faces_of_cell`); `label` (row of the cell); `boundary` (see `largest_boundary`); for each name that the caller
     gave to a boundary `boundary:NAME` (1 where the cell has a face on it, else 0); the vector `generator`, from the
     origin to the cell's generator; and data of the caller. Comments hold the settings and the caller's names of
-    boundaries, field data a polygonal or periodic domain. In a periodic box cells are not cut at the seams.
+    boundaries, field data a polygonal, periodic or spherical domain. In a periodic box cells are not cut at the seams.
+    On a sphere the corners of cells are on it, and VTK draws straight lines between them.
 
     With `walls` "straight" the cells are those of the solver mesh, with their volumes, and without the domain, as the
     file is no diagram to `load`.
@@ -54,7 +57,7 @@ def write_vtu(
     mesh = make_solver_mesh(diagram) if walls == "straight" else None
     vertices = diagram.vertices if mesh is None else mesh.points
     points = appended.add(None, in_space(vertices))
-    if diagram.domain.dim == 2:
+    if diagram.domain.cell_dim == 2:
         kind, topology = _POLYGON, _polygons(diagram if mesh is None else mesh)
     else:
         kind, topology = _POLYHEDRON, polyhedra(diagram if mesh is None else mesh)
@@ -98,6 +101,15 @@ _"""
 def _domain_data(diagram: Diagram) -> dict[str, np.ndarray]:
     """Return field data with the domain, and with the parts of the graph that corners of cells do not define."""
     domain = diagram.domain
+    if isinstance(domain, Sphere):
+        region = {}
+        if isinstance(domain, SphereRegion):
+            region = {
+                "region_within": np.asarray(domain.within),
+                "region_beyond": np.asarray(domain.beyond),
+                "region_area": np.array([domain.area]),
+            }
+        return {"sphere_radius": np.array([domain.radius]), **region}
     if any(domain.periodic):
         starts = face_corners(diagram)[0]
         written = np.cumsum(np.diff(starts) > 0) - 1  # in 3D faces without vertices are left out
@@ -212,7 +224,7 @@ def polyhedra(mesh: Diagram | SolverMesh) -> dict[str, np.ndarray]:
 def cell_data(contents: Contents) -> dict[str, np.ndarray]:
     """Return the cell data by name. Vectors have three coordinates, as VTK requires."""
     diagram = contents.diagram
-    flat, n = diagram.domain.dim == 2, len(diagram)
+    flat, n = diagram.domain.cell_dim == 2, len(diagram)
     # In 3D count the faces that are written: those with vertices.
     seen = np.diff(face_corners(diagram)[0]) > 0
     counts = count_sides(diagram) if flat else np.bincount(face_owners(diagram)[seen], minlength=n)

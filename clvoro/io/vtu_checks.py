@@ -23,8 +23,8 @@ def check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
     n, v = len(diagram), len(diagram.vertices)
     given = {"CellData.label": arrays["CellData.label"]}
     expected: dict[str, np.ndarray] = {"CellData.label": np.arange(n)}
-    if diagram.domain.dim == 2:
-        for name in ("Points.", "CellData.generator"):
+    if diagram.domain.cell_dim == 2:
+        for name in ("Points.", "CellData.generator") if diagram.domain.dim == 2 else ():
             given[f"z of {name}"] = z = arrays[name][:, 2]
             expected[f"z of {name}"] = np.zeros(len(z))
         if not isinstance(diagram.domain, Polygon) or "FieldData.wall_faces" in arrays:

@@ -19,15 +19,19 @@ from typing import NoReturn
 from xml.parsers import expat
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from ..errors import InputError
 from ..files import open_plain
 from ..geometry.box import Box, Domain
 from ..geometry.polygon import Polygon
+from ..geometry.sphere import Sphere
+from ..geometry.sphere_region import SphereRegion
 from ..mesh.check.rebuilt import rebuild
 from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Result
+from ..mesh.spherical import rebuild_on_sphere
 from .arrays import EXPANSION, LEAST
 from .vtu import CURVES, NAMES, SOLVER_MESH
 from .vtu_checks import check_repeated
@@ -37,6 +41,8 @@ _MARK = b'<AppendedData encoding="raw">\n_'
 _END = b"\n</AppendedData>\n</VTKFile>\n"
 _TYPES = {"Float64": "f8", "Float32": "f4", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}
 _BLOCK = 1 << 20
+_OFF_SPHERE = 1e-5
+"""Largest distance of a vertex from its sphere in units of the radius: round-off of float32, and more."""
 _USED = {
     "Points.", "Cells.types", "Cells.connectivity", "Cells.offsets", "Cells.faces", "Cells.faceoffsets",
     "CellData.size", "CellData.error", "CellData.quality", "CellData.volume", "CellData.generator",
@@ -45,6 +51,7 @@ _USED = {
     "FieldData.seam_faces", "FieldData.seam_neighbors", "FieldData.seam_shifts",
     "FieldData.domain_vertices", "FieldData.domain_ring_starts", "FieldData.domain_piece_of_ring",
     "FieldData.domain_edge_numbers", "FieldData.bridges", "FieldData.wall_faces", "FieldData.wall_edges",
+    "FieldData.sphere_radius", "FieldData.region_within", "FieldData.region_beyond", "FieldData.region_area",
 }  # fmt: skip
 
 
@@ -223,7 +230,7 @@ def _assemble(arrays: dict[str, np.ndarray], reader: _Reader) -> Result | Diagra
     flat = bool((kinds == 7).all())
     if not flat and not (kinds == 42).all():
         raise _FileError("its cells are neither all polygons nor all polyhedra")
-    dim = 2 if flat else 3
+    dim = 2 if flat and "FieldData.sphere_radius" not in arrays else 3
     x = np.ascontiguousarray(vertices[:, :dim])
     domain = _domain(arrays, x, reader)
     faces = _cell_polygons(arrays, len(x), domain) if flat else _cell_polyhedra(arrays, len(x))
@@ -237,7 +244,8 @@ def _assemble(arrays: dict[str, np.ndarray], reader: _Reader) -> Result | Diagra
     known = {"points": points, "volumes": volumes, "neighbors": neighbors, "vertices": x}
     known |= {**faces, **across}
     # The other arrays follow from the corners.
-    diagram = Diagram(domain, {**known, **rebuild(Diagram(domain, known))})
+    rest = rebuild_on_sphere if isinstance(domain, Sphere) else rebuild
+    diagram = Diagram(domain, {**known, **rest(Diagram(domain, known))})
     check_repeated(arrays, diagram)
     of_run = [f"CellData.{name}" for name in ("size", "error", "quality")]
     if not set(of_run) & set(arrays):
@@ -251,6 +259,8 @@ def _assemble(arrays: dict[str, np.ndarray], reader: _Reader) -> Result | Diagra
 
 def _domain(arrays: dict[str, np.ndarray], x: np.ndarray, reader: _Reader) -> Domain:
     """Return the domain in the file, or else the bounding box of the vertices."""
+    if "FieldData.sphere_radius" in arrays:
+        return _sphere(arrays, x, reader)
     lower, upper, dim = x.min(axis=0), x.max(axis=0), x.shape[1]
     if not (lower < upper).all():
         raise _FileError("its vertices lie on a line")
@@ -258,6 +268,25 @@ def _domain(arrays: dict[str, np.ndarray], x: np.ndarray, reader: _Reader) -> Do
         return _periodic_box(arrays, dim, reader.names)
     polygon = _polygon(arrays, reader) if dim == 2 else None
     return polygon or Box(tuple(lower), tuple(upper), names=reader.names)
+
+
+def _sphere(arrays: dict[str, np.ndarray], x: np.ndarray, reader: _Reader) -> Sphere:
+    """Return the sphere in the file, or the part of it, on which all vertices and generators must be."""
+    radius = arrays["FieldData.sphere_radius"]
+    if radius.shape != (1,) or radius.dtype.kind != "f":
+        raise _FileError(f"sphere_radius has shape {radius.shape} and dtype {radius.dtype}")
+    sphere = Sphere(float(radius[0]))
+    for name, places in (("vertices", x), ("generators", arrays["CellData.generator"])):
+        if not (np.abs(np.linalg.norm(places, axis=1) / sphere.radius - 1) < _OFF_SPHERE).all():
+            raise _FileError(f"its {name} are not on the {sphere}")
+    if "FieldData.region_beyond" not in arrays:
+        return sphere
+    within, beyond, area = (arrays[f"FieldData.region_{k}"] for k in ("within", "beyond", "area"))
+    if area.shape != (1,):
+        raise _FileError(f"region_area has shape {area.shape}")
+    return SphereRegion(
+        sphere.radius, within=within, beyond=beyond, area=float(area[0]), names=reader.names
+    )
 
 
 def _cell_polygons(arrays: dict[str, np.ndarray], v: int, domain: Domain) -> dict[str, np.ndarray]:
@@ -413,6 +442,13 @@ def _neighbors(
     alone = np.flatnonzero(result < 0)
     sums = np.stack([np.bincount(face, column, len(sides)) for column in x[corners].T], axis=1)
     middle = sums[alone] / sides[alone][:, None]
+    if isinstance(domain, SphereRegion):  # the wall is that of the removed cell across the face
+        result[alone] = -1 - KDTree(domain.beyond).query(middle)[1]
+        return result
+    if isinstance(domain, Sphere):
+        if len(alone):
+            raise _FileError(f"cell {owner[alone[0]]} has a face that is no other cell's")
+        return result
     if isinstance(domain, Polygon):
         result[alone] = -1 - domain.nearest_edge(middle)[0]
         return result
