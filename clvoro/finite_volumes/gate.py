@@ -2,121 +2,53 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from ..arguments import check_choice
-from ..mesh.check.findings import Verdict
+from ..errors import InputError
+from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
+from .criteria import Criterion, Rows, SolverReport
 from .measures import SolverMeasures
+from .mpas_gate import mpas_criteria
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh, WallShape, make_solver_mesh
 
-Solver = Literal["openfoam"]
+Solver = Literal["openfoam", "mpas"]
 """Solvers whose criteria are known."""
 _LEAST = 1e-300
 """OpenFOAM's VSMALL: least area of a face and volume of a cell."""
 
 
-@dataclass(frozen=True)
-class Criterion:
-    """One criterion of a solver.
-
-    Attributes
-    ----------
-    name : str
-    value : float
-        The worst value in the mesh.
-    limit : float
-    above : bool
-        Whether the solver complains of values above the limit; else of those below.
-    demanded : bool
-        Whether the solver rejects a mesh that fails. It only warns of the others.
-    count : int
-        Number of faces or cells that fail.
-    cell : int or None
-        The cell with the worst value, or one of the two cells of the face.
-    place : tuple of float or None
-        Centroid of that cell, or center of the face.
-    """
-
-    name: str
-    value: float
-    limit: float
-    above: bool
-    demanded: bool
-    count: int
-    cell: int | None = None
-    place: tuple[float, ...] | None = None
-
-    @property
-    def ok(self) -> bool:
-        """Whether no face or cell fails."""
-        return self.count == 0
-
-    def __str__(self) -> str:
-        verdict = (
-            "ok" if self.ok else f"{self.count} fail" if self.demanded else f"{self.count} warn"
-        )
-        limit = f"{'<=' if self.above else '>='} {self.limit:.4g}"
-        where = ""
-        if self.place is not None:
-            where = f"cell {self.cell} at ({', '.join(f'{x:.6g}' for x in self.place)})"
-        return f"{self.name:28}{self.value:>12.5g}  {limit:<12}{verdict:<12}{where}".rstrip()
-
-
-@dataclass(frozen=True)
-class SolverReport(Verdict):
-    """The verdict on a mesh; it is true if the solver accepts it.
-
-    Attributes
-    ----------
-    solver : str
-    criteria : tuple of Criterion
-    cells, faces : int
-    area_change : float
-        Volume (2D: area) of the mesh that the solver gets minus that of the domain, over that of the domain.
-    """
-
-    solver: str
-    criteria: tuple[Criterion, ...]
-    cells: int
-    faces: int
-    area_change: float
-
-    @property
-    def ok(self) -> bool:
-        """Whether the solver accepts the mesh."""
-        return all(c.ok for c in self.criteria if c.demanded)
-
-    def __getitem__(self, name: str) -> Criterion:
-        """Return a criterion by its name."""
-        return next(c for c in self.criteria if c.name == name)
-
-    def __str__(self) -> str:
-        failed = [c.name for c in self.criteria if c.demanded and not c.ok]
-        verdict = "accepted" if self.ok else f"rejected: {', '.join(failed)}"
-        changed = ""
-        if self.area_change:
-            changed = f"; straight walls change the area by {self.area_change:+.2g} of the domain"
-        head = f"{self.solver}: {verdict}; {self.cells} cells, {self.faces} faces{changed}"
-        columns = f"{'criterion':28}{'worst':>12}  {'limit':<12}{'verdict':<12}where"
-        return "\n  ".join([head, columns, *map(str, self.criteria)])
-
-
 def check_for_solver(
-    diagram: Diagram, solver: Solver = "openfoam", walls: WallShape = "straight"
+    diagram: Diagram, solver: Solver = "openfoam", walls: WallShape | None = None
 ) -> SolverReport:
     """Check `diagram`, as it is written for a solver, by that solver's criteria; see `Diagram.check`.
 
     Raises
     ------
     InputError
-        If the solver is not known, or `walls` is neither "straight" nor "exact".
+        If the solver is not known or has no meshes of such a domain, or `walls` is neither "straight" nor "exact", or
+        given for "mpas".
     """
-    check_choice("solver", solver, ("openfoam",))
+    check_choice("solver", solver, ("openfoam", "mpas"))
+    if solver == "mpas":
+        if walls is not None:
+            raise InputError(
+                f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out"
+            )
+        faces, domain, made = int(diagram.faces.owner.size), diagram.domain, mpas_criteria(diagram)
+        if isinstance(domain, Sphere):
+            made = [criterion.on_sphere(domain) for criterion in made]
+        return SolverReport(solver, tuple(made), len(diagram), faces, 0.0)
+    if isinstance(diagram.domain, Sphere):
+        raise InputError(
+            f"solver is 'openfoam', whose meshes are polyhedra, and the mesh is on {diagram.domain}; use "
+            "solver='mpas' for meshes on a sphere"
+        )
+    walls = "straight" if walls is None else walls
     mesh = make_solver_mesh(diagram, walls, walls == "straight")
     return SolverReport(
         solver, tuple(_openfoam(mesh)), len(mesh), len(mesh.owner), mesh.area_change
@@ -144,8 +76,8 @@ def _openfoam(mesh: SolverMesh) -> list[Criterion]:
     g, owner = m.geometry, m.cells.owner
     coupled = m.coupled
     angle = m.non_orthogonality
-    cells, faces = _Rows(g.centroids, None, mesh.dim), _Rows(g.centers, owner, mesh.dim)
-    between = _Rows(g.centers[coupled], owner[coupled], mesh.dim)
+    cells, faces = Rows(g.centroids, None, mesh.dim), Rows(g.centers, owner, mesh.dim)
+    between = Rows(g.centers[coupled], owner[coupled], mesh.dim)
     corners = m.cells.points[m.cells.corners]
     span = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     edges = m.edges
@@ -166,7 +98,7 @@ def _openfoam(mesh: SolverMesh) -> list[Criterion]:
         faces("face pyramids", m.pyramids, -1e-15, above=False),
         faces("skewness", m.skewness, 4),
         faces("face tetrahedra", m.bad_tetrahedra, 0),
-        _Rows(ends, _cells_of_edges(m), mesh.dim)(
+        Rows(ends, _cells_of_edges(m), mesh.dim)(
             "edge length over size", m.edge_spans / span, 1e-6, above=False, demanded=False
         ),
         faces("flatness", m.flatness, 0.8, above=False, demanded=False),
@@ -177,42 +109,6 @@ def _openfoam(mesh: SolverMesh) -> list[Criterion]:
     ]
     regions = _regions(mesh)
     return [*made, Criterion("regions", regions, 1, True, False, regions - 1)]
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Places, (k, 3), with their cells, (k,) or None for the cells themselves."""
-
-    places: np.ndarray
-    cells: np.ndarray | None
-    dim: int
-
-    def __call__(
-        self,
-        name: str,
-        values: np.ndarray,
-        limit: float,
-        *,
-        above: bool = True,
-        demanded: bool = True,
-        strict: bool = True,
-        failing: np.ndarray | None = None,
-    ) -> Criterion:
-        """Return a criterion: the worst of `values` (k,), the limit, and the cell with the worst one."""
-        if not len(values):
-            return Criterion(name, 0.0 if above else np.inf, limit, above, demanded, 0)
-        bad = failing
-        if bad is None:
-            bad = values > limit if above else values < limit
-            bad = bad if strict else values >= limit
-        worst = int(np.argmax(values) if above else np.argmin(values))
-        if bad.any() and not bad[worst]:
-            worst = int(np.flatnonzero(bad)[0])
-        cell = worst if self.cells is None else int(self.cells[worst])
-        place = tuple(self.places[worst, : self.dim].tolist())
-        return Criterion(
-            name, float(values[worst]), limit, above, demanded, int(bad.sum()), cell, place
-        )
 
 
 def _cells_of_edges(m: SolverMeasures) -> np.ndarray:

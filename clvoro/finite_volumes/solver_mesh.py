@@ -9,9 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 from ..arguments import check_choice, warn
-from ..errors import MismatchWarning
+from ..errors import InputError, MismatchWarning
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
+from ..geometry.sphere import Sphere
 from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import Sealed
@@ -171,6 +172,11 @@ def make_solver_mesh(
     from .straight_walls import straight_walls
 
     check_choice("walls", walls, ("straight", "exact"))
+    check_not_sphere(
+        diagram,
+        "meshes for solvers have cells in the plane or polyhedra",
+        "use the diagram itself, as diagram.faces, or a file with walls='exact'",
+    )
     faces, twin, shift = faces_with_seams(diagram)
     mesh = SolverMesh(
         domain=diagram.domain,
@@ -202,6 +208,20 @@ def make_solver_mesh(
             MismatchWarning,
         )
     return mesh
+
+
+def check_not_sphere(diagram: Diagram, why: str, instead: str) -> None:
+    """Refuse a diagram on a sphere.
+
+    Raises
+    ------
+    InputError
+        Says `why`, and what to do `instead`.
+    """
+    if isinstance(diagram.domain, Sphere):
+        raise InputError(
+            f"{why}, and the cells on {diagram.domain} are pieces of a curved surface; {instead}"
+        )
 
 
 def compact(mesh: SolverMesh) -> SolverMesh:

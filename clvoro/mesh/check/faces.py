@@ -5,13 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ...geometry.boundary import wall_planes
 from ...geometry.polygon import Polygon
+from ...geometry.sphere import Sphere
 from ..connectivity import face_ends, face_keys, take_rows
 from .findings import ROUNDINGS
 
 if TYPE_CHECKING:
+    from ..diagram import Diagram
     from .findings import Check
     from .rebuilt import Doubts, Rebuilt
 
@@ -27,7 +31,7 @@ def check_corners(check: Check) -> None:
         return
     inner = np.flatnonzero((d.neighbors >= 0) & ~d.shifts.any(axis=1))
     here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
-    if d.domain.dim == 2:
+    if d.domain.cell_dim == 2:
         ends = face_ends(d)
         wrong = (ends[here] != ends[there][:, ::-1]).any(axis=1)
     else:
@@ -45,14 +49,39 @@ def check_corners(check: Check) -> None:
         "vertices once", wrong,
         lambda k: f"the face of cells {owner[here[k]]} and {owner[there[k]]} has other vertices from either side",
     )  # fmt: skip
-    if d.domain.dim == 2 and not any(d.domain.periodic):
-        # For a rectangle; across seams a vertex has several numbers.
+    if d.domain.cell_dim == 2 and not any(d.domain.periodic):
+        # Across seams a vertex has several numbers.
+        expected = _euler_characteristic(d)
         v, e = len(d.vertices), len(d.neighbors) - len(inner) // 2
         check.note(
-            "Euler's formula", np.array([v - e + len(d) != 1]),
-            lambda _: f"{v} vertices - {e} faces + {len(d)} cells is {v - e + len(d)}, expected 1: faces cross, or "
-            "two vertices have one number",
+            "Euler's formula", np.array([expected is not None and v - e + len(d) != expected]),
+            lambda _: f"{v} vertices - {e} faces + {len(d)} cells is {v - e + len(d)}, expected {expected}: faces "
+            "cross, or two vertices have one number",
         )  # fmt: skip
+
+
+def _euler_characteristic(d: Diagram) -> int | None:
+    """Return vertices - faces + cells of a mesh without gaps; None where parts of a boundary touch in a vertex.
+
+    It is 2 for each connected part of a sphere, less one for each of its boundaries, as that of a rectangle.
+    """
+    if not isinstance(d.domain, Sphere):
+        return 1
+    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
+    walls = d.neighbors < 0
+    ends = face_ends(d)[walls]
+    if len(np.unique(ends[:, 0])) < len(ends):
+        return None
+    parts = _count_components(len(d), owner[~walls], d.neighbors[~walls])
+    # All other vertices are parts of their own.
+    others = len(d.vertices) - len(np.unique(ends))
+    return 2 * parts - (_count_components(len(d.vertices), *ends.T) - others)
+
+
+def _count_components(n: int, i: np.ndarray, j: np.ndarray) -> int:
+    """Return the number of connected components of a graph with n nodes and the edges i to j."""
+    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(n, n))
+    return int(connected_components(graph, directed=False)[0])
 
 
 def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:

@@ -15,16 +15,18 @@ from scipy.spatial import KDTree
 
 from ...geometry.boundary import boundary_measure, wall_distance
 from ...geometry.polygon import Polygon
+from ...geometry.sphere import Sphere
 from ..connectivity import face_keys
 from .faces import check_corners, check_measures
 from .findings import ROUNDINGS, Check, Report, StopError
 from .polygon import check_cells, check_edges, check_outlines, hidden
-from .rebuilt import Doubts, Rebuilt
+from .sphere import check_generators, check_places, rebuild_cells
 from .values import check_values
 
 if TYPE_CHECKING:
     from ..diagram import Diagram
     from ..results import Result
+    from .rebuilt import Doubts, Rebuilt
 
 
 def check_diagram(diagram: Diagram) -> Report:
@@ -48,7 +50,7 @@ def _finish(
         # Wrong numbers may cause divisions by 0; they become findings.
         with np.errstate(all="ignore"):
             _check_structure(check)
-            geometry = Rebuilt(diagram, dtype)
+            geometry = rebuild_cells(diagram, dtype)
             _check_geometry(check, geometry)
             if more is not None:
                 more(geometry)
@@ -75,7 +77,7 @@ def _check_structure(check: Check) -> None:
     check.shape("face_centroids", d.face_centroids, (m, dim))
     check.shape("vertices", d.vertices, (len(d.vertices), dim))
     _check_starts(check, "neighbor_starts", d.neighbor_starts, m)
-    if dim == 2:
+    if d.domain.cell_dim == 2:
         check.shape("cell_vertex_starts", d.cell_vertex_starts, (n + 1,), "iu")
         _check_starts(check, "cell_vertex_starts", d.cell_vertex_starts, len(d.cell_vertices))
         corners = d.cell_vertices
@@ -180,20 +182,14 @@ def _check_starts(check: Check, name: str, starts: np.ndarray, total: int) -> No
 def _check_geometry(check: Check, g: Rebuilt) -> None:
     """Check positions, volumes and faces against the rebuilt cells `g`."""
     d = check.diagram
-    n, dim, domain = len(d), d.domain.dim, d.domain
+    n, domain = len(d), d.domain
+    spherical = isinstance(domain, Sphere)
     slack = ROUNDINGS * g.unit
     doubts = g.doubts(slack)
-    check.note(
-        "generators inside", ~domain.contains(d.points) | (domain.wrap(d.points) != d.points).any(axis=1),
-        lambda i: f"generator {i} at {d.points[i]} lies outside {domain}",
-    )  # fmt: skip
-    outside = np.flatnonzero(~domain.contains(d.vertices))
-    if isinstance(domain, Polygon):  # vertices on oblique edges have round-off
-        outside = outside[domain.boundary_distance(d.vertices[outside]) > slack]
-    check.note(
-        "vertices inside", np.ones(len(outside)),
-        lambda k: f"vertex {outside[k]} at {d.vertices[outside[k]]} lies outside {domain}",
-    )  # fmt: skip
+    if spherical:
+        check_places(check, g)
+    else:
+        _check_inside(check, slack)
     check.note(
         "volumes", ~(d.volumes > 0), lambda i: f"volumes[{i}] is {d.volumes[i]}, expected > 0"
     )
@@ -201,19 +197,23 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         "orientation", ~(g.volumes >= -slack * (g.perimeters + slack)),
         lambda i: f"the corners of cell {i} go around clockwise (volume {g.volumes[i]:.4g})",
     )  # fmt: skip
-    excess = np.abs(d.volumes - g.volumes) - doubts.volumes - slack**dim
+    excess = np.abs(d.volumes - g.volumes) - doubts.volumes - slack**domain.cell_dim
     check.note(
         "volumes", np.maximum(excess, 0),
         lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, its corners give {g.volumes[i]:.17g}",
     )  # fmt: skip
     total = float(d.volumes.sum())
-    allowed = slack * (g.perimeters.sum() / np.sqrt(n) + boundary_measure(domain))
+    border = 0.0 if spherical else boundary_measure(domain)
+    allowed = slack * (g.perimeters.sum() / np.sqrt(n) + border)
     check.note(
         "volumes sum", np.array([abs(total - domain.measure) > allowed]),
         lambda _: f"the volumes' sum is {total:.17g}, expected the domain's {domain.measure:.17g}",
     )  # fmt: skip
     _check_faces(check, g, slack, doubts)
-    check_measures(check, g, doubts)
+    if spherical:
+        check_generators(check, g)
+    else:
+        check_measures(check, g, doubts)
     off = np.linalg.norm(d.centroids - d.points - g.centroids, axis=1)
     # The error of a centroid is relative to the volume.
     doubt = slack + doubts.volumes * g.reach / np.maximum(g.volumes, 1e-300)
@@ -228,10 +228,27 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
     _check_nearest(check, g, slack)
 
 
+def _check_inside(check: Check, slack: float) -> None:
+    """Check that generators and vertices lie in the domain."""
+    d, domain = check.diagram, check.diagram.domain
+    check.note(
+        "generators inside", ~domain.contains(d.points) | (domain.wrap(d.points) != d.points).any(axis=1),
+        lambda i: f"generator {i} at {d.points[i]} lies outside {domain}",
+    )  # fmt: skip
+    outside = np.flatnonzero(~domain.contains(d.vertices))
+    if isinstance(domain, Polygon):  # vertices on oblique edges have round-off
+        outside = outside[domain.boundary_distance(d.vertices[outside]) > slack]
+    check.note(
+        "vertices inside", np.ones(len(outside)),
+        lambda k: f"vertex {outside[k]} at {d.vertices[outside[k]]} lies outside {domain}",
+    )  # fmt: skip
+
+
 def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None:
     """Check faces: closed around each cell, right measures, outward, on their walls, equal on both sides."""
-    _check_closed(check, g, slack)
     d, width = check.diagram, doubts.measures
+    if not isinstance(d.domain, Sphere):
+        _check_closed(check, g, slack)
     wrong = np.abs(d.face_measures - g.measures) - width
     check.note(
         "face measures", np.maximum(wrong, 0),
@@ -240,7 +257,8 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
     )  # fmt: skip
     middle = d.face_centroids - d.points[g.owner]
     off = np.linalg.norm(middle - g.middles, axis=1)
-    if d.domain.dim == 3:  # the centroid of a needle is uncertain along it: compare first moments
+    if d.domain.cell_dim == 3:
+        # The centroid of a needle is uncertain along it: compare first moments.
         off = np.minimum(off, off * g.measures / np.maximum(g.reach[g.owner], 1e-150) ** 2)
     check.note(
         "face centroids", np.maximum(off - 4 * doubts.middles, 0),
@@ -299,13 +317,15 @@ def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> N
         "faces outward", np.maximum(inward - width, 0),
         lambda f: f"face {f} of cell {g.owner[f]} does not look towards {d.neighbors[f]}",
     )  # fmt: skip
-    middles = g.middles[walls] + d.points[g.owner[walls]]
-    height = wall_distance(d.domain, -1 - d.neighbors[walls], middles)
-    height[g.measures[walls] == 0] = 0  # a face without measure has no place
-    check.note(
-        "walls", np.maximum(height - slack, 0),
-        lambda k: f"face {walls[k]} of cell {g.owner[walls[k]]} is off its wall by {height[k]:.3g}",
-    )  # fmt: skip
+    if len(walls) and not isinstance(d.domain, Sphere):
+        # Faces towards removed cells are on bisectors; see `check_generators`.
+        middles = g.middles[walls] + d.points[g.owner[walls]]
+        height = wall_distance(d.domain, -1 - d.neighbors[walls], middles)
+        height[g.measures[walls] == 0] = 0  # a face without measure has no place
+        check.note(
+            "walls", np.maximum(height - slack, 0),
+            lambda k: f"face {walls[k]} of cell {g.owner[walls[k]]} is off its wall by {height[k]:.3g}",
+        )  # fmt: skip
     here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
     off = np.abs(d.face_measures[here] - d.face_measures[there])
     wide = np.maximum(width[here], width[there])
@@ -317,15 +337,19 @@ def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> N
 
 
 def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
-    """Check the property of a Voronoi diagram: no generator is nearer to a corner of a cell than the cell's own."""
+    """Check the property of a Voronoi diagram: no generator is nearer to a corner of a cell than the cell's own.
+
+    Generators whose cells meet in a vertex then have the same distance from it. On a sphere distances are arcs.
+    """
     d = check.diagram
     corners = d.vertices[g.corners]
-    own = np.linalg.norm(corners - d.points[g.cells], axis=1)
+    lengths = d.domain.arcs if isinstance(d.domain, Sphere) else np.asarray
+    own = lengths(np.linalg.norm(corners - d.points[g.cells], axis=1))
     # The tree takes a period of 0 for an axis that is not periodic.
     lower, periods = np.array(d.domain.lower), np.where(d.domain.periodic, d.domain.extent, 0.0)
     last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
     tree = KDTree(np.minimum(d.points - lower, last), boxsize=periods)
-    nearest = tree.query(d.vertices - lower)[0][g.corners]
+    nearest = lengths(tree.query(d.vertices - lower)[0][g.corners])
     excess = np.maximum(own - nearest - slack, 0)
     if isinstance(d.domain, Polygon):
         excess[hidden(d, d.domain, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0

@@ -71,7 +71,7 @@ class Rebuilt:
 
     def __init__(self, d: Diagram, dtype: object = None) -> None:
         dim, n = d.domain.dim, len(d)
-        self.real = _precision(d, dtype)
+        self.real = find_precision(d, dtype)
         far = max(map(abs, (*d.domain.lower, *d.domain.upper)))
         size = float(np.linalg.norm(d.domain.extent))
         # The host adds the origin in float64.
@@ -278,22 +278,28 @@ def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return across / distance[:, None], spacing
 
 
-def _precision(d: Diagram, dtype: object) -> np.dtype:
+def find_precision(d: Diagram, dtype: object = None) -> np.dtype:
     """Return the precision in which `d` was computed; if `dtype` is ``"float64"``, it is not float32.
 
-    In float32, volumes and generators or lengths are float32 numbers in the device's unit, which is a power of two.
+    In float32, volumes and generators or lengths are float32 numbers in the device's unit. The unit is a power of two,
+    or the radius of a sphere, with which products are rounded.
     """
     origin, scale = d.domain.frame
-    volumes = d.volumes / scale**d.domain.dim
+    cell_dim = d.domain.cell_dim
+    volumes = d.volumes / scale**cell_dim
     points = (d.points - origin) / scale
-    lengths = getattr(d, "face_measures", points) / scale ** (d.domain.dim - 1)
+    lengths = getattr(d, "face_measures", points) / scale ** (cell_dim - 1)
     # Adding and subtracting the origin has round-off. Some generators were moved onto a wall or into a polygon on the
     # host: if a quarter are float32 numbers, all were.
-    noise = 4 * np.finfo(float).eps * np.maximum(np.abs(np.array(origin)) / scale, 1)
+    fine = np.finfo(float).eps
+    rounded = 0.0 if np.frexp(scale)[0] == 0.5 else 4 * fine
+    noise = 4 * fine * np.maximum(np.abs(np.array(origin)) / scale, 1)
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(points - points.astype(np.float32))
-        single = bool((volumes == volumes.astype(np.float32)).all())
-        short = bool((lengths == lengths.astype(np.float32)).all())
+        single, short = (
+            bool((np.abs(x - x.astype(np.float32)) <= rounded * np.abs(x)).all())
+            for x in (volumes, lengths)
+        )
     single &= (short or bool((off <= noise).mean() >= 0.25)) and dtype != "float64"
     return np.dtype(np.float32 if single else np.float64)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...geometry.polygon import Polygon
+from ...geometry.sphere import Sphere
 from ..straightening import straighten
 from .findings import ROUNDINGS
 from .history import check_history
@@ -21,10 +22,10 @@ if TYPE_CHECKING:
 def check_values(check: Check, result: Result, g: Rebuilt) -> None:
     """Check sizes, errors, quality and history of a result, given its checked diagram."""
     d = result.diagram
-    n, dim = len(d), d.domain.dim
+    n, dim = len(d), d.domain.cell_dim
     for name in ("target_size", "size_error", "quality"):
         check.shape(name, getattr(result, name), (n,))
-    check.shape("points", result.points, (n, dim))
+    check.shape("points", result.points, (n, d.domain.dim))
     h, e, q = result.target_size, result.size_error, result.quality
     check.note(
         "points", (result.points != d.points).any(axis=1),
@@ -39,7 +40,9 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         error = (length - h) / np.minimum(length, h)
         counts = np.diff(d.neighbor_starts)
         perimeter = np.bincount(np.repeat(np.arange(n), counts), d.face_measures, minlength=n)
-        if dim == 2:
+        if isinstance(d.domain, Sphere):
+            quality = 4 * counts * np.tan(np.pi / counts) * d.volumes / perimeter**2
+        elif dim == 2:
             quality = straighten(d, g.real).quality()
         else:
             quality = 36 * np.pi * d.volumes**2 / perimeter**3
