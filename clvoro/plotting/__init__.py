@@ -12,6 +12,7 @@ except ModuleNotFoundError as error:
 from .boundary import plot_boundaries
 from .cells import plot_cells, plot_size
 from .curves import plot_displacements, plot_history
+from .globe import plot_globe
 from .page import write_report
 from .solids import plot_cutaway, plot_distributions, plot_mesh, plot_slice, plot_slices
 
@@ -21,6 +22,7 @@ __all__ = [
     "plot_cutaway",
     "plot_displacements",
     "plot_distributions",
+    "plot_globe",
     "plot_history",
     "plot_mesh",
     "plot_size",

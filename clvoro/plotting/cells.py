@@ -164,14 +164,18 @@ def edge_style(ax: Any, lengths: np.ndarray, extent: np.ndarray) -> tuple[np.nda
 
     `extent` is the width and height of the shown part. Edges of very small cells get no width.
     """
-    box = ax.get_position()
-    width, height = ax.figure.get_size_inches() * (box.width, box.height) * 72
-    points_per_unit = min(width / extent[0], height / extent[1])
-    widths = np.clip(0.045 * points_per_unit * lengths, 0.0, 0.7)
+    widths = np.clip(0.045 * points_per_unit(ax, extent) * lengths, 0.0, 0.7)
     # The thinnest lines fade out: a sudden end of all lines would look like a feature of the mesh.
     colors = np.full((len(widths), 4), 0.1)
     colors[:, 3] = np.clip((widths - 0.06) / 0.14, 0, 1)
     return widths, colors
+
+
+def points_per_unit(ax: Any, extent: np.ndarray) -> float:
+    """Return the scale of a picture that shows a part of this width and height, points per unit of length."""
+    box = ax.get_position()
+    width, height = ax.figure.get_size_inches() * (box.width, box.height) * 72
+    return float(min(width / extent[0], height / extent[1]))
 
 
 def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = None) -> Any:

@@ -172,7 +172,7 @@ class DiagramPicture:
 
     def __init__(self, diagram: Diagram) -> None:
         self.diagram, self.points = diagram, diagram.points
-        self.target_size = diagram.volumes ** (1 / diagram.domain.dim)
+        self.target_size = diagram.volumes ** (1 / diagram.domain.cell_dim)
 
     @property
     def measures(self) -> Measures:
@@ -209,7 +209,7 @@ def coloring_of(mesh: Result, color: Color | ArrayLike, label: str | None = None
     InputError, InputTypeError
         If there is no such color, or the array has another shape or no real numbers.
     """
-    dim = mesh.diagram.domain.dim
+    dim = mesh.diagram.domain.cell_dim
     if isinstance(color, str):
         if isinstance(mesh, DiagramPicture) and color in _OF_RUNS:
             others = [name for name in COLORINGS if name not in _OF_RUNS]
@@ -241,7 +241,7 @@ def coloring(name: str, dim: int = 2) -> Coloring:
 
 def shared_limits(results: Sequence[Result], color: str) -> tuple[float, float]:
     """Return one scale for the cells of all `results`."""
-    scheme = coloring(color, results[0].diagram.domain.dim)
+    scheme = coloring(color, results[0].diagram.domain.cell_dim)
     return scheme.limits(np.concatenate([scheme.values(r) for r in results]))
 
 

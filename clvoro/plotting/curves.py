@@ -103,10 +103,12 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
     Raises
     ------
     InputError
-        For a 3D mesh.
+        For a mesh in 3D or on a sphere.
     """
     if result.diagram.domain.dim != 2:
-        raise InputError("displacements are drawn in 2D, and this mesh is in 3D; plot its history")
+        raise InputError(
+            "displacements are drawn in the plane, and this mesh is in 3D or on a sphere; plot its history"
+        )
     rows = [(n, d) for n, d in (("first", result.initial), ("last", result.final)) if d is not None]
     if not rows:
         return None

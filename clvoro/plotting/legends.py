@@ -73,7 +73,11 @@ def add_color_bar(
     else:
         bar.locator = _RoundSteps()
     if scheme.logarithmic:
-        bar.formatter = FuncFormatter(lambda t, _: short(t))
+        # Where the ends are close, two digits would be the same at all ticks.
+        digits = (
+            2 if high > 2 * low else 2 + int(np.ceil(np.log10(high / max(high - low, 1e-9 * high))))
+        )
+        bar.formatter = FuncFormatter(lambda t, _: short(t, digits))
     bar.update_ticks()
 
 
@@ -96,9 +100,9 @@ def _height(ax: Any) -> float:
     return float(min(0.8 * width * (top - bottom) / (right - left), 0.9 * height))
 
 
-def short(value: float) -> str:
-    """Format a number with two significant digits, with an exponent only for very small or large numbers."""
-    text = f"{value:.2g}"
+def short(value: float, digits: int = 2) -> str:
+    """Format a number with few significant digits, with an exponent only for very small or large numbers."""
+    text = f"{value:.{digits}g}"
     if 1e-4 <= abs(value) < 1e6:
         text = np.format_float_positional(float(text), trim="-")
     return text.replace("-", "−")

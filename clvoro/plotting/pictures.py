@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ..geometry.sphere import Sphere
 from ..mesh.results import Result
 from . import cells as draw
 from .colors import coloring, shared_limits
 from .curves import displacements_height, plot_displacements, plot_history
+from .globe import default_center, plot_globe
 from .legends import add_color_bar
 from .slices import focus, new_slices, plot_slice
 from .solids import cutaway_height, plot_cutaway, plot_distributions
@@ -50,6 +52,8 @@ def pictures_of(
         lambda: plot_history(results, new_figure(WIDTH, 3.1)),
     )
     panels = {**({"initial": initial} if initial is not None else {}), **results}
+    if isinstance(main.diagram.domain, Sphere):
+        return _globe_pictures(panels, history)
     if main.diagram.domain.dim != 2:
         return _solid_pictures(panels, history)
     pictures: list[Picture] = [
@@ -118,6 +122,57 @@ def _solid_pictures(panels: Mapping[str, Result], history: Picture) -> list[Pict
             ("closer", f"Where the cells are smallest ({name}).", lambda: _closer_slice(main))
         )
     return pictures
+
+
+def _globe_pictures(panels: Mapping[str, Result], history: Picture) -> list[Picture]:
+    """Return the pictures of meshes on a sphere: the globe, longitudes and latitudes, and a closer view."""
+    name, main = list(panels.items())[-1]
+
+    def globe(color: str, **options: Any) -> Callable[[], Any]:
+        return lambda: _globe(main, color, **options)
+
+    pictures: list[Picture] = [
+        ("size", "Target size h, where cells are smallest.", globe("size", edges=False)),
+        (
+            "plate",
+            "Target size h against longitude and latitude.",
+            globe("size", projection="plate", edges=False),
+        ),
+        ("cells", f"The mesh ({name}), colored by metric error.", globe("error")),
+    ]
+    if len(panels) == 1:
+        caption = f"The mesh ({name}), colored by cell quality; 1 is a regular polygon."
+        pictures.append(("quality", caption, globe("quality")))
+    else:
+        pictures += _comparisons(panels)
+    pictures += [history, ("sides", f"Cells by number of sides ({name}).", globe("sides"))]
+    if len(main.points) > 3000:
+        pictures.append(
+            ("closer", f"Where the cells are smallest ({name}).", lambda: _closer_globe(main))
+        )
+    return pictures
+
+
+def _globe(result: Result, color: str, **options: Any) -> Any:
+    """Draw one large picture of the whole sphere."""
+    flat = options.get("projection") == "plate"
+    legend = bool(coloring(color).classes)
+    extent = (360, 180) if flat else (2, 2)
+    with styled():
+        figure = new_figure(WIDTH, single_height((0, 0), extent, legend))
+        return plot_globe(result, color, figure.add_subplot(), **options)
+
+
+def _closer_globe(result: Result) -> Any:
+    """Draw two parts around the region with the smallest cells, the second four times closer."""
+    smallest = float(np.quantile(result.target_size, 0.01))
+    radius = float(np.linalg.norm(result.points[0]))
+
+    def draw_part(ax: Any, across: int, limits: tuple[float, float]) -> None:
+        angle = min(float(np.degrees(across * smallest / radius)), 90.0)
+        plot_globe(result, "quality", ax, across=angle, limits=limits, key=False)
+
+    return _two_closer(result, draw_part)
 
 
 def _cutaway(result: Result) -> Any:
@@ -205,12 +260,15 @@ def _grid(panels: Mapping[str, Result], color: str) -> Any:
     """Draw the meshes side by side with one scale."""
     results = list(panels.values())
     box = results[0].diagram.domain
-    scheme, limits = coloring(color, box.dim), shared_limits(results, color)
+    scheme, limits = coloring(color, box.cell_dim), shared_limits(results, color)
     if color == "error":  # a larger limit would hide small errors
         limits = (max(limits[0], -1.0), min(limits[1], 1.0))
     plot: Callable[..., Any] = draw.plot_cells
     lower, upper = np.array(box.lower), np.array(box.upper)
-    if box.dim == 3:
+    if isinstance(box, Sphere):
+        plot = partial(plot_globe, center=default_center(results[-1]))
+        lower, upper = lower[:2], upper[:2]
+    elif box.dim == 3:
         normal = _largest_section(results[-1])
         plot = partial(plot_slice, normal="xyz"[normal], through=focus(results[-1]))
         lower, upper = (np.delete(corner, normal) for corner in (lower, upper))
@@ -227,27 +285,39 @@ def _grid(panels: Mapping[str, Result], color: str) -> Any:
         for ax in axes[len(results) :]:
             ax.set_axis_off()
         values = np.concatenate([scheme.values(r) for r in results])
-        collection = next(c for c in axes[0].collections if c.get_array() is not None)
-        add_color_bar(
-            collection, axes, scheme, values, limits, location="bottom", shrink=0.6, aspect=45
-        )
+        drawn = (*axes[0].collections, *axes[0].images)
+        cells = next(c for c in drawn if c.get_array() is not None)
+        add_color_bar(cells, axes, scheme, values, limits, location="bottom", shrink=0.6, aspect=45)
     return figure
 
 
 def _closer(result: Result) -> Any:
     """Draw two windows around the smallest cells, the second four times closer."""
+
+    def draw_part(ax: Any, across: int, limits: tuple[float, float]) -> None:
+        window = window_around_smallest(result, across)
+        draw.plot_cells(result, "quality", ax, limits=limits, window=window, key=False)
+        ax.locator_params(nbins=4)
+
+    return _two_closer(result, draw_part, 0.8)
+
+
+def _two_closer(
+    result: Result, draw_part: Callable[[Any, int, tuple[float, float]], None], ratio: float = 1.0
+) -> Any:
+    """Draw two closer views, colored by quality; `ratio` is that of height and width."""
     with styled():
-        figure = new_figure(WIDTH, WIDTH / 2 * 0.8 + 0.75)
+        figure = new_figure(WIDTH, WIDTH / 2 * ratio + 0.75)
         axes = figure.subplots(1, 2)
         limits = shared_limits([result], "quality")
         for ax, across in zip(axes, (160, 40), strict=True):
-            lower, upper = window_around_smallest(result, across)
-            draw.plot_cells(result, "quality", ax, limits=limits, window=(lower, upper), key=False)
-            ax.locator_params(nbins=4)
+            draw_part(ax, across, limits)
             ax.set_title(f"{across} $h_\\mathrm{{min}}$ across, where $h$ is smallest")
         scheme = coloring("quality")
+        cells = next(
+            c for c in (*axes[1].collections, *axes[1].images) if c.get_array() is not None
+        )
         add_color_bar(
-            axes[0].collections[0], axes, scheme, result.quality, limits,
-            location="bottom", shrink=0.6, aspect=45,
+            cells, axes, scheme, result.quality, limits, location="bottom", shrink=0.6, aspect=45,
         )  # fmt: skip
     return figure

@@ -24,9 +24,9 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 
 def require_space(diagram: Diagram) -> None:
     """Raise InputError unless the diagram is three-dimensional."""
-    if diagram.domain.dim != 3:
+    if diagram.domain.cell_dim != 3:
         raise InputError(
-            "slices and cut-away views need a mesh in 3D, and this one is in 2D; call result.plot()"
+            "slices and cut-away views need cells in 3D, and these are in 2D; call result.plot()"
         )
 
 

@@ -12,12 +12,14 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
+from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
 from ..mesh.output import MeshOutput
 from ..mesh.results import Result
 from .cells import plot_cells
 from .colors import Color, cell_norm, coloring, coloring_of, picture_of
 from .cutaway import VIEW, draw_cutaway, view_axes
+from .globe import plot_globe
 from .legends import add_key
 from .slices import as_normal, focus, plot_slice, plot_slices, require_space
 from .style import WIDTH, interactive_figure, styled
@@ -37,13 +39,16 @@ def draw_mesh(mesh: Result | Diagram, color: Color | ArrayLike, view: Any, **opt
 
     The options are all those of `Diagram.plot`. Those with their default value are not refused.
     """
-    flat = picture_of(mesh).diagram.domain.dim == 2
+    domain = picture_of(mesh).diagram.domain
+    flat = domain.cell_dim == 2
     if flat and view is not None:
         raise InputError(f"view is {view!r}, which is for meshes in 3D; leave it out")
     if view is not None and view not in get_args(View):
         raise InputError(f"view is {view!r}, expected one of {', '.join(get_args(View))}")
-    kind = "2D" if flat else view or "slices"
-    pictures = {"2D": plot_cells, "slices": plot_slices, "slice": plot_slice, "cutaway": plot_cutaway}  # fmt: skip
+    kind = "sphere" if isinstance(domain, Sphere) else "2D" if flat else view or "slices"
+    pictures = {
+        "2D": plot_cells, "slices": plot_slices, "slice": plot_slice, "cutaway": plot_cutaway, "sphere": plot_globe,
+    }  # fmt: skip
     known = {name: signature(draw).parameters for name, draw in pictures.items()}
     given = {}
     for name, value in options.items():
@@ -161,7 +166,7 @@ def plot_distributions(result: Result, figure: Any = None) -> Any:
         panels = figure.subplots(2, 2).ravel()
         if figure.get_layout_engine() is not None:  # space between titles and the numbers above
             figure.get_layout_engine().set(hspace=0.08)
-        dim = result.diagram.domain.dim
+        dim = result.diagram.domain.cell_dim
         for ax, name in zip(panels, ("error", "quality", "sides", "skewness"), strict=True):
             scheme = coloring(name, dim)
             if name == "sides":
