@@ -1,14 +1,14 @@
 """Transfer of cell data between meshes: speed, errors of mass and bounds, order.
 
-    python bench/transfer.py [--sizes 1e3,1e4,1e5] [--dims 2,3] [--random] [--repeat 3]
+    python bench/transfer.py [--sizes 1e3,1e4,1e5] [--dims 2,3] [--sphere] [--random] [--repeat 3]
                              [--device NAME] [--dtype float32] [--json]
 
-Two uniform meshes of about as many cells ("fast" effort from two seeds; --random: random generators) in the
-unit box. The values of f = sin(3 x + 1) cos(2 y) (1 + z^2) at the centroids of one mesh are transferred to the other
-and compared there. "L1 error" is the mean of |error|, "order" its rate in the mesh width from one row to the next. "1"
-is the first order, "2" the second with the limiter, "2 free" without it. "mass" is the error of the sum of V f over the
-sum of V |f|, "beyond" the distance of new values from the bounds of the old ones. "new cells/s" is the median of whole
-calls, with copies to and from the device.
+Two uniform meshes of about as many cells ("fast" effort from two seeds; --random: random generators) in the unit box,
+or on the unit sphere. The values of f = sin(3 x + 1) cos(2 y) (1 + z^2) at the centroids of one mesh are transferred
+to the other and compared there. "L1 error" is the mean of |error|, "order" its rate in the mesh width from one row to
+the next. "1" is the first order, "2" the second with the limiter, "2 free" without it. "mass" is the error of the sum
+of V f over the sum of V |f|, "beyond" the distance of new values from the bounds of the old ones. "new cells/s" is
+the median of whole calls, with copies to and from the device.
 """
 
 from __future__ import annotations
@@ -37,11 +37,20 @@ def smooth(x: np.ndarray) -> np.ndarray:
     return np.sin(3 * x[:, 0] + 1) * np.cos(2 * x[:, 1]) * last
 
 
-def make_mesh(adapter: clvoro.Adapter, dim: int, n: int, seed: int, random: bool) -> clvoro.Diagram:
-    """Return a mesh of the unit box, its arrays fetched."""
+def make_mesh(
+    adapter: clvoro.Adapter, dim: int, n: int, seed: int, random: bool, sphere: bool = False
+) -> clvoro.Diagram:
+    """Return a mesh of the unit box or sphere, its arrays fetched."""
     box = clvoro.Box((0,) * dim, (1,) * dim)
+    rng, globe = np.random.default_rng(seed), clvoro.Sphere(1.0)
     if random:
-        made = adapter.diagram(box, np.random.default_rng(seed).random((n, dim)))
+        made = (
+            adapter.diagram(globe, rng.normal(size=(n, 3)))
+            if sphere
+            else adapter.diagram(box, rng.random((n, dim)))
+        )
+    elif sphere:
+        made = adapter.run(globe, 1.0, n_cells=n, effort="fast", seed=seed).diagram
     else:
         made = adapter.run(box, n ** (-1 / dim), effort="fast", seed=seed).diagram
     for name in ("volumes", "centroids", "neighbors"):
@@ -94,16 +103,18 @@ def main(arguments: list[str] | None = None) -> int:
     made = parser(__doc__)
     made.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5"), help="cells")
     made.add_argument("--dims", type=counts, default=[2, 3])
+    made.add_argument("--sphere", action="store_true", help="on the unit sphere, not in the box")
     made.add_argument("--random", action="store_true", help="random generators")
     made.add_argument("--repeat", type=int, default=3)
     options = made.parse_args(arguments)
     adapter = make_adapter(options)
     report = Report(options.json, COLUMNS)
-    for dim in options.dims:
+    for dim in [2] if options.sphere else options.dims:
         before: dict[str, tuple[int, float]] = {}
         for n in options.sizes:
             old, new = (
-                make_mesh(adapter, dim, n, FIRST_SEED + k, options.random) for k in range(2)
+                make_mesh(adapter, dim, n, FIRST_SEED + k, options.random, options.sphere)
+                for k in range(2)
             )
             for name, way in WAYS.items():
                 record: dict[str, Any] = {"dim": dim, "way": name, "rate": None}
@@ -115,7 +126,8 @@ def main(arguments: list[str] | None = None) -> int:
                 before[name] = (len(new), record["error"])
                 report.add(record, f"{dim}D, {n} cells, order {name}")
     kind = "random" if options.random else "uniform"
-    report.finish(heading(adapter, f"Transfer between {kind} meshes"))
+    where = " on a sphere" if options.sphere else ""
+    report.finish(heading(adapter, f"Transfer between {kind} meshes{where}"))
     worst = max(record["mass"] for record in report.records)
     return 0 if worst <= 1e-12 else 1
 

@@ -11,6 +11,7 @@ import pyopencl as cl
 
 from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
 from ..geometry.polygon import Polygon
+from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..opencl import probe
@@ -19,15 +20,13 @@ from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..tessellation.bins import Bins
 from .device_transfer import CellData, CellGraph, ConservativeTransfer, transfer_bytes
-from .host_transfer import transfer_on_host
+from .host_transfer import find_defect, transfer_on_host
+from .sphere_transfer import transfer_on_sphere
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..adapter import Adapter
-
-COVER_TOLERANCE = 1e-3
-"""Largest accepted difference between a cell's volume and that of its intersections, as a share of the cell."""
 
 
 def transfer_values(
@@ -45,8 +44,8 @@ def transfer_values(
             f"onto is a mesh of {target.domain}, the values are on {source.domain}; expected the same domain: make "
             "both meshes with one domain"
         )
-    on_host = isinstance(source.domain, Polygon) or any(source.domain.periodic)
-    if on_host and source.domain.dim == 3:
+    on_host = isinstance(source.domain, Polygon | Sphere) or any(source.domain.periodic)
+    if on_host and source.domain.cell_dim == 3:
         raise InputError(
             f"the meshes are of {source.domain}; expected a domain with walls, since transfer in 3D periodic boxes is "
             "not supported"
@@ -163,8 +162,9 @@ def _transfer_on_device(
 def _transfer_on_host(
     source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Do what `_transfer_on_device` does, for polygons and 2D periodic boxes."""
-    means, low, high, covered = transfer_on_host(source, target, columns, order, limited)
+    """Do what `_transfer_on_device` does, for polygons, 2D periodic boxes and spheres."""
+    work = transfer_on_sphere if isinstance(source.domain, Sphere) else transfer_on_host
+    means, low, high, covered = work(source, target, columns, order, limited)
     unit = source.domain.frame[1] ** 2
     _require_cover(covered / unit, target.volumes / unit, 2)
     return means, low, high
@@ -172,10 +172,8 @@ def _transfer_on_host(
 
 def _require_cover(covered: np.ndarray, volumes: np.ndarray, dim: int) -> None:
     """Raise ClvoroError unless the intersections of each cell fill it. Volumes are normalized."""
-    slack = 64 * np.finfo(np.float32).eps * volumes ** (1 - 1 / dim)
-    defect = np.abs(covered - volumes) - COVER_TOLERANCE * volumes - slack
-    worst = int(defect.argmax())
-    if not defect[worst] <= 0:
+    worst = find_defect(covered, volumes, dim)
+    if worst is not None:
         raise ClvoroError(
             f"the intersections of new cell {worst} with old cells fill {covered[worst] / volumes[worst]:.6g} of it, "
             "expected 1: one of the meshes is not the Voronoi diagram of its points; call diagram.check() on both"

@@ -18,6 +18,16 @@ PAIRS = 1 << 20
 """Pairs of cells that are intersected at a time."""
 TINY = 1e-300
 """Replaces a divisor of 0."""
+COVER_TOLERANCE = 1e-3
+"""Largest accepted difference between a cell's volume and that of its intersections, as a share of the cell."""
+
+
+def find_defect(found: np.ndarray, volumes: np.ndarray, dim: int) -> int | None:
+    """Return the cell where `found` differs most from the volume if it is beyond the tolerance. Both are normalized."""
+    slack = 64 * np.finfo(np.float32).eps * volumes ** (1 - 1 / dim)
+    defect = np.abs(found - volumes) - COVER_TOLERANCE * volumes - slack
+    worst = int(defect.argmax())
+    return None if defect[worst] <= 0 else worst
 
 
 def transfer_on_host(
@@ -32,18 +42,15 @@ def transfer_on_host(
     covered : (n_new,) float64
         Sum of the areas of a cell's intersections.
     """
-    width, n = columns.shape[1], len(target)
-    slopes = np.zeros((len(source), width, 2))
-    least = most = columns
+    slopes, least, most = None, columns, columns
     if order == 2:
         slopes, least, most = fit_slopes(source, columns, limited)
+    sums = CellSums(len(target), columns, slopes, least, most)
     new = cell_shapes(target)
     old, image, offsets = _images(source, cell_shapes(source), shapely.total_bounds(new))
     here, there = shapely.STRtree(old).query(new, predicate="intersects")
     by = np.lexsort((there, here))
     here, there = here[by], there[by]
-    mass, covered = np.zeros((n, width)), np.zeros(n)
-    low, high = np.full((n, width), np.inf), np.full((n, width), -np.inf)
     for first in range(0, len(here), PAIRS):
         i, j = here[first : first + PAIRS], there[first : first + PAIRS]
         parts = shapely.intersection(new[i], old[j])
@@ -52,13 +59,60 @@ def transfer_on_host(
         i, k, area, parts = i[some], j[some], area[some], parts[some]
         j = image[k]
         off = shapely.get_coordinates(shapely.centroid(parts)) - source.centroids[j] - offsets[k]
-        covered += np.bincount(i, area, n)
+        sums.add(i, j, area, off)
+    return sums.results()
+
+
+class CellSums:
+    """Sums over the intersections of old and new cells.
+
+    Parameters
+    ----------
+    n : int
+        Number of new cells.
+    columns, least, most : (n_old, width) float64
+        Means over the old cells, and bounds of the data in them.
+    slopes : (n_old, width, d) float64, optional
+
+    Attributes
+    ----------
+    covered : (n,) float64
+        Sum of the areas of a cell's intersections.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        columns: np.ndarray,
+        slopes: np.ndarray | None,
+        least: np.ndarray,
+        most: np.ndarray,
+    ) -> None:
+        self.columns, self.slopes, self.least, self.most = columns, slopes, least, most
+        shape = n, columns.shape[1]
+        self.covered, self.mass = np.zeros(n), np.zeros(shape)
+        self.low, self.high = np.full(shape, np.inf), np.full(shape, -np.inf)
+
+    def add(self, i: np.ndarray, j: np.ndarray, area: np.ndarray, off: np.ndarray) -> None:
+        """Add intersections of cells i and j (k,); `off` (k, d) leads from the centroid of j to that of each."""
+        n, width = self.mass.shape
+        self.covered += np.bincount(i, area, n)
         for c in range(width):
-            value = columns[j, c] + (slopes[j, c] * off).sum(axis=1)
-            mass[:, c] += np.bincount(i, area * value, n)
-        np.minimum.at(low, i, least[j])
-        np.maximum.at(high, i, most[j])
-    return mass / np.maximum(covered, TINY)[:, None], low, high, covered
+            value = self.columns[j, c]
+            if self.slopes is not None:
+                value = value + (self.slopes[j, c] * off).sum(axis=1)
+            self.mass[:, c] += np.bincount(i, area * value, n)
+            np.minimum.at(self.low[:, c], i, self.least[j, c])
+            np.maximum.at(self.high[:, c], i, self.most[j, c])
+
+    def results(self) -> tuple[np.ndarray, ...]:
+        """Return means, low, high and covered; see `transfer_on_host`."""
+        return (
+            self.mass / np.maximum(self.covered, TINY)[:, None],
+            self.low,
+            self.high,
+            self.covered,
+        )
 
 
 def _images(
@@ -96,11 +150,35 @@ def fit_slopes(
 
     The kernel `fit_slopes` in transfer.cl gives the formulas.
     """
-    n, width = columns.shape
-    owner = np.repeat(np.arange(n), np.diff(diagram.neighbor_starts))
+    owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
     inner = diagram.neighbors >= 0
     i, j = owner[inner], diagram.neighbors[inner]
     d = diagram.centroids[j] + diagram.shifts[inner] * diagram.domain.extent - diagram.centroids[i]
+    corners = diagram.vertices[face_ends(diagram)[:, 0]] - diagram.centroids[owner]
+    return fit_linear_functions(columns, i, j, d, owner, corners, limited)
+
+
+def fit_linear_functions(
+    columns: np.ndarray,
+    i: np.ndarray,
+    j: np.ndarray,
+    d: np.ndarray,
+    owner: np.ndarray,
+    corners: np.ndarray,
+    limited: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Do what `fit_slopes` does, with neighbors and corners given.
+
+    Parameters
+    ----------
+    i, j : (m,) int
+        Pairs of neighbors.
+    d : (m, 2) float64
+        From the centroid of i to that of j.
+    owner, corners : (c,) int, (c, 2) float64
+        Corners of cells, relative to the centroids.
+    """
+    n, width = columns.shape
     weight = 1 / np.maximum((d**2).sum(axis=1), TINY)
     normal = np.zeros((n, 2, 2))
     for a in range(2):
@@ -108,7 +186,6 @@ def fit_slopes(
             normal[:, a, b] = np.bincount(i, weight * d[:, a] * d[:, b], n)
     # The pseudo-inverse gives the slope of least norm where the neighbors do not determine one.
     inverse = np.linalg.pinv(normal, rcond=256 * np.finfo(float).eps, hermitian=True)
-    corners = diagram.vertices[face_ends(diagram)[:, 0]] - diagram.centroids[owner]
     slopes = np.empty((n, width, 2))
     least, most = columns.copy(), columns.copy()
     np.minimum.at(least, i, columns[j])
