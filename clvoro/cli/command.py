@@ -47,6 +47,8 @@ examples:
   clvoro convert result/mesh.npz mesh.nc
   clvoro check result/mesh.vtu          verify the mesh
   clvoro check --for openfoam result/mesh.vtu
+  clvoro run ocean --format mpas        a mesh of the Earth for ocean models
+  clvoro check --for mpas out/ocean/mesh.vtu
 """
 
 
@@ -183,7 +185,7 @@ def _add_convert(commands: Any) -> None:
         "convert",
         help="write a mesh in another format",
         description="Read a mesh that clvoro wrote and write it in the format that the suffix of OUT names: "
-        ".vtu, .npz, .foam (or a folder polyMesh), .nc, .vtk, .ply, .obj.",
+        ".vtu, .npz, .foam (or a folder polyMesh), .nc, .info (METIS), .vtk, .ply, .obj.",
     )
     convert.set_defaults(work=_convert)
     convert.add_argument("mesh", metavar="MESH", help="mesh.npz or mesh.vtu")
@@ -200,6 +202,7 @@ def _add_check(commands: Any) -> None:
         help="verify meshes: volumes, graph, faces, the Voronoi property, error and quality",
         description="Verify meshes that clvoro wrote, on the host alone, and print each violation with its place. "
         "With --for openfoam: print each criterion of its checkMesh, with value, limit and worst place. "
+        "With --for mpas: the same for models on C grids, on spheres and in boxes in 2D. "
         "Exit code 0: all is right; 1: something is wrong; 2: a file cannot be read.",
     )
     check.set_defaults(work=_check)
@@ -207,7 +210,7 @@ def _add_check(commands: Any) -> None:
     check.add_argument(
         "--for",
         dest="solver",
-        choices=("openfoam",),
+        choices=("openfoam", "mpas"),
         help="check by the criteria of this solver, which need not be installed, instead",
     )
     _add_walls(check)

@@ -9,7 +9,8 @@ MESH_FILES = {
     "vtk": ("mesh.vtk", None),
     "ply": ("mesh.ply", None),
     "obj": ("mesh.obj", None),
+    "metis": ("graph.info", None),
 }
 """By the name of the format: the file, and the convention that `save` takes."""
 PLANE = ("nc", "mpas", "vtk", "ply", "obj")
-"""Formats that hold 2D meshes only."""
+"""Formats that hold polygons only."""

@@ -22,6 +22,7 @@ from ..errors import Aborted, ClvoroError, InputError, SolverWarning
 from ..finite_volumes.gate import Solver
 from ..finite_volumes.solver_mesh import WallShape
 from ..geometry.polygon import Polygon
+from ..geometry.sphere import Sphere
 from ..io import save, write_history
 from ..io.check_mesh import run_check_mesh
 from ..mesh.results import Result
@@ -229,8 +230,16 @@ class Job:
             raise InputError(
                 f"walls is {self.walls!r}, and no mesh is written for OpenFOAM; add --format foam, or leave it out"
             )
+        if isinstance(self.case.domain, Sphere) and (
+            self.solver is not None or "foam" in self.mesh_formats
+        ):
+            what = "format foam" if self.solver is None else f"check-solver {self.solver}"
+            raise InputError(
+                f"{self.case.name}: {what} is for meshes in boxes and polygons, and the domain is a sphere; expected "
+                "--format mpas or nc, and clvoro check --for mpas"
+            )
         for kind in self.mesh_formats:
-            if kind in PLANE and self.case.domain.dim != 2:
+            if kind in PLANE and self.case.domain.cell_dim != 2:
                 raise InputError(
                     f"{self.case.name}: format {kind} is for meshes in 2D, and the domain is in 3D; expected foam"
                 )
@@ -410,7 +419,7 @@ class Job:
                 f"{s['seconds']:9.2f}  {s['stop_reason']}"
             )
         for name, result in results.items():
-            if result.diagram.domain.dim == 3:
+            if result.diagram.domain.cell_dim == 3:
                 print(f"{name}: {result.measures.line()}")
             if isinstance(result.diagram.domain, Polygon):
                 print(f"{name}: {boundary_line(result)}")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..adaptation.options import Options, arguments_of_run, uses
+from ..geometry.sphere import Sphere
 from ..io import save
 from ..io.atomic import atomic_file, writing
 from ..mesh.results import Result
@@ -76,7 +78,7 @@ def run_frames(
                 shown[time] = result
     finally:  # write the rows of earlier frames also if a frame fails
         _write_rows(rows, out / "frames.csv")
-    if shown and case.domain.dim == 2:
+    if shown and case.domain.cell_dim == 2:
         _draw(shown, out / "pictures" / "frames.png")
     return rows
 
@@ -99,8 +101,9 @@ def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
 
 def _draw(shown: Mapping[float, Result], path: Path) -> None:
     """Draw frames side by side, colored by target size."""
-    from ..plotting import plot_cells
+    from ..plotting import plot_cells, plot_globe
     from ..plotting.colors import coloring
+    from ..plotting.globe import default_center
     from ..plotting.legends import add_key
     from ..plotting.pictures import render
     from ..plotting.style import WIDTH, grid_height, new_figure, styled
@@ -111,18 +114,22 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
     lines = -(-len(results) // columns)
     sizes = np.concatenate([r.target_size for r in results])
     limits = (float(sizes.min()), float(sizes.max()))
+    lower, upper = domain.lower[:2], domain.upper[:2]
+    plot: Callable[..., Any] = plot_cells
+    if isinstance(domain, Sphere):
+        plot = partial(plot_globe, center=default_center(results[0]))
     with styled():
-        figure = new_figure(
-            WIDTH, grid_height(domain.lower, domain.upper, lines, columns, 0.65, 0.3)
-        )
+        figure = new_figure(WIDTH, grid_height(lower, upper, lines, columns, 0.65, 0.3))
         axes = figure.subplots(lines, columns, squeeze=False).ravel()
         for ax, (time, result) in zip(axes, shown.items(), strict=False):
             title = f"t = {time:.2f}, {len(result.points)} cells"
-            plot_cells(result, "size", ax, limits=limits, key=False, title=title)
+            plot(result, "size", ax, limits=limits, key=False, title=title)
             ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
         for ax in axes[len(results) :]:
             ax.set_axis_off()
-        cells, scheme = axes[0].collections[0], coloring("size")
+        drawn = (*axes[0].collections, *axes[0].images)
+        cells = next(item for item in drawn if item.get_array() is not None)
+        scheme = coloring("size")
         add_key(cells, list(axes), scheme, sizes, limits, below=True)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as file:

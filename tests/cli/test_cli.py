@@ -295,7 +295,7 @@ def pressing_run(number):
         (
             ["cases", "papre"],
             cli.BAD_INPUT,
-            "airfoil, channel, lake, paper, sphere, spots, surface",
+            "airfoil, channel, lake, ocean, paper, sphere, spots, surface",
         ),
     ],
 )
@@ -355,6 +355,7 @@ def test_cases_are_listed_and_printed(here, capsys):
         "airfoil",
         "channel",
         "lake",
+        "ocean",
         "paper",
         "sphere",
         "spots",

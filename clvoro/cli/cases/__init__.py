@@ -15,6 +15,7 @@ from ...errors import InputError
 from ...files import open_plain, read_text
 from ...geometry.boundary_layers import Layers
 from ...geometry.box import Domain
+from ...geometry.sphere import Sphere
 from ...io.atomic import atomic_file
 from . import schema, toml
 from .checks import file_name
@@ -46,7 +47,7 @@ class Case:
     folder : Path
         Folder of the files that the case names; those of the built-in cases are found, too.
     place : dict
-        The keys of the file's `[domain]` table; empty for a box made in Python.
+        The keys of the file's `[domain]` table; empty for a box or a sphere made in Python.
     layers : tuple of dict
         The tables of the file's `[[layers]]`.
     frames : int
@@ -139,7 +140,7 @@ class Case:
         return {
             "name": self.name,
             "title": self.title,
-            "domain": self.place or _corners(self.domain),
+            "domain": self.place or _place(self.domain),
             "size": self.size,
             "run": {key: self.run[key] for key in _RUN_ORDER if key in self.run},
             **({"layers": list(self.layers)} if self.layers else {}),
@@ -189,8 +190,10 @@ class Case:
         return path
 
 
-def _corners(domain: Domain) -> dict[str, Any]:
-    """Return the table of a box."""
+def _place(domain: Domain) -> dict[str, Any]:
+    """Return the table of a box or a sphere."""
+    if isinstance(domain, Sphere):
+        return {"kind": "sphere", "radius": domain.radius}
     table: dict[str, Any] = {"lower": list(domain.lower), "upper": list(domain.upper)}
     return {**table, "periodic": list(domain.periodic)} if any(domain.periodic) else table
 

@@ -11,6 +11,7 @@ from ...files import LONGEST_GEOMETRY, read_text
 from ...geometry.box import Box, Domain
 from ...geometry.curves import Curve
 from ...geometry.polygon import Polygon
+from ...geometry.sphere import Sphere
 from .files import locate
 
 
@@ -27,6 +28,8 @@ def build_domain(node: Mapping[str, Any], folder: Path) -> Domain:
     rest = {key: value for key, value in node.items() if key != "kind"}
     if node["kind"] == "box":
         return Box(**rest)
+    if node["kind"] == "sphere":
+        return Sphere(**rest)
     domain = _polygon(node, folder)
     return domain.simplified(node["simplified"]) if "simplified" in node else domain
 

@@ -14,8 +14,10 @@ from ...errors import InputError
 from ...geometry.box import Box, Domain
 from ...geometry.curves import Curve
 from ...geometry.polygon import Polygon
+from ...geometry.sphere import Sphere
 from ...io.arrays import read_array
 from .files import locate
+from .grids import read_grid
 
 
 def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
@@ -40,10 +42,15 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
         return sizing.Constant(node["value"])
     if kind == "expression":
         return sizing.Expression(node["expression"])
+    if kind == "caps":
+        return _caps(node, domain)
     if kind == "raster":
-        values = load_array(folder / node["file"], "size.file")
-        corners = node.get("lower", domain.lower), node.get("upper", domain.upper)
-        return sizing.Raster(values, *corners, **_given(node, "at", "missing", "outside"))
+        return _raster(node, folder, domain)
+    if isinstance(domain, Sphere) and kind in ("hessian", "gradient", "graded"):
+        raise InputError(
+            f"size.kind is {kind!r}, which is for boxes and polygons, not for {domain}; expected caps, distance, "
+            "expression, raster or a combination of them"
+        )
     if kind in ("hessian", "gradient"):
         values = load_array(folder / node["file"], "size.file")
         corners = node.get("lower", domain.lower), node.get("upper", domain.upper)
@@ -79,6 +86,44 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
     raise AssertionError(f"the schema passed a size field of kind {kind!r}")
 
 
+def _caps(node: Mapping[str, Any], domain: Domain) -> Any:
+    from ... import sizing
+
+    if not isinstance(domain, Sphere):
+        raise InputError(
+            f"size.kind is 'caps', which is for a sphere, not for {domain}; expected distance, or kind = \"sphere\" "
+            "in [domain]"
+        )
+    regions = [(r["center"], r["radius"], r["size"]) for r in node["regions"]]
+    return sizing.Caps(
+        regions, h_max=node["h_max"], sphere=domain, **_given(node, "growth", "slope")
+    )
+
+
+def _raster(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
+    """Return a raster of an array with given corners, or of a grid with longitudes and latitudes."""
+    from ... import sizing
+    from ...sizing.lonlat import DEGREES
+
+    path = folder / node["file"]
+    grid = read_grid(path, node.get("variable"))
+    if grid is not None:
+        for key in ("lower", "upper", "at"):
+            if key in node:
+                raise InputError(
+                    f"size.{key} is given, and {path} has longitudes and latitudes; leave it out"
+                )
+        return sizing.Raster.from_xarray(grid, **_given(node, "missing", "outside"))
+    if "variable" in node:
+        raise InputError(
+            f"size.variable is {node['variable']!r}, and {path} is neither a netCDF nor a .npz file; leave it out"
+        )
+    values = load_array(path, "size.file")
+    extent = DEGREES if isinstance(domain, Sphere) else domain
+    corners = node.get("lower", extent.lower), node.get("upper", extent.upper)
+    return sizing.Raster(values, *corners, **_given(node, "at", "missing", "outside"))
+
+
 def _given(node: Mapping[str, Any], *keys: str) -> dict[str, Any]:
     return {key: node[key] for key in keys if key in node}
 
@@ -95,8 +140,14 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
                 surface.check()
         return surface
     if kind == "boundary":
+        if isinstance(domain, Sphere):
+            domain.boundary()  # raises
         return domain if "edges" not in node else domain.boundary(node["edges"])
     if kind == "box":
+        if isinstance(domain, Sphere) and not {"lower", "upper"} <= node.keys():
+            raise InputError(
+                "size.shapes has a box without corners, expected lower and upper in degrees on a sphere"
+            )
         return Box(node.get("lower", domain.lower), node.get("upper", domain.upper))
     if kind in ("circle", "sphere"):
         return sizing.Circle(node["center"], node["radius"])

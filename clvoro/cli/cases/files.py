@@ -8,7 +8,7 @@ from pathlib import Path
 FOLDER = Path(__file__).parent
 """Folder of the built-in cases and their files."""
 WRITTEN = re.compile(
-    r"(mesh|history)(-.*)?\.(vtu|npz|csv|foam|nc|vtk|ply|obj)|case\.toml|report\.html|frames\.csv|frames|pictures|constant"
+    r"(mesh|history)(-.*)?\.(vtu|npz|csv|foam|nc|vtk|ply|obj)|graph\.info|case\.toml|report\.html|frames\.csv|frames|pictures|constant"
 )
 """Names of the files that a run writes into its folder."""
 

@@ -105,6 +105,16 @@ _COVERED: dict[str, Check] = {
 _SIZE = Kinds(
     {
         "constant": Table({"value": positive}, {}),
+        "caps": Table(
+            {
+                "regions": list_of(
+                    Table({"center": vector(2), "radius": not_negative, "size": positive}, {})
+                ),
+                "h_max": positive,
+            },
+            {"growth": positive, "slope": positive},
+            choice=("growth", "slope"),
+        ),
         "distance": Table(
             {"shapes": list_of(SHAPE), "h_min": positive},
             {"growth": positive, "slope": positive, "h_max": positive},
@@ -113,7 +123,7 @@ _SIZE = Kinds(
         "expression": Table({"expression": text}, {}),
         "raster": Table(
             {"file": text},
-            {**_COVERED, "outside": one_of("nearest", "error")},
+            {**_COVERED, "variable": text, "outside": one_of("nearest", "error")},
         ),
         "hessian": Table(
             {"file": text},
@@ -205,13 +215,14 @@ _DOMAINS = Kinds(
             },
             choice=("file", "outer"),
         ),
+        "sphere": Table({}, {"radius": positive}),
     },
     default="box",
 )
 
 
 def domain(value: object, place: str) -> dict[str, Any]:
-    """Check a domain: a box by its corners, a polygon by a file or its rings."""
+    """Check a domain: a box by its corners, a polygon by a file or its rings, a sphere by its kind."""
     if isinstance(value, Mapping) and "kind" not in value:
         corners = [key for key in ("lower", "upper", "periodic") if key in value]
         rings = [key for key in ("polygon", "outer", "holes") if key in value]
@@ -221,7 +232,8 @@ def domain(value: object, place: str) -> dict[str, Any]:
             )
         if not corners and not rings:
             raise InputError(
-                f"{place} is neither a box nor a polygon, expected lower and upper, or outer, or polygon = FILE"
+                f"{place} is neither a box nor a polygon nor a sphere, expected lower and upper, or outer, or "
+                'polygon = FILE, or kind = "sphere"'
             )
         if "polygon" in value:
             rest = {key: item for key, item in value.items() if key != "polygon"}
