@@ -11,7 +11,7 @@ import clvoro
 from clvoro import sizing
 from clvoro.adaptation.sampling.start import count_cells
 
-Kind = tuple[clvoro.Box | clvoro.Polygon, Any, dict[str, Any]]
+Kind = tuple[clvoro.Box | clvoro.Polygon | clvoro.Sphere, Any, dict[str, Any]]
 
 SQUARE, CUBE = clvoro.Box((0, 0), (1, 1)), clvoro.Box((0, 0, 0), (1, 1, 1))
 PERIODIC = clvoro.Box((0, 0), (1, 1), periodic=True)
@@ -32,13 +32,17 @@ LAKE, COAST = blob(), blob(1500)
 
 def even(domain: Any, **options: Any) -> Callable[[int], Kind]:
     """Return runs with cells of equal size."""
-    return lambda n: (domain, (domain.measure / n) ** (1 / domain.dim), options)
+    return lambda n: (domain, (domain.measure / n) ** (1 / domain.cell_dim), options)
 
 
 def of(domain: Any, field: Any, **options: Any) -> Callable[[int], Kind]:
     """Return runs of a field, or a formula, scaled to the number of cells."""
     field = sizing.Expression(field) if isinstance(field, str) else field
-    return lambda n: (domain, field * (count_cells(field, domain) / n) ** (1 / domain.dim), options)
+    return lambda n: (
+        domain,
+        field * (count_cells(field, domain) / n) ** (1 / domain.cell_dim),
+        options,
+    )
 
 
 def layered(domain: Any) -> Callable[[int], Kind]:
@@ -75,7 +79,9 @@ def graded(domain: Any, formula: str) -> Callable[[int], Kind]:
 
 RANDOM = np.random.default_rng(1)
 CURVE = np.column_stack([np.linspace(0.1, 0.9, 500), 0.5 + 0.2 * np.sin(np.linspace(0, 9, 500))])
-SPHERE = sizing.Distance(sizing.Sphere((0.5, 0.5, 0.4), 0.25), h_min=0.045, slope=0.2)
+GLOBE = clvoro.Sphere(1.0)
+CAPS = sizing.Caps([((-45, 45), 0.3, 0.1)], h_max=0.8, growth=1.2, sphere=GLOBE)
+SPHERE = sizing.Distance(sizing.Ball((0.5, 0.5, 0.4), 0.25), h_min=0.045, slope=0.2)
 SHORE = sizing.Distance(COAST.boundary(), h_min=0.002, slope=0.5)
 JUMP = "x < 0.5 ? 1.0 : 10.0"
 STRIPS = {
@@ -114,5 +120,7 @@ KINDS: dict[str, Callable[[int], Kind]] = {
     "cube": even(CUBE), "cube, exact": even(CUBE, method="exact"),
     "cube, coupled": even(CUBE, method="coupled", max_steps=6),
     "cube, fast": even(CUBE, effort="fast"), "cube, graded": graded(CUBE, "x < 0.5 ? 1.0 : 5.0"),
+    "sphere": even(GLOBE), "sphere, exact": even(GLOBE, method="exact"),
+    "sphere, coupled": even(GLOBE, method="coupled", max_steps=12), "sphere, caps": of(GLOBE, CAPS),
     "cube, sphere": of(CUBE, SPHERE), "periodic cube": even(PERIODIC_CUBE),
 }  # fmt: skip
