@@ -12,7 +12,7 @@ from clvoro import sizing
 # The sphere is a source of size: cells cover its inside as well.
 
 box = clvoro.Box((-1, -1, -1), (3, 1, 1))
-sphere = sizing.Distance(sizing.Sphere((0, 0, 0), radius=0.5), h_min=0.05, growth=1.2, h_max=0.25)
+sphere = sizing.Distance(sizing.Ball((0, 0, 0), radius=0.5), h_min=0.05, growth=1.2, h_max=0.25)
 wake = sizing.Distance(sizing.Segment((0.5, 0, 0), (3, 0, 0)), h_min=0.08, growth=1.15)
 mesh = clvoro.adapt(box, sizing.minimum(sphere, wake))
 print(mesh)
