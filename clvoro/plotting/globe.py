@@ -30,6 +30,8 @@ _SMALLEST = 3.0
 """The same where cells are smaller, in points: gaps between polygons would make stripes."""
 _FADE = 0.8
 """Edges are as wide as those of cells that much smaller in a plane: rows of thin lines on a globe look like waves."""
+_WIDE_LABELS = 0.35
+"""Additional width of the labels of degrees and of large sizes beside a map, inches."""
 _PIXELS = 1400  # in the longer direction of such a picture
 _CENTER = (0.0, 25.0)  # of the picture of a uniform mesh
 _STEPS = (
@@ -107,6 +109,8 @@ def plot_globe(
     with styled():
         if ax is None:
             height = single_height(view.lower, view.upper, bool(scheme.classes), title is not None)
+            if isinstance(view, Plate) and not scheme.classes:
+                height -= _WIDE_LABELS * np.divide(*np.subtract(view.upper, view.lower)[::-1])
             ax = interactive_figure(WIDTH, height).add_subplot()
         _frame(ax, view)
         cells = _draw(ax, diagram, view, values, scheme, ends, edges)
