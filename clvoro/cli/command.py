@@ -191,7 +191,9 @@ def _add_convert(commands: Any) -> None:
     convert.add_argument("mesh", metavar="MESH", help="mesh.npz or mesh.vtu")
     convert.add_argument("out", metavar="OUT", type=_path, help="file to write")
     convert.add_argument(
-        "--convention", choices=("ugrid", "mpas"), help="content of a .nc file (default: ugrid)"
+        "--convention",
+        choices=("ugrid", "mpas", "scrip"),
+        help="content of a .nc file (default: ugrid)",
     )
     _add_walls(convert, more="; of a .vtu file: as in the domain is the default")
 

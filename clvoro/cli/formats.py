@@ -6,6 +6,7 @@ MESH_FILES = {
     "foam": ("mesh.foam", None),
     "nc": ("mesh.nc", "ugrid"),
     "mpas": ("mesh-mpas.nc", "mpas"),
+    "scrip": ("mesh-scrip.nc", "scrip"),
     "vtk": ("mesh.vtk", None),
     "ply": ("mesh.ply", None),
     "obj": ("mesh.obj", None),

@@ -238,6 +238,10 @@ class Job:
                 f"{self.case.name}: {what} is for meshes in boxes and polygons, and the domain is a sphere; expected "
                 "--format mpas or nc, and clvoro check --for mpas"
             )
+        if "scrip" in self.mesh_formats and not isinstance(self.case.domain, Sphere):
+            raise InputError(
+                f"{self.case.name}: format scrip is for meshes on a sphere; expected nc, mpas or another format"
+            )
         for kind in self.mesh_formats:
             if kind in PLANE and self.case.domain.cell_dim != 2:
                 raise InputError(

@@ -27,6 +27,7 @@ from .metis import write_metis
 from .mpas import write_mpas
 from .npz import load as load_npz
 from .npz import write_npz
+from .scrip import write_scrip
 from .ugrid import write_ugrid
 from .vtu import write_vtu
 from .vtu_read import load_vtu
@@ -53,7 +54,7 @@ __all__ = [
 ]
 
 _WRITERS = {".npz": write_npz, ".info": write_metis, ".graph": write_metis}
-_CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas}
+_CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas, "scrip": write_scrip}
 
 
 def load(path: str | PathLike[str]) -> Result | Diagram:
@@ -196,5 +197,5 @@ def to_pyvista(
 def _chosen(convention: object) -> Callable[[Contents, Path, str], None]:
     name = "ugrid" if convention is None else convention
     if not isinstance(name, str) or name not in _CONVENTIONS:
-        raise InputError(f"convention is {name!r:.60}, expected 'ugrid' or 'mpas'")
+        raise InputError(f"convention is {name!r:.60}, expected 'ugrid', 'mpas' or 'scrip'")
     return _CONVENTIONS[name]

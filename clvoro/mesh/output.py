@@ -81,7 +81,7 @@ class MeshOutput:
         types: Mapping[str, PatchType] | None = None,
         thickness: float | None = None,
         walls: WallShape | None = None,
-        convention: Literal["ugrid", "mpas"] | None = None,
+        convention: Literal["ugrid", "mpas", "scrip"] | None = None,
         units: str | None = None,
     ) -> None:
         """Write the mesh to `path`; the suffix selects the format.
@@ -133,11 +133,12 @@ class MeshOutput:
             most 30 degrees in sum, face ends near a corner of the domain move into it, and short edges are collapsed.
             Solvers reject cells that are not convex. `clvoro.load` does not read such a ``.vtu`` file. With "exact",
             the default for ``.vtu``, all faces are those of the diagram, as in all other formats.
-        convention : {"ugrid", "mpas"}, optional
+        convention : {"ugrid", "mpas", "scrip"}, optional
             For netCDF. With "ugrid", the default: cells as polygons with size, error, quality and area, and for each
             edge the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas": cells, edges and
             vertices with all variables of the MPAS mesh specification for C grids; cells at seams are connected. On a
-            sphere UGRID has longitudes and latitudes in degrees; MPAS has positions, and both in radians.
+            sphere UGRID has longitudes and latitudes in degrees; MPAS has positions, and both in radians. With "scrip",
+            on spheres only: centers, corners and areas, for tools that remap data between grids.
         units : str, optional
             For netCDF: unit of the coordinates, as UDUNITS writes it. By default "m". In UGRID, "degrees" stands for
             longitudes and latitudes. On a sphere: unit of the radius.

@@ -18,6 +18,38 @@ def result(ctx, request):
     return made(ctx, *request.param)
 
 
+# --- SCRIP ---
+
+
+def test_scrip(result, tmp_path):
+    result.save(tmp_path / "mesh.nc", convention="scrip")
+    file, d = read(tmp_path / "mesh.nc"), result.diagram
+    n, sides = len(d), np.diff(d.neighbor_starts)
+    eps = 2e-15 if is_double(result) else 2e-7
+    assert file["grid_dims"].tolist() == [n]
+    assert file["grid_imask"].tolist() == [1] * n
+    assert file["grid_area"].sum() == pytest.approx(4 * np.pi, rel=50 * eps)
+    assert file.about["grid_corner_lat"]["units"] == b"degrees"
+    lon, lat = file["grid_corner_lon"], file["grid_corner_lat"]
+    assert lon.shape == (n, sides.max())
+    for i in range(0, n, 17):
+        row = d.cell_vertices[d.cell_vertex_starts[i] : d.cell_vertex_starts[i + 1]]
+        row = np.append(row, np.repeat(row[-1], sides.max() - len(row)))
+        corners = d.domain.positions(np.column_stack([lon[i], lat[i]]))
+        np.testing.assert_allclose(corners, d.vertices[row], rtol=0, atol=eps * d.domain.radius)
+    center = np.column_stack([file["grid_center_lon"], file["grid_center_lat"]])
+    np.testing.assert_allclose(
+        d.domain.positions(center), d.centroids, rtol=0, atol=eps * d.domain.radius
+    )
+
+
+def test_scrip_is_for_spheres(tmp_path):
+    plane = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.8)])
+    with pytest.raises(InputError, match="SCRIP files are for meshes on a Sphere"):
+        plane.save(tmp_path / "mesh.nc", convention="scrip")
+    assert not list(tmp_path.iterdir())
+
+
 # --- UGRID ---
 
 

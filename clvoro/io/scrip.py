@@ -1,0 +1,55 @@
+"""Write meshes on a sphere by the SCRIP conventions, for tools that remap data between grids (ESMF, NCO, TempestRemap).
+
+See Jones (1998), A user's guide for SCRIP. Longitudes and latitudes are in degrees, areas in steradians. The corners of
+cells are counter-clockwise; cells of fewer corners repeat the last one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.sphere import Sphere
+from ..mesh.connectivity import cell_corners
+from .contents import Contents
+from .netcdf import NetCDF
+
+
+def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
+    """Write centers, corners and areas of the cells, and a mask of ones; `unit` has no meaning here.
+
+    Raises
+    ------
+    InputError
+        If the mesh is not on a sphere.
+    """
+    del unit
+    diagram, domain = contents.diagram, contents.diagram.domain
+    if not isinstance(domain, Sphere):
+        raise InputError(
+            f"cannot write {path}: SCRIP files are for meshes on a Sphere, not for {domain}; leave out "
+            "convention='scrip'"
+        )
+    starts, corners = cell_corners(diagram)
+    counts, n = np.diff(starts), len(diagram)
+    most = int(counts.max())
+    table = corners[starts[:-1, None] + np.minimum(np.arange(most), counts[:, None] - 1)]
+    file = NetCDF(
+        path,
+        contents,
+        {"grid_size": n, "grid_corners": most, "grid_rank": 1},
+        {"title": "Voronoi cells", "Conventions": "SCRIP"},
+    )
+    file.add("grid_dims", ("grid_rank",), np.array([n], np.int32))
+    file.add("grid_imask", ("grid_size",), np.ones(n, np.int32), units="unitless")
+    centers, around = domain.lonlat(diagram.centroids), domain.lonlat(diagram.vertices)
+    for column, name in enumerate(("lon", "lat")):
+        file.add(f"grid_center_{name}", ("grid_size",), centers[:, column], units="degrees")
+        shape = ("grid_size", "grid_corners")
+        file.add(f"grid_corner_{name}", shape, around[table, column], units="degrees")
+    areas = diagram.volumes / domain.radius**2
+    file.add("grid_area", ("grid_size",), areas, units="radians^2", long_name="area of a cell")
+    file.add_extra("grid_size")
+    file.write()
