@@ -1,13 +1,14 @@
 """Meshes on the sphere: time, sizes, shapes and what C grids need, quasi-uniform and graded.
 
     python bench/sphere.py [--sizes 40962,163842,655362] [--efforts default] [--graded] [--plane]
-                           [--device NAME] [--dtype float32] [--json]
+                           [--openings] [--device NAME] [--dtype float32] [--json]
 
 Quasi-uniform meshes of given numbers of cells, from random generators ("random") and, as a peer, the bisected
 icosahedron after 100 steps of Lloyd's method ("icosahedral"; numbers of cells 10 * 4^k + 2 only). With `--graded`
 meshes of the Earth with caps of fine cells in the North Atlantic: 27, 9 and 3 km times 9, and 1 : 64, with
 a growth of a tenth and of a fifth per cell. With `--plane` the same numbers of cells in a square, for the cost
-per cell. The first run of each kind builds kernels; times are those of a second run.
+per cell. With `--openings` only small meshes are made, from `SEEDS` seeds each, with and without the opening of
+obtuse triangles at the end of a run. The first run of each kind builds kernels; times are those of a second run.
 
 Columns: mean and largest |e|, mean and least Q; obtuse Delaunay triangles and the largest angle; the distance
 between the middles of Voronoi edges and those of their Delaunay edges over the length of the former, mean and largest.
@@ -25,10 +26,12 @@ from _common import FIRST_SEED, Report, counts, heading, make_adapter, names, pa
 
 import clvoro
 from clvoro import sizing
+from clvoro.adaptation import preparation
 
 EARTH = clvoro.Sphere()
 ATLANTIC = (-45, 45)
 LLOYD_STEPS = 100
+SEEDS = 12
 
 
 def nested(growth: float) -> sizing.Field:
@@ -84,13 +87,57 @@ def icosahedral(adapter: clvoro.Adapter, n: int) -> dict[str, Any] | None:
     return {"seconds": time.perf_counter() - begin, **shape(result)}
 
 
+def coarse(growth: float) -> sizing.Field:
+    """Return two caps of fine cells, for about 4,000 cells."""
+    fine = 6e4 if growth < 1.15 else 5e4
+    caps = [(ATLANTIC, 1e6, fine), ((100, -20), 5e5, 1.7 * fine)]
+    return sizing.Caps(caps, h_max=12 * fine, growth=growth)
+
+
+def compare_openings(options: Any) -> None:
+    """Count the runs that end with obtuse triangles, with and without their opening."""
+    adapter = make_adapter(options)
+    kinds: list[tuple[str, Any, dict[str, Any]]] = [
+        *((f"equal, {n}", 1e6, {"n_cells": n}) for n in (642, 2562, 10_242)),
+        ("two caps, growth 1.1", coarse(1.1), {}), ("two caps, growth 1.2", coarse(1.2), {}),
+    ]  # fmt: skip
+    columns = {
+        "mesh": lambda r: r["mesh"],
+        "effort": lambda r: r["effort"],
+        "runs": lambda r: r["runs"],
+        **{
+            f"{way} opening": lambda r, way=way: "{} runs, {} triangles, {:.1f}".format(*r[way])
+            for way in ("without", "with")
+        },
+    }
+    report, most = Report(options.json, columns), preparation.OPENINGS
+    for effort in ("default", "fast"):
+        for name, size, given in kinds:
+            row: dict[str, Any] = {"mesh": name, "effort": effort, "runs": SEEDS}
+            for way, openings in (("without", 0), ("with", most)):
+                preparation.OPENINGS = openings
+                grids = [
+                    adapter.run(EARTH, size, effort=effort, seed=seed, **given).measures.c_grid
+                    for seed in range(SEEDS)
+                ]
+                found = [grid.obtuse for grid in grids]
+                widest = max(float(grid.angles.max()) for grid in grids)
+                row[way] = (sum(count > 0 for count in found), sum(found), widest)
+            report.add(row, name)
+    report.finish(heading(adapter, "Obtuse triangles, and the largest angle in degrees"))
+
+
 def main() -> int:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[40_962, 163_842], help="cells")
     options_of.add_argument("--efforts", type=names, default=["default"])
     options_of.add_argument("--graded", action="store_true", help="graded meshes, too")
     options_of.add_argument("--plane", action="store_true", help="a square, too")
+    options_of.add_argument("--openings", action="store_true", help="only obtuse triangles")
     options = options_of.parse_args()
+    if options.openings:
+        compare_openings(options)
+        return 0
     adapter = make_adapter(options)
     columns = {
         "mesh": lambda r: r["mesh"],

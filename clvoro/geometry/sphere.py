@@ -23,6 +23,12 @@ EARTH_RADIUS = 6371229.0
 """Radius of the Earth in meters as ocean and atmosphere models have it."""
 
 
+def directions(points: np.ndarray) -> np.ndarray:
+    """Return longitudes in [-180, 180] and latitudes of vectors (n, 3) of any length, in degrees, (n, 2)."""
+    x, y, z = points.T
+    return np.degrees(np.column_stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]))
+
+
 @dataclass(frozen=True)
 class Sphere(Domain):
     """The surface of a sphere around the origin.
@@ -165,8 +171,7 @@ class Sphere(Domain):
 
     def lonlat(self, points: ArrayLike) -> np.ndarray:
         """Return longitudes in [-180, 180] and latitudes of positions (n, 3), in degrees, (n, 2)."""
-        x, y, z = np.asarray(points, float).T
-        return np.degrees(np.column_stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]))
+        return directions(np.asarray(points, float))
 
     def arcs(self, chords: ArrayLike) -> np.ndarray:
         """Return the lengths of the arcs of great circles over chords, (n,)."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..arguments import check_number
 from ..errors import InputError
-from ..geometry.sphere import Sphere
+from ..geometry.sphere import Sphere, directions
 from ..mesh.connectivity import face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
@@ -148,8 +148,7 @@ def default_center(result: Result) -> tuple[float, float]:
     areas = result.diagram.volumes
     if areas[smallest].sum() > 0.5 * areas.sum() or best.mean() < 0.25:
         return _CENTER
-    x, y, z = points[best].mean(axis=0)
-    lonlat = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+    lonlat = directions(points[best].mean(axis=0, keepdims=True))[0]
     lon, lat = (5 * np.round(lonlat / 5) + 0.0).tolist()
     return lon, lat
 

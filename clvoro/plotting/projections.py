@@ -11,7 +11,7 @@ from typing import cast
 
 import numpy as np
 
-from ..geometry.sphere import Sphere
+from ..geometry.sphere import Sphere, directions
 from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
 
@@ -153,14 +153,14 @@ class Plate:
 
     def flat(self, points: np.ndarray) -> np.ndarray:
         """Return the places of unit vectors (n, 3), (n, 2), within 180 degrees of the middle."""
-        lonlat = _lonlat(points)
+        lonlat = directions(points)
         lonlat[:, 0] = self.middle + _turn(lonlat[:, 0] - self.middle)
         return lonlat
 
     def reaches(self, points: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Return whether cells around unit vectors (n, 3), with corners within `radii`, may be shown; (n,) bool."""
         lat, reach = (
-            _lonlat(points)[:, 1],
+            directions(points)[:, 1],
             60 * radii,
         )  # the angle over a chord is up to pi / 2 times as long
         return (lat > self.lower[1] - 1.5 * reach) & (lat < self.upper[1] + 1.5 * reach)
@@ -174,7 +174,7 @@ class Plate:
         if not len(cells):
             return Polygons(cells, np.zeros(1, int), np.empty((0, 2)), np.empty(0, int))
         starts, points, faces = outlines(diagram, cells, _turns(diagram, cells))
-        corners = _lonlat(points)
+        corners = directions(points)
         first, next_ = starts[:-1], following(starts)
         jumps = -np.round((corners[next_, 0] - corners[:, 0]) / 360).astype(int)
         steps = corners[next_, 0] - corners[:, 0] + 360 * jumps
@@ -189,7 +189,7 @@ class Plate:
         parts = [Polygons(cells[plain], kept, corners[places], faces[places])]
         for i in np.flatnonzero(polar):
             row = slice(starts[i], starts[i + 1])
-            ring, of = _around_pole(_lonlat(points[row]), faces[row])
+            ring, of = _around_pole(directions(points[row]), faces[row])
             parts.append(Polygons(cells[i : i + 1], np.array([0, len(ring)]), ring, of))
         return self._images(_joined(parts))
 
@@ -280,14 +280,9 @@ def _arcs(diagram: Diagram, cells: np.ndarray) -> tuple[np.ndarray, ...]:
 def _turns(diagram: Diagram, cells: np.ndarray) -> np.ndarray:
     """Return the number of parts in which longitudes differ little, for each face of `cells`."""
     begin, middle, end, _, _ = _arcs(diagram, cells)
-    a, b, c = (_lonlat(x)[:, 0] for x in (begin, middle, end))
+    a, b, c = (directions(x)[:, 0] for x in (begin, middle, end))
     largest = np.maximum(np.abs(_turn(b - a)), np.abs(_turn(c - b)))
     return np.where(largest > _TURN, 2 * np.ceil(largest / _TURN).astype(int), 1)
-
-
-def _lonlat(points: np.ndarray) -> np.ndarray:
-    x, y, z = points.T
-    return np.degrees(np.column_stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]))
 
 
 def _turn(degrees: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from ..arguments import check_number
 from ..errors import InputError, InputTypeError
 from ..geometry.box import Box, Domain
-from ..geometry.sphere import Sphere
+from ..geometry.sphere import Sphere, directions
 from .arguments import check_positive, check_slope
 from .distance import Distance
 from .field import Combined, Field, Scaled, as_field
@@ -90,11 +90,10 @@ class LonLat(Field):
         self.field, self.on_device, self.parts = inner, inner.on_device, inner.parts + 1
 
     def _lonlat(self, points: np.ndarray) -> np.ndarray:
-        x, y, z = points.T
-        lon = np.degrees(np.arctan2(y, x))
+        lon, lat = directions(points).T
         lon = np.where(lon < self.west, lon + 360, lon)
         lon = np.where(lon > self.west + 360, lon - 360, lon)
-        return np.column_stack([lon, np.degrees(np.arctan2(z, np.hypot(x, y)))])
+        return np.column_stack([lon, lat])
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return self.field._evaluate(self._lonlat(points))
