@@ -96,6 +96,7 @@ def test_values(name):
     )
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", list(FIELDS))
 def test_on_the_device(ctx, name, real):
