@@ -15,7 +15,8 @@ Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shape
 `Sphere`, for global models; `regions` finds the cells of oceans and limited areas. `curves` has circles, ellipses, wing
 sections and splines for their boundaries. Sizes: numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`.
 `adapt` returns a `Result`, `voronoi` a `Diagram` of given generators; both have arrays, `save`, `plot`, `check` and
-`transfer`, and `load` reads a saved result. `Adapter` is the full interface, on a device of your choice, with
+`transfer`, and `load` reads a saved result. `power_diagram` takes generators with weights; `transport` finds those with
+which cells have given volumes (`Transported`). `Adapter` is the full interface, on a device of your choice, with
 `MultilevelOptions`, `PaperOptions` and `Checkpoint`; Ctrl-C raises `Interrupted`, which carries the mesh so far. Errors
 and warnings are in `clvoro.errors`, pictures in `clvoro.plotting`, times of kernels in `clvoro.profile`. The command is
 ``clvoro``; begin with ``clvoro --help``.
@@ -32,9 +33,10 @@ from .geometry.sphere import Sphere
 from .io import load
 from .mesh.diagram import Diagram
 from .mesh.results import Displacements, Result
+from .mesh.transported import Transported
 from .opencl import profile
 from .opencl.devices import create_context, list_devices
-from .shared import adapt, voronoi
+from .shared import adapt, power_diagram, transport, voronoi
 
 __version__ = "0.1.0"
 
@@ -52,13 +54,16 @@ __all__ = [
     "Polygon",
     "Result",
     "Sphere",
+    "Transported",
     "adapt",
     "create_context",
     "curves",
     "list_devices",
     "load",
+    "power_diagram",
     "profile",
     "regions",
     "sizing",
+    "transport",
     "voronoi",
 ]

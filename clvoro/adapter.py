@@ -27,12 +27,14 @@ from .adaptation.options import (
 from .adaptation.preparation import Preparation
 from .adaptation.run import run_adaptation
 from .adaptation.stages import Stages
+from .adaptation.transport.given import power_diagram_of, transport_to
 from .arguments import Naming, check_callable, check_choice, check_points
 from .errors import InputError, InputTypeError, Interrupted, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.box import Domain
 from .mesh.diagram import Diagram
 from .mesh.results import Result
+from .mesh.transported import Transported
 from .opencl import devices as device
 from .opencl.build_notice import BuildNotice, noticed_builds
 from .opencl.engine import Engine
@@ -235,6 +237,26 @@ class Adapter:
             t = tessellator.tessellate(sorted_points, n, exact=True, binned=binned)
             t, extended = tessellator.final(t)
         return fetch_diagram(engine, domain, t, labels, extended=extended)
+
+    def power_diagram(self, domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
+        """Return the power diagram of `points` with `weights`; see `clvoro.power_diagram`."""
+        with self._alone():
+            return power_diagram_of(self._stages_for(domain), domain, points, weights)
+
+    def transport(
+        self,
+        domain: Domain,
+        points: ArrayLike,
+        volumes: ArrayLike,
+        *,
+        tolerance: float | None = None,
+        max_steps: int = 100,
+    ) -> Transported:
+        """Return the power diagram of `points` whose cells have `volumes`; see `clvoro.transport`."""
+        with self._alone():
+            return transport_to(
+                self._stages_for(domain), domain, points, volumes, tolerance, max_steps
+            )
 
     def run(
         self,

@@ -82,6 +82,10 @@ class CoarseSizeWarning(UserWarning):
     """The size field gives less than half a cell in the whole domain: probably the units differ."""
 
 
+class EmptyCellsWarning(UserWarning):
+    """Cells of a power diagram are empty, because of the weights of their generators; the message says how many."""
+
+
 class MismatchWarning(UserWarning):
     """A part of the input does not match the domain or the sizes: units or positions probably differ."""
 

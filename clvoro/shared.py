@@ -15,6 +15,7 @@ from .geometry.boundary_layers import Layers
 from .geometry.box import Domain
 from .mesh.diagram import Diagram
 from .mesh.results import Result
+from .mesh.transported import Transported
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -103,6 +104,107 @@ def adapt(
     return shared_adapter().run(
         domain, size, points, method, n_cells, effort=effort, layers=layers, seed=seed, callback=callback
     )  # fmt: skip
+
+
+def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
+    """Return the power diagram (Laguerre diagram) of `points` with `weights` in `domain`, on the best device.
+
+    The cell of generator i is the set of y with ``|y - x_i|^2 - w_i <= |y - x_j|^2 - w_j`` for all j (Aurenhammer 1987,
+    SIAM J. Comput. 16, 78). Its faces are at right angles to the lines between generators, and a larger weight makes
+    the cell larger. It need not contain its generator, and may be empty. Equal weights give the Voronoi diagram.
+
+    Parameters
+    ----------
+    domain : Box
+        With walls.
+    points : (n, d) array of float
+        Distinct generators inside the domain.
+    weights : (n,) array of float
+        In the square of the domain's unit of length. Only their differences count.
+
+    Returns
+    -------
+    Diagram
+        Row i belongs to ``points[i]``. It has `weights`; its `empty_cells` are the rows of cells without volume.
+
+    Raises
+    ------
+    DeviceError
+        If no device works.
+    InputError, InputTypeError
+        If an argument is not as expected, the domain is no box with walls, or points are too close together for the
+        precision.
+    MemoryLimitError
+        If the device has not enough memory.
+
+    Warns
+    -----
+    EmptyCellsWarning
+        If cells are empty; says how many.
+
+    Examples
+    --------
+    >>> points = [(0.5, 0.5), (1.5, 0.5)]
+    >>> d = clvoro.power_diagram(clvoro.Box((0, 0), (2, 1)), points, [0.2, 0])
+    >>> d.volumes.round(3).tolist(), d.empty_cells.tolist()
+    ([1.1, 0.9], [])
+    """
+    return shared_adapter().power_diagram(domain, points, weights)
+
+
+def transport(
+    domain: Domain,
+    points: ArrayLike,
+    volumes: ArrayLike,
+    *,
+    tolerance: float | None = None,
+    max_steps: int = 100,
+) -> Transported:
+    """Find the weights with which the cells of a power diagram have prescribed `volumes`, on the best device.
+
+    These cells transport the volume of the domain to the generators at the least cost, the integral of the squared
+    distance. Damped steps of Newton's method find them for any volumes that sum to that of the domain (Kitagawa,
+    Merigot and Thibert 2019, J. Eur. Math. Soc. 21, 2603).
+
+    Parameters
+    ----------
+    domain : Box
+        With walls.
+    points : (n, d) array of float
+        Distinct generators inside the domain. They stay where they are.
+    volumes : (n,) array of float
+        Volumes > 0 of the cells (areas in 2D). Their sum is that of the domain.
+    tolerance : float, optional
+        Largest relative error of a volume; by default 1e-10, in float32 1e-3.
+    max_steps : int
+        Largest number of Newton steps.
+
+    Returns
+    -------
+    Transported
+
+    Raises
+    ------
+    DeviceError, InputError, InputTypeError, MemoryLimitError
+        As `power_diagram`; also if the volumes do not have the sum of the domain.
+    SolverError
+        If a linear solve breaks down.
+
+    Warns
+    -----
+    SizeErrorWarning
+        If some volumes are farther off than the tolerance at the end; says how many.
+
+    Examples
+    --------
+    >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)]
+    >>> found = clvoro.transport(clvoro.Box((0, 0), (1, 1)), points, [0.2, 0.3, 0.5])
+    >>> found.diagram.volumes.round(9).tolist(), found.converged
+    ([0.2, 0.3, 0.5], True)
+    """
+    return shared_adapter().transport(
+        domain, points, volumes, tolerance=tolerance, max_steps=max_steps
+    )
 
 
 def voronoi(domain: Domain, points: ArrayLike) -> Diagram:

@@ -1,5 +1,5 @@
 /* The position of a generator as the origin of the plane in which its cell is cut. */
-#include "opencl/real.h"
+#include "geometry/weights.h"
 
 #ifdef SPHERE
 /* A generator on the unit sphere as the origin of a plane: its tangent plane, onto which the sphere is projected from
@@ -79,7 +79,14 @@ inline void on_sphere(const REAL *x, REAL2 p, REAL *d)
     EACH_AXIS(a)
     d[a] -= sink * x[a];
 }
+#elif defined(WEIGHTED)
+#define SITE_SIZE 3
+#define SITE(x, i, points) const REAL x[SITE_SIZE] = {points[STRIDE * (i)], points[STRIDE * (i) + 1], WEIGHT(points, i)}
+#define SITE_WEIGHT(x) (x)[2]
 #else
 #define SITE_SIZE 2
 #define SITE(x, i, points) const REAL x[SITE_SIZE] = {points[2 * (i)], points[2 * (i) + 1]}
+#endif
+#ifndef SITE_WEIGHT
+#define SITE_WEIGHT(x) R(0)
 #endif

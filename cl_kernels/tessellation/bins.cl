@@ -9,7 +9,7 @@ kernel void count_root(const int size, global const REAL *points, const FRAME fr
                        global int *ranks, global int *counts)
 {
     WORK_ITEM(i);
-    const int key = bin_in_grid(points + DIM * i, frame, shape);
+    const int key = bin_in_grid(points + STRIDE * i, frame, shape);
     keys[i] = key;
     ranks[i] = atomic_inc(counts + key);
 }
@@ -95,7 +95,7 @@ kernel void count_in_child_bins(const int size, global const REAL *points, BIN_A
     const int g = bins[keys[i]].s1;
     if (bins[keys[i] + 1].s1 == g)
         return;
-    const int key = bin_in_grid(points + DIM * i, grid_frames[g], grid_shapes[g]);
+    const int key = bin_in_grid(points + STRIDE * i, grid_frames[g], grid_shapes[g]);
     keys[i] = key;
     ranks[i] = atomic_inc(counts + key);
 }
@@ -161,11 +161,11 @@ kernel void number_items(const int size, global int *items)
     items[p] = p;
 }
 
-/* Per item p: the position of its generator. */
+/* Per item p: the position of its generator, and its weight. */
 kernel void gather_items(const int size, global const int *items, global const REAL *points, global REAL *binned)
 {
     WORK_ITEM(p);
     const int i = items[p];
-    for (int a = 0; a < DIM; ++a)
-        binned[DIM * p + a] = points[DIM * i + a];
+    for (int a = 0; a < STRIDE; ++a)
+        binned[STRIDE * p + a] = points[STRIDE * i + a];
 }

@@ -6,7 +6,7 @@
    grid_shapes[g]  (first bin, bins along x, y, z); one more entry behind the last bin marks its end
    bins[b]         (first item, next grid): bin b holds items [bins[b].s0, bins[b + 1].s0); it is divided, by grid
                    bins[b].s1, if bins[b + 1].s1 differs */
-#include "opencl/real.h"
+#include "geometry/weights.h"
 
 #define FRAME REAL4
 #define FRAME_INVERSE(f) ((f).s3)

@@ -11,13 +11,21 @@
 #if IN_LANES
 #include "simd/cell_measures.h"
 #endif
+#ifdef WEIGHTED
+/* Cells of a power diagram may be empty. */
+#define TOO_FEW(n) ((n) == 1 || (n) == 2)
+#define CLIP_BOUND_ARGS BOUND_ARGS
+#else
+#define TOO_FEW(n) ((n) < 3)
+#define CLIP_BOUND_ARGS
+#endif
 
 /* Per item p in bin order: the cell of generator i = items[p] as its list of neighbors, counter-clockwise.
 
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest corner cannot cut, so the search widens until the
-   searched square of bins covers that circle. reach[p] is the first guess of the radius, and then the radius.
-   Only the first `rows_wanted` generators get cells.
+   searched square of bins covers that circle. In a power diagram (the paper's 2.5) see `search_radius`. reach[p] is the
+   first guess of the radius, and then the radius. Only the first `rows_wanted` generators get cells.
 
    With s = places[i], which is i for all but the longest rows:
    rows[s * SLOT ...]  neighbors j, or -1 - wall; |row_counts[s]| of them, negative if round-off leaves a doubt
@@ -26,7 +34,7 @@
 kernel void clip_polygons(const int size, const int rows_wanted, global const REAL *binned, global const int *items,
                           global float *reach, BIN_ARGS, global const REAL *points, const REAL4 box_lower,
                           const REAL4 box_upper, const int some, global int *rows, global int *row_counts,
-                          global int *places, global int *flags)
+                          global int *places, global int *flags CLIP_BOUND_ARGS)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -46,9 +54,17 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
 #ifdef SPHERE
         flag = clip_cell_by_bins(&cell, (REAL4)(x[0], x[1], x[2], 0), p, w, inner, false, &in);
 #else
+#ifdef WEIGHTED
+        /* The outermost bins extend beyond the square. */
+        cell.most = weight_within(x, w + 1 / FRAME_INVERSE(grid_frames[0]) BOUNDS) - SITE_WEIGHT(x);
+#endif
         flag = clip_polygon_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
 #endif
+#ifdef WEIGHTED
+        const REAL need = cell.n ? search_radius(x, SITE_WEIGHT(x), cell.reach2 * R(1.01) BOUNDS) : 0;
+#else
         const REAL need = sqrt(cutting_distance2(&cell));
+#endif
         if (!(need > w)) /* a NaN ends the loop, too */
             break;
         inner = w;
@@ -110,7 +126,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
         for (int left = n, k = 0; left > 0; left -= 32, ++k)
             keep[place + k] = left < 32 ? (1u << left) - 1 : ~0u;
         counts[i] = n;
-        if (n < 3)
+        if (TOO_FEW(n))
             atomic_or(flags, FLAG_COLLAPSED);
         return;
     }
@@ -159,7 +175,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
         }
     }
     counts[i] = count;
-    if (count < 3)
+    if (TOO_FEW(count))
         atomic_or(flags, FLAG_COLLAPSED);
 }
 
@@ -269,6 +285,8 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     global const int *row = neighbors + starts[i];
     const int n = starts[i + 1] - starts[i];
+    if (n == 0)
+        return;
     const REAL least = fmin(512 * REAL_EPS, share * volumes[i]);
     const REAL noise2 = flags[5] ? 16 * REAL_EPS * REAL_EPS : 0;
     bool right = volumes[i] > 0;
@@ -344,6 +362,6 @@ kernel void drop_loops(const int size, global const int *places, global const in
         ++face;
     }
     counts[i] = count;
-    if (count < 3)
+    if (TOO_FEW(count))
         atomic_or(flags, FLAG_COLLAPSED);
 }

@@ -20,19 +20,29 @@ inline REAL4 cross_product(REAL4 a, REAL4 b)
                    difference_of_products(a.s0, b.s1, a.s1, b.s0), 0);
 }
 
+/* The weight of the cell's generator, and the square of the vector to the generator behind a plane. */
+#ifdef WEIGHTED
+#define OWN_WEIGHT(cell) (cell)->weight
+#define SQUARE_OF(plane) ((plane).s0 * (plane).s0 + (plane).s1 * (plane).s1 + (plane).s2 * (plane).s2)
+#else
+#define OWN_WEIGHT(cell) R(0)
+#define SQUARE_OF(plane) (2 * (plane).s3)
+#endif
+
 /* The plane for generator q, or instead the bisector of p and q: if these are near each other and far from the cell,
    their planes are nearly parallel, but the difference of the planes is accurate. */
 inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const REAL *points)
 {
     if (label_p < 0 || label_q < 0)
         return q;
-    const REAL4 w =
-        (REAL4)(points[3 * label_q] - points[3 * label_p], points[3 * label_q + 1] - points[3 * label_p + 1],
-                points[3 * label_q + 2] - points[3 * label_p + 2], 0);
+    const REAL4 w = (REAL4)(points[STRIDE * label_q] - points[STRIDE * label_p],
+                            points[STRIDE * label_q + 1] - points[STRIDE * label_p + 1],
+                            points[STRIDE * label_q + 2] - points[STRIDE * label_p + 2], 0);
     const REAL w2 = w.s0 * w.s0 + w.s1 * w.s1 + w.s2 * w.s2;
-    if (w2 > 2 * NEAR_EACH_OTHER * p.s3) /* level is half a square */
+    if (w2 > NEAR_EACH_OTHER * SQUARE_OF(p))
         return q;
-    return (REAL4)(w.s0, w.s1, w.s2, w.s0 * p.s0 + w.s1 * p.s1 + w.s2 * p.s2 + w2 / 2);
+    const REAL level = (w2 - (WEIGHT(points, label_q) - WEIGHT(points, label_p))) / 2;
+    return (REAL4)(w.s0, w.s1, w.s2, w.s0 * p.s0 + w.s1 * p.s1 + w.s2 * p.s2 + level);
 }
 
 /* The intersection of three planes. */
@@ -286,11 +296,24 @@ inline void close_rim(CELL *cell, int face)
 #define CLIP_SHARPLY 0
 #endif
 
-/* Clip the cell by the bisector with the neighbor at x + d: remove the points y with y.d > d.d / 2; returns CLIP_*.
-   With `seen_before` the cell may already have a face with this neighbor. */
+/* Empty the cell in a power diagram, where that is no error; returns CLIP_*. */
+inline int nothing_left(CELL *cell)
+{
+#ifdef WEIGHTED
+    cell->n = 0;
+    cell->reach2 = 0;
+    return CLIP_CUT;
+#else
+    return CLIP_COLLAPSED;
+#endif
+}
+
+/* Clip the cell by the bisector with the neighbor at x + d: remove the points y with y.d > level, which is d.d / 2 for
+   equal weights; returns CLIP_*. In a power diagram nothing may be left: the cell then has no vertices. With
+   `seen_before` the cell may already have a face with this neighbor. */
 inline int clip_polyhedron(CELL *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
 {
-    const REAL level = d2 / 2;
+    const REAL level = (d2 - (WEIGHT(points, label) - OWN_WEIGHT(cell))) / 2;
     const int blocks = (cell->n + 7) / 8;
     REAL8 far = -level;
     for (int b = 0; b < blocks; ++b) {
@@ -314,11 +337,13 @@ inline int clip_polyhedron(CELL *cell, REAL4 d, REAL d2, int label, bool seen_be
 
     if (!find_rim(cell, depth)) {
         if (cell->rim.gone == cell->n)
-            return CLIP_COLLAPSED;
+            return nothing_left(cell);
         const REAL doubt = 64 * distance * (noise_length(distance) + REAL_EPS * sqrt(cell->reach2));
         cell->torn |= !keep_disc(cell, depth, doubt);
-        if (!find_rim(cell, depth))
-            return CLIP_COLLAPSED;
+        if (!find_rim(cell, depth)) {
+            cell->torn = true;
+            return nothing_left(cell);
+        }
     }
     const int face = replace_faces(cell, label);
     if (face == FACE_CAPACITY)
@@ -344,7 +369,8 @@ inline int clip_polyhedron_by_row(CELL *cell, int i, REAL4 x, global const int *
         const int j = neighbors[k];
         if (j < 0)
             continue;
-        const REAL4 d = (REAL4)(points[3 * j] - x.s0, points[3 * j + 1] - x.s1, points[3 * j + 2] - x.s2, 0);
+        const REAL4 d =
+            (REAL4)(points[STRIDE * j] - x.s0, points[STRIDE * j + 1] - x.s1, points[STRIDE * j + 2] - x.s2, 0);
         const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2;
         const int what = d2 == 0 ? CLIP_COINCIDE : clip_polyhedron(cell, d, d2, j, false, points);
         if (what >= CLIP_FULL)

@@ -1,4 +1,4 @@
-#include "opencl/real.h"
+#include "geometry/weights.h"
 
 /* Least distance of a removed vertex beyond the bisector with the neighbor at x + d, times |d|. It exceeds the
    round-off of the vertex and that of positions in the unit box, unless the generators are nearer than that. So the

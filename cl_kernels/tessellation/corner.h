@@ -32,12 +32,13 @@ inline REAL fold_period(REAL d, REAL period)
 #define direction_of direction_in_plane
 inline REAL2 direction_in_plane(const REAL *x, int j, global const REAL *points)
 {
-    return (REAL2)(BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1]));
+    return (REAL2)(BETWEEN(0, x[0], points[STRIDE * j]), BETWEEN(1, x[1], points[STRIDE * j + 1]));
 }
 
 #endif
 
-/* The circumcenter of 0, u and v; u2 and v2 are the squares of u and v. */
+/* The circumcenter of 0, u and v; u2 and v2 are the squares of u and v. With differences of weights subtracted from
+   these, the point in which the three cells meet. */
 inline REAL2 circumcenter(REAL2 u, REAL2 v, REAL u2, REAL v2)
 {
     const REAL inverse = R(0.5) / difference_of_products(u.s0, v.s1, u.s1, v.s0);
@@ -68,14 +69,15 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
 {
     if (a >= 0 && b >= 0) {
         const REAL2 u = direction_of(x, a, points), v = direction_of(x, b, points);
-        const REAL2 w = (REAL2)(APART(0, u.s0, v.s0, points[2 * a], points[2 * b]),
-                                APART(1, u.s1, v.s1, points[2 * a + 1], points[2 * b + 1]));
+        const REAL2 w = (REAL2)(APART(0, u.s0, v.s0, points[STRIDE * a], points[STRIDE * b]),
+                                APART(1, u.s1, v.s1, points[STRIDE * a + 1], points[STRIDE * b + 1]));
         const REAL u2 = dot(u, u), v2 = dot(v, v), w2 = dot(w, w);
+        const REAL to_a = WEIGHT(points, a) - SITE_WEIGHT(x), to_b = WEIGHT(points, b) - SITE_WEIGHT(x);
         /* The circumcenter of the triangle, relative to x_i. If the other two generators are near each other, the
            squares cancel, and it is computed relative to one of them. */
         if (w2 > R(1e-3) * u2)
-            return circumcenter(u, v, u2, v2);
-        return circumcenter(w, -u, w2, u2) + u;
+            return circumcenter(u, v, u2 - to_a, v2 - to_b);
+        return circumcenter(w, -u, w2 - (WEIGHT(points, b) - WEIGHT(points, a)), u2 + to_a) + u;
     }
 #ifdef SPHERE
     return corner_at_square(x, a, b, points);
@@ -91,12 +93,12 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
     const int axis = wall / 2;
     const int o = min(i, j), q = max(i, j);
     const REAL level = wall % 2 ? upper[axis] : lower[axis];
-    const REAL d_across = points[2 * q + axis] - points[2 * o + axis];
-    const REAL d_along = BETWEEN(1 - axis, points[2 * o + 1 - axis], points[2 * q + 1 - axis]);
-    const REAL across = level - points[2 * o + axis];
-    const REAL d2 = d_across * d_across + d_along * d_along;
+    const REAL d_across = points[STRIDE * q + axis] - points[STRIDE * o + axis];
+    const REAL d_along = BETWEEN(1 - axis, points[STRIDE * o + 1 - axis], points[STRIDE * q + 1 - axis]);
+    const REAL across = level - points[STRIDE * o + axis];
+    const REAL d2 = d_across * d_across + d_along * d_along - (WEIGHT(points, q) - WEIGHT(points, o));
     const REAL along = difference_of_products(R(0.5), d2, d_across, across) / d_along +
-                       BETWEEN(1 - axis, x[1 - axis], points[2 * o + 1 - axis]);
+                       BETWEEN(1 - axis, x[1 - axis], points[STRIDE * o + 1 - axis]);
     return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
 #endif
 }

@@ -74,6 +74,10 @@ inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *
         doubtful = is_doubtful(cell, x, points);
         if (doubtful && !flags[5])
             drop_short_faces(cell, points);
+#ifdef WEIGHTED
+        if (cell->n < 3)
+            cell->n = 0; /* no larger than round-off */
+#endif
         if (cell->n > ROW_CAPACITY)
             flag = FLAG_FULL;
     }

@@ -21,15 +21,19 @@ inline wide_t wide_cross(wide_half_plane_t a, wide_half_plane_t b)
     return wide_add(wide_product(a.x, b.y), -wide_product(a.y, b.x));
 }
 
-/* The points nearer to a generator at x than to that of `label`, or inside a wall of the box; relative to x. */
+/* The points nearer to a generator at x than to that of `label` (in a power diagram, by the power distance), or inside
+   a wall of the box; relative to x. */
 inline wide_half_plane_t half_plane_of(const REAL *x, int label, global const REAL *points, const REAL *lower,
                                        const REAL *upper)
 {
     wide_half_plane_t h = {0, 0, 0};
     if (label >= 0) {
-        h.x = BETWEEN_WIDE(0, x[0], points[2 * label]);
-        h.y = BETWEEN_WIDE(1, x[1], points[2 * label + 1]);
+        h.x = BETWEEN_WIDE(0, x[0], points[STRIDE * label]);
+        h.y = BETWEEN_WIDE(1, x[1], points[STRIDE * label + 1]);
         h.level = wide_add(wide_product(h.x, h.x), wide_product(h.y, h.y)) / 2;
+#ifdef WEIGHTED
+        h.level = wide_add(h.level, wide_sum(SITE_WEIGHT(x), -WEIGHT(points, label)) / 2);
+#endif
         return h;
     }
     const int wall = -1 - label, axis = wall / 2;
@@ -47,8 +51,12 @@ inline wide_half_plane_t half_plane_of(const REAL *x, int label, global const RE
 inline wide_half_plane_t between_half_planes(wide_half_plane_t a, wide_half_plane_t b)
 {
     const wide_t x = wide_add(a.x, -b.x), y = wide_add(a.y, -b.y);
+#ifdef WEIGHTED
+    const wide_half_plane_t h = {x, y, wide_add(a.level, -b.level)};
+#else
     const wide_t twice = wide_add(wide_product(x, wide_add(a.x, b.x)), wide_product(y, wide_add(a.y, b.y)));
     const wide_half_plane_t h = {x, y, twice / 2};
+#endif
     return h;
 }
 

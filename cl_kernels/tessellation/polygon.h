@@ -7,6 +7,9 @@
 #else
 #include "tessellation/half_planes.h"
 #endif
+#ifdef WEIGHTED
+#include "tessellation/weight_bounds.h"
+#endif
 
 #ifndef CELL_CAPACITY
 #error "build with -DCELL_CAPACITY=faces that a cell may have while it is clipped"
@@ -25,13 +28,21 @@ typedef struct {
     /* The generator and its position. */
     int generator;
     REAL position[SITE_SIZE], lower[2], upper[2];
+#ifdef WEIGHTED
+    REAL most; /* largest difference of the weight of a generator that is searched from that of this one */
+#endif
 } cell_t;
 
 /* Square of the distance beyond which no generator cuts the cell: twice the reach. Corners of nearly parallel faces
    have an error of eps over the angle, and so has the reach. */
 inline REAL cutting_distance2(const cell_t *cell)
 {
+#ifdef WEIGHTED
+    const REAL far = cutting_radius(cell->reach2 * R(1.01), cell->most);
+    return far * far;
+#else
     return 4 * cell->reach2 * R(1.01);
+#endif
 }
 
 /* Start with the whole box around generator x; on a sphere, with a square in the tangent plane. */
@@ -78,12 +89,12 @@ inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out
     return a + ab * (s / (s - s_out));
 }
 
-/* Signed distance, times |d|, of corner k from the bisector with the neighbor at x + d. Computed from the positions of
-   the generators if round-off may have moved the corner to the other side. */
-inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL d2, REAL doubt, int neighbor,
+/* Signed distance, times |d|, of corner k from the bisector { y : y.d = level } with the neighbor at x + d. Computed
+   from the positions of the generators if round-off may have moved the corner to the other side. */
+inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL level, REAL doubt, int neighbor,
                    global const REAL *points)
 {
-    const REAL s = cell->x[k] * d[0] + cell->y[k] * d[1] - d2 / 2;
+    const REAL s = cell->x[k] * d[0] + cell->y[k] * d[1] - level;
     if (fabs(s) > doubt)
         return s;
     const int before = k == 0 ? cell->n - 1 : k - 1;
@@ -99,11 +110,11 @@ inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL d2, REAL doubt
 }
 
 /* The first corner beyond the bisector, if some are in doubt; n if there is none. */
-OUT_OF_LINE int first_beyond(const cell_t *cell, const REAL *d, REAL d2, REAL doubt, int neighbor,
+OUT_OF_LINE int first_beyond(const cell_t *cell, const REAL *d, REAL level, REAL doubt, int neighbor,
                              global const REAL *points)
 {
     int k = 0;
-    while (k < cell->n && !(beyond(cell, k, d, d2, doubt, neighbor, points) > 0))
+    while (k < cell->n && !(beyond(cell, k, d, level, doubt, neighbor, points) > 0))
         ++k;
     return k;
 }
@@ -115,25 +126,30 @@ inline void copy_corner(cell_t *cell, int to, int from)
     cell->faces[to] = cell->faces[from];
 }
 
-/* Clip the cell by the bisector with the neighbor at x + d: remove the points y with y.d > d.d / 2. False if the cell
-   is full. */
+/* Clip the cell by the bisector with the neighbor at x + d: remove the points y with y.d > level; see weights.h. In a
+   power diagram nothing may be left. False if the cell is full. */
 inline bool clip_polygon(cell_t *cell, const REAL *d, REAL d2, int neighbor, bool seen_before,
                          global const REAL *points)
 {
     const int n = cell->n;
+    const REAL level = (d2 - (WEIGHT(points, neighbor) - SITE_WEIGHT(cell->position))) / 2;
+#ifdef WEIGHTED
+    if (level > 0 && level * level > R(1.01) * d2 * cell->reach2)
+        return true;
+#endif
     const REAL doubt = IN_DOUBT * sqrt(d2 * fmax(d2, cell->reach2));
     /* A corner to remove, if any. Usually no corner is in doubt. */
     int first = 0;
     REAL s_first = 0, far = -REAL_MAX;
     for (; first < n; ++first) {
-        s_first = cell->x[first] * d[0] + cell->y[first] * d[1] - d2 / 2;
+        s_first = cell->x[first] * d[0] + cell->y[first] * d[1] - level;
         if (s_first > doubt)
             break;
         far = fmax(far, s_first);
     }
     if (first == n && far >= -doubt) {
-        first = first_beyond(cell, d, d2, doubt, neighbor, points);
-        s_first = first < n ? beyond(cell, first, d, d2, doubt, neighbor, points) : 0;
+        first = first_beyond(cell, d, level, doubt, neighbor, points);
+        s_first = first < n ? beyond(cell, first, d, level, doubt, neighbor, points) : 0;
     }
     if (first == n)
         return true;
@@ -144,20 +160,27 @@ inline bool clip_polygon(cell_t *cell, const REAL *d, REAL d2, int neighbor, boo
 
     /* The removed corners are first..last, cyclically. */
     int last = first, before = first == 0 ? n - 1 : first - 1;
-    REAL s_last = s_first, s_before = beyond(cell, before, d, d2, doubt, neighbor, points);
+    REAL s_last = s_first, s_before = beyond(cell, before, d, level, doubt, neighbor, points);
     while (s_before > 0 && before != last) {
         first = before;
         s_first = s_before;
         before = first == 0 ? n - 1 : first - 1;
-        s_before = beyond(cell, before, d, d2, doubt, neighbor, points);
+        s_before = beyond(cell, before, d, level, doubt, neighbor, points);
     }
+#ifdef WEIGHTED
+    if (s_before > 0) {
+        cell->n = 0;
+        cell->reach2 = 0;
+        return true;
+    }
+#endif
     int after = last == n - 1 ? 0 : last + 1;
-    REAL s_after = beyond(cell, after, d, d2, doubt, neighbor, points);
+    REAL s_after = beyond(cell, after, d, level, doubt, neighbor, points);
     while (s_after > 0 && after != before) {
         last = after;
         s_last = s_after;
         after = last == n - 1 ? 0 : last + 1;
-        s_after = beyond(cell, after, d, d2, doubt, neighbor, points);
+        s_after = beyond(cell, after, d, level, doubt, neighbor, points);
     }
     /* The bisector cuts the faces before -> first and last -> after. */
     const int last_face = cell->faces[last];

@@ -8,9 +8,9 @@
 
 inline REAL distance_between(global const REAL *points, int i, int j)
 {
-    const REAL dx = points[3 * j] - points[3 * i];
-    const REAL dy = points[3 * j + 1] - points[3 * i + 1];
-    const REAL dz = points[3 * j + 2] - points[3 * i + 2];
+    const REAL dx = points[STRIDE * j] - points[STRIDE * i];
+    const REAL dy = points[STRIDE * j + 1] - points[STRIDE * i + 1];
+    const REAL dz = points[STRIDE * j + 2] - points[STRIDE * i + 2];
     return sqrt(dx * dx + dy * dy + dz * dz);
 }
 
@@ -54,13 +54,46 @@ inline void check_cell_balls(const CELL *cell, int i, REAL4 place, const halo_t 
 }
 #endif
 
+#ifdef WEIGHTED
+/* Cells of a power diagram may be empty. */
+#define TOO_FEW(count) ((count) < 4 && (count) > 0)
+#define CLIP_BOUND_ARGS BOUND_ARGS
+#define CLIP_BOUNDS BOUNDS
+#else
+#define TOO_FEW(count) ((count) < 4)
+#define CLIP_BOUND_ARGS
+#define CLIP_BOUNDS
+#endif
+
+/* A cell without faces. */
+inline void write_empty_cell(int i, global int *row_places, global int *row_counts, global REAL *volumes,
+                             global REAL *offsets, global REAL *covariances)
+{
+    row_places[i] = row_counts[i] = 0;
+    volumes[i] = 0;
+    EACH_AXIS(a)
+    offsets[3 * i + a] = covariances[6 * i + a] = covariances[6 * i + 3 + a] = 0;
+}
+
+/* The radius that the search of a cell must cover, for its present vertices. */
+inline REAL needed_radius(const CELL *cell, REAL4 x CLIP_BOUND_ARGS)
+{
+#ifdef WEIGHTED
+    const REAL at[3] = {x.s0, x.s1, x.s2};
+    return cell->n ? search_radius(at, x.s3, cell->reach2 BOUNDS) * (1 + 8 * REAL_EPS) : 0;
+#else
+    return 2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS);
+#endif
+}
+
 /* Per item p in bin order: the cell of generator i = items[p], its faces and its measures.
 
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest vertex cannot cut, so the search widens until the
-   searched cube of bins covers that ball. reach[p] is the first guess of the radius, and then the radius. With `warm`
-   the cell is first clipped by the neighbors of an earlier, similar diagram, and the search only has to confirm them.
-   Only the first `rows` generators get cells; in a periodic box the balls around their vertices are tested.
+   searched cube of bins covers that ball. In a power diagram (the paper's 2.5) see `search_radius`. reach[p] is the
+   first guess of the radius, and then the radius. With `warm` the cell is first clipped by the neighbors of an earlier,
+   similar diagram, and the search only has to confirm them. Only the first `rows` generators get cells; in a periodic
+   box the balls around their vertices are tested.
 
    A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
    S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20. */
@@ -68,7 +101,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
                            global float *reach, BIN_ARGS, global const REAL *points, const REAL4 box_lower,
                            const REAL4 box_upper, const int warm, global const int *old_starts,
                            global const int *old_neighbors, const int again, const int room, const REAL share,
-                           CELL_OUTPUT_ARGS CELL_ARGS HALO_ARGS)
+                           CELL_OUTPUT_ARGS CELL_ARGS HALO_ARGS CLIP_BOUND_ARGS)
 {
     TAKE_CELL(cell);
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
@@ -77,17 +110,22 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         const int i = items[p];
         if (i >= rows || (again && row_counts[i] != UNFINISHED))
             continue;
-        const REAL4 x = (REAL4)(binned[3 * p], binned[3 * p + 1], binned[3 * p + 2], 0);
+        const REAL4 x = SITE_IN_SPACE(binned, p);
         start_polyhedron(cell, x, box_lower, box_upper);
         int flag = 0;
         REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* a radius of 0 would never widen */
         if (warm) {
             flag = flag_of(clip_polyhedron_by_row(cell, i, x, old_starts, old_neighbors, points));
-            w = 2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS);
+            w = needed_radius(cell, x CLIP_BOUNDS);
         }
         while (flag == 0) {
+#ifdef WEIGHTED
+            /* The outermost bins extend beyond the cube. */
+            const REAL at[3] = {x.s0, x.s1, x.s2};
+            cell->most = weight_within(at, w + 1 / FRAME_INVERSE(grid_frames[0]) BOUNDS) - x.s3;
+#endif
             flag = clip_cell_by_bins(cell, x, p, w, inner, warm, &in);
-            const REAL need = 2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS);
+            const REAL need = needed_radius(cell, x CLIP_BOUNDS);
             if (!(need > w)) /* a NaN ends the loop, too */
                 break;
             inner = w;
@@ -98,6 +136,14 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
             row_counts[i] = flag == FLAG_FULL ? UNFINISHED : 0;
             continue;
         }
+#ifdef WEIGHTED
+        if (cell->n == 0) {
+            write_empty_cell(i, row_places, row_counts, volumes, offsets, covariances);
+            if (cell->torn)
+                atomic_or(report, FLAG_DOUBT);
+            continue;
+        }
+#endif
 
         reach[p] = (float)(2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS));
 #ifdef HALO
@@ -172,6 +218,13 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
             }
             ++count;
         }
+#ifdef WEIGHTED
+        if (count < 4) { /* no larger than round-off */
+            write_empty_cell(i, row_places, row_counts, volumes, offsets, covariances);
+            atomic_or(report, FLAG_DOUBT);
+            continue;
+        }
+#endif
         row_places[i] = place;
         row_counts[i] = count;
         if (with_corners && fits) {
@@ -259,7 +312,7 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
         count += mutual;
     }
     counts[i] = count;
-    if (count < 4 || !(apart <= share * volumes[i]))
+    if (TOO_FEW(count) || !(apart <= share * volumes[i]))
         atomic_or(report, FLAG_COLLAPSED);
     else if (apart > EVEN_SHARE * volumes[i])
         atomic_or(report, FLAG_UNEVEN);

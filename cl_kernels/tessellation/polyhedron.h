@@ -3,7 +3,7 @@
 
    The polyhedron is simple: three faces meet in every vertex (where more do, vertices coincide). Its dual is a
    triangulated sphere: a vertex is the triangle of its three faces, counter-clockwise seen from outside. */
-#include "opencl/real.h"
+#include "geometry/weights.h"
 
 #ifndef FACE_CAPACITY
 #error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 32"
@@ -74,7 +74,11 @@ typedef struct {
     int n;                             /* vertices */
     bool torn;                         /* whether a clip kept something that it should have removed; see clip.h */
     REAL reach2;                       /* largest squared distance of a vertex from the generator */
-    uint alive[FACE_WORDS];            /* set of the existing faces */
+#ifdef WEIGHTED
+    REAL weight; /* of the generator */
+    REAL most;   /* largest difference of the weight of a generator that is searched from this one */
+#endif
+    uint alive[FACE_WORDS]; /* set of the existing faces */
     rim_t rim;
 } cell_t;
 
@@ -152,9 +156,16 @@ inline void find_reach(CELL *cell)
     cell->reach2 = half2.s0 > half2.s1 ? half2.s0 : half2.s1;
 }
 
+/* The position of generator i, and its weight. */
+#define SITE_IN_SPACE(points, i)                                                                                       \
+    (REAL4)((points)[STRIDE * (i)], (points)[STRIDE * (i) + 1], (points)[STRIDE * (i) + 2], WEIGHT(points, i))
+
 /* Start with the whole box around generator x. Face w is wall w. */
 inline void start_polyhedron(CELL *cell, REAL4 x, REAL4 lower, REAL4 upper)
 {
+#ifdef WEIGHTED
+    cell->weight = x.s3;
+#endif
     cell->n = 8;
     cell->torn = false;
     for (int k = 0; k < FACE_WORDS; ++k)

@@ -18,4 +18,13 @@ inline int flag_of(int what)
 }
 
 #define CLIP_BY_ITEM(cell, d, j, warm, points) flag_of(clip_polyhedron(cell, d, (d).s3, j, warm, points))
+#ifdef WEIGHTED
+#include "tessellation/weight_bounds.h"
+#define CUTTING_SQUARE(cell) cutting_square(cell)
+inline REAL cutting_square(const CELL *cell)
+{
+    const REAL far = cutting_radius(cell->reach2, cell->most);
+    return far * far;
+}
+#endif
 #include "tessellation/search.h"

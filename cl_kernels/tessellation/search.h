@@ -1,6 +1,7 @@
 /* The search for generators that may cut a cell, through the bins around it in space. The file that includes this one
    has defined CELL, FLAG_COINCIDE, and CLIP_BY_ITEM(cell, d, j, warm, points): clip the cell by generator j at x + d,
-   whose squared distance is d.s3, and return FLAG_* or 0. */
+   whose squared distance is d.s3, and return FLAG_* or 0. In a power diagram it has defined CUTTING_SQUARE(cell), the
+   square of the distance beyond which no generator cuts: otherwise twice that of the farthest vertex. */
 #include "tessellation/bins.h"
 
 #ifndef MAX_DEPTH
@@ -9,6 +10,10 @@
 
 #define BATCH 256 /* generators that are sorted by distance at a time, at most 256 */
 #define SHELLS 32 /* bits of a word */
+
+#ifndef CUTTING_SQUARE
+#define CUTTING_SQUARE(cell) (4 * (cell)->reach2)
+#endif
 
 /* The arrays to search for neighbors. */
 typedef struct {
@@ -30,7 +35,8 @@ typedef struct {
 /* The vector from x to the generator of item q, and its squared length. */
 inline REAL4 vector_to_item(int q, REAL4 x, const search_t *in)
 {
-    const REAL dx = in->binned[3 * q] - x.s0, dy = in->binned[3 * q + 1] - x.s1, dz = in->binned[3 * q + 2] - x.s2;
+    const REAL dx = in->binned[STRIDE * q] - x.s0, dy = in->binned[STRIDE * q + 1] - x.s1,
+               dz = in->binned[STRIDE * q + 2] - x.s2;
     return (REAL4)(dx, dy, dz, dx * dx + dy * dy + dz * dz);
 }
 
@@ -56,7 +62,7 @@ inline int clip_by_batch(CELL *cell, REAL4 x, batch_t *batch, REAL per_shell, bo
         for (int k = batch->first[shell];; k = batch->next[k]) {
             const int q = batch->places[k];
             const REAL4 d = vector_to_item(q, x, in);
-            if (d.s3 < 4 * cell->reach2) {
+            if (d.s3 < CUTTING_SQUARE(cell)) {
                 if (d.s3 == 0)
                     return FLAG_COINCIDE;
                 const int flag = CLIP_BY_ITEM(cell, d, in->items[q], warm, in->points);
@@ -83,7 +89,7 @@ inline int take_items(CELL *cell, REAL4 x, int own, int begin, int end, batch_t 
 {
     while (begin < end) {
         const int stop = min(end, begin + BATCH - batch->n);
-        const REAL limit = 4 * cell->reach2;
+        const REAL limit = CUTTING_SQUARE(cell);
         int n = batch->n;
         SHORT_LOOP
         for (int q = begin; q < stop; ++q) {
@@ -145,7 +151,7 @@ inline int clip_cell_by_bins(CELL *cell, REAL4 x, int own, REAL w, REAL inner, b
             const bool layer_done = iz >= done_z.s0 && iz <= done_z.s1;
             for (iy = max(iy, ys.s0); iy <= ys.s1; ++iy, part = 0, at = -1) {
                 const REAL away_y = row_distance(x.s1, frame.s1, edge, iy, edge * BIN_SHARE + noise_y);
-                const REAL left2 = 4 * cell->reach2 - away_y * away_y - away_z * away_z;
+                const REAL left2 = CUTTING_SQUARE(cell) - away_y * away_y - away_z * away_z;
                 if (!(left2 > 0))
                     continue;
                 const REAL span = left2 < w * w ? sqrt(left2) * (1 + 8 * REAL_EPS) + edge * R(1e-6) : w;

@@ -6,13 +6,18 @@
 #define WIDE 4
 
 /* Range of x, relative to the generator, in which a row of bins may hold generators that cut the cell: the circles
-   around the corners through the generator, widened by the round-off. */
+   around the corners through the generator, widened by the round-off. In a power diagram the circles are wider or
+   narrower by the difference of weights. */
 inline REAL2 row_extent(const cell_t *cell, REAL below, REAL above)
 {
     REAL2 extent = (REAL2)(REAL_MAX, -REAL_MAX);
     for (int k = 0; k < cell->n; ++k) {
         const REAL x = cell->x[k], y = cell->y[k];
+#ifdef WEIGHTED
+        const REAL radius2 = (x * x + y * y) * R(1.01) + cell->most;
+#else
         const REAL radius2 = (x * x + y * y) * R(1.01);
+#endif
         const REAL away = y < below ? below - y : (y > above ? y - above : 0);
         if (away * away < radius2) {
             const REAL half_chord = sqrt(radius2 - away * away);
@@ -99,7 +104,7 @@ inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, RE
                 if (part == 1 && row_done)
                     end.s0 = first.s0;
                 for (int q = first.s0; q < end.s0; ++q) {
-                    const REAL d[2] = {binned[2 * q] - x[0], binned[2 * q + 1] - x[1]};
+                    const REAL d[2] = {binned[STRIDE * q] - x[0], binned[STRIDE * q + 1] - x[1]};
                     const REAL d2 = d[0] * d[0] + d[1] * d[1];
                     if (d2 >= cutting_distance2(cell) || q == own)
                         continue;

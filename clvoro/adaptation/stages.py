@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from ..solvers.poisson import Poisson
+from ..solvers.transport import Transport
 from ..solvers.volume_projection import VolumeProjection
 from ..tessellation.stages import TessellationStages
 from .corners import Corners
@@ -23,6 +24,7 @@ class Stages(TessellationStages):
     metric: Metric
     density: Density
     poisson: Poisson
+    transport: Transport
     volume_projection: VolumeProjection
     quality_descent: QualityDescent
     motion: Motion
@@ -32,7 +34,7 @@ class Stages(TessellationStages):
     insertion_deletion: InsertionDeletion
 
     CLASSES: ClassVar[dict[str, type]] = {
-        **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson,
+        **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson, "transport": Transport,
         "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "corners": Corners,
         "thin_walls": ThinWalls, "refinement": Refinement, "insertion_deletion": InsertionDeletion,
     }  # fmt: skip

@@ -172,6 +172,7 @@ def make_solver_mesh(
     from .straight_walls import straight_walls
 
     check_choice("walls", walls, ("straight", "exact"))
+    diagram.demand_cells("solver_mesh")
     check_not_sphere(
         diagram,
         "meshes for solvers have cells in the plane or polyhedra",

@@ -25,7 +25,6 @@ from .formats import check_polygons, write_foreign
 from .history import write_history
 from .metis import write_metis
 from .mpas import write_mpas
-from .netcdf_read import load_netcdf
 from .npz import load as load_npz
 from .npz import write_npz
 from .scrip import write_scrip
@@ -59,18 +58,12 @@ _CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas, "scrip": write_scrip}
 
 
 def load(path: str | PathLike[str]) -> Result | Diagram:
-    """Read a result or a diagram from a ``.npz`` or ``.vtu`` file of its `save`, or a mesh on a sphere from ``.nc``.
+    """Read a result or a diagram from a ``.npz`` or ``.vtu`` file of its `save`.
 
     A ``.npz`` file holds everything. A ``.vtu`` file holds cells, sizes, errors and quality: the graph is computed
     again, the history is empty, and a box without periodic directions is the bounding box of the cells. The file is not
     trusted: nothing in it is executed, sizes are compared with the bytes in the file before memory is allocated, and
     arrays must be consistent.
-
-    A ``.nc`` file of a mesh on a sphere may also be of another program. Generators, cells, neighbors and the generators
-    behind a boundary are those that were saved, up to round-off; the boundary has one name, and corners may have other
-    numbers. Files by the MPAS mesh specification have no sizes, errors and quality. UGRID files have longitudes and
-    latitudes of generators (the coordinates of faces); those of clvoro have sizes, errors and quality, too. SCRIP files
-    have corners, and only those of clvoro have generators.
 
     Parameters
     ----------
@@ -88,8 +81,11 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
         fault.
     """
     path = check_path("path", path)
-    readers = {".vtu": load_vtu, ".nc": load_netcdf}
-    return readers.get(Path(path).suffix.lower(), load_npz)(path)
+    if Path(path).suffix.lower() == ".nc":
+        raise InputError(
+            f"cannot load {path}: clvoro writes netCDF for other programs only, expected a .npz or .vtu file"
+        )
+    return (load_vtu if Path(path).suffix.lower() == ".vtu" else load_npz)(path)
 
 
 def save(mesh: Result | Diagram, path: str | PathLike[str], **options: Any) -> None:
@@ -109,6 +105,8 @@ def write_mesh(
     contents = Contents.of(mesh, cell_data)
     path = Path(check_path("path", path))
     suffix = path.suffix.lower()
+    if suffix != ".npz":
+        contents.diagram.demand_cells(f"a {suffix or 'polyMesh'} file")
     is_foam = path.name == "polyMesh" or suffix == ".foam"
     for options, fits, format_, name in (
         (for_foam, is_foam, "OpenFOAM", ".foam"),
@@ -164,6 +162,7 @@ def to_disv(mesh: Result | Diagram, walls: WallShape = "straight") -> Disv:
 def to_fipy(mesh: Result | Diagram, walls: WallShape = "straight") -> VoronoiMesh2D | VoronoiMesh3D:
     """Return a mesh of FiPy; see `Diagram.to_fipy`."""
     diagram = Contents.of(mesh).diagram
+    diagram.demand_voronoi("to_fipy")
     check_not_sphere(
         diagram,
         "FiPy has cells in the plane and polyhedra",
@@ -186,7 +185,9 @@ def to_meshio(
     """Return a mesh of meshio; see `Diagram.to_meshio`."""
     from .convert import to_meshio
 
-    return to_meshio(Contents.of(mesh, cell_data))
+    contents = Contents.of(mesh, cell_data)
+    contents.diagram.demand_cells("to_meshio")
+    return to_meshio(contents)
 
 
 def to_pyvista(
@@ -195,7 +196,9 @@ def to_pyvista(
     """Return an unstructured grid of PyVista; see `Diagram.to_pyvista`."""
     from .convert import to_pyvista
 
-    return to_pyvista(Contents.of(mesh, cell_data))
+    contents = Contents.of(mesh, cell_data)
+    contents.diagram.demand_cells("to_pyvista")
+    return to_pyvista(contents)
 
 
 def _chosen(convention: object) -> Callable[[Contents, Path, str], None]:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
 OWN = frozenset(
-    ("size", "error", "quality", "volume", "area", "sides", "faces_of_cell", "label", "boundary", "generator", "wall")
+    ("size", "error", "quality", "volume", "area", "sides", "faces_of_cell", "label", "boundary", "generator", "wall",
+     "weight")
 )  # fmt: skip
 """Names of clvoro's own cell data in any format."""
 

@@ -106,6 +106,7 @@ class Disv(Sealed):
 def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
     """Return the DISV grid of `diagram`; see `Diagram.to_disv`."""
     domain = diagram.domain
+    diagram.demand_voronoi("to_disv")
     check_not_sphere(
         diagram,
         "DISV grids are layers of cells in the plane",

@@ -37,6 +37,7 @@ def write_mpas(contents: Contents, path: Path, unit: str = "m") -> None:
 
 def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     diagram, domain = contents.diagram, contents.diagram.domain
+    diagram.demand_voronoi("an MPAS file")
     halves = half_edges(diagram, glued=True)
     _check_loops(halves, path)
     shape = measure(diagram, halves)

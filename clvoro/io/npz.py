@@ -53,6 +53,7 @@ _SHAPES = {
     "diagram.neighbor_starts": "N", "diagram.neighbors": "m", "diagram.shifts": "md", "diagram.face_measures": "m",
     "diagram.face_centroids": "md", "diagram.vertices": "vd", "diagram.cell_vertex_starts": "N",
     "diagram.cell_vertices": "c", "diagram.face_vertex_starts": "M", "diagram.face_vertices": "f",
+    "diagram.weights": "n",
     "initial.points": "ad", "initial.lloyd": "ad", "initial.poisson": "ad",  # before any were inserted
     "final.points": "nd", "final.lloyd": "nd", "final.poisson": "nd",
 }  # fmt: skip
@@ -203,7 +204,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
 
 def _not_in(domain: Domain) -> tuple[str, ...]:
     """Return prefixes of the arrays that a diagram of `domain` does not have."""
-    others = [] if any(domain.periodic) else ["shifts"]
+    others = ["weights"] if any(domain.periodic) else ["weights", "shifts"]
     if domain.cell_dim == 3:
         others.append("cell_vert")
     elif not isinstance(domain, Polygon):

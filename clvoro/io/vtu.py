@@ -44,9 +44,9 @@ def write_vtu(
     Cell data: `size` (h), `error` (signed) and `quality` of a result; `volume` (area in 2D); `sides` (in 3D
     `faces_of_cell`); `label` (row of the cell); `boundary` (see `largest_boundary`); for each name that the caller
     gave to a boundary `boundary:NAME` (1 where the cell has a face on it, else 0); the vector `generator`, from the
-    origin to the cell's generator; and data of the caller. Comments hold the settings and the caller's names of
-    boundaries, field data a polygonal, periodic or spherical domain. In a periodic box cells are not cut at the seams.
-    On a sphere the corners of cells are on it, and VTK draws straight lines between them.
+    origin to the cell's generator; in a power diagram `weight`; and data of the caller. Comments hold the settings and
+    the caller's names of boundaries, field data a polygonal, periodic or spherical domain. In a periodic box cells are
+    not cut at the seams. On a sphere the corners of cells are on it, and VTK draws straight lines between them.
 
     With `walls` "straight" the cells are those of the solver mesh, with their volumes, and without the domain, as the
     file is no diagram to `load`.
@@ -236,6 +236,7 @@ def cell_data(contents: Contents) -> dict[str, np.ndarray]:
         "boundary": largest_boundary(diagram),
         **_on_boundaries(diagram.domain, face_owners(diagram), diagram.neighbors, n),
         "generator": in_space(diagram.points),
+        **({"weight": diagram.weights} if diagram.is_power else {}),
         **{k: in_space(v) if v.shape[1:] == (2,) else v for k, v in contents.extra.items()},
     }
 

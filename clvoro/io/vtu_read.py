@@ -46,6 +46,7 @@ _OFF_SPHERE = 1e-5
 _USED = {
     "Points.", "Cells.types", "Cells.connectivity", "Cells.offsets", "Cells.faces", "Cells.faceoffsets",
     "CellData.size", "CellData.error", "CellData.quality", "CellData.volume", "CellData.generator",
+    "CellData.weight",
     "CellData.label", "CellData.sides", "CellData.faces_of_cell",
     "FieldData.box_corners", "FieldData.box_periodic",
     "FieldData.seam_faces", "FieldData.seam_neighbors", "FieldData.seam_shifts",
@@ -243,6 +244,8 @@ def _assemble(arrays: dict[str, np.ndarray], reader: _Reader) -> Result | Diagra
     volumes = arrays["CellData.volume"].astype(float)
     known = {"points": points, "volumes": volumes, "neighbors": neighbors, "vertices": x}
     known |= {**faces, **across}
+    if "CellData.weight" in arrays:
+        known["weights"] = arrays["CellData.weight"].astype(float)
     # The other arrays follow from the corners.
     rest = rebuild_on_sphere if isinstance(domain, Sphere) else rebuild
     diagram = Diagram(domain, {**known, **rest(Diagram(domain, known))})

@@ -117,6 +117,7 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
         In 3D, and in polygonal domains, where edges of one cell need not be on bisectors.
     """
     d, domain = diagram, diagram.domain
+    diagram.demand_voronoi("c_grid")
     if not isinstance(domain, Sphere) and not (isinstance(domain, Box) and domain.dim == 2):
         raise InputError(
             f"measures for C grids are for meshes on a Sphere and in a Box in 2D, not for {domain}; use the other "

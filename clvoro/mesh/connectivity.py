@@ -30,6 +30,18 @@ def neighbor_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
     return diagram.points[neighbors] + diagram.shifts[faces] * domain.extent
 
 
+def plane_shares(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
+    """Return where the planes of half-faces cross the lines between their generators, as shares of these lines, (k,).
+
+    1/2 in a Voronoi diagram; in a power diagram (1 - (w_j - w_i) / |x_j - x_i|^2) / 2. `faces` (k,) are between cells.
+    """
+    if not diagram.is_power:
+        return np.full(len(faces), 0.5)
+    i, j = face_owners(diagram)[faces], diagram.neighbors[faces]
+    between = neighbor_points(diagram, faces) - diagram.points[i]
+    return (1 - (diagram.weights[j] - diagram.weights[i]) / (between**2).sum(axis=1)) / 2
+
+
 def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return keys of the half-faces `faces` (k,) between two cells, and keys of their opposite half-faces.
 

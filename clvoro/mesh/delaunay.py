@@ -1,4 +1,4 @@
-"""The dual of a Voronoi diagram in the plane or on a sphere: the Delaunay triangles of its generators."""
+"""The dual of a diagram in the plane or on a sphere: the Delaunay triangles of its generators, or regular ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,13 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
     # A cell with several loops lists the ends of its bridges twice.
     pairs = np.unique(diagram.cell_vertices * np.int64(n) + cells)
     vertices, cells = pairs // n, pairs % n
-    arms = diagram.points[cells] - diagram.vertices[vertices]
+    centers = diagram.vertices
+    if diagram.is_power:
+        # The generators need not lie around the vertex, but around their own middle.
+        number = np.bincount(vertices, minlength=len(centers))
+        sums = [np.bincount(vertices, diagram.points[cells, a], len(centers)) for a in range(2)]
+        centers = np.column_stack(sums) / number[:, None]
+    arms = diagram.points[cells] - centers[vertices]
     if isinstance(diagram.domain, Sphere):
         axes = diagram.domain.tangents(diagram.vertices)
         arms = np.column_stack([(arms * axis[vertices]).sum(axis=1) for axis in axes])

@@ -84,6 +84,10 @@ class Diagram(MeshOutput):
         face is as narrow as round-off. In a polygonal domain the two ends, with the cell on the left of the way from
         the first to the second.
 
+    weights : (n,) float64
+        Weights w of the generators in a power diagram, in the square of the domain's unit of length. Zeros in a Voronoi
+        diagram.
+
     Raises
     ------
     AttributeError
@@ -115,7 +119,7 @@ class Diagram(MeshOutput):
     _NAMES = (
         "points", "volumes", "centroids", "neighbor_starts", "neighbors", "shifts",
         "face_measures", "face_centroids", "vertices", "cell_vertex_starts", "cell_vertices", "face_vertex_starts",
-        "face_vertices",
+        "face_vertices", "weights",
     )  # fmt: skip
 
     def __init__(
@@ -133,6 +137,8 @@ class Diagram(MeshOutput):
             self._arrays[name] = read_only(
                 np.zeros((len(self.neighbors), self.domain.dim), np.int8)
             )
+        if name == "weights" and not self.is_power:
+            return read_only(np.zeros(len(self)))
         if name not in self._arrays:
             raise AttributeError(
                 f"a diagram in {self.domain.dim}D has no {name}; it has {', '.join(self._there())}"
@@ -144,7 +150,7 @@ class Diagram(MeshOutput):
         return value
 
     def _there(self) -> list[str]:
-        return [n for n in Diagram._NAMES if n == "shifts" or n in self._arrays]
+        return [n for n in Diagram._NAMES if n in ("shifts", "weights") or n in self._arrays]
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self._there()]
@@ -157,7 +163,43 @@ class Diagram(MeshOutput):
         return len(self.points)
 
     def __repr__(self) -> str:
-        return f"Diagram({len(self)} cells in {self.domain})"
+        kind = ""
+        if self.is_power:
+            kind = "power diagram: "
+            if len(self.empty_cells):
+                kind += f"{len(self.empty_cells)} empty of "
+        return f"Diagram({kind}{len(self)} cells in {self.domain})"
+
+    @property
+    def is_power(self) -> bool:
+        """Whether it is a power diagram. Its cells need not contain their generators, and may be empty."""
+        return "weights" in self._arrays
+
+    def with_weights(self, weights: np.ndarray) -> Diagram:
+        """Return this power diagram with the `weights` (n,) that the caller gave, without round-off."""
+        return Diagram(self.domain, {**self._arrays, "weights": weights})
+
+    @property
+    def empty_cells(self) -> np.ndarray:
+        """Rows of cells without volume: none in a Voronoi diagram, (k,) int."""
+        return np.flatnonzero(self.volumes == 0)
+
+    def demand_voronoi(self, what: str) -> None:
+        """Raise an InputError that `what` is for Voronoi diagrams, if this is a power diagram."""
+        if self.is_power:
+            raise InputError(
+                f"{what} takes Voronoi diagrams, and this is a power diagram, whose cells need not contain their "
+                "generators; use clvoro.voronoi(domain, points), or a method other than transport"
+            )
+
+    def demand_cells(self, what: str) -> None:
+        """Raise an InputError that `what` needs cells with a volume, if some are empty."""
+        if self.is_power and len(self.empty_cells):
+            raise InputError(
+                f"{what} needs cells with a volume, and {len(self.empty_cells)} of {len(self)} are empty, the first is "
+                f"{self.empty_cells[0]}; leave out their generators, which does not change the other cells: keep = "
+                "d.volumes > 0; clvoro.power_diagram(d.domain, d.points[keep], d.weights[keep])"
+            )
 
     # The graph.
 

@@ -14,11 +14,29 @@ if TYPE_CHECKING:
     from .diagram import Diagram
 
 
+def power_tree(diagram: Diagram, places: np.ndarray, periods: np.ndarray) -> KDTree:
+    """Return a search tree of the generators at `places` (n, d); 0 in `periods` stands for walls.
+
+    In a power diagram a further coordinate is sqrt(max w - w_i): the square of the distance from a point with 0 there
+    is |y - x_i|^2 - w_i + max w (Aurenhammer 1987). `lifted` adds the coordinate to points.
+    """
+    if not diagram.is_power:
+        return KDTree(places, boxsize=periods)
+    heights = np.sqrt(diagram.weights.max() - diagram.weights)
+    return KDTree(np.column_stack([places, heights]), boxsize=np.append(periods, 0.0))
+
+
+def lifted(diagram: Diagram, places: np.ndarray) -> np.ndarray:
+    """Return `places` (k, d) as a tree of `power_tree` takes them."""
+    return np.pad(places, ((0, 0), (0, 1))) if diagram.is_power else places
+
+
 class Locator:
     """Finds the cells that hold points.
 
-    In a box the cell is that of the nearest generator, also across seams. In a polygonal domain the boundary cuts cells
-    off, so the point may be in the cell of another generator. There the shape of the cell decides.
+    In a box the cell is that of the nearest generator, by the power distance, also across seams. In a polygonal domain
+    the boundary cuts cells off, so the point may be in the cell of another generator. There the shape of the cell
+    decides.
     """
 
     def __init__(self, diagram: Diagram) -> None:
@@ -26,7 +44,7 @@ class Locator:
         self.origin = np.array(self.domain.lower)
         periods = np.where(self.domain.periodic, self.domain.extent, 0.0)
         self.last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
-        self.tree = KDTree(self._place(diagram.points), boxsize=periods)
+        self.tree = power_tree(diagram, self._place(diagram.points), periods)
 
     def _place(self, points: np.ndarray) -> np.ndarray:
         """Return positions relative to the lower corner, in periodic directions within one period."""
@@ -40,7 +58,7 @@ class Locator:
         x = x[inside]
         if not len(x):
             return found
-        found[inside] = self.tree.query(self._place(x))[1]
+        found[inside] = self.tree.query(lifted(self.diagram, self._place(x)))[1]
         if isinstance(self.domain, Polygon):
             found[inside] = self._corrected(x, found[inside])
         return found

@@ -11,7 +11,7 @@ import numpy as np
 from ..geometry.boundary import wall_planes
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
-from .connectivity import face_owners, neighbor_points
+from .connectivity import face_owners, neighbor_points, plane_shares
 from .diagram import Diagram
 from .straightening import straighten
 
@@ -168,7 +168,9 @@ def measure_mesh(diagram: Diagram) -> Measures:
         line[walls] = 2 * gaps[:, None] * normals
         distance = np.linalg.norm(line, axis=1)
         distance[walls[gaps <= 0]] = 0
-    crossing = points[owner] + 0.5 * line
+    share = np.full(len(line), 0.5)
+    share[inner] = plane_shares(diagram, np.flatnonzero(inner))
+    crossing = points[owner] + share[:, None] * line
     if isinstance(domain, Sphere):
         crossing = domain.wrap(crossing)
     offset = np.linalg.norm(middles - crossing, axis=1)
@@ -186,14 +188,18 @@ def measure_mesh(diagram: Diagram) -> Measures:
     angle[inner] = _angles(line[inner], between[inner])
 
     counts = np.diff(starts)
-    surface = np.add.reduceat(areas, starts[:-1])
-    largest, smallest = (f.reduceat(areas, starts[:-1]) for f in (np.maximum, np.minimum))
+    some = counts > 0  # in a power diagram cells may be empty
+    surface, largest, smallest = (np.ones(len(counts)) for _ in range(3))
+    for values, function in ((surface, np.add), (largest, np.maximum), (smallest, np.minimum)):
+        values[some] = function.reduceat(areas, starts[:-1][some])
     if isinstance(domain, Sphere):
         quality = 4 * counts * np.tan(np.pi / counts) * volumes / surface**2
     elif diagram.domain.dim == 2:
-        quality = straighten(diagram).quality()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            quality = straighten(diagram).quality()
     else:
         quality = 36 * np.pi * volumes**2 / surface**3
+    quality[~some] = 0
     here, there = volumes[owner], np.where(inner, volumes[other], volumes[owner])
     ratio = np.maximum(here, there) / np.minimum(here, there)
     polygonal = isinstance(diagram.domain, Polygon)

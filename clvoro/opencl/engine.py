@@ -31,17 +31,22 @@ class DomainKind(NamedTuple):
         Whether it is a periodic box, a polygon, or a sphere.
     periods : tuple of 3 floats
         In the device's coordinates; 0 where there are walls.
+    weighted : bool
+        Whether generators have weights, for power diagrams; see geometry/weights.h.
     """
 
     periodic: bool = False
     polygonal: bool = False
     periods: tuple[float, float, float] = (0.0, 0.0, 0.0)
     spherical: bool = False
+    weighted: bool = False
 
     @property
     def defines(self) -> dict[str, object]:
         """Macros for kernels; see geometry/domain.h."""
-        macros = {"PERIODIC": self.periodic, "POLYGON": self.polygonal, "SPHERE": self.spherical}
+        macros = {
+            "PERIODIC": self.periodic, "POLYGON": self.polygonal, "SPHERE": self.spherical, "WEIGHTED": self.weighted,
+        }  # fmt: skip
         return {name: 1 for name, is_set in macros.items() if is_set}
 
 
@@ -129,6 +134,18 @@ class Engine:
             self.ctx, self.queue, self.dim, np.dtype(np.float32), self.domain_kind, workspace=self.workspace,
             pool=self.pool,
         )  # fmt: skip
+
+    def weighted(self) -> Engine:
+        """Return an engine for power diagrams that shares workspace and kernels with this one."""
+        return Engine(
+            self.ctx, self.queue, self.dim, self.real, self.domain_kind._replace(weighted=True),
+            workspace=self.workspace, pool=self.pool,
+        )  # fmt: skip
+
+    @property
+    def site_size(self) -> int:
+        """Numbers per generator: its coordinates, and its weight in a power diagram."""
+        return self.dim + self.domain_kind.weighted
 
     @property
     def cell_dim(self) -> int:

@@ -74,10 +74,10 @@ def transfer_values(
 
 def _diagram(name: str, mesh: object) -> Diagram:
     """Return the diagram of a mesh."""
-    if isinstance(mesh, Result):
-        return mesh.diagram
-    if isinstance(mesh, Diagram):
-        return mesh
+    diagram = mesh.diagram if isinstance(mesh, Result) else mesh
+    if isinstance(diagram, Diagram):
+        diagram.demand_voronoi("transfer")
+        return diagram
     raise InputTypeError(
         f"{name} is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram"
     )

@@ -98,7 +98,7 @@ class Bins:
 
     def _reserve(self, n: int, bins: int) -> None:
         """Make room for `n` generators and `bins` bins; the contents of the bins stay."""
-        engine, d = self.engine, self.engine.dim
+        engine, d = self.engine, self.engine.site_size
         if n > self._capacity[0]:
             self._keys = engine.empty(n, np.int32)
             self._ranks = engine.empty(n, np.int32)
@@ -150,7 +150,8 @@ class Bins:
     def build(self, box: ClipBox, points: cla.Array, n: int) -> BinnedPoints:
         """Sort the first `n` of `points` (n, d; normalized coordinates, within `box`) into bins.
 
-        The host reads two integers per level; uniform sets have one level.
+        In a power diagram rows of `points` end with weights. The host reads two integers per level; uniform sets have
+        one level.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         lower, upper = (corner.astype(np.float64)[:d] for corner in box.device_corners(engine.real))

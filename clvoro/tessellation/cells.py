@@ -30,6 +30,7 @@ from .device_diagram import (
     restored,
 )
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
+from .weight_bounds import WeightBounds
 
 CELL_CAPACITY = 24
 """Most faces of a cell while it is clipped."""
@@ -57,7 +58,7 @@ class OpenCellError(InputError):
 
 
 class Cells:
-    """Tessellate a box in 2D, or a sphere.
+    """Tessellate a box in 2D, or a sphere; with an engine for power diagrams by points with weights (n, 3).
 
     Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
     one is complete.
@@ -76,12 +77,14 @@ class Cells:
         self._capacity = self._room = self._n = self._enlarged_for = 0
         self._flags = engine.empty(FLAGS, np.int32)
         self._no_flags: dict[tuple[int, int, bool], cla.Array] = {}
+        self._bounds = WeightBounds(engine) if engine.domain_kind.weighted else None
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
         self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
         engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
-        self.lanes = LANES if engine.group_size == 1 and engine.real == np.float64 else 1
+        in_lanes = engine.group_size == 1 and engine.real == np.float64 and self._bounds is None
+        self.lanes = LANES if in_lanes else 1
         self._kernels = engine.kernels(
             "tessellation/cells", {**defines, "IN_LANES": int(self.lanes > 1)}
         )
@@ -217,6 +220,7 @@ class Cells:
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         hulls = self._hulls if total >= self.hulls_from else None
         some = hulls is not None
+        bounds = () if self._bounds is None else self._bounds.build(box, points, total)
         if hulls is not None:
             engine.run_each(
                 hulls.wrap_all_hulls, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
@@ -226,7 +230,7 @@ class Cells:
         while True:
             engine.run_each(
                 self._kernels.clip_polygons, total, np.int32(n), binned.points, binned.items, *search,
-                points, *corners, np.int32(some), rows.slots, rows.counts, rows.places, rows.flags,
+                points, *corners, np.int32(some), rows.slots, rows.counts, rows.places, rows.flags, *bounds,
             )  # fmt: skip
             # Every row is new.
             found = self._match(rows, box, points, n, rows.places, rows.places, exact)
@@ -275,7 +279,7 @@ class Cells:
         engine, m = self.engine, len(t.neighbors)
         measures, centroids = engine.empty(m), engine.empty((m, engine.dim))
         engine.run_each(
-            self._kernels.measure_faces, t.n, t.starts, t.neighbors, t.points,
+            self._kernels.measure_faces, t.n, t.starts, t.neighbors, t.sites,
             *box.device_corners(engine.real), measures, centroids,
         )  # fmt: skip
         return replace(t, face_measures=measures, face_centroids=centroids)

@@ -85,7 +85,7 @@ def domain_position(domain: Domain, place: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Tessellation:
-    """A Voronoi diagram on the device: normalized coordinates, vectors relative to the generator of the row.
+    """A Voronoi or power diagram on the device: normalized coordinates, vectors relative to the generator of the row.
 
     Attributes
     ----------
@@ -107,6 +107,8 @@ class Tessellation:
     vertices : tuple of arrays
         In 3D, if it will be updated: the vertices as triples of faces, (2 m,) uint32, and the keys of the faces, (m,)
         uint32 (tessellation/polyhedra_update.cl); else empty.
+    weighted : array, optional
+        In a power diagram: the points with their weights, (n, d + 1) real.
     trimmed : Trimmed, optional
         How the boundary cut such a diagram.
     round_off : int
@@ -127,6 +129,12 @@ class Tessellation:
     vertices: tuple[cla.Array, ...] = ()
     trimmed: Trimmed | None = None
     round_off: int = 0
+    weighted: cla.Array | None = None
+
+    @property
+    def sites(self) -> cla.Array:
+        """The generators as kernels of the tessellation take them: with weights in a power diagram."""
+        return self.points if self.weighted is None else self.weighted
 
 
 @dataclass(frozen=True)

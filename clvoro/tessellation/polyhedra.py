@@ -31,6 +31,7 @@ from .device_diagram import (
     restored,
 )
 from .periodic.halo import halo_defines
+from .weight_bounds import WeightBounds
 
 HARMLESS = DOUBT | NARROW | UNEVEN
 """Flags of a diagram that is not rejected."""
@@ -133,7 +134,7 @@ class CutCells:
 
 
 class Polyhedra:
-    """Tessellate a box in 3D.
+    """Tessellate a box in 3D; with an engine for power diagrams by points with weights (n, 4).
 
     Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
     one is complete.
@@ -145,7 +146,8 @@ class Polyhedra:
         self._programs: dict[int, SimpleNamespace] = {}
         self._kernels(FACE_CAPACITY)
         self._wrap = None
-        if engine.group_size == 1 and engine.real == np.float64:
+        self._bounds = WeightBounds(engine) if engine.domain_kind.weighted else None
+        if self._bounds is None and engine.group_size == 1 and engine.real == np.float64:
             defines = {
                 "STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine),
             }  # fmt: skip
@@ -272,7 +274,9 @@ class Polyhedra:
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
         with engine.workspace.frame():
             # Diagrams that will be updated need their vertices.
-            keep = not exact and not halo_args and rows == n
+            keep = not exact and not halo_args and rows == n and self._bounds is None
+            if self._bounds is not None:
+                halo_args = (*halo_args, *self._bounds.build(box, points, n))
             cut = self._cut(box, points, n, binned, first, previous, rows, share, halo_args, keep)
             t = None if cut is None else self.match(cut, self._report, points, share)
         if t is None:

@@ -50,6 +50,13 @@ class TessellationStages:
         setattr(self, name, stage)
         return stage
 
+    @property
+    def weighted(self) -> TessellationStages:
+        """The stages for power diagrams; they share workspace and kernels with these."""
+        if "_weighted" not in self.__dict__:
+            self._weighted = TessellationStages(self.engine.weighted())
+        return self._weighted
+
     def clear(self, *names: str) -> None:
         """Free the buffers of these stages, where they exist; their kernels stay."""
         for name in names:
@@ -58,7 +65,7 @@ class TessellationStages:
 
     def release(self) -> None:
         """Free all stages and their buffers; a stage that is used again is created anew."""
-        for name in self.CLASSES:
+        for name in (*self.CLASSES, "_weighted"):
             self.__dict__.pop(name, None)
         self.engine.workspace.clear()
         self.engine.pool.release()

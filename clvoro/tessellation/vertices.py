@@ -66,7 +66,7 @@ class VertexNumbering:
             )
         cell_vertices, positions = engine.empty(m, np.int32), engine.empty((count, engine.dim))
         engine.run_each(
-            k.place_polygon_vertices, t.n, t.points, *box.device_corners(engine.real), t.starts,
+            k.place_polygon_vertices, t.n, t.sites, *box.device_corners(engine.real), t.starts,
             t.neighbors, owners, ids, cell_vertices, positions,
         )  # fmt: skip
         return Vertices(count, positions, cell_vertices)

@@ -174,8 +174,8 @@ typedef struct {
 
 inline REAL4 way_between(int i, int j, global const REAL *points)
 {
-    return (REAL4)(points[3 * j] - points[3 * i], points[3 * j + 1] - points[3 * i + 1],
-                   points[3 * j + 2] - points[3 * i + 2], 0);
+    return (REAL4)(points[STRIDE * j] - points[STRIDE * i], points[STRIDE * j + 1] - points[STRIDE * i + 1],
+                   points[STRIDE * j + 2] - points[STRIDE * i + 2], 0);
 }
 
 inline REAL inner_product(REAL4 a, REAL4 b)
@@ -195,7 +195,7 @@ inline bool is_on_planes(int u, REAL4 y, REAL tolerance, const vertices_t *in)
 {
     const int i = in->owners[u];
     const REAL4 x = way_between(in->origin, i, in->points), from = y - x;
-    const REAL4 own = (REAL4)(in->points[3 * i], in->points[3 * i + 1], in->points[3 * i + 2], 0);
+    const REAL4 own = (REAL4)(in->points[STRIDE * i], in->points[STRIDE * i + 1], in->points[STRIDE * i + 2], 0);
     const REAL4 to_lower = from - (in->lower - own), to_upper = from - (in->upper - own);
     const REAL off_walls[6] = {to_lower.s0, to_upper.s0, to_lower.s1, to_upper.s1, to_lower.s2, to_upper.s2};
     bool on = true;
@@ -206,7 +206,8 @@ inline bool is_on_planes(int u, REAL4 y, REAL tolerance, const vertices_t *in)
             off = off_walls[-1 - label];
         } else {
             const REAL4 way = way_between(i, label, in->points);
-            off = inner_product(way, from - way / 2) / sqrt(inner_product(way, way));
+            const REAL shift = (WEIGHT(in->points, i) - WEIGHT(in->points, label)) / 2;
+            off = (inner_product(way, from - way / 2) - shift) / sqrt(inner_product(way, way));
         }
         on &= fabs(off) < tolerance;
     }
@@ -324,5 +325,5 @@ kernel void write_positions(const int size, VERTEX_ARGS, global const int *ids, 
     const int label = labels[u], id = ids[label];
     if (best_corners[label] == u && id != ids[label + 1])
         for (int a = 0; a < 3; ++a)
-            positions[3 * id + a] = clamp(points[3 * owners[u] + a] + corners[3 * u + a], low[a], high[a]);
+            positions[3 * id + a] = clamp(points[STRIDE * owners[u] + a] + corners[3 * u + a], low[a], high[a]);
 }

@@ -18,7 +18,7 @@
 inline bool make_cell(CELL *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper, global const int *starts,
                       global const int *neighbors)
 {
-    const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
+    const REAL4 x = SITE_IN_SPACE(points, i);
     start_polyhedron(cell, x, lower, upper);
     return clip_polyhedron_by_row(cell, i, x, starts, neighbors, points) != CLIP_FULL;
 }
@@ -42,6 +42,13 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
     {
         if (capacities[i] != 0)
             continue;
+#ifdef WEIGHTED
+        if (starts[i] == starts[i + 1]) {
+            capacities[i] = FACE_CAPACITY;
+            corner_counts[i] = half_face_counts[i] = 0;
+            continue;
+        }
+#endif
         if (!make_cell(cell, i, points, box_lower, box_upper, starts, neighbors)) {
             atomic_or(full, 1);
             continue;
@@ -113,12 +120,19 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
     {
         if (capacities[i] != FACE_CAPACITY)
             continue;
-        make_cell(cell, i, points, box_lower, box_upper, starts, neighbors);
         const int base = corner_starts[i];
+#ifdef WEIGHTED
+        if (starts[i] == starts[i + 1]) {
+            if (i == size - 1)
+                loop_starts[half_face_starts[i]] = 3 * base;
+            continue;
+        }
+#endif
+        make_cell(cell, i, points, box_lower, box_upper, starts, neighbors);
         REAL least = 4 * noise_length(sqrt(cell->reach2));
         for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
             if (cell->labels[f] >= 0)
-                least = fmin(least, sqrt(2 * cell->planes[f].s3) / 64);
+                least = fmin(least, sqrt(SQUARE_OF(cell->planes[f])) / 64);
         CELL_SPACE INDEX *joined = (CELL_SPACE INDEX *)cell->rim.edges; /* of no more use */
         for (int v = 0; v < cell->n; ++v) {
             const int u = base + v;

@@ -11,12 +11,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from ...geometry.boundary import boundary_measure, wall_distance
 from ...geometry.polygon import Polygon
 from ...geometry.sphere import Sphere
 from ..connectivity import face_keys
+from ..locate import lifted, power_tree
 from .faces import check_corners, check_measures
 from .findings import ROUNDINGS, Check, Report, StopError
 from .polygon import check_cells, check_edges, check_outlines, hidden
@@ -190,9 +190,12 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         check_places(check, g)
     else:
         _check_inside(check, slack)
+    # Cells of a power diagram may be empty.
+    filled = np.diff(d.neighbor_starts) > 0 if d.is_power else np.ones(n, bool)
     check.note(
-        "volumes", ~(d.volumes > 0), lambda i: f"volumes[{i}] is {d.volumes[i]}, expected > 0"
-    )
+        "volumes", ~(d.volumes > 0) & (filled | (d.volumes != 0)),
+        lambda i: f"volumes[{i}] is {d.volumes[i]}, expected > 0",
+    )  # fmt: skip
     check.note(
         "orientation", ~(g.volumes >= -slack * (g.perimeters + slack)),
         lambda i: f"the corners of cell {i} go around clockwise (volume {g.volumes[i]:.4g})",
@@ -339,17 +342,20 @@ def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> N
 def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
     """Check the property of a Voronoi diagram: no generator is nearer to a corner of a cell than the cell's own.
 
-    Generators whose cells meet in a vertex then have the same distance from it. On a sphere distances are arcs.
+    Generators whose cells meet in a vertex then have the same distance from it. On a sphere distances are arcs. In a
+    power diagram they are lengths in the space of `power_tree`.
     """
     d = check.diagram
     corners = d.vertices[g.corners]
-    lengths = d.domain.arcs if isinstance(d.domain, Sphere) else np.asarray
-    own = lengths(np.linalg.norm(corners - d.points[g.cells], axis=1))
-    # The tree takes a period of 0 for an axis that is not periodic.
     lower, periods = np.array(d.domain.lower), np.where(d.domain.periodic, d.domain.extent, 0.0)
     last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
-    tree = KDTree(np.minimum(d.points - lower, last), boxsize=periods)
-    nearest = lengths(tree.query(d.vertices - lower)[0][g.corners])
+    # The tree takes a period of 0 for an axis that is not periodic.
+    tree = power_tree(d, np.minimum(d.points - lower, last), periods)
+    lengths = d.domain.arcs if isinstance(d.domain, Sphere) else np.asarray
+    own = lengths(np.linalg.norm(corners - d.points[g.cells], axis=1))
+    if d.is_power:
+        own = np.hypot(own, tree.data[g.cells, -1])
+    nearest = lengths(tree.query(lifted(d, d.vertices - lower))[0][g.corners])
     excess = np.maximum(own - nearest - slack, 0)
     if isinstance(d.domain, Polygon):
         excess[hidden(d, d.domain, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0

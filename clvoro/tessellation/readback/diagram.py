@@ -51,6 +51,8 @@ def fetch_diagram(
     others = ["face_vert" if engine.cell_dim == 2 else "cell_vert"]
     if extended is None:
         others.append("shifts")
+    if t.weighted is None:
+        others.append("weights")
     if isinstance(domain, Polygon):
         reader: _DiagramReader = _PolygonReader(engine, domain, t, labels, copy)
         others.remove("face_vert")
@@ -81,6 +83,7 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
         offsets=kept(t.offsets),
         covariances=t.covariances,
         round_off=t.round_off,
+        weighted=None if t.weighted is None else kept(t.weighted[: t.n]),
     )
 
 
@@ -214,6 +217,11 @@ class _DiagramReader:
         positions = self._read(self.t.points, self.order, 1) + self.origin
         # Round-off must not move a generator on a wall out of the domain.
         return np.clip(positions, self.domain.lower, self.domain.upper)
+
+    def weights(self) -> np.ndarray:
+        assert self.t.weighted is not None
+        rows = self.t.weighted.get()[self.order, self.engine.dim]
+        return rows.astype(np.float64) * self.scale**2
 
     def volumes(self) -> np.ndarray:
         return self._read(self.t.volumes, self.order, self.engine.cell_dim)

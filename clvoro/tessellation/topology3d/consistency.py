@@ -142,7 +142,7 @@ class FaceSharing:
         """What kernels take as VERTEX_ARGS."""
         f = self.half_faces
         return (
-            self.t.points, f.corners, f.owners, f.corner_faces, self.labels, self.best_corners, *self._corners
+            self.t.sites, f.corners, f.owners, f.corner_faces, self.labels, self.best_corners, *self._corners
         )  # fmt: skip
 
     def merge(self, doublings: int) -> bool:

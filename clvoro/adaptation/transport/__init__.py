@@ -1,0 +1,1 @@
+"""Power diagrams of given generators, and cells with prescribed volumes."""

@@ -1,0 +1,133 @@
+"""Power diagrams of the caller's generators, by their weights or by the volumes of their cells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cla
+
+from ...arguments import Naming, check_integer, check_number, check_points, warn
+from ...errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWarning
+from ...geometry.box import Domain
+from ...mesh.diagram import Diagram
+from ...mesh.transported import Transported
+from ...tessellation.power import PowerTessellator
+from ...tessellation.readback.diagram import fetch_diagram
+from ..estimates import check_memory
+from ..stages import Stages
+
+TOLERANCE = {"float64": 1e-10, "float32": 1e-3}
+"""Default of the largest relative error of volumes."""
+SUM_TOLERANCE = 1e-9
+"""Largest relative difference of the sum of volumes from the measure of the domain."""
+WITHIN_REACH = 4.0
+"""A cell is empty if its weight is less than the largest one by more than the square of the domain's diameter. Lower
+weights are raised to this multiple of it, so that nothing overflows."""
+
+
+def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: object) -> Diagram:
+    """Return the power diagram of `points` with `weights`; see `clvoro.power_diagram`."""
+    power = PowerTessellator(stages, domain)
+    host = check_points(points, domain)
+    n, given = len(host), _check_numbers("weights", weights, len(host))
+    check_memory(stages.engine, n, domain, run=False)
+    # Only differences count. Around 0 weights have the least round-off.
+    near = np.maximum(given - given.max(), -WITHIN_REACH * float((domain.extent**2).sum()))
+    scaled = (near - near.mean()) / domain.frame[1] ** 2
+    with Naming(host, domain, stages.engine.real):
+        labels, sorted_points = _sorted(stages, domain, host)
+        device_weights = stages.engine.upload(scaled[labels.get()])
+        t = power.final(power.tessellate(sorted_points, device_weights, n, exact=True))
+    diagram = fetch_diagram(power.stages.engine, domain, t, labels)
+    diagram = diagram.with_weights(given)
+    empty = diagram.empty_cells
+    if len(empty):
+        warn(
+            f"{len(empty)} of {n} cells are empty, the first is {empty[0]}: other generators with larger weights are "
+            "nearer everywhere, by the power distance; diagram.empty_cells lists them",
+            EmptyCellsWarning,
+        )
+    return diagram
+
+
+def transport_to(
+    stages: Stages,
+    domain: Domain,
+    points: object,
+    volumes: object,
+    tolerance: float | None,
+    max_steps: int,
+) -> Transported:
+    """Return the power diagram of `points` whose cells have `volumes`; see `clvoro.transport`."""
+    engine = stages.engine
+    power = PowerTessellator(stages, domain)
+    host = check_points(points, domain)
+    n, given = len(host), _check_numbers("volumes", volumes, len(host))
+    most = check_integer("max_steps", max_steps, 0, 10**6)
+    if tolerance is None:
+        tolerance = TOLERANCE[engine.real.name]
+    tolerance = check_number("tolerance", tolerance, above=0)
+    _check_volumes(given, domain)
+    check_memory(engine, n, domain, run=False)
+    with Naming(host, domain, engine.real):
+        labels, sorted_points = _sorted(stages, domain, host)
+        prescribed = given[labels.get()] / domain.frame[1] ** domain.cell_dim
+        t, _, newton = stages.transport.solve(
+            power, sorted_points, prescribed, engine.zeros(n), tolerance, most, exact=True
+        )
+    diagram = fetch_diagram(power.stages.engine, domain, power.final(t), labels)
+    result = Transported(
+        diagram, np.array(newton.errors), np.array(newton.shares), newton.converged
+    )
+    if not newton.converged:
+        warn(
+            f"the volumes of {newton.far} of {n} cells differ from the prescribed ones by more than {tolerance:.3g}, "
+            f"the largest relative error is {newton.errors[-1]:.3g} after {len(newton.shares)} steps; use "
+            f"{'more max_steps' if len(newton.shares) >= most else 'a larger tolerance or float64'}",
+            SizeErrorWarning,
+        )
+    return result
+
+
+def _sorted(stages: Stages, domain: Domain, host: np.ndarray) -> tuple[cla.Array, cla.Array]:
+    """Return the rows of the generators in the order of the bins, and their positions on the device."""
+    n = len(host)
+    binned = stages.bins.build(
+        domain, stages.engine.upload(domain.place(host, stages.engine.real)), n
+    )
+    return binned.items[:n].copy(), binned.points[:n].copy()
+
+
+def _check_numbers(name: str, value: object, n: int) -> np.ndarray:
+    """Return `value` as a float64 array (n,) of finite numbers."""
+    try:
+        array = np.asarray(value)
+    except Exception as error:  # arrays of other libraries raise anything
+        raise InputTypeError(
+            f"{name} is not an array ({error}), expected one real number per point"
+        ) from error
+    if array.dtype.kind not in "fiu":
+        raise InputTypeError(f"{name} has dtype {array.dtype}, expected real numbers")
+    if array.shape != (n,):
+        raise InputError(f"{name} has shape {array.shape}, expected ({n},), one number per point")
+    array = array.astype(np.float64)
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise InputError(
+            f"{name}[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of {n} are not)"
+        )
+    return array
+
+
+def _check_volumes(volumes: np.ndarray, domain: Domain) -> None:
+    bad = np.flatnonzero(~(volumes > 0))
+    if bad.size:
+        raise InputError(
+            f"volumes[{bad[0]}] is {volumes[bad[0]]}, expected numbers > 0 ({bad.size} of {len(volumes)} are not); "
+            "leave out generators whose cells are to be empty"
+        )
+    total = float(volumes.sum())
+    if not abs(total - domain.measure) <= SUM_TOLERANCE * domain.measure:
+        raise InputError(
+            f"the sum of the {len(volumes)} volumes is {total:.12g}, expected that of the domain, "
+            f"{domain.measure:.12g}; scale them: volumes * (domain.measure / volumes.sum())"
+        )

@@ -1,0 +1,66 @@
+"""Prescribed volumes: Newton's steps, the volumes that they reach, and what is refused."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.errors import InputError, SizeErrorWarning
+from tests.reference.power_diagrams import power_cells
+
+BOXES = {2: clvoro.Box((-1, 0), (2, 1.5)), 3: clvoro.Box((0, 0, 5), (1, 2, 6))}
+
+
+def random_case(dim, n, ratio, seed=61):
+    """Return a box, generators, and volumes that differ by up to `ratio`."""
+    rng, box = np.random.default_rng(seed), BOXES[dim]
+    volumes = ratio ** rng.random(n)
+    return box, rng.uniform(box.lower, box.upper, (n, dim)), volumes * box.measure / volumes.sum()
+
+
+@pytest.mark.parametrize(("dim", "real"), [(2, "float64"), (2, "float32"), (3, "float64")])
+def test_cells_get_any_volumes(ctx, dim, real):
+    box, points, volumes = random_case(dim, 60, 30.0)
+    found = clvoro.Adapter(ctx, real).transport(box, points, volumes)
+    tolerance = 1e-10 if real == "float64" else 1e-3
+    assert found.converged
+    assert found.errors[-1] <= tolerance < found.errors[-2]
+    assert len(found.errors) == len(found.shares) + 1 < 15
+    d = found.diagram
+    np.testing.assert_allclose(d.volumes, volumes, rtol=2 * tolerance)
+    # The weights alone give these volumes.
+    reference = power_cells(box.lower, box.upper, points, d.weights)[0]
+    np.testing.assert_allclose(reference, volumes, rtol=1e-9 if real == "float64" else 3e-3)
+    assert d.check(), d.check()
+
+
+def test_steps_do_not_depend_on_the_number_of_cells(ctx):
+    adapter = clvoro.Adapter(ctx)
+    steps = []
+    for n in (100, 6000):
+        box, points, _ = random_case(2, n, 1.0)
+        found = adapter.transport(box, points, np.full(n, box.measure / n))
+        assert found.converged
+        steps.append(len(found.shares))
+    assert max(steps) <= min(steps) + 3
+
+
+def test_the_same_bits(ctx):
+    box, points, volumes = random_case(2, 400, 5.0)
+    one, two = (clvoro.Adapter(ctx).transport(box, points, volumes).diagram for _ in range(2))
+    for name in ("weights", "volumes", "neighbors", "vertices"):
+        assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
+
+
+def test_bad_input(ctx):
+    adapter, (box, points, volumes) = clvoro.Adapter(ctx), random_case(2, 50, 3.0)
+    for wrong, words in (
+        (1.01 * volumes, "expected that of the domain"),
+        (np.where(np.arange(50) < 3, 0, volumes), "3 of 50"),
+        (volumes[:-1], "shape"),
+    ):
+        with pytest.raises(InputError, match=words):
+            adapter.transport(box, points, wrong)
+    with pytest.warns(SizeErrorWarning, match="of 50 cells differ .* more max_steps"):
+        found = adapter.transport(box, points, volumes, max_steps=1)
+    assert not found.converged
+    assert clvoro.Adapter(ctx).transport(box, points[:1], [box.measure]).diagram.volumes == [4.5]

@@ -1,0 +1,136 @@
+"""Power diagrams against brute force, against Voronoi diagrams, and in files."""
+
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.errors import EmptyCellsWarning, InputError, InputTypeError
+from tests.reference.power_diagrams import power_cells
+
+BOXES = {2: clvoro.Box((-1, 0), (2, 1.5)), 3: clvoro.Box((0, 0, 5), (1, 2, 6))}
+SQUARE = clvoro.Box((0, 0), (1, 1))
+
+
+def random_case(dim, n, spread, seed=31):
+    """Return a box, generators, and weights up to `spread` times the square of their distance."""
+    rng, box = np.random.default_rng(seed), BOXES[dim]
+    points = rng.uniform(box.lower, box.upper, (n, dim))
+    return box, points, spread * (box.measure / n) ** (2 / dim) * rng.random(n) + 7
+
+
+@pytest.mark.parametrize(("dim", "real"), [(2, "float64"), (2, "float32"), (3, "float64")])
+@pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
+def test_cells_are_those_of_the_definition(ctx, dim, real):
+    adapter = clvoro.Adapter(ctx, real)
+    box, points, weights = random_case(dim, 50, 3.0)
+    d = adapter.power_diagram(box, points, weights)
+    volumes, centroids = power_cells(box.lower, box.upper, points, weights)
+    noise = 2e3 * np.finfo(adapter.dtype).eps * max(np.abs(box.upper))
+    assert 5 < len(d.empty_cells) < 25
+    assert d.empty_cells.tolist() == np.flatnonzero(volumes == 0).tolist()
+    np.testing.assert_allclose(d.volumes, volumes, atol=noise)
+    filled = volumes > 1e-3 * volumes.mean()
+    np.testing.assert_allclose(d.centroids[filled], centroids[filled], atol=1e3 * noise)
+    assert d.check(), d.check()
+    assert d.weights.tolist() == weights.tolist()
+    # Cells are found by the power distance.
+    assert d.locate(d.centroids[filled]).tolist() == np.flatnonzero(filled).tolist()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_equal_weights_give_the_voronoi_diagram(ctx, dim):
+    box, points, _ = random_case(dim, 300, 0.0)
+    adapter = clvoro.Adapter(ctx)
+    power, voronoi = (
+        adapter.power_diagram(box, points, np.full(300, -3.0)),
+        adapter.diagram(box, points),
+    )
+    rows = np.diff(voronoi.neighbor_starts)
+    assert np.diff(power.neighbor_starts).tolist() == rows.tolist()
+    for i in range(0, 300, 7):
+        assert set(power.cell(i).neighbors) == set(voronoi.cell(i).neighbors)
+    np.testing.assert_allclose(power.volumes, voronoi.volumes, rtol=1e-12)
+
+
+def test_weights_that_are_linear_move_the_diagram(ctx):
+    """|y - x|^2 - 2 a.x is |y + a - x|^2 up to a term without x: generators are far from their cells."""
+    rng, shift = np.random.default_rng(8), np.array([0.31, -0.17])
+    points = rng.random((3000, 2))
+    inside = SQUARE.contains(points - shift)
+    d = clvoro.Adapter(ctx).power_diagram(SQUARE, points[inside], 2 * points[inside] @ shift)
+    moved = clvoro.Adapter(ctx).diagram(SQUARE, points[inside] - shift)
+    assert len(d.empty_cells) == 0
+    np.testing.assert_allclose(d.volumes, moved.volumes, rtol=1e-9)
+    assert (d.neighbors >= 0).sum() == (moved.neighbors >= 0).sum()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_many_cells_in_a_point(ctx, dim):
+    """In a lattice with two weights in turn all corners are shared by more cells than faces determine."""
+    line = (np.arange(6) + 0.5) / 6
+    points = np.stack(np.meshgrid(*[line] * dim, indexing="ij"), -1).reshape(-1, dim)
+    turn = (
+        np.stack(np.meshgrid(*[np.arange(6)] * dim, indexing="ij"), -1).reshape(-1, dim).sum(axis=1)
+        % 2
+    )
+    box = clvoro.Box((0,) * dim, (1,) * dim)
+    for step in (0.0, 0.01, 0.03):
+        with pytest.warns(EmptyCellsWarning) if step == 0.03 else nullcontext():
+            d = clvoro.Adapter(ctx).power_diagram(box, points, step * turn)
+        assert d.check(), d.check()
+        # The square of the spacing is 0.0278. Cells with neighbors on both sides along an axis are empty.
+        between = ((points > line[0]) & (points < line[-1])).any(axis=1)
+        empty = np.flatnonzero((turn == 0) & between) if step == 0.03 else []
+        assert d.empty_cells.tolist() == list(empty)
+
+
+def test_files_pictures_and_other_libraries(ctx, tmp_path):
+    rng = np.random.default_rng(4)
+    points, weights = rng.random((40, 2)), 0.02 * rng.random(40)
+    with pytest.warns(EmptyCellsWarning, match="of 40 cells are empty"):
+        d = clvoro.Adapter(ctx).power_diagram(SQUARE, points, weights)
+    assert "power diagram" in repr(d)
+    d.save(tmp_path / "d.npz")
+    assert clvoro.load(tmp_path / "d.npz").weights.tolist() == weights.tolist()
+    assert d.measures.quality[d.empty_cells].tolist() == [0] * len(d.empty_cells)
+    d.plot("quality")
+    with pytest.raises(InputError, match="leave out their generators"):
+        d.save(tmp_path / "d.vtu")
+    kept = d.volumes > 0
+    full = clvoro.Adapter(ctx).power_diagram(SQUARE, points[kept], weights[kept])
+    np.testing.assert_allclose(full.volumes, d.volumes[kept], rtol=1e-9)
+    full.save(tmp_path / "d.vtu")
+    loaded = clvoro.load(tmp_path / "d.vtu")
+    assert loaded.check()
+    assert loaded.weights.tolist() == full.weights.tolist()
+    full.save(tmp_path / "case.foam")
+    # Dual triangles cover the same part of the plane, counter-clockwise.
+    a, b, c = points[kept][full.triangles()].swapaxes(0, 1)
+    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    assert (ux * vy - uy * vx > 0).all()
+    for refused in (
+        lambda: full.transfer(np.ones(len(full)), full), full.to_disv,
+        lambda: full.save(tmp_path / "d.nc", convention="mpas"), lambda: full.check("mpas"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match="Voronoi"):
+            refused()
+
+
+def test_bad_input(ctx):
+    adapter, points = clvoro.Adapter(ctx), np.array([(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)])
+    for weights, error, words in (
+        ([0, 1], InputError, "shape"),
+        ([0, 1, np.nan], InputError, "finite"),
+        (["a", "b", "c"], InputTypeError, "real numbers"),
+    ):
+        with pytest.raises(error, match=words):
+            adapter.power_diagram(SQUARE, points, weights)
+    with pytest.raises(InputError, match="coincide"):
+        adapter.power_diagram(SQUARE, points[[0, 0, 1]], [0, 1, 2])
+    with pytest.raises(InputError, match="no power diagrams"):
+        adapter.power_diagram(clvoro.Sphere(), [(0, 0, 1)], [0])
+    with pytest.warns(EmptyCellsWarning, match="2 of 3"):
+        d = adapter.power_diagram(SQUARE, points, [0, 1e300, 0])
+    assert d.volumes.tolist() == [0, 1, 0]
