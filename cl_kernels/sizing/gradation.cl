@@ -12,7 +12,12 @@
    do not read each other: the two colors alternate, and the result does not depend on the order of the work-items. A
    tile that has changed at a side activates the tile across that side. A tile waits while its values and those of its
    neighbors are above a threshold that rises from pass to pass, so that few tiles are swept before their neighbors are
-   final. u only decreases, and decreases of a few ulps are ignored, so the sweeps end. */
+   final. u only decreases, and decreases of a few ulps are ignored, so the sweeps end.
+
+   With GLOBE the grid is one of longitude and latitude on a sphere, its nodes at the centers of pixels. Rows are
+   closed, and their spacing is d_x times the cosine of the latitude. Beyond the first and the last row is the node of
+   the same row at the opposite longitude. The number of tiles along a row is twice an odd number, so that these tiles,
+   too, have different colors. */
 #include "opencl/real.h"
 
 /* Least decrease that is not ignored, relative to u. */
@@ -48,6 +53,23 @@ inline REAL upwind_value(REAL *a, REAL *d, REAL growth)
     return a[0] + rise;
 }
 
+/* Index of the item beside item `at` of a grid along one axis, in the lower (side 0) or upper (1) direction; -1 if
+   there is none. place: position along each axis; count: items along each axis; stride: step of the index along each
+   axis. */
+inline int item_beside(const int at, const int *place, const int *count, const int *stride, const int axis,
+                       const int side)
+{
+    const int onward = place[axis] + (side ? 1 : -1);
+    if (onward >= 0 && onward < count[axis])
+        return at + (side ? stride[axis] : -stride[axis]);
+#ifdef GLOBE
+    const int turned = axis == 0 ? (onward + count[0]) % count[0] : (place[0] + count[0] / 2) % count[0];
+    return at + turned - place[0];
+#else
+    return -1;
+#endif
+}
+
 /* lowest[i] = smallest value of tile i. One work-item per tile. */
 kernel void tile_minima(const int size, const int nx, const int ny, const int nz, global const REAL *restrict u,
                         global REAL *restrict lowest)
@@ -71,7 +93,8 @@ kernel void tile_minima(const int size, const int nx, const int ny, const int nz
 
 /* One pass over the tiles of one `color`, one work-item per tile. active, next_active: 1 for tiles to sweep now, in the
    next pass. Tiles of the other color stay active, and so do tiles without a value below `threshold` in themselves and
-   their neighbors. lowest: smallest value of each tile. u: nx ny nz values with x running fastest, dx, dy, dz apart. */
+   their neighbors. lowest: smallest value of each tile. u: nx ny nz values with x running fastest, dx, dy, dz apart
+   (on a sphere dx at the equator). */
 kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz, const REAL dx, const REAL dy,
                         const REAL dz, const int color, const REAL growth, const REAL threshold,
                         global const int *restrict active, global int *restrict next_active, global REAL *lowest,
@@ -82,8 +105,8 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
         return;
     const int count[3] = {nx, ny, nz};
     const REAL spacing[3] = {dx, dy, dz};
-    int tile[DIM], tiles[DIM], first[DIM], last[DIM], stride[DIM];
-    int rest = i, parity = 0, jump = 1;
+    int tile[DIM], tiles[DIM], first[DIM], last[DIM], stride[DIM], tile_stride[DIM];
+    int rest = i, parity = 0;
     for (int a = 0; a < DIM; ++a) {
         tiles[a] = (count[a] + TILE - 1) / TILE;
         tile[a] = rest % tiles[a];
@@ -91,24 +114,28 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
         parity += tile[a];
         first[a] = tile[a] * TILE;
         last[a] = min(first[a] + TILE, count[a]) - 1;
-        stride[a] = jump;
-        jump *= count[a];
+        stride[a] = a ? stride[a - 1] * count[a - 1] : 1;
+        tile_stride[a] = a ? tile_stride[a - 1] * tiles[a - 1] : 1;
     }
     if ((parity & 1) != color) {
         atomic_or(next_active + i, 1);
         return;
     }
     REAL least = lowest[i], around = least;
-    jump = 1;
-    for (int a = 0; a < DIM; ++a) {
-        around = fmin(around, tile[a] > 0 ? lowest[i - jump] : REAL_MAX);
-        around = fmin(around, tile[a] < tiles[a] - 1 ? lowest[i + jump] : REAL_MAX);
-        jump *= tiles[a];
+    int beside[2 * DIM];
+    for (int k = 0; k < 2 * DIM; ++k) {
+        beside[k] = item_beside(i, tile, tiles, tile_stride, k / 2, k % 2);
+        around = fmin(around, beside[k] >= 0 ? lowest[beside[k]] : REAL_MAX);
     }
     if (around > threshold) {
         atomic_or(next_active + i, 1);
         return;
     }
+#ifdef GLOBE
+    REAL width[TILE];
+    for (int row = first[1]; row <= last[1]; ++row)
+        width[row - first[1]] = spacing[0] * sin((REAL)3.14159265358979323846 * (row + (REAL)0.5) / count[1]);
+#endif
     /* Bits 2 a and 2 a + 1: a node at the lower or upper side along axis a has changed. */
     int changed = 0, sweeps_left = 1 << DIM, direction = 0;
     /* Sweep until all directions in turn have changed nothing. */
@@ -129,11 +156,14 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
             }
             REAL lesser[DIM], across[DIM];
             for (int a = 0; a < DIM; ++a) {
-                const REAL below = place[a] > 0 ? u[at - stride[a]] : REAL_MAX;
-                const REAL above = place[a] < count[a] - 1 ? u[at + stride[a]] : REAL_MAX;
-                lesser[a] = fmin(below, above);
+                const int below = item_beside(at, place, count, stride, a, 0);
+                const int above = item_beside(at, place, count, stride, a, 1);
+                lesser[a] = fmin(below >= 0 ? u[below] : REAL_MAX, above >= 0 ? u[above] : REAL_MAX);
                 across[a] = spacing[a];
             }
+#ifdef GLOBE
+            across[0] = width[place[1] - first[1]];
+#endif
             const REAL now = u[at], limit = upwind_value(lesser, across, growth);
             if (limit < now * (1 - LEAST_DECREASE)) {
                 u[at] = limit;
@@ -146,12 +176,7 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
         sweeps_left = moved ? 1 << DIM : sweeps_left - 1;
     }
     lowest[i] = least;
-    jump = 1;
-    for (int a = 0; a < DIM; ++a) {
-        if ((changed >> (2 * a) & 1) && tile[a] > 0)
-            atomic_or(next_active + i - jump, 1);
-        if ((changed >> (2 * a + 1) & 1) && tile[a] < tiles[a] - 1)
-            atomic_or(next_active + i + jump, 1);
-        jump *= tiles[a];
-    }
+    for (int k = 0; k < 2 * DIM; ++k)
+        if ((changed >> k & 1) && beside[k] >= 0)
+            atomic_or(next_active + beside[k], 1);
 }

@@ -16,7 +16,7 @@ from ..geometry.sphere import Sphere
 from ..sizing import Sizing, as_field
 from ..sizing.field import Field
 from ..sizing.layers import limit_beside_layers
-from ..sizing.lonlat import on_domain
+from ..sizing.on_domain import on_domain
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
 from .efforts import is_near
 from .estimates import Extras, check_memory

@@ -188,7 +188,7 @@ def _add_convert(commands: Any) -> None:
         ".vtu, .npz, .foam (or a folder polyMesh), .nc, .info (METIS), .vtk, .ply, .obj.",
     )
     convert.set_defaults(work=_convert)
-    convert.add_argument("mesh", metavar="MESH", help="mesh.npz or mesh.vtu")
+    convert.add_argument("mesh", metavar="MESH", help="mesh.npz, mesh.vtu, or mesh.nc on a sphere")
     convert.add_argument("out", metavar="OUT", type=_path, help="file to write")
     convert.add_argument(
         "--convention",
@@ -208,7 +208,9 @@ def _add_check(commands: Any) -> None:
         "Exit code 0: all is right; 1: something is wrong; 2: a file cannot be read.",
     )
     check.set_defaults(work=_check)
-    check.add_argument("files", metavar="FILE", nargs="+", help="mesh.npz or mesh.vtu")
+    check.add_argument(
+        "files", metavar="FILE", nargs="+", help="mesh.npz, mesh.vtu, or mesh.nc on a sphere"
+    )
     check.add_argument(
         "--for",
         dest="solver",
@@ -341,8 +343,8 @@ def _level_count(text: str | None) -> str | int | None:
 
 def _readable(name: str) -> str:
     """Return `name` if its suffix is that of a mesh that `load` reads."""
-    if Path(name).suffix.lower() not in (".npz", ".vtu"):
-        raise InputError(f"{name} cannot be read, expected a .npz or .vtu file of clvoro")
+    if Path(name).suffix.lower() not in (".npz", ".vtu", ".nc"):
+        raise InputError(f"{name} cannot be read, expected a .npz, .vtu or .nc file")
     return name
 
 

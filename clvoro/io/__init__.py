@@ -25,6 +25,7 @@ from .formats import check_polygons, write_foreign
 from .history import write_history
 from .metis import write_metis
 from .mpas import write_mpas
+from .netcdf_read import load_netcdf
 from .npz import load as load_npz
 from .npz import write_npz
 from .scrip import write_scrip
@@ -58,12 +59,18 @@ _CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas, "scrip": write_scrip}
 
 
 def load(path: str | PathLike[str]) -> Result | Diagram:
-    """Read a result or a diagram from a ``.npz`` or ``.vtu`` file of its `save`.
+    """Read a result or a diagram from a ``.npz`` or ``.vtu`` file of its `save`, or a mesh on a sphere from ``.nc``.
 
     A ``.npz`` file holds everything. A ``.vtu`` file holds cells, sizes, errors and quality: the graph is computed
     again, the history is empty, and a box without periodic directions is the bounding box of the cells. The file is not
     trusted: nothing in it is executed, sizes are compared with the bytes in the file before memory is allocated, and
     arrays must be consistent.
+
+    A ``.nc`` file of a mesh on a sphere may also be of another program. Generators, cells, neighbors and the generators
+    behind a boundary are those that were saved, up to round-off; the boundary has one name, and corners may have other
+    numbers. Files by the MPAS mesh specification have no sizes, errors and quality. UGRID files have longitudes and
+    latitudes of generators (the coordinates of faces); those of clvoro have sizes, errors and quality, too. SCRIP files
+    have corners, and only those of clvoro have generators.
 
     Parameters
     ----------
@@ -81,11 +88,8 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
         fault.
     """
     path = check_path("path", path)
-    if Path(path).suffix.lower() == ".nc":
-        raise InputError(
-            f"cannot load {path}: clvoro writes netCDF for other programs only, expected a .npz or .vtu file"
-        )
-    return (load_vtu if Path(path).suffix.lower() == ".vtu" else load_npz)(path)
+    readers = {".vtu": load_vtu, ".nc": load_netcdf}
+    return readers.get(Path(path).suffix.lower(), load_npz)(path)
 
 
 def save(mesh: Result | Diagram, path: str | PathLike[str], **options: Any) -> None:

@@ -102,8 +102,9 @@ def _add_coordinates(file: NetCDF, diagram: Diagram, ends: np.ndarray, unit: str
 
 
 def _add_globe(file: NetCDF, sphere: Sphere, unit: str) -> None:
-    """Add the radius of the sphere by the CF conventions, which have it in meters."""
+    """Add the radius of the sphere by the CF conventions, which have it in meters, and in the unit of the file."""
     radius = {"earth_radius": np.float64(sphere.radius)} if unit == "m" else {}
+    file.attributes["sphere_radius"] = np.float64(sphere.radius)
     file.add("globe", (), np.zeros((), np.int32), grid_mapping_name="latitude_longitude", **radius)
 
 

@@ -10,7 +10,7 @@ from ..errors import SizeFieldError
 from .advice import advice_for_size
 from .codegen import generate_code
 from .field import Constant, Field, as_field
-from .lonlat import on_domain
+from .on_domain import on_domain
 
 if TYPE_CHECKING:
     import pyopencl.array as cla

@@ -17,13 +17,29 @@ _TILE = {2: 16, 3: 8}  # nodes along a side
 _PASSES = 16  # between two reads of the active tiles by the host
 
 
-class Gradation:
-    """Lower the values on a grid until their gradient is bounded."""
+def globe_columns(least: float) -> int:
+    """Return a number of columns, at least `least`, for a grid around a sphere: an odd number of pairs of tiles."""
+    pair = 2 * _TILE[2]
+    return pair * (2 * math.ceil(max(least / pair - 1, 0) / 2) + 1)
 
-    def __init__(self, engine: Engine):
+
+class Gradation:
+    """Lower the values on a grid until their gradient is bounded.
+
+    Parameters
+    ----------
+    engine : Engine
+        Of the dimension of the grid.
+    globe : bool
+        Whether the grid is one of longitude and latitude around a sphere, with nodes at the centers of pixels. Then it
+        has `globe_columns` values along a row, and the spacing along x is that at the equator.
+    """
+
+    def __init__(self, engine: Engine, globe: bool = False):
         self.engine = engine
         self._tile = _TILE[engine.dim]
-        self._kernels = engine.kernels("sizing/gradation", defines={"TILE": self._tile})
+        defines: dict[str, object] = {"TILE": self._tile, **({"GLOBE": 1} if globe else {})}
+        self._kernels = engine.kernels("sizing/gradation", defines=defines)
 
     def sweep_tiles(
         self, values: cla.Array, counts: Sequence[int], spacing: Sequence[float], slope: float

@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import InputError, InputTypeError, MemoryLimitError
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
+from ..opencl.engine import WALLED_BOX, DomainKind, Engine
 from ..opencl.host_memory import host_memory
 from .advice import coverage_warnings
 from .arguments import check_slope
@@ -19,12 +20,11 @@ from .field import Field, as_field, count_parts
 from .raster import Raster
 
 if TYPE_CHECKING:
-    from ..opencl.engine import Engine
     from .codegen import CodeWriter
 
-_MAX_NODES = 1 << 22  # by default
+MOST_NODES = 1 << 22  # by default
 _MAX_NODES_GIVEN = 2**31 - 1  # of a resolution that the caller gives
-_BATCH = 1 << 18  # nodes that are evaluated at once
+BATCH = 1 << 18  # nodes that are evaluated at once
 _BYTES_PER_NODE = 48  # on the host, at most
 _PROBES = {2: 129, 3: 33}  # nodes along the longest side of the grid that samples the smallest size
 
@@ -49,12 +49,13 @@ class Graded(Field):
         Bound of |grad h|, in place of `growth`. 0 gives the smallest size everywhere.
     box : Box or Polygon, optional
         Region of the grid; by default the domain. Outside, the nearest value is used. In a polygon `field` is
-        evaluated inside only; sizes also grow straight across the outside.
+        evaluated inside only; sizes also grow straight across the outside. Not for spheres.
     resolution : int or sequence of d ints, optional
         Number of nodes along the longest side of the box, or along each axis. By default the spacing is the smallest
         size (of the field on a coarse grid and at its landmarks), with at least 129 nodes along the longest side (33 in
-        3D) and at most 2^22 in total (2048 x 2048, 161^3; 32 MiB in float64). The error of the growth is about slope
-        times the spacing.
+        3D) and at most 2^22 in total (2048 x 2048, 161^3; 32 MiB in float64). On a sphere it is the number of nodes
+        along the equator, at most 2848 by default (14 km on the Earth). The error of the growth is about slope times
+        the spacing.
 
     Raises
     ------
@@ -86,6 +87,7 @@ class Graded(Field):
         self.field = as_field(field)
         self.parts = count_parts(self.field)
         self.slope = check_slope("Graded", growth, slope)
+        self.on_sphere = self.field.on_sphere
         if box is not None and not isinstance(box, Domain):
             raise InputTypeError(
                 f"Graded box is {type(box).__name__}, expected a clvoro.Box or clvoro.Polygon"
@@ -116,7 +118,7 @@ class Graded(Field):
         known = [raster for (b, _), raster in self._rasters.items() if b == box]
         if engine is None and known:
             return known[0]
-        engine = engine or _default_engine(box.dim)
+        engine = engine or default_engine(box.dim)
         key = (box, engine.real)
         if key not in self._rasters:
             self._rasters[key] = self._compute(box, engine)
@@ -159,8 +161,8 @@ class Graded(Field):
         self._check_room(math.prod(counts.tolist()), engine)
         axes = _axes(box, counts)
         values = np.empty(np.prod(counts))
-        for first in range(0, len(values), _BATCH):
-            flat = np.arange(first, min(first + _BATCH, len(values)))
+        for first in range(0, len(values), BATCH):
+            flat = np.arange(first, min(first + BATCH, len(values)))
             places = np.unravel_index(flat, counts, order="F")
             nodes = np.column_stack([axis[i] for axis, i in zip(axes, places, strict=True)])
             values[flat] = self._at_nodes(box, evaluate, nodes, axes)
@@ -232,9 +234,9 @@ class Graded(Field):
             inner = np.array([box.inner_point(piece) for piece in range(box.n_pieces)])
             probes = np.concatenate([probes[box.contains(probes)], inner])
         least = min(evaluate(probes).min(), at_marks.min(initial=math.inf))
-        finest = (box.measure / _MAX_NODES) ** (1 / box.dim)
+        finest = (box.measure / MOST_NODES) ** (1 / box.dim)
         spacing = min(max(least, finest), coarse)
-        while np.prod(_along(box, spacing), dtype=float) > _MAX_NODES:
+        while np.prod(_along(box, spacing), dtype=float) > MOST_NODES:
             spacing *= 1.02
         return _along(box, spacing)
 
@@ -305,11 +307,11 @@ def _check_resolution(resolution: int | Sequence[int], dim: int | None) -> int |
     return tuple(given.tolist()) if given.ndim else int(given)
 
 
-def _default_engine(dim: int) -> Engine:
+def default_engine(dim: int, kind: DomainKind = WALLED_BOX) -> Engine:
+    """Return an engine in float64 on the default device."""
     import pyopencl as cl
 
     from ..opencl.devices import create_context
-    from ..opencl.engine import Engine
 
     ctx = create_context()
-    return Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64))
+    return Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64), kind)

@@ -14,8 +14,7 @@ from ..geometry.box import Box, Domain
 from ..geometry.sphere import Sphere, directions
 from .arguments import check_positive, check_slope
 from .distance import Distance
-from .field import Combined, Field, Scaled, as_field
-from .graded import Graded
+from .field import Field, as_field
 from .raster import Raster
 
 if TYPE_CHECKING:
@@ -30,28 +29,6 @@ SAGITTA = 1e-3
 MOST_CHORDS, LONGEST_CHORD = 1 << 18, np.radians(1)
 _DEGREES = 180 / math.pi
 _GLOBAL = 359.0  # degrees of longitude from which on a raster goes around the sphere
-
-
-def on_domain(field: Field, domain: Domain) -> Field:
-    """Return `field` for `domain`: on a sphere fields of two dimensions are functions of longitude and latitude.
-
-    Raises
-    ------
-    InputError
-        For a `Graded` field on a sphere.
-    """
-    if not isinstance(domain, Sphere):
-        return field
-    if isinstance(field, (Scaled, Combined)):
-        return field.map_parts(lambda part: on_domain(part, domain))
-    if isinstance(field, Graded):
-        raise InputError(
-            f"{field!r} is limited on a plane grid, expected another field on a sphere; Distance and Caps grow by a "
-            "bounded factor per cell"
-        )
-    if field.dim != 2 or isinstance(field, (LonLat, ArcDistance)):
-        return field
-    return ArcDistance(field, domain) if isinstance(field, Distance) else LonLat(field)
 
 
 class LonLat(Field):

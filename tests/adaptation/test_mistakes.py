@@ -97,6 +97,7 @@ BAD_SIZES = {
 }
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("edges", [(1e6, 1e6, 1e6), (1e6, 1), (2e-3, 3e-3)])
 @pytest.mark.parametrize("what", list(BAD_SIZES))
 def test_bounds_in_errors_suit_the_domain(adapter, what, edges):

@@ -93,7 +93,7 @@ def test_convert(here, capsys):
     assert np.array_equal(load(here / "copy.npz").points, load(here / "a/mesh.npz").points)
     assert call("convert", "copy.vtu", "again.nc", "--convention", "mpas") == cli.OK
     assert call("convert", "copy.nc", "again.vtu") == cli.BAD_INPUT
-    assert "copy.nc cannot be read, expected a .npz or .vtu file" in capsys.readouterr().err
+    assert "copy.nc: it is a mesh in the plane, expected one on a sphere" in capsys.readouterr().err
     assert call("convert", "copy.npz", "again.xyz") == cli.BAD_INPUT
     assert not (here / "again.xyz").exists()
 

@@ -46,7 +46,15 @@ POINTS = {
 PERIODIC = {"closed": False, "periodic": True, "channel": (True, False, False)}
 
 
-@pytest.fixture(scope="module", params=[f"{p}; {b}" for p in POINTS for b in PERIODIC])
+def grid():
+    """Points and kinds of box; the fast tests have each kind of points once."""
+    for i, points in enumerate(POINTS):
+        for j, box in enumerate(PERIODIC):
+            marks = [] if i % len(PERIODIC) == j else [pytest.mark.slow]
+            yield pytest.param(f"{points}; {box}", marks=marks)
+
+
+@pytest.fixture(scope="module", params=grid())
 def meshes(request, ctx):
     """A diagram, its mesh, and its mesh with short edges collapsed."""
     points, periodic = request.param.split("; ")

@@ -217,6 +217,7 @@ def test_wings_with_thin_layers_are_accepted_by_solvers(adapter):
     assert report, report
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("spacing", [0.01, 0.04])
 @pytest.mark.parametrize("angle", [50.5, 60, 90, 120, 150, 170])
 def test_faces_end_in_the_corners_of_bodies_with_layers(adapter, angle, spacing):

@@ -295,12 +295,6 @@ def test_meshes_in_3d_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_files_are_not_read_back(room, tmp_path):
-    room.save(tmp_path / "mesh.nc")
-    with pytest.raises(InputError, match=r"cannot load .*mesh\.nc: .*expected a \.npz"):
-        clvoro.load(tmp_path / "mesh.nc")
-
-
 @pytest.mark.parametrize("convention", BOTH)
 def test_variables_too_large_for_the_format_are_refused(room, tmp_path, monkeypatch, convention):
     largest = {"ugrid": "mesh_face_nodes", "mpas": "edgesOnEdge"}[convention]

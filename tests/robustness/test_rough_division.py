@@ -11,9 +11,8 @@ BOX = clvoro.Box((0, 0), (2.5, 1.5))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 
 
-@pytest.mark.parametrize(
-    "domain", [BOX, pytest.param(CUBE, marks=pytest.mark.slow)], ids=["2D", "3D"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("domain", [BOX, CUBE], ids=["2D", "3D"])
 def test_rough_quotients_change_nothing_but_rounding(ctx, domain, monkeypatch):
     """Float32 quotients and roots that are off by units in the last place, as OpenCL allows."""
     size = clvoro.sizing.Expression(f"{0.06 if domain.dim == 2 else 0.2} * (1 + x / 2)")

@@ -14,7 +14,8 @@ from clvoro import Box, sizing
 from clvoro.errors import InputError, InputTypeError, MemoryLimitError, SizeFieldError
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.host_memory import host_memory
-from clvoro.sizing.gradation import Gradation
+from clvoro.sizing.gradation import Gradation, globe_columns
+from clvoro.sizing.on_domain import on_domain
 
 
 def jacobi(values, spacing, slope):
@@ -362,3 +363,85 @@ def test_host_memory_is_the_limit_of_the_process():
     )
     found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
     assert int(found.stdout) == min(3 << 30, whole)
+
+
+# --- on a sphere ---
+
+
+def globe_cones(sphere, values, slope):
+    """The least of f(y) + slope arc(x, y) over all nodes y of a grid in longitude and latitude."""
+    ny, nx = values.shape
+    lon, lat = np.meshgrid((np.arange(nx) + 0.5) * 360 / nx, (np.arange(ny) + 0.5) * 180 / ny - 90)
+    x = sphere.positions(np.column_stack([lon.ravel(), lat.ravel()]))
+    arcs = np.arccos(np.clip(x @ x.T / sphere.radius**2, -1, 1)) * sphere.radius
+    return (values.ravel() + slope * arcs).min(axis=1).reshape(values.shape)
+
+
+# One node, by longitude and latitude: on the equator, at the date line, beside the poles; and many.
+SOURCES = {
+    "equator": [(91, 1)],
+    "date-line": [(180.1, 40)],
+    "north": [(11, 89.9)],
+    "south": [(-100, -87)],
+}
+
+
+@pytest.mark.parametrize("where", [*SOURCES, "many"])
+def test_growth_on_a_sphere_is_along_great_circles(make_engine, where):
+    engine, slope = make_engine(2), 0.3
+    nx = globe_columns(90)
+    ny, unit = nx // 2, clvoro.Sphere(1)
+    rng, values = np.random.default_rng(71), np.full((ny, nx), 2.0)
+    if where == "many":
+        values.ravel()[rng.integers(0, values.size, 30)] = rng.uniform(0.05, 0.3, 30)
+    for lon, lat in SOURCES.get(where, []):
+        values[int((lat + 90) / 180 * ny), int(lon % 360 / 360 * nx)] = 0.05
+    on_device = engine.upload(values.ravel())
+    Gradation(engine, globe=True).sweep_tiles(
+        on_device, (nx, ny), (2 * np.pi / nx, np.pi / ny), slope
+    )
+    found, exact = on_device.get().reshape(ny, nx), globe_cones(unit, values, slope)
+    spacing = np.pi / ny
+    # As in the plane. Fronts meet at the far side, where values are too low by less than half a step.
+    assert (found >= exact - 0.5 * slope * spacing).all()
+    assert np.abs(found - exact).max() < slope * spacing * math.log(np.pi / spacing) * 0.5
+    assert nx % 64 == 32
+
+
+def test_graded_on_a_sphere():
+    """Small cells beside a pole and across the date line, in a function of longitude and latitude."""
+    earth, slope = clvoro.Sphere(), math.log(1.2)
+    marks = earth.positions([(50, 89), (180, -20)])
+
+    def jump(lonlat):
+        away = np.linalg.norm(earth.positions(lonlat)[:, None] - marks, axis=2).min(axis=1)
+        return np.where(away < 5e5, 1e5, 1e6)
+
+    given = sizing.Graded(sizing.LonLat(jump), growth=1.2, resolution=300)
+    field = on_domain(given, earth)
+    x = earth.wrap(np.random.default_rng(72).normal(size=(2000, 3)))
+    away = earth.arcs(np.linalg.norm(x[:, None] - marks, axis=2)).min(axis=1)
+    expected = np.minimum(1e5 + slope * np.maximum(away - 5e5, 0), 1e6)
+    step = 2 * np.pi * earth.radius / globe_columns(300)
+    assert field(x) == pytest.approx(expected, abs=1.5 * slope * step)
+    # Over the pole and across the date line there is no step.
+    for ways in (
+        [(a, b) for a in (0, 90, 180, 270) for b in (89.9,)],
+        [(179.99, 30), (-179.99, 30)],
+    ):
+        assert np.ptp(field(earth.positions(ways))) < 1.5 * slope * step
+    assert (2 * given).map_parts(lambda f: on_domain(f, earth))(x) == pytest.approx(2 * field(x))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"box": clvoro.Box((0, 0), (1, 1))}, "leave out box"),
+        ({"resolution": (64, 32)}, "nodes along the equator"),
+    ],
+)
+def test_mistakes_on_a_sphere(options, message):
+    with pytest.raises(InputError, match=message):
+        clvoro.adapt(
+            clvoro.Sphere(), sizing.Graded(sizing.Expression("1e6 + 0*lat"), 1.1, **options)
+        )

@@ -8,7 +8,7 @@ import clvoro
 from clvoro import sizing
 from clvoro.errors import ClvoroError
 from clvoro.opencl.engine import Engine
-from clvoro.sizing.lonlat import on_domain
+from clvoro.sizing.on_domain import on_domain
 
 EARTH = clvoro.Sphere()
 POINTS = np.concatenate([
@@ -96,6 +96,7 @@ def test_values(name):
     )
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", list(FIELDS))
 def test_on_the_device(ctx, name, real):
@@ -132,7 +133,6 @@ def test_fields_of_the_plane_stay():
         (lambda: sizing.Caps([((0, 5), -1, 1e5)], 1e5, 1.1), "radius"),
         (lambda: sizing.Caps([((0, 5), 1e5)], 1e5, 1.1), r"regions\[0\]"),
         (lambda: sizing.Caps([((0, 5), 1e5, 1e5)], 1e5, 1.1, sphere=3), "expected a clvoro.Sphere"),
-        (lambda: clvoro.adapt(EARTH, sizing.Graded(sizing.Caps([((0, 5), 1e5, 1e6)], 2e6, 1.1), 1.1)), "on a sphere"),
         (lambda: clvoro.adapt(EARTH, sizing.Expression("lat")), "positive"),
     ],
 )  # fmt: skip

@@ -123,6 +123,7 @@ def test_regular_sets(adapter, name):
     assert len(diagram.vertices) < 8 * len(diagram)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("name", IN_TORUS)
 def test_regular_sets_in_a_periodic_box(adapter, name):
     points = SETS[name] if name != "ring" else pipe([0.4], 80, 2)
