@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from .arguments import check_integer, warn
+from .arguments import check_choice, check_integer, warn
 from .errors import InputError, InputTypeError, MismatchWarning
 from .geometry.lonlat_shapes import area_of, lines_of
 from .geometry.sphere import Sphere
@@ -27,6 +27,7 @@ from .mesh.connectivity import face_owners
 from .mesh.crossing import cells_across, rings_around
 from .mesh.diagram import Diagram
 from .mesh.results import Result
+from .mesh.straits import widen_straits
 from .mesh.subset import check_mask
 
 if TYPE_CHECKING:
@@ -133,6 +134,7 @@ def ocean(
     passages: Lines | None = None,
     blockages: Lines | None = None,
     least_cells: int | None = None,
+    straits: Literal["keep", "widen"] = "keep",
 ) -> np.ndarray:
     """Return which cells of a mesh on a sphere are left when land and lakes are removed.
 
@@ -150,6 +152,9 @@ def ocean(
         Lines along which cells become land, unless a passage crosses them.
     least_cells : int, optional
         Keep all parts of at least so many cells. By default only the part with the largest area.
+    straits : {"keep", "widen"}
+        With "widen" land beside water that is a single cell wide becomes water: straits, passages and inlets are then
+        two cells wide or more. No land bridge opens, no island disappears, and blockages stay.
 
     Returns
     -------
@@ -164,7 +169,8 @@ def ocean(
     Warns
     -----
     MismatchWarning
-        If a passage leads into a lake that is removed.
+        If a passage leads into a lake that is removed, or a strait cannot be widened, as between a passage and a
+        blockage.
 
     Examples
     --------
@@ -175,13 +181,18 @@ def ocean(
     2161
     >>> int(clvoro.regions.ocean(globe, land, passages=[(-20, 0), (40, 0)]).sum())
     2260
+    >>> int(clvoro.regions.ocean(globe, land, passages=[(-20, 0), (40, 0)], straits="widen").sum())
+    2266
     """
     diagram, sphere = _diagram_of(mesh)
+    check_choice("straits", straits, ("keep", "widen"))
     water = ~_inside(diagram, sphere, "land", land)
+    blocked = np.zeros(len(diagram), bool)
     for cells in _crossed(diagram, sphere, "blockages", blockages):
-        water[cells] = False
-    straits = _crossed(diagram, sphere, "passages", passages)
-    for cells in straits:
+        blocked[cells] = True
+    water &= ~blocked
+    opened = _crossed(diagram, sphere, "passages", passages)
+    for cells in opened:
         water[cells] = True
     if not water.any():
         raise InputError(
@@ -189,14 +200,14 @@ def ocean(
             "land and water mixed up?"
         )
     kept = _large_parts(diagram, water, least_cells)
-    for k, cells in enumerate(straits):
+    for k, cells in enumerate(opened):
         if not kept[cells].all():
             warn(
                 f"passages[{k}] leads to water that is not connected with the rest: {(~kept[cells]).sum()} of "
                 f"its {len(cells)} cells are removed; prolong the line into the ocean, or use a smaller least_cells",
                 MismatchWarning,
             )
-    return kept
+    return kept if straits == "keep" else _widened(diagram, sphere, kept, blocked)
 
 
 def rings(mesh: Result | Diagram, keep: ArrayLike, count: int = 7) -> np.ndarray:
@@ -274,6 +285,21 @@ def _crossed(diagram: Diagram, sphere: Sphere, name: str, lines: Any) -> list[np
     for k, cells in enumerate(found):
         if not len(cells):
             raise InputError(f"{name}[{k}] crosses no cell of the mesh: it is outside of {sphere}")
+    return found
+
+
+def _widened(
+    diagram: Diagram, sphere: Sphere, water: np.ndarray, blocked: np.ndarray
+) -> np.ndarray:
+    found, left = widen_straits(diagram, water, blocked)
+    if len(left):
+        lon, lat = sphere.lonlat(diagram.points[left[:1]])[0]
+        warn(
+            f"{len(left)} cells of water remain one cell wide, because more water would open a land bridge, cover an "
+            f"island or a blockage, or leave the mesh; the first one is at {lon:.1f}, {lat:.1f}; use smaller cells "
+            "there",
+            MismatchWarning,
+        )
     return found
 
 

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components, shortest_path
 import clvoro
 from clvoro import regions
 from clvoro.errors import InputError, InputTypeError, MismatchWarning
+from clvoro.mesh.straits import narrow_cells, widen_straits
 from tests.reference.spheres import grid_of_rings, random_points
 
 EARTH = clvoro.Sphere()
@@ -243,6 +244,73 @@ def test_passages_stay_open_and_blockages_close_them(globe):
     assert not closed[lake].any()
     assert not closed[regions.crossed(globe, wall)].any()
     assert regions.ocean(globe, channel, blockages=wall, passages=strait)[lake].all()
+
+
+def slow_narrow(globe, water):
+    """Water cells whose neighbors in the water are not connected with each other around the cell."""
+    graph, found = globe.adjacency.tocsr(), np.zeros(len(globe), bool)
+    beside = [set(row.tolist()) for row in np.split(graph.indices, graph.indptr[1:-1])]
+    for i in np.flatnonzero(water):
+        rest = {j for j in beside[i] if water[j]}
+        reached = {rest.pop()} if rest else set()
+        while more := {j for j in rest if beside[j] & reached}:
+            reached |= more
+            rest -= more
+        found[i] = bool(rest)
+    return found
+
+
+def land_and_water(globe, water):
+    return parts_of(globe, water), parts_of(globe, ~water)
+
+
+# Two straits into the lake, each a cell wide, beside which a passage crosses an isthmus of land.
+STRAITS = [[(0, 0), (0, 60)], [(0, 0), (90, 5)]]
+
+
+def test_straits_are_widened(globe):
+    kept = regions.ocean(globe, RING, passages=STRAITS)
+    assert np.array_equal(narrow_cells(globe, kept), slow_narrow(globe, kept))
+    assert slow_narrow(globe, kept).sum() > 10
+    wide = regions.ocean(globe, RING, passages=STRAITS, straits="widen")
+    assert not slow_narrow(globe, wide).any()
+    assert wide[kept].all()
+    # Not more than a row of cells beside each strait.
+    assert (wide & ~kept).sum() < 2 * slow_narrow(globe, kept).sum()
+    assert land_and_water(globe, wide) == land_and_water(globe, kept) == (1, 2)
+    globe.subset(wide).check().demand()
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_widening_keeps_land_bridges_and_islands(globe, seed):
+    """Scattered land, where many straits and isthmuses are a cell wide."""
+    rng = np.random.default_rng(seed)
+    x = globe.points / EARTH.radius
+    water = sum(np.sin(rng.uniform(2, 9) * x @ v) for v in rng.standard_normal((6, 3))) < 1
+    fixed = rng.random(len(globe)) < 0.1
+    wide, left = widen_straits(globe, water, fixed)
+    assert wide[water].all()
+    assert not (wide & fixed & ~water).any()
+    assert land_and_water(globe, wide) == land_and_water(globe, water)
+    assert np.array_equal(np.flatnonzero(slow_narrow(globe, wide)), left)
+    assert len(left) < slow_narrow(globe, water).sum() / 2
+
+
+def test_straits_between_blockages_stay(globe):
+    """Land on both sides of a passage has to stay."""
+    beside = [[(-6, 12), (-6, 45)], [(6, 12), (6, 45)], [(-1, 50), (-14, 50)]]
+    with pytest.warns(MismatchWarning, match=r"remain one cell wide.*first one is at [-\d]"):
+        kept = regions.ocean(
+            globe,
+            RING,
+            passages=STRAITS[:1],
+            blockages=[*beside, [(0, 12), (0, 45)]],
+            straits="widen",
+        )
+    blocked = regions.crossed(globe, beside) & ~regions.crossed(globe, STRAITS[:1])
+    assert not kept[blocked].any()
+    with pytest.raises(InputError, match="straits is 'wide', expected"):
+        regions.ocean(globe, RING, straits="wide")
 
 
 def test_a_passage_into_a_lake_is_warned_of(globe):

@@ -129,7 +129,7 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
             ax.set_axis_off()
         drawn = (*axes[0].collections, *axes[0].images)
         cells = next(item for item in drawn if item.get_array() is not None)
-        scheme = coloring("size")
+        scheme = coloring("size", domain)
         add_key(cells, list(axes), scheme, sizes, limits, below=True)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as file:

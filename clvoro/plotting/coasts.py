@@ -12,9 +12,15 @@ _SCALES = (("110m", 40.0), ("50m", 8.0), ("10m", 0.0))
 """Scales of the data, and the smallest angle in degrees across a picture that has them."""
 
 
+def kilometer_of(radius: float) -> float | None:
+    """Return the length of a kilometer if `radius` is about that of the Earth in meters or kilometers, else None."""
+    units = (1000.0, 1.0)
+    return next((k for k in units if abs(radius / k / (EARTH_RADIUS / 1000) - 1) < 0.005), None)
+
+
 def is_earth(radius: float) -> bool:
     """Return whether a radius is about that of the Earth, in meters or kilometers."""
-    return any(abs(radius * unit / EARTH_RADIUS - 1) < 0.005 for unit in (1, 1000))
+    return kilometer_of(radius) is not None
 
 
 def coastlines(span: float) -> list[np.ndarray]:

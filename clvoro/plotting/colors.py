@@ -17,9 +17,12 @@ from matplotlib.colors import (
 )
 
 from ..errors import InputError, InputTypeError
+from ..geometry.box import Domain
+from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..mesh.straightening import count_sides
+from .coasts import kilometer_of
 from .style import nice
 
 if TYPE_CHECKING:
@@ -64,6 +67,7 @@ class Coloring:
     limits: Callable[[np.ndarray], tuple[float, float]]
     logarithmic: bool = False
     classes: tuple[str, ...] = ()
+    unit: float = 1.0  # of the numbers beside the color bar
 
 
 def _symmetric(values: np.ndarray) -> tuple[float, float]:
@@ -165,6 +169,8 @@ _SOLID_COLORINGS = {
 Color = Literal["error", "quality", "size", "sides", "skewness", "volume"]
 """Names of the quantities."""
 _OF_RUNS = ("error", "size")
+_ON_EARTH = {"size": ("target size $h$ [km]", 1), "volume": ("area of the cell [km²]", 2)}
+"""Labels, and powers of the unit of length."""
 
 
 class DiagramPicture:
@@ -209,7 +215,6 @@ def coloring_of(mesh: Result, color: Color | ArrayLike, label: str | None = None
     InputError, InputTypeError
         If there is no such color, or the array has another shape or no real numbers.
     """
-    dim = mesh.diagram.domain.cell_dim
     if isinstance(color, str):
         if isinstance(mesh, DiagramPicture) and color in _OF_RUNS:
             others = [name for name in COLORINGS if name not in _OF_RUNS]
@@ -217,7 +222,7 @@ def coloring_of(mesh: Result, color: Color | ArrayLike, label: str | None = None
                 f"color is {color!r}, which a diagram without sizes does not have, expected one of {', '.join(others)} "
                 "or an array"
             )
-        scheme = coloring(color, dim)
+        scheme = coloring(color, mesh.diagram.domain)
         return scheme if label is None else replace(scheme, label=label)
     values = np.asarray(color)
     n = len(mesh.points)
@@ -231,17 +236,24 @@ def coloring_of(mesh: Result, color: Color | ArrayLike, label: str | None = None
     return Coloring(label or "", lambda _: values, "viridis", _most)
 
 
-def coloring(name: str, dim: int = 2) -> Coloring:
-    """Return the coloring of that name for cells in `dim` dimensions, or raise InputError."""
-    known = COLORINGS if dim == 2 else _SOLID_COLORINGS
+def coloring(name: str, domain: Domain | None = None) -> Coloring:
+    """Return the coloring of that name for cells of `domain`, by default in the plane, or raise InputError.
+
+    On the Earth the numbers are in kilometers.
+    """
+    known = COLORINGS if domain is None or domain.cell_dim == 2 else _SOLID_COLORINGS
     if not isinstance(name, str) or name not in known:
         raise InputError(f"color is {name!r:.60}, expected one of {', '.join(known)}")
-    return known[name]
+    kilometer = kilometer_of(domain.radius) if isinstance(domain, Sphere) else None
+    if kilometer is None or name not in _ON_EARTH:
+        return known[name]
+    label, power = _ON_EARTH[name]
+    return replace(known[name], label=label, unit=kilometer**power)
 
 
 def shared_limits(results: Sequence[Result], color: str) -> tuple[float, float]:
     """Return one scale for the cells of all `results`."""
-    scheme = coloring(color, results[0].diagram.domain.cell_dim)
+    scheme = coloring(color, results[0].diagram.domain)
     return scheme.limits(np.concatenate([scheme.values(r) for r in results]))
 
 

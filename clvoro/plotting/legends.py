@@ -77,7 +77,7 @@ def add_color_bar(
         digits = (
             2 if high > 2 * low else 2 + int(np.ceil(np.log10(high / max(high - low, 1e-9 * high))))
         )
-        bar.formatter = FuncFormatter(lambda t, _: short(t, digits))
+        bar.formatter = FuncFormatter(lambda t, _: short(t / scheme.unit, digits))
     bar.update_ticks()
 
 

@@ -260,7 +260,7 @@ def _grid(panels: Mapping[str, Result], color: str) -> Any:
     """Draw the meshes side by side with one scale."""
     results = list(panels.values())
     box = results[0].diagram.domain
-    scheme, limits = coloring(color, box.cell_dim), shared_limits(results, color)
+    scheme, limits = coloring(color, box), shared_limits(results, color)
     if color == "error":  # a larger limit would hide small errors
         limits = (max(limits[0], -1.0), min(limits[1], 1.0))
     plot: Callable[..., Any] = draw.plot_cells

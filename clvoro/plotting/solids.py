@@ -166,9 +166,8 @@ def plot_distributions(result: Result, figure: Any = None) -> Any:
         panels = figure.subplots(2, 2).ravel()
         if figure.get_layout_engine() is not None:  # space between titles and the numbers above
             figure.get_layout_engine().set(hspace=0.08)
-        dim = result.diagram.domain.cell_dim
         for ax, name in zip(panels, ("error", "quality", "sides", "skewness"), strict=True):
-            scheme = coloring(name, dim)
+            scheme = coloring(name, result.diagram.domain)
             if name == "sides":
                 values = np.diff(result.diagram.neighbor_starts)
                 edges = np.arange(values.min(), values.max() + 2) - 0.5

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 from matplotlib import pyplot
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from scipy.spatial import SphericalVoronoi
 
@@ -15,6 +16,7 @@ from clvoro.plotting import coasts, globe, plot_cells, plot_globe, plot_slice
 from clvoro.plotting.globe import default_center
 from clvoro.plotting.pictures import pictures_of
 from clvoro.plotting.projections import Orthographic, Plate, outlines, unit_vectors
+from tests.reference.netcdf_files import result_of
 
 SPHERE = clvoro.Sphere(2.0)
 GRID = [(lon, lat) for lat in (-70, -40, -10, 10, 40, 70) for lon in range(0, 360, 60)]
@@ -367,3 +369,23 @@ def test_coasts(mesh, monkeypatch):
         False,
         False,
     ]
+
+
+@pytest.mark.parametrize(
+    ("radius", "color", "label", "number"),
+    [
+        (6371229.0, "size", "target size $h$ [km]", 1000.0),
+        (6371.229, "size", "target size $h$ [km]", 1.0),
+        (6371229.0, "volume", "area of the cell [km²]", 1e6),
+        (1.0, "size", "target size $h$ [units of length]", 1.0),
+    ],
+)
+def test_sizes_on_the_earth_are_in_kilometers(adapter, radius, color, label, number):
+    diagram = adapter.diagram(clvoro.Sphere(radius), ICOSAHEDRON)
+    mesh = result_of(diagram)
+    figure = plot_globe(mesh, color)
+    figure.canvas.draw()
+    bar = next(ax for ax in figure.findobj(Axes) if ax.get_ylabel() == label)
+    low = (mesh.target_size if color == "size" else diagram.volumes).min()
+    shown = float(bar.get_yticklabels()[0].get_text().replace("−", "-"))
+    assert shown == pytest.approx(low / number, rel=0.06)
