@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ..arguments import Naming, warn
-from ..errors import CoarseSizeWarning, InputError
+from ..errors import CoarseSizeWarning, InputError, SizeFieldError
 from ..geometry.boundary_layers import apart_from, count_rows, free_domain, place_layers
 from ..geometry.box import Domain
 from ..geometry.geojson import may_be_degrees
@@ -37,6 +37,8 @@ LEAST_ON_SPHERE = 4
 """Least number of cells on a sphere: fewer generators leave a half of it free."""
 EVEN_ON_SPHERE = 200
 """Random generators that are fewer may leave a half of a sphere free. The start is an even spiral then."""
+_PLACES = 2000
+"""Places on a sphere at which sizes are compared with its radius."""
 STEPS = 100
 """Default number of steps of a method that repeats one kind of step."""
 
@@ -106,6 +108,8 @@ class Preparation:
             self._tree = density_tree(self.sizing, self.free)
             required = self._tree.integral + len(self.rows)
         warn_of_mismatches(given_field, domain, options.layers)
+        if isinstance(domain, Sphere) and n_cells is None:
+            self._check_against_radius(domain)
         self.target = n_cells if n_cells is not None else max(1, round(required))
         if isinstance(domain, Sphere) and self.target < LEAST_ON_SPHERE:
             given = (
@@ -147,6 +151,18 @@ class Preparation:
                 "n_cells out, or make the cells of the layers wider"
             )
         return limit_beside_layers(field, domain, layers)
+
+    def _check_against_radius(self, sphere: Sphere) -> None:
+        """Raise if the size exceeds the radius somewhere."""
+        places = sphere.spiral_points(_PLACES)
+        h = self.sizing(places)
+        k = int(h.argmax())
+        if h[k] > sphere.radius:
+            lon, lat = sphere.lonlat(places[k : k + 1])[0]
+            raise SizeFieldError(
+                f"h is {h[k]:.6g} at longitude {lon:.0f}, latitude {lat:.0f}, larger than the radius, "
+                f"{sphere.radius:g}; use smaller sizes, in the unit of the radius, or n_cells"
+            )
 
     def _warn_of_coarse_size(self, required: float) -> None:
         domain = self.domain

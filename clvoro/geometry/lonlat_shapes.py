@@ -97,7 +97,7 @@ def area_of(name: str, shape: object) -> LonLatArea:
             "latitudes in degrees, a path or dict of GeoJSON, an array of bool, or a function of longitude and latitude"
         )
     checked = [[check_lonlat(name, ring) for ring in piece] for piece in pieces]
-    _warn_of_radians(name, np.concatenate([ring for piece in checked for ring in piece]))
+    warn_of_radians(name, np.concatenate([ring for piece in checked for ring in piece]))
     outer = [_region(name, piece[0]) for piece in checked]
     holes = [_region(name, ring) for piece in checked for ring in piece[1:]]
     piece_of_hole = np.repeat(np.arange(len(checked)), [len(piece) - 1 for piece in checked])
@@ -141,7 +141,7 @@ def lines_of(name: str, lines: Any) -> list[np.ndarray]:
     for k, line in enumerate(checked):
         if len(line) < 2:
             raise InputError(f"{name}[{k}] has {len(line)} position, expected at least 2")
-    _warn_of_radians(name, np.concatenate(checked))
+    warn_of_radians(name, np.concatenate(checked))
     return [np.column_stack([_unwrapped(x[:, 0], np.diff(x[:, 0])), x[:, 1]]) for x in checked]
 
 
@@ -165,7 +165,8 @@ def check_lonlat(name: str, positions: object) -> np.ndarray:
     return x
 
 
-def _warn_of_radians(name: str, x: np.ndarray) -> None:
+def warn_of_radians(name: str, x: np.ndarray) -> None:
+    """Warn if all longitudes and latitudes `x` (n, 2) would be within one turn in radians."""
     lon, lat = np.abs(x).max(axis=0)
     if lon <= 2 * np.pi + 1e-6 and lat <= np.pi / 2 + 1e-6:
         warn(

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, KDTree
 
 from ..arguments import check_integer, check_number, check_rows
 from ..errors import InputError
@@ -27,6 +27,14 @@ def directions(points: np.ndarray) -> np.ndarray:
     """Return longitudes in [-180, 180] and latitudes of vectors (n, 3) of any length, in degrees, (n, 2)."""
     x, y, z = points.T
     return np.degrees(np.column_stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]))
+
+
+def farthest_place(points: np.ndarray) -> tuple[float, float, float]:
+    """Return longitude and latitude of about the place farthest from `points` on the unit sphere, and that distance."""
+    places = Sphere(1).spiral_points(4000)
+    chord = np.asarray(KDTree(points).query(places)[0])
+    lon, lat = directions(places[chord.argmax() :][:1])[0]
+    return float(lon), float(lat), float(np.degrees(2 * np.arcsin(min(chord.max() / 2, 1))))
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,10 @@ def check_mask(name: str, mask: object, n: int) -> np.ndarray:
             f"{name} has dtype {array.dtype}, expected an array of {n} bool, one per cell{remedy}"
         )
     if array.shape != (n,):
-        raise InputError(f"{name} has shape {array.shape}, expected ({n},): one bool per cell")
+        grid = "; for a mask on a grid pass a function of longitude and latitude that looks it up"
+        raise InputError(
+            f"{name} has shape {array.shape}, expected ({n},): one bool per cell{grid if array.ndim == 2 else ''}"
+        )
     return array
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from ..arguments import check_number
 from ..errors import InputError, InputTypeError
 from ..geometry.box import Box, Domain
+from ..geometry.lonlat_shapes import check_lonlat, warn_of_radians
 from ..geometry.sphere import Sphere, directions
 from .arguments import check_positive, check_slope
 from .distance import Distance
@@ -28,6 +29,7 @@ SAGITTA = 1e-3
 """Largest distance over h_min of an arc from the chords that stand for it."""
 MOST_CHORDS, LONGEST_CHORD = 1 << 18, np.radians(1)
 _DEGREES = 180 / math.pi
+_SLACK = 1e-3  # degrees by which a raster may reach beyond a pole, as corners in float32 do
 _GLOBAL = 359.0  # degrees of longitude from which on a raster goes around the sphere
 
 
@@ -110,6 +112,15 @@ def _on_sphere(raster: Raster) -> tuple[Raster, float]:
     A raster that goes around the sphere has one more column at both sides.
     """
     low, high, count = raster.lower, raster.upper, raster.values.shape[1]
+    if low[1] < -90 - _SLACK or high[1] > 90 + _SLACK:
+        raise InputError(
+            f"{raster!r} goes from {low[1]:g} to {high[1]:g} along its rows, expected latitudes from -90 to 90; "
+            "are longitude and latitude swapped? Values have shape (latitudes, longitudes)"
+        )
+    if np.abs(high - low - (2 * np.pi, np.pi)).max() < 0.1:
+        raise InputError(
+            f"{raster!r} goes once around the sphere in radians, expected degrees: use numpy.degrees for its corners"
+        )
     spacing = (high[0] - low[0]) / max(count - (raster.at == "nodes"), 1)
     nodes = low[0] + spacing * (np.arange(count) + 0.5 * (raster.at == "centers"))
     around = nodes[-1] - nodes[0] + spacing >= _GLOBAL
@@ -150,6 +161,10 @@ class ArcDistance(Distance):
         vars(self).update(vars(given))
         self.dim, self.given, self.sphere, self.on_sphere = 3, given, sphere, True
         longest = min(np.sqrt(8 * SAGITTA * self.h_min / sphere.radius), LONGEST_CHORD)
+        ends = np.concatenate([given._begin, given._end])
+        check_lonlat("a shape of a Distance", ends)
+        if len(given._begin) > 1:
+            warn_of_radians("Distance", ends)
         begin, end = _degree_lines(given._begin, given._end, given._radius)
         length = np.radians(np.hypot(*(end - begin).T))
         longest = max(longest, length.sum() / MOST_CHORDS)

@@ -10,7 +10,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ..errors import ClvoroError, InputError, MemoryLimitError
+from ..errors import ClvoroError, MemoryLimitError
 from ..geometry.box import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
@@ -26,6 +26,7 @@ from .device_diagram import (
     OPEN,
     ROUGH_SHARE,
     CloseError,
+    OpenCellError,
     Tessellation,
     restored,
 )
@@ -45,16 +46,6 @@ LANES, EIGHTS = 8, 16
 """Cells that one work-item of a CPU builds at once in vector lanes, and number of such batches in `hulls.cl`."""
 FIRST_REACH = 1.9
 """Largest first search radius of `hulls.cl`, in units of the local spacing of the bins."""
-
-
-class OpenCellError(InputError):
-    """Generators on a sphere leave a half of it free."""
-
-    def __init__(self, n: int) -> None:
-        super().__init__(
-            f"the {n} generators on the sphere leave a half of it free; expected at least four, on all sides of the "
-            "sphere (in a run: more cells, or sizes that change less from cell to cell)"
-        )
 
 
 class Cells:
@@ -199,7 +190,7 @@ class Cells:
                 if t is not None:
                     return t
                 if flags & OPEN:
-                    raise OpenCellError(total)
+                    raise OpenCellError(points[:total].get())
                 if whole or flags & COINCIDE:
                     raise CloseError(points, total)
                 # Too many short faces may have been dropped: keep all.

@@ -10,6 +10,7 @@ import pyopencl.array as cla
 from scipy.spatial import KDTree
 
 from ..errors import InputError
+from ..geometry.sphere import directions, farthest_place
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,6 +25,30 @@ LEAST_SEPARATION = {"float64": 1e-6, "float32": 3e-3}
 # Bits of the flags in tessellation/face_rows.h and tessellation/search.h.
 FULL, COINCIDE, DOUBT, NARROW, LOOPED, UNEVEN = 1, 2, 8, 16, 32, 64
 OPEN = 64  # in 2D
+
+
+class OpenCellError(InputError):
+    """Generators on a sphere leave a half of it free.
+
+    Parameters
+    ----------
+    points : (n, 3) ndarray
+        The generators, as unit vectors.
+    """
+
+    def __init__(self, points: np.ndarray) -> None:
+        lon, lat, away = farthest_place(points.astype(float))
+        there = np.abs(directions(points)).max(axis=0)
+        hint = ""
+        if len(points) > 1 and (there <= (2 * np.pi + 1e-6, np.pi / 2 + 1e-6)).all():
+            hint = (
+                "; longitudes and latitudes look like radians, expected degrees: use numpy.degrees"
+            )
+        super().__init__(
+            f"the {len(points)} generators on the sphere leave a half of it free: there is none within {away:.0f} "
+            f"degrees of longitude {lon:.0f}, latitude {lat:.0f}; expected at least four, on all sides of the sphere "
+            f"(in a run: more cells, or sizes that change less from cell to cell){hint}"
+        )
 
 
 class CloseError(InputError):

@@ -6,7 +6,7 @@ import pytest
 
 import clvoro
 from clvoro import sizing
-from clvoro.errors import ClvoroError
+from clvoro.errors import ClvoroError, MismatchWarning
 from clvoro.opencl.engine import Engine
 from clvoro.sizing.on_domain import on_domain
 
@@ -134,8 +134,19 @@ def test_fields_of_the_plane_stay():
         (lambda: sizing.Caps([((0, 5), 1e5)], 1e5, 1.1), r"regions\[0\]"),
         (lambda: sizing.Caps([((0, 5), 1e5, 1e5)], 1e5, 1.1, sphere=3), "expected a clvoro.Sphere"),
         (lambda: clvoro.adapt(EARTH, sizing.Expression("lat")), "positive"),
+        (lambda: clvoro.adapt(EARTH, sizing.Raster(WAVES, (-180, -95), (180, 95))), "-95 to 95 along its rows"),
+        (lambda: clvoro.adapt(EARTH, sizing.Raster(WAVES.T, (-90, -180), (90, 180))), "longitude and latitude swapped"),
+        (lambda: clvoro.adapt(EARTH, sizing.Raster(WAVES, (-np.pi, -np.pi / 2), (np.pi, np.pi / 2))), "in radians"),
+        (lambda: clvoro.adapt(EARTH, sizing.Distance(sizing.Circle((3, 100), 5), 1e5, 1.1)), r"position \(3, 100\)"),
+        (lambda: clvoro.adapt(EARTH, sizing.Expression("5e6 + 3e4*lat")), r"longitude -?\d+, latitude 8\d, larger"),
     ],
 )  # fmt: skip
 def test_mistakes(call, message):
     with pytest.raises(ClvoroError, match=message):
         call()
+
+
+def test_radians_are_warned_of():
+    track = sizing.Polyline([(-0.5, 0.7), (1.2, 0.2), (2.9, -1.1)])
+    with pytest.warns(MismatchWarning, match="look like radians"):
+        on_domain(sizing.Distance(track, h_min=1e5, growth=1.1), EARTH)

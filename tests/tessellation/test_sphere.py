@@ -142,6 +142,21 @@ def test_generators_on_one_side(ctx, points):
         clvoro.Adapter(ctx).diagram(UNIT, points)
 
 
+@pytest.mark.parametrize(
+    ("lonlat", "message"),
+    [
+        ([(0, 0), (180, 0)], "none within 90 degrees of longitude"),
+        ([(0, 0), (180, 0), (90, 0), (-90, 0)], "none within 89 degrees of .*latitude -?8"),
+        ([(30, 40), (10, 10), (20, -30), (40, 5)], r"degrees of longitude -15\d, latitude -?\d;"),
+        (np.random.default_rng(7).uniform((-3, -1.5), (3, 1.5), (50, 2)), "look like radians"),
+    ],
+    ids=["antipodal", "equator", "one side", "radians"],
+)
+def test_the_free_half_is_named(ctx, lonlat, message):
+    with pytest.raises(InputError, match=message):
+        clvoro.Adapter(ctx).diagram(UNIT, lonlat)
+
+
 def test_generators_that_coincide(ctx):
     points = np.concatenate([SETS["few"], SETS["few"][:1]])
     with pytest.raises(InputError, match="coincide"):
