@@ -292,8 +292,8 @@ class Adapter:
         method : str
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
             size. "exact" gives every cell its target size, to about 1e-4. The others repeat one kind of step: "lloyd",
-            "poisson" and "coupled" as published, "weighted-lloyd" and "weighted" with the density h^-d (see
-            `clvoro.adaptation.methods`).
+            "poisson" and "coupled" as published, "weighted-lloyd" and "weighted" with the density h^-d, and the moving
+            meshes "mmpde" and "monge-ampere", which map a lattice in a box (see `clvoro.adaptation.methods`).
         n_cells : int, optional
             Number of generators; by default the integral of h^-d over the domain. "adaptive" and "exact" end with
             exactly that many. They scale the size field by a common factor so that the mean of log(L / h) vanishes,
@@ -348,6 +348,8 @@ class Adapter:
             If `dtype` is too coarse for the sizes.
         SizeErrorWarning
             If the cells of a mesh that "adaptive" or "exact" has finished are far from their target sizes.
+        TangledMeshWarning
+            If a moving mesh would fold; says at how many generators.
         UnusedOptionWarning
             If an option is given that the method does not use.
         """

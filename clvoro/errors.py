@@ -102,5 +102,9 @@ class SolverWarning(UserWarning):
     """A solver's own check of a mesh was requested, and the solver is not installed."""
 
 
+class TangledMeshWarning(UserWarning):
+    """A moving mesh would fold; the message says how many cells are concerned."""
+
+
 class UnusedOptionWarning(UserWarning):
     """An option was given that the method of a run does not use; the message names the methods that do."""

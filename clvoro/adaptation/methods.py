@@ -7,6 +7,8 @@
 | `coupled`        | both (the paper's Figure 1)                                                         |
 | `weighted-lloyd` | density-weighted centroid - generator (the paper's 2.4)                             |
 | `weighted`       | the same, and -grad phi, div (rho grad phi) = rho d log(L / h), clipped to k h      |
+| `mmpde`          | descent of Huang's functional on the triangulation of a lattice (the paper's 2.3.4) |
+| `monge-ampere`   | the optimal transport of a lattice, det(I + grad grad phi) = const h^d              |
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ import numpy as np
 from ..solvers.components import balance_components
 from ..solvers.conjugate_gradient import Limits, Solution
 from ..solvers.volume_projection import Penalty, Targets
+from .moving.mmpde import MmpdeMethod
+from .moving.monge_ampere import MongeAmpereMethod
 from .state import MeshState
 
 
@@ -258,10 +262,15 @@ class ProjectedMethod:
 
 PUBLISHED = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")
 """Methods that repeat one kind of step. `clvoro.adaptation.schedule` has those of several kinds."""
+MOVING = ("mmpde", "monge-ampere")
+"""Methods that repeat one kind of step and map a lattice: they start from it, in a box with walls."""
 
 
-def make_method(name: str, relaxation: Relaxation) -> Method:
-    """Return the method called `name`, one of `PUBLISHED`."""
+def make_method(name: str, relaxation: Relaxation, lattice: np.ndarray | None = None) -> Method:
+    """Return the method called `name`, one of `PUBLISHED` or `MOVING`; these need the `lattice` (n, d) at the start."""
+    if name in MOVING:
+        assert lattice is not None
+        return MmpdeMethod(lattice) if name == "mmpde" else MongeAmpereMethod(lattice)
     if name.startswith("weighted"):
         return WeightedMethod(k=relaxation.k, poisson=name == "weighted")
     return PublishedMethod(relaxation, lloyd=name != "poisson", poisson=name != "lloyd")

@@ -14,11 +14,11 @@ import numpy as np
 from ..arguments import check_choice, check_integer, check_number, check_path, warn
 from ..errors import InputError, InputTypeError, UnusedOptionWarning
 from ..geometry.boundary_layers import Layers
-from .methods import PUBLISHED
+from .methods import MOVING, PUBLISHED
 
 MethodName = Literal[
-    "adaptive", "exact", "lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"
-]
+    "adaptive", "exact", "lloyd", "poisson", "coupled", "weighted-lloyd", "weighted", "mmpde", "monge-ampere"
+]  # fmt: skip
 EffortName = Literal["fast", "default", "best"]
 Start = Literal["density", "uniform"]
 METHODS, EFFORTS, STARTS = get_args(MethodName), get_args(EffortName), get_args(Start)
@@ -29,9 +29,10 @@ _USERS = {
     "effort": _MULTILEVEL,
     "levels": _MULTILEVEL,
     "error_target": _MULTILEVEL,
-    "tol": PUBLISHED,
+    "tol": (*PUBLISHED, *MOVING),
     "alpha": ("lloyd", "poisson", "coupled"),  # "lloyd" reports the correction that it leaves out
     "k": PUBLISHED,
+    "start": tuple(name for name in METHODS if name not in MOVING),
 }
 """Options that only some methods use, and these methods."""
 _WITHOUT_EFFECT = {"tol": 0, "levels": 0}
@@ -94,7 +95,7 @@ class MultilevelOptions:
 
 @dataclass(frozen=True)
 class PaperOptions:
-    """Options of the methods that repeat one kind of step: the paper's and the weighted ones.
+    """Options of the methods that repeat one kind of step: the paper's, the weighted ones and moving meshes.
 
     Parameters
     ----------
@@ -102,11 +103,11 @@ class PaperOptions:
         Stop when mean error and mean quality have improved by less than this share over ten steps. With 0 the run
         takes all steps.
     alpha : float, optional
-        Largest relaxation coefficient of the correction, in the paper's (3.4); by default d. The weighted methods do
-        not use it.
+        Largest relaxation coefficient of the correction, in the paper's (3.4); by default d. Only "lloyd", "poisson"
+        and "coupled" use it.
     k : float
         Bound of the correction's length over h, in the paper's (3.5). "weighted-lloyd" and "weighted" bound the whole
-        displacement.
+        displacement; moving meshes do not use it.
 
     Raises
     ------

@@ -9,7 +9,7 @@ import numpy as np
 from ..arguments import Naming, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
 from ..geometry.boundary_layers import apart_from, count_rows, free_domain, place_layers
-from ..geometry.box import Domain
+from ..geometry.box import Box, Domain
 from ..geometry.geojson import may_be_degrees
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
@@ -21,7 +21,8 @@ from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_par
 from .efforts import is_near
 from .estimates import Extras, check_memory
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
-from .methods import Relaxation, make_method
+from .methods import MOVING, Relaxation, make_method
+from .moving.lattice import lattice_points
 from .options import Options
 from .quality_descent import OPENINGS
 from .sampling.charts import charted
@@ -68,6 +69,8 @@ class Preparation:
         Cells of the finest level.
     factor : float
         Factor on the size field that gives `target` cells.
+    lattice : (n, d) ndarray or None
+        Generators at the start of a moving mesh.
     levels : int
         Number of coarser levels.
     memory : float
@@ -96,6 +99,8 @@ class Preparation:
                 f"n_cells is {n_cells}, but {len(points)} points are given, and method {options.method!r} "
                 "keeps their number; leave n_cells out, or use method='adaptive'"
             )
+        if options.method in MOVING:
+            _check_moving(domain, points, options)
         self.rows, self.free = np.empty((0, domain.dim)), domain
         field = given_field = on_domain(as_field(size), domain)
         if options.layers:
@@ -127,6 +132,7 @@ class Preparation:
         self.factor = (required / self.target) ** (1 / domain.cell_dim) if scaled else 1.0
         if self._tree is not None and required * self.factor**-domain.cell_dim >= 0.5:
             warn_of_narrow_parts(domain, lambda x: self.factor * self.sizing(x))
+        self.lattice = lattice_points(domain, self.target) if options.method in MOVING else None
         self.levels = 0
         if options.multilevel:
             self.levels = self._count_levels()
@@ -234,7 +240,7 @@ class Preparation:
             If positions do not resolve the sizes.
         """
         options, real = self.options, self.stages.engine.real
-        host = self.points
+        host = self.points if self.lattice is None else self.lattice
         if host is None:
             least = self.free.n_pieces if self.levels else 1
             if isinstance(self.domain, Sphere):
@@ -276,7 +282,8 @@ class Preparation:
         if not options.multilevel:
             relaxation = Relaxation(options.alpha, options.k)
             steps = STEPS if options.max_steps is None else options.max_steps
-            return repeated_schedule(make_method(options.method, relaxation), steps)
+            method = make_method(options.method, relaxation, self.lattice)
+            return repeated_schedule(method, steps)
         near = self.may_need_correction_only and mesh is not None and self._is_near(mesh)
         # Models on spheres have C grids. The exact sizes would be lost.
         open_triangles = isinstance(self.domain, Sphere) and options.method != "exact"
@@ -292,3 +299,19 @@ class Preparation:
         return is_near(
             self.domain.cell_dim, self.options.effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n
         )  # fmt: skip
+
+
+def _check_moving(domain: Domain, points: np.ndarray | None, options: Options) -> None:
+    """Raise if a moving mesh cannot be made."""
+    name = options.method
+    if not isinstance(domain, Box) or any(domain.periodic):
+        raise InputError(
+            f"domain is {domain!r:.80}, expected a Box with walls for method {name!r}, which maps a lattice onto it; "
+            "use method='adaptive'"
+        )
+    if points is not None or options.layers:
+        given = "points are" if points is not None else "layers are"
+        raise InputError(
+            f"{given} given, but method {name!r} starts from a lattice of its own; leave them out, or use "
+            "method='adaptive'"
+        )

@@ -13,6 +13,7 @@ from .density import Density
 from .insertion_deletion import InsertionDeletion
 from .metric import Metric
 from .motion import Motion
+from .moving.mmpde import Mmpde
 from .quality_descent import QualityDescent
 from .refinement import Refinement
 from .thin_walls import ThinWalls
@@ -28,6 +29,7 @@ class Stages(TessellationStages):
     volume_projection: VolumeProjection
     quality_descent: QualityDescent
     motion: Motion
+    mmpde: Mmpde
     corners: Corners
     thin_walls: ThinWalls
     refinement: Refinement
@@ -35,6 +37,6 @@ class Stages(TessellationStages):
 
     CLASSES: ClassVar[dict[str, type]] = {
         **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson, "transport": Transport,
-        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "corners": Corners,
-        "thin_walls": ThinWalls, "refinement": Refinement, "insertion_deletion": InsertionDeletion,
+        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "mmpde": Mmpde,
+        "corners": Corners, "thin_walls": ThinWalls, "refinement": Refinement, "insertion_deletion": InsertionDeletion,
     }  # fmt: skip

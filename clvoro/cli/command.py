@@ -97,7 +97,7 @@ def _add_settings(run: Any) -> None:
         "--method",
         metavar="M",
         help="adaptive (the default), exact, or one kind of step: coupled (the paper's), lloyd, "
-        "poisson, weighted-lloyd, weighted; or several: lloyd,coupled",
+        "poisson, weighted-lloyd, weighted, mmpde, monge-ampere; or several: lloyd,coupled",
     )
     run.add_argument(
         "--effort",

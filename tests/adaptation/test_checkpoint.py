@@ -31,6 +31,8 @@ RUNS = {
         "effort": "fast",
         "options": clvoro.MultilevelOptions(levels=1),
     },
+    "mmpde": {"method": "mmpde", "max_steps": 9},
+    "monge-ampere": {"method": "monge-ampere", "max_steps": 9},
     "count held": {"method": "exact", "effort": "fast", "n_cells": 250},
     "in 3D": {"method": "exact", "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)},
 }

@@ -21,6 +21,7 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
     """Options of a run; `wild`: also invalid or pointless ones."""
     d = domain.dim
     methods = ["adaptive", "exact", "coupled", "lloyd", "poisson", "weighted", "weighted-lloyd"]
+    moving = isinstance(domain, clvoro.Box) and not any(domain.periodic) and rng.random() < 0.1
     options: dict[str, Any] = {
         "method": str(rng.choice(methods, p=[0.35, 0.2, 0.13, 0.08, 0.08, 0.1, 0.06])),
         "effort": str(rng.choice(["fast", "default", "best"], p=[0.6, 0.3, 0.1])),
@@ -56,6 +57,8 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
             "callback": lambda: CALLBACKS[rng.integers(len(CALLBACKS))],
         }
     options |= {name: make() for name, make in optional.items() if rng.random() < 0.12}
+    if moving and "points" not in options:
+        options["method"] = str(rng.choice(["mmpde", "monge-ampere"]))
     if "points" in options and not wild:
         if options["method"] not in ("adaptive", "exact"):
             options.pop("n_cells", None)  # these methods keep the number

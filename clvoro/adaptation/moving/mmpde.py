@@ -1,0 +1,203 @@
+"""Moving mesh equations (MMPDE): Huang's functional on the triangulation of a lattice (`mmpde.cl`).
+
+W. Huang, Y. Ren, R. D. Russell, SIAM J. Numer. Anal. 31, 1994; W. Huang, L. Kamenski, J. Comput. Phys. 301, 2015.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyopencl.array as cla
+from scipy.spatial import Delaunay
+
+from ...arguments import warn
+from ...errors import TangledMeshWarning
+from ...geometry.box import Domain
+from ...opencl.engine import Engine
+from ...opencl.primitives import Summaries
+from ...solvers.conjugate_gradient import Solution
+from .lattice import mirrored
+
+if TYPE_CHECKING:
+    from ..state import MeshState
+
+RATE = 0.4
+"""Step of the descent, over the inverse of the estimated second derivative. Measured on the test fields of
+bench/_common.py: 0.25 is slower, from 0.5 on the last steps oscillate."""
+MOST_MOMENTUM = 0.97
+"""Largest share of the last displacement that is added. After m steps without a restart it is m / (m + 3)."""
+LONGEST = 0.5
+"""Largest displacement over min(L, h)."""
+ROOM = 0.3
+"""Largest displacement over the least height of the simplices. Two vertices that approach each other by less than half
+of it each cannot turn a simplex over."""
+IMAGE_DEPTH = 2.6
+"""Depth of the mirror images over the spacing of the lattice: two layers."""
+JITTER = 1e-6
+"""Random displacement over the spacing, by which cospherical points of the lattice get a triangulation."""
+FLAT = 1e-3
+"""Volume over the cube of the longest edge below which a simplex is left out: cospherical points have such."""
+
+
+@dataclass(frozen=True)
+class Connections:
+    """The simplices around each generator of a lattice, on the device.
+
+    Attributes
+    ----------
+    starts : (n + 1,) int32
+        Row of each generator.
+    vertices : (m, d) int32
+        The other vertices of each of its simplices: generators, then images.
+    owners, codes : (g,) int32
+        Of the images; see `Mirrored`.
+    reference : (n, d) real
+        Positions in the lattice.
+    """
+
+    starts: cla.Array
+    vertices: cla.Array
+    owners: cla.Array
+    codes: cla.Array
+    reference: cla.Array
+
+
+def connect(engine: Engine, domain: Domain, points: np.ndarray) -> Connections:
+    """Return the Delaunay simplices of a lattice (n, d) and of its images at the walls of a box."""
+    n, d = points.shape
+    spacing = (domain.measure / n) ** (1 / d)
+    images = mirrored(points, np.array(domain.lower), np.array(domain.upper), IMAGE_DEPTH * spacing)
+    shaken = (
+        images.points
+        + np.random.default_rng(7).uniform(-1, 1, images.points.shape) * JITTER * spacing
+    )
+    simplices = Delaunay(shaken).simplices
+    simplices = simplices[(simplices < n).any(axis=1)]
+    corners = images.points[simplices]
+    longest = np.max(
+        [
+            np.linalg.norm(corners[:, a] - corners[:, b], axis=1)
+            for a, b in combinations(range(d + 1), 2)
+        ],
+        0,
+    )
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+    simplices = simplices[volume > FLAT * longest**d]
+    # One entry per simplex and vertex, ordered by vertex.
+    entries = np.concatenate([np.roll(simplices, -k, axis=1) for k in range(d + 1)])
+    entries = entries[entries[:, 0] < n]
+    entries = entries[np.argsort(entries[:, 0], kind="stable")]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(entries[:, 0], minlength=n))])
+    return Connections(
+        engine.upload(starts, np.int32), engine.upload(entries[:, 1:], np.int32),
+        engine.upload(images.owners[n:], np.int32), engine.upload(images.codes[n:], np.int32),
+        engine.upload(domain.place(points, engine.real)),
+    )  # fmt: skip
+
+
+class Mmpde:
+    """The kernels of `mmpde.cl`."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("adaptation/moving/mmpde")
+        self._summaries = Summaries(engine, ("power", "flat"))
+
+    def descend_functional(
+        self,
+        mesh: MeshState,
+        connections: Connections,
+        gradient: cla.Array,
+        descent: cla.Array,
+        room: cla.Array,
+    ) -> tuple[float, int]:
+        """Write the step of the steepest descent to `descent` (n, d), and the least height of simplices to `room` (n,).
+
+        Return the derivative of the functional along the last displacement, and the number of generators beside
+        simplices without volume. `gradient` (n, d) is grad log h.
+        """
+        c, real = connections, self.engine.real.type
+        power, flat = self.engine.scratch(mesh.n), self.engine.scratch(mesh.n)
+        self.engine.run_each(
+            self._kernels.descend_functional, mesh.n, c.starts, c.vertices, c.owners, c.codes, c.reference,
+            mesh.points, mesh.h, gradient, mesh.velocity, real(RATE), *mesh.domain.device_args(self.engine), descent,
+            power, flat, room,
+        )  # fmt: skip
+        self._summaries.collect_all({"power": power, "flat": flat}, mesh.n)
+        found = self._summaries.read()
+        return found["power"].sum, round(found["flat"].sum)
+
+    def bound_displacement(self, mesh: MeshState, share: float, room: cla.Array) -> None:
+        """Add `share` of the last displacement to `mesh.lloyd`, and bound its length."""
+        real = self.engine.real.type
+        self.engine.run_each(
+            self._kernels.bound_displacement, mesh.n, mesh.velocity, real(share), real(LONGEST), real(ROOM),
+            mesh.local_length, room, mesh.lloyd,
+        )  # fmt: skip
+
+
+@dataclass
+class MmpdeMethod:
+    """Descent of Huang's functional, with Nesterov's momentum that restarts when the last step goes uphill.
+
+    Attributes
+    ----------
+    lattice : (n, d) float64
+        The generators at the start, in the order of their labels.
+    age : int
+        Steps since the last restart.
+    warned : int
+        1 after a warning.
+    """
+
+    lattice: np.ndarray = field(repr=False)
+    age: int = 0
+    warned: int = 0
+    connections: Connections | None = field(default=None, repr=False)
+
+    def displace(self, mesh: MeshState) -> Solution:
+        """Evaluate the displacement as `mesh.lloyd`; `mesh.correction` is zero.
+
+        Warns
+        -----
+        TangledMeshWarning
+            If simplices have lost their volume.
+        """
+        engine, stage = mesh.engine, mesh.stages.mmpde
+        if self.connections is None:
+            self.connections = connect(engine, mesh.domain, self.lattice[mesh.labels.get()])
+        mesh.allocate_step()
+        mesh.correction.fill(0)
+        room = engine.scratch(mesh.n)
+        with engine.workspace.frame():
+            gradient, sizes = engine.scratch(mesh.points.shape), engine.scratch(mesh.n)
+            mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
+            power, folded = stage.descend_functional(
+                mesh, self.connections, gradient, mesh.lloyd, room
+            )
+        self._warn(folded, mesh.n)
+        # Uphill: forget the last displacement.
+        self.age = 0 if power > 0 else self.age + 1
+        stage.bound_displacement(mesh, min(MOST_MOMENTUM, self.age / (self.age + 3)), room)
+        mesh.measure_displacements()
+        mesh.summarize_displacements()
+        return Solution.zero()
+
+    def _warn(self, folded: int, n: int) -> None:
+        if folded and not self.warned:
+            self.warned = 1
+            warn(
+                f"mmpde: {folded} of {n} generators are beside simplices of the lattice that have no volume any more, "
+                "because the size field changes too much for a mesh of fixed topology; use method='adaptive', or limit "
+                "the growth of the sizes (clvoro.sizing.Graded)",
+                TangledMeshWarning,
+            )
+
+    def move(self, mesh: MeshState) -> None:
+        """Move by the displacement."""
+        mesh.stages.motion.move_generators(
+            mesh.free, mesh.points, mesh.lloyd, 1.0, mesh.correction, 0.0, mesh.h, mesh.velocity
+        )
