@@ -40,7 +40,8 @@ from _common import (
     test_field,
     work,
 )
-from peers import MissingPeerError, judge, mesh_gmsh
+from _remeshers import MissingPeerError, vertices_gmsh
+from peers import judge, mesh_peer
 
 import clvoro
 
@@ -119,7 +120,7 @@ def measure(
 
 def measure_gmsh(adapter: clvoro.Adapter) -> dict[str, Any] | None:
     try:
-        points, seconds = mesh_gmsh(adapter, 1.0)
+        points, seconds = mesh_peer(vertices_gmsh)(adapter, 1.0)
     except MissingPeerError:
         return None
     found = judge(adapter, points, 1.0)

@@ -1,4 +1,4 @@
-"""Comparison with SciPy and Voro++ (diagrams) and Gmsh (graded meshes) in the same run.
+"""Comparison with SciPy and Voro++ (diagrams), Gmsh and MMG (graded meshes) in the same run.
 
     python bench/peers.py [--sizes 1e5,1e6] [--sets uniform,cubed] [--factors 1,0.5]
                           [--dim 3] [--skip diagrams|meshes] [--device NAME] [--dtype float32]
@@ -16,14 +16,13 @@ there are no meshes.
 Meshes: the size field F3 of `convergence.py` times a factor; cells are the Voronoi cells of the
 vertices, and their error and quality are measured by clvoro in the same way for all, with one
 global factor on h taken out of the error (column "factor"), since other meshers do not promise a
-count. Gmsh (pip install gmsh) takes edge length 1.0746 h, that of regular hexagons of area h^2,
-and its "Frontal-Delaunay" algorithm. Peers that are not installed are left out with a note.
+count. Gmsh ("Frontal-Delaunay") and MMG (pip install gmsh mmgpy) take edge length 1.0746 h, that of
+regular hexagons of area h^2. Peers that are not installed are left out with a note.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import shutil
 import subprocess
@@ -54,15 +53,13 @@ from _common import (
     shown,
     test_field,
 )
+from _remeshers import EDGE, Mesher, MissingPeerError, vertices_gmsh, vertices_mmg
 from diagram import BOX as SQUARE
 from diagram import CUBE, SEED, SETS, SETS_3D
 
 import clvoro
 
 UNIT = {2: SQUARE, 3: CUBE}
-EDGE = 1.0746
-"""Distance of neighbors in the lattice of regular hexagons of area 1."""
-
 VOROPP = r"""
 #include <chrono>
 #include <cmath>
@@ -99,10 +96,6 @@ int main(int, char **arguments)
     printf("%.6f %.12f %ld\n", seconds.count(), volume / thick, faces);
 }
 """
-
-
-class MissingPeerError(Exception):
-    """A peer is not installed. The message says what to install."""
 
 
 # Diagrams.
@@ -181,45 +174,16 @@ def mesh_clvoro(effort: str) -> Callable[[clvoro.Adapter, float], tuple[np.ndarr
     return mesh
 
 
-def mesh_gmsh(_: clvoro.Adapter, factor: float) -> tuple[np.ndarray, float]:
-    """Mesh the box with Gmsh; return the vertices."""
-    try:
-        import gmsh
-    except (ModuleNotFoundError, OSError) as error:
-        raise MissingPeerError(f"gmsh (pip install gmsh): {error}") from error
-    scale = 0.9306 / 4 * factor * EDGE
-    start = time.perf_counter()
-    gmsh.initialize(interruptible=False)
-    try:
-        gmsh.option.setNumber("General.Terminal", 0)
-        gmsh.option.setNumber("General.NumThreads", 1)
-        gmsh.option.setNumber("Mesh.Algorithm", 6)
-        for name in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
-            gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
-        gmsh.model.add("box")
-        gmsh.model.occ.addRectangle(0, 0, 0, 2.5, 1.5)
-        gmsh.model.occ.synchronize()
-        field = gmsh.model.mesh.field.add("MathEval")
-        distance = "Abs(Sqrt((x-0.8)*(x-0.8)+(y-0.75)*(y-0.75))-0.25)"
-        size = f"{scale:.17g}*(0.02+{math.log(1.3):.17g}*{distance})"
-        gmsh.model.mesh.field.setString(field, "F", size)
-        cap = gmsh.model.mesh.field.add("MathEval")
-        gmsh.model.mesh.field.setString(cap, "F", f"{scale * 0.15:.17g}")
-        least = gmsh.model.mesh.field.add("Min")
-        gmsh.model.mesh.field.setNumbers(least, "FieldsList", [field, cap])
-        gmsh.model.mesh.field.setAsBackgroundMesh(least)
-        gmsh.model.mesh.generate(2)
-        seconds = time.perf_counter() - start
-        _, nodes, _ = gmsh.model.mesh.getNodes()
-    finally:
-        gmsh.finalize()
-    return np.clip(nodes.reshape(-1, 3)[:, :2], BOX.lower, BOX.upper), seconds
+def mesh_peer(mesher: Mesher) -> Callable[[clvoro.Adapter, float], tuple[np.ndarray, float]]:
+    """Return the function that meshes the box with a mesher and returns its vertices."""
+    return lambda _, factor: mesher(BOX, test_field("F3") * factor, EDGE[2])
 
 
 MESHES: dict[str, Callable[[clvoro.Adapter, float], tuple[np.ndarray, float]]] = {
     "clvoro, fast": mesh_clvoro("fast"),
     "clvoro, default": mesh_clvoro("default"),
-    "Gmsh, Frontal-Delaunay": mesh_gmsh,
+    "Gmsh, Frontal-Delaunay": mesh_peer(vertices_gmsh),
+    "MMG": mesh_peer(vertices_mmg),
 }
 
 
