@@ -162,9 +162,9 @@ inline void first_moments(places_t *first, WIDE part_in, const places_t *in, WID
 }
 
 /* Find the vertices and sum them up. False if faces at a vertex are nearly parallel or not counter-clockwise, or a
-   neighbor is very near. `reach2` and `beyond` are set. The sums are incomplete if a vertex lies beyond another face.
- */
-inline bool place_corners(corners_t *cell, sums_t *sums)
+   neighbor is very near. `reach2` and `beyond` are set. The sums are incomplete if a vertex lies beyond another face,
+   or without `measured`. */
+inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
 {
     const int blocks = (cell->corners + WIDTH - 1) / WIDTH;
     for (int v = cell->corners; v < WIDTH * blocks; ++v)
@@ -173,7 +173,7 @@ inline bool place_corners(corners_t *cell, sums_t *sums)
         sums->faces[f] = 0;
     sums->xx = sums->yy = sums->zz = sums->yz = sums->zx = sums->xy = 0;
     WIDE far2 = 0, good = 1;
-    bool fits = true;
+    bool fits = measured;
     for (int block = 0; block < blocks; ++block) {
         int at_a[WIDTH], at_b[WIDTH], at_c[WIDTH];
         for (int lane = 0; lane < WIDTH; ++lane) {

@@ -1,4 +1,3 @@
-#include "tessellation/row_copy.h"
 #include "tessellation/row_counts.h"
 #include "tessellation/periodic/halo.h"
 #include "tessellation/polyhedron_search.h"
@@ -277,17 +276,21 @@ inline REAL rounded_area(int i, int begin, int count, global const int *labels, 
    of two cells have a face of zero area that the other does not have. Such a face is dropped, so that the graph is
    symmetric. The cell is flagged as collapsed if the face is wider than round-off explains, or if the areas of its
    faces and those of its neighbors differ by more than a share of the cell. Faces of a neighbor without a row are not
-   compared, nor are those of two certain cells. */
+   compared, nor are those of two certain cells. While cells are missing or wrong, this and the next two kernels do
+   nothing. */
 kernel void match_polyhedron_faces(const int size, global const int *row_places, global const int *row_counts,
                                    global const int *labels, global const REAL *measures, global const REAL *volumes,
-                                   global const REAL *points, const REAL share, const int some_doubtful,
-                                   global uchar *kept, global int *counts, global int *report)
+                                   global const REAL *points, const REAL share, global uchar *kept, global int *counts,
+                                   global int *report)
 {
     WORK_ITEM(i);
     const int n = COUNT_OF(row_counts[i]);
     const bool certain = (row_counts[i] & CERTAIN) != 0;
     counts[i] = n;
-    if (!some_doubtful)
+    /* FLAG_COLLAPSED may be set meanwhile. */
+    const int flags = report[REPORT_FLAGS];
+    const bool known = !(flags & FLAG_FULL) && report[REPORT_UNFINISHED] == 0 && report[REPORT_MARKED] == 0;
+    if (!known || !(flags & FLAG_DOUBT))
         return;
     int count = 0;
     REAL apart = 0; /* volume of the cones to the differences of areas */
@@ -318,15 +321,18 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
         atomic_or(report, FLAG_UNEVEN);
 }
 
-/* Per generator i: its faces, those kept, as row i of the graph; all if there is no doubt.
+/* Per generator i: its faces, those kept, as row i of the graph; all if there is no doubt. There is room for `room`.
 
    neighbors, face_measures (m,), face_centroids (m, 3)  areas, and centroids relative to x_i */
 kernel void place_faces(const int size, global const int *row_places, global const int *row_counts,
                         global const int *labels, global const REAL *measures, global const REAL *centroids,
-                        global const uchar *kept, const int doubt, global const int *starts, global int *neighbors,
-                        global FACE *face_measures, global FACE *face_centroids)
+                        global const uchar *kept, global const int *report, const int room, global const int *starts,
+                        global int *neighbors, global FACE *face_measures, global FACE *face_centroids)
 {
     WORK_ITEM(i);
+    if (!are_complete(report) || report[REPORT_KEPT] > room)
+        return;
+    const bool doubt = (report[REPORT_FLAGS] & FLAG_DOUBT) != 0;
     const int n = COUNT_OF(row_counts[i]), from = row_places[i];
     int to = starts[i];
     for (int k = from; k < from + n; ++k) {
@@ -340,15 +346,26 @@ kernel void place_faces(const int size, global const int *row_places, global con
     }
 }
 
-/* Per generator i: its triples and keys as row i of the graph. There are none if faces were dropped. `keys` are those
-   of KNOWN_CORNERS. */
-kernel void place_cell_corners(const int size, global const int *row_places, global const int *row_counts,
-                               global const uchar4 *corners, global const uint *keys, global const int *starts,
-                               global uchar4 *new_corners, global uint *new_keys)
+/* Per generator i: copy its row of the new graph over the previous graph and, with `with_corners`, its triples and
+   keys. There are none if faces were dropped. `keys` are those of KNOWN_CORNERS. */
+kernel void put_rows(const int size, global const int *row_places, global const int *row_counts,
+                     global const int *report, const int room, global const int *new_starts,
+                     global const int *new_neighbors, const int with_corners, global const uchar4 *corners,
+                     global const uint *keys, global int *starts, global int *neighbors, global uchar4 *new_corners,
+                     global uint *new_keys)
 {
     WORK_ITEM(i);
-    const int from = row_places[i], to = starts[i], n = starts[i + 1] - to;
-    const int state = COUNT_OF(row_counts[i]) == n ? corners[2 * from].s3 : NO_CORNERS;
+    if (!are_complete(report) || report[REPORT_KEPT] > room)
+        return;
+    const int to = new_starts[i], end = new_starts[i + 1], n = end - to;
+    starts[i + 1] = end;
+    if (i == 0)
+        starts[0] = 0;
+    for (int k = to; k < end; ++k)
+        neighbors[k] = new_neighbors[k];
+    if (!with_corners)
+        return;
+    const int from = row_places[i], state = COUNT_OF(row_counts[i]) == n ? corners[2 * from].s3 : NO_CORNERS;
     for (int v = 0; state != NO_CORNERS && v < 2 * n - 4; ++v)
         new_corners[2 * to + v] = corners[2 * from + v];
     for (int f = 0; state == KNOWN_CORNERS && f < n; ++f)

@@ -18,6 +18,8 @@
 
 #define NO_NEIGHBOR INT_MIN
 
+#define ALL_FACES (-1)
+
 /* Marks of a cell: it must be updated again with further neighbors, or clipped. */
 #define UPDATE_AGAIN 1
 #define CLIP_ANEW 2
@@ -232,8 +234,10 @@ inline bool write_measures(const corners_t *cell, const sums_t *sums, int i, int
 }
 
 /* Write the keys that neighbors are compared with: for each face the sum, over its vertices, of the products of the
-   hashes of the two other faces there. */
-inline void write_keys(const corners_t *cell, int place, global uint *keys)
+   hashes of the two other faces there. Returns the set of the faces whose keys differ from the `n` previous ones; these
+   faces were in the same order. */
+inline uint write_keys(const corners_t *cell, int place, global uint *keys, int n, global const int *old_labels,
+                       global const uint *old_keys)
 {
     uint hashes[MOST_FACES], sums[MOST_FACES];
     for (int f = 0; f < cell->faces; ++f) {
@@ -247,8 +251,14 @@ inline void write_keys(const corners_t *cell, int place, global uint *keys)
         sums[at.s1] += c * a;
         sums[at.s2] += a * b;
     }
-    for (int f = 0; f < cell->faces; ++f)
+    uint differ = 0;
+    for (int f = 0, k = 0; f < cell->faces; ++f) {
         keys[place + f] = sums[f];
+        while (k < n && old_labels[k] != cell->labels[f])
+            ++k;
+        differ |= (uint)(k == n || old_keys[k] != sums[f]) << f;
+    }
+    return differ;
 }
 
 /* Make the faces with a new edge between them neighbors. Bit b of old[a], next[a]: there was, is an edge between faces
@@ -269,13 +279,26 @@ inline bool fits_corners(const corners_t *cell)
     return !(largest_lane(beyond) > BEYOND_NOISE);
 }
 
-/* Per generator i, the first ones or, with `some`, those `listed` (as ~i to be clipped) with `further` neighbors: its
-   cell among its previous neighbors and these, with the measures of `clip_polyhedra`; or row_counts[i] = UNFINISHED
-   where the cell is open, has many faces, is near round-off, or is to be clipped.
+/* Per generator i: no marks, no further neighbors. `used` are the faces of the previous diagram. */
+kernel void begin_cell_updates(const int size, const int used, const int report_size, global int *report,
+                               global int *marks, global int *more)
+{
+    WORK_ITEM(i);
+    marks[i] = 0;
+    for (int k = 0; k < MORE; ++k)
+        more[MORE * i + k] = NO_NEIGHBOR;
+    for (int k = 0; i == 0 && k < report_size; ++k)
+        report[k] = k == REPORT_FACES ? used : 0;
+}
+
+/* Per generator i, all or, with `some`, those `listed` (as ~i to be clipped) with `further` neighbors: its cell among
+   its previous neighbors and these, with the measures of `clip_polyhedra`; or row_counts[i] = UNFINISHED where the cell
+   is open, has many faces, is near round-off, or is to be clipped.
 
    `old_corners` and `old_keys`: the triples, from 2 old_starts[i] on, and keys of the previous cells; none if not
    `known`. Cells are written to their previous places, and those with more faces behind all these, from report[1] on.
-   changed[i]: the cell has new triples. report[2] counts unfinished cells. */
+   changed[i]: the set of its faces that neighbors must be compared with. If more cells are listed than `size`, nothing
+   is done. */
 kernel void update_cells(const int size, const int some, global const int *listed, global const int *further,
                          global const int *old_starts, global const int *old_neighbors, const int known,
                          global const uchar4 *old_corners, global const uint *old_keys, global const REAL *points,
@@ -283,6 +306,8 @@ kernel void update_cells(const int size, const int some, global const int *liste
                          global uint *keys, global int *changed, global int *more, global int *marks)
 {
     WORK_ITEM(item);
+    if (some && (item >= report[REPORT_MARKED] || report[REPORT_MARKED] > size))
+        return;
     const int what = some ? listed[item] : item, i = max(what, ~what);
     const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper};
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
@@ -300,7 +325,8 @@ kernel void update_cells(const int size, const int some, global const int *liste
             cell.at[v] = old_corners[2 * start + v];
         const int faces = cell.faces;
         cell.faces = listed_before;
-        flips = place_corners(&cell, &sums);
+        /* With further neighbors the cell is measured later. */
+        flips = place_corners(&cell, &sums, faces == listed_before);
         cell.faces = faces;
         kept = flips && faces == listed_before && fits_corners(&cell);
     }
@@ -316,11 +342,11 @@ kernel void update_cells(const int size, const int some, global const int *liste
         if (done) {
             find_edges(&cell, next);
             join_new_edges(&cell, old, next, &in, marks);
-            done = number_faces(&cell, next) && place_corners(&cell, &sums) && fits_corners(&cell);
+            done = number_faces(&cell, next) && place_corners(&cell, &sums, true) && fits_corners(&cell);
         }
     }
     kept = kept && state == KNOWN_CORNERS;
-    changed[i] = !(done && kept);
+    changed[i] = done && kept ? 0 : ALL_FACES;
     if (done && keep_in_box(&cell, i, x, &in, marks)) {
         const bool longer = cell.faces > old_starts[i + 1] - start;
         const int place = longer ? take_places(report, cell.faces) : start;
@@ -331,44 +357,54 @@ kernel void update_cells(const int size, const int some, global const int *liste
             for (int v = 0; v < cell.corners; ++v)
                 corners[2 * place + v] = cell.at[v];
             corners[2 * place].s3 = KNOWN_CORNERS;
-            if (!kept)
-                write_keys(&cell, place, keys);
             for (int f = 0; kept && f < cell.faces; ++f)
                 keys[place + f] = old_keys[start + f];
-            return;
+            if (!kept) {
+                const bool comparable = state == KNOWN_CORNERS && !some;
+                const uint differ = write_keys(&cell, place, keys, comparable ? listed_before : 0,
+                                               old_neighbors + start, old_keys + start);
+                changed[i] = differ;
+            }
         }
     }
-    atomic_inc(report + 2);
 }
 
-/* Per generator i with a changed cell: compare its faces with those of its neighbors. Cells that differ are marked. Two
-   changed cells are compared once. */
-kernel void check_cells(const int size, global const int *row_places, global const int *row_counts,
-                        global const int *labels, global const REAL *measures, global const uint *keys,
-                        global const int *changed, global int *marks)
+/* Per generator i with a changed cell: compare its faces with those of its neighbors. Cells that differ are marked.
+   Faces with the keys of the previous diagram agree with neighbors that have these, too; others compare them. Two cells
+   that compare all faces do it once. Unfinished cells are compared when they are known; none are if the faces of some
+   cells are missing, as there is only room for `room`. */
+kernel void check_cells(const int size, const int room, global const int *report, global const int *row_places,
+                        global const int *row_counts, global const int *labels, global const REAL *measures,
+                        global const uint *keys, global const int *changed, global int *marks)
 {
     WORK_ITEM(i);
-    if (!changed[i])
+    if (!changed[i] || row_counts[i] == UNFINISHED || report[REPORT_FACES] > room)
         return;
     const int n = COUNT_OF(row_counts[i]), begin = row_places[i];
-    const bool certain = (row_counts[i] & CERTAIN) != 0;
-    REAL area = 0;
-    for (int k = 0; k < n; ++k)
-        area += measures[begin + k];
-    for (int k = begin; k < begin + n; ++k) {
-        const int j = labels[k];
-        const bool other_certain = j >= 0 && (row_counts[j] & CERTAIN) != 0;
-        if (j < 0 || !(certain || other_certain) || (j < i && changed[j]))
+    const bool certain = (row_counts[i] & CERTAIN) != 0, all = changed[i] == ALL_FACES;
+    for (int f = 0; f < n; ++f) {
+        const int k = begin + f, j = labels[k];
+        if (j < 0 || !(all || ((uint)changed[i] >> f & 1)) || row_counts[j] == UNFINISHED)
+            continue;
+        const bool other_certain = (row_counts[j] & CERTAIN) != 0;
+        if (!(certain || other_certain) || (j < i && changed[j] == ALL_FACES))
+            continue;
+        /* A cell that will be updated again is compared then. */
+        if ((marks[i] | marks[j]) & UPDATE_AGAIN)
             continue;
         const int place = row_places[j], m = COUNT_OF(row_counts[j]);
         const bool by_keys = certain && other_certain;
         bool same = false;
         for (int q = place; by_keys && q < place + m; ++q)
             same |= labels[q] == i && keys[q] == keys[k];
-        for (int q = place; !by_keys && q < place + m; ++q)
-            same |= labels[q] == i && fabs(measures[q] - measures[k]) <= AREA_NOISE * area;
-        /* A cell that will be updated again is compared then. */
-        if (same || ((marks[i] | marks[j]) & UPDATE_AGAIN))
+        if (!by_keys) {
+            REAL area = 0;
+            for (int q = begin; q < begin + n; ++q)
+                area += measures[q];
+            for (int q = place; q < place + m; ++q)
+                same |= labels[q] == i && fabs(measures[q] - measures[k]) <= AREA_NOISE * area;
+        }
+        if (same)
             continue;
         if (certain)
             atomic_or(marks + i, CLIP_ANEW);
@@ -377,22 +413,33 @@ kernel void check_cells(const int size, global const int *row_places, global con
     }
 }
 
-/* Per generator i: whether it is marked. report[3] counts the marked ones. */
-kernel void flag_marked_cells(const int size, global const int *marks, global int *flags, global int *report)
+/* Per generator i: whether it is marked. Unfinished cells are counted. FLAG_FULL: there are more than `room` faces. */
+kernel void flag_marked_cells(const int size, const int room, global const int *marks, global const int *row_counts,
+                              global int *flags, global int *report)
 {
     WORK_ITEM(i);
+    if (i == 0 && report[REPORT_FACES] > room)
+        atomic_or(report + REPORT_FLAGS, FLAG_FULL);
     flags[i] = marks[i] != 0;
-    if (marks[i])
-        atomic_inc(report + 3);
+    if (row_counts[i] == UNFINISHED)
+        atomic_inc(report + REPORT_UNFINISHED);
 }
 
 /* Per generator i: list it with its further neighbors if it is marked, as ~i if it is to be clipped, and remove the
-   mark; `sums` are the exclusive prefix sums of the flags. No cell is changed now. */
-kernel void list_marked_cells(const int size, global const int *sums, global const int *more, global int *marks,
-                              global int *changed, global int *listed, global int *further)
+   mark; `sums` are the exclusive prefix sums of the flags. No cell is changed now, but for those to be clipped. Nothing
+   is done if there are more than `most` marked ones. `round` numbers the launches. */
+kernel void list_marked_cells(const int size, const int most, const int round, global const int *sums,
+                              global const int *more, global const int *row_counts, global int *marks,
+                              global int *changed, global int *listed, global int *further, global int *report)
 {
     WORK_ITEM(i);
-    changed[i] = 0;
+    if (i == 0)
+        report[REPORT_UNFINISHED] = 0; /* they are counted again */
+    if (report[REPORT_MARKED] > most)
+        return;
+    if (i == 0)
+        report[REPORT_LISTED + round] = report[REPORT_MARKED];
+    changed[i] = row_counts[i] == UNFINISHED ? ALL_FACES : 0;
     if (!marks[i])
         return;
     const int to = sums[i];

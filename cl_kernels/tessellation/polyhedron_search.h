@@ -1,13 +1,6 @@
 /* The search for generators that may cut a polyhedron, and what may go wrong. */
 #include "tessellation/clip.h"
-
-/* Bits of the error word of kernels. */
-#define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */
-#define FLAG_COINCIDE 2  /* two generators at the same place */
-#define FLAG_COLLAPSED 4 /* generators too close for the precision */
-#define FLAG_DOUBT 8     /* no error: there are doubtful cells, whose faces must be matched */
-#define FLAG_NARROW 16   /* no error: some faces may be no wider than round-off; see consistency.cl */
-#define FLAG_UNEVEN 64   /* no error: two cells differ about their common face by more than a small share of one */
+#include "tessellation/row_counts.h"
 
 /* The flag for an outcome of clip_polyhedron or clip_polyhedron_by_row, or 0. */
 inline int flag_of(int what)

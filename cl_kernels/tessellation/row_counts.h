@@ -9,7 +9,8 @@
                                  any order, later kernels sort them
    labels, measures, centroids   of the faces
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl
-   report (2,)                   error bits; number of faces
+   report (5,)                   error bits; number of faces; number of cells that are UNFINISHED, and of those that an
+                                 update must repeat; number of faces that are kept
    corners                       if `with_corners`: the vertices of a cell from twice its first entry on, as triples of
                                  its faces, counter-clockwise seen from outside. The fourth number of the first one is
                                  one of those below */
@@ -23,9 +24,31 @@
 #define KNOWN_CORNERS 2 /* they agree with those of the neighbors, and have keys; see polyhedra_update.cl */
 #define MOST_FACES 32   /* most faces of a cell with triples: one bit each */
 
-/* Reserve a range in the arrays of faces. Its position depends on the order of work-items, its content does not.
-   report[0]: error bits; report[1]: number of faces. */
+/* The numbers of `report`. */
+#define REPORT_FLAGS 0
+#define REPORT_FACES 1
+#define REPORT_UNFINISHED 2
+#define REPORT_MARKED 3
+#define REPORT_KEPT 4
+#define REPORT_LISTED 5 /* number of cells that each round of an update repeats, from here on */
+
+/* Bits of the error word. */
+#define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */
+#define FLAG_COINCIDE 2  /* two generators at the same place */
+#define FLAG_COLLAPSED 4 /* generators too close for the precision */
+#define FLAG_DOUBT 8     /* no error: there are doubtful cells, whose faces must be matched */
+#define FLAG_NARROW 16   /* no error: some faces may be no wider than round-off; see consistency.cl */
+#define FLAG_UNEVEN 64   /* no error: two cells differ about their common face by more than a small share of one */
+
+/* Reserve a range in the arrays of faces. Its position depends on the order of work-items, its content does not. */
 inline int take_places(global int *report, int count)
 {
-    return atomic_add(report + 1, count);
+    return atomic_add(report + REPORT_FACES, count);
+}
+
+/* Whether all cells are known, and right. */
+inline bool are_complete(global const int *report)
+{
+    const int errors = FLAG_FULL | FLAG_COINCIDE | FLAG_COLLAPSED;
+    return (report[REPORT_FLAGS] & errors) == 0 && report[REPORT_UNFINISHED] == 0 && report[REPORT_MARKED] == 0;
 }

@@ -13,8 +13,8 @@ from ..opencl import memory_limits
 from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..solvers.poisson import max_jacobi_iterations
+from ..tessellation.cut_cells import clipping_space
 from ..tessellation.periodic.halo import block_count
-from ..tessellation.polyhedra import clipping_space
 from .forecast import IMAGE_REACH, expected_boundary_cells
 
 MAX_CELLS = 100_000_000

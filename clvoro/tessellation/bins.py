@@ -10,7 +10,7 @@ import pyopencl.array as cla
 from numpy.typing import DTypeLike
 
 from ..geometry.box import ClipBox
-from ..opencl.device_array import buffer_of, read_number
+from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 
@@ -100,6 +100,7 @@ class Bins:
         """Make room for `n` generators and `bins` bins; the contents of the bins stay."""
         engine, d = self.engine, self.engine.site_size
         if n > self._capacity[0]:
+            self._found = engine.empty(2, np.int32)
             self._keys = engine.empty(n, np.int32)
             self._ranks = engine.empty(n, np.int32)
             self._items = engine.empty(n, np.int32)
@@ -150,8 +151,8 @@ class Bins:
     def build(self, box: ClipBox, points: cla.Array, n: int) -> BinnedPoints:
         """Sort the first `n` of `points` (n, d; normalized coordinates, within `box`) into bins.
 
-        In a power diagram rows of `points` end with weights. The host reads two integers per level; uniform sets have
-        one level.
+        In a power diagram rows of `points` end with weights. The host reads two integers per level, at once; uniform
+        sets have one level.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         lower, upper = (corner.astype(np.float64)[:d] for corner in box.device_corners(engine.real))
@@ -177,17 +178,16 @@ class Bins:
                 k.plan_children, size, self._counts, np.int32(begin), may_divide, self._flags,
                 self._sizes,
             )  # fmt: skip
-            for values in (self._flags, self._sizes):
-                self._scan.exclusive(values, values, size)
+            for place, values in enumerate((self._flags, self._sizes)):
+                self._scan.exclusive(values, values, size, total=(self._found, place))
             self._scan.exclusive(self._counts, self._starts, size, first=begin)
             engine.run_each(
                 k.place_bins, size, self._starts, np.int32(begin), self._grid_of, self._shapes,
                 self._grid_items, np.int32(grids), self._flags, self._bins,
             )  # fmt: skip
-            new_grids = read_number(self._flags, size)
+            new_grids, new_bins = map(int, self._found.get())
             if new_grids == 0:
                 break
-            new_bins = read_number(self._sizes, size)
             child_firsts = self._sizes  # _reserve may replace it
             self._reserve(n, end + new_bins)
             self._clear(self._counts, end, new_bins)

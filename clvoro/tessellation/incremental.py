@@ -15,6 +15,7 @@ from ..opencl.primitives import Scan
 from .cells import CLIPPED, MARKED, Cells
 from .device_diagram import Tessellation
 from .face_rows import spare_slots
+from .rounds import with_room
 
 MAX_ROUNDS = 6
 """Most rounds of clipping and checking; after that the diagram is built from scratch."""
@@ -117,7 +118,7 @@ class IncrementalUpdate:
             clipped = np.diff(found[CLIPPED : CLIPPED + done + len(expected) + 1])
             done, left = int(np.count_nonzero(clipped)), int(found[MARKED])
             if left == 0:
-                self._expected = _with_room(clipped[:done], first_most)
+                self._expected = with_room(clipped[:done], first_most)
                 return cells.complete(rows, box, points, previous, found)
             in_all = most if done else first_most
             if found[2] > most_wrong or clipped.sum() + left > in_all or done >= MAX_ROUNDS - 1:
@@ -133,9 +134,3 @@ class IncrementalUpdate:
         stride = np.int32(SAMPLE)
         self.engine.run(kernel, part, np.int32(n), stride, np.int32(0), *args)
         self.engine.run(kernel, items - part, np.int32(n), stride, one, *args)
-
-
-def _with_room(clipped: np.ndarray, most: int) -> list[int]:
-    """Return the sizes of the launches of the next update, if this one has `clipped` so many cells in each round."""
-    sizes = np.minimum(clipped + clipped // 2 + 256, most)
-    return np.minimum.accumulate(sizes).tolist()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,18 +13,28 @@ import pyopencl.array as cla
 
 from ..errors import ClvoroError, MemoryLimitError
 from ..geometry.box import ClipBox
-from ..opencl.device_array import buffer_of, read_number
+from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
+from .cut_cells import (
+    FACE_CAPACITY,
+    GROWTH,
+    HARMLESS,
+    MOST_FACES,
+    REPORT_FACES,
+    REPORT_KEPT,
+    REPORT_SIZE,
+    CutCells,
+    Matching,
+    capacity_defines,
+    clip_each,
+)
 from .device_diagram import (
-    DOUBT,
     EXACT_SHARE,
     FULL,
-    NARROW,
     ROUGH_SHARE,
-    UNEVEN,
     CloseError,
     NeighborRows,
     Tessellation,
@@ -33,14 +43,6 @@ from .device_diagram import (
 from .periodic.halo import halo_defines
 from .weight_bounds import WeightBounds
 
-HARMLESS = DOUBT | NARROW | UNEVEN
-"""Flags of a diagram that is not rejected."""
-FACE_CAPACITY = 32
-"""Most faces of a cell while it is clipped in private memory."""
-GROWTH, MOST_FACES = 4, 512
-"""Factor to the next capacity for cells with more, and the largest one."""
-LEAST_SPACE, SPACE_PER_CELL, MOST_SPACE = 2**20, 64, 2**26
-"""Bytes of global memory for cells with more than `FACE_CAPACITY` faces while they are clipped, a few at a time."""
 FACES_PER_CELL = 16.5
 """First guess of the half-faces per cell. Random cells have 15.54 on average; walls add some."""
 STRETCH = 128
@@ -49,88 +51,6 @@ CUBE = 8
 """Number of bins along each axis of the cubes that order these generators."""
 FIRST_REACH = 2.0
 """First search radius of `walks.cl`, in units of the local spacing of the bins."""
-
-
-def clipping_space(n: float) -> float:
-    """Return the most bytes that cells with many faces take in global memory while `n` cells are clipped."""
-    return min(max(LEAST_SPACE, SPACE_PER_CELL * n), MOST_SPACE)
-
-
-def cell_bytes(capacity: int, real: np.dtype) -> int:
-    """Return an upper bound of the size of `cell_t` (polyhedron.h), which the kernels check."""
-    index = 1 if 3 * capacity <= 256 else 2
-    return capacity * (16 * real.itemsize + 29 * index + 5) + 320
-
-
-def capacity_defines(engine: Engine, capacity: int) -> dict[str, object]:
-    """Return the defines of kernels that clip cells of up to `capacity` faces."""
-    defines: dict[str, object] = {"FACE_CAPACITY": capacity}
-    if capacity > FACE_CAPACITY:
-        defines["CELL_BYTES"] = cell_bytes(capacity, engine.real)
-    return defines
-
-
-def clip_each(
-    engine: Engine,
-    kernel: cl.Kernel,
-    capacity: int,
-    size: int,
-    args: tuple[object, ...],
-    more_args: tuple[object, ...] = (),
-) -> None:
-    """Enqueue `kernel`, which clips `size` cells of up to `capacity` faces.
-
-    Its arguments are `size`, `args` and `more_args`. Cells with more than `FACE_CAPACITY` faces are clipped in global
-    memory, which it takes after `args`, by one work-item for each cell that fits there.
-    """
-    if capacity <= FACE_CAPACITY:
-        engine.run_each(kernel, size, *args, *more_args)
-        return
-    bytes_ = cell_bytes(capacity, engine.real)
-    count = min(size, int(clipping_space(size)) // bytes_)
-    with engine.workspace.frame():
-        memory = engine.scratch(count * bytes_, np.uint8)
-        more_args = (memory, np.int32(count), *more_args)
-        engine.run(kernel, count, np.int32(size), *args, *more_args, group=1)
-
-
-@dataclass(frozen=True)
-class CutCells:
-    """Cells clipped independently of each other, on the device; see `clip_polyhedra` in `polyhedra.cl`.
-
-    Attributes
-    ----------
-    places, counts : (n,) int32
-        First entry of each cell in the arrays of faces, and number of its faces.
-    labels, measures, centroids
-        Arrays of `m` half-faces.
-    cells : dict
-        Volumes, offsets and covariances.
-    doubtful : bool
-        With round-off two cells might disagree about a face.
-    corners, keys : arrays, optional
-        Triples of faces and keys; see `Tessellation.vertices`.
-    """
-
-    places: cla.Array
-    counts: cla.Array
-    labels: cla.Array
-    measures: cla.Array
-    centroids: cla.Array
-    cells: dict[str, cla.Array]
-    m: int
-    doubtful: bool
-    corners: cla.Array | None = None
-    keys: cla.Array | None = None
-
-    def output(self, report: cla.Array) -> tuple[object, ...]:
-        """Return the CELL_OUTPUT_ARGS of kernels (tessellation/row_counts.h)."""
-        cells = self.cells["volumes"], self.cells["offsets"], self.cells["covariances"]
-        keep, corners = self.corners is not None, report if self.corners is None else self.corners
-        return (
-            self.places, self.counts, self.labels, self.measures, self.centroids, *cells, report,
-            np.int32(keep), corners,
-        )  # fmt: skip
 
 
 class Polyhedra:
@@ -153,7 +73,7 @@ class Polyhedra:
             }  # fmt: skip
             self._walks = engine.kernels("simd/walks", defines)
             self._wrap = self._walks.walk_all_cells
-        self._report = engine.empty(2, np.int32)
+        self._report = engine.empty(REPORT_SIZE, np.int32)
         self._capacity = self._room = self._n = 0
         self._of_vertices: tuple[cla.Array, cla.Array] | None = None
 
@@ -278,10 +198,12 @@ class Polyhedra:
             if self._bounds is not None:
                 halo_args = (*halo_args, *self._bounds.build(box, points, n))
             cut = self._cut(box, points, n, binned, first, previous, rows, share, halo_args, keep)
-            t = None if cut is None else self.match(cut, self._report, points, share)
-        if t is None:
-            raise CloseError(points, n)
-        return t
+            if cut is not None:
+                matching = self.match(cut, self._report, points, share, cut.m)
+                flags = int(self._report.get()[0])
+                if not flags & ~HARMLESS:
+                    return matching.tessellation(flags)
+        raise CloseError(points, n)
 
     def _begin_anew(self, binned: BinnedPoints, first: cla.Array, n: int) -> None:
         """Restore the search radii, so that the last bits of the result do not depend on earlier attempts."""
@@ -321,11 +243,11 @@ class Polyhedra:
         )
         capacity, again, walk = FACE_CAPACITY, False, self._wrap
         first_reach = engine.real.type(FIRST_REACH)
-        self._report.set(np.zeros(2, np.int32))
+        self._begin_report()
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         while True:
             corners = engine.scratch(2 * self._room, np.uint32) if keep else None
-            cut = CutCells(places, counts, *faces, cells, self._room, False, corners, faces[0])
+            cut = CutCells(places, counts, *faces, cells, self._room, corners, faces[0])
             room, written = np.int32(self._room), cut.output(self._report)
             if walk is not None and not again:
                 with engine.workspace.frame():
@@ -343,7 +265,7 @@ class Polyhedra:
             clip_each(
                 engine, self._kernels(capacity).clip_polyhedra, capacity, n, cell_args, halo_args
             )
-            flags, m = (int(v) for v in self._report.get())
+            flags, m = (int(v) for v in self._report.get()[:2])
             if flags & ~(FULL | HARMLESS):
                 return None
             if m > self._room:
@@ -351,7 +273,7 @@ class Polyhedra:
                 self._begin_anew(binned, first, n)
                 faces = self._take_faces(m + m // 32 + 64)
                 capacity, again = FACE_CAPACITY, False
-                self._report.set(np.zeros(2, np.int32))
+                self._begin_report()
             elif flags & FULL:
                 # Clip only the cells with too many faces, with a larger capacity.
                 capacity, again = GROWTH * capacity, True
@@ -360,9 +282,15 @@ class Polyhedra:
                         f"a cell has more than {MOST_FACES} faces, expected fewer; remove or perturb generators "
                         "that lie on a common sphere"
                     )
-                self._report.set(np.array([flags & HARMLESS, m], np.int32))
+                self._begin_report(flags & HARMLESS, m)
             else:
-                return replace(cut, m=m, doubtful=bool(flags & DOUBT))
+                return replace(cut, m=m)
+
+    def _begin_report(self, flags: int = 0, used: int = 0) -> None:
+        """Set the report to `flags` and the number of `used` faces."""
+        report = np.zeros(REPORT_SIZE, np.int32)
+        report[0], report[REPORT_FACES] = flags, used
+        self._report.set(report)
 
     def take_cells(self, n: int, m: int) -> CutCells:
         """Return arrays for `n` cells with `m` half-faces in any order, to be matched."""
@@ -372,7 +300,7 @@ class Polyhedra:
         places, counts, labels = (scratch(size, np.int32) for size in (n, n, m))
         corners, keys = scratch(2 * m, np.uint32), scratch(m, np.uint32)
         return CutCells(
-            places, counts, labels, scratch(m), scratch((m, 3)), cells, m, False, corners, keys
+            places, counts, labels, scratch(m), scratch((m, 3)), cells, m, corners, keys
         )
 
     def clip_rest(
@@ -383,8 +311,8 @@ class Polyhedra:
         points: cla.Array,
         binned: BinnedPoints,
         previous: Tessellation,
-    ) -> bool:
-        """Clip the unfinished cells of `cut` by all generators near them. False if that fails."""
+    ) -> None:
+        """Clip the unfinished cells of `cut` by all generators near them."""
         engine, rows = self.engine, len(cut.counts)
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         share, old = engine.real.type(ROUGH_SHARE), (previous.starts, previous.neighbors)
@@ -393,61 +321,50 @@ class Polyhedra:
             points, *box.device_corners(engine.real), np.int32(1), *old, np.int32(1), np.int32(len(cut.labels)), share,
             *cut.output(report),
         )  # fmt: skip
-        flags, m = (int(v) for v in report.get()[:2])
-        return m <= len(cut.labels) and not flags & ~HARMLESS
 
     def match(
-        self,
-        cut: CutCells,
-        report: cla.Array,
-        points: cla.Array,
-        share: np.floating,
-        sparse: bool = False,
-    ) -> Tessellation | None:
-        """Keep the faces that both cells have, and sort them by rows. None if cells differ by too much.
+        self, cut: CutCells, report: cla.Array, points: cla.Array, share: np.floating, m: int
+    ) -> Matching:
+        """Keep the faces that both cells have, and sort them by rows, if there are at most `m` or room for them.
 
-        With `sparse`, the arrays of faces have gaps, and the rows are counted.
+        Nothing is done if `report` says that cells are missing or wrong.
         """
-        engine, k, m = self.engine, self._kernels(FACE_CAPACITY), cut.m
-        rows, cells, doubt = len(cut.counts), cut.cells, np.int32(cut.doubtful)
+        engine, k = self.engine, self._kernels(FACE_CAPACITY)
+        rows = len(cut.counts)
         # The previous graph stays valid until the end.
-        starts, neighbors = engine.scratch(rows + 1, np.int32), engine.scratch(m, np.int32)
-        kept = engine.scratch(m, np.uint8)
+        starts, kept = engine.scratch(rows + 1, np.int32), engine.scratch(cut.m, np.uint8)
         engine.run_each(
-            k.match_polyhedron_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cells["volumes"],
-            points, share, doubt, kept, starts, report,
+            k.match_polyhedron_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cut.cells["volumes"],
+            points, share, kept, starts, report,
         )  # fmt: skip
-        flags = int(report.get()[0])
-        if flags & ~HARMLESS:
-            return None
-        self._scan.exclusive(starts, starts, rows)
-        if sparse:
-            m = read_number(starts, rows)
-        faces, of_rows = self._faces(m), self._of_cells["starts"][: rows + 1]
-        engine.run_each(
-            k.place_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cut.centroids,
-            kept, doubt, starts, neighbors, faces["face_measures"], faces["face_centroids"],
-        )  # fmt: skip
-        engine.run_each(k.put_graph, rows, starts, neighbors, of_rows, faces["neighbors"])
-        vertices: tuple[cla.Array, ...] = ()
-        if cut.corners is not None:
-            vertices = self._vertices(len(faces["neighbors"]))
+        self._scan.exclusive(starts, starts, rows, total=(report, REPORT_KEPT))
+        matching = Matching(cut, points, kept, starts, report)
+        self.place(matching, m)
+        return matching
+
+    def place(self, matching: Matching, m: int) -> None:
+        """Write the faces of `matching` to the arrays of the diagram, which get room for `m`."""
+        engine, k, cut = self.engine, self._kernels(FACE_CAPACITY), matching.cut
+        rows, report, starts = len(cut.counts), matching.report, matching.starts
+        faces, of_rows = self._faces(m), self._of_cells["starts"][: len(cut.counts) + 1]
+        room = np.int32(len(faces["neighbors"]))
+        with_corners = cut.corners is not None
+        vertices = self._vertices(int(room)) if with_corners else ()
+        with engine.workspace.frame():
+            neighbors = engine.scratch(min(cut.m, int(room)), np.int32)
             engine.run_each(
-                k.place_cell_corners,
-                rows,
-                cut.places,
-                cut.counts,
-                cut.corners,
-                cut.keys,
-                of_rows,
-                *vertices,
-            )
-        return Tessellation(
-            n=rows, points=points, starts=of_rows, neighbors=faces["neighbors"],
-            face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=cells["volumes"],
-            offsets=cells["offsets"], covariances=cells["covariances"], vertices=vertices,
-            round_off=flags & (NARROW | UNEVEN),
-        )  # fmt: skip
+                k.place_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cut.centroids, matching.kept,
+                report, room, starts, neighbors, faces["face_measures"], faces["face_centroids"],
+            )  # fmt: skip
+            engine.run_each(
+                k.put_rows, rows, cut.places, cut.counts, report, room, starts, neighbors, np.int32(with_corners),
+                *((cut.corners, cut.keys) if with_corners else (report, report)), of_rows, faces["neighbors"],
+                *(vertices or (report, report)),
+            )  # fmt: skip
+        matching.arrays = {
+            "starts": of_rows, "neighbors": faces["neighbors"], "face_measures": faces["face_measures"],
+            "face_centroids": faces["face_centroids"], "vertices": vertices,
+        }  # fmt: skip
 
     def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:
         """Return the items of the first `rows` generators in an order that keeps neighbors close."""

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pyopencl.array as cla
 
 from ..geometry.box import ClipBox
 from ..opencl.engine import Engine
+from ..opencl.kernels import Kernels
 from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
 from .bins import BinnedPoints
-from .device_diagram import DOUBT, ROUGH_SHARE, Tessellation
+from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_MARKED, REPORT_SIZE
+from .device_diagram import ROUGH_SHARE, Tessellation
 from .polyhedra import Polyhedra
+from .rounds import with_room
 
 MORE = 8
 """Room for further neighbors of a cell, as in `tessellation/polyhedra_update.cl`."""
@@ -51,8 +53,9 @@ class PolyhedraUpdate:
         self.engine = engine
         self._scan = Scan(engine)
         self._kernels = engine.kernels("tessellation/polyhedra_update")
-        self._report = engine.empty(4, np.int32)
+        self._report = engine.empty(REPORT_SIZE, np.int32)
         self._share = engine.real.type(ROUGH_SHARE)
+        self._n, self._expected, self._clips = 0, [0], False
 
     @framed
     def update(
@@ -65,58 +68,118 @@ class PolyhedraUpdate:
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, 3), the new positions of the generators of `previous`.
 
+        The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the report.
+
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
         `bins` sorts the generators into bins; it is called if cells must be clipped.
         """
-        engine, k, n = self.engine, self._kernels, previous.n
-        before = len(previous.neighbors)
-        room = int((1 + SPARE) * before) + 64
-        cut = cells.take_cells(n, room)
-        changed, marks, listed = (engine.scratch(n, np.int32) for _ in range(3))
-        sums = engine.scratch(n + 1, np.int32)
-        more, most = engine.scratch(n * MORE, np.int32), int(MAX_SHARE * n)
-        further = engine.scratch(max(most, 1) * MORE, np.int32)
-        more.fill(NO_NEIGHBOR)
-        marks.fill(0)
-        old = previous.vertices or (listed, sums)
-        fixed = (
-            previous.starts, previous.neighbors, np.int32(bool(previous.vertices)), *old, points,
-            *box.device_corners(engine.real), np.int32(room),
-        )  # fmt: skip
-        binned: BinnedPoints | None = None
-        count, some, flags, used = n, False, 0, before
-        for _ in range(MAX_ROUNDS):
-            self._report.set(np.array([flags, used, 0, 0], np.int32))
-            engine.run_each(
-                k.update_cells, count, np.int32(some), listed, further, *fixed, *cut.output(self._report),
-                cut.keys, changed, more, marks,
-            )  # fmt: skip
-            flags, used, left, _ = (int(v) for v in self._report.get())
-            if used > room or left > most:
+        n, before = previous.n, len(previous.neighbors)
+        most = int(MAX_SHARE * n)
+        if n != self._n:
+            self._n, self._expected, self._clips = n, [most], False
+        rounds = _Rounds(
+            self.engine, self._kernels, self._scan, self._report, cells, box, points, previous
+        )
+        rounds.update(None)
+        done, sizes, binned = 0, self._expected, None
+        clipped, final = False, not self._clips
+        while True:
+            for size in sizes[: MAX_ROUNDS - done]:
+                rounds.list_marked(done, size)
+                rounds.update(size)
+                done += 1
+            matching = None
+            if final:
+                matching = cells.match(rounds.cut, self._report, points, self._share, before)
+            found = self._report.get()
+            flags, _, left, marked, kept = map(int, found[:REPORT_LISTED])
+            if flags & ~HARMLESS or max(left, marked) > most:
                 return None
-            if left:
-                binned = bins() if binned is None else binned
-                if not cells.clip_rest(cut, self._report, box, points, binned, previous):
+            if marked or left:
+                if done == MAX_ROUNDS:
                     return None
-            engine.run_each(
-                k.check_cells,
-                n,
-                cut.places,
-                cut.counts,
-                cut.labels,
-                cut.measures,
-                cut.keys,
-                changed,
-                marks,
-            )
-            engine.run_each(k.flag_marked_cells, n, marks, sums, self._report)
-            flags, used, _, count = (int(v) for v in self._report.get())
-            if count > most:
-                return None
-            if count == 0:
-                cut = replace(cut, doubtful=bool(flags & DOUBT))
-                return cells.match(cut, self._report, points, self._share, sparse=True)
-            some = True
-            self._scan.exclusive(sums, sums, n)
-            engine.run_each(k.list_marked_cells, n, sums, more, marks, changed, listed, further)
-        return None
+                sizes = [marked] if marked else []
+                if not marked:
+                    rounds.list_marked(done, 0)
+                    done, clipped, final = done + 1, True, True
+                    binned = bins() if binned is None else binned
+                    cells.clip_rest(rounds.cut, self._report, box, points, binned, previous)
+                    rounds.check()
+                continue
+            self._clips = clipped
+            counts = found[REPORT_LISTED : REPORT_LISTED + done]
+            self._expected = with_room(counts[counts > 0], most)
+            if matching is None:
+                sizes, final = [], True
+                continue
+            if kept > len(matching.arrays["neighbors"]):
+                cells.place(matching, kept)
+            return matching.tessellation(flags)
+
+
+class _Rounds:
+    """The launches of the rounds of one update.
+
+    Attributes
+    ----------
+    cut : CutCells
+    room : int
+        Number of faces that it has room for.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        kernels: Kernels,
+        scan: Scan,
+        report: cla.Array,
+        cells: Polyhedra,
+        box: ClipBox,
+        points: cla.Array,
+        previous: Tessellation,
+    ) -> None:
+        self._engine, self._kernels, self._scan, self._report = engine, kernels, scan, report
+        self._n, before = previous.n, len(previous.neighbors)
+        n, most = previous.n, max(int(MAX_SHARE * previous.n), 1)
+        self.room = int((1 + SPARE) * before) + 64
+        self.cut = cells.take_cells(n, self.room)
+        self._changed, self._marks, self._listed = (engine.scratch(n, np.int32) for _ in range(3))
+        self._sums, self._more = engine.scratch(n + 1, np.int32), engine.scratch(n * MORE, np.int32)
+        self._further = engine.scratch(most * MORE, np.int32)
+        old = previous.vertices or (self._listed, self._sums)
+        self._fixed = (
+            previous.starts, previous.neighbors, np.int32(bool(previous.vertices)), *old, points,
+            *box.device_corners(engine.real), np.int32(self.room),
+        )  # fmt: skip
+        engine.run_each(
+            kernels.begin_cell_updates, n, np.int32(before), np.int32(REPORT_SIZE), report, self._marks, self._more
+        )  # fmt: skip
+
+    def update(self, size: int | None) -> None:
+        """Update all cells, or at most `size` listed ones, and check them."""
+        self._engine.run_each(
+            self._kernels.update_cells, self._n if size is None else size, np.int32(size is not None), self._listed,
+            self._further, *self._fixed, *self.cut.output(self._report), self.cut.keys, self._changed, self._more,
+            self._marks,
+        )  # fmt: skip
+        self.check()
+
+    def check(self) -> None:
+        """Check changed cells, and count those that must be updated again, and the unfinished ones."""
+        engine, k, cut = self._engine, self._kernels, self.cut
+        room = np.int32(self.room)
+        engine.run_each(
+            k.check_cells, self._n, room, self._report, cut.places, cut.counts, cut.labels, cut.measures, cut.keys,
+            self._changed, self._marks,
+        )  # fmt: skip
+        engine.run_each(
+            k.flag_marked_cells, self._n, room, self._marks, cut.counts, self._sums, self._report
+        )
+        self._scan.exclusive(self._sums, self._sums, self._n, total=(self._report, REPORT_MARKED))
+
+    def list_marked(self, number: int, most: int) -> None:
+        """List the marked cells, if they are not more than `most`."""
+        self._engine.run_each(
+            self._kernels.list_marked_cells, self._n, np.int32(most), np.int32(number), self._sums, self._more,
+            self.cut.counts, self._marks, self._changed, self._listed, self._further, self._report,
+        )  # fmt: skip

@@ -21,7 +21,7 @@ from clvoro.opencl import prebuild
 from clvoro.opencl import program as _program
 from clvoro.opencl.engine import DomainKind, Engine
 from clvoro.tessellation.cells import CELL_CAPACITY
-from clvoro.tessellation.polyhedra import FACE_CAPACITY
+from clvoro.tessellation.cut_cells import FACE_CAPACITY
 from tests.robustness import oclgrind_work
 from tests.robustness.gpu_like import groups
 

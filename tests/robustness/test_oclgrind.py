@@ -80,7 +80,7 @@ NOT_FOR = {
     "periodic space": IN_PLANE
     | AT_POLYGONS
     | AT_LAYERS
-    | {"ghost_images.measure_required_depths", "polyhedra.place_cell_corners", "polyhedra_update"},
+    | {"ghost_images.measure_required_depths", "polyhedra_update"},
 }
 """Files and kernels that a kind of domain does not need. All others except `ALIKE` run in it, in every variant."""
 PATIENCE = 20

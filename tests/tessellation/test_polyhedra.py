@@ -8,7 +8,7 @@ import pytest
 import clvoro
 from clvoro.opencl import engine, ranges
 from clvoro.opencl.engine import Engine
-from clvoro.tessellation import polyhedra
+from clvoro.tessellation import cut_cells, polyhedra
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.reference import diagrams3d as reference3d
@@ -323,7 +323,7 @@ def test_where_cells_are_clipped_changes_no_bit(ctx, real, monkeypatch):
 
     expected = arrays()
     assert np.diff(clvoro.Adapter(ctx, real).diagram(BOX, points).neighbor_starts).max() > 32
-    monkeypatch.setattr(polyhedra, "LEAST_SPACE", 3 * polyhedra.cell_bytes(128, np.dtype(real)))
+    monkeypatch.setattr(cut_cells, "LEAST_SPACE", 3 * cut_cells.cell_bytes(128, np.dtype(real)))
     few = arrays()
 
     def in_thirds(queue, kernel, items, group, limit):
@@ -333,7 +333,8 @@ def test_where_cells_are_clipped_changes_no_bit(ctx, real, monkeypatch):
     monkeypatch.setattr(engine.ranges, "may_be_interrupted", lambda _: True)
     monkeypatch.setattr(engine, "enqueue_ranges", in_thirds)
     divided = arrays()
-    monkeypatch.setattr(polyhedra, "FACE_CAPACITY", 64)
+    for module in (cut_cells, polyhedra):
+        monkeypatch.setattr(module, "FACE_CAPACITY", 64)
     for one, *others in zip(expected, few, divided, arrays(), strict=True):
         assert all(np.array_equal(one, other) for other in others)
 

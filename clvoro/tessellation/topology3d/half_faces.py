@@ -12,8 +12,8 @@ from ...geometry.box import ClipBox
 from ...opencl.engine import Engine
 from ...opencl.kernels import Kernels
 from ...opencl.primitives import Scan
+from ..cut_cells import FACE_CAPACITY, GROWTH, capacity_defines, clip_each
 from ..device_diagram import Tessellation
-from ..polyhedra import FACE_CAPACITY, GROWTH, capacity_defines, clip_each
 
 MOST_LOOP_ENTRIES = 2**31 - 1
 
