@@ -25,10 +25,10 @@ from .adaptation.options import (
     special,
 )
 from .adaptation.preparation import Preparation
-from .adaptation.run import run_adaptation
+from .adaptation.run import check_run, run_adaptation
 from .adaptation.stages import Stages
 from .adaptation.transport.given import power_diagram_of, transport_to
-from .arguments import Naming, check_callable, check_choice, check_points
+from .arguments import Naming, check_choice, check_points
 from .errors import InputError, InputTypeError, Interrupted, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.box import Domain
@@ -291,25 +291,25 @@ class Adapter:
             after the size field has moved by a few cells. From any other array they run all levels.
         method : str
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
-            size. "exact" gives every cell its target size, to about 1e-4. The others repeat one kind of step: "lloyd",
-            "poisson" and "coupled" as published, "weighted-lloyd" and "weighted" with the density h^-d, and the moving
-            meshes "mmpde" and "monge-ampere", which map a lattice in a box (see `clvoro.adaptation.methods`).
+            size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a
+            power diagram, in boxes with walls. The others repeat one kind of step: "lloyd", "poisson" and "coupled" as
+            published, "weighted-lloyd" and "weighted" with the density h^-d, and the moving meshes "mmpde" and
+            "monge-ampere", which map a lattice in a box (see `clvoro.adaptation.methods`).
         n_cells : int, optional
-            Number of generators; by default the integral of h^-d over the domain. "adaptive" and "exact" end with
-            exactly that many. They scale the size field by a common factor so that the mean of log(L / h) vanishes,
-            and report it as ``Result.size_factor``.
+            Number of generators; by default the integral of h^-d over the domain. "adaptive", "exact" and "transport"
+            end with exactly that many. They scale the size field by a common factor so that the mean of log(L / h)
+            vanishes, and report it as ``Result.size_factor``; "transport" always does.
         effort : "fast", "default" or "best"
-            Amount of work of "adaptive" and "exact".
+            Amount of work of "adaptive", "exact" and "transport".
         layers : Layers or sequence of Layers
             Rows of generators along walls, in 2D, that do not move: the first rows of the result. Beyond them the
             sizes grow gradually from the size of the layers; see `Layers`. Their cells count as having the right size.
         seed : int
             Seed of the random start.
         max_steps : int, optional
-            Largest number of steps, over all levels. By default 100, or all steps of the schedule of "adaptive" and
-            "exact".
+            Largest number of steps, over all levels. By default 100, or all steps of the schedule of those three.
         options : MultilevelOptions or PaperOptions, optional
-            Further options: `MultilevelOptions` for "adaptive" and "exact", `PaperOptions` for the other methods.
+            Further options: `MultilevelOptions` for those three, `PaperOptions` for the other methods.
         checkpoint : path or Checkpoint, optional
             File to which the state of the run is written once per minute. `Checkpoint` chooses the interval, and
             continues a run.
@@ -360,7 +360,7 @@ class Adapter:
             **special(options),
         )  # fmt: skip
         check_choice("on_interrupt", on_interrupt, ("raise", "return"))
-        _check_run(domain, size, callback)
+        check_run(domain, size, callback)
         files = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
         with self._alone():
             for kept in self._stages.values():
@@ -434,19 +434,3 @@ class Adapter:
 def _generators(points: ArrayLike | Start) -> tuple[str, ArrayLike | None]:
     """Return how a random start is distributed, and the caller's generators if they are not random."""
     return (points, None) if isinstance(points, str) else ("density", points)
-
-
-def _check_run(domain: object, size: object, callback: Callable[[np.void], object] | None) -> None:
-    """Check the kinds of arguments before a run begins."""
-    if callback is not None and not callable(callback):
-        raise InputTypeError(
-            f"callback is {callback!r} of type {type(callback).__name__}, expected a function of a row of the history"
-        )
-    if callback is not None:
-        check_callable(
-            "callback", callback, "a row of the history", "write lambda row: callback(...)"
-        )
-    if isinstance(size, Domain) and not isinstance(domain, Domain):
-        raise InputTypeError(
-            f"size is the domain {size!r}, and domain is a {type(domain).__name__}; exchange them: run(domain, size)"
-        )

@@ -71,8 +71,8 @@ def adapt(
     points : (n, d) array of float, "density" or "uniform"
         Generators to start from: those of the array, random ones with density h^-d, or uniform random ones.
     method : str
-        "adaptive" for good cells of the right size, "exact" for cells that have it to about 1e-4; for the others see
-        `Adapter.run`.
+        "adaptive" for good cells of the right size, "exact" for cells that have it to about 1e-4, "transport" for a
+        power diagram of cells that have it to 1e-10; for the others see `Adapter.run`.
     n_cells : int, optional
         Number of cells; by default the number that the size field requires.
     layers : Layers or sequence of Layers

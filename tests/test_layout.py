@@ -41,6 +41,7 @@ OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[
 PARTS = {
     "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
     "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
+    "tessellation.power": {"tessellation.polyhedra"},
     "solvers.transport": {"solvers.poisson", "tessellation.power"},
     "tessellation.cells": {"tessellation.weight_bounds"},
     "tessellation.polyhedra": {"tessellation.weight_bounds"},

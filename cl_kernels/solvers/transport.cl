@@ -1,5 +1,19 @@
 #include "opencl/real.h"
 
+/* Per cell i: the volume of its target size, h_i^d. */
+kernel void prescribe_sizes(const int size, global const REAL *h, global REAL *prescribed)
+{
+    WORK_ITEM(i);
+    prescribed[i] = CELL_DIM == 2 ? h[i] * h[i] : h[i] * h[i] * h[i];
+}
+
+/* Per cell i: its volume times a common factor. */
+kernel void scale_volumes(const int size, const REAL factor, global REAL *prescribed)
+{
+    WORK_ITEM(i);
+    prescribed[i] *= factor;
+}
+
 /* Per cell i, with the prescribed volume m_i:
 
    rhs       2 (m_i - V_i), the right side of Newton's equation L dw = 2 (m - V)

@@ -22,12 +22,14 @@ from .schedule import (
     Action,
     CorrectCount,
     InsertDelete,
+    Prescribe,
     Refine,
     ResetMomentum,
     Step,
     work_of,
 )
 from .state import MeshState
+from .transport.phase import PowerPhase
 
 SAMPLING_GAIN = 0.36
 """Ratio of the errors of two levels in counting cells by sizes at the generators, measured on a field with a kink."""
@@ -163,10 +165,13 @@ class Loop:
                     self.correct_count(action.share, action.ahead)
                 elif isinstance(action, Refine):
                     self.refine()
+                elif isinstance(action, Prescribe):
+                    stop = self.prescribe(action, progress)
                 elif isinstance(action, ResetMomentum):
                     self.mesh.velocity.fill(0)
                 self.position += 1
-                if self.checkpoint is not None:
+                # Weights are not saved. A run resumes before they are found.
+                if self.checkpoint is not None and self.mesh.power is None:
                     self.checkpoint.offer(self, stop)
             else:
                 reason = self.end_reason(stop, over=True)
@@ -209,6 +214,25 @@ class Loop:
             self.mesh.normalize_sizes()
         self.last = action.method
         self.steps += 1
+
+    def prescribe(self, action: Prescribe, progress: float) -> bool:
+        """Give the cells their target volumes, and move generators to the centroids; return whether to stop."""
+        mesh, phase = self.mesh, PowerPhase(self.mesh)
+        mesh.stages.clear("poisson")
+        for move in range(action.moves + 1):
+            self.begun = self.steps + 1
+            with mesh.engine.workspace.frame():
+                if move:
+                    phase.aim()
+                    self.final = self.displacements()
+                    phase.move()
+                self.solution = phase.prescribe()
+            self.steps += 1
+            is_last = move == action.moves
+            stop = self.record(progress if is_last else float(self.rows[-1]["progress"][0]))
+            if self.end_reason(stop):
+                return stop
+        return False
 
     def insert_delete(self, action: InsertDelete) -> None:
         """Insert and delete generators."""

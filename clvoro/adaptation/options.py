@@ -17,12 +17,13 @@ from ..geometry.boundary_layers import Layers
 from .methods import MOVING, PUBLISHED
 
 MethodName = Literal[
-    "adaptive", "exact", "lloyd", "poisson", "coupled", "weighted-lloyd", "weighted", "mmpde", "monge-ampere"
+    "adaptive", "exact", "transport", "lloyd", "poisson", "coupled", "weighted-lloyd", "weighted", "mmpde",
+    "monge-ampere",
 ]  # fmt: skip
 EffortName = Literal["fast", "default", "best"]
 Start = Literal["density", "uniform"]
 METHODS, EFFORTS, STARTS = get_args(MethodName), get_args(EffortName), get_args(Start)
-_MULTILEVEL = ("adaptive", "exact")
+_MULTILEVEL = ("adaptive", "exact", "transport")
 _MOST_STEPS = 10**6  # schedule and history are lists with one entry per step
 
 _USERS = {
@@ -62,7 +63,7 @@ def _check_numbers(options: Any) -> None:
 
 @dataclass(frozen=True)
 class MultilevelOptions:
-    """Options of the methods "adaptive" and "exact", which go from coarse to fine levels.
+    """Options of the methods "adaptive", "exact" and "transport", which go from coarse to fine levels.
 
     Parameters
     ----------
@@ -234,6 +235,11 @@ class Options:
         object.__setattr__(
             self, "layers", (layers,) if isinstance(layers, Layers) else tuple(layers)
         )
+        if self.layers and self.method == "transport":
+            raise InputError(
+                "layers are given with the method transport, expected none: the cells of a power diagram do not keep "
+                "their rows; use method='exact'"
+            )
         warn_of_unused(vars(self), [self.method])
 
     @property
@@ -254,7 +260,7 @@ def special(options: object) -> dict[str, Any]:
     if not isinstance(options, MultilevelOptions | PaperOptions):
         raise InputTypeError(
             f"options is {options!r:.60} of type {type(options).__name__}, expected clvoro.MultilevelOptions (methods "
-            "adaptive, exact) or clvoro.PaperOptions (the other methods)"
+            "adaptive, exact, transport) or clvoro.PaperOptions (the other methods)"
         )
     return dict(vars(options))
 

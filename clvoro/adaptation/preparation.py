@@ -17,6 +17,7 @@ from ..sizing import Sizing, as_field
 from ..sizing.field import Field
 from ..sizing.layers import limit_beside_layers
 from ..sizing.on_domain import on_domain
+from ..tessellation.power import require_power_domain
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
 from .efforts import is_near
 from .estimates import Extras, check_memory
@@ -28,7 +29,7 @@ from .quality_descent import OPENINGS
 from .sampling.charts import charted
 from .sampling.quadrature import DensityTree
 from .sampling.start import density_tree, sample_density, sample_uniform
-from .schedule import Action, adaptive_schedule, auto_levels, repeated_schedule
+from .schedule import MOVES, Action, Prescribe, adaptive_schedule, auto_levels, repeated_schedule
 from .stages import Stages
 from .state import MeshState, Setup
 
@@ -92,6 +93,8 @@ class Preparation:
     ) -> None:
         self.stages, self.domain, self.points, self.options = stages, domain, points, options
         n_cells = options.n_cells
+        if options.method == "transport":
+            require_power_domain(domain)
         # The other methods keep the number of given points.
         fixed_count = points is not None and not options.multilevel
         if points is not None and fixed_count and n_cells not in (None, len(points)):
@@ -286,11 +289,15 @@ class Preparation:
             return repeated_schedule(method, steps)
         near = self.may_need_correction_only and mesh is not None and self._is_near(mesh)
         # Models on spheres have C grids. The exact sizes would be lost.
-        open_triangles = isinstance(self.domain, Sphere) and options.method != "exact"
-        return adaptive_schedule(
-            self.domain.cell_dim, options.effort, self.levels, options.method == "exact", options.error_target,
+        exact = options.method in ("exact", "transport")
+        open_triangles = isinstance(self.domain, Sphere) and not exact
+        schedule = adaptive_schedule(
+            self.domain.cell_dim, options.effort, self.levels, exact, options.error_target,
             warm=self.points is not None, near=near, openings=OPENINGS if open_triangles else 0,
         )  # fmt: skip
+        if options.method == "transport":
+            schedule.append(Prescribe(MOVES))
+        return schedule
 
     def _is_near(self, mesh: MeshState) -> bool:
         n, n_cells = mesh.n, self.options.n_cells

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import check_callable
+from ..errors import InputTypeError
 from ..geometry.box import Domain
 from ..mesh.results import Result
 from ..tessellation.periodic.periodic_tessellator import FewCellsError
@@ -17,6 +19,22 @@ from .options import Checkpoint, Options, uses
 from .preparation import Preparation
 from .resume import Saved
 from .stages import Stages
+
+
+def check_run(domain: object, size: object, callback: Callable[[np.void], object] | None) -> None:
+    """Check the kinds of arguments of `Adapter.run` before a run begins."""
+    if callback is not None and not callable(callback):
+        raise InputTypeError(
+            f"callback is {callback!r} of type {type(callback).__name__}, expected a function of a row of the history"
+        )
+    if callback is not None:
+        check_callable(
+            "callback", callback, "a row of the history", "write lambda row: callback(...)"
+        )
+    if isinstance(size, Domain) and not isinstance(domain, Domain):
+        raise InputTypeError(
+            f"size is the domain {size!r}, and domain is a {type(domain).__name__}; exchange them: run(domain, size)"
+        )
 
 
 def run_adaptation(

@@ -11,6 +11,7 @@
                  target; some of the worst cells are deleted or split
 *separate*       short edges are pushed apart, without descent of the quality
 *project*        the same as polish with a very small penalty: all cells get their target size
+*prescribe*      after *project* in the method "transport": weights give the cells of a power diagram their volumes
 
 In 3D there is no lattice with dislocations, and a mesh that has been coupled long enough hardly loses quality in the
 projection:
@@ -81,6 +82,13 @@ LOOSE_LOG_RATIO_SCALE = 0.25
 
 Measured on F3, a ridge and two circles with target 0.08: the largest |e| is about 0.2 with 0.2, 0.23 to 0.25 with 0.3,
 0.27 to 0.29 with 0.5; larger scales give a minimum of Q that is larger by 0.003 to 0.01."""
+MOVES = 1
+"""Moves to the centroids of power cells.
+
+Measured on F2: the first one raises the mean of Q from .9889 to .9900, and the least from .887 to .906. The volumes
+follow from h at the generators, so that moves up the gradient of h amplify each other: after the third one, centroids
+of the ridge field are up to 0.85 of the cell's size from their generators, and 3 % of these are outside of their cells.
+"""
 STRIDE = 2.0
 """Largest displacement over h of a stride."""
 NEAR_PENALTY = 0.03
@@ -130,7 +138,14 @@ class CorrectCount:
     ahead: bool = False
 
 
-Action = Step | InsertDelete | RepairCells | Refine | CorrectCount | ResetMomentum
+@dataclass(frozen=True)
+class Prescribe:
+    """Give the cells their target volumes in a power diagram, again after each of `moves` moves to the centroids."""
+
+    moves: int = 0
+
+
+Action = Step | InsertDelete | RepairCells | Refine | CorrectCount | ResetMomentum | Prescribe
 
 
 def auto_levels(n: float, dim: int) -> int:

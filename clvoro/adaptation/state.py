@@ -20,6 +20,7 @@ from ..opencl.primitives import Summaries, Summary
 from ..sizing import Sizing
 from ..tessellation.bins import BinnedPoints
 from ..tessellation.device_diagram import Tessellation
+from ..tessellation.power import PowerTessellator
 from ..tessellation.readback.diagram import fetch_diagram
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights, LloydWeights
@@ -133,6 +134,8 @@ class MeshState:
         Solution of the last Poisson solve, the start of the next one.
     multipliers : (n,) float32 or None
         Solution of the last volume projection, the start of the next one.
+    power : PowerTessellator or None
+        What made the present diagram, if it is a power diagram.
     source : (n,) real
         Right side of the Poisson equation. It and the following arrays are in the workspace, valid for one step.
     lloyd, correction : (n, d) real
@@ -169,6 +172,7 @@ class MeshState:
         self.engine = self.stages.engine
         self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser)
         self.summaries = Summaries(self.engine, SUMMARIES)
+        self.power: PowerTessellator | None = None
         self._ordered: cla.Array | None = None
         if isinstance(start, _Data):
             self._data, self.next_label = start, len(start.generators)
@@ -324,22 +328,29 @@ class MeshState:
         stages, data = self.stages, self._data
         if data.cells is None:
             data.cells = CellArrays.empty(self.engine, self.n)
+        previous = data.tessellation
+        if previous is not None and previous.weighted is not None:
+            previous = None
         data.tessellation = self.tessellator.tessellate(
-            self.points, self.n, data.tessellation, binned=binned
+            self.points, self.n, previous, binned=binned
         )
         if self.engine.cell_dim == 2:
             # The next diagrams are usually updated from this one.
             stages.bins.clear()
         self.sizing.evaluate(self.points, self.n, self.h, self.size_factor)
-        with self.engine.workspace.frame():
-            changed = self.engine.scratch(self.n)
-            stages.metric.compare_neighbors(
-                self.t, self.labels, first, self.signatures, changed, self.ever_changed
-            )
-            self.evaluate_metric({"changed": changed, "ever_changed": self.ever_changed})
+        self.compare_and_evaluate(first)
         # An invalid size must be reported before it causes other errors, in the solver for instance.
         if check:
             self.sizing.check(self.points, self.h, self.size_factor)
+
+    def compare_and_evaluate(self, first: bool = False) -> None:
+        """Compare the neighbors with those of the last diagram, and evaluate error and quality."""
+        with self.engine.workspace.frame():
+            changed = self.engine.scratch(self.n)
+            self.stages.metric.compare_neighbors(
+                self.t, self.labels, first, self.signatures, changed, self.ever_changed
+            )
+            self.evaluate_metric({"changed": changed, "ever_changed": self.ever_changed})
 
     def evaluate_metric(self, others: Mapping[str, cla.Array] | None = None) -> None:
         """Evaluate and summarize error and quality, and summarize `others` by name."""
@@ -501,6 +512,10 @@ class MeshState:
         """
         self.stages.clear("poisson")
         self.engine.workspace.clear()
+        if self.t.weighted is not None and self.power is not None:
+            self.tessellation, self._extended = self.power.final(self.t), None
+            self.evaluate_metric()
+            return False
         whole = self.tessellator.has_extended(self.t)
         if not whole:
             # Free the present diagram before the new one is computed.
@@ -513,9 +528,12 @@ class MeshState:
 
     def fetch_diagram(self) -> Diagram:
         """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards."""
+        engine = self.engine
+        if self.t.weighted is not None and self.power is not None:
+            engine = self.power.stages.engine
         self.stages.release()
         return fetch_diagram(
-            self.engine, self.domain, self.t, self.labels, copy=False, extended=self._extended
+            engine, self.domain, self.t, self.labels, copy=False, extended=self._extended
         )
 
 

@@ -96,18 +96,18 @@ def _add_settings(run: Any) -> None:
     run.add_argument(
         "--method",
         metavar="M",
-        help="adaptive (the default), exact, or one kind of step: coupled (the paper's), lloyd, "
+        help="adaptive (the default), exact, transport, or one kind of step: coupled (the paper's), lloyd, "
         "poisson, weighted-lloyd, weighted, mmpde, monge-ampere; or several: lloyd,coupled",
     )
     run.add_argument(
         "--effort",
         choices=("fast", "default", "best"),
-        help="work against quality (adaptive, exact)",
+        help="work against quality (adaptive, exact, transport)",
     )
     run.add_argument(
         "--levels",
         metavar="N",
-        help="number of coarser levels to start from, or auto (the default; adaptive, exact)",
+        help="number of coarser levels to start from, or auto (the default; adaptive, exact, transport)",
     )
     run.add_argument(
         "--start", choices=("density", "uniform"), help="random start: by h^-d, or uniform"

@@ -150,7 +150,7 @@ class Diagram(MeshOutput):
         return value
 
     def _there(self) -> list[str]:
-        return [n for n in Diagram._NAMES if n in ("shifts", "weights") or n in self._arrays]
+        return [n for n in Diagram._NAMES if n == "shifts" or n in self._arrays]
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self._there()]

@@ -94,8 +94,8 @@ class Result(Sealed, MeshOutput):
         (methods that repeat one kind of step, a callback that stops the run), `final` is those of
         one more step of the same method.
     size_factor : float
-        With `n_cells` of methods "adaptive" and "exact", `target_size` is the size field times this common factor;
-        else 1.
+        With `n_cells` of methods "adaptive" and "exact", and always with "transport", `target_size` is the size field
+        times this common factor; else 1.
     settings : dict
         The options that the method uses, to repeat the run.
     origin : (n,) int32 or None

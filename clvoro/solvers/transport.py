@@ -12,13 +12,17 @@ from dataclasses import dataclass, field
 import numpy as np
 import pyopencl.array as cla
 
-from ..errors import SolverError
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..tessellation.device_diagram import Tessellation
 from ..tessellation.power import PowerTessellator
+from .conjugate_gradient import Solution
 from .poisson import Poisson
 
+TOLERANCE = {"float64": 1e-10, "float32": 1e-3}
+"""Default of the largest relative error of volumes."""
+MAX_STEPS = 100
+"""Default of the largest number of Newton steps."""
 LEAST_SHARE = 2.0**-20
 """Smallest share of a Newton step."""
 FORCING, ROUGHEST = 0.1, 1e-3
@@ -37,15 +41,21 @@ class Newton:
         Largest |V - m| / m at the start and after each step.
     shares : list of float
         Share of each Newton step that was taken.
+    factor : float
+        Factor on the prescribed volumes that makes their sum that of the domain.
     converged : bool
     far : int
         Number of cells whose error is above the tolerance, at the end.
+    solution : Solution
+        Of the last linear solve.
     """
 
     errors: list[float] = field(default_factory=list)
     shares: list[float] = field(default_factory=list)
+    factor: float = 1.0
     converged: bool = False
     far: int = 0
+    solution: Solution = field(default_factory=Solution.zero)
 
 
 @dataclass
@@ -70,68 +80,65 @@ class Transport:
         self._kernels = engine.kernels("solvers/transport")
         self._summaries = Summaries(engine, ("volume", "square", "relative"))
 
+    def prescribe_sizes(self, h: cla.Array) -> cla.Array:
+        """Return the volumes h^d (n,) of the target sizes `h` (n,)."""
+        prescribed = self.engine.empty(len(h))
+        self.engine.run_each(self._kernels.prescribe_sizes, len(h), h, prescribed)
+        return prescribed
+
     def solve(
         self,
         power: PowerTessellator,
         points: cla.Array,
-        volumes: np.ndarray,
-        weights: cla.Array,
-        tolerance: float,
-        max_steps: int,
+        prescribed: cla.Array,
+        start: cla.Array | None = None,
+        tolerance: float | None = None,
+        max_steps: int = MAX_STEPS,
         exact: bool = False,
     ) -> tuple[Tessellation, cla.Array, Newton]:
-        """Return the power diagram of `points` (n, d) with the prescribed `volumes` (n,), its weights, and the steps.
+        """Return the power diagram of `points` (n, d) with the `prescribed` volumes (n,), its weights, and the steps.
 
         Parameters
         ----------
-        volumes : (n,) float64
-            In the device's unit. A common factor makes their sum that of the cells.
-        weights : (n,) real
-            Start. With 0 each cell contains its generator, and none is empty.
-        tolerance : float
-            Largest |V - m| / m.
+        prescribed : (n,) real
+            Changed by a common factor, so that their sum is the volume of the domain.
+        start : (n,) real, optional
+            Weights to start from, unless they leave a cell empty. By default 0: no cell is empty then.
+        tolerance : float, optional
+            Largest |V - m| / m; by default that of `TOLERANCE`.
         max_steps : int
         exact : bool
             As for `PowerTessellator.tessellate`.
-
-        Raises
-        ------
-        SolverError
-            If a cell is empty at the start.
         """
-        engine, n, newton = self.engine, len(volumes), Newton()
-        whole = np.prod(np.subtract(*power.domain.device_corners(engine.real)[::-1])[: engine.dim])
-        prescribed = engine.upload(volumes * (float(whole) / volumes.sum()))
-        least = float(prescribed.get().min())
-        now = self._evaluate(power, points, prescribed, weights, exact)
-        if not now.least > 0:
-            empty = int((now.t.volumes.get() <= 0).sum())
-            raise SolverError(
-                f"{empty} of {n} cells are empty at the start of Newton's method, expected none; start from weights 0"
-            )
+        engine, n = self.engine, len(prescribed)
+        tolerance = TOLERANCE[engine.real.name] if tolerance is None else tolerance
+        newton = Newton(factor=self._fit(power, prescribed))
+        least = self._summaries.read_one("volume").least * newton.factor
+
+        def evaluate(weights: cla.Array) -> _State:
+            return self._evaluate(power, points, prescribed, weights, exact)
+
+        now = None if start is None else evaluate(start)
+        if now is None or not now.least > 0:
+            now = evaluate(engine.zeros(n))
         least = 0.5 * min(least, now.least)
         newton.errors.append(now.error)
         ordering = object()
         while now.error > tolerance and len(newton.shares) < max_steps:
-            step = self._newton_step(now, points, ordering)
-            share = 1.0
-            while share >= LEAST_SHARE:
+            step, newton.solution = self._newton_step(now, points, ordering)
+            new, share = None, 2.0
+            while new is None and share > LEAST_SHARE:
+                share /= 2
                 stepped = engine.empty(n)
                 engine.run_each(
-                    self._kernels.step_weights,
-                    n,
-                    engine.real.type(share),
-                    now.weights,
-                    step,
-                    stepped,
-                )
-                new = self._evaluate(power, points, prescribed, stepped, exact)
-                if new.least >= least and new.norm <= (1 - share / 2) * now.norm:
-                    break
-                share /= 2
-            else:
+                    self._kernels.step_weights, n, engine.real.type(share), now.weights, step, stepped
+                )  # fmt: skip
+                new = evaluate(stepped)
+                if new.least < least or new.norm > (1 - share / 2) * now.norm:
+                    new = None
+            if new is None:
                 # Round-off prevents any progress. The arrays of the diagram are overwritten.
-                now = self._evaluate(power, points, prescribed, now.weights, exact)
+                now = evaluate(now.weights)
                 break
             now = new
             newton.errors.append(now.error)
@@ -140,6 +147,18 @@ class Transport:
         if not newton.converged:
             newton.far = int((np.abs(now.relative.get()) > tolerance).sum())
         return now.t, now.weights, newton
+
+    def _fit(self, power: PowerTessellator, prescribed: cla.Array) -> float:
+        """Scale volumes so that their sum is that of the domain; return the factor."""
+        engine = self.engine
+        lower, upper = power.domain.device_corners(engine.real)
+        whole = float(np.prod((upper - lower)[: engine.dim].astype(float)))
+        self._summaries.collect("volume", prescribed, len(prescribed))
+        factor = whole / self._summaries.read_one("volume").sum
+        engine.run_each(
+            self._kernels.scale_volumes, len(prescribed), engine.real.type(factor), prescribed
+        )
+        return factor
 
     def _evaluate(
         self,
@@ -163,7 +182,9 @@ class Transport:
             weights, t, rhs, relative, s["square"].sum ** 0.5, s["relative"].peak, s["volume"].least
         )
 
-    def _newton_step(self, now: _State, points: cla.Array, ordering: object) -> cla.Array:
+    def _newton_step(
+        self, now: _State, points: cla.Array, ordering: object
+    ) -> tuple[cla.Array, Solution]:
         engine, t = self.engine, now.t
         tolerance = max(min(ROUGHEST, FORCING * now.error), FINEST[engine.real.name])
         step = engine.empty(len(points))
@@ -171,7 +192,7 @@ class Transport:
             laplacian = self._poisson.assemble(
                 t.starts, t.neighbors, t.face_measures, points, tolerance=tolerance
             )
-            self._poisson.solve(
+            solution = self._poisson.solve(
                 laplacian, now.rhs, step, tolerance=tolerance, ordering=ordering, from_zero=True
             )
-        return step
+        return step, solution

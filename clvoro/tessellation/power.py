@@ -13,7 +13,16 @@ import pyopencl.array as cla
 from ..errors import InputError
 from ..geometry.box import Box, Domain
 from .device_diagram import CloseError, Tessellation
+from .polyhedra import Polyhedra
 from .stages import TessellationStages
+
+
+def require_power_domain(domain: Domain) -> None:
+    """Raise InputError if there are no power diagrams in such a domain."""
+    if not isinstance(domain, Box) or any(domain.periodic):
+        raise InputError(
+            f"the domain is {domain}, expected a box with walls: there are no power diagrams in other domains"
+        )
 
 
 class PowerTessellator:
@@ -28,10 +37,7 @@ class PowerTessellator:
     """
 
     def __init__(self, stages: TessellationStages, domain: Domain) -> None:
-        if not isinstance(domain, Box) or any(domain.periodic):
-            raise InputError(
-                f"the domain is {domain}, expected a box with walls: there are no power diagrams in other domains"
-            )
+        require_power_domain(domain)
         self.stages, self.domain = stages.weighted, domain
         self._kernels = self.stages.engine.kernels("tessellation/power")
 
@@ -58,4 +64,4 @@ class PowerTessellator:
     def final(self, t: Tessellation) -> Tessellation:
         """Return `t`, the latest diagram, with faces in full precision."""
         cells = self.stages.cells
-        return cells.measure_faces(self.domain, t) if self.stages.engine.dim == 2 else t
+        return t if isinstance(cells, Polyhedra) else cells.measure_faces(self.domain, t)

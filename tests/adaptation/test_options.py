@@ -100,7 +100,9 @@ def test_values_without_effect_cause_no_warning(adapter):
         adapter.run(BOX, 0.4, effort="fast", options=PaperOptions(tol=0))
         adapter.run(BOX, 0.4, method="lloyd", max_steps=0, options=MultilevelOptions(levels=0))
         adapter.memory_needed(BOX, 0.1, method="lloyd")
-    with pytest.warns(UnusedOptionWarning, match="it is for adaptive, exact; leave it out"):
+    with pytest.warns(
+        UnusedOptionWarning, match="it is for adaptive, exact, transport; leave it out"
+    ):
         adapter.memory_needed(BOX, 0.1, method="lloyd", options=MultilevelOptions(levels=2))
 
 

@@ -10,13 +10,12 @@ from ...errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWa
 from ...geometry.box import Domain
 from ...mesh.diagram import Diagram
 from ...mesh.transported import Transported
+from ...solvers.transport import TOLERANCE
 from ...tessellation.power import PowerTessellator
 from ...tessellation.readback.diagram import fetch_diagram
 from ..estimates import check_memory
 from ..stages import Stages
 
-TOLERANCE = {"float64": 1e-10, "float32": 1e-3}
-"""Default of the largest relative error of volumes."""
 SUM_TOLERANCE = 1e-9
 """Largest relative difference of the sum of volumes from the measure of the domain."""
 WITHIN_REACH = 4.0
@@ -72,7 +71,7 @@ def transport_to(
         labels, sorted_points = _sorted(stages, domain, host)
         prescribed = given[labels.get()] / domain.frame[1] ** domain.cell_dim
         t, _, newton = stages.transport.solve(
-            power, sorted_points, prescribed, engine.zeros(n), tolerance, most, exact=True
+            power, sorted_points, engine.upload(prescribed), None, tolerance, most, exact=True
         )
     diagram = fetch_diagram(power.stages.engine, domain, power.final(t), labels)
     result = Transported(
