@@ -18,6 +18,8 @@ from .checkpoint import Checkpointer
 from .efforts import RepairCells
 from .forecast import MOST_SURPLUS
 from .methods import Method
+from .moving.mmpde import MmpdeMethod
+from .moving.monge_ampere import MongeAmpereMethod
 from .schedule import (
     Action,
     CorrectCount,
@@ -391,7 +393,12 @@ class Loop:
         return "max_steps reached" if over or used_up else ""
 
     def stalled(self) -> bool:
-        """Return whether both mean error and mean quality have improved by less than `tol` over the last steps."""
+        """Return whether both mean error and mean quality have improved by less than `tol` over the last steps.
+
+        Moving meshes have criteria of their own.
+        """
+        if isinstance(self.last, MmpdeMethod | MongeAmpereMethod):
+            return bool(self.tol) and self.last.finished
         if not self.tol or len(self.rows) <= 2 * WINDOW:
             return False
         history = np.concatenate(self.rows[-2 * WINDOW :])

@@ -266,11 +266,14 @@ MOVING = ("mmpde", "monge-ampere")
 """Methods that repeat one kind of step and map a lattice: they start from it, in a box with walls."""
 
 
-def make_method(name: str, relaxation: Relaxation, lattice: np.ndarray | None = None) -> Method:
+def make_method(
+    name: str, relaxation: Relaxation, lattice: np.ndarray | None = None, tolerance: float = 1e-3
+) -> Method:
     """Return the method called `name`, one of `PUBLISHED` or `MOVING`; these need the `lattice` (n, d) at the start."""
     if name in MOVING:
         assert lattice is not None
-        return MmpdeMethod(lattice) if name == "mmpde" else MongeAmpereMethod(lattice)
+        kind = MmpdeMethod if name == "mmpde" else MongeAmpereMethod
+        return kind(lattice, tolerance)
     if name.startswith("weighted"):
         return WeightedMethod(k=relaxation.k, poisson=name == "weighted")
     return PublishedMethod(relaxation, lloyd=name != "poisson", poisson=name != "lloyd")

@@ -102,7 +102,8 @@ class PaperOptions:
     ----------
     tol : float
         Stop when mean error and mean quality have improved by less than this share over ten steps. With 0 the run
-        takes all steps.
+        takes all steps. "mmpde" stops when ten steps have decreased its functional by less than this share of the
+        decrease so far, "monge-ampere" when the logarithm of its equation is constant to this number.
     alpha : float, optional
         Largest relaxation coefficient of the correction, in the paper's (3.4); by default d. Only "lloyd", "poisson"
         and "coupled" use it.

@@ -285,7 +285,7 @@ class Preparation:
         if not options.multilevel:
             relaxation = Relaxation(options.alpha, options.k)
             steps = STEPS if options.max_steps is None else options.max_steps
-            method = make_method(options.method, relaxation, self.lattice)
+            method = make_method(options.method, relaxation, self.lattice, options.tol)
             return repeated_schedule(method, steps)
         near = self.may_need_correction_only and mesh is not None and self._is_near(mesh)
         # Models on spheres have C grids. The exact sizes would be lost.

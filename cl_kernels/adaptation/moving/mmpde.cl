@@ -52,19 +52,20 @@ inline void place_vertex(global const REAL *points, const int n, const int j, gl
 }
 
 /* One generator: descent = -rate dI/dx / D, with D = sum_K W p (G1 + p G2) |a|^2, an estimate of the second derivative.
-   power = dI/dx . velocity, flat = 1 if a simplex has no volume, else 0. room = the least height of the simplices.
+   energy = its share of I, power = dI/dx . velocity, flat = 1 if a simplex has no volume, else 0. room = the least
+   height of the simplices.
 
    Row i of `vertices` holds the other d vertices of each simplex of generator i. */
 kernel void descend_functional(const int size, global const int *starts, global const int *vertices,
                                global const int *owners, global const int *codes, global const REAL *reference,
                                global const REAL *points, global const REAL *h, global const REAL *gradient,
                                global const REAL *velocity, const REAL rate, DOMAIN_ARGS, global REAL *descent,
-                               global REAL *power, global REAL *flat, global REAL *room)
+                               global REAL *energy, global REAL *power, global REAL *flat, global REAL *room)
 {
     WORK_ITEM(i);
     BOX_CORNERS(lower, upper);
     const REAL p = R(1.5), theta = R(1) / 3;
-    REAL force[DIM], steepest = 0, stiffness = 0, folded = 0;
+    REAL force[DIM], steepest = 0, stiffness = 0, share = 0, folded = 0;
     EACH_AXIS(c)
     force[c] = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
@@ -134,6 +135,7 @@ kernel void descend_functional(const int size, global const int *starts, global 
         EACH_AXIS(c)
         force[c] += weight * ((g1 + g2 - p * g2) * a0[c] - p * DIM * g1 / norm2 * mapped[c] +
                               (g1 + g2) * DIM * (p - 1) / (DIM + 1) * gradient[DIM * i + c]);
+        share += weight * (g1 + g2) / (DIM + 1);
         stiffness += weight * p * (g1 + p * g2) * length2;
     }
     REAL work = 0;
@@ -142,6 +144,7 @@ kernel void descend_functional(const int size, global const int *starts, global 
         descent[DIM * i + c] = stiffness > 0 ? -rate * force[c] / stiffness : 0;
         work += force[c] * velocity[DIM * i + c];
     }
+    energy[i] = share;
     power[i] = work;
     flat[i] = folded;
     room[i] = steepest > 0 ? 1 / sqrt(steepest) : 0;

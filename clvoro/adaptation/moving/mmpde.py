@@ -27,8 +27,10 @@ if TYPE_CHECKING:
 RATE = 0.4
 """Step of the descent, over the inverse of the estimated second derivative. Measured on the test fields of
 bench/_common.py: 0.25 is slower, from 0.5 on the last steps oscillate."""
-MOST_MOMENTUM = 0.97
+MOST_MOMENTUM = 0.99
 """Largest share of the last displacement that is added. After m steps without a restart it is m / (m + 3)."""
+WINDOW = 10
+"""Steps over which decreases of the functional are compared."""
 LONGEST = 0.5
 """Largest displacement over min(L, h)."""
 ROOM = 0.3
@@ -104,7 +106,7 @@ class Mmpde:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels = engine.kernels("adaptation/moving/mmpde")
-        self._summaries = Summaries(engine, ("power", "flat"))
+        self._summaries = Summaries(engine, ("energy", "power", "flat"))
 
     def descend_functional(
         self,
@@ -113,22 +115,22 @@ class Mmpde:
         gradient: cla.Array,
         descent: cla.Array,
         room: cla.Array,
-    ) -> tuple[float, int]:
+    ) -> tuple[float, float, int]:
         """Write the step of the steepest descent to `descent` (n, d), and the least height of simplices to `room` (n,).
 
-        Return the derivative of the functional along the last displacement, and the number of generators beside
-        simplices without volume. `gradient` (n, d) is grad log h.
+        Return the functional, its derivative along the last displacement, and the number of generators beside simplices
+        without volume. `gradient` (n, d) is grad log h.
         """
         c, real = connections, self.engine.real.type
-        power, flat = self.engine.scratch(mesh.n), self.engine.scratch(mesh.n)
+        energy, power, flat = (self.engine.scratch(mesh.n) for _ in range(3))
         self.engine.run_each(
             self._kernels.descend_functional, mesh.n, c.starts, c.vertices, c.owners, c.codes, c.reference,
             mesh.points, mesh.h, gradient, mesh.velocity, real(RATE), *mesh.domain.device_args(self.engine), descent,
-            power, flat, room,
+            energy, power, flat, room,
         )  # fmt: skip
-        self._summaries.collect_all({"power": power, "flat": flat}, mesh.n)
+        self._summaries.collect_all({"energy": energy, "power": power, "flat": flat}, mesh.n)
         found = self._summaries.read()
-        return found["power"].sum, round(found["flat"].sum)
+        return found["energy"].sum, found["power"].sum, round(found["flat"].sum)
 
     def bound_displacement(self, mesh: MeshState, share: float, room: cla.Array) -> None:
         """Add `share` of the last displacement to `mesh.lloyd`, and bound its length."""
@@ -147,14 +149,27 @@ class MmpdeMethod:
     ----------
     lattice : (n, d) float64
         The generators at the start, in the order of their labels.
+    tolerance : float
+        Least decrease of the functional over `WINDOW` steps, over that since the start.
     age : int
         Steps since the last restart.
+    steps : int
+        Steps done.
+    first, energy : float
+        The functional at the start, and at the begin of the window.
+    finished : bool
+        Whether the functional no longer decreases.
     warned : int
         1 after a warning.
     """
 
     lattice: np.ndarray = field(repr=False)
+    tolerance: float = 1e-3
     age: int = 0
+    steps: int = 0
+    first: float = 0.0
+    energy: float = 0.0
+    finished: bool = False
     warned: int = 0
     connections: Connections | None = field(default=None, repr=False)
 
@@ -175,16 +190,27 @@ class MmpdeMethod:
         with engine.workspace.frame():
             gradient, sizes = engine.scratch(mesh.points.shape), engine.scratch(mesh.n)
             mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
-            power, folded = stage.descend_functional(
+            energy, power, folded = stage.descend_functional(
                 mesh, self.connections, gradient, mesh.lloyd, room
             )
         self._warn(folded, mesh.n)
+        self._compare(energy)
         # Uphill: forget the last displacement.
         self.age = 0 if power > 0 else self.age + 1
         stage.bound_displacement(mesh, min(MOST_MOMENTUM, self.age / (self.age + 3)), room)
         mesh.measure_displacements()
         mesh.summarize_displacements()
         return Solution.zero()
+
+    def _compare(self, energy: float) -> None:
+        """Finish if the functional has hardly decreased over a window of steps."""
+        if self.steps == 0:
+            self.first = energy
+        elif self.steps % WINDOW == 0:
+            self.finished = self.energy - energy <= self.tolerance * (self.first - energy)
+        if self.steps % WINDOW == 0:
+            self.energy = energy
+        self.steps += 1
 
     def _warn(self, folded: int, n: int) -> None:
         if folded and not self.warned:

@@ -36,7 +36,7 @@ SHORTEST = 2.0**-10
 LEAST_STRETCH = 0.3
 """Smallest eigenvalue of I + H after a step, over that before."""
 CONVERGED = {np.dtype(np.float64): 1e-6, np.dtype(np.float32): 1e-3}
-"""Standard deviation of the logarithm of rho det(I + H) with which the equation is solved."""
+"""Standard deviation of the logarithm of rho det(I + H) that is not reduced any more."""
 TOLERANCE, MOST_ITERATIONS = 1e-2, 2000
 """Limits of the linear solves: BiCGStab with Jacobi's preconditioner. Measured on F2 and S2, a factorization takes as
 long in 2D, and ten times as long in 3D."""
@@ -140,15 +140,21 @@ class MongeAmpereMethod:
     ----------
     lattice : (n, d) float64
         The generators at the start, in the order of their labels.
+    tolerance : float
+        Standard deviation of the logarithm of rho det(I + H) below which the method is finished.
     share : float
         Share of Newton's step that the last step has taken.
     warned : int
         1 after a warning. Then the map stays.
+    finished : bool
+        Whether the equation is solved to the tolerance.
     """
 
     lattice: np.ndarray = field(repr=False)
+    tolerance: float = 1e-3
     share: float = 1.0
     warned: int = 0
+    finished: bool = False
     map: LatticeMap | None = field(default=None, repr=False)
 
     def displace(self, mesh: MeshState) -> Solution:
@@ -177,6 +183,8 @@ class MongeAmpereMethod:
     def _step(self, mesh: MeshState, phi: np.ndarray) -> tuple[np.ndarray, Solution]:
         """Return phi after one step."""
         assert self.map is not None
+        if self.warned:
+            return phi, Solution.zero()
         d, jacobian = mesh.domain.dim, self.map.jacobian(phi)
         x = self.map.place(phi)
 
@@ -186,7 +194,8 @@ class MongeAmpereMethod:
 
         stretch = np.linalg.eigvalsh(jacobian)[:, 0]
         before = residual(x, jacobian)
-        if before.std() < CONVERGED[mesh.engine.real] or self.warned:
+        self.finished = bool(before.std() < self.tolerance)
+        if before.std() < CONVERGED[mesh.engine.real]:
             return phi, Solution.zero()
         change, iterations = self.map.newton(jacobian, -d * _slope(mesh, x), before)
         share, bad = min(1.0, 4 * self.share), np.zeros(mesh.n, bool)

@@ -39,7 +39,7 @@ def test_descent_is_that_of_the_functional(ctx, dim):
     room, sizes = engine.empty(n), engine.empty(n)
     mesh.sizing.evaluate_with_gradient(mesh.points, n, sizes, gradient)
     c = connect(engine, mesh.domain, lattice)
-    _, folded = mesh.stages.mmpde.descend_functional(mesh, c, gradient, descent, room)
+    energy, _, folded = mesh.stages.mmpde.descend_functional(mesh, c, gradient, descent, room)
     assert folded == 0
     images = c.owners.get(), c.codes.get()
     x, xi = (moving.with_images(v, *images, mesh.domain) for v in (points, lattice))
@@ -51,6 +51,8 @@ def test_descent_is_that_of_the_functional(ctx, dim):
     )
     # The diagonals of cospherical points at walls are not those of their images.
     assert volumes.sum() / (dim + 1) == pytest.approx(mesh.domain.measure, rel=0.03)
+    terms = moving.functional(x, xi, h, simplices)
+    assert energy == pytest.approx(terms.sum() / (dim + 1))
     places = (points.mean(axis=0), [0, 0.4, 0.4][:dim], [0, 0, 0][:dim])
     for i in (int(np.abs(points - place).sum(axis=1).argmin()) for place in places):
         around = simplices[rows == i]

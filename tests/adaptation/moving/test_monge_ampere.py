@@ -38,12 +38,12 @@ def test_transport_in_one_direction(adapter, dim):
     """Sizes depend on x: the transport is that of the marginal densities, to a small part of a cell."""
     box, n = BOXES[dim], {2: 600, 3: 300}[dim]
     size = sizing.Expression("0.04 + 0.06 * x")
-    result = adapter.run(box, size, method="monge-ampere", n_cells=n, max_steps=12)
+    result = adapter.run(box, size, method="monge-ampere", n_cells=n, max_steps=20)
     xi = lattice_points(box, n)
     expected = moving.transported(xi[:, 0], lambda x: (0.04 + 0.06 * x) ** -dim, box.extent[0])
     off = np.column_stack([expected, xi[:, 1:]]) - result.points
     assert np.abs(off / result.target_size[:, None]).mean() < 0.06
-    assert result.history["residual"][-1] < 1e-6
+    assert result.converged
 
 
 def test_a_fold_is_reported(adapter):
@@ -52,4 +52,4 @@ def test_a_fold_is_reported(adapter):
     with pytest.warns(TangledMeshWarning, match=r"fold at \d+ of 500 generators"):
         result = adapter.run(BOXES[2], size, method="monge-ampere", n_cells=500, max_steps=40)
     assert np.isfinite(result.points).all()
-    assert len(result.points) == 500
+    assert not result.converged
