@@ -314,16 +314,14 @@ inline int nothing_left(CELL *cell)
 inline int clip_polyhedron(CELL *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
 {
     const REAL level = (d2 - (WEIGHT(points, label) - OWN_WEIGHT(cell))) / 2;
-    const int blocks = (cell->n + 7) / 8;
-    REAL8 far = -level;
-    for (int b = 0; b < blocks; ++b) {
-        const REAL8 s = fma(cell->x[b], d.s0, fma(cell->y[b], d.s1, fma(cell->z[b], d.s2, -level)));
+    REALS far = -level;
+    SHORT_LOOP
+    for (int b = 0; CELL_LANES * b < cell->n; ++b) {
+        const REALS s = fma(cell->x[b], d.s0, fma(cell->y[b], d.s1, fma(cell->z[b], d.s2, -level)));
         cell->beyond[b] = s;
         far = s > far ? s : far;
     }
-    const REAL4 far4 = far.lo > far.hi ? far.lo : far.hi;
-    const REAL2 far2 = far4.lo > far4.hi ? far4.lo : far4.hi;
-    const REAL farthest = far2.s0 > far2.s1 ? far2.s0 : far2.s1;
+    const REAL farthest = largest_of(far);
     /* Most bisectors miss the cell: avoid the square root. */
     if (!(farthest > (CLIP_SHARPLY ? 0 : 4 * REAL_EPS * d2)))
         return CLIP_MISSED;

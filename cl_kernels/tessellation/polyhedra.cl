@@ -37,6 +37,30 @@ inline void write_corners(const CELL *cell, global uchar4 *corners)
     }
 }
 
+/* Moments of the cell, up to a factor: xx, yy, zz, and yz, zx, xy; see `clip_polyhedra`. They are summed on their own,
+   because a work-item of a GPU has few registers. */
+inline void second_moments(const CELL *cell, CELL_SPACE const INDEX *start, REAL4 *square, REAL4 *mixed)
+{
+    *square = *mixed = 0;
+    for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1)) {
+        const REAL4 plane = cell->planes[f];
+        const REAL inverse = 1 / sqrt(plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2);
+        const REAL4 normal = plane * inverse;
+        const REAL4 a = vertex_at(cell, start[f]);
+        int v = vertex_after(cell, start[f], f);
+        REAL4 b = vertex_at(cell, v), of_square = 0, of_mixed = 0;
+        for (v = vertex_after(cell, v, f); v != start[f]; v = vertex_after(cell, v, f)) {
+            const REAL4 c = vertex_at(cell, v), s = a + b + c;
+            const REAL weight = dot3(cross3(b - a, c - a), normal);
+            of_square += weight * (a * a + b * b + c * c + s * s);
+            of_mixed += weight * (a.yzxw * a.zxyw + b.yzxw * b.zxyw + c.yzxw * c.zxyw + s.yzxw * s.zxyw);
+            b = c;
+        }
+        *square += normal.s3 * of_square;
+        *mixed += normal.s3 * of_mixed;
+    }
+}
+
 #ifdef HALO
 /* Test the balls around the vertices of the cell of generator i. */
 inline void check_cell_balls(const CELL *cell, int i, REAL4 place, const halo_t *halo)
@@ -160,7 +184,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         int count = 0;
         bool doubtful = cell->torn, narrow = false;
         REAL volume = 0, lost = 0;
-        REAL4 first = 0, square = 0, mixed = 0; /* moments: x, y, z; xx, yy, zz; yz, zx, xy */
+        REAL4 first = 0; /* moments x, y, z */
         for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1)) {
             const REAL4 plane = cell->planes[f];
             const REAL d2 = plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2;
@@ -170,25 +194,17 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
             const REAL4 a = vertex_at(cell, first_vertex);
             int v = vertex_after(cell, first_vertex, f);
             REAL4 b = vertex_at(cell, v);
-            REAL4 ab = b - a;
             REAL area = 0;
-            REAL4 face_first = 0, face_square = 0, face_mixed = 0;
+            REAL4 face_first = 0;
             for (v = vertex_after(cell, v, f); v != first_vertex; v = vertex_after(cell, v, f)) {
                 const REAL4 c = vertex_at(cell, v);
-                const REAL4 ac = c - a;
-                const REAL weight = dot3(cross3(ab, ac), normal);
-                const REAL4 s = a + b + c;
+                const REAL weight = dot3(cross3(b - a, c - a), normal);
                 area += weight;
-                face_first += weight * s;
-                face_square += weight * (a * a + b * b + c * c + s * s);
-                face_mixed += weight * (a.yzxw * a.zxyw + b.yzxw * b.zxyw + c.yzxw * c.zxyw + s.yzxw * s.zxyw);
+                face_first += weight * (a + b + c);
                 b = c;
-                ab = ac;
             }
             volume += normal.s3 * area;
             first += normal.s3 * face_first;
-            square += normal.s3 * face_square;
-            mixed += normal.s3 * face_mixed;
             const int label = cell->labels[f];
             /* Faces below round-off are dropped. Faces so small that a neighbor might drop them are doubtful. */
             const REAL across2 = label >= 0 ? d2 : cell->reach2;
@@ -239,6 +255,8 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
             atomic_or(report, FLAG_COLLAPSED);
         else if (lost > EVEN_SHARE * volume)
             atomic_or(report, FLAG_UNEVEN);
+        REAL4 square, mixed;
+        second_moments(cell, start, &square, &mixed);
         const REAL inverse = 1 / volume;
         first *= inverse / 4;
         square = square * (inverse / 20) - first * first;

@@ -8,7 +8,14 @@
 #ifndef FACE_CAPACITY
 #error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 32"
 #endif
-#define REAL8 CLVORO_JOIN(REAL, 8)
+/* Vertices at a time: eight in the lanes of a vector on CPUs; one on other devices, which have few registers. */
+#if GROUP_SIZE == 1
+#define CELL_LANES 8
+#define REALS CLVORO_JOIN(REAL, 8)
+#else
+#define CELL_LANES 1
+#define REALS REAL
+#endif
 /* F faces have 2 F - 4 vertices, and up to F new ones beside them while they are clipped. In private memory there is
    room for few new ones: a cell that needs more counts as full. */
 #ifdef CELL_BYTES
@@ -65,15 +72,15 @@ typedef struct {
 
 /* Arrays of vertices are padded to whole vectors by zeros: the generator itself, which no bisector cuts off. */
 typedef struct {
-    REAL8 x[VERTEX_CAPACITY / 8], y[VERTEX_CAPACITY / 8], z[VERTEX_CAPACITY / 8];
-    REAL8 beyond[VERTEX_CAPACITY / 8]; /* signed distances from a bisector, times |d| */
-    REAL4 planes[FACE_CAPACITY];       /* of a face: d, level; the plane is y.d = level */
-    int labels[FACE_CAPACITY];         /* of a face: a generator, or -1 - wall */
-    INDEX4 faces[VERTEX_CAPACITY];     /* of a vertex, counter-clockwise: a, b, c */
-    INDEX4 links[VERTEX_CAPACITY];     /* of a vertex: the other ends of the edges between a and b, b and c, c and a */
-    int n;                             /* vertices */
-    bool torn;                         /* whether a clip kept something that it should have removed; see clip.h */
-    REAL reach2;                       /* largest squared distance of a vertex from the generator */
+    REALS x[VERTEX_CAPACITY / CELL_LANES], y[VERTEX_CAPACITY / CELL_LANES], z[VERTEX_CAPACITY / CELL_LANES];
+    REALS beyond[VERTEX_CAPACITY / CELL_LANES]; /* signed distances from a bisector, times |d| */
+    REAL4 planes[FACE_CAPACITY];                /* of a face: d, level; the plane is y.d = level */
+    int labels[FACE_CAPACITY];                  /* of a face: a generator, or -1 - wall */
+    INDEX4 faces[VERTEX_CAPACITY];              /* of a vertex, counter-clockwise: a, b, c */
+    INDEX4 links[VERTEX_CAPACITY]; /* of a vertex: the other ends of the edges between a and b, b and c, c and a */
+    int n;                         /* vertices */
+    bool torn;                     /* whether a clip kept something that it should have removed; see clip.h */
+    REAL reach2;                   /* largest squared distance of a vertex from the generator */
 #ifdef WEIGHTED
     REAL weight; /* of the generator */
     REAL most;   /* largest difference of the weight of a generator that is searched from this one */
@@ -143,17 +150,26 @@ inline void link_vertex(CELL *cell, int w, int first, int v)
     ((CELL_SPACE INDEX *)(cell->links + w))[k] = v;
 }
 
+inline REAL largest_of(REALS v)
+{
+#if CELL_LANES == 1
+    return v;
+#else
+    const REAL4 half4 = v.lo > v.hi ? v.lo : v.hi;
+    const REAL2 half2 = half4.lo > half4.hi ? half4.lo : half4.hi;
+    return half2.s0 > half2.s1 ? half2.s0 : half2.s1;
+#endif
+}
+
 inline void find_reach(CELL *cell)
 {
-    const int blocks = (cell->n + 7) / 8;
-    REAL8 far = fma(cell->x[0], cell->x[0], fma(cell->y[0], cell->y[0], cell->z[0] * cell->z[0]));
-    for (int b = 1; b < blocks; ++b) {
-        const REAL8 r2 = fma(cell->x[b], cell->x[b], fma(cell->y[b], cell->y[b], cell->z[b] * cell->z[b]));
+    REALS far = 0;
+    SHORT_LOOP
+    for (int b = 0; CELL_LANES * b < cell->n; ++b) {
+        const REALS r2 = fma(cell->x[b], cell->x[b], fma(cell->y[b], cell->y[b], cell->z[b] * cell->z[b]));
         far = r2 > far ? r2 : far;
     }
-    const REAL4 half4 = far.lo > far.hi ? far.lo : far.hi;
-    const REAL2 half2 = half4.lo > half4.hi ? half4.lo : half4.hi;
-    cell->reach2 = half2.s0 > half2.s1 ? half2.s0 : half2.s1;
+    cell->reach2 = largest_of(far);
 }
 
 /* The position of generator i, and its weight. */
@@ -171,12 +187,14 @@ inline void start_polyhedron(CELL *cell, REAL4 x, REAL4 lower, REAL4 upper)
     for (int k = 0; k < FACE_WORDS; ++k)
         cell->alive[k] = k == 0 ? 63 : 0;
     const REAL4 low = lower - x, high = upper - x;
-    cell->x[0] = (REAL8)(low.s0, high.s0, low.s0, high.s0, low.s0, high.s0, low.s0, high.s0);
-    cell->y[0] = (REAL8)(low.s1, low.s1, high.s1, high.s1, low.s1, low.s1, high.s1, high.s1);
-    cell->z[0] = (REAL8)(low.s2, low.s2, low.s2, low.s2, high.s2, high.s2, high.s2, high.s2);
-    for (int b = 1; b < VERTEX_CAPACITY / 8; ++b)
+    SHORT_LOOP
+    for (int b = 8 / CELL_LANES; b < VERTEX_CAPACITY / CELL_LANES; ++b)
         cell->x[b] = cell->y[b] = cell->z[b] = 0;
+    SHORT_LOOP
     for (int v = 0; v < 8; ++v) {
+        X(cell)[v] = v & 1 ? high.s0 : low.s0;
+        Y(cell)[v] = v & 2 ? high.s1 : low.s1;
+        Z(cell)[v] = v & 4 ? high.s2 : low.s2;
         const int fx = v & 1, fy = 2 + ((v >> 1) & 1), fz = 4 + (v >> 2);
         /* Counter-clockwise for an even number of lower walls. */
         const bool turned = ((v & 1) + ((v >> 1) & 1) + (v >> 2)) % 2 == 0;

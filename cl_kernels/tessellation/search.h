@@ -82,31 +82,6 @@ inline int2 bin_range(REAL x, REAL w, REAL origin, REAL inverse, int side)
     return (int2)(axis_bin(x - w, origin, inverse, side), axis_bin(x + w, origin, inverse, side));
 }
 
-/* Add those of the items begin .. end - 1 that may cut the cell to the batch; clip when it is full.
-   Returns FLAG_* or 0. */
-inline int take_items(CELL *cell, REAL4 x, int own, int begin, int end, batch_t *batch, REAL per_shell, bool warm,
-                      const search_t *in)
-{
-    while (begin < end) {
-        const int stop = min(end, begin + BATCH - batch->n);
-        const REAL limit = CUTTING_SQUARE(cell);
-        int n = batch->n;
-        SHORT_LOOP
-        for (int q = begin; q < stop; ++q) {
-            batch->places[n] = q;
-            n += vector_to_item(q, x, in).s3 < limit && q != own;
-        }
-        batch->n = n;
-        begin = stop;
-        if (n == BATCH) {
-            const int flag = clip_by_batch(cell, x, batch, per_shell, warm, in);
-            if (flag != 0)
-                return flag;
-        }
-    }
-    return 0;
-}
-
 /* An open grid: its number, its position (layer, row, part of the row, bin), and whether its bin lies in the inner
  * cube. */
 typedef struct {
@@ -114,23 +89,31 @@ typedef struct {
     bool inside;
 } open_grid_t;
 
-/* Clip the cell of item `own` by all generators in the bins within the cube of half-width w but outside the cube of
-   half-width `inner` (inner < 0: no bin has been searched), except those farther than twice the farthest vertex.
-   Returns FLAG_* or 0. */
-inline int clip_cell_by_bins(CELL *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
-{
+/* A walk through the grids, and the items that it has found but that are still to be taken. */
+typedef struct {
     open_grid_t open[MAX_DEPTH]; /* from the root down */
-    const REAL per_shell = SHELLS / (6 * w * w);
-    const FRAME root = in->grid_frames[0];
-    const REAL noise_y = bin_noise(x.s1, root.s1), noise_z = bin_noise(x.s2, root.s2);
-    batch_t batch;
-    batch.n = 0;
-    int depth = 0;
-    open[0].grid = open[0].part = 0;
-    open[0].iz = open[0].iy = open[0].bin = -1;
-    open[0].inside = inner >= 0;
-    while (depth >= 0) {
-        const open_grid_t here = open[depth];
+    int depth, begin, end;
+} grid_walk_t;
+
+/* Begin with all bins of a grid, at a depth. */
+inline void open_grid(grid_walk_t *walk, int depth, int grid, bool inside)
+{
+    walk->depth = depth;
+    walk->open[depth].grid = grid;
+    walk->open[depth].part = 0;
+    walk->open[depth].iz = walk->open[depth].iy = walk->open[depth].bin = -1;
+    walk->open[depth].inside = inside;
+}
+
+/* Find the next items in the bins within the cube of half-width w but outside the cube of half-width `inner` (inner <
+   0: no bin has been searched), except in bins farther than the root of `cut2`. False if there are no more.
+
+   Nothing but the position is kept from call to call: a work-item of a GPU needs its registers to clip. */
+inline bool find_items(grid_walk_t *walk, REAL4 x, REAL w, REAL inner, REAL cut2, const search_t *in)
+{
+    const REAL noise_y = bin_noise(x.s1, in->grid_frames[0].s1), noise_z = bin_noise(x.s2, in->grid_frames[0].s2);
+    while (walk->depth >= 0) {
+        open_grid_t here = walk->open[walk->depth];
         const FRAME frame = in->grid_frames[here.grid];
         const int4 shape = in->grid_shapes[here.grid];
         const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
@@ -144,71 +127,96 @@ inline int clip_cell_by_bins(CELL *cell, REAL4 x, int own, REAL w, REAL inner, b
             done_z = bin_range(x.s2, inner, frame.s2, inverse, shape.s3);
         }
         int child = -1;
-        open_grid_t next = here; /* where to continue */
-        int iy = here.iy, part = here.part, at = here.bin;
-        for (int iz = max(here.iz, zs.s0); iz <= zs.s1 && child < 0; ++iz, iy = -1) {
-            const REAL away_z = row_distance(x.s2, frame.s2, edge, iz, edge * BIN_SHARE + noise_z);
-            const bool layer_done = iz >= done_z.s0 && iz <= done_z.s1;
-            for (iy = max(iy, ys.s0); iy <= ys.s1; ++iy, part = 0, at = -1) {
-                const REAL away_y = row_distance(x.s1, frame.s1, edge, iy, edge * BIN_SHARE + noise_y);
-                const REAL left2 = CUTTING_SQUARE(cell) - away_y * away_y - away_z * away_z;
+        bool inside = false;
+        for (here.iz = max(here.iz, zs.s0); here.iz <= zs.s1 && child < 0; ++here.iz, here.iy = -1) {
+            const REAL away_z = row_distance(x.s2, frame.s2, edge, here.iz, edge * BIN_SHARE + noise_z);
+            const bool layer_done = here.iz >= done_z.s0 && here.iz <= done_z.s1;
+            for (here.iy = max(here.iy, ys.s0); here.iy <= ys.s1; ++here.iy, here.part = 0, here.bin = -1) {
+                const REAL away_y = row_distance(x.s1, frame.s1, edge, here.iy, edge * BIN_SHARE + noise_y);
+                const REAL left2 = cut2 - away_y * away_y - away_z * away_z;
                 if (!(left2 > 0))
                     continue;
                 const REAL span = left2 < w * w ? sqrt(left2) * (1 + 8 * REAL_EPS) + edge * R(1e-6) : w;
                 const int2 xs = bin_range(x.s0, span, frame.s0, inverse, shape.s1);
-                global const int2 *row_bins = in->bins + shape.s0 + (iz * shape.s2 + iy) * shape.s1;
+                global const int2 *row_bins = in->bins + shape.s0 + (here.iz * shape.s2 + here.iy) * shape.s1;
                 /* Parts of a row: left of the searched bins, these (only grids below may hold more), right of them. */
-                const bool row_done = layer_done && iy >= done_y.s0 && iy <= done_y.s1;
-                while (part < 3) {
+                const bool row_done = layer_done && here.iy >= done_y.s0 && here.iy <= done_y.s1;
+                while (here.part < 3) {
                     int from = xs.s0, to = xs.s1;
                     if (row_done) {
-                        from = part == 0 ? from : max(from, part == 1 ? done_x.s0 : done_x.s1 + 1);
-                        to = part == 2 ? to : min(to, part == 0 ? done_x.s0 - 1 : done_x.s1);
+                        from = here.part == 0 ? from : max(from, here.part == 1 ? done_x.s0 : done_x.s1 + 1);
+                        to = here.part == 2 ? to : min(to, here.part == 0 ? done_x.s0 - 1 : done_x.s1);
                     }
-                    from = max(at, from);
+                    from = max(here.bin, from);
                     if (from > to) {
-                        part = row_done ? part + 1 : 3;
-                        at = -1;
+                        here.part = row_done ? here.part + 1 : 3;
+                        here.bin = -1;
                         continue;
                     }
                     /* Adjacent leaves are a contiguous range of items. */
                     const int2 first = row_bins[from];
                     int2 end = row_bins[to + 1];
-                    at = to + 1;
+                    here.bin = to + 1;
                     if (first.s1 != end.s1) {
                         /* Divided bins follow: one bin at a time. */
                         end = row_bins[from + 1];
-                        at = from + 1;
+                        here.bin = from + 1;
                         if (first.s1 != end.s1) {
                             child = first.s1;
                             break;
                         }
                     }
-                    if (part == 1 && row_done)
+                    if ((here.part == 1 && row_done) || first.s0 >= end.s0)
                         continue;
-                    const int flag = take_items(cell, x, own, first.s0, end.s0, &batch, per_shell, warm, in);
-                    if (flag != 0)
-                        return flag;
+                    walk->begin = first.s0;
+                    walk->end = end.s0;
+                    walk->open[walk->depth] = here;
+                    return true;
                 }
                 if (child >= 0) {
-                    next.iz = iz;
-                    next.iy = iy;
-                    next.part = part;
-                    next.bin = at;
-                    open[depth] = next;
-                    open[depth + 1].inside = part == 1 && row_done;
+                    inside = here.part == 1 && row_done;
+                    walk->open[walk->depth] = here;
                     break;
                 }
             }
         }
-        if (child >= 0) {
-            ++depth;
-            open[depth].grid = child;
-            open[depth].part = 0;
-            open[depth].iz = open[depth].iy = open[depth].bin = -1;
-        } else {
-            --depth;
-        }
+        if (child >= 0)
+            open_grid(walk, walk->depth + 1, child, inside);
+        else
+            --walk->depth;
     }
-    return clip_by_batch(cell, x, &batch, per_shell, warm, in);
+    return false;
+}
+
+/* Clip the cell of item `own` by all generators that `find_items` finds, except those farther than twice the farthest
+   vertex. Returns FLAG_* or 0. */
+inline int clip_cell_by_bins(CELL *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
+{
+    const REAL per_shell = SHELLS / (6 * w * w);
+    grid_walk_t walk;
+    open_grid(&walk, 0, 0, inner >= 0);
+    walk.begin = walk.end = 0;
+    batch_t batch;
+    batch.n = 0;
+    bool more = true;
+    while (more) {
+        while (batch.n < BATCH) {
+            if (walk.begin == walk.end && !(more = find_items(&walk, x, w, inner, CUTTING_SQUARE(cell), in)))
+                break;
+            const int stop = min(walk.end, walk.begin + BATCH - batch.n);
+            const REAL limit = CUTTING_SQUARE(cell);
+            int n = batch.n;
+            SHORT_LOOP
+            for (int q = walk.begin; q < stop; ++q) {
+                batch.places[n] = q;
+                n += vector_to_item(q, x, in).s3 < limit && q != own;
+            }
+            batch.n = n;
+            walk.begin = stop;
+        }
+        const int flag = clip_by_batch(cell, x, &batch, per_shell, warm, in);
+        if (flag != 0)
+            return flag;
+    }
+    return 0;
 }
