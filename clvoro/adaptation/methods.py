@@ -215,6 +215,7 @@ class ProjectedMethod:
         gradient, log_ratio = mesh.engine.scratch(mesh.points.shape), mesh.engine.scratch(mesh.n)
         with mesh.engine.workspace.frame():
             w = mesh.lloyd_weights(gradient, log_ratio)
+            mesh.follows_log_ratio = self.error_target > 0
             if self.error_target and self.steps > 2:
                 self._control_penalty(mesh.mean_log_ratio_error(w))
             self.steps += 1

@@ -130,6 +130,8 @@ class MeshState:
     h, error, quality : (n,) real
     local_length : (n,) real
         min(L, h), the unit of bounds of the motion.
+    follows_log_ratio : bool
+        Summarize log(L / h) with error and quality, so that `mean_log_ratio_error` needs no transfer of its own.
     potential : (n,) real
         Solution of the last Poisson solve, the start of the next one.
     multipliers : (n,) float32 or None
@@ -174,6 +176,8 @@ class MeshState:
         self.summaries = Summaries(self.engine, SUMMARIES)
         self.power: PowerTessellator | None = None
         self._ordered: cla.Array | None = None
+        self.follows_log_ratio = False
+        self._log_ratio_error: float | None = None
         if isinstance(start, _Data):
             self._data, self.next_label = start, len(start.generators)
             return
@@ -362,6 +366,9 @@ class MeshState:
                 self.t, self.h, self.error, self.quality, energy, self.local_length
             )
             own = {"error": self.error, "quality": self.quality, "energy": energy}
+            if self.follows_log_ratio:
+                own["log_ratio"] = self.stages.density.cell_weights(self.t, self.h).log_ratio
+            self._log_ratio_error = None
             self.summaries.collect_all({**own, **(others or {})}, self.n)
 
     def zero_fixed(self, displacement: cla.Array) -> None:
@@ -381,7 +388,11 @@ class MeshState:
 
     def mean_log_ratio_error(self, w: CellWeights) -> float:
         """Return the mean of |log(L / h)|."""
-        return self._summarize_log_ratio(w).magnitude / self.n / self.engine.cell_dim
+        if self._log_ratio_error is None:
+            self._log_ratio_error = (
+                self._summarize_log_ratio(w).magnitude / self.n / self.engine.cell_dim
+            )
+        return self._log_ratio_error
 
     def missing_cells(self, w: CellWeights | None = None) -> float:
         """Return how many more cells the size field requires; negative if there are too many.
@@ -474,6 +485,8 @@ class MeshState:
         """
         summaries, first = self.summaries.read_with(self.sizing.invalid_index)
         self.sizing.check(self.points, self.h, self.size_factor, first)
+        if self.follows_log_ratio:
+            self._log_ratio_error = summaries["log_ratio"].magnitude / self.n / self.engine.cell_dim
         return summaries
 
     def refined_count(self) -> int:

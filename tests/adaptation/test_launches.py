@@ -1,0 +1,73 @@
+"""How many commands a step takes, and how often the host waits for it: bounds for every kind of step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clvoro
+from clvoro.adaptation.schedule import Step, adaptive_schedule
+from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.state import MeshState
+from clvoro.opencl.engine import Engine
+from clvoro.opencl.hooks import Tally, watching
+from clvoro.sizing import Sizing
+
+WARM_UP, STEPS = 4, 2
+SOLVERS = ("multigrid", "conjugate_gradient", "volume_projection", "poisson", "aggregation")
+
+
+def methods(dim):
+    """Return the methods of the steps of a default run on its finest level."""
+    steps = [
+        a.method for a in adaptive_schedule(dim, "default", 1, exact=False) if isinstance(a, Step)
+    ]
+    found = {type(m).__name__ + getattr(m, "descent", ""): m for m in steps}
+    return [replace(method) for method in found.values()]
+
+
+def near_lattice(dim, n):
+    """Return `n` points, roughly, of a cubic lattice, and the spacing; far enough from it to have one diagram."""
+    side = round(n ** (1 / dim))
+    corners = np.stack(np.meshgrid(*[np.arange(side)] * dim, indexing="ij"), -1).reshape(-1, dim)
+    noise = np.random.default_rng(6113).uniform(0.2, 0.8, corners.shape)
+    return (corners + noise) / side, 1 / side
+
+
+@pytest.mark.parametrize(
+    ("dim", "n"),
+    [
+        pytest.param(2, 10**4, id="2D, 10,000"),
+        pytest.param(3, 10**4, id="3D, 10,000"),
+        pytest.param(2, 10**6, id="2D, 1,000,000", marks=pytest.mark.slow),
+        pytest.param(3, 10**6, id="3D, 1,000,000", marks=pytest.mark.slow),
+    ],
+)
+def test_a_step_takes_few_commands_and_reads(adapter, dim, n):
+    """A read by the host takes as long as several launches. It reads scalars, and one for each iteration of solvers."""
+    points, spacing = near_lattice(dim, n)
+    box = clvoro.Box((0,) * dim, (1,) * dim)
+    engine = Engine(adapter.ctx, cl.CommandQueue(adapter.ctx), dim, adapter.dtype)
+    for method in methods(dim):
+        tally, reads = Tally(), []
+        mesh = MeshState.create(
+            Stages(engine), box, Sizing(engine, box, spacing), engine.upload(points)
+        )
+        for k in range(WARM_UP + STEPS):
+            with watching(engine.queue, tally) if k >= WARM_UP else watching(engine.queue, Tally()):
+                before = tally.reads
+                with engine.workspace.frame():
+                    method.displace(mesh)
+                    method.move(mesh)
+                mesh.update(check=False)
+                mesh.read_summaries()
+                reads += [tally.reads - before] if k >= WARM_UP else []
+        solving = sum(c for (stage, _), c in tally.calls.items() if stage.split("/")[-1] in SOLVERS)
+        name = f"{type(method).__name__} {getattr(method, 'descent', '')} {reads} {tally.launches} {solving}"
+        # Of the solver, the diagram, and the summaries; three more where cells in 3D must be clipped anew.
+        assert min(reads) <= 3, name
+        assert max(reads) <= (4 if dim == 2 else 7), name
+        assert (tally.launches - solving) / STEPS <= (40 if dim == 2 else 55), name
+        assert tally.writes == 0, name
+        assert tally.bytes_read / STEPS < 4000, name
