@@ -39,7 +39,7 @@ inline void write_corners(const CELL *cell, global uchar4 *corners)
 
 /* Moments of the cell, up to a factor: xx, yy, zz, and yz, zx, xy; see `clip_polyhedra`. They are summed on their own,
    because a work-item of a GPU has few registers. */
-inline void second_moments(const CELL *cell, CELL_SPACE const INDEX *start, REAL4 *square, REAL4 *mixed)
+inline void sum_second_moments(const CELL *cell, CELL_SPACE const INDEX *start, REAL4 *square, REAL4 *mixed)
 {
     *square = *mixed = 0;
     for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1)) {
@@ -256,7 +256,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         else if (lost > EVEN_SHARE * volume)
             atomic_or(report, FLAG_UNEVEN);
         REAL4 square, mixed;
-        second_moments(cell, start, &square, &mixed);
+        sum_second_moments(cell, start, &square, &mixed);
         const REAL inverse = 1 / volume;
         first *= inverse / 4;
         square = square * (inverse / 20) - first * first;
