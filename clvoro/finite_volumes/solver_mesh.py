@@ -168,6 +168,7 @@ def make_solver_mesh(
     """
     from .collapse import collapse_short
     from .convex_corners import join_faces, move_concave_points
+    from .relaxation import relax_points
     from .short_edges import collapse_short_edges
     from .straight_walls import straight_walls
 
@@ -199,6 +200,8 @@ def make_solver_mesh(
         mesh = collapse_short_edges(mesh, parts)
     if straight:
         mesh = move_concave_points(mesh)
+    if collapse and mesh.dim == 2:
+        mesh = relax_points(mesh)
     if collapse and mesh.dim == 3:
         mesh = collapse_short(mesh, np.cbrt(diagram.volumes), diagram.centroids)
     mesh = compact(mesh)

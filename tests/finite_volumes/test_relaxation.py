@@ -1,0 +1,73 @@
+"""Points that move away from skew faces and faces far from orthogonal."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.finite_volumes.geometry import polygon_areas
+from clvoro.finite_volumes.relaxation import face_measures, relax_points
+from clvoro.finite_volumes.solver_mesh import SolverMesh
+from tests.finite_volumes.test_straight_walls import concave_by, polygons
+
+
+def ell(ctx, steps: int) -> SolverMesh:
+    """Return an L of 121 cells after some of Lloyd's steps."""
+    domain = clvoro.Polygon([(0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
+    adapter = clvoro.Adapter(ctx)
+    points = np.random.default_rng(5).random((150, 2)) * 0.98 + 0.01
+    diagram = adapter.diagram(domain, points[domain.contains(points)])
+    for _ in range(steps):
+        diagram = adapter.diagram(domain, diagram.centroids)
+    return diagram.solver_mesh(collapse=False)
+
+
+@pytest.fixture(scope="module")
+def mesh(ctx) -> SolverMesh:
+    """Some faces are bad."""
+    return ell(ctx, 1)
+
+
+def test_angles_and_skewness_are_those_of_the_prisms(mesh):
+    angle, skewness = face_measures(mesh)
+    exact, k = mesh.measures, len(mesh.owner)
+    np.testing.assert_allclose(np.degrees(angle), exact.non_orthogonality[:k], atol=1e-6)
+    np.testing.assert_allclose(skewness, exact.skewness[:k], rtol=1e-6, atol=1e-6)
+
+
+def test_bad_faces_become_fewer_and_nothing_else_suffers(mesh):
+    relaxed = relax_points(mesh)
+    before, after = face_measures(mesh), face_measures(relaxed)
+    assert before[0].max() > np.radians(20)
+    assert after[0].max() < np.radians(19)
+    assert after[1].max() < 1.9
+    assert relaxed.area_change == pytest.approx(mesh.area_change, abs=1e-12)
+    held = np.unique(mesh.corners[mesh.starts[mesh.inner] :])
+    np.testing.assert_array_equal(relaxed.points[held], mesh.points[held])
+    assert max(map(concave_by, polygons(relaxed))) < 1e-4
+    np.testing.assert_allclose(polygon_areas(relaxed), polygon_areas(mesh), rtol=0.3)
+    shortest = [m.measures.shortest_edge.min() for m in (mesh, relaxed)]
+    assert shortest[1] >= 0.9 * min(shortest[0], 0.05)
+
+
+def test_points_far_from_bad_faces_stay(ctx):
+    """Pull one vertex aside: only its surroundings move."""
+    mesh = ell(ctx, 4)
+    p = int(np.argmin(np.hypot(*(mesh.points - 0.25).T)))
+    points = mesh.points.copy()
+    points[p] += 0.02
+    pulled = replace(mesh, points=points)
+    relaxed = relax_points(pulled)
+    assert face_measures(pulled)[0].max() > np.radians(22)
+    assert face_measures(relaxed)[0].max() < np.radians(20)
+    moved = np.hypot(*(relaxed.points - pulled.points).T)
+    assert moved[p] > 0.005
+    assert moved[np.hypot(*(mesh.points - mesh.points[p]).T) > 0.5].max() == 0
+
+
+def test_a_mesh_that_was_not_adapted_is_left_alone(ctx):
+    points = np.random.default_rng(8).random((300, 2))
+    given = clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0), (1, 1)), points)
+    mesh = given.solver_mesh(collapse=False)
+    assert relax_points(mesh) is mesh
