@@ -291,10 +291,11 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
             raise InputError(_NO_ROOM)
         return _FreeBox(tuple(corners[0]), tuple(corners[1]), domain.periodic, whole=domain)
     polygon, _ = as_polygon(domain)
+    # Merged to long lines first: the strips around thousands of short edges would overlap many times.
     strips = [
-        shapely.union_all(np.asarray(shapely.linestrings(chosen_segments(domain, layer)))).buffer(
-            distance
-        )
+        shapely.line_merge(
+            shapely.union_all(np.asarray(shapely.linestrings(chosen_segments(domain, layer))))
+        ).buffer(distance)
         for layer, distance in zip(layers, distances, strict=True)
     ]
     left = polygon.geometry.difference(shapely.union_all(strips))

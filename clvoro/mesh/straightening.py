@@ -140,7 +140,7 @@ def _places(diagram: Diagram, domain: Polygon) -> np.ndarray:
 def along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
     """Return for each half-face on the boundary the next one on its ring, (m,); -1 if there is none."""
     rows = np.flatnonzero(diagram.neighbors < 0)
-    edge = _places(diagram, domain)[rows]
+    edge = _places(diagram, domain)[rows].astype(np.int64)
     begin, end = face_ends(diagram)[rows].T.astype(np.int64)
     # Very short edges have no face.
     used = np.unique(edge)

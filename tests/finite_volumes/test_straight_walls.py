@@ -7,6 +7,7 @@ import shapely
 import clvoro
 from clvoro import Polygon
 from clvoro.errors import InputError
+from clvoro.mesh.straightening import along_rings
 
 SQUARE = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
 ELL = np.array([(0.0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
@@ -247,3 +248,13 @@ def test_a_large_change_of_the_area_gives_a_warning():
         mesh = cells.solver_mesh()
     assert mesh.area_change < -0.04
     cells.solver_mesh(walls="exact")  # no warning
+
+
+def test_rings_of_many_edges_are_closed(ctx):
+    """Edges times vertices exceed the range of int32."""
+    domain = Polygon(circle(50_000, 1.0))
+    points = np.random.default_rng(3).random((50, 2))
+    diagram = clvoro.Adapter(ctx).diagram(domain, points)
+    onward = along_rings(diagram, domain)
+    walls = np.flatnonzero(diagram.neighbors < 0)
+    np.testing.assert_array_equal(np.sort(onward[walls]), walls)
