@@ -67,18 +67,7 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
     -----
     MismatchWarning
     """
-    if isinstance(domain, Polygon):
-        strait, dead_end = find_narrow_parts(domain, size)
-        remedy = ", or fill it: domain.simplified(size) does"
-    else:
-        center = (np.array(domain.lower) + domain.upper) / 2
-        widths = np.where(domain.periodic, np.inf, domain.extent)
-        strait, dead_end = (
-            NarrowPart(center, float(widths.min()), float(size(center[None])[0])),
-            None,
-        )
-        strait = strait if strait.width < NARROW * strait.size else None
-        remedy = ""
+    strait, dead_end = narrow_parts(domain, size)
     found = strait or dead_end
     if found is None:
         return
@@ -88,7 +77,23 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
         text = f"the domain is narrower than half a cell: {here}cells there are long and reach from wall to wall"
     else:
         text = f"the domain has a dead end that is narrower than a cell: {here}cells there have poor shapes"
+    remedy = ", or fill it: domain.simplified(size) does" if isinstance(domain, Polygon) else ""
     warn(f"{text}. Use smaller sizes there, as sizing.FeatureSize does{remedy}", MismatchWarning)
+
+
+def narrow_parts(
+    domain: Domain, size: Callable[[np.ndarray], np.ndarray]
+) -> tuple[NarrowPart | None, NarrowPart | None]:
+    """Return where `domain` is narrower than half a cell of `size`, and in a polygon a dead end, or None for each.
+
+    See `find_narrow_parts`.
+    """
+    if isinstance(domain, Polygon):
+        return find_narrow_parts(domain, size)
+    center = (np.array(domain.lower) + domain.upper) / 2
+    widths = np.where(domain.periodic, np.inf, domain.extent)
+    strait = NarrowPart(center, float(widths.min()), float(size(center[None])[0]))
+    return strait if strait.width < NARROW * strait.size else None, None
 
 
 def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:

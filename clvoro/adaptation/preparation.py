@@ -15,10 +15,16 @@ from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
 from ..sizing import Sizing, as_field
 from ..sizing.field import Field
+from ..sizing.gaps import NARROW
 from ..sizing.layers import limit_beside_layers
 from ..sizing.on_domain import on_domain
 from ..tessellation.power import require_power_domain
-from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
+from .diagnostics import (
+    check_precision,
+    narrow_parts,
+    warn_of_mismatches,
+    warn_of_narrow_parts,
+)
 from .efforts import is_near
 from .estimates import Extras, check_memory
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
@@ -29,7 +35,15 @@ from .quality_descent import OPENINGS
 from .sampling.charts import charted
 from .sampling.quadrature import DensityTree
 from .sampling.start import density_tree, sample_density, sample_uniform
-from .schedule import MOVES, Action, Prescribe, adaptive_schedule, auto_levels, repeated_schedule
+from .schedule import (
+    CELLS_ACROSS,
+    MOVES,
+    Action,
+    Prescribe,
+    adaptive_schedule,
+    auto_levels,
+    repeated_schedule,
+)
 from .stages import Stages
 from .state import MeshState, Setup
 
@@ -212,12 +226,20 @@ class Preparation:
         # For few cells, the preparation may have taken more than the run.
         return max(needed, float(sizing.peak_bytes))
 
+    def _is_narrow(self, coarseness: float) -> bool:
+        """Return whether fewer than `CELLS_ACROSS` cells of size ``coarseness * h`` fit between layers somewhere."""
+        scale = CELLS_ACROSS / NARROW * coarseness * self.factor
+        return narrow_parts(self.free, lambda x: scale * self.sizing(x))[0] is not None
+
     def _count_levels(self) -> int:
         """Return the number of coarser levels, from the points of the caller or from a random sample."""
         d, levels, points = self.domain.cell_dim, self.options.levels, self.points
         if levels == "auto":
             if points is None:
-                return auto_levels(self.target, d)
+                levels = auto_levels(self.target - len(self.rows), d)
+                while levels and self.rows.size and self._is_narrow(2**levels):
+                    levels -= 1
+                return levels
             return max(0, round(math.log2(self.target / len(points)) / d))
         count = int(levels)
         most = int(math.log2(max(self.target, 1)) / d)

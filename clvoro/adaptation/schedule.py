@@ -45,6 +45,10 @@ COARSEST = {2: 1400, 3: 1500}
 A step on fewer cells is not much cheaper (see `STEP_CELLS`). Measured on F2 (see bench/convergence.py) with 23,000 to
 100,000 cells, half as many cells and one more level give no better mesh.
 """
+CELLS_ACROSS = 5.0
+"""Least number of cells between layers on coarser levels. Layers are as fine there as on the finest level, and cells do
+not spread past them. In a bank of tubes with two coarse cells between them, mean |e| is 0.02 to 0.1; without coarser
+levels it is 0.002."""
 STEP_CELLS = 3000
 """Cost of the launches of a step, as a number of cells."""
 SINGLE_LEVEL_ERROR_TARGET = 0.0017

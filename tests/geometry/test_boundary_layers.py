@@ -239,6 +239,16 @@ def test_faces_end_in_the_corners_of_bodies_with_layers(adapter, angle, spacing)
         assert turns.min() > -1e-9
 
 
+def test_there_are_no_levels_too_coarse_for_the_gaps_between_layers(adapter):
+    """Cells do not spread past layers, which are fine on all levels."""
+    tubes = [clvoro.curves.circle((x, 0.5), 0.2, name=f"tube-{x}") for x in (0.3, 0.9)]
+    domain = clvoro.Polygon([(0, 0), (1.2, 0), (1.2, 1), (0, 1)], tubes)
+    layers = clvoro.Layers(0.002, 3, 1.3, spacing=0.012, edges=["tube-0.3", "tube-0.9"])
+    mesh = adapter.run(domain, 0.016, layers=layers, effort="fast")
+    assert mesh.settings["levels"] == 0
+    assert np.abs(mesh.size_error).mean() < 0.01
+
+
 def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
     layers = Layers(0.04, count=2, edges=range(4, 84))
     options = {"layers": layers, "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
