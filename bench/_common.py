@@ -32,7 +32,7 @@ FIRST_SEED = 20251
 
 
 def test_field(name: str) -> sizing.Field:
-    """Return the size field F1, F2, F3, F4, circles or ridge, on `BOX`, or S1, S2 or S3, on `CUBE`; all absolute.
+    """Return the size field F1, F2, F3, F4, circles, ridge or corner on `BOX`, or S1, S2 or S3 on `CUBE`, all absolute.
 
     F1 = 0.02 + 0.3 d, F2 = 0.002 + 0.08 d, F4 = F2 / 6.6, with d the distance to the circle of
     radius 0.3 about (0.9, 0.75); F3 = 0.9306 min(0.15, 0.02 + ln(1.3) d) / 4, radius 0.25 about
@@ -40,6 +40,7 @@ def test_field(name: str) -> sizing.Field:
     (0.5, 0.5, 0.4); S2 = S1 / 2 and S3 = S1 / 4. circles = min(0.012 + 0.12 d1, 0.006 + 0.12 d2), with d1 and d2 the
     distances to the circles of radius 0.35 about (0.7, 0.75) and of radius 0.2 about (1.8, 0.75), has kinks between
     them and at their centers. ridge = 0.007 + 0.12 |y - 0.75 - 0.3 sin(1.6 pi x)| is steeper than 0.2 in places.
+    corner = 0.025 (r + 0.001)^(2/3), with r the distance from the corner (0, 0), has sizes 1 : 180.
     """
     if name == "circles":
         large, small = sizing.Circle((0.7, 0.75), 0.35), sizing.Circle((1.8, 0.75), 0.2)
@@ -49,6 +50,8 @@ def test_field(name: str) -> sizing.Field:
         )
     if name == "ridge":
         return sizing.Expression("0.007 + 0.12 * fabs(y - 0.75 - 0.3 * sin(1.6 * pi * x))")
+    if name == "corner":
+        return sizing.Expression("0.025 * pow(hypot(x, y) + 0.001, 2.0 / 3.0)")
     if name in ("S1", "S2", "S3"):
         sphere = sizing.Ball((0.5, 0.5, 0.4), 0.25)
         return sizing.Distance(sphere, h_min=0.04, slope=0.3) * 0.5 ** (int(name[1]) - 1)
