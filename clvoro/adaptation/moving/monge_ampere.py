@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
-import scipy.sparse.linalg
 from scipy.spatial import KDTree
 
 from ...arguments import warn
@@ -38,10 +37,11 @@ LEAST_STRETCH = 0.3
 CONVERGED = {np.dtype(np.float64): 1e-6, np.dtype(np.float32): 1e-3}
 """Standard deviation of the logarithm of rho det(I + H) that is not reduced any more."""
 TOLERANCE, MOST_ITERATIONS = 1e-2, 2000
-"""Limits of the linear solves: BiCGStab with Jacobi's preconditioner. Measured on F2 and S2, a factorization takes as
-long in 2D, and ten times as long in 3D."""
+"""Limits of the linear solves. Measured on F2 and S2, a factorization takes as long in 2D, and ten times as long in
+3D."""
 ANCHOR = 1e-6
-"""Share of the diagonal that is added, because constants are in the null space."""
+"""Share of the mean diagonal that is added, because constants are in the null space: the solution is then exact up to a
+constant on the right side, and one in phi."""
 
 
 class LatticeMap:
@@ -110,26 +110,44 @@ class LatticeMap:
             for (a, b), operator in self.hessian.items()
         ) + sum(scipy.sparse.diags_array(slope[:, a]) @ g for a, g in enumerate(self.gradient))
         matrix = scipy.sparse.csr_array(-matrix)
-        matrix = matrix + scipy.sparse.diags_array(ANCHOR * np.abs(matrix.diagonal()))
-        change, first = _solve(matrix, residual)
-        constant, second = _solve(matrix, np.ones(len(residual)))
-        change -= change.sum() / constant.sum() * constant
-        return change - change.mean(), first + second
+        anchor = ANCHOR * np.abs(matrix.diagonal()).mean()
+        matrix = matrix + scipy.sparse.diags_array(np.full(len(residual), anchor))
+        change, iterations = _solve(scipy.sparse.csr_array(matrix), residual)
+        return change - change.mean(), iterations
 
 
 def _solve(matrix: scipy.sparse.csr_array, side: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the solution, and the number of iterations."""
-    inverse, iterations = 1 / matrix.diagonal(), 0
-    jacobi = scipy.sparse.linalg.LinearOperator(matrix.shape, lambda x: inverse * x)
+    """Return the solution by BiCGStab with Jacobi's preconditioner, and the number of iterations.
 
-    def count(_: np.ndarray) -> None:
-        nonlocal iterations
-        iterations += 1
+    SciPy's takes scalar products by threads: their last bits would depend on the number of cores.
+    """
 
-    solution, _ = scipy.sparse.linalg.bicgstab(
-        matrix, side, rtol=TOLERANCE, maxiter=MOST_ITERATIONS, M=jacobi, callback=count
-    )
-    return solution, iterations
+    def dot(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.add.reduce(a * b))
+
+    inverse, x, residual = 1 / matrix.diagonal(), np.zeros(len(side)), side.copy()
+    v, p = np.zeros(len(side)), np.zeros(len(side))
+    rho = alpha = omega = 1.0
+    for iteration in range(MOST_ITERATIONS):
+        if dot(residual, residual) <= TOLERANCE**2 * dot(side, side):
+            return x, iteration
+        before, rho = rho, dot(side, residual)
+        p = residual + rho / before * (alpha / omega) * (p - omega * v)
+        y = inverse * p
+        v = matrix @ y
+        along = dot(side, v)
+        if along == 0 or rho == 0:
+            return x, iteration
+        alpha = rho / along
+        middle = residual - alpha * v
+        z = inverse * middle
+        t = matrix @ z
+        omega = dot(t, middle) / max(dot(t, t), 1e-300)
+        if omega == 0:
+            return x + alpha * y, iteration
+        x = x + alpha * y + omega * z
+        residual = middle - omega * t
+    return x, MOST_ITERATIONS
 
 
 @dataclass
