@@ -22,12 +22,17 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+# BLAS must not start threads in peers that are serial.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from _common import (
@@ -268,7 +273,8 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
                         continue
                     hollow = way.source == "given"
                     ax.scatter(
-                        max(r["mean_error"], LEFT), 1 - r["mean_quality"], marker=way.marker, s=34, zorder=3, linewidth=0.8,
+                        max(r["mean_error"], LEFT), 1 - r["mean_quality"], marker=way.marker, s=34, zorder=3,
+                        linewidth=0.8,
                         color=None if hollow else way.color, facecolor="none" if hollow else None,
                         edgecolor=way.color if hollow else None,
                     )  # fmt: skip

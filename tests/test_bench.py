@@ -116,6 +116,21 @@ def test_fields(tmp_path):
     assert (tmp_path / "fields.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
+def test_methods():
+    """On the paper's case: Lloyd misses the sizes, transport maps stretch cells, the default has both right."""
+    methods = "lloyd; coupled; monge-ampere; adaptive, default; insertion and deletion"
+    rows = records("methods.py", "--fields", "paper", "--methods", methods)
+    found = {r["method"]: (r["mean_error"], r["mean_quality"]) for r in rows}
+    assert len(found) == 5
+    assert found["lloyd"][0] > 0.5
+    assert found["monge-ampere"][0] < 0.1
+    assert found["monge-ampere"][1] < 0.9
+    assert found["coupled"][1] > 0.93
+    assert found["adaptive, default"][0] < 0.005
+    assert found["adaptive, default"][1] > 0.96
+
+
 def test_a_table_is_markdown():
     command = [
         sys.executable, str(BENCH / "transfer.py"), "--sizes", "300", "--dims", "3", "--repeat", "1",
