@@ -9,7 +9,6 @@ import shapely
 import clvoro
 from clvoro import sizing
 from clvoro.adaptation.efforts import EFFORTS
-from clvoro.adaptation.options import METHODS
 from clvoro.errors import (
     ClvoroError,
     CoarseSizeWarning,
@@ -50,7 +49,7 @@ def test_row_i_is_the_callers_generator(adapter):
     assert result.initial.points + result.initial.lloyd == pytest.approx(result.points, abs=1e-12)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_no_steps(adapter, method):
     points = random_points(300, 6)
     result = adapter.run(
@@ -331,7 +330,7 @@ def test_max_steps_of_adaptive_runs(adapter):
 
 
 @pytest.mark.sparse
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", runs.FROM_POINTS)
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 250])
 def test_n_cells_is_held(adapter, method, n):
     result = adapter.run(
@@ -584,7 +583,7 @@ def test_one_cell_of_the_right_size(adapter):
         (
             {"method": "best"},
             InputError,
-            "method is 'best', expected one of adaptive, exact, lloyd",
+            "method is 'best', expected one of adaptive, exact, transport, lloyd",
         ),
         ({"method": None}, InputError, "method is None"),
         ({"points": "random"}, InputError, "points is 'random', expected one of density, uniform"),

@@ -5,7 +5,6 @@ import pytest
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.options import METHODS
 from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
 from tests.reference import diagrams3d as reference3d
 from tests.reference import runs
@@ -40,7 +39,7 @@ def second_moment(cell, x):
 
 
 @pytest.mark.sparse
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", runs.FROM_POINTS)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_every_method(adapter, adapter32, dtype, method):
     run = (adapter if dtype == "float64" else adapter32).run
@@ -52,7 +51,7 @@ def test_every_method(adapter, adapter32, dtype, method):
     assert h["mean_quality"][-1] > h["mean_quality"][0] or method == "poisson"
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_uniform_start_and_count(adapter, method):
     result = adapter.run(
         BOX,
@@ -129,7 +128,7 @@ def test_row_i_is_the_callers_generator(adapter):
     )
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_no_steps(adapter, method):
     points = random_points(200, 6)
     result = adapter.run(
@@ -244,7 +243,7 @@ def test_stopped(adapter, options, rows, how):
 
 
 @pytest.mark.sparse
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", runs.FROM_POINTS)
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_n_cells_is_held(adapter, method, n):
     result = adapter.run(BOX, SMALL, n_cells=n, method=method, effort="fast", max_steps=20)
@@ -364,7 +363,7 @@ def test_callable_and_device_field_agree(adapter):
     "method",
     [
         pytest.param(name, marks=() if name in ("adaptive", "coupled") else pytest.mark.slow)
-        for name in METHODS
+        for name in runs.FROM_POINTS
     ],
 )
 def test_elongated_boxes(adapter, adapter32, method):
@@ -386,7 +385,7 @@ def test_points_on_walls_edges_and_corners(adapter):
     diagram = adapter.diagram(BOX, points)
     weights = np.where((points == 0) | (points == 1), 0.5, 1).prod(axis=1)
     assert diagram.volumes == pytest.approx(weights / 27, rel=1e-12)
-    for method in METHODS:
+    for method in runs.FROM_POINTS:
         result = adapter.run(BOX, 0.25, points, method=method, effort="fast", max_steps=12)
         check(result, sizing.Constant(0.25))
 

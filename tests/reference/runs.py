@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
+from clvoro.adaptation.options import METHODS, uses
 from tests.reference import diagrams
+
+FROM_POINTS = [method for method in METHODS if uses(method, "start")]
+"""Methods that take generators of any number at any place; the others begin with a lattice."""
 
 
 def random_points(n, seed, box):

@@ -21,12 +21,13 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
     """Options of a run; `wild`: also invalid or pointless ones."""
     d = domain.dim
     methods = ["adaptive", "exact", "coupled", "lloyd", "poisson", "weighted", "weighted-lloyd"]
-    moving = isinstance(domain, clvoro.Box) and not any(domain.periodic) and rng.random() < 0.1
     options: dict[str, Any] = {
         "method": str(rng.choice(methods, p=[0.35, 0.2, 0.13, 0.08, 0.08, 0.1, 0.06])),
         "effort": str(rng.choice(["fast", "default", "best"], p=[0.6, 0.3, 0.1])),
         "seed": int(rng.integers(0, 2**31)), "start": str(rng.choice(["density", "uniform"])),
     }  # fmt: skip
+    # Without a draw: the inputs of earlier seeds stay.
+    others, chance = ("mmpde", "monge-ampere", "transport"), options["seed"] % 24
     # Most runs in boxes are complete.
     if rng.random() < (0.7 if isinstance(domain, clvoro.Polygon) else 0.4):
         options["max_steps"] = int(rng.integers(0, 15 if d == 2 else 6))
@@ -57,8 +58,9 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
             "callback": lambda: CALLBACKS[rng.integers(len(CALLBACKS))],
         }
     options |= {name: make() for name, make in optional.items() if rng.random() < 0.12}
-    if moving and "points" not in options:
-        options["method"] = str(rng.choice(["mmpde", "monge-ampere"]))
+    walled = isinstance(domain, clvoro.Box) and not any(domain.periodic)
+    if walled and chance < len(others) and "points" not in options:
+        options["method"] = others[chance]
     if "points" in options and not wild:
         if options["method"] not in ("adaptive", "exact"):
             options.pop("n_cells", None)  # these methods keep the number
