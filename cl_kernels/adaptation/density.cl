@@ -4,6 +4,7 @@
 #include "opencl/blocks.h"
 #include "opencl/reduce.h"
 #include "opencl/row_entries.h"
+#include "geometry/site.h"
 
 /* density = rho = h^-d, weight = V rho (the number of generators that the cell should have), log_ratio = r = log(V rho)
    = log(V / h^d) = d log(L / h).
@@ -59,61 +60,64 @@ inline void weighted_offset(const int i, const REAL *gradient, global const REAL
 #endif
 }
 
-/* gradient = grad log h by least squares over the neighbors, weighted by 1 / distance^2; lloyd = displacement to the
-   weighted centroid. One evaluation of h per generator is enough, and the fit averages kinks of h over a cell. */
+/* gradient = grad log h by least squares over the neighbors, weighted by 1 / distance^2, on a sphere in the tangent
+   plane; lloyd = displacement to the weighted centroid. One evaluation of h per generator is enough, and the fit
+   averages kinks of h over a cell. */
 kernel void fit_gradient(const int size, global const int *starts, global const int *neighbors,
                          global const REAL *points, global const REAL *log_h, global const REAL *offsets,
                          global const REAL *covariances, global REAL *gradient, global REAL *lloyd PERIOD_ARGS)
 {
     WORK_ITEM(i);
-    MANY(REAL) sums[DIM][DIM], rises[DIM];
-    REAL m[DIM][DIM], b[DIM], g[DIM];
-    EACH_AXIS(p)
+    MANY(REAL) sums[CELL_DIM][CELL_DIM], rises[CELL_DIM];
+    REAL m[CELL_DIM][CELL_DIM], b[CELL_DIM], g[DIM];
+    EACH_COMPONENT(p)
     {
         rises[p] = 0;
-        EACH_AXIS(q)
+        EACH_COMPONENT(q)
         sums[p][q] = 0;
     }
+#ifdef SPHERE
+    REAL site[SITE_SIZE];
+    place_site(site, i, points);
+#endif
     const int faces = starts[size], end = starts[i + 1];
     for (int k = starts[i]; k < end; k += AT_ONCE) {
         const MANY(int) facing = TAKE(int, neighbors, k, faces), counts = INSIDE(k, end) & (facing >= 0);
         const MANY(int) j = CHOOSE(int, counts, facing, i);
         MANY(REAL) d[DIM], d2 = 0;
         EACH_AXIS(a)
-        {
-            d[a] = nearest_images(PICK(REAL, points, j, DIM, a) - points[DIM * i + a], PERIOD(a));
-            d2 += d[a] * d[a];
-        }
+        d[a] = nearest_images(PICK(REAL, points, j, DIM, a) - points[DIM * i + a], PERIOD(a));
+#ifdef SPHERE
+        const MANY(REAL) one = site[3] * d[0] + site[4] * d[1] + site[5] * d[2];
+        const MANY(REAL) two = site[6] * d[0] + site[7] * d[1] + site[8] * d[2];
+        d[0] = one;
+        d[1] = two;
+#endif
+        EACH_COMPONENT(a)
+        d2 += d[a] * d[a];
         /* Walls have distance 1 and no difference. */
         const MANY(REAL) weight = 1 / CHOOSE(REAL, counts, d2, 1), rise = PICK(REAL, log_h, j, 1, 0) - log_h[i];
-        EACH_AXIS(p)
+        EACH_COMPONENT(p)
         {
             const MANY(REAL) weighted = d[p] * weight;
             rises[p] += weighted * rise;
-            EACH_AXIS(q)
+            EACH_COMPONENT(q)
             if (q >= p)
                 sums[p][q] += weighted * d[q];
         }
     }
-    EACH_AXIS(p)
+    EACH_COMPONENT(p)
     {
         b[p] = SUM(REAL, rises[p]);
-        EACH_AXIS(q)
+        EACH_COMPONENT(q)
         if (q >= p)
             m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
     }
-#ifdef SPHERE
-    /* No gradient along the normal. */
-    const REAL tangential = m[0][0] + m[1][1] + m[2][2];
-    EACH_AXIS(p)
-    EACH_AXIS(q)
-    m[p][q] += tangential * points[3 * i + p] * points[3 * i + q];
-#endif
     /* The gradient is 0 if neighbors are too few or collinear. Division by infinity, because PoCL 6 with LLVM 18
        crashes on a branch here. */
-    const REAL trace = m[0][0] + m[1][1] + (DIM == 3 ? m[DIM - 1][DIM - 1] : 0);
+    const REAL trace = m[0][0] + m[1][1] + (CELL_DIM == 3 ? m[CELL_DIM - 1][CELL_DIM - 1] : 0);
     const REAL least = sqrt(REAL_EPS);
-#if DIM == 2
+#if CELL_DIM == 2
     const REAL det = m[0][0] * m[1][1] - m[0][1] * m[1][0];
     const REAL over = det > least * trace * trace ? det : INFINITY;
     g[0] = (b[0] * m[1][1] - b[1] * m[0][1]) / over;
@@ -133,6 +137,11 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
     g[2] =
         (b[0] * c2 + b[1] * (m[0][1] * m[2][0] - m[0][0] * m[2][1]) + b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) /
         over;
+#endif
+#ifdef SPHERE
+    const REAL along[2] = {g[0], g[1]};
+    EACH_AXIS(a)
+    g[a] = along[0] * site[3 + a] + along[1] * site[6 + a];
 #endif
     EACH_AXIS(a)
     gradient[DIM * i + a] = g[a];

@@ -239,6 +239,9 @@ kernel void descend_quality(const int size, global const int *starts, global con
 /* Distance of a generator from the middle of the opposite side over half that side, after it has moved: 1 is a right
    angle (Thales). */
 #define OPENED R(1.01)
+/* Longest of these moves over the distance of the nearest neighbor. Where sizes jump, triangles are so obtuse that
+   longer moves would put generators on each other. */
+#define LARGEST_OPENING R(0.25)
 
 /* Per generator i: displacement[i], away from the opposite sides of the Delaunay triangles that have an obtuse angle at
    i; counts[i] is the number of these triangles. Two neighbors in a row and i are a triangle. */
@@ -247,13 +250,13 @@ kernel void open_obtuse_triangles(const int size, global const int *starts, glob
 {
     WORK_ITEM(i);
     const int begin = starts[i], end = starts[i + 1];
-    REAL away[DIM] = {0};
+    REAL away[DIM] = {0}, nearest2 = REAL_MAX, way2 = 0;
     int count = 0;
     for (int k = begin; k < end; ++k) {
         const int j = neighbors[k], l = neighbors[k + 1 < end ? k + 1 : begin];
         if (j < 0 || l < 0)
             continue;
-        REAL middle[DIM], middle2 = 0, half2 = 0;
+        REAL middle[DIM], middle2 = 0, half2 = 0, gap2 = 0;
         EACH_AXIS(a)
         {
             const REAL u = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
@@ -261,7 +264,9 @@ kernel void open_obtuse_triangles(const int size, global const int *starts, glob
             middle[a] = (u + v) / 2;
             middle2 += middle[a] * middle[a];
             half2 += (u - v) * (u - v) / 4;
+            gap2 += u * u;
         }
+        nearest2 = fmin(nearest2, gap2);
         if (middle2 >= half2)
             continue;
         const REAL length = sqrt(middle2), way = length > 0 ? (OPENED * sqrt(half2) - length) / length : 0;
@@ -270,6 +275,9 @@ kernel void open_obtuse_triangles(const int size, global const int *starts, glob
         ++count;
     }
     EACH_AXIS(a)
-    displacement[DIM * i + a] = away[a];
+    way2 += away[a] * away[a];
+    const REAL most2 = LARGEST_OPENING * LARGEST_OPENING * nearest2, scale = way2 > most2 ? sqrt(most2 / way2) : 1;
+    EACH_AXIS(a)
+    displacement[DIM * i + a] = scale * away[a];
     counts[i] = count;
 }

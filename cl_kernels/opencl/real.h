@@ -41,6 +41,8 @@
 /* EACH_AXIS(a) ...: an unrolled loop over the axes. PoCL does not unroll such loops, and then keeps arrays of DIM
    values in memory. */
 #define EACH_AXIS(a) _Pragma("unroll") for (int a = 0; a < DIM; ++a)
+/* The same over the components of a vector in the plane of a cell: on a sphere two, along the tangents. */
+#define EACH_COMPONENT(a) _Pragma("unroll") for (int a = 0; a < CELL_DIM; ++a)
 /* A literal in the working precision: R(0.5). */
 #define R(x) ((REAL)(x))
 

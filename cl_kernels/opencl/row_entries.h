@@ -30,6 +30,11 @@
     }                                                                                                                  \
     inline MANY(TYPE) CLVORO_JOIN(take_rows_, TYPE)(global const TYPE *array, int a, int k, int size)                  \
     {                                                                                                                  \
+        if (k + 8 <= size) {                                                                                           \
+            global const TYPE *row = array + DIM * k + a;                                                              \
+            return (MANY(TYPE))(row[0], row[DIM], row[2 * DIM], row[3 * DIM], row[4 * DIM], row[5 * DIM],              \
+                                row[6 * DIM], row[7 * DIM]);                                                           \
+        }                                                                                                              \
         const int8 at = min(k + (int8)(0, 1, 2, 3, 4, 5, 6, 7), (int8)(size - 1));                                     \
         return PICK(TYPE, array, at, DIM, a);                                                                          \
     }                                                                                                                  \

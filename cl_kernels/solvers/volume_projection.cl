@@ -17,6 +17,9 @@
    From a start y_0, such as the solution of the last step, the first direction is p = y_0, and the second has beta = 0.
    alpha is optimal along p, so that a poor start, or one of another scale, does no harm.
 
+   Derivatives with respect to a generator have CELL_DIM components: along the axes, or on a sphere along the two
+   tangents at that generator.
+
    Derivatives across faces are in single precision; vectors are in STORE, which is single precision where the tolerance
    allows it. Sums are in REAL. */
 #include "geometry/domain.h"
@@ -29,6 +32,17 @@
 #define NORM(k) ((k)&1)
 #define GAMMA(k) (2 + ((k)&1))
 #define CURVATURE 4
+
+#ifdef SPHERE
+/* The components along the tangents at y (see `place_site`) of `v` in space. */
+#define ALONG_TANGENTS(TYPE, y, v, out)                                                                                \
+    do {                                                                                                               \
+        const TYPE sign = copysign((TYPE)(1), y[2]), s = -1 / (sign + y[2]), t = y[0] * y[1] * s;                      \
+        const TYPE one = (1 + sign * y[0] * y[0] * s) * v[0] + sign * t * v[1] - sign * y[0] * v[2];                   \
+        out[1] = t * v[0] + (sign + y[1] * y[1] * s) * v[1] - y[1] * v[2];                                             \
+        out[0] = one;                                                                                                  \
+    } while (0)
+#endif
 
 /* eps = min(3, penalty (1 + q^2 / quality_scale^2)) / (1 + (r / log_ratio_scale)^2), q = (1 - Q) / sqrt Q.
 
@@ -51,7 +65,7 @@ inline float penalty_of(float penalty, float quality_scale, float least_quality,
      own[i] = dr_i/dx_i h_i      rows[k] = dr_i/dx_j h_j      columns[k] = dr_j/dx_i h_i   for face k = (i, j)
      r = b = log_ratio + J displacement      z = start if `warm`, else D^-1 r
 
-   together with eps and D^-1. rows and columns have one array of `room` entries per axis; entries of walls are 0.
+   together with eps and D^-1. rows and columns have one array of `room` entries per component; entries of walls are 0.
    Generators with labels below `fixed` do not move. Lengths are divided by h before they are rounded, so that sizes of
    any magnitude are in range. */
 kernel void assemble_projection(int n, const int room, global const int *starts, global const int *neighbors,
@@ -69,26 +83,36 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
     const int faces = starts[n], until = starts[block_end(n)];
     for (BLOCK_LOOP(i, n)) {
         REAL x[DIM];
-        float self[DIM], change = 0;
+        float self[CELL_DIM], change = 0;
         const REAL hi = h[i], unit = 1 / hi, content = CELL_DIM == 2 ? hi * hi : hi * hi * hi;
         const REAL per_face = CELL_DIM == 2 ? unit : unit * unit;
         const float shrink = content / volumes[i];
         float diagonal = 0, least_quality = quality[i];
         const bool is_fixed = fixed > 0 && labels[i] < fixed;
         EACH_AXIS(a)
-        {
-            x[a] = points[DIM * i + a];
-            self[a] = 0;
-        }
+        x[a] = points[DIM * i + a];
+        EACH_COMPONENT(c)
+        self[c] = 0;
+#ifdef SPHERE
+        const float xf[3] = {x[0], x[1], x[2]};
+        const MANY(float) here_in_lanes[3] = {xf[0], xf[1], xf[2]};
+#endif
         const int end = starts[i + 1];
         for (int k = starts[i]; k < end; k += AT_ONCE) {
             const MANY(int) facing = TAKE(int, neighbors, k, faces), counts = INSIDE(k, end) & (facing >= 0);
             const MANY(int) j = select((MANY(int))(i), facing, counts);
-            MANY(float) d[DIM], d2 = 0, square = 0, displaced = 0;
+            MANY(float) d[DIM], d2 = 0, square = 0, displaced = 0, middle[DIM], other[DIM];
+#ifdef SPHERE
+            MANY(float) there_in_lanes[DIM];
+#endif
             EACH_AXIS(a)
             {
-                d[a] = CONVERT(float, nearest_images(PICK(REAL, points, j, DIM, a) - x[a], PERIOD(a)) * unit);
+                const MANY(REAL) xj = PICK(REAL, points, j, DIM, a);
+                d[a] = CONVERT(float, nearest_images(xj - x[a], PERIOD(a)) * unit);
                 d2 += d[a] * d[a];
+#ifdef SPHERE
+                there_in_lanes[a] = CONVERT(float, xj);
+#endif
             }
             /* w = 0 on walls, without a division by their distance of 0. */
             const MANY(float) length = CONVERT(float, CONVERT(REAL, TAKE(FACE, face_measures, k, faces)) * per_face);
@@ -102,25 +126,46 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
             {
                 const MANY(float) m =
                     CONVERT(float, CONVERT(REAL, TAKE_ROWS(FACE, face_centroids, a, k, faces)) * unit);
-                const MANY(float) middle = select((MANY(float))(0), m, counts), other = here * (d[a] - middle);
-                displaced += other * CONVERT(float, PICK(REAL, displacement, j, DIM, a) * unit);
-                square += other * other;
-                self[a] += SUM(float, here *middle);
-                put_float(select(other * ratio, (MANY(float))(0), fixed_there), rows + a * room, k, end, until);
-                put_float(is_fixed ? (MANY(float))(0) : -there * middle, columns + a * room, k, end, until);
+                middle[a] = select((MANY(float))(0), m, counts);
+                other[a] = here * (d[a] - middle[a]);
+                displaced += other[a] * CONVERT(float, PICK(REAL, displacement, j, DIM, a) * unit);
+            }
+#ifdef SPHERE
+            MANY(float) own_side[2], other_side[2];
+            ALONG_TANGENTS(MANY(float), here_in_lanes, middle, own_side);
+            ALONG_TANGENTS(MANY(float), there_in_lanes, other, other_side);
+#else
+            const MANY(float) *own_side = middle, *other_side = other;
+#endif
+            EACH_COMPONENT(c)
+            {
+                square += other_side[c] * other_side[c];
+                self[c] += SUM(float, here *own_side[c]);
+                put_float(select(other_side[c] * ratio, (MANY(float))(0), fixed_there), rows + c * room, k, end, until);
+                put_float(is_fixed ? (MANY(float))(0) : -there * own_side[c], columns + c * room, k, end, until);
             }
             change += SUM(float, displaced);
             diagonal += SUM(float, select(square * ratio * ratio, (MANY(float))(0), fixed_there));
             if (quality_scale > 0)
                 least_quality = fmin(least_quality, least_float(CONVERT(float, PICK(REAL, quality, j, 1, 0))));
         }
+        float slope[DIM], moved[DIM];
         EACH_AXIS(a)
         {
+            slope[a] = gradient[DIM * i + a] * hi;
+            moved[a] = displacement[DIM * i + a] * unit;
+        }
+#ifdef SPHERE
+        ALONG_TANGENTS(float, xf, slope, slope);
+        ALONG_TANGENTS(float, xf, moved, moved);
+#endif
+        EACH_COMPONENT(c)
+        {
             /* A fixed generator changes neither its volume nor its size. */
-            const float t = is_fixed ? 0 : self[a] - DIM * (float)(gradient[DIM * i + a] * hi);
-            change += t * (float)(displacement[DIM * i + a] * unit);
+            const float t = is_fixed ? 0 : self[c] - CELL_DIM * slope[c];
+            change += t * moved[c];
             diagonal += t * t;
-            own[DIM * i + a] = t;
+            own[CELL_DIM * i + c] = t;
         }
         const float e = penalty_of(penalty, quality_scale, least_quality, log_ratio_scale, log_ratio[i]);
         const REAL inverse = 1 / (diagonal + e), b = log_ratio[i] + change;
@@ -188,21 +233,21 @@ inline void step_projection_direction(int k, const iteration_t *it, local REAL *
     Sum curvature = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
         const STORE zi = it->z[i], pi = k > start ? zi + beta * it->p[i] : zi;
-        STORE sum[DIM];
-        EACH_AXIS(a)
-        sum[a] = it->own[DIM * i + a] * zi + (k > start ? beta * it->s[DIM * i + a] : 0);
+        STORE sum[CELL_DIM];
+        EACH_COMPONENT(a)
+        sum[a] = it->own[CELL_DIM * i + a] * zi + (k > start ? beta * it->s[CELL_DIM * i + a] : 0);
         const int end_of_row = it->starts[i + 1];
         for (int f = it->starts[i]; f < end_of_row; f += AT_ONCE) {
             const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
             const MANY(STORE) zj = PICK(STORE, it->z, j, 1, 0);
-            EACH_AXIS(a)
+            EACH_COMPONENT(a)
             sum[a] += SUM(STORE, DERIVATIVE(it->columns, f, a) * zj);
         }
         it->p[i] = pi;
         REAL product = (REAL)it->eps[i] * pi * pi;
-        EACH_AXIS(a)
+        EACH_COMPONENT(a)
         {
-            it->s[DIM * i + a] = sum[a];
+            it->s[CELL_DIM * i + a] = sum[a];
             product += (REAL)sum[a] * sum[a];
         }
         sum_add(&curvature, product);
@@ -227,18 +272,18 @@ inline void step_projection(int k, const iteration_t *it, local REAL *scratch)
         const STORE pi = it->p[i];
         STORE q = it->eps[i] * pi;
         it->y[i] = (k > 0 ? it->y[i] : 0) + alpha * pi;
-        EACH_AXIS(a)
+        EACH_COMPONENT(a)
         {
-            const STORE si = it->s[DIM * i + a];
-            q += it->own[DIM * i + a] * si;
-            it->u[DIM * i + a] = (k > 0 ? it->u[DIM * i + a] : 0) - alpha * si;
+            const STORE si = it->s[CELL_DIM * i + a];
+            q += it->own[CELL_DIM * i + a] * si;
+            it->u[CELL_DIM * i + a] = (k > 0 ? it->u[CELL_DIM * i + a] : 0) - alpha * si;
         }
         const int end_of_row = it->starts[i + 1];
         for (int f = it->starts[i]; f < end_of_row; f += AT_ONCE) {
             const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
             MANY(STORE) sum = 0;
-            EACH_AXIS(a)
-            sum += DERIVATIVE(it->rows, f, a) * PICK(STORE, it->s, j, DIM, a);
+            EACH_COMPONENT(a)
+            sum += DERIVATIVE(it->rows, f, a) * PICK(STORE, it->s, j, CELL_DIM, a);
             q += SUM(STORE, sum);
         }
         const STORE ri = it->r[i] - alpha * q, zi = it->inverse_diagonal[i] * ri;
@@ -282,10 +327,22 @@ kernel void project_by_group(ITERATION_ARGS)
 
 /* correction = h u, and y as the start of the next projection. One work-item per generator. */
 kernel void write_correction(const int size, global const STORE *u, global const STORE *y, global const REAL *h,
-                             global REAL *correction, global float *start)
+                             global const REAL *points, global REAL *correction, global float *start)
 {
     WORK_ITEM(i);
     start[i] = y[i];
+#ifdef SPHERE
+    /* The two tangents in space are the rows of what ALONG_TANGENTS multiplies by. */
+    const float x[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
+    EACH_AXIS(a)
+    {
+        const float axis[3] = {a == 0, a == 1, a == 2};
+        float along[2];
+        ALONG_TANGENTS(float, x, axis, along);
+        correction[3 * i + a] = h[i] * (u[2 * i] * along[0] + u[2 * i + 1] * along[1]);
+    }
+#else
     EACH_AXIS(a)
     correction[DIM * i + a] = h[i] * u[DIM * i + a];
+#endif
 }

@@ -26,6 +26,7 @@ from ..tessellation.tessellator import Tessellator
 from .density import CellWeights, LloydWeights
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
 from .motion import Moving
+from .quality_descent import MOST_OBTUSE
 from .stages import Stages
 from .walls import Walls
 
@@ -460,20 +461,21 @@ class MeshState:
             self.set_generators(rows)
         return counts
 
-    def open_triangles(self) -> bool:
+    def open_triangles(self) -> int:
         """Move generators away from the opposite sides of obtuse triangles, and update the mesh.
 
-        Returns False, without a change, if there are none.
+        Returns their number, or 0 if nothing has changed: there are none, or too many to be opened.
         """
         with self.engine.workspace.frame():
             displacement = self.engine.scratch(self.points.shape)
-            if not self.stages.quality_descent.open_triangles(self.t, displacement):
-                return False
+            count = self.stages.quality_descent.open_triangles(self.t, displacement)
+            if not count or count > MOST_OBTUSE * self.n:
+                return 0
             self.stages.motion.move_generators(
                 self.free, self.points, displacement, 1.0, displacement, 0.0, self.local_length, self.velocity, clip=0.5
             )  # fmt: skip
         self.update()
-        return True
+        return count
 
     def read_summaries(self) -> dict[str, Summary]:
         """Read the summaries of the mesh and of the last step: the scalars that the host needs.

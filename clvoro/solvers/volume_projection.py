@@ -107,7 +107,7 @@ class VolumeProjection:
 
     def _reserve(self, n: int, m: int, store: np.dtype, max_iterations: int) -> _Arrays:
         """Return the arrays for `n` cells and `m` faces, and enlarge the record for `max_iterations`."""
-        engine, d = self.engine, self.engine.dim
+        engine, d = self.engine, self.engine.cell_dim
         if 4 * (max_iterations + 1) > len(self._record):
             self._record = engine.zeros(4 * (max_iterations + 1))
         return _Arrays(
@@ -188,7 +188,7 @@ class VolumeProjection:
             )
         solution = self._solution(rows, tolerance)
         if solution.iterations:
-            engine.run_each(k.write_correction, n, v.u, v.y, targets.h, correction, start)
+            engine.run_each(k.write_correction, n, v.u, v.y, targets.h, t.points, correction, start)
         else:
             correction.fill(0)
         return solution

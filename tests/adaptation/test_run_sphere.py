@@ -3,6 +3,7 @@
 import numpy as np
 import pyopencl as cl
 import pytest
+from scipy.spatial import KDTree
 
 import clvoro
 from clvoro import sizing
@@ -137,6 +138,9 @@ def test_obtuse_triangles_are_opened(ctx, real):
             if np.linalg.norm(middle) < half:
                 expected[i] -= (1.01 * half / np.linalg.norm(middle) - 1) * middle
                 count += 1
+    nearest = KDTree(x).query(x, k=2)[0][:, 1]
+    long = np.linalg.norm(expected, axis=1) / (0.25 * nearest)
+    expected /= np.maximum(long, 1)[:, None]
     displacement = engine.zeros((500, 3))
     assert mesh.stages.quality_descent.open_triangles(mesh.t, displacement) == count > 100
     found = mesh.to_host(displacement)
@@ -144,6 +148,6 @@ def test_obtuse_triangles_are_opened(ctx, real):
 
 
 def test_no_obtuse_triangles_with_little_effort(ctx):
-    result = clvoro.Adapter(ctx).run(EARTH, 0.25 * SIZE, effort="fast")
+    result = clvoro.Adapter(ctx).run(EARTH, 0.25 * SIZE, effort="fast", seed=3)
     assert angles_of_triangles(result.diagram).max() < 90
     assert result.check()

@@ -119,7 +119,8 @@ def hexagons(a, box=BOX):
 
 
 def random_points(n, seed, box=BOX):
-    return np.random.default_rng(seed).random((n, box.dim)) * box.extent + box.lower
+    x = np.random.default_rng(seed).random((n, box.dim)) * box.extent + box.lower
+    return x if box.cell_dim == box.dim else box.wrap(x)
 
 
 def relaxed_points(n, seed, steps=8):

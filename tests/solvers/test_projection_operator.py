@@ -1,8 +1,9 @@
-"""The projection against dense algebra in 2D and 3D, in periodic boxes, and with fixed generators."""
+"""The projection against dense algebra in 2D and 3D, in periodic boxes, on a sphere, and with fixed generators."""
 
 import numpy as np
 import pytest
 
+from clvoro.geometry.sphere import Sphere
 from clvoro.solvers import volume_projection as projection
 from clvoro.solvers.conjugate_gradient import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
@@ -27,6 +28,9 @@ class Given:
         self.quality = rng.uniform(0.3, 1, self.n)
         self.displacement = 0.01 * rng.normal(size=(self.n, box.dim))
         self.displacement[self.held] = 0
+        if box.cell_dim < box.dim:
+            normal = patch.fetch(self.t).points
+            self.displacement -= (self.displacement * normal).sum(axis=1)[:, None] * normal
 
     def project(self, tolerance, max_iterations):
         """Return the solution, the correction, the next start, and the arrays of the iteration."""
@@ -54,7 +58,10 @@ class Given:
             J[i, j] += w * (d - host.face_centroids[k])
             J[i, i] += w * host.face_centroids[k]
             worst[i] = min(worst[i], self.quality[j])
-        J[np.arange(self.n), np.arange(self.n)] -= dim * self.gradient
+        J[np.arange(self.n), np.arange(self.n)] -= self.box.cell_dim * self.gradient
+        if self.box.cell_dim < dim:  # on a sphere generators move in their tangent planes
+            normal = host.points
+            J -= np.einsum("ija,ja->ij", J, normal)[:, :, None] * normal
         J[:, self.held] = 0
         eps = np.minimum(EPS * (1 + (1 - worst) ** 2 / worst / QUALITY_SCALE**2), 3)
         return J, eps / (1 + (self.log_ratio / LOG_RATIO_SCALE) ** 2)
@@ -65,12 +72,13 @@ class Given:
     params=[
         ("plane", "float64", None), ("plane", "float32", None), ("plane", "float64", 16), ("space", "float64", None),
         ("space", "float32", 16), ("torus", "float64", None), ("slab", "float64", None),
+        ("sphere", "float64", None), ("sphere", "float32", 16),
     ],
     ids=lambda p: f"{p[0]}, {p[1]}" + (", groups" if p[2] else ""),
 )  # fmt: skip
 def kind(ctx, request):
     name, real, group_size = request.param
-    box = patch.BOXES[name]
+    box = Sphere(1) if name == "sphere" else patch.BOXES[name]
     return patch.make_engine(ctx, real, box.dim, group_size, box), box
 
 
