@@ -75,6 +75,42 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
     places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
 }
 
+#ifdef WEIGHTED
+/* Per generator i: its cell, clipped by its neighbors in an earlier, similar diagram, and by theirs. A cell from which
+   too little was cut contains that of the diagram. So all are right if the sum of their areas is that of the box. If
+   not, the next round starts from these. A cell without neighbors is empty and stays so. */
+kernel void clip_by_rings(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                          global const int *old_starts, global const int *old_neighbors, global int *rows,
+                          global int *row_counts, global int *places, global int *flags)
+{
+    WORK_ITEM(i);
+    SITE(x, i, points);
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    cell_t cell;
+    start_polygon(&cell, i, x, lower, upper);
+    int flag = 0;
+    const int begin = old_starts[i], end = old_starts[i + 1];
+    if (begin == end)
+        cell.n = 0;
+    /* First the neighbors, then those of the k-th one. */
+    for (int k = begin - 1; k < end; ++k) {
+        const int via = k < begin ? i : old_neighbors[k];
+        for (int l = via < 0 ? 0 : old_starts[via]; via >= 0 && l < old_starts[via + 1]; ++l) {
+            const int j = old_neighbors[l];
+            bool known = j < 0 || j == i;
+            for (int f = 0; f < cell.n && !known; ++f)
+                known = cell.faces[f] == j;
+            const REAL2 way = known ? (REAL2)(1, 0) : direction_of(x, j, points);
+            const REAL d[2] = {way.s0, way.s1};
+            if (!known && !clip_polygon(&cell, d, dot(way, way), j, false, points))
+                flag = FLAG_FULL;
+        }
+    }
+    places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
+}
+#endif
+
 /* Twice the area of the cell of generator j, from its listed faces. */
 inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *points, const REAL *lower, const REAL *upper)
 {

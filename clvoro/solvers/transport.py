@@ -14,7 +14,7 @@ import pyopencl.array as cla
 
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
-from ..tessellation.device_diagram import Tessellation
+from ..tessellation.device_diagram import NeighborRows, Tessellation
 from ..tessellation.power import PowerTessellator
 from .conjugate_gradient import Solution
 from .poisson import Poisson
@@ -79,6 +79,7 @@ class Transport:
         self._poisson = Poisson(engine)
         self._kernels = engine.kernels("solvers/transport")
         self._summaries = Summaries(engine, ("volume", "square", "relative"))
+        self._rows: NeighborRows | None = None
 
     def prescribe_sizes(self, h: cla.Array) -> cla.Array:
         """Return the volumes h^d (n,) of the target sizes `h` (n,)."""
@@ -115,16 +116,20 @@ class Transport:
         newton = Newton(factor=self._fit(power, prescribed))
         least = self._summaries.read_one("volume").least * newton.factor
 
-        def evaluate(weights: cla.Array) -> _State:
-            return self._evaluate(power, points, prescribed, weights, exact)
+        def evaluate(weights: cla.Array, least: float = 0.0) -> _State | None:
+            return self._evaluate(power, points, prescribed, weights, exact, least)
 
+        self._rows = None
         now = None if start is None else evaluate(start)
         if now is None or not now.least > 0:
             now = evaluate(engine.zeros(n))
+        assert now is not None
         least = 0.5 * min(least, now.least)
         newton.errors.append(now.error)
         ordering = object()
         while now.error > tolerance and len(newton.shares) < max_steps:
+            # Trial steps overwrite the diagram.
+            self._rows = NeighborRows(n, now.t.starts.copy(), now.t.neighbors.copy())
             step, newton.solution = self._newton_step(now, points, ordering)
             new, share = None, 2.0
             while new is None and share > LEAST_SHARE:
@@ -133,12 +138,13 @@ class Transport:
                 engine.run_each(
                     self._kernels.step_weights, n, engine.real.type(share), now.weights, step, stepped
                 )  # fmt: skip
-                new = evaluate(stepped)
-                if new.least < least or new.norm > (1 - share / 2) * now.norm:
+                new = evaluate(stepped, least)
+                if new is not None and (new.least < least or new.norm > (1 - share / 2) * now.norm):
                     new = None
             if new is None:
-                # Round-off prevents any progress. The arrays of the diagram are overwritten.
+                # Round-off prevents any progress.
                 now = evaluate(now.weights)
+                assert now is not None
                 break
             now = new
             newton.errors.append(now.error)
@@ -151,10 +157,8 @@ class Transport:
     def _fit(self, power: PowerTessellator, prescribed: cla.Array) -> float:
         """Scale volumes so that their sum is that of the domain; return the factor."""
         engine = self.engine
-        lower, upper = power.domain.device_corners(engine.real)
-        whole = float(np.prod((upper - lower)[: engine.dim].astype(float)))
         self._summaries.collect("volume", prescribed, len(prescribed))
-        factor = whole / self._summaries.read_one("volume").sum
+        factor = power.volume / self._summaries.read_one("volume").sum
         engine.run_each(
             self._kernels.scale_volumes, len(prescribed), engine.real.type(factor), prescribed
         )
@@ -167,9 +171,13 @@ class Transport:
         prescribed: cla.Array,
         weights: cla.Array,
         exact: bool,
-    ) -> _State:
+        least: float,
+    ) -> _State | None:
+        """Return the state with these weights; None if a cell is known to be smaller than `least`."""
         engine, n = self.engine, len(prescribed)
-        t = power.tessellate(points, weights, n, exact)
+        t = power.tessellate(points, weights, n, exact, self._rows, least)
+        if t is None:
+            return None
         rhs, square, relative = (engine.empty(n) for _ in range(3))
         engine.run_each(
             self._kernels.compare_volumes, n, t.volumes, prescribed, rhs, square, relative

@@ -26,6 +26,7 @@ from .device_diagram import (
     OPEN,
     ROUGH_SHARE,
     CloseError,
+    NeighborRows,
     OpenCellError,
     Tessellation,
     restored,
@@ -231,6 +232,27 @@ class Cells:
             # Clip only the cells that had too many faces: their rows are empty. Doubts about others stay.
             some = True
             self._reset_flags(n, len(rows.counts), byte_count=4)
+
+    @framed
+    def clip_by_rings(
+        self, box: ClipBox, points: cla.Array, previous: NeighborRows, exact: bool
+    ) -> Tessellation | None:
+        """Tessellate by `points` with weights (n, 3), starting from the neighbors in `previous`.
+
+        The result is right if the sum of its volumes is that of `box`. None if that fails.
+        """
+        n, old = previous.n, (previous.starts, previous.neighbors)
+        self._reserve(n)
+        rows = self.take_rows(n, spare=spare_slots(n))
+        self.engine.run_each(
+            self._kernels.clip_by_rings, n, points, *box.device_corners(self.engine.real), *old, rows.slots,
+            rows.counts, rows.places, rows.flags,
+        )  # fmt: skip
+        same = rows.places, rows.places
+        flags, m = self._match(rows, box, points, n, *same, exact)
+        if flags & ~DOUBT:
+            return None
+        return self._measure(rows, box, points, n, *same, m, flags, exact)
 
     def match_update(
         self,

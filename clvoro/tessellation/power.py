@@ -8,13 +8,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pyopencl.array as cla
 
 from ..errors import InputError
 from ..geometry.box import Box, Domain
-from .device_diagram import CloseError, Tessellation
+from ..opencl.primitives import Summaries
+from .device_diagram import CloseError, NeighborRows, Tessellation
 from .polyhedra import Polyhedra
 from .stages import TessellationStages
+
+CLOSED = 1e-12
+"""Largest relative difference of the sum of volumes from that of the domain, where no part of a cell is missing."""
+PROGRESS = 0.95
+"""Ratio of the excess of two rounds above which the search begins anew."""
 
 
 def require_power_domain(domain: Domain) -> None:
@@ -39,12 +46,32 @@ class PowerTessellator:
     def __init__(self, stages: TessellationStages, domain: Domain) -> None:
         require_power_domain(domain)
         self.stages, self.domain = stages.weighted, domain
-        self._kernels = self.stages.engine.kernels("tessellation/power")
+        engine = self.stages.engine
+        self._kernels = engine.kernels("tessellation/power")
+        self._summaries = Summaries(engine, ("volume",))
+        lower, upper = domain.device_corners(engine.real)
+        self.volume = float(np.prod((upper - lower)[: engine.dim].astype(float)))
 
     def tessellate(
-        self, points: cla.Array, weights: cla.Array, n: int, exact: bool = False
-    ) -> Tessellation:
+        self,
+        points: cla.Array,
+        weights: cla.Array,
+        n: int,
+        exact: bool = False,
+        previous: NeighborRows | None = None,
+        least: float = 0.0,
+    ) -> Tessellation | None:
         """Return the power diagram of `points` (n, d) with `weights` (n,), in normalized coordinates.
+
+        Parameters
+        ----------
+        exact : bool
+            As for `Cells.tessellate`.
+        previous : NeighborRows, optional
+            The graph of a diagram of similar weights, without empty cells: in 2D and float64 cells start from its
+            neighbors. Far from its generator a cell is found much sooner than by a search around the generator.
+        least : float
+            With `previous`: None is returned as soon as a cell is known to be smaller.
 
         Raises
         ------
@@ -55,11 +82,41 @@ class PowerTessellator:
         weighted = engine.empty((n, engine.site_size))
         engine.run_each(self._kernels.attach_weights, n, points, weights, weighted)
         try:
-            binned = stages.bins.build(self.domain, weighted, n)
-            t = stages.cells.tessellate(self.domain, weighted, n, binned, exact=exact)
+            t = None
+            if previous is not None and engine.dim == 2 and engine.real == np.float64:
+                t, too_small = self._from(weighted, previous, exact, least)
+                if too_small:
+                    return None
+            if t is None:
+                binned = stages.bins.build(self.domain, weighted, n)
+                t = stages.cells.tessellate(self.domain, weighted, n, binned, exact=exact)
         except CloseError:
             raise CloseError(points, n).within(self.domain) from None
         return replace(t, points=points, weighted=weighted)
+
+    def _from(
+        self, weighted: cla.Array, previous: NeighborRows, exact: bool, least: float
+    ) -> tuple[Tessellation | None, bool]:
+        """Return the diagram by way of the neighbors in `previous`, and whether a cell is smaller than `least`.
+
+        The diagram is None if neighbors stay missing. Until all are found cells are too large, never too small.
+        """
+        cells, rows, before = self.stages.cells, previous, np.inf
+        assert not isinstance(cells, Polyhedra)
+        while True:
+            t = cells.clip_by_rings(self.domain, weighted, rows, exact)
+            if t is None:
+                return None, False
+            self._summaries.collect("volume", t.volumes, t.n)
+            found = self._summaries.read_one("volume")
+            if found.least < least:
+                return None, True
+            excess = abs(found.sum - self.volume)
+            if excess <= CLOSED * self.volume:
+                return t, False
+            if not excess < PROGRESS * before:
+                return None, False
+            rows, before = NeighborRows(t.n, t.starts, t.neighbors), excess
 
     def final(self, t: Tessellation) -> Tessellation:
         """Return `t`, the latest diagram, with faces in full precision."""

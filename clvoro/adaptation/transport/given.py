@@ -35,7 +35,9 @@ def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: ob
     with Naming(host, domain, stages.engine.real):
         labels, sorted_points = _sorted(stages, domain, host)
         device_weights = stages.engine.upload(scaled[labels.get()])
-        t = power.final(power.tessellate(sorted_points, device_weights, n, exact=True))
+        t = power.tessellate(sorted_points, device_weights, n, exact=True)
+        assert t is not None
+        t = power.final(t)
     diagram = fetch_diagram(power.stages.engine, domain, t, labels)
     diagram = diagram.with_weights(given)
     empty = diagram.empty_cells

@@ -1,0 +1,90 @@
+"""Prescribed volumes in power diagrams: steps of Newton's method, and time.
+
+    python bench/transport.py [--sizes 1e3,1e4,1e5] [--sizes-3d 1e3,1e4] [--repeat N] [--processor-time]
+                              [--device NAME] [--dtype float32] [--json]
+
+Uniform random generators in a unit box get cells of equal volume, and of volumes in proportion to
+0.02 + |x - c|^2, c the middle of the box (in 2D 1 : 26). "outside" is the share of the cells that do not contain their
+generator, "shares" the shares of the damped Newton steps. Seconds are the least of the repeated solves, with generators
+sorted and arrays read back. `--processor-time` measures the processor time of all threads over the number of compute
+units, for a machine with other work.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+from _common import Report, best, clock_of, counts, heading, make_adapter, parser, shown
+
+import clvoro
+
+SEED = 7411
+
+
+def graded(points: np.ndarray) -> np.ndarray:
+    """Return volumes that grow from the middle of the box."""
+    return 0.02 + ((points - 0.5) ** 2).sum(axis=1)
+
+
+def equal(points: np.ndarray) -> np.ndarray:
+    return np.ones(len(points))
+
+
+VOLUMES = {"equal": equal, "graded": graded}
+COLUMNS = {
+    "dimension": shown("dimension", "d"),
+    "cells": shown("cells", ",d"),
+    "volumes": shown("volumes", ""),
+    "steps": shown("steps", "d"),
+    "shares below 1": shown("damped", ""),
+    "relative error": shown("error", ".1e"),
+    "outside": shown("outside", ".3f"),
+    "s": shown("seconds", ".2f"),
+}
+
+
+def make_options() -> argparse.ArgumentParser:
+    made = parser(__doc__)
+    made.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5"), metavar="N,...")
+    made.add_argument("--sizes-3d", type=counts, default=counts("1e3,1e4"), metavar="N,...")
+    made.add_argument("--repeat", type=int, default=3, metavar="N")
+    made.add_argument("--processor-time", action="store_true", help="not the wall clock")
+    return made
+
+
+def main(arguments: list[str] | None = None) -> None:
+    options = make_options().parse_args(arguments)
+    adapter = make_adapter(options)
+    report, clock = Report(options.json, COLUMNS), clock_of(options, adapter)
+    for dim, sizes in ((2, options.sizes), (3, options.sizes_3d)):
+        box = clvoro.Box((0,) * dim, (1,) * dim)
+        for n in sizes:
+            points = np.random.default_rng(SEED).random((n, dim))
+            for kind, volumes_at in VOLUMES.items():
+                volumes = volumes_at(points)
+                volumes *= box.measure / volumes.sum()
+                adapter.transport(box, points, volumes, max_steps=1)  # builds the kernels
+                seconds, found = best(
+                    options.repeat,
+                    lambda b=box, p=points, v=volumes: adapter.transport(b, p, v),
+                    clock,
+                )
+                inside = found.diagram.locate(points) == np.arange(n)
+                damped = ", ".join(f"{s:g}" for s in found.shares[found.shares < 1])
+                record = {
+                    "dimension": dim,
+                    "cells": n,
+                    "volumes": kind,
+                    "steps": len(found.shares),
+                    "damped": damped or "-",
+                    "error": float(found.errors[-1]),
+                    "outside": float(1 - inside.mean()),
+                    "seconds": seconds,
+                }
+                report.add(record, f"{dim}D, {n} cells, {kind}")
+    report.finish(heading(adapter, "Prescribed volumes"))
+
+
+if __name__ == "__main__":
+    main()
