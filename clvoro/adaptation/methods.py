@@ -151,6 +151,9 @@ class WeightedMethod:
         )  # fmt: skip
 
 
+CALM_RELAXATION, CALM_MOMENTUM, CALM_BAD_CELL_WEIGHT = 1.3, 0.7, 20.0
+"""Largest parameters at thin walls, where larger steps part the pairs of generators. Measured on a slit, twelve starts:
+the least Q is 0.84. With the default's relaxation of 3.2, or with its weight of 40, it is below 0.6 in four or five."""
 PENALTY_PER_ERROR = 750.0
 """Largest penalty over the error target, for targets above 0.004. With a penalty of 3 no mean error above 0.024 is
 reached; with 30 to 60 the shape hardly improves any more."""
@@ -211,6 +214,10 @@ class ProjectedMethod:
     def displace(self, mesh: MeshState) -> Solution:
         """Evaluate the descent, with momentum, and its projection."""
         stages, t = mesh.stages, mesh.t
+        relaxation, momentum, bad_cell_weight = self.relaxation, self.momentum, self.bad_cell_weight
+        if mesh.walls.thin:
+            relaxation, momentum = min(relaxation, CALM_RELAXATION), min(momentum, CALM_MOMENTUM)
+            bad_cell_weight = min(bad_cell_weight, CALM_BAD_CELL_WEIGHT)
         mesh.allocate_step()
         gradient, log_ratio = mesh.engine.scratch(mesh.points.shape), mesh.engine.scratch(mesh.n)
         with mesh.engine.workspace.frame():
@@ -225,10 +232,10 @@ class ProjectedMethod:
             if self.descent != "lloyd":
                 stages.quality_descent.descend(
                     t, mesh.local_length, mesh.quality, mesh.lloyd,
-                    quality_weight=float(self.descent == "quality"), bad_cell_weight=self.bad_cell_weight,
+                    quality_weight=float(self.descent == "quality"), bad_cell_weight=bad_cell_weight,
                     rate=self.rate,
                 )  # fmt: skip
-            stages.motion.add_momentum(self.relaxation, mesh.lloyd, mesh.velocity, self.momentum)
+            stages.motion.add_momentum(relaxation, mesh.lloyd, mesh.velocity, momentum)
             mesh.zero_fixed(mesh.lloyd)
             if self.descent == "quality":
                 mesh.walls.constrain(mesh, mesh.lloyd)

@@ -296,7 +296,7 @@ def _finish_2d(
         penalty *= error_target / effort.error_target
         scale = min(scale, LOOSE_LOG_RATIO_SCALE) if scale else LOOSE_LOG_RATIO_SCALE
     polish = ProjectedMethod(
-        "quality", penalty=penalty, quality_scale=effort.quality_scale,
+        "quality", momentum=effort.polish_momentum, penalty=penalty, quality_scale=effort.quality_scale,
         log_ratio_scale=scale, k=0.3, error_target=error_target,
         bad_cell_weight=effort.bad_cell_weight, tolerance=POLISH_TOLERANCE,
     )  # fmt: skip

@@ -357,18 +357,18 @@ def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
     check(result, F1)
 
 
-@pytest.mark.parametrize(("seed", "n_cells"), [(2, None), (3, 4500)])
-def test_worst_cells_are_mended(adapter, seed, n_cells):
-    """Off the walls none is below the default's 0.92, by generators that come or go while cells are polished.
+@pytest.mark.parametrize(("seed", "n_cells", "least"), [(7, None, 0.947), (5, 4500, 0.94)])
+def test_worst_cells_are_mended(adapter, seed, n_cells, least):
+    """The worst cells off the walls get better by generators that come or go while cells are polished.
 
-    Without them the worst have 0.902 and 0.927; the count is held nevertheless.
+    Without them the worst have 0.944 and 0.928; the count is held nevertheless.
     """
     size = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.008, slope=0.1)
     result = adapter.run(BOX, size, seed=seed, n_cells=n_cells)
     assert n_cells in (None, len(result.points))
     diagram = result.diagram
     at_wall = np.logical_or.reduceat(diagram.neighbors < 0, diagram.neighbor_starts[:-1])
-    assert result.quality[~at_wall].min() >= 0.92
+    assert result.quality[~at_wall].min() >= least
     late = result.history[-EFFORTS["default"].polish + 3 :]
     assert late["deleted"].sum() > 0
 
