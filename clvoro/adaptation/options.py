@@ -71,8 +71,10 @@ class MultilevelOptions:
         Number of coarser levels before the finest one. Level l has the size 2^l h. With generators of the caller it is
         the number of refinements that lead from them to the finest level.
     error_target : float, optional
-        Mean |log(L / h)| that the last steps aim at; a larger one gives cells of a better shape. The default is .0025
-        (effort "fast": .0035, "best": .0039). Above about .04 the shape no longer improves, and errors stay below the
+        Mean |log(L / h)| that the last steps aim at; a larger one gives cells of a better shape. By default .0025
+        (effort "fast": .0035, "best": .0039) where sizes are smooth. In 2D, with more than about 2,800 cells, it grows
+        with the share of the cells where sizes are steep, |grad h| > .1, up to .0155 ("fast": .007, "best": .01). On
+        spheres and with "exact" it does not. Above about .04 the shape no longer improves, and errors stay below the
         target; in 2D the largest error is bounded to about .25.
 
     Raises

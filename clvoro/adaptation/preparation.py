@@ -25,7 +25,7 @@ from .diagnostics import (
     warn_of_mismatches,
     warn_of_narrow_parts,
 )
-from .efforts import is_near
+from .efforts import LEAST_STEEP, choose_error_target, is_near, steep_share
 from .estimates import Extras, check_memory
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import MOVING, Relaxation, make_method
@@ -86,6 +86,10 @@ class Preparation:
         Factor on the size field that gives `target` cells.
     lattice : (n, d) ndarray or None
         Generators at the start of a moving mesh.
+    steep : float
+        Share of the cells where sizes are steep (see `efforts.steep_share`), if it counts.
+    error_target : float or None
+        That of the schedule; None before there is one, and with methods that have none.
     levels : int
         Number of coarser levels.
     memory : float
@@ -123,6 +127,7 @@ class Preparation:
         if options.layers:
             field = self._place_layers(given_field)
         self.sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
+        self.error_target, self._smooth_target = None, None
         self._tree: DensityTree | None = None
         if points is not None and fixed_count:
             required = float(len(points))
@@ -150,6 +155,7 @@ class Preparation:
         if self._tree is not None and required * self.factor**-domain.cell_dim >= 0.5:
             warn_of_narrow_parts(domain, lambda x: self.factor * self.sizing(x))
         self.lattice = lattice_points(domain, self.target) if options.method in MOVING else None
+        self.steep = self._measure_steepness()
         self.levels = 0
         if options.multilevel:
             self.levels = self._count_levels()
@@ -231,6 +237,18 @@ class Preparation:
         scale = CELLS_ACROSS / NARROW * coarseness * self.factor
         return narrow_parts(self.free, lambda x: scale * self.sizing(x))[0] is not None
 
+    def _measure_steepness(self) -> float:
+        """Return the share of the cells where sizes are steep; 0 where shape is not preferred to sizes.
+
+        That is in 3D, on spheres, with few cells, which only serve a tight target, and with exact sizes.
+        """
+        tree, domain = self._tree, self.domain
+        plane = domain.dim == 2 and auto_levels(self.target, 2) > 0
+        if tree is None or self.options.method != "adaptive" or not plane:
+            return 0.0
+        share = steep_share(self.factor * tree.slopes_of_size, tree.cells)
+        return share if share >= LEAST_STEEP else 0.0
+
     def _count_levels(self) -> int:
         """Return the number of coarser levels, from the points of the caller or from a random sample."""
         d, levels, points = self.domain.cell_dim, self.options.levels, self.points
@@ -310,16 +328,34 @@ class Preparation:
             method = make_method(options.method, relaxation, self.lattice, options.tol)
             return repeated_schedule(method, steps)
         near = self.may_need_correction_only and mesh is not None and self._is_near(mesh)
+        dim, effort = self.domain.cell_dim, options.effort
+        self._smooth_target = choose_error_target(dim, effort, self.levels, near)
+        self.error_target = options.error_target or choose_error_target(
+            dim, effort, self.levels, near, self.steep
+        )
         # Models on spheres have C grids. The exact sizes would be lost.
         exact = options.method in ("exact", "transport")
         open_triangles = isinstance(self.domain, Sphere) and not exact
         schedule = adaptive_schedule(
-            self.domain.cell_dim, options.effort, self.levels, exact, options.error_target,
+            dim, effort, self.levels, exact, self.error_target,
             warm=self.points is not None, near=near, openings=OPENINGS if open_triangles else 0,
         )  # fmt: skip
         if options.method == "transport":
             schedule.append(Prescribe(MOVES))
         return schedule
+
+    @property
+    def trade(self) -> str:
+        """The trade of sizes against shape, in words."""
+        target = f"error target {self.error_target:.2g}"
+        if self.options.error_target is not None:
+            return f"{target}, as given"
+        if self.steep == 0:
+            return f"{target}: sizes come first"
+        return (
+            f"{target} in place of {self._smooth_target:.2g}, for cells of a better shape: sizes are steep for "
+            f"{self.steep:.0%} of them"
+        )
 
     def _is_near(self, mesh: MeshState) -> bool:
         n, n_cells = mesh.n, self.options.n_cells

@@ -110,7 +110,9 @@ def _settings(prepared: Preparation) -> dict[str, Any]:
         **vars(options),
         "start": options.start if prepared.points is None else "points",
         "levels": prepared.levels,
+        "error_target": prepared.error_target,
         "dtype": prepared.stages.engine.real.name,
         "layers": [repr(layer) for layer in options.layers],
     }
-    return {name: value for name, value in settings.items() if uses(options.method, name)}
+    used = {name: value for name, value in settings.items() if uses(options.method, name)}
+    return {**used, "trade": prepared.trade} if options.multilevel else used

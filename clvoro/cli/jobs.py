@@ -352,8 +352,10 @@ class Job:
         known = {key: settings.get(key) for key in _REPEATED}
         if known["start"] == "points":
             known["start"] = None
-        if len(self.case.methods) > 1:  # of which each may choose its own levels
-            return self.case.with_run(**{**known, "levels": None}, methods=self.case.run["methods"])
+        if len(self.case.methods) > 1:  # of which each may choose its own levels and error target
+            given = self.case.run.get("error_target") if "error_target" in settings else None
+            own = {"levels": None, "error_target": given}
+            return self.case.with_run(**{**known, **own}, methods=self.case.run["methods"])
         return self.case.with_run(**known, method=settings.get("method"))
 
     def _initial(self, adapter: Any, size: Any, main: Result) -> Result | None:
@@ -423,6 +425,8 @@ class Job:
                 f"{s['seconds']:9.2f}  {s['stop_reason']}"
             )
         for name, result in results.items():
+            if "trade" in result.settings:
+                print(f"{name}: {result.settings['trade']}")
             if result.diagram.domain.cell_dim == 3:
                 print(f"{name}: {result.measures.line()}")
             if isinstance(result.diagram.domain, Polygon):

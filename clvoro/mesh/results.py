@@ -97,7 +97,8 @@ class Result(Sealed, MeshOutput):
         With `n_cells` of methods "adaptive" and "exact", and always with "transport", `target_size` is the size field
         times this common factor; else 1.
     settings : dict
-        The options that the method uses, to repeat the run.
+        The options that the method uses, to repeat the run. ``settings["error_target"]`` is the one that the run had,
+        given or chosen by the size field, and ``settings["trade"]`` says so in words.
     origin : (n,) int32 or None
         Index of each generator in the points with which the run began; -1 for inserted generators, which come last.
     """
@@ -158,10 +159,11 @@ class Result(Sealed, MeshOutput):
         -------
         dict
             ``cells``, ``steps``, ``mean_error`` and ``max_error`` (of |e|), ``mean_quality``, ``min_quality``,
-            ``size_factor``, ``ever_changed`` (share of cells whose set of neighbors changed on the finest level),
-            ``converged``, ``stop_reason`` and ``seconds``. In a polygonal domain also ``boundary_cells``,
-            ``boundary_mean_error``, ..., and ``inner_cells``, ... for the cells on the boundary and the others (None
-            where there is no such cell).
+            ``size_factor``, ``error_target`` and ``trade`` (the mean error that the run aimed at, and why; None with
+            the methods that repeat one kind of step), ``ever_changed`` (share of cells whose set of neighbors changed
+            on the finest level), ``converged``, ``stop_reason`` and ``seconds``. In a polygonal domain also
+            ``boundary_cells``, ``boundary_mean_error``, ..., and ``inner_cells``, ... for the cells on the boundary and
+            the others (None where there is no such cell).
 
         Examples
         --------

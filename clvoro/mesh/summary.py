@@ -25,6 +25,8 @@ def summary(result: Result) -> dict[str, Any]:
         "mean_quality": float(result.quality.mean()),
         "min_quality": float(result.quality.min()),
         "size_factor": float(result.size_factor),
+        "error_target": result.settings.get("error_target"),
+        "trade": result.settings.get("trade"),
         "ever_changed": float(history["ever_changed"][-1]) if len(history) else 0.0,
         "converged": bool(result.converged),
         "stop_reason": result.stop_reason,

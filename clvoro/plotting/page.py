@@ -135,6 +135,8 @@ def _page(
             **facts,
             "size field scaled by": f"{main.size_factor:.4g} to fit the number of cells",
         }
+    if numbers["trade"]:
+        facts = {**facts, "sizes and shape": numbers["trade"]}
     words = "; ".join([f"method {name}", *(f"{k} {v}" for k, v in facts.items())])
     parts = [
         f"<h1>{_safe(title)}</h1><p class=what>{_safe(words)}</p><dl>{cards}</dl>",

@@ -37,6 +37,28 @@ def _rule(dim: int) -> tuple[np.ndarray, np.ndarray]:
     return 0.5 + 0.5 * nodes, weight
 
 
+def _slopes(points: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the root mean square of |grad value| in boxes, (m,), by differences of neighboring Gauss points.
+
+    Parameters
+    ----------
+    points : (m, 3^d, d) float
+        Gauss points. Some may have been moved, even onto each other.
+    values : (m, 3^d) float
+    """
+    m, _, dim = points.shape
+    rows = (m, *(3,) * dim)
+    squares = np.zeros(m)
+    for axis in range(1, dim + 1):
+        step = np.diff(points.reshape(*rows, dim), axis=axis).reshape(m, -1, dim)
+        rise = np.diff(values.reshape(rows), axis=axis).reshape(m, -1)
+        length2 = (step**2).sum(axis=2)
+        squares += np.divide(rise**2, length2, out=np.zeros_like(rise), where=length2 > 0).mean(
+            axis=1
+        )
+    return np.sqrt(squares)
+
+
 class DensityTree:
     """The number of cells h^-d dV in each box of an adaptive tree over the domain.
 
@@ -76,6 +98,8 @@ class DensityTree:
         Integral of h^-d over the part of each box inside the domain.
     slopes : (m, d) float
         Mean change of log(h^-d) across each box.
+    slopes_of_size : (m,) float
+        |grad h| in each box: the root mean square of the slopes between samples, which a kink does not cancel.
     error : float
         Sum of the error estimates, in cells.
 
@@ -102,7 +126,7 @@ class DensityTree:
             self.coverage.split(self.coverage.occupied)
         m = len(self.boxes)
         self.cells, self._differences, self._low, self._high = np.zeros((4, m))
-        self.slopes = np.zeros((m, dim))
+        self.slopes, self.slopes_of_size = np.zeros((m, dim)), np.zeros(m)
         self._integrate(np.ones(m, bool))
         self._evaluate_landmarks(domain)
         self._refine(np.ones(m, bool))
@@ -171,7 +195,9 @@ class DensityTree:
         self.cells[chosen] = self.coverage.scale_by_share(density @ weight, chosen)
         samples = np.ascontiguousarray(h.T)  # faster than NumPy along a short axis
         self._low[chosen], self._high[chosen] = samples.min(axis=0), samples.max(axis=0)
-        self.slopes[chosen] = -dim * (np.log(h) @ offset) / (offset[:, 0] ** 2).sum()
+        logs = np.log(h)
+        self.slopes[chosen] = -dim * (logs @ offset) / (offset[:, 0] ** 2).sum()
+        self.slopes_of_size[chosen] = _slopes(points, logs) * h.mean(axis=1)
 
     def _evaluate_landmarks(self, domain: Domain) -> None:
         """Evaluate h at the landmarks: a grid of corners of boxes, and the landmarks of the field."""
@@ -244,7 +270,7 @@ class DensityTree:
         self._landmark_box = first[box] + child_rank
         fresh = child >= 0
         before = self.cells[chosen]
-        for name in ("cells", "_differences", "_low", "_high", "slopes"):
+        for name in ("cells", "_differences", "_low", "_high", "slopes", "slopes_of_size"):
             setattr(self, name, getattr(self, name)[parent])
         self._integrate(fresh)
         self._lower_by_landmarks()
