@@ -34,6 +34,8 @@ FIRST_SEED = 20251
 def test_field(name: str) -> sizing.Field:
     """Return the size field F1, F2, F3, F4, circles, ridge or corner on `BOX`, or S1, S2 or S3 on `CUBE`, all absolute.
 
+    "steep circles" and "steep ridge" are harder variants.
+
     F1 = 0.02 + 0.3 d, F2 = 0.002 + 0.08 d, F4 = F2 / 6.6, with d the distance to the circle of
     radius 0.3 about (0.9, 0.75); F3 = 0.9306 min(0.15, 0.02 + ln(1.3) d) / 4, radius 0.25 about
     (0.8, 0.75). S1 = 0.04 + 0.3 d, with d the distance to the sphere of radius 0.25 about
@@ -41,6 +43,7 @@ def test_field(name: str) -> sizing.Field:
     distances to the circles of radius 0.35 about (0.7, 0.75) and of radius 0.2 about (1.8, 0.75), has kinks between
     them and at their centers. ridge = 0.007 + 0.12 |y - 0.75 - 0.3 sin(1.6 pi x)| is steeper than 0.2 in places.
     corner = 0.025 (r + 0.001)^(2/3), with r the distance from the corner (0, 0), has sizes 1 : 180.
+    steep circles have the slope 0.2, and steep ridge = 0.0046 + 0.165 |...| has slopes up to 0.3.
     """
     if name == "circles":
         large, small = sizing.Circle((0.7, 0.75), 0.35), sizing.Circle((1.8, 0.75), 0.2)
@@ -48,10 +51,17 @@ def test_field(name: str) -> sizing.Field:
             sizing.Distance(large, h_min=0.012, slope=0.12),
             sizing.Distance(small, h_min=0.006, slope=0.12),
         )
+    if name == "steep circles":
+        return sizing.minimum(
+            sizing.Distance(sizing.Circle((0.7, 0.75), 0.35), h_min=0.0075, slope=0.2),
+            sizing.Distance(sizing.Circle((1.8, 0.75), 0.2), h_min=0.00375, slope=0.2),
+        )
     if name == "ridge":
         return sizing.Expression("0.007 + 0.12 * fabs(y - 0.75 - 0.3 * sin(1.6 * pi * x))")
     if name == "corner":
         return sizing.Expression("0.025 * pow(hypot(x, y) + 0.001, 2.0 / 3.0)")
+    if name == "steep ridge":
+        return sizing.Expression("0.0046 + 0.165 * fabs(y - 0.75 - 0.3 * sin(1.6 * pi * x))")
     if name in ("S1", "S2", "S3"):
         sphere = sizing.Ball((0.5, 0.5, 0.4), 0.25)
         return sizing.Distance(sphere, h_min=0.04, slope=0.3) * 0.5 ** (int(name[1]) - 1)
