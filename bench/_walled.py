@@ -82,6 +82,12 @@ def large_coast() -> Setup:
     return Setup(clvoro.Polygon.from_shapely(sea), 0.03, {})
 
 
+def simplified(coast: Callable[[], Setup]) -> Setup:
+    """Return a coast without what is finer than 1.5 cells."""
+    domain, size, options = coast()
+    return Setup(domain.simplified(1.5 * size), size, options)
+
+
 def channel(layers: bool = False) -> Setup:
     """Return the channel of Schäfer and Turek with its circle, here of 180 edges."""
     c, s = _turned(180)
@@ -211,7 +217,9 @@ def sphere(name: str) -> Callable[[], Setup]:
 
 
 WALLED: dict[str, Callable[[], Setup]] = {
-    "box": box, "lake": lake, "bay": small_coast, "coast": large_coast, "channel": channel,
+    "box": box, "lake": lake, "bay": small_coast, "coast": large_coast,
+    "bay, simplified": lambda: simplified(small_coast), "coast, simplified": lambda: simplified(large_coast),
+    "channel": channel,
     "channel, layers": lambda: channel(layers=True), "wing": wing, "wing, layers": lambda: wing(1e-4),
     "three wings": three_wings, "three wings, layers": lambda: three_wings(1e-4),
     "L": l_shape, "T": t_shape, "comb": comb, "gear": gear, "slit": slit, "needle": needle,

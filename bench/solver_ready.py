@@ -8,8 +8,8 @@ largest non-orthogonality and skewness that `checkMesh` prints, the number of co
 a cell is concave, the error and quality of cells on walls and of the others, and the verdict. Without OpenFOAM the
 script ends with a message. Debian's package `openfoam` is enough.
 
-The domains are in `bench/_walled.py`; S3 has 1e5 cells, and S2 and S3 run with their default effort only unless they
-are named in --only.
+The domains are in `bench/_walled.py` and `bench/_sites.py`. S3 has 1e5 cells; S2 and S3 run with their default effort
+only, unless they are named in --only.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ import re
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from _common import Report, heading, make_adapter, names, off_walls, parser
+from _sites import SITES
 from _walled import WALLED
 
 import clvoro
@@ -35,6 +37,7 @@ FIGURES = {
     "concave": r"Concave cells .*number of cells: (\d+)",
 }
 LARGE = ("S2", "S3")
+DOMAINS: dict[str, Callable[[], tuple[Any, Any, dict[str, Any]]]] = {**WALLED, **SITES}
 
 
 def figures_of(verdict: Verdict) -> dict[str, Any]:
@@ -85,7 +88,7 @@ COLUMNS = {
 def main() -> None:
     """Run the bench."""
     options_of = parser(__doc__)
-    options_of.add_argument("--only", default="", metavar="NAMES", help=", ".join(WALLED))
+    options_of.add_argument("--only", default="", metavar="NAMES", help=", ".join(DOMAINS))
     options_of.add_argument("--effort", default="default,best", metavar="NAMES")
     options_of.add_argument("--exact", action="store_true", help="also runs with method='exact'")
     options_of.add_argument(
@@ -98,12 +101,12 @@ def main() -> None:
     adapter = make_adapter(options)
     report = Report(options.json, COLUMNS)
     chosen = options.only.split(";") if ";" in options.only else names(options.only)
-    if options.only in WALLED:
+    if options.only in DOMAINS:
         chosen = [options.only]  # names have commas
     runs = [(effort, {"effort": effort}) for effort in names(options.effort)]
     runs += [("exact", {"method": "exact"})] * options.exact
-    for name in chosen or WALLED:
-        domain, size, more = WALLED[name]()
+    for name in chosen or DOMAINS:
+        domain, size, more = DOMAINS[name]()
         for run, settings in runs:
             if name in LARGE and run != "default" and not chosen:
                 continue

@@ -173,3 +173,12 @@ def test_cylinder():
     assert all(abs(r["drag"][0]) < 0.8 for r in rows)
     assert all(abs(r["pressure"][0]) < 4 for r in rows)
     assert all(r["cells"][0] == pytest.approx(1500, rel=0.02) for r in rows)
+
+
+@pytest.mark.slow
+def test_sharp_corners():
+    rows = records("sharp_corners.py", "--angles", "30")
+    assert [r["run"] for r in rows] == ["default", "best", "exact"]
+    # An isosceles triangle with this tip has Q = 0.820.
+    assert rows[0]["bound"] == pytest.approx([0.820, 0.686, 0.637], abs=1e-3)
+    assert all(0.6 < r["quality"] < 0.69 and r["accepted"] for r in rows)
