@@ -1,5 +1,9 @@
 """Programs are built for the first kernel that is used, from short declarations with PoCL."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pyopencl as cl
 import pytest
@@ -74,3 +78,28 @@ def test_programs_are_the_same_for_all_periods(ctx):
     texts = [engine.all_defines("adaptation/motion", {}) for engine in engines]
     assert texts[0] == texts[1]
     assert texts[0]["PERIODIC"] == 1
+
+
+RUN_WITHOUT_A_CACHE = """
+import pyopencl.characterize
+pyopencl.characterize.has_src_build_cache = lambda device: False
+import clvoro
+clvoro.Adapter().diagram(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.6)])
+"""
+
+
+@pytest.mark.slow
+def test_binaries_are_kept_where_the_driver_keeps_none(ctx, tmp_path):
+    """PyOpenCL does it. PoCL stands for another driver here."""
+    kept = []
+    for run in range(2):
+        places = {
+            "XDG_CACHE_HOME": tmp_path,
+            "POCL_CACHE_DIR": tmp_path / f"pocl {run}",
+            "POCL_KERNEL_CACHE": 0,
+        }
+        environment = {**os.environ, **{name: str(value) for name, value in places.items()}}
+        subprocess.run([sys.executable, "-c", RUN_WITHOUT_A_CACHE], env=environment, check=True)
+        kept.append({path: path.stat().st_mtime for path in tmp_path.glob("pyopencl/**/binary")})
+    assert kept[0]
+    assert kept[0] == kept[1]

@@ -91,6 +91,13 @@ def noting_programs() -> Iterator[list[Source]]:
         _program.build_program = build
 
 
+def on_sphere(adapter: clvoro.Adapter) -> None:
+    """Make meshes on a sphere: its kernels are variants of those of the plane."""
+    for effort, method in (("default", "adaptive"), ("fast", "exact"), ("fast", "coupled")):
+        steps = 3 if method == "coupled" else None
+        adapter.run(clvoro.Sphere(1.0), 0.45, seed=5, method=method, effort=effort, max_steps=steps)
+
+
 def programs_of_all_kinds(ctx: cl.Context, dtype: str, group: int | None = 128) -> list[Source]:
     """Return every program that small work of all kinds builds: for GPUs in groups of `group`, for a CPU with None."""
     with contextlib.ExitStack() as stack:
@@ -101,6 +108,7 @@ def programs_of_all_kinds(ctx: cl.Context, dtype: str, group: int | None = 128) 
         for name, work in oclgrind_work.WORK.items():
             if not name.startswith("broken"):
                 work(adapter)
+        on_sphere(adapter)
     return sources
 
 
