@@ -65,7 +65,7 @@ def test_a_step_takes_few_commands_and_reads(adapter, dim, n):
                 reads += [tally.reads - before] if k >= WARM_UP else []
         solving = sum(c for (stage, _), c in tally.calls.items() if stage.split("/")[-1] in SOLVERS)
         name = f"{type(method).__name__} {getattr(method, 'descent', '')} {reads} {tally.launches} {solving}"
-        # Of the solver, the diagram, and the summaries; three more where cells in 3D must be clipped anew.
+        # Of the solver, the diagram, and the summaries; some more where cells in 3D must be clipped anew.
         assert min(reads) <= 3, name
         assert max(reads) <= (4 if dim == 2 else 7), name
         assert (tally.launches - solving) / STEPS <= (40 if dim == 2 else 55), name
