@@ -1,25 +1,28 @@
 """Prescribed volumes in power diagrams: steps of Newton's method, and time.
 
     python bench/transport.py [--sizes 1e3,1e4,1e5] [--sizes-3d 1e3,1e4] [--repeat N] [--processor-time]
-                              [--device NAME] [--dtype float32] [--json]
+                              [--picture] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
 Uniform random generators in a unit box get cells of equal volume, and of volumes in proportion to
 0.02 + |x - c|^2, c the middle of the box (in 2D 1 : 26). "outside" is the share of the cells that do not contain their
 generator, "shares" the shares of the damped Newton steps. Seconds are the least of the repeated solves, with generators
 sorted and arrays read back. `--processor-time` measures the processor time of all threads over the number of compute
-units, for a machine with other work.
+units, for a machine with other work. `--picture` writes `transport.png` instead, into `bench/pictures` or `--out`:
+Voronoi cells and power cells of equal area of the same generators.
 """
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import numpy as np
-from _common import Report, best, clock_of, counts, heading, make_adapter, parser, shown
+from _common import PICTURES, Report, best, clock_of, counts, heading, make_adapter, parser, shown
 
 import clvoro
 
 SEED = 7411
+LINE = "#D55E00"
 
 
 def graded(points: np.ndarray) -> np.ndarray:
@@ -49,13 +52,47 @@ def make_options() -> argparse.ArgumentParser:
     made.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5"), metavar="N,...")
     made.add_argument("--sizes-3d", type=counts, default=counts("1e3,1e4"), metavar="N,...")
     made.add_argument("--repeat", type=int, default=3, metavar="N")
+    made.add_argument("--picture", action="store_true", help="draw a picture instead")
+    made.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
     made.add_argument("--processor-time", action="store_true", help="not the wall clock")
     return made
+
+
+def draw(adapter: clvoro.Adapter, folder: Path) -> None:
+    """Draw the Voronoi cells of random generators beside their power cells of equal area."""
+    import matplotlib.pyplot as plt
+
+    box, n = clvoro.Box((0, 0), (1, 1)), 400
+    points = np.random.default_rng(SEED).random((n, 2))
+    equal_cells = adapter.transport(box, points, np.full(n, 1 / n)).diagram
+    panels = {
+        "Voronoi cells": adapter.diagram(box, points),
+        "power cells of equal area": equal_cells,
+    }
+    figure, axes = plt.subplots(1, 2, figsize=(10, 5), layout="constrained")
+    for ax, (title, diagram) in zip(axes, panels.items(), strict=True):
+        diagram.plot(
+            diagram.volumes * n,
+            ax=ax,
+            limits=(-0.5, 2.2),
+            key=False,
+            title=title,
+            label="area over mean",
+        )
+        ways = np.stack([points, diagram.centroids])
+        ax.plot(ways[..., 0], ways[..., 1], "-", color=LINE, linewidth=1)
+        ax.plot(*points.T, ".", color=LINE, markersize=4)
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / "transport.png", dpi=110)
+    print(f"wrote {folder / 'transport.png'}")
 
 
 def main(arguments: list[str] | None = None) -> None:
     options = make_options().parse_args(arguments)
     adapter = make_adapter(options)
+    if options.picture:
+        draw(adapter, options.out)
+        return
     report, clock = Report(options.json, COLUMNS), clock_of(options, adapter)
     for dim, sizes in ((2, options.sizes), (3, options.sizes_3d)):
         box = clvoro.Box((0,) * dim, (1,) * dim)
