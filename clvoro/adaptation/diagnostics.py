@@ -12,6 +12,7 @@ from ..errors import InputError, MismatchWarning, PrecisionWarning, SizeErrorWar
 from ..geometry.boundary_layers import Layers, columns_of
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
+from ..geometry.sphere import Sphere
 from ..mesh.results import Result
 from ..sizing import Sizing
 from ..sizing.field import Field
@@ -31,6 +32,9 @@ ROUND_OFF_ERROR = 0.1
 spacing cost 0.095 (0.07 in 3D) times this ratio (`bench/precision.py --noise`)."""
 MAX_ROUND_OFF_ERROR = 1e-3
 """Mean |e| because of round-off above which a run warns."""
+SHORTEST_EDGE, MAX_EDGE_ERROR = 0.13, 1e-4
+"""On a sphere: length of the shortest edges over h, and the relative error of edges from corner to corner above which a
+run warns. The spacing of positions over the shortest edge is about the largest error (`bench/sphere.py --single`)."""
 MAX_SPACING = 1 / 16
 """Spacing of positions over the smallest h above which a run warns: random starts have pairs much closer than h."""
 
@@ -186,7 +190,8 @@ def check_precision(
     Warns
     -----
     PrecisionWarning
-        If round-off costs more than `MAX_ROUND_OFF_ERROR`, or the spacing is more than `MAX_SPACING` times h.
+        If round-off costs more than `MAX_ROUND_OFF_ERROR`, or the spacing is more than `MAX_SPACING` times h; on a
+        sphere also if edges are off by more than `MAX_EDGE_ERROR`.
     """
     real = sizing.real
     spacing = float(np.finfo(real).eps) / 2 * domain.frame[1]
@@ -201,6 +206,15 @@ def check_precision(
             f"the size field is {h[least]:.3g} at ({where}), but positions in {real} are "
             f"{spacing:.3g} apart in this domain: generators would coincide; {remedy}"
         )
+    if isinstance(domain, Sphere):
+        short = spacing > MAX_EDGE_ERROR * SHORTEST_EDGE * h
+        if short.any():
+            warn(
+                f"positions in {real} are {spacing:.3g} apart on {domain}: edges are off by up to "
+                f"{spacing / (SHORTEST_EDGE * h[least]):.1g} of their lengths, and in {short.mean():.0%} of the cells "
+                f"by more than {MAX_EDGE_ERROR:g}; models on C grids divide by them: {remedy}",
+                PrecisionWarning,
+            )
     mean = float((spacing / h).mean())
     if ROUND_OFF_ERROR * mean > MAX_ROUND_OFF_ERROR or spacing > MAX_SPACING * h[least]:
         warn(
