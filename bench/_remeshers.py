@@ -2,7 +2,7 @@
 
 Both make triangles or tetrahedra. Their vertices are generators of Voronoi cells; those on walls have cells that are
 cut. A mesher does not promise a number of vertices, so `remesh` scales its sizes until it is right to 2 %. Times are
-those of the last call, in one thread. Gmsh reads its sizes from a file, which is not part of its time.
+processor times of the last call, in one thread. Gmsh reads its sizes from a file, which is not part of its time.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def vertices_gmsh(domain: clvoro.Box, size: sizing.Field, edge: float) -> tuple[
             + numbers.tobytes()
             + values.tobytes()
         )
-        start = time.perf_counter()
+        start = time.process_time()
         gmsh.initialize(interruptible=False)
         try:
             for name, value in (
@@ -83,7 +83,7 @@ def vertices_gmsh(domain: clvoro.Box, size: sizing.Field, edge: float) -> tuple[
             gmsh.model.mesh.field.setNumber(field, "TextFormat", 0)
             gmsh.model.mesh.field.setAsBackgroundMesh(field)
             gmsh.model.mesh.generate(d)
-            seconds = time.perf_counter() - start
+            seconds = time.process_time() - start
             _, nodes, _ = gmsh.model.mesh.getNodes()
         finally:
             gmsh.finalize()
@@ -107,14 +107,14 @@ def vertices_mmg(domain: clvoro.Box, size: sizing.Field, edge: float) -> tuple[n
     simplices = _boxes(counts) if d == 3 else Delaunay(vertices, qhull_options="QJ").simplices
     simplices = _oriented(vertices, simplices)
     kind = mmgpy.MmgMesh2D if d == 2 else mmgpy.MmgMesh3D
-    start = time.perf_counter()
+    start = time.process_time()
     for _ in range(PASSES):
         mesh = kind(vertices, simplices.astype(np.int32))
         mesh.set_field("metric", edge * np.asarray(size(vertices))[:, None])
         mesh.remesh(hgrad=-1.0, verbose=-1)
         vertices = np.clip(mesh.get_vertices(), domain.lower, domain.upper)
         simplices = mesh.get_triangles() if d == 2 else mesh.get_tetrahedra()
-    return vertices, time.perf_counter() - start
+    return vertices, time.process_time() - start
 
 
 def _boxes(counts: np.ndarray) -> np.ndarray:

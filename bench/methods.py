@@ -12,9 +12,9 @@ Fields: "paper" is the paper's case (F1; the paper's methods from a uniform star
 corner and S2 are those of `_common.py`, from a random start with the density h^-d. All methods are judged in the same
 way: e after one common factor on h, because other meshers do not promise a count, and the cells off the walls, because
 vertices on walls have cut cells. "changes" is the sum over all steps of the cells whose neighbors have changed, per
-cell. Kernels are built before. Gmsh and MMG (pip install gmsh mmgpy) are left out with a note if they are not there.
-JIGSAW's figures are given, not measured by this script: JIGSAW 1.0, one global factor on h, cells off the walls,
-default settings and 64 optimization passes.
+cell. "CPU s" is the processor time of all threads; kernels are built before. Gmsh and MMG (pip install gmsh mmgpy) are
+left out with a note if they are not there. JIGSAW's figures are given, not measured by this script: JIGSAW 1.0, one
+global factor on h, cells off the walls, default settings and 64 optimization passes, wall time of another machine.
 """
 
 from __future__ import annotations
@@ -159,15 +159,15 @@ def measure(
         arguments, start = dict(way.arguments), "density"
         if name == "paper" and way.source == "the paper":
             arguments["options"], start = clvoro.PaperOptions(tol=0, k=1.0), "uniform"
-        begun = time.perf_counter()
+        begun = time.process_time()
         mesh = adapter.run(domain, size, start, seed=FIRST_SEED, **arguments)
-        record |= {"seconds": time.perf_counter() - begun, "steps": int(mesh.history["step"][-1])}
+        record |= {"seconds": time.process_time() - begun, "steps": int(mesh.history["step"][-1])}
         record["changes"] = float((mesh.history["changed"] / mesh.history["cells"]).sum())
         return {**record, **judge(mesh.diagram, mesh.target_size)}, mesh
     if way.name == "insertion and deletion":
-        begun = time.perf_counter()
+        begun = time.process_time()
         points, steps, changes = insert_delete_smooth(adapter, domain, size, FIRST_SEED)
-        record |= {"seconds": time.perf_counter() - begun, "steps": steps, "changes": changes}
+        record |= {"seconds": time.process_time() - begun, "steps": steps, "changes": changes}
     else:
         points, record["seconds"] = remesh(
             MESHERS[way.name], domain, size, round(count_cells(size, domain))
@@ -195,7 +195,7 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], object]] = {
     "min Q": shown("min_quality", ".3f"),
     "changes": shown("changes", ".1f"),
     "steps": shown("steps", ".0f"),
-    "seconds": shown("seconds", ".2f"),
+    "CPU s": shown("seconds", ".2f"),
 }
 
 
@@ -243,7 +243,7 @@ def growth(records: list[dict[str, Any]]) -> str:
             rows.append(
                 [way.name, *texts[:2], f"{math.log(times) / math.log(cells):.2f}", *texts[2:]]
             )
-    return markdown(["method", "cells", "seconds", "exponent", "steps", "mean |e|", "min Q"], rows)
+    return markdown(["method", "cells", "CPU s", "exponent", "steps", "mean |e|", "min Q"], rows)
 
 
 TITLES = {
