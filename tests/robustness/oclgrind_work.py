@@ -508,6 +508,8 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "exact": large(
         method("exact", options=clvoro.MultilevelOptions(levels=0), effort="fast", max_steps=75)
     ),
+    "mmpde": method("mmpde", n_cells=80, max_steps=2),
+    "solid-mmpde": method("mmpde", CUBE, SOLID, n_cells=130, max_steps=2),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
     **RUNS,
     **{
