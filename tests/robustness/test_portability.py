@@ -28,7 +28,7 @@ COMMON_LIMITS = 128, 512
 LIMITS = {
     "clip_polygons": (272, 1400),
     "clip_marked": (224, 720),
-    "clip_polyhedra": (320, 6144),
+    "clip_polyhedra": (208, 5760),
     "update_cells": (160, 6656),
     "count_corners": (288, 4608),
     "list_corners": (288, 4608),
