@@ -200,23 +200,26 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], object]] = {
 
 
 def compact(records: list[dict[str, Any]]) -> str:
-    """Return the table of all methods and fields: mean |e|, mean Q / min Q."""
+    """Return the table of all methods and fields: mean |e|, and below it mean Q / min Q."""
     found = {(r["method"], r["field"]): r for r in records if r["scale"] == 1}
     fields = [name for name in FIELDS if any(name == field for _, field in found)]
 
     def cell(r: dict[str, Any] | None) -> str:
-        return (
-            ""
-            if r is None
-            else f"{r['mean_error']:.3f}, {r['mean_quality']:.3f} / {r['min_quality']:.2f}"
+        if r is None:
+            return ""
+        mean, least = (
+            f"{r[key]:.{digits}f}".lstrip("0")
+            for key, digits in (("mean_quality", 3), ("min_quality", 2))
         )
+        text = f"{100 * r['mean_error']:.1f} %<br>{mean} / {least}"
+        return text.replace(" ", "\N{NO-BREAK SPACE}")
 
     rows = [
-        [way.name, way.source, *(cell(found.get((way.name, name))) for name in fields)]
+        [f"{way.name} ({way.source})", *(cell(found.get((way.name, name))) for name in fields)]
         for way in WAYS
         if any(way.name == method for method, _ in found)
     ]
-    return markdown(["method", "source", *fields], rows)
+    return markdown(["method", *fields], rows)
 
 
 def growth(records: list[dict[str, Any]]) -> str:
