@@ -106,7 +106,7 @@ ROWS = (
     Row("fast", ("S1", "S2", "S3"), {"effort": "fast"}),
     Row("default", ("S1",), {}),
     Row("default", ("S2", "S3"), {}, SOLID_DEFAULT),
-    Row("best", ("S2",), {"effort": "best"}),
+    Row("best", ("S2", "S3"), {"effort": "best"}),
     Row("exact", ("S1",), {"method": "exact"}),
     Row("exact", ("S2", "S3"), {"method": "exact"}, SOLID_EXACT),
 )  # fmt: skip

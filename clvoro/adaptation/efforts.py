@@ -73,6 +73,8 @@ class Effort:
         Repairs of the worst cells, each before this step of polishing. Some steps follow the last one.
     deficit : float
         1 - mean Q of meshes of this effort in 2D, without walls.
+    coarse_glide, coarse_polish : int
+        In 3D, steps of gliding and of polishing at the end of each coarser level.
     separate : int
         Steps of separating, in 2D. Measured on eleven fields, four starts each: after one no edge is shorter than
         0.07 h, after two 0.09 h.
@@ -97,6 +99,8 @@ class Effort:
     log_ratio_scale: float = 12.0
     repairs: tuple[tuple[int, RepairCells], ...] = ()
     deficit: float = 0.012
+    coarse_glide: int = 0
+    coarse_polish: int = 0
     separate: int = 2
 
 
@@ -121,15 +125,18 @@ EFFORTS = {
 
 EFFORTS_3D = {
     "fast": Effort(
-        30, 4, 2, (), glide=4, polish=0, error_target=0.004, relaxation=1.5, momentum=0.7
+        30, 3, 2, (), glide=0, polish=4, error_target=0.004, relaxation=1.5, momentum=0.8, penalty=0.15,
+        log_ratio_scale=8.0, coarse_glide=5, coarse_polish=10,
     ),
     "default": Effort(
-        40, 8, 2, (), glide=8, polish=0, error_target=0.0025, relaxation=1.5, momentum=0.8
+        40, 4, 2, (), glide=0, polish=8, error_target=0.0025, relaxation=1.5, momentum=0.8, penalty=0.15,
+        log_ratio_scale=8.0, coarse_glide=20, coarse_polish=20,
     ),
     "best": Effort(
-        80, 30, 3, (), glide=60, polish=0, error_target=0.003, relaxation=1.5, momentum=0.8
+        80, 8, 3, (), glide=50, polish=10, error_target=0.003, relaxation=1.5, momentum=0.9, penalty=0.3,
+        log_ratio_scale=8.0, coarse_glide=100, coarse_polish=40,
     ),
-}
+}  # fmt: skip
 """The same in 3D. On a coarser level `couple` steps follow each of three numbers of cells, on the finest
 `couple_finest` each of two."""
 

@@ -165,10 +165,10 @@ class ProjectedMethod:
 
     Attributes
     ----------
-    descent : "lloyd", "quality" or "edges"
-        Displacement to the weighted centroid, with which lattice defects glide and annihilate; descent of the cell
-        quality, which improves cells and pins defects, and of an energy against short edges; or descent of this energy
-        alone.
+    descent : "lloyd", "quality", "edges" or "surface"
+        Displacement to the weighted centroid, with which lattice defects glide and annihilate; in 2D descent of the
+        cell quality, which improves cells and pins defects, and of an energy against short edges; or descent of this
+        energy alone; in 3D "surface", descent of the cell quality.
     relaxation : float
         Factor on the descent.
     momentum : float
@@ -182,7 +182,7 @@ class ProjectedMethod:
     k : float
         Largest displacement over h.
     bad_cell_weight, rate : float
-        Weight of bad cells in the quality descent, and its step length; see `QualityDescent`.
+        Weight of bad cells in the quality descent, and its step length; see `QualityDescent` and `SurfaceDescent`.
     error_target : float
         Mean |log(L / h)| to which the penalty is controlled after three steps; 0 keeps the penalty.
     correct_mean : bool
@@ -195,7 +195,7 @@ class ProjectedMethod:
         Steps done.
     """
 
-    descent: Literal["lloyd", "quality", "edges"] = "lloyd"
+    descent: Literal["lloyd", "quality", "edges", "surface"] = "lloyd"
     relaxation: float = 1.0
     momentum: float = 0.7
     penalty: float = 0.1
@@ -229,7 +229,12 @@ class ProjectedMethod:
             if self.gradient_from_field:
                 sizes = mesh.engine.scratch(mesh.n)
                 mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
-            if self.descent != "lloyd":
+            if self.descent == "surface" and t.vertices:
+                stages.surface_descent.descend(
+                    t, mesh.local_length, mesh.quality, mesh.lloyd, bad_cell_weight=self.bad_cell_weight,
+                    rate=self.rate,
+                )  # fmt: skip
+            elif self.descent in ("quality", "edges"):
                 stages.quality_descent.descend(
                     t, mesh.local_length, mesh.quality, mesh.lloyd,
                     quality_weight=float(self.descent == "quality"), bad_cell_weight=bad_cell_weight,

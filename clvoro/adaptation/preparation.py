@@ -19,6 +19,7 @@ from ..sizing.gaps import NARROW
 from ..sizing.layers import limit_beside_layers
 from ..sizing.on_domain import on_domain
 from ..tessellation.power import require_power_domain
+from .descent.quality_descent import OPENINGS
 from .diagnostics import (
     check_precision,
     narrow_parts,
@@ -31,7 +32,6 @@ from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
 from .options import Options
-from .quality_descent import OPENINGS
 from .sampling.charts import charted
 from .sampling.quadrature import DensityTree
 from .sampling.start import density_tree, sample_density, sample_uniform

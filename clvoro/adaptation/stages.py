@@ -10,11 +10,12 @@ from ..solvers.volume_projection import VolumeProjection
 from ..tessellation.stages import TessellationStages
 from .corners import Corners
 from .density import Density
+from .descent.quality_descent import QualityDescent
+from .descent.surface_descent import SurfaceDescent
 from .insertion_deletion import InsertionDeletion
 from .metric import Metric
 from .motion import Motion
 from .moving.mmpde import Mmpde
-from .quality_descent import QualityDescent
 from .refinement import Refinement
 from .thin_walls import ThinWalls
 
@@ -33,10 +34,12 @@ class Stages(TessellationStages):
     corners: Corners
     thin_walls: ThinWalls
     refinement: Refinement
+    surface_descent: SurfaceDescent
     insertion_deletion: InsertionDeletion
 
     CLASSES: ClassVar[dict[str, type]] = {
         **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson, "transport": Transport,
         "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "mmpde": Mmpde,
         "corners": Corners, "thin_walls": ThinWalls, "refinement": Refinement, "insertion_deletion": InsertionDeletion,
+        "surface_descent": SurfaceDescent,
     }  # fmt: skip

@@ -24,9 +24,9 @@ from ..tessellation.power import PowerTessellator
 from ..tessellation.readback.diagram import fetch_diagram
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights, LloydWeights
+from .descent.quality_descent import MOST_OBTUSE
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
 from .motion import Moving
-from .quality_descent import MOST_OBTUSE
 from .stages import Stages
 from .walls import Walls
 

@@ -130,7 +130,7 @@ class Tessellation:
     outlines : tuple of arrays
         The OUTLINE_ARGS of a diagram trimmed by a boundary (tessellation/clipped/outline.h); else empty.
     vertices : tuple of arrays
-        In 3D, if it will be updated: the vertices as triples of faces, (2 m,) uint32, and the keys of the faces, (m,)
+        In 3D, while generators move: the vertices as triples of faces, (2 m,) uint32, and the keys of the faces, (m,)
         uint32 (tessellation/polyhedra_update.cl); else empty.
     weighted : array, optional
         In a power diagram: the points with their weights, (n, d + 1) real.

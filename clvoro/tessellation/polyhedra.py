@@ -193,8 +193,8 @@ class Polyhedra:
         first = engine.scratch(n, np.float32)
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
         with engine.workspace.frame():
-            # Diagrams that will be updated need their vertices.
-            keep = not exact and not halo_args and rows == n and self._bounds is None
+            # Updates, and the descent of the surface, need the vertices.
+            keep = not exact and (rows < n if halo_args else rows == n) and self._bounds is None
             if self._bounds is not None:
                 halo_args = (*halo_args, *self._bounds.build(box, points, n))
             cut = self._cut(box, points, n, binned, first, previous, rows, share, halo_args, keep)
@@ -245,8 +245,8 @@ class Polyhedra:
         first_reach = engine.real.type(FIRST_REACH)
         self._begin_report()
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
+        corners = engine.scratch(2 * self._room, np.uint32) if keep else None
         while True:
-            corners = engine.scratch(2 * self._room, np.uint32) if keep else None
             cut = CutCells(places, counts, *faces, cells, self._room, corners, faces[0])
             room, written = np.int32(self._room), cut.output(self._report)
             if walk is not None and not again:
@@ -272,6 +272,7 @@ class Polyhedra:
                 # Repeat all: faces beyond the capacity were lost.
                 self._begin_anew(binned, first, n)
                 faces = self._take_faces(m + m // 32 + 64)
+                corners = engine.scratch(2 * self._room, np.uint32) if keep else None
                 capacity, again = FACE_CAPACITY, False
                 self._begin_report()
             elif flags & FULL:

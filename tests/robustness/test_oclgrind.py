@@ -61,7 +61,14 @@ IN_PLANE = {
     "insertion_deletion.mark_pairs", "insertion_deletion.measure_strain", "insertion_deletion.score_bad_cells",
     "insertion_deletion.score_pairs", "insertion_deletion.score_strain", "insertion_deletion.count_pair_changes",
 }  # fmt: skip
-IN_SPACE = {"consistency", "half_faces", "polyhedra", "polyhedra_update", "walks"}
+IN_SPACE = {
+    "consistency",
+    "half_faces",
+    "polyhedra",
+    "polyhedra_update",
+    "walks",
+    "surface_descent",
+}
 AT_POLYGONS = {"boundary_crossings", "trim"}
 AT_LAYERS = {
     "metric.set_fixed_sizes",

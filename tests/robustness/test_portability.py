@@ -18,9 +18,12 @@ CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 MAIN = {
     2: [
         "tessellation/cells", "tessellation/incremental", "solvers/volume_projection", "solvers/poisson",
-        "adaptation/quality_descent",
+        "adaptation/descent/quality_descent",
     ],
-    3: ["tessellation/polyhedra", "tessellation/polyhedra_update", "solvers/volume_projection"],
+    3: [
+        "tessellation/polyhedra", "tessellation/polyhedra_update", "solvers/volume_projection",
+        "adaptation/descent/surface_descent",
+    ],
 }  # fmt: skip
 """Programs whose kernels take most of the time of a step."""
 COMMON_LIMITS = 128, 512

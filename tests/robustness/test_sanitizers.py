@@ -90,7 +90,7 @@ def test_other_results_are_found(harmless, built):
 FUNCTIONS = {
     "bins.sort_bins", "density.evaluate_density", "metric.evaluate_metric", "insertion_deletion.mark_split_delete",
     "insertion_deletion.mark_bad_cells", "volume_projection.assemble_projection",
-    "quality_descent.compute_cell_forces", "corners.share_corners",
+    "quality_descent.compute_cell_forces", "surface_descent.compute_surface_forces", "corners.share_corners",
     "size_field.evaluate_size", "size_field.evaluate_size_gradient",
 }  # fmt: skip
 """Kernels with functions that OpenCL does not ask to be rounded correctly (as log, cbrt, cos): libraries differ."""

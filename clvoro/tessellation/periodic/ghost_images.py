@@ -234,6 +234,7 @@ class GhostImages:
         words = self._report.get()
         flags, places = int(words[1]), None
         measures = t.face_measures[:m], t.face_centroids[:m]
+        vertices = tuple(array[: m * len(array) // len(t.neighbors)] for array in t.vertices)
         self._scan.exclusive(starts, starts, n)
         if flags & DROPPED:
             left = int(starts[n].get())
@@ -245,9 +246,9 @@ class GhostImages:
             engine.run_each(
                 k.close_rows, n, t.starts, kept, starts, *graph, *measures, *closed, places
             )
-            graph, measures = list(closed[:2]), closed[2:]
+            graph, measures, vertices = list(closed[:2]), closed[2:], ()
         folded = Tessellation(
-            n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n]
+            n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n], vertices=vertices
         )  # fmt: skip
         enough = not words[0]
         if not enough:

@@ -7,7 +7,7 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.adaptation.quality_descent import QualityDescent
+from clvoro.adaptation.descent.quality_descent import QualityDescent
 from clvoro.adaptation.stages import Stages
 from clvoro.mesh.connectivity import face_ends
 from clvoro.opencl.engine import Engine

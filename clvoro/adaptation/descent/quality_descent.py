@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 import pyopencl.array as cla
 
-from ..opencl.device_array import read_number
-from ..opencl.engine import Engine
-from ..opencl.primitives import Scan
-from ..tessellation.device_diagram import Tessellation
+from ...opencl.device_array import read_number
+from ...opencl.engine import Engine
+from ...opencl.primitives import Scan
+from ...tessellation.device_diagram import Tessellation
 
 SHORT_EDGE, EDGE_STIFFNESS = 0.2, 2.0
 """Length over h below which edges are pushed apart, and the stiffness of their energy.
@@ -35,7 +35,7 @@ class QualityDescent:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
-        self._kernels = engine.kernels("adaptation/quality_descent")
+        self._kernels = engine.kernels("adaptation/descent/quality_descent")
 
     def descend(
         self,

@@ -1,0 +1,1 @@
+"""Descent of energies of the cells: their quality, and short edges."""

@@ -1,0 +1,54 @@
+"""Gradient descent of the cell quality in 3D, for the last steps of a run (`surface_descent.cl`)."""
+
+from __future__ import annotations
+
+import pyopencl.array as cla
+
+from ...opencl.engine import Engine
+from ...tessellation.device_diagram import Tessellation
+
+
+class SurfaceDescent:
+    """The kernels of `surface_descent.cl`."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("adaptation/descent/surface_descent")
+
+    def descend(
+        self,
+        t: Tessellation,
+        h: cla.Array,
+        quality: cla.Array,
+        lloyd: cla.Array,
+        *,
+        bad_cell_weight: float = 0.0,
+        rate: float = 0.1,
+        max_displacement: float = 0.2,
+    ) -> None:
+        """Write the displacement ``-rate h^2 dE/dx`` to `lloyd` (n, 3), in place of the displacement to the centroid.
+
+        Parameters
+        ----------
+        t : Tessellation
+            With vertices.
+        h, quality : (n,) real
+        bad_cell_weight : float
+            The weight of a cell is omega = 1 - bad_cell_weight log Q.
+        rate : float
+            Step length.
+        max_displacement : float
+            Largest displacement over h.
+        """
+        engine, k, real = self.engine, self._kernels, self.engine.real.type
+        with engine.workspace.frame():
+            forces = engine.scratch((t.n, 2))
+            engine.run_each(
+                k.compute_surface_forces, t.n, t.starts, t.face_measures, t.volumes, quality,
+                real(bad_cell_weight), forces,
+            )  # fmt: skip
+            engine.run_each(
+                k.descend_surface, t.n, t.starts, t.neighbors, t.face_measures, t.face_centroids,
+                t.vertices[0], t.points, h, forces, real(rate), real(max_displacement), lloyd,
+                *engine.period_args,
+            )  # fmt: skip
