@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
-from ..finite_volumes.solver_mesh import check_not_sphere
+from ..finite_volumes.solver_mesh import SolverMesh, check_not_sphere
 from ..finite_volumes.two_point import two_point_faces
 from ..mesh.connectivity import take_rows
 from ..mesh.read_only import Sealed
@@ -17,6 +17,9 @@ from ..mesh.read_only import Sealed
 if TYPE_CHECKING:
     from ..finite_volumes.solver_mesh import WallShape
     from ..mesh.diagram import Diagram
+
+_EMPTY = 1e-13
+"""Length of faces that are left out, over the extent of the domain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +106,17 @@ class Disv(Sealed):
         return f"Disv({len(self.centers)} cells, {len(self.vertices)} vertices; {', '.join(self.boundaries)})"
 
 
+def _without_empty_faces(mesh: SolverMesh) -> SolverMesh:
+    """Return `mesh` without faces between cells that are as short as round-off: MODFLOW divides by their length."""
+    ends = mesh.corners.reshape(-1, 2)
+    a, b = mesh.points[ends].swapaxes(0, 1)
+    short = np.hypot(*(b - a).T) <= _EMPTY * float(np.max(mesh.domain.extent))
+    short[mesh.inner :] = False
+    into = np.arange(len(mesh.points))
+    into[ends[short, 1]] = ends[short, 0]
+    return replace(mesh, corners=into[mesh.corners]).take_faces(~short) if short.any() else mesh
+
+
 def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
     """Return the DISV grid of `diagram`; see `Diagram.to_disv`."""
     domain = diagram.domain
@@ -120,7 +134,7 @@ def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
         raise InputError(
             "DISV grids have no periodic sides, and this box has; use a box without periodic directions"
         )
-    mesh = diagram.solver_mesh(walls, collapse=False)
+    mesh = _without_empty_faces(diagram.solver_mesh(walls, collapse=False))
     starts, loops = cell_loops(mesh)
     cells = np.arange(len(mesh))
     faces = two_point_faces(mesh, diagram.points)

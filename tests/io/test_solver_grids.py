@@ -68,6 +68,8 @@ def test_modflow_finds_the_conductances_of_the_diagram(lake, walls):
     f = d.faces
     k = f.n_inner
     expected = dict(zip(zip(f.owner[:k], f.neighbor[:k], strict=True), range(k), strict=True))
+    # Faces as short as round-off are left out.
+    expected = {pair: face for pair, face in expected.items() if f.area[face] > 1e-12}
     assert connections.keys() == expected.keys()
     on_wall, cut = set(f.owner[k:].tolist()), 0
     for (i, j), (length, distance) in connections.items():
