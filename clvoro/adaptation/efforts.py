@@ -59,6 +59,8 @@ class Effort:
         lattice relaxes by at most the whole displacement per step of Lloyd's. Measured on F1 to F3, default, ten starts
         each: 3.2 with 0.8 in place of 1.3 with 0.7 raises the mean Q by 0.0008 to 0.0019 and the least Q by 0.003 to
         0.013 for the same work.
+    calm_relaxation : float
+        Relaxation of gliding at thin walls; see `CALM_MOMENTUM`.
     polish_momentum : float
         Momentum of polishing.
     penalty : float
@@ -90,6 +92,7 @@ class Effort:
     steep_error_target: float = 0.0
     relaxation: float = 1.3
     momentum: float = 0.7
+    calm_relaxation: float = 1.3
     polish_momentum: float = 0.7
     penalty: float = 0.3
     nuclei: float = 0.0
@@ -107,7 +110,7 @@ class Effort:
 EFFORTS = {
     "fast": Effort(
         8, 2, 3, (0, 1, 4, 8), glide=6, first=4, polish=5, error_target=0.0035, steep_error_target=0.007,
-        relaxation=3.0, deficit=0.022, separate=1,
+        relaxation=3.0, calm_relaxation=1.0, deficit=0.022, separate=1,
     ),
     "default": Effort(
         30, 5, 3, (4, 18, 20, 20), glide=7, polish=21, error_target=0.0025, steep_error_target=0.0155,

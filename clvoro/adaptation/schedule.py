@@ -228,7 +228,7 @@ def _adaptive_2d(
     effort: Effort, levels: int, exact: bool, error_target: float, warm: bool
 ) -> Iterator[Action]:
     glide = ProjectedMethod(
-        "lloyd", effort.relaxation, effort.momentum, penalty=0.1,
+        "lloyd", effort.relaxation, effort.momentum, penalty=0.1, calm_relaxation=effort.calm_relaxation,
         tolerance=GLIDE_TOLERANCE if levels else POLISH_TOLERANCE,
     )  # fmt: skip
     if warm:
