@@ -33,6 +33,7 @@ LIMITS = {
     "clip_marked": (224, 720),
     "clip_polyhedra": (208, 5760),
     "update_cells": (160, 6656),
+    "descend_surface": (176, 2112),
     "count_corners": (288, 4608),
     "list_corners": (288, 4608),
     "share_corners": (144, 4000),
