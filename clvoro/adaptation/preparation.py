@@ -19,6 +19,7 @@ from ..sizing.gaps import NARROW
 from ..sizing.layers import limit_beside_layers
 from ..sizing.on_domain import on_domain
 from ..tessellation.power import require_power_domain
+from .arrays import Setup
 from .descent.quality_descent import OPENINGS
 from .diagnostics import (
     check_precision,
@@ -45,7 +46,7 @@ from .schedule import (
     repeated_schedule,
 )
 from .stages import Stages
-from .state import MeshState, Setup
+from .state import MeshState
 
 GRADIENT_STEP = 0.2
 """Step over h of the differences for the gradient of the size field in exact projections."""

@@ -17,6 +17,7 @@ from ..mesh.results import HISTORY_DTYPE, Displacements
 from ..tessellation.cells import Cells
 from ..tessellation.periodic.halo import block_count
 from ..tessellation.polyhedra_update import are_triples
+from .arrays import SUMMARIES, Setup
 from .checkpoint import (
     DIAGRAM,
     FORMAT,
@@ -32,7 +33,7 @@ from .insertion_deletion import Generators
 from .loop import Progress
 from .schedule import Action, Step
 from .stages import Stages
-from .state import SUMMARIES, MeshState, Setup
+from .state import MeshState
 
 if TYPE_CHECKING:
     from ..geometry.box import Domain

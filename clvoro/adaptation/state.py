@@ -1,12 +1,10 @@
-"""The state of a mesh on the device: generators, their diagram, sizes, error and quality."""
+"""The state of a mesh on the device, and what changes it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -15,171 +13,56 @@ import pyopencl.array as cla
 from ..geometry.box import Domain
 from ..mesh.diagram import Diagram
 from ..opencl.device_array import buffer_of
-from ..opencl.engine import Engine
-from ..opencl.primitives import Summaries, Summary
+from ..opencl.primitives import Summary
 from ..sizing import Sizing
 from ..tessellation.bins import BinnedPoints
-from ..tessellation.device_diagram import Tessellation
 from ..tessellation.power import PowerTessellator
 from ..tessellation.readback.diagram import fetch_diagram
 from ..tessellation.tessellator import Tessellator
+from .arrays import Arrays, CellArrays, MeshArrays, Setup
 from .density import CellWeights, LloydWeights
 from .descent.quality_descent import MOST_OBTUSE
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
-from .motion import Moving
 from .stages import Stages
 from .walls import Walls
 
-SUMMARIES = (
-    "error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio",
-    "weight",
-)  # fmt: skip
 
-
-@dataclass
-class CellArrays:
-    """Arrays (n,) real that follow from the generators; see `MeshState`."""
-
-    h: cla.Array
-    error: cla.Array
-    quality: cla.Array
-    local_length: cla.Array
-    potential: cla.Array
-
-    @classmethod
-    def empty(
-        cls,
-        engine: Engine,
-        n: int,
-        h: cla.Array | None = None,
-        potential: cla.Array | None = None,
-    ) -> CellArrays:
-        """Return new arrays for `n` cells. Only the potential is read before it is written, and starts from 0."""
-        return cls(
-            h=engine.empty(n) if h is None else h,
-            error=engine.empty(n),
-            quality=engine.empty(n),
-            local_length=engine.empty(n),
-            potential=engine.zeros(n) if potential is None else potential,
-        )
-
-
-@dataclass
-class _Data:
-    """All arrays of one set of generators. An interruption leaves the old or the new set, never a mixture."""
-
-    generators: Generators
-    cells: CellArrays | None = None
-    tessellation: Tessellation | None = None
-    multipliers: cla.Array | None = None
-
-
-def _property(part: str, name: str) -> Any:
-    """Return a property for attribute `name` of `part` of `MeshState._data`."""
-    return property(lambda self: getattr(getattr(self._data, part), name))
-
-
-@dataclass(frozen=True)
-class Setup:
-    """What all levels of a run have in common.
-
-    Attributes
-    ----------
-    free : Domain
-        Part of the domain, in its frame, in which generators may move.
-    fixed : int
-        Generators with labels below `fixed` do not move, and the size of their cells is their target size.
-    factor : float
-        Initial factor on the size field on the finest level.
-    """
-
-    stages: Stages
-    domain: Domain
-    sizing: Sizing
-    free: Domain
-    fixed: int = 0
-    factor: float = 1.0
-
-
-class MeshState:
+class MeshState(MeshArrays):
     """Generators of one level with their diagram, sizes, error and quality, all on the device.
+
+    `MeshArrays` has the attributes that are arrays.
 
     Parameters
     ----------
     setup : Setup
     size_factor : float
         Factor on the size field: 2^k on level k above the finest.
-    start : dict of device arrays, or _Data
+    start : dict of device arrays, or Arrays
         Points and labels of the generators, removed from the dict; or all arrays of a saved state.
     coarser : Tessellator, optional
         Tessellator of the coarser level.
 
     Attributes
     ----------
-    n : int
-    points : (n, d) real
-        Normalized coordinates, in the order of the bins.
-    labels : (n,) int32
-        Permanent names of the generators.
-    velocity : (n, d) real
-        Displacement in the last step.
-    signatures : (n,) uint64
-        Hashes of the sets of neighbors; see `Metric.compare_neighbors`.
-    ever_changed : (n,) real
-        1 where the set of neighbors has changed in a step on this level, else 0.
-    tessellation : Tessellation or None
-    h, error, quality : (n,) real
-    local_length : (n,) real
-        min(L, h), the unit of bounds of the motion.
     follows_log_ratio : bool
         Summarize log(L / h) with error and quality, so that `mean_log_ratio_error` needs no transfer of its own.
-    potential : (n,) real
-        Solution of the last Poisson solve, the start of the next one.
-    multipliers : (n,) float32 or None
-        Solution of the last volume projection, the start of the next one.
     power : PowerTessellator or None
         What made the present diagram, if it is a power diagram.
-    source : (n,) real
-        Right side of the Poisson equation. It and the following arrays are in the workspace, valid for one step.
-    lloyd, correction : (n, d) real
-        The two parts of the displacement. Their lengths over h: `lloyd_speed`, `correction_speed` (n,).
     """
-
-    source: cla.Array
-    lloyd: cla.Array
-    correction: cla.Array
-    lloyd_speed: cla.Array
-    correction_speed: cla.Array
-
-    points = _property("generators", "points")
-    labels = _property("generators", "labels")
-    velocity = _property("generators", "velocity")
-    signatures = _property("generators", "signatures")
-    ever_changed = _property("generators", "ever_changed")
-    h = _property("cells", "h")
-    error = _property("cells", "error")
-    quality = _property("cells", "quality")
-    local_length = _property("cells", "local_length")
-    potential = _property("cells", "potential")
 
     def __init__(
         self,
         setup: Setup,
         size_factor: float,
-        start: dict[str, cla.Array] | _Data,
+        start: dict[str, cla.Array] | Arrays,
         coarser: Tessellator | None = None,
     ) -> None:
-        self.setup, self.size_factor = setup, size_factor
-        self.stages, self.domain, self.sizing = setup.stages, setup.domain, setup.sizing
-        self.free, self.fixed = setup.free, setup.fixed
-        self.engine = self.stages.engine
+        super().__init__(setup, size_factor)
         self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser)
-        self.summaries = Summaries(self.engine, SUMMARIES)
         self.power: PowerTessellator | None = None
-        self._ordered: cla.Array | None = None
         self.follows_log_ratio = False
         self._log_ratio_error: float | None = None
-        if isinstance(start, _Data):
+        if isinstance(start, Arrays):
             self._data, self.next_label = start, len(start.generators)
             return
         n = self.next_label = len(start["points"])
@@ -218,46 +101,12 @@ class MeshState:
     ) -> MeshState:
         """Return a mesh from the arrays of another one. Its diagram is set afterwards."""
         cells = CellArrays.empty(setup.stages.engine, len(generators), h, potential)
-        return cls(setup, size_factor, _Data(generators, cells, None, multipliers))
-
-    @property
-    def n(self) -> int:
-        """Number of generators."""
-        return len(self._data.generators)
-
-    @property
-    def tessellation(self) -> Tessellation | None:
-        """The present diagram; None before the first `update`."""
-        return self._data.tessellation
-
-    @tessellation.setter
-    def tessellation(self, t: Tessellation | None) -> None:
-        self._data.tessellation = t
-
-    @property
-    def t(self) -> Tessellation:
-        """The present diagram."""
-        assert self._data.tessellation is not None
-        return self._data.tessellation
-
-    @property
-    def multipliers(self) -> cla.Array | None:
-        """Solution of the last volume projection, if there is one."""
-        return self._data.multipliers
-
-    @multipliers.setter
-    def multipliers(self, array: cla.Array) -> None:
-        self._data.multipliers = array
+        return cls(setup, size_factor, Arrays(generators, cells, None, multipliers))
 
     @cached_property
     def walls(self) -> Walls:
         """Corners and thin walls of the domain, for the cells of this level."""
         return Walls(self.setup, self.size_factor)
-
-    @property
-    def moving(self) -> Moving:
-        """The generators, to be moved."""
-        return Moving(self.points, self.velocity, self.labels, self.fixed)
 
     def _target_sizes(self, points: np.ndarray) -> np.ndarray:
         """Return the target size at `points` (k, d) on this level, (k,)."""
@@ -282,32 +131,12 @@ class MeshState:
         items = binned.items[:n].copy()
         # One array after the other, so that each is freed when it has been sorted.
         new = {name: stages.gather.rows(items, rows.pop(name)) for name in list(rows)}
-        self._data = _Data(Generators(**new))
+        self._data = Arrays(Generators(**new))
         del new, items
         stages.bins.renumber(binned, n)
         self.update(first, binned)
         stages.bins.clear()
         self.engine.workspace.clear()
-
-    def allocate_step(self) -> None:
-        """Allocate the displacements, to the end of the workspace's frame."""
-        self.lloyd, self.correction = (self.engine.scratch(self.points.shape) for _ in range(2))
-
-    def allocate_source(self) -> None:
-        """Allocate the right side of a Poisson equation."""
-        self.source = self.engine.scratch(self.n)
-
-    def measure_displacements(self) -> None:
-        """Compute the lengths of both displacements over h."""
-        self.lloyd_speed, self.correction_speed = (self.engine.scratch(self.n) for _ in range(2))
-        self.stages.motion.measure_displacements(
-            self.lloyd, self.correction, self.h, self.lloyd_speed, self.correction_speed
-        )
-
-    def summarize_displacements(self) -> None:
-        """Summarize the lengths of both displacements."""
-        speeds = {"lloyd": self.lloyd_speed, "correction": self.correction_speed}
-        self.summaries.collect_all(speeds, self.n)
 
     def update(
         self, first: bool = False, binned: BinnedPoints | None = None, *, check: bool = True
@@ -506,19 +335,10 @@ class MeshState:
             self.engine.queue, buffer_of(start["labels"]), buffer_of(self.labels), byte_count=self.labels.nbytes
         )  # fmt: skip
         # Free the other arrays. After an interruption `update` computes them again.
-        self._data = _Data(self._data.generators)
+        self._data = Arrays(self._data.generators)
         mesh = MeshState(self.setup, self.size_factor / 2, start, self.tessellator)
         mesh.next_label = self.next_label + n - self.n
         return mesh
-
-    # Results in physical units, in the order of the caller.
-
-    def to_host(self, array: cla.Array, factor: float = 1.0) -> np.ndarray:
-        """Return `array` (n, ...) on the host in the order of labels, times `factor`."""
-        # The labels are a new array whenever the order changes.
-        if self._ordered is not self.labels:
-            self._order, self._ordered = np.argsort(self.labels.get(), kind="stable"), self.labels
-        return array.get()[self._order].astype(np.float64) * factor
 
     def finalize(self) -> bool:
         """Free what only steps need, and evaluate the diagram in full precision, for `fetch_diagram`.
