@@ -258,6 +258,8 @@ kernel void measure_faces(const int size, global const int *starts, global const
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     const int begin = starts[i], end = starts[i + 1];
+    if (begin == end)
+        return;
     const REAL2 origin = corner(i, x, neighbors[end - 1], neighbors[begin], points, lower, upper);
     REAL2 v = origin;
     for (int k = begin; k < end; ++k) {

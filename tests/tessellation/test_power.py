@@ -86,6 +86,16 @@ def test_many_cells_in_a_point(ctx, dim):
         assert d.empty_cells.tolist() == list(empty)
 
 
+@pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
+def test_the_first_and_the_last_row_are_empty(ctx):
+    """Nothing is read beside the graph, where labels would be those of no generator."""
+    adapter, points = clvoro.Adapter(ctx), np.random.default_rng(3).random((50, 2))
+    for i in range(10):
+        d = adapter.power_diagram(SQUARE, points, np.where(np.arange(50) == i, 2.0, 0.0))
+        assert sorted(d.neighbors) == [-4, -3, -2, -1]
+        assert d.volumes[i] == 1
+
+
 def test_files_pictures_and_other_libraries(ctx, tmp_path):
     rng = np.random.default_rng(4)
     points, weights = rng.random((40, 2)), 0.02 * rng.random(40)
