@@ -139,6 +139,8 @@ def test_bad_input(ctx):
             adapter.power_diagram(SQUARE, points, weights)
     with pytest.raises(InputError, match="coincide"):
         adapter.power_diagram(SQUARE, points[[0, 0, 1]], [0, 1, 2])
+    with pytest.raises(InputError, match="finite differences"):
+        adapter.power_diagram(SQUARE, points, [1e308, -1e308, 0])
     with pytest.raises(InputError, match="no power diagrams"):
         adapter.power_diagram(clvoro.Sphere(), [(0, 0, 1)], [0])
     with pytest.warns(EmptyCellsWarning, match="2 of 3"):

@@ -17,7 +17,8 @@ from ..estimates import check_memory
 from ..stages import Stages
 
 SUM_TOLERANCE = 1e-9
-"""Largest relative difference of the sum of volumes from the measure of the domain."""
+"""Largest relative difference of the sum of volumes from the measure of the domain, if the round-off of the volumes is
+not larger."""
 WITHIN_REACH = 4.0
 """A cell is empty if its weight is less than the largest one by more than the square of the domain's diameter. Lower
 weights are raised to this multiple of it, so that nothing overflows."""
@@ -28,6 +29,10 @@ def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: ob
     power = PowerTessellator(stages, domain)
     host = check_points(points, domain)
     n, given = len(host), _check_numbers("weights", weights, len(host))
+    if not np.isfinite(float(given.max()) - float(given.min())):
+        raise InputError(
+            f"weights are between {given.min():.3g} and {given.max():.3g}, expected finite differences; scale them"
+        )
     check_memory(stages.engine, n, domain, run=False)
     # Only differences count. Around 0 weights have the least round-off.
     near = np.maximum(given - given.max(), -WITHIN_REACH * float((domain.extent**2).sum()))
@@ -67,7 +72,8 @@ def transport_to(
     if tolerance is None:
         tolerance = TOLERANCE[engine.real.name]
     tolerance = check_number("tolerance", tolerance, above=0)
-    _check_volumes(given, domain)
+    kind = np.asarray(volumes).dtype
+    _check_volumes(given, domain, float(np.finfo(kind).eps) if kind.kind == "f" else 0.0)
     check_memory(engine, n, domain, run=False)
     with Naming(host, domain, engine.real):
         labels, sorted_points = _sorted(stages, domain, host)
@@ -119,7 +125,8 @@ def _check_numbers(name: str, value: object, n: int) -> np.ndarray:
     return array
 
 
-def _check_volumes(volumes: np.ndarray, domain: Domain) -> None:
+def _check_volumes(volumes: np.ndarray, domain: Domain, rounding: float) -> None:
+    """Raise InputError unless `volumes` (n,) with a relative `rounding` are positive and fill the domain."""
     bad = np.flatnonzero(~(volumes > 0))
     if bad.size:
         raise InputError(
@@ -127,7 +134,7 @@ def _check_volumes(volumes: np.ndarray, domain: Domain) -> None:
             "leave out generators whose cells are to be empty"
         )
     total = float(volumes.sum())
-    if not abs(total - domain.measure) <= SUM_TOLERANCE * domain.measure:
+    if not abs(total - domain.measure) <= max(SUM_TOLERANCE, rounding) * domain.measure:
         raise InputError(
             f"the sum of the {len(volumes)} volumes is {total:.12g}, expected that of the domain, "
             f"{domain.measure:.12g}; scale them: volumes * (domain.measure / volumes.sum())"
