@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from ..errors import InputError
-from ..opencl.probe import check_process
+from .lazy_arrays import LazyArrays
 from .output import MeshOutput
-from .read_only import read_only, seal
+from .read_only import seal
 
 if TYPE_CHECKING:
     import scipy.sparse
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from .results import Result
 
 
-class Diagram(MeshOutput):
+class Diagram(LazyArrays, MeshOutput):
     """A Voronoi diagram clipped to its domain, as `clvoro.voronoi` and `Adapter.diagram` return it.
 
     Row i belongs to the i-th generator of the caller. Arrays are read from the device when they are first used. They
@@ -116,45 +115,6 @@ class Diagram(MeshOutput):
     True
     """
 
-    _NAMES = (
-        "points", "volumes", "centroids", "neighbor_starts", "neighbors", "shifts",
-        "face_measures", "face_centroids", "vertices", "cell_vertex_starts", "cell_vertices", "face_vertex_starts",
-        "face_vertices", "weights",
-    )  # fmt: skip
-
-    def __init__(
-        self, domain: Domain, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]
-    ) -> None:
-        self.domain = domain
-        self._arrays = {n: a if callable(a) else read_only(a) for n, a in arrays.items()}
-
-    def __getattr__(self, name: str) -> np.ndarray:
-        if name not in Diagram._NAMES:
-            # A copy under construction has no arrays yet; `copy` looks for private names.
-            there = "" if name.startswith("_") else f"; it has {', '.join(self._there())}"
-            raise AttributeError(f"a Diagram has no {name!r}{there}", name=name, obj=self)
-        if name == "shifts" and name not in self._arrays:
-            self._arrays[name] = read_only(
-                np.zeros((len(self.neighbors), self.domain.dim), np.int8)
-            )
-        if name == "weights" and not self.is_power:
-            return read_only(np.zeros(len(self)))
-        if name not in self._arrays:
-            raise AttributeError(
-                f"a diagram in {self.domain.dim}D has no {name}; it has {', '.join(self._there())}"
-            )
-        value = self._arrays[name]
-        if callable(value):
-            check_process()  # it may still be on a device
-            value = self._arrays[name] = read_only(value())
-        return value
-
-    def _there(self) -> list[str]:
-        return [n for n in Diagram._NAMES if n == "shifts" or n in self._arrays]
-
-    def __dir__(self) -> list[str]:
-        return [*super().__dir__(), *self._there()]
-
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays that may still be on a device are read.
         return _rebuilt, (self.domain, {n: getattr(self, n) for n in self._arrays})
@@ -169,11 +129,6 @@ class Diagram(MeshOutput):
             if len(self.empty_cells):
                 kind += f"{len(self.empty_cells)} empty of "
         return f"Diagram({kind}{len(self)} cells in {self.domain})"
-
-    @property
-    def is_power(self) -> bool:
-        """Whether it is a power diagram. Its cells need not contain their generators, and may be empty."""
-        return "weights" in self._arrays
 
     def with_weights(self, weights: np.ndarray) -> Diagram:
         """Return this power diagram with the `weights` (n,) that the caller gave, without round-off."""
