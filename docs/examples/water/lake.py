@@ -18,6 +18,12 @@ lake = clvoro.Polygon.from_geojson(file)
 print(lake)
 
 # %%
+# Some creeks are narrower than the smallest cell. `simplified` fills them, and leaves vertices out that no cell resolves.
+
+lake = lake.simplified(0.012)
+print(lake)
+
+# %%
 size = sizing.FeatureSize(lake, cells_across=4, growth=1.15, h_min=0.012, h_max=0.25)
 mesh = clvoro.adapt(lake, size)
 print(mesh)
