@@ -72,10 +72,10 @@ class MultilevelOptions:
         the number of refinements that lead from them to the finest level.
     error_target : float, optional
         Mean |log(L / h)| that the last steps aim at; a larger one gives cells of a better shape. By default .0025
-        (effort "fast": .0035, "best": .0039) where sizes are smooth. In 2D, with more than about 2,800 cells, it grows
-        with the share of the cells where sizes are steep, |grad h| > .1, up to .0155 ("fast": .007, "best": .01). On
-        spheres and with "exact" it does not. Above about .04 the shape no longer improves, and errors stay below the
-        target; in 2D the largest error is bounded to about .25.
+        (effort "fast": .0035, "best": .0039) where sizes are smooth. In a `Box` in 2D, with more than about 2,800
+        cells, it grows with the share of the cells where sizes are steep, |grad h| > .1, up to .0155 ("fast": .007,
+        "best": .01). In other domains and with "exact" it does not. Above about .04 the shape no longer improves, and
+        errors stay below the target; in 2D the largest error is bounded to about .25.
 
     Raises
     ------
