@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
@@ -112,9 +114,14 @@ def _without_empty_faces(mesh: SolverMesh) -> SolverMesh:
     a, b = mesh.points[ends].swapaxes(0, 1)
     short = np.hypot(*(b - a).T) <= _EMPTY * float(np.max(mesh.domain.extent))
     short[mesh.inner :] = False
-    into = np.arange(len(mesh.points))
-    into[ends[short, 1]] = ends[short, 0]
-    return replace(mesh, corners=into[mesh.corners]).take_faces(~short) if short.any() else mesh
+    if not short.any():
+        return mesh
+    # Several such faces may be in a row. All their ends become the first one.
+    size = len(mesh.points)
+    graph = coo_array((short[short], ends[short].T), shape=(size, size))
+    label = connected_components(graph, directed=False)[1]
+    into = np.unique(label, return_index=True)[1][label]
+    return replace(mesh, corners=into[mesh.corners]).take_faces(~short)
 
 
 def make_disv(diagram: Diagram, walls: WallShape) -> Disv:

@@ -109,6 +109,23 @@ def test_cells_are_clockwise_and_have_their_areas(lake):
     assert np.array_equal(disv.centers, lake.points)
 
 
+def test_faces_in_a_row_as_short_as_round_off_are_left_out():
+    """Generators on a circle up to round-off have many vertices in its center."""
+    angle = 2 * np.pi * np.arange(12) / 12 + 0.1
+    ring = 0.5 + 0.3 * np.column_stack([np.cos(angle), np.sin(angle)])
+    ring += np.random.default_rng(9).uniform(-1e-14, 1e-14, ring.shape)
+    diagram = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), ring)
+    disv = diagram.to_disv()
+    assert len(disv.cell_vertices) < len(diagram.cell_vertices)
+    areas, lengths = [], []
+    for corners in np.split(disv.cell_vertices, disv.cell_vertex_starts[1:-1]):
+        p, q = disv.vertices[corners], disv.vertices[np.roll(corners, -1)]
+        areas.append((p[:, 1] * q[:, 0] - p[:, 0] * q[:, 1]).sum() / 2)
+        lengths.extend(np.hypot(*(q - p).T))
+    np.testing.assert_allclose(areas, diagram.volumes, rtol=1e-11)
+    assert min(lengths) > 0
+
+
 def test_boundaries_have_names_cells_and_lengths(lake):
     disv, d = lake.to_disv(), lake.diagram
     assert tuple(disv.boundaries) == d.domain.boundary_names
