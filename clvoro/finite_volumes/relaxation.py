@@ -5,9 +5,9 @@ The points around such faces minimize a sum of squares,
     sum_f [max(0, angle_f - a)^2 + max(0, skewness_f - s)^2 + max(0, b - l_f / L_f)^2]
         + sum_i [(A_i / A_i0 - 1)^2 + max(0, d - det_i)^2] + sum_c max(0, t - turn_c)^2 + sum_p |move_p|^2 / width_p^2,
 
-each term with a weight: over faces f, with non-orthogonality and skewness as OpenFOAM defines them, and lengths l over
-the smaller size L of their cells; over areas A and
-OpenFOAM's determinants of cells, turns in their corners, and moves of points. Points on walls and at seams do not move.
+each term with a weight. The sums are over faces f (non-orthogonality and skewness as OpenFOAM defines them, and length
+l over the smaller size L of both cells), cells i (area A, and OpenFOAM's determinant), corners c of cells, points p.
+Points on walls and at seams do not move.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _LENGTH_GOAL, _SHORT = 0.15, 0.05
 _DETERMINANT_GOAL, _LEAST_DETERMINANT = 0.02, 3e-3
 """Determinant of a cell that is aimed at, and below which it does not fall; OpenFOAM refuses cells below 1e-3."""
 _SHORTENED = 0.9
-"""By this factor shorter faces may shrink."""
+"""Least length of a face below `_SHORT`, over its length before."""
 _SKEW_WEIGHT, _LENGTH_WEIGHT, _AREA_WEIGHT, _TURN_WEIGHT, _DETERMINANT_WEIGHT = (
     0.3,
     5.0,

@@ -235,10 +235,15 @@ class MongeAmpereMethod:
     def _warn(self, folded: int, n: int, residual: float) -> None:
         if not self.warned:
             self.warned = 1
+            reason = (
+                f"the map would fold at {folded} of {n} generators"
+                if folded
+                else "no step of Newton's method improves the map"
+            )
             warn(
-                f"monge-ampere: the map would fold at {folded} of {n} generators, and stops with volumes that are off "
-                f"by a factor of {np.exp(residual):.3g}: the size field changes too much over a cell; use "
-                "method='adaptive', or limit the growth of the sizes (clvoro.sizing.Graded)",
+                f"monge-ampere: {reason}. It stops with volumes that are off by a factor of {np.exp(residual):.3g}, "
+                "because the size field changes too much over a cell; use method='adaptive', or limit the growth of "
+                "the sizes (clvoro.sizing.Graded)",
                 TangledMeshWarning,
             )
 
