@@ -41,9 +41,9 @@ OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[
 PARTS = {
     "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
     "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
-    "tessellation.power": {"tessellation.polyhedra"},
+    "tessellation.power": {"tessellation.polyhedra", "tessellation.power_cells"},
     "solvers.transport": {"solvers.poisson", "tessellation.power"},
-    "tessellation.cells": {"tessellation.weight_bounds"},
+    "tessellation.power_cells": {"tessellation.cells", "tessellation.weight_bounds"},
     "tessellation.polyhedra": {"tessellation.weight_bounds"},
     "tessellation.incremental": {"tessellation.cells"},
     "tessellation.polyhedra_update": {"tessellation.polyhedra"},

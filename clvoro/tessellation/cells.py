@@ -26,13 +26,11 @@ from .device_diagram import (
     OPEN,
     ROUGH_SHARE,
     CloseError,
-    NeighborRows,
     OpenCellError,
     Tessellation,
     restored,
 )
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
-from .weight_bounds import WeightBounds
 
 CELL_CAPACITY = 24
 """Most faces of a cell while it is clipped."""
@@ -50,7 +48,7 @@ FIRST_REACH = 1.9
 
 
 class Cells:
-    """Tessellate a box in 2D, or a sphere; with an engine for power diagrams by points with weights (n, 3).
+    """Tessellate a box in 2D, or a sphere.
 
     Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
     one is complete.
@@ -69,13 +67,12 @@ class Cells:
         self._capacity = self._room = self._n = self._enlarged_for = 0
         self._flags = engine.empty(FLAGS, np.int32)
         self._no_flags: dict[tuple[int, int, bool], cla.Array] = {}
-        self._bounds = WeightBounds(engine) if engine.domain_kind.weighted else None
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
         self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
         engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
-        in_lanes = engine.group_size == 1 and engine.real == np.float64 and self._bounds is None
+        in_lanes = engine.group_size == 1 and engine.real == np.float64
         self.lanes = LANES if in_lanes else 1
         self._kernels = engine.kernels(
             "tessellation/cells", {**defines, "IN_LANES": int(self.lanes > 1)}
@@ -212,7 +209,7 @@ class Cells:
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         hulls = self._hulls if total >= self.hulls_from else None
         some = hulls is not None
-        bounds = () if self._bounds is None else self._bounds.build(box, points, total)
+        bounds = self._search_bounds(box, points, total)
         if hulls is not None:
             engine.run_each(
                 hulls.wrap_all_hulls, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
@@ -233,26 +230,9 @@ class Cells:
             some = True
             self._reset_flags(n, len(rows.counts), byte_count=4)
 
-    @framed
-    def clip_by_rings(
-        self, box: ClipBox, points: cla.Array, previous: NeighborRows, exact: bool
-    ) -> Tessellation | None:
-        """Tessellate by `points` with weights (n, 3), starting from the neighbors in `previous`.
-
-        The result is right if the sum of its volumes is that of `box`. None if that fails.
-        """
-        n, old = previous.n, (previous.starts, previous.neighbors)
-        self._reserve(n)
-        rows = self.take_rows(n, spare=spare_slots(n))
-        self.engine.run_each(
-            self._kernels.clip_by_rings, n, points, *box.device_corners(self.engine.real), *old, rows.slots,
-            rows.counts, rows.places, rows.flags,
-        )  # fmt: skip
-        same = rows.places, rows.places
-        flags, m = self._match(rows, box, points, n, *same, exact)
-        if flags & ~DOUBT:
-            return None
-        return self._measure(rows, box, points, n, *same, m, flags, exact)
+    def _search_bounds(self, box: ClipBox, points: cla.Array, total: int) -> tuple[object, ...]:
+        """Return what else the search for neighbors of the first `total` points needs."""
+        return ()
 
     def match_update(
         self,

@@ -16,6 +16,7 @@ from ..geometry.box import Box, Domain
 from ..opencl.primitives import Summaries
 from .device_diagram import CloseError, NeighborRows, Tessellation
 from .polyhedra import Polyhedra
+from .power_cells import PowerCells
 from .stages import TessellationStages
 
 CLOSED = 1e-12
@@ -102,7 +103,7 @@ class PowerTessellator:
         The diagram is None if neighbors stay missing. Until all are found cells are too large, never too small.
         """
         cells, rows, before = self.stages.cells, previous, np.inf
-        assert not isinstance(cells, Polyhedra)
+        assert isinstance(cells, PowerCells)
         while True:
             t = cells.clip_by_rings(self.domain, weighted, rows, exact)
             if t is None:

@@ -19,6 +19,7 @@ from .periodic.folded import FoldedCells
 from .periodic.ghost_images import GhostImages
 from .polyhedra import Polyhedra
 from .polyhedra_update import PolyhedraUpdate
+from .power_cells import PowerCells
 
 
 class TessellationStages:
@@ -45,8 +46,12 @@ class TessellationStages:
     def __getattr__(self, name: str) -> object:
         if name not in self.CLASSES:
             raise AttributeError(name)
-        in_space = name == "cells" and self.engine.cell_dim == 3
-        stage = (Polyhedra if in_space else self.CLASSES[name])(self.engine)
+        kind = self.CLASSES[name]
+        if name == "cells" and self.engine.cell_dim == 3:
+            kind = Polyhedra
+        elif name == "cells" and self.engine.domain_kind.weighted:
+            kind = PowerCells
+        stage = kind(self.engine)
         setattr(self, name, stage)
         return stage
 
