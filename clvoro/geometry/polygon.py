@@ -8,39 +8,27 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
+from typing import Any
 
 import numpy as np
 
 from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
-from ..opencl.engine import DomainKind
 from .boundary_names import BoundaryNames, Walls
 from .curved_edges import CurvedEdges
 from .curves import Curve
-from .edge_grid import bin_edges
+from .device_polygon import DevicePolygon
 from .geojson import pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt
-from .region import Region
 from .rings import OrientedRings, make_rings, signed_area
 from .shapes import Edges
 from .simplification import simplify
-
-if TYPE_CHECKING:
-    from ..opencl.engine import Engine
-    from ..opencl.workspace import Workspace
-
-_MARGIN = 1 / 64
-"""Distance from the domain to the box that clips cells, as a share of the bounding box's longest edge."""
-_BEHIND = 16
-"""Tolerance for generators on an edge, in units of round-off on the device."""
 
 BOUNDARY_SHIFTS = (8, 16, 32, 64, 64, 64, 64, 64)
 """Shifts of the boundary in units of round-off, each in another direction. They are tried one after the other if the
 boundary cannot be traced through the diagram. They are within the tolerance of vertices."""
 
 
-class Polygon(Region):
+class Polygon(DevicePolygon):
     """Polygonal domain in 2D.
 
     Parameters
@@ -97,9 +85,6 @@ class Polygon(Region):
     >>> clvoro.Polygon([(0, 0.5), edge, (1, 0), (3, 0), (3, 1), (0, 1)]).boundary_names
     ('outer', 'edge')
     """
-
-    framed_by: Polygon | None = None
-    """The polygon that this one is a part of; its frame is used on the device."""
 
     def __init__(
         self,
@@ -435,48 +420,6 @@ class Polygon(Region):
         """
         rows, vertices = self.find_edges("boundary", walls), self.oriented.vertices
         return Edges(vertices[rows], vertices[self.oriented.next_vertex[rows]])
-
-    # The device's view: the polygon does not touch the box that clips cells.
-
-    @property
-    def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of the bounding box enlarged by 1/64 of its longest edge on every side."""
-        if self.framed_by is not None:
-            return self.framed_by.clip_box
-        margin = _MARGIN * self.extent.max()
-        return self.lower - np.full(2, margin), self.upper + np.full(2, margin)
-
-    @property
-    def frame(self) -> tuple[np.ndarray, float]:
-        """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1]."""
-        lower, upper = self.clip_box
-        return lower, 2.0 ** math.ceil(math.log2((upper - lower).max()))
-
-    def kind(self, real: np.dtype) -> DomainKind:
-        """Return the kind of domain, for which kernels are built."""
-        del real
-        return DomainKind(polygonal=True)
-
-    def device_args(self, engine: Engine) -> tuple[object, ...]:
-        """Return the corners of the clip box and the edges in bins; see geometry/edges.h."""
-        there = self._on_device.setdefault(engine.workspace, {})
-        if engine.real not in there:
-            origin, scale = self.frame
-            begins = (self.oriented.vertices - origin) / scale
-            ends = begins[self.oriented.next_vertex]
-            frame, shape, starts, listed = bin_edges(begins, ends)
-            # The round-off of a generator on an edge: that of the device and that of the domain.
-            frame[3] = _BEHIND * float(np.finfo(engine.real).eps) + self._rounding / scale
-            there[engine.real] = (
-                frame.astype(engine.real), shape, engine.upload(starts, np.int32),
-                engine.upload(np.concatenate([begins, ends], axis=1)[listed].ravel()),
-            )  # fmt: skip
-        return *self.device_corners(engine.real), *there[engine.real]
-
-    @cached_property
-    def _on_device(self) -> WeakKeyDictionary[Workspace, dict[np.dtype, tuple[object, ...]]]:
-        """Results of `device_args` by workspace and precision; they are freed with the workspace."""
-        return WeakKeyDictionary()
 
 
 def _described(values: dict[str, Any]) -> Polygon:
