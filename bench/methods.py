@@ -288,7 +288,7 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
                 title=TITLES[name],
                 xlim=(0.7 * LEFT, 2),
             )
-            ax.set_ylim(*((0.2, 0.5) if solid else (0.003, 0.4)))
+            ax.set_ylim(*((0.2, 0.5) if solid else (0.002, 0.4)))
             if not solid:
                 ax.yaxis.set_minor_formatter(NullFormatter())
             ax.title.set_fontsize(8)
