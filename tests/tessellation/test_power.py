@@ -115,6 +115,9 @@ def test_files_pictures_and_other_libraries(ctx, tmp_path):
     loaded = clvoro.load(tmp_path / "d.vtu")
     assert loaded.check()
     assert loaded.weights.tolist() == full.weights.tolist()
+    assert "weights[3] is nan" in str(
+        full.with_weights(np.where(np.arange(len(full)) == 3, np.nan, full.weights)).check()
+    )
     full.save(tmp_path / "case.foam")
     # Dual triangles cover the same part of the plane, counter-clockwise.
     a, b, c = points[kept][full.triangles()].swapaxes(0, 1)

@@ -70,6 +70,7 @@ def _check_structure(check: Check) -> None:
     check.shape("points", d.points, (n, dim))
     check.shape("volumes", d.volumes, (n,))
     check.shape("centroids", d.centroids, (n, dim))
+    check.shape("weights", d.weights, (n,))
     check.shape("neighbor_starts", d.neighbor_starts, (n + 1,), "iu")
     check.shape("neighbors", d.neighbors, (m,), "i")
     check.shape("shifts", d.shifts, (m, dim), "i")
