@@ -86,6 +86,20 @@ def test_many_cells_in_a_point(ctx, dim):
         assert d.empty_cells.tolist() == list(empty)
 
 
+def test_small_cells_pass_the_check(ctx):
+    """The last cell grows from the vertex of the first three others, which is far from its generator for its size."""
+    points = np.array([(0.31, 0.42), (0.81, 0.47), (0.52, 0.88), (0.47, 0.13), (0.5, 0.5)])
+    weights = np.array([0, 0.01, 0.02, 0.03])
+    x, w = points[:3], weights[:3]
+    squares = (x**2).sum(axis=1) - w
+    vertex = np.linalg.solve(2 * (x[1:] - x[0]), squares[1:] - squares[0])
+    least = ((vertex - points[4]) ** 2).sum() - ((vertex - x[0]) ** 2).sum() + w[0]
+    for more in (1e-4, 1e-7, 1e-10, 1e-13):
+        d = clvoro.Adapter(ctx).power_diagram(SQUARE, points, [*weights, least + more])
+        assert 0 < d.volumes[4] < 100 * more**2
+        assert d.check(), d.check()
+
+
 @pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
 def test_the_first_and_the_last_row_are_empty(ctx):
     """Nothing is read beside the graph, where labels would be those of no generator."""
