@@ -6,7 +6,7 @@
 Prints one table per field, a compact one of all fields, and the growth of time and error with the number of cells. With
 all fields, `methods.png` is drawn into `bench/pictures` or `--out`. `--fast` leaves out the fields with more than
 10,000 cells, the effort "best" and the growth. `--records FILE` writes one JSON object per line; if the file exists,
-tables are made from it without any runs.
+tables are made from it, without any runs and without the picture.
 
 Fields: "paper" is the paper's case (F1; the paper's methods from a uniform start, with k = 1); F2, F3, circles, ridge,
 corner and S2 are those of `_common.py`, from a random start with the density h^-d. All methods are judged in the same
@@ -265,9 +265,8 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
     from clvoro.plotting.style import new_figure, styled
 
     with styled():
-        rows = 4 if meshes else 2
-        figure = new_figure(7.4, 7.4 if meshes else 4.2)
-        grid = figure.add_gridspec(rows, 12, height_ratios=[1.0, 1.0, 0.8, 0.8][:rows])
+        figure = new_figure(7.4, 7.4)
+        grid = figure.add_gridspec(4, 12, height_ratios=[1.0, 1.0, 0.8, 0.8])
         axes = [figure.add_subplot(grid[k // 4, 3 * (k % 4) : 3 * (k % 4) + 3]) for k in range(8)]
         for ax, name in zip(axes, FIELDS, strict=False):
             for way in WAYS:
@@ -309,7 +308,7 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
             axes[k].set_ylabel("1 − mean quality Q [–]", fontsize=8)
         for k in range(3, 7):
             axes[k].set_xlabel("mean size error |e| [–]", fontsize=8)
-        for k, name in enumerate(DRAWN if meshes else ()):
+        for k, name in enumerate(DRAWN):
             ax = figure.add_subplot(grid[2 + k // 3, 4 * (k % 3) : 4 * (k % 3) + 4])
             ax.set_axis_off()
             quality = quality_of(getattr(meshes[name], "diagram", meshes[name]))
@@ -400,7 +399,7 @@ def main() -> None:
     if not options.json:
         print(f"All methods and fields: mean |e|, mean Q / min Q.\n\n{compact(records)}\n")
         print(f"Growth on {GROWTH_FIELD}, and with half its sizes.\n\n{growth(records)}\n")
-    if set(FIELDS) <= {r["field"] for r in records}:
+    if meshes and set(FIELDS) <= {r["field"] for r in records}:
         options.out.mkdir(parents=True, exist_ok=True)
         draw(records, meshes, options.out / "methods.png")
 
