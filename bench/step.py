@@ -49,7 +49,7 @@ from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.profile import Profile, profiled_queue
 from clvoro.sizing import Sizing
-from clvoro.solvers.conjugate_gradient import Solution
+from clvoro.solvers.linear_system import Solution
 
 CELLS_OF_F2 = 22972
 SOLVERS = ("poisson", "multigrid", "aggregation", "conjugate_gradient", "volume_projection")

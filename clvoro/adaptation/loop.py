@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputTypeError
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from ..opencl.primitives import Summary
-from ..solvers.conjugate_gradient import Solution
+from ..solvers.linear_system import Solution
 from .checkpoint import Checkpointer
 from .efforts import RepairCells
 from .forecast import MOST_SURPLUS

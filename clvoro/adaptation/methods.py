@@ -19,7 +19,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from ..solvers.components import balance_components
-from ..solvers.conjugate_gradient import Limits, Solution
+from ..solvers.linear_system import Limits, Solution
 from ..solvers.volume_projection import Penalty, Targets
 from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
@@ -15,9 +13,7 @@ from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.launch import Launch, one_group_limit
 from ..opencl.workspace import framed
-
-Apply = Callable[[cla.Array, cla.Array], object]
-Precondition = Callable[[cla.Array, cla.Array, cla.Array], object]
+from .linear_system import BreakdownError, Limits, Operator, Precondition, Solution
 
 # Rows of the partial sums (as in conjugate_gradient.cl) and columns of the record (as in partial_sums.h).
 CURVATURE, _GAMMA, _ROWS = 3, 6, 11
@@ -25,98 +21,6 @@ RECORD_NORM, RECORD_RUNNING, RECORD_CURVATURE = 0, 2, 3
 _STATE = 8
 _FIRST_READ = 32
 """Iterations whose record is read together with the state that `solve_by_group` leaves."""
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Outcome of an iterative solve.
-
-    Attributes
-    ----------
-    iterations : int
-    residual : float
-        True relative residual ||b - A x|| / ||b|| (2-norm), evaluated from x at the end. If `Limits.verify` is False,
-        that of the recurrence.
-    residuals : (iterations + 1,) float64
-        Relative residual before each iteration, by the recurrence, and the final one.
-    converged : bool
-        Whether `residual` is within the tolerance.
-    reason : str
-        ``"converged"``, ``"zero right side"``, ``"stagnated"`` (limited by the precision) or ``"max_iterations"``.
-        ``" (Jacobi after ...)"`` follows if the solver changed to Jacobi's preconditioner; iterations and residuals
-        are then those of both.
-    """
-
-    iterations: int
-    residual: float
-    residuals: np.ndarray
-    converged: bool
-    reason: str
-
-    @classmethod
-    def zero(cls) -> Solution:
-        """Return the outcome for a right side of zero."""
-        return cls(0, 0.0, np.zeros(1), True, "zero right side")
-
-
-class BreakdownError(SolverError):
-    """The operator or the preconditioner is not positive definite, or not finite.
-
-    Attributes
-    ----------
-    residuals : (iterations + 1,) float64
-        As in `Solution`. The iterate is that of the last valid iteration.
-    """
-
-    def __init__(self, message: str, residuals: list[float]) -> None:
-        super().__init__(message)
-        self.residuals = np.array(residuals)
-
-
-@dataclass(frozen=True)
-class Operator:
-    """A symmetric positive (semi-)definite operator A.
-
-    Attributes
-    ----------
-    apply : callable (x, y)
-        Enqueues y = A x on the engine's queue. y has the dtype of the iteration's vectors, and so has x, except for the
-        start and the solution.
-    writes_curvature : bool
-        `apply` also writes the partial sums of (x, y) to row `CURVATURE` of `ConjugateGradient.partial`.
-    singular : bool
-        The null space of A is the constants: the mean of the right side is removed first, that of x at the end.
-    rows : tuple of device arrays, optional
-        Starts, columns and weights of A, if it is a matrix (see solvers/sparse_rows.h). One work-group then solves
-        systems of few unknowns, if the preconditioner is diagonal.
-    """
-
-    apply: Apply
-    writes_curvature: bool = False
-    singular: bool = False
-    rows: tuple[cla.Array, ...] | None = None
-
-
-@dataclass(frozen=True)
-class Limits:
-    """When an iteration ends.
-
-    Attributes
-    ----------
-    tolerance : float
-        Relative residual in the 2-norm.
-    max_iterations : int
-    lookahead : int
-        Iterations to enqueue at most before the host reads the record. The first read is after as many as the last
-        solve took, but at least 8, if that is less.
-    verify : bool
-        Evaluate the true residual at the end. Otherwise that of the recurrence is trusted.
-    """
-
-    tolerance: float
-    max_iterations: int
-    lookahead: int = 64
-    verify: bool = True
 
 
 class ConjugateGradient:

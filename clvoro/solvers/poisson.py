@@ -17,15 +17,8 @@ from ..errors import InputError
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.launch import COSTS_ON_CPU, CostFactors, Launch, cost_factors, one_group_limit
-from .conjugate_gradient import (
-    CURVATURE,
-    BreakdownError,
-    ConjugateGradient,
-    Limits,
-    Operator,
-    Precondition,
-    Solution,
-)
+from .conjugate_gradient import CURVATURE, ConjugateGradient
+from .linear_system import BreakdownError, Limits, Operator, Precondition, Solution
 from .multigrid import Multigrid
 
 SINGLE_PRECISION_TOLERANCE = 1e-3

@@ -16,7 +16,7 @@ from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..tessellation.device_diagram import NeighborRows, Tessellation
 from ..tessellation.power import PowerTessellator
-from .conjugate_gradient import Solution
+from .linear_system import Solution
 from .poisson import Poisson
 
 TOLERANCE = {"float64": 1e-10, "float32": 1e-3}

@@ -17,7 +17,8 @@ from ..opencl.kernels import Kernels
 from ..opencl.launch import Launch, one_group_limit
 from ..opencl.workspace import framed
 from ..tessellation.device_diagram import Tessellation
-from .conjugate_gradient import RECORD_CURVATURE, RECORD_NORM, RECORD_RUNNING, Limits, Solution
+from .conjugate_gradient import RECORD_CURVATURE, RECORD_NORM, RECORD_RUNNING
+from .linear_system import Limits, Solution
 
 SINGLE_PRECISION_TOLERANCE = 1e-4
 """Tolerance from which on the vectors of the iteration are in single precision."""

@@ -17,7 +17,7 @@ from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
 from clvoro.errors import SizeFieldError
 from clvoro.sizing import Sizing
-from clvoro.solvers.conjugate_gradient import Limits
+from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets
 from tests.reference import graphs, patch
 

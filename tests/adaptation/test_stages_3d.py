@@ -15,7 +15,7 @@ from clvoro.adaptation.metric import Metric
 from clvoro.adaptation.motion import Motion
 from clvoro.adaptation.refinement import Refinement
 from clvoro.geometry.box import Box
-from clvoro.solvers.conjugate_gradient import Limits
+from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.poisson import Poisson
 from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
 from clvoro.tessellation.bins import Bins

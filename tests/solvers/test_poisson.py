@@ -11,7 +11,8 @@ from clvoro.errors import InputError, SolverError
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.launch import COSTS_ON_CPU, COSTS_ON_GPU, COSTS_ON_SHARED_MEMORY, cost_factors
 from clvoro.solvers import conjugate_gradient
-from clvoro.solvers.conjugate_gradient import ConjugateGradient, Limits, Operator
+from clvoro.solvers.conjugate_gradient import ConjugateGradient
+from clvoro.solvers.linear_system import Limits, Operator
 from clvoro.solvers.poisson import Poisson, expected_costs
 from tests.reference import graphs
 

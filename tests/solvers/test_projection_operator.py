@@ -5,7 +5,7 @@ import pytest
 
 from clvoro.geometry.sphere import Sphere
 from clvoro.solvers import volume_projection as projection
-from clvoro.solvers.conjugate_gradient import Limits
+from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
 from tests.reference import patch
 

@@ -9,7 +9,7 @@ from clvoro.adaptation.density import Density
 from clvoro.errors import SolverError
 from clvoro.opencl.engine import Engine
 from clvoro.solvers import volume_projection as projection
-from clvoro.solvers.conjugate_gradient import Limits
+from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
 from tests.reference import diagrams as reference
 from tests.reference import patch

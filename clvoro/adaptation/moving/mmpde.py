@@ -18,7 +18,7 @@ from ...errors import TangledMeshWarning
 from ...geometry.box import Domain
 from ...opencl.engine import Engine
 from ...opencl.primitives import Summaries
-from ...solvers.conjugate_gradient import Solution
+from ...solvers.linear_system import Solution
 from .lattice import mirrored
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 from ...arguments import warn
 from ...errors import TangledMeshWarning
 from ...geometry.box import Domain
-from ...solvers.conjugate_gradient import Solution
+from ...solvers.linear_system import Solution
 from .lattice import mirrored
 
 if TYPE_CHECKING:
