@@ -22,6 +22,7 @@ from ..errors import CheckpointWarning, InputError, OutputError
 from ..mesh.results import Displacements
 from ..tessellation.cells import Cells
 from .fingerprint import schedule_digest
+from .methods import Method
 from .schedule import Action, Step
 from .stages import Stages
 
@@ -36,6 +37,45 @@ DIAGRAM = (
 )  # fmt: skip
 VERTICES = ("triples", "keys")
 """Of a diagram in 3D that will be updated."""
+
+
+@dataclasses.dataclass
+class Progress:
+    """How far a run has come.
+
+    Attributes
+    ----------
+    level : int
+        The present level; 0 is the finest.
+    n_start : int
+        Number of generators at the start.
+    labeled : int
+        Number of labels when the last row of the history was added.
+    position : int
+        Number of actions done.
+    steps : int
+        Number of steps done.
+    rows : list of (1,) array
+        The history.
+    initial, final : Displacements or None
+        Of the first and of the last step. If the last step is not known in advance, they are evaluated again at the
+        end.
+    last : Method or None
+        Method of the last step.
+    elapsed : float
+        Seconds.
+    """
+
+    level: int
+    n_start: int
+    labeled: int
+    position: int = 0
+    steps: int = 0
+    rows: list[np.ndarray] = dataclasses.field(default_factory=list)
+    initial: Displacements | None = None
+    final: Displacements | None = None
+    last: Method | None = None
+    elapsed: float = 0.0
 
 
 class Checkpointer:

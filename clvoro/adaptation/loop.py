@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,10 +13,9 @@ from ..errors import InputTypeError
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from ..opencl.primitives import Summary
 from ..solvers.linear_system import Solution
-from .checkpoint import Checkpointer
+from .checkpoint import Checkpointer, Progress
 from .efforts import RepairCells
 from .forecast import MOST_SURPLUS
-from .methods import Method
 from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod
 from .schedule import (
@@ -43,45 +41,6 @@ without falling to this share of the smallest number so far. For smooth fields t
 INTERRUPTED = "interrupted"
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
 """Reasons of converged runs."""
-
-
-@dataclass
-class Progress:
-    """How far a run has come.
-
-    Attributes
-    ----------
-    level : int
-        The present level; 0 is the finest.
-    n_start : int
-        Number of generators at the start.
-    labeled : int
-        Number of labels when the last row of the history was added.
-    position : int
-        Number of actions done.
-    steps : int
-        Number of steps done.
-    rows : list of (1,) array
-        The history.
-    initial, final : Displacements or None
-        Of the first and of the last step. If the last step is not known in advance, they are evaluated again at the
-        end.
-    last : Method or None
-        Method of the last step.
-    elapsed : float
-        Seconds.
-    """
-
-    level: int
-    n_start: int
-    labeled: int
-    position: int = 0
-    steps: int = 0
-    rows: list[np.ndarray] = field(default_factory=list)
-    initial: Displacements | None = None
-    final: Displacements | None = None
-    last: Method | None = None
-    elapsed: float = 0.0
 
 
 class Loop:

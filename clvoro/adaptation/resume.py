@@ -24,13 +24,13 @@ from .checkpoint import (
     MESH,
     VERSION,
     VERTICES,
+    Progress,
     capacities_of,
     methods_of,
     state_of,
 )
 from .fingerprint import domain_name, schedule_digest
 from .insertion_deletion import Generators
-from .loop import Progress
 from .schedule import Action, Step
 from .stages import Stages
 from .state import MeshState
