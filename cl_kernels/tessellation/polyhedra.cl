@@ -293,9 +293,10 @@ inline REAL rounded_area(int i, int begin, int count, global const int *labels, 
 /* Per generator i: kept[k] of each of its faces, and the number kept. Where any cell is doubtful, round-off may let one
    of two cells have a face of zero area that the other does not have. Such a face is dropped, so that the graph is
    symmetric. The cell is flagged as collapsed if the face is wider than round-off explains, or if the areas of its
-   faces and those of its neighbors differ by more than a share of the cell. Faces of a neighbor without a row are not
-   compared, nor are those of two certain cells. While cells are missing or wrong, this and the next two kernels do
-   nothing. */
+   faces and those of its neighbors differ by more than a share of the cell. In a power diagram cells may be so small
+   that they are uncertain, as long as that is no more than the round-off of a neighbor. Faces of a neighbor without a
+   row are not compared, nor are those of two certain cells. While cells are missing or wrong, this and the next two
+   kernels do nothing. */
 kernel void match_polyhedron_faces(const int size, global const int *row_places, global const int *row_counts,
                                    global const int *labels, global const REAL *measures, global const REAL *volumes,
                                    global const REAL *points, const REAL share, global uchar *kept, global int *counts,
@@ -312,6 +313,7 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
         return;
     int count = 0;
     REAL apart = 0; /* volume of the cones to the differences of areas */
+    REAL most = share * volumes[i];
     for (int k = row_places[i]; k < row_places[i] + n; ++k) {
         const int j = labels[k];
         bool mutual = j < 0 || j >= size || (certain && (row_counts[j] & CERTAIN) != 0);
@@ -331,9 +333,12 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
         }
         kept[k] = mutual;
         count += mutual;
+#ifdef WEIGHTED
+        most = fmax(most, j >= 0 && j < size ? 64 * REAL_EPS * volumes[j] : 0);
+#endif
     }
     counts[i] = count;
-    if (TOO_FEW(count) || !(apart <= share * volumes[i]))
+    if (TOO_FEW(count) || !(apart <= most))
         atomic_or(report, FLAG_COLLAPSED);
     else if (apart > EVEN_SHARE * volumes[i])
         atomic_or(report, FLAG_UNEVEN);

@@ -86,17 +86,25 @@ def test_many_cells_in_a_point(ctx, dim):
         assert d.empty_cells.tolist() == list(empty)
 
 
-def test_small_cells_pass_the_check(ctx):
-    """The last cell grows from the vertex of the first three others, which is far from its generator for its size."""
-    points = np.array([(0.31, 0.42), (0.81, 0.47), (0.52, 0.88), (0.47, 0.13), (0.5, 0.5)])
-    weights = np.array([0, 0.01, 0.02, 0.03])
-    x, w = points[:3], weights[:3]
+@pytest.mark.parametrize(
+    ("points", "sizes"),
+    [
+        ([(0.31, 0.42), (0.81, 0.47), (0.52, 0.88)], (1e-4, 1e-7, 1e-10, 1e-13)),
+        ([(0.2, 0.22, 0.18), (0.8, 0.25, 0.7), (0.3, 0.8, 0.75), (0.75, 0.7, 0.2)], (1e-4, 1e-8)),
+    ],
+)
+def test_small_cells_pass_the_check(ctx, points, sizes):
+    """The last cell grows from the vertex of the others, which is far from its generator for its size."""
+    x, dim = np.array(points), len(points[0])
+    w, last = 0.01 * np.arange(len(x)), np.full(dim, 0.5)
     squares = (x**2).sum(axis=1) - w
     vertex = np.linalg.solve(2 * (x[1:] - x[0]), squares[1:] - squares[0])
-    least = ((vertex - points[4]) ** 2).sum() - ((vertex - x[0]) ** 2).sum() + w[0]
-    for more in (1e-4, 1e-7, 1e-10, 1e-13):
-        d = clvoro.Adapter(ctx).power_diagram(SQUARE, points, [*weights, least + more])
-        assert 0 < d.volumes[4] < 100 * more**2
+    least = ((vertex - last) ** 2).sum() - ((vertex - x[0]) ** 2).sum() + w[0]
+    box = clvoro.Box((0,) * dim, (1,) * dim)
+    for more in sizes:
+        d = clvoro.Adapter(ctx).power_diagram(box, [*x, last], [*w, least + more])
+        # The distances of the generators are about 0.5.
+        assert 0 < d.volumes[-1] < (30 * more) ** dim
         assert d.check(), d.check()
 
 
