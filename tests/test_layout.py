@@ -359,6 +359,15 @@ def test_kernels_are_formatted():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("path", [p for p in SOURCES if p.suffix == ".cl"], ids=name_of)
+def test_macros_of_kernels_are_not_those_of_their_headers(path):
+    """A second definition is a warning on the terminal, and changes what the header means. Defaults are `#ifndef`."""
+    own = {name for name, _ in macros(path)}
+    for header in unit(path)[1:]:
+        again = {name for name, _ in macros(header) if f"#ifndef {name}\n" not in text_of(header)}
+        assert not own & again, name_of(header)
+
+
 def test_names_of_kernels_and_functions_are_unique():
     """A name leads to one file; within it, variants by dimension may share the name."""
     files = collections.defaultdict(set)

@@ -31,8 +31,9 @@ inline int step_of(int code, int a)
     return (a == 0 ? code : a == 1 ? code / 3 : code / 9) % 3 - 1;
 }
 
-/* Bits of the codes with step -1 along axis a. Those with step 0 and 1 are shifted by once and twice the weight. */
-#define WEIGHT(a) ((a) == 0 ? 1 : (a) == 1 ? 3 : 9)
+/* Place value of the step along axis a in a code, and the bits of the codes with step -1 along axis a. Those with step
+   0 and 1 are shifted by once and twice the place value. */
+#define PLACE_VALUE(a) ((a) == 0 ? 1 : (a) == 1 ? 3 : 9)
 #define BACK(a) ((a) == 0 ? 0x1249249 : (a) == 1 ? 0x1c0e07 : 0x1ff)
 
 /* Bits of the codes whose images of x lie within the largest depth along each axis. Most generators have none. */
@@ -43,7 +44,7 @@ inline int codes_near(const REAL *x, global const int *extremes PERIOD_ARGS)
     {
         const REAL period = PERIOD(a), wide = as_float(extremes[a]);
         const bool back = period > 0 && period - x[a] <= wide, ahead = period > 0 && x[a] <= wide;
-        codes &= (back ? BACK(a) : 0) | BACK(a) << WEIGHT(a) | (ahead ? BACK(a) << 2 * WEIGHT(a) : 0);
+        codes &= (back ? BACK(a) : 0) | BACK(a) << PLACE_VALUE(a) | (ahead ? BACK(a) << 2 * PLACE_VALUE(a) : 0);
     }
     return codes & ~(1 << CENTER);
 }
