@@ -489,12 +489,10 @@ PERIODIC = {
 
 
 @needs_bench
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dim", "n", "field"),
-    [
-        pytest.param(*case, id=name, marks=() if name == "waves" else pytest.mark.slow)
-        for name, case in PERIODIC.items()
-    ],
+    [pytest.param(*case, id=name) for name, case in PERIODIC.items()],
 )
 def test_estimate_of_periodic_boxes(bench, monkeypatch, ctx, dim, n, field):
     """The estimate of images follows from the size field. Output may need a quarter less."""

@@ -23,7 +23,7 @@ def adapter(ctx):
     return clvoro.Adapter(ctx)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_diagram_is_computed_again_at_the_end(ctx, dtype):
     """In a periodic box: four cells meet at each corner but for rounding, and which two of them share a face is one of
     the things that the last step and the end decide each for itself. Quality counts the sides."""

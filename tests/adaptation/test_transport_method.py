@@ -14,8 +14,13 @@ def size(points):
 
 
 @pytest.mark.parametrize(
-    ("domain", "h", "real"), [(BOX, size, "float64"), (BOX, size, "float32"), (CUBE, 0.16, "float64")]
-)  # fmt: skip
+    ("domain", "h", "real"),
+    [
+        (BOX, size, "float64"),
+        pytest.param(BOX, size, "float32", marks=pytest.mark.slow),
+        (CUBE, 0.16, "float64"),
+    ],
+)
 def test_all_cells_have_their_size(ctx, domain, h, real):
     result = clvoro.Adapter(ctx, real).run(domain, h, method="transport", effort="fast", seed=3)
     noise = 1e-10 if real == "float64" else 1e-3

@@ -100,7 +100,7 @@ def test_corners_of_the_wall_are_corners_of_cells(adapter, domain, edges, spacin
     )
 
 
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_layers_of_a_periodic_channel_go_through_the_seam(adapter, axis):
     """Cells on both walls are rectangles, also at the seam."""
     shape = (2.0, 1.0) if axis == 0 else (1.0, 2.0)

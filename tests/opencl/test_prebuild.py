@@ -199,7 +199,7 @@ def test_warnings_of_compilers_are_ignored_in_all_threads(recwarn):
     assert list(warnings.filters) == before
 
 
-@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("real", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "kind", ["2D box", *(pytest.param(k, marks=pytest.mark.slow) for k in ("3D box", "2D polygon"))]
 )

@@ -313,6 +313,7 @@ def test_repeats_bit_for_bit_and_needs_no_adapter(mesh):
     np.testing.assert_array_equal(old.transfer(q[:, 1], new, 2), once[:, 1])
 
 
+@pytest.mark.slow
 def test_results_in_single_precision(ctx):
     single = clvoro.Adapter(ctx, dtype="float32")
     earth = Sphere()

@@ -336,7 +336,7 @@ def test_lists_grow_for_a_cell_with_many_overlaps(mesh, adapter):
     np.testing.assert_allclose(got, new.centroids[:, 0], rtol=0, atol=1e-11)
 
 
-@DIMS
+@pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_cells_of_many_faces(adapter, dim):
     """A ring or a sphere of generators around one gives the middle cell 90 faces."""
     box = Box((0,) * dim, (1,) * dim)

@@ -17,7 +17,10 @@ def random_case(dim, n, ratio, seed=61):
     return box, rng.uniform(box.lower, box.upper, (n, dim)), volumes * box.measure / volumes.sum()
 
 
-@pytest.mark.parametrize(("dim", "real"), [(2, "float64"), (2, "float32"), (3, "float64")])
+@pytest.mark.parametrize(
+    ("dim", "real"),
+    [(2, "float64"), pytest.param(2, "float32", marks=pytest.mark.slow), (3, "float64")],
+)
 def test_cells_get_any_volumes(ctx, dim, real):
     box, points, volumes = random_case(dim, 60, 30.0)
     found = clvoro.Adapter(ctx, real).transport(box, points, volumes)

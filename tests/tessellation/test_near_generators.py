@@ -302,7 +302,8 @@ def test_the_face_that_a_line_leaves_by(ctx, kind, real):
     assert {-1, 0, 1} == set(signs)
 
 
-@pytest.mark.parametrize("real", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["float64", "float32"])
 def test_a_cell_of_a_thousand_faces(ctx, real):
     """The cell at the center of a circle; without it a thousand cells meet there up to round-off."""
     t = np.arange(1000) * 2 * np.pi / 1000

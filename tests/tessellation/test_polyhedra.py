@@ -309,7 +309,8 @@ def test_too_many_neighbors_are_rejected(adapter64):
         adapter64.diagram(BOX, points)
 
 
-@pytest.mark.parametrize("real", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["float64", "float32"])
 def test_where_cells_are_clipped_changes_no_bit(ctx, real, monkeypatch):
     """In private memory, or in turns in few places of global memory, in launches of any size."""
     rng = np.random.default_rng(97)

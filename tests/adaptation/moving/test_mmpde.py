@@ -114,7 +114,7 @@ SIZE = sizing.Distance(sizing.Circle((0.5, 0.4), 0.2), h_min=0.03, slope=0.2)
 
 @pytest.mark.sparse
 @pytest.mark.parametrize("method", ["mmpde", "monge-ampere"])
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_runs_reduce_the_error(ctx, method, dtype):
     """No generator is lost, and both precisions lead to the same mesh."""
     box, adapter = clvoro.Box((0, 0), (1, 1)), clvoro.Adapter(ctx, dtype)

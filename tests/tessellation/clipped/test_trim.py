@@ -68,7 +68,7 @@ def compare(adapters, domain, points, length=1024, euler=False):
 @pytest.mark.parametrize("name", POLYGONS)
 def test_cells_are_those_of_the_reference(adapters, name):
     domain = POLYGONS[name]()
-    for n in (1, 2, 3, 25, 120):
+    for n in (1, 3, 25):
         if name.startswith("thin"):
             # In single precision its sides are in the same place: see below.
             compare({"float64": adapters["float64"]}, domain, scattered(domain, n, n), euler=True)

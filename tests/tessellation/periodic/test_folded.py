@@ -59,9 +59,9 @@ def moved(points, box, by, rng):
     return np.where(held, np.clip(points + step, box.lower, box.upper), points + step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "box",
-    [pytest.param(UNIT, id="unit", marks=pytest.mark.slow), pytest.param(CHANNEL, id="channel")],
+    "box", [pytest.param(UNIT, id="unit"), pytest.param(CHANNEL, id="channel")]
 )
 def test_lanes_have_the_bits_of_single_cells(ctx, box, monkeypatch):
     """On CPUs, vector lanes check, clip and measure eight rows at a time."""
