@@ -88,6 +88,7 @@ def test_other_results_are_found(harmless, built):
 
 
 FUNCTIONS = {
+    "mmpde.descend_functional",
     "bins.sort_bins", "density.evaluate_density", "metric.evaluate_metric", "insertion_deletion.mark_split_delete",
     "insertion_deletion.mark_bad_cells", "volume_projection.assemble_projection",
     "quality_descent.compute_cell_forces", "surface_descent.compute_surface_forces", "corners.share_corners",
