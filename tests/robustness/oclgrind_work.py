@@ -137,6 +137,18 @@ def method(
     return work
 
 
+def power(box: clvoro.Box, n: int) -> Callable[[clvoro.Adapter], None]:
+    """Power cells of equal volumes."""
+
+    def work(adapter: clvoro.Adapter) -> None:
+        points = np.random.default_rng(37).uniform(box.lower, box.upper, (n, box.dim))
+        found = adapter.transport(box, points, np.full(n, box.measure / n))
+        assert found.converged
+        found.diagram.vertices  # noqa: B018
+
+    return work
+
+
 def repaired(adapter: clvoro.Adapter) -> None:
     """Generators that move a little: a fifth of the cells change."""
     square, n = clvoro.Box((0, 0), (1, 1)), 120
@@ -510,6 +522,9 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     ),
     "mmpde": method("mmpde", n_cells=80, max_steps=2),
     "solid-mmpde": method("mmpde", CUBE, SOLID, n_cells=130, max_steps=2),
+    "power": power(BOX, 60),
+    "solid-power": power(CUBE, 40),
+    "solid-adaptive": method("adaptive", CUBE, SOLID, effort="fast"),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
     **RUNS,
     **{

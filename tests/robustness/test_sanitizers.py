@@ -95,7 +95,7 @@ FUNCTIONS = {
     "size_field.evaluate_size", "size_field.evaluate_size_gradient",
 }  # fmt: skip
 """Kernels with functions that OpenCL does not ask to be rounded correctly (as log, cbrt, cos): libraries differ."""
-ROUNDINGS = 64
+ROUNDINGS = 128
 """Over the largest number of an array: small size errors, and slopes, are differences of nearly equal numbers."""
 IN_SINGLE = {"volume_projection.assemble_projection"}
 """Of these kernels, those that compute in single precision for generators of any precision."""
