@@ -234,7 +234,7 @@ class Preparation:
         return max(needed, float(sizing.peak_bytes))
 
     def _is_narrow(self, coarseness: float) -> bool:
-        """Return whether fewer than `CELLS_ACROSS` cells of size ``coarseness * h`` fit between layers somewhere."""
+        """Return whether a gap between layers is narrower than `CELLS_ACROSS` cells of size ``coarseness * h``."""
         scale = CELLS_ACROSS / NARROW * coarseness * self.factor
         return narrow_parts(self.free, lambda x: scale * self.sizing(x))[0] is not None
 
