@@ -63,7 +63,7 @@ def name_of(method: Method) -> str:
     assert isinstance(method, ProjectedMethod)
     if method.gradient_from_field:
         return "exact"
-    return {"lloyd": "glide", "quality": "polish", "edges": "separate"}[method.descent]
+    return {"lloyd": "glide", "quality": "polish", "edges": "separate", "surface": "polish"}[method.descent]
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 
    piece_t                  a convex polygon or polyhedron
    build_piece              make the cell of generator i from its row of the neighbor graph
+   note_piece, recall_piece copy a piece to and from the memory of a shape_t
    cut_piece                intersect with one half-space
    measure_piece            compute volume and centroid
    EACH_FACE(piece, f)      loop over the faces; face_label(piece, f) is the label of one */
@@ -98,6 +99,18 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
     return PIECE_WHOLE;
 }
 
+typedef piece_t shape_t;
+
+inline void note_piece(shape_t *shape, const piece_t *piece)
+{
+    *shape = *piece;
+}
+
+inline void recall_piece(piece_t *piece, const shape_t *shape)
+{
+    *piece = *shape;
+}
+
 /* Keep y.normal <= level. Vertices beyond the plane by no more than `depth` count as inside. The new face gets `label`.
  */
 inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
@@ -191,9 +204,49 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
     const int what = clip_polyhedron_by_row(piece, i, x, starts, neighbors, points);
     if (what >= CLIP_FULL)
         return what == CLIP_FULL ? PIECE_FULL : PIECE_BROKEN;
-    for (EACH_FACE(piece, f))
-        piece->labels[f] = NO_LABEL;
     return PIECE_WHOLE;
+}
+
+/* The vertices of a cell, without the room that a piece needs while it is cut. */
+#define SHAPE_VERTICES (2 * FACE_CAPACITY - 4)
+typedef struct {
+    REAL x[SHAPE_VERTICES], y[SHAPE_VERTICES], z[SHAPE_VERTICES];
+    INDEX4 faces[SHAPE_VERTICES], links[SHAPE_VERTICES];
+    uint alive[FACE_WORDS];
+    int n;
+} shape_t;
+
+inline void note_piece(shape_t *shape, const piece_t *piece)
+{
+    const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
+    for (int v = 0; v < piece->n; ++v) {
+        shape->x[v] = x[v];
+        shape->y[v] = y[v];
+        shape->z[v] = z[v];
+        shape->faces[v] = piece->faces[v];
+        shape->links[v] = piece->links[v];
+    }
+    for (int w = 0; w < FACE_WORDS; ++w)
+        shape->alive[w] = piece->alive[w];
+    shape->n = piece->n;
+}
+
+/* All faces are those of the cell itself. */
+inline void recall_piece(piece_t *piece, const shape_t *shape)
+{
+    REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
+    for (int v = 0; v < shape->n; ++v) {
+        x[v] = shape->x[v];
+        y[v] = shape->y[v];
+        z[v] = shape->z[v];
+        piece->faces[v] = shape->faces[v];
+        piece->links[v] = shape->links[v];
+    }
+    for (int w = 0; w < FACE_WORDS; ++w)
+        piece->alive[w] = shape->alive[w];
+    piece->n = shape->n;
+    for (int f = 0; f < FACE_CAPACITY; ++f)
+        piece->labels[f] = NO_LABEL;
 }
 
 /* Keep y.normal <= level. Vertices beyond the plane by no more than `depth` count as inside. The new face gets `label`.

@@ -133,15 +133,17 @@ kernel void transfer_cell_data(const int size, const int first, global const int
     visited_t seen = {0, capacity, queues + (size_t)p * capacity, tables + (size_t)p * 2 * capacity};
     for (int k = 0; k < 2 * capacity; ++k)
         seen.table[k] = -1;
-    piece_t whole, piece;
-    int what = build_piece(&whole, i, starts, neighbors, points, box_lower, box_upper);
+    piece_t piece;
+    shape_t whole;
+    int what = build_piece(&piece, i, starts, neighbors, points, box_lower, box_upper);
     if (what != PIECE_WHOLE) {
         status[i] = what == PIECE_FULL ? PIECE_LARGE : FAILED;
         return;
     }
     REAL4 centroid;
-    volumes[i] = measure_piece(&whole, &centroid);
-    const REAL reach = sqrt(whole.reach2);
+    volumes[i] = measure_piece(&piece, &centroid);
+    const REAL reach = sqrt(piece.reach2);
+    note_piece(&whole, &piece);
     const graph_t old = {old_points, old_starts, old_neighbors};
     visit(&seen, nearest_generator(points + (size_t)DIM * i, &old, n_old, items, bins, grid_frames, grid_shapes));
     for (int c = 0; c < width; ++c) {
@@ -152,7 +154,7 @@ kernel void transfer_cell_data(const int size, const int first, global const int
     REAL sum = 0;
     for (int k = 0; k < seen.n; ++k) {
         const int j = seen.queue[k];
-        piece = whole;
+        recall_piece(&piece, &whole);
         what = cut_by_cell(&piece, x, reach, j, &old);
         if (what == PIECE_FULL || what == PIECE_BROKEN) {
             status[i] = what == PIECE_FULL ? PIECE_LARGE : FAILED;

@@ -271,6 +271,12 @@ inline void join_new_edges(const corners_t *cell, const uint *old, const uint *n
             add_neighbor(cell->labels[a], cell->labels[popcount(~rest & (rest - 1))], in, marks);
 }
 
+/* The links of a cell are not needed any more when its sums are. */
+typedef union {
+    links_t links;
+    sums_t sums;
+} links_or_sums_t;
+
 inline bool fits_corners(const corners_t *cell)
 {
     WIDE beyond = cell->beyond[0];
@@ -313,7 +319,7 @@ kernel void update_cells(const int size, const int some, global const int *liste
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
     global const int *added = some ? further + MORE * item : 0;
     corners_t cell;
-    sums_t sums;
+    links_or_sums_t work;
     const int start = old_starts[i], listed_before = what < 0 ? -1 : list_planes(&cell, i, x, added, &in);
     const int state = listed_before >= 4 && known ? old_corners[2 * start].s3 : NO_CORNERS;
     const bool has_corners = state != NO_CORNERS;
@@ -326,23 +332,22 @@ kernel void update_cells(const int size, const int some, global const int *liste
         const int faces = cell.faces;
         cell.faces = listed_before;
         /* With further neighbors the cell is measured later. */
-        flips = place_corners(&cell, &sums, faces == listed_before);
+        flips = place_corners(&cell, &work.sums, faces == listed_before);
         cell.faces = faces;
         kept = flips && faces == listed_before && fits_corners(&cell);
     }
     if (done && !kept) {
-        links_t links;
         uint old[MOST_FACES], next[MOST_FACES];
         cell.corners = has_corners ? cell.corners : 0;
         find_edges(&cell, old);
-        if (!(flips && repair_corners(&cell, &links, listed_before))) {
+        if (!(flips && repair_corners(&cell, &work.links, listed_before))) {
             list_planes(&cell, i, x, added, &in); /* flips may have removed faces */
-            done = walk_corners(&cell, &links);
+            done = walk_corners(&cell, &work.links);
         }
         if (done) {
             find_edges(&cell, next);
             join_new_edges(&cell, old, next, &in, marks);
-            done = number_faces(&cell, next) && place_corners(&cell, &sums, true) && fits_corners(&cell);
+            done = number_faces(&cell, next) && place_corners(&cell, &work.sums, true) && fits_corners(&cell);
         }
     }
     kept = kept && state == KNOWN_CORNERS;
@@ -351,7 +356,7 @@ kernel void update_cells(const int size, const int some, global const int *liste
         const bool longer = cell.faces > old_starts[i + 1] - start;
         const int place = longer ? take_places(report, cell.faces) : start;
         const measured_t out = {labels, measures, centroids, volumes, offsets, covariances};
-        if (place + cell.faces <= room && write_measures(&cell, &sums, i, place, &out)) {
+        if (place + cell.faces <= room && write_measures(&cell, &work.sums, i, place, &out)) {
             row_places[i] = place;
             row_counts[i] = cell.faces | CERTAIN;
             for (int v = 0; v < cell.corners; ++v)

@@ -12,7 +12,7 @@ from ..geometry.box import ClipBox
 from ..opencl.engine import Engine
 from ..tessellation.bins import BinnedPoints
 
-FACES = {2: 32, 3: 64}
+FACES = {2: 32, 3: 32}
 """Initial face capacity of a piece by dimension; doubled when a piece needs more."""
 MOST_FACES = {2: 4096, 3: 512}
 """Largest face capacity by dimension."""

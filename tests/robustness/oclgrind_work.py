@@ -570,6 +570,21 @@ def name_domains() -> None:
     Engine.__init__ = told
 
 
+def without_scopes() -> None:
+    """Build programs without inlining where LLVM notes scopes of aliases: the simulator does not know this function."""
+    build = _program.compile_text
+
+    def built(
+        ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True
+    ) -> cl.Program:
+        program = build(ctx, text, options, short)
+        if b"noalias.scope.decl" in program.binaries[0]:
+            program = build(ctx, text, (*options, "-fno-inline"), short)
+        return program
+
+    _program.compile_text = built
+
+
 def main(name: str, *options: str) -> None:
     context = clvoro.create_context("oclgrind")
     counts = collections.defaultdict(collections.Counter)
@@ -585,6 +600,7 @@ def main(name: str, *options: str) -> None:
     if "groups" in options:
         use_groups(16, 3)
     name_domains()
+    without_scopes()
     buffers_of_their_own()
     adapter = clvoro.Adapter(context, "float32" if "float32" in options else "float64")
     WORK[name](adapter)
