@@ -37,27 +37,26 @@ inline void write_corners(const CELL *cell, global uchar4 *corners)
     }
 }
 
-/* Moments of the cell, up to a factor: xx, yy, zz, and yz, zx, xy; see `clip_polyhedra`. They are summed on their own,
-   because a work-item of a GPU has few registers. */
+/* Moments of the cell, up to a factor: xx, yy, zz, and yz, zx, xy; see `clip_polyhedra`. They are summed on their own
+   and without a square root, because a work-item of a GPU has few registers. */
 inline void sum_second_moments(const CELL *cell, CELL_SPACE const INDEX *start, REAL4 *square, REAL4 *mixed)
 {
     *square = *mixed = 0;
     for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1)) {
         const REAL4 plane = cell->planes[f];
-        const REAL inverse = 1 / sqrt(plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2);
-        const REAL4 normal = plane * inverse;
+        const REAL height = plane.s3 / (plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2);
         const REAL4 a = vertex_at(cell, start[f]);
         int v = vertex_after(cell, start[f], f);
         REAL4 b = vertex_at(cell, v), of_square = 0, of_mixed = 0;
         for (v = vertex_after(cell, v, f); v != start[f]; v = vertex_after(cell, v, f)) {
             const REAL4 c = vertex_at(cell, v), s = a + b + c;
-            const REAL weight = dot3(cross3(b - a, c - a), normal);
+            const REAL weight = dot3(cross3(b - a, c - a), plane);
             of_square += weight * (a * a + b * b + c * c + s * s);
             of_mixed += weight * (a.yzxw * a.zxyw + b.yzxw * b.zxyw + c.yzxw * c.zxyw + s.yzxw * s.zxyw);
             b = c;
         }
-        *square += normal.s3 * of_square;
-        *mixed += normal.s3 * of_mixed;
+        *square += height * of_square;
+        *mixed += height * of_mixed;
     }
 }
 

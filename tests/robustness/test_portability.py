@@ -31,16 +31,16 @@ COMMON_LIMITS = 128, 512
 LIMITS = {
     "clip_polygons": (272, 1400),
     "clip_marked": (224, 720),
-    "clip_polyhedra": (208, 5760),
-    "update_cells": (160, 6656),
+    "clip_polyhedra": (144, 5760),
+    "update_cells": (160, 5632),
     "descend_surface": (176, 2112),
     "count_corners": (288, 4608),
     "list_corners": (288, 4608),
     "share_corners": (144, 4000),
     "find_loops": (176, 256),
     "walk_edges": (176, 64),
-    "fit_slopes": (224, 8704),
-    "transfer_cell_data": (224, 16384),
+    "fit_slopes": (224, 4608),
+    "transfer_cell_data": (224, 6144),
 }
 """The same for kernels that take more. No variant of any kernel spills registers."""
 needs_clang = pytest.mark.skipif(gpu_programs.clang() is None, reason="needs clang")
