@@ -63,7 +63,9 @@ def name_of(method: Method) -> str:
     assert isinstance(method, ProjectedMethod)
     if method.gradient_from_field:
         return "exact"
-    return {"lloyd": "glide", "quality": "polish", "edges": "separate", "surface": "polish"}[method.descent]
+    return {"lloyd": "glide", "quality": "polish", "edges": "separate", "surface": "polish"}[
+        method.descent
+    ]
 
 
 @contextmanager
