@@ -35,6 +35,13 @@ kernel void evaluate_density(const int size, global const REAL *volumes, global 
     }
 }
 
+/* Component `a` in space of a vector in the plane of a cell. */
+#ifdef SPHERE
+#define SPATIAL(site, v, a) ((v)[0] * (site)[3 + (a)] + (v)[1] * (site)[6 + (a)])
+#else
+#define SPATIAL(site, v, a) ((v)[a])
+#endif
+
 /* Displacement to the centroid weighted by h^-(d + 2), the paper's (2.4): centroidal diagrams of this density have
    cells of size h.
 
@@ -42,16 +49,22 @@ kernel void evaluate_density(const int size, global const REAL *volumes, global 
 
    This is exact for rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell. Measured, quadrature of h inside
    the cells is not better. */
-inline void weighted_offset(const int i, const REAL *gradient, global const REAL *offsets,
+inline void weighted_offset(const int i, const REAL *gradient, const REAL *site, global const REAL *offsets,
                             global const REAL *covariances, global REAL *lloyd)
 {
-    REAL g[DIM];
-    EACH_AXIS(a)
+    REAL g[CELL_DIM];
+    EACH_COMPONENT(a)
     g[a] = -(CELL_DIM + 2) * gradient[a];
-#if DIM == 2
+#if CELL_DIM == 2
     const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
+#ifdef SPHERE
+    const REAL along[2] = {xx * g[0] + xy * g[1], xy * g[0] + yy * g[1]};
+    EACH_AXIS(a)
+    lloyd[3 * i + a] = offsets[3 * i + a] + SPATIAL(site, along, a);
+#else
     lloyd[2 * i] = offsets[2 * i] + xx * g[0] + xy * g[1];
     lloyd[2 * i + 1] = offsets[2 * i + 1] + xy * g[0] + yy * g[1];
+#endif
 #else
     global const REAL *c = covariances + 6 * i;
     lloyd[3 * i] = offsets[3 * i] + c[0] * g[0] + c[1] * g[1] + c[2] * g[2];
@@ -69,7 +82,7 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
 {
     WORK_ITEM(i);
     MANY(REAL) sums[CELL_DIM][CELL_DIM], rises[CELL_DIM];
-    REAL m[CELL_DIM][CELL_DIM], b[CELL_DIM], g[DIM];
+    REAL m[CELL_DIM][CELL_DIM], b[CELL_DIM], g[CELL_DIM];
     EACH_COMPONENT(p)
     {
         rises[p] = 0;
@@ -77,8 +90,9 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
         sums[p][q] = 0;
     }
 #ifdef SPHERE
-    REAL site[SITE_SIZE];
-    place_site(site, i, points);
+    SITE(site, i, points);
+#else
+    const REAL *site = 0;
 #endif
     const int faces = starts[size], end = starts[i + 1];
     for (int k = starts[i]; k < end; k += AT_ONCE) {
@@ -88,8 +102,7 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
         EACH_AXIS(a)
         d[a] = nearest_images(PICK(REAL, points, j, DIM, a) - points[DIM * i + a], PERIOD(a));
 #ifdef SPHERE
-        const MANY(REAL) one = site[3] * d[0] + site[4] * d[1] + site[5] * d[2];
-        const MANY(REAL) two = site[6] * d[0] + site[7] * d[1] + site[8] * d[2];
+        const MANY(REAL) one = ALONG(MANY(REAL), site + 3, d), two = ALONG(MANY(REAL), site + 6, d);
         d[0] = one;
         d[1] = two;
 #endif
@@ -138,14 +151,9 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
         (b[0] * c2 + b[1] * (m[0][1] * m[2][0] - m[0][0] * m[2][1]) + b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) /
         over;
 #endif
-#ifdef SPHERE
-    const REAL along[2] = {g[0], g[1]};
     EACH_AXIS(a)
-    g[a] = along[0] * site[3 + a] + along[1] * site[6 + a];
-#endif
-    EACH_AXIS(a)
-    gradient[DIM * i + a] = g[a];
-    weighted_offset(i, g, offsets, covariances, lloyd);
+    gradient[DIM * i + a] = SPATIAL(site, g, a);
+    weighted_offset(i, g, site, offsets, covariances, lloyd);
 }
 
 /* partial = per work-group, sum of V rho r, then sum of V rho. One block of generators per work-group. */

@@ -6,6 +6,8 @@
    generators. Sites that change in the same call are several rings of cells apart. */
 #include "adaptation/separation.h"
 #include "adaptation/site_selection.h"
+#include "opencl/blocks.h"
+#include "opencl/row_entries.h"
 
 #if CELL_DIM == 2
 #define REGULAR_FACES 6
@@ -73,23 +75,59 @@ kernel void measure_strain(const int size, global const int *starts, global cons
     strain[i] = (float4)(s.s0, s.s1, s.s2, walls == 0 && n == 6);
 }
 
+#ifdef SPHERE
+/* Add to `sum` the strain (xx, xy, yy) of the neighbors times its weight, in the axes of cell i, and the weights: as
+   `strain_from`, for AT_ONCE neighbors. */
+inline float4 add_strains(float4 sum, int i, int size, global const int *starts, global const int *neighbors,
+                          global const REAL *points, global const float4 *strain)
+{
+    global const float *entries = (global const float *)strain;
+    const float x[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
+    float e[3], f[3];
+    FLOAT_TANGENTS(float, x, e, f);
+    MANY(float) xx = 0, xy = 0, yy = 0, weight = 0;
+    const int faces = starts[size], end = starts[i + 1];
+    for (int k = starts[i]; k < end; k += AT_ONCE) {
+        const MANY(int) inside = INSIDE(k, end), j = TAKE(int, neighbors, k, faces);
+        MANY(float) y[3], p[3], q[3];
+        EACH_AXIS(axis)
+        y[axis] = CONVERT(float, PICK(REAL, points, j, 3, axis));
+        FLOAT_TANGENTS(MANY(float), y, p, q);
+        const MANY(float) a = ALONG(MANY(float), e, p), b = ALONG(MANY(float), f, p);
+        const MANY(float) c = ALONG(MANY(float), e, q), d = ALONG(MANY(float), f, q);
+        const MANY(float) w = CHOOSE(float, inside, PICK(float, entries, j, 4, 3), 0);
+        const MANY(float) s0 = w * PICK(float, entries, j, 4, 0), s1 = w * PICK(float, entries, j, 4, 1),
+                          s2 = w * PICK(float, entries, j, 4, 2);
+        xx += a * a * s0 + 2 * a * c * s1 + c * c * s2;
+        xy += a * b * s0 + (a * d + b * c) * s1 + c * d * s2;
+        yy += b * b * s0 + 2 * b * d * s1 + d * d * s2;
+        weight += w;
+    }
+    return sum + (float4)(SUM(float, xx), SUM(float, xy), SUM(float, yy), SUM(float, weight));
+}
+#else
+inline float4 add_strains(float4 sum, int i, int size, global const int *starts, global const int *neighbors,
+                          global const REAL *points, global const float4 *strain)
+{
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbors[k];
+        if (j < 0)
+            continue;
+        const float4 other = strain[j];
+        sum += (float4)(other.s012 * other.s3, other.s3);
+    }
+    return sum;
+}
+#endif
+
 /* mean[i] = weighted mean of the strain over i and its neighbors, and the sum of the weights. */
 kernel void average_strain(const int size, global const int *starts, global const int *neighbors,
                            global const REAL *points, global const float4 *strain, global float4 *mean)
 {
     WORK_ITEM(i);
     const float4 own = strain[i];
-    float weight = own.s3;
-    float4 sum = own * own.s3;
-    for (int k = starts[i]; k < starts[i + 1]; ++k) {
-        const int j = neighbors[k];
-        if (j < 0)
-            continue;
-        const float4 other = strain_from(i, j, strain, points);
-        sum += other * other.s3;
-        weight += other.s3;
-    }
-    mean[i] = (float4)(weight > 0 ? sum.s012 / weight : (float3)(1, 0, 1), weight);
+    const float4 sum = add_strains((float4)(own.s012 * own.s3, own.s3), i, size, starts, neighbors, points, strain);
+    mean[i] = (float4)(sum.s3 > 0 ? sum.s012 / sum.s3 : (float3)(1, 0, 1), sum.s3);
 }
 
 /* pull[i] = b.S.b - t.S.t for a cell i of negative charge and the neighbor of positive charge where |pull| is largest;
@@ -261,7 +299,7 @@ kernel void score_log_ratio(const int size, global const int *starts, global con
 }
 
 /* Unit vector along the longest axis of a cell, from its second moments. */
-#if DIM == 2
+#if CELL_DIM == 2
 inline void longest_axis(global const REAL *moments, REAL *axis)
 {
     const REAL angle = atan2(2 * moments[1], moments[0] - moments[2]) / 2;
@@ -286,11 +324,15 @@ inline void longest_axis(global const REAL *moments, REAL *axis)
 #endif
 
 /* Split cell i across its longest axis. */
-inline void split_cell(int i, global const REAL *offsets, global const REAL *covariances, global const REAL *volumes,
-                       global REAL *shifts, global int *born, global REAL *births)
+inline void split_cell(int i, global const REAL *points, global const REAL *offsets, global const REAL *covariances,
+                       global const REAL *volumes, global REAL *shifts, global int *born, global REAL *births)
 {
     REAL axis[DIM];
-    longest_axis(covariances + DIM * (DIM + 1) / 2 * i, axis);
+    longest_axis(covariances + CELL_DIM * (CELL_DIM + 1) / 2 * i, axis);
+#ifdef SPHERE
+    SITE(x, i, points);
+    in_space(x, (REAL2)(axis[0], axis[1]), axis);
+#endif
     const REAL quarter = (CELL_DIM == 2 ? sqrt(volumes[i]) : cbrt(volumes[i])) / 4;
     born[i] = 1;
     for (int a = 0; a < DIM; ++a) {
@@ -300,9 +342,9 @@ inline void split_cell(int i, global const REAL *offsets, global const REAL *cov
 }
 
 /* Per chosen site: split the cell (sign > 0) or delete it. */
-kernel void mark_split_delete(const int size, global const ulong *chosen, const REAL sign, global const REAL *offsets,
-                              global const REAL *covariances, global const REAL *volumes, global int *kept,
-                              global REAL *shifts, global int *born, global REAL *births)
+kernel void mark_split_delete(const int size, global const ulong *chosen, const REAL sign, global const REAL *points,
+                              global const REAL *offsets, global const REAL *covariances, global const REAL *volumes,
+                              global int *kept, global REAL *shifts, global int *born, global REAL *births)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -310,7 +352,7 @@ kernel void mark_split_delete(const int size, global const ulong *chosen, const 
     if (sign < 0)
         kept[i] = 0;
     else
-        split_cell(i, offsets, covariances, volumes, shifts, born, births);
+        split_cell(i, points, offsets, covariances, volumes, shifts, born, births);
 }
 
 #if CELL_DIM == 2
@@ -331,8 +373,9 @@ kernel void score_bad_cells(const int size, global const int *starts, global con
 
 /* Per chosen site: split a cell of at least `split_from` sides, delete any other. */
 kernel void mark_bad_cells(const int size, global const ulong *chosen, global const int *starts, const int split_from,
-                           global const REAL *offsets, global const REAL *covariances, global const REAL *volumes,
-                           global int *kept, global REAL *shifts, global int *born, global REAL *births)
+                           global const REAL *points, global const REAL *offsets, global const REAL *covariances,
+                           global const REAL *volumes, global int *kept, global REAL *shifts, global int *born,
+                           global REAL *births)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -340,7 +383,7 @@ kernel void mark_bad_cells(const int size, global const ulong *chosen, global co
     if (starts[i + 1] - starts[i] < split_from)
         kept[i] = 0;
     else
-        split_cell(i, offsets, covariances, volumes, shifts, born, births);
+        split_cell(i, points, offsets, covariances, volumes, shifts, born, births);
 }
 #endif
 

@@ -34,10 +34,14 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
 #endif
 #endif
     REAL square = 0;
-    for (int a = 0, diagonal = 0; a < DIM; ++a) {
-        square += offsets[DIM * i + a] * offsets[DIM * i + a] + covariances[DIM * (DIM + 1) / 2 * i + diagonal];
-        diagonal += DIM - a;
+    for (int a = 0, diagonal = 0; a < CELL_DIM; ++a) {
+        const REAL spread = covariances[CELL_DIM * (CELL_DIM + 1) / 2 * i + diagonal];
+        square += offsets[DIM * i + a] * offsets[DIM * i + a] + spread;
+        diagonal += CELL_DIM - a;
     }
+#ifdef SPHERE
+    square += offsets[3 * i + 2] * offsets[3 * i + 2];
+#endif
     energy[i] = volume * square;
     const REAL target = h[i];
     local_length[i] = fmin(length, target);

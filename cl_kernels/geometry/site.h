@@ -30,6 +30,21 @@ inline void place_site(REAL *x, int i, global const REAL *points)
     x[8] = -x[1];
 }
 
+/* The tangents of `place_site` in single precision, for one or several positions. */
+#define FLOAT_TANGENTS(TYPE, x, e, f)                                                                                  \
+    do {                                                                                                               \
+        const TYPE sign = copysign((TYPE)(1), x[2]), s = -1 / (sign + x[2]), t = x[0] * x[1] * s;                      \
+        e[0] = 1 + sign * x[0] * x[0] * s;                                                                             \
+        e[1] = sign * t;                                                                                               \
+        e[2] = -sign * x[0];                                                                                           \
+        f[0] = t;                                                                                                      \
+        f[1] = sign + x[1] * x[1] * s;                                                                                 \
+        f[2] = -x[1];                                                                                                  \
+    } while (0)
+
+/* The component along the tangent e of one vector in space, or of several. */
+#define ALONG(TYPE, e, v) fma((TYPE)((e)[0]), (v)[0], fma((TYPE)((e)[1]), (v)[1], (TYPE)((e)[2]) * (v)[2]))
+
 /* Components along the two tangents. */
 inline REAL2 along_tangents(const REAL *x, const REAL *d)
 {
@@ -51,7 +66,7 @@ inline REAL2 direction_on_sphere(const REAL *x, int j, global const REAL *points
 {
     const REAL d[3] = {points[3 * j] - x[0], points[3 * j + 1] - x[1], points[3 * j + 2] - x[2]};
     const REAL d2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
-    return d2 < OPPOSITE ? along_tangents(x, d) / (1 - d2 / 4) : (REAL2)(1 / REAL_EPS, 0);
+    return d2 < OPPOSITE ? along_tangents(x, d) * (1 / (1 - d2 / 4)) : (REAL2)(1 / REAL_EPS, 0);
 }
 
 /* A point of the tangent plane of `from` in that of `to`. */

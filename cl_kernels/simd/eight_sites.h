@@ -33,13 +33,16 @@ typedef struct {
 } eight_t;
 
 #ifdef SPHERE
+/* Along the z axis in rows of their own, until they are projected. */
 #define ROWS_BEHIND(rows, capacity)                                                                                    \
     double2 rows[(capacity)*LANES];                                                                                    \
-    double rows##_spatial[3 * (capacity)*LANES]
+    double rows##_z[(capacity)*LANES]
 #define put_behind(rows, k, lane, j, points)                                                                           \
-    for (int a = 0; a < 3; ++a)                                                                                        \
-    rows##_spatial[(3 * (k) + a) * LANES + (lane)] = points[3 * (j) + a]
-#define project_rows(rows, most, sites) project_eight_rows(rows, rows##_spatial, most, sites)
+    do {                                                                                                               \
+        rows[ROW_PLACE(k, lane)] = vload2(0, points + 3 * (j));                                                        \
+        rows##_z[(k)*LANES + (lane)] = points[3 * (j) + 2];                                                            \
+    } while (0)
+#define project_rows(rows, most, sites) project_eight_rows(rows, rows##_z, most, sites)
 
 /* The tangents of `place_site`, with the same bits. */
 inline void find_tangents(const eight_t *sites, double8 *e, double8 *f)
@@ -55,17 +58,20 @@ inline void find_tangents(const eight_t *sites, double8 *e, double8 *f)
 }
 
 /* Eight times `direction_of`, with the same bits. */
-inline void project_eight_rows(double2 *behind, const double *spatial, int most, const eight_t *sites)
+inline void project_eight_rows(double2 *behind, const double *behind_z, int most, const eight_t *sites)
 {
     double8 e[3], f[3];
     find_tangents(sites, e, f);
     for (int k = 0; k <= most; ++k) {
-        const double8 x = vload8(3 * k, spatial) - sites->x, y = vload8(3 * k + 1, spatial) - sites->y,
-                      z = vload8(3 * k + 2, spatial) - sites->z;
-        const double8 d2 = x * x + y * y + z * z, scale = 1 - d2 / 4;
+        double8 x, y;
+        load_row(behind, k, &x, &y);
+        x -= sites->x;
+        y -= sites->y;
+        const double8 z = vload8(k, behind_z) - sites->z;
+        const double8 d2 = x * x + y * y + z * z, inverse = 1 / (1 - d2 / 4);
         const long8 near = d2 < OPPOSITE;
-        store_row(behind, k, near ? (e[0] * x + e[1] * y + e[2] * z) / scale : 1 / DBL_EPSILON,
-                  near ? (f[0] * x + f[1] * y + f[2] * z) / scale : 0);
+        store_row(behind, k, near ? (e[0] * x + e[1] * y + e[2] * z) * inverse : 1 / DBL_EPSILON,
+                  near ? (f[0] * x + f[1] * y + f[2] * z) * inverse : 0);
     }
 }
 #else
@@ -133,9 +139,8 @@ inline double8 squared_distances(const eight_t *sites, long q, global const doub
 /* Let row k be the sites themselves. */
 #ifdef SPHERE
 #define put_self(rows, k, sites)                                                                                       \
-    vstore8((sites)->x, 3 * (k), rows##_spatial);                                                                      \
-    vstore8((sites)->y, 3 * (k) + 1, rows##_spatial);                                                                  \
-    vstore8((sites)->z, 3 * (k) + 2, rows##_spatial)
+    store_row(rows, k, (sites)->x, (sites)->y);                                                                        \
+    vstore8((sites)->z, k, rows##_z)
 #else
 #define put_self(rows, k, sites) store_row(rows, k, (sites)->x, (sites)->y)
 #endif

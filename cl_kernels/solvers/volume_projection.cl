@@ -33,17 +33,6 @@
 #define GAMMA(k) (2 + ((k)&1))
 #define CURVATURE 4
 
-#ifdef SPHERE
-/* The components along the tangents at y (see `place_site`) of `v` in space. */
-#define ALONG_TANGENTS(TYPE, y, v, out)                                                                                \
-    do {                                                                                                               \
-        const TYPE sign = copysign((TYPE)(1), y[2]), s = -1 / (sign + y[2]), t = y[0] * y[1] * s;                      \
-        const TYPE one = (1 + sign * y[0] * y[0] * s) * v[0] + sign * t * v[1] - sign * y[0] * v[2];                   \
-        out[1] = t * v[0] + (sign + y[1] * y[1] * s) * v[1] - y[1] * v[2];                                             \
-        out[0] = one;                                                                                                  \
-    } while (0)
-#endif
-
 /* eps = min(3, penalty (1 + q^2 / quality_scale^2)) / (1 + (r / log_ratio_scale)^2), q = (1 - Q) / sqrt Q.
 
    Q is the least quality of the cell and its neighbors; q is close to -log Q, without a logarithm. Bad cells and their
@@ -94,8 +83,9 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
         EACH_COMPONENT(c)
         self[c] = 0;
 #ifdef SPHERE
-        const float xf[3] = {x[0], x[1], x[2]};
-        const MANY(float) here_in_lanes[3] = {xf[0], xf[1], xf[2]};
+        const float at[3] = {x[0], x[1], x[2]};
+        float one[3], two[3];
+        FLOAT_TANGENTS(float, at, one, two);
 #endif
         const int end = starts[i + 1];
         for (int k = starts[i]; k < end; k += AT_ONCE) {
@@ -103,7 +93,7 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
             const MANY(int) j = select((MANY(int))(i), facing, counts);
             MANY(float) d[DIM], d2 = 0, square = 0, displaced = 0, middle[DIM], other[DIM];
 #ifdef SPHERE
-            MANY(float) there_in_lanes[DIM];
+            MANY(float) there_at[DIM];
 #endif
             EACH_AXIS(a)
             {
@@ -111,7 +101,7 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
                 d[a] = CONVERT(float, nearest_images(xj - x[a], PERIOD(a)) * unit);
                 d2 += d[a] * d[a];
 #ifdef SPHERE
-                there_in_lanes[a] = CONVERT(float, xj);
+                there_at[a] = CONVERT(float, xj);
 #endif
             }
             /* w = 0 on walls, without a division by their distance of 0. */
@@ -131,9 +121,10 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
                 displaced += other[a] * CONVERT(float, PICK(REAL, displacement, j, DIM, a) * unit);
             }
 #ifdef SPHERE
-            MANY(float) own_side[2], other_side[2];
-            ALONG_TANGENTS(MANY(float), here_in_lanes, middle, own_side);
-            ALONG_TANGENTS(MANY(float), there_in_lanes, other, other_side);
+            MANY(float) p[3], q[3];
+            FLOAT_TANGENTS(MANY(float), there_at, p, q);
+            const MANY(float) own_side[2] = {ALONG(MANY(float), one, middle), ALONG(MANY(float), two, middle)};
+            const MANY(float) other_side[2] = {ALONG(MANY(float), p, other), ALONG(MANY(float), q, other)};
 #else
             const MANY(float) *own_side = middle, *other_side = other;
 #endif
@@ -156,8 +147,13 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
             moved[a] = displacement[DIM * i + a] * unit;
         }
 #ifdef SPHERE
-        ALONG_TANGENTS(float, xf, slope, slope);
-        ALONG_TANGENTS(float, xf, moved, moved);
+        const float along[4] = {ALONG(float, one, slope), ALONG(float, two, slope), ALONG(float, one, moved),
+                                ALONG(float, two, moved)};
+        EACH_COMPONENT(c)
+        {
+            slope[c] = along[c];
+            moved[c] = along[2 + c];
+        }
 #endif
         EACH_COMPONENT(c)
         {
@@ -332,15 +328,11 @@ kernel void write_correction(const int size, global const STORE *u, global const
     WORK_ITEM(i);
     start[i] = y[i];
 #ifdef SPHERE
-    /* The two tangents in space are the rows of what ALONG_TANGENTS multiplies by. */
     const float x[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
+    float e[3], f[3];
+    FLOAT_TANGENTS(float, x, e, f);
     EACH_AXIS(a)
-    {
-        const float axis[3] = {a == 0, a == 1, a == 2};
-        float along[2];
-        ALONG_TANGENTS(float, x, axis, along);
-        correction[3 * i + a] = h[i] * (u[2 * i] * along[0] + u[2 * i + 1] * along[1]);
-    }
+    correction[3 * i + a] = h[i] * (u[2 * i] * e[a] + u[2 * i + 1] * f[a]);
 #else
     EACH_AXIS(a)
     correction[DIM * i + a] = h[i] * u[DIM * i + a];

@@ -211,8 +211,8 @@ class InsertionDeletion:
         chosen = self._choose(t, keys, PAIR_RINGS)
         self._limit(chosen, n, most)
         engine.run_each(
-            k.mark_bad_cells, n, chosen, t.starts, np.int32(6 if split else 7), t.offsets,
-            t.covariances, t.volumes, *marks.arrays,
+            k.mark_bad_cells, n, chosen, t.starts, np.int32(6 if split else 7), t.points,
+            t.offsets, t.covariances, t.volumes, *marks.arrays,
         )  # fmt: skip
         self._room.clear("keys", "spread", "chosen", "latest")
         return self._apply(domain, t, generators, marks, next_label)
@@ -305,8 +305,9 @@ class InsertionDeletion:
         chosen = self._choose(t, keys, LOG_RATIO_RINGS)
         self._limit(chosen, n, rest if rest > 0 else min(-rest, n - 1))
         engine.run_each(
-            k.mark_split_delete, n, chosen, sign, t.offsets, t.covariances, t.volumes, *marks.arrays
-        )
+            k.mark_split_delete, n, chosen, sign, t.points, t.offsets, t.covariances, t.volumes,
+            *marks.arrays,
+        )  # fmt: skip
 
     def _drop_fixed(self, t: Tessellation, keys: cla.Array, neighbors: bool) -> None:
         """Remove sites at fixed generators and, with `neighbors`, next to them."""

@@ -117,7 +117,7 @@ class Saved:
             "diagram.face_measures": ((m,), a["diagram.face_measures"].dtype),
             "diagram.face_centroids": ((m, d), a["diagram.face_measures"].dtype),
             "diagram.volumes": ((n,), real), "diagram.offsets": ((n, d), real),
-            "diagram.covariances": ((n, d * (d + 1) // 2), real),
+            "diagram.covariances": ((n, 3 if spherical or d == 2 else 6), real),
             "summaries": ((len(SUMMARIES), 4), real),
             "history": ((len(a["history"]),), HISTORY_DTYPE),
         }  # fmt: skip

@@ -101,7 +101,7 @@ class Cells:
                 "starts": engine.empty(n + 1, np.int32),
                 "volumes": engine.empty(n),
                 "offsets": engine.empty((n, d)),
-                "covariances": engine.empty((n, d * (d + 1) // 2)),
+                "covariances": engine.empty((n, 3)),
             }
             self._capacity, self._room, self._n = n, 0, -1
         if n != self._n:
