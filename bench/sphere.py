@@ -8,10 +8,10 @@ icosahedron after 100 steps of Lloyd's method ("icosahedral"; numbers of cells 1
 meshes of the Earth with caps of fine cells in the North Atlantic: 27, 9 and 3 km times 9, and 1 : 64, with
 a growth of a tenth and of a fifth per cell. With `--plane` the same numbers of cells in a square, for the cost
 per cell. With `--openings` only small meshes are made, from `SEEDS` seeds each, with and without the opening of
-obtuse triangles at the end of a run. With `--single` meshes are made in float32 (effort "fast"), and the lengths of
-their edges, from corner to corner, are compared with those of the float64 diagram by the same generators. With
-`--jumps` sizes jump by 1 : 4 at a circle, on the unit sphere and in a square of about its area. The first run of each
-kind builds kernels; times are those of a second run.
+obtuse triangles at the end of a run; errors are those with it. With `--single` meshes are made in float32 (effort
+"fast"), and the lengths of their edges, from corner to corner, are compared with those of the float64 diagram by the
+same generators. With `--jumps` sizes jump by 1 : 4 at a circle, on the unit sphere and in a square of about its area.
+The first run of each kind builds kernels; times are those of a second run.
 
 Columns: mean and largest |e|, mean and least Q; obtuse Delaunay triangles and the largest angle; the distance
 between the middles of Voronoi edges and those of their Delaunay edges over the length of the former, mean and largest.
@@ -108,23 +108,34 @@ def compare_openings(options: Any) -> None:
     ]  # fmt: skip
     columns = {
         "mesh": lambda r: r["mesh"],
-        "effort": lambda r: r["effort"],
+        "method, effort": lambda r: f"{r['method']}, {r['effort']}",
         "runs": lambda r: r["runs"],
         **{
             f"{way} opening": lambda r, way=way: "{} runs, {} triangles, {:.1f}".format(*r[way])
             for way in ("without", "with")
         },
+        "mean, max abs(e)": lambda r: "{:.1e}, {:.1e}".format(*r["errors"]),
     }
     report, most = Report(options.json, columns), preparation.OPENINGS
-    for effort in ("default", "fast"):
+    ways = [
+        ("adaptive", "default"),
+        ("adaptive", "fast"),
+        ("adaptive", "best"),
+        ("exact", "default"),
+        ("exact", "fast"),
+    ]
+    for method, effort in ways:
         for name, size, given in kinds:
-            row: dict[str, Any] = {"mesh": name, "effort": effort, "runs": SEEDS}
+            row: dict[str, Any] = {"mesh": name, "method": method, "effort": effort, "runs": SEEDS}
             for way, openings in (("without", 0), ("with", most)):
                 preparation.OPENINGS = openings
-                grids = [
-                    adapter.run(EARTH, size, effort=effort, seed=seed, **given).measures.c_grid
+                results = [
+                    adapter.run(EARTH, size, method=method, effort=effort, seed=seed, **given)
                     for seed in range(SEEDS)
                 ]
+                grids = [result.measures.c_grid for result in results]
+                error = np.concatenate([np.abs(result.size_error) for result in results])
+                row["errors"] = float(error.mean()), float(error.max())
                 found = [grid.obtuse for grid in grids]
                 widest = max(float(grid.angles.max()) for grid in grids)
                 row[way] = (sum(count > 0 for count in found), sum(found), widest)

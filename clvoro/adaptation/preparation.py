@@ -50,8 +50,8 @@ from .state import MeshState
 
 GRADIENT_STEP = 0.2
 """Step over h of the differences for the gradient of the size field in exact projections."""
-LEAST_ON_SPHERE = 4
-"""Least number of cells on a sphere: fewer generators leave a half of it free."""
+LEAST_ON_SPHERE, LEAST_ADAPTED = 4, 20
+"""Least numbers of cells on a sphere: fewer leave a half of it free, at once or while sizes are corrected."""
 EVEN_ON_SPHERE = 200
 """Random generators that are fewer may leave a half of a sphere free. The start is an even spiral then."""
 _PLACES = 2000
@@ -136,19 +136,9 @@ class Preparation:
             self._tree = density_tree(self.sizing, self.free)
             required = self._tree.integral + len(self.rows)
         warn_of_mismatches(given_field, domain, options.layers)
-        if isinstance(domain, Sphere) and n_cells is None:
-            self._check_against_radius(domain)
         self.target = n_cells if n_cells is not None else max(1, round(required))
-        if isinstance(domain, Sphere) and self.target < LEAST_ON_SPHERE:
-            given = (
-                f"n_cells is {n_cells}"
-                if n_cells
-                else f"the size field requires {required:.2g} cells on {domain}"
-            )
-            raise InputError(
-                f"{given}, expected at least {LEAST_ON_SPHERE} cells, on all sides of the sphere; use smaller sizes, "
-                "in the unit of the radius"
-            )
+        if isinstance(domain, Sphere):
+            self._check_on_sphere(domain, required)
         if n_cells is None and required < 0.5:
             self._warn_of_coarse_size(required)
         scaled = options.multilevel and n_cells is not None
@@ -182,16 +172,37 @@ class Preparation:
             )
         return limit_beside_layers(field, domain, layers)
 
-    def _check_against_radius(self, sphere: Sphere) -> None:
-        """Raise if the size exceeds the radius somewhere."""
-        places = sphere.spiral_points(_PLACES)
-        h = self.sizing(places)
-        k = int(h.argmax())
-        if h[k] > sphere.radius:
-            lon, lat = sphere.lonlat(places[k : k + 1])[0]
-            raise SizeFieldError(
-                f"h is {h[k]:.6g} at longitude {lon:.0f}, latitude {lat:.0f}, larger than the radius, "
-                f"{sphere.radius:g}; use smaller sizes, in the unit of the radius, or n_cells"
+    def _check_on_sphere(self, sphere: Sphere, required: float) -> None:
+        """Raise if cells are too few or too large. `required` cells have the sizes of the field itself."""
+        n_cells, places = self.options.n_cells, sphere.spiral_points(_PLACES)
+        if self._tree is not None:
+            scale = 1.0 if n_cells is None else (required / n_cells) ** 0.5
+            h = scale * self.sizing(places)
+            k = int(h.argmax())
+            # As many equal cells as wanted have the size that they have.
+            if h[k] > sphere.radius and (n_cells is None or h[k] > 1.01 * h.min()):
+                lon, lat = sphere.lonlat(places[k : k + 1])[0]
+                scaled = "" if n_cells is None else f" in a mesh of {n_cells} cells"
+                remedy = (
+                    "use smaller sizes, in the unit of the radius, or n_cells"
+                    if n_cells is None
+                    else "use more cells, or sizes that differ less"
+                )
+                raise SizeFieldError(
+                    f"h{scaled} is {h[k]:.6g} at longitude {lon:.0f}, latitude {lat:.0f}, larger than the radius, "
+                    f"{sphere.radius:g}; {remedy}"
+                )
+        least = LEAST_ADAPTED if self.options.multilevel else LEAST_ON_SPHERE
+        if self.target < least:
+            given = (
+                f"n_cells is {n_cells}"
+                if n_cells
+                else f"the size field requires {required:.2g} cells on {sphere}"
+            )
+            fewer = f"; method='lloyd' makes {LEAST_ON_SPHERE} or more" if n_cells else ""
+            raise InputError(
+                f"{given}, expected at least {least} cells, on all sides of the sphere; use smaller sizes, in the unit "
+                f"of the radius{fewer}"
             )
 
     def _warn_of_coarse_size(self, required: float) -> None:
@@ -263,7 +274,8 @@ class Preparation:
                 return levels
             return max(0, round(math.log2(self.target / len(points)) / d))
         count = int(levels)
-        most = int(math.log2(max(self.target, 1)) / d)
+        least = LEAST_ADAPTED if isinstance(self.domain, Sphere) else 1
+        most = int(math.log2(max(self.target / least, 1)) / d)
         if points is None and count > most:
             raise InputError(
                 f"levels is {levels}, expected at most {most} for {self.target} cells, or 'auto': each "
@@ -290,7 +302,7 @@ class Preparation:
         if host is None:
             least = self.free.n_pieces if self.levels else 1
             if isinstance(self.domain, Sphere):
-                least = LEAST_ON_SPHERE
+                least = LEAST_ADAPTED if self.levels else LEAST_ON_SPHERE
             cells = (self.target - len(self.rows)) / 2 ** (self.domain.cell_dim * self.levels)
             n = max(least, round(cells))
             if isinstance(self.domain, Sphere) and n < EVEN_ON_SPHERE:
@@ -336,12 +348,10 @@ class Preparation:
         self.error_target = options.error_target or choose_error_target(
             dim, effort, self.levels, near, self.steep
         )
-        # Models on spheres have C grids. The exact sizes would be lost.
         exact = options.method in ("exact", "transport")
-        open_triangles = isinstance(self.domain, Sphere) and not exact
         schedule = adaptive_schedule(
-            dim, effort, self.levels, exact, self.error_target,
-            warm=self.points is not None, near=near, openings=OPENINGS if open_triangles else 0,
+            dim, effort, self.levels, exact, self.error_target, warm=self.points is not None, near=near,
+            openings=OPENINGS if isinstance(self.domain, Sphere) else 0,  # models there have C grids
         )  # fmt: skip
         if options.method == "transport":
             schedule.append(Prescribe(MOVES))

@@ -88,6 +88,10 @@ SEPARATE_PENALTY = 20.0
 
 Measured on three fields, three starts each: with 3 the projection undoes a part and costs 0.0003 of mean Q, with 40 the
 largest error on F1 doubles."""
+SETTLING_STEPS = 4
+"""Steps of polishing and separation after the last cells of four sides have been deleted."""
+OPENING_PROJECTIONS = 4
+"""Number of the last exact projections after each of which obtuse triangles are opened."""
 LOOSE_LOG_RATIO_SCALE = 0.25
 """Largest scale of log(L / h) in the penalty, with an error target above the effort's own. It bounds the largest error.
 
@@ -196,12 +200,23 @@ def adaptive_schedule(
     near : bool
         It only needs a correction (see `is_near`). There are no coarser levels then.
     openings : int
-        How often the last step opens obtuse triangles, at most.
+        How often the last steps open obtuse triangles, at most. Some steps before them cells of four sides are deleted,
+        and those of eight split: a cell of four sides has an obtuse triangle.
     """
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
-    if openings and schedule and isinstance(schedule[-1], Step):
-        schedule[-1] = replace(schedule[-1], openings=openings)
-    return schedule
+    return _opened(schedule, exact, openings) if openings else schedule
+
+
+def _opened(schedule: list[Action], exact: bool, openings: int) -> list[Action]:
+    """Return the schedule with the deletion of cells of four sides, and with the opening of obtuse triangles."""
+    steps = [k for k, action in enumerate(schedule) if isinstance(action, Step)]
+    # Exact projections close some triangles again, and correct the sizes of opened ones.
+    opening = steps[-OPENING_PROJECTIONS if exact else -1 :]
+    for k in opening:
+        schedule[k] = replace(schedule[k], openings=openings)
+    before = steps[-min(len(steps), SETTLING_STEPS + (EXACT_STEPS if exact else 0))]
+    repair = [RepairCells(math.inf), CorrectCount(COUNT_EXACTLY if exact else 0.0)]
+    return [*schedule[:before], *repair, *schedule[before:]]
 
 
 def _several_kinds(

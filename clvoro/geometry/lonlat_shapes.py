@@ -166,8 +166,13 @@ def check_lonlat(name: str, positions: object) -> np.ndarray:
 
 
 def warn_of_radians(name: str, x: np.ndarray) -> None:
-    """Warn if all longitudes and latitudes `x` (n, 2) would be within one turn in radians."""
+    """Warn if all longitudes and latitudes `x` (n, 2) would be within one turn in radians.
+
+    A single position in whole numbers, such as (0, 0), says nothing.
+    """
     lon, lat = np.abs(x).max(axis=0)
+    if len(np.unique(x, axis=0)) == 1 and (x == np.round(x)).all():
+        return
     if lon <= 2 * np.pi + 1e-6 and lat <= np.pi / 2 + 1e-6:
         warn(
             f"{name} has longitudes up to {lon:.3g} and latitudes up to {lat:.3g}, which look like radians, expected "

@@ -163,8 +163,7 @@ class ArcDistance(Distance):
         longest = min(np.sqrt(8 * SAGITTA * self.h_min / sphere.radius), LONGEST_CHORD)
         ends = np.concatenate([given._begin, given._end])
         check_lonlat("a shape of a Distance", ends)
-        if len(given._begin) > 1:
-            warn_of_radians("Distance", ends)
+        warn_of_radians("Distance", ends)
         begin, end = _degree_lines(given._begin, given._end, given._radius)
         length = np.radians(np.hypot(*(end - begin).T))
         longest = max(longest, length.sum() / MOST_CHORDS)
@@ -230,6 +229,11 @@ class Caps(Field):
     InputError, InputTypeError
         If a region is not as expected, or a number is out of range.
 
+    Warns
+    -----
+    MismatchWarning
+        If the centers look like radians.
+
     Examples
     --------
     27 km everywhere, 9 km and 3 km in the North Atlantic:
@@ -268,6 +272,7 @@ class Caps(Field):
             rows.append([*center, radius, check_positive(f"Caps regions[{k}] size", region[2])])
         if not rows:
             raise InputError("Caps got no regions, expected at least one")
+        warn_of_radians("Caps", np.array([region[0] for region in regions], float))
         self.regions = np.array(rows)
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:

@@ -126,8 +126,8 @@ class Tessellation:
     offsets : (n, d) real
         Centroid minus generator: the Lloyd displacement.
     covariances : (n, 3) or (n, 6) real
-        Second moments about the centroid per unit volume: xx, xy, yy in 2D, on a sphere along the tangents at the generator
-        (geometry/site.h); xx, xy, xz, yy, yz, zz in 3D.
+        Second moments about the centroid per unit volume: xx, xy, yy in 2D, on a sphere along the tangents at the
+        generator (geometry/site.h); xx, xy, xz, yy, yz, zz in 3D.
     outlines : tuple of arrays
         The OUTLINE_ARGS of a diagram trimmed by a boundary (tessellation/clipped/outline.h); else empty.
     vertices : tuple of arrays

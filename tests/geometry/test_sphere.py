@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import clvoro
+from clvoro import sizing
 from clvoro.errors import ClvoroError
 
 EARTH = clvoro.Sphere()
@@ -63,8 +64,10 @@ def test_icosahedral_points(k):
         (lambda: EARTH.boundary(), "no boundary"),
         (lambda: EARTH.icosahedral_points(12), "at most 11"),
         (lambda: clvoro.voronoi(EARTH, [(100, 50), (95, 95)]), "latitude"),
-        (lambda: clvoro.adapt(EARTH, 1e6, layers=clvoro.Layers(1e5)), "layers"),
-        (lambda: clvoro.adapt(EARTH, 1e6, n_cells=2), "n_cells is 2, expected at least 4"),
+        (lambda: clvoro.adapt(EARTH, 1e6, layers=clvoro.Layers(1e5)), "layers are for a Box .* or a Polygon"),
+        (lambda: clvoro.adapt(EARTH, 1e6, n_cells=19), "n_cells is 19, expected at least 20 cells.* method='lloyd'"),
+        (lambda: clvoro.Adapter().run(EARTH, 1e6, n_cells=3, method="lloyd"), "n_cells is 3, expected at least 4"),
+        (lambda: clvoro.adapt(EARTH, sizing.Expression("50 + lat / 3"), n_cells=20), "in a mesh of 20 .* more cells"),
         (lambda: clvoro.adapt(EARTH, 2e7), "h is 2e.07 at longitude .*larger than the radius"),
     ],
 )  # fmt: skip

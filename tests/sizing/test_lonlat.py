@@ -1,5 +1,7 @@
 """Size fields on the sphere: device against host, host against formulas."""
 
+import warnings
+
 import numpy as np
 import pyopencl as cl
 import pytest
@@ -146,7 +148,20 @@ def test_mistakes(call, message):
         call()
 
 
-def test_radians_are_warned_of():
-    track = sizing.Polyline([(-0.5, 0.7), (1.2, 0.2), (2.9, -1.1)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: sizing.Distance(sizing.Polyline([(-0.5, 0.7), (1.2, 0.2)]), h_min=1e5, growth=1.1),
+        lambda: sizing.Distance(sizing.Circle((-0.5, 0.7), 0.1), h_min=1e5, growth=1.1),
+        lambda: sizing.Caps([((-0.785, 0.785), 3e6, 9e4)], 27e4, 1.1),
+    ],
+)
+def test_radians_are_warned_of(make):
     with pytest.warns(MismatchWarning, match="look like radians"):
-        on_domain(sizing.Distance(track, h_min=1e5, growth=1.1), EARTH)
+        on_domain(make(), EARTH)
+
+
+def test_whole_degrees_are_not_taken_for_radians():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sizing.Caps([((0, 0), 3e6, 9e4)], 27e4, 1.1)

@@ -88,10 +88,12 @@ def test_measures(ctx, name, real):
     assert agree(t.volumes.get(), reference.areas, close)
     assert agree(t.offsets.get().reshape(-1, 3), reference.offsets, close / spacing.min())
     tangents = UNIT.tangents(points[order])
-    packed = np.column_stack([
-        np.einsum("ki,kij,kj->k", tangents[a], reference.moments, tangents[b])
-        for a, b in ((0, 0), (0, 1), (1, 1))
-    ])
+    packed = np.column_stack(
+        [
+            np.einsum("ki,kij,kj->k", tangents[a], reference.moments, tangents[b])
+            for a, b in ((0, 0), (0, 1), (1, 1))
+        ]
+    )
     assert agree(
         t.covariances.get().reshape(-1, 3), packed, 4 * close * spacing.max() / spacing.min()
     )

