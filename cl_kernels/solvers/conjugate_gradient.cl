@@ -152,10 +152,10 @@ kernel void dot_product(int n, int q, global const STORE *a, global const STORE 
     PUT(q, sum.value);
 }
 
-/* p = u + beta p. record[k].running becomes 0 if |r| is within the tolerance, or if a value is not positive or not
-   finite. */
-inline void step_direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p,
-                           global const REAL *partial, global REAL *state, global REAL *record, local REAL *scratch)
+/* beta of iteration k. record[k].running becomes 0, as *end does instead of n, if |r| is within the tolerance, or if a
+   value is not positive or not finite. */
+inline REAL find_beta(int k, int n, REAL tolerance, global const REAL *partial, global REAL *state, global REAL *record,
+                      local REAL *scratch, int *end)
 {
     const int first = get_global_id(0) == 0;
     global REAL *now = record + 4 * k;
@@ -173,8 +173,16 @@ inline void step_direction(int k, int n, REAL tolerance, global const STORE *u, 
         if (k == 0)
             state[3] = target;
     }
-    const REAL beta = k > 0 ? gamma / last[RECORD_GAMMA] : 0;
-    const int end = running ? n : 0;
+    *end = running ? n : 0;
+    return k > 0 ? gamma / last[RECORD_GAMMA] : 0;
+}
+
+/* p = u + beta p. */
+inline void step_direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p,
+                           global const REAL *partial, global REAL *state, global REAL *record, local REAL *scratch)
+{
+    int end;
+    const REAL beta = find_beta(k, n, tolerance, partial, state, record, scratch, &end);
     for (BLOCK_LOOP(i, end))
         p[i] = u[i] + beta * p[i];
 }
@@ -184,6 +192,29 @@ kernel void update_direction(int k, int n, REAL tolerance, global const STORE *u
 {
     local REAL scratch[GROUP_SIZE];
     step_direction(k, n, tolerance, u, p, partial, state, record, scratch);
+}
+
+/* Both in one launch, p = u + beta old and q = A p, with A in sparse rows: p_j is evaluated for each neighbor. */
+#define ENTRY_OF_DIRECTION(j) ((STORE)(u[j] + beta * old[j]))
+ROW_DIFFERENCE(direction_difference, ENTRY_OF_DIRECTION, global const STORE *u, global const STORE *old, REAL beta)
+
+kernel void apply_to_direction(int k, int n, REAL tolerance, global const int *starts, global const int *columns,
+                               global const STORE *weights, global const STORE *u, global const STORE *old,
+                               global STORE *p, global STORE *q, global REAL *partial, global REAL *state,
+                               global REAL *record)
+{
+    local REAL scratch[GROUP_SIZE];
+    int end;
+    const REAL beta = find_beta(k, n, tolerance, partial, state, record, scratch, &end);
+    Sum product = SUM_ZERO;
+    for (BLOCK_LOOP(i, end)) {
+        const STORE pi = ENTRY_OF_DIRECTION(i);
+        const STORE qi = direction_difference(i, n, starts, columns, weights, u, old, beta);
+        p[i] = pi;
+        q[i] = qi;
+        sum_add(&product, (REAL)pi * qi);
+    }
+    PUT(CURVATURE, product.value);
 }
 
 /* Step of iteration k: alpha, alpha for the unscaled x, the mean to remove from r, and the number of unknowns to

@@ -288,25 +288,34 @@ class _System:
         self._operator, self._precondition = operator, precondition
         self._rhs, self._x = rhs, x
         self._kernels = k = solver.kernels_in(store)
-        self._r, self._u, self._p, self._q = (self._engine.scratch(n, store) for _ in range(4))
+        scratch = self._engine.scratch
+        self._r, self._u, self._p, self._q = (scratch(n, store) for _ in range(4))
+        # On CPUs it costs more to evaluate directions of neighbors again than to store them.
+        self._merged = operator.rows is not None and self._engine.group_size > 1
+        directions = (self._p, scratch(n, store)) if self._merged else (self._p, self._p)
         self._size, self._center = np.int32(n), np.int32(operator.singular)
         # The recurrence stops slightly below the tolerance, so that the true residual is within it.
         limit = self._engine.real.type(0.95 * tolerance)
         self._tail = (solver.partial, solver.state, solver.record)
         first = np.int32(0)
-        self._update_direction = Launch(
-            self._engine, k.update_direction, first, self._size, limit, self._u, self._p, *self._tail
-        )  # fmt: skip
-        vectors = self._p, self._q, x, self._r
-        if isinstance(precondition, cla.Array):
-            self._update_solution = Launch(
-                self._engine, k.update_solution_jacobi, first, self._size, self._center, precondition, *vectors,
-                self._u, *self._tail,
-            )  # fmt: skip
-        else:
-            self._update_solution = Launch(
-                self._engine, k.update_solution, first, self._size, self._center, *vectors, *self._tail
-            )  # fmt: skip
+        self._find_direction, self._update_solution = [], []
+        for p, old in (directions[::-1], directions):
+            if self._merged:
+                assert operator.rows is not None
+                direction = (
+                    k.apply_to_direction, first, self._size, limit, *operator.rows, self._u, old, p, self._q
+                )  # fmt: skip
+            else:
+                direction = k.update_direction, first, self._size, limit, self._u, p
+            self._find_direction.append(Launch(self._engine, *direction, *self._tail))
+            vectors = p, self._q, x, self._r
+            if isinstance(precondition, cla.Array):
+                solution = (
+                    k.update_solution_jacobi, first, self._size, self._center, precondition, *vectors, self._u
+                )  # fmt: skip
+            else:
+                solution = k.update_solution, first, self._size, self._center, *vectors
+            self._update_solution.append(Launch(self._engine, *solution, *self._tail))
 
     def measure(self, from_zero: bool = False) -> float:
         """Do the same as `start`, and return the relative norm of r; negative if b is zero."""
@@ -342,13 +351,15 @@ class _System:
         if not isinstance(self._precondition, cla.Array):
             self._precondition(self._r, self._u, self._q)
             self._dot_product(_GAMMA + (k & 1), self._r, self._u)
-        self._update_direction.set_first(k)
-        self._update_direction()
-        self._operator.apply(self._p, self._q)
-        if not self._operator.writes_curvature:
-            self._dot_product(CURVATURE, self._p, self._q)
-        self._update_solution.set_first(k)
-        self._update_solution()
+        direction, solution = self._find_direction[k & 1], self._update_solution[k & 1]
+        direction.set_first(k)
+        direction()
+        if not self._merged:
+            self._operator.apply(self._p, self._q)
+            if not self._operator.writes_curvature:
+                self._dot_product(CURVATURE, self._p, self._q)
+        solution.set_first(k)
+        solution()
 
     def record_norm(self, k: int) -> None:
         """Record the residual before iteration k, and whether k is needed."""

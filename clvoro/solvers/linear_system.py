@@ -75,7 +75,7 @@ class Operator:
         The null space of A is the constants: the mean of the right side is removed first, that of x at the end.
     rows : tuple of device arrays, optional
         Starts, columns and weights of A, if it is a matrix (see solvers/sparse_rows.h). One work-group then solves
-        systems of few unknowns, if the preconditioner is diagonal.
+        systems of few unknowns, if the preconditioner is diagonal. On GPUs an iteration takes a launch less.
     """
 
     apply: Apply
