@@ -394,9 +394,6 @@ kernel void check_cells(const int size, const int room, global const int *report
         const bool other_certain = (row_counts[j] & CERTAIN) != 0;
         if (!(certain || other_certain) || (j < i && changed[j] == ALL_FACES))
             continue;
-        /* A cell that will be updated again is compared then. */
-        if ((marks[i] | marks[j]) & UPDATE_AGAIN)
-            continue;
         const int place = row_places[j], m = COUNT_OF(row_counts[j]);
         const bool by_keys = certain && other_certain;
         bool same = false;
@@ -409,7 +406,8 @@ kernel void check_cells(const int size, const int room, global const int *report
             for (int q = place; q < place + m; ++q)
                 same |= labels[q] == i && fabs(measures[q] - measures[k]) <= AREA_NOISE * area;
         }
-        if (same)
+        /* A cell that will be updated again is compared then. Other work-items change other bits of its mark now. */
+        if (same || ((atomic_or(marks + i, 0) | atomic_or(marks + j, 0)) & UPDATE_AGAIN))
             continue;
         if (certain)
             atomic_or(marks + i, CLIP_ANEW);
