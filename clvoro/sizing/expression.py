@@ -160,11 +160,13 @@ class Expression(Field):
 
     def _emit(self, writer: CodeWriter) -> str:
         frame = writer.store(writer.scale, 1.0 / writer.scale, writer.origin)
+        exponents = self._exponents()
         names: list[str] = []
-        for kind, value, arguments in self._nodes:
+        for node, (kind, value, arguments) in enumerate(self._nodes):
             a = [names[i] for i in arguments]
             if kind == "number":
-                code = f"(REAL)({value!r})"
+                # Formulas that differ in numbers share a kernel. The compiler knows powers of given exponents.
+                code = f"(REAL)({value!r})" if node in exponents else f"data[{writer.store(value)}]"
             elif kind == "axis":
                 code = f"x[{value}] * data[{frame}] + data[{frame + 2 + value}]"
             elif kind == "negate":
@@ -181,6 +183,14 @@ class Expression(Field):
                 code = f"{a[0]} {value} {a[1]}"
             names.append(writer.variable(code))
         return writer.variable(f"{names[-1]} * data[{frame + 1}]")
+
+    def _exponents(self) -> set[int]:
+        """Return the nodes that are second arguments of `pow`, and the numbers that such nodes negate."""
+        found = {arguments[1] for _, value, arguments in self._nodes if value == "pow"}
+        for node in range(len(self._nodes) - 1, -1, -1):
+            if node in found and self._nodes[node].kind == "negate":
+                found.update(self._nodes[node].arguments)
+        return found
 
     def __repr__(self) -> str:
         short = self.text if len(self.text) <= 60 else self.text[:57] + "..."

@@ -183,7 +183,7 @@ def test_merges_are_those_of_a_slow_reference():
     ends = np.stack([mesh.corners, mesh.corners[following(mesh.starts)]], axis=1)
     ends = np.unique(np.sort(ends, axis=1), axis=0)
     length = np.linalg.norm(mesh.points[ends[:, 0]] - mesh.points[ends[:, 1]], axis=1)
-    ends = ends[np.argsort(length)][:70]
+    ends = ends[np.argsort(length)][:40]
     apart = [
         rng.choice(mesh.corners[mesh.starts[f] : mesh.starts[f + 1]], 2, replace=False)
         for f in rng.integers(len(mesh.owner), size=10)

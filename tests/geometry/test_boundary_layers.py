@@ -219,7 +219,7 @@ def test_wings_with_thin_layers_are_accepted_by_solvers(adapter):
 
 @pytest.mark.sparse
 @pytest.mark.parametrize("spacing", [0.01, 0.04])
-@pytest.mark.parametrize("angle", [50.5, 60, 90, 120, 150, 170])
+@pytest.mark.parametrize("angle", [50.5, 90, 120, 170])
 def test_faces_end_in_the_corners_of_bodies_with_layers(adapter, angle, spacing):
     """A triangle with a corner that turns by `angle`: cells around it are convex."""
     slope = np.tan(np.radians(180 - angle) / 2)

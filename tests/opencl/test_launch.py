@@ -139,6 +139,7 @@ def test_groups_are_as_small_as_the_device_requires(ctx, monkeypatch):
     assert launched["gather_rows"] == (336, 16)
 
 
+@pytest.mark.slow
 def test_coarse_levels_take_smaller_groups(ctx, monkeypatch):
     """Multigrid does coarse levels in one group each; some of its kernels are limited to groups of 8."""
     monkeypatch.setattr(engines, "group_sizes", lambda _: engines.GroupSizes(5, 32))

@@ -198,6 +198,16 @@ def test_bits_repeat(make_engine):
     assert all(np.array_equal(a, b) for a, b in zip(*found, strict=True))
 
 
+def test_formulas_that_differ_in_numbers_share_a_kernel():
+    """All numbers are data, but the exponents of pow."""
+    first, second, other = (
+        sizing.generate_code(sizing.Expression(text), PLANE)
+        for text in ("0.1 + 2*pow(x, -3)", "0.7 + 5*pow(x, -3)", "0.1 + 2*pow(x, -2)")
+    )
+    assert first.prelude == second.prelude != other.prelude
+    assert (first.data != second.data).sum() == 2
+
+
 def test_callable_is_evaluated_on_the_host(make_engine):
     engine = make_engine(2)
     seen = []
