@@ -5,15 +5,17 @@
 A fast run makes a mesh of F2 (2D) or S1 (3D), scaled to the count (see `convergence.py`). Some steps of each kind of a
 default run follow. Figures are means per step. "launches" are kernels, copies and fills; "solve" are those of the
 linear solver among them, "set-up" those of a new multigrid. The host waits at each of "reads" and "writes".
-Work-groups are those of a GPU on any device, so that the counts hold there. `--kernels` prints the launches of each
-kernel, too.
+Work-groups, merged kernels and preconditioners are those of a GPU on any device, so that the counts hold there.
+`--kernels` prints the launches of each kernel, too.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,6 +40,9 @@ from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.hooks import Tally, watching
 from clvoro.sizing import Sizing
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from tests.robustness.gpu_like import groups
 
 FIELDS = {2: "F2", 3: "S1"}
 WARM_UP, STEPS = 3, 5
@@ -73,12 +78,13 @@ def counted(
     adapter: clvoro.Adapter, domain: clvoro.Box, field: Any, points: np.ndarray
 ) -> Iterator[tuple[MeshState, Tally]]:
     """Count the commands on a mesh of `points` while the context is open."""
-    engine = Engine(adapter.ctx, cl.CommandQueue(adapter.ctx), domain.dim, adapter.dtype)
-    engine.groups, engine.group_size = GPU_GROUPS, GPU_GROUP_SIZE
     origin, scale = domain.frame
-    start, tally = engine.upload((points - origin) / scale), Tally()
-    with watching(engine.queue, tally):
-        yield MeshState.create(Stages(engine), domain, Sizing(engine, domain, field), start), tally
+    with groups(GPU_GROUP_SIZE, GPU_GROUPS):
+        engine = Engine(adapter.ctx, cl.CommandQueue(adapter.ctx), domain.dim, adapter.dtype)
+        start, tally = engine.upload((points - origin) / scale), Tally()
+        with watching(engine.queue, tally):
+            mesh = MeshState.create(Stages(engine), domain, Sizing(engine, domain, field), start)
+            yield mesh, tally
 
 
 def take_step(mesh: MeshState, method: Method) -> int:

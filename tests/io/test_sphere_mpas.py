@@ -161,8 +161,9 @@ def test_kites_are_spherical_quadrilaterals(mesh):
 
 def test_areas_are_those_of_scipy(result, mesh):
     voronoi = SphericalVoronoi(mesh.cell)
-    # Round-off of corners, which are near other cells' bisectors, times the perimeters of the smallest cells.
-    near = {"rtol": 1e-12, "atol": 1e-14} if is_double(result) else {"rtol": 1e-5, "atol": 1e-8}
+    # Round-off of corners, which are near other cells' bisectors, times the perimeters of the smallest cells. Quotients
+    # of float32 may be off by 2.5 ulp.
+    near = {"rtol": 1e-12, "atol": 1e-14} if is_double(result) else {"rtol": 4e-5, "atol": 1e-8}
     areas = mesh["areaCell"] / mesh.radius**2
     np.testing.assert_allclose(areas, voronoi.calculate_areas(), **near)
     np.testing.assert_allclose(areas, result.diagram.volumes / mesh.radius**2, **near)
