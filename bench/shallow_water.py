@@ -3,7 +3,8 @@
     python bench/shallow_water.py [--cells 2562,10242,40962]
                                   [--meshes uniform,uniform+2,graded,graded+2,icosahedral+50] [--cases 2,5]
                                   [--reference 163842] [--effort default] [--days N] [--alpha 0]
-                                  [--courant 0.8] [--upwinding 0] [--quick] [--device NAME] [--dtype float32] [--json]
+                                  [--courant 0.8] [--upwinding 0] [--quick] [--truncation]
+                                  [--device NAME] [--dtype float32] [--json]
 
 The solver (`_trisk.py`) is NumPy and SciPy; it takes nothing but a `Diagram`. Test 2 is a steady zonal flow, rotated
 by --alpha degrees: 5 days, norms of the error of height. Test 5 is a flow over a mountain: 15 days, norms of the
@@ -20,6 +21,11 @@ square root of the area.
 The last table has the discrete balances, each relative to the magnitudes of its terms: total dh/dt, work of the
 Coriolis force, total dE/dt in space, curl of the tangential field against the mean divergence, and the curl of the
 tangential field of a flow without divergence (geostrophic balance). All should be round-off.
+
+`--truncation` takes no time step. It prints what the operators get wrong in the initial state of test 2, whose du/dt is
+zero: root mean squares over the edges of cells that have five or seven sides, or have a neighbor that does ("odd"),
+and over all others ("else"). "du/dt" and "grad K", the error of the gradient of the kinetic energy, are relative to
+the Coriolis force, "tangential", the error of the tangential velocity, to that velocity.
 
 `--quick` is 642 and 2,562 cells and one day. The script fails if a run is unstable, or a balance is not round-off.
 """
@@ -224,6 +230,40 @@ def measure(
     return record, h + case.bottom, {**about, **balances(model, h, u)}
 
 
+def measure_truncation(kind: str, diagram: clvoro.Diagram, alpha: float) -> dict[str, Any]:
+    """Return errors of the operators in the initial state of test case 2, near odd cells and elsewhere."""
+    mesh = mesh_of(diagram)
+    case = set_up(2, mesh, alpha)
+    model = ShallowWater(mesh, GRAVITY, case.coriolis, case.bottom)
+    operators, areas = model.operators, mesh.edge_areas
+    odd = np.diff(diagram.neighbor_starts) != 6
+    near = odd | (diagram.adjacency @ odd.astype(float) > 0)
+    at_odd = near[mesh.edge_cells].any(axis=1)
+    lean = math.radians(alpha)
+    spin = 2 * math.pi * RADIUS / (12 * DAY) * np.array([-math.sin(lean), 0.0, math.cos(lean)])
+    kinetic = (np.cross(spin, mesh.points) ** 2).sum(axis=1) / 2
+    along = unit(np.diff(mesh.corners[mesh.edge_vertices], axis=1)[:, 0])
+    tangential = (np.cross(spin, mesh.crossings) * along).sum(axis=1)
+    found = operators.tangential @ case.u
+    sign = np.sign(found @ tangential)  # of the direction in which vertices are listed
+
+    def rms(x: np.ndarray, where: np.ndarray) -> float:
+        return float(np.sqrt(areas[where] @ x[where] ** 2 / areas[where].sum()))
+
+    everywhere = np.ones(len(areas), bool)
+    force = rms((operators.vertex_to_edge @ case.coriolis) * tangential, everywhere)
+    errors = {
+        "rate": model.tendency(case.h, case.u)[1] / force,
+        "kinetic": operators.grad @ (operators.kinetic @ case.u**2 - kinetic) / force,
+        "tangential": (found - sign * tangential) / rms(tangential, everywhere),
+    }
+    return {
+        "case": 2, "mesh": kind, "cells": len(odd), "odd": int(odd.sum()),
+        "share": float(areas[at_odd].sum() / areas.sum()),
+        **{name: (rms(x, at_odd), rms(x, ~at_odd)) for name, x in errors.items()},
+    }  # fmt: skip
+
+
 def compare(runs: list[tuple[dict[str, Any], Mesh, np.ndarray]]) -> None:
     """Add to records of case 5 the difference of the surface from that of the last run."""
     for record, mesh, surface in runs[:-1]:
@@ -269,6 +309,15 @@ COLUMNS = {
     "enstrophy": shown("enstrophy", ".1e"),
     "stable": lambda r: "yes" if r["stable"] else "no",
     "s": shown("seconds", ".1f"),
+}
+OF_TRUNCATION = {
+    **common_columns(),
+    "odd cells": shown("odd", ",d"),
+    "share of edges near": shown("share", ".1%"),
+    **{
+        f"{title}: odd, else": lambda r, name=name: "{:.4f}, {:.4f}".format(*r[name])
+        for title, name in (("du/dt", "rate"), ("grad K", "kinetic"), ("tangential", "tangential"))
+    },
 }
 BALANCES = ("mass_rate", "coriolis_work", "energy_rate", "dual_divergence", "geostrophic")
 OF_BALANCES = {
@@ -317,6 +366,7 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("--alpha", type=float, default=0.0, help="degrees, case 2 only")
     made.add_argument("--courant", type=float, default=0.8, help="share of the longest stable step")
     made.add_argument("--upwinding", type=float, default=0.0, help="APVM; 0.5 is usual")
+    made.add_argument("--truncation", action="store_true", help="only errors of the operators")
     made.add_argument("--quick", action="store_true", help="642 and 2,562 cells, one day")
     options = made.parse_args(arguments)
     if options.quick:
@@ -324,6 +374,13 @@ def main(arguments: list[str] | None = None) -> int:
     if not set(options.cases) <= set(DAYS):
         made.error(f"--cases is {options.cases}, expected 2, 5 or both")
     adapter = make_adapter(options)
+    if options.truncation:
+        report = Report(options.json, OF_TRUNCATION)
+        for kind, n, _ in plan(options):
+            diagram = make_mesh(adapter, kind, n, options.effort)
+            report.add(measure_truncation(kind, diagram, options.alpha), f"{kind}, {n} cells")
+        report.finish(heading(adapter, "Errors of the operators of TRiSK"))
+        return 0
     try:
         records, checked = run_all(adapter, options)
     except ValueError as error:

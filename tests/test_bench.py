@@ -182,3 +182,14 @@ def test_sharp_corners():
     # An isosceles triangle with this tip has Q = 0.820.
     assert rows[0]["bound"] == pytest.approx([0.820, 0.686, 0.637], abs=1e-3)
     assert all(0.6 < r["quality"] < 0.69 and r["accepted"] for r in rows)
+
+
+@pytest.mark.slow
+def test_truncation_of_trisk():
+    """Near pentagons the gradient of the kinetic energy is off by a constant over dx, and elsewhere by less."""
+    coarse, fine = records(
+        "shallow_water.py", "--truncation", "--cells", "642,2562", "--meshes", "icosahedral+50"
+    )
+    assert coarse["odd"] == fine["odd"] == 12
+    assert fine["kinetic"][0] > 1.6 * coarse["kinetic"][0]
+    assert fine["kinetic"][1] < 0.2 * fine["kinetic"][0]
