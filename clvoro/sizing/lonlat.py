@@ -272,7 +272,7 @@ class Caps(Field):
             rows.append([*center, radius, check_positive(f"Caps regions[{k}] size", region[2])])
         if not rows:
             raise InputError("Caps got no regions, expected at least one")
-        warn_of_radians("Caps", np.array([region[0] for region in regions], float))
+        warn_of_radians("Caps", np.array([np.asarray(region[0], float) for region in regions]))
         self.regions = np.array(rows)
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
