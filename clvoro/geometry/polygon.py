@@ -362,10 +362,20 @@ class Polygon(DevicePolygon):
             for is_outer, o, h in zip(first, np.cumsum(first), np.cumsum(~first), strict=True)
         ]
         index = np.repeat(np.arange(len(names), dtype=np.int32), np.diff(self.ring_starts))
+        ring = index.copy()
         for c, curve in enumerate(self.curves):
             if curve.name is not None:
                 names += [] if curve.name in names else [curve.name]
                 index[self.curved.curve == c] = names.index(curve.name)
+        for c, curve in enumerate(self.curves):
+            edges = self.curved.curve == c
+            part = index[edges][0]
+            clash = (ring == part) & (index == part)
+            if clash.any() and ring[edges][0] != part:
+                raise InputError(
+                    f"Polygon has the curve {curve}, but edge {np.argmax(clash)} of another ring has the name "
+                    f"{curve.name!r}, too; choose another name for the curve"
+                )
         used, first = np.unique(index, return_index=True)
         used = used[np.argsort(first)]  # in the order of their first edges
         place = np.empty(len(names), np.int32)

@@ -297,6 +297,23 @@ def test_default_names_and_edges_without_length() -> None:
         twice.boundary("none")
 
 
+def test_curves_with_one_name_are_one_part_unless_a_ring_has_the_name() -> None:
+    def tubes(*names: str | None) -> clvoro.Polygon:
+        return clvoro.Polygon(
+            [(0, 0), (3, 0), (3, 1), (0, 1)],
+            [clvoro.curves.circle((k + 0.5, 0.5), 0.2, name=name) for k, name in enumerate(names)],
+        )
+
+    domain = tubes("tubes", None, "tubes")
+    assert domain.boundary_names == ("outer", "tubes", "hole-2")
+    ring = np.repeat(np.arange(4), np.diff(domain.ring_starts))
+    assert (domain.boundaries.select("", "tubes") == np.flatnonzero(ring % 2)).all()
+    assert tubes("hole-2", "hole-1").boundary_names == ("outer", "hole-2", "hole-1")
+    for name, edge in (("hole-2", r"\d+"), ("outer", 0)):
+        with pytest.raises(InputError, match=f"edge {edge} of another ring has the name '{name}'"):
+            tubes(name, None)
+
+
 def test_features_name_their_boundaries() -> None:
     def feature(ring, boundaries):
         closed = [*ring, ring[0]]
