@@ -40,6 +40,7 @@ LEAST_PROGRESS, MAX_OSCILLATIONS = 0.9, 2
 without falling to this share of the smallest number so far. For smooth fields the sign changes at most once."""
 INTERRUPTED = "interrupted"
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
+SETTLED = "tolerance of the moving mesh met"
 """Reasons of converged runs."""
 
 
@@ -148,7 +149,7 @@ class Loop:
                 self.mesh.walls.settle(self.mesh)
             self.solution = None
             self.add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
-        return self.result(reason in (COMPLETED, STALLED), reason, settings)
+        return self.result(reason in (COMPLETED, STALLED, SETTLED), reason, settings)
 
     @property
     def fixed_count(self) -> int | None:
@@ -344,7 +345,10 @@ class Loop:
         """Return why the run ends, or "" if it continues. `over`: the schedule has ended."""
         if stop:
             return "stopped by the callback"
-        if self.stalled():
+        if isinstance(self.last, MmpdeMethod | MongeAmpereMethod):
+            if self.tol and self.last.finished:
+                return SETTLED
+        elif self.stalled():
             return STALLED
         if over and self.tol is None:
             return COMPLETED
@@ -352,12 +356,7 @@ class Loop:
         return "max_steps reached" if over or used_up else ""
 
     def stalled(self) -> bool:
-        """Return whether both mean error and mean quality have improved by less than `tol` over the last steps.
-
-        Moving meshes have criteria of their own.
-        """
-        if isinstance(self.last, MmpdeMethod | MongeAmpereMethod):
-            return bool(self.tol) and self.last.finished
+        """Return whether both mean error and mean quality have improved by less than `tol` over the last steps."""
         if not self.tol or len(self.rows) <= 2 * WINDOW:
             return False
         history = np.concatenate(self.rows[-2 * WINDOW :])

@@ -44,6 +44,7 @@ def test_transport_in_one_direction(adapter, dim):
     off = np.column_stack([expected, xi[:, 1:]]) - result.points
     assert np.abs(off / result.target_size[:, None]).mean() < 0.06
     assert result.converged
+    assert result.stop_reason == "tolerance of the moving mesh met"
 
 
 def test_a_fold_is_reported(adapter):
