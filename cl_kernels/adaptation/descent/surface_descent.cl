@@ -12,6 +12,7 @@
      dE/dx_i = sum over edges of K integral (p - x_i) dl + sum over faces of A / |d| (P_j - P_i) (m - x_i). */
 #include "geometry/domain.h"
 #include "tessellation/row_counts.h"
+#include "tessellation/wide_vectors.h"
 
 /* forces[i] = (3 omega / S, 2 omega / V). One work-item per generator. */
 kernel void compute_surface_forces(const int size, global const int *starts, global const FACE *face_measures,
@@ -26,34 +27,81 @@ kernel void compute_surface_forces(const int size, global const int *starts, glo
     forces[i] = (REAL2)(3 * omega / surface, 2 * omega / volumes[i]);
 }
 
-/* A face of the cell: its plane is y . away = level. `away` is the vector to the neighbor, or the outward normal of a
-   wall. `inverse` is 1 / |away|, and 0 for a wall; `tension` is that of the neighbor. */
+/* The faces of a cell: the plane of each is y . away = level. `away` is the vector to the neighbor, or the outward
+   normal of a wall. `inverse` is 1 / |away|, and 0 for a wall; `tension` is that of the neighbor, and 0 for a wall. */
 typedef struct {
-    REAL4 away;
-    REAL square, level, inverse, tension;
+    REAL x[MOST_FACES], y[MOST_FACES], z[MOST_FACES];
+    REAL square[MOST_FACES], level[MOST_FACES], inverse[MOST_FACES], tension[MOST_FACES];
+} sides_t;
+
+/* The same for the faces in the lanes. */
+typedef struct {
+    places_t away;
+    WIDE square, level, inverse, tension;
 } side_t;
 
-/* K integral (p - x_i) dl of the edge between faces a and b up to its end v, which lies in the direction of a x b. The
-   integral begins at the point of the line that is nearest to x_i. `own` is the tension of the cell. */
-inline REAL4 pull_of_edge(const side_t *a, const side_t *b, REAL own, REAL4 v)
+inline void gather_side(side_t *side, const sides_t *sides, const int *k)
 {
-    const REAL ab = dot(a->away, b->away), d2 = a->square * b->square - ab * ab;
-    const bool wall_a = a->inverse == 0, wall_b = b->inverse == 0;
+    side->away.x = GATHER_WIDE(sides->x, k);
+    side->away.y = GATHER_WIDE(sides->y, k);
+    side->away.z = GATHER_WIDE(sides->z, k);
+    side->square = GATHER_WIDE(sides->square, k);
+    side->level = GATHER_WIDE(sides->level, k);
+    side->inverse = GATHER_WIDE(sides->inverse, k);
+    side->tension = GATHER_WIDE(sides->tension, k);
+}
+
+/* Add `once` times K integral (p - x_i) dl of the edge between faces a and b up to its end v, which lies in the
+   direction of c = a x b. The integral begins at the point of the line that is nearest to x_i: with t = c.v / |c|, it
+   is t v - t^2 / 2 c / |c|. `own` is the tension of the cell. */
+inline void add_pull(places_t *sum, const side_t *a, const side_t *b, const places_t *c, REAL own, const places_t *v,
+                     WIDE once)
+{
+    const WIDE ab = product_of(&a->away, &b->away), squares = a->square * b->square, d2 = squares - ab * ab;
+    const WIDE tensions = a->tension + b->tension, inverses = a->inverse + b->inverse;
+    const WIDE free = (own + a->tension) * (a->square - ab) * a->inverse +
+                      (own + b->tension) * (b->square - ab) * b->inverse -
+                      tensions * sqrt(fmax(a->square + b->square - 2 * ab, (WIDE)0));
+    const WIDE at_wall = own - tensions - (own + tensions) * ab * inverses;
+    const WIDE pull = ((a->inverse == 0) | (b->inverse == 0)) ? at_wall : free;
     /* The edge between two walls does not move, that of nearly parallel faces is short. */
-    if (!(d2 > R(1e-12) * a->square * b->square) || (wall_a && wall_b))
-        return 0;
-    const REAL over = 1 / sqrt(d2);
-    REAL pull;
-    if (wall_a || wall_b) {
-        const side_t *f = wall_a ? b : a;
-        pull = own - f->tension - (own + f->tension) * ab * f->inverse;
-    } else {
-        pull = (own + a->tension) * (a->square - ab) * a->inverse + (own + b->tension) * (b->square - ab) * b->inverse -
-               (a->tension + b->tension) * sqrt(a->square + b->square - 2 * ab);
+    const WIDE over2 = ((d2 > R(1e-12) * squares) & (inverses > 0)) ? 1 / d2 : (WIDE)0;
+    const WIDE along = product_of(c, v) * over2, share = once * pull * along;
+    add_along(sum, share, v);
+    add_along(sum, -share * along / 2, c);
+}
+
+/* The sum of K integral (p - x_i) dl over the edges of a cell with these vertices, as triples of faces. */
+inline REAL4 pull_of_edges(const sides_t *sides, global const uchar4 *corners, int count, REAL own)
+{
+    places_t sum = {0, 0, 0};
+    for (int first = 0; first < count; first += WIDTH) {
+        int at_a[WIDTH], at_b[WIDTH], at_c[WIDTH];
+        REAL counted[WIDTH];
+        for (int lane = 0; lane < WIDTH; ++lane) {
+            const uchar4 at = corners[min(first + lane, count - 1)];
+            at_a[lane] = at.s0;
+            at_b[lane] = at.s1;
+            at_c[lane] = at.s2;
+            counted[lane] = first + lane < count;
+        }
+        side_t a, b, c;
+        gather_side(&a, sides, at_a);
+        gather_side(&b, sides, at_b);
+        gather_side(&c, sides, at_c);
+        places_t ab, bc, ca, v = {0, 0, 0};
+        cross_of(&ab, &a.away, &b.away);
+        cross_of(&bc, &b.away, &c.away);
+        cross_of(&ca, &c.away, &a.away);
+        const WIDE over = 1 / product_of(&a.away, &bc), once = LOAD_WIDE(0, counted);
+        add_along(&v, a.level * over, &bc);
+        add_along(&v, b.level * over, &ca);
+        add_along(&v, c.level * over, &ab);
+        add_pull(&sum, &a, &b, &ab, own, &v, once);
+        add_pull(&sum, &b, &c, &bc, own, &v, once);
+        add_pull(&sum, &c, &a, &ca, own, &v, once);
     }
-    const REAL4 along = over * cross(a->away, b->away);
-    const REAL t = dot(along, v);
-    return pull * over * t * (v - t / 2 * along);
+    return (REAL4)(sum_of_lanes(sum.x), sum_of_lanes(sum.y), sum_of_lanes(sum.z), 0);
 }
 
 /* lloyd = -rate h^2 dE/dx_i, at most max_displacement h. One work-item per generator. A cell without known vertices
@@ -68,40 +116,35 @@ kernel void descend_surface(const int size, global const int *starts, global con
     const int begin = starts[i], faces = starts[i + 1] - begin;
     if (faces > MOST_FACES || corners[2 * begin].s3 == NO_CORNERS)
         return;
-    side_t sides[MOST_FACES];
+    sides_t sides;
     const REAL2 own = forces[i];
     REAL4 g = 0;
     for (int f = 0; f < faces; ++f) {
         const int k = begin + f, j = neighbors[k];
         const REAL4 m = (REAL4)(face_centroids[3 * k], face_centroids[3 * k + 1], face_centroids[3 * k + 2], 0);
-        side_t side;
+        REAL4 away;
         if (j >= 0) {
-            side.away = (REAL4)(DIFFERENCE(0, points[3 * i], points[3 * j]),
-                                DIFFERENCE(1, points[3 * i + 1], points[3 * j + 1]),
-                                DIFFERENCE(2, points[3 * i + 2], points[3 * j + 2]), 0);
-            side.square = dot(side.away, side.away);
-            side.level = side.square / 2;
-            side.inverse = 1 / sqrt(side.square);
-            side.tension = forces[j].s0;
-            g += face_measures[k] * side.inverse * (forces[j].s1 - own.s1) * m;
+            away = (REAL4)(DIFFERENCE(0, points[3 * i], points[3 * j]),
+                           DIFFERENCE(1, points[3 * i + 1], points[3 * j + 1]),
+                           DIFFERENCE(2, points[3 * i + 2], points[3 * j + 2]), 0);
+            sides.square[f] = dot(away, away);
+            sides.level[f] = sides.square[f] / 2;
+            sides.inverse[f] = 1 / sqrt(sides.square[f]);
+            sides.tension[f] = forces[j].s0;
+            g += face_measures[k] * sides.inverse[f] * (forces[j].s1 - own.s1) * m;
         } else {
             const int wall = -1 - j;
             const REAL sign = wall % 2 ? 1 : -1;
-            side.away = (REAL4)(wall < 2 ? sign : 0, wall / 2 == 1 ? sign : 0, wall > 3 ? sign : 0, 0);
-            side.square = 1;
-            side.level = dot(side.away, m);
-            side.inverse = side.tension = 0;
+            away = (REAL4)(wall < 2 ? sign : 0, wall / 2 == 1 ? sign : 0, wall > 3 ? sign : 0, 0);
+            sides.square[f] = 1;
+            sides.level[f] = dot(away, m);
+            sides.inverse[f] = sides.tension[f] = 0;
         }
-        sides[f] = side;
+        sides.x[f] = away.s0;
+        sides.y[f] = away.s1;
+        sides.z[f] = away.s2;
     }
-    for (int v = 0; v < 2 * faces - 4; ++v) {
-        const uchar4 at = corners[2 * begin + v];
-        const side_t *a = sides + at.s0, *b = sides + at.s1, *c = sides + at.s2;
-        const REAL4 bc = cross(b->away, c->away);
-        const REAL4 sum = a->level * bc + b->level * cross(c->away, a->away) + c->level * cross(a->away, b->away);
-        const REAL4 y = sum / dot(a->away, bc);
-        g += pull_of_edge(a, b, own.s0, y) + pull_of_edge(b, c, own.s0, y) + pull_of_edge(c, a, own.s0, y);
-    }
+    g += pull_of_edges(&sides, corners + 2 * begin, 2 * faces - 4, own.s0);
     const REAL unit = h[i];
     REAL4 u = -rate * unit * unit * g;
     const REAL length = sqrt(dot(u, u));
