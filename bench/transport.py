@@ -1,11 +1,12 @@
 """Prescribed volumes in power diagrams: steps of Newton's method, and time.
 
-    python bench/transport.py [--sizes 1e3,1e4,1e5] [--sizes-3d 1e3,1e4] [--repeat N] [--processor-time]
-                              [--picture] [--out DIR] [--device NAME] [--dtype float32] [--json]
+    python bench/transport.py [--sizes 1e3,1e4,1e5] [--sizes-3d 1e3,1e4] [--sizes-lake 1e3,1e4] [--repeat N]
+                              [--processor-time] [--picture] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
-Uniform random generators in a unit box get cells of equal volume, and of volumes in proportion to
-0.02 + |x - c|^2, c the middle of the box (in 2D 1 : 26). "outside" is the share of the cells that do not contain their
-generator, "shares" the shares of the damped Newton steps. Seconds are the least of the repeated solves, with generators
+Uniform random generators in a unit box, and in a lake of 400 edges with an island (see bench/solver_ready.py), get
+cells of equal volume, and of volumes in proportion to 0.02 + |x - c|^2, c = (0.5, 0.5) (in the box in 2D 1 : 26).
+"outside" is the share of the cells that do not contain their generator, "shares" the shares of the damped Newton
+steps. Seconds are the least of the repeated solves, with generators
 sorted and arrays read back. `--processor-time` measures the processor time of all threads over the number of compute
 units, for a machine with other work. `--picture` writes `transport.png` instead, into `bench/pictures` or `--out`:
 Voronoi cells and power cells of equal area of the same generators.
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from _common import PICTURES, Report, best, clock_of, counts, heading, make_adapter, parser, shown
+from _walled import lake
 
 import clvoro
 
@@ -30,13 +32,22 @@ def graded(points: np.ndarray) -> np.ndarray:
     return 0.02 + ((points - 0.5) ** 2).sum(axis=1)
 
 
+def random_points(domain: clvoro.Box | clvoro.Polygon, n: int) -> np.ndarray:
+    """Return n uniform random points in `domain`."""
+    rng, points = np.random.default_rng(SEED), np.empty((0, domain.dim))
+    while len(points) < n:
+        more = rng.uniform(domain.lower, domain.upper, (n, domain.dim))
+        points = np.concatenate([points, more[domain.contains(more)]])
+    return points[:n]
+
+
 def equal(points: np.ndarray) -> np.ndarray:
     return np.ones(len(points))
 
 
 VOLUMES = {"equal": equal, "graded": graded}
 COLUMNS = {
-    "dimension": shown("dimension", "d"),
+    "domain": shown("domain", ""),
     "cells": shown("cells", ",d"),
     "volumes": shown("volumes", ""),
     "steps": shown("steps", "d"),
@@ -51,6 +62,7 @@ def make_options() -> argparse.ArgumentParser:
     made = parser(__doc__)
     made.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5"), metavar="N,...")
     made.add_argument("--sizes-3d", type=counts, default=counts("1e3,1e4"), metavar="N,...")
+    made.add_argument("--sizes-lake", type=counts, default=counts("1e3,1e4"), metavar="N,...")
     made.add_argument("--repeat", type=int, default=3, metavar="N")
     made.add_argument("--picture", action="store_true", help="draw a picture instead")
     made.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
@@ -94,23 +106,27 @@ def main(arguments: list[str] | None = None) -> None:
         draw(adapter, options.out)
         return
     report, clock = Report(options.json, COLUMNS), clock_of(options, adapter)
-    for dim, sizes in ((2, options.sizes), (3, options.sizes_3d)):
-        box = clvoro.Box((0,) * dim, (1,) * dim)
+    domains = {
+        "square": (clvoro.Box((0, 0), (1, 1)), options.sizes),
+        "cube": (clvoro.Box((0, 0, 0), (1, 1, 1)), options.sizes_3d),
+        "lake": (lake().domain, options.sizes_lake),
+    }
+    for name, (domain, sizes) in domains.items():
         for n in sizes:
-            points = np.random.default_rng(SEED).random((n, dim))
+            points = random_points(domain, n)
             for kind, volumes_at in VOLUMES.items():
                 volumes = volumes_at(points)
-                volumes *= box.measure / volumes.sum()
-                adapter.transport(box, points, volumes, max_steps=1)  # builds the kernels
+                volumes *= domain.measure / volumes.sum()
+                adapter.transport(domain, points, volumes, max_steps=1)  # builds the kernels
                 seconds, found = best(
                     options.repeat,
-                    lambda b=box, p=points, v=volumes: adapter.transport(b, p, v),
+                    lambda d=domain, p=points, v=volumes: adapter.transport(d, p, v),
                     clock,
                 )
                 inside = found.diagram.locate(points) == np.arange(n)
                 damped = ", ".join(f"{s:g}" for s in found.shares[found.shares < 1])
                 record = {
-                    "dimension": dim,
+                    "domain": name,
                     "cells": n,
                     "volumes": kind,
                     "steps": len(found.shares),
@@ -119,7 +135,7 @@ def main(arguments: list[str] | None = None) -> None:
                     "outside": float(1 - inside.mean()),
                     "seconds": seconds,
                 }
-                report.add(record, f"{dim}D, {n} cells, {kind}")
+                report.add(record, f"{name}, {n} cells, {kind}")
     report.finish(heading(adapter, "Prescribed volumes"))
 
 

@@ -111,12 +111,14 @@ def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diag
 
     The cell of generator i is the set of y with ``|y - x_i|^2 - w_i <= |y - x_j|^2 - w_j`` for all j (Aurenhammer 1987,
     SIAM J. Comput. 16, 78). Its faces are at right angles to the lines between generators, and a larger weight makes
-    the cell larger. It need not contain its generator, and may be empty. Equal weights give the Voronoi diagram.
+    the cell larger. It need not contain its generator, and may be empty. Equal weights give the Voronoi diagram. In a
+    polygon a cell is the whole part of the domain that the definition gives it: on both sides of a wall thinner than a
+    cell, if need be, where `voronoi` gives the part without the generator to a neighbor.
 
     Parameters
     ----------
-    domain : Box
-        With walls.
+    domain : Box or Polygon
+        A box with walls.
     points : (n, d) array of float
         Distinct generators inside the domain.
     weights : (n,) array of float
@@ -132,7 +134,7 @@ def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diag
     DeviceError
         If no device works.
     InputError, InputTypeError
-        If an argument is not as expected, the domain is no box with walls, or points are too close together for the
+        If an argument is not as expected, the domain is periodic or a sphere, or points are too close together for the
         precision.
     MemoryLimitError
         If the device has not enough memory.
@@ -168,12 +170,12 @@ def transport(
 
     Parameters
     ----------
-    domain : Box
-        With walls.
+    domain : Box or Polygon
+        A box with walls.
     points : (n, d) array of float
         Distinct generators inside the domain. They stay where they are.
     volumes : (n,) array of float
-        Volumes > 0 of the cells (areas in 2D). Their sum is that of the domain.
+        Volumes > 0 of the cells (areas in 2D). Their sum is that of the domain, in each of its pieces.
     tolerance : float, optional
         Largest relative error of a volume; by default 1e-10, in float32 1e-3.
     max_steps : int

@@ -10,3 +10,6 @@
 #define STRIDE DIM
 #define WEIGHT(points, j) R(0)
 #endif
+
+/* The position of generator j in the plane. */
+#define PLACE(points, j) ((REAL2)((points)[STRIDE * (j)], (points)[STRIDE * (j) + 1]))

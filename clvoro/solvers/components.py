@@ -41,6 +41,20 @@ def balance_components(
     source[: t.n].set(balanced.astype(values.dtype))
 
 
+def fit_components(domain: Domain, t: Tessellation, prescribed: cla.Array) -> bool:
+    """Scale the volumes `prescribed` (n,) in each connected component, so that their sum is that of its cells in `t`.
+
+    Return False, and do nothing, if the domain has one piece.
+    """
+    if not isinstance(domain, Polygon) or domain.n_pieces == 1:
+        return False
+    component = connected_components(t)
+    volumes, wanted = t.volumes.get().astype(float), prescribed.get().astype(float)
+    factors = np.bincount(component, volumes) / np.bincount(component, wanted)
+    prescribed.set((wanted * factors[component]).astype(prescribed.dtype))
+    return True
+
+
 def connected_components(t: Tessellation) -> np.ndarray:
     """Return the number of each cell's connected component in the neighbor graph, (n,) int.
 

@@ -16,6 +16,7 @@ from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..tessellation.device_diagram import NeighborRows, Tessellation
 from ..tessellation.power import PowerTessellator
+from .components import balance_components, fit_components
 from .linear_system import Solution
 from .poisson import Poisson
 
@@ -102,7 +103,8 @@ class Transport:
         Parameters
         ----------
         prescribed : (n,) real
-            Changed by a common factor, so that their sum is the volume of the domain.
+            Changed by a common factor, so that their sum is the volume of the domain; then by one for each component of
+            the diagram, where the domain has several pieces.
         start : (n,) real, optional
             Weights to start from, unless they leave a cell empty. By default 0: no cell is empty then.
         tolerance : float, optional
@@ -124,12 +126,16 @@ class Transport:
         if now is None or not now.least > 0:
             now = evaluate(engine.zeros(n))
         assert now is not None
+        if fit_components(power.domain, now.t, prescribed):
+            now = evaluate(now.weights)
+            assert now is not None
         least = 0.5 * min(least, now.least)
         newton.errors.append(now.error)
         ordering = object()
         while now.error > tolerance and len(newton.shares) < max_steps:
             # Trial steps overwrite the diagram.
-            self._rows = NeighborRows(n, now.t.starts.copy(), now.t.neighbors.copy())
+            self._rows = power.rows(now.t)
+            balance_components(power.domain, now.t, now.rhs, prescribed)
             step, newton.solution = self._newton_step(now, points, ordering)
             new, share = None, 2.0
             while new is None and share > LEAST_SHARE:

@@ -13,7 +13,9 @@ import pyopencl.array as cla
 
 from ..errors import InputError
 from ..geometry.box import Box, Domain
+from ..geometry.polygon import Polygon
 from ..opencl.primitives import Summaries
+from .clipped.polygonal import PolygonTessellator
 from .device_diagram import CloseError, NeighborRows, Tessellation
 from .polyhedra import Polyhedra
 from .power_cells import PowerCells
@@ -27,9 +29,10 @@ PROGRESS = 0.95
 
 def require_power_domain(domain: Domain) -> None:
     """Raise InputError if there are no power diagrams in such a domain."""
-    if not isinstance(domain, Box) or any(domain.periodic):
+    if not isinstance(domain, Polygon) and (not isinstance(domain, Box) or any(domain.periodic)):
         raise InputError(
-            f"the domain is {domain}, expected a box with walls: there are no power diagrams in other domains"
+            f"the domain is {domain}, expected a polygon or a box with walls: there are no power diagrams in other "
+            "domains"
         )
 
 
@@ -37,6 +40,11 @@ class PowerTessellator:
     """Tessellate one domain by generators with weights, repeatedly.
 
     Each call overwrites the `Tessellation` of the call before.
+
+    Attributes
+    ----------
+    volume : float
+        That of the domain, in normalized coordinates.
 
     Raises
     ------
@@ -51,7 +59,14 @@ class PowerTessellator:
         self._kernels = engine.kernels("tessellation/power")
         self._summaries = Summaries(engine, ("volume",))
         lower, upper = domain.device_corners(engine.real)
-        self.volume = float(np.prod((upper - lower)[: engine.dim].astype(float)))
+        self._volume = float(np.prod((upper - lower)[: engine.dim].astype(float)))
+        self._polygon = None
+        if isinstance(domain, Polygon):
+            # Weights would move the cells of ghost generators into the domain.
+            self._polygon = PolygonTessellator(self.stages, domain, None)
+            self.volume = domain.measure / domain.frame[1] ** 2
+        else:
+            self.volume = self._volume
 
     def tessellate(
         self,
@@ -93,7 +108,12 @@ class PowerTessellator:
                 t = stages.cells.tessellate(self.domain, weighted, n, binned, exact=exact)
         except CloseError:
             raise CloseError(points, n).within(self.domain) from None
-        return replace(t, points=points, weighted=weighted)
+        t = replace(t, points=points, weighted=weighted)
+        if self._polygon is None:
+            return t
+        clipped = self._polygon.clip(points, t, n)
+        assert isinstance(clipped, Tessellation)
+        return clipped
 
     def _from(
         self, weighted: cla.Array, previous: NeighborRows, exact: bool, least: float
@@ -112,14 +132,22 @@ class PowerTessellator:
             found = self._summaries.read_one("volume")
             if found.least < least:
                 return None, True
-            excess = abs(found.sum - self.volume)
-            if excess <= CLOSED * self.volume:
+            excess = abs(found.sum - self._volume)
+            if excess <= CLOSED * self._volume:
                 return t, False
             if not excess < PROGRESS * before:
                 return None, False
             rows, before = NeighborRows(t.n, t.starts, t.neighbors), excess
 
+    @staticmethod
+    def rows(t: Tessellation) -> NeighborRows:
+        """Return a copy of the graph of `t`, for `previous`: in a polygon that of the cells before they are clipped."""
+        whole = t if t.trimmed is None else t.trimmed.convex
+        return NeighborRows(whole.n, whole.starts.copy(), whole.neighbors.copy())
+
     def final(self, t: Tessellation) -> Tessellation:
         """Return `t`, the latest diagram, with faces in full precision."""
         cells = self.stages.cells
-        return t if isinstance(cells, Polyhedra) else cells.measure_faces(self.domain, t)
+        if self._polygon is not None or isinstance(cells, Polyhedra):
+            return t
+        return cells.measure_faces(self.domain, t)

@@ -7,6 +7,7 @@ import clvoro
 from clvoro.errors import InputError
 
 BOX, CUBE = clvoro.Box((0, 0), (2, 1)), clvoro.Box((0, 0, 0), (1, 1, 1))
+LAKE = clvoro.Polygon([(0, 0), (2, 0), (2.2, 1), (0.3, 1.2)], [[(1, 0.4), (1.4, 0.5), (1.1, 0.7)]])
 
 
 def size(points):
@@ -19,6 +20,7 @@ def size(points):
         (BOX, size, "float64"),
         pytest.param(BOX, size, "float32", marks=pytest.mark.slow),
         (CUBE, 0.16, "float64"),
+        pytest.param(LAKE, size, "float64", marks=pytest.mark.slow),
     ],
 )
 def test_all_cells_have_their_size(ctx, domain, h, real):
@@ -57,8 +59,7 @@ def test_a_resumed_run_ends_with_the_same_bits(ctx, tmp_path):
 
 def test_what_is_refused(ctx):
     adapter = clvoro.Adapter(ctx)
-    polygon = clvoro.Polygon([(0, 0), (1, 0), (0, 1)])
-    for domain in (polygon, clvoro.Sphere(), clvoro.Box((0, 0), (1, 1), periodic=True)):
+    for domain in (clvoro.Sphere(), clvoro.Box((0, 0), (1, 1), periodic=True)):
         with pytest.raises(InputError, match="power diagrams"):
             adapter.run(domain, 0.2, method="transport")
     with pytest.raises(InputError, match="layers"):

@@ -1,6 +1,7 @@
-"""Power diagrams by brute force: the paper's (2.5) in NumPy and SciPy, without any search."""
+"""Power diagrams by brute force: the paper's (2.5) in NumPy, SciPy and Shapely, without any search."""
 
 import numpy as np
+import shapely
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 
@@ -50,3 +51,27 @@ def power_cells(lower, upper, points, weights):
     return np.array([v for v, _ in cells]), np.array(
         [nothing if c is None else c for _, c in cells]
     )
+
+
+def polygon_power_cells(domain, points, weights):
+    """Return the cells in a `clvoro.Polygon` as n Shapely shapes: its shape, cut by each half-plane in turn."""
+    far = 4 * float(np.linalg.norm(domain.extent))
+    cells = []
+    for i, x in enumerate(points):
+        cell = domain.geometry
+        for j in range(len(points)):
+            d = points[j] - x
+            if i == j or cell.is_empty:
+                continue
+            way = d / np.linalg.norm(d)
+            across = far * np.array([-way[1], way[0]])
+            foot = x + (d @ d - (weights[j] - weights[i])) / (2 * d @ d) * d
+            behind = (
+                foot + across,
+                foot - across,
+                foot - across - far * way,
+                foot + across - far * way,
+            )
+            cell = shapely.intersection(cell, shapely.Polygon(behind))
+        cells.append(cell)
+    return cells

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import shapely
 
 import clvoro
-from clvoro.errors import InputError, SizeErrorWarning
-from tests.reference.power_diagrams import power_cells
+from clvoro.errors import InputError, InputTypeError, SizeErrorWarning
+from tests.reference.power_diagrams import polygon_power_cells, power_cells
 
 BOXES = {2: clvoro.Box((-1, 0), (2, 1.5)), 3: clvoro.Box((0, 0, 5), (1, 2, 6))}
 
@@ -36,6 +37,38 @@ def test_cells_get_any_volumes(ctx, dim, real):
     assert d.check(), d.check()
 
 
+def test_cells_in_a_polygon_get_any_volumes(ctx):
+    """A wall is thinner than a cell, so that cells lie on both sides of it."""
+    points = np.random.default_rng(7).uniform((0, 0), (2, 1), (80, 2))
+    domain = clvoro.Polygon(
+        [(0, 0), (2, 0), (2, 1), (1.02, 1), (1.02, 0.3), (0.98, 0.3), (0.98, 1), (0, 1)],
+        [[(1.4, 0.4), (1.7, 0.4), (1.5, 0.7)]],
+    )
+    points = points[domain.contains(points)]
+    volumes = 10 ** np.random.default_rng(9).random(len(points))
+    volumes *= domain.measure / volumes.sum()
+    found = clvoro.Adapter(ctx).transport(domain, points, volumes)
+    assert found.converged
+    assert len(found.shares) < 15
+    np.testing.assert_allclose(found.diagram.volumes, volumes, rtol=1e-10)
+    areas = shapely.area(polygon_power_cells(domain, points, found.diagram.weights))
+    np.testing.assert_allclose(areas, volumes, rtol=1e-8)
+
+
+def test_volumes_in_pieces_of_a_domain(ctx):
+    pieces = shapely.MultiPolygon([shapely.box(0, 0, 1, 1), shapely.box(1.2, 0, 3, 1)])
+    domain = clvoro.Polygon.from_shapely(pieces)
+    points = np.random.default_rng(2).uniform((0, 0), (3, 1), (60, 2))
+    points = points[domain.contains(points)]
+    first = points[:, 0] < 1.1
+    volumes = np.where(first, 1 / first.sum(), 1.8 / (~first).sum())
+    found = clvoro.Adapter(ctx).transport(domain, points, volumes)
+    assert found.converged
+    np.testing.assert_allclose(found.diagram.volumes, volumes, rtol=1e-10)
+    with pytest.raises(InputError, match="in piece 0 of the domain"):
+        clvoro.Adapter(ctx).transport(domain, points, np.full(len(points), 2.8 / len(points)))
+
+
 def test_steps_do_not_depend_on_the_number_of_cells(ctx):
     adapter = clvoro.Adapter(ctx)
     steps = []
@@ -63,6 +96,8 @@ def test_bad_input(ctx):
     ):
         with pytest.raises(InputError, match=words):
             adapter.transport(box, points, wrong)
+    with pytest.raises(InputTypeError, match="3 masked numbers"):
+        adapter.transport(box, points, np.ma.masked_where(np.arange(50) < 3, volumes))
     # Volumes in single precision cannot have the sum of the domain more accurately.
     single = volumes.astype(np.float32)
     assert abs(single.sum(dtype=float) / box.measure - 1) > 1e-9

@@ -4,13 +4,19 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
+import shapely
 
 import clvoro
 from clvoro.errors import EmptyCellsWarning, InputError, InputTypeError
-from tests.reference.power_diagrams import power_cells
+from tests.reference.power_diagrams import polygon_power_cells, power_cells
 
 BOXES = {2: clvoro.Box((-1, 0), (2, 1.5)), 3: clvoro.Box((0, 0, 5), (1, 2, 6))}
 SQUARE = clvoro.Box((0, 0), (1, 1))
+BAYS = clvoro.Polygon(
+    [(0, 0), (4, 0), (4, 3), (2.2, 3), (2.2, 1.2), (1.8, 1.2), (1.8, 3), (0, 3)],
+    [[(2.7, 0.5), (3.3, 0.5), (3.3, 0.9), (2.7, 0.9)], [(0.5, 1), (1, 0.9), (0.9, 1.6)]],
+)
+"""Two bays with a wall between them, thinner than a cell, and two islands."""
 
 
 def random_case(dim, n, spread, seed=31):
@@ -37,6 +43,40 @@ def test_cells_are_those_of_the_definition(ctx, dim, real):
     assert d.weights.tolist() == weights.tolist()
     # Cells are found by the power distance.
     assert d.locate(d.centroids[filled]).tolist() == np.flatnonzero(filled).tolist()
+
+
+@pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
+@pytest.mark.parametrize(
+    ("spread", "slope", "real"),
+    [
+        (3.0, (0, 0), "float64"),
+        (0.5, (1.4, -1.0), "float64"),
+        pytest.param(3.0, (0, 0), "float32", marks=pytest.mark.slow),
+    ],
+)
+def test_cells_in_a_polygon_are_those_of_the_definition(ctx, spread, slope, real):
+    """Slopes of the weights move cells away from their generators, also out of the domain."""
+    rng = np.random.default_rng(18)
+    points = rng.uniform(BAYS.lower, BAYS.upper, (60, 2))
+    points = points[BAYS.contains(points)]
+    n = len(points)
+    weights = spread * BAYS.measure / n * rng.random(n) + points @ slope
+    d = clvoro.Adapter(ctx, real).power_diagram(BAYS, points, weights)
+    cells = polygon_power_cells(BAYS, points, weights)
+    areas = shapely.area(cells)
+    noise = 2e4 * np.finfo(real).eps
+    np.testing.assert_allclose(d.volumes, areas, atol=noise)
+    filled = areas > 1e-2 * areas.mean()
+    centroids = shapely.get_coordinates(shapely.centroid(np.array(cells)[filled]))
+    np.testing.assert_allclose(d.centroids[filled], centroids, atol=1e3 * noise)
+    assert d.empty_cells.tolist() == np.flatnonzero(areas == 0).tolist() != []
+    assert d.check(), d.check()
+    # Some cells lie on both sides of the wall.
+    assert sum(c.geom_type == "MultiPolygon" for c in cells) > 0
+    places = rng.uniform(BAYS.lower, BAYS.upper, (300, 2))
+    places = places[BAYS.contains(places)]
+    squares = ((places[:, None] - points) ** 2).sum(axis=2) - weights
+    assert d.locate(places).tolist() == squares.argmin(axis=1).tolist()
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -6,7 +6,9 @@
    chord_cells    cell of the chord
    chord_edges    edge of the chord
    chord_ends     parameter of its end on the edge, 0 to 1; it begins at the end of the previous chord of the edge
-   shells[v]      for edges of holes: an edge of the outer ring of their piece; -1 for edges of outer rings */
+   shells[v]      for edges of holes: an edge of the outer ring of their piece; -1 for edges of outer rings
+   owner_sites[v] a point of the convex cell that corner v lies in: its generator, or, in a power diagram, where that
+   may be elsewhere, its centroid */
 #include "tessellation/corner.h"
 
 /* Error bits of kernels; the .cl files define further ones. */
@@ -17,15 +19,16 @@ typedef struct {
     global const int *next_vertex, *owners, *firsts, *cells, *edges;
     global const REAL *ends;
     global const int *shells;
+    global const REAL2 *owner_sites;
 } chords_t;
 
 #define CHORD_ARGS                                                                                                     \
     global const REAL2 *vertices, global const int *next_vertex, global const int *vertex_owners,                      \
         global const int *chord_firsts, global const int *chord_cells, global const int *chord_edges,                  \
-        global const REAL *chord_ends, global const int *shells
+        global const REAL *chord_ends, global const int *shells, global const REAL2 *owner_sites
 #define CHORDS                                                                                                         \
     {                                                                                                                  \
-        vertices, next_vertex, vertex_owners, chord_firsts, chord_cells, chord_edges, chord_ends, shells               \
+        vertices, next_vertex, vertex_owners, chord_firsts, chord_cells, chord_edges, chord_ends, shells, owner_sites  \
     }
 
 /* Whether the chord begins, or ends, inside its cell, at a corner of the polygon; otherwise on a face of the cell. */
@@ -60,6 +63,17 @@ inline REAL2 chord_begin(const chords_t *c, int chord)
 
 /* Points closer to a face than this are on it. */
 #define ON_FACE (4 * REAL_EPS)
+
+/* Signed distance, times |d|, of y beyond the face between generator i at x and generator j at x + d. */
+inline REAL beyond_face(REAL2 y, REAL2 x, REAL2 d, int i, int j, global const REAL *points)
+{
+    const REAL s = dot(y - x - d / 2, d);
+#ifdef WEIGHTED
+    return s + (WEIGHT(points, j) - WEIGHT(points, i)) / 2;
+#else
+    return s;
+#endif
+}
 
 inline bool is_on_face(REAL beyond, REAL d2)
 {

@@ -10,10 +10,15 @@
 
 #define MOST_STEPS 64 /* among generators at the same distance up to round-off */
 
+/* Square of the distance of y from generator i, or of the power distance. */
 inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
 {
-    const REAL2 d = (REAL2)(points[2 * i], points[2 * i + 1]) - y;
+    const REAL2 d = PLACE(points, i) - y;
+#ifdef WEIGHTED
+    return dot(d, d) - WEIGHT(points, i);
+#else
     return dot(d, d);
+#endif
 }
 
 /* Signed distance of y beyond the bisector of i and j, on the side of j, times the distance of i and j; antisymmetric
@@ -21,21 +26,29 @@ inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
 inline REAL beyond_bisector(REAL2 y, int i, int j, global const REAL *points)
 {
     const int o = min(i, j), q = max(i, j);
-    const REAL2 x = (REAL2)(points[2 * o], points[2 * o + 1]);
-    const REAL2 d = (REAL2)(points[2 * q], points[2 * q + 1]) - x;
-    const REAL s = dot(y - x - d / 2, d);
+    const REAL2 x = PLACE(points, o), d = PLACE(points, q) - x;
+    const REAL s = beyond_face(y, x, d, o, q, points);
     return i == o ? s : -s;
 }
 
-/* Per vertex of the polygon: the generator of its cell. A walk goes to the neighbor nearest to the vertex while one is
-   nearer; among equally near ones, up to round-off, the bisectors decide. `inner` are the vertices moved inwards by a
-   few units of round-off, so that vertices on faces belong to cells inside. */
+/* Per vertex of the polygon: the generator of its cell, and a point of that cell (see boundary.h). A walk goes to the
+   neighbor nearest to the vertex while one is nearer; among equally near ones, up to round-off, the bisectors decide.
+   `inner` are the vertices moved inwards by a few units of round-off, so that vertices on faces belong to cells inside.
+ */
 kernel void find_boundary_owners(const int size, global const REAL2 *inner, global const int *starts,
-                                 global const int *neighbors, global const REAL *points, global int *owners)
+                                 global const int *neighbors, global const REAL *points, global const REAL2 *offsets,
+                                 global int *owners, global REAL2 *owner_sites)
 {
     WORK_ITEM(v);
     const REAL2 y = inner[v];
-    int cell = owners[v], next = cell;
+    int cell = owners[v];
+#ifdef WEIGHTED
+    /* No walk leads away from an empty cell. */
+    if (starts[cell] == starts[cell + 1])
+        for (cell = 0; starts[cell] == starts[cell + 1];)
+            ++cell;
+#endif
+    int next = cell;
     REAL least = squared_distance(y, cell, points);
     do {
         cell = next;
@@ -64,24 +77,29 @@ kernel void find_boundary_owners(const int size, global const REAL2 *inner, glob
         cell = next;
     }
     owners[v] = cell;
+#ifdef WEIGHTED
+    owner_sites[v] = PLACE(points, cell) + offsets[cell];
+#else
+    owner_sites[v] = PLACE(points, cell);
+#endif
 }
 
 /* Parameter t at which the line a + t e meets the bisector of two generators; symmetric in the two. */
 inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *points)
 {
     const int o = min(i, j), q = max(i, j);
-    const REAL2 x = (REAL2)(points[2 * o], points[2 * o + 1]);
-    const REAL2 d = (REAL2)(points[2 * q], points[2 * q + 1]) - x;
-    return dot(x - a + d / 2, d) / dot(e, d);
+    const REAL2 x = PLACE(points, o), d = PLACE(points, q) - x;
+    return -beyond_face(a, x, d, o, q, points) / dot(e, d);
 }
 
-/* The side of the face between generators at x and x + d to which a polygon corner v on that face belongs. If v is a
-   point of the cell of x: the side of its own generator, at `own`. Otherwise: the left of edge e. Positive: x + d. */
-inline REAL side_of(REAL2 v, REAL2 own, REAL2 x, REAL2 d, REAL2 e)
+/* The side of the face between generator `cell` and one at a distance d to which a polygon corner v on that face
+   belongs; v lies in the cell of `owner`, as does `inside`. If v is a point of `cell`, too: the side of `inside`.
+   Otherwise: the left of edge e. Positive: away from `cell`. */
+inline REAL side_of(REAL2 v, int owner, REAL2 inside, int cell, REAL2 d, REAL2 e, global const REAL *points)
 {
-    const REAL2 between = x - own;
-    const bool touches = is_on_face(dot(v - own - between / 2, between), dot(between, between));
-    const REAL side = touches ? dot(own - v, d) : 0;
+    const REAL2 own = PLACE(points, owner), between = PLACE(points, cell) - own;
+    const bool touches = is_on_face(beyond_face(v, own, between, owner, cell, points), dot(between, between));
+    const REAL side = touches ? dot(inside - v, d) : 0;
     return side != 0 ? side : e.s0 * d.s1 - e.s1 * d.s0;
 }
 
@@ -92,42 +110,39 @@ typedef struct {
     REAL at, rank, doubt;
 } exit_t;
 
-/* Whether an edge leaves the cell of x by exit `a` before exit `b`. In doubt double words decide; if they cannot, the
+/* Whether an edge leaves the cell by exit `a` before exit `b`. In doubt double words decide; if they cannot, the
    nearer of the two generators behind comes first. */
-inline bool leaves_before(exit_t a, exit_t b, REAL2 x, REAL2 start, REAL2 e, global const REAL *points)
+inline bool leaves_before(exit_t a, exit_t b, int cell, REAL2 start, REAL2 e, global const REAL *points)
 {
     if (fabs(a.at - b.at) <= a.doubt + b.doubt) {
         if (a.rank == 0 && b.rank == 0) {
-            const REAL from[2] = {x.s0, x.s1};
+            SITE(from, cell, points);
             const REAL later = leaves_later(half_plane_of(from, a.behind, points, from, from),
                                             half_plane_of(from, b.behind, points, from, from),
-                                            wide_sum(start.s0, -x.s0), wide_sum(start.s1, -x.s1), e);
+                                            wide_sum(start.s0, -from[0]), wide_sum(start.s1, -from[1]), e);
             if (later != 0)
                 return later < 0;
         }
         const REAL2 y = start + (a.doubt < b.doubt ? a.at : b.at) * e;
         const REAL nearer = beyond_bisector(y, b.behind, a.behind, points);
-        const int i = 2 * a.behind, j = 2 * b.behind;
-        const REAL2 d = (REAL2)(points[i] - points[j], points[i + 1] - points[j + 1]);
+        const REAL2 d = PLACE(points, a.behind) - PLACE(points, b.behind);
         if (!is_on_face(nearer, dot(d, d)))
             return nearer > 0;
     }
     return a.at < b.at || (a.at == b.at && a.rank < b.rank);
 }
 
-/* The cell after `cell` on edge a + t e, 0 <= t <= 1, from cell `origin` to cell `target`; -1 if there is none. It is
-   the first exit of the edge. Generators then come in the order of e.x, so the tracing ends. If round-off has led past
-   the end of the edge, it is the neighbor nearest to the generator of the target.
+/* The cell after `cell` on edge a + t e, 0 <= t <= 1, from cell `origin` to cell `target`, with the points `start` and
+   `goal` inside; -1 if there is none. It is the first exit of the edge. Generators then come in the order of e.x, so
+   the tracing ends. If round-off has led past the end of the edge, it is the neighbor nearest to `goal`.
 
    Round-off must not produce an order of crossings that is geometrically impossible. An end of the edge on a face is
-   treated as slightly inside its cell, towards the generator; faces there are crossed in that order (rank). An edge
+   treated as slightly inside its cell, towards `start` or `goal`; faces there are crossed in that order (rank). An edge
    along a face belongs to the side of its ends: to the cell on its left, as ends are moved inwards. */
-inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global const int *starts,
-                      global const int *neighbors, global const REAL *points, REAL *t)
+inline int step_along(int cell, int origin, int target, REAL2 start, REAL2 goal, REAL2 a, REAL2 e,
+                      global const int *starts, global const int *neighbors, global const REAL *points, REAL *t)
 {
-    const REAL2 x = (REAL2)(points[2 * cell], points[2 * cell + 1]);
-    const REAL2 start = (REAL2)(points[2 * origin], points[2 * origin + 1]);
-    const REAL2 goal = (REAL2)(points[2 * target], points[2 * target + 1]);
+    const REAL2 x = PLACE(points, cell);
     const REAL e2 = dot(e, e);
     REAL least = squared_distance(goal, cell, points);
     exit_t first = {-1, 0, 0, 0};
@@ -136,20 +151,20 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
         const int j = neighbors[k];
         if (j < 0)
             continue;
-        const REAL2 d = (REAL2)(points[2 * j], points[2 * j + 1]) - x;
+        const REAL2 d = PLACE(points, j) - x;
         const REAL d2 = squared_distance(goal, j, points);
         if (d2 < least) {
             least = d2;
             towards = j;
         }
         const REAL along = dot(e, d), dd = dot(d, d);
-        const bool begins_on = is_on_face(dot(a - x - d / 2, d), dd),
-                   ends_on = is_on_face(dot(a + e - x - d / 2, d), dd);
+        const bool begins_on = is_on_face(beyond_face(a, x, d, cell, j, points), dd),
+                   ends_on = is_on_face(beyond_face(a + e, x, d, cell, j, points), dd);
         exit_t way = {j, 0, -REAL_MAX, -REAL_MAX};
         if (begins_on && ends_on) {
-            if (side_of(a + e, goal, x, d, e) <= 0)
+            if (side_of(a + e, target, goal, cell, d, e, points) <= 0)
                 continue;
-            way.at = side_of(a, start, x, d, e) > 0 ? 0 : 1;
+            way.at = side_of(a, origin, start, cell, d, e, points) > 0 ? 0 : 1;
         } else {
             if (along <= 0)
                 continue;
@@ -165,7 +180,7 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
             }
         }
         const bool past = !(way.at < 1 || (way.at == 1 && way.rank < 0));
-        if (!past && (first.behind < 0 || leaves_before(way, first, x, a, e, points)))
+        if (!past && (first.behind < 0 || leaves_before(way, first, cell, a, e, points)))
             first = way;
     }
     *t = first.behind < 0 ? 1 : fmax(*t, first.at);
@@ -175,10 +190,10 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
 /* Per edge: trace it. The first pass only counts the chords. `generators` is the number of generators in the domain;
    ghost generators whose cells are crossed are marked. */
 kernel void walk_edges(const int size, const int generators, global const REAL2 *vertices,
-                       global const int *next_vertex, global const int *owners, global const int *starts,
-                       global const int *neighbors, global const REAL *points, const int write, global int *firsts,
-                       global int *chord_cells, global int *chord_edges, global REAL *chord_ends, global int *intruders,
-                       global int *flags)
+                       global const int *next_vertex, global const int *owners, global const REAL2 *owner_sites,
+                       global const int *starts, global const int *neighbors, global const REAL *points,
+                       const int write, global int *firsts, global int *chord_cells, global int *chord_edges,
+                       global REAL *chord_ends, global int *intruders, global int *flags)
 {
     WORK_ITEM(v);
     const int w = next_vertex[v], target = owners[w];
@@ -188,7 +203,9 @@ kernel void walk_edges(const int size, const int generators, global const REAL2 
     /* The tracing enters a cell once at most, whatever the round-off. */
     for (int steps = 0; cell >= 0; ++steps) {
         const bool last = cell == target || steps > size + generators;
-        const int next = last ? -1 : step_along(cell, owners[v], target, a, e, starts, neighbors, points, &t);
+        const int next = last ? -1
+                              : step_along(cell, owners[v], target, owner_sites[v], owner_sites[w], a, e, starts,
+                                           neighbors, points, &t);
         if (cell >= generators) {
             atomic_or(intruders + cell - generators, 1);
             atomic_or(flags, FLAG_OUTSIDE);

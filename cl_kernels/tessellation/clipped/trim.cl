@@ -7,9 +7,11 @@
 /* The diagram of a polygonal domain from the convex diagram of its generators. A cell that the boundary crosses is
    clipped to the domain. The result consists of pieces, each an outer loop and the islands in it. The piece with the
    generator is the cell. Another piece, cut off by a spit or a slit, goes to the neighboring cell with which it shares
-   the longest face, and stays only if there is none. */
+   the longest face, and stays only if there is none. A cell of a power diagram, which need not contain its generator,
+   has all its pieces, or none. */
 
-#define FLAG_ORPHANS 4 /* a cell consists of several pieces */
+#define FLAG_ORPHANS 4          /* a cell consists of several pieces */
+#define OUTSIDE (UNTOUCHED - 1) /* instead of the number of a crossed cell: the cell is outside of the domain */
 
 /* Distance by which a corner may lie outside of the domain; `check` allows the same. */
 #define MOST_OUTSIDE (256 * REAL_EPS)
@@ -132,9 +134,45 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
     for (int place = first + loops; place < list_starts[u + 1] + u + 1; ++place)
         loop_pieces[place] = -1;
     counts[u] = total;
+#ifdef WEIGHTED
+    for (int place = first; place < first + loops; ++place)
+        loop_roots[place] = cell.i;
+#else
     if (outer > 1)
         atomic_or(flags, FLAG_ORPHANS);
+#endif
 }
+
+#ifdef WEIGHTED
+/* Per generator of the domain: mark its cell, and empty it, if it lies outside. The boundary does not cross such a
+   cell, and the generator is not in it: then a ray from the centroid to the right tells. */
+kernel void find_outside(const int size, global const int *starts, global const int *neighbors,
+                         global const REAL *points, global const REAL2 *vertices, global const int *next_vertex,
+                         const int edges, global int *slots, global REAL *volumes, global REAL2 *offsets)
+{
+    WORK_ITEM(i);
+    if (slots[i] != UNTOUCHED || starts[i] == starts[i + 1])
+        return;
+    const REAL2 x = PLACE(points, i), y = x + offsets[i];
+    bool inside = true;
+    for (int k = starts[i]; k < starts[i + 1] && inside; ++k) {
+        const int j = neighbors[k];
+        inside = j < 0 || beyond_face(x, x, PLACE(points, j) - x, i, j, points) < 0;
+    }
+    if (inside)
+        return;
+    for (int e = 0; e < edges; ++e) {
+        const REAL2 a = vertices[e] - y, b = vertices[next_vertex[e]] - y;
+        const REAL side = difference_of_products(a.s0, b.s1, a.s1, b.s0);
+        inside ^= (a.s1 <= 0) != (b.s1 <= 0) && (side > 0) == (b.s1 > 0);
+    }
+    if (!inside) {
+        slots[i] = OUTSIDE;
+        volumes[i] = 0;
+        offsets[i] = 0;
+    }
+}
+#endif
 
 /* Per crossed cell u: its segments, from segment_starts[u] on; `places` holds the piece of each. */
 kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const int *loop_chords,
@@ -190,6 +228,8 @@ kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global con
         if (j < 0 || is_empty(&s, k))
             continue;
         if (j >= n)
+            fits = false;
+        else if (slots[j] == OUTSIDE)
             fits = false;
         else if (slots[j] == UNTOUCHED)
             fits &= s.from[k] < 0 && s.to[k] < 0;
@@ -300,7 +340,9 @@ kernel void copy_whole(const int size, global const int *starts, global const in
                        global REAL2 *new_centroids, global const REAL *volumes, global REAL2 *outlines)
 {
     WORK_ITEM(i);
-    if (slots[i] != UNTOUCHED)
+    if (starts[i] == starts[i + 1] || slots[i] == OUTSIDE)
+        outlines[i] = (REAL2)(0, 6);
+    if (starts[i] == starts[i + 1] || slots[i] != UNTOUCHED)
         return;
     const segments_t s = SEGMENTS;
     const int shift = new_starts[i] - starts[i];

@@ -9,7 +9,7 @@
 /* A convex cell: its generator, its faces, and its chords in ascending order. */
 typedef struct {
     int i, n, chord_count;
-    REAL x[2], lower[2], upper[2];
+    REAL x[SITE_SIZE], lower[2], upper[2];
     global const int *row, *chords;
     global const REAL *points;
 } convex_t;
@@ -28,8 +28,8 @@ inline convex_t convex_cell(int u, CONVEX_ARGS)
     cell.chords = listed + list_starts[u];
     cell.chord_count = list_starts[u + 1] - list_starts[u];
     cell.points = points;
-    cell.x[0] = points[2 * cell.i];
-    cell.x[1] = points[2 * cell.i + 1];
+    for (int a = 0; a < SITE_SIZE; ++a)
+        cell.x[a] = points[STRIDE * cell.i + a];
     cell.lower[0] = box_lower.s0;
     cell.lower[1] = box_lower.s1;
     cell.upper[0] = box_upper.s0;
@@ -65,8 +65,7 @@ typedef struct {
 inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord, int j)
 {
     const int edge = c->edges[chord], o = min(cell->i, j), q = max(cell->i, j);
-    const REAL2 x = (REAL2)(cell->points[2 * o], cell->points[2 * o + 1]);
-    const REAL2 d = (REAL2)(cell->points[2 * q], cell->points[2 * q + 1]) - x, along = (REAL2)(-d.s1, d.s0);
+    const REAL2 x = PLACE(cell->points, o), d = PLACE(cell->points, q) - x, along = (REAL2)(-d.s1, d.s0);
     const REAL2 e = c->vertices[c->next_vertex[edge]] - c->vertices[edge];
     const REAL t = c->ends[chord], sign = cell->i == o ? 1 : -1;
     const int v = t < R(0.5) ? edge : c->next_vertex[edge];
@@ -75,7 +74,7 @@ inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord
     place.face = place_in_row(cell->row, cell->n, j);
     /* Relative to the corner, to separate edges that are closer than the error of the crossing. Not if the corner is on
        the face, nor if the tracing moved the crossing. */
-    const REAL behind = dot(corner - x - d / 2, d), dd = dot(d, d), e2 = dot(e, e);
+    const REAL behind = beyond_face(corner, x, d, o, q, cell->points), dd = dot(d, d), e2 = dot(e, e);
     const REAL walked = t < R(0.5) ? t : t - 1, s = -behind / dot(e, d);
     const bool at_corner = walked == 0 || (is_on_face(behind, dd) && is_at_corner(walked, e2));
     if (!at_corner && (s - walked) * (s - walked) * e2 <= MUCH * MUCH) {
@@ -84,8 +83,7 @@ inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord
         place.turn = sign * further;
         return place;
     }
-    const int owner = c->owners[v];
-    const REAL2 inside = (REAL2)(cell->points[2 * owner], cell->points[2 * owner + 1]) - corner;
+    const REAL2 inside = c->owner_sites[v] - corner;
     const REAL ahead = c->cells[chord] == o ? 1 : -1;
     /* The edge crosses the face forwards, whatever the round-off. */
     const REAL across = fmax(ahead * dot(e, d), R(0)), shift = -ahead * dot(inside, d) * dot(e, along);

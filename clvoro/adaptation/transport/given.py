@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pyopencl.array as cla
+import shapely
 
 from ...arguments import Naming, check_integer, check_number, check_points, warn
 from ...errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWarning
 from ...geometry.box import Domain
+from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
 from ...mesh.transported import Transported
 from ...solvers.transport import TOLERANCE
@@ -73,7 +75,9 @@ def transport_to(
         tolerance = TOLERANCE[engine.real.name]
     tolerance = check_number("tolerance", tolerance, above=0)
     kind = np.asarray(volumes).dtype
-    _check_volumes(given, domain, float(np.finfo(kind).eps) if kind.kind == "f" else 0.0)
+    rounding = float(np.finfo(kind).eps) if kind.kind == "f" else 0.0
+    _check_volumes(given, domain, rounding)
+    _check_pieces(host, given, domain, rounding)
     check_memory(engine, n, domain, run=False)
     with Naming(host, domain, engine.real):
         labels, sorted_points = _sorted(stages, domain, host)
@@ -112,6 +116,11 @@ def _check_numbers(name: str, value: object, n: int) -> np.ndarray:
         raise InputTypeError(
             f"{name} is not an array ({error}), expected one real number per point"
         ) from error
+    if np.ma.is_masked(value):
+        raise InputTypeError(
+            f"{name} is a masked array with {np.ma.count_masked(value)} masked numbers, expected one number per point; "
+            "fill them, or leave out their points"
+        )
     if array.dtype.kind not in "fiu":
         raise InputTypeError(f"{name} has dtype {array.dtype}, expected real numbers")
     if array.shape != (n,):
@@ -139,3 +148,17 @@ def _check_volumes(volumes: np.ndarray, domain: Domain, rounding: float) -> None
             f"the sum of the {len(volumes)} volumes is {total:.12g}, expected that of the domain, "
             f"{domain.measure:.12g}; scale them: volumes * (domain.measure / volumes.sum())"
         )
+
+
+def _check_pieces(points: np.ndarray, volumes: np.ndarray, domain: Domain, rounding: float) -> None:
+    """Raise InputError unless `volumes` fill each piece of the domain that holds the generators `points`."""
+    if not isinstance(domain, Polygon) or domain.n_pieces == 1:
+        return
+    for k, piece in enumerate(shapely.get_parts(domain.geometry)):
+        inside = shapely.dwithin(piece, shapely.points(points), 0)
+        total = float(volumes[inside].sum())
+        if not abs(total - piece.area) <= max(SUM_TOLERANCE, rounding) * domain.measure:
+            raise InputError(
+                f"the sum of the volumes of the {inside.sum()} generators in piece {k} of the domain is {total:.12g}, "
+                f"expected the area of the piece, {piece.area:.12g}; scale them"
+            )

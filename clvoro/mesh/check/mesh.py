@@ -358,7 +358,7 @@ def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
         own = np.hypot(own, tree.data[g.cells, -1])
     nearest = lengths(tree.query(lifted(d, d.vertices - lower))[0][g.corners])
     excess = np.maximum(own - nearest - slack, 0)
-    if isinstance(d.domain, Polygon):
+    if isinstance(d.domain, Polygon) and not d.is_power:
         excess[hidden(d, d.domain, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0
     check.note(
         "nearest generators", excess,

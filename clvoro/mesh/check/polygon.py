@@ -87,8 +87,10 @@ def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
 
 
 def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None:
-    """Check that each cell contains its generator: its faces wind around it once."""
+    """Check that each cell contains its generator: its faces wind around it once. Those of power diagrams need not."""
     d = check.diagram
+    if d.is_power:
+        return
     begin, end = (d.vertices[v] - d.points[g.owner] for v in face_ends(d).T)
     angle = np.arctan2(begin[:, 0] * end[:, 1] - begin[:, 1] * end[:, 0], (begin * end).sum(axis=1))
     turns = np.bincount(g.owner, angle, len(d)) / (2 * np.pi)

@@ -117,6 +117,7 @@ class Boundary:
         before[oriented.sharpest] = -1 - before[oriented.sharpest]
         self.turns = engine.upload(before, np.int32), engine.upload(oriented.turns)
         self.owners = engine.zeros(self.edges, np.int32)
+        self.owner_sites = engine.empty((self.edges, 2))
         self._known = 0  # number of cells when `owners` was computed
         self._flags = engine.empty(1, np.int32)
 
@@ -137,16 +138,17 @@ class Boundary:
         vertices, inner = self.vertices, self.inner
         if any(shift):
             vertices, inner = (engine.upload(places + shift) for places in self._places)
-        graph = (t.starts, t.neighbors, t.points)
+        graph = (t.starts, t.neighbors, t.sites)
         if t.n < self._known:
             self.owners.fill(0)
         self._known = t.n
-        engine.run_each(k.find_boundary_owners, edges, inner, *graph, self.owners)
+        found = self.owners, self.owner_sites
+        engine.run_each(k.find_boundary_owners, edges, inner, *graph, t.offsets, *found)
         firsts = room("firsts", size=edges + 1, dtype=np.int32)
         intruders = room.zeros("intruders", size=max(1, t.n - generators), dtype=np.int32)
         self._flags.fill(0)
         none = np.int32(0), firsts, firsts, firsts, vertices
-        walk = (np.int32(generators), vertices, self.next_vertex, self.owners, *graph)
+        walk = (np.int32(generators), vertices, self.next_vertex, *found, *graph)
         engine.run_each(k.walk_edges, edges, *walk, *none, intruders, self._flags)
         self._scan.exclusive(firsts, firsts, edges)
         count = int(firsts[edges].get())
@@ -170,7 +172,7 @@ class Boundary:
             self._flags,
         )
         arrays = (
-            vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends, self.shells
+            vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends, self.shells, self.owner_sites,
         )  # fmt: skip
         return self._sort(count, arrays, cells, t.n, np.array(shift, float))
 

@@ -80,7 +80,7 @@ class PolygonTessellator:
                 # Round-off at distant ghost generators may make generators appear too close. Try without ghosts.
                 self._ghosts = self._ghosts[:0]
                 continue
-            found = self._clip(points, convex, n)
+            found = self.clip(points, convex, n)
             if isinstance(found, Tessellation):
                 return found
             self._removals += 1
@@ -89,7 +89,7 @@ class PolygonTessellator:
             self._ghosts = self._ghosts[keep & (self._removals < PATIENCE)]
             convex = None
 
-    def _clip(self, points: cla.Array, convex: Tessellation, n: int) -> Tessellation | np.ndarray:
+    def clip(self, points: cla.Array, convex: Tessellation, n: int) -> Tessellation | np.ndarray:
         """Clip `convex` by the boundary; return the diagram of `points` (n, 2), or the ghost generators to remove.
 
         Where many cells share a vertex that lies on a vertex of the boundary, their faces there are as short as

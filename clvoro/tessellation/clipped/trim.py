@@ -80,7 +80,8 @@ class Trim:
         """Return the diagram of `domain` for `points` (n, 2), the first `n` generators of `convex`.
 
         A cell is the piece of its convex cell within the domain that contains the generator. Any other piece goes to
-        the neighboring cell with which it shares the longest face.
+        the neighboring cell with which it shares the longest face. In a power diagram a
+        cell has all its pieces.
 
         Raises
         ------
@@ -90,10 +91,15 @@ class Trim:
         engine, k, room = self.engine, self._kernels, self._room
         u, places = chords.touched_count, chords.count + chords.touched_count
         cells = (
-            convex.starts, convex.neighbors, convex.points, *domain.device_corners(engine.real),
+            convex.starts, convex.neighbors, convex.sites, *domain.device_corners(engine.real),
             chords.touched, chords.list_starts, chords.listed, *chords.arrays,
         )  # fmt: skip
         self._flags.fill(0)
+        if convex.weighted is not None:
+            engine.run_each(
+                k.find_outside, n, convex.starts, convex.neighbors, convex.sites, *chords.arrays[:2],
+                np.int32(len(chords.tangents)), chords.slots, convex.volumes, convex.offsets,
+            )  # fmt: skip
         loops = room("loops", size=places, dtype=np.int32)
         pieces = room("pieces", size=places, dtype=np.int32)
         roots = room("roots", size=places, dtype=np.int32)
@@ -182,7 +188,7 @@ class Trim:
         )  # fmt: skip
         engine.run_each(
             k.write_trimmed, u, *segments, *chords.arrays, chord_owners, *chords.turns,
-            convex.points, *owners, orphans[0], np.int32(orphans[1]), place_cells, starts, neighbors,
+            points, *owners, orphans[0], np.int32(orphans[1]), place_cells, starts, neighbors,
             measures, centroids, face_segments, convex.volumes, convex.offsets, convex.covariances,
             outlines,
         )  # fmt: skip
@@ -198,4 +204,5 @@ class Trim:
             covariances=convex.covariances[:n],
             outlines=(outlines, chords.tangents),
             trimmed=Trimmed(convex, chords, segments, face_segments, found.segment_count),
+            weighted=convex.weighted,
         )

@@ -128,7 +128,8 @@ class _PolygonReader(_DiagramReader):
         ends, starts = self.face_ends[default], self.neighbor_starts()
         row = np.repeat(np.arange(self.n), np.diff(starts))
         following = np.arange(1, self.m + 1)
-        following[starts[1:] - 1] = starts[:-1]
+        filled = np.diff(starts) > 0  # cells of power diagrams may be empty
+        following[starts[1:][filled] - 1] = starts[:-1][filled]
         broken = np.unique(row[ends[:, 1] != ends[following, 0]])
         order, lengths = default.copy(), {}
         for i in broken.tolist():
