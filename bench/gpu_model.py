@@ -21,8 +21,8 @@ reduce the rates. Each launch adds 5 us, each blocking read 20 us. The constants
 model does not know how accesses of neighboring work-items coalesce, what the caches hold, how far lanes diverge, and
 what NVIDIA's own compiler for OpenCL does.
 
-"path" times steps and diagrams on this device as it works, and on the path that GPUs take (scalar kernels, groups of 32
-to 256 work-items, scans and sums by groups), by turns; medians of three.
+"path" takes the processor time of steps and diagrams on a CPU as it works, and on the path that GPUs take (scalar
+kernels, groups of 32 to 256 work-items, scans and sums by groups), by turns; medians of three.
 """
 
 from __future__ import annotations
@@ -354,7 +354,7 @@ def step_records(
 def path_records(
     adapter: Any, measured_at: dict[int, int], repeat: int = 3
 ) -> list[dict[str, Any]]:
-    """Return the seconds of steps and new diagrams on this device, as it works and in a GPU's groups, by turns."""
+    """Return the processor time of steps and new diagrams on a CPU, as it works and in a GPU's groups, by turns."""
     records = []
     for dim, kind in gpu_steps.COUNTED:
         runs, n = {}, measured_at[dim]
@@ -370,10 +370,10 @@ def path_records(
                 for name, run in runs.items():
                     queue = run.mesh.engine.queue
                     queue.finish()
-                    start = time.perf_counter()
+                    start = time.process_time()
                     run.parts[part]()
                     queue.finish()
-                    seconds[name].append(time.perf_counter() - start)
+                    seconds[name].append(time.process_time() - start)
             records.append({
                 "dim": dim, "part": kind if part == "step" else "new diagram", "cells": runs["own"].n,
                 **{str(name): statistics.median(each) for name, each in seconds.items()},
@@ -456,7 +456,10 @@ def main() -> None:
         else:
             print(
                 "\n"
-                + heading(adapter, "Milliseconds on this device, and in the groups of a GPU")
+                + heading(
+                    adapter,
+                    "Milliseconds of processor time as a CPU works, and in the groups of a GPU",
+                )
                 + "\n"
             )
             columns = ["own", *map(str, GROUPS)]

@@ -81,7 +81,7 @@ def check_steps(adapter, dim, n, group):
         # step of a million cells.
         assert min(reads) <= (6 if dim == 3 and n > 10**5 else 3), name
         assert max(reads) <= (4 if dim == 2 else 7), name
-        assert (tally.launches - solving) / STEPS <= (36 if max(reads) <= 3 else 55), name
+        assert (tally.launches - solving) / STEPS <= (40 if max(reads) <= 3 else 55), name
         if group:
             assert tally.launches / STEPS <= LAUNCHES[dim, n], name
         assert tally.writes / STEPS <= (2 if max(reads) > 4 else 0), name

@@ -88,7 +88,7 @@ def test_all_kinds_of_commands_are_counted(run):
     calls = {key: cost.calls for key, cost in taken.costs.items()}
     tessellations = len(result.history)
     assert calls["cells", "measure_cells"] >= tessellations
-    assert calls["motion", "move_generators"] == 5
+    assert calls["motion", "move_generators"] >= 5  # more in ranges
     # With few cells a solve takes one or two launches, which the solver enqueues itself.
     assert tessellations <= calls["conjugate_gradient", "solve_by_group"] <= 2 * tessellations
     assert ("poisson", "apply_laplacian") not in calls
