@@ -187,7 +187,7 @@ class Loop:
                 if move:
                     phase.aim()
                     self.final = self.displacements()
-                    phase.move()
+                    mesh.move_by_displacements()
                 self.solution = phase.prescribe()
             self.steps += 1
             is_last = move == action.moves

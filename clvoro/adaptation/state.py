@@ -201,6 +201,12 @@ class MeshState(MeshArrays):
             self._log_ratio_error = None
             self.summaries.collect_all({**own, **(others or {})}, self.n)
 
+    def move_by_displacements(self) -> None:
+        """Move the generators by `lloyd` and `correction`, in full."""
+        self.stages.motion.move_generators(
+            self.free, self.points, self.lloyd, 1.0, self.correction, 1.0, self.h, self.velocity
+        )
+
     def zero_fixed(self, displacement: cla.Array) -> None:
         """Set `displacement` (n, d) to zero for fixed generators."""
         if self.fixed:

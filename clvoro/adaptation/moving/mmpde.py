@@ -224,6 +224,4 @@ class MmpdeMethod:
 
     def move(self, mesh: MeshState) -> None:
         """Move by the displacement."""
-        mesh.stages.motion.move_generators(
-            mesh.free, mesh.points, mesh.lloyd, 1.0, mesh.correction, 0.0, mesh.h, mesh.velocity
-        )
+        mesh.move_by_displacements()

@@ -249,9 +249,7 @@ class MongeAmpereMethod:
 
     def move(self, mesh: MeshState) -> None:
         """Move by the displacement."""
-        mesh.stages.motion.move_generators(
-            mesh.free, mesh.points, mesh.lloyd, 0.0, mesh.correction, 1.0, mesh.h, mesh.velocity
-        )
+        mesh.move_by_displacements()
 
 
 def _slope(mesh: MeshState, x: np.ndarray) -> np.ndarray:

@@ -46,10 +46,3 @@ class PowerPhase:
         mesh.correction.fill(0)
         mesh.measure_displacements()
         mesh.summarize_displacements()
-
-    def move(self) -> None:
-        """Move the generators by these displacements."""
-        mesh = self.mesh
-        mesh.stages.motion.move_generators(
-            mesh.free, mesh.points, mesh.lloyd, 1.0, mesh.correction, 0.0, mesh.h, mesh.velocity
-        )
