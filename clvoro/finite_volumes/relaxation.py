@@ -12,6 +12,7 @@ Points on walls and at seams do not move.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -50,6 +51,10 @@ _RINGS = 1, 2, 3, 4, 5, 5
 _EVALUATIONS, _TOLERANCE = 25, 1e-3
 _MOST, _SHARE = 50, 0.02
 """Nothing moves if more faces are bad than this number, and than this share: the generators were not adapted."""
+
+
+_BLAS = threading.Lock()
+"""Held while BLAS has one thread, which is a setting of the process."""
 
 
 def relax_points(mesh: SolverMesh) -> SolverMesh:
@@ -267,19 +272,22 @@ class _Patches:
     def solve(self) -> np.ndarray | None:
         """Return the points of the mesh, some of them moved; None if none is."""
         from scipy.optimize import least_squares
+        from threadpoolctl import threadpool_limits
 
         if not self.active.size:
             return None
         pattern = self._pattern()
-        found = least_squares(
-            self._residuals,
-            np.zeros(2 * len(self.active)),
-            jac_sparsity=pattern,
-            max_nfev=_EVALUATIONS,
-            ftol=_TOLERANCE,
-            xtol=_TOLERANCE,
-            tr_options={"maxiter": 40},
-        )
+        # The last bits of sums in BLAS depend on its number of threads.
+        with _BLAS, threadpool_limits(1, user_api="blas"):
+            found = least_squares(
+                self._residuals,
+                np.zeros(2 * len(self.active)),
+                jac_sparsity=pattern,
+                max_nfev=_EVALUATIONS,
+                ftol=_TOLERANCE,
+                xtol=_TOLERANCE,
+                tr_options={"maxiter": 40},
+            )
         return self._accept(found.x.reshape(-1, 2), pattern)
 
     def _accept(self, move: np.ndarray, pattern: scipy.sparse.csr_array) -> np.ndarray | None:

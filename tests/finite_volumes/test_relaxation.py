@@ -4,6 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.optimize
+from scipy.optimize import least_squares
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import clvoro
 from clvoro.finite_volumes.geometry import polygon_areas
@@ -49,6 +52,25 @@ def test_bad_faces_become_fewer_and_nothing_else_suffers(mesh):
     np.testing.assert_allclose(polygon_areas(relaxed), polygon_areas(mesh), rtol=0.3)
     shortest = [m.measures.shortest_edge.min() for m in (mesh, relaxed)]
     assert shortest[1] >= 0.9 * min(shortest[0], 0.05)
+
+
+def test_blas_has_one_thread_meanwhile(mesh, monkeypatch):
+    """Otherwise the bits would depend on the number of cores."""
+    found = []
+
+    def threads() -> set[int]:
+        return {x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"}
+
+    def spy(*args, **options):
+        found.append(threads())
+        return least_squares(*args, **options)
+
+    monkeypatch.setattr(scipy.optimize, "least_squares", spy)
+    with threadpool_limits(2, user_api="blas"):
+        relax_points(mesh)
+        assert threads() == {2}
+    assert found
+    assert all(x == {1} for x in found)
 
 
 def test_points_far_from_bad_faces_stay(ctx):
