@@ -1,6 +1,6 @@
 """Whether OpenFOAM accepts the meshes: `checkMesh -allGeometry -allTopology` for domains with hard walls.
 
-    python bench/solver_ready.py [--only NAMES] [--effort NAMES] [--exact] [--keep FOLDER]
+    python bench/solver_ready.py [--only NAMES] [--effort NAMES] [--exact] [--seeds NUMBERS] [--keep FOLDER]
                                  [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
 
 Each mesh is adapted, written as polyMesh with default settings, and given to OpenFOAM's `checkMesh`. A row has the
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import Report, heading, make_adapter, names, off_walls, parser
+from _common import Report, counts, heading, make_adapter, names, off_walls, parser
 from _sites import SITES
 from _walled import WALLED
 
@@ -91,6 +91,7 @@ def main() -> None:
     options_of.add_argument("--only", default="", metavar="NAMES", help=", ".join(DOMAINS))
     options_of.add_argument("--effort", default="default,best", metavar="NAMES")
     options_of.add_argument("--exact", action="store_true", help="also runs with method='exact'")
+    options_of.add_argument("--seeds", default="", metavar="NUMBERS", help="one run with each")
     options_of.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log"
     )
@@ -105,6 +106,9 @@ def main() -> None:
         chosen = [options.only]  # names have commas
     runs = [(effort, {"effort": effort}) for effort in names(options.effort)]
     runs += [("exact", {"method": "exact"})] * options.exact
+    if options.seeds:
+        seeds = counts(options.seeds)
+        runs = [(f"{run}, seed {s}", {**given, "seed": s}) for run, given in runs for s in seeds]
     for name in chosen or DOMAINS:
         domain, size, more = DOMAINS[name]()
         for run, settings in runs:
