@@ -117,9 +117,10 @@ def draw_cells(
         array=without_ends(values[shown]),
         cmap=scheme.color_map,
         norm=cell_norm(scheme, limits),
-        # An outline in the color of the cell hides gaps between cells from antialiasing.
+        # An outline in the color of the cell hides gaps between cells from antialiasing. Not a bridge between the loops
+        # of a cell: between its parts it may cross an island.
         edgecolors="face",
-        linewidths=0.25,
+        linewidths=np.where(np.diff(starts) > np.diff(diagram.neighbor_starts), 0, 0.25)[shown],
         rasterized=len(shown) > 3000,
     )
     ax.add_collection(cells, autolim=False)
