@@ -39,14 +39,16 @@ LANES = {
 }  # fmt: skip
 """Kernels that find eight cells at a time in vector lanes of a CPU, in float64, or choose these cells."""
 NOT_IN = {
-    "float64": set(),
-    # These are between float32 and the precision of the mesh.
+    # Work-groups take it in place of two kernels.
+    "float64": {"conjugate_gradient.apply_to_direction"},
+    # Most of these are between float32 and the precision of the mesh.
     "float32": LANES | {
+        "conjugate_gradient.apply_to_direction",
         "cells.measure_faces", "aggregation.scale_weights", "multigrid.smooth_into",
         "multigrid.smooth_from_zero_rounded", "multigrid.smooth_pairs_into", "multigrid.smooth_pairs_from_zero_rounded",
         "poisson.apply_laplacian_full",
     },
-    "work-groups": LANES,
+    "work-groups": LANES | {"conjugate_gradient.update_direction"},
 }  # fmt: skip
 """Kernels that do not exist in a variant. All others run in it."""
 ALIKE = {
