@@ -2,6 +2,10 @@
    cell of a generator beside a thin wall extends to the other side, and that part is then cut off. This does not happen
    if the generators on both sides are mirror images of each other.
 
+   Pairs move towards their images by a share that falls linearly from 1 at a wall without thickness to 0 at THIN h, so
+   that it is continuous along a wall that widens. Where the sizes of both sides differ there are no pairs, because a
+   row of cells has no image in a row with fewer cells.
+
    THIN  largest thickness of a thin wall over h */
 #include "geometry/edges.h"
 
@@ -9,11 +13,14 @@
    sides of the wall. */
 #define PAIRED R(0.45)
 #define PARALLEL R(0.5)
+/* Largest ratio of the sizes of two generators that are a pair. */
+#define ALIKE R(1.15)
 /* Step over h of a generator without a partner. */
 #define PUSH R(0.1)
 
-/* The image of y at the middle of the wall between x and y; false if no thin wall is between them. */
-inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, DOMAIN_ARGS)
+/* The image of y at the middle of the wall between x and y, and the share by which pairs move towards their images;
+   false if no thin wall is between them. */
+inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, REAL *share, DOMAIN_ARGS)
 {
     const REAL here[2] = {x.s0, x.s1}, there[2] = {y.s0, y.s1};
     const REAL apart = sqrt(dot(y - x, y - x));
@@ -22,7 +29,8 @@ inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, DOMAIN_ARGS)
     if (t > 1)
         return false;
     const REAL s = exit_over_edge(there, here, &other, DOMAIN);
-    if (s > 1 || (1 - t - s) * apart > R(THIN) * h)
+    *share = 1 - (1 - t - s) * apart / (R(THIN) * h);
+    if (s > 1 || *share < 0)
         return false;
     REAL2 a = edge_ends[edge].s23 - edge_ends[edge].s01, b = edge_ends[other].s23 - edge_ends[other].s01;
     a /= sqrt(dot(a, a));
@@ -52,7 +60,10 @@ inline int image_partner(int i, int n, global const int *convex_starts, global c
         for (int m = starts[i]; m < starts[i + 1]; ++m)
             touches = touches || neighbors[m] == j;
         REAL2 image;
-        if (touches || !image_across(points[i], points[j], fmin(h[i], h[j]), &image, DOMAIN))
+        REAL share;
+        const REAL least_h = fmin(h[i], h[j]);
+        if (touches || fmax(h[i], h[j]) > ALIKE * least_h ||
+            !image_across(points[i], points[j], least_h, &image, &share, DOMAIN))
             continue;
         const REAL away = sqrt(dot(image - points[i], image - points[i]));
         if (away < least) {
@@ -82,13 +93,14 @@ kernel void find_partners(const int size, global const int *cells, const int n, 
         partners[p] = j;
 }
 
-/* Halfway from generator i to the image of j; its position if a wall is in the way. */
+/* A share of half the way from generator i to the image of j; its position if a wall is in the way. */
 inline REAL2 halfway_to_image(int i, int j, global const REAL2 *points, global const REAL *h, DOMAIN_ARGS)
 {
     REAL2 image;
-    if (!image_across(points[i], points[j], fmin(h[i], h[j]), &image, DOMAIN))
+    REAL share;
+    if (!image_across(points[i], points[j], fmin(h[i], h[j]), &image, &share, DOMAIN))
         return points[i];
-    const REAL2 goal = (points[i] + image) / 2;
+    const REAL2 goal = points[i] + share / 2 * (image - points[i]);
     const REAL from[2] = {points[i].s0, points[i].s1}, to[2] = {goal.s0, goal.s1};
     return exit_parameter(from, to, DOMAIN) > 1 ? goal : points[i];
 }
@@ -103,10 +115,11 @@ inline REAL2 pushed_away(int i, int n, int size, global const int *slots, global
     for (int k = convex_starts[i]; k < convex_starts[i + 1]; ++k) {
         const int j = convex_neighbors[k];
         REAL2 image;
+        REAL share;
         if (j < 0 || j >= n || slots[j] >= size || partners[slots[j]] < 0 ||
-            !image_across(points[i], points[j], fmin(h[i], h[j]), &image, DOMAIN))
+            !image_across(points[i], points[j], fmin(h[i], h[j]), &image, &share, DOMAIN))
             continue;
-        away += (image - points[j]) / sqrt(dot(image - points[j], image - points[j]));
+        away += share * (image - points[j]) / sqrt(dot(image - points[j], image - points[j]));
         ++pairs;
     }
     if (pairs < 2)

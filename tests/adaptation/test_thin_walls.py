@@ -41,6 +41,12 @@ def across(points, i, rows):
     return found
 
 
+def share(x, y):
+    """Return by how much a pair moves towards its images, from the length of the line between them in the slit."""
+    inside = 2 * HALF * np.hypot(*(y - x)) / abs(y[0] - x[0])
+    return 1 - inside / (0.3 * H)
+
+
 def nearest_images(points, convex, neighbors):
     """Return the generator beyond the slit whose mirror image is nearest to each point; -1 for none."""
     partners = np.full(len(points), -1)
@@ -75,9 +81,13 @@ def test_pairs(ctx, real):
     pushed = 0
     for i in set(at_wall.tolist()) | paired:
         if i in paired:
-            expected[i] = (x[i] + (1 - x[partners[i], 0], x[partners[i], 1])) / 2
-        elif sum(j in paired and j in at_wall for j in across(x, i, rows[0][i])) > 1:
-            expected[i, 0] += 0.1 * H * np.sign(x[i, 0] - 0.5)
+            y = x[partners[i]]
+            expected[i] += share(x[i], y) / 2 * ((1 - y[0], y[1]) - x[i])
+            continue
+        pairs = [j for j in across(x, i, rows[0][i]) if j in paired and j in at_wall]
+        if len(pairs) > 1:
+            mean = np.mean([share(x[i], x[j]) for j in pairs])
+            expected[i, 0] += 0.1 * H * mean * np.sign(x[i, 0] - 0.5)
             pushed += 1
     assert pushed > 0
     moved = (expected != x).any(axis=1)
@@ -85,6 +95,23 @@ def test_pairs(ctx, real):
     tolerance = 200 * float(np.finfo(real).eps)
     assert origin + mesh.to_host(mesh.points, scale) == pytest.approx(expected, abs=tolerance)
     assert mesh.to_host(mesh.velocity, scale) == pytest.approx(expected - x, abs=tolerance)
+
+
+def test_sides_of_unlike_size_have_no_pairs(ctx):
+    """A row of cells has no image in a row with fewer cells."""
+    x = (np.indices((10, 10)).reshape(2, -1).T + 0.5) / 10
+    x[:, 1] += np.where(x[:, 0] < 0.5, 0.01, -0.01)
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(float), SLIT.kind(np.dtype(float)))
+    moved = []
+    for ratio in (1.1, 1.2):
+        size = as_field(clvoro.sizing.Expression(f"x < 0.5 ? {H} : {H * ratio}"))
+        mesh = MeshState.create(
+            Stages(engine), SLIT, Sizing(engine, SLIT, size), engine.upload(SLIT.place(x, engine.real))
+        )  # fmt: skip
+        before = mesh.points.get()
+        mesh.stages.thin_walls.pair(mesh.free, mesh.t, mesh.h, mesh.moving)
+        moved.append((mesh.points.get() != before).any())
+    assert moved == [True, False]
 
 
 @pytest.mark.parametrize(("thickness", "expected"), [(0.02, True), (0.28, True), (0.32, False)])
