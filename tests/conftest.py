@@ -13,6 +13,9 @@ from tests.grids import points_to_leave
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Dense references are small: more threads of a BLAS library only take the cores of other tests.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# So do more threads of PoCL. The first of several processes keeps them, so that kernels run in parallel somewhere.
+if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
+    os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", "1")
 
 # Examples are the same in every run, and the first build of a kernel may take its time.
 settings.register_profile("clvoro", derandomize=True, deadline=None, database=None)
