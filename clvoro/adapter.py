@@ -344,6 +344,8 @@ class Adapter:
         MismatchWarning, CoarseSizeWarning
             If a part of the input barely overlaps the domain, for example because it has another unit of length, or the
             domain is narrower than half a cell somewhere, or has a dead end narrower than a cell; says where.
+        ObtuseTrianglesWarning
+            If obtuse triangles are left in a mesh on a sphere that "adaptive" or "exact" has finished.
         PrecisionWarning
             If `dtype` is too coarse for the sizes.
         SizeErrorWarning

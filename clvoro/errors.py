@@ -90,6 +90,10 @@ class MismatchWarning(UserWarning):
     """A part of the input does not match the domain or the sizes: units or positions probably differ."""
 
 
+class ObtuseTrianglesWarning(UserWarning):
+    """A mesh on a sphere has obtuse Delaunay triangles, unfit for C grids; the message says how many, where and why."""
+
+
 class PrecisionWarning(UserWarning):
     """The precision is too low for a run to reach its target sizes as well as usual; the message says why."""
 

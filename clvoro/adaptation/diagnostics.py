@@ -8,11 +8,19 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..arguments import warn
-from ..errors import InputError, MismatchWarning, PrecisionWarning, SizeErrorWarning
+from ..errors import (
+    InputError,
+    MismatchWarning,
+    ObtuseTrianglesWarning,
+    PrecisionWarning,
+    SizeErrorWarning,
+)
 from ..geometry.boundary_layers import Layers, columns_of
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
+from ..mesh.connectivity import face_ends, face_owners
+from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..sizing import Sizing
 from ..sizing.field import Field
@@ -145,9 +153,8 @@ def warn_of_errors(result: Result) -> None:
     )
     if len(diagram) == 1 and 2 * made**diagram.domain.cell_dim < wanted**diagram.domain.cell_dim:
         return  # `CoarseSizeWarning` says it before the run
-    place = ", ".join(f"{x:.6g}" for x in result.points[worst])
-    row = diagram.neighbors[diagram.neighbor_starts[worst] : diagram.neighbor_starts[worst + 1]]
-    beside = sizes[[worst, *row[row >= 0]]]
+    place = _place(diagram.domain, result.points[worst])
+    beside = sizes[[worst, *_ring(diagram, worst)]]
     if beside.max() > STEEP * beside.min():
         why = (
             "sizes change there by more than cells can follow from one to the next: bound their growth, as by "
@@ -159,9 +166,54 @@ def warn_of_errors(result: Result) -> None:
             "use smaller sizes, or n_cells, which scales the sizes to a number of cells"
         )
     warn(
-        f"the mesh does not meet its size field: mean |e| is {mean:.2g}, and a cell at ({place}) has the size "
+        f"the mesh does not meet its size field: mean |e| is {mean:.2g}, and a cell at {place} has the size "
         f"{made:.3g} where the size field is {wanted:.3g}; {why}",
         SizeErrorWarning,
+    )
+
+
+def _ring(diagram: Diagram, i: int) -> np.ndarray:
+    """Return the neighbors of cell `i`, without walls."""
+    row = diagram.neighbors[diagram.neighbor_starts[i] : diagram.neighbor_starts[i + 1]]
+    return row[row >= 0]
+
+
+def _place(domain: Domain, x: np.ndarray) -> str:
+    """Return a place in words."""
+    if isinstance(domain, Sphere):
+        lon, lat = domain.lonlat(x[None])[0]
+        return f"longitude {lon:.6g}, latitude {lat:.6g}"
+    return f"({', '.join(f'{c:.6g}' for c in x)})"
+
+
+def warn_of_obtuse_triangles(result: Result) -> None:
+    """Warn if a mesh on a sphere has obtuse triangles, and name the worst.
+
+    Warns
+    -----
+    ObtuseTrianglesWarning
+    """
+    diagram, sizes, grid = result.diagram, result.target_size, result.measures.c_grid
+    if grid.obtuse == 0:
+        return
+    k = int(grid.angles.argmax())
+    half_face = grid.corners[k]
+    pair = int(face_owners(diagram)[half_face]), int(diagram.neighbors[half_face])
+    vertex = diagram.vertices[face_ends(diagram)[half_face, 0]]
+    ratios = np.concatenate([sizes[_ring(diagram, i)] / sizes[i] for i in pair])
+    growth = max(ratios.max(), 1 / ratios.min())
+    if growth > STEEP:
+        why = (
+            f"sizes grow by a factor of {growth:.2g} from cell to cell there: bound their growth, as by sizing.Graded(size, "
+            "growth=1.2)"
+        )
+    else:
+        why = "another seed, or more cells, may give a mesh without"
+    some = f"{grid.obtuse} obtuse triangles" if grid.obtuse > 1 else "an obtuse triangle"
+    warn(
+        f"the mesh has {some}, which C grids do not allow, with an angle of up to {grid.angles[k]:.1f} degrees at "
+        f"{_place(diagram.domain, vertex)}; {why}",
+        ObtuseTrianglesWarning,
     )
 
 
@@ -201,9 +253,9 @@ def check_precision(
         remedy = "use a smaller domain or larger sizes"
     least = int(np.argmin(h))
     if h[least] < spacing:
-        where = ", ".join(f"{c:.6g}" for c in points[least])
+        where = _place(domain, points[least])
         raise InputError(
-            f"the size field is {h[least]:.3g} at ({where}), but positions in {real} are "
+            f"the size field is {h[least]:.3g} at {where}, but positions in {real} are "
             f"{spacing:.3g} apart in this domain: generators would coincide; {remedy}"
         )
     if isinstance(domain, Sphere):

@@ -14,6 +14,7 @@ from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from ..opencl.primitives import Summary
 from ..solvers.linear_system import Solution
 from .checkpoint import Checkpointer, Progress
+from .diagnostics import warn_of_obtuse_triangles
 from .efforts import RepairCells
 from .forecast import MOST_SURPLUS
 from .moving.mmpde import MmpdeMethod
@@ -68,6 +69,8 @@ class Loop:
     ----------
     begun : int
         Number of steps begun.
+    obtuse : int
+        Number of obtuse triangles before they were last opened; 0 if none are left.
     """
 
     def __init__(
@@ -89,6 +92,7 @@ class Loop:
         self.began = time.perf_counter() - p.elapsed
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
         self.solution: Solution | None = None
+        self.obtuse = 0
         steps = [position for position, action in enumerate(schedule) if isinstance(action, Step)]
         self.last_step = steps[-1] if steps and tol is None else None
 
@@ -149,7 +153,10 @@ class Loop:
                 self.mesh.walls.settle(self.mesh)
             self.solution = None
             self.add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
-        return self.result(reason in (COMPLETED, STALLED, SETTLED), reason, settings)
+        result = self.result(reason in (COMPLETED, STALLED, SETTLED), reason, settings)
+        if self.obtuse and result.converged:
+            warn_of_obtuse_triangles(result)
+        return result
 
     @property
     def fixed_count(self) -> int | None:
@@ -170,7 +177,8 @@ class Loop:
         # The next row of the history checks the sizes, too, unless they are scaled before.
         self.mesh.update(check=self.fixed_count is not None)
         for _ in range(action.openings):
-            if not self.mesh.open_triangles():
+            self.obtuse, opened = self.mesh.open_triangles()
+            if not opened:
                 break
         if self.fixed_count is not None:
             self.mesh.normalize_sizes()

@@ -296,21 +296,21 @@ class MeshState(MeshArrays):
             self.set_generators(rows)
         return counts
 
-    def open_triangles(self) -> int:
+    def open_triangles(self) -> tuple[int, bool]:
         """Move generators away from the opposite sides of obtuse triangles, and update the mesh.
 
-        Returns their number, or 0 if nothing has changed: there are none, or too many to be opened.
+        Returns their number, and whether the mesh has changed: not if there are none, or too many to be opened.
         """
         with self.engine.workspace.frame():
             displacement = self.engine.scratch(self.points.shape)
             count = self.stages.quality_descent.open_triangles(self.t, displacement)
             if not count or count > MOST_OBTUSE * self.n:
-                return 0
+                return count, False
             self.stages.motion.move_generators(
                 self.free, self.points, displacement, 1.0, displacement, 0.0, self.local_length, self.velocity, clip=0.5
             )  # fmt: skip
         self.update()
-        return count
+        return count, True
 
     def read_summaries(self) -> dict[str, Summary]:
         """Read the summaries of the mesh and of the last step: the scalars that the host needs.

@@ -1,5 +1,8 @@
 """Runs on the sphere: every method, both precisions, sizes, repeatability, checkpoints."""
 
+import re
+import warnings
+
 import numpy as np
 import pyopencl as cl
 import pytest
@@ -24,6 +27,7 @@ def angles_of_triangles(diagram):
     return np.degrees(np.arccos(cosines))
 
 
+@pytest.mark.filterwarnings("ignore::clvoro.errors.ObtuseTrianglesWarning")
 @pytest.mark.parametrize(("method", "effort"), [("adaptive", "best"), ("exact", "default")])
 def test_few_cells(ctx, method, effort):
     result = clvoro.Adapter(ctx).run(EARTH, 1e6, method=method, effort=effort, n_cells=20)
@@ -157,6 +161,34 @@ def test_obtuse_triangles_are_opened(ctx, real):
     assert mesh.stages.quality_descent.open_triangles(mesh.t, displacement) == count > 100
     found = mesh.to_host(displacement)
     assert found == pytest.approx(expected, abs=1e4 * float(np.finfo(real).eps))
+
+
+def test_warning_of_obtuse_triangles(ctx):
+    """It has their number and the place of the worst; the same sizes with a bounded growth leave none."""
+
+    def jump(lonlat):
+        return np.where(np.abs(lonlat[:, 1]) < 30, 3e5, 1.2e6)
+
+    adapter = clvoro.Adapter(ctx)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = adapter.run(EARTH, sizing.LonLat(jump), effort="fast")
+        adapter.run(EARTH, sizing.LonLat(jump), method="weighted", max_steps=2)  # promises nothing
+        graded = adapter.run(EARTH, sizing.Graded(sizing.LonLat(jump), growth=1.2), effort="fast")
+    (said,) = (w for w in caught if w.category is clvoro.errors.ObtuseTrianglesWarning)
+    assert said.filename == __file__
+    text = str(said.message)
+    numbers = re.search(r"has (\d+) .* to ([\d.]+) degrees at longitude (.*), latitude (.*);", text)
+    count, angle, lon, lat = map(float, numbers.groups())
+    triangles = result.diagram.triangles()
+    angles = angles_of_triangles(result.diagram).max(axis=0)
+    assert count == np.count_nonzero(angles > 90)
+    assert angle == pytest.approx(angles.max(), abs=0.06)
+    corners = result.points[triangles[angles.argmax()]]
+    center = EARTH.positions([(lon, lat)])[0]
+    assert np.ptp(np.linalg.norm(corners - center, axis=1)) < 1e-3 * EARTH.radius
+    assert "a factor of 4 from cell to cell" in text
+    assert graded.measures.c_grid.obtuse == 0
 
 
 def test_no_obtuse_triangles_with_little_effort(ctx):
