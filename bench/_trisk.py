@@ -170,6 +170,14 @@ def mesh_of(diagram: clvoro.Diagram) -> Mesh:
     )  # fmt: skip
 
 
+def sparse_matrix(
+    values: np.ndarray, rows: np.ndarray, columns: np.ndarray, *shape: int
+) -> sparse.csr_array:
+    """Return a sparse matrix. With indices of 32 bits a product reads a quarter less."""
+    indices = rows.astype(np.int32), columns.astype(np.int32)
+    return sparse.csr_array((values, indices), shape=shape)
+
+
 def tangential(mesh: Mesh) -> sparse.csr_array:
     """Return the matrix (m, m) from normal to tangential components of a field on edges (T09).
 
@@ -190,7 +198,7 @@ def tangential(mesh: Mesh) -> sparse.csr_array:
         weights.append(mesh.sign[used] * mesh.sign[other[used]] * (0.5 - passed[used]))
     row, column = np.concatenate(rows), np.concatenate(columns)
     value = np.concatenate(weights) * mesh.dv[column] / mesh.dc[row]
-    return sparse.csr_array((value, (row, column)), shape=(len(mesh.dc),) * 2)
+    return sparse_matrix(value, row, column, len(mesh.dc), len(mesh.dc))
 
 
 class Operators:
@@ -222,25 +230,20 @@ class Operators:
         both = np.repeat(edges, 2)
         signs = np.tile([-1.0, 1.0], m)
 
-        def matrix(
-            values: np.ndarray, rows: np.ndarray, columns: np.ndarray, *shape: int
-        ) -> sparse.csr_array:
-            return sparse.csr_array((values, (rows, columns)), shape=shape)
-
         pairs, ends = mesh.edge_cells.ravel(), mesh.edge_vertices.ravel()
         area = mesh.cell_areas[cell]
-        self.div = matrix(mesh.sign * mesh.dv[edge] / area, cell, edge, n, m)
-        self.grad = matrix(signs / mesh.dc[both], both, pairs, m, n)
-        self.curl = matrix(signs * mesh.dc[both] / mesh.vertex_areas[ends], ends, both, v, m)
-        self.along = matrix(signs / mesh.dv[both], both, ends, m, v)
+        self.div = sparse_matrix(mesh.sign * mesh.dv[edge] / area, cell, edge, n, m)
+        self.grad = sparse_matrix(signs / mesh.dc[both], both, pairs, m, n)
+        self.curl = sparse_matrix(signs * mesh.dc[both] / mesh.vertex_areas[ends], ends, both, v, m)
+        self.along = sparse_matrix(signs / mesh.dv[both], both, ends, m, v)
         self.tangential = tangential(mesh)
-        self.kinetic = matrix(mesh.edge_areas[edge] / (4 * area), cell, edge, n, m)
+        self.kinetic = sparse_matrix(mesh.edge_areas[edge] / (4 * area), cell, edge, n, m)
         half = np.full(2 * m, 0.5)
-        self.cell_to_edge = matrix(half, both, pairs, m, n)
-        self.vertex_to_edge = matrix(half, both, ends, m, v)
+        self.cell_to_edge = sparse_matrix(half, both, pairs, m, n)
+        self.vertex_to_edge = sparse_matrix(half, both, ends, m, v)
         vertex = mesh.corner_vertex
-        self.cell_to_vertex = matrix(mesh.kites / mesh.vertex_areas[vertex], vertex, cell, v, n)
-        self.vertex_to_cell = matrix(mesh.kites / area, cell, vertex, n, v)
+        self.cell_to_vertex = sparse_matrix(mesh.kites / mesh.vertex_areas[vertex], vertex, cell, v, n)
+        self.vertex_to_cell = sparse_matrix(mesh.kites / area, cell, vertex, n, v)
 
 
 class ShallowWater:
@@ -278,8 +281,8 @@ class ShallowWater:
 
     def coriolis_force(self, q: np.ndarray, flux: np.ndarray) -> np.ndarray:
         """Return the tangential flux times potential vorticity q (m,), both on edges: it does no work (R10)."""
-        turned = self.operators.tangential @ np.column_stack([flux, q * flux])
-        return 0.5 * (q * turned[:, 0] + turned[:, 1])
+        turn = self.operators.tangential
+        return 0.5 * (q * (turn @ flux) + turn @ (q * flux))
 
     def tendency(
         self, h: np.ndarray, u: np.ndarray, dt: float = 0.0
