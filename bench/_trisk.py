@@ -242,7 +242,9 @@ class Operators:
         self.cell_to_edge = sparse_matrix(half, both, pairs, m, n)
         self.vertex_to_edge = sparse_matrix(half, both, ends, m, v)
         vertex = mesh.corner_vertex
-        self.cell_to_vertex = sparse_matrix(mesh.kites / mesh.vertex_areas[vertex], vertex, cell, v, n)
+        self.cell_to_vertex = sparse_matrix(
+            mesh.kites / mesh.vertex_areas[vertex], vertex, cell, v, n
+        )
         self.vertex_to_cell = sparse_matrix(mesh.kites / area, cell, vertex, n, v)
 
 

@@ -204,8 +204,8 @@ def warn_of_obtuse_triangles(result: Result) -> None:
     growth = max(ratios.max(), 1 / ratios.min())
     if growth > STEEP:
         why = (
-            f"sizes grow by a factor of {growth:.2g} from cell to cell there: bound their growth, as by sizing.Graded(size, "
-            "growth=1.2)"
+            f"sizes grow by a factor of {growth:.2g} from cell to cell there: bound their growth, as by "
+            "sizing.Graded(size, growth=1.2)"
         )
     else:
         why = "another seed, or more cells, may give a mesh without"
