@@ -296,8 +296,8 @@ def _widened(
         lon, lat = sphere.lonlat(diagram.points[left[:1]])[0]
         warn(
             f"{len(left)} cells of water remain one cell wide, because more water would open a land bridge, cover an "
-            f"island or a blockage, or leave the mesh; the first one is at {lon:.1f}, {lat:.1f}; use smaller cells "
-            "there",
+            f"island or a blockage, or leave the mesh; the first one is at longitude {lon:.1f}, latitude "
+            f"{lat:.1f}; use smaller cells there",
             MismatchWarning,
         )
     return found

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from numbers import Real
 
 import numpy as np
+import shapely
 
 from ..errors import InputError, InputTypeError
 
@@ -185,3 +186,27 @@ class Segment:
     def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the ends (m, d), (m, d) and radii (m,) of the segments that the curve consists of."""
         return self.a[None], self.b[None], np.zeros(1)
+
+
+def shapes_of(geometry: shapely.Geometry) -> list[Circle | Polyline]:
+    """Return the points, lines and rings of a shapely geometry as shapes in 2D.
+
+    Raises
+    ------
+    InputError
+        If the geometry is empty.
+    """
+    if geometry.is_empty:
+        raise InputError(f"the shape is {geometry!r:.40}, expected a geometry that is not empty")
+    found: list[Circle | Polyline] = []
+    for part in shapely.get_parts(geometry):
+        if isinstance(part, shapely.Polygon):
+            rings = part.exterior, *part.interiors
+            found += [ClosedPolyline(shapely.get_coordinates(ring)[:-1]) for ring in rings]
+        elif isinstance(part, shapely.Point):
+            found.append(Circle(shapely.get_coordinates(part)[0], 0.0))
+        elif isinstance(part, shapely.LineString):
+            found.append(Polyline(shapely.get_coordinates(part)))
+        else:
+            found += shapes_of(part)
+    return found

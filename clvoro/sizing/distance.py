@@ -8,13 +8,14 @@ from numbers import Real
 from typing import TYPE_CHECKING
 
 import numpy as np
+import shapely
 
 from ..errors import InputError, InputTypeError
 from ..geometry import curves
 from ..geometry.box import Box, Domain
 from ..geometry.bvh import Tree
 from ..geometry.polygon import Polygon
-from ..geometry.shapes import Circle, ClosedPolyline, Edges, Polyline, Segment
+from ..geometry.shapes import Circle, ClosedPolyline, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface, box_surface
 from ..geometry.triangles import segment_distance2
 from .arguments import check_positive, check_slope
@@ -41,8 +42,8 @@ class Distance(Field):
     shapes : shape or iterable of shapes
         `Circle`, `Segment`, `Polyline`, `ClosedPolyline`; in 3D `Ball`, `Segment`, `Polyline`, `ClosedPolyline`,
         `Surface`; in both a `clvoro.Box`, which stands for its sides, and a `clvoro.Polygon`, which stands for its
-        edges (``domain.boundary("island")`` for some of them); in 2D a curve of `clvoro.curves`. The distance is to
-        the curve or surface, from both sides.
+        edges (``domain.boundary("island")`` for some of them); in 2D a curve of `clvoro.curves`, or a geometry of
+        shapely, which stands for its points, lines and rings. The distance is to the curve or surface, from both sides.
     h_min : float
         Size on the shapes.
     growth : float, optional
@@ -70,24 +71,29 @@ class Distance(Field):
 
     def __init__(
         self,
-        shapes: Shape | Iterable[Shape],
+        shapes: Shape | shapely.Geometry | Iterable[Shape | shapely.Geometry],
         h_min: float,
         growth: float | None = None,
         h_max: float = math.inf,
         slope: float | None = None,
     ):
-        if not isinstance(shapes, (Shape, Iterable)):
+        if not isinstance(shapes, (Shape, shapely.Geometry, Iterable)):
             raise InputTypeError(
                 f"Distance got shapes {shapes!r} of type {type(shapes).__name__}, expected a shape or a list of them, "
                 "such as Distance(Circle((0.5, 0.5), 0.1), h_min=0.01, growth=1.2)"
             )
-        self.shapes = (shapes,) if isinstance(shapes, Shape) else tuple(shapes)
+        several = isinstance(shapes, Iterable) and not isinstance(shapes, (Shape, shapely.Geometry))
+        found = [
+            shapes_of(given) if isinstance(given, shapely.Geometry) else [given]
+            for given in (shapes if several else (shapes,))
+        ]
+        self.shapes = tuple(shape for some in found for shape in some)
         for shape in self.shapes:
             if not isinstance(shape, Shape):
                 raise InputTypeError(
                     f"Distance got a shape of type {type(shape).__name__}, expected Circle, "
-                    "Ball, Segment, Polyline, ClosedPolyline, Edges, Surface, Box, clvoro.Polygon or a curve of "
-                    "clvoro.curves"
+                    "Ball, Segment, Polyline, ClosedPolyline, Edges, Surface, Box, clvoro.Polygon, a curve of "
+                    "clvoro.curves or a geometry of shapely"
                 )
         if not self.shapes:
             raise InputError("Distance got no shapes, expected at least one")

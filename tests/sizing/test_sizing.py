@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 
 from clvoro import sizing
 from clvoro.adapter import Adapter
@@ -321,6 +322,21 @@ def test_distance_to_simple_shapes():
     assert line([(0, 2), (2, 1), (4, 6), (3, 3)]).tolist() == [2.5, 2, 2.5, 2]
     growing = sizing.Distance(sizing.Segment((0, 0), (0, 1)), 1, growth=math.e)
     assert growing([(3, 0.5)]).tolist() == pytest.approx([4])
+
+
+def test_distance_to_geometries_of_shapely():
+    """All points, lines and rings count, in collections and multipolygons, too: shapely measures the same."""
+    court = shapely.box(0, 0, 4, 4).difference(shapely.box(1, 1, 2, 3))
+    lines = shapely.MultiLineString([[(6, 0), (7, 2), (9, 2)], [(8, 8), (9, 9)]])
+    places = shapely.MultiPoint([(-3, 5), (-4, 6)])
+    geometry = shapely.GeometryCollection([court, lines, places])
+    points = np.random.default_rng(2).uniform(-5, 10, (200, 2))
+    edges = shapely.GeometryCollection([court.boundary, lines, places])
+    expected = 1 + 0.5 * shapely.distance(edges, shapely.points(points))
+    for shapes in (geometry, [court, lines, places]):
+        assert sizing.Distance(shapes, 1, slope=0.5)(points) == pytest.approx(expected, rel=1e-12)
+    with pytest.raises(InputError, match="not empty"):
+        sizing.Distance(shapely.Polygon(), 1, slope=0.5)
 
 
 def test_growth_is_the_ratio_of_neighboring_cells():
