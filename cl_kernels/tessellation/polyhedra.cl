@@ -1,3 +1,4 @@
+#include "geometry/domain.h"
 #include "tessellation/row_counts.h"
 #include "tessellation/periodic/halo.h"
 #include "tessellation/polyhedron_search.h"
@@ -5,11 +6,11 @@
 /* Share of the volume of a cell by which its faces may differ from those of neighbors. */
 #define EVEN_SHARE R(1e-3)
 
-inline REAL distance_between(global const REAL *points, int i, int j)
+inline REAL distance_between(global const REAL *points, int i, int j PERIOD_ARGS)
 {
-    const REAL dx = points[STRIDE * j] - points[STRIDE * i];
-    const REAL dy = points[STRIDE * j + 1] - points[STRIDE * i + 1];
-    const REAL dz = points[STRIDE * j + 2] - points[STRIDE * i + 2];
+    const REAL dx = DIFFERENCE(0, points[STRIDE * i], points[STRIDE * j]);
+    const REAL dy = DIFFERENCE(1, points[STRIDE * i + 1], points[STRIDE * j + 1]);
+    const REAL dz = DIFFERENCE(2, points[STRIDE * i + 2], points[STRIDE * j + 2]);
     return sqrt(dx * dx + dy * dy + dz * dz);
 }
 
@@ -278,13 +279,13 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
    Their edge is off by eps R^2 / d^2 of R, and the area of a face along it by as much of R^2. The area of all faces
    replaces R^2. */
 inline REAL rounded_area(int i, int begin, int count, global const int *labels, global const REAL *measures,
-                         global const REAL *points)
+                         global const REAL *points PERIOD_ARGS)
 {
     REAL surface = 0, least = INFINITY;
     for (int k = begin; k < begin + count; ++k) {
         surface += measures[k];
         if (labels[k] >= 0)
-            least = fmin(least, distance_between(points, i, labels[k]));
+            least = fmin(least, distance_between(points, i, labels[k] PERIODS));
     }
     return surface * fmin(64 * REAL_EPS * surface / (least * least), sqrt(REAL_EPS));
 }
@@ -294,12 +295,12 @@ inline REAL rounded_area(int i, int begin, int count, global const int *labels, 
    symmetric. The cell is flagged as collapsed if the face is wider than round-off explains, or if the areas of its
    faces and those of its neighbors differ by more than a share of the cell. In a power diagram cells may be so small
    that they are uncertain, as long as that is no more than the round-off of a neighbor. Faces of a neighbor without a
-   row are not compared, nor are those of two certain cells. While cells are missing or wrong, this and the next two
+   row are not compared, nor are those of two certain cells. In a diagram with ghost images the periods are 0. While cells are missing or wrong, this and the next two
    kernels do nothing. */
 kernel void match_polyhedron_faces(const int size, global const int *row_places, global const int *row_counts,
                                    global const int *labels, global const REAL *measures, global const REAL *volumes,
                                    global const REAL *points, const REAL share, global uchar *kept, global int *counts,
-                                   global int *report)
+                                   global int *report PERIOD_ARGS)
 {
     WORK_ITEM(i);
     const int n = COUNT_OF(row_counts[i]);
@@ -323,11 +324,11 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
             while (q < m && row[q] != i)
                 ++q;
             mutual = q < m;
-            const REAL distance = distance_between(points, i, j);
+            const REAL distance = distance_between(points, i, j PERIODS);
             const REAL other = mutual ? measures[row_places[j] + q] : 0;
             apart += fabs(measures[k] - other) * distance / 6;
             if (!mutual && !(measures[k] < fmax(2048 * REAL_EPS * distance,
-                                                rounded_area(i, row_places[i], n, labels, measures, points))))
+                                                rounded_area(i, row_places[i], n, labels, measures, points PERIODS))))
                 atomic_or(report, FLAG_COLLAPSED);
         }
         kept[k] = mutual;

@@ -1,3 +1,4 @@
+#include "geometry/domain.h"
 #include "tessellation/corner_flips.h"
 
 /* Update of a diagram in 3D: the cells of generators that moved a little, from those that they had before.
@@ -14,7 +15,11 @@
    vanishes. In these, an edge is flipped to one between p and q, which are made neighbors (`update_cells`). All faces
    of changed cells are compared by sums of hashes over their vertices (`check_cells`); where they differ, both cells
    are clipped by all generators near them (`clip_polyhedra`), and never wrong. If round-off may decide about the faces
-   of such a cell, areas are compared, and `match_polyhedron_faces` handles the rest. */
+   of such a cell, areas are compared, and `match_polyhedron_faces` handles the rest.
+
+   In a periodic box neighbors are nearest images, as long as no vertex is as far from its generator as a quarter of a
+   period. Then any two generators about a vertex are less than half a period apart, and all their cells see the same
+   images there. Cells without gap or overlap may cover the box more than once; the host compares the volumes. */
 
 #define NO_NEIGHBOR INT_MIN
 
@@ -41,6 +46,9 @@ typedef struct {
     global int *more; /* MORE further neighbors per generator */
     global const REAL *points;
     REAL4 box_lower, box_upper;
+#ifdef PERIODIC
+    REAL4 periods;
+#endif
 } rows_t;
 
 /* Add the plane of a neighbor or wall to the cell of a generator at x. */
@@ -49,6 +57,8 @@ inline void add_plane(corners_t *cell, int label, REAL4 x, const rows_t *in)
     REAL4 d = 0;
     if (label >= 0) {
         d = (REAL4)(in->points[3 * label], in->points[3 * label + 1], in->points[3 * label + 2], 0) - x;
+        d = (REAL4)(nearest_image(d.s0, in->periods.s0), nearest_image(d.s1, in->periods.s1),
+                    nearest_image(d.s2, in->periods.s2), 0);
     } else {
         const int wall = -1 - label;
         const REAL4 across = 2 * ((wall & 1 ? in->box_upper : in->box_lower) - x);
@@ -114,6 +124,18 @@ inline void add_neighbor(int i, int label, const rows_t *in, global int *marks)
         }
     }
     atomic_or(marks + i, CLIP_ANEW);
+}
+
+/* Whether the generators about each vertex are nearest images of each other. */
+inline bool has_nearest_images(const corners_t *cell, const rows_t *in)
+{
+    bool nearest = true;
+#ifdef PERIODIC
+    const REAL4 periods = in->periods;
+    EACH_AXIS(a)
+    nearest = nearest && !(PERIOD(a) > 0 && 16 * cell->reach2 >= PERIOD(a) * PERIOD(a));
+#endif
+    return nearest;
 }
 
 /* Keep the cell of generator i at x within the walls: those that it does not have become further neighbors. True if
@@ -309,13 +331,13 @@ kernel void update_cells(const int size, const int some, global const int *liste
                          global const int *old_starts, global const int *old_neighbors, const int known,
                          global const uchar4 *old_corners, global const uint *old_keys, global const REAL *points,
                          const REAL4 box_lower, const REAL4 box_upper, const int room, CELL_OUTPUT_ARGS,
-                         global uint *keys, global int *changed, global int *more, global int *marks)
+                         global uint *keys, global int *changed, global int *more, global int *marks PERIOD_ARGS)
 {
     WORK_ITEM(item);
     if (some && (item >= report[REPORT_MARKED] || report[REPORT_MARKED] > size))
         return;
     const int what = some ? listed[item] : item, i = max(what, ~what);
-    const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper};
+    const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS};
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
     global const int *added = some ? further + MORE * item : 0;
     corners_t cell;
@@ -352,7 +374,7 @@ kernel void update_cells(const int size, const int some, global const int *liste
     }
     kept = kept && state == KNOWN_CORNERS;
     changed[i] = done && kept ? 0 : ALL_FACES;
-    if (done && keep_in_box(&cell, i, x, &in, marks)) {
+    if (done && has_nearest_images(&cell, &in) && keep_in_box(&cell, i, x, &in, marks)) {
         const bool longer = cell.faces > old_starts[i + 1] - start;
         const int place = longer ? take_places(report, cell.faces) : start;
         const measured_t out = {labels, measures, centroids, volumes, offsets, covariances};

@@ -311,22 +311,33 @@ class Polyhedra:
         box: ClipBox,
         points: cla.Array,
         binned: BinnedPoints,
-        previous: Tessellation,
+        previous: Tessellation | NeighborRows,
+        size: int | None = None,
+        halo_args: tuple[object, ...] = (),
     ) -> None:
-        """Clip the unfinished cells of `cut` by all generators near them."""
+        """Clip the unfinished cells of `cut` by all of the `size` generators and ghost images near them."""
         engine, rows = self.engine, len(cut.counts)
+        size = rows if size is None else size
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         share, old = engine.real.type(ROUGH_SHARE), (previous.starts, previous.neighbors)
         engine.run_each(
-            self._kernels(FACE_CAPACITY).clip_polyhedra, rows, np.int32(rows), binned.points, binned.items, *search,
+            self._kernels(FACE_CAPACITY).clip_polyhedra, size, np.int32(rows), binned.points, binned.items, *search,
             points, *box.device_corners(engine.real), np.int32(1), *old, np.int32(1), np.int32(len(cut.labels)), share,
-            *cut.output(report),
+            *cut.output(report), *halo_args,
         )  # fmt: skip
 
     def match(
-        self, cut: CutCells, report: cla.Array, points: cla.Array, share: np.floating, m: int
+        self,
+        cut: CutCells,
+        report: cla.Array,
+        points: cla.Array,
+        share: np.floating,
+        m: int,
+        folded: bool = False,
     ) -> Matching:
         """Keep the faces that both cells have, and sort them by rows, if there are at most `m` or room for them.
+
+        In a `folded` diagram neighbors are nearest images.
 
         Nothing is done if `report` says that cells are missing or wrong.
         """
@@ -334,9 +345,10 @@ class Polyhedra:
         rows = len(cut.counts)
         # The previous graph stays valid until the end.
         starts, kept = engine.scratch(rows + 1, np.int32), engine.scratch(cut.m, np.uint8)
+        args = engine.period_args
         engine.run_each(
             k.match_polyhedron_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cut.cells["volumes"],
-            points, share, kept, starts, report,
+            points, share, kept, starts, report, *(args if folded else tuple(0 * arg for arg in args)),
         )  # fmt: skip
         self._scan.exclusive(starts, starts, rows, total=(report, REPORT_KEPT))
         matching = Matching(cut, points, kept, starts, report)

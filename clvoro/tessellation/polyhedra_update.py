@@ -12,8 +12,7 @@ from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
-from .bins import BinnedPoints
-from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_MARKED, REPORT_SIZE
+from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_MARKED, REPORT_SIZE, CutCells
 from .device_diagram import ROUGH_SHARE, Tessellation
 from .polyhedra import Polyhedra
 from .rounds import with_room
@@ -64,14 +63,16 @@ class PolyhedraUpdate:
         box: ClipBox,
         points: cla.Array,
         previous: Tessellation,
-        bins: Callable[[], BinnedPoints],
+        clip: Callable[[CutCells, cla.Array, int], None],
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, 3), the new positions of the generators of `previous`.
+
+        In a periodic box that is the folded diagram. `box` then extends a period beyond the generators.
 
         The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the report.
 
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
-        `bins` sorts the generators into bins; it is called if cells must be clipped.
+        `clip` clips unfinished cells; it gets the report and the number of faces so far.
         """
         n, before = previous.n, len(previous.neighbors)
         most = int(MAX_SHARE * n)
@@ -81,7 +82,7 @@ class PolyhedraUpdate:
             self.engine, self._kernels, self._scan, self._report, cells, box, points, previous
         )
         rounds.update(None)
-        done, sizes, binned = 0, self._expected, None
+        done, sizes = 0, self._expected
         clipped, final = False, not self._clips
         while True:
             for size in sizes[: MAX_ROUNDS - done]:
@@ -90,9 +91,11 @@ class PolyhedraUpdate:
                 done += 1
             matching = None
             if final:
-                matching = cells.match(rounds.cut, self._report, points, self._share, before)
+                matching = cells.match(
+                    rounds.cut, self._report, points, self._share, before, folded=True
+                )
             found = self._report.get()
-            flags, _, left, marked, kept = map(int, found[:REPORT_LISTED])
+            flags, used, left, marked, kept = map(int, found[:REPORT_LISTED])
             if flags & ~HARMLESS or max(left, marked) > most:
                 return None
             if marked or left:
@@ -102,8 +105,7 @@ class PolyhedraUpdate:
                 if not marked:
                     rounds.list_marked(done, 0)
                     done, clipped, final = done + 1, True, True
-                    binned = bins() if binned is None else binned
-                    cells.clip_rest(rounds.cut, self._report, box, points, binned, previous)
+                    clip(rounds.cut, self._report, used)
                     rounds.check()
                 continue
             self._clips = clipped
@@ -160,7 +162,7 @@ class _Rounds:
         self._engine.run_each(
             self._kernels.update_cells, self._n if size is None else size, np.int32(size is not None), self._listed,
             self._further, *self._fixed, *self.cut.output(self._report), self.cut.keys, self._changed, self._more,
-            self._marks,
+            self._marks, *self._engine.period_args,
         )  # fmt: skip
         self.check()
 

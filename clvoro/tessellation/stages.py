@@ -86,14 +86,18 @@ def tessellate_box(
     binned: BinnedPoints | None = None,
 ) -> Tessellation:
     """Tessellate the clip box of `domain`; see `Tessellator.tessellate`."""
-    if isinstance(stages.cells, Polyhedra):
+    cells = stages.cells
+    if isinstance(cells, Polyhedra):
         bins = cache(lambda: stages.bins.build(domain, points, n) if binned is None else binned)
         if previous is not None and not exact:
-            t = stages.polyhedra_update.update(stages.cells, domain, points, previous, bins)
+            t = stages.polyhedra_update.update(
+                cells, domain, points, previous,
+                lambda cut, report, _: cells.clip_rest(cut, report, domain, points, bins(), previous),
+            )  # fmt: skip
             if t is not None:
                 return t
         binned = bins()
-        return stages.cells.tessellate(domain, points, n, binned, previous, exact)
+        return cells.tessellate(domain, points, n, binned, previous, exact)
     if previous is not None and not exact:
         t = stages.incremental.update(stages.cells, domain, points, previous)
         if t is not None:

@@ -79,10 +79,15 @@ class Carried:
     def binned(self, x):
         return self.bins.build(BOX, x, self.n)
 
+    def clip_of(self, x):
+        return lambda cut, report, _: self.cells.clip_rest(
+            cut, report, BOX, x, self.binned(x), self.t
+        )
+
     def move(self, points):
         """Update the diagram to `points`; return whether that succeeded."""
         x = self.upload(points)
-        t = self.update.update(self.cells, BOX, x, self.t, lambda: self.binned(x))
+        t = self.update.update(self.cells, BOX, x, self.t, self.clip_of(x))
         if t is None:
             self.t = self.cells.tessellate(BOX, x, self.n, self.binned(x), exact=False)
         else:
@@ -220,9 +225,7 @@ def test_coinciding_generators_are_left_to_a_new_diagram(engine):
     points = relaxed(carried, POINTS["random"], 2)
     points[3] = points[4]
     x = carried.upload(points)
-    assert (
-        carried.update.update(carried.cells, BOX, x, carried.t, lambda: carried.binned(x)) is None
-    )
+    assert carried.update.update(carried.cells, BOX, x, carried.t, carried.clip_of(x)) is None
 
 
 def test_same_bits_again_and_from_saved_vertices(engine):

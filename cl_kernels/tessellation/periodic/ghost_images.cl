@@ -1,6 +1,8 @@
 #include "geometry/domain.h"
 #if DIM == 2
 #include "tessellation/corner.h"
+#else
+#include "tessellation/row_counts.h"
 #endif
 #include "tessellation/periodic/halo.h"
 
@@ -24,7 +26,7 @@
 /* Bits of report[1]. */
 #define FLAG_DROPPED 1 /* a face below round-off that only one of its cells has; it is to be dropped */
 #define FLAG_FAR 2     /* a neighbor is not the nearest image; report[2] is the least generator with such a neighbor */
-#define FLAG_COLLAPSED 4 /* a face that only one of its cells has is larger than round-off; report[2] likewise */
+#define FLAG_UNMATCHED 4 /* a face that only one of its cells has is larger than round-off; report[2] likewise */
 
 inline int step_of(int code, int a)
 {
@@ -270,7 +272,7 @@ kernel void fold_rows(const int size, global const int *starts, global const int
             const REAL rounding = DIM == 2 ? 2 * REAL_EPS * way : R(0);
             const bool tiny = measure <= rounding || (measure < 2048 * REAL_EPS * (DIM == 2 ? R(1) : way) &&
                                                       cone <= share * volumes[i] && cone <= share * volumes[j]);
-            const int flag = mutual ? 0 : (tiny ? FLAG_DROPPED : FLAG_COLLAPSED);
+            const int flag = mutual ? 0 : (tiny ? FLAG_DROPPED : FLAG_UNMATCHED);
             if (flag || (nearest && far)) {
                 atomic_or(report + 1, flag | (nearest && far ? FLAG_FAR : 0));
                 atomic_min(report + 2, i);
@@ -325,3 +327,28 @@ kernel void unfold_rows(const int size, global const int *starts, global const i
         unfolded[k] = wanted == CENTER ? label : find_image(j, wanted, size, firsts, codes);
     }
 }
+
+#if DIM == 3
+/* Per generator i whose cell was clipped while a folded diagram is updated: replace images by their owners. These cells
+   begin from place `used` on, and there is room for `room` faces. FLAG_FULL: the halo is too shallow, or a neighbor is so far away that those about a vertex need not be nearest images
+   of each other (polyhedra_update.cl). */
+kernel void fold_clipped_cells(const int size, const int used, const int room, global const int *row_places, global const int *row_counts,
+                               global const REAL *points, global const int *owners, global const int *halo_report,
+                               global int *labels, global int *report PERIOD_ARGS)
+{
+    WORK_ITEM(i);
+    if (halo_report[0])
+        atomic_or(report + REPORT_FLAGS, FLAG_FULL);
+    if (row_counts[i] == UNFINISHED || row_places[i] < used || report[REPORT_FACES] > room)
+        return;
+    const int begin = row_places[i], end = begin + COUNT_OF(row_counts[i]);
+    for (int k = begin; k < end; ++k) {
+        const int label = labels[k];
+        EACH_AXIS(a)
+        if (label >= 0 && PERIOD(a) > 0 && fabs(points[3 * label + a] - points[3 * i + a]) >= PERIOD(a) / 4)
+            atomic_or(report + REPORT_FLAGS, FLAG_FULL);
+        if (label >= size)
+            labels[k] = owners[label - size];
+    }
+}
+#endif

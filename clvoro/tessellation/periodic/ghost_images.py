@@ -11,6 +11,7 @@ from ...geometry.box import Box
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
 from ..bins import BinnedPoints
+from ..cut_cells import CutCells
 from ..device_diagram import NeighborRows, Tessellation
 from .halo import Halo, block_count, block_counts, halo_defines
 
@@ -166,7 +167,7 @@ class GhostImages:
         )  # fmt: skip
         return ExtendedPoints(n, count, box, halo, kept, halo_args, extended, firsts, owners, codes)
 
-    def unfold(self, images: ExtendedPoints, previous: Tessellation) -> NeighborRows:
+    def unfold(self, images: ExtendedPoints, previous: Tessellation | NeighborRows) -> NeighborRows:
         """Return rows of the extended graph from `previous`, the diagram of the generators at earlier positions."""
         m = int(previous.starts[images.n].get())
         neighbors = self._room("unfolded", size=m, dtype=np.int32)
@@ -175,6 +176,15 @@ class GhostImages:
             images.points, images.firsts, images.codes, neighbors, *self.engine.period_args,
         )  # fmt: skip
         return NeighborRows(images.n, previous.starts, neighbors)
+
+    def fold_clipped(
+        self, images: ExtendedPoints, cut: CutCells, report: cla.Array, used: int
+    ) -> None:
+        """Replace images by their owners in cells that were clipped in an update, in 3D: those behind `used` faces."""
+        self.engine.run_each(
+            self._kernels.fold_clipped_cells, images.n, np.int32(used), np.int32(cut.m), cut.places, cut.counts,
+            images.points, images.owners, self._report, cut.labels, report, *self.engine.period_args,
+        )  # fmt: skip
 
     def fold(
         self,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +13,16 @@ import pyopencl.array as cla
 from ...errors import InputError
 from ...geometry.box import Box
 from ...opencl.primitives import Summaries
-from ..device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, Tessellation, domain_position
+from ..bins import BinnedPoints
+from ..cut_cells import CutCells
+from ..device_diagram import (
+    EXACT_SHARE,
+    ROUGH_SHARE,
+    CloseError,
+    NeighborRows,
+    Tessellation,
+    domain_position,
+)
 from ..polyhedra import Polyhedra
 from .ghost_images import COLLAPSED, FAR, ExtendedBox, ExtendedPoints, FoldedDiagram
 from .halo import Halo
@@ -96,13 +107,17 @@ class PeriodicTessellator:
         """
         stages, halo, dim = self.stages, self.halo, self.domain.dim
         ghost_images, cells = stages.ghost_images, stages.cells
-        if previous is not None and not exact and not isinstance(cells, Polyhedra):
+        rows: Tessellation | NeighborRows | None = previous
+        if previous is not None and not exact:
             t = self._updated(points, n, previous)
             if t is not None:
                 self.latest = None
                 return t
             # Free scratch memory: images and their bins need room.
             stages.engine.workspace.clear()
+            if isinstance(cells, Polyhedra):
+                # The first of several attempts overwrites an updated diagram.
+                rows = NeighborRows(n, previous.starts.copy(), previous.neighbors.copy())
         if halo.cells == 0:
             volume = self.domain.measure / self.domain.frame[1] ** dim
             halo.fill(FIRST_DEPTH * (volume / n) ** (1 / dim), n)
@@ -114,9 +129,9 @@ class PeriodicTessellator:
                 stages.bins.clear_work()
             args = images.box, images.points, images.count, binned
             if isinstance(cells, Polyhedra):
-                rows = None if previous is None else ghost_images.unfold(images, previous)
+                first = None if rows is None else ghost_images.unfold(images, rows)
                 t = cells.tessellate(
-                    *args, rows, exact, None if keep_extended else n, images.halo_args
+                    *args, first, exact, None if keep_extended else n, images.halo_args
                 )
             else:
                 t = cells.tessellate(*args, exact, None if keep_extended else n)
@@ -155,13 +170,42 @@ class PeriodicTessellator:
         return replace(t, face_measures=faces[0], face_centroids=faces[1])
 
     def _updated(self, points: cla.Array, n: int, previous: Tessellation) -> Tessellation | None:
-        """Update `previous` incrementally to `points`, in 2D; None if too much has changed."""
+        """Update `previous` incrementally to `points`; None if too much has changed."""
         stages = self.stages
-        stages.folded_cells.reserve(n)
-        t = stages.incremental.update(stages.folded_cells, self._wide, points, previous)
+        if isinstance(stages.cells, Polyhedra):
+            t = stages.polyhedra_update.update(
+                stages.cells, self._wide, points, previous, self._clip_of(points, n, previous)
+            )
+        else:
+            stages.folded_cells.reserve(n)
+            t = stages.incremental.update(stages.folded_cells, self._wide, points, previous)
         if t is None:
             return None
         # Cells without gaps may cover the box more than once.
         self._sums.collect("volumes", t.volumes, n)
         total, measure = self._sums.read_one("volumes").sum, float(np.prod(self._edges))
         return t if abs(total - measure) < measure / 2 else None
+
+    def _clip_of(
+        self, points: cla.Array, n: int, previous: Tessellation
+    ) -> Callable[[CutCells, cla.Array, int], None]:
+        """Return a function that clips the unfinished cells of an update of `previous` to `points`, in 3D."""
+        stages, halo, cells = self.stages, self.halo, self.stages.cells
+        assert isinstance(cells, Polyhedra)
+
+        @cache
+        def images_in_bins() -> tuple[ExtendedPoints, BinnedPoints, NeighborRows]:
+            images = stages.ghost_images.extend(
+                self.domain, points, n, halo, (halo.cells / n) ** (1 / 3), False
+            )
+            binned = stages.bins.build(images.box, images.points, images.count)
+            return images, binned, stages.ghost_images.unfold(images, previous)
+
+        def clip(cut: CutCells, report: cla.Array, used: int) -> None:
+            images, binned, rows = images_in_bins()
+            cells.clip_rest(
+                cut, report, images.box, images.points, binned, rows, images.count, images.halo_args
+            )
+            stages.ghost_images.fold_clipped(images, cut, report, used)
+
+        return clip

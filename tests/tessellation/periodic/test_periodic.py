@@ -628,6 +628,7 @@ def test_transfer_across_periodic_boundaries(adapter, periodic, order):
 def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, restored):
     """A second attempt, after a halo that is too shallow, must not start from the graph of the first."""
     from clvoro.adaptation.checkpoint import DIAGRAM
+    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
     from clvoro.tessellation.tessellator import Tessellator
 
     n, stages = 300, adapter._stages_for(SLAB)
@@ -658,6 +659,7 @@ def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, resto
         )  # before they are read: there would be other labels
         return unfold(ghost_images, images, graph)
 
+    monkeypatch.setattr(PeriodicTessellator, "_updated", lambda *_: None)
     monkeypatch.setattr(GhostImages, "extend", narrow)
     monkeypatch.setattr(GhostImages, "unfold", seen)
     again = tessellator.tessellate(x, n, previous)
