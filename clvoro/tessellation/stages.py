@@ -99,7 +99,7 @@ def tessellate_box(
         binned = bins()
         return cells.tessellate(domain, points, n, binned, previous, exact)
     if previous is not None and not exact:
-        t = stages.incremental.update(stages.cells, domain, points, previous)
+        t = stages.incremental.update(cells, domain, points, previous)
         if t is not None:
             return t
         # Free the work arrays of the steps, because the bins need memory.
@@ -107,4 +107,4 @@ def tessellate_box(
     if binned is None:
         binned = stages.bins.build(domain, points, n)
         stages.bins.clear_work()
-    return stages.cells.tessellate(domain, points, n, binned, exact)
+    return cells.tessellate(domain, points, n, binned, exact)
