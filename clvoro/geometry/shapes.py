@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from numbers import Real
+from typing import Any
 
 import numpy as np
 import shapely
@@ -188,7 +189,7 @@ class Segment:
         return self.a[None], self.b[None], np.zeros(1)
 
 
-def shapes_of(geometry: shapely.Geometry) -> list[Circle | Polyline]:
+def shapes_of(geometry: Any) -> list[Circle | Polyline]:
     """Return the points, lines and rings of a shapely geometry as shapes in 2D.
 
     Raises

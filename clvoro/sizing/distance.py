@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from numbers import Real
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
@@ -82,12 +82,13 @@ class Distance(Field):
                 f"Distance got shapes {shapes!r} of type {type(shapes).__name__}, expected a shape or a list of them, "
                 "such as Distance(Circle((0.5, 0.5), 0.1), h_min=0.01, growth=1.2)"
             )
-        several = isinstance(shapes, Iterable) and not isinstance(shapes, (Shape, shapely.Geometry))
-        found = [
-            shapes_of(given) if isinstance(given, shapely.Geometry) else [given]
-            for given in (shapes if several else (shapes,))
-        ]
-        self.shapes = tuple(shape for some in found for shape in some)
+        given_shapes: Any = shapes
+        if isinstance(shapes, (Shape, shapely.Geometry)):
+            given_shapes = [shapes]
+        found: list[Any] = []
+        for given in given_shapes:
+            found += shapes_of(given) if isinstance(given, shapely.Geometry) else [given]
+        self.shapes = tuple(found)
         for shape in self.shapes:
             if not isinstance(shape, Shape):
                 raise InputTypeError(
