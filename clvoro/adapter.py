@@ -292,7 +292,7 @@ class Adapter:
         method : str
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
             size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a
-            power diagram, in polygons and boxes with walls. The others repeat one kind of step: "lloyd", "poisson" and
+            power diagram, in polygons and boxes. The others repeat one kind of step: "lloyd", "poisson" and
             "coupled" as published, "weighted-lloyd" and "weighted" with the density h^-d, and the moving meshes "mmpde"
             and "monge-ampere", which map a lattice in a box (see `clvoro.adaptation.methods`).
         n_cells : int, optional

@@ -118,7 +118,6 @@ def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diag
     Parameters
     ----------
     domain : Box or Polygon
-        A box with walls.
     points : (n, d) array of float
         Distinct generators inside the domain.
     weights : (n,) array of float
@@ -134,7 +133,7 @@ def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diag
     DeviceError
         If no device works.
     InputError, InputTypeError
-        If an argument is not as expected, the domain is periodic or a sphere, or points are too close together for the
+        If an argument is not as expected, the domain is a sphere, or points are too close together for the
         precision.
     MemoryLimitError
         If the device has not enough memory.
@@ -171,7 +170,6 @@ def transport(
     Parameters
     ----------
     domain : Box or Polygon
-        A box with walls.
     points : (n, d) array of float
         Distinct generators inside the domain. They stay where they are.
     volumes : (n,) array of float

@@ -6,6 +6,20 @@
 #ifdef WEIGHTED
 #define STRIDE (DIM + 1)
 #define WEIGHT(points, j) (points)[STRIDE * (j) + DIM]
+
+/* Weights in single precision as integers in the same order, so that maxima do not depend on the order of work-items. A
+   key is that of its weight, rounded up. */
+inline int key_of_weight(REAL weight)
+{
+    const float w = (float)weight;
+    const int bits = as_int(w + fabs(w) * FLT_EPSILON);
+    return bits >= 0 ? bits : bits ^ INT_MAX;
+}
+
+inline float weight_of_key(int key)
+{
+    return as_float(key >= 0 ? key : key ^ INT_MAX);
+}
 #else
 #define STRIDE DIM
 #define WEIGHT(points, j) R(0)

@@ -39,7 +39,7 @@ inline void check_corner_ball(const cells_t *cells, const walk_t *walk, int v, i
                   (double4)(PLANE_LANE(cells->planes, faces[k], 0, lane), PLANE_LANE(cells->planes, faces[k], 1, lane),
                             PLANE_LANE(cells->planes, faces[k], 2, lane), 0);
     }
-    check_vertex_ball(x, i, corner_at(walk, v, lane), ways, labels, &out->halo);
+    check_vertex_ball(x, 0, i, corner_at(walk, v, lane), ways, labels, &out->halo);
 }
 
 /* Test the balls around the vertices of the cells of some lanes, for generators in the box. */

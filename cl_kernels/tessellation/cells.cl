@@ -78,7 +78,8 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
 #ifdef WEIGHTED
 /* Per generator i: its cell, clipped by its neighbors in an earlier, similar diagram, and by theirs. A cell from which
    too little was cut contains that of the diagram. So all are right if the sum of their areas is that of the box. If
-   not, the next round starts from these. A cell without neighbors is empty and stays so. */
+   not, the next round starts from these. A cell without neighbors is empty and stays so. In a folded graph neighbors
+   are nearest images; images farther away are missing. */
 kernel void clip_by_rings(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
                           global const int *old_starts, global const int *old_neighbors, global int *rows,
                           global int *row_counts, global int *places, global int *flags)
@@ -107,6 +108,10 @@ kernel void clip_by_rings(const int size, global const REAL *points, const REAL4
                 flag = FLAG_FULL;
         }
     }
+    /* Along a period no cell reaches a side of the box that contains all. There is no corner on it, either. */
+    for (int f = 0; f < cell.n; ++f)
+        if (cell.faces[f] < 0 && FOLD((-1 - cell.faces[f]) / 2) > 0)
+            atomic_or(flags, FLAG_OPEN);
     places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
 }
 #endif

@@ -93,6 +93,15 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
     const int axis = wall / 2;
     const int o = min(i, j), q = max(i, j);
     const REAL level = wall % 2 ? upper[axis] : lower[axis];
+#ifdef FOLD_0
+    if (FOLD(axis) > 0) {
+        /* Only cells that are not finished reach the sides of a box wider than the period. */
+        const REAL2 d = direction_of(x, j, points);
+        const REAL from = axis == 0 ? d.s0 : d.s1, by = axis == 0 ? d.s1 : d.s0, to = level - x[axis];
+        const REAL there = ((dot(d, d) - (WEIGHT(points, j) - SITE_WEIGHT(x))) / 2 - from * to) / by;
+        return axis == 0 ? (REAL2)(to, there) : (REAL2)(there, to);
+    }
+#endif
     const REAL d_across = points[STRIDE * q + axis] - points[STRIDE * o + axis];
     const REAL d_along = BETWEEN(1 - axis, points[STRIDE * o + 1 - axis], points[STRIDE * q + 1 - axis]);
     const REAL across = level - points[STRIDE * o + axis];

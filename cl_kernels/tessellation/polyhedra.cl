@@ -66,13 +66,13 @@ inline void sum_second_moments(const CELL *cell, CELL_SPACE const INDEX *start, 
 inline void check_cell_balls(const CELL *cell, int i, REAL4 place, const halo_t *halo)
 {
     const REAL x[3] = {place.s0, place.s1, place.s2};
-    const REAL reach = sqrt(cell->reach2);
-    const int count = reaches_beyond(x, reach + widest_ball(halo) * reach, halo) ? cell->n : 0;
+    const REAL widest = widest_ball(halo) * ball_radius(cell->reach2, place.s3, halo);
+    const int count = reaches_beyond(x, sqrt(cell->reach2) + widest, halo) ? cell->n : 0;
     for (int v = 0; v < count; ++v) {
         const INDEX4 f = cell->faces[v];
         const REAL4 ways[3] = {cell->planes[f.s0], cell->planes[f.s1], cell->planes[f.s2]};
         const int labels[3] = {cell->labels[f.s0], cell->labels[f.s1], cell->labels[f.s2]};
-        check_vertex_ball(x, i, vertex_at(cell, v), ways, labels, halo);
+        check_vertex_ball(x, place.s3, i, vertex_at(cell, v), ways, labels, halo);
     }
 }
 #endif

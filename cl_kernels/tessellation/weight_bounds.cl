@@ -1,18 +1,6 @@
 #include "tessellation/weight_bounds.h"
 
-/* Weights as integers in the same order, so that maxima do not depend on the order of work-items. */
-inline int in_order(float w)
-{
-    const int bits = as_int(w);
-    return bits >= 0 ? bits : bits ^ INT_MAX;
-}
-
-inline float out_of_order(int key)
-{
-    return as_float(key >= 0 ? key : key ^ INT_MAX);
-}
-
-/* Per generator i: its weight, rounded up, into the largest one of its tile. Keys begin as INT_MIN. */
+/* Per generator i: the key of its weight into the largest one of its tile. Keys begin as INT_MIN. */
 kernel void collect_weights(const int size, global const REAL *points, const REAL4 tiles_from, const int side,
                             global int *keys)
 {
@@ -20,9 +8,7 @@ kernel void collect_weights(const int size, global const REAL *points, const REA
     REAL x[DIM];
     EACH_AXIS(a)
     x[a] = points[STRIDE * i + a];
-    const float w = (float)WEIGHT(points, i);
-    const int key = in_order(w + fabs(w) * FLT_EPSILON);
-    atomic_max(keys + tile_index(tile_of(x, tiles_from, side), side), key);
+    atomic_max(keys + tile_index(tile_of(x, tiles_from, side), side), key_of_weight(WEIGHT(points, i)));
 }
 
 /* Per tile t of a level with `side` tiles along each axis, from `first` on: the largest key of its parts. These are
@@ -49,5 +35,5 @@ kernel void spread_weights(const int size, const int side, const int first, glob
         for (int y = max(at.s1 - 1, 0); y <= min(at.s1 + 1, side - 1); ++y)
             for (int x = max(at.s0 - 1, 0); x <= min(at.s0 + 1, side - 1); ++x)
                 most = max(most, keys[first + tile_index((int3)(x, y, z), side)]);
-    bounds[first + t] = most == INT_MIN ? -FLT_MAX : out_of_order(most);
+    bounds[first + t] = most == INT_MIN ? -FLT_MAX : weight_of_key(most);
 }

@@ -354,9 +354,9 @@ class MeshState(MeshArrays):
         self.stages.clear("poisson")
         self.engine.workspace.clear()
         if self.t.weighted is not None and self.power is not None:
-            self.tessellation, self._extended = self.power.final(self.t), None
+            self.tessellation, self._extended = self.power.final(self.t)
             self.evaluate_metric()
-            return False
+            return self._extended is not None
         whole = self.tessellator.has_extended(self.t)
         if not whole:
             # Free the present diagram before the new one is computed.

@@ -136,7 +136,7 @@ class Transport:
             # Trial steps overwrite the diagram.
             self._rows = power.rows(now.t)
             balance_components(power.domain, now.t, now.rhs, prescribed)
-            step, newton.solution = self._newton_step(now, points, ordering)
+            step, newton.solution = self._newton_step(power, now, points, ordering)
             new, share = None, 2.0
             while new is None and share > LEAST_SHARE:
                 share /= 2
@@ -197,14 +197,15 @@ class Transport:
         )
 
     def _newton_step(
-        self, now: _State, points: cla.Array, ordering: object
+        self, power: PowerTessellator, now: _State, points: cla.Array, ordering: object
     ) -> tuple[cla.Array, Solution]:
         engine, t = self.engine, now.t
         tolerance = max(min(ROUGHEST, FORCING * now.error), FINEST[engine.real.name])
         step = engine.empty(len(points))
         with engine.workspace.frame():
+            measures = power.laplacian_measures(t)
             laplacian = self._poisson.assemble(
-                t.starts, t.neighbors, t.face_measures, points, tolerance=tolerance
+                t.starts, t.neighbors, measures, points, tolerance=tolerance
             )
             solution = self._poisson.solve(
                 laplacian, now.rhs, step, tolerance=tolerance, ordering=ordering, from_zero=True

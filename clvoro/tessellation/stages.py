@@ -15,7 +15,7 @@ from .cells import Cells
 from .clipped.trim import Trim
 from .device_diagram import Tessellation
 from .incremental import IncrementalUpdate
-from .periodic.folded import FoldedCells
+from .periodic.folded import FoldedCells, FoldedPowerCells
 from .periodic.ghost_images import GhostImages
 from .polyhedra import Polyhedra
 from .polyhedra_update import PolyhedraUpdate
@@ -51,6 +51,8 @@ class TessellationStages:
             kind = Polyhedra
         elif name == "cells" and self.engine.domain_kind.weighted:
             kind = PowerCells
+        elif name == "folded_cells" and self.engine.domain_kind.weighted:
+            kind = FoldedPowerCells
         stage = kind(self.engine)
         setattr(self, name, stage)
         return stage

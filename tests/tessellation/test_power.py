@@ -19,20 +19,33 @@ BAYS = clvoro.Polygon(
 """Two bays with a wall between them, thinner than a cell, and two islands."""
 
 
-def random_case(dim, n, spread, seed=31):
+def random_case(dim, n, spread, seed=31, periodic=False):
     """Return a box, generators, and weights up to `spread` times the square of their distance."""
     rng, box = np.random.default_rng(seed), BOXES[dim]
+    box = clvoro.Box(box.lower, box.upper, periodic=periodic)
     points = rng.uniform(box.lower, box.upper, (n, dim))
     return box, points, spread * (box.measure / n) ** (2 / dim) * rng.random(n) + 7
 
 
-@pytest.mark.parametrize(("dim", "real"), [(2, "float64"), (2, "float32"), (3, "float64")])
+@pytest.mark.parametrize(
+    ("dim", "real", "periodic"),
+    [
+        (2, "float64", False),
+        (2, "float32", False),
+        (3, "float64", False),
+        (2, "float64", True),
+        (2, "float32", True),
+        (2, "float64", (True, False)),
+        (3, "float64", True),
+        pytest.param(3, "float32", (False, True, True), marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
-def test_cells_are_those_of_the_definition(ctx, dim, real):
+def test_cells_are_those_of_the_definition(ctx, dim, real, periodic):
     adapter = clvoro.Adapter(ctx, real)
-    box, points, weights = random_case(dim, 50, 3.0)
+    box, points, weights = random_case(dim, 50, 3.0, periodic=periodic)
     d = adapter.power_diagram(box, points, weights)
-    volumes, centroids = power_cells(box.lower, box.upper, points, weights)
+    volumes, centroids = power_cells(box, points, weights)
     noise = 2e3 * np.finfo(adapter.dtype).eps * max(np.abs(box.upper))
     assert 5 < len(d.empty_cells) < 25
     assert d.empty_cells.tolist() == np.flatnonzero(volumes == 0).tolist()
@@ -42,7 +55,8 @@ def test_cells_are_those_of_the_definition(ctx, dim, real):
     assert d.check(), d.check()
     assert d.weights.tolist() == weights.tolist()
     # Cells are found by the power distance.
-    assert d.locate(d.centroids[filled]).tolist() == np.flatnonzero(filled).tolist()
+    inside = d.domain.wrap(d.centroids[filled])
+    assert d.locate(inside).tolist() == np.flatnonzero(filled).tolist()
 
 
 @pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
@@ -77,6 +91,32 @@ def test_cells_in_a_polygon_are_those_of_the_definition(ctx, spread, slope, real
     places = places[BAYS.contains(places)]
     squares = ((places[:, None] - points) ** 2).sum(axis=2) - weights
     assert d.locate(places).tolist() == squares.argmin(axis=1).tolist()
+
+
+@pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
+@pytest.mark.parametrize("dim", [2, 3])
+def test_images_carry_the_weights_of_their_generators(ctx, dim):
+    """Few cells with very different weights: their neighbors are far images, also their own."""
+    adapter, rng = clvoro.Adapter(ctx), np.random.default_rng(12)
+    for n, spread in ((1, 0.0), (2, 0.5), (3, 2.0), (7, 2.0), (7, 8.0)):
+        box, points, _ = random_case(dim, n, 0.0, seed=n, periodic=True)
+        weights = spread * (box.measure / n) ** (2 / dim) * rng.random(n)
+        d = adapter.power_diagram(box, points, weights)
+        np.testing.assert_allclose(d.volumes, power_cells(box, points, weights)[0], atol=1e-12)
+        assert d.volumes.sum() == pytest.approx(box.measure, rel=1e-13)
+        assert d.check(), d.check()
+
+
+def test_weights_of_a_moved_periodic_diagram(ctx):
+    """Weights with a smooth wave along x move the cells: the generators do not lie in them."""
+    rng, box = np.random.default_rng(5), clvoro.Box((0, 0), (1, 1), periodic=True)
+    points = rng.random((2000, 2))
+    weights = 0.05 * np.sin(2 * np.pi * points[:, 0])
+    d = clvoro.Adapter(ctx).power_diagram(box, points, weights)
+    away = np.abs(d.centroids - points)[:, 0]
+    assert away.max() > 0.1  # five spacings; half the derivative of the weights is 0.16
+    np.testing.assert_allclose(d.volumes, power_cells(box, points, weights)[0], atol=1e-12)
+    assert d.check(), d.check()
 
 
 @pytest.mark.parametrize("dim", [2, 3])

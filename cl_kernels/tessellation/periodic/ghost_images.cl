@@ -137,11 +137,20 @@ kernel void count_images(const int size, global const REAL *points, global const
     MAKE_BLOCKS;
     REAL x[DIM], y[DIM];
     EACH_AXIS(a)
-    x[a] = points[DIM * i + a];
+    x[a] = points[STRIDE * i + a];
     int count = 0;
     for (int codes = codes_near(x, extremes PERIODS); codes != 0;)
         count += make_image(x, take_code(&codes), depths, &blocks, y PERIODS);
     counts[i] = count;
+}
+
+inline void put_site(global REAL *points, int i, const REAL *x, REAL weight)
+{
+    EACH_AXIS(a)
+    points[STRIDE * i + a] = x[a];
+#ifdef WEIGHTED
+    WEIGHT(points, i) = weight;
+#endif
 }
 
 /* Per generator i: copy it to row i of `extended`, and write its images behind row n. Their order, by owner and code,
@@ -154,14 +163,14 @@ kernel void place_images(const int size, global const REAL *points, global const
     MAKE_BLOCKS;
     REAL x[DIM], y[DIM];
     EACH_AXIS(a)
-    extended[DIM * i + a] = x[a] = points[DIM * i + a];
+    x[a] = points[STRIDE * i + a];
+    put_site(extended, i, x, WEIGHT(points, i));
     int g = firsts[i];
     for (int near = codes_near(x, extremes PERIODS); near != 0;) {
         const int code = take_code(&near);
         if (!make_image(x, code, depths, &blocks, y PERIODS))
             continue;
-        EACH_AXIS(a)
-        extended[DIM * (size + g) + a] = y[a];
+        put_site(extended, size + g, y, WEIGHT(points, i));
         owners[g] = i;
         codes[g++] = code;
     }
@@ -182,12 +191,14 @@ kernel void measure_required_depths(const int size, global const int *items, glo
     if (i >= halo.own)
         return;
     const int begin = starts[i], end = starts[i + 1];
-    const REAL radius = reach[p] * (1 + BALL_NOISE), sideways = halo.sideways, outwards = halo.outwards;
-    REAL x[DIM];
+    if (begin == end)
+        return;
+    SITE(x, i, points);
+    const REAL far = (REAL)reach[p] / 2, sideways = halo.sideways, outwards = halo.outwards;
+    const REAL radius = (far + ball_radius(far * far, SITE_WEIGHT(x), &halo)) * (1 + BALL_NOISE);
     bool near = false;
     EACH_AXIS(a)
     {
-        x[a] = points[DIM * i + a];
         near = near || (PERIOD(a) > 0 && fmin(x[a], PERIOD(a) - x[a]) < (1 + sideways + outwards) * radius);
     }
     /* One ball that contains all others and their room for motion. */
@@ -207,7 +218,7 @@ kernel void measure_required_depths(const int size, global const int *items, glo
         if (before >= 0 && after >= 0)
             least2 = fmin(least2, dot(u[1] - u[0], u[1] - u[0]));
         const REAL y[2] = {x[0] + v.s0, x[1] + v.s1}, way = sqrt(least2);
-        check_ball(y, sqrt(dot(v, v)), sideways * way, outwards * way, true, &halo);
+        check_ball(y, ball_radius(dot(v, v), SITE_WEIGHT(x), &halo), sideways * way, outwards * way, true, &halo);
         before = after;
     }
 }
@@ -263,15 +274,20 @@ kernel void fold_rows(const int size, global const int *starts, global const int
             bool far = false;
             EACH_AXIS(a)
             {
-                const REAL d = points[DIM * label + a] - points[DIM * i + a];
-                far = far || DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) != d;
+                const REAL d = points[STRIDE * label + a] - points[STRIDE * i + a];
+                far = far || DIFFERENCE(a, points[STRIDE * i + a], points[STRIDE * j + a]) != d;
                 d2 += d * d;
             }
             const REAL measure = face_measures[k], way = sqrt(d2), cone = measure * way / (2 * DIM);
             /* In cells as narrow as round-off the corners have large errors. */
             const REAL rounding = DIM == 2 ? 2 * REAL_EPS * way : R(0);
-            const bool tiny = measure <= rounding || (measure < 2048 * REAL_EPS * (DIM == 2 ? R(1) : way) &&
-                                                      cone <= share * volumes[i] && cone <= share * volumes[j]);
+            REAL least = share * fmin(volumes[i], volumes[j]);
+#ifdef WEIGHTED
+            /* Cells may be so small that they are uncertain, as long as that is round-off of the other. */
+            least = fmax(least, 64 * REAL_EPS * fmax(volumes[i], volumes[j]));
+#endif
+            const bool tiny =
+                measure <= rounding || (measure < 2048 * REAL_EPS * (DIM == 2 ? R(1) : way) && cone <= least);
             const int flag = mutual ? 0 : (tiny ? FLAG_DROPPED : FLAG_UNMATCHED);
             if (flag || (nearest && far)) {
                 atomic_or(report + 1, flag | (nearest && far ? FLAG_FAR : 0));
@@ -306,6 +322,27 @@ kernel void close_rows(const int size, global const int *starts, global const uc
     }
 }
 
+/* Per generator i: the measures of its faces, times the ratio of two distances: to the nearest image of the neighbor,
+   and to the image across the face. Over the former, as the Poisson matrix divides them, they are those over the latter.
+ */
+kernel void scale_far_measures(const int size, global const int *starts, global const int *folded,
+                               global const int *face_codes, global const FACE *face_measures,
+                               global const REAL *points, global FACE *scaled PERIOD_ARGS)
+{
+    WORK_ITEM(i);
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = folded[k];
+        REAL near2 = 0, across2 = 0;
+        for (int a = 0; a < DIM && j >= 0; ++a) {
+            const REAL from = points[STRIDE * i + a], to = points[STRIDE * j + a];
+            const REAL near = DIFFERENCE(a, from, to), across = to + step_of(face_codes[k], a) * PERIOD(a) - from;
+            near2 += near * near;
+            across2 += across * across;
+        }
+        scaled[k] = across2 > near2 ? face_measures[k] * sqrt(near2 / across2) : face_measures[k];
+    }
+}
+
 /* Per generator i: its row of an earlier folded graph as a row of the extended graph. Owners are replaced by the image
    nearest now, or by -1 if it is not in the halo. Cells only start from these rows; they need not be complete. */
 kernel void unfold_rows(const int size, global const int *starts, global const int *neighbors,
@@ -315,12 +352,12 @@ kernel void unfold_rows(const int size, global const int *starts, global const i
     WORK_ITEM(i);
     REAL x[DIM];
     EACH_AXIS(a)
-    x[a] = points[DIM * i + a];
+    x[a] = points[STRIDE * i + a];
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbors[k];
         int label = j < 0 ? -1 : j, wanted = CENTER, weight = 1;
         for (int a = 0; a < DIM && j >= 0; ++a, weight *= 3) {
-            const REAL d = points[DIM * j + a] - x[a], half_period = PERIOD(a) / 2;
+            const REAL d = points[STRIDE * j + a] - x[a], half_period = PERIOD(a) / 2;
             if (half_period > 0 && fabs(d) > half_period)
                 wanted += d < 0 ? weight : -weight;
         }

@@ -1,7 +1,7 @@
 /* The halo of a periodic box. Each periodic boundary is divided into blocks with a depth each, within which ghost
    images are taken; ghost_images.cl explains why the balls around vertices determine these depths. HALO_ARGS come last
    in a kernel's signature and are empty for domains that are not periodic. MAKE_HALO declares `halo` from them. */
-#include "opencl/real.h"
+#include "geometry/weights.h"
 
 #ifdef HALO
 #ifndef BLOCKS
@@ -33,19 +33,26 @@ typedef struct {
     blocks_t blocks;
     REAL sideways, outwards;            /* room for motion: see `check_ball` */
     float kept;                         /* least share of its depth that a block keeps */
+    REAL most;                          /* largest weight, in a power diagram */
     REAL limits[2 * DIM];               /* balls less deep than this pass, at either end of each axis */
     global const float *depths;         /* per block */
     global int *requests, *too_shallow; /* output: per block, bits of floats; is the halo too shallow? */
 } halo_t;
 
+#ifdef WEIGHTED
+#define MOST_WEIGHT weight_of_key(halo_most[0])
+#else
+#define MOST_WEIGHT 0
+#endif
+
 #define HALO_ARGS                                                                                                      \
     , const int halo_own, const REAL4 halo_period, BLOCK_ARGS, const REAL halo_sideways, const REAL halo_outwards,     \
         const float halo_kept, global const float *halo_depths, global const int *halo_extremes,                       \
-        global int *halo_requests, global int *halo_too_shallow
+        global int *halo_requests, global int *halo_too_shallow, global const int *halo_most
 #define MAKE_HALO                                                                                                      \
     MAKE_BLOCKS;                                                                                                       \
-    halo_t halo = {halo_own,  halo_period, blocks,      halo_sideways, halo_outwards,                                  \
-                   halo_kept, {0},         halo_depths, halo_requests, halo_too_shallow};                              \
+    halo_t halo = {halo_own,  halo_period, blocks, halo_sideways, halo_outwards, halo_kept,                            \
+                   MOST_WEIGHT, {0},       halo_depths, halo_requests, halo_too_shallow};                              \
     find_limits(&halo, halo_extremes)
 
 /* Layout of `extremes`, as bits of floats, whose order is that of floats >= 0: the largest depth along each axis, and
@@ -99,6 +106,18 @@ inline REAL block_distance2(REAL x, int a, int block, const blocks_t *blocks)
     const REAL above = block < count_along(blocks, a) - 1 ? x - (starts[a] + (block + 1) * length) : R(0);
     const REAL away = fmax(fmax(below, above) - 16 * REAL_EPS, R(0));
     return away * away;
+}
+
+/* Radius of the ball around a vertex of a cell that is empty of generators. It has the squared distance r2 from the
+   cell's generator, which has the weight w. In a power diagram it is less by the weight of the other generator: here it
+   is that for the largest weight. */
+inline REAL ball_radius(REAL r2, REAL w, const halo_t *in)
+{
+#ifdef WEIGHTED
+    return sqrt(r2 + fmax(in->most - w, R(0)));
+#else
+    return sqrt(r2);
+#endif
 }
 
 /* Test a ball around x that a generator in the box lies on. Sets too_shallow[0] if it leaves the halo. Requests depths
@@ -179,13 +198,14 @@ inline REAL widest_ball(const halo_t *in)
     return 1 + BALL_NOISE + (in->sideways + in->outwards) * WIDEST_WAY;
 }
 
-/* Test the ball around a vertex, at `at` from generator i at x, where the faces with three others meet. Generator k of
+/* Test the ball around a vertex, at `at` from generator i at x with the weight w, where the faces with three others meet. Generator k of
    these is at ways[k] from x, unless labels[k] is a wall. All cells at the vertex test whether the halo is deep enough.
    Only the one with the least generator adds room for motion, as all compute the same. `sideways` and `outwards` are
    shares of the shortest distance between two of the generators. */
-inline void check_vertex_ball(const REAL *x, int i, REAL4 at, const REAL4 *ways, const int *labels, const halo_t *in)
+inline void check_vertex_ball(const REAL *x, REAL w, int i, REAL4 at, const REAL4 *ways, const int *labels,
+                              const halo_t *in)
 {
-    const REAL radius = sqrt(at.s0 * at.s0 + at.s1 * at.s1 + at.s2 * at.s2);
+    const REAL radius = ball_radius(at.s0 * at.s0 + at.s1 * at.s1 + at.s2 * at.s2, w, in);
     REAL way = 0;
     if ((labels[0] > i || labels[0] < 0) && (labels[1] > i || labels[1] < 0) && (labels[2] > i || labels[2] < 0)) {
         REAL least2 = WIDEST_WAY * WIDEST_WAY * radius * radius;

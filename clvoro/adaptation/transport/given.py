@@ -42,10 +42,10 @@ def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: ob
     with Naming(host, domain, stages.engine.real):
         labels, sorted_points = _sorted(stages, domain, host)
         device_weights = stages.engine.upload(scaled[labels.get()])
-        t = power.tessellate(sorted_points, device_weights, n, exact=True)
+        t = power.tessellate(sorted_points, device_weights, n, exact=True, complete=True)
         assert t is not None
-        t = power.final(t)
-    diagram = fetch_diagram(power.stages.engine, domain, t, labels)
+        t, extended = power.final(t)
+    diagram = fetch_diagram(power.stages.engine, domain, t, labels, extended=extended)
     diagram = diagram.with_weights(given)
     empty = diagram.empty_cells
     if len(empty):
@@ -85,7 +85,8 @@ def transport_to(
         t, _, newton = stages.transport.solve(
             power, sorted_points, engine.upload(prescribed), None, tolerance, most, exact=True
         )
-    diagram = fetch_diagram(power.stages.engine, domain, power.final(t), labels)
+        t, extended = power.final(t)
+    diagram = fetch_diagram(power.stages.engine, domain, t, labels, extended=extended)
     result = Transported(
         diagram, np.array(newton.errors), np.array(newton.shares), newton.converged
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from ...opencl.engine import Engine
 from ..cells import Cells
+from ..power_cells import PowerCells
 
 
 class FoldedCells(Cells):
@@ -31,3 +32,7 @@ class FoldedCells(Cells):
         """Free all buffers of cells and faces."""
         self._of_cells, self._of_faces, self._views = {}, {}, {}
         self._capacity, self._room, self._n = 0, 0, -1
+
+
+class FoldedPowerCells(FoldedCells, PowerCells):
+    """The same for power diagrams: cells start from the neighbors in an earlier folded graph."""

@@ -117,6 +117,8 @@ class GhostImages:
     ) -> ExtendedPoints:
         """Return the first `n` of `points` (n, d) with their images in the halo.
 
+        In a power diagram rows of `points` end with weights.
+
         Parameters
         ----------
         halo : Halo
@@ -148,7 +150,7 @@ class GhostImages:
         self._scan.exclusive(firsts, firsts, n)
         ghosts = int(firsts[n].get())
         count = n + ghosts
-        extended = self._room("points", size=d * count).reshape(-1, d)
+        extended = self._room("points", size=engine.site_size * count).reshape(-1, engine.site_size)
         owners = self._room("owners", size=ghosts, dtype=np.int32)
         codes = self._room("image codes", size=ghosts, dtype=np.int32)
         engine.run_each(
@@ -163,9 +165,21 @@ class GhostImages:
         halo_args = (
             np.int32(n), np.append(periods, np.zeros(4 - d)).astype(engine.real), *blocks,
             engine.real.type(SIDEWAYS), engine.real.type(OUTWARDS), kept,
-            halo.depths, halo.extremes, halo.requests, self._report,
+            halo.depths, halo.extremes, halo.requests, self._report, halo.most,
         )  # fmt: skip
         return ExtendedPoints(n, count, box, halo, kept, halo_args, extended, firsts, owners, codes)
+
+    def scale_far_measures(self, t: Tessellation, codes: cla.Array) -> cla.Array:
+        """Return the measures of the faces of `t`, a folded diagram, for a Poisson matrix that takes nearest images.
+
+        `codes` are those of its faces (see `FoldedDiagram`). The array is in the workspace.
+        """
+        engine, scaled = self.engine, self.engine.scratch(len(t.neighbors), self.engine.face)
+        engine.run_each(
+            self._kernels.scale_far_measures, t.n, t.starts, t.neighbors, codes, t.face_measures, t.sites, scaled,
+            *engine.period_args,
+        )  # fmt: skip
+        return scaled
 
     def unfold(self, images: ExtendedPoints, previous: Tessellation | NeighborRows) -> NeighborRows:
         """Return rows of the extended graph from `previous`, the diagram of the generators at earlier positions."""

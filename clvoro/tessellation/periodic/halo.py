@@ -57,6 +57,8 @@ class Halo:
         Depths that the cells of a diagram require, while it is made: bits of floats.
     extremes : (10,) int32, device
         Largest and least of `depths`; see tessellation/periodic/halo.h.
+    most : (1,) int32, device
+        Key of the largest weight, in a power diagram; see geometry/weights.h.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -66,6 +68,7 @@ class Halo:
         self.depths = engine.zeros(count, np.float32)
         self.requests = engine.zeros(count, np.int32)
         self.extremes = engine.empty(10, np.int32)
+        self.most = engine.zeros(1, np.int32)
 
     def fill(self, depth: float, cells: int) -> None:
         """Estimate that the diagram of `cells` generators requires `depth` everywhere."""

@@ -61,8 +61,12 @@ class PeriodicTessellator:
     Attributes
     ----------
     halo : Halo
+    wide : ExtendedBox
+        Contains every cell, wherever its generator is.
     latest : ExtendedDiagram or None
         Of the latest diagram, if it was kept.
+    codes : (>= m,) int32
+        Codes of the images across the faces of the latest diagram from scratch (see `FoldedDiagram`).
     """
 
     def __init__(self, stages: TessellationStages, domain: Box, halo: Halo | None = None) -> None:
@@ -73,8 +77,7 @@ class PeriodicTessellator:
             for corner in domain.device_corners(stages.engine.real)
         )
         self._edges = upper - lower
-        # Contains every cell, wherever its generator is.
-        self._wide = ExtendedBox(lower - self.periods, upper + self.periods)
+        self.wide = ExtendedBox(lower - self.periods, upper + self.periods)
         self._sums = Summaries(stages.engine, ("volumes",))
         self.halo = Halo(stages.engine) if halo is None else halo
         self.latest: ExtendedDiagram | None = None
@@ -89,6 +92,8 @@ class PeriodicTessellator:
         keep_extended: bool = False,
     ) -> Tessellation:
         """Tessellate by the first `n` of `points`; see `Tessellator.tessellate`.
+
+        In a power diagram rows of `points` end with weights, and `previous` is None.
 
         Parameters
         ----------
@@ -147,12 +152,13 @@ class PeriodicTessellator:
         if flags & COLLAPSED:
             raise CloseError(points, n)
         if flags & FAR:
-            place = domain_position(self.domain, points[generator].get())
+            place = domain_position(self.domain, points[generator].get()[:dim])
             raise FewCellsError(
                 f"the generator at {place}, one of {n}, has a neighbor half a period away or farther, expected at "
                 f"least four or five cells across each period of {self.domain}; use a smaller size, more cells "
                 "(n_cells) or fewer levels"
             )
+        self.codes = folded.codes
         self.latest = ExtendedDiagram(images, t, folded) if keep_extended else None
         return folded.tessellation
 
@@ -174,11 +180,11 @@ class PeriodicTessellator:
         stages = self.stages
         if isinstance(stages.cells, Polyhedra):
             t = stages.polyhedra_update.update(
-                stages.cells, self._wide, points, previous, self._clip_of(points, n, previous)
+                stages.cells, self.wide, points, previous, self._clip_of(points, n, previous)
             )
         else:
             stages.folded_cells.reserve(n)
-            t = stages.incremental.update(stages.folded_cells, self._wide, points, previous)
+            t = stages.incremental.update(stages.folded_cells, self.wide, points, previous)
         if t is None:
             return None
         # Cells without gaps may cover the box more than once.

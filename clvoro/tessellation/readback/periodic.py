@@ -71,7 +71,8 @@ class _PeriodicReader(_DiagramReader):
             return np.arange(count)
         dropped = np.setdiff1d(np.arange(starts[-1]), self.places)
         ends = np.arange(1, starts[-1] + 1)
-        ends[starts[1:] - 1] = starts[:-1]
+        filled = np.diff(starts) > 0  # cells of power diagrams may be empty
+        ends[starts[1:][filled] - 1] = starts[:-1][filled]
         vertices = self.shared.cell_vertices.get()
         pairs = vertices[dropped], vertices[ends[dropped]]
         graph = coo_array((np.ones(len(dropped), np.int8), pairs), (count, count))

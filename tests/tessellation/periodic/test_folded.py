@@ -98,7 +98,7 @@ def test_cells_that_cover_the_box_twice(ctx, real):
     twice = points * [2, 1] + np.column_stack([apart.imag, apart.real])
     stages.folded_cells.reserve(run.n)
     covered = stages.incremental.update(
-        stages.folded_cells, run.periodic._wide, run.place(twice), run.t
+        stages.folded_cells, run.periodic.wide, run.place(twice), run.t
     )
     assert patch.fetch(covered).volumes.sum() == pytest.approx(2, rel=1e-5)
     run = Carried(stages, UNIT, points + 0.001)
