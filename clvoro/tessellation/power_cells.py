@@ -36,8 +36,8 @@ class PowerCells(Cells):
     ) -> Tessellation | None:
         """Tessellate by `points` with weights (n, 3), starting from the neighbors in `previous`.
 
-        The result is right if the sum of its volumes is that of the domain. None if a cell has too many faces, or is open
-        in a folded graph.
+        The result is right if the sum of its volumes is that of the domain. None if a cell has too many faces, or
+        is open in a folded graph.
         """
         n, old = previous.n, (previous.starts, previous.neighbors)
         self._reserve(n)
