@@ -1,9 +1,10 @@
 """Prescribed volumes in power diagrams: steps of Newton's method, and time.
 
-    python bench/transport.py [--sizes 1e3,1e4,1e5] [--sizes-3d 1e3,1e4] [--sizes-lake 1e3,1e4] [--repeat N]
-                              [--processor-time] [--picture] [--out DIR] [--device NAME] [--dtype float32] [--json]
+    python bench/transport.py [--sizes 1e3,1e4,1e5] [--sizes-3d 1e3,1e4] [--sizes-lake 1e3,1e4]
+                              [--sizes-periodic 1e3,1e4] [--repeat N] [--processor-time] [--picture] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
-Uniform random generators in a unit box, and in a lake of 400 edges with an island (see bench/solver_ready.py), get
+Uniform random generators in a unit box with walls, in periodic ones ("torus", in 3D with a tenth of the cells), and in
+a lake of 400 edges with an island (see bench/solver_ready.py), get
 cells of equal volume, and of volumes in proportion to 0.02 + |x - c|^2, c = (0.5, 0.5) (in the box in 2D 1 : 26).
 "outside" is the share of the cells that do not contain their generator, "shares" the shares of the damped Newton
 steps. Seconds are the least of the repeated solves, with generators
@@ -63,6 +64,7 @@ def make_options() -> argparse.ArgumentParser:
     made.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5"), metavar="N,...")
     made.add_argument("--sizes-3d", type=counts, default=counts("1e3,1e4"), metavar="N,...")
     made.add_argument("--sizes-lake", type=counts, default=counts("1e3,1e4"), metavar="N,...")
+    made.add_argument("--sizes-periodic", type=counts, default=counts("1e3,1e4"), metavar="N,...")
     made.add_argument("--repeat", type=int, default=3, metavar="N")
     made.add_argument("--picture", action="store_true", help="draw a picture instead")
     made.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
@@ -110,6 +112,11 @@ def main(arguments: list[str] | None = None) -> None:
         "square": (clvoro.Box((0, 0), (1, 1)), options.sizes),
         "cube": (clvoro.Box((0, 0, 0), (1, 1, 1)), options.sizes_3d),
         "lake": (lake().domain, options.sizes_lake),
+        "torus": (clvoro.Box((0, 0), (1, 1), periodic=True), options.sizes_periodic),
+        "torus in 3D": (
+            clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True),
+            [n // 10 for n in options.sizes_periodic],
+        ),
     }
     for name, (domain, sizes) in domains.items():
         for n in sizes:

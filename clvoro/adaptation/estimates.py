@@ -46,6 +46,17 @@ FOLDED = {2: (9, 57), 3: (40, 25)}
 """Reals and integers per cell (not per image) in addition in periodic boxes."""
 FOLDED_DIAGRAM = {2: {8: 360, 4: 340}, 3: {8: 2000, 4: 1900}}
 """Bytes per cell in addition for one diagram in periodic boxes."""
+POWER_PEAK: dict[int | str, tuple[int, int]] = {2: (74, 119), 3: (255, 264)}
+"""Reals and integers per cell while the method "transport" has both a Voronoi diagram and a power diagram."""
+TRIMMED_POWER_PEAK, FOLDED_POWER = (171, 134), {2: (38, 39), 3: (0, 0)}
+"""The same in polygons; and per cell (not per image) in addition in periodic boxes."""
+POWER_DIAGRAM = {2: {8: 970, 4: 670}, 3: {8: 4700, 4: 3500}}
+"""Bytes per cell for one power diagram, or for prescribed volumes, of random generators."""
+TRIMMED_POWER_DIAGRAM, FOLDED_POWER_DIAGRAM = (
+    {8: 1520, 4: 1020},
+    {2: {8: 600, 4: 520}, 3: {8: 6700, 4: 5400}},
+)
+"""The same in polygons; and in addition in periodic boxes, where large weights need more images."""
 LARGEST: dict[int | str, dict[int, int]] = {
     2: {8: 105, 4: 90}, 3: {8: 610, 4: 310}, SPHERE: {8: 150, 4: 90},
 }  # fmt: skip
@@ -109,10 +120,12 @@ def estimate_memory(
     extras: Extras | None = None,
     *,
     run: bool = True,
+    power: bool = False,
 ) -> float:
     """Return the largest device memory of a run of `n` cells, or of reading its diagram, in bytes.
 
-    Without `run`, return that of `Adapter.diagram`.
+    Without `run`, return that of `Adapter.diagram`. With `power`, the run ends with a power diagram, or the diagram is
+    one.
     """
     extras = Extras() if extras is None else extras
     n *= 1 + extras.surplus
@@ -139,18 +152,21 @@ def estimate_memory(
     if not run:
         per_cell = (TRIMMED_DIAGRAM, BOUNDARY_DIAGRAM, EDGE_DIAGRAM)
         made = in_polygon(*(f[real] for f in per_cell)) if trimmed else cells * DIAGRAM[kind][real]
-        return (
-            made
-            + folded * FOLDED_DIAGRAM[engine.dim][real]
-            + extras.field_bytes
-            + workspace_bytes(engine, n)
-        )
+        made += folded * FOLDED_DIAGRAM[engine.dim][real]
+        if power:
+            by_power = TRIMMED_POWER_DIAGRAM if trimmed else POWER_DIAGRAM[engine.dim]
+            more = folded * FOLDED_POWER_DIAGRAM[engine.dim][real]
+            made = max(made, cells * by_power[real] + more)
+        return made + extras.field_bytes + workspace_bytes(engine, n)
     if trimmed:
         peak = in_polygon(*map(bytes_of, (TRIMMED_PEAK, BOUNDARY_PEAK, EDGE_PEAK)))
         output = in_polygon(*(f[real] for f in (TRIMMED_OUTPUT, BOUNDARY_OUTPUT, EDGE_OUTPUT)))
     else:
         peak = cells * bytes_of(PEAK[kind]) + folded * bytes_of(FOLDED[engine.dim])
         output = cells * OUTPUT[kind][real]
+    if power:
+        of_cells = bytes_of(TRIMMED_POWER_PEAK if trimmed else POWER_PEAK[engine.dim])
+        peak = max(peak, cells * of_cells + folded * bytes_of(FOLDED_POWER[engine.dim]))
     return max(peak + fixed_bytes(engine, n), output) + extras.field_bytes
 
 
@@ -182,6 +198,7 @@ def check_memory(
     extras: Extras | None = None,
     *,
     run: bool = True,
+    power: bool = False,
 ) -> float:
     """Check that the device has memory for `n` cells, and return the bytes needed (see `estimate_memory`).
 
@@ -193,7 +210,7 @@ def check_memory(
     """
     device = engine.queue.device
     name, available = device.name.strip(), available_memory(device)
-    needed = estimate_memory(engine, n, domain, extras, run=run)
+    needed = estimate_memory(engine, n, domain, extras, run=run, power=power)
     if n > MAX_CELLS:
         raise MemoryLimitError(
             f"the run has {n:.3g} cells, expected at most {MAX_CELLS:.3g}, the limit of 32-bit indices (they need "

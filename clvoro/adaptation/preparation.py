@@ -287,7 +287,8 @@ class Preparation:
 
     def _check_memory(self, n: float, extras: Extras | None = None) -> float:
         """Return the bytes that a run of `n` cells needs; raise if the device has less."""
-        return check_memory(self.stages.engine, n, self.domain, extras)
+        power = self.options.method == "transport"
+        return check_memory(self.stages.engine, n, self.domain, extras, power=power)
 
     def generators(self) -> np.ndarray:
         """Return the initial generators (n, d): those of layers, then those of the caller or a random sample.

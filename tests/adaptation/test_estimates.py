@@ -132,6 +132,9 @@ KINDS = {
     "polygon": (lake(), 0.012, lambda *_: {}),
     "layers": (SQUARE, 0.018, lambda *_: {"layers": clvoro.Layers(0.005, count=3, growth=1.2)}),
     "exact": (SQUARE, 0.018, lambda *_: {"method": "exact"}),
+    "transport": (SQUARE, 0.018, lambda *_: {"method": "transport"}),
+    "transport in a polygon": (lake(), 0.012, lambda *_: {"method": "transport"}),
+    "periodic transport": (TORUS, 0.018, lambda *_: {"method": "transport"}),
     "coupled": (SQUARE, 0.018, lambda *_: {"method": "coupled"}),
     "refined": (SQUARE, 0.018, refined),
     "body": (

@@ -110,6 +110,8 @@ def test_bad_input(ctx):
         (1.01 * volumes, "expected that of the domain"),
         (np.where(np.arange(50) < 3, 0, volumes), "3 of 50"),
         (volumes[:-1], "shape"),
+        (np.where(np.arange(50) < 2, np.nan, volumes), "2 of 50 are not"),
+        (np.where(np.arange(50) < 1, np.inf, volumes), "finite"),
     ):
         with pytest.raises(InputError, match=words):
             adapter.transport(box, points, wrong)

@@ -251,3 +251,7 @@ def test_bad_input(ctx):
     with pytest.warns(EmptyCellsWarning, match="2 of 3"):
         d = adapter.power_diagram(SQUARE, points, [0, 1e300, 0])
     assert d.volumes.tolist() == [0, 1, 0]
+    torus = clvoro.Box((0, 0), (1, 1), periodic=True)
+    with pytest.warns(EmptyCellsWarning, match="2 of 3"):
+        d = adapter.power_diagram(torus, points, [0, 1e300, 0])
+    assert d.volumes.tolist() == [0, 1, 0]

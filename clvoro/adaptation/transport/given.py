@@ -35,7 +35,7 @@ def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: ob
         raise InputError(
             f"weights are between {given.min():.3g} and {given.max():.3g}, expected finite differences; scale them"
         )
-    check_memory(stages.engine, n, domain, run=False)
+    check_memory(stages.engine, n, domain, run=False, power=True)
     # Only differences count. Around 0 weights have the least round-off.
     near = np.maximum(given - given.max(), -WITHIN_REACH * float((domain.extent**2).sum()))
     scaled = (near - near.mean()) / domain.frame[1] ** 2
@@ -78,7 +78,7 @@ def transport_to(
     rounding = float(np.finfo(kind).eps) if kind.kind == "f" else 0.0
     _check_volumes(given, domain, rounding)
     _check_pieces(host, given, domain, rounding)
-    check_memory(engine, n, domain, run=False)
+    check_memory(engine, n, domain, run=False, power=True)
     with Naming(host, domain, engine.real):
         labels, sorted_points = _sorted(stages, domain, host)
         prescribed = given[labels.get()] / domain.frame[1] ** domain.cell_dim
@@ -94,10 +94,16 @@ def transport_to(
         warn(
             f"the volumes of {newton.far} of {n} cells differ from the prescribed ones by more than {tolerance:.3g}, "
             f"the largest relative error is {newton.errors[-1]:.3g} after {len(newton.shares)} steps; use "
-            f"{'more max_steps' if len(newton.shares) >= most else 'a larger tolerance or float64'}",
+            f"{_remedy(engine.real, len(newton.shares) >= most)}",
             SizeErrorWarning,
         )
     return result
+
+
+def _remedy(real: np.dtype, used_up: bool) -> str:
+    if used_up:
+        return "more max_steps"
+    return "a larger tolerance" if real == np.float64 else "a larger tolerance or dtype='float64'"
 
 
 def _sorted(stages: Stages, domain: Domain, host: np.ndarray) -> tuple[cla.Array, cla.Array]:
