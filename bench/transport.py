@@ -1,11 +1,12 @@
 """Prescribed volumes in power diagrams: steps of Newton's method, and time.
 
     python bench/transport.py [--sizes 1e3,1e4,1e5] [--sizes-3d 1e3,1e4] [--sizes-lake 1e3,1e4]
-                              [--sizes-periodic 1e3,1e4] [--repeat N] [--processor-time] [--picture] [--out DIR] [--device NAME] [--dtype float32] [--json]
+                              [--sizes-periodic 1e3,1e4] [--repeat N] [--processor-time] [--picture] [--out DIR]
+                              [--device NAME] [--dtype float32] [--json]
 
 Uniform random generators in a unit box with walls, in periodic ones ("torus", in 3D with a tenth of the cells), and in
-a lake of 400 edges with an island (see bench/solver_ready.py), get
-cells of equal volume, and of volumes in proportion to 0.02 + |x - c|^2, c = (0.5, 0.5) (in the box in 2D 1 : 26).
+a lake of 400 edges with an island (see bench/solver_ready.py), get cells of equal volume, and of volumes in proportion
+to 0.02 + |x - c|^2, c = (0.5, 0.5) (in the box in 2D 1 : 26).
 "outside" is the share of the cells that do not contain their generator, "shares" the shares of the damped Newton
 steps. Seconds are the least of the repeated solves, with generators
 sorted and arrays read back. `--processor-time` measures the processor time of all threads over the number of compute

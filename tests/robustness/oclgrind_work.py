@@ -524,6 +524,8 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "solid-mmpde": method("mmpde", CUBE, SOLID, n_cells=130, max_steps=2),
     "power": power(BOX, 60),
     "solid-power": power(CUBE, 40),
+    "periodic-power": power(clvoro.Box((0, 0), (1, 1), periodic=True), 60),
+    "solid-periodic-power": power(clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), 20),
     "solid-adaptive": method("adaptive", CUBE, SOLID, effort="fast"),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
     **RUNS,
