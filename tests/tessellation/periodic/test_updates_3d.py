@@ -148,6 +148,6 @@ def test_cells_that_cover_the_box_twice(ctx):
     )  # fmt: skip
     update, x = carried.stages.polyhedra_update, carried.t.points
     clip = carried.periodic._clip_of(x, N, twice)
-    covered = update.update(carried.stages.cells, carried.periodic._wide, x, twice, clip)
+    covered = update.update(carried.stages.cells, carried.periodic.wide, x, twice, clip)
     assert covered.volumes.get()[:N].sum() == pytest.approx(2, rel=1e-9)
     assert carried.periodic._updated(x, N, twice) is None
