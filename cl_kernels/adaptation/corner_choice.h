@@ -1,6 +1,7 @@
 /* The choice of the generators that share a corner, among the nearest ones that see it.
 
    CANDIDATE_REACH  largest distance over h of a generator from a corner that it may share
+   FARTHEST_REACH   the same where no generator is near: cells are larger than h at the corner
    WIDEST_TIP       angle of a tip above which its first generator may have several neighbors without help */
 #include "geometry/edges.h"
 
@@ -10,6 +11,8 @@
 #define NEAREST 6
 /* Least distance of the others over that of the generators that share the corner. */
 #define OTHERS R(1.3)
+/* Least reach of a corner over the distance of the nearest generator at its walls. */
+#define BEYOND_NEAREST R(1.3)
 /* Margin to straight angles; interior angle above which at least three cells share the corner. */
 #define MARGIN R(0.15)
 #define THREE R(5.8)
@@ -27,7 +30,7 @@ inline REAL gap_between(REAL2 a, REAL2 b)
 /* A corner of a group, and its nearest candidates that see it, in the order of their angles from the first wall. */
 typedef struct {
     REAL2 x;
-    REAL angle, h, extent, first_wall;
+    REAL angle, h, extent, first_wall, reach;
     int count, mask;   /* mask: bits of those that share the corner; 0 if none do */
     int list[NEAREST]; /* their places among the candidates of the group */
     REAL distances[NEAREST], angles[NEAREST];
@@ -81,7 +84,7 @@ inline int collect_candidates(int *cells, const Corner *group, int corner_count,
             const int j = neighbors[k];
             bool near = false;
             for (int c = 0; c < corner_count && j >= 0; ++c)
-                near = near || gap_between(points[j], group[c].x) < R(CANDIDATE_REACH) * group[c].h;
+                near = near || gap_between(points[j], group[c].x) < group[c].reach;
             if (near && count < MOST_CANDIDATES && !is_listed(j, cells, count))
                 cells[count++] = j;
         }
@@ -126,7 +129,7 @@ inline void list_nearest(Corner *corner, const int *cells, int count, global con
                 next = p;
             }
         }
-        if (next < 0 || best > R(CANDIDATE_REACH) * corner->h)
+        if (next < 0 || best > corner->reach)
             break;
         last = best;
         last_place = next;

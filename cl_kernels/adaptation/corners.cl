@@ -219,6 +219,10 @@ kernel void share_corners(const int size, global const int *starts, global const
         group[c].angle = shape.s1;
         group[c].h = shape.s2;
         group[c].extent = shape.s3;
+        const int seed = seeds[first + c];
+        const REAL nearest = seed < n ? gap_between(points[seed], group[c].x) : 0;
+        group[c].reach =
+            fmin(fmax(R(CANDIDATE_REACH) * shape.s2, BEYOND_NEAREST * nearest), R(FARTHEST_REACH) * shape.s2);
     }
     const int found = collect_candidates(cells, group, corner_count, seeds + first, n, starts, neighbors, points);
     /* Keep those that belong to this group and may move. */

@@ -28,11 +28,13 @@ SHARP_TURN, LEAST_TURN = np.radians(20), np.radians(30)
 SPACING, LEAST_SPACING, FAN = 1.1, 0.15, 0.5
 """Spacing of corners over h: ``SPACING - FAN * turn``, for the mean turn of two corners, but at least `LEAST_SPACING`.
 Cells fan out around a corner, so sharp corners may be close to each other."""
-JOINED = 1.6
-"""Distance over h up to which two corners may share a generator. They belong to the same group then."""
-CANDIDATE_REACH = 2.2
-"""Largest distance over h of a generator from a corner that it may share."""
-NEAR = 2 * CANDIDATE_REACH
+JOINED = 1.8
+"""Distance over h, the larger one of both, up to which two corners may share a generator. They belong to the same group
+then."""
+CANDIDATE_REACH, FARTHEST_REACH = 2.2, 3.0
+"""Largest distance over h of a generator from a corner that it may share; the same where no generator is near, because
+sizes grow steeply from the corner, or a cell is missing there."""
+NEAR = 2 * FARTHEST_REACH
 """Distance over h up to which a group has to know the corners of other groups, so that no two groups move the same
 generator."""
 WALL_REACH = 0.5
@@ -108,7 +110,7 @@ def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) ->
     )
     slack = np.concatenate([np.zeros(len(tips)), slack])
     size = np.concatenate([shape[2], h[kept[len(tips) :]]])
-    groups = _grouped(x[kept], size, len(tips))
+    groups = _grouped(x[kept], size)
     sizes = [len(g) for g in groups]
     order = np.concatenate([np.empty(0, int), *groups]).astype(int)
     starts = np.cumsum([0, *sizes]).astype(np.int32)
@@ -215,16 +217,14 @@ def _walls(
     return found[0], found[1], found[2]
 
 
-def _grouped(x: np.ndarray, h: np.ndarray, tips: int) -> list[list[int]]:
-    """Return groups of at most `MOST_IN_GROUP` points, of which the first are `tips`; near points are joined first."""
+def _grouped(x: np.ndarray, h: np.ndarray) -> list[list[int]]:
+    """Return groups of at most `MOST_IN_GROUP` points; near points are joined first."""
     group: list[list[int]] = [[k] for k in range(len(x))]
     if len(x) < 2:
         return group
     pairs = KDTree(x).query_pairs(JOINED * float(h.max()), output_type="ndarray")
     gaps = np.hypot(*(x[pairs[:, 0]] - x[pairs[:, 1]]).T)
-    of_tip = pairs.min(axis=1) < tips
-    sizes = np.where(of_tip, h[pairs].max(axis=1), h[pairs].min(axis=1))
-    close = gaps < JOINED * sizes
+    close = gaps < JOINED * h[pairs].max(axis=1)
     pairs, gaps = pairs[close], gaps[close]
     for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0], gaps.round(12)))].tolist():
         a, b = group[i], group[j]
@@ -309,7 +309,7 @@ class Corners:
             "adaptation/corners",
             {
                 "MOST_IN_GROUP": MOST_IN_GROUP, "MOST_MOVED": MOST_MOVED, "CANDIDATE_REACH": CANDIDATE_REACH,
-                "WIDEST_TIP": float(WIDEST),
+                "FARTHEST_REACH": FARTHEST_REACH, "WIDEST_TIP": float(WIDEST),
             },
         )  # fmt: skip
 

@@ -80,7 +80,15 @@ POLISH_COUNT_3D = 5e-3
 LOOSE_POLISH_3D, SETTLE_PENALTY_3D = 2.0, 0.7
 """Polishing in 3D aims at so many times the error target; one projection with this penalty then meets it. Measured on
 S3, the largest error is half of that of polishing alone, for 0.0007 of mean Q."""
-EXACT_STEPS, EXACT_ITERATIONS = 8, 45
+EXACT_PENALTIES, EXACT_ITERATIONS = (0.1, 0.05, 0.02, 0.01, 0.003, 0.001), 45
+"""Penalties of the exact projection, step by step, and most iterations of each.
+
+A small penalty from the first step on moves generators by large displacements where the number of cells does not fit a
+narrow part of the domain. There they nearly coincide in the end, and sizes are lost for good."""
+EXACT_QUALITY_SCALES = 0.03, 0.1
+"""Scales of the quality in the penalty of the exact projection, and of Newton's steps after it: see `Penalty`."""
+NEWTON_STEPS = 3
+EXACT_STEPS = len(EXACT_PENALTIES) + NEWTON_STEPS
 EXACT_STEPS_3D = 3
 
 SEPARATE_PENALTY = 20.0
@@ -328,13 +336,15 @@ def _finish_2d(
         yield Step(polish)
     if exact:
         project = ProjectedMethod(
-            "quality", penalty=1e-3, iterations=EXACT_ITERATIONS, tolerance=1e-3, k=0.3, gradient_from_field=True,
-            correct_mean=True,
+            "quality", quality_scale=EXACT_QUALITY_SCALES[0], iterations=EXACT_ITERATIONS, tolerance=1e-3, k=0.3,
+            gradient_from_field=True, correct_mean=True,
         )  # fmt: skip
-        # The last two steps only project and separate vertices: Newton's method for the sizes.
-        newton = replace(project, descent="edges", momentum=0.0)
-        yield from [Step(project)] * (EXACT_STEPS - 2)
-        yield from [Step(newton)] * 2
+        yield from [Step(replace(project, penalty=penalty)) for penalty in EXACT_PENALTIES]
+        # The last steps only project and separate vertices: Newton's method for the sizes.
+        newton = replace(
+            project, descent="edges", momentum=0.0, penalty=EXACT_PENALTIES[-1], quality_scale=EXACT_QUALITY_SCALES[1]
+        )  # fmt: skip
+        yield from [Step(newton)] * NEWTON_STEPS
     else:
         separate = replace(
             polish, descent="edges", momentum=0.0, penalty=SEPARATE_PENALTY, quality_scale=0.0, error_target=0.0

@@ -2,13 +2,15 @@
    paper's (4.1), up to a constant per number of faces, and from Sieger, Alliez, Botsch (2010), who penalize short
    edges,
 
-     E = sum_c omega_c (2 log P_c - log A_c) + stiffness / 2 sum_f max(0, short_edge - l_f / h_f)^2,
+     E = sum_c omega_c (2 log P_c - log A_c) + stiffness / 2 sum_f max(0, short_edge - l_f / h_f)^2
+         + close_stiffness / 2 sum_f max(0, close - d_f / h_f)^2,
      dE/dx_i = sum over the vertices and faces of cell i,
 
    with omega >= quality_weight larger for bad cells. A cell pulls its vertices along its faces with the tension
    2 omega / P, and pushes its faces outwards with the pressure omega / A. A short edge pushes its vertices apart. An
    edge f is a face, with h_f the mean of its two cells, or a cell's part of the boundary between two corners of more
-   than 30 degrees. */
+   than 30 degrees. The last sum is over faces only: d_f is the distance of the two generators. Neither shapes nor sizes
+   of cells keep generators apart, because the face between two that nearly coincide may lie in any direction. */
 #include "geometry/domain.h"
 #include "tessellation/clipped/outline.h"
 
@@ -41,7 +43,7 @@ typedef struct {
     global const FACE *lengths, *centroids;
 } rows_t;
 
-/* The energy against short edges. */
+/* An energy against short edges, or against generators that are too close to each other. */
 typedef struct {
     REAL length, stiffness;
 } short_edges_t;
@@ -159,12 +161,12 @@ inline REAL boundary_tension(int i, int j, int side, REAL4 force, const rows_t *
 kernel void descend_quality(const int size, global const int *starts, global const int *neighbors,
                             global const FACE *face_measures, global const FACE *face_centroids,
                             global const REAL *points, global const REAL4 *forces, const REAL rate,
-                            const REAL max_displacement, const REAL short_edge, const REAL stiffness,
-                            global REAL *lloyd OUTLINE_ARGS PERIOD_ARGS)
+                            const REAL max_displacement, const REAL short_edge, const REAL stiffness, const REAL close,
+                            const REAL close_stiffness, global REAL *lloyd OUTLINE_ARGS PERIOD_ARGS)
 {
     WORK_ITEM(i);
     const rows_t rows = {starts, neighbors, face_measures, face_centroids};
-    const short_edges_t edges = {short_edge, stiffness};
+    const short_edges_t edges = {short_edge, stiffness}, pairs = {close, close_stiffness};
     SITE(x, i, points);
     const int begin = starts[i], end = starts[i + 1];
     const REAL4 own = forces[i];
@@ -222,8 +224,10 @@ kernel void descend_quality(const int size, global const int *starts, global con
                 s = dot(wall, pull) / slope;
         }
         g += s * r;
-        if (face.label >= 0)
+        if (face.label >= 0) {
             g += face_measures[k] * face.inverse * (face.forces.s1 - own.s1) * m;
+            g -= edge_tension(1 / face.inverse, (h + face.forces.s2) / 2, &pairs) * face.inverse * face.away;
+        }
         before = face;
     }
     REAL2 u = -rate * h * h * g;

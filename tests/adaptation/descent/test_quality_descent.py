@@ -47,6 +47,7 @@ def descend_from(engine, t, h, bad_cell_weight, rate, max_displacement, quality,
         rate=rate,
         max_displacement=max_displacement,
         edge_stiffness=stiffness,
+        close_stiffness=0.0,
     )
     return out.get()
 
@@ -218,7 +219,7 @@ def test_gradient_of_short_edges(ctx, name):
     out = engine.empty((n, 2))
     QualityDescent(engine).descend(
         t, engine.upload(h / unit), engine.upload(np.full(n, 0.5)), out, quality_weight=0, rate=0.3,
-        max_displacement=1e9, short_edge=short, edge_stiffness=2,
+        max_displacement=1e9, short_edge=short, edge_stiffness=2, close_stiffness=0,
     )  # fmt: skip
     some = rng.permutation(n)[:16]
     gradient = gradient_of(
@@ -228,6 +229,28 @@ def test_gradient_of_short_edges(ctx, name):
     scale = np.abs(expected).max()
     assert (np.abs(expected[some]) > 1e-3 * scale).all(axis=1).sum() > 8
     assert out.get()[some] == pytest.approx(expected[some], rel=1e-4, abs=1e-5 * scale)
+
+
+def test_gradient_of_close_generators(ctx):
+    """Neighbors push each other apart; others at the same distance do not."""
+    points, rng = patch.relaxed_points(N, 2118, steps=1), np.random.default_rng(8)
+    h, limit = rng.uniform(0.1, 0.15, N), 0.9
+    engine = patch.make_engine(ctx)
+    out = engine.empty((N, 2))
+    QualityDescent(engine).descend(
+        patch.tessellate(engine, points), engine.upload(h), engine.upload(np.full(N, 0.5)), out, quality_weight=0,
+        rate=0.3, max_displacement=1e9, edge_stiffness=0, close=limit, close_stiffness=2,
+    )  # fmt: skip
+    expected, pairs = np.zeros((N, 2)), 0
+    for i, cell in enumerate(reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)):
+        for j in cell.neighbors:
+            way = points[i] - points[max(j, 0)]
+            unit, away = (h[i] + h[j]) / 2, np.hypot(*way)
+            if j >= 0 and away < limit * unit:
+                expected[i] += 0.3 * h[i] ** 2 * 2 * (limit - away / unit) / unit * way / away
+                pairs += 1
+    assert 10 < pairs < 4 * N
+    assert out.get() == pytest.approx(expected, rel=1e-9, abs=1e-15)
 
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
