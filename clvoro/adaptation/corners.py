@@ -28,7 +28,7 @@ SHARP_TURN, LEAST_TURN = np.radians(20), np.radians(30)
 SPACING, LEAST_SPACING, FAN = 1.1, 0.15, 0.5
 """Spacing of corners over h: ``SPACING - FAN * turn``, for the mean turn of two corners, but at least `LEAST_SPACING`.
 Cells fan out around a corner, so sharp corners may be close to each other."""
-JOINED = 1.8
+JOINED = 1.6
 """Distance over h, the larger one of both, up to which two corners may share a generator. They belong to the same group
 then."""
 CANDIDATE_REACH, FARTHEST_REACH = 2.2, 3.0

@@ -194,6 +194,26 @@ def test_generators_that_sit_still_stay(ctx):
     assert not np.allclose(once, points)
 
 
+def test_corner_without_generators_nearby(ctx):
+    """Where cells are much larger than h at the corner, the nearest ones share it all the same."""
+    points = np.array([(0.27, 0.42), (0.42, 0.26), (0.1, 0.85), (0.85, 0.1), (0.1, 0.1)])
+    away = np.hypot(*(points[:2] - 0.5).T)
+    assert away.min() > 2.2 * H
+    assert away.max() < min(1.3 * away.min(), 3 * H)
+    moved, _ = project(ctx, L, points)
+    assert np.ptp(np.hypot(*(moved[:2] - 0.5).T)) < 1e-14
+
+
+def test_corners_of_unlike_size_share_generators():
+    """The larger of both sizes says whether they may."""
+    for gap, together in ((0.15, True), (0.17, False)):
+        left, right = 0.45, 0.45 + gap
+        domain = clvoro.Polygon(SQUARE, [[(left, 0.3), (right, 0.3), (right, 0.7), (left, 0.7)]])
+        groups = find_corners(domain, np.where(domain.oriented.vertices[:, 0] < 0.5, H, H / 2))
+        assert len(groups.vertices) == 4
+        assert len(groups) == (2 if together else 4)
+
+
 def test_generators_stay_out_of_layers(ctx):
     """Layers fill the L below y = 0.47, where its corner at y = 0.5 would have some of the others."""
     below = 0.47

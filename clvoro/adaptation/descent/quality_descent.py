@@ -1,4 +1,6 @@
-"""Gradient descent of the cell quality, of short edges and of close generators in 2D, for the last steps of a run (`quality_descent.cl`).
+"""Gradient descent of the cell quality, of short edges and of close generators in 2D (`quality_descent.cl`).
+
+The last steps of a run use it.
 
 On a sphere obtuse Delaunay triangles are opened in the end, for models on C grids.
 """
