@@ -2,9 +2,9 @@
    cell of a generator beside a thin wall extends to the other side, and that part is then cut off. This does not happen
    if the generators on both sides are mirror images of each other.
 
-   Pairs move towards their images by a share that falls linearly from 1 at a wall without thickness to 0 at THIN h, so
-   that it is continuous along a wall that widens. Where the sizes of both sides differ there are no pairs, because a
-   row of cells has no image in a row with fewer cells.
+   Pairs move towards their images by a share. It is 1 up to a thickness of THIN h / 2, and falls linearly to 0 at
+   THIN h, so that it is continuous along a wall that widens. Where the sizes of both sides differ there are no pairs,
+   because a row of cells has no image in a row with fewer cells.
 
    THIN  largest thickness of a thin wall over h */
 #include "geometry/edges.h"
@@ -29,7 +29,7 @@ inline bool image_across(REAL2 x, REAL2 y, REAL h, REAL2 *image, REAL *share, DO
     if (t > 1)
         return false;
     const REAL s = exit_over_edge(there, here, &other, DOMAIN);
-    *share = 1 - (1 - t - s) * apart / (R(THIN) * h);
+    *share = fmin(R(1), 2 - 2 * (1 - t - s) * apart / (R(THIN) * h));
     if (s > 1 || *share < 0)
         return false;
     REAL2 a = edge_ends[edge].s23 - edge_ends[edge].s01, b = edge_ends[other].s23 - edge_ends[other].s01;

@@ -13,11 +13,16 @@ from clvoro.sizing import Sizing, as_field
 from tests.reference import patch
 
 H = 0.1
-HALF = 0.001  # of the wall's thickness
 TOP = 0.7
-SLIT = clvoro.Polygon(
-    [(0, 0), (0.5 - HALF, 0), (0.5 - HALF, TOP), (0.5 + HALF, TOP), (0.5 + HALF, 0), (1, 0), (1, 1), (0, 1)]
-)  # fmt: skip
+
+
+def slit(half):
+    """Return a square with a wall of the thickness 2 `half`."""
+    wall = [(0.5 - half, 0), (0.5 - half, TOP), (0.5 + half, TOP), (0.5 + half, 0)]
+    return clvoro.Polygon([(0, 0), *wall, (1, 0), (1, 1), (0, 1)])
+
+
+SLIT = slit(0.001)
 
 
 def rows_of(t, order):
@@ -41,39 +46,42 @@ def across(points, i, rows):
     return found
 
 
-def share(x, y):
+def share(x, y, half):
     """Return by how much a pair moves towards its images, from the length of the line between them in the slit."""
-    inside = 2 * HALF * np.hypot(*(y - x)) / abs(y[0] - x[0])
-    return 1 - inside / (0.3 * H)
+    inside = 2 * half * np.hypot(*(y - x)) / abs(y[0] - x[0])
+    return min(1, 2 - 2 * inside / (0.3 * H))
 
 
-def nearest_images(points, convex, neighbors):
+def nearest_images(points, convex, neighbors, half):
     """Return the generator beyond the slit whose mirror image is nearest to each point; -1 for none."""
     partners = np.full(len(points), -1)
     for i, x in enumerate(points):
         least = 0.45 * H
         for j in across(points, i, convex[i] - neighbors[i]):
             away = np.hypot(1 - points[j, 0] - x[0], points[j, 1] - x[1])
-            if away < least:
+            if away < least and share(x, points[j], half) >= 0:
                 least, partners[i] = away, j
     return partners
 
 
-@pytest.mark.parametrize("real", ["float64", "float32"])
-def test_pairs(ctx, real):
+@pytest.mark.parametrize(
+    ("real", "half"), [("float64", 0.001), ("float64", 0.01), ("float32", 0.001)]
+)
+def test_pairs(ctx, real, half):
+    domain = slit(half)
     rng = np.random.default_rng(7)
     x = (np.indices((10, 10)).reshape(2, -1).T + 0.5) / 10 + rng.uniform(-0.03, 0.03, (100, 2))
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), SLIT.kind(np.dtype(real)))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.kind(np.dtype(real)))
     mesh = MeshState.create(
-        Stages(engine), SLIT, Sizing(engine, SLIT, as_field(H)), engine.upload(SLIT.place(x, engine.real))
+        Stages(engine), domain, Sizing(engine, domain, as_field(H)), engine.upload(domain.place(x, engine.real))
     )  # fmt: skip
-    origin, scale = SLIT.frame
+    origin, scale = domain.frame
     order = mesh.labels.get()
     rows = [rows_of(t, order) for t in (mesh.t.trimmed.convex, mesh.t)]
     chords = mesh.t.trimmed.chords
     at_wall = order[chords.touched.get()[: chords.touched_count]]
     mesh.stages.thin_walls.pair(mesh.free, mesh.t, mesh.h, mesh.moving)
-    partners, expected = nearest_images(x, *rows), x.copy()
+    partners, expected = nearest_images(x, *rows, half), x.copy()
     paired = {
         i for i, j in enumerate(partners)
         if j >= 0 and partners[j] == i and (i in at_wall or j in at_wall)
@@ -82,14 +90,17 @@ def test_pairs(ctx, real):
     for i in set(at_wall.tolist()) | paired:
         if i in paired:
             y = x[partners[i]]
-            expected[i] += share(x[i], y) / 2 * ((1 - y[0], y[1]) - x[i])
+            expected[i] += share(x[i], y, half) / 2 * ((1 - y[0], y[1]) - x[i])
             continue
-        pairs = [j for j in across(x, i, rows[0][i]) if j in paired and j in at_wall]
+        pairs = [
+            j for j in across(x, i, rows[0][i])
+            if j in paired and j in at_wall and share(x[i], x[j], half) >= 0
+        ]  # fmt: skip
         if len(pairs) > 1:
-            mean = np.mean([share(x[i], x[j]) for j in pairs])
+            mean = np.mean([share(x[i], x[j], half) for j in pairs])
             expected[i, 0] += 0.1 * H * mean * np.sign(x[i, 0] - 0.5)
             pushed += 1
-    assert pushed > 0
+    assert pushed > 0 or half > 0.001
     moved = (expected != x).any(axis=1)
     assert moved.sum() >= 8
     tolerance = 200 * float(np.finfo(real).eps)
@@ -125,9 +136,13 @@ def test_walls_that_are_thin(thickness, expected):
     assert not has_thin_walls(clvoro.Polygon(post), np.full(4, H))
 
 
-def test_cells_beside_a_slit():
-    """They are as good as elsewhere; without pairs some reach through the wall."""
-    result = clvoro.adapt(SLIT, 0.04, seed=7)
+@pytest.mark.parametrize("seed", [5, 8])
+def test_cells_beside_a_slit(seed):
+    """They are as good as elsewhere. Without pairs some reach through the wall, and Q is below 0.5 from any start.
+
+    If pairs do not move by the whole way to their images, it is about 0.5 from these two.
+    """
+    result = clvoro.adapt(SLIT, 0.04, seed=seed)
     assert result.quality.min() > 0.7
     assert np.abs(result.size_error).max() < 0.06
     assert result.diagram.solver_mesh().measures.concavity.max() < 1
