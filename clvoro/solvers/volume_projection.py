@@ -23,6 +23,9 @@ from .linear_system import Limits, Solution
 SINGLE_PRECISION_TOLERANCE = 1e-4
 """Tolerance from which on the vectors of the iteration are in single precision."""
 _ROWS = 5
+_SPARE = 1
+"""Iterations that are enqueued beyond those of the last solve. Counted in default runs on F1, F2 and S1: with 2 a step
+takes two launches more, and as many reads within one in fifty; with 0 one read more in five steps."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +88,9 @@ class VolumeProjection:
     volume.
 
     Conjugate gradients with a diagonal preconditioner start from y = 0, or along the last solution. An iteration takes
-    two kernels. The host enqueues as many iterations as the last solve took and then reads their record. The iterate is
-    frozen on the device when the tolerance is met, so the result does not depend on when the host reads. One work-group
-    does all iterations where cells are few.
+    two kernels. The host enqueues as many iterations as the last solve took, and one more, and then reads their record.
+    The iterate is frozen on the device when the tolerance is met, so the result does not depend on when the host reads.
+    One work-group does all iterations where cells are few.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -206,7 +209,7 @@ class VolumeProjection:
                     launch()
             rows = self._read(end)
             if not rows[:, RECORD_RUNNING].all():
-                self._ahead = _first_stop(rows) + 2
+                self._ahead = _first_stop(rows) + _SPARE
                 return rows
             done, ahead = end, 4
 
