@@ -12,6 +12,7 @@ import json
 import sys
 from collections.abc import Callable
 from itertools import pairwise
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -23,6 +24,7 @@ from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, 
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl import program as _program
 from clvoro.opencl.engine import Engine
+from clvoro.opencl.kernels import Kernels
 from clvoro.opencl.primitives import Scan
 from clvoro.sizing import (
     Ball,
@@ -42,7 +44,7 @@ from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.patch import BOX as PATCH
 from tests.reference.patch import hexagons, tessellate
 from tests.robustness.gpu_like import use_groups
-from tests.robustness.oclgrind_runs import RUNS, large
+from tests.robustness.oclgrind_runs import COMB, RUNS, large
 
 Cells.hulls_from = 0  # hulls for small meshes, too
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
@@ -133,18 +135,6 @@ def method(
         result = adapter.run(box, Expression(size), method=name, seed=911, **options)
         assert np.isfinite(result.size_error).all()
         result.diagram.vertices  # noqa: B018
-
-    return work
-
-
-def power(box: clvoro.Box, n: int) -> Callable[[clvoro.Adapter], None]:
-    """Power cells of equal volumes."""
-
-    def work(adapter: clvoro.Adapter) -> None:
-        points = np.random.default_rng(37).uniform(box.lower, box.upper, (n, box.dim))
-        found = adapter.transport(box, points, np.full(n, box.measure / n))
-        assert found.converged
-        found.diagram.vertices  # noqa: B018
 
     return work
 
@@ -243,6 +233,19 @@ def drop_loops(adapter: clvoro.Adapter) -> None:
     assert [list(neighbors[a:b]) for a, b in pairwise(starts)] == expected
 
 
+def sphere(adapter: clvoro.Adapter) -> None:
+    """Few generators on a sphere, a cluster, and vertices of many cells: those of a cube, and of a small circle."""
+    few = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
+    corners, turn = lattice(2, 3) - 0.5, np.arange(13)
+    cluster = (0, 0, 1) + 1e-3 * (points(20, 3) - 0.5)
+    circle = np.column_stack([0.1 * np.cos(turn), 0.1 * np.sin(turn), np.ones(13)])
+    for each in (few, corners, np.vstack([corners, cluster]), np.vstack([corners, circle])):
+        x = each / np.linalg.norm(each, axis=1)[:, None]
+        diagram = adapter.diagram(clvoro.Sphere(1.0), x)
+        assert abs(diagram.volumes.sum() - 4 * np.pi) < 1e-4
+        assert len(diagram.vertices) > 3
+
+
 def gradation(adapter: clvoro.Adapter) -> None:
     """Size fields that are limited in growth, over several tiles."""
     for dim, counts in ((2, (40, 37)), (3, (12, 11, 13))):
@@ -282,14 +285,8 @@ def polygon(adapter: clvoro.Adapter) -> None:
 
 def comb(adapter: clvoro.Adapter) -> None:
     """Pieces that belong to other cells, islands in lakes within a cell, edges on faces."""
-    teeth = [
-        (k + side, 1 - 0.8 * (side in (0.4, 0.6)))
-        for k in range(4)
-        for side in (0.1, 0.4, 0.6, 0.9)
-    ]
-    domain = clvoro.Polygon([(-1, 0), (4.5, 0), *np.array(teeth)[::-1]])
-    diagram = adapter.diagram(domain, domain.nearest(points(12) * (4, 0.3)))
-    assert abs(diagram.volumes.sum() - domain.measure) < 1e-4
+    diagram = adapter.diagram(COMB, COMB.nearest(points(12) * (4, 0.3)))
+    assert abs(diagram.volumes.sum() - COMB.measure) < 1e-4
     square = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
     lake = clvoro.Polygon.from_pieces([[square, square * 0.5 + 0.25], [square * 0.25 + 0.375]])
     for each in (np.array([(0.5, 0.5), (0.1, 0.1)]), lattice(8, 2)):
@@ -325,7 +322,23 @@ def periodic(adapter: clvoro.Adapter) -> None:
     # The second diagram of a run in 3D begins with the rows of the first, unfolded.
     rod = clvoro.Box((0, 0, 0), (1, 0.4, 0.4), periodic=(True, False, False))
     adapter.run(rod, 0.17, method="coupled", max_steps=2)
+    move_some_far(adapter)
     drop_faces(adapter)
+
+
+def move_some_far(adapter: clvoro.Adapter) -> None:
+    """Move generators a little and some far, in a periodic box in 3D: some cells are clipped anew."""
+    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
+
+    box, n = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(True, True, False)), 216
+    x = lattice(6, 3) + 0.03 * (points(n, 3) - 0.5)
+    stages = adapter._stages_for(box)
+    periodic = PeriodicTessellator(stages, box)
+    t = periodic.tessellate(stages.engine.upload(box.place(x, adapter.dtype)), n)
+    x = x + 0.002 * (points(n, 3, seed=1) - 0.5)
+    x[::31] = (x[::31] + 0.25) % 1
+    t = periodic.tessellate(stages.engine.upload(box.place(x, adapter.dtype)), n, t)
+    assert abs(t.volumes.get()[:n].sum() - 1) < 1e-4
 
 
 def copy(adapter: clvoro.Adapter) -> None:
@@ -499,6 +512,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "polygon": polygon,
     "comb": comb,
     "periodic": periodic,
+    "sphere": sphere,
     "repaired": large(repaired),
     "coupled": large(method("coupled", max_steps=2)),
     "lloyd": method("lloyd", max_steps=1),
@@ -522,10 +536,6 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     ),
     "mmpde": method("mmpde", n_cells=80, max_steps=2),
     "solid-mmpde": method("mmpde", CUBE, SOLID, n_cells=130, max_steps=2),
-    "power": power(BOX, 60),
-    "solid-power": power(CUBE, 40),
-    "periodic-power": power(clvoro.Box((0, 0), (1, 1), periodic=True), 60),
-    "solid-periodic-power": power(clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), 20),
     "solid-adaptive": method("adaptive", CUBE, SOLID, effort="fast"),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
     **RUNS,
@@ -547,29 +557,37 @@ def buffers_of_their_own() -> Callable[[], None]:
 
 
 def domain_of(engine: Engine) -> str:
-    """Return the kind of domain that an engine is for: "plane", "torus", "polygon", "space" or "periodic space"."""
+    """Return the kind of domain that an engine is for: "plane", "torus", "polygon", "sphere", ...
+
+    Engines for power diagrams have "weighted" before it.
+    """
     kind = engine.domain_kind
-    if engine.dim == 3:
-        return "periodic space" if kind.periodic else "space"
-    return "torus" if kind.periodic else "polygon" if kind.polygonal else "plane"
+    if kind.spherical:
+        name = "sphere"
+    elif engine.dim == 3:
+        name = "periodic space" if kind.periodic else "space"
+    else:
+        name = "torus" if kind.periodic else "polygon" if kind.polygonal else "plane"
+    return f"weighted {name}" if kind.weighted else name
 
 
 def name_domains() -> None:
     """Record for each kernel the kind of `domain` of its engine; "none" for kernels without one."""
-    made = Engine.__init__
+    plain = Engine.kernels
 
-    def told(self: Engine, *args: object, **options: object) -> None:
-        made(self, *args, **options)
-        take, domain = self.pool.take, domain_of(self)
+    def named(self: Engine, *args: object, **options: object) -> Kernels:
+        kernels, domain = plain(self, *args, **options), domain_of(self)
+        pool = kernels._pool  # engines of several kinds share it
 
-        def taken(program: cl.Program, name: str) -> cl.Kernel:
-            kernel = take(program, name)
+        def take(program: cl.Program, name: str) -> cl.Kernel:
+            kernel = pool.take(program, name)
             kernel.domain = domain
             return kernel
 
-        self.pool.take = taken
+        kernels._pool = SimpleNamespace(take=take)
+        return kernels
 
-    Engine.__init__ = told
+    Engine.kernels = named
 
 
 def build_for_simulator() -> None:
