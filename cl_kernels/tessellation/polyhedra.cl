@@ -295,8 +295,8 @@ inline REAL rounded_area(int i, int begin, int count, global const int *labels, 
    symmetric. The cell is flagged as collapsed if the face is wider than round-off explains, or if the areas of its
    faces and those of its neighbors differ by more than a share of the cell. In a power diagram cells may be so small
    that they are uncertain, as long as that is no more than the round-off of a neighbor. Faces of a neighbor without a
-   row are not compared, nor are those of two certain cells. In a diagram with ghost images the periods are 0. While cells are missing or wrong, this and the next two
-   kernels do nothing. */
+   row are not compared, nor are those of two certain cells. In a diagram with ghost images the periods are 0. While
+   cells are missing or wrong, this and the next two kernels do nothing. */
 kernel void match_polyhedron_faces(const int size, global const int *row_places, global const int *row_counts,
                                    global const int *labels, global const REAL *measures, global const REAL *volumes,
                                    global const REAL *points, const REAL share, global uchar *kept, global int *counts,

@@ -323,8 +323,8 @@ kernel void close_rows(const int size, global const int *starts, global const uc
 }
 
 /* Per generator i: the measures of its faces, times the ratio of two distances: to the nearest image of the neighbor,
-   and to the image across the face. Over the former, as the Poisson matrix divides them, they are those over the latter.
- */
+   and to the image across the face. Over the former, as the Poisson matrix divides them, they are those over the
+   latter. */
 kernel void scale_far_measures(const int size, global const int *starts, global const int *folded,
                                global const int *face_codes, global const FACE *face_measures,
                                global const REAL *points, global FACE *scaled PERIOD_ARGS)
@@ -367,11 +367,11 @@ kernel void unfold_rows(const int size, global const int *starts, global const i
 
 #if DIM == 3
 /* Per generator i whose cell was clipped while a folded diagram is updated: replace images by their owners. These cells
-   begin from place `used` on, and there is room for `room` faces. FLAG_FULL: the halo is too shallow, or a neighbor is so far away that those about a vertex need not be nearest images
-   of each other (polyhedra_update.cl). */
-kernel void fold_clipped_cells(const int size, const int used, const int room, global const int *row_places, global const int *row_counts,
-                               global const REAL *points, global const int *owners, global const int *halo_report,
-                               global int *labels, global int *report PERIOD_ARGS)
+   begin from place `used` on, and there is room for `room` faces. FLAG_FULL: the halo is too shallow, or a neighbor is
+   so far away that those about a vertex need not be nearest images of each other (polyhedra_update.cl). */
+kernel void fold_clipped_cells(const int size, const int used, const int room, global const int *row_places,
+                               global const int *row_counts, global const REAL *points, global const int *owners,
+                               global const int *halo_report, global int *labels, global int *report PERIOD_ARGS)
 {
     WORK_ITEM(i);
     if (halo_report[0])

@@ -51,8 +51,8 @@ typedef struct {
         global int *halo_requests, global int *halo_too_shallow, global const int *halo_most
 #define MAKE_HALO                                                                                                      \
     MAKE_BLOCKS;                                                                                                       \
-    halo_t halo = {halo_own,  halo_period, blocks, halo_sideways, halo_outwards, halo_kept,                            \
-                   MOST_WEIGHT, {0},       halo_depths, halo_requests, halo_too_shallow};                              \
+    halo_t halo = {halo_own,    halo_period, blocks,      halo_sideways, halo_outwards,   halo_kept,                   \
+                   MOST_WEIGHT, {0},         halo_depths, halo_requests, halo_too_shallow};                            \
     find_limits(&halo, halo_extremes)
 
 /* Layout of `extremes`, as bits of floats, whose order is that of floats >= 0: the largest depth along each axis, and
@@ -198,10 +198,10 @@ inline REAL widest_ball(const halo_t *in)
     return 1 + BALL_NOISE + (in->sideways + in->outwards) * WIDEST_WAY;
 }
 
-/* Test the ball around a vertex, at `at` from generator i at x with the weight w, where the faces with three others meet. Generator k of
-   these is at ways[k] from x, unless labels[k] is a wall. All cells at the vertex test whether the halo is deep enough.
-   Only the one with the least generator adds room for motion, as all compute the same. `sideways` and `outwards` are
-   shares of the shortest distance between two of the generators. */
+/* Test the ball around a vertex, at `at` from generator i at x with the weight w, where the faces with three others
+   meet. Generator k of these is at ways[k] from x, unless labels[k] is a wall. All cells at the vertex test whether the
+   halo is deep enough. Only the one with the least generator adds room for motion, as all compute the same. `sideways`
+   and `outwards` are shares of the shortest distance between two of the generators. */
 inline void check_vertex_ball(const REAL *x, REAL w, int i, REAL4 at, const REAL4 *ways, const int *labels,
                               const halo_t *in)
 {
