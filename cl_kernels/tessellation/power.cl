@@ -8,9 +8,7 @@ kernel void attach_weights(const int size, global const REAL *points, global con
     for (int a = 0; a < DIM; ++a)
         weighted[(DIM + 1) * i + a] = points[DIM * i + a];
     weighted[(DIM + 1) * i + DIM] = weights[i];
-    const int key = key_of_weight(weights[i]);
-    if (key > most[0]) /* spares most of the atomic operations */
-        atomic_max(most, key);
+    atomic_max(most, key_of_weight(weights[i]));
 }
 
 /* Per row i: its position without the weight. */

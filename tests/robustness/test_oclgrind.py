@@ -84,11 +84,12 @@ NOT_FOR = {
     "polygon": IN_SPACE | WITH_WEIGHTS | MOVING_MESH | OBTUSE | {"ghost_images", "cells.measure_faces"},
     # Only in space do diagrams begin with the one before.
     "torus": IN_SPACE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | MOVING_MESH | OBTUSE
-    | {"ghost_images.unfold_rows", "ghost_images.fold_clipped_cells"},
+    | {"ghost_images.unfold_rows", "ghost_images.fold_clipped_cells", "ghost_images.scale_far_measures"},
     "sphere": IN_SPACE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | MOVING_MESH | VOLUMES | {"ghost_images"},
     "space": IN_PLANE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | {"ghost_images"},
     "periodic space": IN_PLANE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | MOVING_MESH
-    | {"ghost_images.measure_required_depths", "transport.prescribe_sizes"},
+    | {"ghost_images.measure_required_depths", "ghost_images.scale_far_measures",
+       "transport.prescribe_sizes"},
 }  # fmt: skip
 """Files and kernels that a kind of domain does not need. All others except `ALIKE` run in it, in every variant."""
 WEIGHTED = {"bins", "power", "weight_bounds"}
@@ -100,11 +101,12 @@ ONLY_FOR = {
 """Files that power diagrams need."""
 NOT_WEIGHTED = {
     # Generators are not sorted, polygons have precise faces, and every part of a cell belongs to it.
-    "weighted plane": {"bins.number_items"},
+    "weighted plane": {"bins.number_items", "power.detach_weights"},
     "weighted polygon": {
-        "bins.number_items", "cells.measure_faces", "trim.adopt_pieces", "trim.settle_pieces", "trim.list_orphans",
+        "bins.number_items", "power.detach_weights", "cells.measure_faces", "trim.adopt_pieces", "trim.settle_pieces",
+        "trim.list_orphans",
     },
-    "weighted space": {"bins.number_items"},
+    "weighted space": {"bins.number_items", "power.detach_weights"},
 }  # fmt: skip
 """Kernels of these files that they do not need."""
 PATIENCE = 20
