@@ -103,6 +103,7 @@ def kernels_of(stage):
 
 
 @functools.cache
+@functools.cache
 def modules():
     """Return all modules of the package as {name: syntax tree}, without the package's own name."""
     found = {}
@@ -121,7 +122,7 @@ def imports(name, tree, known, lazy=False):
     package = name.split(".")[:-1]
     skipped = set()
     for node in ast.walk(tree):
-        typing = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        typing = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
         if typing or (isinstance(node, ast.FunctionDef) and not lazy):
             skipped |= {id(n) for n in ast.walk(node)}
     for node in ast.walk(tree):

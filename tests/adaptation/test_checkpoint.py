@@ -110,7 +110,7 @@ LONG_LIVED = {
     ),
     "adaptive in 3D": (BOX_3D, SIZE_3D, {"method": "adaptive", "effort": "fast"}),
 }
-QUICK = ("coupled", "multigrid"), ("adaptive", "jacobi"), ("weighted in 3D", "multigrid")
+QUICK = ("coupled", "multigrid"), ("adaptive", "jacobi")
 
 
 @pytest.mark.parametrize(

@@ -368,11 +368,12 @@ def test_estimate_does_not_depend_on_the_position_of_the_periodic_boundary():
     assert 1 < min(images[1:]) <= max(images[1:]) < 1.1 * min(images[1:]) < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dim", "formula", "n"),
     [
         (2, "sin(60 * x) > 0.95 ? 1.0 : 16.0", 1500),
-        pytest.param(3, "sin(20 * x) > 0.9 ? 1.0 : 8.0", 1500, marks=pytest.mark.slow),
+        (3, "sin(20 * x) > 0.9 ? 1.0 : 8.0", 1500),
     ],
 )
 def test_surplus_bounds_the_cells_at_jumps(ctx, dim, formula, n):

@@ -199,10 +199,9 @@ def test_warnings_of_compilers_are_ignored_in_all_threads(recwarn):
     assert list(warnings.filters) == before
 
 
-@pytest.mark.parametrize("real", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "kind", ["2D box", *(pytest.param(k, marks=pytest.mark.slow) for k in ("3D box", "2D polygon"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("kind", ["2D box", "3D box", "2D polygon"])
 def test_threads_know_the_programs_of_gpus(ctx, monkeypatch, real, kind):
     """The record is from PoCL in float64; all but a few programs of a run are built ahead on other devices, too."""
     monkeypatch.setattr(engines, "group_sizes", lambda _: engines.GroupSizes(5, 32))

@@ -88,9 +88,13 @@ QUICK = {"coupled": (0.05, WORK[0]), "exact number": (0.1, WORK[2])}
 @pytest.mark.parametrize(
     "name",
     [
-        *QUICK,
+        "exact number",
         "plane",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in LARGE if name != "plane"),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("coupled", *LARGE)
+            if name != "plane"
+        ),
     ],
 )
 def test_ranges_change_no_bit(ctx, monkeypatch, name):
