@@ -14,8 +14,8 @@ LOOSE = 256 * float(np.finfo(np.float32).eps)
 """Tolerance of means in the history, in any precision: the device sums the quality in float32."""
 
 
-def check_history(check: Check, result: Result, eps: float) -> None:
-    """Check numbers and order of the history, and its last row against the mesh, whose errors have round-off `eps`."""
+def check_history(check: Check, result: Result, rounding: float) -> None:
+    """Check numbers and order of the history, and its last row against the mesh: errors up to `rounding`."""
     rows = result.history
     if not len(rows):  # read from a .vtu file
         return
@@ -66,6 +66,6 @@ def check_history(check: Check, result: Result, eps: float) -> None:
     for name, value in expected.items():
         last = rows[name][-1]
         check.note(
-            "history", [not abs(last - value) <= LOOSE * abs(value) + 64 * eps],
+            "history", [not abs(last - value) <= LOOSE * abs(value) + rounding],
             lambda _, name=name, last=last, value=value: f"{name} ends with {last:.6g}, the mesh has {value:.6g}",
         )  # fmt: skip
