@@ -31,6 +31,9 @@ _threads: list[threading.Thread] = []
 _ending = threading.Event()
 _silent = 0
 _IGNORED = ("ignore", None, cl.CompilerWarning, None, 0)
+NO_ABI_WARNINGS = '#pragma clang diagnostic ignored "-Wpsabi"\n'
+"""First line of programs for PoCL. On a CPU without AVX-512 clang otherwise warns that other compilers pass vectors of
+eight doubles in another way, and PoCL prints the number of warnings on the terminal. Kernels call no code of theirs."""
 ROUNDED_QUOTIENTS = "-cl-fp32-correctly-rounded-divide-sqrt"
 STATIC_FUNCTIONS = "#define inline static inline\n"
 """Put before programs; see `needs_static_functions`."""
@@ -170,6 +173,8 @@ def compile_text(
     """Build `text`; if `short`, with the declarations of `shorten`."""
     device = ctx.devices[0]
     options = (*options, *device_options(device))
+    if on_pocl(device):
+        text = NO_ABI_WARNINGS + text
     if needs_static_functions(device):
         text = STATIC_FUNCTIONS + text
     with _silenced():
