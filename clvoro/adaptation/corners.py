@@ -218,7 +218,7 @@ def _walls(
 
 
 def _grouped(x: np.ndarray, h: np.ndarray) -> list[list[int]]:
-    """Return groups of at most `MOST_IN_GROUP` points; near points are joined first."""
+    """Divide points into groups of at most `MOST_IN_GROUP`: join those nearer than `JOINED` h, the nearest first."""
     group: list[list[int]] = [[k] for k in range(len(x))]
     if len(x) < 2:
         return group

@@ -179,7 +179,7 @@ def _ring(diagram: Diagram, i: int) -> np.ndarray:
 
 
 def _place(domain: Domain, x: np.ndarray) -> str:
-    """Return a place in words."""
+    """Return a position as text: longitude and latitude on a sphere, coordinates elsewhere."""
     if isinstance(domain, Sphere):
         lon, lat = domain.lonlat(x[None])[0]
         return f"longitude {lon:.6g}, latitude {lat:.6g}"

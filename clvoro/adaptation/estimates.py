@@ -47,16 +47,17 @@ FOLDED = {2: (9, 57), 3: (40, 25)}
 FOLDED_DIAGRAM = {2: {8: 360, 4: 340}, 3: {8: 2000, 4: 1900}}
 """Bytes per cell in addition for one diagram in periodic boxes."""
 POWER_PEAK: dict[int | str, tuple[int, int]] = {2: (74, 119), 3: (255, 264)}
-"""Reals and integers per cell while the method "transport" has both a Voronoi diagram and a power diagram."""
-TRIMMED_POWER_PEAK, FOLDED_POWER = (171, 134), {2: (38, 39), 3: (0, 0)}
-"""The same in polygons; and per cell (not per image) in addition in periodic boxes."""
+"""Reals and integers per cell while the method "transport" holds a Voronoi diagram and a power diagram."""
+TRIMMED_POWER_PEAK = 171, 134
+"""The same in polygons."""
+FOLDED_POWER = {2: (38, 39), 3: (0, 0)}
+"""The same in periodic boxes: what is added per cell (not per image)."""
 POWER_DIAGRAM = {2: {8: 970, 4: 670}, 3: {8: 4700, 4: 3500}}
-"""Bytes per cell for one power diagram, or for prescribed volumes, of random generators."""
-TRIMMED_POWER_DIAGRAM, FOLDED_POWER_DIAGRAM = (
-    {8: 1520, 4: 1020},
-    {2: {8: 600, 4: 520}, 3: {8: 6700, 4: 5400}},
-)
-"""The same in polygons; and in addition in periodic boxes, where large weights need more images."""
+"""Bytes per cell for one power diagram of random generators, with given weights or with prescribed volumes."""
+TRIMMED_POWER_DIAGRAM = {8: 1520, 4: 1020}
+"""The same in polygons."""
+FOLDED_POWER_DIAGRAM = {2: {8: 600, 4: 520}, 3: {8: 6700, 4: 5400}}
+"""The same in periodic boxes: what is added per cell. Large weights need more ghost images."""
 LARGEST: dict[int | str, dict[int, int]] = {
     2: {8: 105, 4: 90}, 3: {8: 610, 4: 310}, SPHERE: {8: 150, 4: 90},
 }  # fmt: skip

@@ -74,10 +74,8 @@ class MultilevelOptions:
         Mean |log(L / h)| that the last steps aim at; a larger one gives cells of a better shape. By default .0025
         (effort "fast": .0035, "best": .0039) where sizes are smooth. In a `Box` in 2D, with more than about 2,800
         cells, it grows with the share of the cells where sizes are steep, |grad h| > .1, up to .0155 ("fast": .007,
-        "best": .01). In other domains and with "exact" it does not. From 1e-4 on targets are met where sizes are
-        smooth. Above about .04 shape improves little, and errors stay below the target: in 2D the mean error does not
-        exceed about .045, and the largest one about .25. Larger errors would not give better cells: with the neighbors
-        that cells then have, their shape is nearly the best.
+        "best": .01). In other domains and with "exact" it does not. Above about .04 the shape hardly improves, and
+        errors stay below the target; in 2D the largest error is bounded to about .25 (bench/front.py).
 
     Raises
     ------

@@ -81,7 +81,7 @@ LOOSE_POLISH_3D, SETTLE_PENALTY_3D = 2.0, 0.7
 """Polishing in 3D aims at so many times the error target; one projection with this penalty then meets it. Measured on
 S3, the largest error is half of that of polishing alone, for 0.0007 of mean Q."""
 EXACT_PENALTIES, EXACT_ITERATIONS = (0.1, 0.05, 0.02, 0.01, 0.003, 0.001), 45
-"""Penalties of the exact projection, step by step, and most iterations of each.
+"""Penalties of the steps of the exact projection, in this order, and the largest number of iterations per step.
 
 A small penalty from the first step on moves generators by large displacements where the number of cells does not fit a
 narrow part of the domain. There they nearly coincide in the end, and sizes are lost for good."""

@@ -32,8 +32,8 @@ _ending = threading.Event()
 _silent = 0
 _IGNORED = ("ignore", None, cl.CompilerWarning, None, 0)
 NO_ABI_WARNINGS = '#pragma clang diagnostic ignored "-Wpsabi"\n'
-"""First line of programs for PoCL. On a CPU without AVX-512 clang otherwise warns that other compilers pass vectors of
-eight doubles in another way, and PoCL prints the number of warnings on the terminal. Kernels call no code of theirs."""
+"""Put before programs for PoCL. On a CPU without AVX-512 clang warns that other compilers pass vectors of eight doubles
+in another way. That does not matter, because kernels call no code of other compilers."""
 ROUNDED_QUOTIENTS = "-cl-fp32-correctly-rounded-divide-sqrt"
 STATIC_FUNCTIONS = "#define inline static inline\n"
 """Put before programs; see `needs_static_functions`."""

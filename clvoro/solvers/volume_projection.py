@@ -24,8 +24,8 @@ SINGLE_PRECISION_TOLERANCE = 1e-4
 """Tolerance from which on the vectors of the iteration are in single precision."""
 _ROWS = 5
 _SPARE = 1
-"""Iterations that are enqueued beyond those of the last solve. Counted in default runs on F1, F2 and S1: with 2 a step
-takes two launches more, and as many reads within one in fifty; with 0 one read more in five steps."""
+"""Number of iterations that are enqueued beyond those of the last solve. A solve that takes one more needs no second
+read then. Further ones cost two launches each."""
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,8 @@ class PowerTessellator:
         """
         box, cells, rows, before = self.domain, self.stages.cells, previous, np.inf
         if self._periodic is not None:
-            # Round-off aside, no image cuts off too much, and the sum shows whether any is missing.
+            # An image cuts off only what belongs to other cells. If one is missing, the volumes add up to
+            # more than that of the box.
             box, cells = self._periodic.wide, self.stages.folded_cells
         assert isinstance(cells, PowerCells)
         while True:
@@ -165,7 +166,7 @@ class PowerTessellator:
             rows, before = NeighborRows(t.n, t.starts, t.neighbors), excess
 
     def laplacian_measures(self, t: Tessellation) -> cla.Array:
-        """Return the measures of the faces of `t`, the latest diagram, for a Poisson matrix of nearest images."""
+        """Return the face measures of the latest diagram `t` for a Poisson matrix (see `scale_far_measures`)."""
         if self._periodic is None or self._by_rings:
             return t.face_measures
         return self.stages.ghost_images.scale_far_measures(t, self._periodic.codes)
@@ -177,7 +178,7 @@ class PowerTessellator:
         return NeighborRows(whole.n, whole.starts.copy(), whole.neighbors.copy())
 
     def final(self, t: Tessellation) -> tuple[Tessellation, ExtendedDiagram | None]:
-        """Return `t`, the latest diagram, with faces in full precision, and in a periodic box its extended diagram."""
+        """Return the latest diagram `t` with faces in full precision, and, in a periodic box, its extended diagram."""
         cells = self.stages.cells
         if self._periodic is not None:
             return self._final_in_periodic_box(self._periodic, t)

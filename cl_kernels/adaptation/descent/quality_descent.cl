@@ -46,7 +46,7 @@ typedef struct {
 /* An energy against short edges, or against generators that are too close to each other. */
 typedef struct {
     REAL length, stiffness;
-} short_edges_t;
+} repulsion_t;
 
 /* A face of the cell of the generator at x. */
 typedef struct {
@@ -99,7 +99,7 @@ inline bool is_same_vertex(REAL2 p, REAL2 q)
 }
 
 /* dE/dl of an edge. */
-inline REAL edge_tension(REAL length, REAL unit, const short_edges_t *s)
+inline REAL edge_tension(REAL length, REAL unit, const repulsion_t *s)
 {
     return -s->stiffness / unit * fmax(0, s->length - length / unit);
 }
@@ -140,8 +140,7 @@ inline REAL boundary_length(int i, int k, int side, const rows_t *rows OUTLINE_A
 }
 
 /* dE/dl of the boundary of cell i beside its face with cell j, after it (side = 1) or before it (side = -1). */
-inline REAL boundary_tension(int i, int j, int side, REAL4 force, const rows_t *rows,
-                             const short_edges_t *s OUTLINE_ARGS)
+inline REAL boundary_tension(int i, int j, int side, REAL4 force, const rows_t *rows, const repulsion_t *s OUTLINE_ARGS)
 {
     const int begin = rows->starts[i], end = rows->starts[i + 1];
     if (force.s3 < s->length * force.s2)
@@ -166,7 +165,7 @@ kernel void descend_quality(const int size, global const int *starts, global con
 {
     WORK_ITEM(i);
     const rows_t rows = {starts, neighbors, face_measures, face_centroids};
-    const short_edges_t edges = {short_edge, stiffness}, pairs = {close, close_stiffness};
+    const repulsion_t edges = {short_edge, stiffness}, pairs = {close, close_stiffness};
     SITE(x, i, points);
     const int begin = starts[i], end = starts[i + 1];
     const REAL4 own = forces[i];

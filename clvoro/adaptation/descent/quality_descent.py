@@ -1,8 +1,6 @@
-"""Gradient descent of the cell quality, of short edges and of close generators in 2D (`quality_descent.cl`).
+"""Gradient descent in 2D: better cell shapes, no short edges, no generators close to each other (`quality_descent.cl`).
 
-The last steps of a run use it.
-
-On a sphere obtuse Delaunay triangles are opened in the end, for models on C grids.
+The last steps of a run use it. On a sphere obtuse Delaunay triangles are opened in the end, for models on C grids.
 """
 
 from __future__ import annotations
@@ -24,10 +22,8 @@ sizes and quality.
 """
 
 CLOSE, CLOSE_STIFFNESS = 0.5, 3.0
-"""Distance over h below which neighboring generators are pushed apart, and the stiffness of that energy.
-
-Good meshes have no such generators: the least distance on a lake, a channel, a city and around wings is 0.6 to 0.8 h.
-"""
+"""Distance over h below which neighboring generators are pushed apart, and the stiffness of that energy. In a
+hexagonal lattice neighbors are 1.07 h apart."""
 
 OPENINGS = 12
 """Most times that obtuse triangles are opened. After one, others may be obtuse. Two are enough for most meshes; none of

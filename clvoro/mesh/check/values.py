@@ -68,7 +68,7 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         "quality", np.maximum(off - 3 * rounding, 0),
         lambda i: f"quality[{i}] is {q[i]:.10g}, the cell gives {quality[i]:.10g}",
     )  # fmt: skip
-    # The last row may be of the same cells with other round-off: each corner is off by a few units.
+    # A run computes its last errors before faces are measured in full precision, which moves corners by a few units.
     check_history(check, result, 64 * eps + 8 * g.unit / float(length.min(initial=np.inf)))
     _check_factor(check, result)
 

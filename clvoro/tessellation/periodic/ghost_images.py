@@ -170,9 +170,10 @@ class GhostImages:
         return ExtendedPoints(n, count, box, halo, kept, halo_args, extended, firsts, owners, codes)
 
     def scale_far_measures(self, t: Tessellation, codes: cla.Array) -> cla.Array:
-        """Return the measures of the faces of `t`, a folded diagram, for a Poisson matrix that takes nearest images.
+        """Return the face measures of the folded diagram `t`, scaled for a Poisson matrix.
 
-        `codes` are those of its faces (see `FoldedDiagram`). The array is in the workspace.
+        The matrix divides them by the distance to the nearest image of the neighbor; the face may be that of another
+        image. `codes` are those of its faces (see `FoldedDiagram`). The array is in the workspace.
         """
         engine, scaled = self.engine, self.engine.scratch(len(t.neighbors), self.engine.face)
         engine.run_each(
