@@ -80,15 +80,17 @@ POLISH_COUNT_3D = 5e-3
 LOOSE_POLISH_3D, SETTLE_PENALTY_3D = 2.0, 0.7
 """Polishing in 3D aims at so many times the error target; one projection with this penalty then meets it. Measured on
 S3, the largest error is half of that of polishing alone, for 0.0007 of mean Q."""
-EXACT_PENALTIES, EXACT_ITERATIONS = (0.1, 0.05, 0.02, 0.01, 0.003, 0.001), 45
-"""Penalties of the steps of the exact projection, in this order, and the largest number of iterations per step.
+EXACT_PENALTY, EXACT_ITERATIONS = 1e-3, 45
+"""Penalty of the exact projections, and the largest number of iterations of each."""
+GRADUAL_PENALTIES = (0.1, 0.03), (0.03, 0.03), (0.01, 0.03), (1e-3, 0.0), (1e-3, 0.0), (1e-3, 0.0)
+"""In polygons: penalty, and scale of the quality in it (see `Penalty`), of each step before Newton's.
 
 A small penalty from the first step on moves generators by large displacements where the number of cells does not fit a
-narrow part of the domain. There they nearly coincide in the end, and sizes are lost for good."""
-EXACT_QUALITY_SCALES = 0.03, 0.1
-"""Scales of the quality in the penalty of the exact projection, and of Newton's steps after it: see `Penalty`."""
-NEWTON_STEPS = 3
-EXACT_STEPS = len(EXACT_PENALTIES) + NEWTON_STEPS
+narrow part of the domain. There they nearly coincide in the end, and sizes are lost for good. Boxes have no such parts,
+and sizes are met sooner with the small penalty."""
+NEWTON_STEPS = 2
+"""Number of the last exact projections that only project and separate vertices: Newton's method for the sizes."""
+EXACT_STEPS = len(GRADUAL_PENALTIES) + NEWTON_STEPS
 EXACT_STEPS_3D = 3
 
 SEPARATE_PENALTY = 20.0
@@ -192,6 +194,7 @@ def adaptive_schedule(
     warm: bool = False,
     near: bool = False,
     openings: int = 0,
+    gradual: bool = False,
 ) -> list[Action]:
     """Return the schedule of the methods "adaptive" and "exact", with `levels` coarser levels.
 
@@ -210,9 +213,22 @@ def adaptive_schedule(
     openings : int
         How often the last steps open obtuse triangles, at most. Some steps before them cells of four sides are deleted,
         and those of eight split: a cell of four sides has an obtuse triangle.
+    gradual : bool
+        Lower the penalty of exact projections in 2D step by step (see `GRADUAL_PENALTIES`).
     """
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
+    if exact and gradual:
+        _lower_penalties(schedule)
     return _opened(schedule, exact, openings) if openings else schedule
+
+
+def _lower_penalties(schedule: list[Action]) -> None:
+    """Give the exact projections of a schedule the penalties of `GRADUAL_PENALTIES`."""
+    steps = [k for k, action in enumerate(schedule) if isinstance(action, Step)]
+    projections = steps[-EXACT_STEPS:-NEWTON_STEPS]
+    for k, (penalty, scale) in zip(projections, GRADUAL_PENALTIES, strict=True):
+        method = replace(schedule[k].method, penalty=penalty, quality_scale=scale)
+        schedule[k] = replace(schedule[k], method=method)
 
 
 def _opened(schedule: list[Action], exact: bool, openings: int) -> list[Action]:
@@ -336,15 +352,11 @@ def _finish_2d(
         yield Step(polish)
     if exact:
         project = ProjectedMethod(
-            "quality", quality_scale=EXACT_QUALITY_SCALES[0], iterations=EXACT_ITERATIONS, tolerance=1e-3, k=0.3,
+            "quality", penalty=EXACT_PENALTY, iterations=EXACT_ITERATIONS, tolerance=1e-3, k=0.3,
             gradient_from_field=True, correct_mean=True,
         )  # fmt: skip
-        yield from [Step(replace(project, penalty=penalty)) for penalty in EXACT_PENALTIES]
-        # The last steps only project and separate vertices: Newton's method for the sizes.
-        newton = replace(
-            project, descent="edges", momentum=0.0, penalty=EXACT_PENALTIES[-1], quality_scale=EXACT_QUALITY_SCALES[1]
-        )  # fmt: skip
-        yield from [Step(newton)] * NEWTON_STEPS
+        yield from [Step(project)] * (EXACT_STEPS - NEWTON_STEPS)
+        yield from [Step(replace(project, descent="edges", momentum=0.0))] * NEWTON_STEPS
     else:
         separate = replace(
             polish, descent="edges", momentum=0.0, penalty=SEPARATE_PENALTY, quality_scale=0.0, error_target=0.0
