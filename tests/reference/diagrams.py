@@ -42,25 +42,19 @@ def box_voronoi(lower, upper, points) -> list[Cell]:
             image[:, axis] = 2 * wall - image[:, axis]
             images.append(image)
     diagram = Voronoi(np.concatenate([points, *images]))
-    faces: list[list[tuple[int, list[int]]]] = [[] for _ in range(n)]
-    for (p, q), ridge in zip(diagram.ridge_points, diagram.ridge_vertices, strict=True):
-        for i, j in ((p, q), (q, p)):
-            if i < n:
-                faces[i].append((j if j < n else -(j // n), ridge))
+    pairs, ridges = diagram.ridge_points, np.array(diagram.ridge_vertices)
+    owners, others = np.concatenate([pairs, pairs[:, ::-1]]).T
+    # Both ends of each face around its owner.
+    own = owners < n
+    owners, others, ends = owners[own], others[own], np.concatenate([ridges, ridges])[own]
+    a, b = (diagram.vertices[ends[:, k]] - points[owners] for k in range(2))
+    first = np.where(a[:, 0] * b[:, 1] > a[:, 1] * b[:, 0], *ends.T)
+    order = np.lexsort((np.arctan2(*(a + b).T[::-1]), owners))
     cells = []
-    for i in range(n):
-        middles = [diagram.vertices[r].mean(axis=0) - points[i] for _, r in faces[i]]
-        order = np.argsort([np.arctan2(m[1], m[0]) for m in middles])
-        corners, neighbors = [], []
-        for k in order:
-            j, ridge = faces[i][k]
-            a, b = diagram.vertices[ridge] - points[i]
-            first = ridge[0] if a[0] * b[1] - a[1] * b[0] > 0 else ridge[1]
-            corners.append(diagram.vertices[first])
-            neighbors.append(int(j))
-        polygon = np.array(corners)
-        area, centroid = measures(polygon)
-        cells.append(Cell(polygon, neighbors, area, centroid))
+    for rows in np.split(order, np.cumsum(np.bincount(owners, minlength=n))[:-1]):
+        polygon = diagram.vertices[first[rows]]
+        neighbors = [int(j) if j < n else -int(j // n) for j in others[rows]]
+        cells.append(Cell(polygon, neighbors, *measures(polygon)))
     return cells
 
 

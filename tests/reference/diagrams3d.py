@@ -21,10 +21,10 @@ class Cell:
 
 def polygon(corners: np.ndarray, center: np.ndarray) -> tuple[float, np.ndarray, list]:
     """Return area, centroid and triangles of a convex polygon whose corners (k, 3) go around."""
-    middle = corners.mean(axis=0)
-    triangles = [(middle, a, b) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    areas = np.array([np.linalg.norm(np.cross(b - a, c - a)) / 2 for a, b, c in triangles])
-    centroids = np.array([(a + b + c) / 3 for a, b, c in triangles])
+    middle, nexts = corners.mean(axis=0), np.roll(corners, -1, axis=0)
+    triangles = [(middle, a, b) for a, b in zip(corners, nexts, strict=True)]
+    areas = np.linalg.norm(np.cross(corners - middle, nexts - middle), axis=1) / 2
+    centroids = (middle + corners + nexts) / 3
     area = areas.sum()
     return area, (areas[:, None] * centroids).sum(axis=0) / area if area else middle, triangles
 
