@@ -3,7 +3,9 @@
 import base64
 import binascii
 import os
+import re
 import signal
+from functools import partial
 
 import pytest
 from hypothesis import settings
@@ -16,6 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # So do more threads of PoCL. The first of several processes keeps them, so that kernels run in parallel somewhere.
 if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
     os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", "1")
+
 
 # Examples are the same in every run, and the first build of a kernel may take its time.
 settings.register_profile("clvoro", derandomize=True, deadline=None, database=None)
@@ -35,6 +38,34 @@ def hulls_for_small_meshes():
     before, Cells.hulls_from = Cells.hulls_from, 0
     yield
     Cells.hulls_from = before
+
+
+UNOPTIMIZED = re.compile("-D(REAL=float|PERIODIC|POLYGON|SPHERE|WEIGHTED)")
+"""Macros of programs that the fast tests build without optimization: all but those for boxes with walls in float64."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_builds(request):
+    """Let PoCL build many kernels of the fast tests without optimization, which takes a third of the time.
+
+    Their bits are the same: see `test_optimization_changes_no_bit`.
+    """
+    from clvoro.opencl import prebuild, program
+
+    with pytest.MonkeyPatch.context() as patch:
+        fast = request.config.option.markexpr == "not slow"
+        if fast and "CLVORO_TEST_OPTIMIZED" not in os.environ:
+            patch.setattr(program, "compile_text", partial(compile_quickly, program.compile_text))
+            patch.setattr(prebuild, "_start", lambda _: None)  # workers would optimize
+        yield
+
+
+def compile_quickly(plain, ctx, text, options, short=True):
+    """Call `plain`, which is `compile_text` of clvoro."""
+    # Programs that are not `short` contain a size field: many kernels of a few operations.
+    quick = not short or any(map(UNOPTIMIZED.match, options))
+    quick = quick and ctx.devices[0].platform.name == "Portable Computing Language"
+    return plain(ctx, text, (*options, "-cl-opt-disable") if quick else options, short)
 
 
 @pytest.fixture(scope="session")

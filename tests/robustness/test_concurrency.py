@@ -14,7 +14,9 @@ import pyopencl as cl
 import pytest
 
 import clvoro
+from clvoro.opencl import program
 from clvoro.opencl.engine import Engine
+from clvoro.solvers import poisson
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 SHORE = [(0, 0), (3, -0.3), (4, 1), (2.6, 1.2), (2.5, 2.2), (1, 2)]
@@ -122,6 +124,32 @@ def run_large(name):
         clvoro.solvers.poisson.expected_costs = lambda *_: (2.0, 1.0)
     result = adapter.run(domain, field, seed=7, **options)
     return adapter.queue.device.max_compute_units, len(result.points), digest(result)
+
+
+@pytest.fixture
+def unoptimized(monkeypatch):
+    """Return a function after which kernels are built without optimization."""
+    plain = program.compile_text
+
+    def compile_text(ctx, text, options, short=True):
+        return plain(ctx, text, (*options, "-cl-opt-disable"), short)
+
+    return lambda: monkeypatch.setattr(program, "compile_text", compile_text)
+
+
+def test_optimization_changes_no_bit(ctx, alone, unoptimized):
+    """Kernels use strict floating point. The fast tests build most of them without optimization: see `conftest`."""
+    unoptimized()
+    assert run(clvoro.Adapter(cl.Context(ctx.devices)), WORK[1]) == alone[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(LARGE))
+def test_optimization_changes_no_bit_of_large_runs(name, unoptimized, monkeypatch):
+    monkeypatch.setattr(poisson, "expected_costs", poisson.expected_costs)  # which a run replaces
+    optimized = run_large(name)
+    unoptimized()
+    assert run_large(name) == optimized
 
 
 @pytest.mark.slow
