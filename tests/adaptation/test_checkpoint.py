@@ -181,7 +181,7 @@ def test_own_points_and_callables(ctx, tmp_path):
 
 def test_resume_with_far_fewer_cells_than_at_the_start(ctx, tmp_path):
     """Rows keep the capacity of the first mesh."""
-    points, path = np.random.default_rng(12).random((3000, 2)), tmp_path / "state"
+    points, path = np.random.default_rng(12).random((600, 2)), tmp_path / "state"
     square, options = clvoro.Box((0, 0), (1, 1)), {"points": points, "effort": "fast"}
     whole = clvoro.Adapter(ctx).run(square, 0.25, **options)
     stop = {"callback": stop_after(3), "checkpoint": path}

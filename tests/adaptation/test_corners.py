@@ -299,6 +299,7 @@ def test_wide_tips(ctx):
         assert (np.ptp(away) < 1e-9) == equal
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("degrees", [12, 20, 30, 42])
 @pytest.mark.parametrize(
     ("method", "effort"), [("adaptive", "fast"), ("adaptive", "default"), ("exact", "default")]

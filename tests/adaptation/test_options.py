@@ -24,14 +24,9 @@ from clvoro.errors import InputError, InputTypeError, UnusedOptionWarning
 
 BOX = clvoro.Box((0, 0), (1, 1))
 SIZE = clvoro.sizing.Expression("0.16 + 0.1 * x")
-CHANGED = {
-    "effort": "best",
-    "levels": 1,
-    "error_target": 0.02,
-    "tol": 0.9,
-    "alpha": 0.1,
-    "k": 0.1,
-}
+CHANGED_LEVELS = {"effort": "best", "levels": 1, "error_target": 0.02}
+CHANGED_STEPS = {"tol": 0.9, "alpha": 0.1, "k": 0.1}
+CHANGED = CHANGED_LEVELS | CHANGED_STEPS
 CASE = """
 [domain]
 lower = [0, 0]
@@ -81,17 +76,24 @@ def test_options_are_used_or_warned_of(adapter, method):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         _, plain = made()
-    for name, value in CHANGED.items():
+    # Options that the method does not use in one run for each of the two classes.
+    together = [
+        {name: value for name, value in part.items() if not uses(method, name)}
+        for part in (CHANGED_LEVELS, CHANGED_STEPS)
+    ]
+    alone = [{name: value} for name, value in CHANGED.items() if uses(method, name)]
+    for given in filter(None, [*together, *alone]):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            run, found = made(**{name: value})
-        assert (found != plain) == uses(method, name), name
-        assert (name in run.settings) == uses(method, name)
+            run, found = made(**given)
+        assert (found != plain) == (given in alone), given
+        assert set(given).isdisjoint(run.settings) == (given in together)
         warned = [w for w in caught if w.category is UnusedOptionWarning]
-        assert len(warned) == (not uses(method, name)), name
-        for w in warned:
-            assert f"{name} is {value!r}, which the method {method} does not use" in str(w.message)
-            assert w.filename == __file__
+        assert len(warned) == (len(given) if given in together else 0), given
+        for name, value in given.items() if warned else ():
+            said = f"{name} is {value!r}, which the method {method} does not use"
+            assert any(said in str(w.message) for w in warned), name
+        assert {w.filename for w in warned} <= {__file__}
 
 
 def test_values_without_effect_cause_no_warning(adapter):

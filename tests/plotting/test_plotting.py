@@ -118,6 +118,7 @@ def test_error_scale_is_the_same_on_both_sides_of_zero(result):
     assert high >= np.quantile(np.abs(result.size_error), 0.99)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("shape", [(3.0, 1.0), (1.0, 1.0), (0.6, 2.0)])
 @pytest.mark.parametrize("color", ["error", "quality", "size"])
 def test_color_bar_is_as_high_as_the_picture_and_readable(adapter, shape, color):

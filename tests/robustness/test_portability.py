@@ -54,8 +54,8 @@ needs_clang = pytest.mark.skipif(gpu_programs.clang() is None, reason="needs cla
 @pytest.mark.parametrize(
     ("dtype", "domain", "size"),
     [
-        ("float64", BOX, 0.06),
-        pytest.param("float32", BOX, 0.06, marks=pytest.mark.slow),
+        ("float32", BOX, 0.12),
+        pytest.param("float64", BOX, 0.06, marks=pytest.mark.slow),
         pytest.param("float64", CUBE, 0.2, marks=pytest.mark.slow),
         pytest.param("float32", CUBE, 0.2, marks=pytest.mark.slow),
     ],

@@ -74,15 +74,17 @@ def gradient_of(energy, points, some=None, step=1e-5):
 
 @pytest.mark.parametrize("bad_cell_weight", [0.0, 20.0])
 def test_gradient(ctx, bad_cell_weight):
-    """Every generator, those at walls and in corners included, moves by -rate h^2 dE/dx."""
+    """Generators, those at walls and in corners included, move by -rate h^2 dE/dx."""
     points = patch.relaxed_points(N, 2112, steps=3)
     h = np.random.default_rng(6).uniform(0.05, 0.2, N)
     u = descend(patch.make_engine(ctx), points, h, bad_cell_weight, rate=0.3, max_displacement=1e9)
     omega = 1 - bad_cell_weight * np.log(qualities(points)[:, 0])
-    gradient = gradient_of(lambda x: energy(x, omega), points)
-    expected = -0.3 * h[:, None] ** 2 * gradient
+    # Every second one, from the walls to the middle.
+    some = np.argsort(np.minimum(points, patch.BOX.upper - points).min(axis=1))[::2]
+    gradient = gradient_of(lambda x: energy(x, omega), points, some)
+    expected = (-0.3 * h[:, None] ** 2 * gradient)[some]
     # Central differences: rounding of E (about 100 (1 + bad_cell_weight)) over the step, curvature times its square.
-    assert u == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+    assert u[some] == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
 
 
 def test_gradient_in_a_polygon(ctx):
@@ -96,7 +98,9 @@ def test_gradient_in_a_polygon(ctx):
     points = grid.reshape(-1, 2) + rng.uniform(-0.05, 0.05, (grid.size // 2, 2))
     points = points[domain.contains_well(points, 0.02)]
     n, cells = len(points), polygon_voronoi(domain, points)
-    assert any({(i, -7), (i, -8), (i, -9)} <= set(cells.lengths) for i in range(n))
+    around = [i for i in range(n) if {(i, -7), (i, -8), (i, -9)} <= set(cells.lengths)]
+    assert around
+    some = sorted({*around, *range(0, n, 2)})
     # A piece that goes to another cell would make the energy not differentiable.
     assert all(piece.root == piece.home for piece in cells.pieces)
     real = np.dtype("float64")
@@ -116,9 +120,9 @@ def test_gradient_in_a_polygon(ctx):
             perimeter[i] += length
         return float((omega * (2 * np.log(perimeter) - np.log(cells.areas))).sum())
 
-    expected = -0.3 * h[:, None] ** 2 * gradient_of(energy, points) * unit
+    expected = (-0.3 * h[:, None] ** 2 * gradient_of(energy, points, some) * unit)[some]
     # As above.
-    assert u == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+    assert u[some] == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("periodic", [True, (False, True)])

@@ -1,5 +1,7 @@
 """The gradient of the cell quality in 3D against finite differences of the energy, by diagrams from Qhull."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -27,6 +29,14 @@ def measures(points):
     return np.column_stack([36 * np.pi * volume**2 / surface**3, surface, volume])
 
 
+@cache
+def expected_descent():
+    """Return generators, the quality of their cells, and -rate h^2 dE/dx of the first ones."""
+    points = patch.random_points(N, 31, BOX).astype("float32").astype(float)
+    quality = measures(points)[:, 0]
+    return points, quality, -RATE * H**2 * gradient(points, 1 - WEIGHT * np.log(quality))
+
+
 def gradient(points, omega):
     """dE/dx by central differences of E = sum omega (3 log S - 2 log V); omega stays that of the start."""
 
@@ -45,8 +55,7 @@ def gradient(points, omega):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_descent_follows_the_gradient(ctx, dtype):
     engine = patch.make_engine(ctx, dtype, dim=3)
-    points = patch.random_points(N, 31, BOX).astype("float32").astype(float)
-    quality = measures(points)[:, 0]
+    points, quality, expected = expected_descent()
     placed = engine.upload(points)
     t = Polyhedra(engine).tessellate(
         BOX, placed, N, Bins(engine).build(BOX, placed, N), exact=False
@@ -60,7 +69,6 @@ def test_descent_follows_the_gradient(ctx, dtype):
         )  # fmt: skip
         return out.get()
 
-    expected = -RATE * H**2 * gradient(points, 1 - WEIGHT * np.log(quality))
     tolerance = (
         1e-6 if dtype == "float64" else 1e-3
     )  # of the finite differences; of single precision
