@@ -38,8 +38,8 @@ def check(sources, devices_have_it=(False, True)):
 @needs_clang
 def test_float32_programs_need_no_double(ctx):
     """Those of first runs. Where there is double precision, each use of it is reported."""
-    sources = [gpu_programs.programs_of_a_first_run(ctx, dim, "float32") for dim in (2, 3)]
-    check(sum(sources, []), [True])
+    plane, space = (gpu_programs.programs_of_a_first_run(ctx, dim, "float32") for dim in (2, 3))
+    check(plane + space, [True])
 
 
 @needs_clang
