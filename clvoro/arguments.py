@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from os import fsdecode, fsencode, fspath
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,15 @@ def warn(message: str, category: type[Warning]) -> None:
     while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] == package:
         frame, level = frame.f_back, level + 1
     warnings.warn(message, category, stacklevel=level)
+
+
+def format_point(place: Iterable[float], unit: str = "") -> str:
+    """Return coordinates as text for messages: six digits, and tenths of large ones, as those of national grids."""
+    return "(" + ", ".join(_digits(float(x)) + unit for x in place) + ")"
+
+
+def _digits(x: float) -> str:
+    return f"{x:.1f}".removesuffix(".0") if 1e5 <= abs(x) < 1e9 else f"{x:.6g}"
 
 
 def check_points(points: object, domain: Domain) -> np.ndarray:

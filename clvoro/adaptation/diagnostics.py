@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..arguments import warn
+from ..arguments import format_point, warn
 from ..errors import (
     InputError,
     MismatchWarning,
@@ -83,8 +83,7 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
     found = strait or dead_end
     if found is None:
         return
-    where = ", ".join(f"{x:.6g}" for x in found.place)
-    here = f"{found.width:.3g} wide at ({where}), where the size field is {found.size:.3g}; "
+    here = f"{found.width:.3g} wide at {format_point(found.place)}, where the size field is {found.size:.3g}; "
     if strait is not None:
         text = f"the domain is narrower than half a cell: {here}cells there are long and reach from wall to wall"
     else:
@@ -183,7 +182,7 @@ def _place(domain: Domain, x: np.ndarray) -> str:
     if isinstance(domain, Sphere):
         lon, lat = domain.lonlat(x[None])[0]
         return f"longitude {lon:.6g}, latitude {lat:.6g}"
-    return f"({', '.join(f'{c:.6g}' for c in x)})"
+    return format_point(x)
 
 
 def warn_of_obtuse_triangles(result: Result) -> None:

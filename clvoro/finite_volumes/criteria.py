@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..arguments import format_point
 from ..geometry.sphere import Sphere
 from ..mesh.check.findings import Verdict
 
@@ -63,7 +64,7 @@ class Criterion:
         limit = f"{'<=' if self.above else '>='} {self.limit:.4g}"
         where = ""
         if self.place is not None:
-            where = f"cell {self.cell} at ({', '.join(f'{x:.6g}{self.unit}' for x in self.place)})"
+            where = f"cell {self.cell} at {format_point(self.place, self.unit)}"
         return f"{self.name:28}{self.value:>12.5g}  {limit:<12} {verdict:<12}{where}".rstrip()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import check_rows
+from ..arguments import check_rows, format_point
 from ..errors import InputError, InputTypeError
 from .boundary_names import BoundaryNames, Walls
 from .curved_edges import CurvedEdges
@@ -321,8 +321,8 @@ class Polygon(DevicePolygon):
             parts.append(f"{holes} hole{'s' if holes > 1 else ''}")
         if self.curves:
             parts.append(f"{len(self.curves)} curve{'s' if len(self.curves) > 1 else ''}")
-        corners = [", ".join(f"{c:.6g}" for c in corner) for corner in (self.lower, self.upper)]
-        return f"Polygon({', '.join(parts)} within ({corners[0]}) and ({corners[1]}))"
+        corners = format_point(self.lower), format_point(self.upper)
+        return f"Polygon({', '.join(parts)} within {corners[0]} and {corners[1]})"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _described, (self.describe(),)

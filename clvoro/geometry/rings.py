@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from ..arguments import check_rows
+from ..arguments import check_rows, format_point
 from ..errors import InputError, InputTypeError
 from .angles import angles
 from .box import LARGEST_EDGE
@@ -156,7 +156,9 @@ def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
             # Checked first: shapely would find an intersection at every edge.
             other = known.setdefault((k > 0, _shape_key(rings[-1][-1].vertices)), name)
             if other != name:
-                raise InputError(f"Polygon's {name} repeats the {other}; leave one of them out")
+                raise InputError(
+                    f"Polygon's {name} repeats {_called(other)}; leave one of them out"
+                )
     flat = [ring for piece in rings for ring in piece]
     for ring in flat:
         _check_area(ring)
@@ -209,7 +211,7 @@ def _cleaned(given: object, name: str) -> Ring:
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
         raise InputError(
-            f"Polygon's {name} has vertex {bad[0]} at {_at(array[bad[0]])}, expected finite numbers"
+            f"Polygon's {name} has vertex {bad[0]} at {format_point(array[bad[0]])}, expected finite numbers"
         )
     if curved is None:
         if len(array) > 1 and (array[0] == array[-1]).all():
@@ -271,8 +273,8 @@ def _check_lengths(rings: Sequence[Ring]) -> None:
         )
     if extent.max() < _RESOLUTION * np.abs(every).max():
         raise InputError(
-            f"Polygon has a vertex at {_at(every[0])} and an extent of {extent.max():g}, expected a larger extent: too "
-            "few digits of float64 are left; move it to the origin"
+            f"Polygon has a vertex at {format_point(every[0])} and an extent of {extent.max():g}, expected a larger "
+            "extent: too few digits of float64 are left; move it to the origin"
         )
     for ring in rings:
         step = np.roll(ring.vertices, -1, axis=0) - ring.vertices
@@ -281,7 +283,7 @@ def _check_lengths(rings: Sequence[Ring]) -> None:
         if length[e] < SHORTEST_EDGE * extent.max():
             raise InputError(
                 f"Polygon's {ring.name} has an edge of length {length[e]:.3g} at vertex {ring.numbers[e]}"
-                f"{ring.curved.label(ring.numbers[e])}, {_at(ring.vertices[e])}, expected at least "
+                f"{ring.curved.label(ring.numbers[e])}, {format_point(ring.vertices[e])}, expected at least "
                 f"{SHORTEST_EDGE:g} of the domain's size; "
                 "merge its ends (shapely.remove_repeated_points(geometry, tolerance) does)"
             )
@@ -295,8 +297,8 @@ def _check_area(ring: Ring) -> None:
         across = np.abs(offset @ np.array([-far[1], far[0]])) / np.hypot(*far)
     if across.max() < SHORTEST_EDGE * np.hypot(*far):
         raise InputError(
-            f"Polygon's {ring.name} has all its vertices on the line from {_at(ring.vertices[0])} to "
-            f"{_at(ring.vertices[0] + far)}, expected a ring with an area"
+            f"Polygon's {ring.name} has all its vertices on the line from {format_point(ring.vertices[0])} to "
+            f"{format_point(ring.vertices[0] + far)}, expected a ring with an area"
         )
 
 
@@ -328,7 +330,7 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
         away.append((float(distance.min()), int(ring.numbers[np.argmin(distance)])))
     close = min(d for d, _ in away) + 1e-9 * float(np.ptp(rings[0].vertices, axis=0).max())
     there = [  # edges are numbered within their rings
-        f"edge {e} of the {ring.name}{ring.curved.label(e)}"
+        f"edge {e} of {_called(ring.name)}{ring.curved.label(e)}"
         for ring, (d, e) in zip(rings, away, strict=True)
         if d <= close
     ]
@@ -342,7 +344,11 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
     if shape.geom_type == "MultiPolygon":  # each piece is valid
         remedy = _UNITE
     remedy = _REMEDIES.get(reason, remedy)
-    raise InputError(f"Polygon is not valid: {reason} at {_at(place)}, {where}; {remedy}")
+    raise InputError(f"Polygon is not valid: {reason} at {format_point(place)}, {where}; {remedy}")
+
+
+def _called(name: str) -> str:
+    return f"the {name}" if name == "outer ring" else name
 
 
 def distance_to_edges(point: np.ndarray, vertices: np.ndarray) -> np.ndarray:
@@ -366,7 +372,3 @@ def _oriented(ring: Ring, clockwise: bool) -> Ring:
     # Edge j of the reversed ring is edge k - 2 - j of the other: it begins where that ends.
     numbers = np.roll(ring.numbers[::-1], -1)
     return replace(ring, vertices=np.ascontiguousarray(ring.vertices[::-1]), numbers=numbers)
-
-
-def _at(place: np.ndarray) -> str:
-    return "(" + ", ".join(f"{c:.6g}" for c in place) + ")"

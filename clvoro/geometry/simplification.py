@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from ..arguments import check_number
+from ..arguments import check_number, format_point
 from ..errors import InputError, InputTypeError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def _as_sizes(domain: Polygon, size: object) -> Sizes:
         if not ((found > 0) & (found < math.inf)).all():
             row = int(np.argmin((found > 0) & (found < math.inf)))
             raise InputError(
-                f"size is {found[row]:g} at ({points[row, 0]:.6g}, {points[row, 1]:.6g}), expected a positive length"
+                f"size is {found[row]:g} at {format_point(points[row])}, expected a positive length"
             )
         return found
 

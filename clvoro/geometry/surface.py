@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import format_point
 from ..errors import InputError, InputTypeError
 from ..files import open_plain, unlogged
 from .bvh import Tree
@@ -228,7 +229,7 @@ class Surface:
             return
         edges = self.open_edges
         if len(edges):
-            a, b = (self._place(self.vertices[i]) for i in edges[0])
+            a, b = (format_point(self.vertices[i]) for i in edges[0])
             raise InputError(
                 f"{self.name} is open: {len(edges)} edges belong to a single triangle, the first from "
                 f"{a} to {b}; expected a closed surface: fill the holes, or pass join= if "
@@ -237,7 +238,7 @@ class Surface:
         edges, count, where = self._edges
         odd = np.flatnonzero(count % 2)
         triangle, side = divmod(int(where[odd[0]]), 3)
-        a, b = (self._place(self.corners[triangle, (side + k) % 3]) for k in (0, 1))
+        a, b = (format_point(self.corners[triangle, (side + k) % 3]) for k in (0, 1))
         raise InputError(
             f"{self.name} is not closed: {len(odd)} edges belong to an odd number of triangles, the "
             f"first, from {a} to {b}, to {count[odd[0]]}; remove the surplus triangles"
@@ -274,8 +275,8 @@ class Surface:
             p, q = pairs[0].tolist()
             raise InputError(
                 f"{self.name} intersects itself: triangles {p}, at "
-                f"{self._place(self.corners[p].mean(axis=0))}, and {q}, at "
-                f"{self._place(self.corners[q].mean(axis=0))}, and {len(pairs) - 1} more pairs; "
+                f"{format_point(self.corners[p].mean(axis=0))}, and {q}, at "
+                f"{format_point(self.corners[q].mean(axis=0))}, and {len(pairs) - 1} more pairs; "
                 "expected a surface without self-intersections. Repair it in the program that made it, for "
                 "instance with a boolean union of its parts"
             )
@@ -363,10 +364,6 @@ class Surface:
 
     def __len__(self) -> int:
         return len(self.triangles)
-
-    @staticmethod
-    def _place(point: np.ndarray) -> str:
-        return "(" + ", ".join(f"{c:.6g}" for c in point) + ")"
 
     def __repr__(self) -> str:
         return f"Surface({len(self.vertices)} vertices, {len(self.triangles)} triangles)"

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..arguments import format_point
 from ..errors import SizeFieldError
 from .advice import advice_for_size
 from .codegen import generate_code
@@ -255,9 +256,9 @@ class Sizing:
             raise self._error(points[bad[0]], float(sizes[bad[0]]))
 
     def _error(self, place: np.ndarray, value: float) -> SizeFieldError:
-        where, most = ", ".join(f"{c:.6g}" for c in place), MAX_SIZE * self._scale
+        most = MAX_SIZE * self._scale
         return SizeFieldError(
-            f"the size field {self.field!r} is {value:g} at ({where}), expected a positive, finite "
+            f"the size field {self.field!r} is {value:g} at {format_point(place)}, expected a positive, finite "
             f"size on the whole domain, at most {most:.3g} here; "
             f"{advice_for_size(value, self.domain, self.field.on_device, most)}"
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..arguments import format_point
 from ..errors import InputError
 from ..geometry.polygon import Polygon
 from .advice import coverage_warnings
@@ -179,9 +180,9 @@ class Raster(Field):
         slack = _ROUNDINGS * float(np.finfo(float).eps) * far
         out = ((points < self.lower - slack) | (points > self.upper + slack)).any(axis=1)
         if out.any():
-            where = ", ".join(f"{c:.6g}" for c in points[np.argmax(out)])
+            where = format_point(points[np.argmax(out)])
             raise InputError(
-                f"{self!r} does not cover the domain: it has no value at ({where}); give a larger raster, a "
+                f"{self!r} does not cover the domain: it has no value at {where}; give a larger raster, a "
                 "smaller domain, or outside='nearest'"
             )
 

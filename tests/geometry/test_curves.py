@@ -333,7 +333,7 @@ def test_damaged_descriptions(change):
         (lambda: circle((0, 0), -1), "circle radius is -1"),
         (lambda: circle((0, math.nan), 1), "circle center"),
         (lambda: circle((0, 0, 0), 1), "circle center"),
-        (lambda: circle((1e6, 0), 1e-8), r"extent of .* at \(1e\+06, 0\), expected more than round-off"),
+        (lambda: circle((1e6, 0), 1e-8), r"extent of .* at \(1000000, 0\), expected more than round-off"),
         (lambda: circle((0, 0), 1, tolerance=0), "tolerance is 0"),
         (lambda: circle((0, 0), 1, tolerance=1e-16), "tolerance is 1e-16, expected at least"),
         (lambda: circle((0, 0), 1, tolerance=1e-14).vertices, "larger tolerance"),
@@ -386,7 +386,7 @@ FIGURE_EIGHT = [(0, 0), (1, 1), (2, 0), (1, 0.2), (0, 1), (-1, 0.5)]
         ([(0, 0), (1.0000001, 0), arc((0, 0), 1, 0, 90)], [], r"open at \(1.0000001, 0\): items 1 and 2 are 1e-07"),
         ([(0, 0), "x", arc((0, 0), 1, 0, 90)], [], "has item 1, expected a point"),
         ([(0, 0), (1, 0, 0), arc((0, 0), 1, 0, 90)], [], "has item 1, expected a point"),
-        (BOX, [circle((0, 0), 1), circle((0, 0), 1)], "repeats the hole-1"),
+        (BOX, [circle((0, 0), 1), circle((0, 0), 1)], "repeats hole-1"),
         ([(-1e7, -1e7), (1e7, -1e7), (0, 1e7)], [circle((0, 0), 1e-4)], "edge of length .* on circle"),
     ],
 )  # fmt: skip

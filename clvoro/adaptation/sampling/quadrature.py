@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...arguments import format_point
 from ...errors import InputTypeError, SizeFieldError
 from ...sizing.advice import advice_for_size
 from .box_tree import BoxTree, hilbert_tables
@@ -160,9 +161,9 @@ class DensityTree:
             h = np.asarray(self.field(part), dtype=float)
             bad = np.flatnonzero(~((h > 0) & np.isfinite(h)))
             if bad.size:
-                where = ", ".join(f"{c:.6g}" for c in part[bad[0]])
+                where = format_point(part[bad[0]])
                 raise SizeFieldError(
-                    f"the size field is {h[bad[0]]:g} at ({where}), expected a positive, finite "
+                    f"the size field is {h[bad[0]]:g} at {where}, expected a positive, finite "
                     f"size on the whole domain; {self._advice(float(h[bad[0]]))}"
                 )
             found[first : first + _BATCH] = h
@@ -186,9 +187,9 @@ class DensityTree:
             density = reduce(np.multiply, (e[:, None] / h for e in self.boxes.edges(chosen).T))
         if not np.isfinite(density).all():
             i, j = np.argwhere(~np.isfinite(density))[0]
-            where = ", ".join(f"{c:.6g}" for c in points[i, j])
+            where = format_point(points[i, j])
             raise SizeFieldError(
-                f"the size field is {h[i, j]:g} at ({where}): the number of cells overflows; "
+                f"the size field is {h[i, j]:g} at {where}: the number of cells overflows; "
                 f"{self._advice(float(h[i, j]))}"
             )
         offset = at - 0.5

@@ -8,7 +8,7 @@ from typing import Any, ParamSpec
 
 import numpy as np
 
-from ...arguments import check_number
+from ...arguments import check_number, format_point
 from ...errors import InputError, InputTypeError
 from ..boundary_names import WORD
 from .span import Span
@@ -72,7 +72,7 @@ class Curve:
         far = float(np.abs(points).max())
         if not np.isfinite(points).all() or self.extent < _DIGITS * far:
             raise InputError(
-                f"{kind} has an extent of {self.extent:g} at ({points[0, 0]:.6g}, {points[0, 1]:.6g}), expected more "
+                f"{kind} has an extent of {self.extent:g} at {format_point(points[0])}, expected more "
                 "than round-off; make it larger, or move it to the origin"
             )
         given = arguments.get("tolerance")

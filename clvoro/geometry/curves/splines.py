@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ...arguments import check_integer, check_rows
+from ...arguments import check_integer, check_rows, format_point
 from ...errors import InputError
 from .curve import Curve, makes_curves
 from .span import SAMPLES, Span
@@ -89,7 +89,7 @@ def spline(
     if not steps[k] > 1e-12 * np.abs(array - array[0]).max():
         raise InputError(
             f"spline points[{(k + first) % n}] and points[{(k + first + 1) % n}] coincide at "
-            f"({array[k, 0]:.6g}, {array[k, 1]:.6g}), expected distinct points; leave one of them out"
+            f"{format_point(array[k])}, expected distinct points; leave one of them out"
         )
     lengths = np.concatenate([[0.0], np.cumsum(steps)])
     periodic = bool(closed) and not chosen
