@@ -242,7 +242,7 @@ class MeshOutput:
         ax : matplotlib axes, optional
             Axes to draw into; not for "slices", which has several.
         limits : (low, high), optional
-            Ends of the color scale; by default limits that hold 99 % of the cells.
+            Ends of the color scale; by default limits that hold 99 % of the cells, in a window of those in it.
         window : (lower, upper), optional
             For 2D and "slice": corners of the part to show; by default all of it. For the projection "plate" longitudes
             and latitudes.

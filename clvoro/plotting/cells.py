@@ -56,7 +56,7 @@ def plot_cells(
     label : str, optional
         Text at the color bar; by default that of `color`.
     limits : (low, high), optional
-        Ends of the color scale; by default limits that hold 99 % of the cells.
+        Ends of the color scale; by default limits that hold 99 % of the cells shown.
     window : (lower, upper), optional
         Corners of the part to show; the whole domain by default.
     edges : bool
@@ -86,7 +86,8 @@ def plot_cells(
             ax = interactive_figure(WIDTH, height).add_subplot()
         shown, offsets = _cells_in(diagram, lower, upper)
         values = scheme.values(result)
-        low, high = scheme.limits(values) if limits is None else limits
+        seen = values if window is None or not len(shown) else values[np.unique(shown)]
+        low, high = scheme.limits(seen) if limits is None else limits
         cells = draw_cells(ax, diagram, shown, offsets, values, scheme, (low, high))
         frame_part(ax, diagram.domain, lower, upper)
         if edges:
@@ -94,7 +95,7 @@ def plot_cells(
         if title is not None:
             ax.set_title(title)
         if key:
-            add_key(cells, ax, scheme, values, (low, high))
+            add_key(cells, ax, scheme, seen, (low, high))
     return ax.figure
 
 

@@ -36,6 +36,9 @@ _SIDES_LABELS = ("4 or fewer", "5", "6", "7", "8 or more")
 # In 3D, where relaxed cells have some 14 faces.
 _FACES_LABELS = ("≤ 12", "13", "14", "15", "≥ 16")
 
+_FAR = 3.0
+"""Values of the caller are cut from the color scale if the scale would be that many times as long with them."""
+
 # Blue and red around white, without the darkest tenth at either end: faces must stay visible.
 _DIVERGING = LinearSegmentedColormap.from_list(
     "error", colormaps["RdBu_r"](np.linspace(0.09, 0.91, 65))
@@ -101,11 +104,13 @@ def _span(values: np.ndarray) -> tuple[float, float]:
 
 
 def _most(values: np.ndarray) -> tuple[float, float]:
-    """Limits that hold 98 % of the finite values, never equal."""
+    """Limits that hold all finite values, never equal. Where few are far from the others, they hold 98 %."""
     values = values[np.isfinite(values)]
     if not values.size:
         return 0.0, 1.0
     low, high = np.quantile(values, (0.01, 0.99)).tolist()
+    if np.ptp(values) <= _FAR * (high - low):
+        low, high = float(values.min()), float(values.max())
     least = 1e-6 * max(abs(low), abs(high)) or 1.0
     return (low, high) if high - low >= least else (low - least, high + least)
 
@@ -119,7 +124,7 @@ COLORINGS = {
     ),
     "quality": Coloring("cell quality $Q$ [–]", lambda r: r.quality, "viridis", _up_to_one),
     "size": Coloring(
-        "target size $h$ [units of length]",
+        "target size $h$",
         lambda r: r.target_size,
         "viridis",
         _span,
@@ -139,7 +144,7 @@ COLORINGS = {
         _from_zero,
     ),
     "volume": Coloring(
-        "area of the cell [squared unit of length]",
+        "area of the cell",
         lambda r: r.diagram.volumes,
         "viridis",
         _span,
@@ -162,7 +167,7 @@ _SOLID_COLORINGS = {
         lambda v: (11.5, 16.5),
         classes=tuple(f"{label} faces" for label in _FACES_LABELS),
     ),
-    "volume": replace(COLORINGS["volume"], label="volume of the cell [cubed unit of length]"),
+    "volume": replace(COLORINGS["volume"], label="volume of the cell"),
 }
 
 

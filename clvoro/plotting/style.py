@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from ..mesh.results import Result
 
@@ -74,9 +75,22 @@ def frame_domain(ax: Any, lower: Any, upper: Any, ticks: bool = True) -> None:
     if ticks:
         ax.set_xlabel("x")
         ax.set_ylabel("y")
+        if 1e5 <= np.abs([lower, upper]).max() < 1e9:
+            _write_all_digits(ax)
     else:
         ax.set_xticks([])
         ax.set_yticks([])
+
+
+def _write_all_digits(ax: Any) -> None:
+    """Write coordinates of a map, such as 5400000, as they are, and fewer of them along x."""
+    for axis in (ax.xaxis, ax.yaxis):
+        text = axis.get_major_formatter()
+        if isinstance(text, ScalarFormatter):
+            text.set_scientific(False)
+            text.set_useOffset(False)
+    if isinstance(ax.xaxis.get_major_locator(), MaxNLocator):
+        ax.locator_params(axis="x", nbins=6)
 
 
 def grid_height(

@@ -1,10 +1,13 @@
 """Pictures of data of the caller, and of diagrams without sizes."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
+from clvoro.plotting.colors import _most
 
 POINTS = np.random.default_rng(6).random((30, 3))
 
@@ -31,13 +34,18 @@ def test_own_data(diagram):
     figure = diagram.plot(values, label="pressure [Pa]")
     assert set(colored(figure).get_array()) <= set(values)
     assert "pressure [Pa]" in labels(figure)
-    low, high = colored(figure).get_clim()
-    assert -10 <= low < -9
-    assert 18 < high <= 19
+    assert colored(figure).get_clim() == (-10, 19)
     constant = colored(diagram.plot(np.full(30, 7.0)))
     assert constant.get_clim()[0] < 7 < constant.get_clim()[1]
     gaps = np.where(values < 0, np.nan, values)
     assert np.isfinite(colored(diagram.plot(gaps)).get_clim()).all()
+
+
+def test_few_values_far_from_the_others_do_not_set_the_scale():
+    values = np.arange(1000.0)
+    for far, ends in ((1e5, (10, 989)), (1900, (0, 1900)), (np.inf, (0, 998))):
+        values[-1] = far
+        assert _most(values) == pytest.approx(ends, abs=1)
 
 
 def test_diagrams(diagram):
@@ -52,10 +60,26 @@ def test_diagrams(diagram):
     assert "mine" in labels(diagram.plot("volume", label="mine"))
 
 
+def test_coordinates_of_maps_have_all_digits(ctx):
+    ring = np.add([(0, 0), (3000, 0), (3000, 2000), (0, 2000)], (3_500_000, 5_400_000))
+    points = ring.mean(axis=0) + 500 * POINTS[:, :2]
+    figure = clvoro.Adapter(ctx).diagram(clvoro.Polygon(ring), points).plot()
+    figure.draw_without_rendering()
+    for axis in (figure.axes[0].xaxis, figure.axes[0].yaxis):
+        texts = [t.get_text() for t in axis.get_ticklabels()]
+        assert all(t.isdigit() and len(t) == 7 for t in texts)
+        assert not axis.get_offset_text().get_text()
+    boxes = [t.get_window_extent() for t in figure.axes[0].get_xticklabels()]
+    assert all(a.x1 < b.x0 for a, b in pairwise(boxes))
+
+
 def test_views(diagram):
     if diagram.domain.dim == 2:
-        ax = diagram.plot(window=((0, 0), (0.5, 0.5)), edges=False, title="part").axes[0]
-        assert ax.get_xlim() == (0, 0.5)
+        figure = diagram.plot("volume", window=((0, 0), (0.5, 0.5)), edges=False, title="part")
+        assert figure.axes[0].get_xlim() == (0, 0.5)
+        seen = colored(figure).get_array()
+        assert len(seen) < 30
+        assert colored(figure).get_clim() == (seen.min(), seen.max())
         with pytest.raises(InputError, match="view is 'slice', which is for meshes in 3D"):
             diagram.plot(view="slice")
         with pytest.raises(InputError, match="cut is for cutaway, and this picture is 2D"):

@@ -377,7 +377,7 @@ def test_coasts(mesh, monkeypatch):
         (6371229.0, "size", "target size $h$ [km]", 1000.0),
         (6371.229, "size", "target size $h$ [km]", 1.0),
         (6371229.0, "volume", "area of the cell [km²]", 1e6),
-        (1.0, "size", "target size $h$ [units of length]", 1.0),
+        (1.0, "size", "target size $h$", 1.0),
     ],
 )
 def test_sizes_on_the_earth_are_in_kilometers(adapter, radius, color, label, number):
