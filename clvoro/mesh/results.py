@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import numpy as np
 
@@ -180,6 +180,17 @@ class Result(Sealed, MeshOutput):
     def measures(self) -> Measures:
         """Skewness, angles and ratios that matter to finite-volume methods; computed when first used."""
         return self.diagram.measures
+
+    def __len__(self) -> int:
+        """Return the number of cells."""
+        return len(self.points)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> NoReturn:
+            there = name == "domain" or name in Diagram._NAMES or hasattr(Diagram, name)
+            hint = f"; write mesh.diagram.{name}" if there and not name.startswith("_") else ""
+            raise AttributeError(f"a Result has no {name!r}{hint}", name=name, obj=self)
 
     def __repr__(self) -> str:
         e, q = np.abs(self.size_error), self.quality
