@@ -177,8 +177,13 @@ class Adapter:
 
     def _stages_for(self, domain: Domain) -> Stages:
         if not isinstance(domain, Domain):
-            shapely = type(domain).__module__.startswith("shapely")
-            hint = "; write clvoro.Polygon.from_shapely(domain)" if shapely else ""
+            hint = ""
+            if type(domain).__module__.startswith("shapely"):
+                hint = "; write clvoro.Polygon.from_shapely(domain)"
+            elif isinstance(domain, str | PathLike):
+                hint = "; write clvoro.Polygon.from_geojson(domain)"
+            elif isinstance(domain, list | tuple | np.ndarray):
+                hint = "; write clvoro.Polygon(domain)"
             raise InputTypeError(
                 f"domain is a {type(domain).__name__}, expected a clvoro.Box, a clvoro.Polygon or a clvoro.Sphere{hint}"
             )

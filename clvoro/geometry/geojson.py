@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,11 @@ def read_geojson(source: Any) -> tuple[Any, str]:
         try:
             text = read_text(source, LONGEST_GEOMETRY)
         except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"cannot read {name} ({error}), expected GeoJSON") from error
+            foreign = Path(source).suffix.lower() in (".shp", ".gpkg", ".kml")
+            hint = "; write Polygon.from_shapely(geopandas.read_file(path).union_all())"
+            raise InputError(
+                f"cannot read {name} ({error}), expected GeoJSON{hint if foreign else ''}"
+            ) from error
     try:
         return json.loads(text), name
     except (ValueError, RecursionError) as error:

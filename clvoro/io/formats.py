@@ -15,7 +15,20 @@ from .convert import to_meshio
 # value says whether it writes cell data, too.
 _POLYGONS = {".vtk": True, ".ply": False, ".obj": False}
 
-_SAFE = ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .nc (UGRID, MPAS), .info (METIS), .vtk, .ply or .obj"
+_SAFE = (
+    ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .nc (QGIS, UGRID, MPAS), .info (METIS), "
+    ".vtk, .ply or .obj"
+)
+
+_PICTURE = "it is no mesh file; write mesh.plot().savefig(path)"
+_LAYER = (
+    "save as .nc, which QGIS opens as a mesh, or write geopandas.GeoDataFrame(geometry=mesh.to_shapely(), "
+    "crs=...).to_file(path)"
+)
+_INSTEAD = {
+    **dict.fromkeys((".png", ".pdf", ".svg"), _PICTURE),
+    **dict.fromkeys((".shp", ".geojson", ".gpkg"), _LAYER),
+}
 
 
 def write_foreign(contents: Contents, path: Path) -> None:
@@ -23,7 +36,8 @@ def write_foreign(contents: Contents, path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in _POLYGONS:
         why = f"{suffix} is unknown or cannot hold polygons" if suffix else "it has no suffix"
-        raise InputError(f"cannot write {path}: {why}; use {_SAFE}")
+        why = _INSTEAD.get(suffix, f"{why}; use {_SAFE}")
+        raise InputError(f"cannot write {path}: {why}")
     check_polygons(contents, path)
     with_data = _POLYGONS[suffix]
     if contents.extra and not with_data:

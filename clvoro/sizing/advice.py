@@ -41,8 +41,10 @@ def advice_for_size(value: float, domain: Domain, on_device: bool, most: float =
     if value > most or value == math.inf:
         return f"bound it, for instance by clvoro.sizing.minimum(field, {_round(domain.extent.max()):g})"
     least = (domain.measure / _MAX_CELLS) ** (1 / domain.cell_dim)
+    data = "if it stands for missing data, make it NaN and give Raster missing='nearest'; else "
+    missing = data if value < 0 else ""
     return (
-        f"bound it, for instance by clvoro.sizing.maximum(field, {_round(least):g}), which allows for at most "
+        f"{missing}bound it, for instance by clvoro.sizing.maximum(field, {_round(least):g}), which allows for at most "
         f"{_MAX_CELLS:,.0f} cells here"
     )
 

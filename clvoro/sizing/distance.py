@@ -87,10 +87,12 @@ class Distance(Field):
         self.shapes: tuple[Any, ...] = tuple(shape for some in parts for shape in some)
         for shape in self.shapes:
             if not isinstance(shape, Shape):
+                bare = isinstance(shape, list | tuple | np.ndarray | Real)
+                hint = "; write Circle(p, radius=0) for a point p, Polyline(points) for a line"
                 raise InputTypeError(
                     f"Distance got a shape of type {type(shape).__name__}, expected Circle, "
                     "Ball, Segment, Polyline, ClosedPolyline, Edges, Surface, Box, clvoro.Polygon, a curve of "
-                    "clvoro.curves or a geometry of shapely"
+                    f"clvoro.curves or a geometry of shapely{hint if bare else ''}"
                 )
         if not self.shapes:
             raise InputError("Distance got no shapes, expected at least one")

@@ -238,8 +238,8 @@ class _Parser:
         number = re.match(r"\.?\d[\w.]*", rest, re.ASCII)
         if number:
             self._fail(f"{number[0]!r} is not a number; write 0.5 or 5e-1, without suffix", column)
-        power = "; write pow(a, b) for a power" if rest[0] == "^" else ""
-        self._fail(f"unexpected character {rest[0]!r}{power}", column)
+        others = {"^": "; write pow(a, b) for a power", "%": "; write fmod(a, b) for a remainder"}
+        self._fail(f"unexpected character {rest[0]!r}{others.get(rest[0], '')}", column)
 
     def _kind(self) -> str:
         return self.tokens[self.at][0]
