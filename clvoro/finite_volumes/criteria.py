@@ -101,7 +101,7 @@ class SolverReport(Verdict):
         verdict = "accepted" if self.ok else f"rejected: {', '.join(failed)}"
         changed = ""
         if self.area_change:
-            changed = f"; straight walls change the area by {self.area_change:+.2g} of the domain"
+            changed = f"; straight walls change the area by {100 * self.area_change:+.2g} %"
         head = f"{self.solver}: {verdict}; {self.cells} cells, {self.faces} faces{changed}"
         columns = f"{'criterion':28}{'worst':>12}  {'limit':<12} {'verdict':<12}where"
         return "\n  ".join([head, columns, *map(str, self.criteria)])

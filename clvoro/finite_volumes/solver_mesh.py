@@ -90,7 +90,7 @@ class SolverMesh(Sealed):
         return self.cells
 
     def __repr__(self) -> str:
-        changed = f", area {self.area_change:+.2g} of the domain" if self.area_change else ""
+        changed = f", area {100 * self.area_change:+.2g} %" if self.area_change else ""
         return f"SolverMesh({self.cells} cells, {len(self.owner)} faces{changed})"
 
     @cached_property
@@ -207,8 +207,8 @@ def make_solver_mesh(
     mesh = compact(mesh)
     if straight and abs(mesh.area_change) > _LARGE_CHANGE:
         warn(
-            f"straight walls change the area of the domain by {mesh.area_change:+.2g} of it: its boundary has features "
-            "as large as the cells. Use smaller cells there, or keep the exact walls with walls='exact'",
+            f"straight walls change the area of the domain by {100 * mesh.area_change:+.2g} %: its boundary has "
+            "features as large as the cells. Use smaller cells there, or keep the exact walls with walls='exact'",
             MismatchWarning,
         )
     return mesh

@@ -55,7 +55,11 @@ def write_foam(
         f"nPoints:{len(mesh.points)} nCells:{len(contents.diagram)} nFaces:{len(mesh.owner)} "
         f"nInternalFaces:{len(mesh.neighbor)}"
     )
-    changed = f"straight walls: {mesh.area_change:+.3g} of the domain" if mesh.area_change else ""
+    changed = (
+        f"straight walls change the area by {100 * mesh.area_change:+.3g} %"
+        if mesh.area_change
+        else ""
+    )
     notes = {"owner": note, "neighbour": note, "points": changed}
     bodies = {
         "points": (len(mesh.points), _vectors(mesh.points)),
