@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
 from numpy.typing import ArrayLike
 
+from ..arguments import format_point
 from ..errors import InputError
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
@@ -19,7 +20,7 @@ from ..mesh.results import Result
 from .boundary import clip_to_domain, frame_part
 from .colors import COLORINGS, Color, Coloring, cell_norm, coloring_of, picture_of, without_ends
 from .legends import add_color_bar, add_key, round_numbers
-from .style import WIDTH, interactive_figure, single_height, styled
+from .style import WIDTH, corners_of, ends_of, interactive_figure, single_height, styled
 
 
 def require_plane(diagram: Diagram) -> None:
@@ -78,16 +79,21 @@ def plot_cells(
     diagram = result.diagram
     require_plane(diagram)
     scheme = coloring_of(result, color, label)
-    corners = (diagram.domain.lower, diagram.domain.upper) if window is None else window
-    lower, upper = (np.asarray(corner, float) for corner in corners)
+    whole = (diagram.domain.lower, diagram.domain.upper)
+    lower, upper = np.array(whole) if window is None else corners_of(window)
     with styled():
         if ax is None:
             height = single_height(lower, upper, bool(scheme.classes), title is not None)
             ax = interactive_figure(WIDTH, height).add_subplot()
         shown, offsets = _cells_in(diagram, lower, upper)
+        if not len(shown):
+            raise InputError(
+                f"no cell is in the window {format_point(lower)}, {format_point(upper)}, expected a part of "
+                f"{diagram.domain}"
+            )
         values = scheme.values(result)
-        seen = values if window is None or not len(shown) else values[np.unique(shown)]
-        low, high = scheme.limits(seen) if limits is None else limits
+        seen = values if window is None else values[np.unique(shown)]
+        low, high = scheme.limits(seen) if limits is None else ends_of(limits)
         cells = draw_cells(ax, diagram, shown, offsets, values, scheme, (low, high))
         frame_part(ax, diagram.domain, lower, upper)
         if edges:

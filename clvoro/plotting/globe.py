@@ -20,7 +20,7 @@ from .coasts import coastlines, is_earth
 from .colors import Color, Coloring, cell_norm, coloring_of, picture_of, without_ends
 from .legends import add_key
 from .projections import Orthographic, Plate, Polygons, unit_vectors
-from .style import WIDTH, interactive_figure, single_height, styled
+from .style import WIDTH, ends_of, interactive_figure, single_height, styled
 
 Projection = Literal["orthographic", "plate"]
 
@@ -105,7 +105,7 @@ def plot_globe(
     scheme = coloring_of(result, color, label)
     view = _view(result, projection, center, across, window)
     values = scheme.values(result)
-    ends = scheme.limits(values) if limits is None else limits
+    ends = scheme.limits(values) if limits is None else ends_of(limits)
     with styled():
         if ax is None:
             height = single_height(view.lower, view.upper, bool(scheme.classes), title is not None)

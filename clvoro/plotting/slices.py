@@ -17,7 +17,16 @@ from .colors import Color, Coloring, cell_norm, coloring_of, picture_of, without
 from .cutaway import draw_cutaway
 from .legends import add_key
 from .section import Section, cut_cells, plane_axes
-from .style import WIDTH, frame_domain, interactive_figure, new_figure, nice, styled
+from .style import (
+    WIDTH,
+    corners_of,
+    ends_of,
+    frame_domain,
+    interactive_figure,
+    new_figure,
+    nice,
+    styled,
+)
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -111,15 +120,16 @@ def plot_slice(
         )
     right, up = plane_axes(direction)
     flat = np.stack([section.corners @ right, section.corners @ up], axis=1)
-    lower, upper = _shown_part(diagram, flat, direction, right, up) if window is None else window
-    lower, upper = np.asarray(lower, float), np.asarray(upper, float)
+    lower, upper = (
+        _shown_part(diagram, flat, direction, right, up) if window is None else corners_of(window)
+    )
     values = scheme.values(result)
     with styled():
         if ax is None:
             extent = upper - lower
             height = min((WIDTH - 1.3) * float(extent[1] / extent[0]), 1.2 * WIDTH)
             ax = interactive_figure(WIDTH, height + 0.6).add_subplot()
-        ends = scheme.limits(values) if limits is None else limits
+        ends = scheme.limits(values) if limits is None else ends_of(limits)
         cells = _draw_section(ax, section, flat, values, scheme, ends)
         frame_domain(ax, lower, upper)
         if edges:
@@ -186,7 +196,7 @@ def plot_slices(
     scheme = coloring_of(result, color, label)
     point = focus(result) if through is None else np.asarray(through, float)
     values = scheme.values(result)
-    ends = scheme.limits(values) if limits is None else limits
+    ends = scheme.limits(values) if limits is None else ends_of(limits)
     normals, columns, extents = _panels(diagram)
     with styled():
         if figure is None:

@@ -22,7 +22,7 @@ from .cutaway import VIEW, draw_cutaway, view_axes
 from .globe import plot_globe
 from .legends import add_key
 from .slices import as_normal, focus, plot_slice, plot_slices, require_space
-from .style import WIDTH, interactive_figure, styled
+from .style import WIDTH, ends_of, interactive_figure, styled
 
 __all__ = ["plot_cutaway", "plot_distributions", "plot_mesh", "plot_slice", "plot_slices"]
 
@@ -110,7 +110,7 @@ def plot_cutaway(
     point = focus(result) if through is None else np.asarray(through, float)
     what = _cut(cut, len(result.points), angles)
     values = scheme.values(result)
-    ends = scheme.limits(values) if limits is None else limits
+    ends = scheme.limits(values) if limits is None else ends_of(limits)
     with styled():
         if ax is None:
             ax = interactive_figure(WIDTH, cutaway_height(result, angles)).add_subplot()

@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
+from ..errors import InputError
 from ..mesh.results import Result
 
 WIDTH = 7.0
@@ -91,6 +92,30 @@ def _write_all_digits(ax: Any) -> None:
             text.set_useOffset(False)
     if isinstance(ax.xaxis.get_major_locator(), MaxNLocator):
         ax.locator_params(axis="x", nbins=6)
+
+
+def corners_of(window: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of a part of a plane, or raise InputError."""
+    try:
+        corners = np.asarray(window, float)
+    except (TypeError, ValueError):
+        corners = np.empty(0)
+    if corners.shape != (2, 2) or not (corners[0] < corners[1]).all():
+        raise InputError(
+            f"window is {window!r:.80}, expected two corners ((x, y), (x, y)), the lower left one first"
+        )
+    return corners[0], corners[1]
+
+
+def ends_of(limits: Any) -> tuple[float, float]:
+    """Return the ends of a color scale, or raise InputError."""
+    try:
+        low, high = (float(end) for end in limits)
+    except (TypeError, ValueError):
+        low, high = 0.0, 0.0
+    if not low < high:
+        raise InputError(f"limits is {limits!r:.80}, expected two numbers (low, high)")
+    return low, high
 
 
 def grid_height(

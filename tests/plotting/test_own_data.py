@@ -107,3 +107,21 @@ def test_views(diagram):
 def test_bad_colors(diagram, color, error, message):
     with pytest.raises(error, match=message):
         diagram.plot(color)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"limits": (1,)}, "expected two numbers"),
+        ({"limits": (1, 1)}, "expected two numbers"),
+        ({"window": (0, 0, 1, 1)}, "expected two corners"),
+        ({"window": ((1, 1), (0, 0))}, "the lower left one first"),
+        ({"window": ((5, 5), (6, 6))}, r"no cell is in the window \(5, 5\), \(6, 6\)"),
+    ],
+)
+def test_bad_parts_and_scales(diagram, options, message):
+    flat = diagram.domain.dim == 2
+    if not flat and options.get("window", ((0, 0),))[0] == (5, 5):
+        pytest.skip("a slice may show empty space")
+    with pytest.raises(InputError, match=message):
+        diagram.plot("volume", view=None if flat else "slice", **options)
