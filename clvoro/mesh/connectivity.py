@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,11 +11,20 @@ from ..geometry.polygon import Polygon
 from ..geometry.sphere_region import SphereRegion
 from .diagram import Diagram
 
+if TYPE_CHECKING:
+    from ..geometry.boundary_names import Walls
+
 
 def face_owners(diagram: Diagram) -> np.ndarray:
     """Return the cell of each half-face, (m,) int32."""
     starts = diagram.neighbor_starts
     return np.repeat(np.arange(len(diagram), dtype=np.int32), np.diff(starts))
+
+
+def boundary_cells(diagram: Diagram, walls: Walls | None) -> np.ndarray:
+    """Return the cells with a face on one of `walls`, ascending; see `Diagram.boundary_cells`."""
+    chosen = diagram.domain.boundaries.select("boundary", walls)
+    return np.unique(face_owners(diagram)[np.isin(-1 - diagram.neighbors, chosen)])
 
 
 def neighbor_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, cast
 
 if TYPE_CHECKING:
     import meshio
+    import numpy as np
     import pyvista
     from numpy.typing import ArrayLike
 
@@ -71,6 +72,31 @@ class MeshOutput:
         from .subset import take_subset
 
         return cast("Mesh", take_subset(cast("Diagram", self), keep, boundary))
+
+    def boundary_cells(self, boundary: Walls | None = None) -> np.ndarray:
+        """Return the indices of the cells with a face on the boundary, (k,), ascending.
+
+        Parameters
+        ----------
+        boundary : str, int or sequence of them, optional
+            A part of it: names and numbers of edges or sides. By default all of it.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If there is no such boundary.
+
+        Examples
+        --------
+        >>> box = clvoro.Box((0, 0), (1, 1), names={"inlet": "xMin"})
+        >>> cells = clvoro.voronoi(box, [(0.8, 0.5), (0.5, 0.5), (0.2, 0.5)])
+        >>> cells.boundary_cells("inlet").tolist()
+        [2]
+        """
+        from .connectivity import boundary_cells
+
+        diagram: Any = getattr(self._self, "diagram", self._self)
+        return boundary_cells(diagram, boundary)
 
     def save(
         self,

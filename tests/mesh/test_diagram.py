@@ -232,6 +232,28 @@ def test_names_of_boundaries(ctx):
     assert length == pytest.approx({"inlet": 3.0, "island": 2.8, "outer": outer})
 
 
+def test_cells_on_boundaries(ctx):
+    hole = [(0.4, 0.4), (0.6, 0.4), (0.5, 0.6)]
+    outer = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    domains = (
+        clvoro.Polygon(outer, [hole], names={"south": 0, "rest": [1, 2, 3]}),
+        clvoro.Box((0, 0), (1, 1), periodic=(True, False), names={"south": "yMin"}),
+        clvoro.Box((0, 0, 0), (1, 1, 1), names={"south": "yMin"}),
+    )
+    for domain in domains:
+        points = np.random.default_rng(3).random((60, domain.dim))
+        d = clvoro.Adapter(ctx).diagram(domain, points[domain.contains(points)])
+        f = d.faces
+        for name in domain.boundary_names:
+            owners = f.owner[f.boundary == domain.boundary_names.index(name)]
+            assert d.boundary_cells(name).tolist() == sorted(set(owners.tolist()))
+        assert d.boundary_cells().tolist() == sorted(set(f.owner[f.neighbor < 0].tolist()))
+        with pytest.raises(InputError, match="boundary is 'river', expected the name"):
+            d.boundary_cells("river")
+    globe = clvoro.Adapter(ctx).diagram(clvoro.Sphere(1), np.vstack([np.eye(3), -np.eye(3)]))
+    assert globe.boundary_cells().size == 0
+
+
 def test_to_shapely(case):
     diagram, noise = case
     if diagram.domain.dim == 3:
