@@ -101,7 +101,7 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
         If the file is missing, damaged, truncated, of another format or of a newer version; names the file and the
         fault.
     """
-    with explained(path, "a file written by Result.save"):
+    with explained(path, "a .npz, .vtu or (on a sphere) .nc file that save wrote"):
         with open_plain(path) as file, zipfile.ZipFile(file) as archive:
             members = list_members(archive, FORMAT, VERSION)
             if "target_size" not in members:
