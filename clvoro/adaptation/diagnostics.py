@@ -154,7 +154,13 @@ def warn_of_errors(result: Result) -> None:
         return  # `CoarseSizeWarning` says it before the run
     place = _place(diagram.domain, result.points[worst])
     beside = sizes[[worst, *_ring(diagram, worst)]]
-    if beside.max() > STEEP * beside.min():
+    steep = beside.max() > STEEP * beside.min()
+    if steep and diagram.shifts[slice(*diagram.neighbor_starts[worst : worst + 2])].any():
+        why = (
+            "sizes jump at a seam of the periodic box: a field must have the period of the box; repeat its shapes one "
+            "period away"
+        )
+    elif steep:
         why = (
             "sizes change there by more than cells can follow from one to the next: bound their growth, as by "
             "sizing.Graded(size, growth=1.2), or use more cells"

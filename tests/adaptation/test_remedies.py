@@ -1,6 +1,7 @@
 """Remedies in messages: what to write in place of what a newcomer tried, with coordinates of maps."""
 
 import re
+import warnings
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 import clvoro
 from clvoro import sizing
 from clvoro.arguments import format_point
-from clvoro.errors import ClvoroError
+from clvoro.errors import ClvoroError, SizeErrorWarning
 from clvoro.geometry.surface import Surface
 
 BOX = clvoro.Box((0, 0), (1, 1))
@@ -85,3 +86,13 @@ def test_coordinates_of_maps() -> None:
     corners = np.add([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], (EAST, NORTH, 0))
     with pytest.raises(ClvoroError, match="5400001"):
         Surface(corners, [(0, 1, 2), (0, 1, 3), (0, 2, 3)]).require_closed()
+
+
+def test_shapes_at_a_seam_are_to_be_repeated(ctx) -> None:
+    torus, adapter = clvoro.Box((0, 0), (1, 1), periodic=True), clvoro.Adapter(ctx)
+    spots = [sizing.Circle((0.05 + k, 0.5), radius=0.02) for k in (0, -1, 1)]
+    with pytest.warns(SizeErrorWarning, match="repeat its shapes one period away"):
+        adapter.run(torus, sizing.Distance(spots[0], h_min=0.03, growth=1.2), effort="fast")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SizeErrorWarning)
+        adapter.run(torus, sizing.Distance(spots, h_min=0.03, growth=1.2), effort="fast")
