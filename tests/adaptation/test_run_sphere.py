@@ -35,6 +35,7 @@ def test_few_cells(ctx, method, effort):
     assert result.check().ok
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize(
     ("method", "most", "widest"), [("adaptive", 0.0025, 90), ("exact", 3e-4, 90)]
@@ -75,15 +76,20 @@ def test_number_of_cells(ctx):
     assert clvoro.Adapter(ctx).run(EARTH, 1e6, effort="fast").size_factor == 1
 
 
-def test_same_input_same_bits(ctx):
-    runs = [clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast") for _ in range(2)]
-    assert np.array_equal(runs[0].points, runs[1].points)
-    assert np.array_equal(runs[0].diagram.volumes, runs[1].diagram.volumes)
+@pytest.fixture(scope="module")
+def quick(ctx):
+    return clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast")
 
 
-def test_diagram_of_the_result(ctx):
+def test_same_input_same_bits(ctx, quick):
+    again = clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast")
+    assert np.array_equal(again.points, quick.points)
+    assert np.array_equal(again.diagram.volumes, quick.diagram.volumes)
+
+
+def test_diagram_of_the_result(ctx, quick):
     """What steps updated is the diagram of the generators."""
-    result = clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast")
+    result = quick
     again = clvoro.Adapter(ctx).diagram(EARTH, result.points)
     assert (again.adjacency != 0).nnz == (result.diagram.adjacency != 0).nnz
     assert abs(again.adjacency - result.diagram.adjacency).max() < 1e-9 * EARTH.radius
@@ -118,9 +124,9 @@ def test_warm_start(ctx):
     assert np.abs(again.size_error).mean() < 0.0025
 
 
-def test_checkpoint(ctx, tmp_path):
+def test_checkpoint(ctx, quick, tmp_path):
     """An interrupted run goes on to the same bits."""
-    whole, path = clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast"), tmp_path / "state"
+    whole, path = quick, tmp_path / "state"
     part = clvoro.Adapter(ctx).run(
         EARTH, SIZE, effort="fast", checkpoint=clvoro.Checkpoint(path, every=0),
         callback=lambda row: row["step"] >= 20,

@@ -113,7 +113,7 @@ def test_matrix(make, dim, real, weighted):
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 def test_large_tolerances_use_single_precision(make, preconditioner, start):
     """The operator is rounded, and the residual of the recurrence is correct, also for many cells."""
-    engine, n = make(), 20000
+    engine, n = make(), 8000
     graph = graphs.random_graph(n, seed=916)
     poisson, laplacian = assembled(engine, graph, density_of(graph[0]), tolerance=1e-3)
     assert laplacian.weights.dtype == np.float32
