@@ -33,7 +33,7 @@ mesh.plot("size")
 # %%
 # The trailing edge.
 
-mesh.plot("size", window=((0.78, -0.12), (1.16, 0.1)), key=False)
+mesh.plot("size", window=((0.78, -0.12), (1.16, 0.1)))
 
 # %%
 # OpenFOAM reads this folder. Patches have the names of the domain, and are walls unless `types` says otherwise.

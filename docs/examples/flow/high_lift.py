@@ -48,7 +48,7 @@ mesh.plot("size", window=((-0.3, -0.3), (1.3, 0.3)))
 # %%
 # The cove, and the gap between main element and flap.
 
-mesh.plot("size", window=((0.6, -0.06), (0.9, 0.09)), key=False)
+mesh.plot("size", window=((0.6, -0.06), (0.9, 0.09)))
 
 # %%
 # All points on walls of the mesh that a solver reads lie on the curves. OpenFOAM accepts it, and reads the folder.

@@ -53,4 +53,4 @@ plt.show()
 # %%
 # Cells go on across the seams.
 
-mesh.plot("size", window=((0, 0.55), (0.25, 0.8)), key=False)
+mesh.plot("size", window=((0, 0.55), (0.25, 0.8)))
