@@ -31,7 +31,7 @@
 typedef struct {
     int faces, corners;
     int labels[MOST_FACES];
-    REAL px[MOST_FACES], py[MOST_FACES], pz[MOST_FACES], d2[MOST_FACES];
+    REAL4 planes[MOST_FACES];                                                       /* p and d^2 */
     uchar4 at[MOST_CORNERS];                                                        /* faces of a vertex */
     WIDE x[MOST_CORNERS / WIDTH], y[MOST_CORNERS / WIDTH], z[MOST_CORNERS / WIDTH]; /* its position */
     WIDE beyond[MOST_CORNERS / WIDTH];                                              /* its largest y.p - 1/2 */
@@ -45,7 +45,8 @@ typedef struct {
 
 inline REAL4 face_plane(const corners_t *cell, int f)
 {
-    return (REAL4)(cell->px[f], cell->py[f], cell->pz[f], 0);
+    const REAL4 plane = cell->planes[f];
+    return (REAL4)(plane.s0, plane.s1, plane.s2, 0);
 }
 
 inline REAL4 corner_place(const corners_t *cell, int v)
@@ -58,21 +59,14 @@ inline void pad_planes(corners_t *cell)
 {
     const int end = (cell->faces + WIDTH - 1) / WIDTH * WIDTH;
     for (int f = cell->faces; f < end; ++f)
-        cell->px[f] = cell->py[f] = cell->pz[f] = cell->d2[f] = 0;
-}
-
-inline void gather_planes(places_t *p, const corners_t *cell, const int *k)
-{
-    p->x = GATHER_WIDE(cell->px, k);
-    p->y = GATHER_WIDE(cell->py, k);
-    p->z = GATHER_WIDE(cell->pz, k);
+        cell->planes[f] = 0;
 }
 
 /* Sums over the vertices: of each face (area, first moments), and second moments of the cell; see `add_corner` in
    simd/walk_state.h. */
 typedef struct {
     REAL4 faces[MOST_FACES];
-    WIDE xx, yy, zz, yz, zx, xy;
+    WIDE xx[HALVES], yy[HALVES], zz[HALVES], yz[HALVES], zx[HALVES], xy[HALVES];
 } sums_t;
 
 /* Contributions of a vertex at the end of the common edge of faces p and q; see `share_edge` in simd/walk_state.h. */
@@ -107,7 +101,8 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
         cell->at[v] = cell->at[0];
     for (int f = 0; f < cell->faces; ++f)
         sums->faces[f] = 0;
-    sums->xx = sums->yy = sums->zz = sums->yz = sums->zx = sums->xy = 0;
+    for (int turn = 0; turn < HALVES; ++turn)
+        sums->xx[turn] = sums->yy[turn] = sums->zz[turn] = sums->yz[turn] = sums->zx[turn] = sums->xy[turn] = 0;
     WIDE far2 = 0, good = 1;
     bool fits = measured;
     for (int block = 0; block < blocks; ++block) {
@@ -119,9 +114,10 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
             at_c[lane] = at.s2;
         }
         places_t a, b, c, ab, bc, ca;
-        gather_planes(&a, cell, at_a);
-        gather_planes(&b, cell, at_b);
-        gather_planes(&c, cell, at_c);
+        WIDE ia, ib, ic;
+        gather_rows(&a, &ia, cell->planes, at_a);
+        gather_rows(&b, &ib, cell->planes, at_b);
+        gather_rows(&c, &ic, cell->planes, at_c);
         cross_of(&ab, &a, &b);
         cross_of(&bc, &b, &c);
         cross_of(&ca, &c, &a);
@@ -148,9 +144,9 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
         /* Two independent chains of comparisons, which the processor overlaps. */
         WIDE beyond = -1, others = -1;
         for (int f = 0; f < cell->faces; f += 2) {
-            const WIDE s = fma(cell->px[f], y.x, fma(cell->py[f], y.y, cell->pz[f] * y.z));
-            const int g = min(f + 1, cell->faces - 1);
-            const WIDE t = fma(cell->px[g], y.x, fma(cell->py[g], y.y, cell->pz[g] * y.z));
+            const REAL4 p = cell->planes[f], q = cell->planes[min(f + 1, cell->faces - 1)];
+            const WIDE s = fma(p.s0, y.x, fma(p.s1, y.y, p.s2 * y.z));
+            const WIDE t = fma(q.s0, y.x, fma(q.s1, y.y, q.s2 * y.z));
             beyond = s > beyond ? s : beyond;
             others = t > others ? t : others;
         }
@@ -160,7 +156,6 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
         if (!fits)
             continue;
 
-        const WIDE ia = GATHER_WIDE(cell->d2, at_a), ib = GATHER_WIDE(cell->d2, at_b), ic = GATHER_WIDE(cell->d2, at_c);
         const WIDE inverse = 1 / (ab2 * bc2 * ca2);
         part_t of_ab, of_bc, of_ca;
         part_of_edge(&of_ab, product_of(&y, &ab) * bc2 * ca2 * inverse, &a, &b, a2, b2, ia + ib);
@@ -174,24 +169,15 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
         first_moments(&first_a, of_ab.part_p, &to_ab, of_ca.part_q, &to_ca);
         first_moments(&first_b, of_bc.part_p, &to_bc, of_ab.part_q, &to_ab);
         first_moments(&first_c, of_ca.part_p, &to_ca, of_bc.part_q, &to_bc);
-        REAL parts[12][WIDTH];
-        STORE_WIDE(of_ab.part_p + of_ca.part_q, 0, parts[0]);
-        STORE_WIDE(first_a.x, 0, parts[1]);
-        STORE_WIDE(first_a.y, 0, parts[2]);
-        STORE_WIDE(first_a.z, 0, parts[3]);
-        STORE_WIDE(of_bc.part_p + of_ab.part_q, 0, parts[4]);
-        STORE_WIDE(first_b.x, 0, parts[5]);
-        STORE_WIDE(first_b.y, 0, parts[6]);
-        STORE_WIDE(first_b.z, 0, parts[7]);
-        STORE_WIDE(of_ca.part_p + of_bc.part_q, 0, parts[8]);
-        STORE_WIDE(first_c.x, 0, parts[9]);
-        STORE_WIDE(first_c.y, 0, parts[10]);
-        STORE_WIDE(first_c.z, 0, parts[11]);
-        const int lanes = min(WIDTH, cell->corners - WIDTH * block);
+        REAL4 of_a[WIDTH], of_b[WIDTH], of_c[WIDTH];
+        rows_of_lanes(of_a, of_ab.part_p + of_ca.part_q, &first_a);
+        rows_of_lanes(of_b, of_bc.part_p + of_ab.part_q, &first_b);
+        rows_of_lanes(of_c, of_ca.part_p + of_bc.part_q, &first_c);
+        const int turn = HALF_OF(block), lanes = min(WIDTH, cell->corners - WIDTH * block);
         for (int lane = 0; lane < lanes; ++lane) {
-            sums->faces[at_a[lane]] += (REAL4)(parts[0][lane], parts[1][lane], parts[2][lane], parts[3][lane]);
-            sums->faces[at_b[lane]] += (REAL4)(parts[4][lane], parts[5][lane], parts[6][lane], parts[7][lane]);
-            sums->faces[at_c[lane]] += (REAL4)(parts[8][lane], parts[9][lane], parts[10][lane], parts[11][lane]);
+            sums->faces[at_a[lane]] += of_a[lane];
+            sums->faces[at_b[lane]] += of_b[lane];
+            sums->faces[at_c[lane]] += of_c[lane];
         }
         /* Lanes behind the last vertex count nothing. */
         REAL here[WIDTH];
@@ -205,16 +191,16 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
         const WIDE zx = 3 * (t * y.x - fma(u_ab, ab.x, fma(u_bc, bc.x, u_ca * ca.x)));
         const WIDE zy = 3 * (t * y.y - fma(u_ab, ab.y, fma(u_bc, bc.y, u_ca * ca.y)));
         const WIDE zz = 3 * (t * y.z - fma(u_ab, ab.z, fma(u_bc, bc.z, u_ca * ca.z)));
-        sums->xx += fma(2 * zx, y.x, fma(uu_ab, ab.x * ab.x, fma(uu_bc, bc.x * bc.x, uu_ca * ca.x * ca.x)));
-        sums->yy += fma(2 * zy, y.y, fma(uu_ab, ab.y * ab.y, fma(uu_bc, bc.y * bc.y, uu_ca * ca.y * ca.y)));
-        sums->zz += fma(2 * zz, y.z, fma(uu_ab, ab.z * ab.z, fma(uu_bc, bc.z * bc.z, uu_ca * ca.z * ca.z)));
-        sums->yz += fma(zy, y.z, zz * y.y) + fma(uu_ab, ab.y * ab.z, fma(uu_bc, bc.y * bc.z, uu_ca * ca.y * ca.z));
-        sums->zx += fma(zz, y.x, zx * y.z) + fma(uu_ab, ab.z * ab.x, fma(uu_bc, bc.z * bc.x, uu_ca * ca.z * ca.x));
-        sums->xy += fma(zx, y.y, zy * y.x) + fma(uu_ab, ab.x * ab.y, fma(uu_bc, bc.x * bc.y, uu_ca * ca.x * ca.y));
+        sums->xx[turn] += fma(2 * zx, y.x, fma(uu_ab, ab.x * ab.x, fma(uu_bc, bc.x * bc.x, uu_ca * ca.x * ca.x)));
+        sums->yy[turn] += fma(2 * zy, y.y, fma(uu_ab, ab.y * ab.y, fma(uu_bc, bc.y * bc.y, uu_ca * ca.y * ca.y)));
+        sums->zz[turn] += fma(2 * zz, y.z, fma(uu_ab, ab.z * ab.z, fma(uu_bc, bc.z * bc.z, uu_ca * ca.z * ca.z)));
+        sums->yz[turn] += fma(zy, y.z, zz * y.y) + fma(uu_ab, ab.y * ab.z, fma(uu_bc, bc.y * bc.z, uu_ca * ca.y * ca.z));
+        sums->zx[turn] += fma(zz, y.x, zx * y.z) + fma(uu_ab, ab.z * ab.x, fma(uu_bc, bc.z * bc.x, uu_ca * ca.z * ca.x));
+        sums->xy[turn] += fma(zx, y.y, zy * y.x) + fma(uu_ab, ab.x * ab.y, fma(uu_bc, bc.x * bc.y, uu_ca * ca.x * ca.y));
     }
     cell->reach2 = largest_lane(far2);
     REAL nearest2 = INFINITY;
     for (int f = 0; f < cell->faces; ++f)
-        nearest2 = fmin(nearest2, cell->d2[f]);
+        nearest2 = fmin(nearest2, cell->planes[f].s3);
     return largest_lane(-good) < 0 && nearest2 > LEAST_NEAREST2 * cell->reach2; /* a NaN is not good */
 }

@@ -29,15 +29,20 @@ inline int third_face(const corners_t *cell, int v, int a, int b)
 /* The product y.p - 1/2 of a position and the plane of face f: positive beyond the plane. */
 inline REAL beyond_plane(const corners_t *cell, int f, REAL4 y)
 {
-    return fma(cell->px[f], y.s0, fma(cell->py[f], y.s1, cell->pz[f] * y.s2)) - R(0.5);
+    const REAL4 p = cell->planes[f];
+    return fma(p.s0, y.s0, fma(p.s1, y.s1, p.s2 * y.s2)) - R(0.5);
 }
 
 /* The same for WIDTH faces. */
 inline WIDE beyond_planes(const corners_t *cell, int block, REAL4 y)
 {
-    return fma(LOAD_WIDE(block, cell->px), y.s0,
-               fma(LOAD_WIDE(block, cell->py), y.s1, LOAD_WIDE(block, cell->pz) * y.s2)) -
-           R(0.5);
+    int faces[WIDTH];
+    for (int lane = 0; lane < WIDTH; ++lane)
+        faces[lane] = WIDTH * block + lane;
+    places_t p;
+    WIDE d2;
+    gather_rows(&p, &d2, cell->planes, faces);
+    return fma(p.x, y.s0, fma(p.y, y.s1, p.z * y.s2)) - R(0.5);
 }
 
 /* Find vertex v, and its largest product y.p - 1/2. False if its faces are not counter-clockwise. */
@@ -99,7 +104,7 @@ inline bool flip_edge(corners_t *cell, links_t *links, int v, int a, int b, int 
         link_corner(cell, links, v, other, c, e);
     else
         link_corner(cell, links, v, other, e, c);
-    cell->px[gone] = cell->py[gone] = cell->pz[gone] = 0;
+    cell->planes[gone].xyz = 0;
     const int high = max(u, w), low = min(u, w);
     int place = v == cell->corners - 1 ? high : v;
     remove_corner(cell, links, high);
@@ -155,14 +160,12 @@ inline bool repair_corners(corners_t *cell, links_t *links, int known)
     REAL4 planes[MORE];
     for (int f = known; f < end; ++f) {
         planes[f - known] = face_plane(cell, f);
-        cell->px[f] = cell->py[f] = cell->pz[f] = 0;
+        cell->planes[f].xyz = 0;
     }
     bool right = flip_corners(cell, links);
     for (int f = known; f < end && right; ++f) {
         const REAL4 plane = planes[f - known];
-        cell->px[f] = plane.s0;
-        cell->py[f] = plane.s1;
-        cell->pz[f] = plane.s2;
+        cell->planes[f].xyz = plane.xyz;
         REAL *beyond = (REAL *)cell->beyond, most = BEYOND_NOISE;
         int worst = -1;
         for (int v = 0; v < cell->corners; ++v) {
@@ -215,15 +218,15 @@ inline bool walk_corners(corners_t *cell, links_t *links)
     cell->corners = 0;
     int nearest = 0;
     for (int f = 1; f < cell->faces; ++f)
-        nearest = cell->d2[f] < cell->d2[nearest] ? f : nearest;
-    if (!(cell->d2[nearest] > 0))
+        nearest = cell->planes[f].s3 < cell->planes[nearest].s3 ? f : nearest;
+    if (!(cell->planes[nearest].s3 > 0))
         return false;
     int a = nearest;
     const REAL4 p = face_plane(cell, a);
     const REAL4 size = fabs(p);
     const bool flat_x = size.s0 <= size.s1 && size.s0 <= size.s2, flat_y = !flat_x && size.s1 <= size.s2;
     const REAL4 axis = (REAL4)(flat_x, flat_y, !(flat_x || flat_y), 0);
-    REAL4 y = p * (cell->d2[a] / 2), ray = cross(p, axis);
+    REAL4 y = p * (cell->planes[a].s3 / 2), ray = cross(p, axis);
     int b = first_cut(cell, y, ray, a, a);
     if (b < 0)
         return false;
@@ -293,10 +296,7 @@ inline bool number_faces(corners_t *cell, const uint *next)
         if (next[f] != 0) {
             const int to = number[f];
             cell->labels[to] = cell->labels[f];
-            cell->px[to] = cell->px[f];
-            cell->py[to] = cell->py[f];
-            cell->pz[to] = cell->pz[f];
-            cell->d2[to] = cell->d2[f];
+            cell->planes[to] = cell->planes[f];
         }
     cell->faces = faces;
     pad_planes(cell);

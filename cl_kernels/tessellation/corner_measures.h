@@ -51,7 +51,7 @@ inline bool write_measures(const corners_t *cell, const sums_t *sums, int i, int
     bool good = true;
     for (int f = 0; f < cell->faces; ++f, ++place) {
         const REAL4 p = face_plane(cell, f), sum = sums->faces[f];
-        const REAL d2 = cell->d2[f], length = sqrt(d2);
+        const REAL d2 = cell->planes[f].s3, length = sqrt(d2);
         const REAL4 foot = p * (d2 / 2), moment = (REAL4)(sum.s1, sum.s2, sum.s3, 0);
         REAL area = sum.s0 * length / 4;
         /* The centroid, projected to the plane. */

@@ -68,10 +68,7 @@ inline void add_plane(corners_t *cell, int label, REAL4 x, const rows_t *in)
     const int f = cell->faces++;
     const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2, inverse = 1 / d2;
     cell->labels[f] = label;
-    cell->px[f] = d.s0 * inverse;
-    cell->py[f] = d.s1 * inverse;
-    cell->pz[f] = d.s2 * inverse;
-    cell->d2[f] = d2;
+    cell->planes[f] = (REAL4)(d.s0 * inverse, d.s1 * inverse, d.s2 * inverse, d2);
 }
 
 /* Start with the planes of the previous neighbors of generator i at x, and of further ones in ascending order. Returns

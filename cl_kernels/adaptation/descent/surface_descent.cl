@@ -74,8 +74,12 @@ inline void add_pull(places_t *sum, const side_t *a, const side_t *b, const plac
 /* The sum of K integral (p - x_i) dl over the edges of a cell with these vertices, as triples of faces. */
 inline REAL4 pull_of_edges(const sides_t *sides, global const uchar4 *corners, int count, REAL own)
 {
-    places_t sum = {0, 0, 0};
-    for (int first = 0; first < count; first += WIDTH) {
+    places_t sums[HALVES];
+    for (int turn = 0; turn < HALVES; ++turn)
+        sums[turn].x = sums[turn].y = sums[turn].z = 0;
+    for (int block = 0; WIDTH * block < count; ++block) {
+        const int first = WIDTH * block;
+        places_t *sum = &sums[HALF_OF(block)];
         int at_a[WIDTH], at_b[WIDTH], at_c[WIDTH];
         REAL counted[WIDTH];
         for (int lane = 0; lane < WIDTH; ++lane) {
@@ -97,11 +101,17 @@ inline REAL4 pull_of_edges(const sides_t *sides, global const uchar4 *corners, i
         add_along(&v, a.level * over, &bc);
         add_along(&v, b.level * over, &ca);
         add_along(&v, c.level * over, &ab);
-        add_pull(&sum, &a, &b, &ab, own, &v, once);
-        add_pull(&sum, &b, &c, &bc, own, &v, once);
-        add_pull(&sum, &c, &a, &ca, own, &v, once);
+        add_pull(sum, &a, &b, &ab, own, &v, once);
+        add_pull(sum, &b, &c, &bc, own, &v, once);
+        add_pull(sum, &c, &a, &ca, own, &v, once);
     }
-    return (REAL4)(sum_of_lanes(sum.x), sum_of_lanes(sum.y), sum_of_lanes(sum.z), 0);
+    WIDE x[HALVES], y[HALVES], z[HALVES];
+    for (int turn = 0; turn < HALVES; ++turn) {
+        x[turn] = sums[turn].x;
+        y[turn] = sums[turn].y;
+        z[turn] = sums[turn].z;
+    }
+    return (REAL4)(sum_of_lanes(x), sum_of_lanes(y), sum_of_lanes(z), 0);
 }
 
 /* lloyd = -rate h^2 dE/dx_i, at most max_displacement h. One work-item per generator. A cell without known vertices
