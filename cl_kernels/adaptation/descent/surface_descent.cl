@@ -30,8 +30,8 @@ kernel void compute_surface_forces(const int size, global const int *starts, glo
 /* The faces of a cell: the plane of each is y . away = level. `away` is the vector to the neighbor, or the outward
    normal of a wall. `inverse` is 1 / |away|, and 0 for a wall; `tension` is that of the neighbor, and 0 for a wall. */
 typedef struct {
-    REAL x[MOST_FACES], y[MOST_FACES], z[MOST_FACES];
-    REAL square[MOST_FACES], level[MOST_FACES], inverse[MOST_FACES], tension[MOST_FACES];
+    REAL4 away[MOST_FACES]; /* and its square */
+    REAL level[MOST_FACES], inverse[MOST_FACES], tension[MOST_FACES];
 } sides_t;
 
 /* The same for the faces in the lanes. */
@@ -42,10 +42,7 @@ typedef struct {
 
 inline void gather_side(side_t *side, const sides_t *sides, const int *k)
 {
-    side->away.x = GATHER_WIDE(sides->x, k);
-    side->away.y = GATHER_WIDE(sides->y, k);
-    side->away.z = GATHER_WIDE(sides->z, k);
-    side->square = GATHER_WIDE(sides->square, k);
+    gather_rows(&side->away, &side->square, sides->away, k);
     side->level = GATHER_WIDE(sides->level, k);
     side->inverse = GATHER_WIDE(sides->inverse, k);
     side->tension = GATHER_WIDE(sides->tension, k);
@@ -137,22 +134,20 @@ kernel void descend_surface(const int size, global const int *starts, global con
             away = (REAL4)(DIFFERENCE(0, points[3 * i], points[3 * j]),
                            DIFFERENCE(1, points[3 * i + 1], points[3 * j + 1]),
                            DIFFERENCE(2, points[3 * i + 2], points[3 * j + 2]), 0);
-            sides.square[f] = dot(away, away);
-            sides.level[f] = sides.square[f] / 2;
-            sides.inverse[f] = 1 / sqrt(sides.square[f]);
+            away.s3 = dot(away, away);
+            sides.level[f] = away.s3 / 2;
+            sides.inverse[f] = 1 / sqrt(away.s3);
             sides.tension[f] = forces[j].s0;
             g += face_measures[k] * sides.inverse[f] * (forces[j].s1 - own.s1) * m;
         } else {
             const int wall = -1 - j;
             const REAL sign = wall % 2 ? 1 : -1;
             away = (REAL4)(wall < 2 ? sign : 0, wall / 2 == 1 ? sign : 0, wall > 3 ? sign : 0, 0);
-            sides.square[f] = 1;
             sides.level[f] = dot(away, m);
+            away.s3 = 1;
             sides.inverse[f] = sides.tension[f] = 0;
         }
-        sides.x[f] = away.s0;
-        sides.y[f] = away.s1;
-        sides.z[f] = away.s2;
+        sides.away[f] = away;
     }
     g += pull_of_edges(&sides, corners + 2 * begin, 2 * faces - 4, own.s0);
     const REAL unit = h[i];
