@@ -115,9 +115,9 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
         }
         places_t a, b, c, ab, bc, ca;
         WIDE ia, ib, ic;
-        gather_rows(&a, &ia, cell->planes, at_a);
-        gather_rows(&b, &ib, cell->planes, at_b);
-        gather_rows(&c, &ic, cell->planes, at_c);
+        gather_lanes(&a, &ia, cell->planes, at_a);
+        gather_lanes(&b, &ib, cell->planes, at_b);
+        gather_lanes(&c, &ic, cell->planes, at_c);
         cross_of(&ab, &a, &b);
         cross_of(&bc, &b, &c);
         cross_of(&ca, &c, &a);

@@ -41,7 +41,7 @@ inline WIDE beyond_planes(const corners_t *cell, int block, REAL4 y)
         faces[lane] = WIDTH * block + lane;
     places_t p;
     WIDE d2;
-    gather_rows(&p, &d2, cell->planes, faces);
+    gather_lanes(&p, &d2, cell->planes, faces);
     return fma(p.x, y.s0, fma(p.y, y.s1, p.z * y.s2)) - R(0.5);
 }
 

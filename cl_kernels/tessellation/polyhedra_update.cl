@@ -323,8 +323,8 @@ kernel void check_cells(const int size, const int room, global const int *report
         const int place = row_places[j], m = COUNT_OF(row_counts[j]);
         const bool by_keys = certain && other_certain;
         bool same = false;
-        for (int q = place; by_keys && q < place + m; ++q)
-            same |= labels[q] == i && keys[q] == keys[k];
+        for (int q = place; by_keys && !same && q < place + m; ++q)
+            same = labels[q] == i && keys[q] == keys[k];
         if (!by_keys) {
             REAL area = 0;
             for (int q = begin; q < begin + n; ++q)

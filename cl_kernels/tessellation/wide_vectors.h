@@ -3,7 +3,12 @@
 
 /* Vertices or faces in the lanes of a vector on CPUs: as many as a register of the processor holds; one on other
    devices, which have few registers. Sums have the same bits with four and eight lanes: see `sum_of_lanes`. */
-#if GROUP_SIZE == 1 && IS_DOUBLE && !defined(__AVX512F__)
+#if !defined(EIGHT_DOUBLES) && defined(__AVX512F__)
+#define EIGHT_DOUBLES 1
+#elif !defined(EIGHT_DOUBLES)
+#define EIGHT_DOUBLES 0
+#endif
+#if GROUP_SIZE == 1 && IS_DOUBLE && !EIGHT_DOUBLES
 #define WIDTH 4
 #define WIDE CLVORO_JOIN(REAL, 4)
 #define LOAD_WIDE(k, values) vload4(k, values)
@@ -102,7 +107,7 @@ inline void add_along(places_t *c, WIDE s, const places_t *a)
 }
 
 /* Gather rows k[lane] of four numbers: the first three, and the last. */
-inline void gather_rows(places_t *first, WIDE *last, const REAL4 *rows, const int *k)
+inline void gather_lanes(places_t *first, WIDE *last, const REAL4 *rows, const int *k)
 {
 #if WIDTH == 1
     const REAL4 row = rows[k[0]];

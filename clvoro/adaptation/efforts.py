@@ -77,6 +77,8 @@ class Effort:
         1 - mean Q of meshes of this effort in 2D, without walls.
     coarse_glide, coarse_polish : int
         In 3D, steps of gliding and of polishing at the end of each coarser level.
+    recouple : int
+        In 3D, coupled steps after each correction of the number of cells on a coarser level.
     separate : int
         Steps of separating, in 2D. Measured on eleven fields, four starts each: after one no edge is shorter than
         0.07 h, after two 0.09 h.
@@ -104,6 +106,7 @@ class Effort:
     deficit: float = 0.012
     coarse_glide: int = 0
     coarse_polish: int = 0
+    recouple: int = 0
     separate: int = 2
 
 
@@ -128,20 +131,20 @@ EFFORTS = {
 
 EFFORTS_3D = {
     "fast": Effort(
-        12, 3, 2, (), glide=0, polish=4, error_target=0.004, relaxation=1.5, momentum=0.8, penalty=0.15,
-        log_ratio_scale=8.0, coarse_glide=5, coarse_polish=10,
+        12, 2, 2, (), glide=0, polish=4, error_target=0.004, relaxation=1.5, momentum=0.8, penalty=0.15,
+        log_ratio_scale=8.0, coarse_glide=5, coarse_polish=10, recouple=1,
     ),
     "default": Effort(
-        16, 4, 2, (), glide=0, polish=8, error_target=0.0025, relaxation=2.5, momentum=0.9, penalty=0.15,
-        log_ratio_scale=8.0, coarse_glide=16, coarse_polish=8,
+        16, 3, 2, (), glide=0, polish=8, error_target=0.0025, relaxation=2.5, momentum=0.9, penalty=0.15,
+        log_ratio_scale=8.0, coarse_glide=16, coarse_polish=8, recouple=1,
     ),
     "best": Effort(
         80, 8, 3, (), glide=50, polish=10, error_target=0.003, relaxation=1.5, momentum=0.9, penalty=0.3,
-        log_ratio_scale=8.0, coarse_glide=100, coarse_polish=40,
+        log_ratio_scale=8.0, coarse_glide=100, coarse_polish=40, recouple=4,
     ),
 }  # fmt: skip
-"""The same in 3D. On a coarser level `couple` steps follow each of three numbers of cells, on the finest
-`couple_finest` each of two.
+"""The same in 3D. On a coarser level `couple` steps come before the first correction of the number of cells, and
+`recouple` after each of two. On the finest level there are `couple_finest`, and as many again after a correction.
 
 Measured on S1, S2 and S3 (see bench/convergence.py), default, two to five starts each: 16 steps of gliding with a
 relaxation of 2.5 and a momentum of 0.9, then 8 of polishing, give S2 and S3 the mean Q of 20 with 1.5 and 0.8, then 20,

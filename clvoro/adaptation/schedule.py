@@ -16,9 +16,11 @@
 In 3D there is no lattice with dislocations. Each level glides, then polishes:
 
     density start ─► [ couple ─► correct count ahead ] x 2 ─► couple ─► glide ─► polish ─► refine ─► ...
-        ─► couple ─► correct count ─► couple ─► glide ─► polish (─► project)
+        ─► couple ─► correct count (─► couple) ─► glide ─► polish (─► project)
 
-*correct count ahead*  to the number from which refinement gives that of the next level
+*correct count ahead*  to the number from which polishing and refinement give that of the next level
+
+On the finest level the number is then usually right, and cells are coupled again only if it has changed.
 
 From a mesh that is close to its size field, for instance after the field has moved by a few cells:
 
@@ -75,6 +77,9 @@ COARSE_PENALTY, COARSE_TOLERANCE = 0.3, 0.1
 POLISH_MOMENTUM_3D, POLISH_RATE_3D = 0.5, 0.055
 """Share of the last displacement, and step length, of polishing in 3D, where the weight of cells is about 7.5. Measured
 on S2, eight steps: with twice the rate, or a momentum of 0.8, the largest errors grow and quality falls."""
+COUNT_FINEST_3D = 3e-3
+"""Share of the cells by which their number may differ on the finest of several levels in 3D. It changes lengths by a
+third of that, much less than the error target."""
 POLISH_COUNT_3D = 5e-3
 """Share of the cells by which their number may differ while polishing in 3D. Only fields with few, steep cells do."""
 LOOSE_POLISH_3D, SETTLE_PENALTY_3D = 2.0, 0.7
@@ -124,10 +129,14 @@ NEAR_PENALTY = 0.03
 
 @dataclass(frozen=True)
 class Step:
-    """Displace and move all generators, and tessellate them; then open obtuse triangles, at most `openings` times."""
+    """Displace and move all generators, and tessellate them; then open obtuse triangles, at most `openings` times.
+
+    With `recent`, only if the number of cells has changed since so many steps.
+    """
 
     method: Method
     openings: int = 0
+    recent: int = 0
 
 
 @dataclass(frozen=True)
@@ -378,17 +387,18 @@ def _adaptive_3d(
         elif not warm:
             yield from couple * effort.start
         if level:
-            for _ in range(2):
-                yield from couple * effort.couple
+            for steps in (effort.couple, effort.recouple):
+                yield from couple * steps
                 yield CorrectCount(COUNT_LEAST, ahead=True)
-            yield from couple * effort.couple
+            yield from couple * effort.recouple
         if level or not (levels or warm):
             yield from [Step(coarse_glide)] * effort.coarse_glide
             yield from [Step(coarse_polish)] * effort.coarse_polish
             yield ResetMomentum()
     yield from couple * effort.couple_finest
-    yield CorrectCount(COUNT_LEAST)
-    yield from couple * effort.couple_finest
+    yield CorrectCount(COUNT_FINEST_3D if levels else COUNT_LEAST)
+    for step in range(effort.couple_finest):
+        yield replace(couple[0], recent=step + 1 if levels else 0)
     yield CorrectCount()
     yield from _finish_3d(effort, exact, error_target, effort.penalty)
 

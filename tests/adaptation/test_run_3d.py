@@ -1,10 +1,14 @@
 """`Adapter.run` in three dimensions: every method, its promises and figures, nasty domains and size fields."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import clvoro
 from clvoro import sizing
+from clvoro.adaptation.efforts import EFFORTS_3D
+from clvoro.adaptation.loop import Loop
 from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
 from tests.reference import diagrams3d as reference3d
 from tests.reference import runs
@@ -284,11 +288,31 @@ def test_levels_from_the_callers_points(adapter):
 
 
 def test_refinement_gives_the_number_of_the_next_level(adapter):
-    """Few generators are inserted or deleted on the finest level."""
+    """Few generators are inserted or deleted on the finest level, and cells are coupled again only after that."""
     result = adapter.run(BOX, S1, options=clvoro.MultilevelOptions(levels=1), seed=3)
-    h = result.history
-    first = int(np.argmax(h["level"] == 0))
-    assert abs(h["cells"][first] / len(result.points) - 1) < 0.04
+    h = result.history[result.history["level"] == 0]
+    assert abs(h["cells"][0] / len(result.points) - 1) < 0.03
+    changed = (h["cells"] != h["cells"][0]).any()
+    assert (
+        len(h) == EFFORTS_3D["default"].couple_finest * (1 + changed) + EFFORTS_3D["default"].polish
+    )
+
+
+@pytest.mark.parametrize(
+    ("rows", "n", "steps", "changed"),
+    [
+        ([(1, 90), (0, 700), (0, 700)], 700, 2, False),
+        ([(1, 90), (0, 700), (0, 700)], 690, 1, True),
+        ([(0, 700), (0, 700), (0, 690)], 690, 1, False),
+        ([(0, 700), (0, 700), (0, 690)], 690, 2, True),
+        ([(1, 90), (0, 700)], 700, 2, False),
+    ],
+)
+def test_cells_are_coupled_again_after_a_change_of_their_number(rows, n, steps, changed):
+    kind = [("level", int), ("cells", int)]
+    rows = [np.array([row], kind) for row in rows]
+    loop = SimpleNamespace(rows=rows, level=0, mesh=SimpleNamespace(n=n))
+    assert Loop.count_changed(loop, steps) == changed
 
 
 # Domains and size fields of all kinds.

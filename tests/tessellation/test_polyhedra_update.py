@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import clvoro
+from clvoro.adaptation.descent.surface_descent import SurfaceDescent
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from clvoro.tessellation.polyhedra_update import PolyhedraUpdate, are_triples
+from tests.reference import patch
 
 BOX = clvoro.Box((0, 0, 0), (1, 1, 0.75))
 UPPER = np.array([1, 1, 0.75])
@@ -245,6 +247,31 @@ def test_same_bits_again_and_from_saved_vertices(engine):
         found[-1].append(t.neighbors.get()[:m].tobytes())
     assert found[0] == found[1]
     assert found[0] == found[2]
+
+
+def test_same_bits_with_four_and_eight_lanes(ctx, monkeypatch):
+    """Vector units of CPUs hold four or eight numbers of double precision."""
+    kernels, found = Engine.kernels, []
+    for eight in (0, 1):
+        monkeypatch.setattr(
+            Engine, "kernels",
+            lambda self, stage, defines=None, prelude="", eight=eight: kernels(
+                self, stage, {**(defines or {}), "EIGHT_DOUBLES": eight}, prelude
+            ),
+        )  # fmt: skip
+        engine = patch.make_engine(ctx, "float64", dim=3)
+        carried = Carried(engine, POINTS["random"])
+        relaxed(carried, POINTS["random"], 4)
+        t = carried.t
+        quality, h = engine.upload(np.full(N, 0.7)), engine.upload(np.full(N, 0.1))
+        way = engine.zeros((N, 3))
+        SurfaceDescent(engine).descend(t, h, quality, way, bad_cell_weight=5.0, rate=0.05)
+        assert np.abs(way.get()).max() > 1e-4
+        arrays = t.volumes, t.offsets, t.covariances, t.face_measures, t.face_centroids, way
+        m = t.starts.get()[-1]
+        found.append([a.get()[: m if "face" in name else N].tobytes() for name, a in zip(
+            ("", "", "", "face", "face", ""), arrays, strict=True)])  # fmt: skip
+    assert found[0] == found[1]
 
 
 def test_damaged_triples_are_found(engine):

@@ -42,7 +42,7 @@ typedef struct {
 
 inline void gather_side(side_t *side, const sides_t *sides, const int *k)
 {
-    gather_rows(&side->away, &side->square, sides->away, k);
+    gather_lanes(&side->away, &side->square, sides->away, k);
     side->level = GATHER_WIDE(sides->level, k);
     side->inverse = GATHER_WIDE(sides->inverse, k);
     side->tension = GATHER_WIDE(sides->tension, k);
