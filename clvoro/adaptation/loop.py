@@ -32,11 +32,9 @@ from .schedule import (
 from .state import MeshState
 from .transport.phase import PowerPhase
 
-SAMPLING_GAIN = 0.36
-"""Ratio of the errors of two levels in counting cells by sizes at the generators, measured on a field with a kink."""
-POLISH_GAIN = 1.017
-"""Factor by which polishing raises the number of generators after refinement in 3D: it widens faces that are too small
-to bring one. Measured on S1, S2 and S3 (see bench/convergence.py): 1.016 to 1.018."""
+SAMPLING_GAIN = 0.26
+"""Ratio of the errors of two levels in counting cells by sizes at the generators. Measured with polished cells on S2 and
+S3, which have a kink (see bench/convergence.py): 0.25 to 0.27."""
 WINDOW = 10
 """Steps over which error and quality are averaged to detect stagnation."""
 LEAST_PROGRESS, MAX_OSCILLATIONS = 0.9, 2
@@ -245,8 +243,10 @@ class Loop:
         factor = 2.0 ** (self.mesh.engine.cell_dim * self.level)
         return self.mesh.fixed + (1 + MOST_SURPLUS) * self.required / factor
 
-    def missing_for_next_level(self) -> float:
-        """Return how many cells are missing so that polishing and refinement give the number of the next level, in 3D.
+    def missing_for_next_level(self, growth: float) -> float:
+        """Return how many cells are missing so that refinement gives the number of the next finer level.
+
+        Its number is `growth` times that by refinement now.
 
         The sum of V rho differs from the integral, because h is sampled at the generators; on the next level the
         difference is smaller by `SAMPLING_GAIN`. Refinement gives less than 2^d times as many cells, because cells at
@@ -257,27 +257,27 @@ class Loop:
         # The number of cells on this level according to the integral.
         exact = self.required / factor**self.level
         bias = min((mesh.n + mesh.missing_cells()) / exact - 1, MOST_SURPLUS)
-        lack = factor * mesh.n / (POLISH_GAIN * mesh.refined_count()) - 1
+        lack = factor * mesh.n / (growth * mesh.refined_count()) - 1
         wanted = exact * (1 + SAMPLING_GAIN * bias)
         for level in range(self.level):
             wanted *= 1 + lack / 2**level
         return wanted - mesh.n
 
-    def correct_count(self, share: float = 0.0, ahead: bool = False) -> None:
+    def correct_count(self, share: float = 0.0, ahead: float = 0.0) -> None:
         """Correct the number of cells.
 
         Parameters
         ----------
         share : float
             Tolerance relative to the number that the size field requires. With 0 only a fixed number is corrected.
-        ahead : bool
-            Correct towards the number from which refinement gives that of the next level.
+        ahead : float
+            If not 0, correct towards the number from which refinement gives that of the next level, with this growth.
         """
         least, before, oscillations = math.inf, 0.0, 0
         while True:
             if share == 0 and self.fixed_count is None:
                 break
-            missing = self.missing_for_next_level() if ahead else self.missing()
+            missing = self.missing_for_next_level(ahead) if ahead else self.missing()
             if abs(missing) <= share * self.mesh.n:
                 break
             # At jumps of h each new cell changes the required number, so that it can oscillate without end. Changes

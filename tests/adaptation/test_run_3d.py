@@ -291,7 +291,7 @@ def test_refinement_gives_the_number_of_the_next_level(adapter):
     """Few generators are inserted or deleted on the finest level, and cells are coupled again only after that."""
     result = adapter.run(BOX, S1, options=clvoro.MultilevelOptions(levels=1), seed=3)
     h = result.history[result.history["level"] == 0]
-    assert abs(h["cells"][0] / len(result.points) - 1) < 0.03
+    assert abs(h["cells"][0] / len(result.points) - 1) < 0.015
     changed = (h["cells"] != h["cells"][0]).any()
     assert (
         len(h) == EFFORTS_3D["default"].couple_finest * (1 + changed) + EFFORTS_3D["default"].polish
