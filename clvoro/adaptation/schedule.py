@@ -19,8 +19,7 @@ In 3D there is no lattice with dislocations. Each level glides, then polishes:
         ─► refine ─► ...
         ─► couple ─► correct count (─► couple) ─► glide ─► polish (─► project)
 
-*correct count ahead*  to the number from which refinement gives that of the next level. Only if it then still has to
-change on the finest level, cells are coupled again.
+*correct count ahead*  to the number from which refinement gives that of the next level, where it seldom has to change
 
 From a mesh that is close to its size field, for instance after the field has moved by a few cells:
 
@@ -78,8 +77,8 @@ POLISH_MOMENTUM_3D, POLISH_RATE_3D = 0.5, 0.055
 """Share of the last displacement, and step length, of polishing in 3D, where the weight of cells is about 7.5. Measured
 on S2, eight steps: with twice the rate, or a momentum of 0.8, the largest errors grow and quality falls."""
 POLISH_GROWTH_3D = 1.016
-"""Factor by which polishing raises the number of generators after refinement: it widens faces that are too small to
-bring one. Measured: 1.009 for a constant size, 1.016 to 1.018 on S2 and S3 (see bench/convergence.py)."""
+"""Factor by which polishing raises the number of generators after refinement: it widens faces too small to bring one.
+Measured: 1.009 for a constant size, 1.016 to 1.018 on S2 and S3 (see bench/convergence.py)."""
 COUNT_FINEST_3D = 3e-3
 """Share of the cells by which their number may differ on the finest of several levels in 3D: lengths by a third."""
 POLISH_COUNT_3D = 5e-3
@@ -401,9 +400,8 @@ def _adaptive_3d(
             yield CorrectCount(COUNT_LEAST, ahead=1.0)
     yield from couple * effort.couple_finest
     yield CorrectCount(COUNT_FINEST_3D if levels else COUNT_LEAST)
-    yield from [
-        replace(couple[0], recent=k if levels else 0) for k in range(1, effort.couple_finest + 1)
-    ]
+    for k in range(effort.couple_finest):
+        yield replace(couple[0], recent=k + 1 if levels else 0)
     yield CorrectCount()
     yield from _finish_3d(effort, exact, error_target, effort.penalty)
 
