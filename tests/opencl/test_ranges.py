@@ -88,11 +88,10 @@ QUICK = {"coupled": (0.05, WORK[0]), "exact number": (0.1, WORK[2])}
 @pytest.mark.parametrize(
     "name",
     [
-        "exact number",
         "plane",
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("coupled", *LARGE)
+            for name in (*QUICK, *LARGE)
             if name != "plane"
         ),
     ],
