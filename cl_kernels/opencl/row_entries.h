@@ -14,6 +14,8 @@
 #define MANY(TYPE) CLVORO_JOIN(TYPE, 8)
 /* Mask of the entries before the end. */
 #define INSIDE(k, end) ((k) + (int8)(0, 1, 2, 3, 4, 5, 6, 7) < (end))
+/* Whether a mask holds for one entry or more. */
+#define ANY(mask) any(mask)
 #define PICK(TYPE, array, j, stride, a)                                                                                \
     ((MANY(TYPE))((array)[(j).s0 * (stride) + (a)], (array)[(j).s1 * (stride) + (a)],                                  \
                   (array)[(j).s2 * (stride) + (a)], (array)[(j).s3 * (stride) + (a)],                                  \
@@ -90,6 +92,7 @@ inline MANY(REAL) nearest_images(MANY(REAL) d, REAL period)
 #define AT_ONCE 1
 #define MANY(TYPE) TYPE
 #define INSIDE(k, end) ((k) < (end))
+#define ANY(mask) (mask)
 #define PICK(TYPE, array, j, stride, a) ((array)[(j) * (stride) + (a)])
 #define take_int(array, k, size) ((array)[k])
 #define take_float(array, k, size) ((array)[k])

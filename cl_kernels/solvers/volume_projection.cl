@@ -37,7 +37,7 @@
 
    Q is the least quality of the cell and its neighbors; q is close to -log Q, without a logarithm. Bad cells and their
    neighbors may miss their size a little, since they limit the quality. Cells far from their size may not, which bounds
-   the largest error. A scale of 0 leaves its factor out. */
+   the largest error. A scale of 0 leaves its factor out. Cells on walls have a quality scale of their own. */
 inline float penalty_of(float penalty, float quality_scale, float least_quality, float log_ratio_scale, float log_ratio)
 {
     float e = penalty;
@@ -62,7 +62,7 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
                                 global const REAL *volumes, global const REAL *points, global const REAL *gradient,
                                 global const REAL *h, global const REAL *quality, global const REAL *log_ratio,
                                 global const REAL *displacement, const REAL penalty, const REAL quality_scale,
-                                const REAL log_ratio_scale, global float *rows, global float *columns,
+                                const REAL wall_quality_scale, const REAL log_ratio_scale, global float *rows, global float *columns,
                                 global STORE *own, global STORE *eps, global STORE *inverse_diagonal, global STORE *r,
                                 global STORE *z, global REAL *partial, global const int *labels, const int fixed,
                                 const int warm, global const float *start PERIOD_ARGS)
@@ -77,6 +77,7 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
         const REAL per_face = CELL_DIM == 2 ? unit : unit * unit;
         const float shrink = content / volumes[i];
         float diagonal = 0, least_quality = quality[i];
+        bool on_wall = false;
         const bool is_fixed = fixed > 0 && labels[i] < fixed;
         EACH_AXIS(a)
         x[a] = points[DIM * i + a];
@@ -91,6 +92,7 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
         for (int k = starts[i]; k < end; k += AT_ONCE) {
             const MANY(int) facing = TAKE(int, neighbors, k, faces), counts = INSIDE(k, end) & (facing >= 0);
             const MANY(int) j = select((MANY(int))(i), facing, counts);
+            on_wall = on_wall || ANY(INSIDE(k, end) & (facing < 0));
             MANY(float) d[DIM], d2 = 0, square = 0, displaced = 0, middle[DIM], other[DIM];
 #ifdef SPHERE
             MANY(float) there_at[DIM];
@@ -163,7 +165,8 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
             diagonal += t * t;
             own[CELL_DIM * i + c] = t;
         }
-        const float e = penalty_of(penalty, quality_scale, least_quality, log_ratio_scale, log_ratio[i]);
+        const float scale = on_wall ? wall_quality_scale : quality_scale;
+        const float e = penalty_of(penalty, scale, least_quality, log_ratio_scale, log_ratio[i]);
         const REAL inverse = 1 / (diagonal + e), b = log_ratio[i] + change;
         eps[i] = e;
         inverse_diagonal[i] = inverse;

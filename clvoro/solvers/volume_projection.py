@@ -55,12 +55,14 @@ class Penalty:
     """The penalty eps that trades accuracy of the volumes for a shorter displacement.
 
     eps_i = min(3, eps (1 + q_i^2 / quality_scale^2)) / (1 + (r_i / log_ratio_scale)^2), q = (1 - Q) / sqrt Q of the
-    worst cell among i and its neighbors. A scale of 0 leaves its factor out.
+    worst cell among i and its neighbors. A scale of 0 leaves its factor out. In cells on walls the quality scale
+    is `at_walls` times as large: walls limit their quality, and missed sizes help less.
     """
 
     eps: float
     quality_scale: float = 0.0
     log_ratio_scale: float = 0.0
+    at_walls: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,8 @@ class VolumeProjection:
             engine, k.assemble_projection, np.int32(n), np.int32(m), t.starts, t.neighbors, t.face_measures,
             t.face_centroids, t.volumes, t.points, targets.gradient, targets.h, targets.quality,
             targets.log_ratio, displacement, real(penalty.eps), real(penalty.quality_scale),
-            real(penalty.log_ratio_scale), v.rows, v.columns, v.own, v.eps, v.inverse, v.r, v.z, self._partial,
+            real(penalty.at_walls * penalty.quality_scale), real(penalty.log_ratio_scale), v.rows, v.columns, v.own,
+            v.eps, v.inverse, v.r, v.z, self._partial,
             t.starts if labels is None else labels, np.int32(fixed), np.int32(warm), start,
             *engine.period_args, groups=groups,
         )()  # fmt: skip

@@ -284,18 +284,28 @@ def test_not_finite(engine, points):
 
 
 def test_penalty_of_bad_cells(engine, points, assembled):
-    """eps grows with (1 - Q) / sqrt Q of the worst cell around, up to 3."""
+    """eps grows with (1 - Q) / sqrt Q of the worst cell around, up to 3; on walls with a scale of their own."""
     quality = np.random.default_rng(15).uniform(0.3, 1, N)
     host = patch.fetch(patch.tessellate(engine, points))
     worst = quality.copy()
     inner = host.neighbors >= 0
     np.minimum.at(worst, host.owners[inner], quality[host.neighbors[inner]])
-    eps = np.minimum(0.2 * (1 + (1 - worst) ** 2 / worst / 0.3**2), 3)
+
+    def penalties(scale):
+        return np.minimum(0.2 * (1 + (1 - worst) ** 2 / worst / scale**2), 3)
+
+    eps = penalties(0.3)
+    on_wall = np.zeros(N, bool)
+    on_wall[host.owners[~inner]] = True
+    assert 5 < on_wall.sum() < N - 5
     assert 5 < (eps == 3).sum() < N - 5
-    made = Assembled(
-        engine, points, sizes(points), np.tile(SLOPE, (N, 1)), eps=0.2, quality_scale=0.3, quality=quality
-    )  # fmt: skip
-    assert made.eps == pytest.approx(eps, rel=1e-5)  # of single precision
+    for at_walls in (1.0, 2.0):
+        made = Assembled(
+            engine, points, sizes(points), np.tile(SLOPE, (N, 1)), eps=0.2, quality_scale=0.3, at_walls=at_walls,
+            quality=quality,
+        )  # fmt: skip
+        expected = np.where(on_wall, penalties(0.3 * at_walls), eps)
+        assert made.eps == pytest.approx(expected, rel=1e-5)  # of single precision
 
 
 def test_perturbed_mesh_converges_quadratically(engine):
