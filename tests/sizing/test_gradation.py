@@ -288,8 +288,8 @@ def test_a_run_on_a_graded_field():
     assert np.abs(result.target_size - ramp).max() < 1.01 * math.log(1.3) / 64  # one spacing
 
 
-def test_resolution_is_chosen_and_capped(make_engine):
-    engine = make_engine(2)
+def test_resolution_is_chosen_and_capped(queue):
+    engine = Engine(queue.context, queue, 2, np.dtype(float))
 
     def shape(field, **options):
         return sizing.Graded(field, 1.2, box=PLANE, **options).raster(engine=engine).values.shape
