@@ -20,7 +20,7 @@ SHORT_ON_WALL = 0.05
 _STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell; OpenFOAM counts cells with less than about 1e-6 as concave."""
 _ROUNDS = 12
-_FREE, _WALL, _CORNER = range(3)
+_FREE, _WALL, CORNER = range(3)
 """Kinds of points: of two with different kinds, the one of the larger kind stays."""
 
 
@@ -80,7 +80,7 @@ class _Round:
         self.starts, self.loop, broken = simple_loops(mesh)
         self.cell = np.repeat(np.arange(len(mesh)), np.diff(self.starts))
         self.images = mesh.images if any(mesh.domain.periodic) else np.arange(v)
-        self.kind = _kinds(mesh, parts, self.images)
+        self.kind = point_kinds(mesh, parts, self.images)
         ratio = _lengths_over_limits(mesh, broken)
         ends = mesh.corners.reshape(-1, 2)
         first, second = self.images[ends].T
@@ -188,8 +188,14 @@ def _lengths_over_limits(mesh: SolverMesh, broken: np.ndarray) -> np.ndarray:
     return lengths / thinner / np.where(mesh.neighbor >= 0, SHORT, SHORT_ON_WALL)
 
 
-def _kinds(mesh: SolverMesh, parts: np.ndarray, images: np.ndarray) -> np.ndarray:
-    """Return whether each point is free, on a wall, or fixed in a corner, (v,) int."""
+def point_kinds(
+    mesh: SolverMesh, parts: np.ndarray, images: np.ndarray | None = None
+) -> np.ndarray:
+    """Return whether each point is free, on a wall, or fixed in a corner, (v,) int.
+
+    `images` (v,) int is the class of each point, if points are periodic images of one another.
+    """
+    images = np.arange(len(mesh.points)) if images is None else images
     walls = slice(mesh.inner, mesh.outer)
     a, b = mesh.corners.reshape(-1, 2)[walls].T
     part = parts[-1 - mesh.neighbor[walls]]
@@ -204,7 +210,7 @@ def _kinds(mesh: SolverMesh, parts: np.ndarray, images: np.ndarray) -> np.ndarra
         np.arctan2(cross(behind[:, :2], ahead[:, :2]), (behind[:, :2] * ahead[:, :2]).sum(axis=1))
     )
     smooth = (met == 2) & (turn < WALL_CORNER) & (ahead[:, 2] == behind[:, 2])
-    return np.where(met == 0, _FREE, np.where(smooth, _WALL, _CORNER))[images]
+    return np.where(met == 0, _FREE, np.where(smooth, _WALL, CORNER))[images]
 
 
 def _least_turns(corners: np.ndarray, starts: np.ndarray) -> np.ndarray:

@@ -57,7 +57,7 @@ class SolverMesh(Sealed):
     shift : (f, d) int8
         At a seam the image of the face is at ``shift * domain.extent``, counted from the twin. Else 0.
     half_face : (f,) int64
-        A half-face of the diagram for each face.
+        A half-face of the diagram for each face; -1 for a face that the diagram does not have.
     """
 
     domain: Domain
@@ -201,7 +201,7 @@ def make_solver_mesh(
     if straight:
         mesh = move_concave_points(mesh)
     if collapse and mesh.dim == 2:
-        mesh = relax_points(mesh)
+        mesh = relax_points(mesh, parts, straight)
     if collapse and mesh.dim == 3:
         mesh = collapse_short(mesh, np.cbrt(diagram.volumes), diagram.centroids)
     mesh = compact(mesh)

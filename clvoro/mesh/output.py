@@ -203,8 +203,9 @@ class MeshOutput:
             edges shorter than 0.02 h and faces smaller than 0.001 h^2 are collapsed, with h the cube root of the
             smaller cell's volume; so are faces smaller than 0.02 h^2 whose skewness exceeds 1.8. Faces may then be
             slightly warped: their flatness is at least 0.95. Points on the box stay on it, so that the cells still fill
-            it. What would make a cell concave is left as it is. In 2D points around skew faces, and faces far from
-            orthogonal, then move a little.
+            it. What would make a cell concave is left as it is. In 2D, skew faces, faces far from orthogonal and
+            cells that are not convex are then repaired: points around them move, those on straight walls along the
+            boundary, and a few faces connect other cells than in the diagram.
 
         Returns
         -------

@@ -114,11 +114,14 @@ def test_a_face_ends_in_a_corner_that_is_near(ctx, seed):
     assert mesh.area_change == 0
 
 
-def test_a_corner_without_a_face_end_remains(ctx):
-    points = np.array([(0.4, 0.4), (0.1, 0.9), (0.9, 0.1)])
-    mesh = clvoro.Adapter(ctx).diagram(Polygon(ELL), points).solver_mesh()
-    assert max(map(concave_by, polygons(mesh))) == pytest.approx(90)
-    assert mesh.area_change == 0
+@pytest.mark.parametrize("points", [[(0.4, 0.4)], [(0.4, 0.4), (0.1, 0.9), (0.9, 0.1)]])
+def test_a_corner_without_a_face_end_remains_only_without_repair(ctx, points):
+    diagram = clvoro.Adapter(ctx).diagram(Polygon(ELL), np.array(points))
+    for collapse in (False, True):
+        mesh = diagram.solver_mesh(collapse=collapse)
+        concave = max(map(concave_by, polygons(mesh)))
+        assert concave == pytest.approx(90) if len(points) == 1 or not collapse else concave < -0.1
+        assert mesh.area_change == 0
 
 
 def test_faces_do_not_cross_from_one_name_to_another(ctx):

@@ -1,0 +1,209 @@
+"""Figures of patches, and the terms of the sum of squares that `Descent` minimizes.
+
+The sum is
+
+    sum_f [max(0, angle_f - a)^2 + max(0, skewness_f - s)^2 + max(0, b - l_f / L_f)^2]
+        + sum_i [(A_i / A_i0 - 1)^2 + max(0, d - sqrt(det_i))^2] + sum_c max(0, t - turn_c)^2
+        + sum_p |move_p|^2 / width_p^2,
+
+each term with a weight. The sums are over faces f (non-orthogonality and skewness as OpenFOAM defines them, and length
+l over the smaller size L of both cells), cells i (area A, and OpenFOAM's determinant), corners c of cells, points p.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+
+from ..mesh.connectivity import following, take_rows
+
+LENGTH_GOAL = 0.15
+"""Length of a face over the size of its smaller cell that is aimed at.
+
+Faces that are shorter at first, and not at a bad cell, need not become longer.
+"""
+_ANGLE_GOAL, _SKEWNESS_GOAL = np.radians(16), 1.5
+_TURN_GOAL = 0.02
+"""Least turn in the corners of cells that is aimed at."""
+_DETERMINANT_GOAL = 0.02
+"""Determinant of a cell that is aimed at."""
+_SKEW_WEIGHT, _LENGTH_WEIGHT, _AREA_WEIGHT, _TURN_WEIGHT, _DETERMINANT_WEIGHT = (
+    0.3, 5.0, 0.5, 5.0, 1.5,
+)  # fmt: skip
+
+
+class Figures(NamedTuple):
+    """What the sum of squares and the prices are computed from, for g sets of points.
+
+    Attributes
+    ----------
+    angle, skewness, length : (g, f) float
+        Of faces; lengths over the smaller size of their cells.
+    area, determinant : (g, n) float
+        Of cells.
+    turn : (g, k) float
+        Angles to the left in the corners of cells.
+    """
+
+    angle: np.ndarray
+    skewness: np.ndarray
+    length: np.ndarray
+    area: np.ndarray
+    determinant: np.ndarray
+    turn: np.ndarray
+
+
+def face_figures(
+    ends: tuple[np.ndarray, ...],
+    here: tuple[np.ndarray, ...],
+    there: tuple[np.ndarray, ...],
+    wall: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return non-orthogonality in radians, skewness and length of faces, (..., f) each.
+
+    Parameters
+    ----------
+    ends : x and y of the first end, x and y of the second
+    here, there : x and y of the centroids on both sides
+    wall : (f,) bool
+        Faces without a cell behind them.
+    """
+    ax, ay, bx, by = ends
+    ux, uy = bx - ax, by - ay
+    length = np.maximum(np.sqrt(ux * ux + uy * uy), 1e-300)
+    ux, uy = ux / length, uy / length
+    x, y = (ax + bx) / 2 - here[0], (ay + by) / 2 - here[1]
+    height = x * uy - y * ux
+    s, t = there[0] - here[0], there[1] - here[1]
+    through = np.where(wall, height, s * uy - t * ux)
+    aside = np.where(wall, 0.0, s * ux + t * uy)
+    ratio = np.where(np.abs(through) > 1e-300, aside / np.where(through == 0, 1, through), 0.0)
+    offset = np.abs(x * ux + y * uy - height * ratio)
+    least = np.where(wall, 0.4, 0.2) * np.sqrt(through * through + aside * aside)
+    angle = np.where(wall, 0.0, np.arctan2(np.abs(aside), through))
+    return angle, offset / np.maximum(length / 2, np.maximum(least, 1e-300)), length
+
+
+@dataclass(eq=False)
+class Cells:
+    """Some cells of a patch, and the faces whose figures depend on these cells only.
+
+    Attributes
+    ----------
+    starts, loop, row : int
+        Points around each cell as ragged rows, and the cell of each.
+    between : (k,) bool
+        Whether another cell is behind the side that begins there.
+    bound : (k,) bool
+        Corners of walls within a cell.
+    faces : (f,) int
+        Faces of the patch.
+    ends : (f, 2) int
+    owner, neighbor : (f,) int
+        Among these cells; the neighbor is the owner on a `wall`.
+    wall : (f,) bool
+    aim : (f,) float
+    area, size : (n,) float
+        Of the cells at first.
+    origin : (n, 2) float
+        A point near each cell.
+    """
+
+    starts: np.ndarray
+    loop: np.ndarray
+    row: np.ndarray
+    between: np.ndarray
+    bound: np.ndarray
+    faces: np.ndarray
+    ends: np.ndarray
+    owner: np.ndarray
+    neighbor: np.ndarray
+    wall: np.ndarray
+    aim: np.ndarray
+    area: np.ndarray
+    size: np.ndarray
+    origin: np.ndarray
+
+    def __post_init__(self) -> None:
+        self.after = following(self.starts)
+        self.smaller = np.minimum(self.size[self.owner], self.size[self.neighbor])
+        sides = np.add.reduceat(self.between.astype(np.int64), self.starts[:-1])
+        self.sides = np.maximum(sides, 1)
+
+    def part(self, cells: np.ndarray, faces: np.ndarray) -> Cells:
+        """Return some of the cells, (m,) int ascending, and of the faces, (e,) int."""
+        starts, at = take_rows(self.starts, np.arange(len(self.loop)), cells)
+        place = np.full(len(self.area), -1)
+        place[cells] = np.arange(len(cells))
+        return Cells(
+            starts, self.loop[at], place[self.row[at]], self.between[at], self.bound[at],
+            self.faces[faces], self.ends[faces], place[self.owner[faces]], place[self.neighbor[faces]],
+            self.wall[faces], self.aim[faces], self.area[cells], self.size[cells], self.origin[cells],
+        )  # fmt: skip
+
+    def figures(self, x: np.ndarray, y: np.ndarray) -> Figures:
+        """Return the figures for points with these coordinates, (g, v) each."""
+        first = self.starts[:-1]
+        px, py = (z[:, self.loop] - o[self.row] for z, o in zip((x, y), self.origin.T, strict=True))
+        qx, qy = px[:, self.after], py[:, self.after]
+        twice = px * qy - py * qx
+        double = np.add.reduceat(twice, first, axis=1)
+        safe = 3 * np.where(double > 0, double, np.inf)
+        centers = tuple(
+            o + np.add.reduceat(twice * z, first, axis=1) / safe
+            for z, o in zip((px + qx, py + qy), self.origin.T, strict=True)
+        )
+        a, b = self.ends.T
+        angle, skewness, length = face_figures(
+            (x[:, a], y[:, a], x[:, b], y[:, b]),
+            tuple(c[:, self.owner] for c in centers),
+            tuple(c[:, self.neighbor] for c in centers),
+            self.wall,
+        )
+        ux, uy = qx - px, qy - py
+        vx, vy = ux[:, self.after], uy[:, self.after]
+        turn = np.empty(ux.shape)
+        turn[:, self.after] = np.arctan2(ux * vy - uy * vx, ux * vx + uy * vy)
+        ux, uy = ux * self.between, uy * self.between
+        xx, xy, yy = (np.add.reduceat(z, first, axis=1) for z in (ux * ux, ux * uy, uy * uy))
+        mean = np.add.reduceat(np.sqrt(ux * ux + uy * uy), first, axis=1) / self.sides
+        determinant = (xx * yy - xy * xy) / (8 * np.maximum(mean, 1e-75) ** 4)
+        return Figures(angle, skewness, length / self.smaller, double / 2, determinant, turn)
+
+    def residuals(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the terms of the sum of squares but those of the moves, (g, r)."""
+        now = self.figures(x, y)
+        terms = (
+            np.maximum(now.angle - _ANGLE_GOAL, 0),
+            _SKEW_WEIGHT * np.maximum(now.skewness - _SKEWNESS_GOAL, 0),
+            _LENGTH_WEIGHT * np.maximum(self.aim - now.length, 0),
+            _AREA_WEIGHT * (now.area / self.area - 1),
+            # The root has a slope where the faces of a cell are parallel.
+            _DETERMINANT_WEIGHT
+            * np.maximum(_DETERMINANT_GOAL**0.5 - np.sqrt(np.maximum(now.determinant, 0)), 0),
+            _TURN_WEIGHT * np.where(self.bound, 0, np.maximum(_TURN_GOAL - now.turn, 0)),
+        )
+        return np.concatenate(terms, axis=1)
+
+    def pattern(self, active: np.ndarray, count: int) -> scipy.sparse.csr_array:
+        """Return which of all terms depend on which of the `active` ones of `count` points, (r + 2 m, m)."""
+        m, n, f = len(active), len(self.area), len(self.faces)
+        index = np.full(count, -1)
+        index[active] = np.arange(m)
+        moves = index[self.loop] >= 0
+
+        def incidence(
+            rows: np.ndarray, columns: np.ndarray, height: int, width: int
+        ) -> scipy.sparse.csr_array:
+            return scipy.sparse.csr_array((np.ones(len(rows)), (rows, columns)), (height, width))
+
+        of_cells = incidence(self.row[moves], index[self.loop[moves]], n, m)
+        both = np.concatenate([self.owner, self.neighbor])
+        of_faces = incidence(np.tile(np.arange(f), 2), both, f, n) @ of_cells
+        of_turns = incidence(np.arange(len(self.row)), self.row, len(self.row), n) @ of_cells
+        of_moves = incidence(np.arange(2 * m), np.repeat(np.arange(m), 2), 2 * m, m)
+        blocks = [*[of_faces] * 3, *[of_cells] * 2, of_turns, of_moves]
+        return scipy.sparse.csr_array(scipy.sparse.vstack(blocks))
