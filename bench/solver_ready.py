@@ -1,12 +1,15 @@
 """Whether OpenFOAM accepts the meshes: `checkMesh -allGeometry -allTopology` for domains with hard walls.
 
-    python bench/solver_ready.py [--only NAMES] [--effort NAMES] [--exact] [--seeds NUMBERS] [--keep FOLDER]
+    python bench/solver_ready.py [--only NAMES] [--effort NAMES] [--exact] [--seeds N or NUMBERS] [--keep FOLDER]
                                  [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
 
 Each mesh is adapted, written as polyMesh with default settings, and given to OpenFOAM's `checkMesh`. A row has the
 largest non-orthogonality and skewness that `checkMesh` prints, the number of concave cells, the largest angle by which
 a cell is concave, the error and quality of cells on walls and of the others, and the verdict. Without OpenFOAM the
 script ends with a message. Debian's package `openfoam` is enough.
+
+With --seeds there is one row per domain and run, for all seeds: how many meshes are accepted, and the worst figures.
+`--seeds 6` is short for `--seeds 1,2,3,4,5,6`. Processor time is that of the run and that of the solver mesh within it.
 
 The domains are in `bench/_walled.py` and `bench/_sites.py`. S3 has 1e5 cells; S2 and S3 run with their default effort
 only, unless they are named in --only.
@@ -53,7 +56,10 @@ def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
     result.save(case / "constant" / "polyMesh")
     verdict = check_case(case)
     (case / "checkMesh.log").write_text(verdict.text)
-    d, solver = result.diagram, result.measures.solver
+    begin = time.process_time()
+    solver = result.solver_mesh().measures
+    seconds = time.process_time() - begin
+    d = result.diagram
     inner = off_walls(d)
     wall, e = ~inner, np.abs(result.size_error)
 
@@ -61,7 +67,7 @@ def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
         return float(getattr(values[part], how)()) if part.any() else float("nan")
 
     return {
-        "cells": len(d), **figures_of(verdict),
+        "cells": len(d), "solver_mesh_seconds": seconds, **figures_of(verdict),
         "concave_degrees": float(solver.concavity.max()),
         "shortest": float(solver.shortest_edge.min()),
         "wall_error": of(e, wall, "mean"), "wall_quality": of(result.quality, wall, "min"),
@@ -85,13 +91,45 @@ COLUMNS = {
 }
 
 
+WORST = {
+    "non_orthogonality": max, "skewness": max, "concave": max, "concave_degrees": max, "shortest": min,
+    "wall_error": max, "wall_quality": min, "inner_error": max, "inner_quality": min,
+}  # fmt: skip
+SEED_COLUMNS = {
+    "domain": lambda r: r["domain"],
+    "run": lambda r: r["run"],
+    "accepted": lambda r: f"{r['accepted']} of {r['meshes']}",
+    "within 20 degrees and 2": lambda r: f"{r['within']} of {r['meshes']}",
+    **{name: COLUMNS[name] for name in list(COLUMNS)[4:-1]},
+    "processor s": lambda r: f"{r['seconds']:.1f}, {r['solver_mesh_seconds']:.2f}",
+    "refused": lambda r: r["refused"],
+}
+"""Columns of the rows for several seeds: worst figures, means of times."""
+
+
+def over_seeds(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return one row for meshes that differ in their seeds only."""
+    refused = [f"seed {r['seed']}: {r['complaints'][:60]}" for r in rows if not r["ok"]]
+    times = ("seconds", "solver_mesh_seconds")
+    return {
+        "domain": rows[0]["domain"], "run": rows[0]["run"], "meshes": len(rows),
+        "accepted": len(rows) - len(refused), "ok": not refused,
+        "within": sum(r["ok"] and r["non_orthogonality"] <= 20 and r["skewness"] <= 2 for r in rows),
+        **{name: worst(r[name] for r in rows) for name, worst in WORST.items()},
+        **{name: sum(r[name] for r in rows) / len(rows) for name in times},
+        "refused": "; ".join(refused),
+    }  # fmt: skip
+
+
 def main() -> None:
     """Run the bench."""
     options_of = parser(__doc__)
     options_of.add_argument("--only", default="", metavar="NAMES", help=", ".join(DOMAINS))
     options_of.add_argument("--effort", default="default,best", metavar="NAMES")
     options_of.add_argument("--exact", action="store_true", help="also runs with method='exact'")
-    options_of.add_argument("--seeds", default="", metavar="NUMBERS", help="one run with each")
+    options_of.add_argument(
+        "--seeds", default="", metavar="NUMBERS", help="one run with each; N for 1 to N"
+    )
     options_of.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log"
     )
@@ -100,36 +138,47 @@ def main() -> None:
     if shutil.which("checkMesh") is None:
         raise SystemExit("checkMesh is not installed; Debian has it in the package openfoam")
     adapter = make_adapter(options)
-    report = Report(options.json, COLUMNS)
+    seeds = counts(options.seeds)
+    if len(seeds) == 1:
+        seeds = list(range(1, seeds[0] + 1))
+    report = Report(options.json, SEED_COLUMNS if seeds else COLUMNS)
     chosen = options.only.split(";") if ";" in options.only else names(options.only)
     if options.only in DOMAINS:
         chosen = [options.only]  # names have commas
     runs = [(effort, {"effort": effort}) for effort in names(options.effort)]
     runs += [("exact", {"method": "exact"})] * options.exact
-    if options.seeds:
-        seeds = counts(options.seeds)
-        runs = [(f"{run}, seed {s}", {**given, "seed": s}) for run, given in runs for s in seeds]
     for name in chosen or DOMAINS:
         domain, size, more = DOMAINS[name]()
         for run, settings in runs:
             if name in LARGE and run != "default" and not chosen:
                 continue
-            begin = time.perf_counter()
-            result = adapter.run(domain, size, **{**more, **settings})
-            seconds = time.perf_counter() - begin
-            with tempfile.TemporaryDirectory() as folder:
-                label = f"{name}-{run}".replace(", ", "-").replace(" ", "-")
-                case = Path(folder) if options.keep is None else options.keep / label
-                row = measure(result, case)
-            if options.pictures is not None and domain.dim == 2:
-                options.pictures.mkdir(parents=True, exist_ok=True)
-                result.plot(title=f"{name}, {run}").savefig(
-                    options.pictures / f"{label}.png", dpi=200
-                )
-            row = {"domain": name, "run": run, "seconds": seconds, **row}
-            report.add(row, f"{name}, {run}: {'OK' if row['ok'] else row['complaints']}")
-    good = sum(row["ok"] for row in report.records)
-    report.finish(heading(adapter, f"{good} of {len(report.records)} meshes pass checkMesh"))
+            rows = []
+            for seed in seeds or [None]:
+                begin, used = time.perf_counter(), time.process_time()
+                chosen_seed = {} if seed is None else {"seed": seed}
+                result = adapter.run(domain, size, **{**more, **settings, **chosen_seed})
+                seconds = time.perf_counter() - begin
+                seconds = seconds if seed is None else time.process_time() - used
+                part = "" if seed is None else f"-{seed}"
+                label = f"{name}-{run}{part}".replace(", ", "-").replace(" ", "-")
+                with tempfile.TemporaryDirectory() as folder:
+                    row = measure(
+                        result, Path(folder) if options.keep is None else options.keep / label
+                    )
+                if options.pictures is not None and domain.dim == 2:
+                    options.pictures.mkdir(parents=True, exist_ok=True)
+                    figure = result.plot(title=f"{name}, {run}")
+                    figure.savefig(options.pictures / f"{label}.png", dpi=200)
+                rows.append({"domain": name, "run": run, "seed": seed, "seconds": seconds, **row})
+            if seeds:
+                row = over_seeds(rows)
+                report.add(row, f"{name}, {run}: {row['accepted']} of {len(rows)} {row['refused']}")
+            else:
+                row = rows[0]
+                report.add(row, f"{name}, {run}: {'OK' if row['ok'] else row['complaints']}")
+    good = sum(row.get("accepted", row["ok"]) for row in report.records)
+    total = sum(row.get("meshes", 1) for row in report.records)
+    report.finish(heading(adapter, f"{good} of {total} meshes pass checkMesh"))
 
 
 if __name__ == "__main__":
