@@ -131,7 +131,7 @@ EFFORTS = {
 
 EFFORTS_3D = {
     "fast": Effort(
-        12, 2, 2, (), glide=0, polish=4, error_target=0.004, relaxation=1.5, momentum=0.8, penalty=0.15,
+        12, 2, 3, (), glide=0, polish=4, error_target=0.004, relaxation=1.5, momentum=0.8, penalty=0.15,
         log_ratio_scale=8.0, coarse_glide=5, coarse_polish=10, recouple=1,
     ),
     "default": Effort(
