@@ -62,10 +62,11 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
                                 global const REAL *volumes, global const REAL *points, global const REAL *gradient,
                                 global const REAL *h, global const REAL *quality, global const REAL *log_ratio,
                                 global const REAL *displacement, const REAL penalty, const REAL quality_scale,
-                                const REAL wall_quality_scale, const REAL log_ratio_scale, global float *rows, global float *columns,
-                                global STORE *own, global STORE *eps, global STORE *inverse_diagonal, global STORE *r,
-                                global STORE *z, global REAL *partial, global const int *labels, const int fixed,
-                                const int warm, global const float *start PERIOD_ARGS)
+                                const REAL wall_quality_scale, const REAL log_ratio_scale, global float *rows,
+                                global float *columns, global STORE *own, global STORE *eps,
+                                global STORE *inverse_diagonal, global STORE *r, global STORE *z, global REAL *partial,
+                                global const int *labels, const int fixed, const int warm,
+                                global const float *start PERIOD_ARGS)
 {
     local REAL scratch[GROUP_SIZE];
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
