@@ -9,7 +9,7 @@ a cell is concave, the error and quality of cells on walls and of the others, an
 script ends with a message. Debian's package `openfoam` is enough.
 
 With --seeds there is one row per domain and run, for all seeds: how many meshes are accepted, and the worst figures.
-`--seeds 6` is short for `--seeds 1,2,3,4,5,6`. Processor time is that of the run and that of the solver mesh within it.
+`--seeds 6` is short for `--seeds 1,2,3,4,5,6`. Processor times are those of the run, and of making the solver mesh.
 
 The domains are in `bench/_walled.py` and `bench/_sites.py`. S3 has 1e5 cells; S2 and S3 run with their default effort
 only, unless they are named in --only.
