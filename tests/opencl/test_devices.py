@@ -353,10 +353,11 @@ def test_process_gets_a_cache_if_the_users_is_read_only(tmp_path):
         "device.create_context(); print(os.environ['XDG_CACHE_HOME'])"
     )
     blocked = {"XDG_CACHE_HOME": str(tmp_path / "file" / "cache"), "TMPDIR": str(tmp_path)}
+    given = {key: value for key, value in os.environ.items() if key != "POCL_CACHE_DIR"}
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=ROOT,
-        env={**os.environ, **blocked},
+        env={**given, **blocked},
         capture_output=True,
         text=True,
     )
