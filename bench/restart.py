@@ -11,8 +11,8 @@ after all transfers of second order of a peak of height 1 and width 0.05 beside 
 of its mass.
 
 A mesh is corrected in a few steps if its mean |e| is at most 0.15 and its count within 2 % of that of the size field.
-Otherwise the run starts as from any points. A field that moves far is therefore better followed in steps of about five
-cells.
+Otherwise the run starts as from any points. A field that moves far is therefore better followed in steps of one or two
+of its smallest cells.
 """
 
 from __future__ import annotations
