@@ -33,8 +33,8 @@ from .state import MeshState
 from .transport.phase import PowerPhase
 
 SAMPLING_GAIN = 0.26
-"""Ratio of the errors of two levels in counting cells by sizes at the generators. Measured with polished cells on S2
-and S3, which have a kink (see bench/convergence.py): 0.25 to 0.27."""
+"""The number of cells by sizes at the generators has an error. On the next finer level it is smaller by this factor:
+0.25 is that of a smooth field, and a kink adds a little."""
 WINDOW = 10
 """Steps over which error and quality are averaged to detect stagnation."""
 LEAST_PROGRESS, MAX_OSCILLATIONS = 0.9, 2

@@ -77,10 +77,10 @@ POLISH_MOMENTUM_3D, POLISH_RATE_3D = 0.5, 0.055
 """Share of the last displacement, and step length, of polishing in 3D, where the weight of cells is about 7.5. Measured
 on S2, eight steps: with twice the rate, or a momentum of 0.8, the largest errors grow and quality falls."""
 POLISH_GROWTH_3D = 1.016
-"""Factor by which polishing, which widens small faces, raises the number after refinement: measured 1.009 to 1.018."""
+"""Factor by which polishing raises the number after refinement: it widens small faces, so cells have more neighbors."""
 COUNT_FINEST_3D = {False: 3e-3, True: 1e-4}
-"""Share of the cells by which their number may differ on the finest of several levels in 3D: lengths by a third. With
-exact sizes, on S3, 6e-4 of the cells too few raise the largest error from 7e-5 to 3e-4."""
+"""Share of the cells by which their number may differ on the finest of several levels in 3D, without and with exact
+sizes. Lengths then differ by a third of it."""
 POLISH_COUNT_3D = 5e-3
 """Share of the cells by which their number may differ while polishing in 3D. Only fields with few, steep cells do."""
 LOOSE_POLISH_3D, SETTLE_PENALTY_3D = 2.0, 0.7

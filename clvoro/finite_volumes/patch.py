@@ -1,4 +1,4 @@
-"""Patches of a solver mesh in 2D: cells whose points and faces can change, within others that stay."""
+"""Patches of a solver mesh in 2D: groups of cells whose points and faces may change. All other cells stay."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ Faces that are shorter at first, and not at a bad cell, need not become longer.
 """
 _ANGLE_GOAL, _SKEWNESS_GOAL = np.radians(16), 1.5
 _TURN_GOAL = 0.02
-"""Least turn in the corners of cells that is aimed at."""
+"""Turns in the corners of cells are to be at least this large, in radians."""
 _DETERMINANT_GOAL = 0.02
 """Determinant of a cell that is aimed at."""
 _SKEW_WEIGHT, _LENGTH_WEIGHT, _AREA_WEIGHT, _TURN_WEIGHT, _DETERMINANT_WEIGHT = (
@@ -36,7 +36,7 @@ _SKEW_WEIGHT, _LENGTH_WEIGHT, _AREA_WEIGHT, _TURN_WEIGHT, _DETERMINANT_WEIGHT = 
 
 
 class Figures(NamedTuple):
-    """What the sum of squares and the prices are computed from, for g sets of points.
+    """Figures of faces, cells and corners, each for g sets of points.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class Cells:
         self.sides = np.maximum(sides, 1)
 
     def part(self, cells: np.ndarray, faces: np.ndarray) -> Cells:
-        """Return some of the cells, (m,) int ascending, and of the faces, (e,) int."""
+        """Return the part with these cells, (m,) int in ascending order, and these faces, (e,) int."""
         starts, at = take_rows(self.starts, np.arange(len(self.loop)), cells)
         place = np.full(len(self.area), -1)
         place[cells] = np.arange(len(cells))
@@ -189,7 +189,7 @@ class Cells:
         return np.concatenate(terms, axis=1)
 
     def pattern(self, active: np.ndarray, count: int) -> scipy.sparse.csr_array:
-        """Return which of all terms depend on which of the `active` ones of `count` points, (r + 2 m, m)."""
+        """Return which terms depend on which `active` points, a matrix (r + 2 m, m); there are `count` points."""
         m, n, f = len(active), len(self.area), len(self.faces)
         index = np.full(count, -1)
         index[active] = np.arange(m)

@@ -175,8 +175,19 @@ class _Connections:
         p = self.patch
         return int(p.neighbor[face] if p.owner[face] == cell else p.owner[face])
 
+    def _between(self, face: int, owner: int, neighbor: int, **changed: np.ndarray) -> Patch:
+        """Return the patch with the `changed` arrays and `face` between two cells, or a cell and a wall."""
+        p = self.patch
+        made = replace(
+            p, owner=p.owner.copy(), neighbor=p.neighbor.copy(), half_face=p.half_face.copy(), aim=p.aim.copy(),
+            **changed,
+        )  # fmt: skip
+        made.owner[face], made.neighbor[face] = owner, neighbor
+        made.half_face[face], made.aim[face] = -1, LENGTH_GOAL
+        return made
+
     def _flipped(self, face: int) -> Iterator[Patch]:
-        """Yield the patch in which the cells at both ends of a face between cells share it; at a wall, one has it."""
+        """Yield the patch in which a face is between the cells at its ends; with an end on a wall, it becomes a wall."""
         p = self.patch
         a, b = p.ends[face].tolist()
         left, right = int(p.owner[face]), int(p.neighbor[face])
@@ -206,12 +217,7 @@ class _Connections:
         ends[right_a][ends[right_a] == a] = b
         ends[left_b][ends[left_b] == b] = a
         ends[face] = (b, a) if first < last else (a, b)
-        owner, neighbor, half = p.owner.copy(), p.neighbor.copy(), p.half_face.copy()
-        owner[face], neighbor[face], half[face] = min(first, last), max(first, last), -1
-        yield replace(
-            p, points=points, ends=ends, owner=owner, neighbor=neighbor, half_face=half,
-            aim=np.where(np.arange(len(ends)) == face, LENGTH_GOAL, p.aim),
-        )  # fmt: skip
+        yield self._between(face, min(first, last), max(first, last), points=points, ends=ends)
 
     def _opened(
         self, face: int, ends_of_face: tuple[int, int], cell: int, inner: tuple[int, int], walls: tuple[int, int]
@@ -248,12 +254,8 @@ class _Connections:
                 ends[inner[k]][ends[inner[k]] == a] = pair[k]
                 ends[walls[k]][ends[walls[k]] == b] = pair[k]
             ends[face] = pair
-            owner, neighbor, half = p.owner.copy(), p.neighbor.copy(), p.half_face.copy()
-            owner[face], neighbor[face], half[face] = cell, p.neighbor[walls[0 if back else 1]], -1
-            yield replace(
-                p, points=points, positions=positions, ends=ends, owner=owner, neighbor=neighbor,
-                half_face=half, aim=np.where(np.arange(len(ends)) == face, LENGTH_GOAL, p.aim),
-            )  # fmt: skip
+            wall = int(p.neighbor[walls[0 if back else 1]])
+            yield self._between(face, cell, wall, points=points, positions=positions, ends=ends)
 
     def _closed(self, face: int) -> Iterator[Patch]:
         """Yield the patch in which a cell has left the wall, and the cells beside it there share a face."""
@@ -278,9 +280,6 @@ class _Connections:
                 ends[f][ends[f] == stays] = goes
             # On the way from the wall into the domain, the first cell along the wall is on the left.
             ends[face] = (stays, goes) if first < last else (goes, stays)
-            owner, neighbor, half = p.owner.copy(), p.neighbor.copy(), p.half_face.copy()
-            owner[face], neighbor[face], half[face] = min(first, last), max(first, last), -1
-            yield replace(
-                p, points=points, positions=positions, ends=ends, owner=owner, neighbor=neighbor,
-                half_face=half, aim=np.where(np.arange(len(ends)) == face, LENGTH_GOAL, p.aim),
+            yield self._between(
+                face, min(first, last), max(first, last), points=points, positions=positions, ends=ends
             )  # fmt: skip

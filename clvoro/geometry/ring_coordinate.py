@@ -24,7 +24,7 @@ class RingCoordinate:
         return np.searchsorted(firsts, s, side="right")
 
     def moved(self, s: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """Return the positions `s` (k,) moved by lengths (..., k) along their rings."""
+        """Return where positions `s` (k,) get when they move by lengths `by` (..., k) along their rings."""
         ring = self._rings(s)
         begin, end = self.begins[self.ring_starts[ring]], self.begins[self.ring_starts[ring + 1]]
         return begin + (s - begin + by) % (end - begin)
