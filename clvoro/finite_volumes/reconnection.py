@@ -187,7 +187,7 @@ class _Connections:
         return made
 
     def _flipped(self, face: int) -> Iterator[Patch]:
-        """Yield the patch in which a face is between the cells at its ends; with an end on a wall, it becomes a wall."""
+        """Yield the patch in which a face is between the cells at its ends; at a wall it becomes a wall."""
         p = self.patch
         a, b = p.ends[face].tolist()
         left, right = int(p.owner[face]), int(p.neighbor[face])
