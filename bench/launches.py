@@ -33,8 +33,9 @@ from _common import (
 
 import clvoro
 from clvoro.adaptation.methods import Method, ProjectedMethod, WeightedMethod
+from clvoro.adaptation.plan.actions import Step
+from clvoro.adaptation.plan.schedule import adaptive_schedule
 from clvoro.adaptation.sampling.start import count_cells
-from clvoro.adaptation.schedule import Step, adaptive_schedule
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine

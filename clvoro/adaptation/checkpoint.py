@@ -23,7 +23,7 @@ from ..mesh.results import Displacements
 from ..tessellation.cells import Cells
 from .fingerprint import schedule_digest
 from .methods import Method
-from .schedule import Action, Step
+from .plan.actions import Action, Step
 from .stages import Stages
 
 if TYPE_CHECKING:

@@ -15,20 +15,20 @@ from ..opencl.primitives import Summary
 from ..solvers.linear_system import Solution
 from .checkpoint import Checkpointer, Progress
 from .diagnostics import warn_of_obtuse_triangles
-from .efforts import RepairCells
 from .forecast import MOST_SURPLUS
 from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod
-from .schedule import (
+from .plan.actions import (
     Action,
     CorrectCount,
     InsertDelete,
     Prescribe,
     Refine,
+    RepairCells,
     ResetMomentum,
     Step,
-    work_of,
 )
+from .plan.schedule import work_of
 from .state import MeshState
 from .transport.phase import PowerPhase
 

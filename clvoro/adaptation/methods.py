@@ -286,7 +286,7 @@ class ProjectedMethod:
 
 
 PUBLISHED = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")
-"""Methods that repeat one kind of step. `clvoro.adaptation.schedule` has those of several kinds."""
+"""Methods that repeat one kind of step. `clvoro.adaptation.plan.schedule` has those of several kinds."""
 MOVING = ("mmpde", "monge-ampere")
 """Methods that repeat one kind of step and map a lattice: they start from it, in a box with walls."""
 

@@ -27,24 +27,17 @@ from .diagnostics import (
     warn_of_mismatches,
     warn_of_narrow_parts,
 )
-from .efforts import LEAST_STEEP, choose_error_target, is_near, steep_share
 from .estimates import Extras, check_memory
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
 from .options import Options
+from .plan.actions import Action, Prescribe
+from .plan.efforts import LEAST_STEEP, choose_error_target, is_near, steep_share
+from .plan.schedule import CELLS_ACROSS, MOVES, adaptive_schedule, auto_levels, repeated_schedule
 from .sampling.charts import charted
 from .sampling.quadrature import DensityTree
 from .sampling.start import density_tree, sample_density, sample_uniform
-from .schedule import (
-    CELLS_ACROSS,
-    MOVES,
-    Action,
-    Prescribe,
-    adaptive_schedule,
-    auto_levels,
-    repeated_schedule,
-)
 from .stages import Stages
 from .state import MeshState
 

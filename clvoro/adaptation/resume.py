@@ -31,7 +31,7 @@ from .checkpoint import (
 )
 from .fingerprint import domain_name, schedule_digest
 from .insertion_deletion import Generators
-from .schedule import Action, Step
+from .plan.actions import Action, Step
 from .stages import Stages
 from .state import MeshState
 

@@ -5,8 +5,8 @@ import pytest
 
 import clvoro
 from clvoro import Box, sizing
-from clvoro.adaptation.efforts import EFFORTS, is_near
-from clvoro.adaptation.schedule import adaptive_schedule
+from clvoro.adaptation.plan.efforts import EFFORTS, is_near
+from clvoro.adaptation.plan.schedule import adaptive_schedule
 
 BOXES = {2: Box((0, 0), (1, 0.8)), 3: Box((0, 0, 0), (1, 0.8, 0.7))}
 SHORT = {

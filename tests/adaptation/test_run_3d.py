@@ -7,8 +7,8 @@ import pytest
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.efforts import EFFORTS_3D
 from clvoro.adaptation.loop import Loop
+from clvoro.adaptation.plan.efforts import EFFORTS_3D
 from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
 from tests.reference import diagrams3d as reference3d
 from tests.reference import runs

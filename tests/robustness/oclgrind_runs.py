@@ -12,15 +12,15 @@ import numpy as np
 
 import clvoro
 from clvoro.adaptation import preparation
-from clvoro.adaptation.efforts import RepairCells
 from clvoro.adaptation.insertion_deletion import InsertionDeletion
 from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
-from clvoro.adaptation.schedule import (
+from clvoro.adaptation.plan.actions import (
     Action,
     CorrectCount,
     InsertDelete,
     Prescribe,
     Refine,
+    RepairCells,
     ResetMomentum,
     Step,
 )

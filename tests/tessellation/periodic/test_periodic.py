@@ -423,7 +423,7 @@ def test_ends_of_a_dropped_face_become_one_vertex(adapter, box, monkeypatch):
 
 
 def test_coarse_levels_with_too_few_cells_are_left_out(double):
-    from clvoro.adaptation.schedule import auto_levels
+    from clvoro.adaptation.plan.schedule import auto_levels
 
     box = clvoro.Box((0, 0, 0), (4, 4, 0.3), periodic=True)
     result = double.run(box, 0.07, effort="fast", max_steps=1)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .actions import RepairCells
+
 NEAR_ERROR, NEAR_COUNT = 0.15, 0.02
 """Mean |e|, and share of missing cells, up to which a given mesh is only corrected. Measured on F2 (see
 bench/restart.py): beyond them cells lose quality that only insertion and deletion restore."""
@@ -25,14 +27,6 @@ LEAST_STEEP = 0.01
 """Share of steep cells up to which a field counts as smooth."""
 SINGLE_LEVEL_ERROR_TARGET = 0.0017
 """Largest error target with one level. A mesh that is small enough for one level can reach a smaller error."""
-
-
-@dataclass(frozen=True)
-class RepairCells:
-    """Delete or split the worst cells, with 1 - Q above `deficit`; see `InsertionDeletion.repair_cells`."""
-
-    deficit: float
-    split: bool = False
 
 
 @dataclass(frozen=True)

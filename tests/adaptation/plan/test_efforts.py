@@ -5,7 +5,7 @@ import pytest
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.efforts import (
+from clvoro.adaptation.plan.efforts import (
     EFFORTS,
     EFFORTS_3D,
     SINGLE_LEVEL_ERROR_TARGET,

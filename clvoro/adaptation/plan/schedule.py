@@ -33,11 +33,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from .efforts import EFFORTS, EFFORTS_3D, Effort, RepairCells, choose_error_target
-from .insertion_deletion import CLIMB_STRAIN
-from .methods import Method, ProjectedMethod, WeightedMethod
+from ..methods import Method, ProjectedMethod, WeightedMethod
+from .actions import Action, CorrectCount, InsertDelete, Refine, RepairCells, ResetMomentum, Step
+from .efforts import EFFORTS, EFFORTS_3D, Effort, choose_error_target
 
 COARSEST = {2: 1400, 3: 1500}
 """Approximate number of cells of the coarsest level by dimension.
@@ -126,63 +126,6 @@ STRIDE = 2.0
 """Largest displacement over h of a stride."""
 NEAR_PENALTY = 0.03
 """Initial penalty of polishing a corrected mesh: a larger one would give up the sizes first."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """Displace and move all generators, and tessellate them; then open obtuse triangles, at most `openings` times.
-
-    With `recent`, only if the number of cells has changed since so many steps.
-    """
-
-    method: Method
-    openings: int = 0
-    recent: int = 0
-
-
-@dataclass(frozen=True)
-class InsertDelete:
-    """Insert and delete generators.
-
-    `nuclei` is the share of the cells where dislocations may be nucleated, `climb_strain` the strain above which they
-    climb, `least` the smallest share of missing cells for which anything is done.
-    """
-
-    nuclei: float = 0.0
-    climb_strain: float = CLIMB_STRAIN
-    least: float = 0.0
-
-
-@dataclass(frozen=True)
-class Refine:
-    """Refine to the next finer level."""
-
-
-@dataclass(frozen=True)
-class ResetMomentum:
-    """Set the velocities to zero."""
-
-
-@dataclass(frozen=True)
-class CorrectCount:
-    """Correct the number of cells to the fixed one.
-
-    With `share`, correct it to within that share of the number that the size field requires; with `ahead`, to the
-    number from which refinement gives that of the next level, which until then grows by this factor.
-    """
-
-    share: float = 0.0
-    ahead: float = 0.0
-
-
-@dataclass(frozen=True)
-class Prescribe:
-    """Give the cells their target volumes in a power diagram, again after each of `moves` moves to the centroids."""
-
-    moves: int = 0
-
-
-Action = Step | InsertDelete | RepairCells | Refine | CorrectCount | ResetMomentum | Prescribe
 
 
 def auto_levels(n: float, dim: int) -> int:
