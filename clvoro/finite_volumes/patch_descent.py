@@ -1,8 +1,7 @@
 """Points of a patch moved so that its faces are less skew and nearer to orthogonal: a least-squares problem.
 
-Points on walls slide along the boundary or stay. The method is Levenberg's and Marquardt's, with differences in place
-of derivatives; the sum of squares is that of `patch_figures`. Whether a patch becomes better is decided by its price,
-the sum of what is beyond the limits.
+Points on walls slide along the boundary or stay. The sum of squares is that of `patch_figures`; its derivatives are
+differences. Whether a patch becomes better is decided by its price, the sum of what is beyond the limits.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
-import scipy.sparse.csgraph
 
 from ..geometry.ring_coordinate import RingCoordinate
 from ..mesh.connectivity import following
@@ -33,14 +31,8 @@ _INVERTED_PRICE, _CONCAVE_PRICE = 100.0, 3.0
 _MOVE_WEIGHT = 0.1
 _STEP = 1e-6
 """Step of differences, over the width of a cell."""
-_LONGEST = 0.5
-"""Longest move of a point in one step, over the width of a cell."""
-_DAMPINGS = 9
-"""Most tries of a step, each with a damping eight times as large."""
 _TOLERANCE = 1e-3
-"""Share of the sum of squares by which a step must reduce it if another one is to follow."""
-_DENSE = 400
-"""Most unknowns for a dense matrix."""
+"""Relative change of the sum of squares at which the moves end."""
 
 
 class Descent:
@@ -137,7 +129,7 @@ class Descent:
     def solve(
         self, near: np.ndarray, ring: RingCoordinate | None, slide: bool, steps: int
     ) -> Descent:
-        """Return the descent after some `steps` in which points of the cells `near` (n,) bool moved.
+        """Return the descent after points of the cells `near` (n,) bool moved, in at most so many `steps`.
 
         Points on walls `slide` along the boundary `ring` or stay.
         """
@@ -209,6 +201,8 @@ def _minimum(
     cells: Cells, motion: _Motion, pattern: scipy.sparse.csr_array, steps: int
 ) -> np.ndarray:
     """Return the moves (1, m, 2) after some steps towards a minimum of the sum of squares."""
+    from scipy.optimize import least_squares
+
     m = len(motion.active)
 
     def residuals(moves: np.ndarray) -> np.ndarray:
@@ -223,52 +217,20 @@ def _minimum(
     for axis in range(2):
         steps_aside[2 * color + axis, np.arange(m), axis] = _STEP
     steps_aside[:, motion.slides, 1] = 0
-    moves, damping = np.zeros((1, m, 2)), 1e-3
-    now = residuals(moves)[0]
-    cost = float((now * now).sum())
-    for _ in range(steps):
-        slope = (residuals(moves + steps_aside) - now) / _STEP
-        shape = (len(now), 2 * m)
-        jacobian = scipy.sparse.csr_array((slope[groups, rows], (rows, columns)), shape)
-        hessian, gradient = jacobian.T @ jacobian, jacobian.T @ now
-        diagonal = hessian.diagonal()
-        for _ in range(_DAMPINGS):
-            step = _solved(hessian, damping * diagonal + 1e-9, -gradient).reshape(1, m, 2)
-            step = np.clip(step, -_LONGEST, _LONGEST)
-            ahead = residuals(moves + step)[0]
-            reached = float((ahead * ahead).sum())
-            if reached < cost:
-                break
-            damping *= 8
-        else:
-            break
-        gain = cost - reached
-        moves, now, cost, damping = moves + step, ahead, reached, max(damping / 5, 1e-6)
-        if gain < _TOLERANCE * cost:
-            break
-    return moves
 
+    def at(x: np.ndarray) -> np.ndarray:
+        return residuals(x.reshape(1, m, 2))[0]
 
-def _solved(matrix: scipy.sparse.csr_array, added: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solution of a symmetric system with `added` on the diagonal; patches along walls are narrow bands."""
-    from scipy.linalg import solveh_banded
+    def jacobian(x: np.ndarray) -> scipy.sparse.csr_array:
+        slope = (residuals(x.reshape(1, m, 2) + steps_aside) - at(x)) / _STEP
+        return scipy.sparse.csr_array(
+            (slope[groups, rows], (rows, columns)), (len(slope[0]), 2 * m)
+        )
 
-    n = len(right)
-    if n <= _DENSE:
-        return np.linalg.solve(matrix.toarray() + np.diag(added), right)
-    order = scipy.sparse.csgraph.reverse_cuthill_mckee(matrix, symmetric_mode=True)
-    rank = np.empty(n, np.int64)
-    rank[order] = np.arange(n)
-    whole = scipy.sparse.coo_array(matrix + scipy.sparse.diags_array(added))
-    i, j = rank[whole.row], rank[whole.col]
-    upper = i <= j
-    i, j, values = i[upper], j[upper], whole.data[upper]
-    width = int((j - i).max())
-    band = np.zeros((width + 1, n))
-    band[width + i - j, j] = values
-    found = np.empty(n)
-    found[order] = solveh_banded(band, right[order])
-    return found
+    found = least_squares(
+        at, np.zeros(2 * m), jacobian, ftol=_TOLERANCE, max_nfev=steps, tr_solver="lsmr"
+    )
+    return found.x.reshape(1, m, 2)
 
 
 def _colors(pattern: scipy.sparse.csr_array) -> np.ndarray:

@@ -29,8 +29,8 @@ _RINGS = 5
 """Rings of cells around a bad place that are regarded."""
 _TRIES = (1, 3)
 """Rings of cells whose points move before faces change."""
-_FIRST_STEPS, _STEPS = 4, 12
-"""Steps of descent after each change, and after the best ones."""
+_FIRST_STEPS, _STEPS = 7, 15
+"""Most steps of descent after each change, and after the best ones."""
 _BEST = 3
 _MOST = 100
 """Most places that are regarded in a patch, the same ones again included."""

@@ -28,7 +28,7 @@ _RINGS = 5
 """Rings of cells around those beyond a limit that make a patch."""
 _TRIES = (1, 3)
 """Rings of cells whose points inside move, one try after the other."""
-_STEPS = 12
+_STEPS = 15
 _MOST, _SHARE = 50, 0.02
 """Nothing changes if more faces are bad than this number, and than this share: the generators were not adapted."""
 
