@@ -18,8 +18,24 @@ import pyopencl.array as cla
 
 from .memory_limits import check_allocation
 
-_QUICK = "_fast" in inspect.signature(cla.Array.__init__).parameters
-"""Whether PyOpenCL's constructor has a private option that skips checks."""
+_ATTRIBUTES = {
+    "queue", "context", "shape", "dtype", "strides", "events", "nbytes", "size", "allocator", "base_data", "offset",
+    "_flags",
+}  # fmt: skip
+"""What PyOpenCL's constructor sets."""
+
+
+def _is_known() -> bool:
+    """Return whether an array of this PyOpenCL has the attributes that `make_array` sets, and no others."""
+    if "_fast" not in inspect.signature(cla.Array.__init__).parameters:
+        return False
+    kind = np.dtype(np.int8)
+    plain = cla.Array(None, (1,), kind, data=0, strides=(1,), _fast=True, _size=1)
+    return set(vars(plain)) == _ATTRIBUTES
+
+
+_QUICK = _is_known()
+"""Whether arrays are made without PyOpenCL's constructor, which takes most of the time."""
 _PATTERN = 64
 """Largest pattern in bytes to fill memory with; long patterns are faster."""
 _ZEROS = np.zeros(_PATTERN, np.uint8)
@@ -31,13 +47,21 @@ _marks = count()
 class DeviceArray(cla.Array):
     """A contiguous array on an in-order queue; see `make_array`."""
 
-    @cached_property
-    def mark(self) -> int:
-        """Unique number of this array. Views of its first rows have the same number, and no other array ever has it.
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.mark = next(_marks)
 
-        An address does not identify an array, because freed memory is used again.
-        """
-        return next(_marks)
+    mark: int
+    """Unique number of this array. Views of its first rows have the same number, and no other array ever has it.
+
+    An address does not identify an array, because freed memory is used again.
+    """
+
+    @cached_property
+    def context(self) -> cl.Context:  # type: ignore[override]
+        """The context of the queue."""
+        assert self.queue is not None
+        return self.queue.context
 
     def _place(self) -> tuple[cl.CommandQueue, cl.Buffer]:
         """Return queue and buffer of an array that is not empty."""
@@ -124,16 +148,22 @@ def make_array(
     MemoryLimitError
         If the device does not allocate so large a buffer.
     """
-    shape = shape if isinstance(shape, tuple) else (int(shape),)
+    if type(shape) is not tuple:
+        shape = (int(shape),)  # type: ignore[arg-type]
+    size = math.prod(shape)
+    bytes_ = size * dtype.itemsize
     if data is None:
-        check_allocation(queue.device, math.prod(shape) * dtype.itemsize)
+        check_allocation(queue.device, bytes_)
     if not _QUICK:
         return DeviceArray(queue, shape, dtype, data=data, offset=offset)
-    strides, step = [], dtype.itemsize
+    if data is None and bytes_:
+        data = cl.Buffer(queue.context, cl.mem_flags.READ_WRITE, bytes_)
+    strides, step = (), dtype.itemsize
     for length in reversed(shape):
-        strides.append(step)
-        step *= max(1, length)
-    return DeviceArray(
-        None, shape, dtype, data=data, offset=offset, strides=tuple(reversed(strides)),
-        _fast=True, _size=int(math.prod(shape)), _context=queue.context, _queue=queue,
-    )  # fmt: skip
+        strides, step = (step, *strides), step * max(1, length)
+    array = DeviceArray.__new__(DeviceArray)
+    array.queue, array.base_data, array.offset = queue, data, offset
+    array.shape, array.dtype, array.strides = shape, dtype, strides
+    array.size, array.nbytes = size, bytes_
+    array.events, array.allocator, array._flags, array.mark = [], None, None, next(_marks)
+    return array

@@ -151,11 +151,21 @@ def comparison_key(args: Sequence[object]) -> list[object]:
 
 def with_buffers(args: Sequence[object]) -> list[Any]:
     """Return the arguments with arrays replaced by their buffers."""
-    return [a.data if isinstance(a, cla.Array) else a for a in args]
+    # `data` raises an error for an array that does not begin at the start of its buffer.
+    return [
+        (a.data if a.offset else a.base_data)
+        if type(a) is DeviceArray
+        else a.data
+        if isinstance(a, cla.Array)
+        else a
+        for a in args
+    ]
 
 
 def _key_of(argument: object) -> object:
     """Return the key of an argument that is neither a device array nor an int."""
+    if type(argument) is np.float64 and argument:
+        return argument
     # The bytes of 0 and -0 differ. A new object is equal to nothing else.
     return argument.tobytes() if isinstance(argument, (np.generic, np.ndarray)) else object()
 
