@@ -231,3 +231,28 @@ kernel void gather_rows(const int size, global const int *items, global const ui
     for (int w = 0; w < words; ++w)
         out[words * p + w] = rows[words * i + w];
 }
+
+/* Row p of `out` is list order[p] of `items`, which begins at starts[order[p]], and begins at to[p]. An item has
+   `words` 32-bit words of any type. */
+kernel void gather_lists(const int size, global const int *order, global const int *starts, global const int *to,
+                         global const uint *items, const int words, global uint *out)
+{
+    WORK_ITEM(p);
+    const int begin = starts[order[p]];
+    const ulong count = (ulong)words * (starts[order[p] + 1] - begin);
+    items += (ulong)words * begin;
+    out += (ulong)words * to[p];
+    for (ulong w = 0; w < count; ++w)
+        out[w] = items[w];
+}
+
+/* The same for items that are integers: names[item] where an item is not negative. */
+kernel void gather_renamed_lists(const int size, global const int *order, global const int *starts,
+                                 global const int *to, global const int *items, global const int *names,
+                                 global int *out)
+{
+    WORK_ITEM(p);
+    const int shift = to[p] - starts[order[p]];
+    for (int c = starts[order[p]]; c < starts[order[p] + 1]; ++c)
+        out[c + shift] = items[c] < 0 ? items[c] : names[items[c]];
+}

@@ -13,6 +13,7 @@ from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..sizing import Sizing
 from ..tessellation.device_diagram import Tessellation
+from ..tessellation.readback.diagram import order_of
 from .insertion_deletion import Generators
 from .motion import Moving
 from .stages import Stages
@@ -204,9 +205,13 @@ class MeshArrays:
         speeds = {"lloyd": self.lloyd_speed, "correction": self.correction_speed}
         self.summaries.collect_all(speeds, self.n)
 
-    def to_host(self, array: cla.Array, factor: float = 1.0) -> np.ndarray:
-        """Return `array` (n, ...) on the host in the order of labels, times `factor`."""
+    def ordered(self, array: cla.Array) -> np.ndarray:
+        """Return `array` (n, ...) on the host in the order of labels."""
         # The labels are a new array whenever the order changes.
         if self._ordered is not self.labels:
-            self._order, self._ordered = np.argsort(self.labels.get(), kind="stable"), self.labels
-        return array.get()[self._order].astype(np.float64) * factor
+            self._order, self._ordered = order_of(self.labels.get()), self.labels
+        return np.take(array.get(), self._order, axis=0)
+
+    def to_host(self, array: cla.Array, factor: float = 1.0) -> np.ndarray:
+        """Return `array` (n, ...) on the host in the order of labels, times `factor`."""
+        return np.multiply(self.ordered(array), factor, dtype=np.float64)

@@ -334,29 +334,34 @@ class Loop:
         """Append a row to the history."""
         mesh = self.mesh
         s, n, labeled = mesh.read_summaries(), mesh.n, mesh.next_label
-        row = np.zeros(1, HISTORY_DTYPE)
-        row["step"], row["level"], row["cells"] = self.steps, self.level, n
-        row["progress"] = progress
-        self.write_quality(row, s)
+        row: dict[str, float] = dict.fromkeys(HISTORY_DTYPE.fields or (), 0)
+        row |= {"step": self.steps, "level": self.level, "cells": n, "progress": progress}
+        row |= self.qualities(s)
         row["changed"], row["ever_changed"] = round(s["changed"].sum), s["ever_changed"].sum / n
         # Each inserted generator gets a new label.
         row["inserted"] = labeled - self.labeled
-        before = self.rows[-1]["cells"] if self.rows else self.n_start
+        before = int(self.rows[-1]["cells"][0]) if self.rows else self.n_start
         row["deleted"] = before + row["inserted"] - n
         if self.solution is not None:
             row["lloyd"], row["poisson"] = s["lloyd"].sum / n, s["correction"].sum / n
             row["iterations"], row["residual"] = self.solution.iterations, self.solution.residual
         row["seconds"] = time.perf_counter() - self.began
+        # Faster than one field after the other.
+        new = np.array([tuple(row.values())], HISTORY_DTYPE)
         # Without a call in between: after an interruption there, insertions would be counted twice.
-        self.rows += [row]
+        self.rows += [new]
         self.labeled = labeled
 
-    def write_quality(self, row: np.ndarray, s: dict[str, Summary]) -> None:
-        """Write errors, qualities and energy to `row`, from the summaries `s`."""
+    def qualities(self, s: dict[str, Summary]) -> dict[str, float]:
+        """Return errors, qualities and energy for a row of the history, from the summaries `s`."""
         mesh, n = self.mesh, self.mesh.n
-        row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak
-        row["mean_quality"], row["min_quality"] = s["quality"].sum / n, s["quality"].least
-        row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.cell_dim + 2)
+        return {
+            "mean_error": s["error"].magnitude / n,
+            "max_error": s["error"].peak,
+            "mean_quality": s["quality"].sum / n,
+            "min_quality": s["quality"].least,
+            "energy": s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.cell_dim + 2),
+        }
 
     def end_reason(self, stop: bool, over: bool = False) -> str:
         """Return why the run ends, or "" if it continues. `over`: the schedule has ended."""
@@ -408,8 +413,9 @@ class Loop:
                 final = self.displacements()
         if mesh.finalize():
             # Faces shorter than round-off may have changed, and with them the quality.
-            self.write_quality(self.rows[-1], mesh.read_summaries())
-        labels = np.sort(mesh.labels.get())
+            for name, value in self.qualities(mesh.read_summaries()).items():
+                self.rows[-1][name] = value
+        labels = mesh.ordered(mesh.labels)
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
         diagram = mesh.fetch_diagram()

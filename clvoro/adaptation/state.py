@@ -336,7 +336,10 @@ class MeshState(MeshArrays):
         finer = self.stages.refinement.refine(self.free, self.t, self.h, self.labels, self.fixed)
         start, n = {"points": finer}, len(finer)
         del finer
-        start["labels"] = self.engine.upload(self.next_label + np.arange(n) - self.n, np.int32)
+        start["labels"] = self.engine.upload(
+            np.arange(self.next_label - self.n, self.next_label - self.n + n, dtype=np.int32),
+            np.int32,
+        )
         cl.enqueue_copy(
             self.engine.queue, buffer_of(start["labels"]), buffer_of(self.labels), byte_count=self.labels.nbytes
         )  # fmt: skip

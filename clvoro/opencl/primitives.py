@@ -6,8 +6,9 @@ takes 3.4 ms for 10^6 integers on PoCL with two cores, and 1.7 s to compile. The
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pyopencl.array as cla
@@ -55,8 +56,7 @@ class Scan:
         engine.run_blocks(k.scan_blocks, *given, *to)
 
 
-@dataclass(frozen=True)
-class Summary:
+class Summary(NamedTuple):
     """Sum, sum of magnitudes, minimum and maximum of an array."""
 
     sum: float
@@ -153,15 +153,54 @@ class Gather:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._kernel = engine.kernels("opencl/primitives").gather_rows
+        self._kernels = engine.kernels("opencl/primitives")
 
     def rows(self, items: cla.Array, array: cla.Array) -> cla.Array:
         """Return a new array whose row p is ``array[items[p]]``."""
         shape = (items.shape[0], *array.shape[1:])
         out = self.engine.empty(shape, array.dtype)
-        words = int(np.prod(array.shape[1:], dtype=int)) * array.dtype.itemsize // 4
-        self.engine.run_each(self._kernel, shape[0], items, array, np.int32(words), out)
+        self.engine.run_each(
+            self._kernels.gather_rows, shape[0], items, array, _words_of(array), out
+        )
         return out
+
+    def lists(self, lists: Lists, array: cla.Array, names: cla.Array | None = None) -> cla.Array:
+        """Return a new array of the same shape with the lists of rows of `array` in another order.
+
+        With `names` the array is int32, and a number i that is not negative becomes ``names[i]``.
+        """
+        out = self.engine.empty(array.shape, array.dtype)
+        if not len(array):
+            return out
+        size, given = len(lists.order), (lists.order, lists.starts, lists.to, array)
+        if names is None:
+            self.engine.run_each(self._kernels.gather_lists, size, *given, _words_of(array), out)
+        else:
+            self.engine.run_each(self._kernels.gather_renamed_lists, size, *given, names, out)
+        return out
+
+
+class Lists(NamedTuple):
+    """Lists of rows, one after the other, and their new order, on the device.
+
+    Attributes
+    ----------
+    order : (n,) int32
+        Present place of each list in the new order.
+    starts : (n + 1,) int32
+        Where the present lists begin.
+    to : (n or more,) int32
+        Where the lists begin in the new order.
+    """
+
+    order: cla.Array
+    starts: cla.Array
+    to: cla.Array
+
+
+def _words_of(array: cla.Array) -> np.int32:
+    """Return the number of 32-bit words of a row."""
+    return np.int32(math.prod(array.shape[1:]) * array.dtype.itemsize // 4)
 
 
 class NamedArrays:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from clvoro.opencl.primitives import Gather, Scan, Summaries
+from clvoro.opencl.primitives import Gather, Lists, Scan, Summaries
 from tests.reference import patch
 
 
@@ -87,11 +87,11 @@ def test_summaries_are_read_together_with_an_integer(engine):
     values = summaries.values.get()
     found, first = summaries.read_with(note)
     assert first == -7
-    assert vars(found["z"]) == dict.fromkeys(("sum", "magnitude", "least", "largest"), 0)
+    assert found["z"] == (0, 0, 0, 0)
     for name, factor in (("a", 1), ("b", 2), ("c", 1)):
         assert found[name].least == factor * arrays[name].min()
         assert found[name].largest == factor * arrays[name].max()
-    assert np.array_equal(values, [list(vars(found[name]).values()) for name in "zabc"])
+    assert np.array_equal(values, [found[name] for name in "zabc"])
     # Restored slots have their old values, also after later collections.
     summaries.collect("c", engine.upload(np.full(n, 9.0)), n)
     summaries.values.set(values)
@@ -138,3 +138,28 @@ def test_gather(scan, dtype, width):
     out = Gather(engine).rows(engine.upload(items, np.int32), engine.upload(array, dtype))
     assert out.dtype == dtype
     assert np.array_equal(out.get(), array[items])
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.float32, np.float64])
+@pytest.mark.parametrize("width", [None, 2])
+@pytest.mark.parametrize("n", [1, 300])
+def test_gather_lists(scan, dtype, width, n):
+    rng = np.random.default_rng(7 + n)
+    counts, order = rng.integers(0, 9, n), rng.permutation(n)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    to = np.concatenate([[0], np.cumsum(counts[order])])
+    items = rng.integers(-5, n, (starts[-1],) if width is None else (starts[-1], width))
+    places = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in order])
+    engine = scan.engine
+    lists = Lists(*(engine.upload(a, np.int32) for a in (order, starts, to)))
+    found = Gather(engine).lists(lists, engine.upload(items, dtype))
+    assert found.dtype == dtype
+    assert np.array_equal(found.get(), items[places].astype(dtype))
+    if dtype == np.int32 and width is None:
+        names = rng.permutation(n)
+        renamed = Gather(engine).lists(
+            lists, engine.upload(items, dtype), engine.upload(names, dtype)
+        )
+        assert np.array_equal(
+            renamed.get(), np.where(items >= 0, names[np.maximum(items, 0)], items)[places]
+        )

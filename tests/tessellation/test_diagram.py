@@ -12,6 +12,7 @@ from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import FLAGS, ROW_CAPACITY, Cells
 from clvoro.tessellation.device_diagram import DOUBT
 from clvoro.tessellation.face_rows import SLOT
+from clvoro.tessellation.readback.diagram import order_of
 from tests.reference import diagrams as reference
 
 BOX = clvoro.Box((0.0, 0.0), (2.5, 1.5))
@@ -336,3 +337,11 @@ def test_cells_with_two_faces_are_rejected(ctx, doubtful):
         flags, m = cells._match(rows, BOX, points, n, *old, exact=True)
         assert m == 9 - two
         assert flags == (COLLAPSED if two else 0) | (DOUBT if doubtful else 0)
+
+
+@pytest.mark.parametrize(
+    "labels", [[], [0], [3], [2, 0, 1], [7, 1, 4], [10**9, 5, 0], [0, 4, 2, 9]]
+)
+def test_order_of_labels(labels):
+    given = np.array(labels, np.int32)
+    assert np.array_equal(order_of(given), np.argsort(given))

@@ -12,6 +12,7 @@ from ...geometry.box import Box, ClipBox, Domain
 from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
+from ...opencl.primitives import Gather, Lists
 from ..device_diagram import UNEVEN, CloseError, Tessellation
 from ..periodic.periodic_tessellator import ExtendedDiagram
 from ..topology3d.consistency import SharedFaces, share_faces
@@ -66,6 +67,16 @@ def fetch_diagram(
     return reader.diagram()
 
 
+def order_of(labels: np.ndarray) -> np.ndarray:
+    """Return the places of `labels` (n,) in ascending order. They are distinct and not negative."""
+    largest = int(labels.max(initial=-1))
+    if largest >= 4 * len(labels):
+        return np.argsort(labels, kind="stable")
+    places = np.full(largest + 1, -1, np.int32)
+    places[labels] = np.arange(len(labels), dtype=np.int32)
+    return places[places >= 0].astype(np.intp)
+
+
 def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
     """Return `t`, or a copy of it, with arrays cut to its `m` faces."""
 
@@ -112,7 +123,7 @@ class _DiagramReader:
     @cached_property
     def order(self) -> np.ndarray:
         """Row on the device of each row of the result, (n,)."""
-        return np.argsort(self.labels, kind="stable")
+        return order_of(self.labels)
 
     def diagram(self) -> Diagram:
         """Return the result, with the arrays that `names` lists."""
@@ -176,20 +187,27 @@ class _DiagramReader:
         return np.concatenate([[0], np.cumsum(self.kept)])[starts]
 
     @cached_property
-    def owners(self) -> np.ndarray:
-        """Row on the device of the cell of each face of the result, (m,)."""
-        return np.repeat(self.order, np.diff(self.starts)[self.order])
+    def counts(self) -> np.ndarray:
+        """Number of faces of each row of the result, (n,)."""
+        return np.diff(self.starts)[self.order]
 
     @cached_property
     def slots(self) -> np.ndarray:
         """Index on the device of each face of the result, (m,)."""
-        m = len(self.owners)
-        places = (
-            self.starts[self.owners]
-            + np.arange(m)
-            - self.neighbor_starts()[self.ranks[self.owners]]
-        )
+        shift = self.starts[self.order] - self.neighbor_starts()[:-1]
+        places = np.repeat(shift, self.counts)
+        places += np.arange(len(places), dtype=places.dtype)
         return places if self.kept is None else np.flatnonzero(self.kept)[places]
+
+    @cached_property
+    def lists(self) -> Lists | None:
+        """Cells with their faces in the order of the result, on the device; None if it has not the same faces."""
+        if self.kept is not None:
+            return None
+        upload = self.engine.upload
+        return Lists(
+            upload(self.order, np.int32), self.t.starts, upload(self.neighbor_starts(), np.int32)
+        )
 
     @cached_property
     def ranks(self) -> np.ndarray:
@@ -208,15 +226,36 @@ class _DiagramReader:
         """`starts` of the vertex loops of faces on the device, (m + 1,)."""
         return self.faces.starts.get()
 
-    def _read(self, array: cla.Array, rows: np.ndarray, power: int) -> np.ndarray:
-        return array.get().astype(np.float64)[rows] * self.scale**power
+    def _read(self, array: cla.Array, power: int) -> np.ndarray:
+        """Return an array of cells in physical units."""
+        return self._physical(np.take(array.get(), self.order, axis=0), power)
+
+    def _read_faces(self, array: cla.Array) -> np.ndarray:
+        """Return an array of faces."""
+        if self.lists is None:
+            return np.take(array.get(), self.slots, axis=0)
+        return Gather(self.engine).lists(self.lists, array).get()
+
+    def _physical(self, numbers: np.ndarray, power: int = 1) -> np.ndarray:
+        """Return `numbers` in physical units. The array may be used for that."""
+        if numbers.dtype != np.float64:
+            return np.multiply(numbers, self.scale**power, dtype=np.float64)
+        numbers *= self.scale**power
+        return numbers
+
+    def _placed(self, numbers: np.ndarray) -> np.ndarray:
+        """Return positions in physical units, within the domain. The array may be used for that."""
+        x = self._physical(numbers)
+        # Round-off must not move a point on a wall out of the domain. Axis by axis is faster.
+        for a in range(x.shape[1]):
+            x[:, a] += self.origin[a]
+            np.clip(x[:, a], self.domain.lower[a], self.domain.upper[a], out=x[:, a])
+        return x
 
     # One method per array of `Diagram`.
 
     def points(self) -> np.ndarray:
-        positions = self._read(self.t.points, self.order, 1) + self.origin
-        # Round-off must not move a generator on a wall out of the domain.
-        return np.clip(positions, self.domain.lower, self.domain.upper)
+        return self._placed(np.take(self.t.points.get(), self.order, axis=0))
 
     def weights(self) -> np.ndarray:
         assert self.t.weighted is not None
@@ -224,20 +263,27 @@ class _DiagramReader:
         return rows.astype(np.float64) * self.scale**2
 
     def volumes(self) -> np.ndarray:
-        return self._read(self.t.volumes, self.order, self.engine.cell_dim)
+        return self._read(self.t.volumes, self.engine.cell_dim)
 
     def centroids(self) -> np.ndarray:
-        return self._read(self.t.offsets, self.order, 1) + self.points()
+        found = self._read(self.t.offsets, 1)
+        found += self.points()
+        return found
 
     def neighbor_starts(self) -> np.ndarray:
-        return np.concatenate([[0], np.cumsum(np.diff(self.starts)[self.order])]).astype(np.int32)
+        found = np.zeros(self.n + 1, np.int32)
+        np.cumsum(self.counts, out=found[1:])
+        return found
 
     def neighbors(self) -> np.ndarray:
-        j = self.t.neighbors.get()[self.slots]
-        return np.where(j >= 0, self.ranks[np.maximum(j, 0)], j).astype(np.int32)
+        if self.lists is None:
+            j = self._read_faces(self.t.neighbors)
+            return np.where(j >= 0, self.ranks[np.maximum(j, 0)], j)
+        ranks = self.engine.upload(self.ranks, np.int32)
+        return Gather(self.engine).lists(self.lists, self.t.neighbors, ranks).get()
 
     def face_measures(self) -> np.ndarray:
-        measures = self._read(self.t.face_measures, self.slots, self.engine.cell_dim - 1)
+        measures = self._physical(self._read_faces(self.t.face_measures), self.engine.cell_dim - 1)
         if self.kept is not None and self.faces.merged:
             # Of a small face the vertices may have been merged along a line.
             small = measures < SMALL_FACE * measures.mean()
@@ -256,20 +302,20 @@ class _DiagramReader:
         return np.linalg.norm(np.add.reduceat(triangles, starts), axis=1) / 2
 
     def face_centroids(self) -> np.ndarray:
-        own = self._read(self.t.points, self.owners, 1) + self.origin
-        return self._read(self.t.face_centroids, self.slots, 1) + own
+        own = self._read(self.t.points, 1) + self.origin
+        found = self._physical(self._read_faces(self.t.face_centroids))
+        found += np.repeat(own, self.counts, axis=0)
+        return found
 
     def vertices(self) -> np.ndarray:
         shared = self.shared if self.engine.cell_dim == 2 else self.faces
-        positions = shared.positions.get().astype(np.float64) * self.scale + self.origin
-        # Round-off must not move a vertex out of the domain.
-        return np.clip(positions, self.domain.lower, self.domain.upper)
+        return self._placed(shared.positions.get())
 
     def cell_vertex_starts(self) -> np.ndarray:
         return self.neighbor_starts()
 
     def cell_vertices(self) -> np.ndarray:
-        return self.shared.cell_vertices.get()[self.slots]
+        return self._read_faces(self.shared.cell_vertices)
 
     def face_vertex_starts(self) -> np.ndarray:
         lengths = np.diff(self.loop_starts)[self.slots]

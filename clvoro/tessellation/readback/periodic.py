@@ -99,7 +99,7 @@ class _PeriodicReader(_DiagramReader):
         return self.faces.vertices.get()[places]
 
     def points(self) -> np.ndarray:
-        positions = self._read(self.t.points, self.order, 1) + self.origin
+        positions = self._read(self.t.points, 1) + self.origin
         lower, upper = np.array(self.domain.lower), np.array(self.domain.upper)
         last = np.where(self.domain.periodic, np.nextafter(upper, lower), upper)
         return np.clip(positions, lower, last)

@@ -122,6 +122,11 @@ class _PolygonReader(_DiagramReader):
         return order
 
     @cached_property
+    def lists(self) -> None:
+        """None: faces have another order than on the device."""
+        return
+
+    @cached_property
     def _chained(self) -> tuple[np.ndarray, dict[int, list[int]]]:
         """Indices of faces, and the lengths of the loops of those rows of the result that have several loops."""
         default = super().slots
