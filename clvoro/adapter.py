@@ -424,7 +424,7 @@ class Adapter:
         --------
         >>> adapter = clvoro.Adapter()
         >>> bytes_ = adapter.memory_needed(clvoro.Box((0, 0), (1, 1)), 0.01)
-        >>> 4e6 < bytes_ < 5e6
+        >>> 5e6 < bytes_ < 6e6
         True
         """
         start, given = _generators(points)

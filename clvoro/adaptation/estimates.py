@@ -20,7 +20,7 @@ from .forecast import IMAGE_REACH, expected_boundary_cells
 MAX_CELLS = 100_000_000
 """Limit of the 32-bit indices into rows of neighbors."""
 SPHERE = "sphere"
-PEAK: dict[int | str, tuple[int, int]] = {2: (21, 73), 3: (156, 211), SPHERE: (33, 90)}
+PEAK: dict[int | str, tuple[int, int]] = {2: (28, 78), 3: (132, 278), SPHERE: (33, 90)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, and on a sphere (bench/memory.py)."""
 TRIMMED_PEAK = (62, 75)
 """The same in polygons, where the boundary trims cells and faces are in full precision."""

@@ -1,4 +1,4 @@
-"""A stack of device memory for temporary arrays.
+"""A pool of device memory for temporary arrays.
 
 Stages need temporary arrays: lists of candidate faces, the vectors of a linear solve. They take them from the workspace
 for the time of a frame,
@@ -13,6 +13,7 @@ Commands that still use it are done before, because the queue is in order.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, insort
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar
@@ -27,6 +28,13 @@ from .device_array import make_array
 Method = TypeVar("Method", bound=Callable[..., Any])
 MOST_VIEWS = 1000
 """Largest number of arrays that are kept. Sizes, such as the number of faces, change from step to step."""
+SLACK, MORE_SLACK = 1.05, 1.05
+"""Bytes that are kept over those that arrays have needed at a time, and the factor of this ratio whenever buffers are
+freed because of it: needs that alternate must not free and allocate for ever."""
+LOOSEST, SMALL = 4, 4096
+"""Largest ratio of a buffer's bytes to those of its array, and bytes that it may have in any case."""
+SPARE = 32
+"""A new buffer is larger than needed by one part in so many: the next step may need a little more."""
 
 
 def framed(method: Method) -> Method:
@@ -41,10 +49,12 @@ def framed(method: Method) -> Method:
 
 
 class Workspace:
-    """A stack of device arrays.
+    """Device arrays that are valid in a frame.
 
-    The memory grows when a frame needs more than all before, and is kept in one piece, unless this is larger than the
-    device's largest buffer. So repeated steps allocate nothing.
+    An array lies in the smallest free buffer that is large enough, and not much too large. If there is none, one is
+    allocated, and free ones are given up while there is more memory than arrays have needed at a time. So repeated
+    steps soon allocate nothing. Each array begins at the start of its buffer: with several arrays in one buffer, as
+    sub-buffers, NVIDIA's driver 580 crashes when they are released.
 
     Parameters
     ----------
@@ -53,68 +63,68 @@ class Workspace:
 
     def __init__(self, queue: cl.CommandQueue) -> None:
         self._queue = queue
-        # Sub-buffers must begin at multiples of this. No two arrays share a cache line.
-        self._unit = max(64, queue.device.mem_base_addr_align // 8)
-        self._limit = memory_limits.largest_allocation(queue.device)
-        # For each open frame, the bytes in use of each piece when it began.
-        self._before: list[list[int]] = []
+        self._made = 0
+        # For each open frame, the buffers that it has taken and the bytes of their arrays.
+        self._frames: list[list[tuple[int, int]]] = []
+        self._needed: list[int] = []
         self.clear()
 
     def clear(self) -> None:
         """Free all memory, if no frame is open."""
-        if self._before:
+        if self._frames:
             return
-        # The pieces, and the bytes in use from the start of each.
-        self._pieces: list[cl.Buffer] = []
-        self._taken: list[int] = []
-        self._views: dict[tuple[object, ...], tuple[cla.Array, int]] = {}
-        self._most = 0
+        self._buffers: dict[int, cl.Buffer] = {}
+        # The free ones by size and number, the smallest first.
+        self._free: list[tuple[int, int]] = []
+        # Arrays by number of the buffer, shape and type.
+        self._views: dict[tuple[object, ...], cla.Array] = {}
+        self._held, self._most, self._slack = 0, 0, SLACK
 
     def frame(self) -> Workspace:
         """Return a context manager; at its end all arrays taken inside are given back."""
         return self
 
     def __enter__(self) -> None:
-        if not self._before and len(self._pieces) > 1 and self._most <= self._limit:
-            # The size is known now: one piece replaces the others.
-            self._pieces, self._taken, self._views = [], [], {}
-            self._add(self._most)
-        if not self._before and len(self._views) > MOST_VIEWS:
+        if not self._frames and len(self._views) > MOST_VIEWS:
             self._views = {}
-        self._before.append(self._taken.copy())
+        self._frames.append([])
+        self._needed.append(0)
 
     def __exit__(self, *_: object) -> None:
-        before = self._before.pop()
-        self._taken[:] = before + [0] * (len(self._pieces) - len(before))
+        self._most = max(self._most, sum(self._needed))
+        self._needed.pop()
+        for taken in self._frames.pop():
+            insort(self._free, taken)
 
     def take(self, shape: int | tuple[int, ...], dtype: np.dtype) -> cla.Array | None:
         """Return an array with arbitrary content, valid to the end of the frame; None if no frame is open."""
-        if not self._before:
+        if not self._frames:
             return None
-        if len(self._taken) == 1:
-            known = self._views.get((0, self._taken[0], shape, dtype))
-            if known is not None:
-                view, self._taken[0] = known
-                return view
         items = math.prod(shape) if isinstance(shape, tuple) else int(shape)
         size = max(items * dtype.itemsize, 1)
-        size = -(-size // self._unit) * self._unit
-        number = 0
-        while number < len(self._pieces) and self._taken[number] + size > self._pieces[number].size:
-            number += 1
-        if number == len(self._pieces):
-            self._add(size)
-        start = self._taken[number]
-        key = number, start, shape, dtype
+        self._needed[-1] += size
+        place = bisect_left(self._free, (size, 0))
+        fits = place < len(self._free) and self._free[place][0] <= max(LOOSEST * size, SMALL)
+        taken = self._free.pop(place) if fits else self._allocate(size)
+        self._frames[-1].append(taken)
+        key = taken[1], shape, dtype
         if key not in self._views:
-            # The view is kept, because creating one takes as long as a launch.
-            view = self._pieces[number].get_sub_region(start, size)
-            self._views[key] = make_array(self._queue, shape, dtype, view), start + size
-        array, self._taken[number] = self._views[key]
-        self._most = max(self._most, sum(self._taken))
-        return array
+            # The array is kept, because creating one takes as long as a launch.
+            self._views[key] = make_array(self._queue, shape, dtype, self._buffers[taken[1]])
+        return self._views[key]
 
-    def _add(self, size: int) -> None:
-        memory_limits.check_allocation(self._queue.device, size)
-        self._pieces.append(cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size))
-        self._taken.append(0)
+    def _allocate(self, size: int) -> tuple[int, int]:
+        """Make a buffer of at least `size` bytes: return its size and number."""
+        device = self._queue.device
+        memory_limits.check_allocation(device, size)
+        most = max(self._most, sum(self._needed))
+        while self._free and self._held + size > self._slack * most:
+            _, old = self._free.pop()
+            self._held -= self._buffers.pop(old).size
+            self._views = {key: view for key, view in self._views.items() if key[0] != old}
+            self._slack *= MORE_SLACK
+        size = max(size, min(size + size // SPARE, memory_limits.largest_allocation(device)))
+        self._made += 1
+        self._held += size
+        self._buffers[self._made] = cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size)
+        return size, self._made
