@@ -55,22 +55,22 @@ typedef struct {
     f < (piece)->n;                                                                                                    \
     ++f
 
-inline int face_label(const piece_t *piece, int f)
+inline int face_label(private const piece_t *piece, int f)
 {
     return piece->labels[f];
 }
 
-inline REAL4 corner_of(const piece_t *piece, int k)
+inline REAL4 corner_of(private const piece_t *piece, int k)
 {
     return (REAL4)(piece->x[k], piece->y[k], 0, 0);
 }
 
-inline int corner_count(const piece_t *piece)
+inline int corner_count(private const piece_t *piece)
 {
     return piece->n;
 }
 
-inline int build_piece(piece_t *piece, int i, global const int *starts, global const int *neighbors,
+inline int build_piece(private piece_t *piece, int i, global const int *starts, global const int *neighbors,
                        global const REAL *points, REAL4 box_lower, REAL4 box_upper)
 {
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
@@ -101,19 +101,19 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
 
 typedef piece_t shape_t;
 
-inline void note_piece(shape_t *shape, const piece_t *piece)
+inline void note_piece(private shape_t *shape, private const piece_t *piece)
 {
     *shape = *piece;
 }
 
-inline void recall_piece(piece_t *piece, const shape_t *shape)
+inline void recall_piece(private piece_t *piece, private const shape_t *shape)
 {
     *piece = *shape;
 }
 
 /* Keep y.normal <= level. Vertices beyond the plane by no more than `depth` count as inside. The new face gets `label`.
  */
-inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
+inline int cut_piece(private piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
 {
     const int n = piece->n;
     REAL s[CELL_CAPACITY];
@@ -157,7 +157,7 @@ inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int l
 }
 
 /* Sum over triangles that share corner 0, so that small pieces far from the generator keep their accuracy. */
-inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
+inline REAL measure_piece(private const piece_t *piece, private REAL4 *centroid)
 {
     const REAL4 o = corner_of(piece, 0);
     REAL sum = 0;
@@ -181,22 +181,22 @@ typedef cell_t piece_t;
     f < FACE_CAPACITY;                                                                                                 \
     f = next_face(piece, f + 1)
 
-inline int face_label(const piece_t *piece, int f)
+inline int face_label(private const piece_t *piece, int f)
 {
     return piece->labels[f];
 }
 
-inline REAL4 corner_of(const piece_t *piece, int k)
+inline REAL4 corner_of(private const piece_t *piece, int k)
 {
-    return (REAL4)(((const REAL *)piece->x)[k], ((const REAL *)piece->y)[k], ((const REAL *)piece->z)[k], 0);
+    return (REAL4)(((private const REAL *)piece->x)[k], ((private const REAL *)piece->y)[k], ((private const REAL *)piece->z)[k], 0);
 }
 
-inline int corner_count(const piece_t *piece)
+inline int corner_count(private const piece_t *piece)
 {
     return piece->n;
 }
 
-inline int build_piece(piece_t *piece, int i, global const int *starts, global const int *neighbors,
+inline int build_piece(private piece_t *piece, int i, global const int *starts, global const int *neighbors,
                        global const REAL *points, REAL4 box_lower, REAL4 box_upper)
 {
     const REAL4 x = load_vector(points, i);
@@ -216,9 +216,9 @@ typedef struct {
     int n;
 } shape_t;
 
-inline void note_piece(shape_t *shape, const piece_t *piece)
+inline void note_piece(private shape_t *shape, private const piece_t *piece)
 {
-    const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
+    private const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
     for (int v = 0; v < piece->n; ++v) {
         shape->x[v] = x[v];
         shape->y[v] = y[v];
@@ -232,9 +232,9 @@ inline void note_piece(shape_t *shape, const piece_t *piece)
 }
 
 /* All faces are those of the cell itself. */
-inline void recall_piece(piece_t *piece, const shape_t *shape)
+inline void recall_piece(private piece_t *piece, private const shape_t *shape)
 {
-    REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
+    private REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
     for (int v = 0; v < shape->n; ++v) {
         x[v] = shape->x[v];
         y[v] = shape->y[v];
@@ -252,10 +252,10 @@ inline void recall_piece(piece_t *piece, const shape_t *shape)
 /* Keep y.normal <= level. Vertices beyond the plane by no more than `depth` count as inside. The new face gets `label`.
    Unlike `clip_polyhedron` this takes any plane. New vertices are interpolated along edges, which is accurate since no
    edge is longer than the cell. */
-inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
+inline int cut_piece(private piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
 {
-    const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
-    REAL *s = (REAL *)piece->beyond;
+    private const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
+    private REAL *s = (private REAL *)piece->beyond;
     int beyond = 0;
     for (int v = 0; v < piece->n; ++v) {
         s[v] = x[v] * normal.s0 + y[v] * normal.s1 + z[v] * normal.s2 - level;
@@ -280,10 +280,10 @@ inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int l
 }
 
 /* Sum over tetrahedra that share vertex 0, so that small pieces far from the generator keep their accuracy. */
-inline REAL measure_piece(piece_t *piece, REAL4 *centroid)
+inline REAL measure_piece(private piece_t *piece, private REAL4 *centroid)
 {
     const REAL4 o = corner_of(piece, 0);
-    const INDEX *start = face_starts(piece);
+    private const INDEX *start = face_starts(piece);
     REAL sum = 0;
     REAL4 first = 0;
     for (EACH_FACE(piece, f)) {

@@ -84,7 +84,7 @@ inline int nearest_generator(global const REAL *x, const graph_t *graph, int n, 
 
 /* Intersect a piece, relative to x, with old cell j: { y : |y - x_j| <= |y - x_k| for all neighbors k }. Both cells of
    a face compute its plane by the same operations, so that their pieces are complementary. Returns PIECE_*. */
-inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, const graph_t *graph)
+inline int cut_by_cell(private piece_t *piece, REAL4 x, REAL reach, int j, const graph_t *graph)
 {
     int what = PIECE_WHOLE;
     const REAL4 xj = load_vector(graph->points, j);

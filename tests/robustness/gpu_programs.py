@@ -31,6 +31,13 @@ TARGETS = {
     "NVIDIA": ["-target", "nvptx64-nvidia-nvcl"],
     "AMD": ["-target", "amdgcn-amd-amdhsa", "-mcpu=gfx90a", "-nogpulib"],
     "SPIR": ["-target", "spir64", "-emit-llvm"],
+    "generic": [
+        "-target",
+        "spir64",
+        "-cl-std=CL2.0",
+        "-emit-llvm",
+        "-Wno-constant-logical-operand",
+    ],
 }
 CLANG = [
     "-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header", "-Xclang",
