@@ -76,7 +76,7 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
         )
         for adapter in (one, other)
     )
-    off = float((np.linalg.norm(a.points - b.points, axis=1) / a.size).max())
+    off = float((np.linalg.norm(a.points - b.points, axis=1) / a.target_size).max())
     graph = bool(np.array_equal(a.diagram.neighbors, b.diagram.neighbors))
     records.append({**same, "what": f"{STEPS} steps", "cells": len(a.points), "graph": graph, "off": off,
                     "in_eps": off / eps})  # fmt: skip
