@@ -1,8 +1,9 @@
-"""Prepare OpenCL runtimes before the first query of platforms: register Intel's, and provide a kernel cache.
+"""Prepare OpenCL runtimes before the first query of platforms: register those not listed, and provide a kernel cache.
 
 The loader looks for runtimes in `/etc/OpenCL/vendors`, where pip cannot write. So it does not find
-Intel's CPU runtime (`pip install "clvoro[cpu]"`), which lies in `<prefix>/lib`. Loaders read two
-more places, which *add* runtimes to those of the system. Both are filled here:
+Intel's CPU runtime (`pip install "clvoro[cpu]"`), which lies in `<prefix>/lib`. In containers the entry of NVIDIA's
+driver is often missing, though the driver is there. Loaders read two more places, which *add* runtimes to those of the
+system. Both are filled here:
 
 - `$PYOPENCL_HOME/.libs/*.icd`, for the loader in PyOpenCL's wheel (ocl-icd). When imported,
   PyOpenCL sets the variable to its own folder; the folder made here repeats its entries.
@@ -30,12 +31,21 @@ _ROOM = 1 << 22
 """Bytes that must be free in the cache. The kernels of a run take 2 to 20 MB."""
 _DISTRIBUTION = "intel-opencl-rt"
 _LIBRARY = "libintelocl.so"
+_NVIDIA_LIBRARY = "libnvidia-opencl.so.1"
+_NVIDIA_FOLDERS = (
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib64",
+    "/usr/local/nvidia/lib64",
+    "/usr/lib/wsl/lib",
+)
+"""Where distributions, container toolkits and clusters put NVIDIA's driver."""
 
 
 def prepare() -> None:
-    """Provide a cache and register Intel's runtime; call it after `import pyopencl`, before platforms are queried."""
+    """Provide a cache and register runtimes; call it after `import pyopencl`, before platforms are queried."""
     provide_cache()
-    register_runtime()
+    register_runtimes()
 
 
 def provide_cache() -> Path | None:
@@ -92,36 +102,42 @@ def cache_home() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
-def register_runtime() -> Path | None:
-    """Register Intel's CPU runtime, if pip has installed it and the loader does not know it.
+def register_runtimes() -> list[Path]:
+    """Register Intel's CPU runtime, if pip has installed it, and NVIDIA's driver, if the loader does not know them.
 
-    Takes a fraction of a millisecond if the runtime is not installed. Never raises: a missing runtime
-    is reported when a device is chosen.
+    Takes a fraction of a millisecond if neither is installed. Never raises: a missing runtime is reported when a device
+    is chosen.
 
     Returns
     -------
-    pathlib.Path or None
-        The runtime's library, if it was registered.
+    list of pathlib.Path
+        The libraries that were registered.
     """
     if not sys.platform.startswith("linux"):
-        return None
+        return []
+    found = {"intelocl": _intel_library, "nvidia-opencl": _nvidia_library}
+    libraries = []
+    for word, find in found.items():
+        with contextlib.suppress(OSError, RuntimeError, ValueError, metadata.PackageNotFoundError):
+            library = find()
+            if library is not None and not _known_to_system(word):
+                libraries.append(library)
     try:
-        library = _installed_library()
-        if library is None or _known_to_system():
-            return None
-        home = _loader_home(library)
-    except (OSError, RuntimeError, ValueError, metadata.PackageNotFoundError):
-        return None
+        home = _loader_home(libraries) if libraries else None
+    except (OSError, RuntimeError, ValueError):
+        home = None
+    if home is None:
+        return []
     os.environ["PYOPENCL_HOME"] = str(home)
     # Child processes inherit this variable. In them PyOpenCL sets the other one again.
-    others = os.environ.get("OCL_ICD_FILENAMES", "")
-    if "intelocl" not in others:
-        os.environ["OCL_ICD_FILENAMES"] = f"{others}:{library}" if others else str(library)
-    return library
+    others = [name for name in os.environ.get("OCL_ICD_FILENAMES", "").split(":") if name]
+    new = [str(library) for library in libraries if str(library) not in others]
+    os.environ["OCL_ICD_FILENAMES"] = ":".join(others + new)
+    return libraries
 
 
-def _installed_library() -> Path | None:
-    """Return the runtime's library in the running Python's environment."""
+def _intel_library() -> Path | None:
+    """Return the library of Intel's runtime in the running Python's environment."""
     for file in metadata.distribution(_DISTRIBUTION).files or []:
         if file.name == _LIBRARY:
             path = Path(os.fspath(file.locate())).resolve()
@@ -129,27 +145,33 @@ def _installed_library() -> Path | None:
     return None
 
 
-def _known_to_system() -> bool:
-    """Return whether the loader finds another Intel CPU runtime; two copies would collide."""
+def _nvidia_library() -> Path | None:
+    """Return the library of NVIDIA's driver for OpenCL."""
+    paths = (Path(folder, _NVIDIA_LIBRARY) for folder in _NVIDIA_FOLDERS)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _known_to_system(word: str) -> bool:
+    """Return whether the loader finds a runtime with `word` in its name; two copies would collide."""
     vendors = os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH")
     place = Path(vendors or "/etc/OpenCL/vendors")
     entries = place.glob("*.icd") if place.is_dir() else [place] if place.is_file() else []
-    # The library must exist, too. When oneAPI is removed, its entry stays.
+    # The library must exist, too. When a runtime is removed, its entry may stay.
     for entry in entries:
         name = entry.read_text(errors="replace").strip()
-        if "intelocl" in name and (os.sep not in name or Path(name).is_file()):
+        if word in name and (os.sep not in name or Path(name).is_file()):
             return True
     return False
 
 
-def _loader_home(library: Path) -> Path:
-    """Return a folder with `.libs/*.icd` for the loader: PyOpenCL's own entries and `library`.
+def _loader_home(libraries: list[Path]) -> Path:
+    """Return a folder with `.libs/*.icd` for the loader: PyOpenCL's own entries and `libraries`.
 
     The folder's name is a hash of its content. So environments do not share a folder, and other
     processes find it complete.
     """
     own = Path(os.environ.get("PYOPENCL_HOME", os.devnull)) / ".libs"
-    entries = {"clvoro-intel-cpu.icd": str(library)}
+    entries = {f"clvoro-{library.name}.icd": str(library) for library in libraries}
     for icd in sorted(own.glob("*.icd")):
         name = icd.read_text().strip()
         # A bare name is a library beside the entry.

@@ -301,6 +301,7 @@ def pip_runtime(tmp_path, monkeypatch):
     (home / ".libs" / "libpocl-1.so").write_bytes(b"")
     files = type("Distribution", (), {"files": [FakeFile(library)]})
     monkeypatch.setattr(_runtimes.metadata, "distribution", lambda name: files)
+    monkeypatch.setattr(_runtimes, "_NVIDIA_FOLDERS", (str(tmp_path / "nvidia"),))
     (tmp_path / "vendors").mkdir()
     monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path / "vendors"))
     monkeypatch.setenv("PYOPENCL_HOME", str(home))
@@ -312,7 +313,7 @@ def pip_runtime(tmp_path, monkeypatch):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the runtime is for Linux")
 def test_pip_runtime_is_added_to_the_others(pip_runtime, tmp_path):
     before = Path(os.environ["PYOPENCL_HOME"])
-    assert _runtimes.register_runtime() == pip_runtime
+    assert _runtimes.register_runtimes() == [pip_runtime]
     icds = Path(os.environ["PYOPENCL_HOME"], ".libs").glob("*.icd")
     assert sorted(icd.read_text() for icd in icds) == sorted(
         [f"{pip_runtime}\n", f"{before / '.libs' / 'libpocl-1.so'}\n"]
@@ -321,7 +322,7 @@ def test_pip_runtime_is_added_to_the_others(pip_runtime, tmp_path):
     assert os.environ["OCL_ICD_VENDORS"] == str(tmp_path / "vendors")
     # In a child, PyOpenCL resets its variable and the other one is inherited.
     after, os.environ["PYOPENCL_HOME"] = os.environ["PYOPENCL_HOME"], str(before)
-    assert _runtimes.register_runtime() == pip_runtime
+    assert _runtimes.register_runtimes() == [pip_runtime]
     assert os.environ["PYOPENCL_HOME"] == after
     assert os.environ["OCL_ICD_FILENAMES"] == str(pip_runtime)
 
@@ -329,9 +330,24 @@ def test_pip_runtime_is_added_to_the_others(pip_runtime, tmp_path):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the runtime is for Linux")
 def test_registered_runtime_is_not_added_again(pip_runtime, tmp_path):
     (tmp_path / "vendors" / "intel.icd").write_text("/removed/libintelocl.so\n")
-    assert _runtimes.register_runtime() == pip_runtime  # its library is gone
+    assert _runtimes.register_runtimes() == [pip_runtime]  # its library is gone
     (tmp_path / "vendors" / "intel.icd").write_text(f"{pip_runtime}\n")
-    assert _runtimes.register_runtime() is None
+    assert _runtimes.register_runtimes() == []
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the paths are Linux's")
+def test_driver_without_an_entry_is_registered(pip_runtime, tmp_path):
+    """In containers the entry of NVIDIA's driver is often missing."""
+    driver = tmp_path / "nvidia" / "libnvidia-opencl.so.1"
+    driver.parent.mkdir()
+    driver.write_bytes(b"")
+    os.environ["OCL_ICD_FILENAMES"] = "/other.so"
+    assert _runtimes.register_runtimes() == [pip_runtime, driver]
+    icds = Path(os.environ["PYOPENCL_HOME"], ".libs").glob("*.icd")
+    assert {f"{pip_runtime}\n", f"{driver}\n"} <= {icd.read_text() for icd in icds}
+    assert os.environ["OCL_ICD_FILENAMES"] == f"/other.so:{pip_runtime}:{driver}"
+    (tmp_path / "vendors" / "nvidia.icd").write_text("libnvidia-opencl.so.1\n")
+    assert _runtimes.register_runtimes() == [pip_runtime]
 
 
 def test_environment_is_unchanged_without_a_pip_runtime(monkeypatch):
@@ -339,8 +355,9 @@ def test_environment_is_unchanged_without_a_pip_runtime(monkeypatch):
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(_runtimes.metadata, "distribution", missing)
+    monkeypatch.setattr(_runtimes, "_NVIDIA_FOLDERS", ())
     before = dict(os.environ)
-    assert _runtimes.register_runtime() is None
+    assert _runtimes.register_runtimes() == []
     assert dict(os.environ) == before
 
 
