@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import TYPE_CHECKING, NoReturn
@@ -164,8 +165,18 @@ class Field:
 
     __gt__ = __le__ = __ge__ = __lt__
 
-    # With None, NumPy passes operators between arrays and a field to the field, which rejects them.
-    __array_ufunc__ = None
+    def __array_ufunc__(
+        self, ufunc: np.ufunc, method: str, *inputs: object, **options: object
+    ) -> Field:
+        """Combine fields by NumPy's functions for ``+``, ``*``, ``/`` and `minimum` and `maximum`; reject others."""
+        operation = _OF_UFUNCS.get(ufunc)
+        if operation is None or method != "__call__" or options:
+            raise InputTypeError(
+                f"numpy.{ufunc.__name__} got {self!r}, but a size field is not an array; write an Expression, or a "
+                f"function such as lambda points: numpy.{ufunc.__name__}(field(points))"
+            )
+        numbers = [float(f) if isinstance(f, Real) else as_field(f) for f in inputs]
+        return operation(*numbers)
 
 
 class Constant(Field):
@@ -365,6 +376,15 @@ def minimum(*fields: object) -> Field:
 def maximum(*fields: object) -> Field:
     """Return the pointwise maximum of `fields` (fields, numbers or callables) as a field."""
     return _combined("max", fields)
+
+
+_OF_UFUNCS: dict[object, Callable[..., Field]] = {
+    np.add: operator.add,
+    np.multiply: operator.mul,
+    np.divide: operator.truediv,
+    np.minimum: minimum,
+    np.maximum: maximum,
+}
 
 
 def _combined(operation: str, fields: tuple[object, ...]) -> Field:

@@ -644,7 +644,10 @@ def test_sizes_beyond_the_domain_and_the_precision(make_engine):
         (lambda: _CIRCLE / 0, InputError, "divisor"),
         (lambda: "2" / _CIRCLE, TypeError, "operand"),
         (lambda: 0 / _CIRCLE, InputError, "positive"),
-        (lambda: np.ones(3) * _CIRCLE, TypeError, "operand"),
+        (lambda: np.ones(3) * _CIRCLE, InputTypeError, "Raster"),
+        (lambda: _CIRCLE * np.ones(3), InputTypeError, "Raster"),
+        (lambda: np.sqrt(_CIRCLE), InputTypeError, r"lambda points: numpy.sqrt\(field"),
+        (lambda: np.minimum.accumulate(_CIRCLE), InputTypeError, "numpy.minimum"),
         (lambda: _CIRCLE * sizing.Expression("z"), InputError, "dimensions"),
         (lambda: sizing.minimum(), InputError, "at least one"),
         (lambda: _CIRCLE(np.zeros((2, 5))), InputError, "pass points.T"),
@@ -719,3 +722,19 @@ def test_too_many_parts_are_rejected():
     for f in formulas[1:200]:
         least = sizing.minimum(least, f)
     assert least.parts == 201
+
+
+def test_numpy_combines_fields():
+    """NumPy's functions of the same meaning give the same fields."""
+    points = np.random.default_rng(0).random((50, 2))
+    values = _CIRCLE(points)
+    for made, expected in (
+        (np.minimum(_CIRCLE, 0.1), np.minimum(values, 0.1)),
+        (np.maximum(0.1, _CIRCLE), np.maximum(0.1, values)),
+        (np.minimum(_CIRCLE, lambda p: p[:, 0]), np.minimum(values, points[:, 0])),
+        (np.float64(2) * _CIRCLE, 2 * values),
+        (_CIRCLE / np.float32(2), values / 2),
+        (np.add(_CIRCLE, _CIRCLE), 2 * values),
+    ):
+        assert isinstance(made, sizing.Field)
+        assert np.array_equal(made(points), expected)
