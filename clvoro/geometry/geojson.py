@@ -22,6 +22,7 @@ _GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECAS
 _ALIKE = (
     0.95  # lengths of degrees of longitude and latitude with at least this ratio count as equal
 )
+_FAR = 3  # a domain so many times its extent away from the equator has longitudes and latitudes
 _DEEPEST = 8  # nested parentheses: a MULTIPOLYGON has three, and GEOS uses a stack frame for each
 
 
@@ -152,11 +153,15 @@ def may_be_degrees(lower: Sequence[float], upper: Sequence[float]) -> bool:
 
 
 def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
-    """Warn if the crs of GeoJSON has longitudes and latitudes, and their degrees differ in length."""
+    """Warn if GeoJSON has longitudes and latitudes, by its crs or apparently, and their degrees differ in length.
+
+    Without a crs the standard says that these are longitudes and latitudes, but plans in meters are written so, too.
+    They lie around the origin or beside it.
+    """
     crs = node.get("crs")
     properties = crs.get("properties") if isinstance(crs, Mapping) else None
     system = properties.get("name") if isinstance(properties, Mapping) else None
-    if not isinstance(system, str) or not _GEOGRAPHIC.search(system):
+    if isinstance(system, str) and not _GEOGRAPHIC.search(system):
         return
     try:
         x = np.concatenate([np.asarray(ring, float).reshape(-1, 2) for p in pieces for ring in p])
@@ -164,12 +169,16 @@ def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
         return
     if not len(x) or not may_be_degrees(x.min(axis=0).tolist(), x.max(axis=0).tolist()):
         return
+    if not isinstance(system, str) and np.abs(x).min(axis=0)[1] < _FAR * np.ptp(x, axis=0).max():
+        return
     latitude = float(np.abs(x[:, 1]).max())
     if math.cos(math.radians(latitude)) < _ALIKE:
+        known = isinstance(system, str)
+        has = f"longitudes and latitudes ({system})" if known else "coordinates like degrees"
         warn(
-            f"{name} has longitudes and latitudes ({system}), which are used as lengths in the plane: at latitude "
+            f"{name} has {has}, which are used as lengths in the plane: at latitude "
             f"{latitude:.3g} cells would be {math.cos(math.radians(latitude)):.2g} times as wide as high; project the "
-            "coordinates first, or remove the crs if they are projected",
+            f"coordinates first{', or remove the crs if they are projected' if known else ''}",
             MismatchWarning,
         )
 

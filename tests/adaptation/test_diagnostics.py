@@ -156,20 +156,25 @@ def lake(latitude, crs):
 
 
 @pytest.mark.parametrize(
-    "crs", ["urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326", "urn:ogc:def:crs:EPSG::4326"]
+    "crs", ["urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326", "urn:ogc:def:crs:EPSG::4326", None]
 )
 def test_longitudes_and_latitudes(tmp_path, crs):
     path = tmp_path / "lake.geojson"
     path.write_text(json.dumps(lake(46.2, crs)))
-    with pytest.warns(
-        MismatchWarning, match=r"lake\.geojson has longitudes and latitudes.* 0\.69 times"
-    ):
+    what = "coordinates like degrees" if crs is None else "longitudes and latitudes"
+    with pytest.warns(MismatchWarning, match=rf"lake\.geojson has {what}.* 0\.69 times"):
         clvoro.Polygon.from_geojson(path)
 
 
 @pytest.mark.parametrize(
     ("latitude", "crs"),
-    [(46.2, None), (46.2, "urn:ogc:def:crs:EPSG::25832"), (460.2, "EPSG:4326"), (3.0, "EPSG:4326")],
+    [
+        (0.2, None),
+        (460.2, None),
+        (46.2, "urn:ogc:def:crs:EPSG::25832"),
+        (460.2, "EPSG:4326"),
+        (3.0, "EPSG:4326"),
+    ],
 )
 def test_no_warning_for_projected_coordinates(latitude, crs):
     with warnings.catch_warnings():
@@ -178,7 +183,8 @@ def test_no_warning_for_projected_coordinates(latitude, crs):
 
 
 def test_degrees_with_sizes_in_meters(ctx):
-    domain = clvoro.Polygon.from_geojson(lake(46.2, None))
+    with pytest.warns(MismatchWarning):
+        domain = clvoro.Polygon.from_geojson(lake(46.2, None))
     with pytest.warns(CoarseSizeWarning, match="longitudes and latitudes"):
         clvoro.Adapter(ctx).run(domain, 100.0, max_steps=0)
 
