@@ -63,6 +63,10 @@ class DeviceArray(cla.Array):
         assert self.queue is not None
         return self.queue.context
 
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self.shape[0] if self.shape else super().__len__()
+
     def _place(self) -> tuple[cl.CommandQueue, cl.Buffer]:
         """Return queue and buffer of an array that is not empty."""
         return cast("tuple[cl.CommandQueue, cl.Buffer]", (self.queue, self.base_data))

@@ -222,7 +222,7 @@ class NamedArrays:
     def __call__(self, *name: object, size: int, dtype: DTypeLike | None = None) -> cla.Array:
         """Return the first `size` items of the array called `name`; their content is arbitrary."""
         array = self._arrays.get(name)
-        if array is None or len(array) < size:
+        if array is None or array.shape[0] < size:
             room = max(size + int(self._spare * size), 1)
             # The old array is freed first.
             array = None
@@ -230,7 +230,7 @@ class NamedArrays:
             self._parts.pop(name, None)
             array = self._arrays[name] = self._engine.empty(room, dtype)
         part = self._parts.get(name)
-        if part is None or len(part) != size:
+        if part is None or part.shape[0] != size:
             part = self._parts[name] = array[:size]
         return part
 

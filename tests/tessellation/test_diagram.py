@@ -12,7 +12,7 @@ from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import FLAGS, ROW_CAPACITY, Cells
 from clvoro.tessellation.device_diagram import DOUBT
 from clvoro.tessellation.face_rows import SLOT
-from clvoro.tessellation.readback.diagram import order_of
+from clvoro.tessellation.readback.diagram import order_of, used_indices
 from tests.reference import diagrams as reference
 
 BOX = clvoro.Box((0.0, 0.0), (2.5, 1.5))
@@ -345,3 +345,12 @@ def test_cells_with_two_faces_are_rejected(ctx, doubtful):
 def test_order_of_labels(labels):
     given = np.array(labels, np.int32)
     assert np.array_equal(order_of(given), np.argsort(given))
+
+
+@pytest.mark.parametrize("indices", [[], [2], [4, 0, 4, 1], [[3, 3], [0, 1]]])
+def test_used_indices(indices):
+    given = np.array(indices, int)
+    used, places = used_indices(given, 5)
+    assert np.array_equal(used, np.unique(given))
+    assert np.array_equal(used[places], given)
+    assert places.shape == given.shape

@@ -77,6 +77,20 @@ def order_of(labels: np.ndarray) -> np.ndarray:
     return places[places >= 0].astype(np.intp)
 
 
+def starts_of(counts: np.ndarray) -> np.ndarray:
+    """Return where lists of `counts` (n,) items begin, and the end of the last, (n + 1,) int32."""
+    found = np.zeros(len(counts) + 1, np.int32)
+    np.cumsum(counts, out=found[1:])
+    return found
+
+
+def used_indices(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers below `count` that occur among `indices`, sorted, and the place of each index among them."""
+    used = np.zeros(count, bool)
+    used[indices] = True
+    return np.flatnonzero(used), np.take(np.cumsum(used, dtype=np.int32) - 1, indices)
+
+
 def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
     """Return `t`, or a copy of it, with arrays cut to its `m` faces."""
 
@@ -271,9 +285,7 @@ class _DiagramReader:
         return found
 
     def neighbor_starts(self) -> np.ndarray:
-        found = np.zeros(self.n + 1, np.int32)
-        np.cumsum(self.counts, out=found[1:])
-        return found
+        return starts_of(self.counts)
 
     def neighbors(self) -> np.ndarray:
         if self.lists is None:
@@ -318,10 +330,16 @@ class _DiagramReader:
         return self._read_faces(self.shared.cell_vertices)
 
     def face_vertex_starts(self) -> np.ndarray:
-        lengths = np.diff(self.loop_starts)[self.slots]
-        return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+        return starts_of(np.take(np.diff(self.loop_starts), self.slots))
 
     def face_vertices(self) -> np.ndarray:
+        if self.lists is not None:
+            # The loops of a cell's faces follow one another on the device, too.
+            begins = self.loop_starts[self.starts]
+            to = starts_of(np.diff(begins)[self.order])
+            upload = self.engine.upload
+            loops = Lists(self.lists.order, upload(begins, np.int32), upload(to, np.int32))
+            return Gather(self.engine).lists(loops, self.faces.vertices[: int(to[-1])]).get()
         starts = self.face_vertex_starts()
         shift = self.loop_starts[self.slots] - starts[:-1]
         places = np.arange(starts[-1]) + np.repeat(shift, np.diff(starts))

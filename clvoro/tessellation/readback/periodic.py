@@ -12,7 +12,7 @@ from ...opencl.engine import Engine
 from ..device_diagram import Tessellation
 from ..periodic.periodic_tessellator import ExtendedDiagram
 from ..vertices import VertexNumbering, Vertices
-from .diagram import _DiagramReader, kept_faces
+from .diagram import _DiagramReader, kept_faces, starts_of, used_indices
 
 
 class _PeriodicReader(_DiagramReader):
@@ -82,7 +82,8 @@ class _PeriodicReader(_DiagramReader):
     @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices of the extended diagram that are corners of cells in the box, and the index of each corner."""
-        return np.unique(self.extended_corners(), return_inverse=True)
+        shared = self.shared if self.engine.dim == 2 else self.faces
+        return used_indices(self.extended_corners(), len(shared.positions))
 
     @cached_property
     def extended_places(self) -> np.ndarray:
@@ -117,11 +118,10 @@ class _PeriodicReader(_DiagramReader):
         return np.where(self.domain.periodic, positions, inside)
 
     def cell_vertices(self) -> np.ndarray:
-        return self.corners[1].astype(np.int32)
+        return self.corners[1]
 
     def face_vertex_starts(self) -> np.ndarray:
-        lengths = np.diff(self.loop_starts)[self.extended_places]
-        return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+        return starts_of(np.take(np.diff(self.loop_starts), self.extended_places))
 
     def face_vertices(self) -> np.ndarray:
-        return self.corners[1].astype(np.int32)
+        return self.corners[1]

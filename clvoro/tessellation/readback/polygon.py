@@ -12,7 +12,7 @@ from ...opencl.engine import Engine
 from ..clipped.boundary_crossings import UNTOUCHED
 from ..device_diagram import Tessellation
 from ..vertices import VertexNumbering, Vertices
-from .diagram import _DiagramReader, kept_faces
+from .diagram import _DiagramReader, kept_faces, used_indices
 
 
 class _PolygonReader(_DiagramReader):
@@ -147,8 +147,8 @@ class _PolygonReader(_DiagramReader):
     @cached_property
     def _numbered(self) -> tuple[np.ndarray, np.ndarray]:
         """The vertices that are ends of faces, and the index of each end, (m, 2)."""
-        used, numbers = np.unique(self.face_ends[self.slots], return_inverse=True)
-        return used, numbers.reshape(-1, 2).astype(np.int32)
+        count = self.shared.count + len(self.crossings[0])
+        return used_indices(self.face_ends[self.slots], count)
 
     def vertices(self) -> np.ndarray:
         used, count = self._numbered[0], self.shared.count
