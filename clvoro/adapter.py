@@ -13,6 +13,7 @@ import pyopencl as cl
 
 from .adaptation.diagnostics import warn_of_errors
 from .adaptation.estimates import check_memory
+from .adaptation.fixed_points import check_fixed
 from .adaptation.loop import INTERRUPTED
 from .adaptation.options import (
     Checkpoint,
@@ -23,6 +24,7 @@ from .adaptation.options import (
     PaperOptions,
     Start,
     special,
+    split_start,
 )
 from .adaptation.preparation import Preparation
 from .adaptation.run import check_run, run_adaptation
@@ -273,6 +275,7 @@ class Adapter:
         *,
         effort: EffortName = "default",
         layers: Layers | Sequence[Layers] = (),
+        fixed: ArrayLike | None = None,
         seed: int = 0,
         max_steps: int | None = None,
         options: MultilevelOptions | PaperOptions | None = None,
@@ -309,6 +312,9 @@ class Adapter:
         layers : Layers or sequence of Layers
             Rows of generators along walls, in 2D, that do not move: the first rows of the result. Beyond them the
             sizes grow gradually from the size of the layers; see `Layers`. Their cells count as having the right size.
+        fixed : (k, d) array of float, optional
+            Generators that do not move, such as wells: rows 0 to k - 1 of the result, exactly at these positions. Their
+            neighbors move until all have their sizes. Not for "transport" and moving meshes, which move all of them.
         seed : int
             Seed of the random start.
         max_steps : int, optional
@@ -331,7 +337,8 @@ class Adapter:
         Raises
         ------
         InputError, InputTypeError
-            If an argument is not as expected, or the checkpoint is damaged or belongs to another run.
+            If an argument is not as expected, or the checkpoint is damaged or belongs to another run; or if a generator
+            of `fixed` is outside, on a wall, within a layer, or at the place of another one; says where.
         SizeFieldError
             If h is not positive and finite somewhere; names the place.
         MemoryLimitError
@@ -348,7 +355,8 @@ class Adapter:
             checkpoint is kept.
         MismatchWarning, CoarseSizeWarning
             If a part of the input barely overlaps the domain, for example because it has another unit of length, or the
-            domain is narrower than half a cell somewhere, or has a dead end narrower than a cell; says where.
+            domain is narrower than half a cell somewhere, or has a dead end narrower than a cell, or a generator of
+            `fixed` is near a wall or another one for the size there; says where.
         ObtuseTrianglesWarning
             If obtuse triangles are left in a mesh on a sphere that "adaptive" or "exact" has finished.
         PrecisionWarning
@@ -360,7 +368,7 @@ class Adapter:
         UnusedOptionWarning
             If an option is given that the method does not use.
         """
-        start, given = _generators(points)
+        start, given = split_start(points)
         merged = Options(
             method=method, start=start, effort=effort, seed=seed, max_steps=max_steps, n_cells=n_cells,
             layers=layers,  # type: ignore[arg-type]
@@ -374,12 +382,14 @@ class Adapter:
                 kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
             stages = self._stages_for(domain)
             host = None if given is None else check_points(given, domain)
+            wells = check_fixed(fixed, domain, self.dtype)
             with noticed_builds(stages.engine, self.on_build) as notice:
                 result = run_adaptation(
                     stages,
                     domain,
                     size,
                     host,
+                    wells,
                     merged,
                     files,
                     self._shown(callback, notice),
@@ -427,7 +437,7 @@ class Adapter:
         >>> 5e6 < bytes_ < 6e6
         True
         """
-        start, given = _generators(points)
+        start, given = split_start(points)
         merged = Options(
             method=method, start=start, n_cells=n_cells, **special(options),
             layers=layers,  # type: ignore[arg-type]
@@ -436,8 +446,3 @@ class Adapter:
             stages = self._stages_for(domain)
             host = None if given is None else check_points(given, domain)
             return Preparation(stages, domain, size, host, merged).memory
-
-
-def _generators(points: ArrayLike | Start) -> tuple[str, ArrayLike | None]:
-    """Return how a random start is distributed, and the caller's generators if they are not random."""
-    return (points, None) if isinstance(points, str) else ("density", points)

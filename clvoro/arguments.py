@@ -35,8 +35,8 @@ def _digits(x: float) -> str:
     return f"{x:.1f}".removesuffix(".0") if 1e5 <= abs(x) < 1e9 else f"{x:.6g}"
 
 
-def check_points(points: object, domain: Domain) -> np.ndarray:
-    """Return `points` as a float64 array (n, d) inside `domain`.
+def check_points(points: object, domain: Domain, name: str = "points") -> np.ndarray:
+    """Return `points` as a float64 array (n, d) inside `domain`; errors call them `name`.
 
     Raises
     ------
@@ -45,19 +45,19 @@ def check_points(points: object, domain: Domain) -> np.ndarray:
     InputError
         If its shape is not (n, d) with n >= 1, or a value is not finite or outside; names the first.
     """
-    array = domain.check_rows("points", points)
+    array = domain.check_rows(name, points)
     if len(array) == 0:
-        raise InputError(f"points has shape {array.shape}, expected at least one generator")
+        raise InputError(f"{name} has shape {array.shape}, expected at least one generator")
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
         raise InputError(
-            f"points[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of "
+            f"{name}[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of "
             f"{len(array)} points are not); remove them"
         )
     bad = np.flatnonzero(~domain.contains(array))
     if bad.size:
         raise InputError(
-            f"points[{bad[0]}] is {array[bad[0]]}, outside {domain} ({bad.size} of {len(array)} "
+            f"{name}[{bad[0]}] is {array[bad[0]]}, outside {domain} ({bad.size} of {len(array)} "
             "points are); move or remove them, or enlarge the domain"
         )
     return array

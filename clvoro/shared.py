@@ -53,6 +53,7 @@ def adapt(
     method: MethodName = "adaptive",
     n_cells: int | None = None,
     layers: Layers | Sequence[Layers] = (),
+    fixed: ArrayLike | None = None,
     seed: int = 0,
     callback: Callable[[np.void], object] | None = None,
 ) -> Result:
@@ -77,6 +78,8 @@ def adapt(
         Number of cells; by default the number that the size field requires.
     layers : Layers or sequence of Layers
         Boundary layers, in 2D.
+    fixed : (k, d) array of float, optional
+        Generators that do not move, such as wells: rows 0 to k - 1 of the result.
     seed : int
         Seed of the random start.
     callback : callable, optional
@@ -102,7 +105,8 @@ def adapt(
     (True, True)
     """
     return shared_adapter().run(
-        domain, size, points, method, n_cells, effort=effort, layers=layers, seed=seed, callback=callback
+        domain, size, points, method, n_cells, effort=effort, layers=layers, fixed=fixed, seed=seed,
+        callback=callback,
     )  # fmt: skip
 
 

@@ -76,7 +76,10 @@ class Setup:
     free : Domain
         Part of the domain, in its frame, in which generators may move.
     fixed : int
-        Generators with labels below `fixed` do not move, and the size of their cells is their target size.
+        Generators with labels below `fixed` do not move.
+    points : (k, d) ndarray
+        Positions of those with the labels 0 to k - 1, on the finest level. Their cells have target sizes like all
+        others. The other fixed generators are those of layers: the size of their cells is their target size.
     factor : float
         Initial factor on the size field on the finest level.
     """
@@ -85,8 +88,14 @@ class Setup:
     domain: Domain
     sizing: Sizing
     free: Domain
-    fixed: int = 0
+    fixed: int
+    points: np.ndarray
     factor: float = 1.0
+
+    @property
+    def first_row(self) -> int:
+        """Label of the first generator of layers."""
+        return len(self.points)
 
 
 class MeshArrays:

@@ -29,7 +29,7 @@ from .stages import Stages
 if TYPE_CHECKING:
     from .loop import Loop
 
-FORMAT, VERSION = "clvoro-checkpoint", 8
+FORMAT, VERSION = "clvoro-checkpoint", 9
 MESH = ("points", "labels", "velocity", "signatures", "ever_changed", "h", "potential")
 PER_FACE = ("neighbors", "face_measures", "face_centroids")
 DIAGRAM = (
@@ -49,6 +49,8 @@ class Progress:
         The present level; 0 is the finest.
     n_start : int
         Number of generators at the start.
+    started : int
+        Number of labels at the start: those of fixed generators that enter later are among them.
     labeled : int
         Number of labels when the last row of the history was added.
     position : int
@@ -68,6 +70,7 @@ class Progress:
 
     level: int
     n_start: int
+    started: int
     labeled: int
     position: int = 0
     steps: int = 0
@@ -136,6 +139,7 @@ class Checkpointer:
         arrays: dict[str, np.ndarray] = {f"mesh.{name}": getattr(mesh, name).get() for name in MESH}
         if mesh.multipliers is not None:
             arrays["multipliers"] = mesh.multipliers.get()
+        arrays["taken"] = mesh.taken
         arrays["summaries"] = mesh.summaries.values.get()
         starts = t.starts.get()
         m = int(starts[-1])
@@ -156,7 +160,7 @@ class Checkpointer:
                     arrays[f"{part}.{field.name}"] = getattr(getattr(loop, part), field.name)
         arrays["history"] = np.concatenate(loop.rows)
         state = {
-            "position": loop.position, "level": loop.level, "n_start": loop.n_start,
+            "position": loop.position, "level": loop.level, "n_start": loop.n_start, "started": loop.started,
             "steps": loop.steps, "next_label": mesh.next_label, "spare": len(t.neighbors) - m,
             "size_factor": float(mesh.size_factor).hex(),
             "elapsed": time.perf_counter() - loop.began,

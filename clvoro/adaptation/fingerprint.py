@@ -13,17 +13,25 @@ from ..geometry.box import Domain
 
 
 def run_fingerprint(
-    domain: Domain, options: dict[str, Any], dtype: np.dtype, points: np.ndarray | None
+    domain: Domain,
+    options: dict[str, Any],
+    dtype: np.dtype,
+    points: np.ndarray | None,
+    fixed: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """Return plain values that identify a run. A checkpoint of another run is rejected."""
-    start = None if points is None else hashlib.sha256(np.ascontiguousarray(points).tobytes())
     return {
         "domain": domain_fingerprint(domain),
         "dtype": dtype.name,
-        "points": None if start is None else start.hexdigest(),
+        "points": None if points is None else _digest(points),
+        "fixed": _digest(fixed) if fixed is not None and len(fixed) else None,
         **options,
         "layers": [repr(layer) for layer in options["layers"]],
     }
+
+
+def _digest(positions: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(positions).tobytes()).hexdigest()
 
 
 def domain_fingerprint(domain: Domain) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from ..opencl.primitives import Summary
 from ..solvers.linear_system import Solution
 from .checkpoint import Checkpointer, Progress
 from .diagnostics import warn_of_obtuse_triangles
+from .fixed_points import origins, put_back
 from .forecast import MOST_SURPLUS
 from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod
@@ -85,10 +86,19 @@ class Loop:
         checkpoint: Checkpointer | None = None,
         progress: Progress | None = None,
     ) -> None:
-        p = Progress(levels, mesh.n, mesh.next_label) if progress is None else progress
+        p = (
+            Progress(levels, mesh.n, mesh.next_label, mesh.next_label)
+            if progress is None
+            else progress
+        )
         self.mesh, self.schedule, self.levels, self.checkpoint = mesh, schedule, levels, checkpoint
         self.level, self.position, self.begun, self.steps = p.level, p.position, p.steps, p.steps
-        self.n_start, self.labeled, self.rows = p.n_start, p.labeled, p.rows
+        self.n_start, self.started, self.labeled, self.rows = (
+            p.n_start,
+            p.started,
+            p.labeled,
+            p.rows,
+        )
         self.initial, self.final, self.last = p.initial, p.final, p.last
         self.began = time.perf_counter() - p.elapsed
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
@@ -241,7 +251,8 @@ class Loop:
         requires more cells there, which require more in turn. Where h is smooth the number is close to the integral.
         """
         factor = 2.0 ** (self.mesh.engine.cell_dim * self.level)
-        return self.mesh.fixed + (1 + MOST_SURPLUS) * self.required / factor
+        rows = self.mesh.fixed - self.mesh.setup.first_row
+        return rows + (1 + MOST_SURPLUS) * self.required / factor
 
     def missing_for_next_level(self, growth: float) -> float:
         """Return how many cells are missing so that refinement gives the number of the next finer level.
@@ -302,7 +313,7 @@ class Loop:
         # The finer level needs another solver and more memory.
         self.mesh.stages.clear("poisson")
         self.mesh.engine.workspace.clear()
-        finer = self.mesh.refine()
+        finer = self.mesh.refine(finest=self.level == 1)
         # One assignment, because an interruption between two would leave a mesh that does not belong to its level.
         self.mesh, self.level = finer, self.level - 1
 
@@ -419,6 +430,7 @@ class Loop:
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
         diagram = mesh.fetch_diagram()
+        put_back(diagram, mesh.setup.points)
         return Result(
             points=diagram.points,
             diagram=diagram,
@@ -433,5 +445,5 @@ class Loop:
             final=final,
             size_factor=mesh.size_factor,
             settings=settings,
-            origin=np.where(labels < self.n_start, labels, -1).astype(np.int32),
+            origin=origins(labels, self.started, mesh.taken),
         )

@@ -53,11 +53,17 @@ class Metric:
         )  # fmt: skip
 
     def set_fixed_sizes(
-        self, labels: cla.Array, fixed: int, volumes: cla.Array, h: cla.Array
+        self, labels: cla.Array, first: int, fixed: int, volumes: cla.Array, h: cla.Array
     ) -> None:
-        """Set `h` (n,) to the present size of cells whose label is below `fixed`."""
+        """Set `h` (n,) to the present size of cells whose label is at least `first` and below `fixed`."""
         self.engine.run_each(
-            self._kernels.set_fixed_sizes, len(h), labels, np.int32(fixed), volumes, h
+            self._kernels.set_fixed_sizes,
+            len(h),
+            labels,
+            np.int32(first),
+            np.int32(fixed),
+            volumes,
+            h,
         )
 
     def scale_sizes(self, factor: float, h: cla.Array) -> None:

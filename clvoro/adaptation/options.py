@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from numbers import Real
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from ..arguments import check_choice, check_integer, check_number, check_path, w
 from ..errors import InputError, InputTypeError, UnusedOptionWarning
 from ..geometry.boundary_layers import Layers
 from .methods import MOVING, PUBLISHED
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 MethodName = Literal[
     "adaptive", "exact", "transport", "lloyd", "poisson", "coupled", "weighted-lloyd", "weighted", "mmpde",
@@ -249,6 +252,11 @@ class Options:
     def multilevel(self) -> bool:
         """Whether a plan leads from coarse to fine, in place of one kind of step that is repeated."""
         return self.method in _MULTILEVEL
+
+
+def split_start(points: ArrayLike | Start) -> tuple[str, ArrayLike | None]:
+    """Return how a random start is distributed, and the caller's generators if they are not random."""
+    return (points, None) if isinstance(points, str) else ("density", points)
 
 
 def special(options: object) -> dict[str, Any]:

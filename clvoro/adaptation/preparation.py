@@ -28,6 +28,7 @@ from .diagnostics import (
     warn_of_narrow_parts,
 )
 from .estimates import Extras, check_memory
+from .fixed_points import check_room, take_places
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
@@ -66,6 +67,8 @@ class Preparation:
     options : Options
     max_levels : int, optional
         Largest automatic number of coarser levels.
+    fixed : (k, d) array, optional
+        Fixed generators, checked.
 
     Attributes
     ----------
@@ -102,17 +105,31 @@ class Preparation:
         points: np.ndarray | None,
         options: Options,
         max_levels: int | None = None,
+        fixed: np.ndarray | None = None,
     ) -> None:
         self.stages, self.domain, self.points, self.options = stages, domain, points, options
+        self.fixed = np.empty((0, domain.dim)) if fixed is None else fixed
         n_cells = options.n_cells
         if options.method == "transport":
             require_power_domain(domain)
+        if len(self.fixed) and options.method in ("transport", *MOVING):
+            raise InputError(
+                f"fixed generators are given, but method {options.method!r} moves all generators; use "
+                "method='adaptive' or 'exact'"
+            )
         # The other methods keep the number of given points.
         fixed_count = points is not None and not options.multilevel
         if points is not None and fixed_count and n_cells not in (None, len(points)):
             raise InputError(
                 f"n_cells is {n_cells}, but {len(points)} points are given, and method {options.method!r} "
                 "keeps their number; leave n_cells out, or use method='adaptive'"
+            )
+        most = len(points) if points is not None and fixed_count else n_cells
+        if most is not None and len(self.fixed) > most:
+            what = "n_cells is" if points is None else "the number of points is"
+            raise InputError(
+                f"{what} {most}, but {len(self.fixed)} generators are fixed, expected at least as many; leave "
+                "n_cells out, or give more of them"
             )
         if options.method in MOVING:
             _check_moving(domain, points, options)
@@ -138,6 +155,10 @@ class Preparation:
         self.factor = (required / self.target) ** (1 / domain.cell_dim) if scaled else 1.0
         if self._tree is not None and required * self.factor**-domain.cell_dim >= 0.5:
             warn_of_narrow_parts(domain, lambda x: self.factor * self.sizing(x))
+        if len(self.fixed):
+            check_room(
+                self.fixed, domain, self.free, self.rows, self.factor * self.sizing(self.fixed)
+            )
         self.lattice = lattice_points(domain, self.target) if options.method in MOVING else None
         self.steep = self._measure_steepness()
         self.levels = 0
@@ -150,14 +171,17 @@ class Preparation:
     @property
     def setup(self) -> Setup:
         """What all levels have in common."""
-        return Setup(self.stages, self.domain, self.sizing, self.free, len(self.rows), self.factor)
+        n_fixed = len(self.fixed) + len(self.rows)
+        return Setup(
+            self.stages, self.domain, self.sizing, self.free, n_fixed, self.fixed, self.factor
+        )
 
     def _place_layers(self, field: Field) -> Field:
         """Place the generators of the layers, and return the size field limited beside them."""
         domain, layers, n_cells = self.domain, self.options.layers, self.options.n_cells
         self._check_memory(count_rows(domain, layers))
         self.rows, self.free = place_layers(domain, layers), free_domain(domain, layers)
-        least = len(self.rows) + self.free.n_pieces
+        least = len(self.rows) + max(self.free.n_pieces, len(self.fixed))
         if n_cells is not None and n_cells < least:
             raise InputError(
                 f"n_cells is {n_cells}, but layers have {len(self.rows)} cells, expected at least {least}; leave "
@@ -314,14 +338,19 @@ class Preparation:
     def mesh(self) -> MeshState:
         """Return the mesh of the initial generators."""
         host, real = self.generators(), self.stages.engine.real
+        setup, upload = self.setup, self.stages.engine.upload
+        placed = self.domain.place(host, real)
+        labels = np.arange(setup.first_row, setup.first_row + len(host), dtype=np.int32)
+        taken = np.full(len(self.fixed), -1, np.int32)
+        if len(taken) and self.levels == 0:
+            placed, labels, taken = take_places(
+                placed, labels, self.fixed, self.domain, setup.fixed
+            )
         with Naming(host, self.domain, real):
-            points = self.stages.engine.upload(self.domain.place(host, real))
-            start = {
-                "points": points,
-                "labels": self.stages.engine.upload(np.arange(len(points)), np.int32),
-            }
-            del points
-            return MeshState(self.setup, self.factor * 2.0**self.levels, start)
+            start = {"points": upload(placed), "labels": upload(labels, np.int32)}
+            mesh = MeshState(setup, self.factor * 2.0**self.levels, start)
+        mesh.next_label, mesh.taken = setup.first_row + len(host), taken
+        return mesh
 
     @property
     def may_need_correction_only(self) -> bool:

@@ -42,6 +42,7 @@ _COUNTS = (
     "position",
     "level",
     "n_start",
+    "started",
     "steps",
     "next_label",
     "spare",
@@ -120,6 +121,7 @@ class Saved:
             "diagram.covariances": ((n, 3 if spherical or d == 2 else 6), real),
             "summaries": ((len(SUMMARIES), 4), real),
             "history": ((len(a["history"]),), HISTORY_DTYPE),
+            "taken": ((len(a["taken"]),), np.int32),
         }  # fmt: skip
         if "multipliers" in a:
             shapes["multipliers"] = ((n,), np.float32)
@@ -176,7 +178,7 @@ class Saved:
             was, now = self.fingerprint.get(name), fingerprint.get(name)
             if was == now:
                 continue
-            if name == "points":
+            if name in ("points", "fixed"):
                 was, now = ("none" if v is None else f"others ({v:.8}...)" for v in (was, now))
             if name == "domain":
                 was, now = (domain_name(v) for v in (was, now))
@@ -210,7 +212,8 @@ class Saved:
         points, n = generators.points, len(generators)
         sizes = engine.empty(n)
         sizing.evaluate(points, n, sizes)
-        moving = a["mesh.labels"] >= setup.fixed
+        labels = a["mesh.labels"]
+        moving = (labels >= setup.fixed) | (labels < setup.first_row)
         self._compare_sizes(sizes.get().astype(float) * self.size_factor, domain, moving)
         del sizes
         multipliers = engine.upload(a["multipliers"], np.float32) if "multipliers" in a else None
@@ -221,7 +224,7 @@ class Saved:
         diagram = {name: a[f"diagram.{name}"] for name in DIAGRAM}
         vertices = [a[f"vertices.{name}"] for name in VERTICES if f"vertices.{name}" in a]
         mesh.tessellation = mesh.tessellator.restore(points, diagram, state["spare"], vertices)
-        mesh.next_label = state["next_label"]
+        mesh.next_label, mesh.taken = state["next_label"], a["taken"]
         periodic = mesh.tessellator.periodic
         if periodic is not None:
             periodic.halo.required.set(a["seam.needed"])
@@ -263,7 +266,8 @@ class Saved:
         return Progress(
             level=state["level"],
             n_start=state["n_start"],
-            labeled=state["n_start"] + int(history["inserted"].sum()),
+            started=state["started"],
+            labeled=state["started"] + int(history["inserted"].sum()),
             position=state["position"],
             steps=state["steps"],
             rows=[row.reshape(1) for row in history],

@@ -42,6 +42,7 @@ def run_adaptation(
     domain: Domain,
     size: object,
     points: np.ndarray | None,
+    fixed: np.ndarray,
     options: Options,
     files: Checkpoint,
     callback: Callable[[np.void], object] | None,
@@ -57,12 +58,12 @@ def run_adaptation(
     saved = None if source is None else Saved(source)
     fingerprint = {}
     if saved is not None or files.path is not None:
-        fingerprint = run_fingerprint(domain, vars(options), stages.engine.real, points)
+        fingerprint = run_fingerprint(domain, vars(options), stages.engine.real, points, fixed)
     if saved is not None:
         saved.check_fingerprint(fingerprint)
     max_levels = None if saved is None else saved.levels
     while True:
-        prepared = Preparation(stages, domain, size, points, options, max_levels)
+        prepared = Preparation(stages, domain, size, points, options, max_levels, fixed)
         if on_memory is not None:
             on_memory(prepared.memory)
             on_memory = None
@@ -113,6 +114,7 @@ def _settings(prepared: Preparation) -> dict[str, Any]:
         "error_target": prepared.error_target,
         "dtype": prepared.stages.engine.real.name,
         "layers": [repr(layer) for layer in options.layers],
+        "fixed": len(prepared.fixed),
     }
     used = {name: value for name, value in settings.items() if uses(options.method, name)}
     return {**used, "trade": prepared.trade} if options.multilevel else used

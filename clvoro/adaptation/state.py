@@ -22,6 +22,7 @@ from ..tessellation.tessellator import Tessellator
 from .arrays import Arrays, CellArrays, MeshArrays, Setup
 from .density import CellWeights, LloydWeights
 from .descent.quality_descent import MOST_OBTUSE
+from .fixed_points import take_places
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
 from .stages import Stages
 from .walls import Walls
@@ -46,6 +47,8 @@ class MeshState(MeshArrays):
     ----------
     follows_log_ratio : bool
         Summarize log(L / h) with error and quality, so that `mean_log_ratio_error` needs no transfer of its own.
+    taken : (k,) int32
+        Labels of those whose places fixed generators have taken; -1 for none.
     power : PowerTessellator or None
         What made the present diagram, if it is a power diagram.
     """
@@ -61,6 +64,7 @@ class MeshState(MeshArrays):
         self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser)
         self.power: PowerTessellator | None = None
         self.follows_log_ratio = False
+        self.taken = np.full(setup.first_row, -1, np.int32)
         self._log_ratio_error: float | None = None
         if isinstance(start, Arrays):
             self._data, self.next_label = start, len(start.generators)
@@ -86,7 +90,8 @@ class MeshState(MeshArrays):
         """Return the mesh of `points` (n, d) in normalized coordinates; labels are 0, 1, ... by default."""
         if labels is None:
             labels = stages.engine.upload(np.arange(len(points)), np.int32)
-        setup = Setup(stages, domain, sizing, domain if free is None else free, fixed)
+        none = np.empty((0, domain.dim))
+        setup = Setup(stages, domain, sizing, domain if free is None else free, fixed, none)
         return cls(setup, size_factor, {"points": points, "labels": labels})
 
     @classmethod
@@ -188,8 +193,10 @@ class MeshState(MeshArrays):
 
     def evaluate_metric(self, others: Mapping[str, cla.Array] | None = None) -> None:
         """Evaluate and summarize error and quality, and summarize `others` by name."""
-        if self.fixed:
-            self.stages.metric.set_fixed_sizes(self.labels, self.fixed, self.t.volumes, self.h)
+        if self.fixed > self.setup.first_row:
+            self.stages.metric.set_fixed_sizes(
+                self.labels, self.setup.first_row, self.fixed, self.t.volumes, self.h
+            )
         with self.engine.workspace.frame():
             energy = self.engine.scratch(self.n)
             self.stages.metric.evaluate(
@@ -306,6 +313,7 @@ class MeshState(MeshArrays):
             count = self.stages.quality_descent.open_triangles(self.t, displacement)
             if not count or count > MOST_OBTUSE * self.n:
                 return count, False
+            self.zero_fixed(displacement)
             self.stages.motion.move_generators(
                 self.free, self.points, displacement, 1.0, displacement, 0.0, self.local_length, self.velocity, clip=0.5
             )  # fmt: skip
@@ -330,10 +338,14 @@ class MeshState(MeshArrays):
         """Return the number of generators after `refine`."""
         return self.stages.refinement.count(self.t)
 
-    def refine(self) -> MeshState:
-        """Return the mesh of the next finer level. The present generators keep their labels."""
+    def refine(self, finest: bool = False) -> MeshState:
+        """Return the mesh of the next finer level. The present generators keep their labels.
+
+        On the finest one fixed generators take the places of others.
+        """
         self.stages.metric.scale_sizes(0.5, self.h)
-        finer = self.stages.refinement.refine(self.free, self.t, self.h, self.labels, self.fixed)
+        rows = self.fixed if self.fixed > self.setup.first_row else 0
+        finer = self.stages.refinement.refine(self.free, self.t, self.h, self.labels, rows)
         start, n = {"points": finer}, len(finer)
         del finer
         start["labels"] = self.engine.upload(
@@ -343,10 +355,15 @@ class MeshState(MeshArrays):
         cl.enqueue_copy(
             self.engine.queue, buffer_of(start["labels"]), buffer_of(self.labels), byte_count=self.labels.nbytes
         )  # fmt: skip
+        taken = self.taken
+        if finest and len(taken):
+            host = start["points"].get(), start["labels"].get()
+            *new, taken = take_places(*host, self.setup.points, self.domain, self.fixed)
+            start["points"], start["labels"] = map(self.engine.upload, new, (None, np.int32))
         # Free the other arrays. After an interruption `update` computes them again.
         self._data = Arrays(self._data.generators)
         mesh = MeshState(self.setup, self.size_factor / 2, start, self.tessellator)
-        mesh.next_label = self.next_label + n - self.n
+        mesh.next_label, mesh.taken = self.next_label + mesh.n - self.n, taken
         return mesh
 
     def finalize(self) -> bool:

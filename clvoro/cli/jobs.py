@@ -216,7 +216,7 @@ class Job:
         return tell
 
     def _refuse_unknown(self, arguments: dict[str, Any]) -> None:
-        known = {option.name for option in fields(Options)} | {"points"}
+        known = {option.name for option in fields(Options)} | {"points", "fixed"}
         for name in arguments:
             if name not in known:
                 raise InputError(

@@ -18,7 +18,7 @@ from ..mesh.results import Result
 if TYPE_CHECKING:
     from .cases import Case
 
-_KEPT = ("n_cells", "max_steps", "tol", "alpha", "k", "seed", "effort", "error_target")
+_KEPT = ("n_cells", "max_steps", "tol", "alpha", "k", "seed", "effort", "error_target", "fixed")
 """Settings of the run that later frames keep."""
 COLUMNS = (
     "frame",

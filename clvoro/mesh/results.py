@@ -100,7 +100,8 @@ class Result(Sealed, MeshOutput):
         The options that the method uses, to repeat the run. ``settings["error_target"]`` is the one that the run had,
         given or chosen by the size field, and ``settings["trade"]`` says so in words.
     origin : (n,) int32 or None
-        Index of each generator in the points with which the run began; -1 for inserted generators, which come last.
+        Index of each generator in the points with which the run began, of a fixed one that of the point whose place it
+        has taken; -1 for inserted generators, which come last.
     """
 
     points: np.ndarray

@@ -31,6 +31,11 @@ RUNS = {
         "effort": "fast",
         "options": clvoro.MultilevelOptions(levels=1),
     },
+    "fixed": {
+        "effort": "fast",
+        "options": clvoro.MultilevelOptions(levels=1),
+        "fixed": [(0.4, 0.4), (1.7, 1.1)],
+    },
     "mmpde": {"method": "mmpde", "max_steps": 9},
     "monge-ampere": {"method": "monge-ampere", "max_steps": 9},
     "count held": {"method": "exact", "effort": "fast", "n_cells": 250},
@@ -260,6 +265,7 @@ OTHERS = {
     "k": {"options": clvoro.PaperOptions(k=0.25)},
     "n_cells": {"n_cells": 300},
     "points": {"points": np.random.default_rng(4).random((50, 2))},
+    "fixed": {"fixed": [(0.5, 0.5)]},
 }
 
 

@@ -125,14 +125,16 @@ def test_moves_longer_than_the_domain(engine, box):
 
 
 def test_sizes_that_are_held(engine, box, t):
-    """Cells of fixed generators have the right size, unless they are more than half too large."""
+    """Cells of layers have the right size, unless they are more than half too large."""
     rng = np.random.default_rng(5606)
     labels, lengths = rng.permutation(N), t.volumes.get() ** (1 / box.dim)
     h = lengths / rng.uniform(0.5, 2.5, N)
     on_device = engine.upload(h)
     for _ in range(2):  # again with its own result
-        Metric(engine).set_fixed_sizes(engine.upload(labels, np.int32), 70, t.volumes, on_device)
-        right = (labels < 70) & (lengths <= 1.5 * h)
+        Metric(engine).set_fixed_sizes(
+            engine.upload(labels, np.int32), 20, 90, t.volumes, on_device
+        )
+        right = (labels >= 20) & (labels < 90) & (lengths <= 1.5 * h)
         assert 0 < np.count_nonzero(right) < 70
         expected = np.where(right, lengths, h)
         assert on_device.get() == pytest.approx(expected, rel=4 * np.finfo(float).eps)

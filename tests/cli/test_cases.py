@@ -293,3 +293,16 @@ def test_toml_writes_numpy_and_leaves_out_none():
     assert toml.read(text) == {"a": 0.1, "b": [0, 1, 2]}
     with pytest.raises(TypeError, match="no form"):
         toml.write({"a": object()})
+
+
+def test_fixed_generators_are_positions_or_a_file(tmp_path):
+    at = [[0.5, 0.25], [1.5, 0.75]]
+    np.save(tmp_path / "wells.npy", at)
+    size = "[size]\nkind = 'constant'\nvalue = 0.3\n[run]\n"
+    inline, named = (case(f"{size}fixed = {value}", tmp_path) for value in (at, "'wells.npy'"))
+    out = tmp_path / "out"
+    out.mkdir()
+    for read in (inline, named, load_case(named.write(out))):
+        assert np.array_equal(read.run_arguments()["fixed"], at)
+    with pytest.raises(InputError, match=r"run\.fixed.*a list of 1 or more points"):
+        case(f"{size}fixed = 0.5")

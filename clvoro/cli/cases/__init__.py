@@ -26,7 +26,7 @@ from .files import FOLDER, WRITTEN, locate
 __all__ = ["WRITTEN", "Case", "builtin_cases", "load_case"]
 
 _RUN_ORDER = (
-    "method", "methods", "effort", "levels", "error_target", "start", "points", "n_cells",
+    "method", "methods", "effort", "levels", "error_target", "start", "points", "fixed", "n_cells",
     "max_steps", "tol", "alpha", "k",
     "seed", "dtype",
 )  # fmt: skip
@@ -129,8 +129,9 @@ class Case:
         """Return the arguments of `Adapter.run` that the case sets, except method and dtype."""
         apart = ("method", "methods", "dtype")
         arguments = {key: value for key, value in self.run.items() if key not in apart}
-        if "points" in arguments:
-            arguments["points"] = load_array(self.folder / arguments["points"], "run.points")
+        for key in ("points", "fixed"):
+            if isinstance(arguments.get(key), str):
+                arguments[key] = load_array(self.folder / arguments[key], f"run.{key}")
         if self.layers:
             arguments["layers"] = [Layers(**table) for table in self.layers]
         return arguments
@@ -155,7 +156,7 @@ class Case:
         """Return the tables of the case that name files, and the keys with the names."""
         entries = [(node, "file") for node in named_files(self.size)]
         entries += [(self.place, "file")] * ("file" in self.place)
-        entries += [(self.run, "points")] * ("points" in self.run)
+        entries += [(self.run, k) for k in ("points", "fixed") if isinstance(self.run.get(k), str)]
         return entries
 
     def _moved(self) -> tuple[Case, dict[str, Path]]:

@@ -246,6 +246,11 @@ def domain(value: object, place: str) -> dict[str, Any]:
     return checked
 
 
+def fixed(value: object, place: str) -> object:
+    """Check fixed generators: the name of a file, or a list of positions."""
+    return text(value, place) if isinstance(value, str) else vectors(1)(value, place)
+
+
 _RUN = Table(
     {},
     {
@@ -253,6 +258,7 @@ _RUN = Table(
         "methods": names_of(*METHODS),
         "start": one_of("density", "uniform"),
         "points": text,
+        "fixed": fixed,
         "n_cells": whole(1),
         "max_steps": whole(0),
         "tol": not_negative,

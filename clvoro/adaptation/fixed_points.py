@@ -1,0 +1,215 @@
+"""Fixed generators: positions of the caller, such as those of wells, at which generators stay.
+
+They have the first labels, 0, 1, ... Each of them takes the place of the nearest other generator when the finest level
+begins. Coarser levels do not have them, as they may be close together for the cells there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from scipy.spatial import KDTree
+
+from ..arguments import check_points, coincident_pair, format_point, warn
+from ..errors import InputError, InputTypeError, MismatchWarning
+from ..geometry.box import Box, Domain
+from ..geometry.polygon import Polygon
+from ..mesh.diagram import Diagram
+from ..mesh.read_only import read_only
+
+CLOSE, AT_WALL, ON_WALL = 0.4, 0.2, 0.01
+"""Distances over h below which a run warns of two fixed generators or of one near a wall, and refuses one on a wall.
+
+Cells have their sizes at any distance. Measured with equal sizes in a box and a polygon, three starts each: at these
+distances the centroid of the cell is 0.25 h from its generator, and Q is about 0.9; from twice these on, Q is 0.95.
+At smaller ones the centroid is up to 0.4 h away, and Q is 0.84."""
+CANDIDATES, BEHIND_WALL = 8, 4.0
+"""Others near a fixed generator that are compared, and the factor on the distance of those behind a wall."""
+
+
+def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
+    """Return positions of fixed generators as a float64 array (k, d); k is 0 for None and for empty arrays.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If they are not an array of distinct positions inside `domain`.
+    """
+    if fixed is None:
+        return np.empty((0, domain.dim))
+    if isinstance(fixed, str | bool):
+        raise InputTypeError(
+            f"fixed is {fixed!r}, expected positions of generators, an array of shape (k, d)"
+        )
+    if not len(domain.check_rows("fixed", fixed)):
+        return np.empty((0, domain.dim))
+    array = check_points(fixed, domain, "fixed")
+    if any(domain.periodic):
+        array = domain.wrap(array)
+    pair = coincident_pair(domain.place(array, real))
+    if pair is not None:
+        i, j = pair
+        raise InputError(
+            f"fixed[{i}] and fixed[{j}] coincide in {real} at {format_point(array[i])}, expected distinct generators; "
+            "remove duplicates (numpy.unique(fixed, axis=0))"
+        )
+    return array
+
+
+def check_room(
+    points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarray, h: np.ndarray
+) -> None:
+    """Check that cells of the sizes `h` (k,) around `points` (k, d) have room.
+
+    Parameters
+    ----------
+    free : Domain
+        The domain without layers.
+    rows : (m, d) array
+        Generators of layers.
+
+    Raises
+    ------
+    InputError
+        If a generator is in a layer, or on a wall.
+
+    Warns
+    -----
+    MismatchWarning
+        If one is near a wall, or two are near each other, for the sizes there.
+    """
+    hidden = np.flatnonzero(~free.contains(points))
+    if hidden.size:
+        i = hidden[0]
+        raise InputError(
+            f"fixed[{i}] is at {format_point(points[i])}, in the layers or next to them, expected generators beyond "
+            "them; move it, or leave out the layers of this wall"
+        )
+    depth = wall_distances(points, domain) / h
+    i = int(depth.argmin())
+    if depth[i] < ON_WALL:
+        raise InputError(
+            f"fixed[{i}] is at {format_point(points[i])}, on a wall: {depth[i]:.2g} of the size there, {h[i]:.3g}, "
+            f"away from it, expected at least {ON_WALL:g}: boundary faces would go through it; move it into the domain"
+        )
+    if depth[i] < AT_WALL:
+        warn(
+            f"fixed[{i}] is at {format_point(points[i])}, {depth[i] * h[i]:.3g} from a wall, where the size field is "
+            f"{h[i]:.3g}: it is near the edge of its cell. Move it away from the wall, or use sizes of at most "
+            f"{depth[i] * h[i] / AT_WALL:.2g} there",
+            MismatchWarning,
+        )
+    everything = np.concatenate([points, rows])
+    if len(everything) == 1:
+        return
+    x, periods = in_frame(everything, domain)
+    distance, other = KDTree(x, boxsize=periods).query(x[: len(points)], k=2)
+    near = distance[:, 1] * domain.frame[1] / h
+    i = int(near.argmin())
+    j = int(other[i, 1])
+    if near[i] < CLOSE:
+        neighbor = f"fixed[{j}]" if j < len(points) else "a generator of the layers"
+        warn(
+            f"fixed[{i}] is at {format_point(points[i])}, {near[i] * h[i]:.3g} from {neighbor}, where the size field "
+            f"is {h[i]:.3g}: they are near the edges of their cells. Use sizes of at most "
+            f"{near[i] * h[i] / CLOSE:.2g} there",
+            MismatchWarning,
+        )
+
+
+def wall_distances(points: np.ndarray, domain: Domain) -> np.ndarray:
+    """Return the distances (k,) of `points` (k, d) inside `domain` from its boundary, infinite without one."""
+    if isinstance(domain, Polygon):
+        return shapely.distance(shapely.points(points), domain.geometry.boundary)
+    if not isinstance(domain, Box):
+        return np.full(len(points), np.inf)
+    gaps = np.minimum(points - domain.lower, domain.upper - points)
+    return np.where(domain.periodic, np.inf, gaps).min(axis=1)
+
+
+def in_frame(points: np.ndarray, domain: Domain) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return `points` in the device's coordinates and float64, and the periods (d,) for `KDTree`, if there are any."""
+    real = np.dtype(np.float64)
+    periodic = isinstance(domain, Box) and any(domain.periodic)
+    return domain.place(points, real), domain.periods(real) if periodic else None
+
+
+def take_places(
+    points: np.ndarray,
+    labels: np.ndarray,
+    fixed: np.ndarray,
+    domain: Domain,
+    n_fixed: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return generators and labels in which those at `fixed` (k, d) have taken the places of the nearest others.
+
+    Parameters
+    ----------
+    points : (n, d) real
+        In the device's coordinates.
+    labels : (n,) int32
+    n_fixed : int
+        Generators with smaller labels, those of layers, stay.
+
+    Returns
+    -------
+    points, labels
+        More than `n` rows if there are too few others.
+    taken : (k,) int32
+        Labels of those whose places they have taken; -1 for none.
+    """
+    points, labels = points.copy(), labels.copy()
+    x, periods = in_frame(fixed, domain)
+    others = np.flatnonzero(labels >= n_fixed)
+    places = np.full(len(fixed), -1)
+    while (places < 0).any() and len(others):
+        waiting = np.flatnonzero(places < 0)
+        count = min(CANDIDATES, len(others))
+        tree = KDTree(points[others].astype(np.float64), boxsize=periods, balanced_tree=False)
+        distance, index = tree.query(x[waiting], k=np.arange(1, count + 1))
+        if isinstance(domain, Polygon):
+            hidden = ~_sees(domain, fixed[waiting, None], points[others[index]])
+            distance = np.where(hidden, BEHIND_WALL * distance, distance)
+        used = np.zeros(len(others), bool)
+        for k in np.argsort(distance, axis=None, kind="stable").tolist():
+            row, candidate = waiting[k // count], index.flat[k]
+            if places[row] < 0 and not used[candidate]:
+                places[row], used[candidate] = others[candidate], True
+        others = others[~used]
+    positions, names = domain.place(fixed, points.dtype), np.arange(len(fixed), dtype=labels.dtype)
+    there = places >= 0
+    taken = np.where(there, labels[places], -1).astype(np.int32)
+    points[places[there]], labels[places[there]] = positions[there], names[there]
+    points = np.concatenate([points, positions[~there]])
+    return points, np.concatenate([labels, names[~there]]), taken
+
+
+def _sees(domain: Polygon, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return whether the domain has the segments from `a` (k, 1, 2) to `b` (k, m, 2), of the device, (k, m)."""
+    origin, scale = domain.frame
+    ends = np.stack(np.broadcast_arrays(a, b * scale + origin), axis=2)
+    shapely.prepare(domain.geometry)
+    return np.asarray(shapely.covers(domain.geometry, shapely.linestrings(ends)))
+
+
+def put_back(diagram: Diagram, fixed: np.ndarray) -> None:
+    """Give the first generators of `diagram` the positions `fixed` (k, d) of the caller, without round-off."""
+    if len(fixed):
+        points = diagram.points.copy()
+        points[: len(fixed)] = fixed
+        diagram._arrays["points"] = read_only(points)
+
+
+def origins(labels: np.ndarray, started: int, taken: np.ndarray) -> np.ndarray:
+    """Return the index in the points at the start for generators with `labels` (n,) in ascending order, or -1, (n,).
+
+    Parameters
+    ----------
+    started : int
+        Number of labels at the start: first those of the k fixed generators.
+    taken : (k,) int32
+        Labels of those whose places fixed generators have taken, or -1.
+    """
+    k = len(taken)
+    before = np.concatenate([taken, labels[k:]])
+    return np.where((before >= k) & (before < started), before - k, -1).astype(np.int32)
