@@ -20,9 +20,9 @@ from ..mesh.read_only import read_only
 CLOSE, AT_WALL, ON_WALL = 0.4, 0.2, 0.01
 """Distances over h below which a run warns of two fixed generators or of one near a wall, and refuses one on a wall.
 
-Cells have their sizes at any distance. Measured with equal sizes in a box and a polygon, three starts each: at these
-distances the centroid of the cell is 0.25 h from its generator, and Q is about 0.9; from twice these on, Q is 0.95.
-At smaller ones the centroid is up to 0.4 h away, and Q is 0.84."""
+Cells have their sizes at any distance (`bench/fixed_points.py --near`). In 2D, at the distances of the warnings, the
+centroid of the cell is 0.2 h from its generator, and Q is above 0.9; on a wall, or at the place of another one, that is
+0.4 h and 0.84."""
 CANDIDATES, BEHIND_WALL = 8, 4.0
 """Others near a fixed generator that are compared, and the factor on the distance of those behind a wall."""
 
@@ -106,7 +106,7 @@ def check_room(
     distance, other = KDTree(x, boxsize=periods).query(x[: len(points)], k=2)
     near = distance[:, 1] * domain.frame[1] / h
     i = int(near.argmin())
-    j = int(other[i, 1])
+    j = int(np.asarray(other)[i, 1])
     if near[i] < CLOSE:
         neighbor = f"fixed[{j}]" if j < len(points) else "a generator of the layers"
         warn(
@@ -129,9 +129,8 @@ def wall_distances(points: np.ndarray, domain: Domain) -> np.ndarray:
 
 def in_frame(points: np.ndarray, domain: Domain) -> tuple[np.ndarray, np.ndarray | None]:
     """Return `points` in the device's coordinates and float64, and the periods (d,) for `KDTree`, if there are any."""
-    real = np.dtype(np.float64)
-    periodic = isinstance(domain, Box) and any(domain.periodic)
-    return domain.place(points, real), domain.periods(real) if periodic else None
+    x, real = domain.place(points, np.dtype(np.float64)), np.dtype(np.float64)
+    return x, domain.periods(real) if isinstance(domain, Box) and any(domain.periodic) else None
 
 
 def take_places(
@@ -166,7 +165,8 @@ def take_places(
         waiting = np.flatnonzero(places < 0)
         count = min(CANDIDATES, len(others))
         tree = KDTree(points[others].astype(np.float64), boxsize=periods, balanced_tree=False)
-        distance, index = tree.query(x[waiting], k=np.arange(1, count + 1))
+        near = tree.query(x[waiting], k=count)
+        distance, index = (np.reshape(found, (-1, count)) for found in near)
         if isinstance(domain, Polygon):
             hidden = ~_sees(domain, fixed[waiting, None], points[others[index]])
             distance = np.where(hidden, BEHIND_WALL * distance, distance)

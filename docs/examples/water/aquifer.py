@@ -16,7 +16,7 @@ import clvoro
 from clvoro import sizing
 
 # %%
-# The catchment, the river and the wells, in meters.
+# The catchment, the river and the wells, in meters. Each well is a generator that does not move: the wells have the first cells.
 
 x = [0, 500, 1500, 2300, 2400, 1700, 700, 100]
 y = [300, 0, -100, 300, 1100, 1600, 1500, 1000]
@@ -30,7 +30,7 @@ size = sizing.minimum(
     sizing.Distance(sizing.Polyline(river), h_min=20, growth=1.15, h_max=90),
     *(sizing.Distance(sizing.Circle(w, radius=1), h_min=4, growth=1.2) for w in wells),
 )
-mesh = clvoro.adapt(domain, size)
+mesh = clvoro.adapt(domain, size, fixed=wells)
 print(mesh)
 
 # %%
@@ -48,7 +48,7 @@ upper = scipy.sparse.coo_array((conductance, (i, j)), shape=(n, n))
 matrix = scipy.sparse.diags_array((upper + upper.T).sum(axis=1)) - upper - upper.T
 
 water = 6e-9 * cells.volumes  # m3/s of recharge
-water[cells.locate(wells)] -= pumping
+water[: len(wells)] -= pumping
 
 leak = np.where(
     sizing.Distance(sizing.Polyline(river), h_min=1, slope=1)(cells.points) < 21, 1e-2, 0

@@ -21,7 +21,8 @@ import clvoro
 from clvoro import sizing
 
 # %%
-# The river is a part of the boundary and has a name. Cells are small at the wells.
+# The river is a part of the boundary and has a name. Cells are small at the wells. Each well is the center of its cell, exactly: `fixed`
+# wells are the first generators of the mesh.
 
 outline = [
     (0, 0),
@@ -42,7 +43,7 @@ size = sizing.minimum(
     sizing.Distance(domain.boundary("river"), h_min=35, growth=1.15, h_max=120),
     *(sizing.Distance(sizing.Circle(w, radius=1), h_min=6, growth=1.15) for w in wells),
 )
-mesh = clvoro.adapt(domain, size)
+mesh = clvoro.adapt(domain, size, fixed=wells)
 grid = mesh.to_disv()
 print(grid)
 
@@ -54,7 +55,7 @@ thickness, conductivity, rain = 20.0, 5e-4, 5e-9
 river = grid.boundaries["river"]
 stage = 50 - 2 * river.feet[:, 0] / 3500
 conductance = river.conductance(conductivity * thickness)
-cells = mesh.diagram.locate(wells)
+cells = np.arange(len(wells))
 
 folder = tempfile.mkdtemp()
 sim = flopy.mf6.MFSimulation(sim_ws=folder, exe_name="mf6")
@@ -115,10 +116,10 @@ place = (1700, 1700)
 coarse = sizing.Distance(sizing.Circle(place, radius=1), h_min=20, slope=0.1, h_max=150)
 
 
-def drawdown(diagram, well, steps):
+def drawdown(diagram, steps):
     """Return the drawdown s(T) by implicit Euler steps from s = 0. The first steps are the shortest."""
     flow = flow_matrix(diagram, transmissivity)
-    s, source = np.zeros(len(diagram)), rate * (np.arange(len(diagram)) == well)
+    s, source = np.zeros(len(diagram)), rate * (np.arange(len(diagram)) == 0)
     for dt in np.diff(end * np.linspace(0, 1, steps + 1) ** 3):
         capacity = storage * diagram.volumes / dt
         s = scipy.sparse.linalg.spsolve(
@@ -129,10 +130,9 @@ def drawdown(diagram, well, steps):
 
 figure, ax = plt.subplots(layout="constrained")
 for scale in (1, 0.5):
-    diagram = clvoro.adapt(aquifer, coarse * scale).diagram
-    well = diagram.locate([place])[0]
-    s = 2 * drawdown(diagram, well, 40) - drawdown(diagram, well, 20)
-    r = np.linalg.norm(diagram.points - diagram.points[well], axis=1)
+    diagram = clvoro.adapt(aquifer, coarse * scale, fixed=[place]).diagram
+    s = 2 * drawdown(diagram, 40) - drawdown(diagram, 20)
+    r = np.linalg.norm(diagram.points - place, axis=1)
     theis = scipy.special.exp1(r**2 * storage / (4 * transmissivity * end))
     theis *= rate / (4 * np.pi * transmissivity)
     seen = (r > 100) & (r < 1500)
