@@ -10,14 +10,21 @@
 
 #define NONE (-1)
 
-/* partial[item] = largest weight of the entries of one work-item. Entries behind the last row are ignored. */
+/* partial[group] = largest weight of the entries of a group. Entries behind the last row are ignored. */
 kernel void find_largest_weight(int n, global const int *starts, global const SOURCE *weights, global SOURCE *partial)
 {
     const int m = starts[n];
     SOURCE most = 0;
     for (BLOCK_LOOP(k, m))
         most = fmax(most, weights[k]);
-    partial[get_global_id(0)] = most;
+    local SOURCE shares[GROUP_SIZE];
+    shares[get_local_id(0)] = most;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (get_local_id(0) > 0)
+        return;
+    for (int item = 1; item < GROUP_SIZE; ++item)
+        most = fmax(most, shares[item]);
+    partial[get_group_id(0)] = most;
 }
 
 /* out[k] = 2^exponent weights[k], in the multigrid's precision, whose range may be smaller than the operator's. One

@@ -138,11 +138,14 @@ class Aggregation:
         m, source = len(graph.weights), graph.weights.dtype
         kernels = self._kernels_from(source)
         if not same_exponent:
-            find = kernels.find_largest_weight
-            items = self.engine.groups * self.engine.block_of(find)
-            partial = self._room("largest", source, size=items, dtype=source)
-            size = np.int32(len(graph))
-            self.engine.run_blocks(find, size, graph.starts, graph.weights, partial)
+            partial = self._room("largest", source, size=self.engine.groups, dtype=source)
+            self.engine.run_blocks(
+                kernels.find_largest_weight,
+                np.int32(len(graph)),
+                graph.starts,
+                graph.weights,
+                partial,
+            )
             largest = float(partial.get().max())
             self.exponent = -math.frexp(largest)[1] if 0 < largest < math.inf else 0
             if source == self.engine.real and abs(self.exponent) <= _EXPONENT_RANGE:
