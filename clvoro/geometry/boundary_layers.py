@@ -248,25 +248,27 @@ def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
 
 
 def outer_segments(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parts (k, 2, 2) of the last row of `layer` between neighboring columns, and their lengths (k,).
+    """Return the parts (k, 2, 2) of the last row of `layer` between neighboring columns, and their widths (k,).
 
-    Parts that are outside of the domain, or nearer to another wall, are left out.
+    Widths are their lengths, but at least `_NEAR` of that between the feet of the columns: in corners columns of two
+    walls come close together. Parts that are outside of the domain, or nearer to another wall, are left out.
     """
     polygon, _ = as_polygon(domain)
-    y, found = float(layer.rows[-1]), [np.empty((0, 2, 2))]
+    y = float(layer.rows[-1])
+    found, least = [np.empty((0, 2, 2))], [np.empty(0)]
     for chain in _chains(domain, layer):
         feet, normals = place_columns(chain, layer.width, layer.height)
-        row = feet + y * normals
-        for part in (row, place_fan(chain, layer.width, y)):
-            found.append(np.stack([part[:-1], part[1:]], axis=1))
         if chain.closed:
-            found.append(np.stack([row[-1:], row[:1]], axis=1))
+            feet, normals = (np.concatenate([x, x[:1]]) for x in (feet, normals))
+        row, fan = feet + y * normals, place_fan(chain, layer.width, y)
+        found += [np.stack([part[:-1], part[1:]], axis=1) for part in (row, fan)]
+        least += [_NEAR * np.hypot(*np.diff(feet, axis=0).T), np.zeros(max(len(fan) - 1, 0))]
     segments = np.concatenate(found)
+    widths = np.maximum(np.hypot(*(segments[:, 1] - segments[:, 0]).T), np.concatenate(least))
     middles = segments.mean(axis=1)
     kept = polygon.contains(middles)
     kept[kept] = _distances(middles[kept], chosen_segments(domain, layer)) >= _OWN * y
-    segments = segments[kept]
-    return segments, np.hypot(*(segments[:, 1] - segments[:, 0]).T)
+    return segments[kept], widths[kept]
 
 
 def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:

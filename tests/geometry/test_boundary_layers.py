@@ -249,6 +249,17 @@ def test_there_are_no_levels_too_coarse_for_the_gaps_between_layers(adapter):
     assert np.abs(mesh.size_error).mean() < 0.01
 
 
+def test_sizes_are_met_where_columns_of_two_walls_come_close(adapter):
+    """In this corner they are 4.5 apart. Sizes beyond had that limit once, and |e| was up to 75."""
+    domain = clvoro.Polygon([(600, 2100), (-200, 900), (0, 0), (700, 900)])
+    layers = clvoro.Layers(8, 4, 1.2, spacing=25, edges=(0, 1))
+    segments, widths = outer_segments(domain, layers)
+    lengths = np.hypot(*(segments[:, 1] - segments[:, 0]).T)
+    assert lengths.min() < 5 < 0.5 * layers.width < widths.min()
+    result = adapter.run(domain, 60.0, layers=layers, seed=3)
+    assert np.abs(result.size_error).max() < 0.3
+
+
 def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
     layers = Layers(0.04, count=2, edges=range(4, 84))
     options = {"layers": layers, "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
