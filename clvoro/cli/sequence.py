@@ -102,7 +102,7 @@ def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
 def _draw(shown: Mapping[float, Result], path: Path) -> None:
     """Draw frames side by side, colored by target size."""
     from ..plotting import plot_cells, plot_globe
-    from ..plotting.colors import coloring
+    from ..plotting.colors import coloring, shared_limits
     from ..plotting.globe import default_center
     from ..plotting.legends import add_key
     from ..plotting.pictures import render
@@ -113,7 +113,7 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
     columns = min(3, len(results))
     lines = -(-len(results) // columns)
     sizes = np.concatenate([r.target_size for r in results])
-    limits = (float(sizes.min()), float(sizes.max()))
+    limits = shared_limits(results, "size")
     lower, upper = domain.lower[:2], domain.upper[:2]
     plot: Callable[..., Any] = plot_cells
     if isinstance(domain, Sphere):

@@ -292,9 +292,10 @@ def test_start_from_longitudes_and_latitudes(here):
     assert load(here / "out/small/mesh.npz").points == pytest.approx(X, rel=1e-9, abs=1e-6)
 
 
-def test_frames(here):
+@pytest.mark.parametrize("sizes", ["250 + lat * {t}", "300 + 0 * {t}"], ids=["moving", "constant"])
+def test_frames(here, sizes):
     text = SMALL.replace(
-        "kind = 'constant'\nvalue = 300", "kind = 'expression'\nexpression = '250 + lat * {t}'"
+        "kind = 'constant'\nvalue = 300", f"kind = 'expression'\nexpression = '{sizes}'"
     )
     (here / "small.toml").write_text(text + "[sequence]\nframes = 2\n")
     assert call("run", "small.toml", "--quiet") == cli.OK
