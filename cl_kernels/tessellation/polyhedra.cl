@@ -2,9 +2,7 @@
 #include "tessellation/row_counts.h"
 #include "tessellation/periodic/halo.h"
 #include "tessellation/polyhedron_search.h"
-
-/* Share of the volume of a cell by which its faces may differ from those of neighbors. */
-#define EVEN_SHARE R(1e-3)
+#include "tessellation/cell_output.h"
 
 inline REAL distance_between(global const REAL *points, int i, int j PERIOD_ARGS)
 {
@@ -12,21 +10,6 @@ inline REAL distance_between(global const REAL *points, int i, int j PERIOD_ARGS
     const REAL dy = DIFFERENCE(1, points[STRIDE * i + 1], points[STRIDE * j + 1]);
     const REAL dz = DIFFERENCE(2, points[STRIDE * i + 2], points[STRIDE * j + 2]);
     return sqrt(dx * dx + dy * dy + dz * dz);
-}
-
-inline REAL4 vertex_at(const CELL *cell, int v)
-{
-    return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
-}
-
-inline REAL dot3(REAL4 a, REAL4 b)
-{
-    return a.s0 * b.s0 + a.s1 * b.s1 + a.s2 * b.s2;
-}
-
-inline REAL4 cross3(REAL4 a, REAL4 b)
-{
-    return a.yzxw * b.zxyw - a.zxyw * b.yzxw;
 }
 
 /* Write the vertices as triples of the faces, which are numbered in the order of their places. */
@@ -223,14 +206,8 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
                 narrow |= !(area > slim / 2 * sqrt(width2));
             }
             doubtful |= across2 < near2;
-            if (fits) {
-                const REAL third = area > 0 ? 1 / (3 * area) : 0;
-                labels[place + count] = label;
-                measures[place + count] = area / 2;
-                centroids[3 * (place + count)] = face_first.s0 * third;
-                centroids[3 * (place + count) + 1] = face_first.s1 * third;
-                centroids[3 * (place + count) + 2] = face_first.s2 * third;
-            }
+            if (fits)
+                write_face(place + count, label, area, face_first, labels, measures, centroids);
             ++count;
         }
 #ifdef WEIGHTED
@@ -250,27 +227,10 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         }
         if (doubtful || narrow)
             atomic_or(report, (doubtful ? FLAG_DOUBT : 0) | (narrow ? FLAG_NARROW : 0));
-        /* In a box as thin as round-off all faces are below it. */
-        if (count < 4 || !(volume > 0 && lost <= share * volume))
-            atomic_or(report, FLAG_COLLAPSED);
-        else if (lost > EVEN_SHARE * volume)
-            atomic_or(report, FLAG_UNEVEN);
+        flag_lost_faces(count, volume, lost, share, report);
         REAL4 square, mixed;
         sum_second_moments(cell, start, &square, &mixed);
-        const REAL inverse = 1 / volume;
-        first *= inverse / 4;
-        square = square * (inverse / 20) - first * first;
-        mixed = mixed * (inverse / 20) - first.yzxw * first.zxyw;
-        volumes[i] = volume / 6;
-        offsets[3 * i] = first.s0;
-        offsets[3 * i + 1] = first.s1;
-        offsets[3 * i + 2] = first.s2;
-        covariances[6 * i] = square.s0;
-        covariances[6 * i + 1] = mixed.s2;
-        covariances[6 * i + 2] = mixed.s1;
-        covariances[6 * i + 3] = square.s1;
-        covariances[6 * i + 4] = mixed.s0;
-        covariances[6 * i + 5] = square.s2;
+        write_cell_moments(i, volume, first, square, mixed, volumes, offsets, covariances);
     }
 }
 

@@ -41,10 +41,12 @@
 #define ADD_VERTEX(set, v) ((set)[VERTEX_WORD(v)] |= (ulong)1 << ((v)&63))
 #define HAS_VERTEX(set, v) (((set)[VERTEX_WORD(v)] >> ((v)&63)) & 1)
 
-/* Cells lie in private memory, or, with -DCELL_BYTES=bytes of one cell, in `cell_places` places in global memory, where
-   work-item k clips each `cell_places`-th cell from the k-th on: drivers of GPUs reserve private memory for all
-   work-items that fit on the device at once. */
-#ifdef CELL_BYTES
+/* Cells lie in private memory; or, if a team builds them, in local memory; or, with -DCELL_BYTES=bytes of one cell, in
+   `cell_places` places in global memory, where work-item k clips each `cell_places`-th cell from the k-th on: drivers
+   of GPUs reserve private memory for all work-items that fit on the device at once. */
+#ifdef TEAM
+#define CELL_SPACE local
+#elif defined(CELL_BYTES)
 #define CELL_SPACE global
 #define CELL_ARGS , global uchar *cell_memory, const int cell_places
 #define EACH_CELL(i) for (int i = get_global_id(0); i < size; i += cell_places)

@@ -169,7 +169,11 @@ class Engine:
         return "double" if real == np.float64 else "float"
 
     def kernels(
-        self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""
+        self,
+        stage: str,
+        defines: Mapping[str, object] | None = None,
+        prelude: str = "",
+        group_size: int | None = None,
     ) -> Kernels:
         """Return the kernels of `cl_kernels/<stage>.cl`; see `Kernels`.
 
@@ -180,12 +184,14 @@ class Engine:
             Macros besides those of the engine.
         prelude : str
             OpenCL C before the file.
+        group_size : int, optional
+            Work-items per group of block-wise kernels, by default the engine's.
         """
         name, full = f"{stage}.cl", self.all_defines(stage, defines or {})
         # Called through the module, because tests replace the function.
         return Kernels(
             lambda size: program.build_program(self.ctx, name, {**full, "GROUP_SIZE": size}, prelude),
-            stage, self.pool, self.group_size,
+            stage, self.pool, group_size or self.group_size,
         )  # fmt: skip
 
     def all_defines(self, stage: str, defines: Mapping[str, object]) -> dict[str, object]:

@@ -39,6 +39,8 @@ STATIC_FUNCTIONS = "#define inline static inline\n"
 """Put before programs; see `needs_static_functions`."""
 POCL = "Portable Computing Language"
 """Name of PoCL's platform."""
+NVIDIA = "NVIDIA CUDA"
+"""Name of NVIDIA's platform."""
 
 
 def kernel_folder() -> Path:
@@ -206,6 +208,11 @@ def needs_static_functions(device: cl.Device) -> bool:
 def on_pocl(device: cl.Device) -> bool:
     """Return whether `device` is one of PoCL's, which builds one program at a time, whatever the number of threads."""
     return device.platform.name.strip() == POCL
+
+
+def on_nvidia(device: cl.Device) -> bool:
+    """Return whether NVIDIA's compiler builds programs for `device`."""
+    return device.platform.name.strip() == NVIDIA
 
 
 def has_short_declarations(ctx: cl.Context) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ..errors import ClvoroError, MemoryLimitError
+from ..errors import BuildError, ClvoroError, MemoryLimitError
 from ..geometry.box import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
@@ -41,6 +41,7 @@ from .device_diagram import (
     restored,
 )
 from .periodic.halo import halo_defines
+from .teams import TEAM, are_for, fits, has_warps, team_defines
 from .weight_bounds import WeightBounds
 
 FACES_PER_CELL = 16.5
@@ -65,6 +66,11 @@ class Polyhedra:
         self._scan = Scan(engine)
         self._programs: dict[int, SimpleNamespace] = {}
         self._kernels(FACE_CAPACITY)
+        self._teams = None
+        if are_for(engine):
+            self._teams = engine.kernels(
+                "tessellation/polyhedra_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
+            )  # fmt: skip
         self._wrap = None
         self._bounds = WeightBounds(engine) if engine.domain_kind.weighted else None
         if self._bounds is None and engine.group_size == 1 and engine.real == np.float64:
@@ -84,6 +90,21 @@ class Polyhedra:
             }  # fmt: skip
             self._programs[capacity] = self.engine.kernels("tessellation/polyhedra", defines)
         return self._programs[capacity]
+
+    def _team_kernel(self) -> cl.Kernel | None:
+        """Return the kernel that builds cells by teams; None if they are not for this engine, or do not work.
+
+        They do not if the driver does not build the kernel. Then work-items build their cells alone.
+        """
+        if self._teams is not None:
+            try:
+                kernel = self._teams.clip_polyhedra_by_teams
+                if fits(kernel, self.engine.queue.device):
+                    return kernel
+            except BuildError:
+                pass
+            self._teams = None
+        return None
 
     def _reserve_cells(self, n: int) -> None:
         """Allocate the arrays per cell for `n` cells."""
@@ -262,9 +283,12 @@ class Polyhedra:
                 np.int32(rows), binned.points, binned.items, *search, points, lower, upper,
                 np.int32(warm), *old, some, room, share, *written,
             )  # fmt: skip
-            clip_each(
-                engine, self._kernels(capacity).clip_polyhedra, capacity, n, cell_args, halo_args
-            )
+            by_team = None if some else self._team_kernel()
+            if by_team is not None:
+                engine.run(by_team, TEAM * n, np.int32(n), *cell_args, group=TEAM)
+            else:
+                clip = self._kernels(capacity).clip_polyhedra
+                clip_each(engine, clip, capacity, n, cell_args, halo_args)
             flags, m = (int(v) for v in self._report.get()[:2])
             if flags & ~(FULL | HARMLESS):
                 return None

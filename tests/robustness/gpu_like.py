@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 from clvoro.opencl import engine, launch, ranges
 from clvoro.solvers import poisson
+from clvoro.tessellation import teams
 
 LONGEST = 2e-3
 """Seconds after which a launch is divided in tests, so that those of small meshes are, too."""
@@ -37,3 +38,13 @@ def groups(size: int, count: int = 16) -> Iterator[None]:
         yield
     finally:
         engine.group_sizes, poisson.cost_factors = before
+
+
+@contextmanager
+def by_teams(wanted: bool) -> Iterator[None]:
+    """Let teams build the cells in 3D of engines made inside the ``with`` block, or not, on any device."""
+    before, teams.are_faster = teams.are_faster, lambda _: wanted
+    try:
+        yield
+    finally:
+        teams.are_faster = before

@@ -22,6 +22,7 @@ from clvoro.opencl import program as _program
 from clvoro.opencl.engine import DomainKind, Engine
 from clvoro.tessellation.cells import CELL_CAPACITY
 from clvoro.tessellation.cut_cells import FACE_CAPACITY
+from clvoro.tessellation.teams import TEAM, team_defines
 from tests.robustness import oclgrind_work
 from tests.robustness.gpu_like import groups
 
@@ -106,7 +107,10 @@ def on_sphere(adapter: clvoro.Adapter) -> None:
 
 
 def programs_of_all_kinds(ctx: cl.Context, dtype: str, group: int | None = 128) -> list[Source]:
-    """Return every program that small work of all kinds builds: for GPUs in groups of `group`, for a CPU with None."""
+    """Return every program that small work of all kinds builds: for GPUs in groups of `group`, for a CPU with None.
+
+    That of teams is among those for GPUs, without warp instructions, which only NVIDIA's compiler has.
+    """
     with contextlib.ExitStack() as stack:
         if group is not None:
             stack.enter_context(groups(group))
@@ -116,7 +120,16 @@ def programs_of_all_kinds(ctx: cl.Context, dtype: str, group: int | None = 128) 
             if not name.startswith("broken"):
                 work(adapter)
         on_sphere(adapter)
-    return sources
+    return sources if group is None else [*sources, team_program(ctx, dtype, warps=False)]
+
+
+def team_program(ctx: cl.Context, dtype: str, warps: bool) -> Source:
+    """Return the program that builds cells in 3D by teams, with or without warp instructions."""
+    stage = "tessellation/polyhedra_by_teams"
+    engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(dtype))
+    defines = engine.all_defines(stage, team_defines(warps)) | {"GROUP_SIZE": TEAM}
+    text, options = _program.program_text(f"{stage}.cl", defines, "")
+    return Source(f"{stage}.cl", options, text)
 
 
 def programs_of_a_first_run(ctx: cl.Context, dim: int, dtype: str) -> list[Source]:

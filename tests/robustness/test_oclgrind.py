@@ -38,6 +38,8 @@ LANES = {
     "walks.walk_all_cells",
 }  # fmt: skip
 """Kernels that find eight cells at a time in vector lanes of a CPU, in float64, or choose these cells."""
+ELSEWHERE = {"polyhedra_by_teams"}
+"""Files of kernels that only other devices than this one take: test_polyhedra_teams.py compares their bits."""
 NOT_IN = {
     # Work-groups take it in place of two kernels.
     "float64": {"conjugate_gradient.apply_to_direction"},
@@ -253,14 +255,14 @@ def test_nothing_is_found(trusted, name, variant):
 
 
 def all_kernels():
-    """Return the kernels of every file, those of its headers too, as "file.kernel"."""
+    """Return the kernels of every file but `ELSEWHERE`, those of its headers too, as "file.kernel"."""
     found = set()
     for path in kernel_folder().rglob("*.cl"):
         source = source_text(path.relative_to(kernel_folder()).as_posix())
         text = re.sub(r"/\*.*?\*/|//[^\n]*", "", source, flags=re.DOTALL)
         text = re.sub(r"^\s*#.*(?:\\\n.*)*", "", text, flags=re.MULTILINE)
         found |= {f"{path.stem}.{name}" for name in re.findall(r"\bkernel\b[^(]*?(\w+)\s*\(", text)}
-    return found
+    return without(found, ELSEWHERE)
 
 
 @pytest.mark.parametrize("variant", list(VARIANTS))
