@@ -108,10 +108,12 @@ kernel void clip_by_rings(const int size, global const REAL *points, const REAL4
                 flag = FLAG_FULL;
         }
     }
+#ifdef FOLD_0
     /* Along a period no cell reaches a side of the box that contains all. There is no corner on it, either. */
     for (int f = 0; f < cell.n; ++f)
         if (cell.faces[f] < 0 && FOLD((-1 - cell.faces[f]) / 2) > 0)
             atomic_or(flags, FLAG_OPEN);
+#endif
     places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
 }
 #endif
