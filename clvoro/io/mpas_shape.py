@@ -134,7 +134,9 @@ def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
     lengths = diagram.face_measures[halves.rows[first]]
     distances = np.where(inner[first], np.hypot(*line[first].T), np.sqrt(3) * lengths)
     # In polygons a cell may include a part of another region, whose edges lie on no bisector of its generator.
-    off = np.abs(((middle - line / 2) * line).sum(axis=1))[first] / distances
+    # Files of others may have generators at one place. They are refused later.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.abs(((middle - line / 2) * line).sum(axis=1))[first] / distances
     on_bisector = inner[first] & (off <= _roundings(diagram, distances))
     foot = np.where(on_bisector[edge][:, None], line / 2, middle)
     kites = (_cross(begin, foot) + _cross(foot[halves.previous], begin)) / 2

@@ -70,6 +70,9 @@ def find_weights(
         passed = passed[going] + shares[there]
         at, edge = place[here] + step - 1, halves.edge[there]
         edges[at] = edge
-        ratio = lengths[edge] / distances[halves.edge[here]]
+        with np.errstate(
+            divide="ignore"
+        ):  # distances of 0 in files of others, which are refused later
+            ratio = lengths[edge] / distances[halves.edge[here]]
         values[at] = normal[here] * normal[there] * (0.5 - passed) * ratio
     return Weights(counts, edges, values)
