@@ -16,7 +16,8 @@ from .distance import Distance
 from .evaluation import Sizing
 from .expression import Expression
 from .feature import FeatureSize
-from .field import Constant, Field, Function, as_field, maximum, minimum
+from .field import Constant, Field, as_field, maximum, minimum
+from .function import Function
 from .graded import Graded
 from .lonlat import Caps, LonLat
 from .raster import Raster, Scattered
