@@ -178,6 +178,20 @@ inline void find_reach(CELL *cell)
 #define SITE_IN_SPACE(points, i)                                                                                       \
     (REAL4)((points)[STRIDE * (i)], (points)[STRIDE * (i) + 1], (points)[STRIDE * (i) + 2], WEIGHT(points, i))
 
+/* Vertex v of 8 of the box from `low` to `high`, its faces and links. */
+inline void start_vertex(CELL *cell, int v, REAL4 low, REAL4 high)
+{
+    X(cell)[v] = v & 1 ? high.s0 : low.s0;
+    Y(cell)[v] = v & 2 ? high.s1 : low.s1;
+    Z(cell)[v] = v & 4 ? high.s2 : low.s2;
+    const int fx = v & 1, fy = 2 + ((v >> 1) & 1), fz = 4 + (v >> 2);
+    /* Counter-clockwise for an even number of lower walls. */
+    const bool turned = ((v & 1) + ((v >> 1) & 1) + (v >> 2)) % 2 == 0;
+    cell->faces[v] = turned ? (INDEX4)(fx, fz, fy, 0) : (INDEX4)(fx, fy, fz, 0);
+    const int along_x = v ^ 1, along_y = v ^ 2, along_z = v ^ 4;
+    cell->links[v] = turned ? (INDEX4)(along_y, along_x, along_z, 0) : (INDEX4)(along_z, along_x, along_y, 0);
+}
+
 /* Start with the whole box around generator x. Face w is wall w. */
 inline void start_polyhedron(CELL *cell, REAL4 x, REAL4 lower, REAL4 upper)
 {
@@ -193,17 +207,8 @@ inline void start_polyhedron(CELL *cell, REAL4 x, REAL4 lower, REAL4 upper)
     for (int b = 8 / CELL_LANES; b < VERTEX_CAPACITY / CELL_LANES; ++b)
         cell->x[b] = cell->y[b] = cell->z[b] = 0;
     SHORT_LOOP
-    for (int v = 0; v < 8; ++v) {
-        X(cell)[v] = v & 1 ? high.s0 : low.s0;
-        Y(cell)[v] = v & 2 ? high.s1 : low.s1;
-        Z(cell)[v] = v & 4 ? high.s2 : low.s2;
-        const int fx = v & 1, fy = 2 + ((v >> 1) & 1), fz = 4 + (v >> 2);
-        /* Counter-clockwise for an even number of lower walls. */
-        const bool turned = ((v & 1) + ((v >> 1) & 1) + (v >> 2)) % 2 == 0;
-        cell->faces[v] = turned ? (INDEX4)(fx, fz, fy, 0) : (INDEX4)(fx, fy, fz, 0);
-        const int along_x = v ^ 1, along_y = v ^ 2, along_z = v ^ 4;
-        cell->links[v] = turned ? (INDEX4)(along_y, along_x, along_z, 0) : (INDEX4)(along_z, along_x, along_y, 0);
-    }
+    for (int v = 0; v < 8; ++v)
+        start_vertex(cell, v, low, high);
     for (int w = 0; w < 6; ++w)
         cell->labels[w] = -1 - w;
     cell->planes[0] = (REAL4)(-1, 0, 0, -low.s0);

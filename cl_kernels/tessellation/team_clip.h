@@ -262,16 +262,8 @@ inline void team_start(local shared_t *at, team_t *team, known_t *known, REAL4 x
     const int v = team->lane;
     if (v < 3)
         at->words[v] = 0;
-    if (v < 8) {
-        X(cell)[v] = v & 1 ? high.s0 : low.s0;
-        Y(cell)[v] = v & 2 ? high.s1 : low.s1;
-        Z(cell)[v] = v & 4 ? high.s2 : low.s2;
-        const int fx = v & 1, fy = 2 + ((v >> 1) & 1), fz = 4 + (v >> 2);
-        const bool turned = ((v & 1) + ((v >> 1) & 1) + (v >> 2)) % 2 == 0;
-        cell->faces[v] = turned ? (INDEX4)(fx, fz, fy, 0) : (INDEX4)(fx, fy, fz, 0);
-        const int along_x = v ^ 1, along_y = v ^ 2, along_z = v ^ 4;
-        cell->links[v] = turned ? (INDEX4)(along_y, along_x, along_z, 0) : (INDEX4)(along_z, along_x, along_y, 0);
-    }
+    if (v < 8)
+        start_vertex(cell, v, low, high);
     if (v < 6) {
         const bool above = v & 1;
         const int axis = v >> 1;
