@@ -17,7 +17,7 @@ def are_faster(device: cl.Device) -> bool:
     """Return whether teams build cells faster than single work-items on `device`: on NVIDIA's GPUs.
 
     By the platform, not by a measurement: the same choice in every run. The kernel for 1e6 random generators in float64
-    takes 43.9 ms by teams and 138.5 ms without on an H200 (driver 580, 2026-11-27).
+    took 43.9 ms by teams and 138.5 ms without on an H200 (see "On a GPU" in bench/RESULTS.md).
     """
     return has_warps(device)
 
