@@ -65,8 +65,8 @@ LARGEST: dict[int | str, dict[int, int]] = {
 TRIMMED_LARGEST = {8: 130, 4: 90}
 """The same in polygons."""
 PARTIAL_SUMS, SCANS, ARRAYS = 64, 8, 64
-"""Independent of the number of cells: reals per work-group for sums, scans, and arrays in the workspace, each of which
-wastes up to one unit."""
+"""Independent of the number of cells: per work-group, reals for sums and integers for scans; and small arrays, each
+counted as one unit of alignment."""
 FEW = 6000
 """Cells from which on linear solves use multigrid, so that the record of iterations stays short."""
 

@@ -185,7 +185,7 @@ def take_places(
 
 
 def _sees(domain: Polygon, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return whether the domain has the segments from `a` (k, 1, 2) to `b` (k, m, 2), of the device, (k, m)."""
+    """Return which segments from `a` (k, 1, 2) to `b` (k, m, 2), in device coordinates, lie in the domain, (k, m)."""
     origin, scale = domain.frame
     ends = np.stack(np.broadcast_arrays(a, b * scale + origin), axis=2)
     shapely.prepare(domain.geometry)

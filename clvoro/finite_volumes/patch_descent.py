@@ -21,9 +21,9 @@ ANGLE, SKEWNESS = np.radians(19), 1.9
 STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell."""
 _SHORT = 0.05
-"""A face that is shorter adds to the price of the patch. Lengths are over the size of the smaller of both cells."""
+"""A shorter face raises the price of the patch. Lengths are relative to the smaller of its two cells."""
 LEAST_DETERMINANT = 3e-3
-"""A cell with a smaller determinant adds to the price of the patch. OpenFOAM refuses cells below 1e-3."""
+"""A cell with a smaller determinant raises the price of the patch. OpenFOAM refuses cells below 1e-3."""
 _MOST_EXCESS = 4
 """Faces that exceed a limit by more than this times it have the same price."""
 _INVERTED_PRICE, _CONCAVE_PRICE = 100.0, 3.0

@@ -214,10 +214,7 @@ class Engine:
         """
         group = fit_group(kernel, ITEM_GROUP if group is None else group)
         bind(kernel, args)
-        items = -(-max(int(size), 1) // group) * group
-        if self._divides:
-            return enqueue_ranges(self.queue, kernel, items, group, range_of(kernel))
-        return cl.enqueue_nd_range_kernel(self.queue, kernel, (items,), (group,))
+        return self.enqueue(kernel, -(-max(int(size), 1) // group) * group, group)
 
     def enqueue(self, kernel: cl.Kernel, items: int, group: int) -> cl.Event:
         """Enqueue `kernel`, with its arguments set, over `items` work-items: whole work-groups of `group` items.

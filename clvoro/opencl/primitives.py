@@ -181,7 +181,7 @@ class Gather:
 
 
 class Lists(NamedTuple):
-    """Lists of rows, one after the other, and their new order, on the device.
+    """Device arrays that say how lists of rows, which follow one another in an array, change places.
 
     Attributes
     ----------

@@ -39,7 +39,7 @@ _NVIDIA_FOLDERS = (
     "/usr/local/nvidia/lib64",
     "/usr/lib/wsl/lib",
 )
-"""Where distributions, container toolkits and clusters put NVIDIA's driver."""
+"""Folders in which distributions, container toolkits and clusters install NVIDIA's driver."""
 
 
 def prepare() -> None:
@@ -103,7 +103,7 @@ def cache_home() -> Path:
 
 
 def register_runtimes() -> list[Path]:
-    """Register Intel's CPU runtime, if pip has installed it, and NVIDIA's driver, if the loader does not know them.
+    """Register two runtimes if they are installed and the loader does not know them: Intel's from pip, NVIDIA's driver.
 
     Takes a fraction of a millisecond if neither is installed. Never raises: a missing runtime is reported when a device
     is chosen.

@@ -28,13 +28,13 @@ from .device_array import make_array
 Method = TypeVar("Method", bound=Callable[..., Any])
 MOST_VIEWS = 1000
 """Largest number of arrays that are kept. Sizes, such as the number of faces, change from step to step."""
-SLACK, MORE_SLACK = 1.05, 1.05
-"""Bytes that are kept over those that arrays have needed at a time, and the factor of this ratio whenever buffers are
-freed because of it: needs that alternate must not free and allocate for ever."""
+SLACK = 1.05
+"""The pool may be larger by this factor than the most that all arrays have needed together. Each time a buffer is freed
+for that, the factor grows by itself: otherwise two needs that alternate would free and allocate in every step."""
 LOOSEST, SMALL = 4, 4096
-"""Largest ratio of a buffer's bytes to those of its array, and bytes that it may have in any case."""
+"""A buffer may have so many times the bytes of its array, or so many bytes in any case."""
 SPARE = 32
-"""A new buffer is larger than needed by one part in so many: the next step may need a little more."""
+"""A new buffer has a 32nd more bytes than needed, because the next step may need a little more."""
 
 
 def framed(method: Method) -> Method:
@@ -64,7 +64,7 @@ class Workspace:
     def __init__(self, queue: cl.CommandQueue) -> None:
         self._queue = queue
         self._made = 0
-        # For each open frame, the buffers that it has taken and the bytes of their arrays.
+        # For each open frame: size and number of each buffer that it has taken, and the bytes of all its arrays.
         self._frames: list[list[tuple[int, int]]] = []
         self._needed: list[int] = []
         self.clear()
@@ -78,7 +78,7 @@ class Workspace:
         self._free: list[tuple[int, int]] = []
         # Arrays by number of the buffer, shape and type.
         self._views: dict[tuple[object, ...], cla.Array] = {}
-        self._held, self._most, self._slack = 0, 0, SLACK
+        self._most, self._slack = 0, SLACK
 
     def frame(self) -> Workspace:
         """Return a context manager; at its end all arrays taken inside are given back."""
@@ -118,13 +118,14 @@ class Workspace:
         device = self._queue.device
         memory_limits.check_allocation(device, size)
         most = max(self._most, sum(self._needed))
-        while self._free and self._held + size > self._slack * most:
-            _, old = self._free.pop()
-            self._held -= self._buffers.pop(old).size
+        held = sum(buffer.size for buffer in self._buffers.values())
+        while self._free and held + size > self._slack * most:
+            freed, old = self._free.pop()
+            held -= freed
+            del self._buffers[old]
             self._views = {key: view for key, view in self._views.items() if key[0] != old}
-            self._slack *= MORE_SLACK
+            self._slack *= SLACK
         size = max(size, min(size + size // SPARE, memory_limits.largest_allocation(device)))
         self._made += 1
-        self._held += size
         self._buffers[self._made] = cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size)
         return size, self._made

@@ -215,7 +215,7 @@ class _DiagramReader:
 
     @cached_property
     def lists(self) -> Lists | None:
-        """Cells with their faces in the order of the result, on the device; None if it has not the same faces."""
+        """How the device brings the faces into the order of the result; None if the result leaves faces out."""
         if self.kept is not None:
             return None
         upload = self.engine.upload
