@@ -1,6 +1,5 @@
-#include "geometry/domain.h"
+#include "tessellation/update_rows.h"
 #include "tessellation/corner_flips.h"
-#include "tessellation/corner_measures.h"
 
 /* Update of a diagram in 3D: the cells of generators that moved a little, from those that they had before.
 
@@ -24,8 +23,6 @@
 
 #define NO_NEIGHBOR INT_MIN
 
-#define ALL_FACES (-1)
-
 /* Marks of a cell: it must be updated again with further neighbors, or clipped. */
 #define UPDATE_AGAIN 1
 #define CLIP_ANEW 2
@@ -34,41 +31,12 @@
    was clipped. */
 #define AREA_NOISE (IS_DOUBLE ? R(1e-9) : R(1e-4))
 
-/* A hash of the other cell or wall at a face. */
-inline uint hash_of_label(int label)
-{
-    uint h = as_uint(label) * 2654435761u;
-    h = (h ^ (h >> 15)) * 2246822519u;
-    return (h ^ (h >> 13)) | 1;
-}
-
-typedef struct {
-    global const int *starts, *neighbors;
-    global int *more; /* MORE further neighbors per generator */
-    global const REAL *points;
-    REAL4 box_lower, box_upper;
-#ifdef PERIODIC
-    REAL4 periods;
-#endif
-} rows_t;
-
 /* Add the plane of a neighbor or wall to the cell of a generator at x. */
 inline void add_plane(corners_t *cell, int label, REAL4 x, const rows_t *in)
 {
-    REAL4 d = 0;
-    if (label >= 0) {
-        d = (REAL4)(in->points[3 * label], in->points[3 * label + 1], in->points[3 * label + 2], 0) - x;
-        d = (REAL4)(nearest_image(d.s0, in->periods.s0), nearest_image(d.s1, in->periods.s1),
-                    nearest_image(d.s2, in->periods.s2), 0);
-    } else {
-        const int wall = -1 - label;
-        const REAL4 across = 2 * ((wall & 1 ? in->box_upper : in->box_lower) - x);
-        d = (REAL4)(wall < 2 ? across.s0 : 0, wall >> 1 == 1 ? across.s1 : 0, wall > 3 ? across.s2 : 0, 0);
-    }
     const int f = cell->faces++;
-    const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2, inverse = 1 / d2;
     cell->labels[f] = label;
-    cell->planes[f] = (REAL4)(d.s0 * inverse, d.s1 * inverse, d.s2 * inverse, d2);
+    cell->planes[f] = plane_of_face(label, x, in);
 }
 
 /* Start with the planes of the previous neighbors of generator i at x, and of further ones in ascending order. Returns
@@ -122,18 +90,6 @@ inline void add_neighbor(int i, int label, const rows_t *in, global int *marks)
         }
     }
     atomic_or(marks + i, CLIP_ANEW);
-}
-
-/* Whether the generators about each vertex are nearest images of each other. */
-inline bool has_nearest_images(const corners_t *cell, const rows_t *in)
-{
-    bool nearest = true;
-#ifdef PERIODIC
-    const REAL4 periods = in->periods;
-    EACH_AXIS(a)
-    nearest = nearest && !(PERIOD(a) > 0 && 16 * cell->reach2 >= PERIOD(a) * PERIOD(a));
-#endif
-    return nearest;
 }
 
 /* Keep the cell of generator i at x within the walls: those that it does not have become further neighbors. True if
@@ -223,27 +179,28 @@ kernel void begin_cell_updates(const int size, const int used, const int report_
         report[k] = k == REPORT_FACES ? used : 0;
 }
 
-/* Per generator i, all or, with `some`, those `listed` (as ~i to be clipped) with `further` neighbors: its cell among
-   its previous neighbors and these, with the measures of `clip_polyhedra`; or row_counts[i] = UNFINISHED where the cell
-   is open, has many faces, is near round-off, or is to be clipped.
+/* Per generator i: its cell among its previous neighbors and `further` ones, with the measures of `clip_polyhedra`; or
+   row_counts[i] = UNFINISHED where the cell is open, has many faces, is near round-off, or is to be clipped. `which`
+   are all cells, or marked ones, or those left by teams (update_rows.h). The latter two are `listed`, marked ones as ~i
+   if they are to be clipped. Only marked ones have further neighbors.
 
    `old_corners` and `old_keys`: the triples, from 2 old_starts[i] on, and keys of the previous cells; none if not
    `known`. Cells are written to their previous places, and those with more faces behind all these, from report[1] on.
    changed[i]: the set of its faces that neighbors must be compared with. If more cells are listed than `size`, nothing
    is done. */
-kernel void update_cells(const int size, const int some, global const int *listed, global const int *further,
+kernel void update_cells(const int size, const int which, global const int *listed, global const int *further,
                          global const int *old_starts, global const int *old_neighbors, const int known,
                          global const uchar4 *old_corners, global const uint *old_keys, global const REAL *points,
                          const REAL4 box_lower, const REAL4 box_upper, const int room, CELL_OUTPUT_ARGS,
                          global uint *keys, global int *changed, global int *more, global int *marks PERIOD_ARGS)
 {
     WORK_ITEM(item);
-    if (some && (item >= report[REPORT_MARKED] || report[REPORT_MARKED] > size))
+    if (which != ALL_CELLS && (item >= report[REPORT_MARKED] || report[REPORT_MARKED] > size))
         return;
-    const int what = some ? listed[item] : item, i = max(what, ~what);
+    const int what = which == ALL_CELLS ? item : listed[item], i = max(what, ~what);
     const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS};
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
-    global const int *added = some ? further + MORE * item : 0;
+    global const int *added = which == MARKED_CELLS ? further + MORE * item : 0;
     corners_t cell;
     links_or_sums_t work;
     const int start = old_starts[i], listed_before = what < 0 ? -1 : list_planes(&cell, i, x, added, &in);
@@ -278,7 +235,7 @@ kernel void update_cells(const int size, const int some, global const int *liste
     }
     kept = kept && state == KNOWN_CORNERS;
     changed[i] = done && kept ? 0 : ALL_FACES;
-    if (done && has_nearest_images(&cell, &in) && keep_in_box(&cell, i, x, &in, marks)) {
+    if (done && has_nearest_images(cell.reach2, &in) && keep_in_box(&cell, i, x, &in, marks)) {
         const bool longer = cell.faces > old_starts[i + 1] - start;
         const int place = longer ? take_places(report, cell.faces) : start;
         const measured_t out = {labels, measures, centroids, volumes, offsets, covariances};
@@ -291,7 +248,7 @@ kernel void update_cells(const int size, const int some, global const int *liste
             for (int f = 0; kept && f < cell.faces; ++f)
                 keys[place + f] = old_keys[start + f];
             if (!kept) {
-                const bool comparable = state == KNOWN_CORNERS && !some;
+                const bool comparable = state == KNOWN_CORNERS && which != MARKED_CELLS;
                 const uint differ = write_keys(&cell, place, keys, comparable ? listed_before : 0,
                                                old_neighbors + start, old_keys + start);
                 changed[i] = differ;

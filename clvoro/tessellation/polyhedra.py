@@ -11,7 +11,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ..errors import BuildError, ClvoroError, MemoryLimitError
+from ..errors import ClvoroError, MemoryLimitError
 from ..geometry.box import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
@@ -41,7 +41,7 @@ from .device_diagram import (
     restored,
 )
 from .periodic.halo import halo_defines
-from .teams import TEAM, are_for, fits, has_warps, team_defines
+from .teams import TEAM, TeamKernel, are_for_new_cells, has_warps, team_defines
 from .weight_bounds import WeightBounds
 
 FACES_PER_CELL = 16.5
@@ -66,11 +66,14 @@ class Polyhedra:
         self._scan = Scan(engine)
         self._programs: dict[int, SimpleNamespace] = {}
         self._kernels(FACE_CAPACITY)
-        self._teams = None
-        if are_for(engine):
-            self._teams = engine.kernels(
-                "tessellation/polyhedra_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
-            )  # fmt: skip
+        self._team: TeamKernel | None = None
+        if are_for_new_cells(engine):
+            by_teams = engine.kernels(
+                "tessellation/polyhedra_by_teams",
+                team_defines(has_warps(engine.queue.device)),
+                group_size=TEAM,
+            )
+            self._team = TeamKernel(by_teams, "clip_polyhedra_by_teams")
         self._wrap = None
         self._bounds = WeightBounds(engine) if engine.domain_kind.weighted else None
         if self._bounds is None and engine.group_size == 1 and engine.real == np.float64:
@@ -90,21 +93,6 @@ class Polyhedra:
             }  # fmt: skip
             self._programs[capacity] = self.engine.kernels("tessellation/polyhedra", defines)
         return self._programs[capacity]
-
-    def _team_kernel(self) -> cl.Kernel | None:
-        """Return the kernel that builds cells by teams; None if they are not for this engine, or do not work.
-
-        They do not if the driver does not build the kernel. Then work-items build their cells alone.
-        """
-        if self._teams is not None:
-            try:
-                kernel = self._teams.clip_polyhedra_by_teams
-                if fits(kernel, self.engine.queue.device):
-                    return kernel
-            except BuildError:
-                pass
-            self._teams = None
-        return None
 
     def _reserve_cells(self, n: int) -> None:
         """Allocate the arrays per cell for `n` cells."""
@@ -283,7 +271,7 @@ class Polyhedra:
                 np.int32(rows), binned.points, binned.items, *search, points, lower, upper,
                 np.int32(warm), *old, some, room, share, *written,
             )  # fmt: skip
-            by_team = None if some else self._team_kernel()
+            by_team = None if some or self._team is None else self._team.get()
             if by_team is not None:
                 engine.run(by_team, TEAM * n, np.int32(n), *cell_args, group=TEAM)
             else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 
 from ..geometry.box import ClipBox
@@ -16,6 +17,7 @@ from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_MARKED, REPORT_SIZE, CutC
 from .device_diagram import ROUGH_SHARE, Tessellation
 from .polyhedra import Polyhedra
 from .rounds import with_room
+from .teams import TEAM, TeamKernel, are_for, has_warps, team_defines
 
 MORE = 8
 """Room for further neighbors of a cell, as in `tessellation/polyhedra_update.cl`."""
@@ -26,6 +28,8 @@ MAX_ROUNDS = 8
 """Most rounds of making cells again; after that the diagram is built from scratch."""
 MAX_SHARE = 0.5
 """Largest share of cells to make again in one round. Beyond it a new diagram costs less."""
+ALL_CELLS, MARKED_CELLS, LEFT_CELLS = 0, 1, 2
+"""Which cells a kernel updates, as in `tessellation/update_rows.h`."""
 SPARE = 0.25
 """Room for cells that gain faces, over the half-faces of the previous diagram."""
 
@@ -52,6 +56,12 @@ class PolyhedraUpdate:
         self.engine = engine
         self._scan = Scan(engine)
         self._kernels = engine.kernels("tessellation/polyhedra_update")
+        self._team: TeamKernel | None = None
+        if are_for(engine):
+            by_teams = engine.kernels(
+                "tessellation/polyhedra_update_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
+            )  # fmt: skip
+            self._team = TeamKernel(by_teams, "update_cells_by_teams")
         self._report = engine.empty(REPORT_SIZE, np.int32)
         self._share = engine.real.type(ROUGH_SHARE)
         self._n, self._expected, self._clips = 0, [0], False
@@ -81,13 +91,13 @@ class PolyhedraUpdate:
         rounds = _Rounds(
             self.engine, self._kernels, self._scan, self._report, cells, box, points, previous
         )
-        rounds.update(None)
+        rounds.update_all(self._team.get() if self._team is not None else None)
         done, sizes = 0, self._expected
         clipped, final = False, not self._clips
         while True:
             for size in sizes[: MAX_ROUNDS - done]:
                 rounds.list_marked(done, size)
-                rounds.update(size)
+                rounds.update_marked(size)
                 done += 1
             matching = None
             if final:
@@ -151,17 +161,31 @@ class _Rounds:
         old = previous.vertices or (self._listed, self._sums)
         self._fixed = (
             previous.starts, previous.neighbors, np.int32(bool(previous.vertices)), *old, points,
-            *box.device_corners(engine.real), np.int32(self.room),
+            *box.device_corners(engine.real), np.int32(self.room), *self.cut.output(report), self.cut.keys,
+            self._changed,
         )  # fmt: skip
         engine.run_each(
             kernels.begin_cell_updates, n, np.int32(before), np.int32(REPORT_SIZE), report, self._marks, self._more
         )  # fmt: skip
 
-    def update(self, size: int | None) -> None:
-        """Update all cells, or at most `size` listed ones, and check them."""
+    def update_all(self, by_teams: cl.Kernel | None) -> None:
+        """Update all cells: with a kernel, teams those that keep their vertices, and single work-items the others."""
+        which = ALL_CELLS if by_teams is None else LEFT_CELLS
+        if by_teams is not None:
+            self._engine.run(
+                by_teams, TEAM * self._n, np.int32(self._n), self._listed, *self._fixed, *self._engine.period_args,
+                group=TEAM,
+            )  # fmt: skip
+        self._update(self._n, which)
+
+    def update_marked(self, most: int) -> None:
+        """Update the listed cells, if they are not more than `most`."""
+        self._update(most, MARKED_CELLS)
+
+    def _update(self, size: int, which: int) -> None:
+        """Update `which` cells, at most `size`, and check them."""
         self._engine.run_each(
-            self._kernels.update_cells, self._n if size is None else size, np.int32(size is not None), self._listed,
-            self._further, *self._fixed, *self.cut.output(self._report), self.cut.keys, self._changed, self._more,
+            self._kernels.update_cells, size, np.int32(which), self._listed, self._further, *self._fixed, self._more,
             self._marks, *self._engine.period_args,
         )  # fmt: skip
         self.check()

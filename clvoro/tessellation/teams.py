@@ -1,16 +1,18 @@
-"""Where teams of work-items build cells in 3D (`polyhedra_by_teams.cl`)."""
+"""Where teams of work-items build and update cells in 3D (`polyhedra_by_teams.cl`, `polyhedra_update_by_teams.cl`)."""
 
 from __future__ import annotations
 
 import pyopencl as cl
 
+from ..errors import BuildError
 from ..opencl.engine import WALLED_BOX, Engine
+from ..opencl.kernels import Kernels
 from ..opencl.program import on_nvidia
 from .bins import MAX_LEVELS
 from .cut_cells import FACE_CAPACITY
 
 TEAM = 32
-"""Work-items of a team, and most faces of its cell."""
+"""Work-items of a team, and most faces of its cell: MOST_FACES in `tessellation/row_counts.h`."""
 
 
 def are_faster(device: cl.Device) -> bool:
@@ -28,18 +30,49 @@ def has_warps(device: cl.Device) -> bool:
 
 
 def are_for(engine: Engine) -> bool:
-    """Return whether teams build the cells of `engine`: in boxes with walls, without weights."""
-    walled = engine.domain_kind == WALLED_BOX and FACE_CAPACITY == TEAM
-    return walled and are_faster(engine.queue.device)
+    """Return whether teams update the cells of `engine`: in boxes in 3D, without weights."""
+    return not engine.domain_kind.weighted and are_faster(engine.queue.device)
+
+
+def are_for_new_cells(engine: Engine) -> bool:
+    """Return whether they also build its cells from scratch: in boxes with walls."""
+    return engine.domain_kind == WALLED_BOX and FACE_CAPACITY == TEAM and are_for(engine)
 
 
 def team_defines(warps: bool) -> dict[str, object]:
-    """Return the defines of `polyhedra_by_teams.cl`, with or without warp instructions."""
+    """Return the defines of kernels by teams, with or without warp instructions."""
     macros: dict[str, object] = {"MAX_DEPTH": MAX_LEVELS, "FACE_CAPACITY": FACE_CAPACITY}
     return macros | {"WARP_ASM": 1} if warps else macros
 
 
-def fits(kernel: cl.Kernel, device: cl.Device) -> bool:
+class TeamKernel:
+    """A kernel whose groups are teams.
+
+    Parameters
+    ----------
+    kernels : Kernels
+        Those of its program, which is not built yet.
+    name : str
+    """
+
+    def __init__(self, kernels: Kernels, name: str) -> None:
+        self._kernels: Kernels | None = kernels
+        self._name = name
+
+    def get(self) -> cl.Kernel | None:
+        """Return the kernel; None if the driver does not build it, or the device has no room for a team."""
+        if self._kernels is not None:
+            try:
+                kernel = getattr(self._kernels, self._name)
+                if _fits(kernel, kernel.context.devices[0]):
+                    return kernel
+            except BuildError:
+                pass
+            self._kernels = None
+        return None
+
+
+def _fits(kernel: cl.Kernel, device: cl.Device) -> bool:
     """Return whether `device` has room for a team of `kernel`: work-items of a group, and local memory."""
     info = cl.kernel_work_group_info
     most = kernel.get_work_group_info(info.WORK_GROUP_SIZE, device)

@@ -38,7 +38,7 @@ LANES = {
     "walks.walk_all_cells",
 }  # fmt: skip
 """Kernels that find eight cells at a time in vector lanes of a CPU, in float64, or choose these cells."""
-ELSEWHERE = {"polyhedra_by_teams"}
+ELSEWHERE = {"polyhedra_by_teams", "polyhedra_update_by_teams"}
 """Files of kernels that only other devices than this one take: test_polyhedra_teams.py compares their bits."""
 NOT_IN = {
     # Work-groups take it in place of two kernels.

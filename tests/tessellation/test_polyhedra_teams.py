@@ -1,9 +1,10 @@
-"""Cells in 3D that teams of work-items build have the bits of those that single work-items build.
+"""Cells in 3D that teams of work-items build or update have the bits of those by single work-items.
 
 PoCL takes minutes to hours to compile barriers in nested loops. So these tests need an NVIDIA GPU, or Intel's runtime.
 """
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pyopencl as cl
@@ -19,6 +20,7 @@ from clvoro.tessellation import teams
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.robustness.gpu_like import by_teams, groups
+from tests.tessellation import test_polyhedra_update as updates
 from tests.tessellation.test_polyhedra import BOX, POINTS, directions
 
 ARRAYS = (
@@ -83,7 +85,7 @@ def diagrams(ctx, dtype, points, wanted):
         found[turn, "corners"] = corners(t, found[turn, "starts"])
         found[turn, "reach"] = binned.reach.get()[:n]
         points = np.clip(points + 0.01 * (rng.random(points.shape) - 0.5), BOX.lower, BOX.extent)
-    assert (cells._teams is not None) == wanted, "the other kernel has run"
+    assert (cells._team is not None) == wanted, "the other kernel has run"
     return found
 
 
@@ -128,14 +130,71 @@ def test_same_bits_in_ranges(ctx, monkeypatch):
     assert all(np.array_equal(found[key], array) for key, array in expected.items())
 
 
+@pytest.fixture
+def as_written(monkeypatch):
+    """Build without optimization. Intel's compiler else adds products to the sums of single work-items by fma."""
+    monkeypatch.setattr(
+        program, "compile_text", partial(without_optimization, program.compile_text)
+    )
+
+
+def without_optimization(plain, ctx, text, options, short=True):
+    """Call `plain`, which is `compile_text` of clvoro."""
+    return plain(ctx, text, (*options, "-cl-opt-disable"), short)
+
+
+STEPS = 1e-4, 2e-3, 2e-2, 1e-3, 0.0
+"""Lengths of moves over the spacing: all cells keep their vertices, or some, or few."""
+
+
+def updated(ctx, dtype, name, wanted):
+    """Return, for each of several updates, whether it succeeded and its arrays; and the number of launches by teams."""
+    with groups(128), by_teams(wanted):
+        queue = cl.CommandQueue(ctx)
+        points = updates.POINTS[name]
+        carried = updates.Carried(Engine(ctx, queue, 3, np.dtype(dtype)), points)
+    rng, found, tally = np.random.default_rng(3), [], Tally()
+    with watching(queue, tally):
+        for step in STEPS:
+            points = points + step * updates.spacing(points) * rng.standard_normal(points.shape)
+            found.append([carried.move(points)])
+            t = carried.t
+            m = int(t.starts.get()[t.n])
+            for array_name in ARRAYS:
+                array = getattr(t, array_name).get()
+                found[-1].append(array[:m] if array_name.startswith(("nei", "face")) else array)
+            found[-1].append(corners(t, found[-1][1]))
+            found[-1].append(t.vertices[1].get()[:m])
+    return found, tally.calls["polyhedra_update_by_teams", "update_cells_by_teams"]
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("name", ["random", "graded", "nearly bcc", "bcc", "on walls", "five"])
+def test_same_bits_of_updates(ctx, as_written, name, dtype):
+    (plain, none), (by_team, launches) = (updated(ctx, dtype, name, w) for w in (False, True))
+    assert launches == len(STEPS)
+    assert none == 0
+    assert any(step[0] for step in plain)
+    for expected, found in zip(plain, by_team, strict=True):
+        # Keys are written by updates alone.
+        for a, b in zip(expected[: None if expected[0] else -1], found, strict=False):
+            assert np.array_equal(a, b)
+
+
 @pytest.mark.slow
-def test_same_bits_of_a_run(ctx):
+@pytest.mark.parametrize("periodic", [False, True])
+def test_same_bits_of_a_run(ctx, as_written, periodic):
+    box = clvoro.Box((0, 0, 0), (2, 1.5, 1), periodic=periodic)
+
     def run(wanted):
         with groups(128), by_teams(wanted):
             adapter, tally = clvoro.Adapter(ctx, "float64"), Tally()
             with watching(adapter.queue, tally):
-                result = adapter.run(BOX, 0.25, seed=3)
-            assert (tally.calls["polyhedra_by_teams", "clip_polyhedra_by_teams"] > 0) == wanted
+                result = adapter.run(box, 0.25, seed=3)
+            calls = tally.calls
+            built = calls["polyhedra_by_teams", "clip_polyhedra_by_teams"]
+            assert (built > 0) == (wanted and not periodic)
+            assert (calls["polyhedra_update_by_teams", "update_cells_by_teams"] > 0) == wanted
             return result.diagram
 
     plain, by_team = run(False), run(True)
@@ -146,20 +205,25 @@ def test_same_bits_of_a_run(ctx):
 # On any device.
 
 
-def test_items_work_alone_if_the_kernel_is_not_built(monkeypatch):
-    adapter, build, asked = clvoro.Adapter(dtype="float32"), program.build_program, []
+def test_items_work_alone_if_the_kernels_are_not_built(monkeypatch):
+    adapter, build, asked = clvoro.Adapter(dtype="float32"), program.build_program, set()
 
     def fails(context, name, defines, prelude):
-        if name.endswith("polyhedra_by_teams.cl"):
-            asked.append(name)
+        if name.endswith("by_teams.cl"):
+            asked.add(name)
             raise BuildError("no")
         return build(context, name, defines, prelude)
 
-    expected = adapter.diagram(BOX, POINTS["random"]).volumes
+    def mesh(adapter):
+        return adapter.run(
+            BOX, 0.5, points=POINTS["random"][:60], method="lloyd", max_steps=3
+        ).points
+
+    expected = mesh(adapter)
     monkeypatch.setattr(program, "build_program", fails)
     with by_teams(True):
-        found = clvoro.Adapter(adapter.ctx, "float32").diagram(BOX, POINTS["random"]).volumes
-    assert asked
+        found = mesh(clvoro.Adapter(adapter.ctx, "float32"))
+    assert len(asked) == 2
     assert np.array_equal(found, expected)
 
 
@@ -184,9 +248,10 @@ def test_devices_with_teams(platform, capability, expected):
 
 
 def test_domains_with_teams():
-    """Boxes with walls, without weights."""
+    """In boxes without weights they update cells, and with walls they also build them."""
     context, kind_of = clvoro.create_context(), engine_module.DomainKind
     with by_teams(True):
         for kind in (kind_of(), kind_of(periodic=True), kind_of(weighted=True)):
             made = Engine(context, cl.CommandQueue(context), 3, np.dtype(np.float32), kind)
-            assert teams.are_for(made) == (kind == engine_module.WALLED_BOX)
+            assert teams.are_for(made) == (not kind.weighted)
+            assert teams.are_for_new_cells(made) == (kind == engine_module.WALLED_BOX)

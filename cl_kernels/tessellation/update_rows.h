@@ -1,0 +1,56 @@
+/* Cells in 3D that are updated, alone or by teams; see polyhedra_update.cl. */
+#include "geometry/domain.h"
+#include "tessellation/corner_shares.h"
+
+#define ALL_FACES (-1)
+
+/* Which cells an update makes: all; those that are marked, with further neighbors; else those that teams have left. */
+#define ALL_CELLS 0
+#define MARKED_CELLS 1
+
+/* A hash of the other cell or wall at a face. */
+inline uint hash_of_label(int label)
+{
+    uint h = as_uint(label) * 2654435761u;
+    h = (h ^ (h >> 15)) * 2246822519u;
+    return (h ^ (h >> 13)) | 1;
+}
+
+typedef struct {
+    global const int *starts, *neighbors;
+    global int *more; /* MORE further neighbors per generator */
+    global const REAL *points;
+    REAL4 box_lower, box_upper;
+#ifdef PERIODIC
+    REAL4 periods;
+#endif
+} rows_t;
+
+/* The plane (p, d^2) between a generator at x and a neighbor or wall. */
+inline REAL4 plane_of_face(int label, REAL4 x, const rows_t *in)
+{
+    REAL4 d = 0;
+    if (label >= 0) {
+        d = (REAL4)(in->points[3 * label], in->points[3 * label + 1], in->points[3 * label + 2], 0) - x;
+        d = (REAL4)(nearest_image(d.s0, in->periods.s0), nearest_image(d.s1, in->periods.s1),
+                    nearest_image(d.s2, in->periods.s2), 0);
+    } else {
+        const int wall = -1 - label;
+        const REAL4 across = 2 * ((wall & 1 ? in->box_upper : in->box_lower) - x);
+        d = (REAL4)(wall < 2 ? across.s0 : 0, wall >> 1 == 1 ? across.s1 : 0, wall > 3 ? across.s2 : 0, 0);
+    }
+    const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2, inverse = 1 / d2;
+    return (REAL4)(d.s0 * inverse, d.s1 * inverse, d.s2 * inverse, d2);
+}
+
+/* Whether the generators about each vertex are nearest images of each other; no vertex is farther than reach2. */
+inline bool has_nearest_images(REAL reach2, const rows_t *in)
+{
+    bool nearest = true;
+#ifdef PERIODIC
+    const REAL4 periods = in->periods;
+    EACH_AXIS(a)
+    nearest = nearest && !(PERIOD(a) > 0 && 16 * reach2 >= PERIOD(a) * PERIOD(a));
+#endif
+    return nearest;
+}
