@@ -7,7 +7,7 @@ they cut off, and for slivers. All prices are in squares of the size of the cell
 from __future__ import annotations
 
 from itertools import pairwise
-from math import atan2, hypot, inf
+from math import atan2, hypot, inf, sqrt
 
 import numpy as np
 
@@ -33,12 +33,17 @@ def _turn(a: Point, b: Point, c: Point) -> float:
     return atan2(x * v - y * u, x * u + y * v)
 
 
-def _offset(a: Point, b: Point, c: Point) -> float:
-    """Return the distance of b from the straight line between a and c."""
-    x, y, u, v = c[0] - a[0], c[1] - a[1], b[0] - a[0], b[1] - a[1]
-    square = x * x + y * y
-    t = min(max((x * u + y * v) / square, 0.0), 1.0) if square > 0 else 0.0
-    return hypot(u - t * x, v - t * y)
+def _offset(a: Point, b: Point, c: Point) -> tuple[float, float]:
+    """Return the distance of b from the straight line between a and c, and twice the area of the triangle.
+
+    The area is negative where the way from a over b to c turns to the right.
+    """
+    (p, q), (u, v), (x, y) = a, b, c
+    x, y, u, v = x - p, y - q, u - p, v - q
+    square, along, left = x * x + y * y, x * u + y * v, u * y - v * x
+    if 0 < along < square:
+        return abs(left) / sqrt(square), left
+    return (hypot(u, v) if along <= 0 else hypot(u - x, v - y)), left
 
 
 def chord_points(line: list[Point], fixed: list[bool], size: float) -> list[int]:
@@ -49,46 +54,51 @@ def chord_points(line: list[Point], fixed: list[bool], size: float) -> list[int]
     """
     last = len(line) - 1
     kept, turned = [0], 0.0
+    (p, q), (s, t) = line[:2]
+    x, y = s - p, t - q
     for i in range(1, last):
-        turned += _turn(line[i - 1], line[i], line[i + 1])
-        if fixed[i - 1] or abs(turned) > SIDE_TURN:
+        p, q = line[i + 1]
+        u, v = p - s, q - t
+        turned += atan2(x * v - y * u, x * u + y * v)
+        if fixed[i - 1] or turned > SIDE_TURN or turned < -SIDE_TURN:
             kept.append(i)
             turned = 0.0
+        x, y, s, t = u, v, p, q
     kept.append(last)
     if len(kept) == 2:
         return kept
+    filled, cut = _FILLED * size, _CUT * size
 
     def offset(k: int) -> float:
         """Return the distance of a kink from the chord, or infinity if it stays."""
-        a, b, c = line[kept[k - 1]], line[kept[k]], line[kept[k + 1]]
-        far = _offset(a, b, c)
-        limit = _FILLED if _turn(a, b, c) < 0 else _CUT
-        return inf if fixed[kept[k] - 1] or far >= limit * size else far
+        at = kept[k]
+        if fixed[at - 1]:
+            return inf
+        far, left = _offset(line[kept[k - 1]], line[at], line[kept[k + 1]])
+        return inf if far >= (filled if left < 0 else cut) else far
 
     offsets = [inf, *map(offset, range(1, len(kept) - 1)), inf]
     while (least := min(offsets)) < inf:
         k = offsets.index(least)
         del kept[k], offsets[k]
-        for j in (k - 1, k):
-            if 0 < j < len(kept) - 1:
-                offsets[j] = offset(j)
-    _drop_for_area(line, fixed, kept, _FILLED * size)
+        if k > 1:
+            offsets[k - 1] = offset(k - 1)
+        if k < len(kept) - 1:
+            offsets[k] = offset(k)
+    if len(kept) > 2:
+        _drop_for_area(line, fixed, kept, filled)
     return kept
 
 
 def _drop_for_area(line: list[Point], fixed: list[bool], kept: list[int], limit: float) -> None:
     """Drop kinks nearer than `limit` without which the area is nearer to the exact one, as on rough walls."""
-    if len(kept) == 2:
-        return
     lost = _area(line) - _area([line[i] for i in kept])
     while True:
         best, where, saved = abs(lost), -1, 0.0
         for k in range(1, len(kept) - 1):
-            three = [line[i] for i in kept[k - 1 : k + 2]]
-            area = _area(three)
-            if fixed[kept[k] - 1] or _offset(*three) > limit:
-                continue
-            if abs(lost + area) < best:
+            far, left = _offset(line[kept[k - 1]], line[kept[k]], line[kept[k + 1]])
+            area = left / 2
+            if abs(lost + area) < best and far <= limit and not fixed[kept[k] - 1]:
                 best, where, saved = abs(lost + area), k, area
         if where < 0:
             return
@@ -99,8 +109,11 @@ def _drop_for_area(line: list[Point], fixed: list[bool], kept: list[int], limit:
 def _area(line: list[Point]) -> float:
     """Return the area to the left of a line and to the right of its chord."""
     (x, y), area = line[0], 0.0
-    for (u, v), (s, t) in pairwise(line[1:]):
-        area += (u - x) * (t - y) - (v - y) * (s - x)
+    p = q = 0.0
+    for s, t in line[1:]:
+        s, t = s - x, t - y
+        area += p * t - q * s
+        p, q = s, t
     return area / 2
 
 
@@ -109,16 +122,16 @@ def chord_cost(line: list[Point], kept: list[int], size: float) -> float:
     total = 0.0
     for first, last in pairwise(kept):
         total += abs(_area(line[first : last + 1]))
-        off, farthest = 0.0, first
-        for i in range(first + 1, last):
-            here = _offset(line[first], line[i], line[last])
-            if here > off:
-                off, farthest = here, i
+        a, c = line[first], line[last]
+        off, farthest = 0.0, a
+        for b in line[first + 1 : last]:
+            far, _ = _offset(a, b, c)
+            if far > off:
+                off, farthest = far, b
         total += _OFF_PRICE * off * size
-        if farthest > first and _turn(line[first], line[farthest], line[last]) < -_SHARP:
+        if off > 0 and _turn(a, farthest, c) < -_SHARP:
             total += _SHARP_PRICE * size * size
-        (x, y), (u, v) = line[first], line[last]
-        if hypot(u - x, v - y) < _SLIVER * size:
+        if hypot(c[0] - a[0], c[1] - a[1]) < _SLIVER * size:
             total += _SLIVER_PRICE * size * size
     return total
 

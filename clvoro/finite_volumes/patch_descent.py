@@ -1,7 +1,7 @@
 """Points of a patch moved so that its faces are less skew and nearer to orthogonal: a least-squares problem.
 
 Points on walls slide along the boundary or stay. The sum of squares is that of `patch_figures`; its derivatives are
-differences. Whether a patch becomes better is decided by its price, the sum of what is beyond the limits.
+those of `patch_slopes`. Whether a patch becomes better is decided by its price, the sum of what is beyond the limits.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from ..geometry.ring_coordinate import RingCoordinate
 from ..mesh.connectivity import following
 from .patch import BORDER, Patch, cell_sides
 from .patch_figures import LENGTH_GOAL, Cells
+from .patch_slopes import slopes
 
 ANGLE, SKEWNESS = np.radians(19), 1.9
 """Faces beyond one of these are improved."""
@@ -30,9 +31,13 @@ _INVERTED_PRICE, _CONCAVE_PRICE = 100.0, 3.0
 """Prices of a cell without a positive area, and of a concave corner for each radian."""
 _MOVE_WEIGHT = 0.1
 _STEP = 1e-6
-"""Step of differences, over the width of a cell."""
+"""Step of differences along the boundary, over the width of a cell."""
 _TOLERANCE = 1e-3
 """Relative change of the sum of squares at which the moves end."""
+_DAMPING, _RISE, _FALL = 1.0, 5.0, 5.0
+"""First damping of Levenberg and Marquardt; its factors after a step that fails, and after one that succeeds."""
+_MOST_DENSE = 200
+"""Unknowns up to which matrices are dense."""
 
 
 class Descent:
@@ -102,20 +107,20 @@ class Descent:
 
     def _set_prices(self) -> None:
         c = self.cells
-        now = c.figures(*self.patch.points.T[:, None])
-        excess = np.minimum(np.maximum(now.angle[0] / ANGLE - 1, 0), _MOST_EXCESS) ** 2
-        excess += np.minimum(np.maximum(now.skewness[0] / SKEWNESS - 1, 0), _MOST_EXCESS) ** 2
+        now = c.figures(*self.patch.points.T)
+        excess = np.minimum(np.maximum(now.angle / ANGLE - 1, 0), _MOST_EXCESS) ** 2
+        excess += np.minimum(np.maximum(now.skewness / SKEWNESS - 1, 0), _MOST_EXCESS) ** 2
         beyond = excess > 0
-        excess += np.maximum(1 - now.length[0] / _SHORT, 0) ** 2
-        n, turn = len(c.area), now.turn[0]
+        excess += np.maximum(1 - now.length / _SHORT, 0) ** 2
+        n, turn = len(c.area), now.turn
         self.bent = turn < STRAIGHT
         prices = np.bincount(c.row, self.bent * (1 + _CONCAVE_PRICE * np.maximum(-turn, 0)), n)
-        prices += now.determinant[0] < LEAST_DETERMINANT
-        prices += _INVERTED_PRICE * (now.area[0] <= 0)
+        prices += now.determinant < LEAST_DETERMINANT
+        prices += _INVERTED_PRICE * (now.area <= 0)
         self.bad = prices > 0
         self.bad[c.owner[beyond]] = self.bad[c.neighbor[beyond]] = True
         prices += (np.bincount(c.owner, excess, n) + np.bincount(c.neighbor, excess, n)) / 2
-        self.prices, self.face_prices, self.lengths = prices, excess, now.length[0]
+        self.prices, self.face_prices, self.lengths = prices, excess, now.length
 
     def near(self, chosen: np.ndarray, rings: int) -> np.ndarray:
         """Return the cells `chosen` (n,) bool and some rings of cells around them, (n,) bool."""
@@ -152,13 +157,13 @@ class Descent:
         part = c.part(np.flatnonzero(used), faces)
         slides = np.flatnonzero(on_wall[active])
         motion = _Motion(p, active, slides, self._widths()[active], ring)
-        found = _minimum(part, motion, part.pattern(active, len(free)), steps)
+        moves = _minimum(part, motion, steps)
         points = p.points.copy()
-        points.T[:, active] = [z[0, active] for z in motion.placed(found)]
+        points[active] = motion.placed(moves)[:, active].T
         positions = p.positions.copy()
         if slides.size and ring is not None:
             at = active[slides]
-            positions[at] = ring.moved(positions[at], found[0, slides, 0] * motion.scale[slides])
+            positions[at] = ring.moved(positions[at], moves[slides, 0] * motion.scale[slides])
         made = replace(p, points=points, positions=positions)
         return Descent(made, (c.starts, c.loop, self.sides), self.goals)
 
@@ -186,60 +191,91 @@ class _Motion:
     ring: RingCoordinate | None
 
     def placed(self, moves: np.ndarray) -> np.ndarray:
-        """Return the coordinates of all points (2, g, v) for `moves` (g, m, 2)."""
-        found = np.repeat(self.patch.points.T[:, None], len(moves), axis=1)
+        """Return the coordinates of all points (2, v) for `moves` (m, 2)."""
+        found = self.patch.points.T.copy()
         far = moves * self.scale[:, None]
-        found[:, :, self.active] += np.moveaxis(far, 2, 0)
+        found[:, self.active] += far.T
         if self.slides.size and self.ring is not None:
             at = self.active[self.slides]
-            s = self.ring.moved(self.patch.positions[at], far[:, self.slides, 0])
-            found[:, :, at] = np.moveaxis(self.ring.points(s), 2, 0)
+            s = self.ring.moved(self.patch.positions[at], far[self.slides, 0])
+            found[:, at] = self.ring.points(s).T
+        return found
+
+    def frames(self, moves: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the active points' coordinates by their moves, (2, 2, m)."""
+        found = np.zeros((2, 2, len(self.active)))
+        found[0, 0] = found[1, 1] = self.scale
+        if self.slides.size:
+            aside = moves.copy()
+            aside[self.slides, 0] += _STEP
+            at = self.active[self.slides]
+            found[:, 0, self.slides] = (self.placed(aside) - self.placed(moves))[:, at] / _STEP
+            found[:, 1, self.slides] = 0
         return found
 
 
-def _minimum(
-    cells: Cells, motion: _Motion, pattern: scipy.sparse.csr_array, steps: int
-) -> np.ndarray:
-    """Return the moves (1, m, 2) after some steps towards a minimum of the sum of squares."""
-    from scipy.optimize import least_squares
-
+def _minimum(cells: Cells, motion: _Motion, steps: int) -> np.ndarray:
+    """Return the moves (m, 2) after some steps of Levenberg and Marquardt towards a minimum of the sum of squares."""
     m = len(motion.active)
-
-    def residuals(moves: np.ndarray) -> np.ndarray:
-        terms = cells.residuals(*motion.placed(moves))
-        return np.concatenate([terms, _MOVE_WEIGHT * moves.reshape(len(moves), -1)], axis=1)
-
-    color = _colors(pattern)
-    rows, points = pattern.nonzero()
-    rows, columns = np.tile(rows, 2), np.concatenate([2 * points, 2 * points + 1])
-    groups = np.concatenate([2 * color[points], 2 * color[points] + 1])
-    steps_aside = np.zeros((2 * color.max() + 2, m, 2))
-    for axis in range(2):
-        steps_aside[2 * color + axis, np.arange(m), axis] = _STEP
-    steps_aside[:, motion.slides, 1] = 0
-
-    def at(x: np.ndarray) -> np.ndarray:
-        return residuals(x.reshape(1, m, 2))[0]
-
-    def jacobian(x: np.ndarray) -> scipy.sparse.csr_array:
-        slope = (residuals(x.reshape(1, m, 2) + steps_aside) - at(x)) / _STEP
-        return scipy.sparse.csr_array(
-            (slope[groups, rows], (rows, columns)), (len(slope[0]), 2 * m)
-        )
-
-    found = least_squares(
-        at, np.zeros(2 * m), jacobian, ftol=_TOLERANCE, max_nfev=steps, tr_solver="lsmr"
-    )
-    return found.x.reshape(1, m, 2)
+    moves = np.zeros((m, 2))
+    terms = cells.terms(*motion.placed(moves))
+    cost, damping, left = float(terms @ terms), _DAMPING, steps
+    while left:
+        equations = _Equations(cells, motion, moves, terms)
+        while left:
+            left -= 1
+            tried = moves - equations.solve(damping)
+            now = cells.terms(*motion.placed(tried))
+            lower = cost - float(now @ now) - _MOVE_WEIGHT**2 * float((tried * tried).sum())
+            if lower > 0:
+                break
+            damping *= _RISE
+        else:
+            break
+        moves, terms, cost = tried, now, cost - lower
+        damping /= _FALL
+        if lower < _TOLERANCE * cost:
+            break
+    return moves
 
 
-def _colors(pattern: scipy.sparse.csr_array) -> np.ndarray:
-    """Return a number for each column, (m,) int, such that no row has two columns with the same number."""
-    conflict = scipy.sparse.csr_array(pattern.T @ pattern)
-    starts: list[int] = np.asarray(conflict.indptr).tolist()
-    others: list[int] = np.asarray(conflict.indices).tolist()
-    color = [-1] * (len(starts) - 1)
-    for i in range(len(color)):
-        taken = {color[j] for j in others[starts[i] : starts[i + 1]]}
-        color[i] = next(k for k in range(len(taken) + 1) if k not in taken)
-    return np.array(color)
+class _Equations:
+    """The normal equations for a step from `moves` (m, 2)."""
+
+    def __init__(self, cells: Cells, motion: _Motion, moves: np.ndarray, terms: np.ndarray) -> None:
+        v, m = len(motion.patch.points), len(motion.active)
+        number = np.full(v, -1)
+        number[motion.active] = np.arange(m)
+        found = slopes(cells, *motion.placed(moves))
+        used = np.flatnonzero(number[found.points] >= 0)
+        rows, points = found.terms[used], number[found.points[used]]
+        frames = motion.frames(moves)[:, :, points]
+        values = (found.x[used] * frames[0] + found.y[used] * frames[1]).ravel()
+        columns, k = np.concatenate([2 * points, 2 * points + 1]), 2 * m
+        rows = np.tile(rows, 2)
+        self.gradient = np.bincount(columns, values * terms[rows], k)
+        self.gradient += _MOVE_WEIGHT**2 * moves.ravel()
+        if k <= _MOST_DENSE:
+            place = np.zeros(len(terms), np.int64)
+            place[rows] = 1
+            height = int(place.sum())
+            place = np.cumsum(place) - 1
+            jacobian = np.bincount(place[rows] * k + columns, values, height * k)
+            jacobian = jacobian.reshape(height, k)
+        else:
+            jacobian = scipy.sparse.csr_array((values, (rows, columns)), (len(terms), k))
+        self.matrix = jacobian.T @ jacobian
+
+    def solve(self, damping: float) -> np.ndarray:
+        """Return the step (m, 2) with `damping` added to the diagonal."""
+        from scipy.sparse.linalg import splu
+
+        matrix, k = self.matrix, len(self.gradient)
+        damping += _MOVE_WEIGHT**2
+        if isinstance(matrix, np.ndarray):
+            found = np.linalg.solve(matrix + damping * np.eye(k), self.gradient)
+        else:
+            damped = scipy.sparse.csc_matrix(matrix + damping * scipy.sparse.eye_array(k))
+            factors = splu(damped, "MMD_AT_PLUS_A", options={"SymmetricMode": True})
+            found = factors.solve(self.gradient)
+        return found.reshape(-1, 2)

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
 
 from ..mesh.connectivity import following, take_rows
 
@@ -25,26 +24,26 @@ LENGTH_GOAL = 0.15
 
 Faces that are shorter at first, and not at a bad cell, need not become longer.
 """
-_ANGLE_GOAL, _SKEWNESS_GOAL = np.radians(16), 1.5
-_TURN_GOAL = 0.02
+ANGLE_GOAL, SKEWNESS_GOAL = np.radians(16), 1.5
+TURN_GOAL = 0.02
 """Turns in the corners of cells are to be at least this large, in radians."""
-_DETERMINANT_GOAL = 0.02
+DETERMINANT_GOAL = 0.02
 """Determinant of a cell that is aimed at."""
-_SKEW_WEIGHT, _LENGTH_WEIGHT, _AREA_WEIGHT, _TURN_WEIGHT, _DETERMINANT_WEIGHT = (
+SKEW_WEIGHT, LENGTH_WEIGHT, AREA_WEIGHT, TURN_WEIGHT, DETERMINANT_WEIGHT = (
     0.3, 5.0, 0.5, 5.0, 1.5,
 )  # fmt: skip
 
 
 class Figures(NamedTuple):
-    """Figures of faces, cells and corners, each for g sets of points.
+    """Figures of faces, cells and corners.
 
     Attributes
     ----------
-    angle, skewness, length : (g, f) float
+    angle, skewness, length : (f,) float
         Of faces; lengths over the smaller size of their cells.
-    area, determinant : (g, n) float
+    area, determinant : (n,) float
         Of cells.
-    turn : (g, k) float
+    turn : (k,) float
         Angles to the left in the corners of cells.
     """
 
@@ -129,6 +128,9 @@ class Cells:
 
     def __post_init__(self) -> None:
         self.after = following(self.starts)
+        self.before = np.empty_like(self.after)
+        self.before[self.after] = np.arange(len(self.after))
+        self.origin_of_corner = self.origin[self.row].T
         self.smaller = np.minimum(self.size[self.owner], self.size[self.neighbor])
         sides = np.add.reduceat(self.between.astype(np.int64), self.starts[:-1])
         self.sides = np.maximum(sides, 1)
@@ -145,65 +147,45 @@ class Cells:
         )  # fmt: skip
 
     def figures(self, x: np.ndarray, y: np.ndarray) -> Figures:
-        """Return the figures for points with these coordinates, (g, v) each."""
-        first = self.starts[:-1]
-        px, py = (z[:, self.loop] - o[self.row] for z, o in zip((x, y), self.origin.T, strict=True))
-        qx, qy = px[:, self.after], py[:, self.after]
+        """Return the figures for points with these coordinates, (v,) each."""
+        first, after = self.starts[:-1], self.after
+        px, py = (z[self.loop] - o for z, o in zip((x, y), self.origin_of_corner, strict=True))
+        qx, qy = px[after], py[after]
         twice = px * qy - py * qx
-        double = np.add.reduceat(twice, first, axis=1)
+        double = np.add.reduceat(twice, first)
         safe = 3 * np.where(double > 0, double, np.inf)
         centers = tuple(
-            o + np.add.reduceat(twice * z, first, axis=1) / safe
+            o + np.add.reduceat(twice * z, first) / safe
             for z, o in zip((px + qx, py + qy), self.origin.T, strict=True)
         )
         a, b = self.ends.T
         angle, skewness, length = face_figures(
-            (x[:, a], y[:, a], x[:, b], y[:, b]),
-            tuple(c[:, self.owner] for c in centers),
-            tuple(c[:, self.neighbor] for c in centers),
+            (x[a], y[a], x[b], y[b]),
+            tuple(c[self.owner] for c in centers),
+            tuple(c[self.neighbor] for c in centers),
             self.wall,
         )
         ux, uy = qx - px, qy - py
-        vx, vy = ux[:, self.after], uy[:, self.after]
-        turn = np.empty(ux.shape)
-        turn[:, self.after] = np.arctan2(ux * vy - uy * vx, ux * vx + uy * vy)
+        vx, vy = ux[after], uy[after]
+        turn = np.empty(len(ux))
+        turn[after] = np.arctan2(ux * vy - uy * vx, ux * vx + uy * vy)
         ux, uy = ux * self.between, uy * self.between
-        xx, xy, yy = (np.add.reduceat(z, first, axis=1) for z in (ux * ux, ux * uy, uy * uy))
-        mean = np.add.reduceat(np.sqrt(ux * ux + uy * uy), first, axis=1) / self.sides
+        xx, xy, yy = (np.add.reduceat(z, first) for z in (ux * ux, ux * uy, uy * uy))
+        mean = np.add.reduceat(np.sqrt(ux * ux + uy * uy), first) / self.sides
         determinant = (xx * yy - xy * xy) / (8 * np.maximum(mean, 1e-75) ** 4)
         return Figures(angle, skewness, length / self.smaller, double / 2, determinant, turn)
 
-    def residuals(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the terms of the sum of squares but those of the moves, (g, r)."""
+    def terms(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the terms of the sum of squares but those of the moves, (3 f + 2 n + k,)."""
         now = self.figures(x, y)
         terms = (
-            np.maximum(now.angle - _ANGLE_GOAL, 0),
-            _SKEW_WEIGHT * np.maximum(now.skewness - _SKEWNESS_GOAL, 0),
-            _LENGTH_WEIGHT * np.maximum(self.aim - now.length, 0),
-            _AREA_WEIGHT * (now.area / self.area - 1),
+            np.maximum(now.angle - ANGLE_GOAL, 0),
+            SKEW_WEIGHT * np.maximum(now.skewness - SKEWNESS_GOAL, 0),
+            LENGTH_WEIGHT * np.maximum(self.aim - now.length, 0),
+            AREA_WEIGHT * (now.area / self.area - 1),
             # The root has a slope where the faces of a cell are parallel.
-            _DETERMINANT_WEIGHT
-            * np.maximum(_DETERMINANT_GOAL**0.5 - np.sqrt(np.maximum(now.determinant, 0)), 0),
-            _TURN_WEIGHT * np.where(self.bound, 0, np.maximum(_TURN_GOAL - now.turn, 0)),
+            DETERMINANT_WEIGHT
+            * np.maximum(DETERMINANT_GOAL**0.5 - np.sqrt(np.maximum(now.determinant, 0)), 0),
+            TURN_WEIGHT * np.where(self.bound, 0, np.maximum(TURN_GOAL - now.turn, 0)),
         )
-        return np.concatenate(terms, axis=1)
-
-    def pattern(self, active: np.ndarray, count: int) -> scipy.sparse.csr_array:
-        """Return which terms depend on which `active` points, a matrix (r + 2 m, m); there are `count` points."""
-        m, n, f = len(active), len(self.area), len(self.faces)
-        index = np.full(count, -1)
-        index[active] = np.arange(m)
-        moves = index[self.loop] >= 0
-
-        def incidence(
-            rows: np.ndarray, columns: np.ndarray, height: int, width: int
-        ) -> scipy.sparse.csr_array:
-            return scipy.sparse.csr_array((np.ones(len(rows)), (rows, columns)), (height, width))
-
-        of_cells = incidence(self.row[moves], index[self.loop[moves]], n, m)
-        both = np.concatenate([self.owner, self.neighbor])
-        of_faces = incidence(np.tile(np.arange(f), 2), both, f, n) @ of_cells
-        of_turns = incidence(np.arange(len(self.row)), self.row, len(self.row), n) @ of_cells
-        of_moves = incidence(np.arange(2 * m), np.repeat(np.arange(m), 2), 2 * m, m)
-        blocks = [*[of_faces] * 3, *[of_cells] * 2, of_turns, of_moves]
-        return scipy.sparse.csr_array(scipy.sparse.vstack(blocks))
+        return np.concatenate(terms)

@@ -29,9 +29,9 @@ _RINGS = 5
 """Rings of cells around a bad place that are regarded."""
 _TRIES = (1, 3)
 """Rings of cells whose points move before faces change."""
-_FIRST_STEPS, _STEPS = 7, 15
-"""Most steps of descent after each change, and after the best ones."""
-_BEST = 3
+_FIRST_STEPS, _SECOND_STEPS, _STEPS = 2, 7, 15
+"""Most steps of descent after each change, after the `_GOOD` best ones, and after the `_BEST` of these."""
+_GOOD, _BEST = 10, 3
 _MOST = 100
 """Most places that are regarded in a patch, the same ones again included."""
 
@@ -94,6 +94,8 @@ def _best_changes(given: Descent, focus: np.ndarray, ring: RingCoordinate | None
             made = Descent.of(patch, given.goals)
             if made is not None:
                 found.append(_settled(made, focus, ring, (1,), _FIRST_STEPS))
+    good = sorted(found, key=_price)[:_GOOD]
+    found = [_settled(made, focus, ring, (1,), _SECOND_STEPS) for made in good]
     best: list[Descent] = []
     for made in sorted(found, key=_price)[:_BEST]:
         best.append(_settled(made, focus, ring, (2, 3), _STEPS))

@@ -240,10 +240,13 @@ class _Work:
                     continue
                 best, gain = None, 0.0
                 for move in self._moves(run, moved):
-                    before = sum(r.cost for r, _ in move.faces)
-                    after = sum(self.cost(r, faces, move.point) for r, faces in move.faces)
-                    if before - after - move.price > gain:
-                        best, gain = move, before - after - move.price
+                    saved = sum(r.cost for r, _ in move.faces) - move.price
+                    for r, faces in move.faces:
+                        if saved <= gain:  # costs are not negative
+                            break
+                        saved -= self.cost(r, faces, move.point)
+                    if saved > gain:
+                        best, gain = move, saved
                 if best is None:
                     continue
                 for r, faces in best.faces:

@@ -126,20 +126,20 @@ def test_cells_that_are_no_rings_have_no_sides(mesh):
 
 def test_figures_are_those_of_the_solver_mesh(mesh):
     given = Descent.of(take_patch(mesh, np.ones(len(mesh), bool)))
-    now, measures = given.cells.figures(*given.patch.points.T[:, None]), mesh.measures
+    now, measures = given.cells.figures(*given.patch.points.T), mesh.measures
     assert np.array_equal(given.cells.faces, np.arange(mesh.outer))
     # OpenFOAM's centroids of concave cells are not exact.
     bent = np.zeros(len(mesh), bool)
     bent[given.cells.row[given.bent]] = True
     rows = np.flatnonzero(~bent[given.cells.owner] & ~bent[given.cells.neighbor])
     assert len(rows) > 0.9 * mesh.outer
-    angle = np.degrees(now.angle[0, rows])
+    angle = np.degrees(now.angle[rows])
     np.testing.assert_allclose(angle, measures.non_orthogonality[rows], atol=1e-6)
-    np.testing.assert_allclose(now.skewness[0, rows], measures.skewness[rows], rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(now.determinant[0], measures.determinant, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(now.area[0], measures.sizes**2, rtol=1e-9)
+    np.testing.assert_allclose(now.skewness[rows], measures.skewness[rows], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(now.determinant, measures.determinant, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(now.area, measures.sizes**2, rtol=1e-9)
     assert np.array_equal(
-        np.isclose(np.bincount(given.cells.row, now.turn[0]), 2 * np.pi), np.ones(len(mesh), bool)
+        np.isclose(np.bincount(given.cells.row, now.turn), 2 * np.pi), np.ones(len(mesh), bool)
     )
 
 

@@ -102,7 +102,7 @@ def test_all_changes_of_faces_keep_the_mesh_consistent(ctx):
                 continue
             inner = made.neighbor >= 0
             assert (made.owner[inner] < made.neighbor[inner]).all()
-            areas = changed.cells.figures(*made.points.T[:, None]).area[0]
+            areas = changed.cells.figures(*made.points.T).area
             a, b = made.points[made.ends[made.walls]].swapaxes(0, 1)
             outline = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
             assert areas.sum() == pytest.approx(outline, rel=1e-9)
