@@ -13,10 +13,10 @@ from .independent import independent
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh
 
-SHORT = 0.02
-"""A face is short if it is shorter than this, over the width of the thinner of its cells."""
-SHORT_ON_WALL = 0.05
-"""The same for a face on a wall: OpenFOAM divides the skewness of such a face by its length."""
+SHORT, THIN = 0.055, 0.2
+"""A face is short if it is shorter than both, over the smaller size of its cells and over the width of the thinner one.
+
+Between columns of boundary layers cells are much longer than wide: there the second one holds."""
 _STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell; OpenFOAM counts cells with less than about 1e-6 as concave."""
 _ROUNDS = 12
@@ -182,10 +182,10 @@ def _lengths_over_limits(mesh: SolverMesh, broken: np.ndarray) -> np.ndarray:
     lengths = np.linalg.norm(b - a, axis=1)
     both = np.concatenate([mesh.owner, mesh.neighbor[: mesh.inner]])
     perimeter = np.bincount(both, np.concatenate([lengths, lengths[: mesh.inner]]), len(mesh))
-    width = 4 * polygon_areas(mesh) / np.maximum(perimeter, 1e-300)
-    width[broken] = 0
-    thinner = np.maximum(smaller_size(mesh.owner, mesh.neighbor, width), 1e-300)
-    return lengths / thinner / np.where(mesh.neighbor >= 0, SHORT, SHORT_ON_WALL)
+    area = np.maximum(polygon_areas(mesh), 0)
+    limit = np.minimum(SHORT * np.sqrt(area), THIN * 4 * area / np.maximum(perimeter, 1e-300))
+    limit[broken] = 0
+    return lengths / np.maximum(smaller_size(mesh.owner, mesh.neighbor, limit), 1e-300)
 
 
 def point_kinds(
