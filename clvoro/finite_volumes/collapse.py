@@ -10,7 +10,7 @@ from ..mesh.connectivity import following, take_rows
 from .defects import Limits
 from .geometry import smaller_size, sum_rows
 from .merging import Cells, Merges
-from .offsets import pack, unpack
+from .seams import pack, unpack
 from .solver_mesh import SolverMesh
 
 SHORT_EDGE = 0.02

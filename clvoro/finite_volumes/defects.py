@@ -9,7 +9,7 @@ import numpy as np
 
 from ..mesh.connectivity import take_rows
 from .geometry import cell_geometry, face_geometry, smaller_size
-from .offsets import unpack
+from .seams import unpack
 
 if TYPE_CHECKING:
     from .neighborhood import Neighborhood

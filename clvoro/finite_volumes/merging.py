@@ -17,7 +17,7 @@ from .defects import Defects, Limits, find_defects
 from .geometry import sum_rows
 from .independent import independent
 from .neighborhood import Neighborhood
-from .offsets import unpack
+from .seams import unpack
 
 _TRIES = 4
 """Vertices of a group, the nearest to its mean first, that are tried as the place where all meet."""

@@ -1,4 +1,4 @@
-"""Faces at the seams of a periodic box, once for each of the two cells."""
+"""Faces at the seams of a periodic box, once for each of the two cells, and offsets of periodic images."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from ..mesh.connectivity import (
     take_rows,
 )
 from ..mesh.diagram import Diagram
+
+_BASE = 64
+"""Offsets of images, three numbers between -32 and 31, are digits of one integer: offsets add as integers."""
 
 
 def faces_with_seams(diagram: Diagram) -> tuple[FaceTopology, np.ndarray, np.ndarray]:
@@ -109,3 +112,15 @@ def align_seams(
     turned = np.array(corners)
     turned[places] = corners[starts[lower][face] + (within + nearest[face]) % counts[face]]
     return turned
+
+
+def pack(offsets: np.ndarray) -> np.ndarray:
+    """Return offsets (k, 3) as integers (k,) int64."""
+    return offsets.astype(np.int64) @ _BASE ** np.arange(3)
+
+
+def unpack(codes: np.ndarray) -> np.ndarray:
+    """Return integers of `pack` (k,) as offsets (k, 3)."""
+    half = _BASE // 2
+    digits = codes + half * (1 + _BASE + _BASE**2)
+    return np.stack([digits // _BASE**a % _BASE - half for a in range(3)], axis=1)

@@ -10,7 +10,7 @@ from clvoro.finite_volumes import collapse
 from clvoro.finite_volumes.collapse import collapse_short
 from clvoro.finite_volumes.defects import Limits
 from clvoro.finite_volumes.merging import Merges
-from clvoro.finite_volumes.offsets import pack, unpack
+from clvoro.finite_volumes.seams import pack, unpack
 from clvoro.mesh.connectivity import following
 from tests.reference import polyhedra
 from tests.reference.solids import solid_diagram
