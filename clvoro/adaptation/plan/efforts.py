@@ -39,7 +39,10 @@ class Effort:
         Coupled steps on the coarsest level, on the levels between, and on the finest.
     sweeps : tuple of int
         Sweeps (insert/delete, then glide) on the finest level, on the next coarser one, and so on. The last number
-        holds for all coarser levels.
+        holds for all coarser levels. More of them there give no better mesh: default on F2 and F3 (bench/convergence.py
+        and bench/front.py, three to ten starts each) has the same sizes and quality with 20 as with 3.
+    alone : int
+        Sweeps if there are no coarser levels.
     glide : int
         Steps of a sweep.
     polish : int
@@ -93,6 +96,7 @@ class Effort:
     penalty: float = 0.3
     nuclei: float = 0.0
     first: int = 99
+    alone: int = 0
     bad_cell_weight: float = 20.0
     quality_scale: float = 0.03
     log_ratio_scale: float = 12.0
@@ -106,16 +110,16 @@ class Effort:
 
 EFFORTS = {
     "fast": Effort(
-        8, 2, 3, (0, 1, 4, 8), glide=6, first=4, polish=5, error_target=0.0035, steep_error_target=0.007,
+        8, 2, 3, (0, 1, 4, 8), alone=8, glide=6, first=4, polish=5, error_target=0.0035, steep_error_target=0.007,
         relaxation=3.0, calm_relaxation=1.0, deficit=0.022, separate=1,
     ),
     "default": Effort(
-        30, 5, 3, (4, 18, 20, 20), glide=7, polish=21, error_target=0.0025, steep_error_target=0.0155,
+        30, 5, 3, (4, 20, 6, 3), alone=20, glide=7, polish=21, error_target=0.0025, steep_error_target=0.0155,
         relaxation=3.2, momentum=0.8, bad_cell_weight=40.0, quality_scale=0.02, log_ratio_scale=11.0,
         repairs=((5, RepairCells(0.06)), (9, RepairCells(0.06)), (13, RepairCells(0.07))),
     ),
     "best": Effort(
-        60, 5, 10, (26, 16, 16, 16), glide=6, polish=60, error_target=0.0039, steep_error_target=0.01,
+        60, 5, 10, (26, 16, 16, 16), alone=26, glide=6, polish=60, error_target=0.0039, steep_error_target=0.01,
         relaxation=3.2, momentum=0.85, polish_momentum=0.8, penalty=0.7, nuclei=0.0015,
         bad_cell_weight=120.0, quality_scale=0.02, log_ratio_scale=24.0,
         repairs=((12, RepairCells(0.035)), (24, RepairCells(0.035, split=True)), (36, RepairCells(0.035))),

@@ -239,8 +239,7 @@ def _adaptive_2d(
         yield CorrectCount(COUNT_SHARE)
         sweeps = effort.sweeps[min(level, len(effort.sweeps) - 1)]
         if levels == 0:
-            # There are no sweeps on coarser levels.
-            sweeps = max(sweeps, effort.sweeps[-1])
+            sweeps = effort.alone
         elif level == levels:
             sweeps = min(sweeps, effort.first)
         for sweep in range(sweeps):
