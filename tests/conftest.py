@@ -62,8 +62,8 @@ def quick_builds(request):
 
 def compile_quickly(plain, ctx, text, options, short=True):
     """Call `plain`, which is `compile_text` of clvoro."""
-    # Programs that are not `short` contain a size field: many kernels of a few operations.
-    quick = not short or any(map(UNOPTIMIZED.match, options))
+    # There are many programs with a size field. Their kernels take a few operations.
+    quick = "size_at" in text or any(map(UNOPTIMIZED.match, options))
     quick = quick and ctx.devices[0].platform.name == "Portable Computing Language"
     return plain(ctx, text, (*options, "-cl-opt-disable") if quick else options, short)
 

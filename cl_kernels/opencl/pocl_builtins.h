@@ -1,4 +1,4 @@
-/* The built-in functions that the kernels call. PoCL reads 18,000 lines of declarations for every program, which takes
+/* The built-in functions that the kernels and the formulas of size fields call. PoCL reads 18,000 lines of declarations for every program, which takes
    longer than to compile most of them; with -D_OPENCL_H_ it leaves them out, and reads these. */
 #define CONST_FUNCTION __attribute__((overloadable, const))
 #define READING_FUNCTION __attribute__((overloadable, pure))
@@ -35,6 +35,23 @@
     T CONST_FUNCTION fmax(T, T);                                                                                       \
     T CONST_FUNCTION fma(T, T, T);                                                                                     \
     T CONST_FUNCTION select(T, T, I)
+
+/* Those that only formulas of size fields call; see clvoro/sizing/expression.py. */
+#define DECLARE_FORMULAS(T)                                                                                            \
+    T CONST_FUNCTION exp2(T);                                                                                          \
+    T CONST_FUNCTION log2(T);                                                                                          \
+    T CONST_FUNCTION log10(T);                                                                                         \
+    T CONST_FUNCTION sinh(T);                                                                                          \
+    T CONST_FUNCTION cosh(T);                                                                                          \
+    T CONST_FUNCTION tanh(T);                                                                                          \
+    T CONST_FUNCTION asin(T);                                                                                          \
+    T CONST_FUNCTION acos(T);                                                                                          \
+    T CONST_FUNCTION pow(T, T);                                                                                        \
+    T CONST_FUNCTION hypot(T, T);                                                                                      \
+    T CONST_FUNCTION fmod(T, T);                                                                                       \
+    T CONST_FUNCTION mix(T, T, T);                                                                                     \
+    T CONST_FUNCTION step(T, T);                                                                                       \
+    T CONST_FUNCTION smoothstep(T, T, T)
 
 #define DECLARE_INTEGER(T)                                                                                             \
     DECLARE_ARITHMETIC(T);                                                                                             \
@@ -117,6 +134,8 @@
 
 DECLARE_REALS(float, int);
 DECLARE_REALS(double, long);
+DECLARE_FORMULAS(float);
+DECLARE_FORMULAS(double);
 DECLARE_INTEGERS(int, uint);
 DECLARE_INTEGERS(long, ulong);
 DECLARE_VECTOR_CONVERSIONS();

@@ -81,14 +81,12 @@ def build_program(
         With the compiler's log, if the source does not compile.
     """
     try:
-        return _build_once(ctx, *program_text(name, defines, prelude), short=not prelude)
+        return _build_once(ctx, *program_text(name, defines, prelude))
     except cl.Error as error:
         raise BuildError(f"cl_kernels/{name} does not compile: {error}") from error
 
 
-def _build_once(
-    ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True
-) -> cl.Program:
+def _build_once(ctx: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
     """Build a program, or wait for the thread that builds it. Whoever comes first builds it."""
     global _building
     key = (ctx.int_ptr, text, options)
@@ -100,7 +98,7 @@ def _build_once(
     if known is None:
         try:
             with _one_at_a_time if on_pocl(ctx.devices[0]) else contextlib.nullcontext():
-                result.set_result(compile_text(ctx, text, options, short))
+                result.set_result(compile_text(ctx, text, options))
         except BaseException as error:
             del _programs[key]
             result.set_exception(error)

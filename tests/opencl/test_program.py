@@ -7,11 +7,14 @@ import uuid
 
 import numpy as np
 import pyopencl as cl
+import pyopencl.array as cla
 import pytest
 
 import clvoro
 from clvoro.opencl import program
 from clvoro.opencl.engine import Engine
+from clvoro.opencl.program import source_text
+from clvoro.sizing.expression import _FUNCTIONS
 
 
 @pytest.fixture
@@ -61,8 +64,36 @@ def test_short_declarations_are_enough_for_all_programs(ctx, dtype, monkeypatch)
     built, plain = [], cl.Program
     monkeypatch.setattr(program.cl, "Program", lambda *a: built.append(a[1]) or plain(*a))
     programs_of_all_kinds(ctx, dtype, group=None)
-    full = [text for text in built if "DECLARE_REALS" not in text]
-    assert all("size_at" in text for text in full)
+    assert built
+    assert all("DECLARE_REALS" in text for text in built)
+
+
+@pytest.mark.parametrize(("real", "dtype"), [("double", "float64"), ("float", "float32")])
+def test_short_declarations_have_the_functions_of_formulas(ctx, monkeypatch, real, dtype):
+    """As PoCL's own: the same calls, so the same bits."""
+    if not program.has_short_declarations(ctx):
+        pytest.skip("for some versions of PoCL only")
+    names = ("x[0]", "x[1]", "x[2]")
+    calls = [f"{f.opencl}({', '.join(names[: f.arguments])})" for f in _FUNCTIONS.values()]
+    puts = "\n".join(f"h[{row}] = {call};" for row, call in enumerate(calls))
+    text = (
+        f"{source_text('sizing/size_fields.h')}\n"
+        f"kernel void evaluate(global {real} *x, global {real} *h) {{\n{puts}\n}}"
+    )
+    texts, plain = [], cl.Program
+    monkeypatch.setattr(program.cl, "Program", lambda *a: texts.append(a[1]) or plain(*a))
+    found = []
+    for short in (True, False):
+        built = program.compile_text(ctx, text, (f"-DREAL={real}", "-DDIM=2"), short=short)
+        assert ("DECLARE_REALS" in texts[-1]) == short
+        with cl.CommandQueue(ctx) as queue:
+            x = cla.to_device(queue, np.array([0.3, 0.7, 0.4], dtype))
+            h = cla.zeros(queue, len(calls), dtype)
+            built.evaluate(queue, (1,), (1,), x.data, h.data)
+            found.append(h.get())
+    assert found[0].tobytes() == found[1].tobytes()
+    expected = [f.numpy(*(0.3, 0.7, 0.4)[: f.arguments]) for f in _FUNCTIONS.values()]
+    np.testing.assert_allclose(found[0], expected, rtol=1e-5 if real == "float" else 1e-13)
 
 
 def test_programs_are_the_same_for_all_periods(ctx):
