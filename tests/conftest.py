@@ -2,6 +2,8 @@
 
 import base64
 import binascii
+import contextlib
+import ctypes
 import os
 import re
 import signal
@@ -19,6 +21,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
     os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", "1")
 
+
+# Arrays take memory again that others have left. Otherwise the system clears it anew for each array above 128 KiB.
+with contextlib.suppress(OSError, AttributeError, TypeError):
+    ctypes.CDLL(None).mallopt(-3, 1 << 25)  # M_MMAP_THRESHOLD of glibc
+    ctypes.CDLL(None).mallopt(-1, 1 << 30)  # M_TRIM_THRESHOLD
 
 # Examples are the same in every run, and the first build of a kernel may take its time.
 settings.register_profile("clvoro", derandomize=True, deadline=None, database=None)
@@ -38,6 +45,25 @@ def hulls_for_small_meshes():
     before, Cells.hulls_from = Cells.hulls_from, 0
     yield
     Cells.hulls_from = before
+
+
+class Invokers(dict):
+    """Code with which PyOpenCL sets the arguments of kernels, by the types of arguments.
+
+    PyOpenCL reads it from a file and compiles it for each kernel object. Tests make ten thousands of them, as adapters
+    of their own share none.
+    """
+
+    store_if_not_present = dict.setdefault
+
+
+@pytest.fixture(scope="session", autouse=True)
+def invokers_in_memory():
+    from pyopencl import invoker
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(invoker, "invoker_cache", Invokers(), raising=False)
+        yield
 
 
 UNOPTIMIZED = re.compile("-D(REAL=float|PERIODIC|POLYGON|SPHERE|WEIGHTED)")
