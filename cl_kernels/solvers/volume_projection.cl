@@ -33,20 +33,22 @@
 #define GAMMA(k) (2 + ((k)&1))
 #define CURVATURE 4
 
-/* eps = min(3, penalty (1 + q^2 / quality_scale^2)) / (1 + (r / log_ratio_scale)^2), q = (1 - Q) / sqrt Q.
+/* eps = min(3, penalty (1 + q^2 / quality_scale^2)) / (1 + (r / log_ratio_scale)^power), q = (1 - Q) / sqrt Q.
 
    Q is the least quality of the cell and its neighbors; q is close to -log Q, without a logarithm. Bad cells and their
    neighbors may miss their size a little, since they limit the quality. Cells far from their size may not, which bounds
-   the largest error. A scale of 0 leaves its factor out. Cells on walls have a quality scale of their own. */
-inline float penalty_of(float penalty, float quality_scale, float least_quality, float log_ratio_scale, float log_ratio)
+   the largest error. The power is 2, or 4: then r below the scale costs less, and r above it more. A scale of 0 leaves
+   its factor out. Cells on walls have a quality scale of their own. */
+inline float penalty_of(float penalty, float quality_scale, float least_quality, float log_ratio_scale, int power,
+                        float log_ratio)
 {
     float e = penalty;
     if (quality_scale > 0) {
         const float q = (1 - least_quality) / quality_scale;
         e = fmin(e * (1 + q * q / fmax(least_quality, 1e-6f)), fmax(3.0f, penalty));
     }
-    const float r = log_ratio_scale > 0 ? log_ratio / log_ratio_scale : 0;
-    return e / (1 + r * r);
+    const float r = log_ratio_scale > 0 ? log_ratio / log_ratio_scale : 0, square = r * r;
+    return e / (1 + (power == 4 ? square * square : square));
 }
 
 /* Assemble the operator and the right side, one work-item per generator i of a block:
@@ -62,8 +64,8 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
                                 global const REAL *volumes, global const REAL *points, global const REAL *gradient,
                                 global const REAL *h, global const REAL *quality, global const REAL *log_ratio,
                                 global const REAL *displacement, const REAL penalty, const REAL quality_scale,
-                                const REAL wall_quality_scale, const REAL log_ratio_scale, global float *rows,
-                                global float *columns, global STORE *own, global STORE *eps,
+                                const REAL wall_quality_scale, const REAL log_ratio_scale, const int power,
+                                global float *rows, global float *columns, global STORE *own, global STORE *eps,
                                 global STORE *inverse_diagonal, global STORE *r, global STORE *z, global REAL *partial,
                                 global const int *labels, const int fixed, const int warm,
                                 global const float *start PERIOD_ARGS)
@@ -167,7 +169,7 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
             own[CELL_DIM * i + c] = t;
         }
         const float scale = on_wall ? wall_quality_scale : quality_scale;
-        const float e = penalty_of(penalty, scale, least_quality, log_ratio_scale, log_ratio[i]);
+        const float e = penalty_of(penalty, scale, least_quality, log_ratio_scale, power, log_ratio[i]);
         const REAL inverse = 1 / (diagonal + e), b = log_ratio[i] + change;
         eps[i] = e;
         inverse_diagonal[i] = inverse;

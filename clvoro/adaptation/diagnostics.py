@@ -143,7 +143,11 @@ def warn_of_errors(result: Result) -> None:
     amounts = np.abs(result.size_error)
     worst = int(amounts.argmax())
     mean, largest = float(amounts.mean()), float(amounts[worst])
-    if mean < MEAN_ERROR and largest < LARGEST_ERROR:
+    # The caller may have given a large error target.
+    if (
+        mean < max(MEAN_ERROR, result.settings.get("error_target") or 0.0)
+        and largest < LARGEST_ERROR
+    ):
         return
     diagram, sizes = result.diagram, result.target_size
     wanted, made = (

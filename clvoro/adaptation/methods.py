@@ -161,7 +161,7 @@ CALM_MOMENTUM, CALM_BAD_CELL_WEIGHT = 0.7, 20.0
 the least Q is 0.84. With the default's relaxation of 3.2, or with its weight of 40, it is below 0.6 in four or five."""
 PENALTY_PER_ERROR = 750.0
 """Largest penalty over the error target, for targets above 0.004. With a penalty of 3 no mean error above 0.024 is
-reached; with 30 to 60 the shape hardly improves any more."""
+reached; with 30 to 60 the shape hardly improves any more. The smallest penalty is 1e-3, or a smaller target."""
 
 
 @dataclass
@@ -182,8 +182,8 @@ class ProjectedMethod:
         Share of the last displacement that is added.
     penalty : float
         Penalty eps of the projection: the smaller, the more accurate the sizes.
-    quality_scale, log_ratio_scale : float
-        Scales of the penalty; see `Penalty`.
+    quality_scale, log_ratio_scale, power : float, float, int
+        Scales and power of the penalty; see `Penalty`.
     iterations, tolerance : int, float
         Limits of each projection. Each one starts from the last solution, and leaves a residual to the next step.
     k : float
@@ -208,6 +208,7 @@ class ProjectedMethod:
     penalty: float = 0.1
     quality_scale: float = 0.0
     log_ratio_scale: float = 0.0
+    power: int = 2
     iterations: int = 30
     tolerance: float = 1e-2
     k: float = 0.4
@@ -263,7 +264,7 @@ class ProjectedMethod:
         at_walls = AT_WALLS if isinstance(mesh.domain, Polygon) else 1.0
         solution = stages.volume_projection.project(
             t, Targets(mesh.local_length, gradient, log_ratio, mesh.quality), mesh.lloyd, mesh.correction,
-            Penalty(self.penalty, self.quality_scale, self.log_ratio_scale, at_walls),
+            Penalty(self.penalty, self.quality_scale, self.log_ratio_scale, at_walls, self.power),
             Limits(self.tolerance, self.iterations), labels=mesh.labels, fixed=mesh.fixed,
             start=mesh.multipliers, warm=warm,
         )  # fmt: skip
@@ -275,7 +276,8 @@ class ProjectedMethod:
         """Change the penalty towards the one that gives the error target."""
         change = self.error_target / max(error, 1e-9)  # the error may be 0
         largest = max(3.0, PENALTY_PER_ERROR * self.error_target)
-        self.penalty = min(largest, max(1e-3, self.penalty * min(1.33, max(0.75, change))))
+        least = min(1e-3, self.error_target)
+        self.penalty = min(largest, max(least, self.penalty * min(1.33, max(0.75, change))))
 
     def move(self, mesh: MeshState) -> None:
         """Move by both, at most by k h."""

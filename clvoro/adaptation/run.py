@@ -20,6 +20,10 @@ from .preparation import Preparation
 from .resume import Saved
 from .stages import Stages
 
+REACHED = 0.8
+"""Share of the error target below which the shape ends the trade. Where targets are met, the error is at least 0.88 of
+them (`bench/front.py`)."""
+
 
 def check_run(domain: object, size: object, callback: Callable[[np.void], object] | None) -> None:
     """Check the kinds of arguments of `Adapter.run` before a run begins."""
@@ -69,15 +73,30 @@ def run_adaptation(
             on_memory = None
         try:
             loop = _start(prepared, fingerprint, saved, files, callback)
-            return loop.run(
+            result = loop.run(
                 options.n_cells if options.multilevel else None,
                 float(prepared.target),
                 _settings(prepared),
             )
+            _note_end_of_trade(result, options)
+            return result
         except FewCellsError:
             if options.levels != "auto" or prepared.levels == 0:
                 raise
             max_levels = prepared.levels - 1
+
+
+def _note_end_of_trade(result: Result, options: Options) -> None:
+    """Add to `trade` in the settings where the error ends, if it is far below the target of the caller."""
+    target = options.error_target
+    if options.method != "adaptive" or target is None or not result.converged:
+        return
+    length = result.diagram.volumes ** (1 / result.diagram.domain.cell_dim)
+    error = float(np.abs(np.log(length / result.target_size)).mean())
+    if error < REACHED * target:
+        result.settings["trade"] += (
+            f"; it ends at {error:.2g}, because larger errors give no better shape"
+        )
 
 
 def _start(

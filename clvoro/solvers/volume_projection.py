@@ -54,15 +54,16 @@ class Targets:
 class Penalty:
     """The penalty eps that trades accuracy of the volumes for a shorter displacement.
 
-    eps_i = min(3, eps (1 + q_i^2 / quality_scale^2)) / (1 + (r_i / log_ratio_scale)^2), q = (1 - Q) / sqrt Q of the
-    worst cell among i and its neighbors. A scale of 0 leaves its factor out. In cells on walls the quality scale
-    is `at_walls` times as large: walls limit their quality, and missed sizes help less.
+    eps_i = min(3, eps (1 + q_i^2 / quality_scale^2)) / (1 + |r_i / log_ratio_scale|^power), q = (1 - Q) / sqrt Q of the
+    worst cell among i and its neighbors. The power is 2 or 4. A scale of 0 leaves its factor out. In cells on walls the
+    quality scale is `at_walls` times as large: walls limit their quality, and missed sizes help less.
     """
 
     eps: float
     quality_scale: float = 0.0
     log_ratio_scale: float = 0.0
     at_walls: float = 1.0
+    power: int = 2
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,8 @@ class VolumeProjection:
             engine, k.assemble_projection, np.int32(n), np.int32(m), t.starts, t.neighbors, t.face_measures,
             t.face_centroids, t.volumes, t.points, targets.gradient, targets.h, targets.quality,
             targets.log_ratio, displacement, real(penalty.eps), real(penalty.quality_scale),
-            real(penalty.at_walls * penalty.quality_scale), real(penalty.log_ratio_scale), v.rows, v.columns, v.own,
+            real(penalty.at_walls * penalty.quality_scale), real(penalty.log_ratio_scale),
+            np.int32(penalty.power), v.rows, v.columns, v.own,
             v.eps, v.inverse, v.r, v.z, self._partial,
             t.starts if labels is None else labels, np.int32(fixed), np.int32(warm), start,
             *engine.period_args, groups=groups,

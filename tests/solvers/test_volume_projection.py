@@ -147,7 +147,9 @@ def test_right_side(engine, points):
 def project(engine, points, h, gradient, r, displacement, tolerance=1e-6, **options):
     out = engine.empty((len(points), 2))
     targets = Targets(*map(engine.upload, (h, gradient, r, np.ones(len(points)))))
-    penalty = Penalty(options.pop("eps"), log_ratio_scale=options.pop("log_ratio_scale", 0.0))
+    penalty = Penalty(
+        options.pop("eps"), log_ratio_scale=options.pop("log_ratio_scale", 0.0), power=options.pop("power", 2)
+    )  # fmt: skip
     solution = VolumeProjection(engine).project(
         patch.tessellate(engine, points), targets, engine.upload(displacement), out, penalty,
         Limits(tolerance, options.pop("max_iterations")), **options,
@@ -155,13 +157,13 @@ def project(engine, points, h, gradient, r, displacement, tolerance=1e-6, **opti
     return out.get(), solution
 
 
-@pytest.mark.parametrize("log_ratio_scale", [0.0, 0.2])
-def test_projection(engine, points, log_ratio_scale):
+@pytest.mark.parametrize(("log_ratio_scale", "power"), [(0.0, 2), (0.2, 2), (0.2, 4)])
+def test_projection(engine, points, log_ratio_scale, power):
     """u' = -W J^T (J W J^T + eps)^-1 (r + J Ld), by dense algebra; a cell that is far off has the smaller eps."""
     r, lloyd = log_ratios(points), np.random.default_rng(14).normal(0, 0.01, (N, 2))
     given = (points, sizes(points), np.tile(SLOPE, (N, 1)), r, lloyd)
-    made = Assembled(engine, *given, eps=0.02, log_ratio_scale=log_ratio_scale)
-    eps = 0.02 / (1 + (r / log_ratio_scale) ** 2 if log_ratio_scale else np.ones(N))
+    made = Assembled(engine, *given, eps=0.02, log_ratio_scale=log_ratio_scale, power=power)
+    eps = 0.02 / (1 + (r / log_ratio_scale) ** power if log_ratio_scale else np.ones(N))
     assert made.eps == pytest.approx(eps, rel=1e-6)  # of single precision
     expected = made.correction(made.rhs)
     correction, solution = project(
@@ -169,6 +171,7 @@ def test_projection(engine, points, log_ratio_scale):
         *given,
         eps=0.02,
         log_ratio_scale=log_ratio_scale,
+        power=power,
         max_iterations=1000,
         tolerance=1e-12,
     )

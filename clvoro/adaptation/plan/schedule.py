@@ -108,14 +108,17 @@ SETTLING_STEPS = 4
 """Steps of polishing and separation after the last cells of four sides have been deleted."""
 OPENING_PROJECTIONS = 4
 """Number of the last exact projections after each of which obtuse triangles are opened."""
-LOOSE_LOG_RATIO_SCALE = 0.25
+LOOSE_LOG_RATIO_SCALE = 0.28
 """Largest scale of log(L / h) in the penalty, with an error target above the effort's own. It bounds the largest error.
 
-Measured on F3, a ridge and two circles with target 0.08: the largest |e| is about 0.2 with 0.2, 0.23 to 0.25 with 0.3,
-0.27 to 0.29 with 0.5; larger scales give a minimum of Q that is larger by 0.003 to 0.01. On the way there the scale
-grows like the power 1.5 of the target: on these fields, default with target 0.01, it is 20 to 30 times the target. In
-place of 11 times, that raises the mean Q by 0.0003 and the least by 0.002 to 0.005; the largest errors are 0.08 to 0.10
-in place of 0.06 to 0.07."""
+The power is 4 then. Measured on F3, circles and two ridges with targets 0.014 to 0.2: at the same mean error the mean Q
+is larger than with a power of 2 by up to 0.0003, and with target 0.2 the largest |e| is 0.20 to 0.24 in place of 0.21
+to 0.29. On the way there the scale grows like the power 1.5 of the target. In place of a multiple of it, that raises
+the mean Q by 0.0003 and the least by 0.002 to 0.005."""
+TIGHT = 0.43
+"""Share of the effort's error target below which polishing begins with a penalty that is smaller in proportion, the
+number of cells is exact, and grad log h comes from the field. With target 1e-4 the mean |e| on F3, circles and a ridge
+is 0.9e-4 to 1.4e-4 then, in place of 1.7e-4 to 6e-4."""
 MOVES = 1
 """Moves to the centroids of power cells.
 
@@ -284,14 +287,23 @@ def _finish_2d(
     effort: Effort, exact: bool, error_target: float, penalty: float
 ) -> Iterator[Action]:
     """Polish, and project."""
-    scale, looser = effort.log_ratio_scale * error_target, error_target / effort.error_target
-    if looser > 1:
+    scale, looser, power = (
+        effort.log_ratio_scale * error_target,
+        error_target / effort.error_target,
+        2,
+    )
+    tight = looser < TIGHT
+    if looser > 1 or tight:
         penalty *= looser
-        scale = min(scale * looser**0.5, LOOSE_LOG_RATIO_SCALE)
+    if looser > 1:
+        scale, power = min(scale * looser**0.5, LOOSE_LOG_RATIO_SCALE), 4
+    if effort.loose and error_target > effort.loose.above:
+        effort = replace(effort, polish=effort.loose.steps, polish_momentum=effort.loose.momentum)
     polish = ProjectedMethod(
         "quality", momentum=effort.polish_momentum, penalty=penalty, quality_scale=effort.quality_scale,
         log_ratio_scale=scale, k=0.3, error_target=error_target,
-        bad_cell_weight=effort.bad_cell_weight, tolerance=POLISH_TOLERANCE,
+        bad_cell_weight=effort.bad_cell_weight, tolerance=POLISH_TOLERANCE, power=power,
+        gradient_from_field=tight,
     )  # fmt: skip
     repairs = dict(effort.repairs)
     for step in range(effort.polish):
@@ -300,7 +312,7 @@ def _finish_2d(
             yield CorrectCount()
         if step in repairs:
             yield repairs[step]
-            yield CorrectCount(COUNT_EXACTLY if exact else 0.0)
+            yield CorrectCount(COUNT_EXACTLY if exact or tight else 0.0)
         yield Step(polish)
     if exact:
         project = ProjectedMethod(

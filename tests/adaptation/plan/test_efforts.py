@@ -1,5 +1,8 @@
 """The error target that a run chooses: the share of steep cells against a grid, and the meshes that follow."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 
@@ -109,3 +112,23 @@ def test_a_kinked_and_steep_field_gets_cells_of_a_good_shape(adapter):
     explicit = clvoro.MultilevelOptions(error_target=target)
     again = adapter.run(BOX, RIDGE, seed=31, options=explicit, max_steps=0)
     assert again.settings["error_target"] == target
+
+
+def test_a_target_beyond_the_best_shape_ends_there_and_does_not_warn(adapter):
+    """Where the penalty is largest, mean |e| is 0.07 to 0.09 on this field."""
+    options = clvoro.MultilevelOptions(error_target=0.3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", clvoro.errors.SizeErrorWarning)
+        result = adapter.run(BOX, RIDGE, seed=31, effort="fast", options=options)
+    error = np.abs(result.size_error)
+    assert 0.05 < error.mean() < 0.12
+    assert error.max() < 0.35
+    assert re.search("as given; it ends at 0.[0-9]+, because", result.summary()["trade"])
+
+
+def test_small_error_targets_are_met(adapter):
+    """Without a smaller first penalty and the exact number of cells, mean |e| is 6e-4."""
+    options = clvoro.MultilevelOptions(error_target=2e-4)
+    result = adapter.run(BOX, RIDGE, seed=31, options=options)
+    assert abs(result.size_error).mean() < 3e-4
+    assert result.summary()["trade"] == "error target 0.0002, as given"
