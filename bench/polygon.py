@@ -7,9 +7,11 @@ The first table compares the diagram of a polygon of `--edges` edges, a coast wi
 as many generators: from nothing, and updated without motion, where only the boundary is clipped again. Times are
 processor times over the number of cores, medians of several runs by turns.
 
-The second table runs the fields F2 and F3 of `bench/convergence.py` on such a polygon, against one
-and a half times the error targets of the box, and its mean quality less .01. Quality is that of cells
-without a face on the boundary; the others have separate columns.
+The second table runs size fields of `bench/convergence.py` on such a polygon. F2 and F3 stand against one
+and a half times the error targets of the box, and its mean quality less .01. Fields with kinks, where a run trades
+sizes for shape, stand against the goals of `bench/front.py`, and their cells on the boundary against a mean |e| of
+.006.
+Quality is that of cells without a face on the boundary; the others have separate columns.
 """
 
 from __future__ import annotations
@@ -41,12 +43,17 @@ from clvoro.opencl.engine import Engine
 from clvoro.tessellation.tessellator import Tessellator
 
 MOST_RATIO = 1.3
+SMOOTH = {"mean_error": 0.006, "max_error": 0.06, "mean_quality": 0.980}
+KINKED = {
+    "mean_error": 0.015, "max_error": 0.25, "mean_quality": 0.985, "min_quality": 0.92, "boundary_error": 0.006,
+}  # fmt: skip
 MESHES = (
-    ("fast", "F2", {"effort": "fast"}, {"mean_error": 0.006, "mean_quality": 0.975}),
-    ("default", "F2", {}, {"mean_error": 0.004, "max_error": 0.04, "mean_quality": 0.990}),
-    ("default", "F3", {}, {"mean_error": 0.004, "max_error": 0.04, "mean_quality": 0.990}),
+    ("fast", "F2", {"effort": "fast"}, {"mean_error": 0.009, "mean_quality": 0.965}),
+    ("default", "F2", {}, SMOOTH),
+    ("default", "F3", {}, SMOOTH),
     ("exact", "F2", {"method": "exact"},
-     {"mean_deviation": 1e-4, "max_deviation": 2e-3, "mean_quality": 0.986}),
+     {"mean_deviation": 1.5e-4, "max_deviation": 3e-3, "mean_quality": 0.976}),
+    *(("default", field, {}, KINKED) for field in ("circles", "ridge", "steep circles", "steep ridge")),
 )  # fmt: skip
 
 
@@ -143,7 +150,7 @@ def meshes(adapter: clvoro.Adapter, edges: int, report: Report) -> bool:
         }  # fmt: skip
         missed = [
             key for key, bound in targets.items()
-            if (found[key] < bound - 0.01 if "quality" in key else found[key] > 1.5 * bound)
+            if (record[key] < bound if "quality" in key else record[key] > bound)
         ]  # fmt: skip
         record["missed"] = ", ".join(missed)
         good &= not missed

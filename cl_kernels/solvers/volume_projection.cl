@@ -64,10 +64,10 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
                                 global const REAL *volumes, global const REAL *points, global const REAL *gradient,
                                 global const REAL *h, global const REAL *quality, global const REAL *log_ratio,
                                 global const REAL *displacement, const REAL penalty, const REAL quality_scale,
-                                const REAL wall_quality_scale, const REAL log_ratio_scale, const int power,
-                                global float *rows, global float *columns, global STORE *own, global STORE *eps,
-                                global STORE *inverse_diagonal, global STORE *r, global STORE *z, global REAL *partial,
-                                global const int *labels, const int fixed, const int warm,
+                                const REAL wall_penalty, const REAL wall_quality_scale, const REAL log_ratio_scale,
+                                const int power, global float *rows, global float *columns, global STORE *own,
+                                global STORE *eps, global STORE *inverse_diagonal, global STORE *r, global STORE *z,
+                                global REAL *partial, global const int *labels, const int fixed, const int warm,
                                 global const float *start PERIOD_ARGS)
 {
     local REAL scratch[GROUP_SIZE];
@@ -168,8 +168,8 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
             diagonal += t * t;
             own[CELL_DIM * i + c] = t;
         }
-        const float scale = on_wall ? wall_quality_scale : quality_scale;
-        const float e = penalty_of(penalty, scale, least_quality, log_ratio_scale, power, log_ratio[i]);
+        const float base = on_wall ? wall_penalty : penalty, scale = on_wall ? wall_quality_scale : quality_scale;
+        const float e = penalty_of(base, scale, least_quality, log_ratio_scale, power, log_ratio[i]);
         const REAL inverse = 1 / (diagonal + e), b = log_ratio[i] + change;
         eps[i] = e;
         inverse_diagonal[i] = inverse;

@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -182,8 +183,8 @@ class ProjectedMethod:
         Share of the last displacement that is added.
     penalty : float
         Penalty eps of the projection: the smaller, the more accurate the sizes.
-    quality_scale, log_ratio_scale, power : float, float, int
-        Scales and power of the penalty; see `Penalty`.
+    quality_scale, log_ratio_scale, power, most_at_walls : float, float, int, float
+        Scales, power and bound of the penalty; see `Penalty`. The bound holds in polygons only.
     iterations, tolerance : int, float
         Limits of each projection. Each one starts from the last solution, and leaves a residual to the next step.
     k : float
@@ -209,6 +210,7 @@ class ProjectedMethod:
     quality_scale: float = 0.0
     log_ratio_scale: float = 0.0
     power: int = 2
+    most_at_walls: float = math.inf
     iterations: int = 30
     tolerance: float = 1e-2
     k: float = 0.4
@@ -261,10 +263,12 @@ class ProjectedMethod:
         warm = mesh.multipliers is not None
         if not warm:
             mesh.multipliers = mesh.engine.zeros(mesh.n, np.float32)
-        at_walls = AT_WALLS if isinstance(mesh.domain, Polygon) else 1.0
+        at_walls, most = (
+            (AT_WALLS, self.most_at_walls) if isinstance(mesh.domain, Polygon) else (1.0, math.inf)
+        )
         solution = stages.volume_projection.project(
             t, Targets(mesh.local_length, gradient, log_ratio, mesh.quality), mesh.lloyd, mesh.correction,
-            Penalty(self.penalty, self.quality_scale, self.log_ratio_scale, at_walls, self.power),
+            Penalty(self.penalty, self.quality_scale, self.log_ratio_scale, at_walls, self.power, most),
             Limits(self.tolerance, self.iterations), labels=mesh.labels, fixed=mesh.fixed,
             start=mesh.multipliers, warm=warm,
         )  # fmt: skip

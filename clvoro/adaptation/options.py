@@ -75,9 +75,9 @@ class MultilevelOptions:
         the number of refinements that lead from them to the finest level.
     error_target : float, optional
         Mean |log(L / h)| that the last steps aim at; a larger one gives cells of a better shape. By default .0025
-        (effort "fast": .0035, "best": .0039) where sizes are smooth. In a `Box` in 2D, with more than about 2,800
-        cells, it grows with the share of the cells where sizes are steep, |grad h| > .1, up to .0155 ("fast": .007,
-        "best": .01). In other domains and with "exact" it does not. In 2D targets from 1e-4 on are met, up to where
+        (effort "fast": .0035, "best": .0039) where sizes are smooth. In the plane, with more than about 2,800 cells,
+        it grows with the share of the cells where sizes are steep, |grad h| > .1, up to .0155 ("fast": .007,
+        "best": .01). On spheres, in 3D and with "exact" it does not. In 2D targets from 1e-4 on are met, up to where
         the shape is as good as it gets: on steep fields at a mean error of about .05, on smooth ones of .03. With a
         larger target the mesh stays there, ``settings["trade"]`` says so, and the largest error stays bounded to
         about .25 (`bench/front_ends.py`).

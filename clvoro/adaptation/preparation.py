@@ -269,12 +269,14 @@ class Preparation:
     def _measure_steepness(self) -> float:
         """Return the share of the cells where sizes are steep; 0 where shape is not preferred to sizes.
 
-        That is in 3D, on spheres, with few cells, which only serve a tight target, and with exact sizes. It is in
-        polygons, too, where cells at walls take most of the error: their mean |e| in the built-in case `lake` would be
-        0.020 instead of 0.005.
+        That is in 3D, on spheres, with few cells, which only serve a tight target, and with exact sizes.
         """
         tree, domain = self._tree, self.domain
-        plane = isinstance(domain, Box) and domain.dim == 2 and auto_levels(self.target, 2) > 0
+        plane = (
+            isinstance(domain, Box | Polygon)
+            and domain.dim == 2
+            and auto_levels(self.target, 2) > 0
+        )
         if tree is None or self.options.method != "adaptive" or not plane:
             return 0.0
         share = steep_share(self.factor * tree.slopes_of_size, tree.cells)

@@ -6,6 +6,7 @@ projection does in incompressible flow.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +57,8 @@ class Penalty:
 
     eps_i = min(3, eps (1 + q_i^2 / quality_scale^2)) / (1 + |r_i / log_ratio_scale|^power), q = (1 - Q) / sqrt Q of the
     worst cell among i and its neighbors. The power is 2 or 4. A scale of 0 leaves its factor out. In cells on walls the
-    quality scale is `at_walls` times as large: walls limit their quality, and missed sizes help less.
+    quality scale is `at_walls` times as large, and eps at most `most_at_walls`: walls limit their quality, and missed
+    sizes help less.
     """
 
     eps: float
@@ -64,6 +66,7 @@ class Penalty:
     log_ratio_scale: float = 0.0
     at_walls: float = 1.0
     power: int = 2
+    most_at_walls: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,7 @@ class VolumeProjection:
             engine, k.assemble_projection, np.int32(n), np.int32(m), t.starts, t.neighbors, t.face_measures,
             t.face_centroids, t.volumes, t.points, targets.gradient, targets.h, targets.quality,
             targets.log_ratio, displacement, real(penalty.eps), real(penalty.quality_scale),
+            real(min(penalty.eps, penalty.most_at_walls)),
             real(penalty.at_walls * penalty.quality_scale), real(penalty.log_ratio_scale),
             np.int32(penalty.power), v.rows, v.columns, v.own,
             v.eps, v.inverse, v.r, v.z, self._partial,

@@ -1,5 +1,6 @@
 """The derivative of the volumes against differences of Qhull's, and the projection against NumPy."""
 
+import math
 import warnings
 
 import numpy as np
@@ -287,27 +288,27 @@ def test_not_finite(engine, points):
 
 
 def test_penalty_of_bad_cells(engine, points, assembled):
-    """eps grows with (1 - Q) / sqrt Q of the worst cell around, up to 3; on walls with a scale of their own."""
+    """eps grows with (1 - Q) / sqrt Q of the worst cell around, up to 3; walls have a scale and a bound."""
     quality = np.random.default_rng(15).uniform(0.3, 1, N)
     host = patch.fetch(patch.tessellate(engine, points))
     worst = quality.copy()
     inner = host.neighbors >= 0
     np.minimum.at(worst, host.owners[inner], quality[host.neighbors[inner]])
 
-    def penalties(scale):
-        return np.minimum(0.2 * (1 + (1 - worst) ** 2 / worst / scale**2), 3)
+    def penalties(scale, penalty=0.2):
+        return np.minimum(penalty * (1 + (1 - worst) ** 2 / worst / scale**2), 3)
 
     eps = penalties(0.3)
     on_wall = np.zeros(N, bool)
     on_wall[host.owners[~inner]] = True
     assert 5 < on_wall.sum() < N - 5
     assert 5 < (eps == 3).sum() < N - 5
-    for at_walls in (1.0, 2.0):
+    for at_walls, most in ((1.0, math.inf), (2.0, math.inf), (1.0, 0.05)):
         made = Assembled(
             engine, points, sizes(points), np.tile(SLOPE, (N, 1)), eps=0.2, quality_scale=0.3, at_walls=at_walls,
-            quality=quality,
+            most_at_walls=most, quality=quality,
         )  # fmt: skip
-        expected = np.where(on_wall, penalties(0.3 * at_walls), eps)
+        expected = np.where(on_wall, penalties(0.3 * at_walls, min(most, 0.2)), eps)
         assert made.eps == pytest.approx(expected, rel=1e-5)  # of single precision
 
 

@@ -160,7 +160,7 @@ EFFORTS_3D = {
         log_ratio_scale=8.0, coarse_glide=16, coarse_polish=8, recouple=1,
     ),
     "best": Effort(
-        80, 8, 3, (), glide=50, polish=10, error_target=0.003, relaxation=1.5, momentum=0.9, penalty=0.3,
+        80, 8, 3, (), glide=85, polish=10, error_target=0.003, relaxation=1.5, momentum=0.9, penalty=0.3,
         log_ratio_scale=8.0, coarse_glide=100, coarse_polish=40, recouple=4,
     ),
 }  # fmt: skip
