@@ -63,7 +63,7 @@ NOTES = (
 
 ERROR_TARGETS = {
     "fast": (None, 0.0015, 0.007, 0.014, 0.04),
-    "default": (None, 0.0005, 0.001, 0.0035, 0.007, 0.014, 0.04, 0.08),
+    "default": (None, 0.0001, 0.0005, 0.001, 0.0035, 0.007, 0.014, 0.04, 0.08),
     "best": (None, 0.0005, 0.0012, 0.002, 0.008, 0.016, 0.04, 0.08),
 }
 """Error targets per effort; None is the effort's own."""

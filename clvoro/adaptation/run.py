@@ -95,7 +95,7 @@ def _note_end_of_trade(result: Result, options: Options) -> None:
     error = float(np.abs(np.log(length / result.target_size)).mean())
     if error < REACHED * target:
         result.settings["trade"] += (
-            f"; it ends at {error:.2g}, because larger errors give no better shape"
+            f"; it ends at {error:.2g}, as larger errors hardly give a better shape"
         )
 
 

@@ -123,7 +123,7 @@ def test_a_target_beyond_the_best_shape_ends_there_and_does_not_warn(adapter):
     error = np.abs(result.size_error)
     assert 0.05 < error.mean() < 0.12
     assert error.max() < 0.35
-    assert re.search("as given; it ends at 0.[0-9]+, because", result.summary()["trade"])
+    assert re.search("as given; it ends at 0.[0-9]+, as larger", result.summary()["trade"])
 
 
 def test_small_error_targets_are_met(adapter):
