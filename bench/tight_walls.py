@@ -12,9 +12,10 @@ A row has the number of cells at walls, how many of them have Q < 0.75, and wher
   boundary itself is longer, because it has kinks within the cell;
 - elsewhere: none of these. `--places` lists them.
 
-A cell counts where it fits first. h is the wanted size of the cell. Then follows the mean |e| of cells at walls: all,
-the narrow ones, and the others. In corners sharper than 35 degrees Q >= 0.75 is impossible; see
-`bench/sharp_corners.py`. The domains are those of `bench/solver_ready.py`; put semicolons between names with commas.
+A cell counts where it fits first. h is the wanted size of the cell. In corners sharper than 35 degrees Q >= 0.75 is
+impossible; see `bench/sharp_corners.py`. Then follow the mean |e| and the least Q of cells at walls: of those with a
+corner of the domain of more than 30 degrees (`have_corners`, as `corner_cells` of `Result.summary`), and of the others.
+Boxes have no row. The domains are those of `bench/solver_ready.py`; put semicolons between names with commas.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from solver_ready import DOMAINS
 
 import clvoro
 from clvoro.finite_volumes.prisms import simple_loops
+from clvoro.mesh.straightening import have_corners
 
 LEAST_QUALITY = 0.75
 SHARP = 35.0
@@ -74,6 +76,8 @@ def measure(result: clvoro.Result) -> dict[str, Any]:
     sharp = angles < SHARP
     rough = ~sharp & (straight >= LEAST_QUALITY)
     left = ~sharp & ~rough
+    at_corner = have_corners(d)[wall]
+    parts = wall[at_corner], wall[~at_corner]
 
     def mean(rows: np.ndarray) -> float:
         return float(e[rows].mean()) if rows.size else float("nan")
@@ -82,8 +86,9 @@ def measure(result: clvoro.Result) -> dict[str, Any]:
         "wall": len(wall), "low": int((q[wall] < LEAST_QUALITY).sum()),
         "narrow": int((q[wall[narrow]] < LEAST_QUALITY).sum()),
         "sharp": int(sharp.sum()), "rough": int(rough.sum()), "elsewhere": int(left.sum()),
-        "error": [mean(wall), mean(wall[narrow]), mean(wall[~narrow])],
-        "narrow_cells": int(narrow.sum()),
+        "error": [mean(wall), *map(mean, parts)],
+        "quality": [float(q[rows].min()) if rows.size else float("nan") for rows in parts],
+        "corners": len(parts[0]),
         "places": [
             {"at": d.points[i].tolist(), "h": h[i], "quality": q[i], "straight": s, "angle": angle}
             for i, s, angle in zip(rest[left], straight[left], angles[left], strict=True)
@@ -101,10 +106,9 @@ COLUMNS = {
     "rough": lambda r: r["rough"],
     "elsewhere": lambda r: r["elsewhere"],
     "mean e at walls": lambda r: f"{r['error'][0]:.4f}",
-    "narrow ones (cells)": lambda r: (
-        f"{r['error'][1]:.4f} ({r['narrow_cells']})" if r["narrow_cells"] else ""
-    ),
-    "others": lambda r: f"{r['error'][2]:.4f}",
+    "at corners": lambda r: f"{r['corners']} ({r['corners'] / r['wall']:.0%})",
+    "mean e, min Q there": lambda r: f"{r['error'][1]:.4f}, {r['quality'][0]:.3f}",
+    "mean e, min Q at other walls": lambda r: f"{r['error'][2]:.4f}, {r['quality'][1]:.3f}",
 }
 
 

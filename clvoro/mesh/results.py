@@ -164,7 +164,8 @@ class Result(Sealed, MeshOutput):
             the methods that repeat one kind of step), ``ever_changed`` (share of cells whose set of neighbors changed
             on the finest level), ``converged``, ``stop_reason`` and ``seconds``. In a polygonal domain also
             ``boundary_cells``, ``boundary_mean_error``, ..., and ``inner_cells``, ... for the cells on the boundary and
-            the others (None where there is no such cell).
+            the others; and ``corner_cells``, ... for those on the boundary with a corner of more than 30 degrees, where
+            the domain bounds size and quality (None where there is no such cell).
 
         Examples
         --------

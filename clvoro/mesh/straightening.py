@@ -91,6 +91,33 @@ def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
     )
 
 
+def have_corners(diagram: Diagram) -> np.ndarray:
+    """Return which cells in a polygonal domain have a corner of the boundary, (n,) bool.
+
+    That is a turn by more than 30 degrees (`SIDE_TURN`): at the end of a wall face of the cell, or in sum within it, so
+    that the cell has several sides on one stretch of the boundary.
+    """
+    domain = diagram.domain
+    assert isinstance(domain, Polygon)
+    owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
+    of, _, _ = _stretches(diagram, domain, owner, np.dtype(np.float64))
+    following, edges = along_rings(diagram, domain), _places(diagram, domain)
+    here = np.flatnonzero(following >= 0)
+    there = following[here]
+    # The sum of turns from one edge to another one behind it on the same ring.
+    oriented = domain.oriented
+    rings = np.searchsorted(oriented.ring_starts, edges[here], side="right")
+    sums = np.cumsum(oriented.turns)
+    whole = np.add.reduceat(oriented.turns, oriented.ring_starts[:-1])
+    turned = sums[edges[there]] - sums[edges[here]]
+    turned += np.where(edges[there] < edges[here], whole[rings - 1], 0)
+    within = owner[here] == owner[there]
+    cornered = (np.abs(turned) > SIDE_TURN) | (within & (of[here] != of[there]))
+    found = np.zeros(len(diagram), bool)
+    found[owner[here[cornered]]] = found[owner[there[cornered]]] = True
+    return found
+
+
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the cross products of vectors in 2D, (k, 2) each: (k,)."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

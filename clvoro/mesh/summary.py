@@ -8,6 +8,7 @@ import numpy as np
 
 from ..geometry.polygon import Polygon
 from .results import Result
+from .straightening import have_corners
 
 
 def summary(result: Result) -> dict[str, Any]:
@@ -36,15 +37,17 @@ def summary(result: Result) -> dict[str, Any]:
 
 
 def beside_boundary(result: Result) -> dict[str, dict[str, Any]]:
-    """Return number, mean |e|, mean and least Q of the cells on the `boundary` and of the `inner` ones.
+    """Return number, mean |e|, mean and least Q of `boundary` cells, those of them at a `corner`, and `inner` cells.
 
-    The values are None if there is no such cell.
+    A corner is a turn of the boundary by more than 30 degrees; see `have_corners`. The values are None if there is no
+    such cell.
     """
     d = result.diagram
     owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
     on_boundary = np.bincount(owner, d.neighbors < 0, len(d)) > 0
     found = {}
-    for name, which in (("boundary", on_boundary), ("inner", ~on_boundary)):
+    at_corner = have_corners(d)
+    for name, which in (("boundary", on_boundary), ("corner", at_corner), ("inner", ~on_boundary)):
         error, quality = np.abs(result.size_error[which]), result.quality[which]
         some = bool(which.any())
         found[name] = {
@@ -57,9 +60,10 @@ def beside_boundary(result: Result) -> dict[str, dict[str, Any]]:
 
 
 def boundary_line(result: Result) -> str:
-    """Return the figures of cells on the boundary and of the others as one line of text."""
+    """Return the figures of cells on the boundary, of those at its corners, and of the others as one line of text."""
+    names = {"boundary": "boundary cells", "corner": "of them at corners", "inner": "inner cells"}
     return "; ".join(
-        f"{s['cells']} {name} cells: mean |e| {s['mean_error']:.4f}, mean Q {s['mean_quality']:.4f}, "
+        f"{s['cells']} {names[name]}: mean |e| {s['mean_error']:.4f}, mean Q {s['mean_quality']:.4f}, "
         f"min Q {s['min_quality']:.3f}"
         for name, s in beside_boundary(result).items()
         if s["cells"]

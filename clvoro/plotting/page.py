@@ -193,7 +193,7 @@ def _measures(name: str, result: Result) -> str:
 
 
 def _apart(results: Mapping[str, Result], main: str) -> str:
-    """Return the table of boundary cells and inner cells."""
+    """Return the table of boundary cells, those of them at corners, and inner cells."""
     rows = []
     for method, result in results.items():
         for part, s in beside_boundary(result).items():

@@ -624,6 +624,8 @@ def test_boundary_cells_are_reported_separately(result, tmp_path) -> None:
         assert s[f"{name}_mean_quality"] == pytest.approx(result.quality[which].mean())
         assert s[f"{name}_min_quality"] == result.quality[which].min()
     assert f"{sum(touching)} boundary cells: mean |e|" in boundary_line(result)
+    assert 0 < s["corner_cells"] < s["boundary_cells"]
+    assert f"; {s['corner_cells']} of them at corners: mean |e|" in boundary_line(result)
     page = write_report(result, tmp_path, size=size)[0].read_text()
     assert "Cells on the boundary" in page
     assert f"<td>{sum(touching)}</td>" in page
