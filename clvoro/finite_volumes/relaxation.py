@@ -16,7 +16,7 @@ from ..geometry.polygon import Polygon
 from ..geometry.ring_coordinate import RingCoordinate
 from ..mesh.connectivity import following
 from .geometry import polygon_centroids, turns
-from .patch import Patch, put_back, take_patch
+from .patch import Patch, part_of, put_back, take_patch
 from .patch_descent import ANGLE, LEAST_DETERMINANT, SKEWNESS, STRAIGHT, Descent
 from .patch_figures import face_figures
 from .prisms import simple_loops
@@ -57,11 +57,14 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
     ring = RingCoordinate(domain) if straight and isinstance(domain, Polygon) else None
     kinds = point_kinds(mesh, parts)
     region = _grown(loops, bad)
+    around, parts = take_patch(mesh, region), _connected_parts(mesh, region, bad)
     made = []
     # The last bits of sums in BLAS depend on its number of threads.
     with _BLAS, threadpool_limits(1, user_api="blas"):
-        for cells in _connected_parts(mesh, region, bad):
-            patch = _with_positions(take_patch(mesh, cells), ring, kinds)
+        for cells in parts:
+            patch = part_of(around, cells[around.cells])
+            patch.cells, patch.ids = around.cells[patch.cells], around.ids[patch.ids]
+            patch = _with_positions(patch, ring, kinds)
             given = Descent.of(patch)
             if given is not None and given.bad.any():
                 better = _improved(given, ring, straight)

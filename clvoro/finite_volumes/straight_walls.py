@@ -115,6 +115,9 @@ class _Work:
         self.starts, self.loops, broken = simple_loops(mesh)
         self.broken = set(broken.tolist())
         self.costs: dict[tuple[int, int, int], float] = {}
+        self.chords: dict[
+            tuple[int, int], list[int]
+        ] = {}  # of the runs from one face to another one
 
     def _following(self, onward: np.ndarray) -> list[int]:
         """Return the next wall face on the ring for each one, counted from the first; -1 at an end.
@@ -204,7 +207,16 @@ class _Work:
         """Return which points of a run remain."""
         if self.spared[run.cell] == 2:
             return list(range(len(run.faces) + 1))
-        return chord_points(self.line(run.faces), self.fixed(run.faces), self.sizes[run.cell])
+        return self.chords_of(run, run.faces)
+
+    def chords_of(self, run: _Run, faces: Sequence[int]) -> list[int]:
+        """Return which points of a run remain if it has these faces."""
+        key = (faces[0], faces[-1])
+        if key not in self.chords:
+            self.chords[key] = chord_points(
+                self.line(faces), self.fixed(faces), self.sizes[run.cell]
+            )
+        return self.chords[key]
 
     def cost(self, run: _Run, faces: Sequence[int], point: int) -> float:
         """Return the cost of a run if it had these faces, or only this point if there are none."""
@@ -216,8 +228,7 @@ class _Work:
     def _cost_of(self, run: _Run, faces: Sequence[int], point: int) -> float:
         size = self.sizes[run.cell]
         if faces:
-            line, fixed = self.line(faces), self.fixed(faces)
-            kept = chord_points(line, fixed, size)
+            line, kept = self.line(faces), self.chords_of(run, faces)
             total, left = chord_cost(line, kept, size), [line[i] for i in kept]
             for a, b in pairwise(left):
                 skew = skewness(a, b, self.centroids[run.cell])
