@@ -14,6 +14,7 @@ from clvoro import Adapter, Box
 from clvoro.errors import InputError
 from clvoro.mesh.connectivity import face_corners, face_owners, following
 from clvoro.plotting import (
+    page,
     plot_cells,
     plot_cutaway,
     plot_displacements,
@@ -253,7 +254,9 @@ def test_distributions_are_complete(result):
     assert sum(heights.values()) == pytest.approx(100)
 
 
-def test_report_of_a_solid(result, tmp_path):
+def test_report_of_a_solid(result, tmp_path, monkeypatch):
+    """With the figures of all pictures; `test_few_cells` renders them."""
+    monkeypatch.setattr(page, "render", lambda *_: b"")
     first = dataclasses.replace(result, size_error=2 * result.size_error)
     files = write_report({"lloyd": first, "coupled": result}, tmp_path, initial=first)
     names = {f.stem for f in files}
@@ -261,9 +264,9 @@ def test_report_of_a_solid(result, tmp_path):
         "report", "size", "cells", "cutaway", "quality", "diagrams_error", "diagrams_quality", "history",
         "distributions", "sides",
     }  # fmt: skip
-    page = files[0].read_text(encoding="utf-8")
-    assert "Measures for finite volumes" in page
-    assert f"{result.measures.summary()['mean_skewness']:.4g}" in page
+    text = files[0].read_text(encoding="utf-8")
+    assert "Measures for finite volumes" in text
+    assert f"{result.measures.summary()['mean_skewness']:.4g}" in text
 
 
 def test_closer_look_at_a_large_mesh(result, monkeypatch):

@@ -592,7 +592,7 @@ def test_updated_cycle_is_positive_definite(make, amount):
 
 def test_coarse_levels_are_reused_while_they_converge(make):
     """Small motions cost a few iterations. After large ones the next solve builds a new multigrid."""
-    engine, n = make(), 6000
+    engine, n = make(), 3000
     first, second = neighboring_weights(n, 0.05)
     scattered = neighboring_weights(n, 1.5)[1]
     poisson, cells = Poisson(engine), object()
