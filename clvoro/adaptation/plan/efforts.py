@@ -59,7 +59,7 @@ class Effort:
         holds for all coarser levels. More of them there give no better mesh: default on F2 and F3 (bench/convergence.py
         and bench/front.py, three to ten starts each) has the same sizes and quality with 20 as with 3.
     alone : int
-        Sweeps if there are no coarser levels.
+        Sweeps if there are no coarser levels; in 3D, steps of gliding before the last ones.
     glide : int
         Steps of a sweep.
     polish : int
@@ -153,15 +153,15 @@ EFFORTS = {
 EFFORTS_3D = {
     "fast": Effort(
         12, 2, 3, (), glide=0, polish=4, error_target=0.004, relaxation=1.5, momentum=0.8, penalty=0.15,
-        log_ratio_scale=8.0, coarse_glide=5, coarse_polish=10, recouple=1,
+        log_ratio_scale=8.0, alone=5, coarse_glide=5, coarse_polish=10, recouple=1,
     ),
     "default": Effort(
         16, 3, 2, (), glide=0, polish=8, error_target=0.0025, relaxation=2.5, momentum=0.9, penalty=0.15,
-        log_ratio_scale=8.0, coarse_glide=16, coarse_polish=8, recouple=1,
+        log_ratio_scale=8.0, alone=16, coarse_glide=12, coarse_polish=8, recouple=1,
     ),
     "best": Effort(
         80, 8, 3, (), glide=85, polish=10, error_target=0.003, relaxation=1.5, momentum=0.9, penalty=0.3,
-        log_ratio_scale=8.0, coarse_glide=100, coarse_polish=40, recouple=4,
+        log_ratio_scale=8.0, alone=100, coarse_glide=100, coarse_polish=40, recouple=4,
     ),
 }  # fmt: skip
 """The same in 3D. On a coarser level `couple` steps come before the first correction of the number of cells, and

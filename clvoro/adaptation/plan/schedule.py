@@ -354,7 +354,7 @@ def _adaptive_3d(
                 yield CorrectCount(COUNT_LEAST, POLISH_GROWTH_3D)
             yield from couple * effort.recouple
         if level or not (levels or warm):
-            yield from [Step(coarse_glide)] * effort.coarse_glide
+            yield from [Step(coarse_glide)] * (effort.coarse_glide if levels else effort.alone)
             yield from [Step(coarse_polish)] * effort.coarse_polish
             yield ResetMomentum()
         if level:
