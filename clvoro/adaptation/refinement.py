@@ -14,9 +14,16 @@ from ..tessellation.device_diagram import Tessellation
 
 SHORT_FACE = 0.02
 """Share of a cell's length (squared in 3D) below which a face brings no new generator."""
-COINCIDENT, MAX_CHECKED = 256, 5000
-"""Distance in ulps below which new generators in polygons count as coincident, and the number of generators up to which
-this is checked, on the host. It only happens with cells larger than the edges of the boundary."""
+COINCIDENT = 256
+"""Distance in ulps below which new generators in polygons count as coincident."""
+CHECKED, CHECKED_PER_EDGE = 5000, 4
+"""Number of generators, in all or per edge of the boundary, up to which this is checked, on the host. It only happens
+with cells larger than the edges."""
+
+
+def most_checked(domain: Polygon) -> int:
+    """Return the number of new and old generators up to which coincident ones are looked for."""
+    return max(CHECKED, CHECKED_PER_EDGE * len(domain.oriented.vertices))
 
 
 class Refinement:
@@ -55,7 +62,7 @@ class Refinement:
             t.face_centroids, *t.outlines,
         )  # fmt: skip
         # Several cells that are much larger than the edges of the boundary can bring one at the same corner.
-        if isinstance(domain, Polygon) and len(finer) <= MAX_CHECKED:
+        if isinstance(domain, Polygon) and len(finer) <= most_checked(domain):
             return self._without_coincident(finer, n)
         return finer
 

@@ -165,7 +165,7 @@ class Result(Sealed, MeshOutput):
             on the finest level), ``converged``, ``stop_reason`` and ``seconds``. In a polygonal domain also
             ``boundary_cells``, ``boundary_mean_error``, ..., and ``inner_cells``, ... for the cells on the boundary and
             the others; and ``corner_cells``, ... for those on the boundary with a corner of more than 30 degrees, where
-            the domain bounds size and quality (None where there is no such cell).
+            the domain limits the quality (None where there is no such cell).
 
         Examples
         --------

@@ -5,7 +5,8 @@ import pytest
 import shapely
 from scipy.spatial import cKDTree
 
-from clvoro.adaptation.refinement import SHORT_FACE, Refinement
+import clvoro
+from clvoro.adaptation.refinement import SHORT_FACE, Refinement, most_checked
 from clvoro.adaptation.stages import Stages
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
@@ -154,6 +155,18 @@ def test_squares_get_no_point_twice(ctx):
     _, finer = refine(patch.make_engine(ctx), points, np.full(48, 1 / 16))
     assert len(finer) == 48 + 7 * 6 + 8 * 5 + 2 * (8 + 6)
     assert len(np.unique(finer, axis=0)) == len(finer)
+
+
+def test_new_generators_that_coincide_are_removed(ctx):
+    """Those with others, and of two new ones the second. 1,600 islands bring some at 6,000 generators."""
+    engine, old = patch.make_engine(ctx), patch.random_points(30, 5)
+    new = np.array([[0.25, 0.5], old[7] * (1 + 1e-15), [0.3, 0.5], [0.25, 0.5]])
+    finer = engine.upload(np.concatenate([old, new]))
+    found = Refinement(engine)._without_coincident(finer, 30).get()
+    assert np.array_equal(found, np.concatenate([old, new[[0, 2]]]))
+    ring = np.array([[np.cos(a), np.sin(a)] for a in np.arange(4800) * (2 * np.pi / 4800)])
+    assert most_checked(clvoro.Polygon(ring)) > 6000
+    assert most_checked(POLYGONS["square"]()) < 6000
 
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
