@@ -1,5 +1,6 @@
-/* The built-in functions that the kernels and the formulas of size fields call. PoCL reads 18,000 lines of declarations for every program, which takes
-   longer than to compile most of them; with -D_OPENCL_H_ it leaves them out, and reads these. */
+/* The built-in functions that the kernels and the formulas of size fields call. PoCL reads 18,000 lines of
+   declarations for every program, which takes longer than to compile most of them; with -D_OPENCL_H_ it leaves
+   them out, and reads these. */
 #define CONST_FUNCTION __attribute__((overloadable, const))
 #define READING_FUNCTION __attribute__((overloadable, pure))
 #define WRITING_FUNCTION __attribute__((overloadable))

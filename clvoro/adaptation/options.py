@@ -77,10 +77,12 @@ class MultilevelOptions:
         Mean |log(L / h)| that the last steps aim at; a larger one gives cells of a better shape. By default .0025
         (effort "fast": .0035, "best": .0039) where sizes are smooth. In the plane, with more than about 2,800 cells,
         it grows with the share of the cells where sizes are steep, |grad h| > .1, up to .0155 ("fast": .007,
-        "best": .01). On spheres, in 3D and with "exact" it does not. In 2D targets from 1e-4 on are met, up to where
-        the shape is as good as it gets: on steep fields at a mean error of about .05, on smooth ones of .03. With a
-        larger target the mesh stays there, ``settings["trade"]`` says so, and the largest error stays bounded to
-        about .25 (`bench/front_ends.py`).
+        "best": .01). On spheres, in 3D and with "exact" it does not. In 2D the default nearly meets targets from 1e-4
+        on, from about 2,800 cells on; "best" ends at .00014 to .0002, "fast" with a target of .001 at .004, and runs
+        with one level at .0007 to .0009. The shape is as good as it gets at a mean error of about .05 on steep fields,
+        of .03 on smooth ones ("fast": .06 to .07, and .04). With a larger target the mesh stays there,
+        ``settings["trade"]`` says so, and the largest error stays bounded to about .25 ("fast": .28;
+        `bench/front_ends.py` has the default and "best").
 
     Raises
     ------

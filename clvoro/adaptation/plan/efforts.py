@@ -56,8 +56,9 @@ class Effort:
         Coupled steps on the coarsest level, on the levels between, and on the finest.
     sweeps : tuple of int
         Sweeps (insert/delete, then glide) on the finest level, on the next coarser one, and so on. The last number
-        holds for all coarser levels. More of them there give no better mesh: default on F2 and F3 (bench/convergence.py
-        and bench/front.py, three to ten starts each) has the same sizes and quality with 20 as with 3.
+        holds for all coarser levels. From the third finest level on, more of them give no better mesh: default on F2
+        and F3 (bench/convergence.py and bench/front.py, three to ten starts each) has the same sizes and quality with
+        20 there as with fewer.
     alone : int
         Sweeps if there are no coarser levels; in 3D, steps of gliding before the last ones.
     glide : int
@@ -94,8 +95,9 @@ class Effort:
     recouple : int
         In 3D, coupled steps after each correction of the number of cells on a coarser level.
     loose : LoosePolish, optional
-        In 2D. Measured on F3, two circles and ridges, default: with the steps and momentum of other targets mean |e| on
-        F3 ends at 0.025, mean Q at 0.9978, with these at 0.033 and 0.9985. Below a target of 0.02 they gain nothing.
+        In 2D. With the default and target 0.2 mean |e| on F3 ends at 0.0356, mean Q at 0.9984 (bench/front_ends.py).
+        With the steps and momentum of other targets they ended at 0.025 and 0.9978, by a trial without a script. Below
+        a target of 0.02 they gain nothing on F3, two circles and ridges.
     separate : int
         Steps of separating, in 2D. Measured on eleven fields, four starts each: after one no edge is shorter than
         0.07 h, after two 0.09 h.
