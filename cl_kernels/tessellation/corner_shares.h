@@ -1,5 +1,5 @@
-/* A vertex of a cell in 3D, where the planes of three faces meet, and its shares of areas, volumes and moments; a face
-   and its moments, from the shares of its vertices. One vertex per lane of a vector.
+/* A vertex of a cell in 3D, where the planes of three faces meet, and its shares of areas, volumes and moments. One
+   vertex per lane of a vector.
 
    All positions are relative to the generator. The plane of a neighbor at d is y.p = 1/2 with p = d / d^2. */
 #include "opencl/real.h"
@@ -97,17 +97,18 @@ typedef struct {
     WIDE xx, yy, zz, yz, zx, xy;
 } shares_t;
 
-/* The shares of the vertex where planes a, b, c of neighbors at squared distances a2, b2, c2 meet. `once`: 1, or 0 in
+/* The shares of the vertex where planes a, b, c meet; the squared distances of their neighbors
+   are da2, db2, dc2. `once`: 1, or 0 in
    lanes that add nothing to the cell. */
 inline void share_corner(shares_t *share, const corner_t *at, const places_t *a, const places_t *b, const places_t *c,
-                         WIDE ia, WIDE ib, WIDE ic, WIDE once)
+                         WIDE da2, WIDE db2, WIDE dc2, WIDE once)
 {
     const places_t y = at->y, ab = at->ab, bc = at->bc, ca = at->ca;
     const WIDE ab2 = at->ab2, bc2 = at->bc2, ca2 = at->ca2, inverse = 1 / (ab2 * bc2 * ca2);
     part_t of_ab, of_bc, of_ca;
-    part_of_edge(&of_ab, product_of(&y, &ab) * bc2 * ca2 * inverse, a, b, at->a2, at->b2, ia + ib);
-    part_of_edge(&of_bc, product_of(&y, &bc) * ca2 * ab2 * inverse, b, c, at->b2, at->c2, ib + ic);
-    part_of_edge(&of_ca, product_of(&y, &ca) * ab2 * bc2 * inverse, c, a, at->c2, at->a2, ic + ia);
+    part_of_edge(&of_ab, product_of(&y, &ab) * bc2 * ca2 * inverse, a, b, at->a2, at->b2, da2 + db2);
+    part_of_edge(&of_bc, product_of(&y, &bc) * ca2 * ab2 * inverse, b, c, at->b2, at->c2, db2 + dc2);
+    part_of_edge(&of_ca, product_of(&y, &ca) * ab2 * bc2 * inverse, c, a, at->c2, at->a2, dc2 + da2);
     const places_t twice = {2 * y.x, 2 * y.y, 2 * y.z};
     places_t to_ab = twice, to_bc = twice, to_ca = twice;
     add_along(&to_ab, -of_ab.g, &ab);

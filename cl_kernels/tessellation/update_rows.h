@@ -4,7 +4,8 @@
 
 #define ALL_FACES (-1)
 
-/* Which cells an update makes: all; those that are marked, with further neighbors; else those that teams have left. */
+/* Which cells an update makes: all; those that are marked, with further neighbors; else (2) those that teams have left.
+ */
 #define ALL_CELLS 0
 #define MARKED_CELLS 1
 

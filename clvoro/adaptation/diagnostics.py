@@ -144,10 +144,9 @@ def warn_of_errors(result: Result) -> None:
     worst = int(amounts.argmax())
     mean, largest = float(amounts.mean()), float(amounts[worst])
     # The caller may have given a large error target.
-    if (
-        mean < max(MEAN_ERROR, result.settings.get("error_target") or 0.0)
-        and largest < LARGEST_ERROR
-    ):
+    settings = result.settings
+    aimed = settings.get("error_target") if settings.get("method") == "adaptive" else None
+    if mean < max(MEAN_ERROR, aimed or 0.0) and largest < LARGEST_ERROR:
         return
     diagram, sizes = result.diagram, result.target_size
     wanted, made = (

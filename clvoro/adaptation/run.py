@@ -16,13 +16,14 @@ from .checkpoint import Checkpointer
 from .fingerprint import run_fingerprint
 from .loop import Loop
 from .options import Checkpoint, Options, uses
+from .plan.efforts import EFFORTS
 from .preparation import Preparation
 from .resume import Saved
 from .stages import Stages
 
 REACHED = 0.8
-"""Share of the error target below which the shape ends the trade. Where targets are met, the error is at least 0.88 of
-them (`bench/front.py`)."""
+"""Share of an error target, larger than the effort's own, below which `trade` says where the error ends. Where such
+targets are met, the error is at least 0.82 of them (`bench/front.py`)."""
 
 
 def check_run(domain: object, size: object, callback: Callable[[np.void], object] | None) -> None:
@@ -88,15 +89,15 @@ def run_adaptation(
 
 def _note_end_of_trade(result: Result, options: Options) -> None:
     """Add to `trade` in the settings where the error ends, if it is far below the target of the caller."""
-    target = options.error_target
-    if options.method != "adaptive" or target is None or not result.converged:
+    target, own = options.error_target, EFFORTS[options.effort].error_target
+    planar = result.diagram.domain.cell_dim == 2
+    if not (options.method == "adaptive" and planar and target and result.converged):
         return
-    length = result.diagram.volumes ** (1 / result.diagram.domain.cell_dim)
-    error = float(np.abs(np.log(length / result.target_size)).mean())
-    if error < REACHED * target:
-        result.settings["trade"] += (
-            f"; it ends at {error:.2g}, as larger errors hardly give a better shape"
-        )
+    error = float(np.abs(result.size_error).mean())
+    if target > own and error < REACHED * target:
+        # With few steps it is their number that ends it.
+        why = "" if options.effort == "fast" else ", as larger errors hardly give a better shape"
+        result.settings["trade"] += f"; it ends at {error:.2g}{why}"
 
 
 def _start(

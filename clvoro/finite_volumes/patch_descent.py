@@ -274,6 +274,8 @@ class _Equations:
         damping += _MOVE_WEIGHT**2
         if isinstance(matrix, np.ndarray):
             found = np.linalg.solve(matrix + damping * np.eye(k), self.gradient)
+        elif not np.isfinite(matrix.data).all():
+            found = np.full(k, np.nan)  # as of dense matrices; the step is refused
         else:
             damped = scipy.sparse.csc_matrix(matrix + damping * scipy.sparse.eye_array(k))
             factors = splu(damped, "MMD_AT_PLUS_A", options={"SymmetricMode": True})

@@ -57,11 +57,11 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
     ring = RingCoordinate(domain) if straight and isinstance(domain, Polygon) else None
     kinds = point_kinds(mesh, parts)
     region = _grown(loops, bad)
-    around, parts = take_patch(mesh, region), _connected_parts(mesh, region, bad)
+    around, groups = take_patch(mesh, region), _connected_parts(mesh, region, bad)
     made = []
     # The last bits of sums in BLAS depend on its number of threads.
     with _BLAS, threadpool_limits(1, user_api="blas"):
-        for cells in parts:
+        for cells in groups:
             patch = part_of(around, cells[around.cells])
             patch.cells, patch.ids = around.cells[patch.cells], around.ids[patch.ids]
             patch = _with_positions(patch, ring, kinds)

@@ -115,9 +115,8 @@ class _Work:
         self.starts, self.loops, broken = simple_loops(mesh)
         self.broken = set(broken.tolist())
         self.costs: dict[tuple[int, int, int], float] = {}
-        self.chords: dict[
-            tuple[int, int], list[int]
-        ] = {}  # of the runs from one face to another one
+        # Points that remain, by the cell and by the first and last face of a run.
+        self.chords: dict[tuple[int, int, int], list[int]] = {}
 
     def _following(self, onward: np.ndarray) -> list[int]:
         """Return the next wall face on the ring for each one, counted from the first; -1 at an end.
@@ -211,7 +210,7 @@ class _Work:
 
     def chords_of(self, run: _Run, faces: Sequence[int]) -> list[int]:
         """Return which points of a run remain if it has these faces."""
-        key = (faces[0], faces[-1])
+        key = (run.cell, faces[0], faces[-1])
         if key not in self.chords:
             self.chords[key] = chord_points(
                 self.line(faces), self.fixed(faces), self.sizes[run.cell]

@@ -73,7 +73,7 @@ class Polyhedra:
                 team_defines(has_warps(engine.queue.device)),
                 group_size=TEAM,
             )
-            self._team = TeamKernel(by_teams, "clip_polyhedra_by_teams")
+            self._team = TeamKernel(engine.queue.device, by_teams, "clip_polyhedra_by_teams")
         self._wrap = None
         self._bounds = WeightBounds(engine) if engine.domain_kind.weighted else None
         if self._bounds is None and engine.group_size == 1 and engine.real == np.float64:

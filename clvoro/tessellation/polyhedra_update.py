@@ -61,7 +61,7 @@ class PolyhedraUpdate:
             by_teams = engine.kernels(
                 "tessellation/polyhedra_update_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
             )  # fmt: skip
-            self._team = TeamKernel(by_teams, "update_cells_by_teams")
+            self._team = TeamKernel(engine.queue.device, by_teams, "update_cells_by_teams")
         self._report = engine.empty(REPORT_SIZE, np.int32)
         self._share = engine.real.type(ROUGH_SHARE)
         self._n, self._expected, self._clips = 0, [0], False
@@ -91,7 +91,8 @@ class PolyhedraUpdate:
         rounds = _Rounds(
             self.engine, self._kernels, self._scan, self._report, cells, box, points, previous
         )
-        rounds.update_all(self._team.get() if self._team is not None else None)
+        kept = self._team is not None and bool(previous.vertices)
+        rounds.update_all(self._team.get() if self._team is not None and kept else None)
         done, sizes = 0, self._expected
         clipped, final = False, not self._clips
         while True:

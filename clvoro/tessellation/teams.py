@@ -50,21 +50,22 @@ class TeamKernel:
 
     Parameters
     ----------
+    device : pyopencl.Device
     kernels : Kernels
         Those of its program, which is not built yet.
     name : str
     """
 
-    def __init__(self, kernels: Kernels, name: str) -> None:
+    def __init__(self, device: cl.Device, kernels: Kernels, name: str) -> None:
         self._kernels: Kernels | None = kernels
-        self._name = name
+        self._device, self._name = device, name
 
     def get(self) -> cl.Kernel | None:
         """Return the kernel; None if the driver does not build it, or the device has no room for a team."""
         if self._kernels is not None:
             try:
                 kernel = getattr(self._kernels, self._name)
-                if _fits(kernel, kernel.context.devices[0]):
+                if _fits(kernel, self._device):
                     return kernel
             except BuildError:
                 pass

@@ -115,15 +115,15 @@ def test_a_kinked_and_steep_field_gets_cells_of_a_good_shape(adapter):
 
 
 def test_a_target_beyond_the_best_shape_ends_there_and_does_not_warn(adapter):
-    """Where the penalty is largest, mean |e| is 0.07 to 0.09 on this field."""
+    """With effort "fast", mean |e| is then 0.07 on this field, and the largest 0.28."""
     options = clvoro.MultilevelOptions(error_target=0.3)
     with warnings.catch_warnings():
         warnings.simplefilter("error", clvoro.errors.SizeErrorWarning)
         result = adapter.run(BOX, RIDGE, seed=31, effort="fast", options=options)
     error = np.abs(result.size_error)
-    assert 0.05 < error.mean() < 0.12
-    assert error.max() < 0.35
-    assert re.search("as given; it ends at 0.[0-9]+, as larger", result.summary()["trade"])
+    assert 0.05 < error.mean() < 0.1
+    assert error.max() < 0.32
+    assert re.search("as given; it ends at 0.[0-9]+$", result.summary()["trade"])
 
 
 def test_small_error_targets_are_met(adapter):
