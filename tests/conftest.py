@@ -2,8 +2,6 @@
 
 import base64
 import binascii
-import contextlib
-import ctypes
 import os
 import re
 import signal
@@ -21,11 +19,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
     os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", "1")
 
-
-# Arrays take memory again that others have left. Otherwise the system clears it anew for each array above 128 KiB.
-with contextlib.suppress(OSError, AttributeError, TypeError):
-    ctypes.CDLL(None).mallopt(-3, 1 << 25)  # M_MMAP_THRESHOLD of glibc
-    ctypes.CDLL(None).mallopt(-1, 1 << 30)  # M_TRIM_THRESHOLD
 
 # Examples are the same in every run, and the first build of a kernel may take its time.
 settings.register_profile("clvoro", derandomize=True, deadline=None, database=None)

@@ -95,7 +95,7 @@ def _note_end_of_trade(result: Result, options: Options) -> None:
         return
     error = float(np.abs(result.size_error).mean())
     if target > own and error < REACHED * target:
-        # With few steps it is their number that ends it.
+        # Effort "fast" ends there because its steps end, not because the shape is as good as it gets.
         why = "" if options.effort == "fast" else ", as larger errors hardly give a better shape"
         result.settings["trade"] += f"; it ends at {error:.2g}{why}"
 

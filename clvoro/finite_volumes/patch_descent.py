@@ -71,8 +71,8 @@ class Descent:
         wall = patch.neighbor[faces] < 0
         after = following(starts)
         on_wall = patch.walls[self.sides]
-        before = np.empty_like(after)
-        before[after] = np.arange(len(after))
+        bound = np.empty_like(on_wall)  # corners between two faces on walls
+        bound[after] = on_wall & on_wall[after]
         origin = patch.points[loop[starts[:-1]]]
         if goals is None:
             p = patch.points[loop] - origin[row]
@@ -83,7 +83,7 @@ class Descent:
         self.goals = goals
         owner = patch.owner[faces]
         self.cells = Cells(
-            starts, loop, row, ~on_wall, on_wall & on_wall[before], faces, patch.ends[faces], owner,
+            starts, loop, row, ~on_wall, bound, faces, patch.ends[faces], owner,
             np.where(wall, owner, patch.neighbor[faces]), wall, patch.aim[faces], goals[:, 0], goals[:, 1], origin,
         )  # fmt: skip
         self._set_prices()
@@ -267,7 +267,7 @@ class _Equations:
         self.matrix = jacobian.T @ jacobian
 
     def solve(self, damping: float) -> np.ndarray:
-        """Return the step (m, 2) with `damping` added to the diagonal."""
+        """Return the Levenberg-Marquardt step (m, 2); `damping` is added to the diagonal of the matrix."""
         from scipy.sparse.linalg import splu
 
         matrix, k = self.matrix, len(self.gradient)

@@ -80,7 +80,7 @@ class _Slopes:
         self.centers = np.stack(sums) / (3 * self.double)
 
     def of_areas(self, term: int) -> Slopes:
-        """Return the derivatives of the terms of areas, the first of which is `term`."""
+        """Return the derivatives of the terms for areas; `term` is the number of the first one."""
         c = self.cells
         weight = AREA_WEIGHT / 2 / c.area[c.row]
         return Slopes(
@@ -140,7 +140,7 @@ class _Slopes:
         return Slopes(terms[which], c.loop[at], u * xx + v * yx, u * xy + v * yy)
 
     def of_determinants(self, term: int) -> Slopes:
-        """Return the derivatives of the terms of determinants, the first of which is `term`."""
+        """Return the derivatives of the terms for determinants; `term` is the number of the first one."""
         c, first = self.cells, self.cells.starts[:-1]
         ux, uy = (self.qx - self.px) * c.between, (self.qy - self.py) * c.between
         xx, xy, yy = (np.add.reduceat(z, first) for z in (ux * ux, ux * uy, uy * uy))
@@ -160,7 +160,7 @@ class _Slopes:
         return Slopes(terms, points, *np.concatenate([of_side, -of_side], axis=1))
 
     def of_turns(self, term: int) -> Slopes:
-        """Return the derivatives of the terms of turns, the first of which is `term`."""
+        """Return the derivatives of the terms for turns in corners; `term` is the number of the first one."""
         c = self.cells
         ux, uy, vx, vy = self.px - self.ox, self.py - self.oy, self.qx - self.px, self.qy - self.py
         turn = np.arctan2(ux * vy - uy * vx, ux * vx + uy * vy)

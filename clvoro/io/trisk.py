@@ -70,9 +70,8 @@ def find_weights(
         passed = passed[going] + shares[there]
         at, edge = place[here] + step - 1, halves.edge[there]
         edges[at] = edge
-        with np.errstate(
-            divide="ignore"
-        ):  # distances of 0 in files of others, which are refused later
+        # Files of others may have distances of 0. They are refused later.
+        with np.errstate(divide="ignore"):
             ratio = lengths[edge] / distances[halves.edge[here]]
         values[at] = normal[here] * normal[there] * (0.5 - passed) * ratio
     return Weights(counts, edges, values)

@@ -29,7 +29,7 @@ MAX_ROUNDS = 8
 MAX_SHARE = 0.5
 """Largest share of cells to make again in one round. Beyond it a new diagram costs less."""
 ALL_CELLS, MARKED_CELLS, LEFT_CELLS = 0, 1, 2
-"""Which cells a kernel updates, as in `tessellation/update_rows.h`."""
+"""Which cells `update_cells` updates: all, those marked by a check, or those that teams have left."""
 SPARE = 0.25
 """Room for cells that gain faces, over the half-faces of the previous diagram."""
 
@@ -91,8 +91,8 @@ class PolyhedraUpdate:
         rounds = _Rounds(
             self.engine, self._kernels, self._scan, self._report, cells, box, points, previous
         )
-        kept = self._team is not None and bool(previous.vertices)
-        rounds.update_all(self._team.get() if self._team is not None and kept else None)
+        team = self._team if previous.vertices else None
+        rounds.update_all(None if team is None else team.get())
         done, sizes = 0, self._expected
         clipped, final = False, not self._clips
         while True:

@@ -1,4 +1,4 @@
-"""Where teams of work-items build and update cells in 3D (`polyhedra_by_teams.cl`, `polyhedra_update_by_teams.cl`)."""
+"""Kernels with which a team of work-items builds or updates a cell in 3D, and the devices and domains that use them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .bins import MAX_LEVELS
 from .cut_cells import FACE_CAPACITY
 
 TEAM = 32
-"""Work-items of a team, and most faces of its cell: MOST_FACES in `tessellation/row_counts.h`."""
+"""Number of work-items of a team. A cell has at most as many faces (MOST_FACES in `tessellation/row_counts.h`)."""
 
 
 def are_faster(device: cl.Device) -> bool:
@@ -30,12 +30,12 @@ def has_warps(device: cl.Device) -> bool:
 
 
 def are_for(engine: Engine) -> bool:
-    """Return whether teams update the cells of `engine`: in boxes in 3D, without weights."""
+    """Return whether teams update cells in 3D: without weights, on devices where they are faster."""
     return not engine.domain_kind.weighted and are_faster(engine.queue.device)
 
 
 def are_for_new_cells(engine: Engine) -> bool:
-    """Return whether they also build its cells from scratch: in boxes with walls."""
+    """Return whether teams also build cells from scratch: then the box must have walls on all sides."""
     return engine.domain_kind == WALLED_BOX and FACE_CAPACITY == TEAM and are_for(engine)
 
 

@@ -115,13 +115,6 @@ The power is 4 then. Measured on F3, circles and two ridges with targets 0.014 t
 is larger than with a power of 2 by up to 0.0003, and with target 0.2 the largest |e| is 0.20 to 0.24 in place of 0.21
 to 0.29. On the way there the scale grows like the power 1.5 of the target. In place of a multiple of it, that raises
 the mean Q by 0.0003 and the least by 0.002 to 0.005."""
-MOST_AT_WALLS = 0.4
-"""Largest penalty of cells on the walls of polygons in polishing.
-
-Walls limit the quality of these cells, so they would give up their sizes for little. Without it, mean |e| at walls is
-0.0093 instead of 0.0041 on the coast of `bench/solver_ready.py`, 0.0041 instead of 0.0011 on the gear, and 0.0068
-instead of 0.0012 on F2 in the coast of `bench/polygon.py` (default, one start each). The mean Q there differs by at
-most 0.002."""
 TIGHT = 0.43
 """Share of the effort's error target below which polishing begins with a penalty that is smaller in proportion, the
 number of cells is exact, and grad log h comes from the field. With target 1e-4 the mean |e| on F3, circles and a ridge
@@ -294,23 +287,19 @@ def _finish_2d(
     effort: Effort, exact: bool, error_target: float, penalty: float
 ) -> Iterator[Action]:
     """Polish, and project."""
-    scale, looser, power = (
-        effort.log_ratio_scale * error_target,
-        error_target / effort.error_target,
-        2,
-    )
+    looser = error_target / effort.error_target
     tight = looser < TIGHT
-    if looser > 1 or tight:
-        penalty *= looser
+    scale, power = effort.log_ratio_scale * error_target, 2
     if looser > 1:
         scale, power = min(scale * looser**0.5, LOOSE_LOG_RATIO_SCALE), 4
+    if looser > 1 or tight:
+        penalty *= looser
     if effort.loose and error_target > effort.loose.above:
         effort = replace(effort, polish=effort.loose.steps, polish_momentum=effort.loose.momentum)
     polish = ProjectedMethod(
         "quality", momentum=effort.polish_momentum, penalty=penalty, quality_scale=effort.quality_scale,
         log_ratio_scale=scale, k=0.3, error_target=error_target,
         bad_cell_weight=effort.bad_cell_weight, tolerance=POLISH_TOLERANCE, power=power,
-        most_at_walls=MOST_AT_WALLS,
         gradient_from_field=tight,
     )  # fmt: skip
     repairs = dict(effort.repairs)
