@@ -9,10 +9,11 @@ import numpy as np
 from ..arguments import check_choice
 from ..errors import InputError
 from ..geometry.sphere import Sphere
+from ..mesh.c_grid import RIGHT_ANGLE, measure_c_grid
+from ..mesh.connectivity import face_ends, face_keys, face_owners
 from ..mesh.diagram import Diagram
 from .criteria import Criterion, Rows, SolverReport
 from .measures import SolverMeasures
-from .mpas_gate import mpas_criteria
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh, WallShape, make_solver_mesh
 
@@ -20,6 +21,16 @@ Solver = Literal["openfoam", "mpas"]
 """Solvers whose criteria are known."""
 _LEAST = 1e-300
 """OpenFOAM's VSMALL: least area of a face and volume of a cell."""
+_SHORTEST_EDGE = 1e-6
+"""Least length of an edge over the distance of its generators: the schemes divide by lengths of edges."""
+_LEAST_ANGLE = 30.0
+"""Angle of a triangle, in degrees, below which the mesh is warned of."""
+_LEAST_EDGE_RATIO = 0.1
+"""Ratio of the shortest to the longest edge of a cell below which the mesh is warned of."""
+_MOST_CENTROID_OFFSET = 0.1
+"""Distance from generator to centroid over the size of the cell above which the mesh is warned of.
+
+C grids take the value at the generator for the mean over the cell, which is of second order at the centroid only."""
 
 
 def check_for_solver(
@@ -39,7 +50,7 @@ def check_for_solver(
             raise InputError(
                 f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out"
             )
-        faces, domain, made = int(diagram.faces.owner.size), diagram.domain, mpas_criteria(diagram)
+        faces, domain, made = int(diagram.faces.owner.size), diagram.domain, _mpas(diagram)
         if isinstance(domain, Sphere):
             made = [criterion.on_sphere(domain) for criterion in made]
         return SolverReport(solver, tuple(made), len(diagram), faces, 0.0)
@@ -126,3 +137,33 @@ def _regions(mesh: SolverMesh) -> int:
     pair = (mesh.owner[joined], mesh.neighbor[joined])
     graph = scipy.sparse.coo_array((np.ones(len(joined)), pair), (len(mesh), len(mesh)))
     return int(scipy.sparse.csgraph.connected_components(graph, directed=False)[0])
+
+
+def _mpas(diagram: Diagram) -> list[Criterion]:
+    """Return the criteria for meshes of MPAS.
+
+    Raises
+    ------
+    InputError
+        In 3D and in polygonal domains.
+    """
+    d, m = diagram, measure_c_grid(diagram)
+    dim, owner = d.domain.dim, face_owners(diagram)
+    inner = np.flatnonzero(m.inner)
+    inner = inner[np.less(*face_keys(d, inner))]  # each edge once
+    cells = Rows(d.points, None, dim)
+    edges = Rows(d.face_centroids[inner], owner[inner], dim)
+    places, cell = d.vertices[face_ends(d)[m.corners, 0]], owner[m.corners]
+    corners, vertices = Rows(places, cell, dim), Rows(places[m.first], cell[m.first], dim)
+    return [
+        cells("edges of a cell", np.diff(d.neighbor_starts), 3, above=False),
+        cells("cell area", d.volumes, _LEAST, above=False),
+        edges("edge length over distance", m.length_ratio[inner], _SHORTEST_EDGE, above=False),
+        corners("largest angle of triangle", m.angles, RIGHT_ANGLE),
+        corners("smallest angle of triangle", m.angles, _LEAST_ANGLE, above=False, demanded=False),
+        corners("kite area over cell area", m.kites, 0, above=False),
+        vertices("cells at a vertex", m.vertex_cells[m.first], 3, demanded=False),
+        edges("edge offset", m.edge_offset[inner], 0.5, demanded=False),
+        cells("centroid offset", m.centroid_offset, _MOST_CENTROID_OFFSET, demanded=False),
+        cells("edge ratio", m.edge_ratio, _LEAST_EDGE_RATIO, above=False, demanded=False),
+    ]

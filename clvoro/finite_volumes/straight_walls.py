@@ -1,66 +1,35 @@
 """Straight walls in 2D: along the boundary each cell gets one face where the boundary turns by little.
 
 A run is the part of a ring of the domain that belongs to one cell, from one face end to the next. Its faces become
-chords; see `chord_points`. Before that, a face end may move along the wall into a vertex of the domain: into a
+chords; see `kept_points`. Before that, a face end may move along the wall into a vertex of the domain: into a
 re-entrant corner, so that both cells are convex, or into another kink that a chord would cut off. Each move must lower
 a cost: that of the chords, for corners that are not convex, for skew faces, and for the way of the face end. A cell
-with a short run may leave the wall: both ends of the run move into one point.
+with a short run may leave the wall: both ends of the run move into one point. The moves that gain most are made first.
 
 Where the boundary is a curve, all points on walls lie on the curve itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
-from math import atan2, hypot
+from dataclasses import replace
 
 import numpy as np
 
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.straightening import along_rings, cross
-from .chords import Point, chord_cost, chord_points, concave_price, skewness
+from .chords import chords, kept_points, least_of_rows
 from .geometry import polygon_centroids, polygon_sides
-from .prisms import simple_loops
+from .independent import independent
 from .solver_mesh import SolverMesh
+from .wall_runs import WallRuns
 
 REACH = 0.4
 """Farthest way of a face end into a vertex of the domain, over the smaller size of its two cells."""
 _SHORT = 0.03
 """Faces shorter than this over the size of the cell may be bad."""
-_SKEW_PRICE, _WAY_PRICE, _TILT_PRICE = 0.1, 0.02, 0.6
-"""Prices in squares of the size of the cell: for the square of the skewness above 1, for the way of a face end over the
-size, and for the square of the angle by which its face turns, in radians."""
-
-
-@dataclass(eq=False)
-class _Run:
-    """A cell's part of a ring: wall faces, one after the other."""
-
-    cell: int
-    faces: list[int]
-    behind: list[Point]
-    """The two points before the run in the loop around the cell, if it is known."""
-    ahead: list[Point]
-    """The two points after it."""
-    before: _Run | None = None
-    """The run across the face end at the beginning; None if that end does not move."""
-    after: _Run | None = None
-    end: tuple[int, int] = (-1, -1)
-    """The face between two cells at the end, and which of its corners."""
-    cost: float = 0.0
-
-
-@dataclass(frozen=True)
-class _Move:
-    """New faces of some runs; those of a run that leaves the wall are empty."""
-
-    faces: list[tuple[_Run, list[int]]]
-    point: int
-    ends: list[tuple[int, int]]
-    price: float
+_CHEAP = 1e-4
+"""Runs that cost less than this remain as they are, in squares of the size of the cell."""
 
 
 def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> SolverMesh:
@@ -76,11 +45,16 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
     """
     domain = diagram.domain
     assert isinstance(domain, Polygon)
-    work = _Work(_on_curves(mesh, domain), along_rings(diagram, domain), parts)
+    mesh = _on_curves(mesh, domain)
+    runs = WallRuns(mesh, along_rings(diagram, domain), parts)
+    # 1: the ends of the cell do not move; 2: its walls remain as they are.
+    spared, most = np.zeros(len(mesh), int), np.where(_starlike(mesh), 2, 1)
     while True:
-        made = work.straightened()
-        if not work.spare(np.flatnonzero(~_starlike(made)).tolist()):
+        made = _straightened(runs, spared)
+        worse = ~_starlike(made) & (spared < most)
+        if not worse.any():
             return made
+        spared[worse] += 1
 
 
 def _on_curves(mesh: SolverMesh, domain: Polygon) -> SolverMesh:
@@ -96,269 +70,208 @@ def _on_curves(mesh: SolverMesh, domain: Polygon) -> SolverMesh:
     return replace(mesh, points=points)
 
 
-class _Work:
-    """The walls of one mesh."""
+def _straightened(runs: WallRuns, spared: np.ndarray) -> SolverMesh:
+    """Return the mesh with straight walls, where `spared` (n,) is not 2; face ends move where it is 0."""
+    mesh, ends = runs.mesh, _Ends(runs, spared == 0)
+    while ends.move():
+        pass
+    corners, moved = mesh.corners.reshape(-1, 2).copy(), np.flatnonzero(ends.target >= 0)
+    corners[runs.face[moved], runs.side[moved]] = ends.target[moved]
+    left = np.flatnonzero(ends.end > ends.begin)
+    lines, points, face = runs.lines(left, ends.begin[left], ends.end[left])
+    kept = kept_points(lines) | (spared[runs.cell[left]] == 2)[lines.row]
+    steps, firsts, counts = chords(lines, kept)
+    chord = np.repeat(np.arange(len(firsts)), counts)
+    longest = steps[least_of_rows(chord, -runs.lengths[face[steps]])]
+    rest = np.ones(len(runs.walls), bool)  # whole rings within one cell
+    rest[runs.order] = False
+    a = np.concatenate([points[steps[firsts]], runs.first[rest]])
+    b = np.concatenate([points[steps[firsts + counts - 1] + 1], runs.last[rest]])
+    source = runs.walls[np.concatenate([face[longest], np.flatnonzero(rest)])]
+    owner = mesh.owner[source].copy()
+    owner[: len(firsts)] = runs.cell[left[lines.row[steps[firsts]]]]
+    order = np.lexsort((owner, -mesh.neighbor[source]))
+    k = mesh.inner
+    taken = np.concatenate([np.arange(k), source[order]])
+    pairs = np.concatenate([corners[:k], np.stack([a, b], axis=1)[order]])
+    return replace(
+        mesh,
+        starts=2 * np.arange(len(pairs) + 1),
+        corners=pairs.ravel(),
+        owner=np.concatenate([mesh.owner[:k], owner[order]]),
+        neighbor=mesh.neighbor[taken],
+        twin=mesh.twin[taken],
+        shift=mesh.shift[taken],
+        half_face=mesh.half_face[taken],
+    )
 
-    def __init__(self, mesh: SolverMesh, onward: np.ndarray, parts: np.ndarray) -> None:
-        self.mesh, self.walls = mesh, np.arange(mesh.inner, mesh.outer)
-        self.points: list[Point] = list(map(tuple, mesh.points.tolist()))
-        self.ends = mesh.corners.reshape(-1, 2)
-        self.begin, self.final = (c.tolist() for c in self.ends[self.walls].T)
-        areas, centroids = polygon_centroids(mesh)
-        self.sizes = np.sqrt(np.maximum(areas, 0)).tolist()
-        self.centroids: list[Point] = list(map(tuple, centroids.tolist()))
-        self.part = parts[-1 - mesh.neighbor[self.walls]].tolist()
-        # 1: the ends of the cell do not move; 2: its walls remain as they are.
-        self.spared, self.most = np.zeros(len(mesh), int), np.where(_starlike(mesh), 2, 1)
-        self.next = self._following(onward)
-        self.at = self._single_faces()
-        self.starts, self.loops, broken = simple_loops(mesh)
-        self.broken = set(broken.tolist())
-        self.costs: dict[tuple[int, int, int], float] = {}
-        # Points that remain, by the cell and by the first and last face of a run.
-        self.chords: dict[tuple[int, int, int], list[int]] = {}
 
-    def _following(self, onward: np.ndarray) -> list[int]:
-        """Return the next wall face on the ring for each one, counted from the first; -1 at an end.
+class _Ends:
+    """The ends of runs while they move: each at most once, and the moves that gain most first.
 
-        `onward` (m,) is the next half-face of the diagram on its ring; see `along_rings`.
-        """
-        place = np.full(len(onward) + 1, -1)
-        rows = self.mesh.half_face[self.walls]
-        place[rows] = np.arange(len(rows))
-        after = onward[rows]
-        for _ in range(64):  # half-faces without length have no face
-            skipped = (after >= 0) & (place[after] < 0)
-            if not skipped.any():
-                break
-            after[skipped] = onward[after[skipped]]
-        after = np.where((after >= 0) & (place[after] >= 0), place[after], -1)
-        a, b = self.ends[self.walls].T
-        joined = (after >= 0) & (a[after] == b)
-        return np.where(joined, after, -1).tolist()
+    Attributes
+    ----------
+    begin, end : (r,) int
+        Places between which the runs are.
+    cost : (r,) float
+    free : (e,) bool
+        Face ends that can move.
+    target : (e,) int
+    stale : (r,) bool
+        Runs that the last moves changed.
+    gain, way : (e + r,) float, int
+        The best move of each face end, and of each run that leaves the wall: what it gains, and by how many faces. The
+        end of a run before the one that leaves moves over so many faces.
+    """
 
-    def _single_faces(self) -> dict[int, tuple[int, int]]:
-        """Return the only inner face, and which of its ends, at points with exactly one inner and two wall faces."""
-        k, v = self.mesh.inner, len(self.points)
-        inner = self.ends[:k].ravel()
-        walls = self.ends[self.walls].ravel()
-        count = np.bincount(inner, minlength=v)
-        single = (count == 1) & (np.bincount(walls, minlength=v) == 2)
-        places = np.flatnonzero(single[inner])
-        return {int(inner[p]): (int(p) // 2, int(p) % 2) for p in places}
+    def __init__(self, runs: WallRuns, can_move: np.ndarray) -> None:
+        """`can_move` (n,) bool are cells whose face ends can move."""
+        w = self.walls = runs
+        self.begin, self.end, count = w.begin.copy(), w.end.copy(), len(w.begin)
+        self.free = can_move[w.cell[w.one]] & can_move[w.cell[w.two]]
+        self.target = np.full(len(w.one), -1)
+        # The face ends at the beginning and at the end of each run, behind them one that never moves.
+        self.ends_of = np.full((2, count), len(w.one))
+        self.ends_of[0, w.two] = self.ends_of[1, w.one] = np.arange(len(w.one))
+        self.gain = np.zeros(len(w.one) + count)
+        self.way = np.zeros(len(self.gain), np.int64)
+        self.cost, self.stale = np.zeros(count), np.zeros(count, bool)
+        self.stale[w.one[self.free]] = self.stale[w.two[self.free]] = True
+        self._renew()
 
-    def spare(self, cells: list[int]) -> bool:
-        """Do less in these cells, which straight walls turned inside out; return whether that is possible."""
-        left = [c for c in cells if self.spared[c] < self.most[c]]
-        self.spared[left] += 1
-        return bool(left)
+    def _renew(self) -> None:
+        """Renew the costs of runs that have changed, and the best moves there."""
+        w, count = self.walls, len(self.walls.one)
+        some = np.flatnonzero(self.stale)
+        self.cost[some] = w.cost(some, self.begin[some], self.end[some])
+        dear = self.cost > _CHEAP * w.sizes[w.cell] ** 2
+        near = self.stale[w.one] | self.stale[w.two]
+        self.gain[:count][near | ~self.free] = 0
+        self._set_shifts(np.flatnonzero(self.free & near & (dear[w.one] | dear[w.two])))
+        free = np.append(self.free, False)[self.ends_of].all(axis=0)
+        self.gain[count:][~free] = 0
+        runs = np.flatnonzero(free)
+        one, two = self._beside(runs)
+        near = self.stale[runs] | self.stale[one] | self.stale[two]
+        self.gain[count + runs[near]] = 0
+        self._set_exits(runs[near & dear[runs] & (one != two)])
 
-    # Runs.
+    def _beside(self, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the runs before and after `runs`, both of whose ends can move."""
+        return self.walls.one[self.ends_of[0, runs]], self.walls.two[self.ends_of[1, runs]]
 
-    def runs(self) -> list[_Run]:
-        """Return the runs of all cells."""
-        owner = self.mesh.owner[self.walls].tolist()
-        previous = [-1] * len(owner)
-        for i, j in enumerate(self.next):
-            if j >= 0:
-                previous[j] = i
-        found: dict[int, _Run] = {}
-        for i, p in enumerate(previous):
-            if p >= 0 and owner[p] == owner[i]:
-                continue
-            faces, j = [i], self.next[i]
-            while j >= 0 and owner[j] == owner[i] and j != i:
-                faces.append(j)
-                j = self.next[j]
-            found[i] = _Run(owner[i], faces, *self._beside(owner[i], faces))
-        for run in found.values():
-            j = self.next[run.faces[-1]]
-            other = found.get(j)
-            if other is None or other is run or self.spared[[run.cell, other.cell]].any():
-                continue
-            at = self.at.get(self.begin[j])
-            sides = {run.cell, other.cell}
-            if at is None or {int(self.mesh.owner[at[0]]), int(self.mesh.neighbor[at[0]])} != sides:
-                continue
-            if run.ahead and other.behind:
-                run.after, other.before, run.end = other, run, at
-        return list(found.values())
+    def _ways(
+        self, run: np.ndarray, begin: np.ndarray, counts: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Return for so many faces from each place on: the row, the number from 0, and the length up to its end."""
+        starts = np.cumsum(counts) - counts
+        row = np.repeat(np.arange(len(run)), counts)
+        k = np.arange(len(row)) - starts[row]
+        length = self.walls.lengths[self.walls.at(run[row], begin[row] + k)]
+        sums = np.concatenate([[0.0], np.cumsum(length)])
+        return row, k, sums[1:] - sums[starts[row]]
 
-    def _beside(self, cell: int, faces: list[int]) -> tuple[list[Point], list[Point]]:
-        """Return the two points before and the two after some wall faces in the loop around their cell."""
-        loop = self.loops[self.starts[cell] : self.starts[cell + 1]].tolist()
-        if cell in self.broken or len(loop) < len(faces) + 3:
-            return [], []
-        first, last = loop.index(self.begin[faces[0]]), loop.index(self.final[faces[-1]])
-        behind = [loop[first - 2], loop[first - 1]]
-        ahead = [loop[(last + k) % len(loop)] for k in (1, 2)]
-        return [self.points[p] for p in behind], [self.points[p] for p in ahead]
-
-    def line(self, faces: Sequence[int]) -> list[Point]:
-        """Return the points along wall faces."""
-        return [self.points[self.begin[f]] for f in faces] + [self.points[self.final[faces[-1]]]]
-
-    def fixed(self, faces: Sequence[int]) -> list[bool]:
-        """Return whether the name of the boundary changes in each inner point of a run."""
-        return [self.part[a] != self.part[b] for a, b in pairwise(faces)]
-
-    def kept(self, run: _Run) -> list[int]:
-        """Return which points of a run remain."""
-        if self.spared[run.cell] == 2:
-            return list(range(len(run.faces) + 1))
-        return self.chords_of(run, run.faces)
-
-    def chords_of(self, run: _Run, faces: Sequence[int]) -> list[int]:
-        """Return which points of a run remain if it has these faces."""
-        key = (run.cell, faces[0], faces[-1])
-        if key not in self.chords:
-            self.chords[key] = chord_points(
-                self.line(faces), self.fixed(faces), self.sizes[run.cell]
-            )
-        return self.chords[key]
-
-    def cost(self, run: _Run, faces: Sequence[int], point: int) -> float:
-        """Return the cost of a run if it had these faces, or only this point if there are none."""
-        key = (run.cell, *((faces[0], faces[-1]) if faces else (-1, point)))
-        if key not in self.costs:
-            self.costs[key] = self._cost_of(run, faces, point)
-        return self.costs[key]
-
-    def _cost_of(self, run: _Run, faces: Sequence[int], point: int) -> float:
-        size = self.sizes[run.cell]
-        if faces:
-            line, kept = self.line(faces), self.chords_of(run, faces)
-            total, left = chord_cost(line, kept, size), [line[i] for i in kept]
-            for a, b in pairwise(left):
-                skew = skewness(a, b, self.centroids[run.cell])
-                total += _SKEW_PRICE * (max(skew - 1, 0) * size) ** 2
-        else:
-            total, left = 0.0, [self.points[point]]
-        return total + concave_price([*run.behind, *left, *run.ahead]) * size * size
-
-    # Face ends that move.
-
-    def move_ends(self, runs: list[_Run]) -> dict[tuple[int, int], int]:
-        """Move the ends of runs where that lowers the cost; return the new point of the faces' ends that moved."""
-        for run in runs:
-            run.cost = self.cost(run, run.faces, -1)
-        moved: dict[tuple[int, int], int] = {}
-        for _ in range(2):
-            changed = False
-            for run in sorted(runs, key=lambda r: -r.cost):
-                if run.cost <= 1e-4 * self.sizes[run.cell] ** 2 or not run.faces:
-                    continue
-                best, gain = None, 0.0
-                for move in self._moves(run, moved):
-                    saved = sum(r.cost for r, _ in move.faces) - move.price
-                    for r, faces in move.faces:
-                        if saved <= gain:  # costs are not negative
-                            break
-                        saved -= self.cost(r, faces, move.point)
-                    if saved > gain:
-                        best, gain = move, saved
-                if best is None:
-                    continue
-                for r, faces in best.faces:
-                    r.faces, r.cost = faces, self.cost(r, faces, best.point)
-                    if not faces:  # two faces end in the point now
-                        r.before.after = r.after.before = None  # type: ignore[union-attr]
-                        r.before = r.after = None
-                moved |= dict.fromkeys(best.ends, best.point)
-                changed = True
-            if not changed:
-                break
-        return moved
-
-    def _moves(self, run: _Run, moved: dict[tuple[int, int], int]) -> Iterator[_Move]:
-        """Return how the ends of a run can move into vertices of the domain, or the run can leave the wall."""
-        for one, two in ((run.before, run), (run, run.after)):
-            if one is not None and two is not None and one.end not in moved:
-                yield from self._shifts(one, two)
-        one, two = run.before, run.after
-        if one is None or two is None or one is two or one.end in moved or run.end in moved:
-            return
-        reach = REACH * min(self.sizes[r.cell] for r in (one, run, two))
-        ways = [0.0, *accumulate(map(self._length, run.faces))]
-        if ways[-1] > 2 * reach:
-            return
-        points = [self.begin[f] for f in run.faces] + [self.final[run.faces[-1]]]
-        fixed = [k + 1 for k, here in enumerate(self.fixed(run.faces)) if here]
-        for k, point in enumerate(points):
-            if fixed and fixed != [k]:
-                continue
-            price = self._price(one, points[0], point) + self._price(run, points[-1], point)
-            faces = [(one, one.faces + run.faces[:k]), (run, []), (two, run.faces[k:] + two.faces)]
-            if max(ways[k], ways[-1] - ways[k]) <= reach:
-                yield _Move(faces, point, [one.end, run.end], price)
-
-    def _shifts(self, one: _Run, two: _Run) -> Iterator[_Move]:
-        """Return how the common end of two runs can move."""
-        reach = REACH * min(self.sizes[one.cell], self.sizes[two.cell])
-        old = self.begin[two.faces[0]]
-        way = 0.0
-        for k in range(1, len(two.faces)):
-            way += self._length(two.faces[k - 1])
-            if way > reach:
-                break
-            point = self.begin[two.faces[k]]
-            faces = [(one, one.faces + two.faces[:k]), (two, two.faces[k:])]
-            yield _Move(faces, point, [one.end], self._price(one, old, point))
-        way = 0.0
-        for k in range(1, len(one.faces)):
-            way += self._length(one.faces[-k])
-            if way > reach:
-                break
-            point = self.begin[one.faces[-k]]
-            faces = [(one, one.faces[:-k]), (two, one.faces[-k:] + two.faces)]
-            yield _Move(faces, point, [one.end], self._price(one, old, point))
-
-    def _price(self, run: _Run, old: int, new: int) -> float:
-        """Return the price for moving the end of a run: for its way, and for the angle by which the face turns."""
-        (x, y), (u, v), (s, t) = self.points[old], self.points[new], run.ahead[0]
-        size = self.sizes[run.cell]
-        x, y, u, v = x - s, y - t, u - s, v - t
-        tilt = atan2(x * v - y * u, x * u + y * v)
-        return _WAY_PRICE * hypot(u - x, v - y) * size + _TILT_PRICE * (tilt * size) ** 2
-
-    def _length(self, face: int) -> float:
-        (x, y), (u, v) = self.points[self.begin[face]], self.points[self.final[face]]
-        return hypot(u - x, v - y)
-
-    def straightened(self) -> SolverMesh:
-        """Return the mesh with straight walls."""
-        mesh, runs = self.mesh, self.runs()
-        moved = self.move_ends(runs)
-        corners = self.ends.copy()
-        for (face, side), point in moved.items():
-            corners[face, side] = point
-        rows: list[tuple[int, int, int, int]] = []  # two points, cell, wall face
-        done = np.zeros(len(self.walls), bool)
-        for run in runs:
-            done[run.faces] = True
-            for first, last in pairwise(self.kept(run) if run.faces else []):
-                part = run.faces[first:last]
-                longest = max(part, key=self._length)
-                rows.append((self.begin[part[0]], self.final[part[-1]], run.cell, longest))
-        for face in np.flatnonzero(~done).tolist():  # whole rings within one cell
-            cell = int(mesh.owner[self.walls[face]])
-            rows.append((self.begin[face], self.final[face], cell, face))
-        a, b, owner, source = np.array(rows, np.int64).reshape(-1, 4).T
-        source = self.walls[source]
-        order = np.lexsort((owner, -mesh.neighbor[source]))
-        k = mesh.inner
-        taken = np.concatenate([np.arange(k), source[order]])
-        ends = np.concatenate([corners[:k], np.stack([a, b], axis=1)[order]])
-        return replace(
-            mesh,
-            starts=2 * np.arange(len(ends) + 1),
-            corners=ends.ravel(),
-            owner=np.concatenate([mesh.owner[:k], owner[order].astype(mesh.owner.dtype)]),
-            neighbor=mesh.neighbor[taken],
-            twin=mesh.twin[taken],
-            shift=mesh.shift[taken],
-            half_face=mesh.half_face[taken],
+    def _set_shifts(self, some: np.ndarray) -> None:
+        """Find the best way of `some` face ends."""
+        w = self.walls
+        one, two = w.one[some], w.two[some]
+        reach = REACH * np.minimum(w.sizes[w.cell[one]], w.sizes[w.cell[two]])
+        first, place, old = self.begin[one], self.end[one], w.first[w.at(one, self.end[one])]
+        row, k, way = self._ways(one, first, place - first)
+        total = np.zeros(len(some))
+        np.maximum.at(total, row, way)
+        before = np.stack([row, k + 1 - (place - first)[row]]), total[row] - way
+        row, k, way = self._ways(two, self.begin[two], self.end[two] - self.begin[two])
+        (row, by), way = (
+            np.concatenate(z, axis=-1)
+            for z in zip(before, (np.stack([row, k + 1]), way), strict=True)
         )
+        # Each run keeps a face.
+        room = by != (self.end[two] - self.begin[two])[row]
+        near = np.flatnonzero((way <= reach[row]) & (by != 0) & room)
+        row, by = row[near], by[near]
+        new = w.first[w.at(one[row], place[row] + by)]
+        gain = (self.cost[one] + self.cost[two])[row] - w.way_price(one[row], old[row], new)
+        lines = ((one, first, place, 0, 1), (two, self.begin[two], self.end[two], 1, 0))
+        self._keep_best(some, row, by, gain, lines)
+
+    def _set_exits(self, runs: np.ndarray) -> None:
+        """Find the best points into which the ends of `runs` can move."""
+        w = self.walls
+        one, two = self._beside(runs)
+        size = w.sizes[w.cell]
+        reach = REACH * np.minimum(np.minimum(size[one], size[two]), size[runs])
+        counts = self.end[runs] - self.begin[runs]
+        row, k, way = self._ways(runs, self.begin[runs], counts + 1)
+        # From the way to the end of each face to that to its beginning.
+        way -= w.lengths[w.at(runs[row], self.begin[runs[row]] + k)]
+        total = np.zeros(len(runs))
+        np.maximum.at(total, row, way)
+        part = w.part[w.at(runs[row], self.begin[runs[row]] + k)]
+        named = (k > 0) & (k < counts[row])
+        named[1:] &= part[1:] != part[:-1]
+        names = np.bincount(row, named, len(runs))[row]
+        far = np.maximum(way, total[row] - way) > reach[row]
+        near = np.flatnonzero(~far & ((names == 0) | ((names == 1) & named)))
+        row, by = row[near], k[near]
+        ends = [w.first[w.at(runs[row], z[runs[row]])] for z in (self.begin, self.end)]
+        new = w.first[w.at(runs[row], self.begin[runs[row]] + by)]
+        gain = (self.cost[one] + self.cost[runs] + self.cost[two])[row]
+        gain -= w.way_price(one[row], ends[0], new) + w.way_price(runs[row], ends[1], new)
+        lines = (
+            (one, self.begin[one], self.end[one], 0, 1),
+            (runs, self.begin[runs], self.begin[runs], 1, 1),
+            (two, self.begin[two] - counts, self.end[two], 1, 0),
+        )
+        self._keep_best(len(w.one) + runs, row, by, gain, lines)
+
+    def _keep_best(
+        self, places: np.ndarray, row: np.ndarray, by: np.ndarray, gain: np.ndarray, lines: tuple
+    ) -> None:
+        """Keep the best move of each row in `places`, after the costs of new lines are taken from its gain.
+
+        A line is a run, where it begins and ends, and how both move with `by`. Costs are not negative, so moves
+        without a gain are not regarded any further.
+        """
+        for run, begin, end, first, last in lines:
+            left = np.flatnonzero(gain > 0)
+            row, by, gain = row[left], by[left], gain[left]
+            gain -= self.walls.cost(run[row], begin[row] + first * by, end[row] + last * by)
+        order = np.lexsort((-gain, row))
+        order = order[np.diff(row[order], prepend=-1) > 0]
+        self.gain[places[row[order]]] = np.maximum(gain[order], 0)
+        self.way[places[row[order]]] = by[order]
+
+    def move(self) -> bool:
+        """Make moves that gain, the best ones first, and no two of the same run; return whether there is one."""
+        w, count = self.walls, len(self.walls.one)
+        found = np.flatnonzero(self.gain > 0)
+        if not found.size:
+            return False
+        shifts, runs = found[found < count], found[found >= count] - count
+        one, two = self._beside(runs)
+        changed = np.concatenate([w.one[shifts], w.two[shifts], one, runs, two])
+        k, j = np.arange(len(shifts)), len(shifts) + np.arange(len(runs))
+        sets = np.concatenate([k, k, j, j, j])
+        taken = independent(sets, changed, -self.gain[found], len(self.begin))
+        self.stale[:] = False
+        self.stale[changed[taken[sets]]] = True
+        shifts, exits = shifts[taken[: len(shifts)]], taken[len(shifts) :]
+        one, runs, two = one[exits], runs[exits], two[exits]
+        # Ends move to a place; those of a run that leaves to the same one.
+        by, over = self.way[shifts], self.way[count + runs]
+        self.target[shifts] = w.first[w.at(w.one[shifts], self.end[w.one[shifts]] + by)]
+        self.end[w.one[shifts]] += by
+        self.begin[w.two[shifts]] += by
+        point = w.first[w.at(runs, self.begin[runs] + over)]
+        self.target[self.ends_of[0, runs]] = self.target[self.ends_of[1, runs]] = point
+        self.end[one] += over
+        self.begin[two] -= self.end[runs] - self.begin[runs] - over
+        self.begin[runs] += over
+        self.end[runs] = self.begin[runs]
+        self.free[self.target >= 0] = False
+        self._renew()
+        return True
 
 
 def _starlike(mesh: SolverMesh) -> np.ndarray:
