@@ -262,22 +262,31 @@ class _Equations:
             place = np.cumsum(place) - 1
             jacobian = np.bincount(place[rows] * k + columns, values, height * k)
             jacobian = jacobian.reshape(height, k)
+            self.matrix = jacobian.T @ jacobian
+            self.entries, self.diagonal = self.matrix.ravel(), np.arange(k) * (k + 1)
+            self.entries[self.diagonal] += _MOVE_WEIGHT**2
         else:
             jacobian = scipy.sparse.csr_array((values, (rows, columns)), (len(terms), k))
-        self.matrix = jacobian.T @ jacobian
+            product = jacobian.T @ jacobian + scipy.sparse.eye_array(k) * _MOVE_WEIGHT**2
+            self.matrix = scipy.sparse.csc_matrix(product)
+            self.matrix.sort_indices()
+            self.entries = self.matrix.data
+            column = np.repeat(np.arange(k), np.diff(self.matrix.indptr))
+            self.diagonal = np.flatnonzero(self.matrix.indices == column)
+        self.damping = 0.0
 
     def solve(self, damping: float) -> np.ndarray:
         """Return the Levenberg-Marquardt step (m, 2); `damping` is added to the diagonal of the matrix."""
         from scipy.sparse.linalg import splu
 
-        matrix, k = self.matrix, len(self.gradient)
-        damping += _MOVE_WEIGHT**2
+        matrix = self.matrix
+        self.entries[self.diagonal] += damping - self.damping
+        self.damping = damping
         if isinstance(matrix, np.ndarray):
-            found = np.linalg.solve(matrix + damping * np.eye(k), self.gradient)
-        elif not np.isfinite(matrix.data).all():
-            found = np.full(k, np.nan)  # as of dense matrices; the step is refused
+            found = np.linalg.solve(matrix, self.gradient)
+        elif not np.isfinite(self.entries).all():
+            found = np.full(len(self.gradient), np.nan)  # as of dense matrices; the step is refused
         else:
-            damped = scipy.sparse.csc_matrix(matrix + damping * scipy.sparse.eye_array(k))
-            factors = splu(damped, "MMD_AT_PLUS_A", options={"SymmetricMode": True})
+            factors = splu(matrix, "MMD_AT_PLUS_A", options={"SymmetricMode": True})
             found = factors.solve(self.gradient)
         return found.reshape(-1, 2)

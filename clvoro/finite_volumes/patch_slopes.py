@@ -102,7 +102,7 @@ class _Slopes:
         step = _STEP * c.smaller[rows]
         aside = at[:, None, rows] + np.eye(8)[:, :, None] * step
         moved = face_figures(tuple(aside[:4]), tuple(aside[4:6]), tuple(aside[6:]), c.wall[rows])
-        parts = []
+        parts, terms, cells, by = [], [], [], []
         sign = (1.0, SKEW_WEIGHT, -LENGTH_WEIGHT / c.smaller[rows])
         for kind in range(3):
             slope = sign[kind] * (moved[kind] - now[kind][rows]) / step
@@ -113,9 +113,13 @@ class _Slopes:
                     Slopes(kind * f + faces, c.ends[faces, end], *slope[2 * end : 2 * end + 2])
                 )
             if kind < 2:
-                for side, cell in enumerate((c.owner, c.neighbor)):
-                    by = slope[4 + 2 * side : 6 + 2 * side]
-                    parts.append(self._of_centroids(kind * f + faces, cell[faces], *by))
+                terms += [kind * f + faces] * 2
+                cells += [c.owner[faces], c.neighbor[faces]]
+                by += [slope[4:6], slope[6:8]]
+        by_centroids = np.concatenate(by, axis=1)
+        parts.append(
+            self._of_centroids(np.concatenate(terms), np.concatenate(cells), *by_centroids)
+        )
         return Slopes(*(np.concatenate(z) for z in zip(*parts, strict=True)))
 
     def _of_centroids(

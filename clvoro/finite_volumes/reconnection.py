@@ -25,6 +25,8 @@ _TRIED = 0.5
 """Faces shorter than this over the size of the smaller cell are tried near those beyond a limit."""
 _GAIN = 0.1
 """Least gain of a change, over the price of the cells that it is for."""
+_SMALL = 1.5e-3
+"""Price of a place at which faces remain as they are: a face there has less than 20 degrees and a skewness below 2."""
 _RINGS = 5
 """Rings of cells around a bad place that are regarded."""
 _TRIES = (1, 3)
@@ -50,7 +52,7 @@ def repaired(given: Descent, ring: RingCoordinate | None) -> Descent:
         assert local is not None
         near = focus[chosen]
         best = _settled(local, near, ring, _TRIES, _STEPS)
-        if best.bad[best.near(near, 2)].any():
+        if best.prices[best.near(near, 2) & best.bad].sum() > _SMALL:
             best = _changed(best, near, ring)
         if local.price - best.price < _GAIN * given.prices[focus].sum():
             left &= ~focus
@@ -94,14 +96,24 @@ def _best_changes(given: Descent, focus: np.ndarray, ring: RingCoordinate | None
             made = Descent.of(patch, given.goals)
             if made is not None:
                 found.append(_settled(made, focus, ring, (1,), _FIRST_STEPS))
-    good = sorted(found, key=_price)[:_GOOD]
-    found = [_settled(made, focus, ring, (1,), _SECOND_STEPS) for made in good]
-    best: list[Descent] = []
-    for made in sorted(found, key=_price)[:_BEST]:
-        best.append(_settled(made, focus, ring, (2, 3), _STEPS))
-        if not best[-1].bad.any():
+    good = _each_settled(sorted(found, key=_price)[:_GOOD], focus, ring, (1,), _SECOND_STEPS)
+    return _each_settled(good[:_BEST], focus, ring, (2, 3), _STEPS)
+
+
+def _each_settled(
+    some: list[Descent],
+    focus: np.ndarray,
+    ring: RingCoordinate | None,
+    rings: tuple[int, ...],
+    steps: int,
+) -> list[Descent]:
+    """Return patches after moves of points, see `_settled`, up to the first one without a bad cell, the best first."""
+    found: list[Descent] = []
+    for made in some:
+        found.append(_settled(made, focus, ring, rings, steps))
+        if not found[-1].bad.any():
             break
-    return sorted(best, key=_price)
+    return sorted(found, key=_price)
 
 
 def _settled(

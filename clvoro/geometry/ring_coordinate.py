@@ -62,21 +62,29 @@ class RingCoordinate:
         reach : (k,) float
             How far from that edge the point can be, along the ring.
         """
-        found = np.empty(len(points))
-        for i, (p, place, far) in enumerate(
-            zip(points, self.domain.oriented.places[walls].tolist(), reach.tolist(), strict=True)
-        ):
-            ring = int(np.searchsorted(self.ring_starts, place, side="right")) - 1
-            rows = np.arange(self.ring_starts[ring], self.ring_starts[ring + 1])
-            total = self.begins[rows[-1] + 1] - self.begins[rows[0]]
-            ahead = (self.begins[rows] - self.begins[place]) % total
-            near = (ahead <= far + self.lengths[place]) | (
-                ahead + self.lengths[rows] >= total - far
-            )
-            rows = rows[near]
-            share = ((p - self.vertices[rows]) * self.along[rows]).sum(axis=1)
-            share = np.clip(share / self.lengths[rows] ** 2, 0, 1)
-            off = np.hypot(*(self.vertices[rows] + share[:, None] * self.along[rows] - p).T)
-            best = int(np.argmin(off))
-            found[i] = self.begins[rows[best]] + share[best] * self.lengths[rows[best]]
-        return found
+        if not len(points):
+            return np.empty(0)
+        place = self.domain.oriented.places[walls].astype(np.int64)
+        ring = np.searchsorted(self.ring_starts, place, side="right") - 1
+        first, count = self.ring_starts[ring], np.diff(self.ring_starts)[ring]
+        start = self.begins[first]
+        total = self.begins[first + count] - start
+        # Edges from one end of the reach to the other, counted on beyond the ends of the ring.
+        middle = self.begins[place] - start
+        ends = [middle - reach, middle + self.lengths[place] + reach]
+        laps = [np.floor(s / total) for s in ends]
+        low, high = (
+            self.edges(start + s - lap * total) - first + (lap * count).astype(np.int64)
+            for s, lap in zip(ends, laps, strict=True)
+        )
+        counts = np.minimum(high - low + 1, count)
+        begins = np.cumsum(counts) - counts
+        row = np.repeat(np.arange(len(points)), counts)
+        edge = first[row] + (low[row] + np.arange(len(row)) - begins[row]) % count[row]
+        along, aside = self.along[edge], points[row] - self.vertices[edge]
+        share = np.clip((aside * along).sum(axis=1) / self.lengths[edge] ** 2, 0, 1)
+        off = np.hypot(*(aside - share[:, None] * along).T)
+        nearest = np.flatnonzero(off == np.repeat(np.minimum.reduceat(off, begins), counts))
+        nearest = nearest[np.diff(row[nearest], prepend=-1) > 0]
+        found = self.begins[edge[nearest]] + share[nearest] * self.lengths[edge[nearest]]
+        return start + (found - start) % total
