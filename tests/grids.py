@@ -13,22 +13,29 @@ Point = list[tuple[object, ...]]
 def points_to_leave(items: Iterable[pytest.Item]) -> Iterator[pytest.Item]:
     """Yield the tests that are marked `sparse` and left to the slow set.
 
-    The fast set keeps every value of every axis at least once, in combinations that differ as much as possible.
+    The fast set keeps every value of every axis at least once; with `sparse(n)` it keeps n points. They differ as much
+    as possible, and equals are taken in their order: the most important point is the first.
     """
     grids: dict[str, list[tuple[pytest.Item, Point]]] = defaultdict(list)
+    most: dict[str, int | None] = {}
     for item in items:
-        if item.get_closest_marker("sparse") and not item.get_closest_marker("slow"):
-            grids[item.nodeid.partition("[")[0]].append((item, _point_of(item)))
-    for left in grids.values():
+        mark = item.get_closest_marker("sparse")
+        if mark and not item.get_closest_marker("slow"):
+            name = item.nodeid.partition("[")[0]
+            grids[name].append((item, _point_of(item)))
+            most[name] = mark.args[0] if mark.args else None
+    for name, left in grids.items():
         used: Counter[tuple[object, ...]] = Counter()
+        kept = 0
         while left:
             # The point with most new values; among equals, the one whose values are rarest so far.
             item, point = min(
                 left, key=lambda p: (sum(v in used for v in p[1]), sum(used[v] for v in p[1]))
             )
-            if all(v in used for v in point):
+            if all(v in used for v in point) if most[name] is None else kept == most[name]:
                 yield from (item for item, _ in left)
                 break
+            kept += 1
             used.update(point)
             left.remove((item, point))
 

@@ -10,9 +10,8 @@ from tests.grids import points_to_leave
 
 def item(axes, params, *marks):
     """As much of a test as the choice looks at; an axis may have several names."""
-    found = [pytest.mark.parametrize(names, [None]).mark for names in axes] + [
-        getattr(pytest.mark, name).mark for name in marks
-    ]
+    found = [pytest.mark.parametrize(names, [None]).mark for names in axes]
+    found += [mark.mark for mark in marks]
     return SimpleNamespace(
         nodeid="test_it[...]", callspec=SimpleNamespace(params=params), params=params,
         iter_markers=lambda name: (m for m in found if m.name == name),
@@ -25,7 +24,9 @@ def test_every_value_of_every_axis_is_kept():
     # The axis of precisions is a fixture's: no mark names it.
     items = [
         item(
-            [("n", "kind"), "shape"], {"n": n, "kind": kind, "shape": shape, "real": real}, "sparse"
+            [("n", "kind"), "shape"],
+            {"n": n, "kind": kind, "shape": shape, "real": real},
+            pytest.mark.sparse,
         )
         for (n, kind), shape, real in product(sizes, shapes, reals)
     ]
@@ -40,5 +41,17 @@ def test_every_value_of_every_axis_is_kept():
 def test_unmarked_and_slow_grids_stay_as_they_are():
     pairs = list(product([1, 2], [3, 4]))
     plain = [item(["a", "b"], {"a": a, "b": b}) for a, b in pairs]
-    slow = [item(["a", "b"], {"a": a, "b": b}, "sparse", "slow") for a, b in pairs]
+    slow = [
+        item(["a", "b"], {"a": a, "b": b}, pytest.mark.sparse, pytest.mark.slow) for a, b in pairs
+    ]
     assert not list(points_to_leave(plain + slow))
+
+
+def test_number_of_points():
+    pairs = list(product([1, 2, 3], ["a", "b"]))
+    for count, kept in ((1, [(1, "a")]), (2, [(1, "a"), (2, "b")]), (9, pairs)):
+        items = [
+            item(["n", "kind"], {"n": n, "kind": k}, pytest.mark.sparse(count)) for n, k in pairs
+        ]
+        left = list(points_to_leave(items))
+        assert [(i.params["n"], i.params["kind"]) for i in items if i not in left] == kept
