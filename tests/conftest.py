@@ -2,6 +2,7 @@
 
 import base64
 import binascii
+import gc
 import os
 import re
 import signal
@@ -115,6 +116,13 @@ if "CLVORO_TEST_DIVISION" in os.environ:
     from tests.robustness.rough_division import use_rough_division
 
     use_rough_division()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish():
+    """Let the garbage collector pass over modules and tests, which are a million objects and stay."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -105,7 +105,6 @@ def kernels_of(stage):
 
 
 @functools.cache
-@functools.cache
 def modules():
     """Return all modules of the package as {name: syntax tree}, without the package's own name."""
     found = {}
@@ -115,6 +114,17 @@ def modules():
     return found
 
 
+def import_statements(node, lazy):
+    typing = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+    if typing or (isinstance(node, ast.FunctionDef) and not lazy):
+        return
+    if isinstance(node, ast.ImportFrom):
+        yield node
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, (ast.stmt, ast.ExceptHandler)):
+            yield from import_statements(child, lazy)
+
+
 def imports(name, tree, known, lazy=False):
     """Return which modules of the package are imported when `name` is, with the imported names: {module: names}.
 
@@ -122,13 +132,8 @@ def imports(name, tree, known, lazy=False):
     """
     found = {}
     package = name.split(".")[:-1]
-    skipped = set()
-    for node in ast.walk(tree):
-        typing = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
-        if typing or (isinstance(node, ast.FunctionDef) and not lazy):
-            skipped |= {id(n) for n in ast.walk(node)}
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.ImportFrom) or not node.level or id(node) in skipped:
+    for node in import_statements(tree, lazy):
+        if not node.level:
             continue
         base = package[: len(package) - (node.level - 1)] + (node.module or "").split(".")
         base = [part for part in base if part]

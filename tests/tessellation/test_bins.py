@@ -47,13 +47,13 @@ def walk(binned, n, dim, eps):
             count = end - start
             if grid == next_grid:
                 # The spacing at an empty leaf is not used.
-                for width in range(1, max(sides) + 1 if count else 2):
+                for width in range(1, max(sides) + 1 if count else 1):
                     block = counts[
                         tuple(slice(max(i - width, 0), i + width + 1) for i in index[::-1])
                     ]
                     if block.sum() >= SPACING_COUNT:
                         break
-                spacing = edge * (OCCUPANCY * block.size / max(block.sum(), 1)) ** (1 / dim)
+                spacing = edge * (OCCUPANCY * block.size / block.sum()) ** (1 / dim) if count else 0
                 leaves.append((start, count, origin, edge, level, spacing))
             else:
                 assert frames[grid, :dim] == pytest.approx(origin, abs=8 * eps)
@@ -75,24 +75,22 @@ def check(binned, points, dim, eps):
     items = binned.items.get()[:n]
     assert np.array_equal(np.sort(items), np.arange(n)), "not every generator is in one place"
     assert np.array_equal(binned.points.get().reshape(-1, dim)[:n], points[items])
-    reach = binned.reach.get()[:n]
-    covered = np.zeros(n, int)
-    spacings = binned.spacing.get()[:n]
+    starts, counts, origins, edges, levels, spacings = map(np.array, zip(*leaves, strict=True))
+    assert ((counts <= SPLIT_COUNT[dim]) | (levels == MAX_LEVELS - 1)).all()
+    leaf = np.repeat(np.arange(len(leaves)), counts)
+    place = starts[leaf] + np.arange(len(leaf)) - np.repeat(np.cumsum(counts) - counts, counts)
+    assert np.array_equal(np.sort(place), np.arange(n)), "leaves overlap or leave a gap"
+    ascends = np.diff(items[place]) > 0
+    assert ascends[np.diff(leaf) == 0].all(), "a leaf is not sorted"
+    assert np.allclose(binned.reach.get()[place], edges[leaf], rtol=1e-6)
+    # float32, and 1 / edge of the grid is rounded
+    assert np.allclose(binned.spacing.get()[place], spacings[leaf], rtol=1e-6)
+    # A generator lies in its bin up to bin_noise (bins.h), which the search allows for.
+    inside = points[items[place]].astype(float)
     first = binned.grid_frames.get()[:dim].astype(float)
-    for start, count, origin, edge, level, spacing in leaves:
-        place = slice(start, start + count)
-        covered[place] += 1
-        assert (np.diff(items[place]) > 0).all(), "a leaf is not sorted"
-        assert count <= SPLIT_COUNT[dim] or level == MAX_LEVELS - 1
-        assert np.allclose(reach[place], edge, rtol=1e-6)
-        # float32, and 1 / edge of the grid is rounded
-        assert np.allclose(spacings[place], spacing, rtol=1e-6)
-        # A generator lies in its bin up to bin_noise (bins.h), which the search allows for.
-        inside = points[items[place]].astype(float)
-        noise = 16 * eps * (np.abs(inside) + np.abs(first))
-        below, above = origin - inside, inside - (origin + edge)
-        assert (np.maximum(below, above) <= noise).all()
-    assert (covered == 1).all(), "leaves overlap or leave a gap"
+    noise = 16 * eps * (np.abs(inside) + np.abs(first))
+    below, above = origins[leaf] - inside, inside - (origins[leaf] + edges[leaf, None])
+    assert (np.maximum(below, above) <= noise).all()
     sides = binned.grid_shapes.get()[1 : 1 + dim]
     assert np.prod(sides) <= 2**dim * max(n / OCCUPANCY, 1), "far more bins than generators"
     return leaves
@@ -184,6 +182,7 @@ def test_bits_do_not_depend_on_earlier_sets(ctx, real):
             assert np.array_equal(items, first[name]), name
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("box", BOXES)
 def test_renumbered_bins_are_those_of_the_sorted_generators(ctx, real, box):
     """Renumbering gives the bits of a second sort, so that generators are binned once."""
