@@ -131,6 +131,7 @@ def test_methods():
     assert found["adaptive, default"][1] > 0.96
 
 
+@pytest.mark.slow
 def test_a_table_is_markdown():
     command = [
         sys.executable, str(BENCH / "transfer.py"), "--sizes", "300", "--dims", "3", "--repeat", "1",

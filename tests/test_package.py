@@ -86,6 +86,7 @@ def test_wheel_holds_package_and_kernels_and_no_more(wheel):
         assert found[name] == (ROOT / name.removeprefix("clvoro/")).read_bytes()
 
 
+@pytest.mark.slow
 def test_sdist_holds_sources_and_builds_the_same_wheel(sdist, wheel, tmp_path):
     with tarfile.open(sdist) as archive:
         names = {n.split("/", 1)[1] for n in archive.getnames() if "/" in n}
@@ -106,6 +107,7 @@ def test_unpacked_wheel_runs_in_a_path_with_a_space(wheel, tmp_path):
     assert folder == place / "clvoro" / "cl_kernels"
 
 
+@pytest.mark.slow
 def test_checkout_runs_in_a_path_with_a_space(tmp_path):
     place = copy_sources(tmp_path / "my checkout")
     assert run_program(sys.executable, place) == place / "cl_kernels"

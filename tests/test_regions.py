@@ -80,6 +80,7 @@ def test_positions_may_be_on_both_sides_of_the_date_line(globe, lonlat):
     assert np.array_equal(regions.inside(globe, shapely.Polygon(ring)), expected)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("order", [1, -1])
 @pytest.mark.parametrize("pole", [1, -1])
 def test_rings_around_a_pole(globe, lonlat, pole, order):
@@ -147,6 +148,7 @@ def test_all_kinds_of_land_are_the_same(globe, lonlat, tmp_path):
 # --- lines ---
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     "line", [[(-30, -20), (50, 40), (20, 70)], [(150, 10), (-160, -35)]], ids=str
 )

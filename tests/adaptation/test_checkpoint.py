@@ -75,7 +75,7 @@ def assert_same(a, b):
     assert a.settings == b.settings
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("kind", list(RUNS))
 def test_resumed_runs_end_the_same(ctx, tmp_path, dtype, kind):
@@ -118,6 +118,7 @@ LONG_LIVED = {
 QUICK = ("coupled", "multigrid"), ("adaptive", "jacobi")
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("kind", "solver"),
     [
@@ -184,6 +185,7 @@ def test_own_points_and_callables(ctx, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_resume_with_far_fewer_cells_than_at_the_start(ctx, tmp_path):
     """Rows keep the capacity of the first mesh."""
     points, path = np.random.default_rng(12).random((600, 2)), tmp_path / "state"
@@ -198,6 +200,7 @@ def test_resume_with_far_fewer_cells_than_at_the_start(ctx, tmp_path):
     )
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("kind", ["adaptive", "in 3D"])
 def test_stopped_before_the_first_step(ctx, tmp_path, kind):
     box, size = (BOX_3D, SIZE_3D) if kind == "in 3D" else (BOX, SIZE)
@@ -226,6 +229,7 @@ def test_resume_at_the_end_of_the_run(ctx, tmp_path):
     )
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("before", ["diagram", "failed run"])
 @pytest.mark.parametrize("square", [clvoro.Box((0, 0), (1, 1)), clvoro.Box((0,) * 3, (1,) * 3)])
 def test_after_something_larger(ctx, tmp_path, square, before):
@@ -393,6 +397,7 @@ DAMAGED_LEVELS = {
 }
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("name", list(DAMAGED_LEVELS))
 def test_damaged_levels_are_rejected(ctx, tmp_path, monkeypatch, name):
     monkeypatch.setattr(poisson, "expected_costs", lambda *_: (1.0, 0.0))

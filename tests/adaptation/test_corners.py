@@ -168,6 +168,7 @@ def project(ctx, domain, points, real="float64", fixed=0):
     return origin + mesh.to_host(mesh.points, scale), mesh.to_host(mesh.velocity, scale)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("domain", [L, WEDGE], ids=["L", "wedge"])
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_projection(ctx, domain, real):
@@ -266,6 +267,7 @@ def test_tips_that_matter(domain, h, expected):
     assert sorted(map(tuple, found[groups.angles < np.pi].tolist())) == expected
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_projection_at_a_tip(ctx, real):
     """The second and the third generator get their mean distance, and turn apart until 0.4 of the angle is between."""
@@ -299,7 +301,7 @@ def test_wide_tips(ctx):
         assert (np.ptp(away) < 1e-9) == equal
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("degrees", [12, 20, 30, 42])
 @pytest.mark.parametrize(
     ("method", "effort"), [("adaptive", "fast"), ("adaptive", "default"), ("exact", "default")]
@@ -372,6 +374,7 @@ RUNS = [
 ]
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(("method", "real", "domain", "more"), RUNS)
 def test_faces_end_in_corners(method, real, domain, more, adapter, adapter32):
     h, more = 0.045, dict(more)

@@ -21,6 +21,7 @@ def engine(ctx, request):
     return patch.make_engine(ctx, real, group_size=group_size)
 
 
+@pytest.mark.sparse(2)
 def test_excess(engine):
     t = patch.tessellate(engine, patch.random_points(N, 111))
     h = np.random.default_rng(5).uniform(0.01, 0.2, N)
@@ -36,6 +37,7 @@ def test_excess(engine):
     assert w.log_ratio.get() == pytest.approx(excess - mean, abs=rel)
 
 
+@pytest.mark.sparse(1)
 def test_gradient_of_an_exponential(engine):
     """A linear log h is fitted exactly, also at walls and in corners, with at least two neighbors."""
     points = patch.random_points(N, 112)

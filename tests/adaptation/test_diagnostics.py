@@ -203,6 +203,7 @@ effort = "fast"
 """
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(("center", "said"), [("900, 400", True), ("0.9, 0.4", False)])
 def test_the_command_line_warns(tmp_path, capfd, center, said):
     (tmp_path / "c.toml").write_text(CASE.replace("CENTER", center))
@@ -218,6 +219,7 @@ JUMP = sizing.Expression("x < 0.95 ? 0.05 : 0.01")
 """Of a twentieth of a cell at the wall: the cells beside it ask for what no neighbor of theirs can be."""
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("size", "n_cells", "category", "advice"),
     [
@@ -239,6 +241,7 @@ def test_warnings_of_coarse_sizes(ctx, size, n_cells, category, advice):
         assert w.filename == __file__
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "effort"),
     [("adaptive", "fast"), pytest.param("exact", "default", marks=pytest.mark.slow)],

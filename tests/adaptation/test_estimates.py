@@ -64,7 +64,7 @@ def bench(monkeypatch):
     return importlib.import_module("memory")
 
 
-@pytest.mark.sparse
+@pytest.mark.slow
 @needs_bench
 @pytest.mark.parametrize("real", [np.dtype("float64"), np.dtype("float32")], ids=str)
 @pytest.mark.parametrize(("dim", "field", "n"), CASES)
@@ -84,6 +84,7 @@ def test_figures_match_measured_buffers(bench, dim, field, n, real):
     assert 0.85 <= found["held"] <= 1.1
 
 
+@pytest.mark.slow
 @needs_bench
 @pytest.mark.parametrize(
     ("name", "real"),
@@ -103,6 +104,7 @@ def test_steep_sizes_are_allowed_for(bench, name, real):
     assert LEAST_HELD <= found["held"] <= 1.1, found
 
 
+@pytest.mark.slow
 @needs_bench
 @pytest.mark.parametrize("extent", [(1, 1e-5), (1, 1, 1e-5)], ids=["thread", "sheet"])
 def test_thin_boxes_take_no_more(bench, extent):
@@ -147,6 +149,7 @@ KINDS = {
 """Domain, size, and what else a run is given."""
 
 
+@pytest.mark.slow
 @needs_bench
 @pytest.mark.parametrize("real", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
 @pytest.mark.parametrize(
@@ -175,6 +178,7 @@ GOING_ON = {
 """Domain and size."""
 
 
+@pytest.mark.slow
 @needs_bench
 @pytest.mark.parametrize(
     "name",
@@ -211,7 +215,7 @@ DIAGRAMS = {
 }
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @needs_bench
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", DIAGRAMS)
@@ -284,7 +288,7 @@ def test_groups_of_a_gpu_hold_what_is_told(bench, real):
     assert 0.85 <= held / estimate <= 1.1
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @needs_bench
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("n", [1, 30, 1000])
@@ -353,6 +357,7 @@ def test_estimate_does_not_depend_on_the_unit_of_length():
     assert found == [found[0]] * 3
 
 
+@pytest.mark.slow
 def test_estimate_does_not_depend_on_the_position_of_the_periodic_boundary():
     """Images by balls alone where cells are alike; of a strip all cells wherever it meets a seam."""
     for box in (TORUS, clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)):
@@ -418,6 +423,7 @@ def test_estimate_includes_the_size_field(bench):
         assert 0.85 <= held / estimate <= 1.1
 
 
+@pytest.mark.sparse(1)
 @needs_bench
 @pytest.mark.parametrize(
     ("dim", "old", "new", "order"), [(2, 2000, 2000, 1), (2, 4000, 100, 2), (3, 300, 900, 2)]
@@ -569,6 +575,7 @@ def largest(monkeypatch):
     return found
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize(
     ("domain", "size"),

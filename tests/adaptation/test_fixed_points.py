@@ -37,7 +37,7 @@ def beside(mesh, k):
     return np.union1d(found[found >= 0], np.arange(k))
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("kind", list(RUNS))
 def test_generators_stay_and_their_cells_have_the_sizes(ctx, monkeypatch, dtype, kind):
@@ -65,6 +65,7 @@ def test_generators_stay_and_their_cells_have_the_sizes(ctx, monkeypatch, dtype,
     assert mesh.check()
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("method", ["lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"])
 def test_published_methods_keep_them_and_the_number_of_cells(adapter, method):
     start = np.random.default_rng(1).random((90, 2)) * (2, 1)

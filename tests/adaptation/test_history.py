@@ -44,6 +44,7 @@ def test_diagram_is_computed_again_at_the_end(ctx, dtype):
     assert others > 0, "the last step and the end have decided alike: nothing is tried here"
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("kind", "levels", "stopped"),
     [(kind, 0, 0) for kind in DOMAINS] + [("flat", 0, 1), ("flat", 1, 0), ("flat", 1, 1)],
@@ -154,6 +155,7 @@ def press_anywhere(adapter, kind, times):
     assert came >= times // 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["counted", "coupled"])
 def test_interruption_at_some_lines(adapter, kind):
     press_anywhere(adapter, kind, 4)

@@ -227,6 +227,7 @@ def test_two_pairs_of_opposite_strain_both_climb(engine):
     assert sweep.points[sweep.moved[0], 0] < 0.5 < sweep.points[sweep.deleted[0], 0]
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("total", [-30.0, -9.4, -1.0, 1.0, 6.0, 30.0])
 def test_number_is_corrected_exactly(engine, total):
     """Without climbing: the exact number, the strongest first, with a least distance, at most a share in one call."""
@@ -262,6 +263,7 @@ def test_cells_are_split_along_their_longest_axis(engine):
         assert np.abs(sweep.born - other).max(axis=1).min() < 1e-12
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 @pytest.mark.parametrize("total", [-50.0, 50.0])
 @pytest.mark.parametrize("climb", [True, False])
@@ -356,6 +358,7 @@ def test_no_nucleation_without_strain(engine):
     )
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_repeated_runs_give_the_same_bits(ctx, real):
     engine = patch.make_engine(ctx, real)

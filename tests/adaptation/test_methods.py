@@ -139,6 +139,7 @@ def test_weighted_moves_at_most_k(stages, poisson, cautious):
     assert mesh.points.get()[inside] == pytest.approx(expected[inside], abs=1e-13)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("name", [*PUBLISHED, "glide", "polish"])
 def test_perfect_mesh_does_not_change(stages, name):
     """A square lattice of the target size is at rest, also at walls."""
@@ -225,6 +226,7 @@ def test_mean_log_ratio_error_of_perfect_cells(stages):
     assert np.isfinite(method.penalty)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("value", ["-0.02", "0.0", "0.0/0.0"])
 def test_invalid_size_is_reported_as_in_the_field(stages, value):
     """On a coarse level h is a multiple of the field."""

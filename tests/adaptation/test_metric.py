@@ -33,6 +33,7 @@ def second_moment(polygon, x):
     return total
 
 
+@pytest.mark.sparse(1)
 def test_definitions(engine):
     points = patch.random_points(N, 618).astype(engine.real).astype(float)
     rng = np.random.default_rng(55)

@@ -61,6 +61,7 @@ def test_gradient_is_the_sum_over_faces(ctx):
     assert u == pytest.approx(expected, rel=1e-11, abs=1e-11)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize(("limit", "k"), [(2.0, 0.5), (2.0, 1e3), (0.25, 0.5), (7.0, 1e-3)])
 def test_relax_globally(engine, limit, k):
     """One alpha for all, alpha = min(limit, k / max(|u| / h))."""
@@ -110,6 +111,7 @@ def move(engine, box, points, lloyd, a, correction, b, h, clip):
     return on_device.get(), velocity.get()
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("clip", [0.0, 0.3])
 @pytest.mark.parametrize(("a", "b"), [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.7, -2.0)])
 def test_move(engine, clip, a, b):

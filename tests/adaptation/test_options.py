@@ -27,6 +27,8 @@ SIZE = clvoro.sizing.Expression("0.16 + 0.1 * x")
 CHANGED_LEVELS = {"effort": "best", "levels": 1, "error_target": 0.02}
 CHANGED_STEPS = {"tol": 0.9, "alpha": 0.1, "k": 0.1}
 CHANGED = CHANGED_LEVELS | CHANGED_STEPS
+FEW = ("adaptive", "coupled")
+"""One method of each of the two classes of options."""
 CASE = """
 [domain]
 lower = [0, 0]
@@ -62,7 +64,8 @@ def test_adapt_has_the_defaults_of_a_run():
         assert parameter.annotation == of_run[name].annotation, name
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.sparse(2)
+@pytest.mark.parametrize("method", sorted(METHODS, key=FEW.__contains__, reverse=True))
 def test_options_are_used_or_warned_of(adapter, method):
     """An option changes the result, its history, or causes a warning."""
 
@@ -161,6 +164,7 @@ def run(folder, text, *options):
     return cli.main([*run, *options])
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize(
     ("run_table", "options", "warned"),
     [
@@ -193,6 +197,7 @@ def demand_use(case):
         warn_of_unused(case.run, [method or Options.method for method in case.methods])
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("name", builtin_cases())
 def test_built_in_cases_have_no_unused_options(name):
     case = load_case(name)

@@ -55,6 +55,7 @@ def test_warnings_and_errors_at_the_bounds(ctx, real):
         check(1.0, unit * 1.01)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("noise", [1e-2, 1e-1])
 @pytest.mark.parametrize(
     ("box", "h"), [(clvoro.Box((0, 0), (1, 1)), 0.05), (clvoro.Box((0,) * 3, (1,) * 3), 0.15)]
@@ -87,6 +88,7 @@ def test_runs_say_it_before_they_begin(ctx):
         double.run(box, field, method="weighted", max_steps=0, seed=5)
 
 
+@pytest.mark.slow
 def test_single_precision_with_sizes_1_to_1000(ctx):
     """The mean error is that of double precision to 1e-3, without a warning. `bench/diagnostics.py` does 1e6 cells."""
     box = clvoro.Box((0, 0), (2.5, 1.5))

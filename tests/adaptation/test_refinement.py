@@ -24,6 +24,7 @@ def as_sorted(points):
     return points[np.lexsort(points.T)]
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("n", [1, 2, 3, 40, 700])
 def test_children(ctx, real, n):
@@ -89,6 +90,7 @@ def children_in(shape, tangents, host, h, labels, fixed):
     return np.array(children)
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("fixed", [0, 30])
 @pytest.mark.parametrize("name", ["star", "holes", "islands", "comb", "fine comb", "corner"])
 def test_children_in_polygons(ctx, name, fixed):

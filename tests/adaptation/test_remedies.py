@@ -88,6 +88,7 @@ def test_coordinates_of_maps() -> None:
         Surface(corners, [(0, 1, 2), (0, 1, 3), (0, 2, 3)]).require_closed()
 
 
+@pytest.mark.slow
 def test_shapes_at_a_seam_are_to_be_repeated(ctx) -> None:
     torus, adapter = clvoro.Box((0, 0), (1, 1), periodic=True), clvoro.Adapter(ctx)
     spots = [sizing.Circle((0.05 + k, 0.5), radius=0.02) for k in (0, -1, 1)]

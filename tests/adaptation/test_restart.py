@@ -39,6 +39,7 @@ def steps_to_tolerance(history):
     return int(history["step"][np.argmax(within)]) if within.any() else None
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_moved_by_two_cells(adapter, first, dim):
     before = first[dim]
@@ -53,6 +54,7 @@ def test_moved_by_two_cells(adapter, first, dim):
     assert after.converged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["adaptive", "exact"])
 def test_moved_again_and_again(adapter, first, method):
     points = first[2].points

@@ -48,6 +48,7 @@ def test_row_i_is_the_callers_generator(adapter):
     assert result.initial.points + result.initial.lloyd == pytest.approx(result.points, abs=1e-12)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_no_steps(adapter, method):
     points = random_points(300, 6)
@@ -60,6 +61,7 @@ def test_no_steps(adapter, method):
     check(result, F1)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("method", ["lloyd", "weighted-lloyd"])
 def test_warm_start(adapter, method):
     """Five steps, and five more from their result, are the same as ten."""
@@ -124,6 +126,7 @@ def test_threads_take_turns(adapter):
             assert np.array_equal(points, alone)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     "options",
     [
@@ -152,6 +155,7 @@ def test_seed(adapter, start):
     assert (a.points != b.points).all()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(("method", "steps", "off"), [("coupled", 5, 1e-7), ("weighted", 3, 5e-6)])
 def test_units_do_not_matter(adapter, method, steps, off):
     """A mesh in millimeters far from the origin is the same mesh."""
@@ -248,6 +252,7 @@ def test_adaptive_runs_end_with_the_schedule(adapter):
 LEVELS = {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("options", "rows"),
     [
@@ -283,6 +288,7 @@ def test_other_values_of_the_callback_do_not_stop(adapter):
     assert result.history["step"][-1] == 3
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("options", "rows"),
     [({"method": "coupled"}, 1), ({"method": "coupled"}, 5), (LEVELS, 3), ({"effort": "fast"}, 50)],
@@ -328,7 +334,7 @@ def test_max_steps_of_adaptive_runs(adapter):
 # Counts and levels.
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 250])
 def test_n_cells_is_held(adapter, method, n):
@@ -345,6 +351,7 @@ def test_n_cells_is_held(adapter, method, n):
         )
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("n_cells", [400, 1000])
 def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
     """The mesh is as good as with the count of the field."""
@@ -356,6 +363,7 @@ def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
     check(result, F1)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(("seed", "n_cells", "least"), [(5, None, 0.948), (7, 4500, 0.94)])
 def test_worst_cells_are_mended(adapter, seed, n_cells, least):
     """The worst cells off the walls get better by generators that come or go while cells are polished.
@@ -383,6 +391,7 @@ def test_number_of_cells_is_that_of_the_size_field(adapter):
         assert result.size_factor == 1
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("levels", [0, 1, 2])
 def test_levels(adapter, levels):
     result = adapter.run(
@@ -405,6 +414,7 @@ def test_levels_from_the_callers_points(adapter):
         check(result, F1)
 
 
+@pytest.mark.slow
 def test_far_too_many_points(adapter):
     """They are reduced to the number that the size field requires."""
     result = adapter.run(BOX, F1, random_points(3000, 17), effort="fast")
@@ -419,6 +429,7 @@ def figures(result):
     return e.mean(), e.max(), q.mean(), q.min()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "error", "quality"),
     [
@@ -465,12 +476,12 @@ def test_published_ordering(adapter):
     assert coupled[2] < lloyd[2] + 0.005
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("options", "mean", "largest", "quality", "least"),
     [
-        ({}, 0.002, 0.02, 0.967, 0.85),
         ({"effort": "fast"}, 0.010, 0.1, 0.967, 0.85),
+        ({}, 0.002, 0.02, 0.967, 0.85),
         ({"method": "exact"}, 1e-3, 1e-3, 0.965, 0.85),
     ],
 )
@@ -506,6 +517,7 @@ def test_final_displacements_are_those_of_the_last_step(adapter):
     assert (np.linalg.norm(whole.points - stopped.points, axis=1) > 0).all()
 
 
+@pytest.mark.slow
 def test_error_target_trades_sizes_for_quality(adapter):
     """A larger error target gives better cells."""
     tight, loose = (
@@ -523,9 +535,10 @@ def test_error_target_trades_sizes_for_quality(adapter):
 # Nasty size fields.
 
 NASTY = {
-    "ratio 100 across a line": sizing.Expression("x < 1.25 ? 0.03 : 3.0"),
     "ratio 100 across a slanted line": sizing.Expression("x + 0.37*y < 0.8 ? 0.02 : 2.0"),
     "spike narrower than its own h": sizing.Expression("hypot(x-1.2, y-0.7) < 0.002 ? 0.02 : 0.1"),
+    "larger than the domain": sizing.Constant(100.0),
+    "ratio 100 across a line": sizing.Expression("x < 1.25 ? 0.03 : 3.0"),
     "peak": sizing.Expression("0.05 + 5*exp(-400*((x-1.2)*(x-1.2)+(y-0.7)*(y-0.7)))"),
     "steep": sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.01, slope=3),
     "growth off a wall": sizing.Expression("0.02 + 0.5*y"),
@@ -533,11 +546,11 @@ NASTY = {
     "stripes": sizing.Expression("0.08 + 0.06*sin(40*x)"),
     "constant": sizing.Constant(0.07),
     "about the domain": sizing.Constant(1.3),
-    "larger than the domain": sizing.Constant(100.0),
     "just the domain": sizing.Constant(np.sqrt(3.75)),
 }
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
 @pytest.mark.parametrize("name", NASTY)
 def test_nasty_fields(adapter, name):
@@ -553,7 +566,7 @@ def test_nasty_fields(adapter, name):
         assert np.abs(result.size_error).mean() < 0.05
 
 
-@pytest.mark.sparse
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
 @pytest.mark.parametrize(
     "name", ["ratio 100 across a line", "spike narrower than its own h", "larger than the domain"]

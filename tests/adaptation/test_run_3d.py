@@ -42,7 +42,7 @@ def second_moment(cell, x):
 # Every method.
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_every_method(adapter, adapter32, dtype, method):
@@ -55,6 +55,7 @@ def test_every_method(adapter, adapter32, dtype, method):
     assert h["mean_quality"][-1] > h["mean_quality"][0] or method == "poisson"
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_uniform_start_and_count(adapter, method):
     result = adapter.run(
@@ -72,6 +73,7 @@ def test_uniform_start_and_count(adapter, method):
     check(result, SMALL)
 
 
+@pytest.mark.slow
 def test_figures_of_repeated_steps(adapter):
     """Lloyd's alone never meets the sizes, Poisson's alone meets them with poor cells, coupled does both."""
     start = random_points(500, 18)
@@ -91,7 +93,7 @@ def test_figures_of_repeated_steps(adapter):
     assert weighted[0] < coupled[0]
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize(
     ("options", "mean", "largest", "quality"),
@@ -132,6 +134,7 @@ def test_row_i_is_the_callers_generator(adapter):
     )
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_no_steps(adapter, method):
     points = random_points(200, 6)
@@ -143,6 +146,7 @@ def test_no_steps(adapter, method):
     check(result, SMALL)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("method", ["lloyd", "weighted-lloyd"])
 def test_warm_start(adapter, method):
     """Four steps, and four more from their result, are the same as eight."""
@@ -169,6 +173,7 @@ def test_origin_names_the_callers_generators(adapter):
     check(result, SMALL)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("dtype", "options"),
     [
@@ -215,7 +220,7 @@ def test_units_do_not_matter(adapter):
 # How a run ends; counts and levels.
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("options", "rows"),
     [({"method": "coupled"}, 4), ({"options": clvoro.MultilevelOptions(levels=1)}, 6)],
@@ -246,7 +251,7 @@ def test_stopped(adapter, options, rows, how):
     check(result, S1)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_n_cells_is_held(adapter, method, n):
@@ -255,6 +260,7 @@ def test_n_cells_is_held(adapter, method, n):
     check(result, SMALL)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("n_cells", [210, 260])
 def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
     result = adapter.run(BOX, SMALL, n_cells=n_cells, method="exact", seed=15)
@@ -279,6 +285,7 @@ def test_levels(adapter, levels):
     check(result, S1)
 
 
+@pytest.mark.slow
 def test_levels_from_the_callers_points(adapter):
     for n, level in ((250, 1), (1900, 0)):
         result = adapter.run(BOX, S1, random_points(n, 17), effort="fast")
@@ -350,6 +357,7 @@ SIMILAR = ("smaller of two", "segment", "jump", "corner", "wall", "about the dom
 """Fields that are similar to others of these."""
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.filterwarnings(
     "ignore::clvoro.errors.CoarseSizeWarning"
 )  # one is larger than the domain
@@ -384,6 +392,7 @@ def test_callable_and_device_field_agree(adapter):
     assert host.points == pytest.approx(device.points, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [
@@ -453,6 +462,7 @@ def test_a_lattice_keeps_its_quality(adapter):
 # Bad input.
 
 
+@pytest.mark.sparse(9)
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [

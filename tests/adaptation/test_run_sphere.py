@@ -27,15 +27,16 @@ def angles_of_triangles(diagram):
     return np.degrees(np.arccos(cosines))
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.filterwarnings("ignore::clvoro.errors.ObtuseTrianglesWarning")
-@pytest.mark.parametrize(("method", "effort"), [("adaptive", "best"), ("exact", "default")])
+@pytest.mark.parametrize(("method", "effort"), [("exact", "default"), ("adaptive", "best")])
 def test_few_cells(ctx, method, effort):
     result = clvoro.Adapter(ctx).run(EARTH, 1e6, method=method, effort=effort, n_cells=20)
     assert len(result.diagram) == 20
     assert result.check().ok
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize(
     ("method", "most", "widest"), [("adaptive", 0.0025, 90), ("exact", 3e-4, 90)]
@@ -61,6 +62,7 @@ def test_sizes_and_shapes(ctx, method, most, widest, real):
     assert areas == pytest.approx(expected.areas, rel=rounding)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("method", ["lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"])
 def test_methods_of_the_paper(ctx, method):
     result = clvoro.Adapter(ctx).run(EARTH, SIZE, method=method, points="uniform", max_steps=40)
@@ -70,6 +72,7 @@ def test_methods_of_the_paper(ctx, method):
     assert result.diagram.volumes.sum() == pytest.approx(EARTH.measure, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_number_of_cells(ctx):
     result = clvoro.Adapter(ctx).run(EARTH, SIZE, n_cells=1000, effort="fast")
     assert len(result.diagram) == 1000
@@ -81,12 +84,6 @@ def quick(ctx):
     return clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast")
 
 
-def test_same_input_same_bits(ctx, quick):
-    again = clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast")
-    assert np.array_equal(again.points, quick.points)
-    assert np.array_equal(again.diagram.volumes, quick.diagram.volumes)
-
-
 def test_diagram_of_the_result(ctx, quick):
     """What steps updated is the diagram of the generators."""
     result = quick
@@ -96,6 +93,7 @@ def test_diagram_of_the_result(ctx, quick):
     assert again.volumes == pytest.approx(result.diagram.volumes, rel=1e-10)
 
 
+@pytest.mark.slow
 def test_icosahedral_start(ctx):
     """Lloyd's method keeps the twelve pentagons and makes the cells equal."""
     start = EARTH.icosahedral_points(4)
@@ -116,6 +114,7 @@ def test_icosahedral_start(ctx):
     assert moved[1] < 0.3 * moved[0]
 
 
+@pytest.mark.slow
 def test_warm_start(ctx):
     adapter = clvoro.Adapter(ctx)
     first = adapter.run(EARTH, SIZE)
@@ -138,6 +137,7 @@ def test_checkpoint(ctx, quick, tmp_path):
     assert np.array_equal(rest.points, whole.points)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_obtuse_triangles_are_opened(ctx, real):
     """Random cells have many. The shortest move of the corners gives each its missing height, to first order."""
@@ -173,7 +173,7 @@ def test_warning_of_obtuse_triangles(ctx):
     """It has their number and the place of the worst; the same sizes with a bounded growth leave none."""
 
     def jump(lonlat):
-        return np.where(np.abs(lonlat[:, 1]) < 30, 3e5, 1.2e6)
+        return np.where(np.abs(lonlat[:, 1]) < 30, 6e5, 2.4e6)
 
     adapter = clvoro.Adapter(ctx)
     with warnings.catch_warnings(record=True) as caught:
@@ -197,6 +197,7 @@ def test_warning_of_obtuse_triangles(ctx):
     assert graded.measures.c_grid.obtuse == 0
 
 
+@pytest.mark.slow
 def test_no_obtuse_triangles_with_little_effort(ctx):
     """A cell of four sides would have one: with this seed there is one before the last steps."""
     result = clvoro.Adapter(ctx).run(EARTH, 1e6, n_cells=10_242, effort="fast", seed=11)

@@ -69,6 +69,7 @@ def at_walls(host):
 # Metric.
 
 
+@pytest.mark.sparse(1)
 def test_metric(engine):
     points = random_points(N, 618, engine.real)
     rng = np.random.default_rng(55)
@@ -207,6 +208,7 @@ def test_projection_uses_the_derivative_of_the_volumes(double):
 # Refinement.
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("n", [1, 2, 3, 200])
 def test_children(engine, n):
     points = random_points(n, n + 41, engine.real)
@@ -278,6 +280,7 @@ class Sweep:
         self.born = self.points[~old]
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("total", [-7.0, -1.0, 1.0, 7.0, 500.0, -500.0])
 def test_number_is_corrected_exactly(engine, total):
     n = 600
@@ -313,6 +316,7 @@ def test_cells_are_split_along_their_longest_axis(double):
         assert np.abs(sweep.born - (2 * centroid - there)).max(axis=1).min() < 1e-12
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("n", [1, 2, 3])
 @pytest.mark.parametrize("total", [-50.0, 50.0])
 def test_few_cells(engine, n, total):

@@ -33,6 +33,7 @@ def inner_faces(host):
     return k, host.owners[k], host.neighbors[k]
 
 
+@pytest.mark.sparse(2)
 def test_gradient_of_log_h(engine, box, t):
     """The gradient is a least-squares fit with weights 1 / distance^2. Weighted centroids follow from it."""
     h = np.random.default_rng(5602).uniform(0.02, 0.2, N)
@@ -69,6 +70,7 @@ def test_gradient_of_a_potential(engine, box, t):
     assert u.get() == pytest.approx(expected, rel=1e-11, abs=1e-11)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("clip", [0.0, 0.7])
 def test_moves(engine, box, clip):
     """Walls reflect, seams are crossed, and h limits the displacement. Fixed generators do not move."""
@@ -140,6 +142,7 @@ def test_sizes_that_are_held(engine, box, t):
         assert on_device.get() == pytest.approx(expected, rel=4 * np.finfo(float).eps)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("fixed", [0, 90])
 def test_children(engine, box, t, fixed):
     """New generators are at midpoints across large faces and at walls, but not at fixed generators."""

@@ -136,6 +136,7 @@ def test_walls_that_are_thin(thickness, expected):
     assert not has_thin_walls(clvoro.Polygon(post), np.full(4, H))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 8])
 def test_cells_beside_a_slit(seed):
     """They are as good as elsewhere. Without pairs some reach through the wall, and Q is below 0.5 from any start.

@@ -14,6 +14,7 @@ def size(points):
     return 0.07 + 0.08 * points[:, 0]
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("domain", "h", "real"),
     [
@@ -51,6 +52,7 @@ def test_all_cells_have_their_size(ctx, domain, h, real):
     )
 
 
+@pytest.mark.slow
 def test_a_resumed_run_ends_with_the_same_bits(ctx, tmp_path):
     adapter, run = clvoro.Adapter(ctx), {"method": "transport", "effort": "fast", "n_cells": 90}
     whole = adapter.run(BOX, size, **run)

@@ -84,6 +84,7 @@ def test_the_body_is_the_formula_it_names():
     assert case.size_field()(body.vertices) == pytest.approx(0.025)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sphere", pytest.param("surface", marks=pytest.mark.slow)])
 def test_run_writes_everything(here, capsys, name):
     assert call("run", name, "--cells", 300, "--effort", "fast", "--json") == cli.OK
@@ -101,6 +102,7 @@ def test_run_writes_everything(here, capsys, name):
         assert (out / "lobes.obj").is_file(), "the case's file is copied along"
 
 
+@pytest.mark.slow
 def test_printed_case_runs_elsewhere(here, capsys):
     """Its surface is found among the built-in cases' files, unless one of that name lies beside it."""
     assert call("cases", "surface") == cli.OK

@@ -146,6 +146,7 @@ def test_fractal_rings_do_not_cross_themselves() -> None:
     assert (ring[:: 1 << 7] == SQUARE).all()
 
 
+@pytest.mark.slow
 def test_the_lake_is_that_of_its_script() -> None:
     file = FOLDER / "lake.geojson"
     assert file.stat().st_size < 100_000
@@ -157,6 +158,7 @@ def test_the_lake_is_that_of_its_script() -> None:
     assert {"lake", "channel"} <= set(builtin_cases())
 
 
+@pytest.mark.slow
 def test_the_lake_has_cells_across_its_straits() -> None:
     case = load_case("lake")
     size, domain = case.size_field(), case.domain

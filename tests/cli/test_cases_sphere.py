@@ -213,6 +213,7 @@ def test_ocean_is_what_it_says():
     assert np.mean(size(x) ** -2.0) * case.domain.measure == pytest.approx(15700, rel=0.01)
 
 
+@pytest.mark.slow
 def test_run_writes_everything(here, capsys):
     options = ("--cells", 500, "--effort", "fast", "--json", "--format", "nc,mpas,metis")
     assert call("run", "ocean", *options) == cli.OK
@@ -255,6 +256,7 @@ def test_meshes_are_checked_and_converted(here, capsys):
     assert call("check", "b.vtu", "b.npz") == cli.OK
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -292,6 +294,7 @@ def test_start_from_longitudes_and_latitudes(here):
     assert load(here / "out/small/mesh.npz").points == pytest.approx(X, rel=1e-9, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sizes", ["250 + lat * {t}", "300 + 0 * {t}"], ids=["moving", "constant"])
 def test_frames(here, sizes):
     text = SMALL.replace(

@@ -131,6 +131,7 @@ def test_meshes_are_checked_for_a_solver(here, capsys, monkeypatch):
     assert "no mesh is written for OpenFOAM" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_solver_checks_the_mesh_itself(here, capsys, monkeypatch):
     """With a stand-in for checkMesh, which has the last word."""
     (here / "round.toml").write_text(ROUND)
@@ -200,6 +201,7 @@ def test_start_from_points(here):
     assert call("run", "out/warm/case.toml", "--no-report", "--quiet", "--out", "again") == cli.OK
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("last_step", [0, 2])
 def test_interrupt_keeps_what_there_is(here, monkeypatch, capsys, last_step):
     plain = progress.Progress.__call__
@@ -350,6 +352,7 @@ def test_usage(arguments, capsys):
     assert "usage:" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_cases_are_listed_and_printed(here, capsys):
     assert call("cases") == cli.OK
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [
@@ -367,11 +370,13 @@ def test_cases_are_listed_and_printed(here, capsys):
     assert call("run", "mine.toml", "--steps", 0, "--no-report", "--quiet") == cli.OK
 
 
+@pytest.mark.slow
 def test_devices(capsys):
     assert call("devices") == cli.OK
     assert "float64" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_module_and_version():
     run = [sys.executable, "-m", "clvoro", "--version"]
     shown = subprocess.run(run, capture_output=True, text=True, check=True)

@@ -64,6 +64,7 @@ def meshes(request, ctx):
     return diagram, before, diagram.solver_mesh()
 
 
+@pytest.mark.sparse(2)
 def test_short_edges_and_small_faces_are_gone(meshes):
     """Cells with edges shorter than 0.02 h, and with faces smaller than 0.001 h^2."""
     _, *both = meshes
@@ -73,6 +74,7 @@ def test_short_edges_and_small_faces_are_gone(meshes):
     assert faces[1] <= 0.03 * faces[0]
 
 
+@pytest.mark.sparse(2)
 def test_skewed_faces_are_rarer(meshes):
     """Small faces between two cells, far from the line between the centroids."""
     diagram, *both = meshes
@@ -86,6 +88,7 @@ def test_skewed_faces_are_rarer(meshes):
     assert skewed[1] <= 0.2 * skewed[0]
 
 
+@pytest.mark.sparse(2)
 def test_cells_fill_the_domain(meshes):
     diagram, _, after = meshes
     volumes = after.measures.geometry.volumes
@@ -95,6 +98,7 @@ def test_cells_fill_the_domain(meshes):
     assert len(after) == len(diagram)
 
 
+@pytest.mark.sparse(2)
 def test_walls_edges_and_corners_stay(meshes):
     diagram, _, after = meshes
     box = diagram.domain
@@ -117,6 +121,7 @@ def test_walls_edges_and_corners_stay(meshes):
         assert away.min(axis=1).max() < 1e-15
 
 
+@pytest.mark.sparse(2)
 def test_cells_are_polyhedra(meshes):
     """Euler's formula, two faces at each edge, and faces that meet on one path."""
     _, _, after = meshes
@@ -139,6 +144,7 @@ def test_cells_are_polyhedra(meshes):
     assert len(np.unique(pairs, axis=0)) == len(pairs)
 
 
+@pytest.mark.sparse(2)
 def test_faces_are_flat_and_cells_convex(meshes):
     _, _, after = meshes
     m = after.measures
@@ -148,6 +154,7 @@ def test_faces_are_flat_and_cells_convex(meshes):
     assert not m.concave.any()
 
 
+@pytest.mark.sparse(2)
 def test_faces_are_in_order_and_seams_are_images(meshes):
     _, _, after = meshes
     inner = list(zip(after.owner[: after.inner], after.neighbor[: after.inner], strict=True))
@@ -183,10 +190,10 @@ def test_merges_are_those_of_a_slow_reference():
     ends = np.stack([mesh.corners, mesh.corners[following(mesh.starts)]], axis=1)
     ends = np.unique(np.sort(ends, axis=1), axis=0)
     length = np.linalg.norm(mesh.points[ends[:, 0]] - mesh.points[ends[:, 1]], axis=1)
-    ends = ends[np.argsort(length)][:25]
+    ends = ends[np.argsort(length)][:12]
     apart = [
         rng.choice(mesh.corners[mesh.starts[f] : mesh.starts[f + 1]], 2, replace=False)
-        for f in rng.integers(len(mesh.owner), size=10)
+        for f in rng.integers(len(mesh.owner), size=6)
     ]
     limits, verdicts = Limits(non_orthogonality=60, skewness=4), []
     for a, b in [*ends.tolist(), *np.array(apart).tolist()]:
@@ -224,7 +231,7 @@ def test_merges_are_those_of_a_slow_reference():
             made = polyhedra.Mesh.of(collapse._unfold(mesh, cells, np.arange(len(mesh.owner))))
             assert len(made.faces) == len(new.faces)
             assert len(made.points) == len(new.points)
-    assert 8 < sum(verdicts) < len(verdicts) - 8
+    assert 3 < sum(verdicts) < len(verdicts) - 3
 
 
 def test_clear_meshes_are_left_alone():

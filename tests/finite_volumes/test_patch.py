@@ -67,6 +67,7 @@ def faces_of(patch) -> set:
     return set(zip(*(c[rows].tolist() for c in columns), strict=True))
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("seed", range(2))
 def test_patches_go_back_as_they_came(mesh, seed):
     chosen = some_cells(mesh, seed)
@@ -165,6 +166,7 @@ def test_positions_run_along_the_rings(domain):
     assert np.array_equal(ring._rings(ahead), ring._rings(s))
 
 
+@pytest.mark.sparse(2)
 def test_points_slide_along_the_boundary_and_fixed_ones_stay(mesh):
     patch, ring = with_positions(mesh, take_patch(mesh, np.ones(len(mesh), bool)))
     given = Descent.of(patch)

@@ -47,6 +47,7 @@ def lengths_of_parts(mesh) -> np.ndarray:
     return np.bincount(part, np.hypot(*(b - a).T))
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("seed", [0, 2])
 def test_repaired_meshes_are_accepted_and_whole(ctx, seed):
     diagram = coast(ctx, seed)
@@ -78,6 +79,7 @@ def test_repaired_meshes_are_accepted_and_whole(ctx, seed):
     assert np.median(np.abs(areas / diagram.volumes - 1)) < 0.02
 
 
+@pytest.mark.slow
 def test_points_alone_do_not_suffice(ctx, monkeypatch):
     """Without other connections some of these meshes remain beyond the limits."""
     monkeypatch.setattr(relaxation, "repaired", lambda given, ring: given)
@@ -115,6 +117,7 @@ def test_all_changes_of_faces_keep_the_mesh_consistent(ctx):
     assert min(count.values()) > 100
 
 
+@pytest.mark.slow
 def test_a_passage_one_cell_wide_gets_faces_that_are_not_parallel(ctx):
     """OpenFOAM refuses cells whose faces to others all have the same direction."""
     domain = clvoro.Polygon([(0, 0), (3, 0), (3, 0.22), (0, 0.18)])

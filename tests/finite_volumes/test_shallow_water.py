@@ -49,6 +49,7 @@ def rms(x):
     return np.sqrt((x**2).mean())
 
 
+@pytest.mark.sparse(1)
 def test_metric_terms(diagram, mesh):
     # Differences of unit vectors some hundredths apart lose two digits of sixteen.
     assert mesh.cell_areas == pytest.approx(diagram.volumes, rel=1e-12)
@@ -67,6 +68,7 @@ def test_edges_are_orthogonal_and_right_handed(mesh):
     assert np.einsum("ij,ij->i", np.cross(normal, along), mesh.crossings).min() > 0.99
 
 
+@pytest.mark.sparse(1)
 def test_tangential_weights_against_a_walk_around_each_cell(mesh):
     m = len(mesh.dc)
     expected = np.zeros((m, m))
@@ -129,6 +131,7 @@ def test_balances_notice_a_wrong_weight(random_model):
     assert found["mass_rate"] < ROUND_OFF
 
 
+@pytest.mark.sparse(1)
 def test_upwinding_does_no_work_and_dissipates_enstrophy(mesh):
     case = shallow_water.set_up(5, mesh, 0.0)
     changes = {}
@@ -141,6 +144,7 @@ def test_upwinding_does_no_work_and_dissipates_enstrophy(mesh):
     assert abs(changes[0.5]["energy"]) < 1e-5
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("alpha", [0.0, 60.0])
 def test_steady_flow_of_case_2(mesh, alpha):
     case = shallow_water.set_up(2, mesh, alpha)

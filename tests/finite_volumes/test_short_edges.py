@@ -57,6 +57,7 @@ def pair(request, ctx):
         return diagram.solver_mesh(walls, collapse=False), diagram.solver_mesh(walls)
 
 
+@pytest.mark.sparse(1)
 def test_short_faces_are_gone(pair):
     before, after = pair
     assert np.count_nonzero(ratios(before) < 1) > 10
@@ -65,6 +66,7 @@ def test_short_faces_are_gone(pair):
     assert len(after) == len(before)
 
 
+@pytest.mark.sparse(1)
 def test_cells_remain_convex_and_the_area_whole(pair):
     before, after = pair
     was = np.array([concave_by(p) for p in cells_of(before)])

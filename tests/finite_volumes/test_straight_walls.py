@@ -182,6 +182,7 @@ def test_points_on_curved_walls_lie_on_the_curves(ctx):
     assert result.solver_mesh("exact", collapse=False).area_change == 0
 
 
+@pytest.mark.slow
 def test_the_change_of_area_is_of_second_order(ctx):
     """Cells beside a circle: chords between points on the circle."""
     disc = clvoro.curves.circle((0.5, 0.5), 0.4)
@@ -195,13 +196,15 @@ def test_the_change_of_area_is_of_second_order(ctx):
     assert order == pytest.approx(2, abs=0.3)
 
 
-@pytest.mark.parametrize("name", ["plane", "solid"])
-def test_vtu_files_hold_solver_meshes(ring, ctx, tmp_path, name):
+@pytest.mark.sparse(1)
+@pytest.mark.parametrize("name", ["solid", "plane"])
+def test_vtu_files_hold_solver_meshes(request, ctx, tmp_path, name):
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy
 
-    result = ring
-    if name == "solid":
+    if name == "plane":
+        result = request.getfixturevalue("ring")
+    else:
         result = clvoro.Adapter(ctx).run(clvoro.Box((0, 0, 0), (1, 1, 1)), 0.2, effort="fast")
     result.save(tmp_path / "exact.vtu", walls="exact")
     result.save(tmp_path / "mesh.vtu")

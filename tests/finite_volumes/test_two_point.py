@@ -38,6 +38,7 @@ def errors(mesh, walls):
     return off.max(), np.sqrt((d.volumes * off**2).sum() / d.volumes.sum())
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("walls", ["straight", "exact"])
 def test_errors_are_of_second_order_up_to_the_walls(walls):
     domain = clvoro.Polygon(PENTAGON, [ISLAND])

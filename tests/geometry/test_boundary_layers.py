@@ -72,6 +72,7 @@ RAGGED = clvoro.Polygon(
 )
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("domain", "edges", "spacing"),
     [(RAMP, range(3), 0.05), (CHANNEL, range(4, 84), 0.0075), (CHANNEL, range(4, 84), 0.014),
@@ -100,6 +101,7 @@ def test_corners_of_the_wall_are_corners_of_cells(adapter, domain, edges, spacin
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_layers_of_a_periodic_channel_go_through_the_seam(adapter, axis):
     """Cells on both walls are rectangles, also at the seam."""
@@ -142,6 +144,7 @@ def test_sizes_grow_from_the_layers(adapter):
     assert result.diagram.volumes.sum() == pytest.approx(CHANNEL.measure, rel=1e-12)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("method", ["lloyd", "coupled", "weighted", "exact"])
 def test_no_method_moves_generators_of_layers(adapter, method):
     layers = Layers(0.04, count=2, edges=range(4, 84))
@@ -207,6 +210,7 @@ def test_widths_of_columns_change_gradually_where_a_closed_wall_begins(start):
     assert 1 / 1.4 < ratio.min() < ratio.max() < 1.4
 
 
+@pytest.mark.slow
 def test_wings_with_thin_layers_are_accepted_by_solvers(adapter):
     wing = clvoro.curves.naca("0012", name="wing")
     domain = clvoro.Polygon([(-1, -1), (2, -1), (2, 1), (-1, 1)], [wing])
@@ -217,7 +221,7 @@ def test_wings_with_thin_layers_are_accepted_by_solvers(adapter):
     assert report, report
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("spacing", [0.01, 0.04])
 @pytest.mark.parametrize("angle", [50.5, 90, 120, 170])
 def test_faces_end_in_the_corners_of_bodies_with_layers(adapter, angle, spacing):
@@ -239,6 +243,7 @@ def test_faces_end_in_the_corners_of_bodies_with_layers(adapter, angle, spacing)
         assert turns.min() > -1e-9
 
 
+@pytest.mark.slow
 def test_there_are_no_levels_too_coarse_for_the_gaps_between_layers(adapter):
     """Cells do not spread past layers, which are fine on all levels."""
     tubes = [clvoro.curves.circle((x, 0.5), 0.2, name=f"tube-{x}") for x in (0.3, 0.9)]
@@ -348,6 +353,7 @@ def test_the_count_bounds_the_number_of_generators(domain, edges):
     assert 0.8 * count < placed <= count
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("beside", [-1e-13, -1e-14, 0, 1e-14, 1e-13, 1e-10])
 def test_strips_may_end_beside_corners(adapter, beside):
     """The region beyond them has no edge as short as round-off there."""
@@ -366,6 +372,7 @@ def test_domains_without_walls_in_2d_are_refused():
         place_layers(BOX, [0.1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_new_generators_keep_away_from_layers_around_corners(ctx, dtype):
     """Cells in narrow tips reach around corners into the layers on the other side. No generator is inserted there."""

@@ -70,6 +70,7 @@ def middles_of_faces(diagram):
     return ends.mean(axis=1), -1 - diagram.neighbors[walls]
 
 
+@pytest.mark.sparse(3)
 def test_neighbors_are_the_callers_edges(meshed) -> None:
     rings, edges, result = meshed
     middles, walls = middles_of_faces(result.diagram)
@@ -113,6 +114,7 @@ def test_layers_stand_on_the_named_walls(meshed) -> None:
     assert away.max() < layers.rows[-1] * (1 + 1e-12)
 
 
+@pytest.mark.sparse(3)
 def test_feature_size_does_not_depend_on_orientation(meshed) -> None:
     _, _, result = meshed
     x = result.diagram.points
@@ -121,6 +123,7 @@ def test_feature_size_does_not_depend_on_orientation(meshed) -> None:
     assert h == pytest.approx(plain, rel=1e-9)
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("walls", ["exact", "straight"])
 def test_openfoam_has_the_names(meshed, tmp_path, walls) -> None:
     _, edges, result = meshed
@@ -163,6 +166,7 @@ def test_netcdf_has_walls_and_names(meshed, tmp_path) -> None:
     assert about["flag_values"].tolist() == list(range(5))
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("suffix", [".npz", ".vtu"])
 def test_files_keep_walls_and_names(meshed, tmp_path, suffix) -> None:
     _, _, result = meshed
@@ -174,6 +178,7 @@ def test_files_keep_walls_and_names(meshed, tmp_path, suffix) -> None:
     assert np.array_equal(again.neighbors, result.diagram.neighbors)
 
 
+@pytest.mark.sparse(2)
 def test_cell_data_have_the_boundary_of_the_largest_face(meshed) -> None:
     _, edges, result = meshed
     d = result.diagram
@@ -231,6 +236,7 @@ def test_names_of_boxes(adapter_of_module, tmp_path) -> None:
     ]
 
 
+@pytest.mark.sparse(2)
 def test_plots_show_the_names(meshed) -> None:
     pytest.importorskip("matplotlib")
     from clvoro.plotting import plot_boundaries

@@ -42,6 +42,7 @@ def sagittas(curve):
     return np.array(found)
 
 
+@pytest.mark.sparse(3)
 @each_curve
 def test_the_polyline_has_equal_sagittas(curve):
     found = sagittas(curve)
@@ -228,6 +229,7 @@ def test_curves_are_shapes_of_size_fields():
 # --- nearest points
 
 
+@pytest.mark.sparse(3)
 @each_curve
 def test_points_on_curves(curve):
     ring = curve if curve.closed else [curve]

@@ -53,6 +53,7 @@ def in_frame(domain):
     return shapely.transform(domain.geometry, lambda x: (x - origin) / scale)
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("name", NAMES)
 def test_one_step_agrees_with_shapely(move, name):
     domain = POLYGONS[name]()
@@ -101,6 +102,7 @@ def edges(domain, origin, scale):
     return list(zip(begins, begins[domain.oriented.next_vertex], strict=True))
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("name", NAMES)
 def test_generators_pushed_outwards_stay_inside(move, name):
     domain = POLYGONS[name]()
@@ -156,7 +158,7 @@ def test_bins_list_all_edges_in_them(name):
             assert e in held[row * shape[0] + column]
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("method", ["lloyd", "poisson", "coupled", "weighted", "exact", "adaptive"])
 def test_runs_stay_inside(ctx, method, real):

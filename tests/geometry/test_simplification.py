@@ -122,6 +122,7 @@ def test_sizes_that_vary():
     assert found.upper[0] < 2.1
 
 
+@pytest.mark.slow
 def test_meshes_of_simplified_domains():
     """The boundary has spikes that are a third of a cell wide."""
     domain = clvoro.Polygon(rough(400, 4)).simplified(0.1)

@@ -40,6 +40,7 @@ def data_for(n):
     }
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("suffix", [".npz", ".vtu"])
 def test_a_diagram_is_loaded_as_it_was_saved(diagram, tmp_path, suffix):
     path = tmp_path / f"diagram{suffix}"
@@ -75,6 +76,7 @@ def test_own_data_in_vtu_and_npz(diagram, tmp_path):
             np.testing.assert_array_equal(found[:, :2] if values.ndim == 2 else found, values)
 
 
+@pytest.mark.sparse(2)
 def test_own_data_in_other_formats(diagram, result, tmp_path):
     data = data_for(len(diagram))
     for suffix in (".foam", ".ply"):
@@ -170,6 +172,7 @@ def test_sizes_are_cell_data(result):
     np.testing.assert_array_equal(np.concatenate(mesh.cell_data["size"]), result.target_size[order])
 
 
+@pytest.mark.sparse(2)
 def test_to_pyvista(diagram):
     pytest.importorskip("pyvista")
     grid = diagram.to_pyvista({"row": np.arange(len(diagram))})

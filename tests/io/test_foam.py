@@ -85,6 +85,7 @@ def prism_volumes(result, points):
     return d.volumes if d.domain.dim == 3 else d.volumes * points[:, 2].max()
 
 
+@pytest.mark.sparse(1)
 def test_order_is_upper_triangular(mesh):
     _, _, owner, neighbor, _ = mesh
     inner = list(zip(owner[: len(neighbor)].tolist(), neighbor.tolist(), strict=True))
@@ -201,6 +202,7 @@ needs_openfoam = pytest.mark.skipif(
 )
 
 
+@pytest.mark.slow
 @needs_openfoam
 def test_as_openfoam_checks_it(result, tmp_path):
     said = check_mesh(result, tmp_path)

@@ -39,6 +39,7 @@ def cyclic(patches):
     return {name: patch for name, patch in patches.items() if patch[0] == "cyclic"}
 
 
+@pytest.mark.sparse(2)
 def test_cells_are_whole_and_closed(result, mesh):
     points, faces, owner, neighbor, _ = mesh
     box, n = result.diagram.domain, len(result.points)
@@ -63,6 +64,7 @@ def test_there_is_one_pair_of_patches_for_each_periodic_direction(result, mesh):
     assert list(cyclic(mesh[-1])) == [f"{axis}{end}" for axis in axes for end in ("Max", "Min")]
 
 
+@pytest.mark.sparse(2)
 def test_both_sides_of_a_seam_are_images_in_the_same_order(result, mesh):
     points, faces, owner, _, patches = mesh
     box, d = result.diagram.domain, result.diagram
@@ -122,6 +124,7 @@ def test_names_of_cyclic_patches_are_reserved(ctx, tmp_path):
         io.polymesh.poly_mesh(diagram)
 
 
+@pytest.mark.sparse(2)
 @needs_openfoam
 def test_as_openfoam_checks_it(result, tmp_path):
     said = check_mesh(result, tmp_path)
@@ -143,6 +146,7 @@ def test_one_cell_is_its_own_neighbor(ctx, tmp_path):
     assert {p.name for p in mesh.patches} == {"xMin", "xMax", "yMin", "yMax", "back", "front"}
 
 
+@pytest.mark.sparse(2)
 @needs_openfoam
 @pytest.mark.skipif(shutil.which("laplacianFoam") is None, reason="laplacianFoam is not installed")
 def test_openfoam_conducts_heat_across_the_seams(result, tmp_path):

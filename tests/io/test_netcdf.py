@@ -56,6 +56,7 @@ def sides(corners):
 # --- UGRID ---
 
 
+@pytest.mark.sparse(3)
 def test_topology_names_all_variables(mesh):
     assert b"UGRID-1.0" in mesh.attributes["Conventions"]
     topology = mesh.about["mesh"]
@@ -234,6 +235,7 @@ def test_as_xarray_reads_it(room, tmp_path):
                     assert np.array_equal(found[name].values, values)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.filterwarnings("ignore:Projected")  # about areas on a sphere, which are not used
 def test_as_uxarray_reads_it(result, tmp_path):
     uxarray = pytest.importorskip("uxarray")

@@ -99,6 +99,7 @@ def tight(mesh, reference=1.0):
     return pytest.approx(reference, rel=0, abs=2e-13)
 
 
+@pytest.mark.sparse(3)
 def test_the_file_has_all_variables_of_the_specification(result, mesh):
     file, domain = mesh.file, result.diagram.domain
     assert file.attributes["on_a_sphere"] == b"NO"
@@ -191,6 +192,7 @@ def test_tables_agree(mesh):
             assert cells[a] in mesh.cellsOnEdge[edges[(a + 1) % k]]
 
 
+@pytest.mark.sparse(3)
 def test_edges_and_vertices_are_in_counter_clockwise_order(result, mesh):
     for i in range(mesh.n):
         corners = [mesh.away(mesh.cell[i], mesh.vertex[v]) for v in mesh.verticesOnCell[i]]
@@ -207,6 +209,7 @@ def test_edges_and_vertices_are_in_counter_clockwise_order(result, mesh):
         assert steps.sum() == pytest.approx(2 * np.pi, abs=1e-9)
 
 
+@pytest.mark.sparse(3)
 def test_normals_point_from_the_first_cell_to_the_second(mesh):
     for e in range(mesh.e):
         i, j = mesh.cellsOnEdge[e]
@@ -237,6 +240,7 @@ def test_normals_point_from_the_first_cell_to_the_second(mesh):
         )
 
 
+@pytest.mark.sparse(3)
 def test_only_edges_of_adopted_parts_are_off_bisectors(mesh):
     off = 0
     for e in range(mesh.e):
@@ -246,6 +250,7 @@ def test_only_edges_of_adopted_parts_are_off_bisectors(mesh):
     assert (off > 0) == (mesh.name in OFF_BISECTORS)
 
 
+@pytest.mark.sparse(3)
 def test_kites_are_the_parts_of_cells_and_triangles(result, mesh):
     kites, domain = mesh["kiteAreasOnVertex"], result.diagram.domain
     of_cells = np.zeros(mesh.n)
@@ -303,6 +308,7 @@ def slow_weights(mesh, e):
     return found
 
 
+@pytest.mark.sparse(3)
 def test_weights_are_those_of_the_formula(mesh):
     for e in range(mesh.e):
         others, weights = zip(*slow_weights(mesh, e), strict=True)

@@ -32,6 +32,7 @@ def folder_of(mesh, path, convention):
     return clvoro.load(path / "mesh.nc")
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_round_trip(result, tmp_path, convention):
     found = folder_of(result, tmp_path, convention)

@@ -84,7 +84,7 @@ def result(ctx) -> clvoro.Result:
 # Checks.
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("n", [3, 60, 900])
 @pytest.mark.parametrize("name", list(DOMAINS))
@@ -167,6 +167,7 @@ def test_checks_in_any_unit(ctx, scale: float) -> None:
     assert report, report
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("case", list(SPOILT))
 def test_checks_name_each_fault(result, case: str) -> None:
     changes, name = SPOILT[case]
@@ -264,6 +265,7 @@ def corners_by_hand(diagram, i: int) -> tuple[np.ndarray, bool]:
     return x[corners], walked == len(rows)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_quality_is_that_of_the_cell_with_straight_sides(ctx, dtype: str) -> None:
     eps, straightened, joined = float(np.finfo(dtype).eps), 0, 0
@@ -351,6 +353,7 @@ def same_diagram(one, other) -> None:
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", list(DOMAINS))
 def test_npz_keeps_everything(ctx, tmp_path, name: str) -> None:
     made = mesh(ctx, DOMAINS[name](), 40)
@@ -385,6 +388,7 @@ def test_damaged_npz_is_refused(result, tmp_path, name: str, change, says: str) 
         clvoro.load(path)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", list(DOMAINS))
 def test_vtu_is_read_back(ctx, tmp_path, name: str) -> None:
     made = mesh(ctx, DOMAINS[name](), 40)
@@ -464,6 +468,7 @@ def pond(ctx) -> clvoro.Result:
     return mesh(ctx, domain, 60)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("walls", ["exact", "straight"])
 def test_openfoam_cells_are_closed(pond, tmp_path, walls) -> None:
     pond.save(tmp_path / "constant" / "polyMesh", walls=walls)
@@ -573,6 +578,7 @@ OUTSIDE = [(0.85, 0.8), (3.5, 2.0), (3.017, 0.417)]  # the triangle, beyond the 
 INSIDE = [(0.2, 2.8), (2.0, 0.3), (2.0, 1.7)]
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("color", ["error", "quality", "size", "sides", "skewness"])
 def test_cells_fill_the_domain_and_nothing_else(result, color: str) -> None:
     pytest.importorskip("matplotlib")
@@ -659,6 +665,7 @@ def test_overlaps_sum_to_the_cells(pair) -> None:
     assert (expected > 0).sum() > 60
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", list(DOMAINS))
 def test_transfer_is_conservative_and_exact(ctx, name: str) -> None:
     domain = DOMAINS[name]()

@@ -61,6 +61,7 @@ def modflow_connections(disv):
     return found, single
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("walls", ["exact", "straight"])
 def test_modflow_finds_the_conductances_of_the_diagram(lake, walls):
     disv, d = lake.to_disv(walls), lake.diagram
@@ -172,6 +173,7 @@ def test_flopy_takes_the_grid(lake, tmp_path):
     np.testing.assert_allclose(records["cond"], river.conductance(1e-3), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_drawdown_of_a_well_is_that_of_theis():
     """A confined aquifer, discretized as MODFLOW does it: from vertices and centers of the DISV grid only."""
     radius, transmissivity, storage, pumping = 3000.0, 5e-3, 2e-4, 0.02
@@ -210,6 +212,7 @@ def test_drawdown_of_a_well_is_that_of_theis():
     assert np.abs(drawdown - theis)[seen].max() < 0.01 * theis[r > 10].max()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_fipy_has_the_generators_and_volumes(dim):
     fipy = pytest.importorskip("fipy")
@@ -239,6 +242,7 @@ def test_fipy_has_the_generators_and_volumes(dim):
     assert flux[inlet].sum() == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_faces_of_fipy_close_each_cell(dim):
     """Also at re-entrant corners, and whatever cell FiPy calls the first of a face."""
@@ -297,6 +301,7 @@ def test_grids_that_solvers_lack_are_refused():
         alone.to_disv()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_fipy_joins_the_sides_of_periodic_boxes(dim):
     """The mean of cos(2 pi x) decays at its rate, and constants have no gradient."""

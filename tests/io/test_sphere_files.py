@@ -21,6 +21,7 @@ def result(ctx, request):
 # --- SCRIP ---
 
 
+@pytest.mark.sparse(2)
 def test_scrip(result, tmp_path):
     result.save(tmp_path / "mesh.nc", convention="scrip")
     file, d = read(tmp_path / "mesh.nc"), result.diagram
@@ -122,6 +123,7 @@ def test_ugrid_topology_is_that_of_the_cells(result, tmp_path):
 # --- files to read again ---
 
 
+@pytest.mark.sparse(2)
 def test_npz_is_exact(result, tmp_path):
     for mesh in (result, result.diagram):
         mesh.save(tmp_path / "mesh.npz")
@@ -178,6 +180,7 @@ def test_damaged_npz_is_refused(ctx, tmp_path, changes, message):
         clvoro.load(tmp_path / "mesh.npz")
 
 
+@pytest.mark.sparse(2)
 def test_vtu_reads_back(result, tmp_path):
     for mesh in (result, result.diagram):
         mesh.save(tmp_path / "mesh.vtu")

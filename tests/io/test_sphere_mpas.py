@@ -79,6 +79,7 @@ def test_excess_of_arcs_has_no_step():
 # --- the file ---
 
 
+@pytest.mark.sparse(2)
 def test_the_file_has_all_variables_of_the_specification(result, mesh):
     file, sphere = mesh.file, result.diagram.domain
     assert file.attributes["on_a_sphere"] == b"YES"
@@ -198,6 +199,7 @@ def test_an_edge_at_a_pole_has_the_east_of_longitude_0(mesh):
     assert mesh["angleEdge"][at_pole] == pytest.approx(np.pi / 2)
 
 
+@pytest.mark.sparse(2)
 def test_tables_are_counter_clockwise(mesh):
     for i in range(mesh.n):
         corners = mesh.vertex[mesh.verticesOnCell[i]]
@@ -216,6 +218,7 @@ def test_tables_are_counter_clockwise(mesh):
     assert (triangles(*generators) >= 0).all()
 
 
+@pytest.mark.sparse(2)
 def test_weights_are_those_of_the_formula(mesh):
     for e in range(mesh.e):
         others, weights = zip(*slow_weights(mesh, e), strict=True)
@@ -224,6 +227,7 @@ def test_weights_are_those_of_the_formula(mesh):
         np.testing.assert_allclose(row, weights, rtol=1e-10, atol=1e-13 * np.abs(row).max())
 
 
+@pytest.mark.sparse(2)
 def test_the_coriolis_force_does_no_work(mesh):
     check_energy(mesh)
 

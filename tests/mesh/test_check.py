@@ -66,6 +66,7 @@ def swap(a, b):
     return change
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("n", [1, 2, 3, 700])
 def test_right_diagrams_pass(ctx, dtype, n):
@@ -122,6 +123,7 @@ def test_volumes_in_float32_do_not_make_a_float32_mesh(flat, known):
     assert {"volumes", "nearest generators"} <= names_of(report)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("kind", ["flat", "solid"])
 def test_vertex_that_is_stored_twice_is_found(kind, request):
     result = request.getfixturevalue(kind)
@@ -245,7 +247,7 @@ COMMON = {
 }  # fmt: skip
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("periodic", [False, True])
 def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):
@@ -267,6 +269,7 @@ def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):
         assert "quality" in names_of(dataclasses.replace(result, quality=quality).check())
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_periods_round_on_the_device(ctx, dtype):
     """By half an ulp, much in a thin box: its cells close across seams only up to that round-off."""
@@ -349,6 +352,7 @@ def test_numbers_of_a_result_are_recomputed(flat, solid, name):
         }
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("kind", ["flat", "solid"])
 @pytest.mark.parametrize("suffix", ["npz", "vtu"])
 def test_files_pass_and_spoilt_ones_do_not(kind, suffix, request, tmp_path, capsys):

@@ -45,6 +45,7 @@ CASES = [
 ]  # fmt: skip
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize(("kind", "part", "name", "change"), CASES)
 def test_arrays_for_other_programs_have_to_agree(
     meshes, kind, part, name, change, tmp_path, monkeypatch

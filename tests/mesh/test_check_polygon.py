@@ -90,6 +90,7 @@ def test_one_generator_on_the_boundary_has_its_precision(adapters):
                 assert real in str(report)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("method", ["coupled", "weighted", "exact"])
 def test_pieces_of_one_cell_each_have_no_potential(adapters, method):
     """The source of an isolated cell minus its mean is 0 up to round-off."""

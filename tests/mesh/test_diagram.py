@@ -53,6 +53,7 @@ def half_faces(diagram):
                 yield i, k
 
 
+@pytest.mark.sparse(6)
 def test_every_face_is_there_once(case):
     diagram, noise = case
     f = diagram.faces
@@ -111,6 +112,7 @@ def test_geometry_of_faces(case):
         assert abs((f.center[k] - foot) @ f.normal[k]) < noise
 
 
+@pytest.mark.sparse(6)
 def test_corners_of_faces_go_around_the_normal(case):
     diagram, noise = case
     f = diagram.faces
@@ -139,6 +141,7 @@ def test_adjacency(case):
     np.testing.assert_allclose(graph, expected, atol=10 * noise)
 
 
+@pytest.mark.sparse(6)
 def test_cells(case):
     diagram, noise = case
     for i in range(len(diagram)):
@@ -182,6 +185,7 @@ def winds_around(diagram, i, point):
     return abs(angle) > np.pi
 
 
+@pytest.mark.sparse(6)
 def test_locate(case):
     diagram, _ = case
     domain = diagram.domain

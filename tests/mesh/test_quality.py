@@ -75,6 +75,7 @@ def test_two_cells_by_hand():
     assert m.summary()["mean_skewness"] == pytest.approx(0.125)
 
 
+@pytest.mark.sparse(1)
 def test_one_face_after_the_other(diagram):
     d, m = diagram, measure_mesh(diagram)
     box, dim = d.domain, d.domain.dim
@@ -106,6 +107,7 @@ def test_one_face_after_the_other(diagram):
         assert m.worst_of_cell("centroid_angle")[i] == m.centroid_angle[owner == i].max()
 
 
+@pytest.mark.sparse(1)
 def test_faces_are_at_right_angles_to_the_lines_of_the_generators(diagram):
     """Up to round-off, so `Measures` has no angle between face and generators."""
     d = diagram
@@ -140,6 +142,7 @@ def test_generator_on_a_wall(y, skewness):
     assert np.isfinite(m.centroid_angle).all()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_cells_of_many_sides(ctx, real):
     """Regular polygons of up to 19 sides and their neighbors: the device finds the same quality as the host."""

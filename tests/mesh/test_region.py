@@ -63,6 +63,7 @@ def test_the_check_accepts_parts(globe, part):
     globe.subset(np.arange(len(globe)) % 2 == 0).check().demand()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_vertices_of_four_cells(ctx, dtype):
     """Corners of removed cells touch there, or kept ones do."""
@@ -245,6 +246,7 @@ def test_made_up_results_are_parts_too(part):
     assert len(result.subset(part.points[:, 0] > 0).target_size) == (part.points[:, 0] > 0).sum()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("most", [10, 60_000])
 def test_pictures_leave_removed_cells_out(globe, monkeypatch, most):
     """As polygons and, with many cells, as pixels; more walls than cells."""

@@ -42,6 +42,7 @@ POINTS = {
 }
 
 
+@pytest.mark.sparse(8)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("radius", [1.0, EARTH.radius, 1e-3])
 @pytest.mark.parametrize("name", list(POINTS))
@@ -60,6 +61,7 @@ def result(ctx, request):
     return adapter.run(EARTH, 8e5, points=points, n_cells=800, method="lloyd", max_steps=3)
 
 
+@pytest.mark.sparse(1)
 def test_right_result_passes(result):
     report = result.check()
     assert report, report
@@ -184,6 +186,7 @@ DAMAGE = {
 }  # fmt: skip
 
 
+@pytest.mark.sparse(14)
 @pytest.mark.parametrize("name", list(DAMAGE))
 def test_damage_is_found(result, name):
     changes, expected = DAMAGE[name]

@@ -30,6 +30,7 @@ CORNERS = {
 }
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", CORNERS)
 def test_cells_have_corners(ctx, name):
     ring, points, expected = CORNERS[name]

@@ -23,6 +23,7 @@ def quick(request, monkeypatch):
 SHAPES = [7, (7,), (7, 2), (3, 4, 5), (), (0,), (0, 2), (1,)]
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("shape", SHAPES)
 def test_arrays_agree_with_pyopencl(queue, shape):
@@ -88,6 +89,7 @@ def test_too_many_indices_raise(queue):
         make_array(queue, (), np.dtype(np.int32))[0]
 
 
+@pytest.mark.sparse(20)
 @pytest.mark.parametrize("dtype", [np.int32, np.uint64, np.float32, np.float64, np.uint8])
 @pytest.mark.parametrize("size", [1, 2, 3, 16, 33, 1000, 1024])
 @pytest.mark.parametrize("value", [0, 5])

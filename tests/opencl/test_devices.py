@@ -190,6 +190,7 @@ def test_environment_variable_chooses(ctx, monkeypatch):
     assert device.create_context(entry.index).devices[0].name.strip() == entry.name
 
 
+@pytest.mark.slow
 def test_real_devices_are_listed_with_their_verdict(ctx):
     entries = device.list_devices()
     default = [d for d in entries if d.default]
@@ -201,6 +202,7 @@ def test_real_devices_are_listed_with_their_verdict(ctx):
     assert sum(line.startswith("*  ") for line in table.splitlines()) == 1
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("good", "bad", "verdict"),
     [
@@ -258,6 +260,7 @@ def test_options_of_the_device_are_built_with(ctx, monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_runtime_that_crashes_is_listed(ctx, tmp_path, monkeypatch):
     (tmp_path / "sitecustomize.py").write_text(
         "import os, sys\n"
@@ -361,6 +364,7 @@ def test_environment_is_unchanged_without_a_pip_runtime(monkeypatch):
     assert dict(os.environ) == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the cache folder is Linux's")
 def test_process_gets_a_cache_if_the_users_is_read_only(tmp_path):
     # A file where the folder should be stops root, too.

@@ -44,6 +44,7 @@ def engine(ctx):
     return Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
@@ -63,6 +64,7 @@ def test_record_has_the_kernels_of_a_run(engine, kind):
     assert launches(found) == launches(recorded)
 
 
+@pytest.mark.slow
 def test_workers_build_recorded_kernels_once(engine, tmp_path):
     record = {
         "programs": [["opencl/primitives", {}], ["adaptation/motion", {}]],

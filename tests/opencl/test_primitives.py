@@ -24,6 +24,7 @@ def scan(ctx, request):
     return Scan(patch.make_engine(ctx, group_size=request.param))
 
 
+@pytest.mark.sparse(16)
 @pytest.mark.parametrize("n", [0, 1, 2, 7, 8, 9, 1000, 8192, 8193, 8200, 100003])
 @pytest.mark.parametrize("first", [0, 5])
 def test_scan(scan, n, first):
@@ -36,6 +37,7 @@ def test_scan(scan, n, first):
     assert np.array_equal(device.get(), values)
 
 
+@pytest.mark.sparse(9)
 @pytest.mark.parametrize("n", [1, 3, 1025, 4096, 50001])
 def test_scan_in_place(scan, n):
     values = np.random.default_rng(n).integers(0, 5, n + 1).astype(np.int32)
@@ -44,6 +46,7 @@ def test_scan_in_place(scan, n):
     assert np.array_equal(device.get(), np.concatenate([[0], np.cumsum(values[:n])]))
 
 
+@pytest.mark.sparse(8)
 @pytest.mark.parametrize("n", [1, 2, 5, 129, 4096, 300007])
 def test_summaries(engine, n):
     values = np.random.default_rng(n + 5).normal(0.01, 1, n).astype(engine.real)
@@ -62,6 +65,7 @@ def test_summaries(engine, n):
     assert (a.sum, a.magnitude, a.least) == (-b.sum, b.magnitude, -b.largest)
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("count", [2, 7, 8])
 def test_summaries_of_many_arrays_agree_with_single_ones(engine, count):
     n, rng = 3001, np.random.default_rng(count)
@@ -127,6 +131,7 @@ def test_summary_shows_nan_and_infinity(engine):
     assert math.isnan(summaries.read()["a"].sum)
 
 
+@pytest.mark.sparse(12)
 @pytest.mark.parametrize("dtype", [np.int32, np.float32, np.float64, np.uint64])
 @pytest.mark.parametrize("width", [None, 2, 3])
 def test_gather(scan, dtype, width):
@@ -140,6 +145,7 @@ def test_gather(scan, dtype, width):
     assert np.array_equal(out.get(), array[items])
 
 
+@pytest.mark.sparse(12)
 @pytest.mark.parametrize("dtype", [np.int32, np.float32, np.float64])
 @pytest.mark.parametrize("width", [None, 2])
 @pytest.mark.parametrize("n", [1, 300])

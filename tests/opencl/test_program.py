@@ -68,6 +68,7 @@ def test_short_declarations_are_enough_for_all_programs(ctx, dtype, monkeypatch)
     assert all("DECLARE_REALS" in text for text in built)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(("real", "dtype"), [("double", "float64"), ("float", "float32")])
 def test_short_declarations_have_the_functions_of_formulas(ctx, monkeypatch, real, dtype):
     """As PoCL's own: the same calls, so the same bits."""

@@ -85,6 +85,7 @@ def test_only_gpus_are_interrupted(ctx):
 QUICK = {"coupled": (0.05, WORK[0]), "exact number": (0.1, WORK[2])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

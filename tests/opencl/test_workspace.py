@@ -160,6 +160,7 @@ def test_few_views_are_kept(engine):
     assert len(engine.workspace._views) <= MOST_VIEWS
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     "method", [WeightedMethod(tolerance=1e-2), ProjectedMethod(), ProjectedMethod("quality", 0.3)]
 )
@@ -181,6 +182,7 @@ def test_steps_allocate_nothing(engine, made, method):
     assert counts[3:] == counts[3:4] * 4
 
 
+@pytest.mark.slow
 def test_search_for_flaws_frees_its_memory(engine, made):
     """Memory of the search is freed before the next diagram."""
     size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))

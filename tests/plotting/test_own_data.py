@@ -29,6 +29,7 @@ def labels(figure):
     return {ax.get_xlabel() for ax in axes} | {ax.get_ylabel() for ax in axes}
 
 
+@pytest.mark.sparse(1)
 def test_own_data(diagram):
     values = np.arange(30) - 10
     figure = diagram.plot(values, label="pressure [Pa]")
@@ -48,6 +49,7 @@ def test_few_values_far_from_the_others_do_not_set_the_scale():
         assert _most(values) == pytest.approx(ends, abs=1)
 
 
+@pytest.mark.sparse(1)
 def test_diagrams(diagram):
     if diagram.domain.dim == 2:
         drawn = colored(diagram.plot()).get_array()

@@ -118,7 +118,7 @@ def test_error_scale_is_the_same_on_both_sides_of_zero(result):
     assert high >= np.quantile(np.abs(result.size_error), 0.99)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("shape", [(3.0, 1.0), (1.0, 1.0), (0.6, 2.0)])
 @pytest.mark.parametrize("color", ["error", "quality", "size"])
 def test_color_bar_is_as_high_as_the_picture_and_readable(adapter, shape, color):
@@ -302,6 +302,7 @@ def test_round_numbers(value, up, rounded):
     assert nice(value, up) == rounded
 
 
+@pytest.mark.slow
 def test_report_holds_its_pictures(results, adapter, tmp_path):
     first = results["coupled"].initial.points
     initial = adapter.run(BOX, size, points=first, max_steps=0)
@@ -340,6 +341,7 @@ def test_same_run_gives_the_same_page(result, tmp_path):
     assert one == two
 
 
+@pytest.mark.slow
 def test_a_picture_that_fails_costs_no_other(result, tmp_path, monkeypatch):
     drawn = pictures_of({"coupled": result})
 
@@ -356,6 +358,7 @@ def test_a_picture_that_fails_costs_no_other(result, tmp_path, monkeypatch):
     assert text.count("src=") == len(list(tmp_path.glob("pictures/*.png"))) == len(drawn) - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "n", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
 )

@@ -56,6 +56,7 @@ def polygon_areas(section, normal):
     return 0.5 * np.add.reduceat(doubled, section.starts[:-1])
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, -1, 0), (0.3, -1, 0.7)])
 def test_section_is_that_of_the_cells(result, normal):
     """A point of the plane is in the polygon of the cell whose generator is nearest."""
@@ -94,6 +95,7 @@ def test_section_covers_the_plane_once_even_along_faces():
     assert len(cut_cells(d, (0, 0, 1), (0, 0, 2.5)).cells) == 0
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("color", ["error", "quality", "size", "sides", "skewness"])
 def test_slice_is_drawn_with_its_values(result, color):
     figure = plot_slice(result, color, normal="y", through=(0, 0.3, 3))
@@ -128,6 +130,7 @@ def test_every_side_of_a_slice_is_drawn_once(result):
     assert lengths[walls].sum() == pytest.approx(6)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("cut", ["octant", (0.0, -1.0, 0.0), None])
 def test_what_is_drawn_last_is_what_the_viewer_sees(result, cut):
     """The first kept cell on a line of sight is that of the last polygon drawn there."""
@@ -220,6 +223,7 @@ def test_result_plots_itself(result):
         plot_size(lambda x: x[:, 0], result.diagram.domain)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(("upper", "panels"), [((6, 1, 1.5), 2), ((1, 1, 5), 2), ((1, 4, 1), 2)])
 def test_long_domains_are_shown_lengthwise(upper, panels):
     points = np.random.default_rng(2029).uniform((0, 0, 0), upper, (40, 3))
@@ -254,6 +258,7 @@ def test_distributions_are_complete(result):
     assert sum(heights.values()) == pytest.approx(100)
 
 
+@pytest.mark.slow
 def test_report_of_a_solid(result, tmp_path, monkeypatch):
     """With the figures of all pictures; `test_few_cells` renders them."""
     monkeypatch.setattr(page, "render", lambda *_: b"")
@@ -277,7 +282,8 @@ def test_closer_look_at_a_large_mesh(result, monkeypatch):
     assert np.ptp(ax.get_xlim()) == pytest.approx(60 * 0.005)
 
 
-@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [1, 2])
 def test_few_cells(tmp_path, n):
     points = np.random.default_rng(6).uniform(LOWER, UPPER, (n, 3))
     few = solids.solid_result(solids.solid_diagram(LOWER, UPPER, points))
@@ -298,6 +304,7 @@ def clipped_area(section, lower, upper, right, up):
     return sum(p.intersection(window).area for p in polygons), shapely.union_all(polygons), window
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, 1, 0)])
 def test_section_of_a_periodic_box_covers_its_whole_width(periodic, normal):
     d = periodic.diagram

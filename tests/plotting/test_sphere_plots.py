@@ -129,6 +129,7 @@ VIEWS = [
 ]
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("view", VIEWS)
 def test_polygons_cover_the_picture_once(diagram, view):
     polygons = view.polygons(diagram, np.arange(len(diagram)))
@@ -228,6 +229,7 @@ def collections(figure, kind):
     return [c for c in figure.axes[0].collections if type(c) is kind]
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("options", [{}, {"projection": "plate"}, {"across": 30.0}])
 @pytest.mark.parametrize("color", ["error", "quality", "size", "sides", "own"])
 def test_values_are_those_of_the_cells(mesh, color, options):
@@ -340,6 +342,7 @@ def test_other_pictures_refuse(mesh, adapter):
         plane.plot(projection="plate")
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("number", [1, 2])
 def test_pictures_of_a_report(mesh, number):
     pictures = pictures_of({f"run {k}": mesh for k in range(number)})
@@ -371,6 +374,7 @@ def test_coasts(mesh, monkeypatch):
     ]
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("radius", "color", "label", "number"),
     [

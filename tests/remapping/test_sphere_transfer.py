@@ -132,6 +132,7 @@ def slopes(x, q, means, limited):
     return found
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("way", ["first", "second", "limited"])
 def test_matches_intersections_by_shapely(mesh, adapter, way):
     old, new = mesh(90, 5), mesh(70, 6)
@@ -150,6 +151,7 @@ def test_matches_intersections_by_shapely(mesh, adapter, way):
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("counts", [(5, 40), (40, 5), (12, 12)])
 def test_cells_as_wide_as_the_sphere(adapter, counts):
     """Cells of 70 degrees from generator to corner: shares of random points, within five standard deviations."""
@@ -170,6 +172,7 @@ def test_cells_as_wide_as_the_sphere(adapter, counts):
     assert (np.abs(got - mean) <= 5 * spread / np.sqrt(count) + 1e-12).all()
 
 
+@pytest.mark.sparse(8)
 @ORDERS
 @pytest.mark.parametrize("radius", [1.0, 6371229.0])
 @pytest.mark.parametrize(
@@ -211,6 +214,7 @@ def test_limited_values_stay_within_those_nearby(mesh, adapter):
     np.testing.assert_array_equal(got[z < -0.2], 0)
 
 
+@pytest.mark.sparse(1)
 @ORDERS
 @pytest.mark.parametrize("limited", [True, False])
 def test_order_of_convergence(adapter, order, limited):
@@ -232,6 +236,7 @@ def test_order_of_convergence(adapter, order, limited):
     assert order == 1 or errors[1] < 1e-3
 
 
+@pytest.mark.sparse(4)
 @ORDERS
 @pytest.mark.parametrize("points", [
     random_points(700, 1327), grid_of_rings(), UNIT.icosahedral_points(3), clustered_points(800, 9),
@@ -244,6 +249,7 @@ def test_same_mesh_is_the_identity(adapter, points, order):
     np.testing.assert_allclose(got, q, rtol=0, atol=1e-11)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("levels", [(2, 3), (3, 2), (0, 4), (4, 0)])
 def test_refined_icosahedra(adapter, levels, order):
@@ -291,6 +297,7 @@ def test_small_cells_keep_their_digits(adapter):
     np.testing.assert_allclose(got[inner], exact[inner], rtol=0, atol=1e-12)
 
 
+@pytest.mark.sparse(1)
 @ORDERS
 def test_transfer_to_refined_mesh_and_back(mesh, adapter, order):
     old = mesh(150, 3037)

@@ -155,7 +155,7 @@ def corners(diagram, i):
     return diagram.vertices[np.unique(rows)]
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @DIMS
 @pytest.mark.parametrize("way", ["first", "second", "limited"])
 def test_matches_plain_clipping(mesh, adapter, dim, way):
@@ -182,6 +182,7 @@ def test_matches_plain_clipping(mesh, adapter, dim, way):
     np.testing.assert_allclose(got, expected, atol=1e-12 if dim == 2 else 1e-5)
 
 
+@pytest.mark.sparse(8)
 @DIMS
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("counts", [(400, 300), (40, 900), (900, 40), (1, 50), (50, 1), (1, 1)])
@@ -200,6 +201,7 @@ def test_mass_bounds_and_constants(mesh, adapter, dim, order, counts):
     np.testing.assert_array_equal(got[:, 1], -2.7)
 
 
+@pytest.mark.sparse(1)
 @DIMS
 def test_linear_functions_are_exact_without_limiter(mesh, adapter, dim):
     old, new = mesh(dim, 500, 2203), mesh(dim, 700, 6101)
@@ -261,6 +263,7 @@ def test_same_mesh_is_the_identity(mesh, adapter, dim, order):
     np.testing.assert_allclose(got, q, rtol=0, atol=1e-12)
 
 
+@pytest.mark.sparse(4)
 @DIMS
 @pytest.mark.parametrize(
     "sides", [(6, 6, 0.0), (6, 12, 0.0), (12, 6, 0.0), (6, 9, 0.0), (6, 6, 0.5)]
@@ -293,6 +296,7 @@ def test_lattices(adapter, dim, sides):
     np.testing.assert_allclose(got, expected.ravel(), rtol=0, atol=1e-12)
 
 
+@pytest.mark.sparse(1)
 @DIMS
 def test_transfer_to_refined_mesh_and_back(mesh, adapter, dim):
     """The finer mesh contains the old generators; mass and bounds are kept both ways."""
@@ -312,6 +316,7 @@ def test_transfer_to_refined_mesh_and_back(mesh, adapter, dim):
     assert np.abs(back - q).mean() < np.abs(q).mean()
 
 
+@pytest.mark.sparse(1)
 @DIMS
 def test_size_ratio_of_a_million(adapter, dim):
     """One mesh has a cluster of 1e-6 of the box: a cell overlaps thousands, or lies within one."""
@@ -402,6 +407,7 @@ def test_repeats_bit_for_bit_and_needs_no_adapter(mesh):
     np.testing.assert_array_equal(old.transfer(q[:, 1], new, 2), once[:, 1])
 
 
+@pytest.mark.sparse(1)
 @DIMS
 def test_results_in_single_precision(ctx, dim):
     single = clvoro.Adapter(ctx, dtype="float32")
@@ -414,6 +420,7 @@ def test_results_in_single_precision(ctx, dim):
     assert got.max() <= q.max()
 
 
+@pytest.mark.sparse(1)
 @DIMS
 def test_device_without_double_precision(mesh, ctx, monkeypatch, dim):
     from clvoro.remapping import cell_data

@@ -60,6 +60,7 @@ def alone(ctx):
     return [run(clvoro.Adapter(ctx), options) for options in WORK]
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("shared", ["context", "adapter", "nothing"])
 def test_threads_do_not_disturb_each_other(ctx, alone, shared):
     adapter = clvoro.Adapter(ctx)
@@ -85,6 +86,7 @@ def test_diagrams_from_many_threads(ctx):
     assert all(np.array_equal(a, b) for a, b in zip(expected, found, strict=True))
 
 
+@pytest.mark.slow
 def test_processes_find_the_same_bits(ctx, alone):
     program = "import sys; sys.path.insert(0, '.'); import clvoro; from tests import conftest\n"
     program += "from tests.robustness import test_concurrency as t\n"
@@ -137,6 +139,7 @@ def unoptimized(monkeypatch):
     return lambda: monkeypatch.setattr(program, "compile_text", compile_text)
 
 
+@pytest.mark.slow
 def test_optimization_changes_no_bit(ctx, alone, unoptimized):
     """Kernels use strict floating point. The fast tests build most of them without optimization: see `conftest`."""
     unoptimized()

@@ -53,6 +53,7 @@ def test_refusals_have_to_be_true():
     demand_truth(generators, domain, "float32", near)
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
@@ -86,6 +87,7 @@ def test_polygons_that_failed_once(kind, seed):
     assert fuzz.attempt(kind, seed)[0] == "mesh"
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
@@ -119,6 +121,7 @@ def test_generators_that_were_told_to_coincide_once(kind, seed):
     assert fuzz.attempt(kind, seed)[0] == "mesh"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [pytest.param(5, marks=pytest.mark.slow), 300])
 def test_parts_that_were_cut_off_pass_the_check(seed):
     """Around corners of holes, and in a cell with two faces to one neighbor. Earlier versions refused both."""

@@ -53,6 +53,7 @@ IN_BOXES = LIMITS | {"clip_polygons": (272, 1400), "clip_polyhedra": (128, 5632)
 needs_clang = pytest.mark.skipif(gpu_programs.clang() is None, reason="needs clang")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dtype", "domain", "size"),
     [
@@ -151,6 +152,7 @@ def check_figures(vendor, sources, folder, limits):
             assert not found.spills, what
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not gpu_programs.can_measure("AMD"), reason="needs clang and libclc")
 @pytest.mark.parametrize("dim", [2, 3])
 def test_main_kernels_take_few_registers_and_little_private_memory(ctx, dim, tmp_path):

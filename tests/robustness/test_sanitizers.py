@@ -67,6 +67,7 @@ def harmless(ctx, tmp_path_factory):
     return found
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("sanitizer", list(TRAPS))
 def test_what_is_right_passes(harmless, built, sanitizer):
     outcomes, said = sanitized.repeat(harmless, sanitizer, built)
@@ -74,6 +75,7 @@ def test_what_is_right_passes(harmless, built, sanitizer):
     assert said == ""
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize(("sanitizer", "trap"), [(s, t) for s in TRAPS for t in TRAPS[s]])
 def test_what_is_wrong_is_found(harmless, built, sanitizer, trap):
     wrong = replace(harmless, text=KERNEL.format(TRAPS[sanitizer][trap]))

@@ -83,6 +83,7 @@ def test_what_differs_is_found(agreement, record):
     assert not agreement.good(record)
 
 
+@pytest.mark.slow
 def test_one_device_is_no_second_one(agreement):
     """Intel's processors are called so under any implementation."""
     records("two_devices.py", "--devices", "pocl,pocl", code=1)

@@ -244,6 +244,7 @@ def test_a_checkpoint_that_does_not_fit_costs_neither_the_run_nor_the_one_before
     assert os.listdir(tmp_path) == ["state"]
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("content", [b"precious", b"PK\x03\x04", "mesh"])
 def test_checkpoints_replace_nothing_else(adapter, tmp_path, content):
     path = tmp_path / "file.npz"

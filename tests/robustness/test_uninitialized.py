@@ -37,7 +37,7 @@ def filled(monkeypatch):
     return fill_with
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("options", WORK, ids=[str(w["method"]) for w in WORK])
 def test_runs(ctx, filled, options, dtype):

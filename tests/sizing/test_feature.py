@@ -127,6 +127,7 @@ def reference(
     return (np.sqrt(length2) / across + slope * away).min(axis=1)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_gaps_of_random_polygons(seed: int) -> None:
     domain = clvoro.Polygon(ragged(14, seed), [ragged(7, seed + 9, (0.05, 0.0), 0.2)])
@@ -184,6 +185,7 @@ def test_number_of_cells_per_radius_of_curvature() -> None:
 # --- on the device, and what is refused ----------------------------------------------------------
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_device_and_host_agree(ctx, dtype: str) -> None:
     domain = clvoro.Polygon(ragged(40) + 100, [ragged(20, 5, (100.05, 100.0), 0.2)])
@@ -222,13 +224,13 @@ def test_graded_fields_are_evaluated_inside_only() -> None:
         assert domain.contains(x).all()
         return np.where(x[:, 0] < 0.3, 0.02, 0.4)
 
-    graded = sizing.Graded(jump, slope=0.4, resolution=801)
+    graded = sizing.Graded(jump, slope=0.4, resolution=401)
     graded.raster(domain)
     x = inner(domain)
     h = graded(x)
     # The shortest way from the left is perpendicular to the jump. The error of the scheme is the growth over a spacing.
     exact = np.minimum(np.where(x[:, 0] < 0.3, 0.02, 0.02 + 0.4 * (x[:, 0] - 0.3)), 0.4)
-    spacing = domain.extent.max() / 800
+    spacing = domain.extent.max() / 400
     assert (h >= exact - 2 * 0.4 * spacing).all()
     assert h.max() < 0.4
 

@@ -90,6 +90,7 @@ COARSE = {"circle": 5e-4}
 """Relative error of curves that stand for others; that of chords is a thousandth of h_min at most."""
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("name", list(FIELDS))
 def test_values(name):
     field, expected = FIELDS[name]
@@ -98,7 +99,7 @@ def test_values(name):
     )
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", list(FIELDS))
 def test_on_the_device(ctx, name, real):

@@ -99,6 +99,13 @@ CASES = [
     *(pytest.param(PLANE, f, id=f"2D {k}") for k, f in PLANE_FIELDS.items()),
     *(pytest.param(SPACE, f, id=f"3D {k}") for k, f in SPACE_FIELDS.items()),
 ]
+# The first of them differ most: the fast tests run these.
+DIFFERENT = (
+    "2D constant", "2D polygon capped", "2D mixed", "2D raster centers", "2D raster row", "2D expression", "2D product",
+    "2D quotient", "2D minimum", "3D sphere", "3D helix", "3D raster", "3D expression", "3D minimum", "3D quotient",
+    "3D box",
+)  # fmt: skip
+CASES.sort(key=lambda case: case.id not in DIFFERENT)
 
 
 @pytest.fixture
@@ -121,7 +128,7 @@ def _device_points(engine, domain, points):
     return engine.upload((points - origin) / scale)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(16)
 @pytest.mark.parametrize(("domain", "field"), CASES)
 def test_device_agrees_with_numpy(make_engine, domain, field):
     engine = make_engine(domain.dim)
@@ -143,7 +150,7 @@ def test_device_agrees_with_numpy(make_engine, domain, field):
     assert not h.get()[N:].any()
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(16)
 @pytest.mark.parametrize(("domain", "field"), CASES)
 def test_gradient(make_engine, domain, field):
     """Against the host's own central differences over the same stretch."""
@@ -209,6 +216,7 @@ def test_formulas_that_differ_in_numbers_share_a_kernel():
     assert (first.data != second.data).sum() == 2
 
 
+@pytest.mark.sparse(1)
 def test_callable_is_evaluated_on_the_host(make_engine):
     engine = make_engine(2)
     seen = []
@@ -244,6 +252,7 @@ def test_callable_is_evaluated_on_the_host(make_engine):
         assert PLANE.contains(x).all()
 
 
+@pytest.mark.sparse(1)
 def test_parts_of_a_mixed_field_run_on_the_device(make_engine, monkeypatch):
     """Beside a callable the rest is still evaluated on the device, also where it is negative."""
     engine = make_engine(2)
@@ -267,6 +276,7 @@ def test_parts_of_a_mixed_field_run_on_the_device(make_engine, monkeypatch):
     assert np.abs(slope.get() * h.get()[:, None]).max() < bound
 
 
+@pytest.mark.slow
 def test_operators_are_those_of_numbers(double):
     a = sizing.Expression("1 + x")
     b = sizing.Expression("2 + y*y")
@@ -534,7 +544,7 @@ def test_sizes_times_a_factor(make_engine, field):
     assert np.array_equal(scaled.get(), engine.real.type(1.7) * h.get())
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("case", BAD_VALUES)
 @pytest.mark.parametrize("gradient", [False, True])
 def test_invalid_sizes_are_reported_with_their_place(make_engine, case, gradient):
@@ -562,6 +572,7 @@ def test_invalid_sizes_are_reported_with_their_place(make_engine, case, gradient
         stage(points)
 
 
+@pytest.mark.sparse(1)
 def test_sizes_beyond_the_domain_and_the_precision(make_engine):
     """A size larger than the domain is valid; one outside the range of the precision is not."""
     engine = make_engine(2)

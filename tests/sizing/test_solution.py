@@ -32,6 +32,7 @@ LOWER, UPPER = (1.0, -2.0, 0.5), (3.0, -1.0, 1.1)
 COUNTS = (41, 31, 13)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("p", [1, 2, 4.5, math.inf])
 def test_a_parabola_gets_equal_cells(d, p):
@@ -50,6 +51,7 @@ def test_a_parabola_gets_equal_cells(d, p):
     assert size.values == pytest.approx(math.sqrt(8 * e / largest), rel=1e-9)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("p", [1, 2, 6])
 def test_sizes_follow_the_formula(d, p):

@@ -79,6 +79,7 @@ GRAPHS = {
 }
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", GRAPHS)
 def test_aggregates_and_coarse_graph(make, name):
     """Against P^T W P of SciPy, P the groups' indicator."""
@@ -184,7 +185,7 @@ def test_cycle_in_place(make, n):
     assert np.array_equal(r.get(), right)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("group_size", [None, 16], ids=["cpu", "gpu"])
 @pytest.mark.parametrize("name", ["random", "random 3D", "star"])
 def test_merged_steps_and_levels_give_the_same_bits(make, monkeypatch, name, group_size):
@@ -243,6 +244,7 @@ def test_walls_are_ignored(make):
     assert np.abs(results[0] - results[1]).max() <= 1e-5 * np.abs(results[0]).max()
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", [np.float64, np.float32])
 @pytest.mark.parametrize("n", [30, 900, 3000])
 def test_cycle(make, real, n):
@@ -308,7 +310,7 @@ def refine(points, n, rng):
 WEIGHTS = ["even", "decades", "jump", "random", "islands"]
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("mesh", ["random", "refined"])
 @pytest.mark.parametrize("name", WEIGHTS)
 def test_preconditioner_is_symmetric_positive_definite(make, name, mesh):
@@ -391,6 +393,7 @@ def solve(engine, W, seed=17, tolerance=1e-8):
     return solution, true
 
 
+@pytest.mark.slow
 def test_iterations_random(make):
     """Twice to four times fewer than the smoothed or plain aggregation of a textbook."""
     solution, true = solve(make(), random_weights(10000, seed=71))
@@ -410,7 +413,7 @@ def test_iterations_graded_and_weighted(make):
     assert solve(make(), weights_of(graph, density))[0].iterations <= 25
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", [np.float64, np.float32])
 @pytest.mark.parametrize("mesh", ["random", "refined"])
 @pytest.mark.parametrize(
@@ -427,6 +430,7 @@ def test_iterations_with_strongly_varying_weights(make, name, most, mesh, real):
     assert true <= (1.01e-8 if real is np.float64 else 1e-3)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", [np.float64, np.float32])
 @pytest.mark.parametrize("scale", [1e-25, 1e20])
 def test_weights_of_any_unit(make, real, scale):
@@ -438,6 +442,7 @@ def test_weights_of_any_unit(make, real, scale):
     assert solution.iterations == solve(make(real=real), W, tolerance=1e-4)[0].iterations
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("name", "most"), [("lattice", 20), ("random 3D", 20), ("chain", 40), ("star", 20)]
 )
@@ -462,6 +467,7 @@ def test_few_cells(make, n):
     assert solution.iterations <= 12
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("fault", ["indefinite", "negative", "not finite", "useless"])
 def test_jacobi_continues_after_a_failure(make, monkeypatch, fault):
     """A failed preconditioner costs its iterations, and raises no exception."""
@@ -592,7 +598,7 @@ def test_updated_cycle_is_positive_definite(make, amount):
 
 def test_coarse_levels_are_reused_while_they_converge(make):
     """Small motions cost a few iterations. After large ones the next solve builds a new multigrid."""
-    engine, n = make(), 3000
+    engine, n = make(), 1500
     first, second = neighboring_weights(n, 0.05)
     scattered = neighboring_weights(n, 1.5)[1]
     poisson, cells = Poisson(engine), object()

@@ -90,7 +90,7 @@ def density_of(points):
     return (0.1 + 0.9 * points[:, 0]) ** -2.0
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("weighted", [False, True])
@@ -108,7 +108,7 @@ def test_matrix(make, dim, real, weighted):
     assert np.allclose(inverse * A.diagonal(), 1, rtol=0, atol=16 * np.finfo(real).eps)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("start", ["zero", "near"])
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 def test_large_tolerances_use_single_precision(make, preconditioner, start):
@@ -180,7 +180,7 @@ def test_measures_of_a_face_are_averaged(make):
     assert np.array_equal(A, [[2.5, -2.5], [-2.5, 2.5]])
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_solution(make, dim, weighted):
@@ -202,6 +202,7 @@ def test_solution(make, dim, weighted):
     assert abs(phi.get().mean()) <= 1e-14 * np.abs(expected).max()
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", REALS)
 def test_residuals_equal_those_of_a_dense_solver(make, real):
     engine = make(real=real)
@@ -221,6 +222,7 @@ def test_residuals_equal_those_of_a_dense_solver(make, real):
     assert residual == pytest.approx(solution.residual, rel=0.5)
 
 
+@pytest.mark.sparse(1)
 def test_float32_reports_stagnation(make):
     engine = make(real=np.float32)
     poisson, laplacian = assembled(engine, graphs.random_graph(900, seed=361))
@@ -231,6 +233,7 @@ def test_float32_reports_stagnation(make):
     assert solution.residual < 1e-5
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("scale", [1e-30, 1e25])
 def test_tiny_and_huge_right_sides(make, real, scale):
@@ -287,6 +290,7 @@ def test_one_and_two_cells(make, real):
     assert np.allclose(phi.get(), [0.25, -0.25], rtol=1e-6)
 
 
+@pytest.mark.sparse(1)
 def test_auto_takes_the_cheaper_preconditioner(make):
     """Jacobi for few cells, multigrid from some thousand on, from fewer for smaller tolerances."""
     for dim in (2, 3):
@@ -335,7 +339,7 @@ def test_start_far_from_the_solution(make):
     assert np.abs(x.get() - expected).max() <= 1e-4 * np.abs(expected).max()
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 @pytest.mark.parametrize("real", REALS)
 def test_repeated_solves_give_the_same_bits(make, real, preconditioner):
@@ -350,7 +354,7 @@ def test_repeated_solves_give_the_same_bits(make, real, preconditioner):
     assert np.array_equal(first.get(), second.get())
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 @pytest.mark.parametrize("left", [np.nan, 1e3])
 def test_buffers_of_earlier_solves_do_not_matter(make, preconditioner, left):
@@ -374,6 +378,7 @@ def test_buffers_of_earlier_solves_do_not_matter(make, preconditioner, left):
         assert np.array_equal(one, other)
 
 
+@pytest.mark.sparse(1)
 def test_result_does_not_depend_on_the_lookahead(make):
     engine = make()
     _, laplacian = assembled(engine, graphs.random_graph(800, seed=57))
@@ -390,6 +395,7 @@ def test_result_does_not_depend_on_the_lookahead(make):
     assert all(np.array_equal(x, results[0][1]) for _, x in results)
 
 
+@pytest.mark.sparse(1)
 def test_preconditioner_is_applied_once_per_iteration(make):
     """Where the host looks after each iteration, the preconditioner is applied as often as there are iterations."""
     engine = make()
@@ -438,6 +444,7 @@ def test_one_work_group_solves_alike(n, group_size, monkeypatch):
     assert np.abs(x - y).max() <= 1e-7 * np.abs(x).max()
 
 
+@pytest.mark.sparse(1)
 def test_callable_preconditioner(make):
     """Jacobi's as a callable gives the same iterates as the built-in one."""
     engine = make()

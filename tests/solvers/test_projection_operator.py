@@ -82,7 +82,7 @@ def kind(ctx, request):
     return patch.make_engine(ctx, real, box.dim, group_size, box), box
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("share", [0.0, 1 / 3], ids=["", "held"])
 def test_correction(kind, share, monkeypatch):
     """u = -W J^T y with (J W J^T + eps) y = r + J Ld, by dense algebra; in many launches and in one."""

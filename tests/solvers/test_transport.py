@@ -19,6 +19,7 @@ def random_case(dim, n, ratio, seed=61, periodic=False):
     return box, rng.uniform(box.lower, box.upper, (n, dim)), volumes * box.measure / volumes.sum()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("dim", "real", "periodic"),
     [
@@ -54,6 +55,7 @@ def test_newton_with_far_neighbors(ctx):
     assert len(found.shares) < 9
 
 
+@pytest.mark.slow
 def test_cells_in_a_polygon_get_any_volumes(ctx):
     """A wall is thinner than a cell, so that cells lie on both sides of it."""
     points = np.random.default_rng(7).uniform((0, 0), (2, 1), (80, 2))

@@ -108,6 +108,7 @@ def differences(points):
     return J
 
 
+@pytest.mark.sparse(1)
 def test_derivative(assembled, differences):
     """Every cell by every generator, walls included; the field's own gradient is on the diagonal."""
     # Volumes of 0.01 to 1e-13 of the box over a step of 1e-6; single precision is finer.
@@ -115,6 +116,7 @@ def test_derivative(assembled, differences):
     assert np.abs(assembled.derivative()).max() > 5
 
 
+@pytest.mark.sparse(2)
 def test_transpose(assembled):
     """B^T by rows equals the transpose of B, to single precision."""
     B = assembled.B
@@ -158,6 +160,7 @@ def project(engine, points, h, gradient, r, displacement, tolerance=1e-6, **opti
     return out.get(), solution
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize(("log_ratio_scale", "power"), [(0.0, 2), (0.2, 2), (0.2, 4)])
 def test_projection(engine, points, log_ratio_scale, power):
     """u' = -W J^T (J W J^T + eps)^-1 (r + J Ld), by dense algebra; a cell that is far off has the smaller eps."""
@@ -183,7 +186,7 @@ def test_projection(engine, points, log_ratio_scale, power):
     assert correction == pytest.approx(expected, abs=3e-5 * np.abs(expected).max())
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3, 1e-5])
 def test_tolerance(engine, points, tolerance):
     """The residual by dense algebra equals that of the recurrence; vectors are in single precision down to 1e-4."""
@@ -226,6 +229,7 @@ def test_unwritten_rows_of_the_record_cause_no_warning(ctx, points, monkeypatch)
     assert solution.converged
 
 
+@pytest.mark.sparse(1)
 def test_result_does_not_depend_on_the_lookahead(engine, points):
     given = (points, sizes(points), np.tile(SLOPE, (N, 1)), log_ratios(points))
     t, results = patch.tessellate(engine, points), []
@@ -243,6 +247,7 @@ def test_result_does_not_depend_on_the_lookahead(engine, points):
         assert np.array_equal(residuals, results[0][1])
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("of", ["solution", "scaled", "turned", "other", "zero"])
 def test_start(engine, points, of):
     """The solution does not depend on the start, and becomes the next start; a good start saves iterations."""
@@ -312,6 +317,7 @@ def test_penalty_of_bad_cells(engine, points, assembled):
         assert made.eps == pytest.approx(expected, rel=1e-5)  # of single precision
 
 
+@pytest.mark.sparse(2)
 def test_perturbed_mesh_converges_quadratically(engine):
     """Targets are a mesh's own sizes, so that log ratios arise from the perturbation; one projection squares them."""
     points = patch.relaxed_points(N, 607)

@@ -48,6 +48,7 @@ def compare(a, b):
         assert np.array_equal(a[name], b[name]), name
 
 
+@pytest.mark.sparse(1)
 def test_cells_in_rings_are_correct(engine):
     points = wheels().astype(engine.real)
     diagram = clvoro.Adapter(engine.ctx, engine.real).diagram(BOX, points)
@@ -80,6 +81,7 @@ def test_only_long_rows_take_more_room(engine):
     engine.workspace.clear()
 
 
+@pytest.mark.slow
 def test_incremental_update_has_room_for_long_rows(engine, monkeypatch):
     """Without room the update returns None."""
     points = wheels()

@@ -87,6 +87,7 @@ def wrapped_rows(engine, points, first_reach=FIRST_REACH):
     return rows.counts.get(), rows.slots.get().reshape(n, -1)
 
 
+@pytest.mark.sparse(12)
 @pytest.mark.parametrize("name", list(POINTS))
 def test_rows_are_those_of_clipping(engine, name):
     points = np.clip(POINTS[name], 0, [1, 0.75])
@@ -110,6 +111,7 @@ def test_rows_are_those_of_clipping(engine, name):
     assert reach_a == pytest.approx(reach_b, rel=1e-6)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     "name",
     ["1 random", "9 random", "random", "clusters", "ring and center", "lattice to the walls"],
@@ -162,6 +164,7 @@ def test_cells_have_up_to_sixteen_faces(engine, count, is_wrapped):
     assert not is_wrapped or rows[0, :count].tolist() == list(range(1, count + 1))
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("first_reach", [0.2, 0.7, 5.0])
 @pytest.mark.parametrize("name", ["random", "radial", "hexagons", "cubed"])
 def test_rows_do_not_depend_on_the_first_search_radius(engine, name, first_reach):

@@ -108,7 +108,7 @@ def check(t, eps):
     assert np.allclose(near, np.linalg.norm(across, axis=1), rtol=1e-6, atol=32 * eps)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
 def test_update_gives_the_diagram_made_anew(engine, name, share, monkeypatch):
@@ -159,7 +159,7 @@ def fitting(t):
     ])  # fmt: skip
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.2])
 def test_rows_marked_as_fitting_fit(engine, name, share):
@@ -189,7 +189,7 @@ def test_most_cells_are_made_in_lanes(ctx, monkeypatch):
     engine, rng = patch.make_engine(ctx), np.random.default_rng(40968)
     if engine.group_size > 1:
         pytest.skip("lanes are for CPUs")
-    points = patch.random_points(4000, 40969)
+    points = patch.random_points(2050, 40969)
     carried, rounds, found = Carried(engine, points), [], []
     run = Engine.run_each
 
@@ -265,6 +265,7 @@ def cross(a, b):
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("group_size", [None, 128])
 def test_mostly_changed_cells_are_clipped(ctx, group_size, monkeypatch):
     """The first round clips cells with changed neighbors and few others; later rounds clip few."""
@@ -383,6 +384,7 @@ def test_marks_after_each_round_of_clipping(ctx, monkeypatch):
     assert times > 40
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("expected", [[], [1], [64], [280, 1], [280] * 4, None])
 def test_rounds_that_are_enqueued_ahead_change_nothing(engine, expected):
     """Too few rounds, too many, and rounds that are too small."""
@@ -401,6 +403,7 @@ def test_rounds_that_are_enqueued_ahead_change_nothing(engine, expected):
     assert carried.incremental._expected[0] > 256
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("share", [0.1, 0.2, 2.0])
 def test_sample_first(engine, share, monkeypatch):
     """A check in two parts gives the same bits; if most of the sample is wrong, the rest is not checked."""
@@ -436,6 +439,7 @@ def test_many_changes_are_made_anew(engine):
     assert not was
 
 
+@pytest.mark.sparse(1)
 def test_exchanged_generators(engine):
     """All cells stay, but two generators exchange theirs."""
     points = patch.relaxed_points(200, 40965).astype(engine.real)
@@ -460,6 +464,7 @@ def test_turned_inside_out(engine):
     assert np.array_equal(t.volumes, carried.reference(mirrored).volumes)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", ["lattice", "hexagons", "cocircular"])
 def test_onto_a_lattice(engine, name, monkeypatch):
     """As faces vanish nearly every row is doubtful: the result has only faces above round-off, or none exists."""
@@ -495,6 +500,7 @@ def test_onto_a_lattice(engine, name, monkeypatch):
         assert max(certain) == 0
 
 
+@pytest.mark.sparse(1)
 def test_far_jump(engine):
     """One generator crosses the domain; only its old and new surroundings change."""
     points = patch.relaxed_points(300, 40966).astype(engine.real)

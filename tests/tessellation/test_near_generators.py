@@ -29,6 +29,7 @@ def pairs(diagram):
     }
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("seed", [0, 2, 3, 5, 11, 20])
 def test_a_line_among_others(ctx, seed):
     """Positions are exact in single precision, so both precisions have the same graph."""
@@ -60,14 +61,16 @@ def cluster(seed, real):
     return np.unique(np.clip(np.vstack([x, others]), 0, 1).astype(real), axis=0).astype(float)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_clusters_among_few(ctx, real):
     adapter = clvoro.Adapter(ctx, real)
-    for seed in [*range(60), 134, 269, 666]:
+    for seed in [*range(21), 134, 269, 666]:
         report = adapter.diagram(UNIT, cluster(seed, real)).check()
         assert report, report
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("periodic", [False, True], ids=["walls", "seams"])
 def test_generators_one_ulp_apart(ctx, periodic, real):
@@ -84,7 +87,7 @@ def test_generators_one_ulp_apart(ctx, periodic, real):
         assert report, report
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("seed", [20, 39, 55, 135])
 def test_a_cluster_alone_in_a_periodic_box(ctx, seed, real):
@@ -103,6 +106,7 @@ def test_a_cluster_alone_in_a_periodic_box(ctx, seed, real):
     assert report, report
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("size", [1e-44, 1e-60, 1e-160, 1e-300])
@@ -125,7 +129,7 @@ def arc(seed, n, real):
     return np.unique(x.astype(real), axis=0).astype(float)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("n", [100, 400])
 def test_arcs(ctx, n, real, monkeypatch):
@@ -189,6 +193,7 @@ kernel void probe(const int size, global const REAL *points, global const int4 *
 """
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("kind", ["far", "near", "circle", "lattice", "odd lattice"])
 def test_the_side_of_a_corner(ctx, kind, real):
@@ -259,6 +264,7 @@ kernel void probe(const int size, global const REAL *points, global REAL *found)
 """
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("kind", ["far", "near", "tie", "lattice", "odd lattice"])
 def test_the_face_that_a_line_leaves_by(ctx, kind, real):

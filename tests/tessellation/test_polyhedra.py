@@ -185,7 +185,7 @@ def check_loops(diagram, eps, crowding=1.0):
 CROWDING = {"circle": 4, "prism": 4, "sphere": 4, "sphere with center": 4, "clusters": 1e4}
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("name", list(POINTS))
 def test_invariants(adapter, name):
     diagram = adapter.diagram(BOX, POINTS[name])
@@ -194,7 +194,7 @@ def test_invariants(adapter, name):
     check_loops(diagram, eps, CROWDING.get(name, 1))
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("kind", list(LATTICES))
 @pytest.mark.parametrize("roundings", [1, 50, 500, 5000])
 def test_lattices_off_by_round_off(adapter, kind, roundings):
@@ -212,6 +212,7 @@ def test_lattices_off_by_round_off(adapter, kind, roundings):
         check_loops(diagram, eps, 2)
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("name", FINE)
 def test_against_qhull(adapter64, name):
     points = POINTS[name]
@@ -293,6 +294,7 @@ def test_warm_start_gives_the_same_cells(adapter64):
         assert set(neighbors[a:b].tolist()) == set(other[a:b].tolist())
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("n", [100, 300])
 def test_many_neighbors_enlarge_the_capacity(adapter64, n):
     """The cell in the middle of a sphere of generators has a face with each, and is the only one that needs room."""
@@ -347,6 +349,7 @@ def test_duplicates_are_named(adapter):
         adapter.diagram(BOX, points)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", ["random", "fcc", "sphere"])
 def test_same_bits_twice(adapter, name):
     a, b = adapter.diagram(BOX, POINTS[name]), adapter.diagram(BOX, POINTS[name])

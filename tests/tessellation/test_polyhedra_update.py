@@ -159,6 +159,7 @@ def relaxed(carried, points, steps=6):
     return points
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("name", POINTS)
 def test_updated_diagrams_equal_new_ones(engine, name):
     points = POINTS[name]
@@ -169,6 +170,7 @@ def test_updated_diagrams_equal_new_ones(engine, name):
         carried.check_symmetry()
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("share", [0, 1e-3, 0.02, 0.05])
 def test_small_moves_of_a_relaxed_set_are_updated(engine, share):
     carried, rng = Carried(engine, POINTS["random"]), np.random.default_rng(9)
@@ -179,6 +181,7 @@ def test_small_moves_of_a_relaxed_set_are_updated(engine, share):
         carried.check_symmetry()
 
 
+@pytest.mark.sparse(1)
 def test_kept_vertices_have_no_nearer_generator(engine):
     """The certificate, by brute force: the ball around each vertex through its generators is empty."""
     carried, rng = Carried(engine, POINTS["random"]), np.random.default_rng(11)
@@ -203,6 +206,7 @@ def test_kept_vertices_have_no_nearer_generator(engine):
     assert vertices > 20 * N
 
 
+@pytest.mark.sparse(1)
 def test_one_generator_that_jumps(engine):
     carried = Carried(engine, POINTS["random"])
     points = relaxed(carried, POINTS["random"], 3)
@@ -211,6 +215,7 @@ def test_one_generator_that_jumps(engine):
     carried.check_symmetry()
 
 
+@pytest.mark.sparse(1)
 def test_generators_toward_a_wall_gain_it(engine):
     carried = Carried(engine, POINTS["random"])
     points = relaxed(carried, POINTS["random"], 3)
@@ -230,6 +235,7 @@ def test_coinciding_generators_are_left_to_a_new_diagram(engine):
     assert carried.update.update(carried.cells, BOX, x, carried.t, carried.clip_of(x)) is None
 
 
+@pytest.mark.sparse(1)
 def test_same_bits_again_and_from_saved_vertices(engine):
     rng = np.random.default_rng(13)
     moves = 0.02 * spacing(POINTS["random"]) * rng.uniform(-1, 1, (3, N, 3))

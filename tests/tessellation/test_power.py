@@ -27,6 +27,7 @@ def random_case(dim, n, spread, seed=31, periodic=False):
     return box, points, spread * (box.measure / n) ** (2 / dim) * rng.random(n) + 7
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize(
     ("dim", "real", "periodic"),
     [
@@ -59,6 +60,7 @@ def test_cells_are_those_of_the_definition(ctx, dim, real, periodic):
     assert d.locate(inside).tolist() == np.flatnonzero(filled).tolist()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
 @pytest.mark.parametrize(
     ("spread", "slope", "real"),
@@ -93,6 +95,7 @@ def test_cells_in_a_polygon_are_those_of_the_definition(ctx, spread, slope, real
     assert d.locate(places).tolist() == squares.argmin(axis=1).tolist()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
 @pytest.mark.parametrize("dim", [2, 3])
 def test_images_carry_the_weights_of_their_generators(ctx, dim):
@@ -198,6 +201,7 @@ def test_the_first_and_the_last_row_are_empty(ctx):
         assert d.volumes[i] == 1
 
 
+@pytest.mark.slow
 def test_files_pictures_and_other_libraries(ctx, tmp_path):
     rng = np.random.default_rng(4)
     points, weights = rng.random((40, 2)), 0.02 * rng.random(40)

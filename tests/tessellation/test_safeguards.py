@@ -58,7 +58,7 @@ def wound_twice(of_three, spacing=0.06):
     return middle + 0.36 * at / abs(z[inside]).max(), middle + to
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("of_three", [False, True], ids=["generator", "three"])
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_cells_that_cover_the_box_twice(ctx, real, group_size, generous, of_three):
@@ -77,6 +77,7 @@ def test_former_neighbors_are_clipped_again(ctx, group_size, generous):
     assert t is None or np.allclose(t.volumes, expected.volumes, rtol=0, atol=1e-15)
 
 
+@pytest.mark.sparse(1)
 def test_two_cells_that_do_not_fit_are_clipped_again(ctx, group_size, generous):
     points = np.array(
         [[0.7414, 0.2586], [0.6, 0.6], [0.6, 0.2], [0.7414, 0.5414], [0.4, 0.4], [0.4586, 0.2586], [0.8, 0.4],
@@ -123,6 +124,7 @@ def test_bits_where_round_off_decides(ctx, real, points, moved, group_size, gene
         assert_same(t, expected)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("noise", [1e-6, 1e-5])
 def test_a_square_lattice_is_updated(ctx, noise, generous):
     """In single precision four cells meet at almost every vertex, and may have different faces there."""

@@ -49,6 +49,7 @@ def as_cycle(row):
     return row[first:] + row[:first]
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("name", list(SETS))
 def test_neighbors(ctx, name, real):
@@ -62,6 +63,7 @@ def test_neighbors(ctx, name, real):
     assert len(wrong) <= (0 if real == "float64" else 0.01 * len(points))
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("name", list(SETS))
 def test_measures(ctx, name, real):
@@ -108,6 +110,7 @@ def test_measures(ctx, name, real):
             assert np.abs(middles[k] + points[order[i]] - middle).max() < close / spacing.min()
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("points", [*SETS.values(), grid_of_rings()], ids=[*SETS, "rings"])
 def test_cells_fill_the_sphere(ctx, points, real):
@@ -169,6 +172,7 @@ def test_generators_that_coincide(ctx):
         clvoro.Adapter(ctx).diagram(UNIT, points)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("step", [1e-3, 0.02, 0.2])
 def test_update(ctx, step, real):

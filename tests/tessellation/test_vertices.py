@@ -26,7 +26,7 @@ def test_many_cells_at_one_point_of_a_wall(ctx, dtype):
         check_invariants(adapter.diagram(BOX, points), float(np.finfo(dtype).eps))
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 # At 900 and 1030 round-off makes faces that cross, for some turns.
 @pytest.mark.parametrize("n", [300, 900, 1030, 2000])
 @pytest.mark.parametrize("turn", [0.0, 0.1, 0.3])
@@ -57,6 +57,7 @@ def wheel_of(n, twice):
     return starts.astype(np.int32), np.concatenate(rows).astype(np.int32)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("n", "twice", "ends"), [(50, False, True), (MOST_AROUND + 2, False, False), (50, True, False)]
 )

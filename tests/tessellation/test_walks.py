@@ -136,6 +136,7 @@ def tessellations(engine, points, rows=None):
     return found
 
 
+@pytest.mark.sparse(12)
 @pytest.mark.parametrize("name", list(POINTS))
 def test_cells_are_those_of_clipping(engine, name):
     (a, reach_a), (b, reach_b) = tessellations(engine, POINTS[name])
@@ -158,6 +159,7 @@ def test_cells_are_those_of_clipping(engine, name):
     assert reach_a == pytest.approx(reach_b, rel=1e-6)
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize(
     ("name", "share"),
     [
@@ -182,6 +184,7 @@ def morton(side):
     )
 
 
+@pytest.mark.sparse(5)
 @pytest.mark.parametrize("name", ["1 random", "random", "cubed", "clusters", "to the walls"])
 @pytest.mark.parametrize("extent", [(1, 1, 1), (1, 0.2, 0.05), (1, 0.6, 1)])
 def test_cells_are_walked_in_morton_order(engine, name, extent):

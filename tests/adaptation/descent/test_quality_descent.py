@@ -72,6 +72,7 @@ def gradient_of(energy, points, some=None, step=1e-5):
     return gradient
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("bad_cell_weight", [0.0, 20.0])
 def test_gradient(ctx, bad_cell_weight):
     """Generators, those at walls and in corners included, move by -rate h^2 dE/dx."""
@@ -125,6 +126,7 @@ def test_gradient_in_a_polygon(ctx):
     assert u[some] == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("periodic", [True, (False, True)])
 def test_gradient_across_seams(ctx, periodic):
     """Generators at a seam look at the nearest images of their neighbors; diagrams are the device's own."""
@@ -204,6 +206,7 @@ def edge_energy(d, h, short):
     return total
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("name", DOMAINS)
 def test_gradient_of_short_edges(ctx, name):
     """Faces, parts of the boundary, and those that end in a corner; diagrams are the device's own."""
@@ -257,6 +260,7 @@ def test_gradient_of_close_generators(ctx):
     assert out.get() == pytest.approx(expected, rel=1e-9, abs=1e-15)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_short_edges_grow(ctx, real):
     """Four generators nearly on a square: the edge between them grows in both directions."""
@@ -273,7 +277,8 @@ def test_short_edges_grow(ctx, real):
     assert length(points + u) > 2 * length(points)
 
 
-@pytest.mark.parametrize("settings", [{}, {"effort": "fast"}, {"method": "exact"}], ids=str)
+@pytest.mark.sparse(1)
+@pytest.mark.parametrize("settings", [{"effort": "fast"}, {}, {"method": "exact"}], ids=str)
 def test_runs_have_no_short_edges(ctx, settings):
     """A steep field: without the energy about one run of five has an edge of 0.04 h or less."""
     field = clvoro.sizing.Distance(clvoro.sizing.Circle((0.5, 0.4), 0.2), h_min=0.012, slope=0.3)
@@ -316,6 +321,7 @@ def test_a_regular_mesh_stays(ctx):
     assert np.linalg.norm(u, axis=1).max() < 0.1 * 0.125
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize(
     "points",

@@ -52,6 +52,7 @@ def gradient(points, omega):
     return result
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_descent_follows_the_gradient(ctx, dtype):
     engine = patch.make_engine(ctx, dtype, dim=3)

@@ -30,6 +30,7 @@ def make_mesh(ctx, dim, real="float64", shift=0.0):
     return mesh, lattice[order], points[order]
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_descent_is_that_of_the_functional(ctx, dim):
     """-rate dI/dx / D at generators inside, at a wall and in a corner."""
@@ -112,7 +113,7 @@ def test_folded_simplices_are_reported(ctx):
 SIZE = sizing.Distance(sizing.Circle((0.5, 0.4), 0.2), h_min=0.03, slope=0.2)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("method", ["mmpde", "monge-ampere"])
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_runs_reduce_the_error(ctx, method, dtype):

@@ -38,6 +38,7 @@ def share_on_grid(field, box, step):
     return (steepness * h**-2).sum() / (h**-2).sum()
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     "field",
     [
@@ -77,6 +78,7 @@ def test_chosen_error_targets(effort):
     assert choose_error_target(3, effort, levels=1, steep=1.0) == EFFORTS_3D[effort].error_target
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("field", "arguments", "target", "words"),
     [
@@ -95,6 +97,7 @@ def test_sizes_come_first_where_they_can(adapter, field, arguments, target, word
     )
 
 
+@pytest.mark.slow
 def test_a_kinked_and_steep_field_gets_cells_of_a_good_shape(adapter):
     """Mean Q is 0.983 and the least Q 0.91 with an error target of 0.0025."""
     result = adapter.run(BOX, RIDGE, seed=31)
@@ -114,6 +117,7 @@ def test_a_kinked_and_steep_field_gets_cells_of_a_good_shape(adapter):
     assert again.settings["error_target"] == target
 
 
+@pytest.mark.slow
 def test_a_target_beyond_the_best_shape_ends_there_and_does_not_warn(adapter):
     """With effort "fast", mean |e| is then 0.07 on this field, and the largest 0.28."""
     options = clvoro.MultilevelOptions(error_target=0.3)

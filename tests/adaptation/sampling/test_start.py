@@ -68,6 +68,7 @@ INTEGRALS = {
 }
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("case", INTEGRALS)
 def test_count_of_known_integrals(case):
     domain, field, expected = INTEGRALS[case]
@@ -97,6 +98,7 @@ def test_tolerance_is_met():
     assert errors[2] < 1e-5
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     "text",
     [
@@ -222,6 +224,7 @@ def test_known_sizes_are_bounds(tree):
     assert (tree._high[box] >= tree._landmark_sizes).all()
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize(("n", "seed"), [(1, 11), (7, 12), (588, 13), (22972, 14)])
 def test_each_box_gets_its_share(tree, n, seed):
     """Every box of the tree has its expected number of points, rounded up or down."""
@@ -277,6 +280,7 @@ def test_uniform_is_plain_uniform():
     assert np.std(counts) > 10
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", [np.float64, np.float32, np.float16])
 @pytest.mark.parametrize("start", ["density", "uniform"])
 def test_points_are_distinct_and_inside(real, start):
@@ -306,6 +310,7 @@ def test_more_points_than_the_precision_has():
         sample_density(field, box, 1500, 99, np.float32)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_device_and_host_agree(ctx, dtype):
     import pyopencl as cl

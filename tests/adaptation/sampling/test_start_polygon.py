@@ -40,6 +40,7 @@ def guarded(domain: clvoro.Polygon, field):
     return size
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("name", DOMAINS)
 def test_constant_sizes_count_the_area(name: str) -> None:
     domain = DOMAINS[name]
@@ -48,6 +49,7 @@ def test_constant_sizes_count_the_area(name: str) -> None:
     assert count_cells(guarded(domain, h), domain) == pytest.approx(1000, rel=1e-10)
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("field", [GROWING, DIP], ids=["growing", "dip"])
 def test_counts_of_varying_sizes(field) -> None:
     """The reference is a sum over the midpoints of 1200 x 1200 pixels, of which the boundary cuts one in 200."""
@@ -83,7 +85,7 @@ def test_shares_are_those_of_area(name: str) -> None:
     assert np.abs(inside.mean(axis=1) - coverage.share).max() < spread
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("start", ["density", "uniform"])
 @pytest.mark.parametrize("name", DOMAINS)
@@ -179,6 +181,7 @@ def test_two_common_faces_bring_two_generators(ctx) -> None:
         assert np.hypot(*(finer - middle).T).min() < 1e-12
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("method", ["coupled", "adaptive"])
 def test_sources_are_balanced_per_component(ctx, method: str) -> None:
     """The Poisson equation on a graph of two parts has a solution only if the sources of each part sum up to 0."""

@@ -29,6 +29,7 @@ def envelope(a, e, points):
         assert t > 0
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", ["star", "holes", "pieces", "comb", "slit"])
 def test_chords(ctx, name, real):
@@ -95,6 +96,7 @@ def test_cells_of_outside_generators_that_the_boundary_crosses_are_reported(ctx)
     assert boundary.cut(t, N).tolist() == expected
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_vertices_belong_to_the_nearer_of_two_close_generators(ctx, real):
     """The two rounded distances are equal, but the bisector is far from the vertex."""

@@ -24,7 +24,7 @@ def tessellate(ctx, domain, points):
     return engine, Tessellator(Stages(engine), domain).tessellate(placed, len(points))
 
 
-@pytest.mark.sparse
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["exact", "adaptive", "coupled", "weighted"])
 @pytest.mark.parametrize("name", TOUCHING)
 def test_runs_from_shared_corners(ctx, name, method):

@@ -65,6 +65,7 @@ def compare(adapters, domain, points, length=1024, euler=False):
     return cells
 
 
+@pytest.mark.sparse(12)
 @pytest.mark.parametrize("name", POLYGONS)
 def test_cells_are_those_of_the_reference(adapters, name):
     domain = POLYGONS[name]()
@@ -76,6 +77,7 @@ def test_cells_are_those_of_the_reference(adapters, name):
             compare(adapters, domain, scattered(domain, n, n), euler=True)
 
 
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("name", POLYGONS)
 def test_no_cell_is_better_than_a_regular_polygon(adapters, name):
     domain = POLYGONS[name]()
@@ -102,7 +104,7 @@ def test_pieces_change_cells(adapters):
     assert roots <= set(range(150))
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("kind", ["centers", "corners", "hexagons"])
 @pytest.mark.parametrize(
     "name",
@@ -117,6 +119,7 @@ def test_edges_on_faces_and_vertices_on_vertices(adapters, name, kind):
             compare(adapters, domain, points)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", ["frame", "diamond hole", "star", "islands", "comb", "stairs"])
 def test_generators_on_the_boundary(adapters, name):
     domain = POLYGONS[name]()
@@ -149,6 +152,7 @@ def test_points_on_a_circle_around_a_vertex(adapters):
         compare(adapters, domain, ring[domain.contains(ring)])
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("name", TOUCHING)
 def test_rings_that_touch(adapters, name):
     domain = TOUCHING[name]()
@@ -163,6 +167,7 @@ def test_rings_that_touch(adapters, name):
             assert faults(adapter.diagram(domain, inside), real) == []
 
 
+@pytest.mark.slow
 def test_round_off_decides_nothing(adapters):
     """Vertices lie on faces and on Voronoi vertices up to some eps."""
     rng = np.random.default_rng(8)
@@ -253,6 +258,7 @@ def test_parts_thinner_than_round_off_are_rejected_or_correct(adapters):
     assert refused < 30
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("make", "n"),
     [(lambda: koch(5), 2), (lambda: koch(5), 1000), (lambda: coast(4096), 3), (lambda: coast(4096), 1000),
@@ -299,6 +305,7 @@ def stages(ctx, request):
     return Stages(Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.kind(real)))
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("name", ["star", "holes", "islands", "koch", "comb"])
 def test_ghost_generators_change_nothing(stages, name):
     domain = POLYGONS[name]()
@@ -317,7 +324,7 @@ def test_ghost_generators_change_nothing(stages, name):
     assert np.array_equal(found[0][3], found[1][3])
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", ["star", "holes", "islands", "koch", "comb"])
 def test_updated_diagrams_are_those_made_anew(stages, name):
     domain = POLYGONS[name]()

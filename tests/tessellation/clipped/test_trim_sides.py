@@ -84,6 +84,7 @@ def test_parts_of_a_cell_on_both_sides_of_a_face_are_one(adapters, real):
         ).sum() == 2  # the bottom is cut, and none the less one side
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("k", [12, 24, 36, 48, 60, 90, 360])
 def test_arcs_of_thirty_degrees_are_one_side(adapters, real, k):
@@ -97,7 +98,7 @@ def test_arcs_of_thirty_degrees_are_one_side(adapters, real, k):
     assert 30 < np.degrees(SIDE_TURN) < 30.1
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(8)
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("name", [*POLYGONS, *(f"touching {name}" for name in TOUCHING)])
 def test_sides_of_all_kinds_of_cells(adapters, real, name):
@@ -123,6 +124,7 @@ def test_sides_along_edges_without_a_length(adapters, real):
     compare(adapters[real], domain, scattered(domain, 40, 3))
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", REALS)
 def test_missing_neighbors(ctx, real):
     """A cell at a straight wall lacks 2 neighbors, in a corner of 90 degrees 3.5, of 270 degrees 0.5."""

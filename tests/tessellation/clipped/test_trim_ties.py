@@ -33,6 +33,7 @@ def check(adapters, shape, points):
         assert diagram.volumes.sum(dtype=float) == pytest.approx(domain.measure, abs=64 * eps)
 
 
+@pytest.mark.sparse(10)
 @pytest.mark.parametrize("seed", [*range(160, 190), 5215])
 def test_blocks_and_lattices(adapters, seed):
     """Squares of a lattice, some cut in half, with some generators of the same lattice or of a finer one."""
@@ -49,6 +50,7 @@ def test_blocks_and_lattices(adapters, seed):
     check(adapters, shape, points[rng.random(len(points)) < rng.choice([0.3, 0.6, 1.0])])
 
 
+@pytest.mark.sparse(9)
 @pytest.mark.parametrize("seed", [*range(20), 111, 160, 211, 333, 385, 438, 5553])
 def test_corners_where_many_faces_meet(adapters, seed):
     """A wedge of the square, a hole, or a polygon, with a corner at the center of generators on a circle."""
@@ -70,6 +72,7 @@ def test_corners_where_many_faces_meet(adapters, seed):
     check(adapters, shape, points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("real", [0, 1])
 def test_generators_as_close_as_a_slit_is_wide(adapters, real):
     """Two close generators have nearly the same face with a third.
@@ -92,6 +95,7 @@ def test_generators_as_close_as_a_slit_is_wide(adapters, real):
         assert report, report
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("make", [slit, spit])
 @pytest.mark.parametrize("real", [0, 1])
 def test_faces_across_the_tip_of_a_wedge(adapters, real, make):
@@ -118,6 +122,7 @@ def crowd(seed: int, n: int) -> np.ndarray:
     return points[PAIR.contains(points)]
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", [0, 1])
 @pytest.mark.parametrize("n", [8, 60, 200])
 def test_crowds_around_a_corner(adapters, real, n):

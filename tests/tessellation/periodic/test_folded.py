@@ -86,6 +86,7 @@ def test_lanes_have_the_bits_of_single_cells(ctx, box, monkeypatch):
     assert changed == 5
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_cells_that_cover_the_box_twice(ctx, real):
     """A motion twice around in one step leaves all rows consistent, in two sheets that do not know each other."""

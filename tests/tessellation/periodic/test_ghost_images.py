@@ -107,6 +107,7 @@ class Given:
         return found
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("name", BOXES)
 def test_images_are_those_in_the_halo(adapter, name):
     given = Given(adapter, name, 60, stepped=True)
@@ -135,6 +136,7 @@ def test_images_are_those_in_the_halo(adapter, name):
     assert np.array_equal(images.firsts.get(), firsts)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", BOXES)
 def test_unfolded_rows_name_the_nearest_images(adapter, name):
     """A neighbor without an image becomes -1; the former code of an image does not matter."""
@@ -228,6 +230,7 @@ class Folding:
         return found
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", BOXES)
 def test_faces_that_are_missing_on_one_side(adapter, name):
     """Such faces are dropped if they are below round-off and cut at most a share off either cell."""
@@ -275,6 +278,7 @@ def test_faces_that_are_missing_on_one_side(adapter, name):
     assert 6 <= dropped <= 18
 
 
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize(("name", "n"), [("torus", 6), ("channel", 5), ("cube", 12), ("torus", 90)])
 def test_neighbors_that_are_not_the_nearest_images(adapter, name, n):
     """The rows are complete, and the first generator with such a neighbor is reported."""

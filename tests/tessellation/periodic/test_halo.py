@@ -163,6 +163,7 @@ def check_depths(adapter, box, points, walks):
     assert requests > 30
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("short", [0.6, 0.9])
 def test_too_shallow_blocks_are_detected(adapter, short):
     """The halo is reported too shallow if one block of many is, and only then."""
@@ -202,6 +203,7 @@ def is_enough(stages, ghost_images: GhostImages, box, x, n, halo):
     return ghost_images.fold(images, binned, t, x, 0.5, True)[1]
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(("dim", "count"), [(2, 60), (3, 100)])
 def test_depths_do_not_depend_on_the_order_of_generators(adapter, dim, count):
     """Number 0, which bounds are most easily wrong for, is each generator near the boundary in turn."""
@@ -258,6 +260,7 @@ def test_there_are_up_to_two_blocks_per_cell():
     assert (block_counts(np.array([1.0, 1.0, 0.0]), 100)[:2] == BLOCKS[3]).all()
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize(
     ("dim", "before", "after"),
     [(2, 600, 900), (3, 600, 5000), (3, 5000, 600), (3, 5000, 40_000), (3, 40_000, 5000)],

@@ -84,7 +84,7 @@ def faces_of(diagram):
     return dict(zip(keys, diagram.face_measures.tolist(), strict=True))
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 60, 500])
 @pytest.mark.parametrize(
     "box", [UNIT, CHANNEL, CUBE, SLAB], ids=["unit", "channel", "cube", "slab"]
@@ -121,6 +121,7 @@ def test_euler(double, box):
         assert vertices - 2 * vertices + edges_and_faces - n == 0
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("box", [UNIT, SLAB], ids=["unit", "slab"])
 def test_translation(adapter, box):
     """An exact translation along the periods gives the same cells, apart from the order of sums."""
@@ -166,6 +167,7 @@ def bcc(n):
     return np.concatenate([at, at + 0.5 / n]), (1, 1, 1), 14
 
 
+@pytest.mark.sparse(12)
 @pytest.mark.parametrize("offset", [0, 1 / 3])
 @pytest.mark.parametrize(
     ("lattice", "n"),
@@ -194,6 +196,7 @@ def test_lattices(adapter, lattice, n, offset):
     assert d.check()
 
 
+@pytest.mark.sparse(1)
 def test_clusters_need_a_deep_halo(adapter):
     """A cell as long as half a period needs images from many spacings away."""
     rng = np.random.default_rng(5)
@@ -205,7 +208,7 @@ def test_clusters_need_a_deep_halo(adapter):
         assert d.check()
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("box", [CHANNEL, SLAB], ids=["channel", "slab"])
 def test_images_include_all_that_cells_need(adapter, box):
     """All generators on the balls around vertices have images, none lies inside; small cells need few."""
@@ -309,7 +312,7 @@ SPOT = sizing.Expression(
 """A refined spot around (0.05, 0.9), across two periodic boundaries."""
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     "options",
     [
@@ -338,12 +341,14 @@ def test_runs(adapter, options):
         assert result.quality.mean() > 0.955  # of so few; .960 to .977 over twelve starts
 
 
+@pytest.mark.sparse(1)
 def test_the_same_bits_from_run_to_run(adapter):
     one, two = (adapter.run(UNIT, SPOT, seed=3, effort="fast") for _ in range(2))
     for name in ("points", "size_error", "quality"):
         assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
 
 
+@pytest.mark.sparse(1)
 def test_incremental_update_across_periodic_boundaries(adapter):
     """Diagrams updated from step to step equal those made anew."""
     from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
@@ -372,6 +377,7 @@ def rows_of(t):
     return t.neighbors.get()[: starts[-1]], starts[1:-1]
 
 
+@pytest.mark.sparse(1)
 def test_rows_do_not_depend_on_cells_of_images(adapter):
     """Rows of generators are the same whether or not images get cells, even in lattices off by one ulp."""
     from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
@@ -399,7 +405,7 @@ def test_faces_of_one_side_only_are_dropped(adapter):
     drop_faces(adapter)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("box", [UNIT, CHANNEL], ids=["unit", "channel"])
 def test_ends_of_a_dropped_face_become_one_vertex(adapter, box, monkeypatch):
     """Four cells meet at each vertex up to round-off, and images are cut in another order."""
@@ -422,6 +428,7 @@ def test_ends_of_a_dropped_face_become_one_vertex(adapter, box, monkeypatch):
     assert box is CHANNEL or sum(dropped)
 
 
+@pytest.mark.slow
 def test_coarse_levels_with_too_few_cells_are_left_out(double):
     from clvoro.adaptation.plan.schedule import auto_levels
 
@@ -432,6 +439,7 @@ def test_coarse_levels_with_too_few_cells_are_left_out(double):
         double.run(box, 0.07, options=clvoro.MultilevelOptions(levels=1), max_steps=1)
 
 
+@pytest.mark.slow
 def test_resume(double, tmp_path):
     """A resumed run has the same bits: incremental updates in 2D, the depth of the halo in 3D."""
     for box, size in ((UNIT, SPOT), (CUBE, sizing.Constant(0.17))):
@@ -456,6 +464,7 @@ def test_resume(double, tmp_path):
             )
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("box", [CUBE, SLAB], ids=["cube", "slab"])
 def test_runs_3d(double, box):
     size = sizing.Constant(0.16)
@@ -466,6 +475,7 @@ def test_runs_3d(double, box):
     assert (np.abs(result.diagram.shifts).max(axis=0) == box.periodic).all()
 
 
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(("lattice", "n"), [(hexagonal, 10), (bcc, 5)])
 def test_a_lattice_stays(double, lattice, n):
     """All forces vanish by symmetry: generators move by round-off only."""
@@ -499,6 +509,7 @@ def test_too_few_cells_for_a_run(double):
 # Files, pictures, cases.
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("box", [UNIT, CHANNEL, SLAB], ids=["unit", "channel", "slab"])
 @pytest.mark.parametrize("kind", ["npz", "vtu"])
 def test_files(double, tmp_path, box, kind):
@@ -554,6 +565,7 @@ def test_pictures_are_filled_up_to_the_boundary(double):
     assert len(cells.get_paths()) > len(result.points)
 
 
+@pytest.mark.slow
 def test_a_case_with_frames(tmp_path, monkeypatch, capsys):
     from clvoro.cli.cases import Case, load_case
     from clvoro.cli.command import main
@@ -593,7 +605,7 @@ def test_a_case_with_frames(tmp_path, monkeypatch, capsys):
         Case.from_toml(text.replace("[true, true]", "1"), "wave")
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("periodic", [(True, True), (True, False)])
 @pytest.mark.parametrize("order", [1, 2])
 def test_transfer_across_periodic_boundaries(adapter, periodic, order):
@@ -624,6 +636,7 @@ def test_transfer_across_periodic_boundaries(adapter, periodic, order):
     assert mean_error(1200) < mean_error(300) / (1.6 if order == 1 else 2.4)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("restored", [False, True])
 def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, restored):
     """A second attempt, after a halo that is too shallow, must not start from the graph of the first."""
@@ -670,7 +683,8 @@ def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, resto
     assert off.max() < ROUNDING[adapter.dtype.name] * volumes.mean()
 
 
-@pytest.mark.parametrize(("dim", "size"), [(2, "0.15"), (3, "0.3")])
+@pytest.mark.sparse(1)
+@pytest.mark.parametrize(("dim", "size"), [(3, "0.3"), (2, "0.15")])
 def test_boxes_of_other_lengths_share_their_kernels(double, dim, size):
     """Kernels on folded rows in 2D have the periods built in; building these takes a second or so."""
     size, periodic = sizing.Expression(size), (True, False, True)[:dim]

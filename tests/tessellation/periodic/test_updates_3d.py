@@ -90,6 +90,7 @@ def moved(points, box, by, rng):
     return np.where(held, np.clip(points + step, box.lower, box.upper), points + step)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize(
     "box", [pytest.param(UNIT, id="unit"), pytest.param(CHANNEL, id="channel")]

@@ -54,6 +54,7 @@ def off_walls(seed):
     return np.clip(points, BOX.lower, BOX.upper)
 
 
+@pytest.mark.sparse(2)
 def test_corners_lie_on_their_faces(seen):
     for u in seen.u:
         normals, share, r = [], 1.0, np.linalg.norm(seen.corners[u])
@@ -72,6 +73,7 @@ def test_corners_lie_on_their_faces(seen):
         assert seen.sharpness[u] == pytest.approx(span * share, rel=1e-5)
 
 
+@pytest.mark.sparse(2)
 def test_corners_of_one_vertex(seen):
     by_faces = {
         (i, faces): u for u, (i, faces) in enumerate(zip(seen.owners, seen.faces, strict=True))
@@ -96,6 +98,7 @@ def test_corners_of_one_vertex(seen):
     assert np.array_equal(seen.vertices, least[of])
 
 
+@pytest.mark.sparse(2)
 def test_half_faces_are_rows_and_then_walls(seen):
     check_half_faces(seen)
 

@@ -116,6 +116,7 @@ def check(adapter, box, points):
     return diagram
 
 
+@pytest.mark.sparse(10)
 @pytest.mark.parametrize("name", SETS)
 def test_regular_sets(adapter, name):
     diagram = check(adapter, CUBE, SETS[name])
@@ -123,13 +124,14 @@ def test_regular_sets(adapter, name):
     assert len(diagram.vertices) < 8 * len(diagram)
 
 
-@pytest.mark.sparse
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", IN_TORUS)
 def test_regular_sets_in_a_periodic_box(adapter, name):
     points = SETS[name] if name != "ring" else pipe([0.4], 80, 2)
     check(adapter, TORUS, points)
 
 
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("units", [50, 200, 800])
 def test_lattices_that_are_off_by_units_of_round_off(adapter, units):
     """Faces along all edges, as narrow as round-off: one that is merged must not merge all others."""
@@ -155,6 +157,7 @@ def near_each_other(gap, seed=0):
 KINDS = list(near_each_other(1))
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("periodic", [False, True], ids=["walls", "seams"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_least_separation(adapter, kind, periodic):
@@ -162,6 +165,7 @@ def test_the_least_separation(adapter, kind, periodic):
     check(adapter, TORUS if periodic else CUBE, near_each_other(gap)[kind])
 
 
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_nearer_generators(adapter, kind):
     """The result is a correct mesh, or an error that names the two. A few units of round-off apart it is the error."""
