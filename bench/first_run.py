@@ -56,7 +56,7 @@ import numpy as np, pyopencl as cl
 import clvoro
 from clvoro.opencl import engine as engines, kernels as kernel_objects, prebuild
 made, launches, programs, kinds = {{}}, {{}}, [], []
-plain = engines.Engine.kernels, cl.Kernel.set_args, cl.enqueue_nd_range_kernel
+plain = engines.Engine.kernels, kernel_objects.set_changed, cl.enqueue_nd_range_kernel
 def kernels(engine, stage, defines=None, prelude=""):
     taken = plain[0](engine, stage, defines, prelude)
     kinds.append(prebuild.kind_of(engine))
@@ -68,9 +68,11 @@ def getattribute(taken, name):
         kernel.made = made[id(taken)][1:]
     return kernel
 old = kernel_objects.Kernels.__getattr__
-def set_args(kernel, *args):
-    kernel.sizes = [a.nbytes if isinstance(a, (np.generic, np.ndarray)) else 0 for a in args]
-    plain[1](kernel, *args)
+def size_of(a):
+    return 4 if type(a) is int else a.nbytes if isinstance(a, (np.generic, np.ndarray)) else 0
+def set_changed(kernel, args, changed):
+    kernel.sizes = [size_of(a) for a in args]
+    plain[1](kernel, args, changed)
 def enqueue(queue, kernel, size, group, *args, **options):
     program_of, prelude = getattr(kernel, "made", (None, "x"))
     if not prelude:
@@ -80,7 +82,7 @@ def enqueue(queue, kernel, size, group, *args, **options):
         launches.setdefault(key, kernel.sizes)
     return plain[2](queue, kernel, size, group, *args, **options)
 engines.Engine.kernels, kernel_objects.Kernels.__getattr__ = kernels, getattribute
-cl.Kernel.set_args, cl.enqueue_nd_range_kernel = set_args, enqueue
+kernel_objects.set_changed, cl.enqueue_nd_range_kernel = set_changed, enqueue
 prebuild._is_new = lambda *_: False
 clvoro.Adapter().run({domain}, {size})
 rows = [[*key, sizes] for key, sizes in launches.items()]

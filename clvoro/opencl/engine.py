@@ -214,7 +214,7 @@ class Engine:
         """
         group = fit_group(kernel, ITEM_GROUP if group is None else group)
         bind(kernel, args)
-        return self.enqueue(kernel, -(-max(int(size), 1) // group) * group, group)
+        return self.enqueue(kernel, (max(int(size), 1) + group - 1) // group * group, group)
 
     def enqueue(self, kernel: cl.Kernel, items: int, group: int) -> cl.Event:
         """Enqueue `kernel`, with its arguments set, over `items` work-items: whole work-groups of `group` items.
@@ -229,7 +229,7 @@ class Engine:
         self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None
     ) -> cl.Event:
         """Enqueue `kernel` over `size` work-items; `size` is its first argument (see WORK_ITEM in opencl/real.h)."""
-        return self.run(kernel, size, np.int32(size), *args, group=group)
+        return self.run(kernel, size, int(size), *args, group=group)
 
     def run_blocks(self, kernel: cl.Kernel, *args: object) -> cl.Event:
         """Enqueue a block-wise `kernel` over `groups` work-groups of `group_size` items (see opencl/blocks.h)."""

@@ -2,7 +2,7 @@
 
 While a queue is watched, PyOpenCL's functions that enqueue commands (`enqueue_nd_range_kernel`,
 `Kernel.__call__`, `enqueue_copy`, `enqueue_fill`) are replaced by functions that also pass the event
-to the watchers, and `Kernel.set_args` records the sizes of buffers. So stages need no code for
+to the watchers, and `kernels.set_changed` records the sizes of buffers. So stages need no code for
 profiles, and runs without one are not slower.
 """
 
@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
 import pyopencl as cl
+
+from . import kernels
 
 MEMORY = "memory"
 """Stage of copies, fills, reads and writes by the host."""
@@ -120,12 +122,12 @@ def _call_kernel(
     return event
 
 
-def _set_args(kernel: cl.Kernel, *args: Any) -> None:
-    _original["set_args"](kernel, *args)
+def _set_changed(kernel: cl.Kernel, args: Sequence[Any], changed: Iterable[int]) -> None:
+    _original["set_changed"](kernel, args, changed)
     kernel.bytes_bound = _bytes_of(args)  # type: ignore[attr-defined]
 
 
-def _bytes_of(arguments: tuple[Any, ...]) -> int:
+def _bytes_of(arguments: Sequence[Any]) -> int:
     """Return the sum of the sizes of buffers, each counted once."""
     given = (getattr(a, "base_data", a) for a in arguments)
     buffers = {a.int_ptr: a.size for a in given if isinstance(a, cl.MemoryObject)}
@@ -162,5 +164,5 @@ _HOOKS: tuple[tuple[Any, str, Callable[..., Any]], ...] = (
     (cl, "enqueue_copy", _enqueue_copy),
     (cl, "enqueue_fill", _enqueue_fill),
     (cl.Kernel, "__call__", _call_kernel),
-    (cl.Kernel, "set_args", _set_args),
+    (kernels, "set_changed", _set_changed),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,10 +15,6 @@ from .device_array import DeviceArray
 from .program import source_text
 from .ranges import Range
 from .runtimes import cache_remedy
-
-_UNTYPED_CALLS = 3
-"""Calls of a kernel before PyOpenCL gets the types of its arguments."""
-
 
 def group_limit(kernel: cl.Kernel) -> int:
     """Return the largest work-group that `kernel` can be launched in, which depends on the registers that it needs."""
@@ -49,8 +45,8 @@ def range_of(kernel: cl.Kernel) -> Range:
 class KernelPool:
     """Kernel objects that are used again.
 
-    Creating a kernel object and setting the types of its arguments takes as long as a hundred launches. Stages are made
-    for each run, and take their kernels from here. Two stages never share one, because a kernel holds its arguments.
+    Creating a kernel object and setting its arguments takes as long as ten launches. Stages are made for each run, and
+    take their kernels from here. Two stages never share one, because a kernel holds its arguments.
     """
 
     def __init__(self) -> None:
@@ -131,65 +127,55 @@ class Kernels(SimpleNamespace):
 
 
 def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:
-    """Set the arguments of `kernel` if they are not set already. Arrays are passed as their buffers.
+    """Set those arguments of `kernel` that have changed. Arrays are passed as their buffers, a Python int as an int.
 
-    From step to step the arguments are mostly the same. To compare them takes a quarter of the time of setting them.
+    From step to step most arguments are the same. To compare them takes less time than to set them. In all calls an
+    argument must have the same type.
     """
-    key = comparison_key(args)
-    if key == getattr(kernel, "bound", None):
+    key, before = comparison_key(args), getattr(kernel, "bound", None)
+    if key == before:
         return
-    set_args(kernel, with_buffers(args))
+    changed: Sequence[int] = range(len(args))
+    if before is not None and len(before) == len(key):
+        pairs = enumerate(zip(key, before, strict=True))
+        changed = [k for k, (new, old) in pairs if new is not old and new != old]
+    elif len(args) != kernel.num_args:
+        raise TypeError(f"{kernel.function_name} got {len(args)} arguments, expected {kernel.num_args}")
+    kernel.bound = None  # type: ignore[attr-defined]
+    set_changed(kernel, args, changed)
     kernel.bound = key  # type: ignore[attr-defined]
 
 
 def comparison_key(args: Sequence[object]) -> list[object]:
     """Return a key that is equal for equal arguments only. It does not keep the arrays in memory."""
     return [
-        a.mark if type(a) is DeviceArray else a if type(a) is np.int32 else _key_of(a) for a in args
-    ]
-
-
-def with_buffers(args: Sequence[object]) -> list[Any]:
-    """Return the arguments with arrays replaced by their buffers."""
-    # `data` raises an error for an array that does not begin at the start of its buffer.
-    return [
-        (a.data if a.offset else a.base_data)
-        if type(a) is DeviceArray
-        else a.data
-        if isinstance(a, cla.Array)
-        else a
-        for a in args
+        a.mark if type(a) is DeviceArray else a if type(a) is int else _key_of(a) for a in args
     ]
 
 
 def _key_of(argument: object) -> object:
-    """Return the key of an argument that is neither a device array nor an int."""
-    if type(argument) is np.float64 and argument:
+    """Return the key of an argument that is neither a device array nor a Python int."""
+    kind = type(argument)
+    if kind is np.int32 or (kind is np.float64 and argument):
         return argument
     # The bytes of 0 and -0 differ. A new object is equal to nothing else.
     return argument.tobytes() if isinstance(argument, (np.generic, np.ndarray)) else object()
 
 
-def set_args(kernel: cl.Kernel, given: list[Any]) -> None:
-    """Set the arguments of `kernel`: buffers, numbers and vectors.
-
-    PyOpenCL tries one type after another for each argument. For a number this takes five times as long as the launch.
-    `set_arg_types` avoids it, but takes as long as twenty numbers. So it is called for kernels that are launched often.
-    An argument must have the same type in every call.
-    """
-    kernel.bound = None  # type: ignore[attr-defined]
-    calls = getattr(kernel, "calls", 0)
-    if calls == _UNTYPED_CALLS:
-        kernel.set_arg_types([_type_of(a) for a in given])
-    if calls <= _UNTYPED_CALLS:
-        kernel.calls = calls + 1  # type: ignore[attr-defined]
-    kernel.set_args(*given)
+def set_changed(kernel: cl.Kernel, args: Sequence[Any], changed: Iterable[int]) -> None:
+    """Set the arguments number `changed` among `args` of `kernel`. What watches arguments replaces this function."""
+    for k in changed:
+        a = args[k]
+        if isinstance(a, cla.Array):
+            # `data` raises an error for an array that does not begin at the start of its buffer.
+            kernel.set_arg(k, a.data if a.offset else a.base_data)
+        elif isinstance(a, (int, np.generic, np.ndarray)):
+            _set_number(kernel, k, np.int32(a) if isinstance(a, int) else a)
+        else:
+            kernel.set_arg(k, a)
 
 
-def _type_of(argument: object) -> np.dtype | None:
-    """Return the type of a number, raw bytes for a vector, None for a buffer."""
-    if isinstance(argument, np.number):
-        return argument.dtype
-    if isinstance(argument, np.ndarray):
-        return np.dtype((np.void, argument.nbytes))
-    return None
+_set_number: Callable[[cl.Kernel, int, Any], None] = getattr(
+    cl.Kernel, "_set_arg_buf", cl.Kernel.set_arg
+)
+"""Sets a number or vector. `set_arg` first tries all other types, which takes ten times as long as a launch."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 import pyopencl as cl
 
 from .engine import Engine
-from .kernels import bind, set_args, with_buffers
+from . import kernels
+from .kernels import bind
 
 
 class CostFactors(NamedTuple):
@@ -51,7 +51,8 @@ def one_group_limit(engine: Engine) -> int:
 class Launch:
     """A block-wise kernel with its arguments set. A call only enqueues it.
 
-    The kernel must not be used elsewhere at the same time, because it has one set of arguments.
+    The kernel must not be used elsewhere between its construction, or `set_first`, and the call, because it has one set
+    of arguments.
 
     Parameters
     ----------
@@ -67,9 +68,8 @@ class Launch:
         self, engine: Engine, kernel: cl.Kernel, *args: object, groups: int | None = None
     ) -> None:
         bind(kernel, args)
-        self._args = args
-        self._given: list[object] = []
-        self._kernel = kernel
+        self._args, self._kernel = args, kernel
+        self._key = kernel.bound  # type: ignore[attr-defined]
         self._queue = engine.queue
         group = engine.block_of(kernel)
         self._size = ((engine.groups if groups is None else groups) * group,)
@@ -77,10 +77,14 @@ class Launch:
 
     def set_first(self, value: int) -> None:
         """Set the kernel's first argument, an int."""
-        if not self._given:
-            self._given = with_buffers(self._args)
-        self._given[0] = np.int32(value)
-        set_args(self._kernel, self._given)
+        args = value, *self._args[1:]
+        if self._kernel.bound is self._key:  # type: ignore[attr-defined]
+            kernels.set_changed(self._kernel, args, (0,))
+            self._key[0] = value
+        else:
+            # Another launch has bound the kernel.
+            bind(self._kernel, args)
+            self._key = self._kernel.bound  # type: ignore[attr-defined]
 
     def __call__(self) -> None:
         """Enqueue the kernel."""

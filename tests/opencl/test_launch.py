@@ -31,14 +31,14 @@ def engine(ctx):
 
 @pytest.fixture
 def settings(monkeypatch):
-    """The calls of `set_args`."""
-    plain, calls = cl.Kernel.set_args, []
+    """The numbers of the arguments that each call of `set_changed` sets."""
+    plain, calls = kernels.set_changed, []
 
-    def noted(kernel, *args):
-        calls.append(args)
-        plain(kernel, *args)
+    def noted(kernel, args, changed):
+        calls.append(list(changed))
+        plain(kernel, args, changed)
 
-    monkeypatch.setattr(cl.Kernel, "set_args", noted)
+    monkeypatch.setattr(kernels, "set_changed", noted)
     return calls
 
 
@@ -67,7 +67,10 @@ def test_changed_arguments_are_set(engine, kernel, settings):
             n = how.get("n", 4)
             assert to.get()[:n] == pytest.approx(np.arange(8.0)[:n] + more, abs=0)
             assert (to.get()[n:] == -5).all()
-    assert len(settings) >= 5 * len(cases) - 4
+    # At first all; then those that have changed, of which there are at most two: one is reset.
+    assert settings[0] == list(range(5))
+    assert {k for changed in settings[1:] for k in changed} == {0, 1, 2, 4}
+    assert all(1 <= len(changed) <= 3 for changed in settings[1:])
 
 
 def test_unchanged_arguments_are_not_set(engine, kernel, settings):
@@ -77,12 +80,17 @@ def test_unchanged_arguments_are_not_set(engine, kernel, settings):
         # Views of the first rows, and numbers of other objects, are the same arguments.
         put(engine, kernel, source[:6], to, 0.25 + 0 * turn, (3, 0))
         assert to.get()[:4].tolist() == [3.25, 4.25, 5.25, 6.25]
-    assert len(settings) == 1
+    assert settings == [list(range(5))]
     tail = to[2:]
     with pytest.raises(cl.array.ArrayHasOffsetError):
         put(engine, kernel, source, tail)
     put(engine, kernel, source, to)
-    assert len(settings) == 2
+    assert len(settings) == 3 and settings[-1] == list(range(5))
+
+
+def test_a_wrong_number_of_arguments_is_an_error(engine, kernel):
+    with pytest.raises(TypeError, match="got 4 arguments, expected 5"):
+        bind(kernel, (4, np.float64(0), np.zeros(2, np.int32), engine.zeros(8)))
 
 
 def test_arguments_do_not_keep_arrays(engine, kernel):

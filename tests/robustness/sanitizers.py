@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 import pyopencl as cl
 
+from clvoro.opencl import kernels as _kernels
 from clvoro.opencl import program as _program
 from tests.robustness.oclgrind_work import buffers_of_their_own
 
@@ -77,20 +78,14 @@ class Recorder:
         self.programs: dict[int, Program] = {}
         self.launches: collections.Counter[tuple[int, str]] = collections.Counter()
         self.taken: collections.Counter[tuple[int, str]] = collections.Counter()
-        self._plain = (cl.Kernel.set_args, cl.Kernel.set_arg, cl.enqueue_nd_range_kernel)
+        self._plain = (_kernels.set_changed, cl.enqueue_nd_range_kernel)
         self._build = _program.build_program
         self._share = lambda: None
 
     def __enter__(self) -> Recorder:
-        set_args, set_arg, _ = self._plain
-
-        def noted_args(kernel, *args):
-            kernel.noted = list(args)
-            set_args(kernel, *args)
-
-        def noted_arg(kernel, k, value):
-            kernel.noted[k] = value
-            set_arg(kernel, k, value)
+        def noted_args(kernel, args, changed):
+            kernel.noted = [getattr(a, "base_data", np.int32(a) if type(a) is int else a) for a in args]
+            self._plain[0](kernel, args, changed)
 
         def noted_build(ctx, name, defines, prelude):
             program = self._build(ctx, name, defines, prelude)
@@ -101,14 +96,14 @@ class Recorder:
                 )
             return program
 
-        cl.Kernel.set_args, cl.Kernel.set_arg = noted_args, noted_arg
+        _kernels.set_changed = noted_args
         cl.enqueue_nd_range_kernel = self._enqueue
         _program.build_program = noted_build
         self._share = buffers_of_their_own()
         return self
 
     def __exit__(self, *_: object) -> None:
-        cl.Kernel.set_args, cl.Kernel.set_arg, cl.enqueue_nd_range_kernel = self._plain
+        _kernels.set_changed, cl.enqueue_nd_range_kernel = self._plain
         _program.build_program = self._build
         self._share()
 
@@ -116,20 +111,20 @@ class Recorder:
         number = kernel.get_info(cl.kernel_info.PROGRAM).int_ptr
         program = self.programs.get(number)
         if program is None:  # PyOpenCL's own
-            return self._plain[2](queue, kernel, size, group, *rest, **more)
+            return self._plain[1](queue, kernel, size, group, *rest, **more)
         name = kernel.function_name
         which = (number, name)
         self.launches[which] += 1
         # Launches 1, 2, 4, ...: late launches of a run have other input than early ones.
         count, taken = self.launches[which], self.taken[which]
         if taken >= self.most or count < 2**taken:
-            return self._plain[2](queue, kernel, size, group, *rest, **more)
+            return self._plain[1](queue, kernel, size, group, *rest, **more)
         self.taken[which] += 1
         buffers = list(
             {a.int_ptr: a for a in kernel.noted if isinstance(a, cl.MemoryObject)}.values()
         )
         before = [fetch(queue, each) for each in buffers]
-        event = self._plain[2](queue, kernel, size, group, *rest, **more)
+        event = self._plain[1](queue, kernel, size, group, *rest, **more)
         after = [fetch(queue, each) for each in buffers]
         path = self.folder / f"{kernel.stage}.{name}.{which[0]:x}.{count}"
         at_once = group[0] > 1 and "barrier(" in program.text
