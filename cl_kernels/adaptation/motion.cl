@@ -34,25 +34,13 @@ kernel void compute_potential_gradient(const int size, global const int *starts,
 /* u = alpha u with alpha = min(limit, k / max_i(|u_i| / h_i)), the paper's (3.5). summaries[4 slot + 3] is the maximum.
  */
 kernel void relax_correction(const int size, global const REAL *summaries, const int slot, const REAL limit,
-                             const REAL k, global REAL *u, global REAL *speed)
+                             const REAL k, global REAL *u)
 {
     WORK_ITEM(i);
     const REAL fastest = summaries[4 * slot + 3];
     const REAL alpha = fastest * limit > k ? k / fastest : limit;
     EACH_AXIS(a)
     u[DIM * i + a] *= alpha;
-    speed[i] *= alpha;
-}
-
-/* speed = |u| / h. One launch for both displacements of a step takes PoCL twice as long as two, because it does not
-   vectorize. */
-kernel void measure_displacement(const int size, global const REAL *u, global const REAL *h, global REAL *speed)
-{
-    WORK_ITEM(i);
-    REAL u2 = 0;
-    EACH_AXIS(a)
-    u2 += u[DIM * i + a] * u[DIM * i + a];
-    speed[i] = sqrt(u2) / h[i];
 }
 
 /* x += a lloyd + b correction, the paper's (3.4), clipped to clip h_i (clip = 0: not clipped), and kept in the domain.

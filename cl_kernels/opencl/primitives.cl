@@ -141,35 +141,70 @@ inline void add_value(summary_t *a, REAL value)
     a->largest = fmax(a->largest, value);
 }
 
+/* |u_i| / h_i. */
+inline REAL length_over(int i, global const REAL *u, global const REAL *h)
+{
+    REAL square = 0;
+    EACH_AXIS(a)
+    square += u[DIM * i + a] * u[DIM * i + a];
+    return sqrt(square) / h[i];
+}
+
 #if GROUP_SIZE == 1
 #define REAL8 CLVORO_JOIN(REAL, 8)
 
-/* Items [begin, end), eight at a time, because one sum would wait for each addition. */
-inline void add_run(summary_t *a, global const REAL *values, int begin, int end)
+/* Define a function that adds items [begin, end), eight at a time, because one sum would wait for each addition.
+   EIGHT(i) are the eight from i on and ONE(i) is one; they may use `names`, the function's further arguments. */
+#define ADD_RUN(name, EIGHT, ONE, ...)                                                                                 \
+    inline void name(summary_t *a, int begin, int end, __VA_ARGS__)                                                    \
+    {                                                                                                                  \
+        REAL8 sum = 0, sum_low = 0, magnitude = 0, magnitude_low = 0, least = REAL_MAX, largest = -REAL_MAX;           \
+        int i = begin;                                                                                                 \
+        for (; i + 8 <= end; i += 8) {                                                                                 \
+            const REAL8 value = EIGHT(i);                                                                              \
+            ADD_COMPENSATED(REAL8, sum, sum_low, value);                                                               \
+            ADD_COMPENSATED(REAL8, magnitude, magnitude_low, fabs(value));                                             \
+            least = fmin(least, value);                                                                                \
+            largest = fmax(largest, value);                                                                            \
+        }                                                                                                              \
+        REAL s[8], l[8], m[8], n[8], lo[8], hi[8];                                                                     \
+        vstore8(sum, 0, s);                                                                                            \
+        vstore8(sum_low, 0, l);                                                                                        \
+        vstore8(magnitude, 0, m);                                                                                      \
+        vstore8(magnitude_low, 0, n);                                                                                  \
+        vstore8(least, 0, lo);                                                                                         \
+        vstore8(largest, 0, hi);                                                                                       \
+        for (int k = 0; k < 8; ++k) {                                                                                  \
+            const summary_t lane = {s[k], l[k], m[k], n[k], lo[k], hi[k]};                                             \
+            merge_summary(a, lane);                                                                                    \
+        }                                                                                                              \
+        for (; i < end; ++i)                                                                                           \
+            add_value(a, ONE(i));                                                                                      \
+    }
+
+#define EIGHT_VALUES(i) vload8(0, values + (i))
+#define ONE_VALUE(i) values[i]
+ADD_RUN(add_run, EIGHT_VALUES, ONE_VALUE, global const REAL *values)
+
+/* Component a of the vectors i to i + 7. */
+#define EIGHT_COMPONENTS(u, i, a)                                                                                      \
+    (REAL8)(u[DIM * (i) + (a)], u[DIM * ((i) + 1) + (a)], u[DIM * ((i) + 2) + (a)], u[DIM * ((i) + 3) + (a)],          \
+            u[DIM * ((i) + 4) + (a)], u[DIM * ((i) + 5) + (a)], u[DIM * ((i) + 6) + (a)], u[DIM * ((i) + 7) + (a)])
+
+inline REAL8 eight_lengths(int i, global const REAL *u, global const REAL *h)
 {
-    REAL8 sum = 0, sum_low = 0, magnitude = 0, magnitude_low = 0, least = REAL_MAX, largest = -REAL_MAX;
-    int i = begin;
-    for (; i + 8 <= end; i += 8) {
-        const REAL8 value = vload8(0, values + i);
-        ADD_COMPENSATED(REAL8, sum, sum_low, value);
-        ADD_COMPENSATED(REAL8, magnitude, magnitude_low, fabs(value));
-        least = fmin(least, value);
-        largest = fmax(largest, value);
+    REAL8 square = 0;
+    EACH_AXIS(a)
+    {
+        const REAL8 part = EIGHT_COMPONENTS(u, i, a);
+        square += part * part;
     }
-    REAL s[8], l[8], m[8], n[8], lo[8], hi[8];
-    vstore8(sum, 0, s);
-    vstore8(sum_low, 0, l);
-    vstore8(magnitude, 0, m);
-    vstore8(magnitude_low, 0, n);
-    vstore8(least, 0, lo);
-    vstore8(largest, 0, hi);
-    for (int k = 0; k < 8; ++k) {
-        const summary_t lane = {s[k], l[k], m[k], n[k], lo[k], hi[k]};
-        merge_summary(a, lane);
-    }
-    for (; i < end; ++i)
-        add_value(a, values[i]);
+    return sqrt(square) / vload8(0, h + i);
 }
+
+#define EIGHT_LENGTHS(i) eight_lengths(i, u, h)
+#define ONE_LENGTH(i) length_over(i, u, h)
+ADD_RUN(add_lengths, EIGHT_LENGTHS, ONE_LENGTH, global const REAL *u, global const REAL *h)
 #endif
 
 /* Block-wise: partials[groups * slot + group] = summary of the group's items of an array, of the first `count` of eight
@@ -186,7 +221,7 @@ kernel void summarize_blocks(global const REAL *a0, global const REAL *a1, globa
         global summary_t *out = partials + get_num_groups(0) * slot_of[a] + get_group_id(0);
         summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
 #if GROUP_SIZE == 1
-        add_run(&mine, values, block_begin(n), block_end(n));
+        add_run(&mine, block_begin(n), block_end(n), values);
 #else
         for (BLOCK_LOOP(i, n))
             add_value(&mine, values[i]);
@@ -194,6 +229,26 @@ kernel void summarize_blocks(global const REAL *a0, global const REAL *a1, globa
         merge_group(&mine, shares);
         if (get_local_id(0) == 0)
             *out = mine;
+    }
+}
+
+/* The same for |u_i| / h_i and |v_i| / h_i, which are not stored. */
+kernel void summarize_lengths(global const REAL *u, global const REAL *v, global const REAL *h, const int n,
+                              const int slot_of_u, const int slot_of_v, global summary_t *partials)
+{
+    GROUP_SUMMARIES(shares);
+    for (int a = 0; a < 2; ++a) {
+        global const REAL *vectors = a == 0 ? u : v;
+        summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
+#if GROUP_SIZE == 1
+        add_lengths(&mine, block_begin(n), block_end(n), vectors, h);
+#else
+        for (BLOCK_LOOP(i, n))
+            add_value(&mine, length_over(i, vectors, h));
+#endif
+        merge_group(&mine, shares);
+        if (get_local_id(0) == 0)
+            partials[get_num_groups(0) * (a == 0 ? slot_of_u : slot_of_v) + get_group_id(0)] = mine;
     }
 }
 

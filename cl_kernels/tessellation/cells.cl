@@ -1,3 +1,4 @@
+#include "opencl/blocks.h"
 #include "tessellation/corner.h"
 
 #include "tessellation/vertex_walk.h"
@@ -409,4 +410,15 @@ kernel void drop_loops(const int size, global const int *places, global const in
     counts[i] = count;
     if (TOO_FEW(count))
         atomic_or(flags, FLAG_COLLAPSED);
+}
+
+/* The starts of n rows, and their neighbors if `whole`, to their place, once nothing is read from there any more. */
+kernel void copy_graph(const int n, const int whole, global const int *starts, global const int *neighbors,
+                       global int *starts_to, global int *neighbors_to)
+{
+    const int faces = whole ? starts[n] : 0;
+    for (BLOCK_LOOP(i, n + 1))
+        starts_to[i] = starts[i];
+    for (BLOCK_LOOP(k, faces))
+        neighbors_to[k] = neighbors[k];
 }

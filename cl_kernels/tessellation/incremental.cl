@@ -167,10 +167,13 @@ kernel void check_rows(const int size, const int stride, const int rest, const i
         atomic_add(flags + 2, found);
 }
 
-/* Per generator i: an empty mark, and no new row. */
-kernel void begin_update(const int size, global int *marks, global int *places)
+/* Per generator i: an empty mark, and no new row. The flags are reset, with the spare slots from `first_spare` on. */
+kernel void begin_update(const int size, global int *marks, global int *places, global int *flags, const int flag_count,
+                         const int first_spare, const int slot_count)
 {
     WORK_ITEM(i);
+    for (int f = 0; i == 0 && f < flag_count; ++f)
+        flags[f] = f == 3 ? first_spare : f == 4 ? slot_count : 0;
     marks[i] = 0;
     places[i] = -1;
 }

@@ -131,15 +131,13 @@ class MeshArrays:
     source : (n,) real
         Right side of the Poisson equation. It and the following arrays are in the workspace, valid for one step.
     lloyd, correction : (n, d) real
-        The two parts of the displacement. Their lengths over h: `lloyd_speed`, `correction_speed` (n,).
+        The two parts of the displacement.
     """
 
     _data: Arrays
     source: cla.Array
     lloyd: cla.Array
     correction: cla.Array
-    lloyd_speed: cla.Array
-    correction_speed: cla.Array
 
     points = _property("generators", "points")
     labels = _property("generators", "labels")
@@ -202,17 +200,9 @@ class MeshArrays:
         """Allocate the right side of a Poisson equation."""
         self.source = self.engine.scratch(self.n)
 
-    def measure_displacements(self) -> None:
-        """Compute the lengths of both displacements over h."""
-        self.lloyd_speed, self.correction_speed = (self.engine.scratch(self.n) for _ in range(2))
-        self.stages.motion.measure_displacements(
-            self.lloyd, self.correction, self.h, self.lloyd_speed, self.correction_speed
-        )
-
     def summarize_displacements(self) -> None:
-        """Summarize the lengths of both displacements."""
-        speeds = {"lloyd": self.lloyd_speed, "correction": self.correction_speed}
-        self.summaries.collect_all(speeds, self.n)
+        """Summarize the lengths of both displacements over h."""
+        self.summaries.collect_lengths(("lloyd", "correction"), self.lloyd, self.correction, self.h)
 
     def ordered(self, array: cla.Array) -> np.ndarray:
         """Return `array` (n, ...) on the host in the order of labels."""

@@ -32,7 +32,7 @@ class Method(Protocol):
     """A way to move generators."""
 
     def displace(self, mesh: MeshState) -> Solution | None:
-        """Compute `mesh.lloyd`, `mesh.correction` and their lengths over h. They are valid in the workspace's frame."""
+        """Compute `mesh.lloyd` and `mesh.correction`, valid in the workspace's frame, and summarize their lengths."""
         ...
 
     def move(self, mesh: MeshState) -> None:
@@ -85,14 +85,11 @@ class PublishedMethod:
                 laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, ordering=mesh.labels
             )
         motion.compute_potential_gradient(t, mesh.potential, mesh.correction)
-        mesh.measure_displacements()
-        mesh.zero_fixed(mesh.correction)
-        mesh.summaries.collect("correction", mesh.correction_speed, mesh.n)
-        alpha = mesh.engine.cell_dim if r.alpha is None else r.alpha
-        motion.relax_correction(
-            mesh.summaries, "correction", alpha, r.k, mesh.correction, mesh.correction_speed
-        )
         mesh.summarize_displacements()
+        alpha = mesh.engine.cell_dim if r.alpha is None else r.alpha
+        motion.relax_correction(mesh.summaries, "correction", alpha, r.k, mesh.correction)
+        mesh.summarize_displacements()
+        mesh.zero_fixed(mesh.correction)
         return solution
 
     def move(self, mesh: MeshState) -> None:
@@ -140,9 +137,8 @@ class WeightedMethod:
                 ordering=mesh.labels, from_zero=True,
             )  # fmt: skip
         motion.compute_potential_gradient(t, mesh.potential, mesh.correction)
-        mesh.measure_displacements()
-        mesh.zero_fixed(mesh.correction)
         mesh.summarize_displacements()
+        mesh.zero_fixed(mesh.correction)
         return solution
 
     def move(self, mesh: MeshState) -> None:
@@ -276,7 +272,6 @@ class ProjectedMethod:
             Limits(self.tolerance, self.iterations), labels=mesh.labels, fixed=mesh.fixed,
             start=mesh.multipliers, warm=warm,
         )  # fmt: skip
-        mesh.measure_displacements()
         mesh.summarize_displacements()
         return solution
 

@@ -46,32 +46,16 @@ class Motion:
         )  # fmt: skip
 
     def relax_correction(
-        self,
-        summaries: Summaries,
-        name: str,
-        limit: float,
-        k: float,
-        u: cla.Array,
-        speed: cla.Array,
+        self, summaries: Summaries, name: str, limit: float, k: float, u: cla.Array
     ) -> None:
-        """Scale `u` and `speed` by alpha = min(limit, k / max(speed)), the paper's (3.5).
+        """Scale `u` (n, d) by alpha = min(limit, k / max(|u| / h)), the paper's (3.5).
 
-        The summary `name` of `speed` must have been collected.
+        The summary `name` of |u| / h must have been collected.
         """
         real = self.engine.real.type
-        n = speed.shape[0]
         self.engine.run_each(
-            self._kernels.relax_correction, n, summaries.values, np.int32(summaries.slots[name]),
-            real(limit), real(k), u, speed,
+            self._kernels.relax_correction, len(u), summaries.values, summaries.slots[name], real(limit), real(k), u
         )  # fmt: skip
-
-    def measure_displacements(
-        self, u: cla.Array, v: cla.Array, h: cla.Array, u_speed: cla.Array, v_speed: cla.Array
-    ) -> None:
-        """Write |u| / h to `u_speed` (n,) and |v| / h to `v_speed` (n,)."""
-        kernel, n = self._kernels.measure_displacement, h.shape[0]
-        self.engine.run_each(kernel, n, u, h, u_speed)
-        self.engine.run_each(kernel, n, v, h, v_speed)
 
     def move_generators(
         self,

@@ -129,13 +129,18 @@ def buffer_of(array: cla.Array) -> cl.Buffer:
 
 def read_number(array: cla.Array, index: int) -> Any:
     """Fetch one number of a 1D array, without the view that ``array[index].get()`` makes."""
-    if not 0 <= index < len(array):
-        raise IndexError(f"index {index} of an array of {len(array)}")
-    host = np.empty(1, array.dtype)
-    start = array.offset + index * array.dtype.itemsize
+    return read_numbers(array, index, 1).item()
+
+
+def read_numbers(array: cla.Array, first: int, count: int) -> np.ndarray:
+    """Fetch ``array[first : first + count]`` of a 1D array without a view, which takes as long as a launch."""
+    if not 0 <= first <= first + count <= len(array):
+        raise IndexError(f"items {first} to {first + count - 1} of an array of {len(array)}")
+    host = np.empty(count, array.dtype)
+    start = array.offset + first * array.dtype.itemsize
     queue, buffer = cast("cl.CommandQueue", array.queue), cast("cl.Buffer", array.base_data)
     cl.enqueue_copy(queue, host, buffer, src_offset=start)
-    return host.item()
+    return host
 
 
 def make_array(

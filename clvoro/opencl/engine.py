@@ -251,7 +251,7 @@ class Engine:
 
     def scratch(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
         """Return an uninitialized array of the workspace, valid to its frame's end; outside of one, a new array."""
-        real = np.dtype(self.real if dtype is None else dtype)
+        real = self.real if dtype is None else np.dtype(dtype)
         taken = self.workspace.take(shape, real)
         return self.empty(shape, real) if taken is None else taken
 

@@ -16,6 +16,7 @@ from .program import source_text
 from .ranges import Range
 from .runtimes import cache_remedy
 
+
 def group_limit(kernel: cl.Kernel) -> int:
     """Return the largest work-group that `kernel` can be launched in, which depends on the registers that it needs."""
     device = kernel.context.devices[0]
@@ -140,7 +141,9 @@ def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:
         pairs = enumerate(zip(key, before, strict=True))
         changed = [k for k, (new, old) in pairs if new is not old and new != old]
     elif len(args) != kernel.num_args:
-        raise TypeError(f"{kernel.function_name} got {len(args)} arguments, expected {kernel.num_args}")
+        raise TypeError(
+            f"{kernel.function_name} got {len(args)} arguments, expected {kernel.num_args}"
+        )
     kernel.bound = None  # type: ignore[attr-defined]
     set_changed(kernel, args, changed)
     kernel.bound = key  # type: ignore[attr-defined]
@@ -148,9 +151,7 @@ def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:
 
 def comparison_key(args: Sequence[object]) -> list[object]:
     """Return a key that is equal for equal arguments only. It does not keep the arrays in memory."""
-    return [
-        a.mark if type(a) is DeviceArray else a if type(a) is int else _key_of(a) for a in args
-    ]
+    return [a.mark if type(a) is DeviceArray else a if type(a) is int else _key_of(a) for a in args]
 
 
 def _key_of(argument: object) -> object:

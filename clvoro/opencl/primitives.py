@@ -46,9 +46,9 @@ class Scan:
         `out` may be `values` if it has room and `first` is 0. The last sum is also written to ``array[place]`` if
         `total`, (array, place), is given.
         """
-        k, engine, given = self._kernels, self.engine, (values, np.int32(first), np.int32(n))
+        k, engine, given = self._kernels, self.engine, (values, first, n)
         array, place = (out, n) if total is None else total
-        to = self._sums, out, array, np.int32(place)
+        to = self._sums, out, array, place
         if n <= FEW:
             engine.run_groups(k.scan_blocks, 1, *given, *to)
             return
@@ -107,10 +107,19 @@ class Summaries:
             self._slots_of[names] = vector, sum(1 << slot for slot in slots)
         slots, which = self._slots_of[names]
         self.engine.run_blocks(
-            self._kernels.summarize_blocks, *given, *spare, np.int32(len(given)), np.int32(n), slots,
-            self._partials,
+            self._kernels.summarize_blocks, *given, *spare, len(given), n, slots, self._partials,
         )  # fmt: skip
         self._pending |= which
+
+    def collect_lengths(
+        self, names: tuple[str, str], u: cla.Array, v: cla.Array, unit: cla.Array
+    ) -> None:
+        """Summarize the lengths of `u` and `v`, (n, d), over `unit` (n,) into the slots of two names."""
+        one, two = (self.slots[name] for name in names)
+        self.engine.run_blocks(
+            self._kernels.summarize_lengths, u, v, unit, len(unit), one, two, self._partials
+        )
+        self._pending |= 1 << one | 1 << two
 
     @property
     def values(self) -> cla.Array:
@@ -122,9 +131,8 @@ class Summaries:
     def _combine(self, note: cla.Array | None) -> None:
         """Combine the partial summaries, and write the first number of `note` after them."""
         self.engine.run_groups(
-            self._kernels.combine_blocks, len(self.slots), self._partials, np.int32(self.engine.groups),
-            np.int32(self._pending), np.int32(note is not None), self._record if note is None else note,
-            self._values, self._record,
+            self._kernels.combine_blocks, len(self.slots), self._partials, self.engine.groups, self._pending,
+            int(note is not None), self._record if note is None else note, self._values, self._record,
         )  # fmt: skip
         self._pending = 0
 
@@ -144,7 +152,7 @@ class Summaries:
         size = self._values.nbytes
         host = self._record.get()
         rows = host[:size].view(self.engine.real).reshape(-1, 4).tolist()
-        summaries = {name: Summary(*rows[slot]) for name, slot in self.slots.items()}
+        summaries = {name: Summary._make(rows[slot]) for name, slot in self.slots.items()}
         return summaries, int(host[size:].view(np.int32)[0])
 
 

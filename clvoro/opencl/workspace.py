@@ -79,6 +79,8 @@ class Workspace:
         # Arrays by number of the buffer, shape and type.
         self._views: dict[tuple[object, ...], cla.Array] = {}
         self._most, self._slack = 0, SLACK
+        # Bytes of all buffers.
+        self._held = 0
 
     def frame(self) -> Workspace:
         """Return a context manager; at its end all arrays taken inside are given back."""
@@ -101,31 +103,33 @@ class Workspace:
         if not self._frames:
             return None
         items = math.prod(shape) if isinstance(shape, tuple) else int(shape)
-        size = max(items * dtype.itemsize, 1)
+        size = items * dtype.itemsize or 1
         self._needed[-1] += size
-        place = bisect_left(self._free, (size, 0))
-        fits = place < len(self._free) and self._free[place][0] <= max(LOOSEST * size, SMALL)
-        taken = self._free.pop(place) if fits else self._allocate(size)
+        free = self._free
+        place = bisect_left(free, (size, 0))
+        fits = place < len(free) and free[place][0] <= max(LOOSEST * size, SMALL)
+        taken = free.pop(place) if fits else self._allocate(size)
         self._frames[-1].append(taken)
         key = taken[1], shape, dtype
-        if key not in self._views:
+        view = self._views.get(key)
+        if view is None:
             # The array is kept, because creating one takes as long as a launch.
-            self._views[key] = make_array(self._queue, shape, dtype, self._buffers[taken[1]])
-        return self._views[key]
+            view = self._views[key] = make_array(self._queue, shape, dtype, self._buffers[taken[1]])
+        return view
 
     def _allocate(self, size: int) -> tuple[int, int]:
         """Make a buffer of at least `size` bytes: return its size and number."""
         device = self._queue.device
         memory_limits.check_allocation(device, size)
         most = max(self._most, sum(self._needed))
-        held = sum(buffer.size for buffer in self._buffers.values())
-        while self._free and held + size > self._slack * most:
+        while self._free and self._held + size > self._slack * most:
             freed, old = self._free.pop()
-            held -= freed
+            self._held -= freed
             del self._buffers[old]
             self._views = {key: view for key, view in self._views.items() if key[0] != old}
             self._slack *= SLACK
         size = max(size, min(size + size // SPARE, memory_limits.largest_allocation(device)))
         self._made += 1
         self._buffers[self._made] = cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size)
+        self._held += size
         return size, self._made

@@ -7,12 +7,13 @@ projection does in incompressible flow.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pyopencl.array as cla
 
 from ..errors import SolverError
+from ..opencl.device_array import read_numbers
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.launch import Launch, one_group_limit
@@ -29,8 +30,7 @@ _SPARE = 1
 read then. Further ones cost two launches each."""
 
 
-@dataclass(frozen=True)
-class Targets:
+class Targets(NamedTuple):
     """Cells against the size field, on the device.
 
     Attributes
@@ -51,8 +51,7 @@ class Targets:
     quality: cla.Array
 
 
-@dataclass(frozen=True)
-class Penalty:
+class Penalty(NamedTuple):
     """The penalty eps that trades accuracy of the volumes for a shorter displacement.
 
     eps_i = min(3, eps (1 + q_i^2 / quality_scale^2)) / (1 + |r_i / log_ratio_scale|^power), q = (1 - Q) / sqrt Q of the
@@ -69,18 +68,17 @@ class Penalty:
     most_at_walls: float = math.inf
 
 
-@dataclass(frozen=True)
-class _Arrays:
+class _Arrays(NamedTuple):
     """Arrays of one iteration, as volume_projection.cl names them."""
 
     rows: cla.Array
     columns: cla.Array
     own: cla.Array
+    s: cla.Array
+    u: cla.Array
     eps: cla.Array
     inverse: cla.Array
     p: cla.Array
-    s: cla.Array
-    u: cla.Array
     y: cla.Array
     r: cla.Array
     z: cla.Array
@@ -120,11 +118,9 @@ class VolumeProjection:
         engine, d = self.engine, self.engine.cell_dim
         if 4 * (max_iterations + 1) > len(self._record):
             self._record = engine.zeros(4 * (max_iterations + 1))
-        return _Arrays(
-            **{name: engine.scratch((d, m), np.float32) for name in ("rows", "columns")},
-            **{name: engine.scratch((n, d), store) for name in ("own", "s", "u")},
-            **{name: engine.scratch(n, store) for name in ("eps", "inverse", "y", "r", "z", "p")},
-        )
+        shapes = ((d, m), np.dtype(np.float32), 2), ((n, d), store, 3), (n, store, 6)
+        take = engine.scratch
+        return _Arrays(*(take(shape, real) for shape, real, count in shapes for _ in range(count)))
 
     @framed
     def project(
@@ -176,18 +172,18 @@ class VolumeProjection:
         start = engine.scratch(n, np.float32) if start is None else start
         groups = 1 if n <= self._one_group_limit else engine.groups
         Launch(
-            engine, k.assemble_projection, np.int32(n), np.int32(m), t.starts, t.neighbors, t.face_measures,
+            engine, k.assemble_projection, n, m, t.starts, t.neighbors, t.face_measures,
             t.face_centroids, t.volumes, t.points, targets.gradient, targets.h, targets.quality,
             targets.log_ratio, displacement, real(penalty.eps), real(penalty.quality_scale),
             real(min(penalty.eps, penalty.most_at_walls)),
             real(penalty.at_walls * penalty.quality_scale), real(penalty.log_ratio_scale),
-            np.int32(penalty.power), v.rows, v.columns, v.own,
+            penalty.power, v.rows, v.columns, v.own,
             v.eps, v.inverse, v.r, v.z, self._partial,
-            t.starts if labels is None else labels, np.int32(fixed), np.int32(warm), start,
+            t.starts if labels is None else labels, fixed, int(warm), start,
             *engine.period_args, groups=groups,
         )()  # fmt: skip
         iteration = (
-            np.int32(n), np.int32(most), np.int32(m), np.int32(warm), real(tolerance), t.starts, t.neighbors,
+            n, most, m, int(warm), real(tolerance), t.starts, t.neighbors,
             v.rows, v.columns, v.own, v.eps, v.inverse, v.p, v.s, v.u, v.y, v.r, v.z, self._partial, self._record,
         )  # fmt: skip
         if groups == 1:
@@ -195,8 +191,8 @@ class VolumeProjection:
             rows = self._read(most)
         else:
             rows = self._iterate(
-                Launch(engine, k.update_projection_direction, np.int32(0), *iteration),
-                Launch(engine, k.update_projection, np.int32(0), *iteration),
+                Launch(engine, k.update_projection_direction, 0, *iteration),
+                Launch(engine, k.update_projection, 0, *iteration),
                 most,
             )
         solution = self._solution(rows, tolerance)
@@ -206,7 +202,7 @@ class VolumeProjection:
             correction.fill(0)
         return solution
 
-    def _iterate(self, direction: Launch, update: Launch, most: int) -> np.ndarray:
+    def _iterate(self, direction: Launch, update: Launch, most: int) -> list[list[float]]:
         """Iterate until the tolerance is met, or `most` times; return the record up to there or further."""
         direction()
         done, ahead = 0, self._ahead
@@ -217,16 +213,16 @@ class VolumeProjection:
                     launch.set_first(number)
                     launch()
             rows = self._read(end)
-            if not rows[:, RECORD_RUNNING].all():
+            if not all(row[RECORD_RUNNING] for row in rows):
                 self._ahead = _first_stop(rows) + _SPARE
                 return rows
             done, ahead = end, 4
 
-    def _read(self, end: int) -> np.ndarray:
+    def _read(self, end: int) -> list[list[float]]:
         """Return the rows of the record up to iteration `end`."""
-        return self._record[: 4 * (end + 1)].get().reshape(-1, 4).astype(np.float64)
+        return read_numbers(self._record, 0, 4 * (end + 1)).reshape(-1, 4).tolist()
 
-    def _solution(self, rows: np.ndarray, tolerance: float) -> Solution:
+    def _solution(self, rows: list[list[float]], tolerance: float) -> Solution:
         """Return the outcome by the record.
 
         Raises
@@ -235,24 +231,24 @@ class VolumeProjection:
             If a number is not finite.
         """
         iterations = _first_stop(rows)
-        flat = bool(iterations and not rows[iterations - 1, RECORD_CURVATURE] > 0)
+        flat = bool(iterations and not rows[iterations - 1][RECORD_CURVATURE] > 0)
         iterations -= flat
-        norms = rows[: iterations + 1, RECORD_NORM]
-        curvature = rows[iterations, RECORD_CURVATURE]
+        norms = [row[RECORD_NORM] for row in rows[: iterations + 1]]
+        curvature = rows[iterations][RECORD_CURVATURE]
         # A curvature of 0 means that the residual is below the limit of the precision.
-        if not np.isfinite(norms).all() or (flat and curvature != 0):
+        if not all(map(math.isfinite, norms)) or (flat and curvature != 0):
             raise SolverError(
                 "the volume projection got sizes, a displacement or a diagram that is not finite: squared residuals "
                 f"{norms}, curvature {curvature}. Check the input"
             )
         if norms[0] == 0:
             return Solution.zero()
-        residuals = np.sqrt(norms / norms[0])
+        residuals = np.sqrt(np.array(norms) / norms[0])
         converged = bool(residuals[-1] <= tolerance)
         reason = "converged" if converged else "stagnated" if flat else "max_iterations"
         return Solution(iterations, float(residuals[-1]), residuals, converged, reason)
 
 
-def _first_stop(rows: np.ndarray) -> int:
+def _first_stop(rows: list[list[float]]) -> int:
     """Return the first iteration that was not carried out. Later rows of the record have no meaning."""
-    return int(np.flatnonzero(rows[:, RECORD_RUNNING] == 0)[0])
+    return next(k for k, row in enumerate(rows) if row[RECORD_RUNNING] == 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -241,7 +241,7 @@ class Cells:
         points: cla.Array,
         previous: Tessellation,
         fits: cla.Array,
-    ) -> np.ndarray:
+    ) -> list[int]:
         """Match the rows of `previous`, replaced by `rows` where these have a slot; return the flags.
 
         While cells are marked nothing is done. `fits` (n,) is 1 for a row if every neighbor lists the generator between
@@ -249,7 +249,7 @@ class Cells:
         """
         old = previous.starts, previous.neighbors
         self._enqueue_match(rows, box, points, previous.n, *old, exact=False, fits=fits)
-        return self._flags.get()
+        return self._flags.get().tolist()
 
     def complete(
         self,
@@ -257,7 +257,7 @@ class Cells:
         box: ClipBox,
         points: cla.Array,
         previous: Tessellation,
-        found: np.ndarray,
+        found: Sequence[int],
     ) -> Tessellation | None:
         """Return the diagram of the rows matched by `match_update` with the flags `found`; None if they are wrong."""
         n, old, (flags, m) = previous.n, (previous.starts, previous.neighbors), _verdict(found)
@@ -278,11 +278,8 @@ class Cells:
         return replace(t, face_measures=measures, face_centroids=centroids)
 
     def _read_flags(self) -> tuple[int, int]:
-        """Return the flags and the number of half-faces.
-
-        `DOUBT`: some cells are doubtful. `CROWDED`: there were too few spare slots.
-        """
-        return _verdict(self._flags.get())
+        """Return the flags and the number of half-faces. `CROWDED`: there were too few spare slots."""
+        return _verdict(self._flags.get().tolist())
 
     def _match(
         self,
@@ -314,7 +311,7 @@ class Cells:
         engine.run_each(
             self._kernels.match_polygon_faces, n, rows.places, rows.slots, rows.counts, old_starts,
             old_neighbors, points, *box.device_corners(engine.real),
-            np.int32(fits is not None), self._share(exact), rows.places if fits is None else fits,
+            int(fits is not None), self._share(exact), rows.places if fits is None else fits,
             rows.keep, starts, rows.flags,
         )  # fmt: skip
         self._count(rows, starts, n)
@@ -343,7 +340,7 @@ class Cells:
         direct = old_starts is rows.places and not flags & DOUBT
         neighbors = faces["neighbors"] if direct else engine.scratch(m, np.int32)
         engine.run(
-            self._kernels.measure_cells, -(-n // self.lanes), np.int32(n), rows.places, rows.slots,
+            self._kernels.measure_cells, -(-n // self.lanes), n, rows.places, rows.slots,
             rows.counts, old_starts, old_neighbors, rows.keep, starts, points, *corners,
             neighbors, faces["face_measures"], faces["face_centroids"], new["volumes"],
             new["offsets"], new["covariances"],
@@ -358,11 +355,10 @@ class Cells:
                 return self._measure_without_loops(rows, box, points, n, neighbors, exact)
             if wrong:
                 return None
-        copied = [(starts, new["starts"])]
-        if not direct:
-            copied.append((neighbors, faces["neighbors"]))
-        for array, to in copied:
-            cl.enqueue_copy(engine.queue, buffer_of(to), buffer_of(array), byte_count=array.nbytes)
+        whole = int(not direct)
+        engine.run_blocks(
+            self._kernels.copy_graph, n, whole, starts, neighbors, new["starts"], faces["neighbors"]
+        )
         return Tessellation(
             n=n, points=points, starts=new["starts"], neighbors=faces["neighbors"],
             face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=new["volumes"],
@@ -395,9 +391,14 @@ class Cells:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
 
     def take_rows(
-        self, n: int, slots: int | None = None, spare: int = 0, whole: bool = False
+        self,
+        n: int,
+        slots: int | None = None,
+        spare: int = 0,
+        whole: bool = False,
+        reset: bool = True,
     ) -> FaceRows:
-        """Return `n` empty rows of faces, of which `slots` (by default all) may be new; the flags are reset.
+        """Return `n` empty rows of faces, of which `slots` (by default all) may be new; `reset` the flags.
 
         `spare` slots follow, for rows longer than one slot. With `whole`, faces no longer than round-off stay.
         """
@@ -408,7 +409,8 @@ class Cells:
                 f"the faces of {n} cells need {slots * SLOT:.3g} entries, expected fewer than 2^31, which "
                 "32-bit indices can tell apart; use fewer cells, or perturb generators that lie on a common circle"
             )
-        self._reset_flags(first, slots, whole)
+        if reset:
+            self._reset_flags(first, slots, whole)
         return FaceRows(
             engine.scratch(slots * SLOT, np.int32), engine.scratch(slots, np.int32),
             engine.scratch(slots, np.uint32), engine.scratch(n, np.int32), engine.scratch(n + 1, np.int32),
@@ -440,8 +442,8 @@ class Cells:
         self._enlarged_for = n
 
 
-def _verdict(flags: np.ndarray) -> tuple[int, int]:
+def _verdict(flags: Sequence[int]) -> tuple[int, int]:
     """Return the error bits and the number of half-faces."""
-    wrong, doubtful, _, spare, slots = (int(v) for v in flags[:5])
+    wrong, doubtful, _, spare, slots = flags[:5]
     wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)
-    return wrong, int(flags[FACES])
+    return wrong, flags[FACES]

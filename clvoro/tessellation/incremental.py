@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from types import SimpleNamespace
 from weakref import ReferenceType, ref
 
@@ -12,7 +13,7 @@ import pyopencl.array as cla
 from ..geometry.box import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from .cells import CLIPPED, MARKED, Cells
+from .cells import CLIPPED, FLAGS, MARKED, Cells
 from .device_diagram import Tessellation
 from .face_rows import spare_slots
 from .rounds import with_room
@@ -77,31 +78,32 @@ class IncrementalUpdate:
         if self._last is None or self._last() is not previous:
             self._fits.fill(0)
         first_most, most = int(MAX_SHARE * n), int((MAX_SHARE + AGAIN_SHARE) * n)
-        rows = cells.take_rows(n, most, spare_slots(n))
+        spare = spare_slots(n)
+        rows = cells.take_rows(n, most, spare, reset=False)
         marks, listed = engine.scratch(n, np.int32), engine.scratch(most, np.int32)
         sums = engine.scratch(n + 1, np.int32)
         corners = box.device_corners(engine.real)
         old = (previous.starts, previous.neighbors)
         most_wrong = int(WRONG_SHARE * n / SAMPLE) if n >= SAMPLED_FROM else n
-        engine.run_each(k.begin_update, n, marks, rows.places)
-        check = np.int32(most_wrong), *old, points, *corners, self._fits, marks, rows.flags
+        engine.run_each(
+            k.begin_update, n, marks, rows.places, rows.flags, FLAGS, most, most + spare
+        )
+        check = most_wrong, *old, points, *corners, self._fits, marks, rows.flags
         self._check(k.check_rows, -(-n // cells.lanes), n, check)
         done, expected = 0, [first_most] if self._expected is None else self._expected
         while True:
             for number, size in enumerate(expected, done):
                 in_all = most if number else first_most
-                limits = np.int32(size), np.int32(in_all), np.int32(most_wrong)
+                limits = size, in_all, most_wrong
                 self._scan.exclusive(marks, sums, n)
-                engine.run_each(
-                    k.list_marked, n, np.int32(number), *limits, marks, sums, listed, rows.flags
-                )
-                few = np.int32(FEW if cells.lanes > 1 and number == 0 else n + 1)
+                engine.run_each(k.list_marked, n, number, *limits, marks, sums, listed, rows.flags)
+                few = FEW if cells.lanes > 1 and number == 0 else n + 1
                 if few <= size:
                     engine.run_each(
                         k.wrap_marked, -(-size // cells.lanes), few, rows.flags, listed, rows.places, rows.slots,
                         rows.counts, *old, points, *corners, group=1,
                     )  # fmt: skip
-                this = listed, np.int32(number)
+                this = listed, number
                 engine.run_each(
                     k.clip_marked, size, *this, few, rows.places, rows.slots, rows.counts, *old, points, *corners,
                     self._fits, rows.flags,
@@ -115,22 +117,22 @@ class IncrementalUpdate:
                 )  # fmt: skip
             self._scan.exclusive(marks, sums, n, total=(rows.flags, MARKED))
             found = cells.match_update(rows, box, points, previous, self._fits)
-            clipped = np.diff(found[CLIPPED : CLIPPED + done + len(expected) + 1])
-            done, left = int(np.count_nonzero(clipped)), int(found[MARKED])
+            sums_of_rounds = found[CLIPPED : CLIPPED + done + len(expected) + 1]
+            clipped = [after - before for before, after in pairwise(sums_of_rounds)]
+            done, left = sum(count > 0 for count in clipped), found[MARKED]
             if left == 0:
                 self._expected = with_room(clipped[:done], first_most)
                 return cells.complete(rows, box, points, previous, found)
             in_all = most if done else first_most
-            if found[2] > most_wrong or clipped.sum() + left > in_all or done >= MAX_ROUNDS - 1:
+            if found[2] > most_wrong or sum(clipped) + left > in_all or done >= MAX_ROUNDS - 1:
                 return None
             expected = [left]
 
     def _check(self, kernel: cl.Kernel, items: int, n: int, args: tuple[object, ...]) -> None:
         """Check all rows with `items` work-items, or only a sample if it shows that too many have changed."""
-        one, part = np.int32(1), -(-items // SAMPLE)
         if n < SAMPLED_FROM:
-            self.engine.run(kernel, items, np.int32(n), one, np.int32(0), *args)
+            self.engine.run(kernel, items, n, 1, 0, *args)
             return
-        stride = np.int32(SAMPLE)
-        self.engine.run(kernel, part, np.int32(n), stride, np.int32(0), *args)
-        self.engine.run(kernel, items - part, np.int32(n), stride, one, *args)
+        part = -(-items // SAMPLE)
+        self.engine.run(kernel, part, n, SAMPLE, 0, *args)
+        self.engine.run(kernel, items - part, n, SAMPLE, 1, *args)

@@ -105,8 +105,8 @@ class PolyhedraUpdate:
                 matching = cells.match(
                     rounds.cut, self._report, points, self._share, before, folded=True
                 )
-            found = self._report.get()
-            flags, used, left, marked, kept = map(int, found[:REPORT_LISTED])
+            found = self._report.get().tolist()
+            flags, used, left, marked, kept = found[:REPORT_LISTED]
             if flags & ~HARMLESS or max(left, marked) > most:
                 return None
             if marked or left:
@@ -121,7 +121,7 @@ class PolyhedraUpdate:
                 continue
             self._clips = clipped
             counts = found[REPORT_LISTED : REPORT_LISTED + done]
-            self._expected = with_room(counts[counts > 0], most)
+            self._expected = with_room((count for count in counts if count > 0), most)
             if matching is None:
                 sizes, final = [], True
                 continue

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Iterable
 
 
-def with_room(clipped: np.ndarray, most: int) -> list[int]:
-    """Return the sizes of the launches of the next update, if this one has `clipped` so many cells in each round."""
-    sizes = np.minimum(clipped + clipped // 2 + 256, most)
-    return np.minimum.accumulate(sizes).tolist()
+def with_room(clipped: Iterable[int], most: int) -> list[int]:
+    """Return the sizes of the launches of the next update, if this one has `clipped` so many cells in each round.
+
+    No round is larger than the one before.
+    """
+    sizes: list[int] = []
+    for count in clipped:
+        most = min(count + count // 2 + 256, most)
+        sizes.append(most)
+    return sizes

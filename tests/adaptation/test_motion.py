@@ -69,36 +69,21 @@ def test_relax_globally(engine, limit, k):
     u, speed = rng.normal(size=(N, 2)), rng.uniform(0, 3, N)
     summaries = Summaries(engine, ("other", "speed"))
     summaries.collect("other", engine.upload(10 * speed), N)
-    on_device = engine.upload(u), engine.upload(speed)
-    summaries.collect("speed", on_device[1], N)
-    Motion(engine).relax_correction(summaries, "speed", limit, k, *on_device)
+    on_device = engine.upload(u)
+    summaries.collect("speed", engine.upload(speed), N)
+    Motion(engine).relax_correction(summaries, "speed", limit, k, on_device)
     alpha = min(limit, k / speed.max())
     eps = float(np.finfo(engine.real).eps)
-    assert on_device[0].get() == pytest.approx(alpha * u, rel=8 * eps)
-    assert on_device[1].get() == pytest.approx(alpha * speed, rel=8 * eps)
+    assert on_device.get() == pytest.approx(alpha * u, rel=8 * eps)
 
 
 def test_relax_nothing(engine):
     """All displacements zero: alpha is the limit, and no 0 / 0 arises."""
     summaries = Summaries(engine, ("speed",))
-    u, speed = engine.zeros((N, 2)), engine.zeros(N)
-    summaries.collect("speed", speed, N)
-    Motion(engine).relax_correction(summaries, "speed", 2.0, 0.5, u, speed)
+    u = engine.zeros((N, 2))
+    summaries.collect("speed", engine.zeros(N), N)
+    Motion(engine).relax_correction(summaries, "speed", 2.0, 0.5, u)
     assert not u.get().any()
-    assert not speed.get().any()
-
-
-def test_measure_displacements(engine):
-    rng = np.random.default_rng(23)
-    both, h, speeds = (
-        rng.normal(size=(2, N, 2)),
-        rng.uniform(0.1, 2, N),
-        [engine.empty(N), engine.empty(N)],
-    )
-    Motion(engine).measure_displacements(*map(engine.upload, both), engine.upload(h), *speeds)
-    for u, speed in zip(both, speeds, strict=True):
-        expected = np.linalg.norm(u, axis=1) / h
-        assert speed.get() == pytest.approx(expected, rel=8 * float(np.finfo(engine.real).eps))
 
 
 def move(engine, box, points, lloyd, a, correction, b, h, clip):

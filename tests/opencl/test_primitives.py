@@ -123,6 +123,23 @@ def test_summaries_repeat_bit_by_bit(engine):
     assert summaries.read()["a"] == summaries.read()["b"]
 
 
+@pytest.mark.parametrize("n", [1, 7, 8, 5000])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_lengths(ctx, engine, dim, n):
+    """Lengths are summarized as if they had been computed before, to the last bit."""
+    engine = patch.make_engine(ctx, engine.real, group_size=engine.group_size, dim=dim)
+    rng = np.random.default_rng(n)
+    u, v = rng.normal(size=(2, n, dim)).astype(engine.real)
+    h = rng.uniform(0.1, 2, n).astype(engine.real)
+    summaries, expected = Summaries(engine, "abc"), Summaries(engine, "abc")
+    summaries.collect_lengths(("c", "a"), *map(engine.upload, (u, v, h)))
+    for name, w in (("c", u), ("a", v)):
+        square = w[:, 0] * w[:, 0] + w[:, 1] * w[:, 1]
+        lengths = np.sqrt(square + w[:, 2] * w[:, 2] if dim == 3 else square) / h
+        expected.collect(name, engine.upload(lengths), n)
+    assert summaries.read() == expected.read()
+
+
 def test_summary_shows_nan_and_infinity(engine):
     values = np.ones(1000)
     values[613] = np.nan

@@ -84,7 +84,9 @@ class Recorder:
 
     def __enter__(self) -> Recorder:
         def noted_args(kernel, args, changed):
-            kernel.noted = [getattr(a, "base_data", np.int32(a) if type(a) is int else a) for a in args]
+            kernel.noted = [
+                getattr(a, "base_data", np.int32(a) if type(a) is int else a) for a in args
+            ]
             self._plain[0](kernel, args, changed)
 
         def noted_build(ctx, name, defines, prelude):

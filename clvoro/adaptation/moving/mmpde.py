@@ -198,7 +198,6 @@ class MmpdeMethod:
         # Uphill: forget the last displacement.
         self.age = 0 if power > 0 else self.age + 1
         stage.bound_displacement(mesh, min(MOST_MOMENTUM, self.age / (self.age + 3)), room)
-        mesh.measure_displacements()
         mesh.summarize_displacements()
         return Solution.zero()
 

@@ -194,7 +194,6 @@ class MongeAmpereMethod:
         mesh.allocate_step()
         mesh.lloyd.fill(0)
         mesh.correction.set((x - mesh.points.get()).astype(mesh.engine.real))
-        mesh.measure_displacements()
         mesh.summarize_displacements()
         return solution
 

@@ -44,5 +44,4 @@ class PowerPhase:
         mesh.allocate_step()
         mesh.lloyd = mesh.t.offsets
         mesh.correction.fill(0)
-        mesh.measure_displacements()
         mesh.summarize_displacements()
