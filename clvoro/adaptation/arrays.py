@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ class Arrays:
 
 def _property(part: str, name: str) -> Any:
     """Return a property for attribute `name` of `part` of `MeshArrays._data`."""
-    return property(lambda self: getattr(getattr(self._data, part), name))
+    return property(attrgetter(f"_data.{part}.{name}"))
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ class MeshArrays:
     @property
     def n(self) -> int:
         """Number of generators."""
-        return len(self._data.generators)
+        return self._data.generators.points.shape[0]
 
     @property
     def tessellation(self) -> Tessellation | None:

@@ -212,9 +212,10 @@ class Engine:
         `size` is rounded up to whole work-groups of `group` items, or fewer if the device requires it. The kernel must
         skip the items beyond `size`.
         """
-        group = fit_group(kernel, ITEM_GROUP if group is None else group)
+        group = fit_group(kernel, group or ITEM_GROUP)
         bind(kernel, args)
-        return self.enqueue(kernel, (max(int(size), 1) + group - 1) // group * group, group)
+        items = (size + group - 1) // group * group if size > 0 else group
+        return self.enqueue(kernel, items, group)
 
     def enqueue(self, kernel: cl.Kernel, items: int, group: int) -> cl.Event:
         """Enqueue `kernel`, with its arguments set, over `items` work-items: whole work-groups of `group` items.
@@ -229,7 +230,8 @@ class Engine:
         self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None
     ) -> cl.Event:
         """Enqueue `kernel` over `size` work-items; `size` is its first argument (see WORK_ITEM in opencl/real.h)."""
-        return self.run(kernel, size, int(size), *args, group=group)
+        size = int(size)
+        return self.run(kernel, size, size, *args, group=group)
 
     def run_blocks(self, kernel: cl.Kernel, *args: object) -> cl.Event:
         """Enqueue a block-wise `kernel` over `groups` work-groups of `group_size` items (see opencl/blocks.h)."""
@@ -251,9 +253,8 @@ class Engine:
 
     def scratch(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
         """Return an uninitialized array of the workspace, valid to its frame's end; outside of one, a new array."""
-        real = self.real if dtype is None else np.dtype(dtype)
-        taken = self.workspace.take(shape, real)
-        return self.empty(shape, real) if taken is None else taken
+        taken = self.workspace.take(shape, self.real if dtype is None else dtype)
+        return self.empty(shape, dtype) if taken is None else taken
 
     def zeros(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
         """Return a device array of zeros."""

@@ -30,8 +30,9 @@ def power_of_two(limit: int) -> int:
 
 def fit_group(kernel: cl.Kernel, group: int) -> int:
     """Return `group`, or the largest power of two that `kernel` can be launched in if that is smaller."""
-    limit = getattr(kernel, "limit", None)
-    if limit is None:
+    try:
+        limit = kernel.limit  # type: ignore[attr-defined]
+    except AttributeError:
         limit = kernel.limit = group_limit(kernel)  # type: ignore[attr-defined]
     return group if group <= limit else power_of_two(limit)
 
@@ -167,7 +168,7 @@ def set_changed(kernel: cl.Kernel, args: Sequence[Any], changed: Iterable[int]) 
     """Set the arguments number `changed` among `args` of `kernel`. What watches arguments replaces this function."""
     for k in changed:
         a = args[k]
-        if isinstance(a, cla.Array):
+        if type(a) is DeviceArray or isinstance(a, cla.Array):
             # `data` raises an error for an array that does not begin at the start of its buffer.
             kernel.set_arg(k, a.data if a.offset else a.base_data)
         elif isinstance(a, (int, np.generic, np.ndarray)):

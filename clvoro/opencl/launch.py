@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import pyopencl as cl
 
-from .engine import Engine
 from . import kernels
+from .engine import Engine
 from .kernels import bind
 
 

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
+from numpy.typing import DTypeLike
 
 from . import memory_limits
 from .device_array import make_array
@@ -48,6 +49,28 @@ def framed(method: Method) -> Method:
     return run  # type: ignore[return-value]
 
 
+class _Taken:
+    """An array taken in a frame, and what has been taken after it: a node of a tree.
+
+    Attributes
+    ----------
+    view : DeviceArray or None
+        None at the root, before the first array.
+    buffer : int
+        Number of its buffer.
+    needed : int
+        Bytes of this array and of all that were taken before it and are in use.
+    after : dict
+        Nodes of the next array by its shape and type.
+    """
+
+    __slots__ = ("after", "buffer", "needed", "view")
+
+    def __init__(self, view: cla.Array | None, buffer: int, needed: int) -> None:
+        self.view, self.buffer, self.needed = view, buffer, needed
+        self.after: dict[tuple[object, object], _Taken] = {}
+
+
 class Workspace:
     """Device arrays that are valid in a frame.
 
@@ -55,6 +78,9 @@ class Workspace:
     allocated, and free ones are given up while there is more memory than arrays have needed at a time. So repeated
     steps soon allocate nothing. Each array begins at the start of its buffer: with several arrays in one buffer, as
     sub-buffers, NVIDIA's driver 580 crashes when they are released.
+
+    Steps take arrays of the same sizes in the same order. So the choice of buffers is kept as a tree: if the same
+    arrays are in use, the next one of the same shape is the same array.
 
     Parameters
     ----------
@@ -64,72 +90,88 @@ class Workspace:
     def __init__(self, queue: cl.CommandQueue) -> None:
         self._queue = queue
         self._made = 0
-        # For each open frame: size and number of each buffer that it has taken, and the bytes of all its arrays.
-        self._frames: list[list[tuple[int, int]]] = []
-        self._needed: list[int] = []
+        # Length of the path at the beginning of each open frame.
+        self._frames: list[int] = []
         self.clear()
 
     def clear(self) -> None:
         """Free all memory, if no frame is open."""
         if self._frames:
             return
+        # Size and number of each buffer, the smallest first, and the buffers by number.
+        self._sizes: list[tuple[int, int]] = []
         self._buffers: dict[int, cl.Buffer] = {}
-        # The free ones by size and number, the smallest first.
-        self._free: list[tuple[int, int]] = []
         # Arrays by number of the buffer, shape and type.
         self._views: dict[tuple[object, ...], cla.Array] = {}
+        # The arrays in use, in the order in which they were taken, after the root.
+        self._path = [_Taken(None, 0, 0)]
+        self._nodes = 0
         self._most, self._slack = 0, SLACK
-        # Bytes of all buffers.
-        self._held = 0
 
     def frame(self) -> Workspace:
         """Return a context manager; at its end all arrays taken inside are given back."""
         return self
 
     def __enter__(self) -> None:
-        if not self._frames and len(self._views) > MOST_VIEWS:
+        if not self._frames and max(self._nodes, len(self._views)) > MOST_VIEWS:
+            self._forget()
             self._views = {}
-        self._frames.append([])
-        self._needed.append(0)
+        self._frames.append(len(self._path))
 
     def __exit__(self, *_: object) -> None:
-        self._most = max(self._most, sum(self._needed))
-        self._needed.pop()
-        for taken in self._frames.pop():
-            insort(self._free, taken)
+        self._most = max(self._most, self._path[-1].needed)
+        del self._path[self._frames.pop() :]
 
-    def take(self, shape: int | tuple[int, ...], dtype: np.dtype) -> cla.Array | None:
+    def take(self, shape: int | tuple[int, ...], dtype: DTypeLike) -> cla.Array | None:
         """Return an array with arbitrary content, valid to the end of the frame; None if no frame is open."""
         if not self._frames:
             return None
-        items = math.prod(shape) if isinstance(shape, tuple) else int(shape)
-        size = items * dtype.itemsize or 1
-        self._needed[-1] += size
-        free = self._free
-        place = bisect_left(free, (size, 0))
-        fits = place < len(free) and free[place][0] <= max(LOOSEST * size, SMALL)
-        taken = free.pop(place) if fits else self._allocate(size)
-        self._frames[-1].append(taken)
-        key = taken[1], shape, dtype
-        view = self._views.get(key)
-        if view is None:
-            # The array is kept, because creating one takes as long as a launch.
-            view = self._views[key] = make_array(self._queue, shape, dtype, self._buffers[taken[1]])
-        return view
+        node = self._path[-1].after.get((shape, dtype)) or self._choose(shape, dtype)
+        self._path.append(node)
+        return node.view
 
-    def _allocate(self, size: int) -> tuple[int, int]:
-        """Make a buffer of at least `size` bytes: return its size and number."""
+    def _choose(self, shape: int | tuple[int, ...], dtype: DTypeLike) -> _Taken:
+        """Return the node of an array that has not been taken after the present ones before."""
+        real, last = np.dtype(dtype), self._path[-1]
+        items = math.prod(shape) if isinstance(shape, tuple) else int(shape)
+        size = max(items * real.itemsize, 1)
+        used = {node.buffer for node in self._path}
+        place = bisect_left(self._sizes, (size, 0))
+        fitting = (number for _, number in self._sizes[place:] if number not in used)
+        number = next(fitting, None)
+        if number is None or self._buffers[number].size > max(LOOSEST * size, SMALL):
+            number = self._allocate(size, used)
+        key = number, shape, real
+        if key not in self._views:
+            # The array is kept, because creating one takes as long as a launch.
+            self._views[key] = make_array(self._queue, shape, real, self._buffers[number])
+        node = last.after[shape, dtype] = _Taken(self._views[key], number, last.needed + size)
+        self._nodes += 1
+        return node
+
+    def _forget(self) -> None:
+        """Forget the choice of buffers, except for arrays in use."""
+        self._nodes = 0
+        for node in self._path:
+            node.after = {}
+
+    def _allocate(self, size: int, used: set[int]) -> int:
+        """Make a buffer of at least `size` bytes, with those called `used` in use; return its number."""
         device = self._queue.device
         memory_limits.check_allocation(device, size)
-        most = max(self._most, sum(self._needed))
-        while self._free and self._held + size > self._slack * most:
-            freed, old = self._free.pop()
-            self._held -= freed
+        most = max(self._most, self._path[-1].needed + size)
+        held = sum(size for size, _ in self._sizes)
+        free = [entry for entry in self._sizes if entry[1] not in used]
+        while free and held + size > self._slack * most:
+            freed, old = free.pop()
+            held -= freed
+            self._sizes.remove((freed, old))
             del self._buffers[old]
             self._views = {key: view for key, view in self._views.items() if key[0] != old}
+            self._forget()
             self._slack *= SLACK
         size = max(size, min(size + size // SPARE, memory_limits.largest_allocation(device)))
         self._made += 1
         self._buffers[self._made] = cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size)
-        self._held += size
-        return size, self._made
+        insort(self._sizes, (size, self._made))
+        return self._made

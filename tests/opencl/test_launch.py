@@ -85,7 +85,8 @@ def test_unchanged_arguments_are_not_set(engine, kernel, settings):
     with pytest.raises(cl.array.ArrayHasOffsetError):
         put(engine, kernel, source, tail)
     put(engine, kernel, source, to)
-    assert len(settings) == 3 and settings[-1] == list(range(5))
+    assert len(settings) == 3
+    assert settings[-1] == list(range(5))
 
 
 def test_a_wrong_number_of_arguments_is_an_error(engine, kernel):
