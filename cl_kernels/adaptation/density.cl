@@ -156,7 +156,8 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
     weighted_offset(i, g, site, offsets, covariances, lloyd);
 }
 
-/* partial = per work-group, sum of V rho r, then sum of V rho. One block of generators per work-group. */
+/* partial = per work-group, sum of V rho r, then sum of V rho: the ratio of their sums is the mean of r. A wrong number of
+   generators changes the mean; motion cannot correct it, insertion and deletion can. */
 kernel void sum_log_ratio(const int size, global const REAL *weight, global const REAL *log_ratio, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
@@ -170,14 +171,4 @@ kernel void sum_log_ratio(const int size, global const REAL *weight, global cons
         partial[get_group_id(0)] = sums[0];
         partial[get_num_groups(0) + get_group_id(0)] = sums[1];
     }
-}
-
-/* r -= mean r, weighted by V rho. A wrong number of generators changes the mean; motion cannot correct it, insertion
-   and deletion can. */
-kernel void subtract_mean_log_ratio(const int size, global const REAL *partial, global REAL *log_ratio)
-{
-    local REAL scratch[GROUP_SIZE];
-    const REAL mean = total_sum(partial, scratch) / total_sum(partial + get_num_groups(0), scratch);
-    for (BLOCK_LOOP(i, size))
-        log_ratio[i] -= mean;
 }

@@ -33,6 +33,20 @@
 #define GAMMA(k) (2 + ((k)&1))
 #define CURVATURE 4
 
+/* Numbers of launches so far: `counts` tells each kernel of an iteration its number. So its arguments are the same in
+   all iterations. A kernel reads the count of the other one and writes its own. */
+#define UPDATES 0
+#define DIRECTIONS 1
+
+/* Sum of the partial values of `groups` work-groups of an earlier kernel: the same bits as `total_sum` there. */
+inline REAL sum_of_groups(global const REAL *partial, int groups, local REAL *scratch)
+{
+    REAL sum = 0;
+    for (int g = get_local_id(0); g < groups; g += GROUP_SIZE)
+        sum += partial[g];
+    return group_sum(sum, scratch);
+}
+
 /* eps = min(3, penalty (1 + q^2 / quality_scale^2)) / (1 + (r / log_ratio_scale)^power), q = (1 - Q) / sqrt Q.
 
    Q is the least quality of the cell and its neighbors; q is close to -log Q, without a logarithm. Bad cells and their
@@ -56,9 +70,10 @@ inline float penalty_of(float penalty, float quality_scale, float least_quality,
      own[i] = dr_i/dx_i h_i      rows[k] = dr_i/dx_j h_j      columns[k] = dr_j/dx_i h_i   for face k = (i, j)
      r = b = log_ratio + J displacement      z = start if `warm`, else D^-1 r
 
-   together with eps and D^-1. rows and columns have one array of `room` entries per component; entries of walls are 0.
-   Generators with labels below `fixed` do not move. Lengths are divided by h before they are rounded, so that sizes of
-   any magnitude are in range. */
+   together with eps and D^-1. From the log ratios their mean is subtracted if `mean_groups` is not 0: the sums of
+   `sum_log_ratio` over so many groups are in `mean_partial`. rows and columns have one array of `room` entries per
+   component; entries of walls are 0. Generators with labels below `fixed` do not move. Lengths are divided by h before
+   they are rounded, so that sizes of any magnitude are in range. */
 kernel void assemble_projection(int n, const int room, global const int *starts, global const int *neighbors,
                                 global const FACE *face_measures, global const FACE *face_centroids,
                                 global const REAL *volumes, global const REAL *points, global const REAL *gradient,
@@ -67,10 +82,16 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
                                 const REAL wall_penalty, const REAL wall_quality_scale, const REAL log_ratio_scale,
                                 const int power, global float *rows, global float *columns, global STORE *own,
                                 global STORE *eps, global STORE *inverse_diagonal, global STORE *r, global STORE *z,
-                                global REAL *partial, global const int *labels, const int fixed, const int warm,
+                                global REAL *partial, global int *counts, global const REAL *mean_partial,
+                                const int mean_groups, global const int *labels, const int fixed, const int warm,
                                 global const float *start PERIOD_ARGS)
 {
     local REAL scratch[GROUP_SIZE];
+    const REAL weighed = sum_of_groups(mean_partial, mean_groups, scratch);
+    const REAL weight = sum_of_groups(mean_partial + mean_groups, mean_groups, scratch);
+    const REAL mean = mean_groups > 0 ? weighed / weight : 0;
+    if (get_global_id(0) == 0)
+        counts[UPDATES] = 0;
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
     const int faces = starts[n], until = starts[block_end(n)];
     for (BLOCK_LOOP(i, n)) {
@@ -169,8 +190,9 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
             own[CELL_DIM * i + c] = t;
         }
         const float base = on_wall ? wall_penalty : penalty, scale = on_wall ? wall_quality_scale : quality_scale;
-        const float e = penalty_of(base, scale, least_quality, log_ratio_scale, power, log_ratio[i]);
-        const REAL inverse = 1 / (diagonal + e), b = log_ratio[i] + change;
+        const REAL ratio = log_ratio[i] - mean;
+        const float e = penalty_of(base, scale, least_quality, log_ratio_scale, power, ratio);
+        const REAL inverse = 1 / (diagonal + e), b = ratio + change;
         eps[i] = e;
         inverse_diagonal[i] = inverse;
         const REAL first = warm ? start[i] : inverse * b;
@@ -298,17 +320,23 @@ inline void step_projection(int k, const iteration_t *it, local REAL *scratch)
     PUT(GAMMA(k + 1), gamma.value);
 }
 
-kernel void update_projection_direction(const int k, ITERATION_ARGS)
+kernel void update_projection_direction(ITERATION_ARGS, global int *counts)
 {
     local REAL scratch[GROUP_SIZE];
     const iteration_t it = ITERATION;
+    const int k = counts[UPDATES];
+    if (get_global_id(0) == 0)
+        counts[DIRECTIONS] = k + 1;
     step_projection_direction(k, &it, scratch);
 }
 
-kernel void update_projection(const int k, ITERATION_ARGS)
+kernel void update_projection(ITERATION_ARGS, global int *counts)
 {
     local REAL scratch[GROUP_SIZE];
     const iteration_t it = ITERATION;
+    const int k = counts[DIRECTIONS] - 1;
+    if (get_global_id(0) == 0)
+        counts[UPDATES] = k + 1;
     step_projection(k, &it, scratch);
 }
 

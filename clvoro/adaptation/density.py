@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import pyopencl.array as cla
 
 from ..opencl.engine import Engine
@@ -65,7 +64,7 @@ class Density:
         """Write the weights; return log h (n,)."""
         log_h = self.engine.scratch(t.n)
         self.engine.run(
-            self._kernels.evaluate_density, -(-t.n // 4), np.int32(t.n), t.volumes, h, w.density,
+            self._kernels.evaluate_density, -(-t.n // 4), t.n, t.volumes, h, w.density,
             w.weight, w.log_ratio, log_h,
         )  # fmt: skip
         return log_h
@@ -92,8 +91,13 @@ class Density:
             )  # fmt: skip
         return w
 
-    def subtract_mean_log_ratio(self, w: CellWeights) -> None:
-        """Subtract from ``w.log_ratio`` its mean, weighted by ``w.weight``."""
-        run, k, size = self.engine.run_blocks, self._kernels, np.int32(len(w.log_ratio))
-        run(k.sum_log_ratio, size, w.weight, w.log_ratio, self._partial)
-        run(k.subtract_mean_log_ratio, size, self._partial, w.log_ratio)
+    def sum_log_ratio(self, w: CellWeights) -> cla.Array:
+        """Return sums of ``w.weight * w.log_ratio`` over parts of the cells, and behind them those of ``w.weight``.
+
+        The ratio of both is the weighted mean of the log ratios. The next call overwrites the sums.
+        """
+        size = len(w.log_ratio)
+        self.engine.run_blocks(
+            self._kernels.sum_log_ratio, size, w.weight, w.log_ratio, self._partial
+        )
+        return self._partial

@@ -104,6 +104,7 @@ class Loop:
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
         self.solution: Solution | None = None
         self.obtuse = 0
+        self._unit = mesh.domain.frame[1]
         steps = [position for position, action in enumerate(schedule) if isinstance(action, Step)]
         self.last_step = steps[-1] if steps and tol is None else None
 
@@ -371,7 +372,7 @@ class Loop:
             "max_error": s["error"].peak,
             "mean_quality": s["quality"].sum / n,
             "min_quality": s["quality"].least,
-            "energy": s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.cell_dim + 2),
+            "energy": s["energy"].sum * self._unit ** (mesh.engine.cell_dim + 2),
         }
 
     def end_reason(self, stop: bool, over: bool = False) -> str:

@@ -258,8 +258,7 @@ class ProjectedMethod:
             mesh.zero_fixed(mesh.lloyd)
             if self.descent == "quality":
                 mesh.walls.constrain(mesh, mesh.lloyd)
-            if not self.correct_mean:
-                stages.density.subtract_mean_log_ratio(w)
+            sums = None if self.correct_mean else stages.density.sum_log_ratio(w)
         warm = mesh.multipliers is not None
         if not warm:
             mesh.multipliers = mesh.engine.zeros(mesh.n, np.float32)
@@ -267,7 +266,7 @@ class ProjectedMethod:
             (AT_WALLS, MOST_AT_WALLS) if isinstance(mesh.domain, Polygon) else (1.0, math.inf)
         )
         solution = stages.volume_projection.project(
-            t, Targets(mesh.local_length, gradient, log_ratio, mesh.quality), mesh.lloyd, mesh.correction,
+            t, Targets(mesh.local_length, gradient, log_ratio, mesh.quality, sums), mesh.lloyd, mesh.correction,
             Penalty(self.penalty, self.quality_scale, self.log_ratio_scale, at_walls, self.power, most),
             Limits(self.tolerance, self.iterations), labels=mesh.labels, fixed=mesh.fixed,
             start=mesh.multipliers, warm=warm,

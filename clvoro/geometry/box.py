@@ -355,16 +355,17 @@ class Box(Domain):
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners in the device's coordinates, padded to four numbers as kernels take them."""
-        lower, upper = super().device_corners(real)
-        if not any(self.periodic):
-            return lower, upper
-        known: dict[np.dtype, np.ndarray] = vars(self).setdefault("_upper", {})
+        known: dict[np.dtype, tuple[np.ndarray, np.ndarray]] = vars(self).setdefault(
+            "_box_corners", {}
+        )
         if real not in known:
-            upper = upper.copy()
-            upper[: self.dim] = np.where(self.periodic, self.periods(real), upper[: self.dim])
-            upper.setflags(write=False)
-            known[real] = upper
-        return lower, known[real]
+            lower, upper = super().device_corners(real)
+            if any(self.periodic):
+                upper = upper.copy()
+                upper[: self.dim] = np.where(self.periodic, self.periods(real), upper[: self.dim])
+                upper.setflags(write=False)
+            known[real] = lower, upper
+        return known[real]
 
     def kind(self, real: np.dtype) -> DomainKind:
         """Return the kind of domain and its periods, in the device's coordinates."""

@@ -240,7 +240,7 @@ class Engine:
     def run_groups(self, kernel: cl.Kernel, groups: int, *args: object) -> cl.Event:
         """Enqueue a block-wise `kernel` over `groups` work-groups."""
         bind(kernel, args)
-        group = self.block_of(kernel)
+        group = getattr(kernel, "block", self.group_size)
         return cl.enqueue_nd_range_kernel(self.queue, kernel, (groups * group,), (group,))
 
     def block_of(self, kernel: cl.Kernel) -> int:

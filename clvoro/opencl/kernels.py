@@ -152,13 +152,19 @@ def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:
 
 def comparison_key(args: Sequence[object]) -> list[object]:
     """Return a key that is equal for equal arguments only. It does not keep the arrays in memory."""
-    return [a.mark if type(a) is DeviceArray else a if type(a) is int else _key_of(a) for a in args]
+    return [
+        a.mark
+        if (kind := type(a)) is DeviceArray
+        else a
+        if kind is int or (kind is np.float64 and a)
+        else _key_of(a)
+        for a in args
+    ]
 
 
 def _key_of(argument: object) -> object:
     """Return the key of an argument that is neither a device array nor a Python int."""
-    kind = type(argument)
-    if kind is np.int32 or (kind is np.float64 and argument):
+    if type(argument) is np.int32:
         return argument
     # The bytes of 0 and -0 differ. A new object is equal to nothing else.
     return argument.tobytes() if isinstance(argument, (np.generic, np.ndarray)) else object()

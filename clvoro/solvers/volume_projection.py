@@ -43,12 +43,15 @@ class Targets(NamedTuple):
         r = log(V / h^d).
     quality : (n,) real
         Q.
+    sums : (2 k,) real, optional
+        Sums of V rho r and V rho over k parts of the cells: the mean of r is subtracted. See `Density.sum_log_ratio`.
     """
 
     h: cla.Array
     gradient: cla.Array
     log_ratio: cla.Array
     quality: cla.Array
+    sums: cla.Array | None = None
 
 
 class Penalty(NamedTuple):
@@ -102,6 +105,7 @@ class VolumeProjection:
         self._partial = engine.empty(_ROWS * engine.groups)
         # The host may read rows that no kernel has written.
         self._record = engine.zeros(4 * 64)
+        self._counts = engine.empty(2, np.int32)
         self._kernels: dict[np.dtype, Kernels] = {}
         self._ahead = 8
         self._one_group_limit = one_group_limit(engine)
@@ -178,8 +182,9 @@ class VolumeProjection:
             real(min(penalty.eps, penalty.most_at_walls)),
             real(penalty.at_walls * penalty.quality_scale), real(penalty.log_ratio_scale),
             penalty.power, v.rows, v.columns, v.own,
-            v.eps, v.inverse, v.r, v.z, self._partial,
-            t.starts if labels is None else labels, fixed, int(warm), start,
+            v.eps, v.inverse, v.r, v.z, self._partial, self._counts,
+            self._partial if targets.sums is None else targets.sums,
+            0 if targets.sums is None else len(targets.sums) // 2, t.starts if labels is None else labels, fixed, int(warm), start,
             *engine.period_args, groups=groups,
         )()  # fmt: skip
         iteration = (
@@ -191,8 +196,8 @@ class VolumeProjection:
             rows = self._read(most)
         else:
             rows = self._iterate(
-                Launch(engine, k.update_projection_direction, 0, *iteration),
-                Launch(engine, k.update_projection, 0, *iteration),
+                Launch(engine, k.update_projection_direction, *iteration, self._counts),
+                Launch(engine, k.update_projection, *iteration, self._counts),
                 most,
             )
         solution = self._solution(rows, tolerance)
@@ -208,10 +213,9 @@ class VolumeProjection:
         done, ahead = 0, self._ahead
         while True:
             end = min(done + ahead, most)
-            for k in range(done, end):
-                for launch, number in ((update, k), (direction, k + 1)):
-                    launch.set_first(number)
-                    launch()
+            for _ in range(done, end):
+                update()
+                direction()
             rows = self._read(end)
             if not all(row[RECORD_RUNNING] for row in rows):
                 self._ahead = _first_stop(rows) + _SPARE

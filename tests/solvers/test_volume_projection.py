@@ -54,7 +54,11 @@ class Assembled:
         given["quality"] = options.pop("quality", given["quality"])
         taken, reserve = [], projection._reserve
         projection._reserve = lambda *args: taken.append(reserve(*args)) or taken[-1]
-        targets = Targets(*map(engine.upload, (h, gradient, given["r"], given["quality"])))
+        sums = options.pop("sums", None)
+        targets = Targets(
+            *map(engine.upload, (h, gradient, given["r"], given["quality"])),
+            sums=None if sums is None else engine.upload(sums),
+        )
         projection.project(
             t, targets, engine.upload(given["displacement"]), engine.empty((n, 2)), Penalty(**options),
             Limits(1e-12, 0),
@@ -145,6 +149,18 @@ def test_right_side(engine, points):
     )
     expected = r + np.einsum("ija,ja->i", made.derivative(), lloyd)
     assert made.rhs == pytest.approx(expected, abs=1e-6 * np.abs(expected).max())
+
+
+def test_mean_is_subtracted(engine, points):
+    """Partial sums of V rho r and V rho, of any number of groups: their ratio is the mean of r."""
+    r, given = log_ratios(points), (engine, points, sizes(points), np.tile(SLOPE, (N, 1)))
+    penalty = {"eps": 0.3, "log_ratio_scale": 0.4}
+    parts = np.random.default_rng(3).uniform(0.5, 2, (2, 37))
+    made = Assembled(*given, r, sums=parts.ravel(), **penalty)
+    mean = parts[0].sum() / parts[1].sum()
+    assert made.rhs == pytest.approx(r - mean, abs=1e-13)
+    expected = Assembled(*given, r - mean, **penalty)
+    assert made.eps == pytest.approx(expected.eps, rel=1e-6)
 
 
 def project(engine, points, h, gradient, r, displacement, tolerance=1e-6, **options):
