@@ -13,8 +13,8 @@ Point = list[tuple[object, ...]]
 def points_to_leave(items: Iterable[pytest.Item]) -> Iterator[pytest.Item]:
     """Yield the tests that are marked `sparse` and left to the slow set.
 
-    The fast set keeps every value of every axis at least once; with `sparse(n)` it keeps n points. They differ as much
-    as possible, and equals are taken in their order: the most important point is the first.
+    The fast set keeps every value of every axis at least once; with `sparse(n)` it keeps n points, the first among
+    them. They differ as much as possible, and equals are from evenly spaced places of the list.
     """
     grids: dict[str, list[tuple[pytest.Item, Point]]] = defaultdict(list)
     most: dict[str, int | None] = {}
@@ -25,6 +25,9 @@ def points_to_leave(items: Iterable[pytest.Item]) -> Iterator[pytest.Item]:
             grids[name].append((item, _point_of(item)))
             most[name] = mark.args[0] if mark.args else None
     for name, left in grids.items():
+        if n := most[name]:
+            spaced = {k * len(left) // n for k in range(n)}
+            left = [left[k] for k in sorted(range(len(left)), key=lambda k: k not in spaced)]
         used: Counter[tuple[object, ...]] = Counter()
         kept = 0
         while left:

@@ -37,9 +37,9 @@ RUNS = {
         "fixed": [(0.4, 0.4), (1.7, 1.1)],
     },
     "mmpde": {"method": "mmpde", "max_steps": 9},
+    "in 3D": {"method": "exact", "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)},
     "monge-ampere": {"method": "monge-ampere", "max_steps": 9},
     "count held": {"method": "exact", "effort": "fast", "n_cells": 250},
-    "in 3D": {"method": "exact", "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)},
 }
 BOX_3D = clvoro.Box((0, 0, 0), (1, 1.5, 1))
 SIZE_3D = clvoro.sizing.Expression("0.16 + 0.2*fabs(hypot(x-0.4, y-0.7)-0.3)")
@@ -75,7 +75,7 @@ def assert_same(a, b):
     assert a.settings == b.settings
 
 
-@pytest.mark.sparse(2)
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("kind", list(RUNS))
 def test_resumed_runs_end_the_same(ctx, tmp_path, dtype, kind):

@@ -27,8 +27,6 @@ SIZE = clvoro.sizing.Expression("0.16 + 0.1 * x")
 CHANGED_LEVELS = {"effort": "best", "levels": 1, "error_target": 0.02}
 CHANGED_STEPS = {"tol": 0.9, "alpha": 0.1, "k": 0.1}
 CHANGED = CHANGED_LEVELS | CHANGED_STEPS
-FEW = ("adaptive", "coupled")
-"""One method of each of the two classes of options."""
 CASE = """
 [domain]
 lower = [0, 0]
@@ -65,7 +63,7 @@ def test_adapt_has_the_defaults_of_a_run():
 
 
 @pytest.mark.sparse(2)
-@pytest.mark.parametrize("method", sorted(METHODS, key=FEW.__contains__, reverse=True))
+@pytest.mark.parametrize("method", METHODS)
 def test_options_are_used_or_warned_of(adapter, method):
     """An option changes the result, its history, or causes a warning."""
 

@@ -550,7 +550,7 @@ NASTY = {
 }
 
 
-@pytest.mark.sparse(3)
+@pytest.mark.sparse(2)
 @pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
 @pytest.mark.parametrize("name", NASTY)
 def test_nasty_fields(adapter, name):

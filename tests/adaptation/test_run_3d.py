@@ -42,7 +42,7 @@ def second_moment(cell, x):
 # Every method.
 
 
-@pytest.mark.sparse(2)
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_every_method(adapter, adapter32, dtype, method):
@@ -357,7 +357,7 @@ SIMILAR = ("smaller of two", "segment", "jump", "corner", "wall", "about the dom
 """Fields that are similar to others of these."""
 
 
-@pytest.mark.sparse(2)
+@pytest.mark.sparse(1)
 @pytest.mark.filterwarnings(
     "ignore::clvoro.errors.CoarseSizeWarning"
 )  # one is larger than the domain

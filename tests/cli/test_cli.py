@@ -131,7 +131,6 @@ def test_meshes_are_checked_for_a_solver(here, capsys, monkeypatch):
     assert "no mesh is written for OpenFOAM" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_a_solver_checks_the_mesh_itself(here, capsys, monkeypatch):
     """With a stand-in for checkMesh, which has the last word."""
     (here / "round.toml").write_text(ROUND)
@@ -352,7 +351,6 @@ def test_usage(arguments, capsys):
     assert "usage:" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_cases_are_listed_and_printed(here, capsys):
     assert call("cases") == cli.OK
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [
@@ -370,7 +368,6 @@ def test_cases_are_listed_and_printed(here, capsys):
     assert call("run", "mine.toml", "--steps", 0, "--no-report", "--quiet") == cli.OK
 
 
-@pytest.mark.slow
 def test_devices(capsys):
     assert call("devices") == cli.OK
     assert "float64" in capsys.readouterr().out

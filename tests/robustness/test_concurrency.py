@@ -60,7 +60,7 @@ def alone(ctx):
     return [run(clvoro.Adapter(ctx), options) for options in WORK]
 
 
-@pytest.mark.sparse(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", ["context", "adapter", "nothing"])
 def test_threads_do_not_disturb_each_other(ctx, alone, shared):
     adapter = clvoro.Adapter(ctx)

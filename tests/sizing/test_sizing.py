@@ -99,13 +99,6 @@ CASES = [
     *(pytest.param(PLANE, f, id=f"2D {k}") for k, f in PLANE_FIELDS.items()),
     *(pytest.param(SPACE, f, id=f"3D {k}") for k, f in SPACE_FIELDS.items()),
 ]
-# The first of them differ most: the fast tests run these.
-DIFFERENT = (
-    "2D constant", "2D polygon capped", "2D mixed", "2D raster centers", "2D raster row", "2D expression", "2D product",
-    "2D quotient", "2D minimum", "3D sphere", "3D helix", "3D raster", "3D expression", "3D minimum", "3D quotient",
-    "3D box",
-)  # fmt: skip
-CASES.sort(key=lambda case: case.id not in DIFFERENT)
 
 
 @pytest.fixture

@@ -509,7 +509,6 @@ def test_too_few_cells_for_a_run(double):
 # Files, pictures, cases.
 
 
-@pytest.mark.sparse(2)
 @pytest.mark.parametrize("box", [UNIT, CHANNEL, SLAB], ids=["unit", "channel", "slab"])
 @pytest.mark.parametrize("kind", ["npz", "vtu"])
 def test_files(double, tmp_path, box, kind):
@@ -565,7 +564,6 @@ def test_pictures_are_filled_up_to_the_boundary(double):
     assert len(cells.get_paths()) > len(result.points)
 
 
-@pytest.mark.slow
 def test_a_case_with_frames(tmp_path, monkeypatch, capsys):
     from clvoro.cli.cases import Case, load_case
     from clvoro.cli.command import main
@@ -588,7 +586,7 @@ def test_a_case_with_frames(tmp_path, monkeypatch, capsys):
     (tmp_path / "wave.toml").write_text(text)
     out = tmp_path / "out"
     monkeypatch.setattr("clvoro.cli.progress.EVERY", 0.0)
-    assert main(["run", str(tmp_path / "wave.toml"), "--out", str(out)]) == 0
+    assert main(["run", str(tmp_path / "wave.toml"), "--out", str(out), "--no-report"]) == 0
     assert "wave: frame 2 of 3\nwave: frame 3 of 3\n" in capsys.readouterr().err
     table = np.genfromtxt(out / "frames.csv", delimiter=",", names=True)
     assert table["time"].tolist() == pytest.approx([0, 1 / 3, 2 / 3])
@@ -597,7 +595,6 @@ def test_a_case_with_frames(tmp_path, monkeypatch, capsys):
         mesh = load_vtu(out / "frames" / f"mesh-{frame:03d}.vtu")
         shift = (mesh.points[:, 0] - frame / 3) * 2 * np.pi
         assert np.abs(mesh.target_size / (0.12 + 0.03 * np.cos(shift)) - 1).max() < 0.1
-    assert (out / "pictures" / "frames.png").stat().st_size > 10_000
     again = Case.from_toml((out / "case.toml").read_text(), "wave")
     assert again.domain == UNIT
     assert again.frames == 3
