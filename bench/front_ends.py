@@ -36,7 +36,7 @@ from scipy.fft import dctn, idctn
 from scipy.interpolate import RectBivariateSpline
 
 import clvoro
-from clvoro.adaptation.plan import efforts, schedule
+from clvoro.adaptation.plan import efforts
 
 FIELDS = ("F3", "circles", "ridge", "steep circles", "steep ridge")
 TARGET, STEPS, SMOOTHED_TARGET = 0.2, 400, 0.02
@@ -76,16 +76,19 @@ def runs_on(
     def adapt(
         size: Any, target: float, free: efforts.Effort | None = None, **more: Any
     ) -> clvoro.Result:
-        kept, bound = efforts.EFFORTS["default"], schedule.LOOSE_LOG_RATIO_SCALE
+        kept = efforts.EFFORTS["default"]
         try:
-            if free is not None:
-                efforts.EFFORTS["default"], schedule.LOOSE_LOG_RATIO_SCALE = free, math.inf
+            efforts.EFFORTS["default"] = free or kept
             options = clvoro.MultilevelOptions(error_target=target)
             return adapter.run(BOX, size, seed=FIRST_SEED, options=options, **more)
         finally:
-            efforts.EFFORTS["default"], schedule.LOOSE_LOG_RATIO_SCALE = kept, bound
+            efforts.EFFORTS["default"] = kept
 
-    unbound = replace(efforts.EFFORTS["default"], loose=efforts.LoosePolish(0.0, STEPS, 0.9))
+    unbound = replace(
+        efforts.EFFORTS["default"],
+        loose=efforts.LoosePolish(0.0, STEPS, 0.9),
+        largest_log_ratio_scale=math.inf,
+    )
     lloyd = {"max_steps": STEPS, "options": clvoro.PaperOptions(tol=0)}
     return {
         f"default, target {TARGET:g}": lambda: adapt(field, TARGET),

@@ -156,9 +156,15 @@ def warn_of_errors(result: Result) -> None:
     if len(diagram) == 1 and 2 * made**diagram.domain.cell_dim < wanted**diagram.domain.cell_dim:
         return  # `CoarseSizeWarning` says it before the run
     place = _place(diagram.domain, result.points[worst])
-    beside = sizes[[worst, *_ring(diagram, worst)]]
-    steep = beside.max() > STEEP * beside.min()
-    if steep and diagram.shifts[slice(*diagram.neighbor_starts[worst : worst + 2])].any():
+    near = [worst, *_ring(diagram, worst)]
+    steep = any(
+        abs(math.log(sizes[j] / sizes[i])) > math.log(STEEP)
+        for i in near
+        for j in _ring(diagram, i)
+    )
+    if steep and any(
+        diagram.shifts[slice(*diagram.neighbor_starts[i : i + 2])].any() for i in near
+    ):
         why = (
             "sizes jump at a seam of the periodic box: a field must have the period of the box; repeat its shapes one "
             "period away"

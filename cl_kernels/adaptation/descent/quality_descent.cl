@@ -152,7 +152,9 @@ inline REAL boundary_tension(int i, int j, int side, REAL4 force, const rows_t *
     return 0;
 }
 
-/* lloyd = -rate h^2 dE/dx_i, at most max_displacement h. One work-item per generator.
+/* lloyd = -rate h^2 dE/dx_i, at most max_displacement h. One work-item per generator. E is as stiff as the weight of
+   the worst cell at i is large, so the rate is smaller in proportion where the largest omega h^2 / A of cell i and its
+   neighbors exceeds `full_rate`.
 
    The vertex v between the faces to j and q moves by (x_j - x_i).dv = (x_q - x_i).dv = (v - x_i).dx_i; on a wall it
    moves along the wall. Each cell at a face pulls its two vertices along the face, with its tension. The force on v is
@@ -161,7 +163,8 @@ kernel void descend_quality(const int size, global const int *starts, global con
                             global const FACE *face_measures, global const FACE *face_centroids,
                             global const REAL *points, global const REAL4 *forces, const REAL rate,
                             const REAL max_displacement, const REAL short_edge, const REAL stiffness, const REAL close,
-                            const REAL close_stiffness, global REAL *lloyd OUTLINE_ARGS PERIOD_ARGS)
+                            const REAL close_stiffness, const REAL full_rate,
+                            global REAL *lloyd OUTLINE_ARGS PERIOD_ARGS)
 {
     WORK_ITEM(i);
     const rows_t rows = {starts, neighbors, face_measures, face_centroids};
@@ -171,6 +174,7 @@ kernel void descend_quality(const int size, global const int *starts, global con
     const REAL4 own = forces[i];
     const REAL h = own.s2;
     REAL2 g = 0;
+    REAL pressure = own.s1;
     Face before = read_face(end - 1, x, &rows, points, forces OUTLINE PERIODS);
     for (int k = begin; k < end; ++k) {
         const Face face = read_face(k, x, &rows, points, forces OUTLINE PERIODS);
@@ -224,12 +228,13 @@ kernel void descend_quality(const int size, global const int *starts, global con
         }
         g += s * r;
         if (face.label >= 0) {
+            pressure = fmax(pressure, face.forces.s1);
             g += face_measures[k] * face.inverse * (face.forces.s1 - own.s1) * m;
             g -= edge_tension(1 / face.inverse, (h + face.forces.s2) / 2, &pairs) * face.inverse * face.away;
         }
         before = face;
     }
-    REAL2 u = -rate * h * h * g;
+    REAL2 u = -rate * fmin(h * h, full_rate / pressure) * g;
     const REAL length = sqrt(dot(u, u));
     if (length > max_displacement * h)
         u *= max_displacement * h / length;

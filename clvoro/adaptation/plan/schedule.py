@@ -108,13 +108,6 @@ SETTLING_STEPS = 4
 """Steps of polishing and separation after the last cells of four sides have been deleted."""
 OPENING_PROJECTIONS = 4
 """Number of the last exact projections after each of which obtuse triangles are opened."""
-LOOSE_LOG_RATIO_SCALE = 0.28
-"""Largest scale of log(L / h) in the penalty, with an error target above the effort's own. It bounds the largest error.
-
-The power is 4 then. Measured on F3, circles and two ridges with targets 0.014 to 0.2: at the same mean error the mean Q
-is larger than with a power of 2 by up to 0.0003, and with target 0.2 the largest |e| is 0.20 to 0.24 in place of 0.21
-to 0.29. On the way there the scale grows like the power 1.5 of the target. In place of a multiple of it, that raises
-the mean Q by 0.0003 and the least by 0.002 to 0.005."""
 TIGHT = 0.43
 """Share of the effort's error target below which polishing begins with a penalty that is smaller in proportion, the
 number of cells is exact, and grad log h comes from the field. With target 1e-4 the mean |e| on F3, circles and a ridge
@@ -291,7 +284,7 @@ def _finish_2d(
     tight = looser < TIGHT
     scale, power = effort.log_ratio_scale * error_target, 2
     if looser > 1:
-        scale, power = min(scale * looser**0.5, LOOSE_LOG_RATIO_SCALE), 4
+        scale, power = min(scale * looser**0.5, effort.largest_log_ratio_scale), 4
     if looser > 1 or tight:
         penalty *= looser
     if effort.loose and error_target > effort.loose.above:

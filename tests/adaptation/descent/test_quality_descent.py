@@ -35,7 +35,9 @@ def energy(points, omega):
     return float((omega * (2 * np.log(perimeter) - np.log(area))).sum())
 
 
-def descend_from(engine, t, h, bad_cell_weight, rate, max_displacement, quality, stiffness=0.0):
+def descend_from(
+    engine, t, h, bad_cell_weight, rate, max_displacement, quality, stiffness=0.0, full_rate=1e30
+):
     """Displacements from the diagram `t`."""
     out = engine.empty((t.n, 2))
     QualityDescent(engine).descend(
@@ -48,6 +50,7 @@ def descend_from(engine, t, h, bad_cell_weight, rate, max_displacement, quality,
         max_displacement=max_displacement,
         edge_stiffness=stiffness,
         close_stiffness=0.0,
+        full_rate=full_rate,
     )
     return out.get()
 
@@ -310,6 +313,22 @@ def test_longest(ctx):
     length = np.linalg.norm(free, axis=1)
     assert 3 < (length > 0.003).sum() < N
     assert u == pytest.approx(free * np.minimum(1, 0.003 / length)[:, None], rel=1e-9, abs=1e-15)
+
+
+def test_rate_falls_with_the_weight_of_bad_cells(ctx):
+    """In proportion to the largest omega h^2 / A of a cell and its neighbors, beyond a limit."""
+    points = patch.relaxed_points(N, 2114, steps=0)
+    h, limit = np.random.default_rng(9).uniform(0.05, 0.15, N), 3.0
+    q, _, area = qualities(points).T
+    engine = patch.make_engine(ctx)
+    t = patch.tessellate(engine, points)
+    free, u = (descend_from(engine, t, h, 20.0, 0.1, 1e9, q, full_rate=f) for f in (1e30, limit))
+    per_area = (1 - 20 * np.log(q)) / area
+    cells = reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)
+    rows = [[i, *(j for j in cell.neighbors if j >= 0)] for i, cell in enumerate(cells)]
+    pressure = h**2 * np.array([per_area[row].max() for row in rows])
+    assert N // 4 < (pressure > limit).sum() < N
+    assert u == pytest.approx(free * np.minimum(1, limit / pressure)[:, None], rel=1e-9, abs=1e-15)
 
 
 def test_a_regular_mesh_stays(ctx):
