@@ -552,7 +552,6 @@ def test_paths_with_zero_bytes_are_refused():
         clvoro.Polygon.from_geojson("a\0b.geojson")
 
 
-@pytest.mark.sparse(4)
 @pytest.mark.parametrize("name", FORMATS)
 def test_damaged_files_are_refused_or_read(valid, tmp_path, name):
     assert read_damaged(tmp_path, name, valid[name], range(40))["refused"] > 5

@@ -255,6 +255,7 @@ def test_same_bits_again_and_from_saved_vertices(engine):
     assert found[0] == found[2]
 
 
+@pytest.mark.slow
 def test_same_bits_with_four_and_eight_lanes(ctx, monkeypatch):
     """Vector units of CPUs hold four or eight numbers of double precision."""
     kernels, found = Engine.kernels, []

@@ -201,7 +201,6 @@ def test_the_first_and_the_last_row_are_empty(ctx):
         assert d.volumes[i] == 1
 
 
-@pytest.mark.slow
 def test_files_pictures_and_other_libraries(ctx, tmp_path):
     rng = np.random.default_rng(4)
     points, weights = rng.random((40, 2)), 0.02 * rng.random(40)

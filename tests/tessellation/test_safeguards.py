@@ -68,6 +68,7 @@ def test_cells_that_cover_the_box_twice(ctx, real, group_size, generous, of_thre
     assert t is None or t.volumes.sum() == pytest.approx(0.75, rel=1e-6)
 
 
+@pytest.mark.sparse(1)
 def test_former_neighbors_are_clipped_again(ctx, group_size, generous):
     """One of four cells loses neighbors that still list it: all are clipped again."""
     points = np.array([[0.27, 0.01], [0.38, 0.0], [0.57, 0.02], [0.03, 0.03]])

@@ -439,7 +439,6 @@ def test_coarse_levels_with_too_few_cells_are_left_out(double):
         double.run(box, 0.07, options=clvoro.MultilevelOptions(levels=1), max_steps=1)
 
 
-@pytest.mark.slow
 def test_resume(double, tmp_path):
     """A resumed run has the same bits: incremental updates in 2D, the depth of the halo in 3D."""
     for box, size in ((UNIT, SPOT), (CUBE, sizing.Constant(0.17))):
