@@ -126,7 +126,7 @@ def test_threads_take_turns(adapter):
             assert np.array_equal(points, alone)
 
 
-@pytest.mark.sparse(2)
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     "options",
     [
@@ -458,6 +458,7 @@ def test_figures_of_repeated_steps(adapter, options, error, quality):
     assert max(figures(r)[2] for r in results) >= quality
 
 
+@pytest.mark.slow
 def test_published_ordering(adapter):
     """Lloyd's alone never meets the sizes, Poisson's alone meets them with poor cells, coupled does both."""
     start = random_points(588, 18)

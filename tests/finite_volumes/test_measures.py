@@ -87,7 +87,7 @@ def measured(m: SolverMeasures) -> dict[str, float]:
     }
 
 
-@pytest.mark.sparse(4)
+@pytest.mark.sparse(2)
 @needs_openfoam
 @pytest.mark.parametrize("walls", ["exact", "straight"])
 @pytest.mark.parametrize(

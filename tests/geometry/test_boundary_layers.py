@@ -254,6 +254,7 @@ def test_there_are_no_levels_too_coarse_for_the_gaps_between_layers(adapter):
     assert np.abs(mesh.size_error).mean() < 0.01
 
 
+@pytest.mark.slow
 def test_sizes_are_met_where_columns_of_two_walls_come_close(adapter):
     """In this corner they are 4.5 apart. Sizes beyond had that limit once, and |e| was up to 75."""
     domain = clvoro.Polygon([(600, 2100), (-200, 900), (0, 0), (700, 900)])

@@ -591,6 +591,7 @@ def test_cells_fill_the_domain_and_nothing_else(result, color: str) -> None:
     assert len(lines) == 1  # all four rings, closed
 
 
+@pytest.mark.slow
 def test_size_is_evaluated_inside_only(result) -> None:
     pytest.importorskip("matplotlib")
     from clvoro.plotting import plot_size

@@ -246,7 +246,7 @@ def test_made_up_results_are_parts_too(part):
     assert len(result.subset(part.points[:, 0] > 0).target_size) == (part.points[:, 0] > 0).sum()
 
 
-@pytest.mark.sparse(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("most", [10, 60_000])
 def test_pictures_leave_removed_cells_out(globe, monkeypatch, most):
     """As polygons and, with many cells, as pixels; more walls than cells."""

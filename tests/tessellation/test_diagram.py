@@ -125,7 +125,7 @@ def test_invariants(adapter, points):
     check_invariants(diagram, float(np.finfo(adapter.dtype).eps))
 
 
-@pytest.mark.sparse(8)
+@pytest.mark.sparse(6)
 def test_against_exact_arithmetic(adapter64, points):
     points = points[:: max(1, len(points) // 40)]
     diagram = adapter64.diagram(BOX, points)
@@ -180,7 +180,7 @@ def test_any_scale_and_place(adapter64, scale):
     assert diagram.volumes / scale**2 == pytest.approx(plain.volumes, rel=1e-11)
 
 
-@pytest.mark.sparse(3)
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9, 1e-12, 1e-14, 2e-16])
 def test_near_duplicates(adapter64, gap):
     """Gaps are valid as long as bisectors with far generators differ; smaller gaps are rejected."""

@@ -159,7 +159,7 @@ def fitting(t):
     ])  # fmt: skip
 
 
-@pytest.mark.sparse(3)
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.2])
 def test_rows_marked_as_fitting_fit(engine, name, share):
@@ -184,6 +184,7 @@ def test_rows_marked_as_fitting_fit(engine, name, share):
         assert changed > 3
 
 
+@pytest.mark.slow
 def test_most_cells_are_made_in_lanes(ctx, monkeypatch):
     """Cells at walls, doubtful cells and those with several changes are clipped, at ten times the cost."""
     engine, rng = patch.make_engine(ctx), np.random.default_rng(40968)
@@ -265,7 +266,7 @@ def cross(a, b):
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-@pytest.mark.sparse(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("group_size", [None, 128])
 def test_mostly_changed_cells_are_clipped(ctx, group_size, monkeypatch):
     """The first round clips cells with changed neighbors and few others; later rounds clip few."""

@@ -212,7 +212,7 @@ def test_lattices_off_by_round_off(adapter, kind, roundings):
         check_loops(diagram, eps, 2)
 
 
-@pytest.mark.sparse(6)
+@pytest.mark.sparse(4)
 @pytest.mark.parametrize("name", FINE)
 def test_against_qhull(adapter64, name):
     points = POINTS[name]

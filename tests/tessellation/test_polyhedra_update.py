@@ -181,7 +181,7 @@ def test_small_moves_of_a_relaxed_set_are_updated(engine, share):
         carried.check_symmetry()
 
 
-@pytest.mark.sparse(1)
+@pytest.mark.slow
 def test_kept_vertices_have_no_nearer_generator(engine):
     """The certificate, by brute force: the ball around each vertex through its generators is empty."""
     carried, rng = Carried(engine, POINTS["random"]), np.random.default_rng(11)

@@ -49,7 +49,7 @@ def as_cycle(row):
     return row[first:] + row[:first]
 
 
-@pytest.mark.sparse(4)
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("name", list(SETS))
 def test_neighbors(ctx, name, real):
@@ -63,7 +63,7 @@ def test_neighbors(ctx, name, real):
     assert len(wrong) <= (0 if real == "float64" else 0.01 * len(points))
 
 
-@pytest.mark.sparse(4)
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("name", list(SETS))
 def test_measures(ctx, name, real):

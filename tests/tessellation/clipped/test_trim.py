@@ -77,7 +77,7 @@ def test_cells_are_those_of_the_reference(adapters, name):
             compare(adapters, domain, scattered(domain, n, n), euler=True)
 
 
-@pytest.mark.sparse(6)
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("name", POLYGONS)
 def test_no_cell_is_better_than_a_regular_polygon(adapters, name):
     domain = POLYGONS[name]()

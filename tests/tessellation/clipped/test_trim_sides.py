@@ -98,7 +98,7 @@ def test_arcs_of_thirty_degrees_are_one_side(adapters, real, k):
     assert 30 < np.degrees(SIDE_TURN) < 30.1
 
 
-@pytest.mark.sparse(8)
+@pytest.mark.sparse(5)
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("name", [*POLYGONS, *(f"touching {name}" for name in TOUCHING)])
 def test_sides_of_all_kinds_of_cells(adapters, real, name):

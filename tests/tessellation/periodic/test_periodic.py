@@ -312,7 +312,7 @@ SPOT = sizing.Expression(
 """A refined spot around (0.05, 0.9), across two periodic boundaries."""
 
 
-@pytest.mark.sparse(2)
+@pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     "options",
     [
@@ -341,7 +341,7 @@ def test_runs(adapter, options):
         assert result.quality.mean() > 0.955  # of so few; .960 to .977 over twelve starts
 
 
-@pytest.mark.sparse(1)
+@pytest.mark.slow
 def test_the_same_bits_from_run_to_run(adapter):
     one, two = (adapter.run(UNIT, SPOT, seed=3, effort="fast") for _ in range(2))
     for name in ("points", "size_error", "quality"):

@@ -54,7 +54,7 @@ def off_walls(seed):
     return np.clip(points, BOX.lower, BOX.upper)
 
 
-@pytest.mark.sparse(2)
+@pytest.mark.sparse(1)
 def test_corners_lie_on_their_faces(seen):
     for u in seen.u:
         normals, share, r = [], 1.0, np.linalg.norm(seen.corners[u])
