@@ -134,7 +134,9 @@ def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:
     From step to step most arguments are the same. To compare them takes less time than to set them. In all calls an
     argument must have the same type.
     """
-    key, before = comparison_key(args), getattr(kernel, "bound", None)
+    before = getattr(kernel, "bound", None)
+    # The same as `comparison_key`, without a call.
+    key = [a.mark if type(a) is DeviceArray else a if type(a) is int else _key_of(a) for a in args]
     if key == before:
         return
     changed: Sequence[int] = range(len(args))
@@ -152,22 +154,18 @@ def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:
 
 def comparison_key(args: Sequence[object]) -> list[object]:
     """Return a key that is equal for equal arguments only. It does not keep the arrays in memory."""
-    return [
-        a.mark
-        if (kind := type(a)) is DeviceArray
-        else a
-        if kind is int or (kind is np.float64 and a)
-        else _key_of(a)
-        for a in args
-    ]
+    return [a.mark if type(a) is DeviceArray else a if type(a) is int else _key_of(a) for a in args]
 
 
 def _key_of(argument: object) -> object:
     """Return the key of an argument that is neither a device array nor a Python int."""
-    if type(argument) is np.int32:
+    kind = type(argument)
+    if kind is np.ndarray:
+        return argument.tobytes()  # type: ignore[attr-defined]
+    if kind is np.int32 or (kind is np.float64 and argument):
         return argument
     # The bytes of 0 and -0 differ. A new object is equal to nothing else.
-    return argument.tobytes() if isinstance(argument, (np.generic, np.ndarray)) else object()
+    return argument.tobytes() if isinstance(argument, np.generic) else object()
 
 
 def set_changed(kernel: cl.Kernel, args: Sequence[Any], changed: Iterable[int]) -> None:

@@ -99,6 +99,7 @@ class Polyhedra:
         if n <= self._capacity:
             return
         engine = self.engine
+        self._of_rows: dict[str, cla.Array] = {}
         self._of_cells = {
             "starts": engine.empty(n + 1, np.int32),
             "volumes": engine.empty(n),
@@ -106,7 +107,17 @@ class Polyhedra:
             "covariances": engine.empty((n, 6)),
         }
         self._of_faces: dict[str, cla.Array] = {}
-        self._capacity = n
+        self._capacity, self._rows = n, -1
+
+    def _cell_rows(self, n: int) -> dict[str, cla.Array]:
+        """Return the arrays per cell for `n` cells."""
+        self._reserve_cells(n)
+        if n != self._rows:
+            self._of_rows = {
+                name: a[: n + (name == "starts")] for name, a in self._of_cells.items()
+            }
+            self._rows = n
+        return self._of_rows
 
     def _take_faces(self, m: int) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return arrays for labels, measures and centroids of `m` half-faces, in any order."""
@@ -148,10 +159,7 @@ class Polyhedra:
     ) -> Tessellation:
         """Return the `saved` diagram of `points` (n, 3), with room for `spare` more half-faces."""
         n, m = len(points), len(saved["neighbors"]) + spare
-        self._reserve_cells(n)
-        cells = {
-            name: a[: n + 1] if name == "starts" else a[:n] for name, a in self._of_cells.items()
-        }
+        cells = self._cell_rows(n)
         faces = {name: array[:m] for name, array in self._faces(m).items()}
         t = restored(points, {**cells, **faces}, saved)
         if vertices:
@@ -243,7 +251,7 @@ class Polyhedra:
         self._n = rows
         places, counts = engine.scratch(rows, np.int32), engine.scratch(rows, np.int32)
         lower, upper = box.device_corners(engine.real)
-        cells = {name: a[:rows] for name, a in self._of_cells.items() if name != "starts"}
+        cells = self._cell_rows(rows)
         warm = previous is not None and previous.n == rows
         old = (
             (previous.starts, previous.neighbors)
@@ -307,8 +315,7 @@ class Polyhedra:
 
     def take_cells(self, n: int, m: int) -> CutCells:
         """Return arrays for `n` cells with `m` half-faces in any order, to be matched."""
-        self._reserve_cells(n)
-        cells = {name: a[:n] for name, a in self._of_cells.items() if name != "starts"}
+        cells = self._cell_rows(n)
         scratch = self.engine.scratch
         places, counts, labels = (scratch(size, np.int32) for size in (n, n, m))
         corners, keys = scratch(2 * m, np.uint32), scratch(m, np.uint32)
@@ -371,7 +378,7 @@ class Polyhedra:
         """Write the faces of `matching` to the arrays of the diagram, which get room for `m`."""
         engine, k, cut = self.engine, self._kernels(FACE_CAPACITY), matching.cut
         rows, report, starts = len(cut.counts), matching.report, matching.starts
-        faces, of_rows = self._faces(m), self._of_cells["starts"][: len(cut.counts) + 1]
+        faces, of_rows = self._faces(m), self._cell_rows(rows)["starts"]
         room = np.int32(len(faces["neighbors"]))
         with_corners = cut.corners is not None
         vertices = self._vertices(int(room)) if with_corners else ()
