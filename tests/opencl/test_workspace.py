@@ -106,6 +106,27 @@ def test_different_needs_in_turn_soon_allocate_nothing(engine, made):
     assert most <= held <= 2 * most, "the pool is much larger than the largest need"
 
 
+def test_choices_are_repeated_as_long_as_their_buffers_exist(engine):
+    """Nested frames of random needs, some again and again: arrays in use never share a buffer, and all are counted."""
+    rng, pool = np.random.default_rng(4), engine.workspace
+    needs = [rng.integers(1, 10**5, size=6).tolist() for _ in range(9)]
+    taken = {}
+    for turn in range(300):
+        k = int(rng.integers(len(needs)))
+        with pool.frame():
+            arrays = [engine.scratch(n, np.uint8) for n in needs[k][:3]]
+            for inner in (needs[k][3:], needs[k - 1][3:]):
+                with pool.frame():
+                    all_ = [*arrays, *(engine.scratch(n, np.uint8) for n in inner)]
+                    held = {buffer.int_ptr for buffer in pool._buffers.values()}
+                    used = [array.base_data.int_ptr for array in all_]
+                    assert len(set(used)) == len(used)
+                    assert held.issuperset(used)
+        if turn >= 250:
+            assert all(a is b for a, b in zip(arrays, taken.get(k, arrays), strict=True))
+            taken[k] = arrays
+
+
 def test_arrays_begin_at_the_start_of_a_buffer(engine):
     """Kernels get buffers. Sub-buffers make NVIDIA's driver crash."""
     with engine.workspace.frame():
