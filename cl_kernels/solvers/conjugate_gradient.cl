@@ -95,9 +95,12 @@ inline void set_residual(int n, int from_zero, int center, global const REAL *b,
 }
 
 kernel void start_residual(int n, int from_zero, int center, global const REAL *b, global const STORE *w,
-                           global REAL *x, global STORE *r, global STORE *p, global REAL *partial, global REAL *state)
+                           global REAL *x, global STORE *r, global STORE *p, global REAL *partial, global REAL *state,
+                           global int *counts)
 {
     local REAL scratch[GROUP_SIZE];
+    if (get_global_id(0) == 0)
+        counts[UPDATES] = 0;
     set_residual(n, from_zero, center, b, w, x, r, p, partial, state, scratch);
 }
 
@@ -187,24 +190,25 @@ inline void step_direction(int k, int n, REAL tolerance, global const STORE *u, 
         p[i] = u[i] + beta * p[i];
 }
 
-kernel void update_direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p,
+kernel void update_direction(global int *counts, int n, REAL tolerance, global const STORE *u, global STORE *p,
                              global const REAL *partial, global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
-    step_direction(k, n, tolerance, u, p, partial, state, record, scratch);
+    step_direction(number_of_direction(counts), n, tolerance, u, p, partial, state, record, scratch);
 }
 
 /* Both in one launch, p = u + beta old and q = A p, with A in sparse rows: p_j is evaluated for each neighbor. */
 #define ENTRY_OF_DIRECTION(j) ((STORE)(u[j] + beta * old[j]))
 ROW_DIFFERENCE(direction_difference, ENTRY_OF_DIRECTION, global const STORE *u, global const STORE *old, REAL beta)
 
-kernel void apply_to_direction(int k, int n, REAL tolerance, global const int *starts, global const int *columns,
-                               global const STORE *weights, global const STORE *u, global const STORE *old,
-                               global STORE *p, global STORE *q, global REAL *partial, global REAL *state,
-                               global REAL *record)
+kernel void apply_to_direction(global int *counts, int n, REAL tolerance, global const int *starts,
+                               global const int *columns, global const STORE *weights, global const STORE *u,
+                               global const STORE *old, global STORE *p, global STORE *q, global REAL *partial,
+                               global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
     int end;
+    const int k = number_of_direction(counts);
     const REAL beta = find_beta(k, n, tolerance, partial, state, record, scratch, &end);
     Sum product = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
@@ -245,10 +249,11 @@ inline Step step_length(int k, int n, int center, global const REAL *partial, gl
 
 /* Record |r| before iteration k, for the host, and whether k is needed. The next row gets state[2] and |b|^2. One
    work-group. Iteration k overwrites both rows. */
-kernel void record_norm(int k, global const REAL *partial, global const REAL *state, global REAL *record,
-                        const int groups)
+kernel void record_norm(global const int *counts, global const REAL *partial, global const REAL *state,
+                        global REAL *record, const int groups)
 {
     local REAL scratch[GROUP_SIZE];
+    const int k = counts[UPDATES];
     global REAL *now = record + 4 * k;
     const REAL norm = total_of_row(partial, NORM_R(k), groups, scratch);
     const REAL norm_b = total_of_row(partial, NORM_B, groups, scratch);
@@ -262,10 +267,12 @@ kernel void record_norm(int k, global const REAL *partial, global const REAL *st
 }
 
 /* x += alpha p, r -= alpha q. */
-kernel void update_solution(int k, int n, int center, global const STORE *p, global const STORE *q, global REAL *x,
-                            global STORE *r, global REAL *partial, global REAL *state, global REAL *record)
+kernel void update_solution(global int *counts, int n, int center, global const STORE *p, global const STORE *q,
+                            global REAL *x, global STORE *r, global REAL *partial, global REAL *state,
+                            global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
+    const int k = number_of_update(counts);
     const Step s = step_length(k, n, center, partial, state, record, scratch);
     Sum norm = SUM_ZERO, sum = SUM_ZERO;
     for (BLOCK_LOOP(i, s.end)) {
@@ -300,12 +307,12 @@ inline void step_jacobi(int k, int n, int center, global const STORE *inverse_di
     PUT(GAMMA(k + 1), gamma.value);
 }
 
-kernel void update_solution_jacobi(int k, int n, int center, global const STORE *inverse_diagonal,
+kernel void update_solution_jacobi(global int *counts, int n, int center, global const STORE *inverse_diagonal,
                                    global const STORE *p, global const STORE *q, global REAL *x, global STORE *r,
                                    global STORE *u, global REAL *partial, global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
-    step_jacobi(k, n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
+    step_jacobi(number_of_update(counts), n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
 }
 
 /* Partial sums of x, for `center_solution`. */

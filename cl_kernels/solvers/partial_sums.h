@@ -12,6 +12,28 @@
             ROW(q)[get_group_id(0)] = put_;                                                                            \
     }
 
+/* Numbers of launches so far: `counts` tells the kernels of an iteration its number k, so that their arguments are the
+   same in all iterations. A kernel reads the count of the other one and writes its own. A kernel before
+   the first iteration sets counts[UPDATES] = 0. */
+#define UPDATES 0
+#define DIRECTIONS 1
+
+inline int number_of_direction(global int *counts)
+{
+    const int k = counts[UPDATES];
+    if (get_global_id(0) == 0)
+        counts[DIRECTIONS] = k + 1;
+    return k;
+}
+
+inline int number_of_update(global int *counts)
+{
+    const int k = counts[DIRECTIONS] - 1;
+    if (get_global_id(0) == 0)
+        counts[UPDATES] = k + 1;
+    return k;
+}
+
 /* The record has one row of four values per iteration: |r|^2, (r, M^-1 r), whether the iteration is carried out, and
    (p, A p). From the iteration on that is not carried out, kernels change nothing. The host may therefore enqueue more
    iterations than needed: the result is the same. */

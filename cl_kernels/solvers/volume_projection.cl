@@ -33,11 +33,6 @@
 #define GAMMA(k) (2 + ((k)&1))
 #define CURVATURE 4
 
-/* Numbers of launches so far: `counts` tells each kernel of an iteration its number. So its arguments are the same in
-   all iterations. A kernel reads the count of the other one and writes its own. */
-#define UPDATES 0
-#define DIRECTIONS 1
-
 /* Sum of the partial values of `groups` work-groups of an earlier kernel: the same bits as `total_sum` there. */
 inline REAL sum_of_groups(global const REAL *partial, int groups, local REAL *scratch)
 {
@@ -324,20 +319,14 @@ kernel void update_projection_direction(ITERATION_ARGS, global int *counts)
 {
     local REAL scratch[GROUP_SIZE];
     const iteration_t it = ITERATION;
-    const int k = counts[UPDATES];
-    if (get_global_id(0) == 0)
-        counts[DIRECTIONS] = k + 1;
-    step_projection_direction(k, &it, scratch);
+    step_projection_direction(number_of_direction(counts), &it, scratch);
 }
 
 kernel void update_projection(ITERATION_ARGS, global int *counts)
 {
     local REAL scratch[GROUP_SIZE];
     const iteration_t it = ITERATION;
-    const int k = counts[DIRECTIONS] - 1;
-    if (get_global_id(0) == 0)
-        counts[UPDATES] = k + 1;
-    step_projection(k, &it, scratch);
+    step_projection(number_of_update(counts), &it, scratch);
 }
 
 /* All iterations by one work-group, for few cells. */

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import pyopencl as cl
 
-from . import kernels
 from .engine import Engine
 from .kernels import bind
 
@@ -51,9 +50,6 @@ def one_group_limit(engine: Engine) -> int:
 class Launch:
     """A block-wise kernel with its arguments set. A call only enqueues it.
 
-    The kernel must not be used elsewhere between its construction, or `set_first`, and the call, because it has one set
-    of arguments.
-
     Parameters
     ----------
     engine : Engine
@@ -67,25 +63,19 @@ class Launch:
     def __init__(
         self, engine: Engine, kernel: cl.Kernel, *args: object, groups: int | None = None
     ) -> None:
-        bind(kernel, args)
         self._args, self._kernel = args, kernel
-        self._key = kernel.bound  # type: ignore[attr-defined]
+        self._bind()
         self._queue = engine.queue
         group = engine.block_of(kernel)
         self._size = ((engine.groups if groups is None else groups) * group,)
         self._group = (group,)
 
-    def set_first(self, value: int) -> None:
-        """Set the kernel's first argument, an int."""
-        args = value, *self._args[1:]
-        if self._kernel.bound is self._key:  # type: ignore[attr-defined]
-            kernels.set_changed(self._kernel, args, (0,))
-            self._key[0] = value
-        else:
-            # Another launch has bound the kernel.
-            bind(self._kernel, args)
-            self._key = self._kernel.bound  # type: ignore[attr-defined]
+    def _bind(self) -> None:
+        bind(self._kernel, self._args)
+        self._key = self._kernel.bound  # type: ignore[attr-defined]
 
     def __call__(self) -> None:
-        """Enqueue the kernel."""
+        """Enqueue the kernel. Its arguments are set again if it has been used elsewhere meanwhile."""
+        if self._kernel.bound is not self._key:  # type: ignore[attr-defined]
+            self._bind()
         cl.enqueue_nd_range_kernel(self._queue, self._kernel, self._size, self._group)

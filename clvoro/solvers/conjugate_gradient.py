@@ -43,6 +43,7 @@ class ConjugateGradient:
         self.partial = engine.zeros(_ROWS * engine.groups)
         """Partial sums, one row per quantity."""
         self.state = engine.zeros(6)
+        self.counts = engine.empty(2, np.int32)
         self._record_capacity = 0
         self._group_state = engine.zeros(_STATE + 4)
         self._one_group_limit = one_group_limit(engine)
@@ -221,7 +222,7 @@ class ConjugateGradient:
             end = min(done + ahead, most)
             for k in range(done, end):
                 system.iterate(k)
-            system.record_norm(end)
+            system.record_norm()
             *rows, (removed, norm_b, *_) = (
                 self.record[4 * done : 4 * (end + 2)].get().reshape(-1, 4)
             )
@@ -297,7 +298,7 @@ class _System:
         # The recurrence stops slightly below the tolerance, so that the true residual is within it.
         limit = self._engine.real.type(0.95 * tolerance)
         self._tail = (solver.partial, solver.state, solver.record)
-        first = np.int32(0)
+        first = solver.counts
         self._find_direction, self._update_solution = [], []
         for p, old in (directions[::-1], directions):
             if self._merged:
@@ -336,7 +337,7 @@ class _System:
         self._launch(k.sum_right_sides, self._size, anew, self._rhs, self._q, partial)
         self._launch(
             k.start_residual, self._size, anew, self._center, self._rhs, self._q, self._x, self._r, self._p, partial,
-            state,
+            state, self._solver.counts,
         )  # fmt: skip
 
     def begin(self) -> None:
@@ -352,19 +353,17 @@ class _System:
             self._precondition(self._r, self._u, self._q)
             self._dot_product(_GAMMA + (k & 1), self._r, self._u)
         direction, solution = self._find_direction[k & 1], self._update_solution[k & 1]
-        direction.set_first(k)
         direction()
         if not self._merged:
             self._operator.apply(self._p, self._q)
             if not self._operator.writes_curvature:
                 self._dot_product(CURVATURE, self._p, self._q)
-        solution.set_first(k)
         solution()
 
-    def record_norm(self, k: int) -> None:
-        """Record the residual before iteration k, and whether k is needed."""
+    def record_norm(self) -> None:
+        """Record the residual before the next iteration, and whether it is needed."""
         groups = np.int32(self._engine.groups)
-        self._launch_one_group(self._kernels.record_norm, np.int32(k), *self._tail, groups)
+        self._launch_one_group(self._kernels.record_norm, self._solver.counts, *self._tail, groups)
 
     def center(self) -> None:
         """Subtract its mean from x."""
