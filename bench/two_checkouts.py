@@ -5,7 +5,8 @@
 OTHER is the folder of another checkout of the project, for instance a git worktree of an earlier commit. Each
 repetition starts one process per checkout. It adapts a mesh once to build the kernels, then `--runs` times, and reports
 the median of the seconds: processor time of all threads, without that of the system. The load of the machine hardly
-changes it. The table has the median of these over the repetitions for each checkout, and the median of the ratios of
+changes it. "host" is the processor time of the thread that calls clvoro: on PoCL, kernels run in other threads. The
+table has the median of these over the repetitions for each checkout, and the median of the ratios of
 the pairs, with their range. S2 and S3 are fields of `convergence.py`. S3 takes minutes: name it to run it.
 """
 
@@ -18,6 +19,7 @@ import statistics
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from _common import Report, spread
 
@@ -43,7 +45,7 @@ RUNS = {
 LARGE = {name.format("S3"): f"CUBE, graded(4), {options}" for name, options in GRADED.items()}
 """Runs that are not measured unless they are named."""
 CHILD = """
-import resource, sys, warnings
+import resource, sys, time, warnings
 sys.path.insert(0, {checkout!r})
 warnings.simplefilter("ignore")
 import numpy as np
@@ -66,17 +68,22 @@ def clock():
 domain, size, options = {run}
 adapter = clvoro.Adapter()
 adapter.run(domain, size * {coarser}, **options)
-seconds = []
+seconds, host = [], []
 for seed in range({runs}):
-    begin = clock()
+    begin, there = clock(), time.thread_time()
     adapter.run(domain, size, seed=seed, **options)
     seconds.append(clock() - begin)
+    host.append(time.thread_time() - there)
 print(*seconds)
+print(*host)
 """
 
 
-def seconds_of(checkout: Path, name: str, runs: int) -> float:
-    """Return the median of the processor seconds of `runs` runs in a new process that imports `checkout`."""
+def seconds_of(checkout: Path, name: str, runs: int) -> tuple[float, ...]:
+    """Return medians of the processor seconds of `runs` runs in a new process that imports `checkout`.
+
+    They are those of all threads, and of the host.
+    """
     coarser = 2 if name in LARGE else 1
     code = CHILD.format(
         checkout=str(checkout), run={**RUNS, **LARGE}[name], runs=runs, coarser=coarser
@@ -87,7 +94,9 @@ def seconds_of(checkout: Path, name: str, runs: int) -> float:
     )
     if done.returncode:
         raise SystemExit(f"{checkout}: {done.stderr.strip().splitlines()[-1]}")
-    return statistics.median(map(float, done.stdout.split()))
+    return tuple(
+        statistics.median(map(float, line.split())) for line in done.stdout.strip().splitlines()
+    )
 
 
 COLUMNS = {
@@ -95,6 +104,9 @@ COLUMNS = {
     "other, s": lambda r: f"{statistics.median(r['other']):.3f}",
     "this, s": lambda r: f"{statistics.median(r['this']):.3f}",
     "ratio": lambda r: spread(r["ratios"], ".2f"),
+    "host, other, s": lambda r: f"{statistics.median(r['host_other']):.3f}",
+    "host, this, s": lambda r: f"{statistics.median(r['host_this']):.3f}",
+    "host, ratio": lambda r: spread(r["host_ratios"], ".2f"),
 }
 
 
@@ -122,9 +134,12 @@ def main() -> None:
             (seconds_of(other, name, options.runs), seconds_of(HERE, name, options.runs))
             for _ in range(options.repeat)
         ]
-        theirs, ours = zip(*pairs, strict=True)
-        ratios = [b / a for a, b in pairs]
-        report.add({"run": name, "other": theirs, "this": ours, "ratios": ratios}, name)
+        record: dict[str, Any] = {"run": name}
+        for k, prefix in enumerate(("", "host_")):
+            theirs, ours = [a[k] for a, _ in pairs], [b[k] for _, b in pairs]
+            ratios = [b / a for a, b in zip(theirs, ours, strict=True)]
+            record |= {f"{prefix}other": theirs, f"{prefix}this": ours, f"{prefix}ratios": ratios}
+        report.add(record, name)
     report.finish(
         f"Runs of this checkout against {json.dumps(options.other.name)}, in processor seconds."
     )
