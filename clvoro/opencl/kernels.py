@@ -174,7 +174,8 @@ def set_changed(kernel: cl.Kernel, args: Sequence[Any], changed: Iterable[int]) 
         a = args[k]
         if type(a) is DeviceArray or isinstance(a, cla.Array):
             # `data` raises an error for an array that does not begin at the start of its buffer.
-            kernel.set_arg(k, a.data if a.offset else a.base_data)
+            buffer: Any = a.data if a.offset else a.base_data
+            kernel.set_arg(k, buffer)
         elif isinstance(a, (int, np.generic, np.ndarray)):
             _set_number(kernel, k, np.int32(a) if isinstance(a, int) else a)
         else:
