@@ -78,16 +78,21 @@ class Recorder:
         self.programs: dict[int, Program] = {}
         self.launches: collections.Counter[tuple[int, str]] = collections.Counter()
         self.taken: collections.Counter[tuple[int, str]] = collections.Counter()
-        self._plain = (_kernels.set_changed, cl.enqueue_nd_range_kernel)
+        self._plain = (_kernels.set_changed, cl.enqueue_nd_range_kernel, cl.Kernel.set_args)
         self._build = _program.build_program
         self._share = lambda: None
 
     def __enter__(self) -> Recorder:
-        def noted_args(kernel, args, changed):
-            kernel.noted = [
-                getattr(a, "base_data", np.int32(a) if type(a) is int else a) for a in args
-            ]
+        def noted(args):
+            return [getattr(a, "base_data", np.int32(a) if type(a) is int else a) for a in args]
+
+        def noted_changed(kernel, args, changed):
+            kernel.noted = noted(args)
             self._plain[0](kernel, args, changed)
+
+        def noted_args(kernel, *args):
+            kernel.noted = noted(args)
+            self._plain[2](kernel, *args)
 
         def noted_build(ctx, name, defines, prelude):
             program = self._build(ctx, name, defines, prelude)
@@ -98,14 +103,14 @@ class Recorder:
                 )
             return program
 
-        _kernels.set_changed = noted_args
+        _kernels.set_changed, cl.Kernel.set_args = noted_changed, noted_args
         cl.enqueue_nd_range_kernel = self._enqueue
         _program.build_program = noted_build
         self._share = buffers_of_their_own()
         return self
 
     def __exit__(self, *_: object) -> None:
-        _kernels.set_changed, cl.enqueue_nd_range_kernel = self._plain
+        _kernels.set_changed, cl.enqueue_nd_range_kernel, cl.Kernel.set_args = self._plain
         _program.build_program = self._build
         self._share()
 
