@@ -88,15 +88,18 @@ LOOSE_POLISH_3D, SETTLE_PENALTY_3D = 2.0, 0.7
 S3, the largest error is half of that of polishing alone, for 0.0007 of mean Q."""
 EXACT_PENALTY, EXACT_ITERATIONS = 1e-3, 45
 """Penalty of the exact projections, and the largest number of iterations of each."""
-GRADUAL_PENALTIES = (0.1, 0.03), (0.03, 0.03), (0.01, 0.03), (1e-3, 0.0), (1e-3, 0.0), (1e-3, 0.0)
+GRADUAL_PENALTIES = ((0.1, 0.03), (0.03, 0.03), (0.01, 0.03), *[(1e-3, 0.0)] * 6)
 """In polygons: penalty, and scale of the quality in it (see `Penalty`), of each step before Newton's.
 
 A small penalty from the first step on moves generators by large displacements where the number of cells does not fit a
 narrow part of the domain. There they nearly coincide in the end, and sizes are lost for good. Boxes have no such parts,
 and sizes are met sooner with the small penalty."""
+NEWTON_QUALITY_SCALE = 0.1
+"""In polygons: scale of the quality in the penalty of Newton's steps. Bad cells may miss their size a little."""
 NEWTON_STEPS = 2
 """Number of the last exact projections that only project and separate vertices: Newton's method for the sizes."""
-EXACT_STEPS = len(GRADUAL_PENALTIES) + NEWTON_STEPS
+EXACT_STEPS = 6 + NEWTON_STEPS
+"""Number of exact projections in boxes."""
 EXACT_STEPS_3D = 3
 
 SEPARATE_PENALTY = 20.0
@@ -166,28 +169,34 @@ def adaptive_schedule(
         Lower the penalty of exact projections in 2D step by step (see `GRADUAL_PENALTIES`).
     """
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
-    if exact and gradual:
-        _lower_penalties(schedule)
-    return _opened(schedule, exact, openings) if openings else schedule
+    projections = EXACT_STEPS if exact else 0
+    if exact and gradual and dim == 2:
+        schedule[-projections:] = _gradual(*schedule[-projections :: projections - 1])
+        projections = len(GRADUAL_PENALTIES) + NEWTON_STEPS
+    return _opened(schedule, projections, openings) if openings else schedule
 
 
-def _lower_penalties(schedule: list[Action]) -> None:
-    """Give the exact projections of a schedule the penalties of `GRADUAL_PENALTIES`."""
-    steps = [k for k, action in enumerate(schedule) if isinstance(action, Step)]
-    projections = steps[-EXACT_STEPS:-NEWTON_STEPS]
-    for k, (penalty, scale) in zip(projections, GRADUAL_PENALTIES, strict=True):
-        method = replace(schedule[k].method, penalty=penalty, quality_scale=scale)
-        schedule[k] = replace(schedule[k], method=method)
+def _gradual(project: Step, newton: Step) -> list[Step]:
+    """Return the exact projections in polygons."""
+    methods = [
+        replace(project.method, penalty=penalty, quality_scale=scale, careful=True)
+        for penalty, scale in GRADUAL_PENALTIES
+    ]
+    last = replace(newton.method, quality_scale=NEWTON_QUALITY_SCALE, careful=True)
+    return [*map(Step, methods), *[Step(last)] * NEWTON_STEPS]
 
 
-def _opened(schedule: list[Action], exact: bool, openings: int) -> list[Action]:
-    """Return the schedule with the deletion of cells of four sides, and with the opening of obtuse triangles."""
+def _opened(schedule: list[Action], exact: int, openings: int) -> list[Action]:
+    """Return the schedule with the deletion of cells of four sides, and with the opening of obtuse triangles.
+
+    `exact` is the number of exact projections.
+    """
     steps = [k for k, action in enumerate(schedule) if isinstance(action, Step)]
     # Exact projections close some triangles again, and correct the sizes of opened ones.
     opening = steps[-OPENING_PROJECTIONS if exact else -1 :]
     for k in opening:
         schedule[k] = replace(schedule[k], openings=openings)
-    before = steps[-min(len(steps), SETTLING_STEPS + (EXACT_STEPS if exact else 0))]
+    before = steps[-min(len(steps), SETTLING_STEPS + exact)]
     repair = [RepairCells(math.inf), CorrectCount(COUNT_EXACTLY if exact else 0.0)]
     return [*schedule[:before], *repair, *schedule[before:]]
 
