@@ -5,6 +5,7 @@ import pytest
 
 from clvoro import sizing
 from clvoro.adaptation.methods import (
+    AT_WALLS_OF_BOXES,
     PENALTY_PER_ERROR,
     PUBLISHED,
     ProjectedMethod,
@@ -178,7 +179,7 @@ def test_projected_displacements(stages):
     stages.volume_projection.project(
         mesh.t, Targets(mesh.local_length, w.gradient, w.log_ratio, mesh.quality, sums),
         stages.engine.upload(expected), correction,
-        Penalty(0.2, 0.1, 0.3), Limits(1e-2, 25),
+        Penalty(0.2, 0.1, 0.3, AT_WALLS_OF_BOXES), Limits(1e-2, 25),
     )  # fmt: skip
     ProjectedMethod(
         "lloyd", 1.3, 0.6, penalty=0.2, quality_scale=0.1, log_ratio_scale=0.3, iterations=25
