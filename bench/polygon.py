@@ -1,6 +1,6 @@
 """The cost of polygonal domains, and the quality of their meshes.
 
-    python bench/polygon.py [--cells 1e6] [--edges 10000] [--runs 5] [--seeds 3] [--only cost,meshes]
+    python bench/polygon.py [--cells 1e6] [--edges 10000] [--runs 5] [--seeds 7] [--only cost,meshes]
                             [--device NAME] [--dtype float32] [--json]
 
 The first table compares the diagram of a polygon of `--edges` edges, a coast with an island, with that of a box with
@@ -174,7 +174,7 @@ def main() -> int:
     made.add_argument("--cells", type=lambda text: counts(text)[0], default=1_000_000)
     made.add_argument("--edges", type=lambda text: counts(text)[0], default=10_000)
     made.add_argument("--runs", type=int, default=5)
-    made.add_argument("--seeds", type=int, default=3)
+    made.add_argument("--seeds", type=int, default=7)
     made.add_argument("--only", type=names, default=["cost", "meshes"])
     options = made.parse_args()
     adapter, good = make_adapter(options), True

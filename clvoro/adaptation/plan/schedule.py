@@ -291,8 +291,9 @@ def _finish_2d(
     """Polish, and project."""
     looser = error_target / effort.error_target
     tight = looser < TIGHT
-    scale, power = effort.log_ratio_scale * error_target, 2
+    scale, power, bad_cell_weight = effort.log_ratio_scale * error_target, 2, effort.bad_cell_weight
     if looser > 1:
+        bad_cell_weight *= min(looser, effort.loose_bad_cells)
         scale, power = min(scale * looser**0.5, effort.largest_log_ratio_scale), 4
     if looser > 1 or tight:
         penalty *= looser
@@ -301,7 +302,7 @@ def _finish_2d(
     polish = ProjectedMethod(
         "quality", momentum=effort.polish_momentum, penalty=penalty, quality_scale=effort.quality_scale,
         log_ratio_scale=scale, k=0.3, error_target=error_target,
-        bad_cell_weight=effort.bad_cell_weight, tolerance=POLISH_TOLERANCE, power=power,
+        bad_cell_weight=bad_cell_weight, tolerance=POLISH_TOLERANCE, power=power,
         gradient_from_field=tight,
     )  # fmt: skip
     repairs = dict(effort.repairs)
