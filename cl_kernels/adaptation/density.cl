@@ -156,8 +156,8 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
     weighted_offset(i, g, site, offsets, covariances, lloyd);
 }
 
-/* partial = per work-group, sum of V rho r, then sum of V rho: the ratio of their sums is the mean of r. A wrong number of
-   generators changes the mean; motion cannot correct it, insertion and deletion can. */
+/* partial = per work-group, sum of V rho r, then sum of V rho: the ratio of their sums is the mean of r. A wrong number
+   of generators changes the mean; motion cannot correct it, insertion and deletion can. */
 kernel void sum_log_ratio(const int size, global const REAL *weight, global const REAL *log_ratio, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];

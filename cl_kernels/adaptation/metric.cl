@@ -76,8 +76,8 @@ kernel void compare_neighbors(const int size, global const int *starts, global c
     ever_changed[i] = first ? 0 : fmax(ever_changed[i], (REAL)differs);
 }
 
-/* h[i] = L_i for generators of layers, first <= labels[i] < fixed: their size is right. But a cell much larger than h[i] has taken
-   the place of cells that are missing beside it: it counts as too large. One work-item per generator. */
+/* h[i] = L_i for generators of layers, first <= labels[i] < fixed: their size is right. But a cell much larger than
+   h[i] has taken the place of cells that are missing beside it: it counts as too large. One work-item per generator. */
 kernel void set_fixed_sizes(const int size, global const int *labels, const int first, const int fixed,
                             global const REAL *volumes, global REAL *h)
 {

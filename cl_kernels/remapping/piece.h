@@ -188,7 +188,8 @@ inline int face_label(private const piece_t *piece, int f)
 
 inline REAL4 corner_of(private const piece_t *piece, int k)
 {
-    return (REAL4)(((private const REAL *)piece->x)[k], ((private const REAL *)piece->y)[k], ((private const REAL *)piece->z)[k], 0);
+    return (REAL4)(((private const REAL *)piece->x)[k], ((private const REAL *)piece->y)[k],
+                   ((private const REAL *)piece->z)[k], 0);
 }
 
 inline int corner_count(private const piece_t *piece)
@@ -218,7 +219,8 @@ typedef struct {
 
 inline void note_piece(private shape_t *shape, private const piece_t *piece)
 {
-    private const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
+  private
+    const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
     for (int v = 0; v < piece->n; ++v) {
         shape->x[v] = x[v];
         shape->y[v] = y[v];
@@ -234,7 +236,8 @@ inline void note_piece(private shape_t *shape, private const piece_t *piece)
 /* All faces are those of the cell itself. */
 inline void recall_piece(private piece_t *piece, private const shape_t *shape)
 {
-    private REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
+  private
+    REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
     for (int v = 0; v < shape->n; ++v) {
         x[v] = shape->x[v];
         y[v] = shape->y[v];
@@ -254,8 +257,10 @@ inline void recall_piece(private piece_t *piece, private const shape_t *shape)
    edge is longer than the cell. */
 inline int cut_piece(private piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
 {
-    private const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
-    private REAL *s = (private REAL *)piece->beyond;
+  private
+    const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
+  private
+    REAL *s = (private REAL *)piece->beyond;
     int beyond = 0;
     for (int v = 0; v < piece->n; ++v) {
         s[v] = x[v] * normal.s0 + y[v] * normal.s1 + z[v] * normal.s2 - level;
@@ -283,7 +288,8 @@ inline int cut_piece(private piece_t *piece, REAL4 normal, REAL level, REAL dept
 inline REAL measure_piece(private piece_t *piece, private REAL4 *centroid)
 {
     const REAL4 o = corner_of(piece, 0);
-    private const INDEX *start = face_starts(piece);
+  private
+    const INDEX *start = face_starts(piece);
     REAL sum = 0;
     REAL4 first = 0;
     for (EACH_FACE(piece, f)) {
