@@ -171,7 +171,7 @@ the least Q is 0.84. With the default's relaxation of 3.2, or with its weight of
 EXACT_PENALTY_PER_ERROR, MET_ERROR = 4.0, 1e-3
 """Least penalty of exact projections in polygons, for each mean |log(L / h)| above the second number. Cells must pass
 through narrow parts of the domain where they have too few on one side; with a small penalty they are squeezed there.
-Measured on the motor of `bench/solver_ready.py` with method "exact": 17 cells at walls have Q below 0.75 without it, 1
+Measured on the motor of `bench/solver_ready.py` with method "exact": 17 cells at walls have Q below 0.75 without it, 4
 with it and with `GRADUAL_PENALTIES`."""
 PENALTY_PER_ERROR = 750.0
 """Largest penalty over the error target, for targets above 0.004. With a penalty of 3 no mean error above 0.024 is
