@@ -163,8 +163,8 @@ MOST_AT_WALLS = 0.4
 their sizes for little: with default settings mean |e| at walls is 0.0109 on the coast of `bench/solver_ready.py`,
 0.0037 on the gear and 0.0070 on F2 in the coast of `bench/polygon.py` without it, and 0.0050, 0.0010 and 0.0011 with
 it. The mean Q there changes by 0.0005 on F2. On the coast, best, five starts, it is 0.0050 to 0.0072; with 0.15 in
-place of 0.4 the largest three become 0.0048 or less. But then more cells at walls have a low quality with method "exact" (12 in place of 7
-in the bay, 66 in place of 57 on the coast)."""
+place of 0.4 the largest three become 0.0048 or less. But then more cells at walls have a low quality with method
+"exact": 12 in place of 7 in the bay, 66 in place of 57 on the coast."""
 CALM_MOMENTUM, CALM_BAD_CELL_WEIGHT = 0.7, 20.0
 """Largest parameters at thin walls, where larger steps part the pairs of generators. Measured on a slit, twelve starts:
 the least Q is 0.84. With the default's relaxation of 3.2, or with its weight of 40, it is below 0.6 in four or five."""
