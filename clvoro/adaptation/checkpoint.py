@@ -35,8 +35,8 @@ PER_FACE = ("neighbors", "face_measures", "face_centroids")
 DIAGRAM = (
     "starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances",
 )  # fmt: skip
-VERTICES = ("triples", "keys")
-"""Of a diagram in 3D that will be updated."""
+VERTICES = {"triples": 2, "keys": 1}
+"""Arrays of a diagram in 3D that will be updated, and their entries per face. They may be longer than that."""
 
 
 @dataclasses.dataclass
@@ -146,8 +146,8 @@ class Checkpointer:
         for name in DIAGRAM:
             array = getattr(t, name)
             arrays[f"diagram.{name}"] = (array[:m] if name in PER_FACE else array).get()
-        for name, array in zip(VERTICES, t.vertices, strict=False):
-            arrays[f"vertices.{name}"] = array[: m * len(array) // len(t.neighbors)].get()
+        for (name, per_face), array in zip(VERTICES.items(), t.vertices, strict=False):
+            arrays[f"vertices.{name}"] = array[: per_face * m].get()
         for name, array in mesh.stages.poisson.save(mesh.labels).items():
             arrays[f"multigrid.{name}"] = array
         periodic = mesh.tessellator.periodic

@@ -115,10 +115,10 @@ LONG_LIVED = {
     ),
     "adaptive in 3D": (BOX_3D, SIZE_3D, {"method": "adaptive", "effort": "fast"}),
 }
-QUICK = ("coupled", "multigrid"), ("adaptive", "jacobi")
+QUICK = ("coupled", "multigrid"), ("adaptive in 3D", "jacobi")
 
 
-@pytest.mark.sparse(1)
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("kind", "solver"),
     [

@@ -536,7 +536,7 @@ def test_estimate_of_periodic_boxes(bench, monkeypatch, ctx, dim, n, field):
     assert estimate_memory(engine, cells, box, Extras(images)) == pytest.approx(expected * cells)
     run += fixed
     # With few large cells, the halo is not equally deep along a seam.
-    assert (0.9 if dim == 2 else 0.8) <= found["run"] / run <= 1.1
+    assert (0.88 if dim == 2 else 0.8) <= found["run"] / run <= 1.1
     assert 0.75 <= found["output"] / output <= 1.1 or found["output"] < found["run"]
     assert run > 1.5 * estimate_memory(engine, cells) / cells or dim == 3
 

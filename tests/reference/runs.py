@@ -64,8 +64,9 @@ def check(result, field, box, real="float64"):
     assert h["inserted"][0] == h["deleted"][0] == 0
     assert (h["cells"][-1], h["level"][-1]) == (n, 0)
     errors = np.abs(result.size_error)
-    assert h["mean_error"][-1] == pytest.approx(errors.mean(), rel=1e4 * eps, abs=eps)
-    assert h["max_error"][-1] == pytest.approx(errors.max(), rel=1e4 * eps, abs=eps)
+    # Volumes are round-off apart between the run and its result: exact sizes have errors of a few eps.
+    assert h["mean_error"][-1] == pytest.approx(errors.mean(), rel=1e4 * eps, abs=16 * eps)
+    assert h["max_error"][-1] == pytest.approx(errors.max(), rel=1e4 * eps, abs=16 * eps)
     # In 2D the lengths of faces are in single precision during a run.
     close = 2 * float(np.finfo(np.float32).eps) if dim == 2 else 64 * eps
     assert h["mean_quality"][-1] == pytest.approx(result.quality.mean(), rel=close)
