@@ -59,14 +59,14 @@ def complex_of(points: np.ndarray) -> np.ndarray:
 
 
 def turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the angles by which the ways from a over b to c turn to the left."""
+    """Return the angles by which the paths a, b, c turn to the left in b, in radians."""
     return np.angle(np.conj(b - a) * (c - b))
 
 
 def _offset(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances of b from the straight lines between a and c, and the areas of the triangles.
+    """Return the distances of b from the segments between a and c, and the areas of the triangles a, b, c.
 
-    The area is negative where the way from a over b to c turns to the right.
+    An area is negative where the path a, b, c turns to the right.
     """
     along, aside = c - a, b - a
     both, length = np.conj(aside) * along, np.abs(along)
@@ -79,10 +79,10 @@ def _offset(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np
 
 
 def kept_points(lines: Lines) -> np.ndarray:
-    """Return which points of the lines chords run between, (k,) bool, the first and the last ones included.
+    """Return which points of the lines are ends of chords, (k,) bool; the first and the last one of a line are.
 
-    A stretch that turns by at most 30 degrees in sum becomes straight. Then kinks near the chord are dropped, and at
-    last kinks without which the area is nearer to the exact one, as on rough walls.
+    First, a stretch becomes straight if its turns add up to at most 30 degrees. Then kinks near their chord are
+    dropped. At last, kinks are dropped if the area without them is nearer to the exact one, as on rough walls.
     """
     if not len(lines.row):
         return np.zeros(0, bool)
@@ -95,7 +95,7 @@ def kept_points(lines: Lines) -> np.ndarray:
 
 
 def _stretch_ends(lines: Lines) -> np.ndarray:
-    """Return the points in which stretches end that turn by at most 30 degrees in sum, and the ends, (k,) bool."""
+    """Return where stretches end whose turns add up to at most 30 degrees, (k,) bool; lines end there, too."""
     starts, x = lines.starts, lines.points
     turns = np.zeros(len(x))
     turns[1:-1] = turn(x[:-2], x[1:-1], x[2:])
@@ -104,7 +104,7 @@ def _stretch_ends(lines: Lines) -> np.ndarray:
     counts = np.diff(starts)
     longest_first = np.argsort(-counts, kind="stable")
     counts, at = counts[longest_first], starts[:-1][longest_first]
-    # Line by line at its next inner point.
+    # The k-th inner point of all lines at once: `number` lines have one, those with the most points first.
     number = np.searchsorted(-counts, -np.arange(2, counts.max(initial=0)), side="left")
     turned = np.zeros(len(at))
     for k, going in enumerate(number.tolist(), 1):
@@ -117,15 +117,16 @@ def _stretch_ends(lines: Lines) -> np.ndarray:
 
 
 class _Kinks:
-    """Points of lines that are left while others are dropped.
+    """Ends of chords while some of them are dropped.
 
     Attributes
     ----------
     items : (m,) int
         Points of the lines.
     left : (m,) bool
+        Not dropped yet.
     before, after : (m,) int
-        The ones before and after it that are left.
+        The nearest items before and after each one that are left.
     """
 
     def __init__(self, lines: Lines, chosen: np.ndarray) -> None:
@@ -139,11 +140,11 @@ class _Kinks:
         self.limit = (_FILLED * lines.sizes)[self.row]
 
     def _triangles(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distances of `some` points from their chords, and the areas that come with them."""
+        """Return the distances of `some` items from the chords without them, and the areas of the triangles."""
         return _offset(self.x[self.before[some]], self.x[some], self.x[self.after[some]])
 
     def _drop(self, some: np.ndarray) -> np.ndarray:
-        """Drop points that do not follow each other; return those whose chord changes."""
+        """Drop items, no two of which are adjacent; return the others whose chord changes."""
         before, after = self.before[some], self.after[some]
         self.left[some] = False
         self.after[before], self.before[after] = after, before
@@ -151,7 +152,7 @@ class _Kinks:
         return near[self.can_go[near]]
 
     def drop_nearest(self) -> None:
-        """Drop kinks near their chords, round by round those that are nearer than the kinks before and after them."""
+        """Drop kinks near their chords. Each round drops those that are nearer than the kinks before and after them."""
         cut = (_CUT * self.lines.sizes)[self.row]
 
         def offsets(some: np.ndarray) -> np.ndarray:
@@ -170,7 +171,7 @@ class _Kinks:
             going = near[np.isfinite(far[near])]
 
     def drop_for_area(self) -> None:
-        """Drop kinks near their chords without which the area is nearer to the exact one."""
+        """Drop kinks near their chords if the area without them is nearer to the exact one."""
         lines = self.lines
         lost = _areas(lines.points, lines.starts)
         rest = np.flatnonzero(self.left)
@@ -193,7 +194,7 @@ class _Kinks:
 
 
 def least_of_rows(row: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the place of the first least value of each row; equal entries of `row` are together."""
+    """Return the place of the smallest value of each row, the first one of equals; entries of a row are adjacent."""
     if not len(row):
         return np.zeros(0, np.int64)
     begins = np.flatnonzero(np.diff(row, prepend=-1) > 0)
@@ -209,7 +210,10 @@ def _of_lines(items: np.ndarray, row: np.ndarray, lines: np.ndarray) -> np.ndarr
 
 
 def _areas(points: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Return the area to the left of each line and to the right of its chord."""
+    """Return the area between each line and the segment from its first to its last point, (l,).
+
+    It is positive where the line is to the right of the segment.
+    """
     p = points - np.repeat(points[starts[:-1]], np.diff(starts))
     twice = np.zeros(len(p))
     twice[:-1] = (np.conj(p[:-1]) * p[1:]).imag
@@ -218,7 +222,7 @@ def _areas(points: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 def chords(lines: Lines, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points but the last ones of `lines`, (s,), and the place and number of those of each chord."""
+    """Return all points of `lines` but the last of each, (s,); where each chord begins among them, and its number."""
     step = np.ones(len(lines.row), bool)
     step[lines.starts[1:] - 1] = False
     steps = np.flatnonzero(step)
@@ -227,7 +231,9 @@ def chords(lines: Lines, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def chord_costs(lines: Lines, kept: np.ndarray, centroids: np.ndarray) -> np.ndarray:
-    """Return the cost of each line with the points `kept` (k,) bool, (l,), apart from corners that are not convex.
+    """Return the cost of each line, (l,), with chords between the points `kept` (k,) bool.
+
+    Corners that are not convex have a price of their own, see `concave_prices`.
 
     `centroids` (l,) complex are those of the cells.
     """
@@ -265,7 +271,7 @@ def skewness(a: np.ndarray, b: np.ndarray, centroids: np.ndarray) -> np.ndarray:
 def concave_prices(
     lines: Lines, kept: np.ndarray, behind: np.ndarray, ahead: np.ndarray
 ) -> np.ndarray:
-    """Return the price of each line for corners of its cell that are not convex, (l,).
+    """Return the price of each line, (l,), for the corners at which its cell is not convex.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ Solver = Literal["openfoam", "mpas"]
 _LEAST = 1e-300
 """OpenFOAM's VSMALL: least area of a face and volume of a cell."""
 _SHORTEST_EDGE = 1e-6
-"""Least length of an edge over the distance of its generators: the schemes divide by lengths of edges."""
+"""Least ratio of the length of an edge to the distance of its generators: C-grid schemes divide by the length."""
 _LEAST_ANGLE = 30.0
 """Angle of a triangle, in degrees, below which the mesh is warned of."""
 _LEAST_EDGE_RATIO = 0.1

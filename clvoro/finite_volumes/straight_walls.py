@@ -107,7 +107,7 @@ def _straightened(runs: WallRuns, spared: np.ndarray) -> SolverMesh:
 
 
 class _Ends:
-    """The ends of runs while they move: each at most once, and the moves that gain most first.
+    """The ends of runs while they move. Each moves at most once, and those that gain most move first.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class _Ends:
     def _ways(
         self, run: np.ndarray, begin: np.ndarray, counts: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Return for so many faces from each place on: the row, the number from 0, and the length up to its end."""
+        """Return for `counts` faces from each place on: the row, the number from 0, and the length up to their end."""
         starts = np.cumsum(counts) - counts
         row = np.repeat(np.arange(len(run)), counts)
         k = np.arange(len(row)) - starts[row]
@@ -172,7 +172,7 @@ class _Ends:
         return row, k, sums[1:] - sums[starts[row]]
 
     def _set_shifts(self, some: np.ndarray) -> None:
-        """Find the best way of `some` face ends."""
+        """Find the best place for `some` face ends along the wall."""
         w = self.walls
         one, two = w.one[some], w.two[some]
         reach = REACH * np.minimum(w.sizes[w.cell[one]], w.sizes[w.cell[two]])
@@ -203,7 +203,7 @@ class _Ends:
         reach = REACH * np.minimum(np.minimum(size[one], size[two]), size[runs])
         counts = self.end[runs] - self.begin[runs]
         row, k, way = self._ways(runs, self.begin[runs], counts + 1)
-        # From the way to the end of each face to that to its beginning.
+        # `_ways` measures up to the end of each face; here lengths up to its beginning are needed.
         way -= w.lengths[w.at(runs[row], self.begin[runs[row]] + k)]
         total = np.zeros(len(runs))
         np.maximum.at(total, row, way)
@@ -243,7 +243,7 @@ class _Ends:
         self.way[places[row[order]]] = by[order]
 
     def move(self) -> bool:
-        """Make moves that gain, the best ones first, and no two of the same run; return whether there is one."""
+        """Make the moves that gain most, at most one of each run; return False if no move gains anything."""
         w, count = self.walls, len(self.walls.one)
         found = np.flatnonzero(self.gain > 0)
         if not found.size:

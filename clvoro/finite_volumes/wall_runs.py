@@ -1,6 +1,6 @@
-"""Runs along walls in 2D: the parts of the rings of a domain that belong to one cell, from one face end to the next.
+"""Runs along walls in 2D. A run is the part of the boundary from the end of one inner face to the end of the next.
 
-What a run costs is that of its chords, see `chord_costs`, and of corners that are not convex.
+It belongs to one cell. Its cost is that of its chords, and of corners at which the cell is not convex: see `chords`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from .prisms import simple_loops
 from .solver_mesh import SolverMesh
 
 _WAY_PRICE, _TILT_PRICE = 0.02, 0.6
-"""Prices in squares of the size of the cell: for the way of a face end over the size, and for the square of the angle
-by which its face turns, in radians."""
+"""Prices of moving the end of a face, in squares of the size of the cell: for the distance over the size, and for the
+square of the angle in radians by which the face turns."""
 
 
 class WallRuns:
@@ -52,7 +52,7 @@ class WallRuns:
         self._set_runs(self._following(onward))
         self.behind, self.ahead, self.known = self._beside()
         self.one, self.two, self.face, self.side = self._links()
-        # What lines cost: their keys, ascending, and the costs.
+        # Costs that are known, by a key for run, begin and end; the keys ascend.
         self.keys, self.costs = np.zeros(0, np.int64), np.zeros(0)
 
     def _following(self, onward: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ class WallRuns:
         return np.where(joined, after, -1)
 
     def _set_runs(self, following: np.ndarray) -> None:
-        """Set `order`, the runs, and the run after each one, -1 if there is none."""
+        """Set `order`, the runs, and `after`: the next run on the boundary, -1 if there is none."""
         owner = self.mesh.owner[self.walls]
         before = np.full(len(owner), -1)
         goes_on = np.flatnonzero(following >= 0)
@@ -120,7 +120,7 @@ class WallRuns:
         keys = keys[order]
 
         def places(points: np.ndarray) -> np.ndarray:
-            """Return where `points` are in the loops around the cells of the runs."""
+            """Return the places of `points`, one per run, in the loops of points around the cells of the runs."""
             at = np.searchsorted(keys, self.cell * v + points)
             return order[np.minimum(at, len(keys) - 1)] - starts[self.cell]
 
@@ -159,9 +159,9 @@ class WallRuns:
     def lines(
         self, run: np.ndarray, begin: np.ndarray, end: np.ndarray
     ) -> tuple[Lines, np.ndarray, np.ndarray]:
-        """Return the lines of runs from place to place, their points, and the wall faces that begin there.
+        """Return the lines of runs between two places, their points, and the wall face that begins in each point.
 
-        In the last point of a line that is the face before it. A line with `begin` = `end` is a point.
+        For the last point of a line it is the face that ends there. A line with `begin` = `end` is one point.
         """
         counts = end - begin + 1
         starts = np.concatenate([[0], np.cumsum(counts)])
@@ -176,7 +176,7 @@ class WallRuns:
         return Lines(starts, self.points[points], fixed, sizes), points, face
 
     def cost(self, run: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the costs of runs if they had the faces from place to place, or only one point."""
+        """Return the costs of runs if they went from place `begin` to place `end`; equal places are one point."""
         m = len(self.order) + 1
         begin = begin - self.chain_begin[run]
         keys = (run * m + begin % self.chain_length[run]) * m + end - begin - self.chain_begin[run]
@@ -195,7 +195,7 @@ class WallRuns:
         return self.costs[np.searchsorted(self.keys, keys)]
 
     def way_price(self, run: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
-        """Return the prices for moving the ends of runs: for the way, and for the angle by which the face turns."""
+        """Return the prices of moving the ends of runs from points `old` to `new`."""
         size, foot = self.sizes[self.cell[run]], self.ahead[run, 0]
         u, v = self.points[old] - foot, self.points[new] - foot
         tilt = np.angle(np.conj(u) * v)

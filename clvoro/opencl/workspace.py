@@ -50,7 +50,7 @@ def framed(method: Method) -> Method:
 
 
 class _Taken:
-    """An array taken in a frame, and what has been taken after it: a node of a tree.
+    """A node of the tree of arrays: one array, whose children are the arrays that were once taken next.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class _Taken:
     needed : int
         Bytes of this array and of all that were taken before it and are in use.
     after : dict
-        Nodes of the next array by its shape and type.
+        The children, by shape and type.
     """
 
     __slots__ = ("after", "buffer", "needed", "view")
@@ -90,7 +90,7 @@ class Workspace:
     def __init__(self, queue: cl.CommandQueue) -> None:
         self._queue = queue
         self._made = 0
-        # Length of the path at the beginning of each open frame.
+        # For each open frame, how many nodes `_path` had when it began.
         self._frames: list[int] = []
         self.clear()
 
@@ -131,7 +131,7 @@ class Workspace:
         return node.view
 
     def _choose(self, shape: int | tuple[int, ...], dtype: DTypeLike) -> _Taken:
-        """Return the node of an array that has not been taken after the present ones before."""
+        """Return a new child of the last node, for an array that was never taken next to the present ones."""
         real, last = np.dtype(dtype), self._path[-1]
         items = math.prod(shape) if isinstance(shape, tuple) else int(shape)
         size = max(items * real.itemsize, 1)

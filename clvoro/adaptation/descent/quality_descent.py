@@ -5,6 +5,8 @@ The last steps of a run use it. On a sphere obtuse Delaunay triangles are opened
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyopencl.array as cla
 
@@ -13,24 +15,38 @@ from ...opencl.engine import Engine
 from ...opencl.primitives import Scan
 from ...tessellation.device_diagram import Tessellation
 
-SHORT_EDGE, EDGE_STIFFNESS = 0.2, 2.0
-"""Length over h below which edges are pushed apart, and the stiffness of their energy.
+
+@dataclass(frozen=True)
+class Repulsion:
+    """The energy ``stiffness / 2 max(0, length - l / h)^2`` of two points at the distance l.
+
+    Attributes
+    ----------
+    length : float
+        Distance over h below which they are pushed apart.
+    stiffness : float
+    """
+
+    length: float
+    stiffness: float
+
+
+SHORT_EDGES = Repulsion(0.2, 2.0)
+"""The ends of edges.
 
 In a step the length of an edge between four cells on a square changes by up to 4 rate stiffness times the length that
-is missing. Measured on seven fields and domains, three to five starts each: 0.15 to 0.25 and 1.75 to 5 give the same
-sizes and quality.
+is missing. Measured on seven fields and domains, three to five starts each: lengths of 0.15 to 0.25 and a stiffness of
+1.75 to 5 give the same sizes and quality.
 """
+CLOSE_PAIRS = Repulsion(0.5, 3.0)
+"""Neighboring generators. In a hexagonal lattice they are 1.07 h apart."""
 
 FULL_RATE = 5.0
 """Largest omega h^2 / A up to which a generator moves at the full rate; h^2 / A is 1.15 where a cell has its size.
 
 E is as stiff as the weights of bad cells are large. Without this limit the default in a coast of 10,000 edges has a
-least Q that is 0.008 smaller, and a largest |e| of 0.035 and 0.122 in place of 0.031 and 0.108 (F3 and steep ridge,
-bench/polygon.py, medians of three)."""
-
-CLOSE, CLOSE_STIFFNESS = 0.5, 3.0
-"""Distance over h below which neighboring generators are pushed apart, and the stiffness of that energy. In a
-hexagonal lattice neighbors are 1.07 h apart."""
+least Q of 0.918 and 0.922 in place of 0.925 and 0.928 with the steep ridge and the steep circles, and a largest |e| of
+0.119 and 0.115 in place of 0.108 and 0.115 (the rows of `bench/polygon.py`, medians of seven starts)."""
 
 OPENINGS = 12
 """Most times that obtuse triangles are opened. After one, others may be obtuse. Two are enough for most meshes; none of
@@ -59,10 +75,8 @@ class QualityDescent:
         bad_cell_weight: float = 5.0,
         rate: float = 0.1,
         max_displacement: float = 0.2,
-        short_edge: float = SHORT_EDGE,
-        edge_stiffness: float = EDGE_STIFFNESS,
-        close: float = CLOSE,
-        close_stiffness: float = CLOSE_STIFFNESS,
+        edges: Repulsion = SHORT_EDGES,
+        pairs: Repulsion = CLOSE_PAIRS,
         full_rate: float = FULL_RATE,
     ) -> None:
         """Write the displacement ``-rate h^2 dE/dx`` to `lloyd` (n, 2), in place of the displacement to the centroid.
@@ -76,11 +90,8 @@ class QualityDescent:
             Step length.
         max_displacement : float
             Largest displacement over h.
-        short_edge, edge_stiffness : float
-            Length over h below which edges are pushed apart, and the second derivative of their energy with respect to
-            that.
-        close, close_stiffness : float
-            The same for the distance of neighboring generators.
+        edges, pairs : Repulsion
+            Energies of the ends of edges, and of neighboring generators.
         full_rate : float
             Largest omega h^2 / A of a cell and its neighbors up to which its generator moves at the full rate; beyond
             it the rate is smaller in proportion.
@@ -94,8 +105,8 @@ class QualityDescent:
             )  # fmt: skip
             engine.run_each(
                 k.descend_quality, t.n, t.starts, t.neighbors, t.face_measures, t.face_centroids,
-                t.points, forces, real(rate), real(max_displacement), real(short_edge),
-                real(edge_stiffness), real(close), real(close_stiffness), real(full_rate), lloyd,
+                t.points, forces, real(rate), real(max_displacement), real(edges.length),
+                real(edges.stiffness), real(pairs.length), real(pairs.stiffness), real(full_rate), lloyd,
                 *t.outlines, *engine.period_args,
             )  # fmt: skip
 

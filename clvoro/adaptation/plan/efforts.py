@@ -88,9 +88,10 @@ class Effort:
         Parameters of polishing: see `ProjectedMethod`. The last one is relative to the error target.
     loose_bad_cells : float
         Largest factor on the weight of bad cells with an error target above the effort's own; up to it the factor is
-        the ratio of the two. Measured on F3 and circles, default, targets 0.0095 and 0.0155, six starts each: the least
-        Q grows by 0.005 and 0.002, the largest |e| by 0.008 and 0.002. With the effort's own target nothing is gained,
-        and the largest |e| grows. "fast" has too few steps: on the ridge the mean |e| would grow from 0.0137 to 0.0145.
+        the ratio of the two. Measured on F3 and circles with the targets of `bench/front.py --goals`, default, six
+        starts each: the least Q grows by 0.005 and 0.002, the largest |e| by 0.008 and 0.002. With the effort's own
+        target nothing is gained, and the largest |e| grows. "fast" has too few steps: on the ridge the mean |e| would
+        grow from 0.0137 to 0.0145.
     largest_log_ratio_scale : float
         Largest scale of log(L / h) in the penalty, with an error target above the effort's own. It bounds the largest
         error. The power is 4 then. Measured on F3, circles and two ridges with targets 0.014 to 0.2: at the same mean

@@ -171,13 +171,13 @@ def adaptive_schedule(
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
     projections = EXACT_STEPS if exact else 0
     if exact and gradual and dim == 2:
-        schedule[-projections:] = _gradual(*schedule[-projections :: projections - 1])
+        schedule[-projections:] = _gradual(schedule[-projections], schedule[-1])
         projections = len(GRADUAL_PENALTIES) + NEWTON_STEPS
     return _opened(schedule, projections, openings) if openings else schedule
 
 
 def _gradual(project: Step, newton: Step) -> list[Step]:
-    """Return the exact projections in polygons."""
+    """Return the exact projections in polygons, given a projection and a Newton step of those in boxes."""
     methods = [
         replace(project.method, penalty=penalty, quality_scale=scale, careful=True)
         for penalty, scale in GRADUAL_PENALTIES

@@ -7,7 +7,7 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.adaptation.descent.quality_descent import QualityDescent
+from clvoro.adaptation.descent.quality_descent import QualityDescent, Repulsion
 from clvoro.adaptation.stages import Stages
 from clvoro.mesh.connectivity import face_ends
 from clvoro.opencl.engine import Engine
@@ -17,6 +17,7 @@ from tests.reference import patch
 from tests.reference.polygon_diagrams import polygon_voronoi
 
 N = 40
+NONE = Repulsion(0.2, 0.0)
 
 
 def qualities(points):
@@ -48,8 +49,8 @@ def descend_from(
         bad_cell_weight=bad_cell_weight,
         rate=rate,
         max_displacement=max_displacement,
-        edge_stiffness=stiffness,
-        close_stiffness=0.0,
+        edges=Repulsion(0.2, stiffness),
+        pairs=NONE,
         full_rate=full_rate,
     )
     return out.get()
@@ -229,7 +230,7 @@ def test_gradient_of_short_edges(ctx, name):
     out = engine.empty((n, 2))
     QualityDescent(engine).descend(
         t, engine.upload(h / unit), engine.upload(np.full(n, 0.5)), out, quality_weight=0, rate=0.3,
-        max_displacement=1e9, short_edge=short, edge_stiffness=2, close_stiffness=0,
+        max_displacement=1e9, edges=Repulsion(short, 2), pairs=NONE,
     )  # fmt: skip
     some = rng.permutation(n)[:16]
     gradient = gradient_of(
@@ -249,7 +250,7 @@ def test_gradient_of_close_generators(ctx):
     out = engine.empty((N, 2))
     QualityDescent(engine).descend(
         patch.tessellate(engine, points), engine.upload(h), engine.upload(np.full(N, 0.5)), out, quality_weight=0,
-        rate=0.3, max_displacement=1e9, edge_stiffness=0, close=limit, close_stiffness=2,
+        rate=0.3, max_displacement=1e9, edges=NONE, pairs=Repulsion(limit, 2),
     )  # fmt: skip
     expected, pairs = np.zeros((N, 2)), 0
     for i, cell in enumerate(reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)):
