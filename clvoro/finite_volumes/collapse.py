@@ -8,7 +8,7 @@ import scipy.sparse.csgraph
 
 from ..mesh.connectivity import following, take_rows
 from .defects import Limits
-from .geometry import smaller_size, sum_rows
+from .geometry import lengths, smaller_size, sum_rows
 from .merging import Cells, Merges
 from .seams import pack, unpack
 from .solver_mesh import SolverMesh
@@ -27,7 +27,7 @@ _LONGEST = 0.25
 """Longest edge that is collapsed, if it is the shortest of a small face."""
 LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, skewness=3))
 """Tried in turn, the later ones where short edges or small faces are left."""
-_CHUNK = 1 << 16
+_CHUNK = 1 << 13
 """Faces that are scanned at a time."""
 
 
@@ -74,17 +74,17 @@ def collapse_short(
 def _fold(mesh: SolverMesh, sizes: np.ndarray) -> tuple[Cells, np.ndarray]:
     """Return the cells of `mesh` with faces at seams and images of points once; the faces of `mesh` that they have."""
     upper = np.flatnonzero((mesh.twin < 0) | (mesh.twin > np.arange(len(mesh.twin))))
-    starts, corners = take_rows(mesh.starts, mesh.corners, upper)
-    points, codes = mesh.points, np.zeros(len(mesh.points), np.int64)
-    extent = np.asarray(mesh.domain.extent, float)
-    classes = np.arange(len(points))
+    points, extent = mesh.points, np.asarray(mesh.domain.extent, float)
     if len(upper) < len(mesh.owner):
+        starts, corners = take_rows(mesh.starts, mesh.corners, upper)
         _, first, classes = np.unique(mesh.images, return_index=True, return_inverse=True)
         away = np.where(mesh.domain.periodic, (points - points[first[classes]]) / extent, 0)
-        codes = pack(np.rint(away))
-        points = points[first]
+        codes = pack(np.rint(away))[corners]
+        points, corners = points[first], classes[corners]
+    else:
+        starts, corners, codes = mesh.starts, mesh.corners, np.zeros(len(mesh.corners), np.int64)
     cells = Cells(
-        points, starts, classes[corners], codes[corners], mesh.owner[upper], mesh.neighbor[upper],
+        points, starts, corners, codes, mesh.owner[upper], mesh.neighbor[upper],
         pack(mesh.shift[upper]), extent, sizes, SMALL_FACE,
     )  # fmt: skip
     for wall in np.unique(-1 - mesh.neighbor[mesh.neighbor < 0]).tolist():
@@ -108,15 +108,14 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
     lower = place[left] < 0
     source = place[np.where(lower, mesh.twin[left], left)]
     starts, where = cells.face_corners(source)
-    _, where = take_rows(starts, where, np.arange(len(left)), lower)
-    shift = np.repeat(np.where(lower, cells.face_codes[source], 0), np.diff(starts))
-    vertices, codes = cells.corners[where], cells.codes[where] - shift
-    corners, points = vertices, cells.points
-    if codes.any():
+    corners, points = cells.corners[where], cells.points
+    if len(seam):
+        _, where = take_rows(starts, where, np.arange(len(left)), lower)
+        shift = np.repeat(np.where(lower, cells.face_codes[source], 0), np.diff(starts))
+        vertices, codes = cells.corners[where], cells.codes[where] - shift
         order = np.lexsort((codes, vertices))
         new = np.ones(len(order), bool)
         new[1:] = (np.diff(vertices[order]) != 0) | (np.diff(codes[order]) != 0)
-        corners = np.empty(len(order), np.int64)
         corners[order] = np.cumsum(new) - 1
         points = cells.positions(vertices[order][new], codes[order][new])
     return mesh.take_faces(left, points=points, starts=starts, corners=corners)
@@ -160,13 +159,14 @@ class _Scan:
         self.begin = cells.corners[places]
         self.end = self.begin[after]
         self.code = cells.codes[places][after] - cells.codes[places]
-        self.length, self.h = np.linalg.norm(x[after] - x, axis=1), h[face]
+        self.length, self.h = lengths(x.take(after, axis=0) - x), h[face]
         self.short = self.length < SHORT_EDGE * self.h
-        away = x - x[self.starts[face]]
-        twice = sum_rows(face, np.cross(away, away[after]), len(self.faces))
-        self.small = np.linalg.norm(twice, axis=1) < 2 * SMALL_FACE * h**2
+        away = x - x.take(self.starts[face], axis=0)
+        twice = sum_rows(face, np.cross(away, away.take(after, axis=0)), len(self.faces))
+        area = lengths(twice) / 2
+        self.small = area < SMALL_FACE * h**2
         if cells.centroids is not None:
-            rows = ~self.small & (np.linalg.norm(twice, axis=1) < 2 * _SKEWED_FACE * h**2)
+            rows = ~self.small & (area < _SKEWED_FACE * h**2)
             rows &= cells.neighbor[self.faces] >= 0
             skewness = self._skewness(np.flatnonzero(rows), x, twice, cells.centroids)
             self.small[rows] = skewness > SKEWED
@@ -184,9 +184,12 @@ class _Scan:
         arm, n = center - own, normals[rows]
         share = np.einsum("ij,ij->i", n, arm) / np.einsum("ij,ij->i", n, line)
         off = arm - share[:, None] * line
-        size = np.maximum(np.linalg.norm(off, axis=1), 1e-300)
-        along = np.einsum("ij,ij->i", x[places] - center[face], (off / size[:, None])[face])
-        reach = 0.2 * np.linalg.norm(line, axis=1)
+        size = np.maximum(lengths(off), 1e-300)
+        along = np.einsum(
+            "ij,ij->i", x.take(places, axis=0) - center.take(face, axis=0),
+            (off / size[:, None]).take(face, axis=0),
+        )  # fmt: skip
+        reach = 0.2 * lengths(line)
         np.maximum.at(reach, face, np.abs(along))
         return size / reach
 
@@ -257,7 +260,7 @@ class _Scan:
         steps = np.rint(away / self.cells.extent)
         away -= steps * self.cells.extent
         width = np.zeros(g)
-        np.maximum.at(width, group, np.linalg.norm(away, axis=1))
+        np.maximum.at(width, group, lengths(away))
         k = int(sets.max(initial=-1)) + 1
         extent, size = np.zeros(k), np.full(k, np.inf)
         np.maximum.at(extent, sets, width)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mesh.connectivity import take_rows
-from .geometry import cell_geometry, face_geometry, smaller_size
+from .geometry import cell_geometry, face_geometry, lengths, smaller_size
 from .seams import unpack
 
 if TYPE_CHECKING:
@@ -104,11 +104,11 @@ def find_defects(
     with np.errstate(invalid="ignore", divide="ignore"):
         shapes = _shapes(around, x)
         h = smaller_size(w.owner[around.faces], w.neighbor[around.faces], w.sizes)
-        large = np.linalg.norm(shapes.areas, axis=1) >= w.small * h**2
+        large = lengths(shapes.areas) >= w.small * h**2
         changed = around.alive & (around.set_of_face >= 0)
         wrong = changed & ~(shapes.flatness >= limits.flatness)
         wrong |= changed & _bad_tetrahedra(around, x, shapes)
-        arms = shapes.seen - shapes.middles[around.side_cell]
+        arms = shapes.seen - shapes.middles.take(around.side_cell, axis=0)
         low = ~(np.einsum("ij,ij->i", shapes.outward, arms) > 0)
         wrong[around.side_face[low]] |= changed[around.side_face[low]]
         sets = around.set_of_face
@@ -132,14 +132,14 @@ def _shapes(around: Neighborhood, x: np.ndarray) -> _Shapes:
     starts = np.append(around.starts[rows], len(x))
     centers, areas = np.full((f, 3), np.nan), np.full((f, 3), np.nan)
     centers[rows], areas[rows] = face_geometry(x, starts, np.arange(len(x)))
-    about = np.cross(x[around.after] - x, centers[around.face] - x)
-    spread = 0.5 * np.bincount(around.face, np.linalg.norm(about, axis=1), f)
+    about = np.cross(x.take(around.after, axis=0) - x, centers.take(around.face, axis=0) - x)
+    spread = 0.5 * np.bincount(around.face, lengths(about), f)
     side = around.side_face
-    seen = centers[side] - unpack(around.side_code) * around.whole.extent
-    outward = areas[side] * around.side_sign[:, None]
+    seen = centers.take(side, axis=0) - unpack(around.side_code) * around.whole.extent
+    outward = areas.take(side, axis=0) * around.side_sign[:, None]
     none = np.zeros(0, np.int64)
     middles, volumes = cell_geometry(seen, outward, around.side_cell, none, len(around.cells))
-    flatness = np.linalg.norm(areas, axis=1) / spread
+    flatness = lengths(areas) / spread
     return _Shapes(centers, areas, flatness, seen, outward, middles, volumes)
 
 
@@ -187,10 +187,10 @@ def _quality(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> tuple[np.n
     height = np.einsum("ij,ij->i", area, to_face)
     d = np.where(inner[:, None], other - own, height[:, None] * area)
     across = np.einsum("ij,ij->i", area, d)
-    length = np.linalg.norm(d, axis=1)
+    length = lengths(d)
     angle = np.degrees(np.arccos(np.clip(across / length, -1, 1)))
     off = to_face - (height / across)[:, None] * d
-    size = np.linalg.norm(off, axis=1)
+    size = lengths(off)
     along = off / np.maximum(size, 1e-300)[:, None]
     starts, place = take_rows(around.starts, np.arange(len(around.corners)), rows)
     row = np.repeat(np.arange(len(rows)), np.diff(starts))

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 _TINY = 1e-150
 """OpenFOAM's ROOTVSMALL, which keeps quotients finite."""
+_CHUNK = 1 << 13
+"""Faces that are evaluated at a time: their arrays fit the caches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +55,25 @@ def face_geometry(
     starts : (f + 1,) int, corners : int
         Corners of each face, at least three.
     """
-    here = points[corners]
-    means = np.add.reduceat(here, starts[:-1]) / np.diff(starts)[:, None]
-    middle = np.repeat(means, np.diff(starts), axis=0)
-    there = points[corners[following(starts)]]
+    f = len(starts) - 1
+    centers, areas = np.empty((f, 3)), np.empty((f, 3))
+    for first in range(0, f, _CHUNK):
+        end = min(first + _CHUNK, f)
+        part = corners[starts[first] : starts[end]]
+        here = points.take(part, axis=0)
+        faces = starts[first : end + 1] - starts[first]
+        centers[first:end], areas[first:end] = _geometry(here, faces)
+    return centers, areas
+
+
+def _geometry(here: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return centers and area vectors of faces whose corners are `here` (k, 3)."""
+    counts = np.diff(starts)
+    there = here.take(following(starts), axis=0)
+    means = np.add.reduceat(here, starts[:-1]) / counts[:, None]
+    middle = np.repeat(means, counts, axis=0)
     normals = np.cross(there - here, middle - here)
-    weights = np.linalg.norm(normals, axis=1)
+    weights = lengths(normals)
     total = np.add.reduceat(weights, starts[:-1])
     # Relative to the mean, so that little is lost in cancellation.
     moments = np.add.reduceat(weights[:, None] * (here + there - 2 * middle), starts[:-1])
@@ -138,6 +153,11 @@ def turns(corners: np.ndarray, after: np.ndarray) -> np.ndarray:
     behind = np.empty_like(ahead)
     behind[after] = ahead
     return np.arctan2(cross(behind, ahead), (behind * ahead).sum(axis=1))
+
+
+def lengths(vectors: np.ndarray) -> np.ndarray:
+    """Return the length of each of `vectors` (k, d), (k,)."""
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
 def sum_rows(places: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

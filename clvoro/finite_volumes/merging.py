@@ -14,14 +14,14 @@ import scipy.sparse
 
 from ..mesh.connectivity import take_rows
 from .defects import Defects, Limits, find_defects
-from .geometry import sum_rows
+from .geometry import lengths, sum_rows
 from .independent import independent
 from .neighborhood import Neighborhood
 from .seams import unpack
 
 _TRIES = 4
 """Vertices of a group, the nearest to its mean first, that are tried as the place where all meet."""
-_CHUNK = 2048
+_CHUNK = 512
 """Sets of vertices that are tried at a time."""
 
 
@@ -113,24 +113,21 @@ class Cells:
     ) -> None:
         self.points, self.extent = np.array(points, float), np.asarray(extent, float)
         self.begin, self.count = starts[:-1].copy(), np.diff(starts)
-        self.corners, self.codes = corners.astype(np.int64), codes.astype(np.int64)
+        self.corners, self.codes = corners.astype(np.int64), codes
         self.owner, self.neighbor = owner.astype(np.int64), neighbor.astype(np.int64)
         self.face_codes, self.n = face_codes, len(sizes)
         self.sizes, self.small = sizes, small
         self.limits = Limits()
         self.centroids: np.ndarray | None = None
-        v, f = len(points), len(owner)
-        rows = np.repeat(np.arange(f), self.count)
+        v = len(points)
         self.walls = np.zeros(v, np.int64)
-        outer = self.neighbor[rows] < 0
-        np.bitwise_or.at(self.walls, self.corners[outer], 1 << (-1 - self.neighbor[rows[outer]]))
-        self.at_vertex = _inverse(self.corners, rows, v)
-        inner = np.flatnonzero(self.neighbor >= 0)
-        self.at_cell = _inverse(
-            np.concatenate([self.owner, self.neighbor[inner]]),
-            np.concatenate([np.arange(f), inner]),
-            self.n,
-        )
+        outer = np.flatnonzero(self.neighbor < 0)
+        wall_of = np.repeat(-1 - self.neighbor[outer], self.count[outer])
+        np.bitwise_or.at(self.walls, take_rows(starts, self.corners, outer)[1], 1 << wall_of)
+        self.at_vertex = _inverse(starts, self.corners, v)
+        sides = np.where(self.neighbor >= 0, 2, 1)
+        both = np.stack([self.owner, self.neighbor], axis=1).ravel()
+        self.at_cell = _inverse(np.concatenate([[0], np.cumsum(sides)]), both[both >= 0], self.n)
         self.next = np.full(v, -1)  # vertices that have been merged, as linked lists
         self.last = np.arange(v)
         self.now = np.arange(v)  # the vertex that each vertex has become, and where its image is
@@ -142,8 +139,8 @@ class Cells:
     def positions(self, vertices: np.ndarray, codes: np.ndarray) -> np.ndarray:
         """Return the positions of images of vertices, (k, 3)."""
         if not codes.any():
-            return self.points[vertices]
-        return self.points[vertices] + unpack(codes) * self.extent
+            return self.points.take(vertices, axis=0)
+        return self.points.take(vertices, axis=0) + unpack(codes) * self.extent
 
     def face_corners(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return starts and places of the corners of `faces`."""
@@ -194,7 +191,7 @@ class Cells:
         sets = merges.sets[kept]
         made = Merges(starts, vertices, codes, sets, merges.priority, merges.reach)
         x = self.positions(vertices, codes)
-        away = np.linalg.norm(x - x[starts[:-1]][made.group], axis=1)
+        away = lengths(x - x[starts[:-1]][made.group])
         of = sets[made.group]
         key = np.sort(of * v + vertices)  # a vertex in two groups of a set
         wrong = np.concatenate([of[away > merges.reach[of]], key[1:][np.diff(key) == 0] // v])
@@ -321,9 +318,9 @@ class Cells:
         self.touched[around.cells[done[around.set_of_cell]]] = True
 
 
-def _inverse(items: np.ndarray, rows: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each of `size` items the rows that have it: starts, and rows item by item."""
-    pairs = scipy.sparse.coo_array(
-        (np.ones(len(items), np.int8), (items, rows)), (size, int(rows.max(initial=-1)) + 1)
+def _inverse(starts: np.ndarray, items: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each of `size` items the rows of the ragged array `starts` and `items` that have it, also ragged."""
+    rows = scipy.sparse.csc_array(
+        (np.ones(len(items), np.int8), items, starts), (size, len(starts) - 1)
     ).tocsr()
-    return pairs.indptr.astype(np.int64), pairs.indices.astype(np.int64)
+    return rows.indptr, rows.indices

@@ -122,10 +122,9 @@ class SolverMesh(Sealed):
         rows = np.flatnonzero(kept) if kept.dtype == bool else kept
         place = np.full(len(self.owner) + 1, -1)
         place[rows] = np.arange(len(rows))
-        starts, corners = take_rows(self.starts, self.corners, rows)
+        if "starts" not in arrays:
+            arrays["starts"], arrays["corners"] = take_rows(self.starts, self.corners, rows)
         taken = {
-            "starts": starts,
-            "corners": corners,
             "owner": self.owner[rows],
             "neighbor": self.neighbor[rows],
             "twin": place[self.twin[rows]],
