@@ -22,7 +22,7 @@ MAX_CELLS = 100_000_000
 SPHERE = "sphere"
 PEAK: dict[int | str, tuple[int, int]] = {2: (28, 80), 3: (140, 280), SPHERE: (33, 90)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, and on a sphere (bench/memory.py)."""
-TRIMMED_PEAK = (62, 75)
+TRIMMED_PEAK = (68, 79)
 """The same in polygons, where the boundary trims cells and faces are in full precision."""
 BOUNDARY_PEAK, EDGE_PEAK = (100, 187), (22, 20)
 """The same in addition per cell at the boundary, with its ghost generators, and per edge of the boundary."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +22,7 @@ _FILES = {
     "boundary": "polyBoundaryMesh",
     "faces": "faceList",
 }
-
-
+_BYTE_ORDER = {"little": "LSB", "big": "MSB"}[sys.byteorder]
 _CHUNK = 1 << 16
 
 
@@ -31,6 +32,7 @@ def write_foam(
     patches: Mapping[str, Walls] | None = None,
     types: Mapping[str, PatchType] | None = None,
     thickness: float | None = None,
+    binary: bool | None = None,
     walls: WallShape | None = None,
 ) -> None:
     """Write a polyMesh.
@@ -42,6 +44,8 @@ def write_foam(
         are left. Or ``CASE/name.foam``, an empty file that ParaView opens, with the mesh in ``CASE/constant/polyMesh``.
     patches, types, thickness, walls : optional
         See `poly_mesh`. The note in the file `points` says by how much straight walls change the area.
+    binary : bool, optional
+        Write numbers as bytes: labels of 32 bits and scalars of 64.
     """
     mesh = poly_mesh(contents.diagram, patches, types, thickness, walls or "straight")
     marker = path if path.suffix.lower() == ".foam" else None
@@ -61,31 +65,55 @@ def write_foam(
         else ""
     )
     notes = {"owner": note, "neighbour": note, "points": changed}
-    bodies = {
-        "points": (len(mesh.points), _vectors(mesh.points)),
-        "faces": (len(mesh.owner), _faces(mesh.starts, mesh.corners)),
-        "owner": (len(mesh.owner), _labels(mesh.owner)),
-        "neighbour": (len(mesh.neighbor), _labels(mesh.neighbor)),
-        "boundary": (len(mesh.patches), [_boundary(mesh)]),
-    }
+    if binary:
+        lists = {
+            "points": _bytes(mesh.points, np.float64),
+            "faces": chain(_bytes(mesh.starts, np.int32), _bytes(mesh.corners, np.int32)),
+            "owner": _bytes(mesh.owner, np.int32),
+            "neighbour": _bytes(mesh.neighbor, np.int32),
+        }
+    else:
+        lists = {
+            "points": _text(len(mesh.points), _vectors(mesh.points)),
+            "faces": _text(len(mesh.owner), _faces(mesh.starts, mesh.corners)),
+            "owner": _text(len(mesh.owner), _labels(mesh.owner)),
+            "neighbour": _text(len(mesh.neighbor), _labels(mesh.neighbor)),
+        }
+    lists["boundary"] = _text(len(mesh.patches), [_boundary(mesh)])
     # `faces` is moved last: a case without it is recognized as incomplete.
     with atomic_folder(folder / "faces") as target:
-        for name, kind in _FILES.items():
-            count, body = bodies[name]
-            head = _header(name, kind, notes.get(name, ""))
-            with open(target.with_name(name), "w", encoding="ascii", newline="\n") as file:
-                file.write(f"{head}{count}\n(\n")
-                file.writelines(body)
-                file.write(")\n")
+        for name in _FILES:
+            head = _header(name, notes.get(name, ""), bool(binary) and name != "boundary")
+            with open(target.with_name(name), "wb") as file:
+                file.write(head.encode("ascii"))
+                file.writelines(lists[name])
 
 
-def _header(name: str, kind: str, note: str) -> str:
+def _header(name: str, note: str, binary: bool) -> str:
+    kind = "faceCompactList" if binary and name == "faces" else _FILES[name]
     noted = f'    note        "{note}";\n' if note else ""
+    arch = f'    arch        "{_BYTE_ORDER};label=32;scalar=64";\n' if binary else ""
     return (
-        "FoamFile\n{\n    version     2.0;\n    format      ascii;\n"
+        f"FoamFile\n{{\n    version     2.0;\n    format      {'binary' if binary else 'ascii'};\n{arch}"
         f"    class       {kind};\n{noted}"
         f'    location    "constant/polyMesh";\n    object      {name};\n}}\n\n'
     )
+
+
+def _bytes(values: np.ndarray, dtype: type) -> Iterator[bytes]:
+    """Write a list as OpenFOAM does: its length, then its bytes in parentheses, if there are any."""
+    yield b"%d\n" % len(values)
+    if len(values):
+        yield b"("
+        yield np.ascontiguousarray(values, dtype).tobytes()
+        yield b")\n"
+
+
+def _text(count: int, body: Iterable[str]) -> Iterator[bytes]:
+    yield b"%d\n(\n" % count
+    for part in body:
+        yield part.encode("ascii")
+    yield b")\n"
 
 
 def _chunks(count: int) -> Iterator[slice]:

@@ -106,6 +106,7 @@ class MeshOutput:
         patches: Mapping[str, Walls] | None = None,
         types: Mapping[str, PatchType] | None = None,
         thickness: float | None = None,
+        binary: bool | None = None,
         walls: WallShape | None = None,
         convention: Literal["ugrid", "mpas", "scrip"] | None = None,
         units: str | None = None,
@@ -153,6 +154,9 @@ class MeshOutput:
             Inlets, outlets and far fields need "patch": ``types={"inlet": "patch"}``.
         thickness : float, optional
             For OpenFOAM and a mesh in 2D: height of the layer of prisms. By default the mean width of a cell.
+        binary : bool, optional
+            For OpenFOAM: write numbers as bytes (labels of 32 bits, scalars of 64), which is faster and takes less
+            space. By default numbers are text.
         walls : {"straight", "exact"}, optional
             For OpenFOAM and ``.vtu``. With "straight", the default for OpenFOAM, the file has the cells of
             `Diagram.solver_mesh`: the faces of a cell on the boundary become one straight face where they turn by at
@@ -180,7 +184,7 @@ class MeshOutput:
         # Not `_self`: `clvoro.io.save` may get an object that is no mesh, which `write_mesh` refuses.
         write_mesh(
             cast("Result | Diagram", self), path, cell_data, walls,
-            for_foam={"patches": patches, "types": types, "thickness": thickness},
+            for_foam={"patches": patches, "types": types, "thickness": thickness, "binary": binary},
             for_netcdf={"convention": convention, "units": units},
         )  # fmt: skip
 

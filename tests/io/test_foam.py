@@ -160,6 +160,43 @@ def test_text_does_not_depend_on_the_size_of_parts(solid, tmp_path, monkeypatch)
         assert (tmp_path / "two" / "polyMesh" / path.name).read_bytes() == path.read_bytes()
 
 
+def read_binary(folder, name):
+    """The arrays in a binary file of OpenFOAM, one after another: int32, or points in float64."""
+    head, body = (folder / name).read_bytes().split(b"}\n\n", 1)
+    fields = dict(re.findall(r"(\w+) +(.+);", head.decode()))
+    assert fields["format"] == "binary"
+    assert fields["arch"] == '"LSB;label=32;scalar=64"'
+    item = np.dtype((np.float64, 3) if name == "points" else np.int32)
+    arrays = []
+    while body:
+        count, body = body.split(b"\n", 1)
+        end = int(count) * item.itemsize
+        if int(count):
+            assert (body[:1], body[end + 1 : end + 3]) == (b"(", b")\n")
+            body, rest = body[1 : end + 1], body[end + 3 :]
+        arrays.append(
+            np.frombuffer(body if int(count) else b"", item.base).reshape(-1, *item.shape)
+        )
+        body = rest if int(count) else body
+    return fields["class"], arrays
+
+
+def test_binary_files_hold_the_same(result, tmp_path):
+    io.save(result, tmp_path / "text" / "polyMesh")
+    io.save(result, tmp_path / "bytes" / "polyMesh", binary=True)
+    points, faces, owner, neighbor, _ = read(tmp_path / "text" / "polyMesh")
+    folder = tmp_path / "bytes" / "polyMesh"
+    for name, values in (("points", points), ("owner", owner), ("neighbour", neighbor)):
+        (found,) = read_binary(folder, name)[1]
+        np.testing.assert_array_equal(found, values)
+    kind, (starts, corners) = read_binary(folder, "faces")
+    assert kind == "faceCompactList"
+    assert np.diff(starts).tolist() == [len(face) for face in faces]
+    assert corners.tolist() == [v for face in faces for v in face]
+    twin = tmp_path / "text" / "polyMesh" / "boundary"
+    assert (folder / "boundary").read_bytes() == twin.read_bytes()
+
+
 def test_a_marker_file_puts_the_mesh_into_its_case(solid, tmp_path):
     tmp_path = tmp_path / "made" / "as needed"
     io.save(solid, tmp_path / "case.foam")
@@ -170,11 +207,12 @@ def test_a_marker_file_puts_the_mesh_into_its_case(solid, tmp_path):
         assert twin.read_bytes() == path.read_bytes()
 
 
-def test_as_vtk_reads_it(result, tmp_path):
+@pytest.mark.parametrize("binary", [False, True])
+def test_as_vtk_reads_it(result, binary, tmp_path):
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy
 
-    io.save(result, tmp_path / "case.foam", walls="exact")
+    io.save(result, tmp_path / "case.foam", walls="exact", binary=binary)
     (tmp_path / "system").mkdir()
     (tmp_path / "system" / "controlDict").write_text(
         "FoamFile { version 2.0; format ascii; class dictionary; object controlDict; }\n"
@@ -186,7 +224,8 @@ def test_as_vtk_reads_it(result, tmp_path):
     sizes.SetInputConnection(reader.GetOutputPort())
     sizes.Update()
     found = vtk_to_numpy(sizes.GetOutput().GetBlock(0).GetCellData().GetArray("Volume"))
-    volumes = prism_volumes(result, read(tmp_path / "constant" / "polyMesh")[0])
+    io.save(result, tmp_path / "polyMesh", walls="exact")
+    volumes = prism_volumes(result, read(tmp_path / "polyMesh")[0])
     # VTK stores these points in single precision, and orients wedges in two ways.
     np.testing.assert_allclose(np.abs(found), volumes, rtol=0, atol=1e-4 * volumes.mean())
 
@@ -204,8 +243,9 @@ needs_openfoam = pytest.mark.skipif(
 
 @pytest.mark.slow
 @needs_openfoam
-def test_as_openfoam_checks_it(result, tmp_path):
-    said = check_mesh(result, tmp_path)
+@pytest.mark.parametrize("binary", [False, True])
+def test_as_openfoam_checks_it(result, binary, tmp_path):
+    said = check_mesh(result, tmp_path, binary=binary)
     topology = said.split("Checking topology...")[1].split("Checking geometry...")
     assert "***" not in topology[0]
     for line in ("Boundary openness", "Max cell openness", "Cell volumes", "Face pyramids"):
@@ -256,7 +296,7 @@ def test_wrong_options_are_refused(plane, tmp_path, options, says):
 def test_options_of_other_meshes_and_formats_are_refused(solid, plane, tmp_path):
     with pytest.raises(InputError, match="thickness is for meshes in 2D"):
         io.save(solid, tmp_path / "polyMesh", thickness=1.0)
-    for option in ({"types": {}}, {"thickness": 1}, {"patches": {}}):
+    for option in ({"types": {}}, {"thickness": 1}, {"patches": {}}, {"binary": True}):
         with pytest.raises(InputError, match=f"with {next(iter(option))}, which is for OpenFOAM"):
             io.save(plane, tmp_path / "mesh.vtu", **option)
     for option in ({"units": "m"}, {"convention": "mpas"}):
