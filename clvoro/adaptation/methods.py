@@ -114,6 +114,7 @@ class WeightedMethod:
     tolerance: float = 1e-2
     cautious: bool = False
     """Clip to k min(L, h), because cells can still be much smaller than a new, coarse target size."""
+    lloyd: bool = True
 
     def displace(self, mesh: MeshState) -> Solution:
         """Evaluate the weighted Lloyd displacement and the correction."""
@@ -144,7 +145,7 @@ class WeightedMethod:
     def move(self, mesh: MeshState) -> None:
         """Move by both, at most by k h."""
         mesh.stages.motion.move_generators(
-            mesh.free, mesh.points, mesh.lloyd, 1.0, mesh.correction, float(self.poisson),
+            mesh.free, mesh.points, mesh.lloyd, float(self.lloyd), mesh.correction, float(self.poisson),
             mesh.local_length if self.cautious else mesh.h, mesh.velocity, clip=self.k,
         )  # fmt: skip
 

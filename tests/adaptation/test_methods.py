@@ -123,13 +123,13 @@ def test_weighted_displacements(stages):
 
 
 @pytest.mark.parametrize("cautious", [True, False])
-@pytest.mark.parametrize("poisson", [True, False])
-def test_weighted_moves_at_most_k(stages, poisson, cautious):
+@pytest.mark.parametrize(("lloyd", "poisson"), [(True, True), (True, False), (False, True)])
+def test_weighted_moves_at_most_k(stages, lloyd, poisson, cautious):
     """Each displacement is clipped separately, at k h or, if cautious, at k min(h, L)."""
     mesh, host = make_mesh(stages, patch.random_points(N, 11))
-    method = WeightedMethod(k=0.25, poisson=poisson, cautious=cautious)
+    method = WeightedMethod(k=0.25, lloyd=lloyd, poisson=poisson, cautious=cautious)
     method.displace(mesh)
-    d = mesh.lloyd.get() + poisson * mesh.correction.get()
+    d = lloyd * mesh.lloyd.get() + poisson * mesh.correction.get()
     h = FIELD(host.points)
     longest = 0.25 * (np.minimum(h, np.sqrt(host.volumes)) if cautious else h)
     length = np.linalg.norm(d, axis=1)
