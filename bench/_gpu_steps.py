@@ -28,14 +28,15 @@ from clvoro.opencl.engine import Engine
 from clvoro.opencl.hooks import Tally
 from clvoro.sizing import Sizing
 from clvoro.solvers import poisson
-from tests.robustness.gpu_like import groups
+from clvoro.tessellation.teams import TEAM
+from tests.robustness.gpu_like import by_teams, groups
 from tests.robustness.oclgrind_runs import as_for_many
 
 COUNTS = Path(__file__).with_name("gpu_counts.json")
 COUNTED = (2, "weighted"), (2, "glide"), (2, "polish"), (3, "weighted"), (3, "glide"), (3, "polish")
 WARM_UP = 3
 """Steps before those that count: cells then keep most neighbors from step to step."""
-COUNTED_AT = {2: (300, 1200), 3: (250, 700)}
+COUNTED_AT = {2: (300, 1200), 3: (128, 432)}
 """Numbers of cells at which Oclgrind counts. The work of a kernel over cells is that of a cell at the larger number,
 times the cells. Kernels with as many work-items for any number of cells have a fixed part, from both numbers."""
 COUNTED_GROUP, COUNTED_ITEMS = 128, 16 * 128
@@ -97,6 +98,8 @@ class Run:
             self.mesh = MeshState.create(Stages(engine), box, size, engine.upload(points))
             self.method = replace(kinds(dim)[kind])  # type: ignore[type-var]
             self.n = len(points)
+            rng = np.random.default_rng(1)
+            self.random = engine.upload(rng.uniform(size=points.shape))
             for _ in range(warm_up):
                 self.step()
 
@@ -105,8 +108,8 @@ class Run:
         take_step(self.mesh, self.method)
 
     def diagram(self) -> None:
-        """Make the diagram from nothing."""
-        self.mesh.tessellation = self.mesh.tessellator.tessellate(self.mesh.points, self.mesh.n)
+        """Make the diagram of random points from nothing, as `diagram.py`."""
+        self.mesh.tessellation = self.mesh.tessellator.tessellate(self.random, self.mesh.n)
 
     @property
     def parts(self) -> dict[str, Callable[[], None]]:
@@ -179,6 +182,19 @@ def commands(
     return found
 
 
+def with_teams(found: Commands) -> Commands:
+    """Return the commands on an NVIDIA GPU: teams build cells in 3D, and update those that keep their vertices.
+
+    PoCL takes minutes to hours to compile their kernels.
+    """
+    for alone in ("clip_polyhedra", "update_cells"):
+        if alone in found.launches:
+            row, team = found.launches[alone], f"{alone}_by_teams"
+            found.launches[team] = Launches(1, TEAM * found.cells, TEAM, row.bytes / row.calls)
+    found.launches.pop("clip_polyhedra", None)
+    return found
+
+
 # Counting by Oclgrind.
 
 
@@ -235,7 +251,7 @@ def parse_counts(text: str) -> dict[str, dict[str, Work]]:
 def count_in_this_process(dim: int, kind: str, n: int) -> None:
     """Take a step and make a diagram on Oclgrind, whose plugin prints what is executed.
 
-    Steps before them are taken on PoCL, which is hundreds of times as fast.
+    Steps before them are taken on PoCL, which is hundreds of times as fast. Teams build and update cells in 3D.
     """
     with (
         groups(COUNTED_GROUP, COUNTED_ITEMS // COUNTED_GROUP),
@@ -244,16 +260,18 @@ def count_in_this_process(dim: int, kind: str, n: int) -> None:
         mock.patch.object(primitives, "FEW", 0),
     ):
         near = Run(clvoro.Adapter(clvoro.create_context("portable"), "float64"), dim, kind, n)
-        # The second step of a method keeps its aggregates or multipliers, as later ones do.
-        simulator = clvoro.Adapter(clvoro.create_context("oclgrind"), "float64")
-        run = Run(simulator, dim, kind, n, near.mesh.points.get(), warm_up=1)
-        for name, part in run.parts.items():
-            run.mesh.engine.queue.finish()
-            print(f"=== {name}", flush=True)
-            items = commands(run, name, 1, part).launches
-            print("=== end", flush=True)
-            sized = {k: {"items": v.items, "calls": v.calls} for k, v in items.items()}
-            print("@@@" + json.dumps({"part": name, "cells": run.n, "kernels": sized}), flush=True)
+        with by_teams(dim == 3):
+            # The second step of a method keeps its aggregates or multipliers, as later ones do.
+            simulator = clvoro.Adapter(clvoro.create_context("oclgrind"), "float64")
+            run = Run(simulator, dim, kind, n, near.mesh.points.get(), warm_up=1)
+            for name, part in run.parts.items():
+                run.mesh.engine.queue.finish()
+                print(f"=== {name}", flush=True)
+                items = commands(run, name, 1, part).launches
+                print("=== end", flush=True)
+                sized = {k: {"items": v.items, "calls": v.calls} for k, v in items.items()}
+                record = {"part": name, "cells": run.n, "kernels": sized}
+                print("@@@" + json.dumps(record), flush=True)
 
 
 def counted(dim: int, kind: str) -> dict[str, Any]:

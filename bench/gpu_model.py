@@ -11,15 +11,17 @@ work-item in bytes, "spills" the bytes of its stores and loads, "local" the byte
 warps fit on a multiprocessor, and "resident" the private memory of all work-items that an H200 runs at a time if it
 is full. Kernels above the limits `--registers` and `--private` are in the table; the last row is for all others.
 
-"steps" models the time of a step and of a new diagram on an H200 from launches, which are counted on this device in the
-groups that a GPU takes (`--measured-at` cells), and from the instructions and bytes that each kernel executes, which
-Oclgrind has counted (`gpu_counts.json`; `--count` writes it where Oclgrind is installed: see CONTRIBUTING.md). A kernel
-takes the largest of five times: "instructions" and "real" (those in float64) at the device's rates, with the share of
-lanes that work; "access", its reads and writes at a quarter of the coalesced rate; "memory", bytes that miss the caches
-at 70 % of the bandwidth, or all at that of the level-2 cache; and "depth", one work-item on its own. Few resident warps
-reduce the rates. Each launch adds 5 us, each blocking read 20 us. The constants of this file are the assumptions. The
-model does not know how accesses of neighboring work-items coalesce, what the caches hold, how far lanes diverge, and
-what NVIDIA's own compiler for OpenCL does.
+"steps" models the time of a step, and of a new diagram of random points, on an H200 from launches, which are counted on
+this device in the groups that a GPU takes (`--measured-at` cells), and from the instructions and bytes that each kernel
+executes, which Oclgrind has counted (`gpu_counts.json`; `--count` writes it where Oclgrind is installed: see
+CONTRIBUTING.md). In 3D teams build and update cells, as on NVIDIA's GPUs. A kernel takes the largest of five times:
+"instructions" and "real" (those in float64) at the device's rates, with the share of lanes that work; "access", its
+reads and writes at a quarter of the coalesced rate; "memory", bytes that miss the caches at 70 % of the bandwidth, or
+all at that of the level-2 cache; and "depth", one work-item on its own. Few resident warps reduce the rates. The host
+takes 40 us for each launch, and 57 us for each copy, fill and blocking read, as measured; it works beside the device,
+so that a part takes the larger of both. The constants of this file are the assumptions. The model does not know how
+accesses of neighboring work-items coalesce, what the caches hold, how far lanes diverge, and what NVIDIA's own compiler
+for OpenCL does.
 
 "path" takes the processor time of steps and diagrams on a CPU as it works, and on the path that GPUs take (scalar
 kernels, groups of 32 to 256 work-items, scans and sums by groups), by turns; medians of three.
@@ -96,8 +98,16 @@ H200 = Device(
     "H200", units=132, warps=64, registers=65536, clock=1.98e9, bandwidth=0.7 * 4.8e12, cached=5.5e12, flops=34e12,
     first_cache=192e3, second_cache=50e6,
 )  # fmt: skip
-LAUNCH, READ = 5e-6, 20e-6
-"""Seconds of a launch, copy or fill, and of a blocking read, added to the time of the kernels."""
+LAUNCH, MOVE = 40e-6, 57e-6
+"""Seconds of the host for a launch, with its arguments and the Python around it, and for a copy, fill or read.
+
+Measured in the run of a million cells on an H200 (see "On a GPU" in RESULTS.md): 1.75 s for 43,172 launches, 0.53 s for
+9,250 copies, reads and fills."""
+SCATTERED = 8
+"""Bytes that an access of one byte of private memory moves where work-items access different indices, as when they walk
+along links: NVIDIA interleaves private memory by words of 4 bytes, and moves sectors of 32."""
+WALKING = "clip_polygons", "clip_polyhedra", "clip_marked", "update_cells"
+"""Kernels that do."""
 ALU_WARPS, MEMORY_WARPS = 16, 32
 """Resident warps from which on arithmetic, and reads of memory, hide their latencies."""
 WORKING, WORKING_IN_CLIPS = 0.7, 0.35
@@ -271,9 +281,10 @@ def term(
     working = WORKING_IN_CLIPS if kernel.startswith("clip_") else WORKING
     rate = units * device.clock * min(1, warps / ALU_WARPS) * min(working, launches.group / 32)
     touched = min(private, work["stored_private_bytes"] / items) * warps * 32
+    scattered = SCATTERED if kernel in WALKING else 1
     missed = max(0, 1 - device.first_cache / touched) if touched else 0
     missed_again = max(0, 1 - device.second_cache / (touched * units)) if touched else 0
-    spilled = work["private_bytes"] * missed
+    spilled = work["private_bytes"] * missed * scattered
     loaded = work["global_bytes"]
     moved = (min(loaded, bound) if bound else loaded) + spilled * missed_again
     share = min(1, warps / MEMORY_WARPS) * min(1, 2 * units / device.units)
@@ -328,6 +339,9 @@ def step_records(
         with gpu_steps.gpu_groups(), gpu_programs.noting_programs() as sources:
             run = gpu_steps.Run(adapter, dim, kind, measured_at[dim])
             commands = {part: gpu_steps.commands(run, part) for part in run.parts}
+        if dim == 3:
+            commands = {part: gpu_steps.with_teams(found) for part, found in commands.items()}
+            sources += gpu_programs.team_programs(adapter.ctx, "float64", warps=True)
         print(f"{kind} step in {dim}D: {run.n} cells", file=sys.stderr, flush=True)
         figures: dict[str, gpu_programs.Figures] = {}
         if gpu_programs.can_measure("NVIDIA"):
@@ -341,10 +355,12 @@ def step_records(
             for n in sizes:
                 terms, missing = modeled(found, parts[part], figures, n)
                 device = sum(t.total for t in terms)
-                total = device + LAUNCH * found.count + READ * found.reads
+                moves = found.copies + found.reads
+                host = LAUNCH * (found.count - found.copies) + MOVE * moves
+                total = max(device, host)
                 records.append({
                     "dim": dim, "part": kind if part == "step" else "new diagram", "cells": n, "seconds": total,
-                    "device": device, "launches": found.count, "reads": found.reads, "rate": n / total,
+                    "device": device, "host": host, "launches": found.count, "reads": found.reads, "rate": n / total,
                     "missing": missing,
                     "kernels": [{**t._asdict(), "total": t.total, "limit": t.limit} for t in terms],
                 })  # fmt: skip
@@ -386,12 +402,12 @@ def step_tables(records: list[dict[str, Any]]) -> str:
     rows = [
         [
             f"{r['part']}, {r['dim']}D", f"{r['cells']:.0e}".replace("+0", ""), f"{r['launches']:.0f}",
-            f"{r['reads']:.0f}", f"{1e3 * r['device']:.2f}", f"{1e3 * r['seconds']:.2f}", f"{1e-6 * r['rate']:.0f}",
+            f"{r['reads']:.0f}", f"{1e3 * r['device']:.2f}", f"{1e3 * r['host']:.2f}", f"{1e-6 * r['rate']:.0f}",
         ]
         for r in records
     ]  # fmt: skip
     text = markdown(
-        ["part", "cells", "launches", "reads", "kernels, ms", "all, ms", "M cells/s"], rows
+        ["part", "cells", "launches", "reads", "kernels, ms", "host, ms", "M cells/s"], rows
     )
     largest_n = max(r["cells"] for r in records)
     lines = []
