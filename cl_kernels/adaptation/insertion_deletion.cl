@@ -10,14 +10,6 @@
 #include "opencl/row_entries.h"
 
 #if CELL_DIM == 2
-#define REGULAR_FACES 6
-#define FACE_WEIGHT R(0.2)
-#else
-#define REGULAR_FACES 14
-#define FACE_WEIGHT R(0.05)
-#endif
-
-#if CELL_DIM == 2
 inline REAL2 difference(global const REAL *points, int from, int to PERIOD_ARGS)
 {
     SITE(x, from, points);
@@ -293,8 +285,7 @@ kernel void score_log_ratio(const int size, global const int *starts, global con
         keys[i] = 0;
         return;
     }
-    const REAL faces = starts[i + 1] - starts[i];
-    const REAL magnitude = 2 + sign * (log_ratio[i] + FACE_WEIGHT * (faces - REGULAR_FACES));
+    const REAL magnitude = 2 + sign * need_of_split(log_ratio[i], starts[i + 1] - starts[i]);
     keys[i] = magnitude > 0 ? site_key(fmin(magnitude, R(4)), i) : 0;
 }
 

@@ -1,12 +1,6 @@
 /* Selection of sites where generators are inserted or deleted. Each generator has a key. The strongest sites that are
    several rings of cells apart are chosen. One work-item per generator. */
-#include "opencl/real.h"
-
-/* A key that orders sites by magnitude, then by index. 0 is not a site. */
-inline ulong site_key(REAL magnitude, int i)
-{
-    return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - i);
-}
+#include "adaptation/site_key.h"
 
 /* spread[i] = largest key of i and its neighbors. */
 kernel void spread_keys(const int size, global const int *starts, global const int *neighbors, global const ulong *keys,

@@ -217,6 +217,25 @@ class InsertionDeletion:
         self._room.clear("keys", "spread", "chosen", "latest")
         return self._apply(domain, t, generators, marks, next_label)
 
+    def split_delete(
+        self,
+        domain: Domain,
+        t: Tessellation,
+        generators: Generators,
+        next_label: int,
+        sites: tuple[cla.Array, cla.Array],
+        fixed: int = 0,
+    ) -> Outcome | None:
+        """Split and delete cells at `sites`, each (n,) uint64 and not 0 at sites; otherwise as `insert_delete`."""
+        engine, marks = self.engine, _Marks.clean(self._room, t.n, self.engine.dim)
+        self._labels, self._fixed = generators.labels, fixed
+        for sign, chosen in zip((1, -1), sites, strict=True):
+            engine.run_each(
+                self._kernels.mark_split_delete, t.n, chosen, engine.real.type(sign), t.points, t.offsets,
+                t.covariances, t.volumes, *marks.arrays,
+            )  # fmt: skip
+        return self._apply(domain, t, generators, marks, next_label)
+
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return charge and number of walls (n, 2), and the strain averaged over one and over two rings (n, 4)."""
         engine, k, n = self.engine, self._kernels, t.n
@@ -277,7 +296,7 @@ class InsertionDeletion:
         )  # fmt: skip
         self._drop_fixed(t, keys, neighbors=True)
         if change.nuclei:
-            engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, PAIR_RINGS), keys)
+            engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, PAIR_RINGS), keys)
         chosen = self._choose(t, keys, PAIR_RINGS)
         tally = self._room.zeros("tally", size=SHIFTS, dtype=np.int32)
         engine.run_each(k.count_pair_changes, n, chosen, pull, kinds, partners, strain_limit, tally)
@@ -301,7 +320,7 @@ class InsertionDeletion:
         keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(k.score_log_ratio, n, t.starts, t.neighbors, log_ratio, sign, keys)
         self._drop_fixed(t, keys, neighbors=False)
-        engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, LOG_RATIO_RINGS), keys)
+        engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, LOG_RATIO_RINGS), keys)
         chosen = self._choose(t, keys, LOG_RATIO_RINGS)
         self._limit(chosen, n, rest if rest > 0 else min(-rest, n - 1))
         engine.run_each(
@@ -317,7 +336,7 @@ class InsertionDeletion:
                 np.int32(self._fixed), np.int32(neighbors), keys,
             )  # fmt: skip
 
-    def _spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
+    def spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
         """Return the largest key within `rings` rings of each generator."""
         engine, n = self.engine, t.n
         into, other = (self._room("spread", turn, size=n, dtype=np.uint64) for turn in range(2))
@@ -326,15 +345,25 @@ class InsertionDeletion:
             source, into, other = into, other, into
         return source
 
-    def _choose(self, t: Tessellation, keys: cla.Array, rings: int) -> cla.Array:
+    def choose_once(
+        self, t: Tessellation, keys: cla.Array, rings: int, labels: cla.Array, fixed: int
+    ) -> cla.Array:
+        """Return the keys of the sites that are the strongest within `rings` rings, away from fixed generators."""
+        self._labels, self._fixed = labels, fixed
+        self._drop_fixed(t, keys, neighbors=True)
+        return self._choose(t, keys, rings, rounds=1)
+
+    def _choose(
+        self, t: Tessellation, keys: cla.Array, rings: int, rounds: int = ROUNDS
+    ) -> cla.Array:
         """Return the keys of the strongest sites that are `rings` rings apart. `keys` is overwritten."""
         engine, k, n = self.engine, self._kernels, t.n
         chosen = self._room.zeros("chosen", size=n, dtype=np.uint64)
         latest = self._room("latest", size=n, dtype=np.uint64)
-        for turn in range(ROUNDS):
+        for turn in range(rounds):
             if turn > 0:
-                engine.run_each(k.drop_sites, n, self._spread(t, latest, rings), keys)
-            spread = self._spread(t, keys, rings)
+                engine.run_each(k.drop_sites, n, self.spread(t, latest, rings), keys)
+            spread = self.spread(t, keys, rings)
             engine.run_each(k.choose_sites, n, keys, spread, chosen, latest)
         return chosen
 

@@ -21,6 +21,7 @@ from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod
 from .plan.actions import (
     Action,
+    BalanceCounts,
     CorrectCount,
     InsertDelete,
     Prescribe,
@@ -93,12 +94,8 @@ class Loop:
         )
         self.mesh, self.schedule, self.levels, self.checkpoint = mesh, schedule, levels, checkpoint
         self.level, self.position, self.begun, self.steps = p.level, p.position, p.steps, p.steps
-        self.n_start, self.started, self.labeled, self.rows = (
-            p.n_start,
-            p.started,
-            p.labeled,
-            p.rows,
-        )
+        self.n_start, self.started, self.labeled = p.n_start, p.started, p.labeled
+        self.rows = p.rows
         self.initial, self.final, self.last = p.initial, p.final, p.last
         self.began = time.perf_counter() - p.elapsed
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
@@ -142,6 +139,8 @@ class Loop:
                     self.repair_cells(action)
                 elif isinstance(action, CorrectCount):
                     self.correct_count(action.share, action.ahead)
+                elif isinstance(action, BalanceCounts):
+                    self.mesh.balance_counts()
                 elif isinstance(action, Refine):
                     self.refine()
                 elif isinstance(action, Prescribe):

@@ -377,7 +377,7 @@ class Preparation:
         schedule = adaptive_schedule(
             dim, effort, self.levels, exact, self.error_target, warm=self.points is not None, near=near,
             openings=OPENINGS if isinstance(self.domain, Sphere) else 0,  # models there have C grids
-            gradual=isinstance(self.domain, Polygon),
+            narrow_parts=isinstance(self.domain, Polygon),
         )  # fmt: skip
         if options.method == "transport":
             schedule.append(Prescribe(MOVES))

@@ -13,6 +13,7 @@ from .density import Density
 from .descent.quality_descent import QualityDescent
 from .descent.surface_descent import SurfaceDescent
 from .insertion_deletion import InsertionDeletion
+from .local_counts import LocalCounts
 from .metric import Metric
 from .motion import Motion
 from .moving.mmpde import Mmpde
@@ -36,10 +37,11 @@ class Stages(TessellationStages):
     refinement: Refinement
     surface_descent: SurfaceDescent
     insertion_deletion: InsertionDeletion
+    local_counts: LocalCounts
 
     CLASSES: ClassVar[dict[str, type]] = {
         **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson, "transport": Transport,
         "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "mmpde": Mmpde,
         "corners": Corners, "thin_walls": ThinWalls, "refinement": Refinement, "insertion_deletion": InsertionDeletion,
-        "surface_descent": SurfaceDescent,
+        "surface_descent": SurfaceDescent, "local_counts": LocalCounts,
     }  # fmt: skip

@@ -294,6 +294,30 @@ class MeshState(MeshArrays):
         del new
         return self._replace(rows, counts)
 
+    def balance_counts(self) -> tuple[int, int]:
+        """Insert and delete generators where parts of the domain have too few or too many; return the numbers of both.
+
+        See `LocalCounts`.
+        """
+        stages, engine, new = self.stages, self.engine, None
+        stages.clear("poisson")
+        engine.workspace.clear()
+        with engine.workspace.frame():
+            w = stages.density.cell_weights(self.t, self.h)
+            changes = engine.scratch(self.n, np.int32)
+            if stages.local_counts.choose(self, w, changes):
+                sites = (
+                    stages.local_counts.sites(changes, 1),
+                    stages.local_counts.sites(changes, -1),
+                )
+                new = stages.insertion_deletion.split_delete(
+                    self.free, self.t, self._data.generators, self.next_label, sites, self.fixed
+                )
+        stages.clear("poisson")
+        rows, counts = _take_apart(new)
+        del new
+        return self._replace(rows, counts)
+
     def _replace(self, rows: dict[str, cla.Array], counts: tuple[int, int]) -> tuple[int, int]:
         """Replace the generators by `rows`, if there are any; return the numbers of insertions and deletions."""
         self.engine.workspace.clear()

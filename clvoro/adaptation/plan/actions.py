@@ -64,10 +64,24 @@ class CorrectCount:
 
 
 @dataclass(frozen=True)
+class BalanceCounts:
+    """Insert and delete cells where parts of the domain have too few or too many; see `LocalCounts`."""
+
+
+@dataclass(frozen=True)
 class Prescribe:
     """Give the cells their target volumes in a power diagram, again after each of `moves` moves to the centroids."""
 
     moves: int = 0
 
 
-Action = Step | InsertDelete | RepairCells | Refine | CorrectCount | ResetMomentum | Prescribe
+Action = (
+    Step
+    | InsertDelete
+    | RepairCells
+    | Refine
+    | CorrectCount
+    | BalanceCounts
+    | ResetMomentum
+    | Prescribe
+)

@@ -1,11 +1,12 @@
 """Schedules: the order of the steps of a run, from the coarsest level to the finest.
 
     density start ─► couple ─► [ insert/delete ─► glide ] x sweeps
-        ─► refine ─► couple ─► [...] ... ─► correct count ─► polish ─► separate (or project)
+        ─► refine ─► couple ─► [...] ... (─► balance counts) ─► correct count ─► polish ─► separate (or project)
 
 *couple*         weighted Lloyd and Poisson: from any start to approximately the target sizes
 *insert/delete*  dislocations climb, and the number of cells follows the field
 *glide*          weighted Lloyd with momentum and a soft projection: lattice defects move and annihilate
+*balance counts* in polygons: cells are inserted and deleted where parts of the domain have too few or too many
 *correct count*  to a fixed number of cells, if there is one
 *polish*         projected descent of the cell quality and of short edges; the penalty is controlled to reach the error
                  target; some of the worst cells are deleted or split
@@ -37,7 +38,16 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from ..methods import Method, ProjectedMethod, WeightedMethod
-from .actions import Action, CorrectCount, InsertDelete, Refine, RepairCells, ResetMomentum, Step
+from .actions import (
+    Action,
+    BalanceCounts,
+    CorrectCount,
+    InsertDelete,
+    Refine,
+    RepairCells,
+    ResetMomentum,
+    Step,
+)
 from .efforts import EFFORTS, EFFORTS_3D, Effort, choose_error_target
 
 COARSEST = {2: 1400, 3: 1500}
@@ -159,7 +169,7 @@ def adaptive_schedule(
     warm: bool = False,
     near: bool = False,
     openings: int = 0,
-    gradual: bool = False,
+    narrow_parts: bool = False,
 ) -> list[Action]:
     """Return the schedule of the methods "adaptive" and "exact", with `levels` coarser levels.
 
@@ -178,12 +188,15 @@ def adaptive_schedule(
     openings : int
         How often the last steps open obtuse triangles, at most. Some steps before them cells of four sides are deleted,
         and those of eight split: a cell of four sides has an obtuse triangle.
-    gradual : bool
-        Lower the penalty of exact projections in 2D step by step (see `GRADUAL_PENALTIES`).
+    narrow_parts : bool
+        The domain may have parts that are joined by few cells. In 2D the number of cells in each part is then balanced
+        before polishing, and the penalty of exact projections falls step by step (see `GRADUAL_PENALTIES`).
     """
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
     projections = EXACT_STEPS if exact else 0
-    if exact and gradual and dim == 2:
+    if narrow_parts and dim == 2:
+        schedule.insert(schedule.index(ResetMomentum()) - 1, BalanceCounts())
+    if exact and narrow_parts and dim == 2:
         last = schedule[-1]
         assert isinstance(last, Step)
         assert isinstance(last.method, ProjectedMethod)

@@ -1,0 +1,96 @@
+"""The number of generators in each part of a domain (`local_counts.cl`).
+
+A slot or an arm of a polygon may have too many generators, and the next one too few, although their sum is right. To
+even this out by displacements, whole cells would have to pass through the narrow parts between them. So generators are
+inserted and deleted instead, where this saves the most displacement.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyopencl.array as cla
+
+from ..opencl.device_array import read_numbers
+from ..opencl.engine import Engine
+from ..opencl.workspace import framed
+from ..solvers.components import balance_components
+
+if TYPE_CHECKING:
+    from .density import CellWeights
+    from .state import MeshState
+
+LEAST_GAIN = 2.0
+"""Half the sum of |u|^2 / h^2 over the cells that an insertion or deletion must save. Measured on the motor and the
+river of `bench/solver_ready.py`, exact, two starts each: with 1 to 4 no cell at walls has a low quality in the end, but
+for two in a dead end that is narrower than a cell. In most open domains there is no site where 2 is to be gained."""
+SITE_RINGS, BLOCKED_RINGS = 16, 3
+"""Rings of cells between sites of one round, and of different rounds. Measured on the motor and the river: with 8 rings
+in place of 16 there are up to 1.4 times as many changes, some of which undo others."""
+OFFSET_PER_CELL, LARGEST_OFFSET = 0.25, 3.0
+"""Potential that is added per missing cell of the whole domain, and its limit."""
+MOST_ROUNDS = 30
+"""Rounds end when no site gains enough: in the motor and the river after 13 to 31, elsewhere earlier."""
+TOLERANCE = 1e-2
+"""Relative residual of the potential."""
+
+
+class LocalCounts:
+    """The kernels of `local_counts.cl`."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("adaptation/local_counts")
+        self._accepted = engine.empty(2, np.int32)
+
+    @framed
+    def choose(self, mesh: MeshState, w: CellWeights, changes: cla.Array) -> bool:
+        """Write to `changes` (n,) int32 where to insert (1) and where to delete (-1); return whether it is anywhere.
+
+        Each round takes the sites where the potential is largest, solves for the potential after changes there, and
+        accepts those that gain enough.
+        """
+        engine, k, n, t, poisson = self.engine, self._kernels, mesh.n, mesh.t, mesh.stages.poisson
+        selection, real = mesh.stages.insertion_deletion, engine.real.type
+        potential, before, source = (engine.scratch(n) for _ in range(3))
+        chosen, blocked, keys = (engine.scratch(n, np.uint64) for _ in range(3))
+        for array in (potential, changes, chosen, blocked):
+            array.fill(0)
+        missing, total = mesh.missing_cells(w), 0
+        laplacian = poisson.assemble(
+            t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=TOLERANCE
+        )
+        for turn in range(MOST_ROUNDS):
+            offset = real(min(max(OFFSET_PER_CELL * missing, -LARGEST_OFFSET), LARGEST_OFFSET))
+            if turn:
+                engine.run_each(
+                    k.score_potential, n, t.starts, t.neighbors, w.log_ratio, potential, offset, real(LEAST_GAIN),
+                    selection.spread(t, blocked, BLOCKED_RINGS), keys,
+                )  # fmt: skip
+                chosen = selection.choose_once(t, keys, SITE_RINGS, mesh.labels, mesh.fixed)
+            engine.run_each(
+                k.try_changes, n, w.weight, changes, chosen, potential, offset, before, source
+            )
+            balance_components(mesh.domain, t, source, w.weight)
+            poisson.solve(laplacian, source, potential, tolerance=TOLERANCE, from_zero=turn == 0)
+            if turn == 0:
+                continue
+            self._accepted.fill(0)
+            engine.run_each(
+                k.accept_changes, n, chosen, before, potential, offset, real(LEAST_GAIN), changes, blocked,
+                self._accepted,
+            )  # fmt: skip
+            inserted, deleted = map(int, read_numbers(self._accepted, 0, 2))
+            if inserted == deleted == 0:
+                break
+            missing, total = missing - inserted + deleted, total + inserted + deleted
+        return total > 0
+
+    def sites(self, changes: cla.Array, sign: int) -> cla.Array:
+        """Return 1 where `changes` (n,) have this sign, and 0 elsewhere: (n,) uint64 in the workspace."""
+        found = self.engine.scratch(len(changes), np.uint64)
+        self.engine.run_each(
+            self._kernels.select_changes, len(changes), changes, np.int32(sign), found
+        )
+        return found

@@ -1,0 +1,126 @@
+"""Numbers of generators in parts of a polygon that a neck joins: the choice against a reference, and the outcome."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clvoro
+from clvoro.adaptation import local_counts
+from clvoro.adaptation.plan.actions import BalanceCounts
+from clvoro.adaptation.plan.schedule import adaptive_schedule
+from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.state import MeshState
+from clvoro.opencl.engine import Engine
+from clvoro.sizing import Sizing, as_field
+from tests.reference import local_counts as reference
+
+H = 0.1
+LEFT, RIGHT, APART = (0.0, 0.0), (1.4, 0.0), (3.0, 0.0)
+NECK = [(1, 0.35), (1.4, 0.35), (1.4, 0), (2.4, 0), (2.4, 1), (1.4, 1), (1.4, 0.65), (1, 0.65)]
+ROOMS = np.array([(0, 0), (1, 0), *NECK, (1, 1), (0, 1)], float)
+"""Two rooms of 100 cells each, joined by a neck that is three cells wide and four long."""
+DOMAINS = {
+    "rooms": clvoro.Polygon(ROOMS),
+    "and a piece": clvoro.Polygon.from_pieces(
+        [[ROOMS], [np.array([(3, 0), (3.6, 0), (3.6, 0.6), (3, 0.6)])]]
+    ),
+}
+
+
+def grid(corner, size, counts, rng):
+    """Return an irregular lattice of generators in a rectangle."""
+    at = np.indices(counts).reshape(2, -1).T + 0.5 + rng.uniform(-0.2, 0.2, (np.prod(counts), 2))
+    return np.array(corner) + at / counts * size
+
+
+def unbalanced(left, right, pieces=False):
+    """Return generators of both rooms, with `left` and `right` (columns, rows) of them."""
+    rng = np.random.default_rng(41)
+    parts = [
+        grid(LEFT, 1, left, rng), grid(RIGHT, 1, right, rng), grid((1, 0.35), (0.4, 0.3), (4, 3), rng)
+    ]  # fmt: skip
+    return np.concatenate([*parts, grid(APART, 0.6, (7, 7), rng)] if pieces else parts)
+
+
+def make_mesh(ctx, domain, points, fixed=0, real=np.float64):
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.kind(np.dtype(real)))
+    on_device = engine.upload(domain.place(points, engine.real))
+    sizing = Sizing(engine, domain, as_field(H))
+    return MeshState.create(Stages(engine), domain, sizing, on_device, fixed=fixed)
+
+
+def chosen(mesh):
+    """Return the changes that are chosen, (n,) int32."""
+    with mesh.engine.workspace.frame():
+        w = mesh.stages.density.cell_weights(mesh.t, mesh.h)
+        changes = mesh.engine.scratch(mesh.n, np.int32)
+        some = mesh.stages.local_counts.choose(mesh, w, changes)
+        found = changes.get()
+    assert some == found.any()
+    return found
+
+
+def cells_of(mesh):
+    t, n = mesh.t, mesh.n
+    starts = t.starts.get()
+    neighbors, measures = (a.get()[: starts[-1]] for a in (t.neighbors, t.face_measures))
+    points, h = mesh.points.get(), mesh.h.get()
+    owners, inner = np.repeat(np.arange(n), np.diff(starts)), neighbors >= 0
+    pairs = np.column_stack([owners, neighbors])[inner]
+    return reference.Cells(
+        pairs,
+        measures[inner] / np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T),
+        np.diff(starts),
+        np.bincount(owners[~inner], minlength=n) > 0,
+        t.volumes.get() / h**2,
+    )
+
+
+def energy_of(mesh):
+    """Return E of the reference: half the sum of |u|^2 / h^2."""
+    cells = cells_of(mesh)
+    return cells.potential(cells.weight - 1) @ (cells.weight - 1) / 2
+
+
+@pytest.mark.parametrize(("name", "fixed"), [("rooms", 0), ("rooms", 40), ("and a piece", 0)])
+def test_choice(ctx, monkeypatch, name, fixed):
+    """With exact potentials the sites are those of the reference, also next to fixed generators."""
+    monkeypatch.setattr(local_counts, "TOLERANCE", 1e-11)
+    points = unbalanced((14, 8), (8, 11), name != "rooms")
+    mesh = make_mesh(ctx, DOMAINS[name], points, fixed)
+    found = chosen(mesh)
+    held = mesh.labels.get() < fixed
+    expected = reference.changes(cells_of(mesh), held)
+    assert np.array_equal(found, expected)
+    assert min((expected > 0).sum(), (expected < 0).sum()) >= 3
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_rooms_get_their_cells(ctx, real):
+    """Cells are inserted and deleted until no further change gains enough. New cells have new labels."""
+    mesh = make_mesh(ctx, DOMAINS["rooms"], unbalanced((12, 9), (13, 7)), real=real)
+    energy = energy_of(mesh)
+    n, first = mesh.n, mesh.next_label
+    inserted, deleted = mesh.balance_counts()
+    assert mesh.n == n + inserted - deleted
+    labels = np.sort(mesh.labels.get())
+    assert np.array_equal(labels[labels >= first], first + np.arange(inserted))
+    origin, scale = mesh.domain.frame
+    x = mesh.to_host(mesh.points, scale)[:, 0] + origin[0]
+    assert [(x < 1).sum(), (x > 1.4).sum()] == pytest.approx([100, 100], abs=5)
+    assert energy_of(mesh) < energy / 4
+
+
+def test_balanced_rooms_do_not_change(ctx):
+    """A room with a cell too many does not gain enough to delete one."""
+    mesh = make_mesh(ctx, DOMAINS["rooms"], unbalanced((10, 10), (10, 10))[1:])
+    before = mesh.points.get()
+    assert mesh.balance_counts() == (0, 0)
+    assert np.array_equal(mesh.points.get(), before)
+
+
+def test_only_narrow_parts_in_the_plane_are_balanced():
+    for dim, narrow, expected in ((2, True, 1), (2, False, 0), (3, True, 0)):
+        for near in (False, True):
+            schedule = adaptive_schedule(dim, "default", 0, True, near=near, narrow_parts=narrow)
+            assert schedule.count(BalanceCounts()) == expected
