@@ -11,11 +11,12 @@ from unittest import mock
 import numpy as np
 
 import clvoro
-from clvoro.adaptation import preparation
+from clvoro.adaptation import local_counts, preparation
 from clvoro.adaptation.insertion_deletion import InsertionDeletion
 from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
 from clvoro.adaptation.plan.actions import (
     Action,
+    BalanceCounts,
     CorrectCount,
     InsertDelete,
     Prescribe,
@@ -32,6 +33,8 @@ Work = Callable[[clvoro.Adapter], None]
 
 SHARE = 0.1
 """Share of the cells that may be repaired or nucleate dislocations. Default shares of few cells are less than one."""
+LEAST_GAIN = 0.01
+"""Gain for which a generator is inserted or deleted. Few cells seldom gain as much as by default."""
 
 
 @contextmanager
@@ -87,6 +90,8 @@ def every_action(domain: Domain, levels: int) -> list[Action]:
         ]
     else:
         plan.append(Step(ProjectedMethod()))
+    if isinstance(domain, clvoro.Polygon):
+        plan += [BalanceCounts(), CorrectCount()]
     return [*plan, ResetMomentum(), *polishing(domain)]
 
 
@@ -105,6 +110,7 @@ def every_step(
             with (
                 mock.patch.object(preparation, "adaptive_schedule", return_value=plan),
                 mock.patch.object(InsertionDeletion, "repair_cells", repair_cells),
+                mock.patch.object(local_counts, "LEAST_GAIN", LEAST_GAIN),
             ):
                 result = adapter.run(
                     domain,

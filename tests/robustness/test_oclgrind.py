@@ -73,7 +73,7 @@ IN_SPACE = {
     "walks",
     "surface_descent",
 }
-AT_POLYGONS = {"boundary_crossings", "corners", "thin_walls", "trim"}
+AT_POLYGONS = {"boundary_crossings", "corners", "local_counts", "thin_walls", "trim"}
 AT_LAYERS = {
     "metric.set_fixed_sizes",
     "motion.zero_fixed_displacements",
