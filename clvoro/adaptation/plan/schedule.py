@@ -189,8 +189,8 @@ def adaptive_schedule(
         How often the last steps open obtuse triangles, at most. Some steps before them cells of four sides are deleted,
         and those of eight split: a cell of four sides has an obtuse triangle.
     narrow_parts : bool
-        The domain may have parts that are joined by few cells. In 2D the number of cells in each part is then balanced
-        before polishing, and the penalty of exact projections falls step by step (see `GRADUAL_PENALTIES`).
+        The domain may have parts that few cells join. In 2D the number of cells in each part is then balanced before
+        polishing, and the penalty of exact projections falls step by step (see `GRADUAL_PENALTIES`).
     """
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
     projections = EXACT_STEPS if exact else 0
@@ -207,11 +207,9 @@ def adaptive_schedule(
 
 def _gradual(newton: ProjectedMethod) -> list[Action]:
     """Return the exact projections in polygons, given Newton's step of those in boxes."""
-    limited = replace(
-        newton, tolerance=GRADUAL_TOLERANCE, iterations=GRADUAL_ITERATIONS, careful=True
-    )
-    first = replace(limited, descent="quality", relaxation=1.0, momentum=0.7)
-    last = replace(limited, descent="edges", relaxation=1.0, quality_scale=NEWTON_QUALITY_SCALE)
+    base = replace(newton, tolerance=GRADUAL_TOLERANCE, iterations=GRADUAL_ITERATIONS, careful=True)
+    first = replace(base, descent="quality", relaxation=1.0, momentum=0.7)
+    last = replace(base, descent="edges", relaxation=1.0, quality_scale=NEWTON_QUALITY_SCALE)
     methods = [replace(first, penalty=p, quality_scale=scale) for p, scale in GRADUAL_PENALTIES]
     return [Step(method) for method in [*methods, *[last] * GRADUAL_NEWTON_STEPS]]
 
