@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.sparse
 import shapely
 
 from ..arguments import check_number, format_point
@@ -36,6 +37,8 @@ _LEVEL = 1.25
 _SLIT = 1e-3
 """Slits narrower than this, over the least size, are closed."""
 _MOST_SQUARES = 1 << 20
+_MOST_CORNERS = 2000
+"""Larger shapes are dilated in parts."""
 _TRIES = 6
 
 _DEFAULT = re.compile(r"(outer|hole)(-\d+)?")
@@ -124,24 +127,61 @@ def _narrow_parts(
     """Return the parts of the water, or of the land, in which no disc of the diameter ``scale * h`` fits."""
     found = []
     for h, zone in zones:
-        near = water if zone is None else water.intersection(zone.buffer(2 * h))
+        within = water if zone is None else water.intersection(zone.buffer(2 * h))
         radius = (1 if land else -1) * scale * h / 2
-        open_parts = near.buffer(radius, quad_segs=16).buffer(-_OVER * radius, quad_segs=16)
-        parts = open_parts.difference(near) if land else near.difference(open_parts)
-        found.append(parts if zone is None else parts.intersection(zone))
-    return list(_polygons(shapely.union_all(found)))
+        for tile, near in _tiles(within, (1 + _OVER) * scale * h / 2):
+            open_parts = near.buffer(radius, quad_segs=16).buffer(-_OVER * radius, quad_segs=16)
+            parts = open_parts.difference(near) if land else near.difference(open_parts)
+            for cut in (tile, zone):
+                parts = parts if cut is None else parts.intersection(cut)
+            found.append(parts)
+    return _joined([part for parts in found for part in _polygons(parts)])
+
+
+def _tiles(shape: Any, margin: float) -> Iterator[tuple[Any, Any]]:
+    """Yield rectangles that cover `shape`, and of each the part of it that is nearer than `margin`.
+
+    The time for the dilation of one shape grows with the square of the number of its rings. A small shape is yielded as
+    it is, with None for the rectangle.
+    """
+    if shapely.get_num_coordinates(shape) <= _MOST_CORNERS:
+        yield None, shape
+        return
+    left = [(shape.bounds, shape)]
+    while left:
+        (x, y, u, v), near = left.pop()
+        long, wide = max(u - x, v - y), u - x > v - y
+        if shapely.get_num_coordinates(near) <= _MOST_CORNERS or long < 4 * margin:
+            yield shapely.box(x, y, u, v), near
+            continue
+        s, t = (x + u) / 2, (y + v) / 2
+        for half in ((x, y, s, v), (s, y, u, v)) if wide else ((x, y, u, t), (x, t, u, v)):
+            around = shapely.box(*half).buffer(margin, join_style="mitre")
+            left.append((half, near.intersection(around)))
+
+
+def _joined(parts: list[Any]) -> list[Any]:
+    """Return polygons in which those of `parts` that touch are one."""
+    if len(parts) < 2:
+        return parts
+    pairs = shapely.STRtree(parts).query(parts, predicate="intersects")
+    graph = scipy.sparse.coo_array((np.ones(len(pairs[0])), pairs), (len(parts), len(parts)))
+    component = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    order = np.argsort(component, kind="stable")
+    groups = np.split(np.array(parts)[order], np.flatnonzero(np.diff(component[order])) + 1)
+    found: list[Any] = []
+    for group in groups:
+        found += list(group) if len(group) == 1 else _polygons(shapely.union_all(group))
+    return found
 
 
 def _narrow_water(
     water: Any, zones: list[tuple[float, Any]], sizes: Sizes, scale: float
 ) -> list[Any]:
     parts = _narrow_parts(water, zones, scale, land=False)
-    lengths = scale * _sizes_at(parts, sizes)
-    return [
-        p
-        for p, h in zip(parts, lengths, strict=True)
-        if p.area > LEAST_PART * h**2 or _extent(p) > LONGEST_PART * h
-    ]
+    h = scale * _sizes_at(parts, sizes)
+    large = (shapely.area(parts) > LEAST_PART * h**2) | (_extents(parts) > LONGEST_PART * h)
+    return [parts[k] for k in np.flatnonzero(large)]
 
 
 def _small_land(
@@ -149,15 +189,17 @@ def _small_land(
 ) -> list[Any]:
     """Return islands and capes that are smaller than h. Land that joins two larger parts is kept."""
     islands = [shapely.Polygon(ring) for piece in _polygons(water) for ring in piece.interiors]
-    lengths = _sizes_at(islands, sizes)
-    found = [p for p, h in zip(islands, lengths, strict=True) if _extent(p) < h]
-    dropped = shapely.union_all(found)
+    found = [islands[k] for k in np.flatnonzero(_extents(islands) < _sizes_at(islands, sizes))]
+    dropped, boundary = shapely.union_all(found), water.boundary
+    shapely.prepare(dropped)
     capes = _narrow_parts(water, zones, scale, land=True)
-    for part, h in zip(capes, _sizes_at(capes, sizes), strict=True):
-        small = part.area < LEAST_PART * (scale * h) ** 2
-        if small or _extent(part) > h or part.intersects(dropped):
+    lengths = _sizes_at(capes, sizes)
+    small = shapely.area(capes) < LEAST_PART * (scale * lengths) ** 2
+    left = np.flatnonzero(~small & (_extents(capes) <= lengths))
+    for part, h in ((capes[k], lengths[k]) for k in left):
+        if dropped.intersects(part):
             continue
-        coast = shapely.intersection(water.boundary, part.envelope.buffer(h))
+        coast = shapely.intersection(boundary, part.envelope.buffer(h))
         roots = part.boundary.difference(coast.buffer(1e-6 * h))
         roots = shapely.line_merge(roots) if roots.geom_type == "MultiLineString" else roots
         if len(getattr(roots, "geoms", [roots])) == 1:
@@ -170,10 +212,13 @@ def _sizes_at(parts: list[Any], sizes: Sizes) -> np.ndarray:
     return sizes(shapely.get_coordinates(shapely.point_on_surface(parts))) if parts else np.empty(0)
 
 
-def _extent(part: Any) -> float:
-    """Return the longest side of the smallest rectangle around `part`."""
-    corners = shapely.get_coordinates(shapely.oriented_envelope(part))
-    return float(np.hypot(*np.diff(corners, axis=0).T).max(initial=0.0))
+def _extents(parts: list[Any]) -> np.ndarray:
+    """Return the longest side of the smallest rectangle around each part."""
+    corners, row = shapely.get_coordinates(shapely.oriented_envelope(parts), return_index=True)
+    sides, found = np.hypot(*np.diff(corners, axis=0).T), np.zeros(len(parts))
+    same = row[1:] == row[:-1]
+    np.maximum.at(found, row[1:][same], sides[same])
+    return found
 
 
 def _polygons(shape: Any) -> Iterator[Any]:

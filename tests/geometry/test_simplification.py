@@ -6,6 +6,7 @@ import shapely
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
+from clvoro.geometry import simplification
 
 BOX = [(0, 0), (1, 0), (1, 1), (0, 1)]
 H = 0.1
@@ -84,6 +85,24 @@ def test_vertices_are_thinned():
         assert found.geometry.is_valid
         assert found.boundary_distance(fine.vertices).max() <= tolerance * H * (1 + 1e-9)
     assert len(found.vertices) < len(domain.simplified(H).vertices) < 500
+
+
+@pytest.mark.parametrize("land", [False, True])
+@pytest.mark.parametrize("scale", [1, 0.25])
+def test_large_coasts_are_dilated_in_parts(monkeypatch, land, scale):
+    """Narrow parts are those of the coast in one piece, but for what dilations round off."""
+    middles = np.mgrid[-0.6:0.7:0.2, -0.6:0.7:0.2].reshape(2, -1).T
+    islands = [c + 0.03 * rough(20, k) for k, c in enumerate(middles)]
+    water = clvoro.Polygon(rough(900, 4), islands).geometry
+
+    def narrow_parts(most):
+        monkeypatch.setattr(simplification, "_MOST_CORNERS", most)
+        return simplification._narrow_parts(water, [(0.05, None)], scale, land)
+
+    found, wanted = narrow_parts(200), narrow_parts(10**9)
+    assert len(found) == len(wanted) > 100
+    found, wanted = shapely.union_all(found), shapely.union_all(wanted)
+    assert found.symmetric_difference(wanted).area < 1e-6 * wanted.area
 
 
 def test_names():
