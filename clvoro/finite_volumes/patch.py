@@ -10,6 +10,8 @@ from .solver_mesh import SolverMesh, compact
 
 BORDER = np.iinfo(np.int32).min
 """In place of the neighbor of a face that stays: the cell behind it is not in the patch."""
+LIMITS = (np.radians(19), 1.9)
+"""Non-orthogonality in radians and skewness; faces beyond one of these are improved."""
 
 
 @dataclass(eq=False)
@@ -37,6 +39,8 @@ class Patch:
         Those, and points on walls that cannot slide along them.
     positions : (v,) float64
         Position of each point on a wall along the boundary; NaN for others.
+    limits : (float, float)
+        Non-orthogonality in radians and skewness beyond which faces are bad.
     """
 
     cells: np.ndarray
@@ -50,6 +54,7 @@ class Patch:
     held: np.ndarray
     fixed: np.ndarray
     positions: np.ndarray
+    limits: tuple[float, float] = LIMITS
 
     @property
     def walls(self) -> np.ndarray:
@@ -102,7 +107,7 @@ def part_of(patch: Patch, chosen: np.ndarray) -> Patch:
     held[local[at_border[owner] | beyond]] = True
     return Patch(
         cells, patch.points[ids], ids, local, owner, neighbor, patch.half_face[rows],
-        patch.aim[rows], held, held | patch.fixed[ids], patch.positions[ids],
+        patch.aim[rows], held, held | patch.fixed[ids], patch.positions[ids], patch.limits,
     )  # fmt: skip
 
 

@@ -17,8 +17,6 @@ from .patch import BORDER, Patch, cell_sides
 from .patch_figures import LENGTH_GOAL, Cells
 from .patch_slopes import slopes
 
-ANGLE, SKEWNESS = np.radians(19), 1.9
-"""Faces beyond one of these are improved."""
 STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell."""
 _SHORT = 0.05
@@ -106,10 +104,10 @@ class Descent:
         return float(self.prices.sum())
 
     def _set_prices(self) -> None:
-        c = self.cells
+        c, (angle, skewness) = self.cells, self.patch.limits
         now = c.figures(*self.patch.points.T)
-        excess = np.minimum(np.maximum(now.angle / ANGLE - 1, 0), _MOST_EXCESS) ** 2
-        excess += np.minimum(np.maximum(now.skewness / SKEWNESS - 1, 0), _MOST_EXCESS) ** 2
+        excess = np.minimum(np.maximum(now.angle / angle - 1, 0), _MOST_EXCESS) ** 2
+        excess += np.minimum(np.maximum(now.skewness / skewness - 1, 0), _MOST_EXCESS) ** 2
         beyond = excess > 0
         excess += np.maximum(1 - now.length / _SHORT, 0) ** 2
         n, turn = len(c.area), now.turn

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arguments import check_number
+from ..arguments import check_number, format_point
 from ..errors import InputError
 from ..mesh.connectivity import take_rows
 from ..mesh.read_only import Sealed
@@ -90,9 +90,12 @@ def cell_loops(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
     """
     starts, loop, broken = simple_loops(mesh)
     if broken.size:
+        own = mesh.owner == broken[0]
+        place = mesh.points[mesh.corners.reshape(-1, 2)[own]].mean(axis=(0, 1))
         raise InputError(
-            f"cell {broken[0]} ({len(broken)} in all) goes around a part of the boundary or touches itself, "
-            "and the cells of solvers have no holes; use smaller cells there, leave out the hole, or save as .vtu"
+            f"cell {broken[0]} ({len(broken)} in all) goes around a part of the boundary or touches itself, at "
+            f"{format_point(place)}, and the cells of solvers have no holes; use smaller cells there, drop the hole, "
+            "as domain.simplified(size) does, or save as .vtu"
         )
     return starts, loop
 

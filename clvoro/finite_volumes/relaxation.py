@@ -16,8 +16,8 @@ from ..geometry.polygon import Polygon
 from ..geometry.ring_coordinate import RingCoordinate
 from ..mesh.connectivity import following
 from .geometry import polygon_centroids, turns
-from .patch import Patch, part_of, put_back, take_patch
-from .patch_descent import ANGLE, LEAST_DETERMINANT, SKEWNESS, STRAIGHT, Descent
+from .patch import LIMITS, Patch, part_of, put_back, take_patch
+from .patch_descent import LEAST_DETERMINANT, STRAIGHT, Descent
 from .patch_figures import face_figures
 from .prisms import simple_loops
 from .reconnection import repaired
@@ -29,8 +29,12 @@ _RINGS = 5
 _TRIES = (1, 3)
 """Rings of cells whose points inside move, one try after the other."""
 _STEPS = 15
-_MOST, _SHARE = 50, 0.02
-"""Nothing changes if more faces are bad than this number, and than this share: the generators were not adapted."""
+_MOST, _SHARE = 50, 0.005
+"""If more faces are bad than this number, and than this share, the next limits hold. Then the time for the repair
+remains a small part of that of a run."""
+_LIMITS = (LIMITS, (np.radians(30), 2.5), (np.radians(45), 3.0))
+_NOT_ADAPTED = 0.12
+"""Nothing changes if more faces than this share are bad by the first limits: the generators were not adapted."""
 
 _BLAS = threading.Lock()
 """Held while BLAS has one thread, which is a setting of the process."""
@@ -50,14 +54,19 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
     from threadpoolctl import threadpool_limits
 
     loops = simple_loops(mesh)
-    bad, count = _bad_cells(mesh, loops, straight)
-    if not bad.any() or count > max(_MOST, _SHARE * len(mesh.owner)):
+    limited = _limited(mesh)
+    if limited is None:
+        return mesh
+    limits, faces = limited
+    bad = _bad_cells(mesh, loops, faces, straight)
+    if not bad.any():
         return mesh
     domain = mesh.domain
     ring = RingCoordinate(domain) if straight and isinstance(domain, Polygon) else None
     kinds = point_kinds(mesh, parts)
     region = _grown(loops, bad)
     around, groups = take_patch(mesh, region), _connected_parts(mesh, region, bad)
+    around.limits = limits
     made = []
     # The last bits of sums in BLAS depend on its number of threads.
     with _BLAS, threadpool_limits(1, user_api="blas"):
@@ -82,16 +91,25 @@ def _improved(given: Descent, ring: RingCoordinate | None, faces: bool) -> Desce
     return repaired(given, ring) if faces else given
 
 
+def _limited(mesh: SolverMesh) -> tuple[tuple[float, float], np.ndarray] | None:
+    """Return the limits that hold for `mesh`, and the faces beyond one of them; None if it was not adapted."""
+    angle, skewness = face_measures(mesh)
+    beyond = [np.flatnonzero((angle > a) | (skewness > s)) for a, s in _LIMITS]
+    if len(beyond[0]) > max(_MOST, _NOT_ADAPTED * len(angle)):
+        return None
+    few = [len(faces) <= max(_MOST, _SHARE * len(angle)) for faces in beyond]
+    k = few.index(True) if any(few) else -1
+    return _LIMITS[k], beyond[k]
+
+
 def _bad_cells(
-    mesh: SolverMesh, loops: tuple[np.ndarray, ...], all_kinds: bool
-) -> tuple[np.ndarray, int]:
-    """Return which cells have a face beyond a limit, (n,) bool, and the number of such faces.
+    mesh: SolverMesh, loops: tuple[np.ndarray, ...], faces: np.ndarray, all_kinds: bool
+) -> np.ndarray:
+    """Return which cells have one of the `faces`, (n,) bool.
 
     With `all_kinds`, also cells that are not convex or have a low determinant.
     """
     starts, points, broken = loops
-    angle, skewness = face_measures(mesh)
-    faces = np.flatnonzero((angle > ANGLE) | (skewness > SKEWNESS))
     found = np.zeros(len(mesh), bool)
     found[mesh.owner[faces]] = True
     found[mesh.neighbor[faces[mesh.neighbor[faces] >= 0]]] = True
@@ -100,7 +118,7 @@ def _bad_cells(
         found[np.repeat(np.arange(len(mesh)), np.diff(starts))[bent]] = True
         found |= _determinants(mesh) < LEAST_DETERMINANT
     found[broken] = False
-    return found, len(faces)
+    return found
 
 
 def _determinants(mesh: SolverMesh) -> np.ndarray:

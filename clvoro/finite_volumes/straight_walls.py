@@ -15,7 +15,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..arguments import format_point, warn
+from ..errors import MismatchWarning
 from ..geometry.polygon import Polygon
+from ..geometry.simplification import DEFAULT_NAME
 from ..mesh.diagram import Diagram
 from ..mesh.straightening import along_rings, cross
 from .chords import chords, kept_points, least_of_rows
@@ -45,7 +48,7 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
     """
     domain = diagram.domain
     assert isinstance(domain, Polygon)
-    mesh = _on_curves(mesh, domain)
+    mesh = _on_curves(_without_islands(mesh, domain, parts), domain)
     runs = WallRuns(mesh, along_rings(diagram, domain), parts)
     # 1: the ends of the cell do not move; 2: its walls remain as they are.
     spared, most = np.zeros(len(mesh), int), np.where(_starlike(mesh), 2, 1)
@@ -55,6 +58,49 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
         if not worse.any():
             return made
         spared[worse] += 1
+
+
+def _without_islands(mesh: SolverMesh, domain: Polygon, parts: np.ndarray) -> SolverMesh:
+    """Return `mesh` without the holes of the domain that lie within one cell each.
+
+    Those stay with which a named part of the boundary would vanish, but for rings that nobody gave a name.
+
+    Warns
+    -----
+    MismatchWarning
+        If there are such holes.
+    """
+    walls = np.arange(mesh.inner, mesh.outer)
+    edge, owner = -1 - mesh.neighbor[walls], mesh.owner[walls].astype(np.int64)
+    ring, rings = (
+        np.searchsorted(domain.ring_starts, edge, "right") - 1,
+        len(domain.ring_starts) - 1,
+    )
+    least, most = np.full(rings, len(mesh)), np.full(rings, -1)
+    np.minimum.at(least, ring, owner)
+    np.maximum.at(most, ring, owner)
+    within = (least == most) & (np.diff(domain.piece_of_ring, prepend=-1) == 0)
+    left = np.bincount(parts[edge[~within[ring]]], minlength=parts.max() + 1) > 0
+    names = domain.boundaries.names
+    named = np.array([DEFAULT_NAME.fullmatch(name) is None for name in names])
+    named = named[domain.boundaries.index[edge]]
+    within[ring[named & ~left[parts[edge]]]] = False
+    if not within.any():
+        return mesh
+    extents = [np.ptp(domain.rings[k], axis=0).max() for k in np.flatnonzero(within)]
+    k = int(np.flatnonzero(within)[np.argmax(extents)])
+    count, place = int(within.sum()), format_point(domain.rings[k].mean(axis=0))
+    what = "1 island lies within one cell and is"
+    if count > 1:
+        what = f"{count} islands lie within one cell each and are"
+    warn(
+        f"{what} left out of the mesh for solvers, as the one at {place}, {max(extents):.3g} long. Use smaller cells "
+        "there, or drop what is smaller than a cell first, as domain.simplified(size) does",
+        MismatchWarning,
+    )
+    kept = np.ones(len(mesh.owner), bool)
+    kept[walls[within[ring]]] = False
+    return mesh.take_faces(kept)
 
 
 def _on_curves(mesh: SolverMesh, domain: Polygon) -> SolverMesh:

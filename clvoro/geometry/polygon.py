@@ -21,7 +21,7 @@ from .device_polygon import DevicePolygon
 from .geojson import pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt
 from .rings import OrientedRings, make_rings, signed_area
 from .shapes import Edges
-from .simplification import simplify
+from .simplification import pieces_of, simplify
 
 BOUNDARY_SHIFTS = (8, 16, 32, 64, 64, 64, 64, 64)
 """Shifts of the boundary in units of round-off, each in another direction. They are tried one after the other if the
@@ -286,6 +286,11 @@ class Polygon(DevicePolygon):
         """
         pieces, names = simplify(self, size, tolerance)
         return Polygon.from_pieces(pieces, names or None)
+
+    def split(self) -> list[Polygon]:
+        """Return the pieces, the largest first. Edges keep the names that you gave; curves become polylines."""
+        made = [Polygon.from_pieces([rings], names or None) for rings, names in pieces_of(self)]
+        return sorted(made, key=lambda piece: -piece.measure)
 
     @cached_property
     def _next_given(self) -> np.ndarray:

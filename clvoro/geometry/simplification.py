@@ -41,7 +41,8 @@ _MOST_CORNERS = 2000
 """Larger shapes are dilated in parts."""
 _TRIES = 6
 
-_DEFAULT = re.compile(r"(outer|hole)(-\d+)?")
+DEFAULT_NAME = re.compile(r"(outer|hole)(-\d+)?")
+"""Names of rings to which nobody gave a name."""
 
 Sizes = Callable[[np.ndarray], np.ndarray]
 
@@ -67,6 +68,21 @@ def simplify(
             "the domain is narrower than the size everywhere, and nothing is left of it; choose a smaller size"
         )
     return _thinned(domain, water, sizes, tolerance)
+
+
+def pieces_of(domain: Polygon) -> list[tuple[list[np.ndarray], dict[str, list[int]]]]:
+    """Return the rings of each piece, and the names of its edges but for those of rings without a name."""
+    found = []
+    for piece in range(domain.n_pieces):
+        rows = np.flatnonzero(domain.piece_of_ring == piece)
+        edges = slice(domain.ring_starts[rows[0]], domain.ring_starts[rows[-1] + 1])
+        index, names = domain.boundaries.index[edges], {}
+        for part in np.unique(index).tolist():
+            name = domain.boundaries.names[part]
+            if DEFAULT_NAME.fullmatch(name) is None:
+                names[name] = np.flatnonzero(index == part).tolist()
+        found.append(([domain.rings[row] for row in rows], names))
+    return found
 
 
 def _as_sizes(domain: Polygon, size: object) -> Sizes:
@@ -190,7 +206,7 @@ def _small_land(
     """Return islands and capes that are smaller than h. Land that joins two larger parts is kept."""
     islands = [shapely.Polygon(ring) for piece in _polygons(water) for ring in piece.interiors]
     found = [islands[k] for k in np.flatnonzero(_extents(islands) < _sizes_at(islands, sizes))]
-    dropped, boundary = shapely.union_all(found), water.boundary
+    dropped, boundary = shapely.MultiPolygon(found), water.boundary
     shapely.prepare(dropped)
     capes = _narrow_parts(water, zones, scale, land=True)
     lengths = _sizes_at(capes, sizes)
@@ -266,7 +282,7 @@ def _thinned(
             break
     names: dict[str, list[int]] = {}
     named = set(domain.boundaries.names) - {
-        n for n in domain.boundaries.names if _DEFAULT.fullmatch(n)
+        n for n in domain.boundaries.names if DEFAULT_NAME.fullmatch(n)
     }
     named |= set(domain.names or ()) & set(domain.boundaries.names)
     edge = 0

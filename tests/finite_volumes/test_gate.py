@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.errors import InputError
+from clvoro.errors import InputError, MismatchWarning
 from clvoro.mesh.check.findings import CheckError
 from tests.finite_volumes.test_straight_walls import ELL, SQUARE, circle
 
@@ -64,12 +64,20 @@ def test_a_corner_is_named_with_its_place(bad):
 
 
 def test_a_cell_around_an_island_is_the_only_finding(ctx):
-    domain = clvoro.Polygon(SQUARE, [circle(5, 0.05)])
+    """An island with a name stays. Without one it is left out, with a warning, and the cell is accepted."""
     points = np.array([(0.6, 0.5), (0.05, 0.5), (0.95, 0.5)])
-    diagram = clvoro.Adapter(ctx).diagram(domain, points)
-    report = diagram.check(solver="openfoam")
+    named = clvoro.Polygon(SQUARE, [circle(5, 0.05)], names={"rock": range(4, 9)})
+    report = clvoro.Adapter(ctx).diagram(named, points).check(solver="openfoam")
     assert [c.name for c in report.criteria] == ["cells around islands"]
     assert (report.ok, report.criteria[0].cell) == (False, 0)
+    domain = clvoro.Polygon(SQUARE, [circle(5, 0.05)])
+    diagram = clvoro.Adapter(ctx).diagram(domain, points)
+    with pytest.warns(MismatchWarning, match=r"1 island lies within one cell .* at \(0\.5, 0\.5\)"):
+        mesh = diagram.solver_mesh()
+    assert set(-1 - mesh.neighbor[mesh.inner :]) == set(range(4))
+    assert mesh.area_change == pytest.approx(1 / domain.measure - 1, rel=1e-12)
+    with pytest.warns(MismatchWarning, match="1 island"):
+        assert diagram.check(solver="openfoam")["concavity"].ok
 
 
 def test_two_regions_are_reported_but_accepted(ctx):

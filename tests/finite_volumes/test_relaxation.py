@@ -7,7 +7,9 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import clvoro
+from clvoro.finite_volumes import relaxation
 from clvoro.finite_volumes.geometry import polygon_areas
+from clvoro.finite_volumes.patch import LIMITS
 from clvoro.finite_volumes.relaxation import face_measures, relax_points
 from clvoro.finite_volumes.solver_mesh import SolverMesh
 from tests.finite_volumes.test_straight_walls import concave_by, polygons
@@ -50,6 +52,21 @@ def test_bad_faces_become_fewer_and_nothing_else_suffers(mesh):
     np.testing.assert_allclose(polygon_areas(relaxed), polygon_areas(mesh), rtol=0.3)
     shortest = [m.measures.shortest_edge.min() for m in (mesh, relaxed)]
     assert shortest[1] >= 0.9 * min(shortest[0], 0.05)
+
+
+def test_many_bad_faces_raise_the_limits(mesh, monkeypatch):
+    """Only what is beyond the second limits is improved: fewer points move."""
+    parts, worst = mesh.domain.boundaries.index, np.sort(face_measures(mesh)[0])[-2:]
+    assert worst[0] > np.radians(19)
+    usual = relax_points(mesh, parts, straight=False)
+    second = (worst.mean(), 9.0)
+    monkeypatch.setattr(relaxation, "_LIMITS", (LIMITS, second))
+    monkeypatch.setattr(relaxation, "_MOST", 1)
+    monkeypatch.setattr(relaxation, "_NOT_ADAPTED", 1)
+    relaxed = relax_points(mesh, parts, straight=False)
+    assert face_measures(relaxed)[0].max() < second[0]
+    moved = [(m.points != mesh.points).any(axis=1).sum() for m in (relaxed, usual)]
+    assert 0 < moved[0] < moved[1]
 
 
 def test_blas_has_one_thread_meanwhile(mesh, monkeypatch):

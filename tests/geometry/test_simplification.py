@@ -105,6 +105,20 @@ def test_large_coasts_are_dilated_in_parts(monkeypatch, land, scale):
     assert found.symmetric_difference(wanted).area < 1e-6 * wanted.area
 
 
+def test_pieces():
+    """The largest comes first, with its holes and the names of its edges."""
+    pond, lake = [rectangle(2, 0, 0.5, 0.5)], [BOX, rectangle(0.4, 0.4, 0.2, 0.1)]
+    domain = clvoro.Polygon.from_pieces(
+        [pond, lake], {"inlet": 1, "dam": [4, 5], "rock": range(8, 12)}
+    )
+    large, small = domain.split()
+    assert (large.measure, small.measure) == (pytest.approx(0.98), pytest.approx(0.25))
+    assert large.boundary_names == ("dam", "rock", "outer")
+    np.testing.assert_array_equal(large.boundary_index, [0, 0, 2, 2, 1, 1, 1, 1])
+    assert small.boundary_names == ("inlet", "outer")
+    np.testing.assert_array_equal(np.flatnonzero(small.boundary_index == 0), [1])
+
+
 def test_names():
     domain = clvoro.Polygon(rough(600, 2), [rectangle(0, 0, 0.3, 0.3), rectangle(-0.5, 0, 0.02, 0.02)],
                             names={"open": range(200), "rock": range(604, 608), "house": range(600, 604)})  # fmt: skip
