@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import shapely
 
 from ..arguments import format_point, warn
 from ..errors import (
@@ -35,6 +36,8 @@ MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
 jumps 1 : 2 between two cells, the largest value is 1."""
 STEEP = 1.25
 """Ratio of the sizes of adjacent cells above which a size error is attributed to the growth of h."""
+FEW_CELLS = 30
+"""Pieces of a polygon that fewer cells would fill do not meet their sizes."""
 ROUND_OFF_ERROR = 0.1
 """Mean |e| because of round-off, over the ratio of the spacing of positions to h. Random changes of up to half a
 spacing cost 0.095 (0.07 in 3D) times this ratio (`bench/precision.py --noise`)."""
@@ -174,6 +177,8 @@ def warn_of_errors(result: Result) -> None:
             "sizes change there by more than cells can follow from one to the next: bound their growth, as by "
             "sizing.Graded(size, growth=1.2), or use more cells"
         )
+    elif isinstance(diagram.domain, Polygon) and len(diagram) > FEW_CELLS:
+        why = _why_in_polygon(diagram.domain, result.points[worst], wanted)
     else:
         why = (
             f"the domain has a measure of {diagram.domain.measure:.6g}, which cells of this size do not fill evenly: "
@@ -183,6 +188,21 @@ def warn_of_errors(result: Result) -> None:
         f"the mesh does not meet its size field: mean |e| is {mean:.2g}, and a cell at {place} has the size "
         f"{made:.3g} where the size field is {wanted:.3g}; {why}",
         SizeErrorWarning,
+    )
+
+
+def _why_in_polygon(domain: Polygon, x: np.ndarray, h: float) -> str:
+    """Return why the cell at `x` has not the size `h` where sizes vary little, and the remedy."""
+    point = shapely.Point(x)
+    piece = min(domain.pieces, key=lambda shape: shape.distance(point))
+    if domain.n_pieces > 1 and piece.area < FEW_CELLS * h**2:
+        return (
+            f"it is in a piece of the domain that {piece.area / h**2:.2g} cells would fill: use smaller sizes there, "
+            "or keep the largest piece, domain.split()[0]"
+        )
+    return (
+        "narrow parts of the domain do not hold a whole number of cells of this size: use smaller sizes there, as "
+        "sizing.FeatureSize does, or fill them: domain.simplified(size) does"
     )
 
 

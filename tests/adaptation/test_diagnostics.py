@@ -10,6 +10,7 @@ import pytest
 
 import clvoro
 from clvoro import sizing
+from clvoro.adaptation import diagnostics
 from clvoro.adaptation.diagnostics import layer_mismatches, warn_of_narrow_parts
 from clvoro.cli import command as cli
 from clvoro.errors import CoarseSizeWarning, InputError, MismatchWarning, SizeErrorWarning
@@ -239,6 +240,16 @@ def test_warnings_of_coarse_sizes(ctx, size, n_cells, category, advice):
         assert advice in str(w.message)
         assert "Graded" not in str(w.message)
         assert w.filename == __file__
+
+
+def test_size_errors_in_polygons_have_a_remedy():
+    """A small piece shall be left out, and a narrow part be filled."""
+    pond, lake = [(2, 0), (2.12, 0), (2.12, 0.12), (2, 0.12)], [(0, 0), (1, 0), (1, 1), (0, 1)]
+    both = clvoro.Polygon.from_pieces([[pond], [lake]])
+    why = diagnostics._why_in_polygon(both, np.array([2.05, 0.05]), 0.1)
+    assert "a piece of the domain that 1.4 cells would fill" in why
+    assert "domain.split()[0]" in why
+    assert "domain.simplified(size)" in diagnostics._why_in_polygon(both, np.array([0.5, 0.5]), 0.1)
 
 
 @pytest.mark.slow
