@@ -65,7 +65,7 @@ def kinds(dim: int) -> dict[str, Method]:
 def name_of(method: Method) -> str:
     """Return the name of a kind of step."""
     if isinstance(method, WeightedMethod):
-        return "weighted"
+        return "weighted" if method.lloyd else "correct"
     assert isinstance(method, ProjectedMethod)
     if method.gradient_from_field:
         return "exact"

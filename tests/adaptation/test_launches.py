@@ -37,7 +37,9 @@ def methods(dim):
         for a in adaptive_schedule(dim, "default", 1, exact=exact)
         if isinstance(a, Step)
     ]
-    found = {(type(m), getattr(m, "descent", ""), is_exact(m)): m for m in steps}
+    found = {
+        (type(m), getattr(m, "descent", getattr(m, "lloyd", None)), is_exact(m)): m for m in steps
+    }
     return [replace(method) for method in found.values()]
 
 

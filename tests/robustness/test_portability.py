@@ -34,7 +34,7 @@ LIMITS = {
     "clip_marked": (224, 720),
     "measure_cells": (192, 512),
     "descend_quality": (144, 512),
-    "clip_polyhedra": (208, 5760),
+    "clip_polyhedra": (224, 5760),
     "clip_polyhedra_by_teams": (176, 320),
     "update_cells_by_teams": (176, 320),
     "update_cells": (160, 5632),
