@@ -56,13 +56,15 @@ class Place(NamedTuple):
     growth: float = 1.15
     across: int = 0
     lake: tuple[float, float] | None = None
+    view: tuple[float, float, float, float] | None = None
+    """In kilometers: west, south, east and north of the part that pictures show beside the whole."""
 
 
 PLACES = {
     "Aegean": Place((22.4, 34.8, 28.4, 41.1), 1.0, 12),
     "Stockholm": Place((17.9, 58.7, 19.6, 60.0), 0.25, 4),
     "fjords": Place((4.6, 59.6, 7.8, 61.6), 0.25, 3, 1.15, across=4),
-    "Chesapeake Bay": Place((-77.4, 36.6, -75.0, 39.7), 0.4, 5),
+    "Chesapeake Bay": Place((-77.4, 36.6, -75.0, 39.7), 0.4, 5, view=(0, -6, 40, 30)),
     "British Isles": Place((-12.0, 48.0, 4.0, 61.5), 2.5, 30),
     "Lake Huron": Place((-89.0, 41.0, -79.0, 47.0), 1.0, 8, lake=(-82.5, 44.8)),
 }
@@ -183,6 +185,24 @@ def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def draw(result: clvoro.Result, place: Place, path: Path) -> None:
+    """Draw a mesh, and beside it a part of it."""
+    from clvoro.plotting.cells import plot_cells
+    from clvoro.plotting.style import new_figure, styled
+
+    with styled():
+        figure = new_figure(7.2, 4.2)
+        for ax in figure.subplots(1, 2, width_ratios=[1, 1.5], squeeze=False)[0]:
+            plot_cells(result, "size", ax=ax, key=False)
+            ax.set(xticks=[], yticks=[], ylabel="", xlabel=f"{len(result.points):,} cells")
+        west, south, east, north = place.view or (
+            *result.diagram.domain.lower,
+            *result.diagram.domain.upper,
+        )
+        ax.set(xlim=(west, east), ylim=(south, north), xlabel=f"{east - west:.0f} km")
+        figure.savefig(path, dpi=115)
+
+
 COLUMNS = {
     "coast": lambda r: r["coast"],
     "run": lambda r: r["run"],
@@ -247,8 +267,7 @@ def main() -> None:
                     result.save(options.keep / f"{label}.npz")
                 if options.pictures is not None:
                     options.pictures.mkdir(parents=True, exist_ok=True)
-                    figure = result.plot("size", title=f"{name}, {kind}")
-                    figure.savefig(options.pictures / f"{label}.png", dpi=200)
+                    draw(result, place, options.pictures / f"{label}.png")
                 more = {
                     "edges": len(domain.vertices), "seconds": seconds, "simplified_seconds": spent,
                     "warnings": [str(w.message) for w in seen],
