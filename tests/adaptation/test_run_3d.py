@@ -265,8 +265,9 @@ def test_n_cells_is_held(adapter, method, n):
 def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
     result = adapter.run(BOX, SMALL, n_cells=n_cells, method="exact", seed=15)
     assert len(result.points) == n_cells
-    # Sizes are evaluated at generators. With twelve starts on two devices the factor is 0.990 to 1.024 times that.
-    assert result.size_factor == pytest.approx(np.cbrt(291 / n_cells), rel=0.05)
+    # Sizes are evaluated at generators. With 210 cells, eight starts and four sizes of groups the factor is 1.027 to
+    # 1.058 times that.
+    assert result.size_factor == pytest.approx(np.cbrt(291 / n_cells), rel=0.08)
     length = np.cbrt(result.diagram.volumes)
     # Three steps; at so few cells h changes by a third from one to the next.
     assert np.abs(np.log(length / result.target_size)).mean() < 2e-3
