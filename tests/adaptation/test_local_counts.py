@@ -6,7 +6,7 @@ import pytest
 
 import clvoro
 from clvoro.adaptation import local_counts
-from clvoro.adaptation.plan.actions import BalanceCounts
+from clvoro.adaptation.plan.actions import BalanceCounts, Refine
 from clvoro.adaptation.plan.schedule import adaptive_schedule
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
@@ -119,8 +119,13 @@ def test_balanced_rooms_do_not_change(ctx):
     assert np.array_equal(mesh.points.get(), before)
 
 
-def test_only_narrow_parts_in_the_plane_are_balanced():
-    for dim, narrow, expected in ((2, True, 1), (2, False, 0), (3, True, 0)):
-        for near in (False, True):
-            schedule = adaptive_schedule(dim, "default", 0, True, near=near, narrow_parts=narrow)
-            assert schedule.count(BalanceCounts()) == expected
+@pytest.mark.parametrize("levels", [0, 2])
+def test_only_narrow_parts_in_the_plane_are_balanced(levels):
+    """Before each refinement, which multiplies what a part lacks, and before polishing."""
+    for dim, narrow, expected in ((2, True, 1 + levels), (2, False, 0), (3, True, 0)):
+        schedule = adaptive_schedule(dim, "default", levels, True, narrow_parts=narrow)
+        at = [k for k, action in enumerate(schedule) if action == BalanceCounts()]
+        assert len(at) == expected
+        assert [schedule[k + 1] for k in at[:levels]] == [Refine()] * len(at[:levels])
+        near = adaptive_schedule(dim, "default", 0, True, near=True, narrow_parts=narrow)
+        assert near.count(BalanceCounts()) == min(expected, 1)

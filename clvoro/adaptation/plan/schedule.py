@@ -1,7 +1,8 @@
 """Schedules: the order of the steps of a run, from the coarsest level to the finest.
 
     density start ─► couple ─► [ insert/delete ─► glide ] x sweeps
-        ─► refine ─► couple ─► [...] ... (─► balance counts) ─► correct count ─► polish ─► separate (or project)
+        (─► balance counts) ─► refine ─► couple ─► [...] ...
+        (─► balance counts) ─► correct count ─► polish ─► separate (or project)
 
 *couple*         weighted Lloyd and Poisson: from any start to approximately the target sizes
 *insert/delete*  dislocations climb, and the number of cells follows the field
@@ -51,11 +52,8 @@ from .actions import (
 from .efforts import EFFORTS, EFFORTS_3D, Effort, choose_error_target
 
 COARSEST = {2: 1400, 3: 1500}
-"""Approximate number of cells of the coarsest level by dimension.
-
-A step on fewer cells is not much cheaper (see `STEP_CELLS`). Measured on F2 (see bench/convergence.py) with 23,000 to
-100,000 cells, half as many cells and one more level give no better mesh.
-"""
+"""Approximate number of cells of the coarsest level by dimension. A step on fewer cells is not much cheaper (see
+`STEP_CELLS`). Measured on F2 with 23,000 to 100,000 cells, half as many and one more level give no better mesh."""
 CELLS_ACROSS = 5.0
 """Least number of cells between layers on coarser levels. Layers are as fine there as on the finest level, and cells do
 not spread past them. In a bank of tubes with two coarse cells between them, mean |e| is 0.02 to 0.1; without coarser
@@ -190,18 +188,20 @@ def adaptive_schedule(
         and those of eight split: a cell of four sides has an obtuse triangle.
     narrow_parts : bool
         The domain may have parts that few cells join. In 2D the number of cells in each part is then balanced before
-        polishing, and the penalty of exact projections falls step by step (see `GRADUAL_PENALTIES`).
+        polishing, and before each refinement, which multiplies what a part lacks. The penalty of exact projections
+        falls step by step (see `GRADUAL_PENALTIES`).
     """
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
     projections = EXACT_STEPS if exact else 0
     if narrow_parts and dim == 2:
         schedule.insert(schedule.index(ResetMomentum()) - 1, BalanceCounts())
-    if exact and narrow_parts and dim == 2:
-        last = schedule[-1]
-        assert isinstance(last, Step)
-        assert isinstance(last.method, ProjectedMethod)
-        schedule[-projections:] = _gradual(last.method)
-        projections = len(GRADUAL_PENALTIES) + GRADUAL_NEWTON_STEPS
+        schedule = [x for a in schedule for x in ((BalanceCounts(), a) if a == Refine() else (a,))]
+        if exact:
+            last = schedule[-1]
+            assert isinstance(last, Step)
+            assert isinstance(last.method, ProjectedMethod)
+            schedule[-projections:] = _gradual(last.method)
+            projections = len(GRADUAL_PENALTIES) + GRADUAL_NEWTON_STEPS
     return _opened(schedule, projections, openings) if openings else schedule
 
 
