@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from .state import MeshState
 
 LEAST_GAIN = 2.0
-"""Half the sum of |u|^2 / h^2 over the cells that an insertion or deletion must save. Measured on the motor and the
-river of `bench/solver_ready.py`, exact, two starts each: with 1 to 4 no cell at walls has a low quality in the end, but
-for two in a dead end that is narrower than a cell. In most open domains there is no site where 2 is to be gained."""
+"""Half the sum of |u|^2 / h^2 over the cells that an insertion or deletion must save. With 1 to 4 the motor and the
+river of `bench/solver_ready.py`, exact, have no squeezed cells at walls (by a prototype in NumPy, two starts each). In
+most open domains there is no site where 2 is to be gained."""
 SITE_RINGS, BLOCKED_RINGS = 16, 3
-"""Rings of cells between sites of one round, and of different rounds. Measured on the motor and the river: with 8 rings
-in place of 16 there are up to 1.4 times as many changes, some of which undo others."""
+"""Rings of cells between sites of one round, and of different rounds. With 8 rings the motor and the river have up to
+1.2 times as many changes, some of which undo others."""
 OFFSET_PER_CELL, LARGEST_OFFSET = 0.25, 3.0
 """Potential that is added per missing cell of the whole domain, and its limit."""
 MOST_ROUNDS = 30
-"""Rounds end when no site gains enough: in the motor and the river after 13 to 31, elsewhere earlier."""
+"""Rounds end when no site gains enough: in the motor and the river after 11 to 30, elsewhere earlier."""
 TOLERANCE = 1e-2
 """Relative residual of the potential."""
 
