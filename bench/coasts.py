@@ -28,13 +28,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
+import solver_ready
 from _common import FIRST_SEED, Report, heading, make_adapter, names, off_walls, parser
-from solver_ready import figures_of
 
 import clvoro
 from clvoro import sizing
-from clvoro.errors import InputError
-from clvoro.io.check_mesh import Verdict, check_case
 
 RADIUS = 6371.0
 """Of the earth, in kilometers."""
@@ -159,30 +157,9 @@ def size_of(domain: clvoro.Polygon, place: Place, coarse: float) -> sizing.Field
 
 def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
     """Write the mesh, check it, and return its figures."""
-    diagram, begin = result.diagram, time.process_time()
-    solver = diagram.solver_mesh()
-    seconds = time.process_time() - begin
-    measures = solver.measures
-    sizes = np.sqrt(diagram.volumes)
-    ends = solver.points[solver.corners.reshape(-1, 2)]
-    lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
-    beyond = np.where(solver.neighbor < 0, solver.owner, solver.neighbor)
-    try:
-        result.save(case / "constant" / "polyMesh")
-        verdict = figures_of(check_case(case))
-    except InputError as error:
-        verdict = {**figures_of(Verdict(False, (), "")), "complaints": str(error)}
-    inner, e = off_walls(diagram), np.abs(result.size_error)
-    q = result.quality[~inner]
-    return {
-        "cells": len(diagram), "solver_seconds": seconds, **verdict,
-        "concave_degrees": float(measures.concavity.max()),
-        "shortest": float((lengths / np.minimum(sizes[solver.owner], sizes[beyond])).min()),
-        "wall_error": float(e[~inner].mean()), "wall_quality": float(q.min()),
-        "low": int((q < LEAST_QUALITY).sum()), "wall": len(q),
-        "inner_error": float(e[inner].mean()), "inner_quality": float(result.quality[inner].mean()),
-        "area_change": solver.area_change,
-    }  # fmt: skip
+    q = result.quality[~off_walls(result.diagram)]
+    low = int((q < LEAST_QUALITY).sum())
+    return {**solver_ready.measure(result, case), "low": low, "wall": len(q)}
 
 
 def draw(result: clvoro.Result, place: Place, path: Path) -> None:
@@ -212,17 +189,10 @@ COLUMNS = {
     "simplified s": lambda r: f"{r['simplified_seconds']:.1f}" if r["simplified_seconds"] else "",
     "run s": lambda r: f"{r['seconds']:.1f}",
     "solver mesh s": lambda r: (
-        f"{r['solver_seconds']:.2f} ({r['solver_seconds'] / (r['seconds'] + r['solver_seconds']):.0%})"
+        f"{r['solver_mesh_seconds']:.2f} ({r['solver_mesh_seconds'] / (r['seconds'] + r['solver_mesh_seconds']):.0%})"
     ),
-    "non-orth.": lambda r: f"{r['non_orthogonality']:.1f}",
-    "skewness": lambda r: f"{r['skewness']:.2f}",
-    "concave cells": lambda r: f"{r['concave']:.0f}",
-    "by degrees": lambda r: f"{r['concave_degrees']:.2g}",
-    "shortest edge": lambda r: f"{r['shortest']:.1e}",
-    "mean e, min Q at walls": lambda r: f"{r['wall_error']:.4f}, {r['wall_quality']:.3f}",
+    **dict(list(solver_ready.COLUMNS.items())[4:]),
     "Q < 0.75": lambda r: f"{r['low']} ({r['low'] / r['wall']:.1%})",
-    "mean e, mean Q inside": lambda r: f"{r['inner_error']:.4f}, {r['inner_quality']:.4f}",
-    "checkMesh": lambda r: "Mesh OK" if r["ok"] else f"fails: {r['complaints'][:120]}",
 }
 
 

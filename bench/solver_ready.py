@@ -31,6 +31,7 @@ from _sites import SITES
 from _walled import WALLED
 
 import clvoro
+from clvoro.errors import InputError
 from clvoro.io.check_mesh import Verdict, check_case
 
 NUMBER = r"([-+.\deE]*\d)"
@@ -53,9 +54,12 @@ def figures_of(verdict: Verdict) -> dict[str, Any]:
 
 def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
     """Write the mesh, check it, and return its figures."""
-    result.save(case / "constant" / "polyMesh")
-    verdict = check_case(case)
-    (case / "checkMesh.log").write_text(verdict.text)
+    try:
+        result.save(case / "constant" / "polyMesh")
+        verdict = check_case(case)
+        (case / "checkMesh.log").write_text(verdict.text)
+    except InputError as error:  # a cell that goes around an island is no polygon
+        verdict = Verdict(False, (str(error),), "")
     begin = time.process_time()
     solver = result.solver_mesh().measures
     seconds = time.process_time() - begin

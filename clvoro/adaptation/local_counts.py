@@ -29,7 +29,7 @@ SITE_RINGS, BLOCKED_RINGS = 16, 3
 """Rings of cells between sites of one round, and of different rounds. With 8 rings the motor and the river have up to
 1.2 times as many changes, some of which undo others."""
 OFFSET_PER_CELL, LARGEST_OFFSET = 0.25, 3.0
-"""Potential that is added per missing cell of the whole domain, and its limit."""
+"""Added to the potential for each cell that the whole domain lacks, and the largest sum. It favors insertions."""
 MOST_ROUNDS = 30
 """Rounds end when no site gains enough: in the motor and the river after 11 to 30, elsewhere earlier."""
 TOLERANCE = 1e-2

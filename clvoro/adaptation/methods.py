@@ -115,6 +115,7 @@ class WeightedMethod:
     cautious: bool = False
     """Clip to k min(L, h), because cells can still be much smaller than a new, coarse target size."""
     lloyd: bool = True
+    """Move to the centroids, too. Else the Poisson displacement alone corrects the sizes."""
 
     def displace(self, mesh: MeshState) -> Solution:
         """Evaluate the weighted Lloyd displacement and the correction."""
@@ -172,8 +173,8 @@ the least Q is 0.84. With the default's relaxation of 3.2, or with its weight of
 EXACT_PENALTY_PER_ERROR, MET_ERROR = 4.0, 1e-3
 """Least penalty of exact projections in polygons, for each mean |log(L / h)| above the second number. Cells must pass
 through narrow parts of the domain where they have too few on one side; with a small penalty they are squeezed there.
-Measured on the motor of `bench/solver_ready.py` with method "exact": 17 cells at walls have Q below 0.75 without it, 4
-with it and with `GRADUAL_PENALTIES`."""
+Measured on the motor of `bench/solver_ready.py` with method "exact", before the numbers of cells were balanced: 17
+cells at walls have Q below 0.75 without it, 4 with it and with `GRADUAL_PENALTIES`."""
 PENALTY_PER_ERROR = 750.0
 """Largest penalty over the error target, for targets above 0.004. With a penalty of 3 no mean error above 0.024 is
 reached; with 30 to 60 the shape hardly improves any more. The smallest penalty is 1e-3, or a smaller target."""

@@ -117,7 +117,7 @@ def _stretch_ends(lines: Lines) -> np.ndarray:
 
 
 class _Kinks:
-    """Ends of chords while some of them are dropped.
+    """The ends of chords, and which of them have been dropped.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class _Kinks:
             going = near[np.isfinite(far[near])]
 
     def drop_for_area(self) -> None:
-        """Drop kinks near their chords if the area without them is nearer to the exact one."""
+        """Drop each kink near its chord without which the area of the cell is nearer to the exact one."""
         lines = self.lines
         lost = _areas(lines.points, lines.starts)
         rest = np.flatnonzero(self.left)

@@ -40,13 +40,9 @@ def join_faces(mesh: SolverMesh) -> SolverMesh:
         if not middles.size:
             return mesh
         starts, loops, broken = simple_loops(mesh)
-        after = following(starts)
-        bent = np.zeros(len(mesh), bool)
-        bent[
-            np.repeat(np.arange(len(mesh)), np.diff(starts))[
-                turns(mesh.points[loops], after) < _STRAIGHT
-            ]
-        ] = True
+        # Only cells that are not convex become less concave.
+        cell, bent = np.repeat(np.arange(len(mesh)), np.diff(starts)), np.zeros(len(mesh), bool)
+        bent[cell[turns(mesh.points[loops], following(starts)) < _STRAIGHT]] = True
         sides = before[middles]
         middles = middles[bent[mesh.owner[sides]] | bent[mesh.neighbor[sides]]]
         spoiled = set(broken.tolist())

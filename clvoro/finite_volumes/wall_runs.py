@@ -74,7 +74,7 @@ class WallRuns:
         return np.where(joined, after, -1)
 
     def _set_runs(self, following: np.ndarray) -> None:
-        """Set `order`, the runs, and `after`: the next run on the boundary, -1 if there is none."""
+        """Set `order`, which lists the runs, and `after`, for each run the next one on the boundary or -1."""
         owner = self.mesh.owner[self.walls]
         before = np.full(len(owner), -1)
         goes_on = np.flatnonzero(following >= 0)
@@ -176,7 +176,10 @@ class WallRuns:
         return Lines(starts, self.points[points], fixed, sizes), points, face
 
     def cost(self, run: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the costs of runs if they went from place `begin` to place `end`; equal places are one point."""
+        """Return what each run would cost if it began at place `begin` and ended at place `end`.
+
+        If both are equal, the run is one point.
+        """
         m = len(self.order) + 1
         begin = begin - self.chain_begin[run]
         keys = (run * m + begin % self.chain_length[run]) * m + end - begin - self.chain_begin[run]

@@ -288,7 +288,10 @@ class Polygon(DevicePolygon):
         return Polygon.from_pieces(pieces, names or None)
 
     def split(self) -> list[Polygon]:
-        """Return the pieces, the largest first. Edges keep the names that you gave; curves become polylines."""
+        """Return each piece of the domain as a polygon, the largest first.
+
+        Edges keep the names that you gave. Curves become polylines.
+        """
         made = [Polygon.from_pieces([rings], names or None) for rings, names in pieces_of(self)]
         return sorted(made, key=lambda piece: -piece.measure)
 

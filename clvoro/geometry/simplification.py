@@ -42,7 +42,7 @@ _MOST_CORNERS = 2000
 _TRIES = 6
 
 DEFAULT_NAME = re.compile(r"(outer|hole)(-\d+)?")
-"""Names of rings to which nobody gave a name."""
+"""The names of rings that have none of their own, such as "outer" and "hole-1"."""
 
 Sizes = Callable[[np.ndarray], np.ndarray]
 

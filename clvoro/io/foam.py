@@ -101,7 +101,7 @@ def _header(name: str, note: str, binary: bool) -> str:
 
 
 def _bytes(values: np.ndarray, dtype: type) -> Iterator[bytes]:
-    """Write a list as OpenFOAM does: its length, then its bytes in parentheses, if there are any."""
+    """Yield a binary list of OpenFOAM: its length, and its bytes in parentheses. An empty list has no parentheses."""
     yield b"%d\n" % len(values)
     if len(values):
         yield b"("

@@ -50,7 +50,7 @@ def framed(method: Method) -> Method:
 
 
 class _Taken:
-    """A node of the tree of arrays: one array, whose children are the arrays that were once taken next.
+    """A node of the tree of arrays. It is one array; its children are the arrays that have been taken right after it.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Kernels in which a team of work-items builds or updates one cell in 3D. Devices and domains that use them."""
+"""Kernels in which a team of work-items builds or updates one cell in 3D, and which devices and domains use them."""
 
 from __future__ import annotations
 

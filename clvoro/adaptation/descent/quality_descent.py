@@ -32,14 +32,14 @@ class Repulsion:
 
 
 SHORT_EDGES = Repulsion(0.2, 2.0)
-"""The ends of edges.
+"""How both ends of an edge repel each other.
 
 In a step the length of an edge between four cells on a square changes by up to 4 rate stiffness times the length that
 is missing. Measured on seven fields and domains, three to five starts each: lengths of 0.15 to 0.25 and a stiffness of
 1.75 to 5 give the same sizes and quality.
 """
 CLOSE_PAIRS = Repulsion(0.5, 3.0)
-"""Neighboring generators. In a hexagonal lattice they are 1.07 h apart."""
+"""How neighboring generators repel each other. In a hexagonal lattice they are 1.07 h apart."""
 
 FULL_RATE = 5.0
 """Largest omega h^2 / A up to which a generator moves at the full rate; h^2 / A is 1.15 where a cell has its size.
