@@ -342,6 +342,7 @@ class Job:
             case=case,
             facts={"device": where, "precision": str(adapter.dtype)},
             formats=self.picture_formats,
+            tell=self._now_and_then(),
         )
 
     def _repeatable(self, results: dict[str, Result]) -> Case:

@@ -17,6 +17,7 @@ from ..geometry.polygon import Polygon
 from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
+from . import pixels
 from .boundary import clip_to_domain, frame_part
 from .colors import COLORINGS, Color, Coloring, cell_norm, coloring_of, picture_of, without_ends
 from .legends import add_color_bar, add_key, round_numbers
@@ -45,6 +46,8 @@ def plot_cells(
     title: str | None = None,
 ) -> Any:
     """Draw the cells of a 2D mesh as colored polygons.
+
+    With more than 30,000 cells in the picture each pixel has the color of the cell at its center.
 
     Parameters
     ----------
@@ -94,7 +97,11 @@ def plot_cells(
         values = scheme.values(result)
         seen = values if window is None else values[np.unique(shown)]
         low, high = scheme.limits(seen) if limits is None else ends_of(limits)
-        cells = draw_cells(ax, diagram, shown, offsets, values, scheme, (low, high))
+        if len(shown) > pixels.MOST_POLYGONS:
+            cells = pixels.add_image(ax, diagram, lower, upper, values, scheme, (low, high))
+            clip_to_domain(ax, diagram.domain, cells)
+        else:
+            cells = draw_cells(ax, diagram, shown, offsets, values, scheme, (low, high))
         frame_part(ax, diagram.domain, lower, upper)
         if edges:
             draw_edges(ax, diagram, shown, offsets, np.subtract(upper, lower))
@@ -116,6 +123,7 @@ def draw_cells(
 ) -> PolyCollection:
     """Add the filled polygons of the cells `shown` (indices), moved by `offsets`, to `ax`."""
     starts, corners = diagram.cell_vertex_starts, diagram.vertices[diagram.cell_vertices]
+    bridged = np.diff(starts) > np.diff(diagram.neighbor_starts)
     polygons = [
         corners[starts[i] : starts[i + 1]] + by for i, by in zip(shown, offsets, strict=True)
     ]
@@ -127,7 +135,7 @@ def draw_cells(
         # An outline in the color of the cell hides gaps between cells from antialiasing. Not a bridge between the loops
         # of a cell: between its parts it may cross an island.
         edgecolors="face",
-        linewidths=np.where(np.diff(starts) > np.diff(diagram.neighbor_starts), 0, 0.25)[shown],
+        linewidths=np.where(bridged, 0, 0.25)[shown] if bridged.any() else 0.25,
         rasterized=len(shown) > 3000,
     )
     ax.add_collection(cells, autolim=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
@@ -15,6 +16,7 @@ from ..geometry.sphere import Sphere, directions
 from ..mesh.connectivity import face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
+from . import pixels
 from .cells import edge_style, points_per_unit
 from .coasts import coastlines, is_earth
 from .colors import Color, Coloring, cell_norm, coloring_of, picture_of, without_ends
@@ -24,15 +26,12 @@ from .style import WIDTH, ends_of, interactive_figure, single_height, styled
 
 Projection = Literal["orthographic", "plate"]
 
-MOST_POLYGONS = 60_000
-"""With more cells in a picture, each pixel has the color of the cell that it is in."""
 _SMALLEST = 3.0
-"""The same where cells are smaller, in points: gaps between polygons would make stripes."""
+"""Where cells are smaller, in points, the picture is an image: gaps between polygons would make stripes."""
 _FADE = 0.8
 """Edges are as wide as those of cells that much smaller in a plane: rows of thin lines on a globe look like waves."""
 _WIDE_LABELS = 0.35
 """Additional width of the labels of degrees and of large sizes beside a map, inches."""
-_PIXELS = 1400  # in the longer direction of such a picture
 _CENTER = (0.0, 25.0)  # of the picture of a uniform mesh
 _STEPS = (
     0.01,
@@ -222,12 +221,21 @@ def _draw(
     reach = np.maximum.reduceat(reach, diagram.cell_vertex_starts[:-1])
     cells = np.flatnonzero(view.reaches(points, reach))
     widths, colors = _face_style(ax, diagram, view)
-    if len(cells) <= MOST_POLYGONS and not _has_tiny(ax, diagram, view, cells):
+    if len(cells) <= pixels.MOST_POLYGONS and not _has_tiny(ax, diagram, view, cells):
         polygons = view.polygons(diagram, cells)
         drawn: Any = _filled(polygons, values, scheme, ends)
         ax.add_collection(drawn, autolim=False)
     else:
-        drawn = _raster(ax, diagram, view, values, scheme, ends)
+        drawn = pixels.add_image(
+            ax,
+            diagram,
+            view.lower,
+            view.upper,
+            values,
+            scheme,
+            ends,
+            partial(_locate, diagram, view),
+        )
         wide = np.maximum.reduceat(widths > 0, diagram.neighbor_starts[:-1])
         polygons = view.polygons(diagram, cells[wide[cells]] if edges else cells[:0])
     if edges:
@@ -236,6 +244,14 @@ def _draw(
         for artist in (*ax.collections, *ax.images):
             artist.set_clip_path(Circle((0, 0), 1, transform=ax.transData))
     return drawn
+
+
+def _locate(diagram: Diagram, view: Orthographic | Plate, places: np.ndarray) -> np.ndarray:
+    """Return the cells at positions (k, 2) in the picture; -1 beside the globe."""
+    inside, directions = view.directions(places)
+    cells = np.full(len(places), -1)
+    cells[inside] = diagram.locate(directions)
+    return cells
 
 
 def _has_tiny(ax: Any, diagram: Diagram, view: Orthographic | Plate, cells: np.ndarray) -> bool:
@@ -262,28 +278,6 @@ def _filled(
         edgecolors="face",
         linewidths=0.25,
         rasterized=len(polygons.cells) > 3000,
-    )
-
-
-def _raster(
-    ax: Any, diagram: Diagram, view: Orthographic | Plate, values: np.ndarray, scheme: Coloring,
-    ends: tuple[float, float],
-) -> Any:  # fmt: skip
-    """Add an image with the value of the cell at the center of each pixel."""
-    extent = view.upper - view.lower
-    counts = np.ceil(_PIXELS * extent / extent.max()).astype(int)
-    x, y = (view.lower[a] + extent[a] * (np.arange(counts[a]) + 0.5) / counts[a] for a in (0, 1))
-    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    inside, directions = view.directions(places)
-    shown = np.full(len(places), np.nan)
-    # A part of a sphere has no cells elsewhere: -1 leads to the last place.
-    shown[inside] = np.append(without_ends(values), np.nan)[diagram.locate(directions)]
-    return ax.imshow(
-        np.ma.masked_invalid(shown).reshape(len(y), len(x)),
-        extent=(view.lower[0], view.upper[0], view.lower[1], view.upper[1]),
-        origin="lower",
-        cmap=scheme.color_map,
-        norm=cell_norm(scheme, ends),
     )
 
 

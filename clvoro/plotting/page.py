@@ -49,6 +49,7 @@ def write_report(
     facts: Mapping[str, str] | None = None,
     formats: Sequence[str] = ("png",),
     dpi: int = 170,
+    tell: Callable[[str], object] | None = None,
 ) -> list[Path]:
     """Write `report.html` and its pictures into `folder`.
 
@@ -70,6 +71,8 @@ def write_report(
     formats : sequence of {"png", "pdf", "svg"}
         Files per picture; the page itself always holds PNG.
     dpi : int
+    tell : callable, optional
+        Called with a line of text before each picture is drawn.
 
     Returns
     -------
@@ -88,7 +91,10 @@ def write_report(
     with writing(target / "pictures"):
         (target / "pictures").mkdir(parents=True, exist_ok=True)
     written, figures, failed = [], [], None
-    for name, caption, draw in pictures_of(results, initial, size):
+    pictures = pictures_of(results, initial, size)
+    for number, (name, caption, draw) in enumerate(pictures, 1):
+        if tell is not None:
+            tell(f"picture {number} of {len(pictures)}, {name}")
         try:
             figure = draw()
             png = render(figure, "png", dpi)

@@ -7,7 +7,6 @@ import re
 
 import numpy as np
 import pytest
-from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
@@ -16,6 +15,7 @@ import clvoro
 from clvoro.errors import InputError
 from clvoro.plotting import (
     page,
+    pixels,
     plot_cells,
     plot_displacements,
     plot_history,
@@ -32,12 +32,6 @@ BOX = clvoro.Box((-1, 2), (1, 3))
 
 def size(x):
     return 0.08 + 0.2 * np.hypot(x[:, 0], x[:, 1] - 2.5)
-
-
-@pytest.fixture(autouse=True)
-def nothing_stays_open():
-    yield
-    pyplot.close("all")
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +186,34 @@ def test_limits_and_window_are_taken(result):
     assert inside <= shown < len(result.points)
 
 
+RING = clvoro.Polygon([(0, 0), (2, 0), (2, 1), (0, 1)], [[(0.4, 0.4), (1.6, 0.4), (1.6, 0.6)]])
+
+
+@pytest.mark.parametrize("domain", [BOX, RING, clvoro.Box((0, 0), (2, 1), periodic=True)], ids=str)
+def test_pixels_have_the_values_of_their_cells(adapter, domain, monkeypatch):
+    monkeypatch.setattr(pixels, "MOST_POLYGONS", 10)
+    points = domain.lower + np.random.default_rng(3).random((300, 2)) * domain.extent
+    diagram = adapter.diagram(domain, points[domain.contains(points)])
+    own = np.arange(len(diagram))
+    figure = plot_cells(diagram, own)
+    (image,) = figure.axes[0].images
+    assert not of_kind(figure, PolyCollection)
+    shown, box = image.get_array(), np.reshape(image.get_extent(), (2, 2)).T
+    counts = np.array(shown.shape[::-1])
+    places = np.argwhere(np.ones(shown.shape))[:, ::-1]
+    cells = diagram.locate(box[0] + (places + 0.5) / counts * (box[1] - box[0]))
+    inside = cells >= 0
+    assert inside.mean() == pytest.approx(domain.measure / domain.extent.prod(), abs=0.01)
+    assert np.array_equal(shown.ravel()[inside], own[cells[inside]])
+    # Beside the boundary are a few more pixels; the rest is blank, and the boundary cuts them off.
+    assert (~shown.mask.ravel()).mean() - inside.mean() < 0.05
+    assert (image.get_clip_path() is not None) == (domain is RING)
+    # Another color takes the same pixels.
+    monkeypatch.setattr(type(diagram), "locate", None)
+    (again,) = plot_cells(diagram, -own).axes[0].images
+    assert np.array_equal(again.get_array().filled(1), -shown.filled(-1))
+
+
 def test_side_shares_are_complete(result):
     legend = plot_cells(result, "sides").axes[0].get_legend()
     shares = [float(re.search(r"([\d.]+)%", t.get_text())[1]) for t in legend.get_texts()]
@@ -306,7 +328,7 @@ def test_round_numbers(value, up, rounded):
 def test_report_holds_its_pictures(results, adapter, tmp_path):
     first = results["coupled"].initial.points
     initial = adapter.run(BOX, size, points=first, max_steps=0)
-    title, case = "Cells & <size>", '# a "case" <b>'
+    title, case, told = "Cells & <size>", '# a "case" <b>', []
     files = write_report(
         results,
         tmp_path,
@@ -315,7 +337,9 @@ def test_report_holds_its_pictures(results, adapter, tmp_path):
         title=title,
         case=case,
         formats=("png", "svg"),
+        tell=told.append,
     )
+    assert [line.split(",")[0] for line in told] == [f"picture {k} of 7" for k in range(1, 8)]
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert files[0] == tmp_path / "report.html"
     assert all(file.stat().st_size > 500 for file in files)

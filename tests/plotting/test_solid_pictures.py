@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 import shapely
-from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.path import Path
 from scipy.spatial import cKDTree
@@ -37,12 +36,6 @@ LOWER, UPPER = (-1.0, 0.0, 2.0), (1.0, 1.0, 3.5)
 def result():
     points = np.random.default_rng(77123).uniform(LOWER, UPPER, (150, 3))
     return solids.solid_result(solids.solid_diagram(LOWER, UPPER, points))
-
-
-@pytest.fixture(autouse=True)
-def no_figure_stays_open():
-    yield
-    pyplot.close("all")
 
 
 def has_color_bar(figure):
