@@ -19,6 +19,7 @@ from unittest import mock
 import numpy as np
 import pyopencl as cl
 from launches import kinds, take_step
+from update_3d import Shares
 
 import clvoro
 from clvoro.adaptation.stages import Stages
@@ -34,8 +35,9 @@ from tests.robustness.oclgrind_runs import as_for_many
 
 COUNTS = Path(__file__).with_name("gpu_counts.json")
 COUNTED = (2, "weighted"), (2, "glide"), (2, "polish"), (3, "weighted"), (3, "glide"), (3, "polish")
-WARM_UP = 3
-"""Steps before those that count: cells then keep most neighbors from step to step."""
+WARM_UP = {(3, "weighted"): 1, (3, "glide"): 1, (3, "polish"): 2}
+"""Steps before those that count, if not 3. In 3D the shares of cells that keep their vertices, and that are updated
+again, are then near those of a run of a million cells (see `update_3d.py --shares`)."""
 COUNTED_AT = {2: (300, 1200), 3: (128, 432)}
 """Numbers of cells at which Oclgrind counts. The work of a kernel over cells is that of a cell at the larger number,
 times the cells. Kernels with as many work-items for any number of cells have a fixed part, from both numbers."""
@@ -85,7 +87,7 @@ class Run:
         kind: str,
         n: int,
         points: np.ndarray | None = None,
-        warm_up: int = WARM_UP,
+        warm_up: int | None = None,
     ) -> None:
         engine = Engine(adapter.ctx, adapter.queue, dim, adapter.dtype)
         box, points = (
@@ -100,7 +102,7 @@ class Run:
             self.n = len(points)
             rng = np.random.default_rng(1)
             self.random = engine.upload(rng.uniform(size=points.shape))
-            for _ in range(warm_up):
+            for _ in range(WARM_UP.get((dim, kind), 3) if warm_up is None else warm_up):
                 self.step()
 
     def step(self) -> None:
@@ -183,15 +185,15 @@ def commands(
 
 
 def with_teams(found: Commands) -> Commands:
-    """Return the commands on an NVIDIA GPU: teams build cells in 3D, and update those that keep their vertices.
+    """Return the commands on an NVIDIA GPU: teams build and update cells in 3D.
 
     PoCL takes minutes to hours to compile their kernels.
     """
     for alone in ("clip_polyhedra", "update_cells"):
         if alone in found.launches:
             row, team = found.launches[alone], f"{alone}_by_teams"
-            found.launches[team] = Launches(1, TEAM * found.cells, TEAM, row.bytes / row.calls)
-    found.launches.pop("clip_polyhedra", None)
+            found.launches[team] = Launches(row.calls, TEAM * row.items, TEAM, row.bytes)
+            del found.launches[alone]
     return found
 
 
@@ -268,11 +270,17 @@ def count_in_this_process(dim: int, kind: str, n: int) -> None:
                 if name == "diagram" and kind != "weighted":
                     continue
                 run.mesh.engine.queue.finish()
+                shares = Shares()
+                shares.kind = kind if dim == 3 and name == "step" else ""
                 print(f"=== {name}", flush=True)
-                items = commands(run, name, 1, part).launches
+                with shares.counting():
+                    items = commands(run, name, 1, part).launches
                 print("=== end", flush=True)
                 sized = {k: {"items": v.items, "calls": v.calls} for k, v in items.items()}
-                record = {"part": name, "cells": run.n, "kernels": sized}
+                counted = {
+                    k: float(v) for step in shares.steps for k, v in step.items() if k != "kind"
+                }
+                record = {"part": name, "cells": run.n, "kernels": sized, "shares": counted}
                 print("@@@" + json.dumps(record), flush=True)
 
 
@@ -299,14 +307,18 @@ def counted(dim: int, kind: str) -> dict[str, Any]:
                 if kernel in part:
                     part[kernel].items = each["items"]
             rows = {k: [round(v) for v in vars(w).values()] for k, w in part.items()}
-            found.setdefault(sized["part"], []).append({"cells": sized["cells"], "kernels": rows})
+            found.setdefault(sized["part"], []).append(
+                {"cells": sized["cells"], "shares": sized["shares"], "kernels": rows}
+            )
     return found
 
 
-def save_counts() -> None:
-    """Count all kinds of steps, and write `COUNTS`."""
-    found = {}
+def save_counts(dims: list[int]) -> None:
+    """Count all kinds of steps in `dims` dimensions, and write them to `COUNTS`."""
+    found = json.loads(COUNTS.read_text()) if COUNTS.exists() else {}
     for dim, kind in COUNTED:
+        if dim not in dims:
+            continue
         print(f"{kind} step in {dim}D", file=sys.stderr, flush=True)
         found[f"{dim}D {kind}"] = counted(dim, kind)
     COUNTS.write_text(json.dumps(found).replace("], ", "],\n ") + "\n")

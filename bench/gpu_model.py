@@ -236,11 +236,14 @@ class Term(NamedTuple):
 
 
 def work_of(
-    pair: list[dict[str, Any]], kernel: str, items: float, n: float
+    pair: list[dict[str, Any]], kernel: str, items: float, n: float, calls: float
 ) -> dict[str, float] | None:
-    """Return the work of one launch over `items` work-items for `n` cells, from that counted at two sizes."""
+    """Return the work of one of `calls` over `items` work-items for `n` cells, from that counted at two sizes."""
     few, many = (each["kernels"][kernel] for each in pair)
     names_of = [name for name in many if name not in ("launches", "items")]
+    if kernel.startswith("update_cells"):
+        # Launches have room for more cells than are updated again: the work of all launches is that of the cells.
+        return {k: many[k] / pair[1]["cells"] * n / calls for k in names_of}
     (_, f), (j, g) = (
         (w["items"] / w["launches"], {k: w[k] / w["launches"] for k in names_of})
         for w in (few, many)
@@ -326,7 +329,7 @@ def modeled(
             missing.append(kernel)
             continue
         items = per_launch if is_fixed(pair, kernel) else per_launch * n / found.cells
-        work = work_of(pair, kernel, items, n)
+        work = work_of(pair, kernel, items, n, launches.calls)
         bound = launches.bytes / launches.calls * n / found.cells
         terms.append(term(H200, kernel, launches, work, figures.get(kernel), items, bound))
     return sorted(terms, key=lambda t: -t.total), missing
@@ -445,7 +448,10 @@ def main() -> None:
         help="cells of the meshes whose launches are counted, in 2D and 3D",
     )  # fmt: skip
     options_of.add_argument(
-        "--count", action="store_true", help=f"write {gpu_steps.COUNTS.name}, by Oclgrind"
+        "--count",
+        type=counts,
+        metavar="DIMS",
+        help=f"write {gpu_steps.COUNTS.name}, by Oclgrind: 2,3",
     )
     options_of.add_argument("--count-one", type=names, help=argparse.SUPPRESS)
     options = options_of.parse_args()
@@ -454,7 +460,7 @@ def main() -> None:
         gpu_steps.count_in_this_process(int(dim), kind, int(n))
         return
     if options.count:
-        gpu_steps.save_counts()
+        gpu_steps.save_counts(options.count)
         return
     if unknown := set(options.dtypes) - set(DTYPES):
         options_of.error(f"no precision {', '.join(unknown)}; there are {', '.join(DTYPES)}")

@@ -1,6 +1,14 @@
-/* A cell in 3D as the vertices of its planes: a vertex is a triple of faces, counter-clockwise seen from outside. */
+/* A cell in 3D as the vertices of its planes: a vertex is a triple of faces, counter-clockwise seen from outside. It
+   lies in private memory; or, if a team updates it, in local memory. */
 #include "tessellation/corner_shares.h"
 
+#ifdef TEAM
+#define CORNER_SPACE local
+#else
+#define CORNER_SPACE private
+#endif
+#define CORNERS CORNER_SPACE corners_t
+#define LINKS CORNER_SPACE links_t
 #define NO_CORNER 255
 
 typedef struct {
@@ -13,140 +21,24 @@ typedef struct {
     REAL reach2;
 } corners_t;
 
+/* The numbers in vectors of WIDTH. */
+#define NUMBERS(vectors) ((CORNER_SPACE REAL *)(vectors))
+
 /* Where two faces are consecutive at a vertex: its number, [a][b]. */
 typedef struct {
     uchar at[MOST_FACES * MOST_FACES];
 } links_t;
 
-inline REAL4 face_plane(const corners_t *cell, int f)
+inline REAL4 face_plane(const CORNERS *cell, int f)
 {
     const REAL4 plane = cell->planes[f];
     return (REAL4)(plane.s0, plane.s1, plane.s2, 0);
 }
 
-inline REAL4 corner_place(const corners_t *cell, int v)
+inline REAL4 corner_place(const CORNERS *cell, int v)
 {
-    return (REAL4)(((const REAL *)cell->x)[v], ((const REAL *)cell->y)[v], ((const REAL *)cell->z)[v], 0);
+    return (REAL4)(NUMBERS(cell->x)[v], NUMBERS(cell->y)[v], NUMBERS(cell->z)[v], 0);
 }
 
-#define CORNERS corners_t
 #define CORNER_PLACE corner_place
 #include "tessellation/corner_measures.h"
-
-/* Pad the planes to whole vectors by those of no neighbor, p = 0. */
-inline void pad_planes(corners_t *cell)
-{
-    const int end = (cell->faces + WIDTH - 1) / WIDTH * WIDTH;
-    for (int f = cell->faces; f < end; ++f)
-        cell->planes[f] = 0;
-}
-
-/* Sums of the shares of the vertices: of each face (area, first moments), and second moments of the cell. */
-typedef struct {
-    REAL4 faces[MOST_FACES];
-    WIDE xx[HALVES], yy[HALVES], zz[HALVES], yz[HALVES], zx[HALVES], xy[HALVES];
-} sums_t;
-
-/* Find the vertices and sum them up. False if faces at a vertex are nearly parallel or not counter-clockwise, or a
-   neighbor is very near. `reach2` and `beyond` are set. The sums are incomplete if a vertex lies beyond another face,
-   or without `measured`. */
-inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
-{
-    const int blocks = (cell->corners + WIDTH - 1) / WIDTH;
-    for (int v = cell->corners; v < WIDTH * blocks; ++v)
-        cell->at[v] = cell->at[0];
-    for (int f = 0; f < cell->faces; ++f)
-        sums->faces[f] = 0;
-    for (int turn = 0; turn < HALVES; ++turn)
-        sums->xx[turn] = sums->yy[turn] = sums->zz[turn] = sums->yz[turn] = sums->zx[turn] = sums->xy[turn] = 0;
-    WIDE far2 = 0, good = 1;
-    bool fits = measured;
-    for (int block = 0; block < blocks; ++block) {
-        int at_a[WIDTH], at_b[WIDTH], at_c[WIDTH];
-        for (int lane = 0; lane < WIDTH; ++lane) {
-            const uchar4 at = cell->at[WIDTH * block + lane];
-            at_a[lane] = at.s0;
-            at_b[lane] = at.s1;
-            at_c[lane] = at.s2;
-        }
-        places_t a, b, c;
-        WIDE ia, ib, ic;
-        gather_lanes(&a, &ia, cell->planes, at_a);
-        gather_lanes(&b, &ib, cell->planes, at_b);
-        gather_lanes(&c, &ic, cell->planes, at_c);
-        corner_t corner;
-        find_corner(&corner, &a, &b, &c);
-        const places_t y = corner.y;
-        cell->x[block] = y.x;
-        cell->y[block] = y.y;
-        cell->z[block] = y.z;
-        far2 = corner.y2 > far2 ? corner.y2 : far2;
-        good *= corner.good;
-        /* Two independent chains of comparisons, which the processor overlaps. */
-        WIDE beyond = -1, others = -1;
-        for (int f = 0; f < cell->faces; f += 2) {
-            const REAL4 p = cell->planes[f], q = cell->planes[min(f + 1, cell->faces - 1)];
-            const WIDE s = fma(p.s0, y.x, fma(p.s1, y.y, p.s2 * y.z));
-            const WIDE t = fma(q.s0, y.x, fma(q.s1, y.y, q.s2 * y.z));
-            beyond = s > beyond ? s : beyond;
-            others = t > others ? t : others;
-        }
-        beyond = others > beyond ? others : beyond;
-        cell->beyond[block] = beyond - R(0.5);
-        fits = fits && !(largest_lane(beyond) > R(0.5) + BEYOND_NOISE);
-        if (!fits)
-            continue;
-
-        const int turn = HALF_OF(block), lanes = min(WIDTH, cell->corners - WIDTH * block);
-        /* Lanes behind the last vertex count nothing. */
-        REAL here[WIDTH];
-        for (int lane = 0; lane < WIDTH; ++lane)
-            here[lane] = lane < lanes;
-        const WIDE once = LOAD_WIDE(0, here);
-        shares_t share;
-        share_corner(&share, &corner, &a, &b, &c, ia, ib, ic, once);
-        REAL4 of_a[WIDTH], of_b[WIDTH], of_c[WIDTH];
-        rows_of_lanes(of_a, share.a, &share.first_a);
-        rows_of_lanes(of_b, share.b, &share.first_b);
-        rows_of_lanes(of_c, share.c, &share.first_c);
-        for (int lane = 0; lane < lanes; ++lane) {
-            sums->faces[at_a[lane]] += of_a[lane];
-            sums->faces[at_b[lane]] += of_b[lane];
-            sums->faces[at_c[lane]] += of_c[lane];
-        }
-        sums->xx[turn] += share.xx;
-        sums->yy[turn] += share.yy;
-        sums->zz[turn] += share.zz;
-        sums->yz[turn] += share.yz;
-        sums->zx[turn] += share.zx;
-        sums->xy[turn] += share.xy;
-    }
-    cell->reach2 = largest_lane(far2);
-    REAL nearest2 = INFINITY;
-    for (int f = 0; f < cell->faces; ++f)
-        nearest2 = fmin(nearest2, cell->planes[f].s3);
-    return largest_lane(-good) < 0 && nearest2 > LEAST_NEAREST2 * cell->reach2; /* a NaN is not good */
-}
-
-/* Write the faces from `place` on, and the moments of the cell of generator i, from its sums. False if a face has no
-   more area than round-off. */
-inline bool write_measures(const corners_t *cell, const sums_t *sums, int i, int place, const measured_t *out)
-{
-    REAL4 first = 0;
-    REAL volume = 0;
-    REAL seconds[SECONDS] = {sum_of_lanes(sums->xx), sum_of_lanes(sums->yy), sum_of_lanes(sums->zz),
-                             sum_of_lanes(sums->yz), sum_of_lanes(sums->zx), sum_of_lanes(sums->xy)};
-    bool wide = true;
-    for (int f = 0; f < cell->faces; ++f) {
-        face_t face;
-        measure_face(&face, cell, f, cell->planes[f], sums->faces[f], cell->reach2);
-        put_face(place + f, cell->labels[f], &face, out);
-        wide &= face.wide;
-        volume += face.volume;
-        first += face.first;
-        for (int k = 0; k < SECONDS; ++k)
-            seconds[k] += face.seconds[k];
-    }
-    put_moments(i, volume, first, seconds, out);
-    return wide && volume > 0;
-}

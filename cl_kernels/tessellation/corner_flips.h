@@ -1,41 +1,38 @@
 /* The vertices of a cell in 3D after its generator and neighbors have moved: by flips from its earlier vertices, or by
    a walk along its edges. */
 #include "tessellation/cell_corners3d.h"
+#include "tessellation/update_rows.h"
 
 #define MOST_FLIPS 24
-#define MORE 8 /* room for further neighbors of a cell */
 
 #define LINK(links, a, b) ((links)->at[(a)*MOST_FACES + (b)])
 
-inline void clear_links(links_t *links, int faces)
-{
-    for (int k = 0; k < faces * MOST_FACES; ++k)
-        links->at[k] = NO_CORNER;
-}
-
-inline void link_corner(corners_t *cell, links_t *links, int v, int a, int b, int c)
+inline void link_corner(CORNERS *cell, LINKS *links, int v, int a, int b, int c)
 {
     cell->at[v] = (uchar4)(a, b, c, 0);
     LINK(links, a, b) = LINK(links, b, c) = LINK(links, c, a) = v;
 }
 
 /* The face of vertex v that follows b, where b follows a. */
-inline int third_face(const corners_t *cell, int v, int a, int b)
+inline int third_face(const CORNERS *cell, int v, int a, int b)
 {
     const uchar4 at = cell->at[v];
     return at.s0 != a && at.s0 != b ? at.s0 : (at.s1 != a && at.s1 != b ? at.s1 : at.s2);
 }
 
 /* The product y.p - 1/2 of a position and the plane of face f: positive beyond the plane. */
-inline REAL beyond_plane(const corners_t *cell, int f, REAL4 y)
+inline REAL beyond_plane(const CORNERS *cell, int f, REAL4 y)
 {
     const REAL4 p = cell->planes[f];
     return fma(p.s0, y.s0, fma(p.s1, y.s1, p.s2 * y.s2)) - R(0.5);
 }
 
 /* The same for WIDTH faces. */
-inline WIDE beyond_planes(const corners_t *cell, int block, REAL4 y)
+inline WIDE beyond_planes(const CORNERS *cell, int block, REAL4 y)
 {
+#if WIDTH == 1
+    return beyond_plane(cell, block, y);
+#else
     int faces[WIDTH];
     for (int lane = 0; lane < WIDTH; ++lane)
         faces[lane] = WIDTH * block + lane;
@@ -43,10 +40,11 @@ inline WIDE beyond_planes(const corners_t *cell, int block, REAL4 y)
     WIDE d2;
     gather_lanes(&p, &d2, cell->planes, faces);
     return fma(p.x, y.s0, fma(p.y, y.s1, p.z * y.s2)) - R(0.5);
+#endif
 }
 
 /* Find vertex v, and its largest product y.p - 1/2. False if its faces are not counter-clockwise. */
-inline bool place_corner(corners_t *cell, int v)
+inline bool place_corner(CORNERS *cell, int v)
 {
     const uchar4 at = cell->at[v];
     const REAL4 a = face_plane(cell, at.s0), b = face_plane(cell, at.s1), c = face_plane(cell, at.s2);
@@ -55,35 +53,35 @@ inline bool place_corner(corners_t *cell, int v)
     if (!(det > 0))
         return false;
     const REAL4 y = (ab + bc + ca) / (2 * det);
-    ((REAL *)cell->x)[v] = y.s0;
-    ((REAL *)cell->y)[v] = y.s1;
-    ((REAL *)cell->z)[v] = y.s2;
+    NUMBERS(cell->x)[v] = y.s0;
+    NUMBERS(cell->y)[v] = y.s1;
+    NUMBERS(cell->z)[v] = y.s2;
     WIDE beyond = -1;
     for (int block = 0; WIDTH * block < cell->faces; ++block) {
         const WIDE s = beyond_planes(cell, block, y);
         beyond = s > beyond ? s : beyond;
     }
-    ((REAL *)cell->beyond)[v] = largest_lane(beyond);
+    NUMBERS(cell->beyond)[v] = largest_lane(beyond);
     return true;
 }
 
 /* Move the last vertex to the place of vertex v, which is removed. */
-inline void remove_corner(corners_t *cell, links_t *links, int v)
+inline void remove_corner(CORNERS *cell, LINKS *links, int v)
 {
     const int last = --cell->corners;
     if (v == last)
         return;
     const uchar4 at = cell->at[last];
     link_corner(cell, links, v, at.s0, at.s1, at.s2);
-    ((REAL *)cell->x)[v] = ((REAL *)cell->x)[last];
-    ((REAL *)cell->y)[v] = ((REAL *)cell->y)[last];
-    ((REAL *)cell->z)[v] = ((REAL *)cell->z)[last];
-    ((REAL *)cell->beyond)[v] = ((REAL *)cell->beyond)[last];
+    NUMBERS(cell->x)[v] = NUMBERS(cell->x)[last];
+    NUMBERS(cell->y)[v] = NUMBERS(cell->y)[last];
+    NUMBERS(cell->z)[v] = NUMBERS(cell->z)[last];
+    NUMBERS(cell->beyond)[v] = NUMBERS(cell->beyond)[last];
 }
 
 /* Replace the edge between faces a and b, at vertices v = (a, b, c) and (b, a, e), by one between c and e; or remove
    face a or b if it is a triangle. False if that is impossible. */
-inline bool flip_edge(corners_t *cell, links_t *links, int v, int a, int b, int c)
+inline bool flip_edge(CORNERS *cell, LINKS *links, int v, int a, int b, int c)
 {
     const int w = LINK(links, b, a), e = third_face(cell, w, b, a);
     if (LINK(links, c, e) == NO_CORNER && LINK(links, e, c) == NO_CORNER) {
@@ -114,11 +112,11 @@ inline bool flip_edge(corners_t *cell, links_t *links, int v, int a, int b, int 
 }
 
 /* Flip edges until all vertices lie in the cell. False if the cell remains wrong. */
-inline bool flip_corners(corners_t *cell, links_t *links)
+inline bool flip_corners(CORNERS *cell, LINKS *links)
 {
     for (int flips = 0; flips < MOST_FLIPS; ++flips) {
         int worst = 0;
-        const REAL *beyond = (const REAL *)cell->beyond;
+        CORNER_SPACE const REAL *beyond = NUMBERS(cell->beyond);
         for (int v = 1; v < cell->corners; ++v)
             worst = beyond[v] > beyond[worst] ? v : worst;
         if (!(beyond[worst] > BEYOND_NOISE))
@@ -148,15 +146,10 @@ inline bool flip_corners(corners_t *cell, links_t *links)
 }
 
 /* Flip edges, then cut the cell by the planes from number `known` on, one after the other: the vertex farthest beyond a
-   plane is replaced by three, and edges are flipped. False if the cell remains wrong. */
-inline bool repair_corners(corners_t *cell, links_t *links, int known)
+   plane is replaced by three, and edges are flipped. Its vertices are linked. False if the cell remains wrong. */
+inline bool repair_corners(CORNERS *cell, LINKS *links, int known)
 {
     const int end = cell->faces;
-    clear_links(links, end);
-    for (int v = 0; v < cell->corners; ++v) {
-        const uchar4 at = cell->at[v];
-        link_corner(cell, links, v, at.s0, at.s1, at.s2);
-    }
     REAL4 planes[MORE];
     for (int f = known; f < end; ++f) {
         planes[f - known] = face_plane(cell, f);
@@ -166,7 +159,8 @@ inline bool repair_corners(corners_t *cell, links_t *links, int known)
     for (int f = known; f < end && right; ++f) {
         const REAL4 plane = planes[f - known];
         cell->planes[f].xyz = plane.xyz;
-        REAL *beyond = (REAL *)cell->beyond, most = BEYOND_NOISE;
+        CORNER_SPACE REAL *beyond = NUMBERS(cell->beyond);
+        REAL most = BEYOND_NOISE;
         int worst = -1;
         for (int v = 0; v < cell->corners; ++v) {
             const REAL s = beyond_plane(cell, f, corner_place(cell, v));
@@ -189,7 +183,7 @@ inline bool repair_corners(corners_t *cell, links_t *links, int known)
 }
 
 /* The face that cuts a ray from y along `ray` first, except a and b; -1 if there is none. */
-inline int first_cut(const corners_t *cell, REAL4 y, REAL4 ray, int a, int b)
+inline int first_cut(const CORNERS *cell, REAL4 y, REAL4 ray, int a, int b)
 {
     WIDE least = INFINITY, faces = -1;
     for (int block = 0; WIDTH * block < cell->faces; ++block) {
@@ -211,10 +205,10 @@ inline int first_cut(const corners_t *cell, REAL4 y, REAL4 ray, int a, int b)
     return first;
 }
 
-/* Find all vertices by a walk along the edges. False if the cell is open, or round-off leaves it so. */
-inline bool walk_corners(corners_t *cell, links_t *links)
+/* Find all vertices by a walk along the edges. There are no links before. False if the cell is open, or round-off
+   leaves it so. */
+inline bool walk_corners(CORNERS *cell, LINKS *links)
 {
-    clear_links(links, cell->faces);
     cell->corners = 0;
     int nearest = 0;
     for (int f = 1; f < cell->faces; ++f)
@@ -260,45 +254,4 @@ inline bool walk_corners(corners_t *cell, links_t *links)
         if (open > MOST_CORNERS)
             return false;
     }
-}
-
-/* Bit b of next[a]: face b follows a at a vertex. */
-inline void find_edges(const corners_t *cell, uint *next)
-{
-    for (int f = 0; f < MOST_FACES; ++f)
-        next[f] = 0;
-    for (int v = 0; v < cell->corners; ++v) {
-        const uchar4 at = cell->at[v];
-        next[at.s0] |= 1u << at.s1;
-        next[at.s1] |= 1u << at.s2;
-        next[at.s2] |= 1u << at.s0;
-    }
-}
-
-/* Number the faces that have vertices anew. False if the vertices form no closed surface. */
-inline bool number_faces(corners_t *cell, const uint *next)
-{
-    uchar number[MOST_FACES];
-    int faces = 0;
-    for (int f = 0; f < cell->faces; ++f) {
-        number[f] = faces;
-        faces += next[f] != 0;
-    }
-    if (faces < 4 || cell->corners != 2 * faces - 4)
-        return false;
-    if (faces == cell->faces)
-        return true;
-    for (int v = 0; v < cell->corners; ++v) {
-        const uchar4 at = cell->at[v];
-        cell->at[v] = (uchar4)(number[at.s0], number[at.s1], number[at.s2], 0);
-    }
-    for (int f = 0; f < cell->faces; ++f)
-        if (next[f] != 0) {
-            const int to = number[f];
-            cell->labels[to] = cell->labels[f];
-            cell->planes[to] = cell->planes[f];
-        }
-    cell->faces = faces;
-    pad_planes(cell);
-    return true;
 }

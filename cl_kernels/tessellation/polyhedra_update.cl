@@ -1,5 +1,6 @@
 #include "tessellation/update_rows.h"
 #include "tessellation/corner_flips.h"
+#include "tessellation/corner_sums.h"
 
 /* Update of a diagram in 3D: the cells of generators that moved a little, from those that they had before.
 
@@ -20,12 +21,6 @@
    In a periodic box neighbors are nearest images, as long as no vertex is as far from its generator as a quarter of a
    period. Then any two generators about a vertex are less than half a period apart, and all their cells see the same
    images there. Cells without gap or overlap may cover the box more than once; the host compares the volumes. */
-
-#define NO_NEIGHBOR INT_MIN
-
-/* Marks of a cell: it must be updated again with further neighbors, or clipped. */
-#define UPDATE_AGAIN 1
-#define CLIP_ANEW 2
 
 /* Largest difference of the areas of two half-faces, as a share of the area of the cell, where one is from a cell that
    was clipped. */
@@ -66,32 +61,6 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
     return n;
 }
 
-inline bool names_neighbor(int label, int i, const rows_t *in)
-{
-    bool found = false;
-    const int end = in->starts[i + 1];
-    for (int k = in->starts[i]; k < end; ++k)
-        found |= in->neighbors[k] == label;
-    return found;
-}
-
-/* Make `label` a further neighbor of i, unless it was one; i is clipped if there is no room. */
-inline void add_neighbor(int i, int label, const rows_t *in, global int *marks)
-{
-    if (i < 0 || names_neighbor(label, i, in))
-        return;
-    for (int k = 0; k < MORE; ++k) {
-        const int known = atomic_cmpxchg(in->more + MORE * i + k, NO_NEIGHBOR, label);
-        if (known == label)
-            return;
-        if (known == NO_NEIGHBOR) {
-            atomic_or(marks + i, UPDATE_AGAIN);
-            return;
-        }
-    }
-    atomic_or(marks + i, CLIP_ANEW);
-}
-
 /* Keep the cell of generator i at x within the walls: those that it does not have become further neighbors. True if
    there is none. */
 inline bool keep_in_box(const corners_t *cell, int i, REAL4 x, const rows_t *in, global int *marks)
@@ -113,6 +82,58 @@ inline bool keep_in_box(const corners_t *cell, int i, REAL4 x, const rows_t *in,
         add_neighbor(i, -1 - wall, in, marks);
     }
     return inside;
+}
+
+/* Remove all links, and link the vertices. */
+inline void link_corners(CORNERS *cell, LINKS *links)
+{
+    for (int k = 0; k < cell->faces * MOST_FACES; ++k)
+        links->at[k] = NO_CORNER;
+    for (int v = 0; v < cell->corners; ++v) {
+        const uchar4 at = cell->at[v];
+        link_corner(cell, links, v, at.s0, at.s1, at.s2);
+    }
+}
+
+/* Bit b of next[a]: face b follows a at a vertex. */
+inline void find_edges(const CORNERS *cell, uint *next)
+{
+    for (int f = 0; f < MOST_FACES; ++f)
+        next[f] = 0;
+    for (int v = 0; v < cell->corners; ++v) {
+        const uchar4 at = cell->at[v];
+        next[at.s0] |= 1u << at.s1;
+        next[at.s1] |= 1u << at.s2;
+        next[at.s2] |= 1u << at.s0;
+    }
+}
+
+/* Number the faces that have vertices anew. False if the vertices form no closed surface. */
+inline bool number_faces(CORNERS *cell, const uint *next)
+{
+    uchar number[MOST_FACES];
+    int faces = 0;
+    for (int f = 0; f < cell->faces; ++f) {
+        number[f] = faces;
+        faces += next[f] != 0;
+    }
+    if (faces < 4 || cell->corners != 2 * faces - 4)
+        return false;
+    if (faces == cell->faces)
+        return true;
+    for (int v = 0; v < cell->corners; ++v) {
+        const uchar4 at = cell->at[v];
+        cell->at[v] = (uchar4)(number[at.s0], number[at.s1], number[at.s2], 0);
+    }
+    for (int f = 0; f < cell->faces; ++f)
+        if (next[f] != 0) {
+            const int to = number[f];
+            cell->labels[to] = cell->labels[f];
+            cell->planes[to] = cell->planes[f];
+        }
+    cell->faces = faces;
+    pad_planes(cell);
+    return true;
 }
 
 /* Write the keys that neighbors are compared with: for each face the sum, over its vertices, of the products of the
@@ -181,8 +202,8 @@ kernel void begin_cell_updates(const int size, const int used, const int report_
 
 /* Per generator i: its cell among its previous neighbors and `further` ones, with the measures of `clip_polyhedra`; or
    row_counts[i] = UNFINISHED where the cell is open, has many faces, is near round-off, or is to be clipped. `which`
-   are all cells, or marked ones, or those left by teams (update_rows.h). The latter two are `listed`, marked ones as ~i
-   if they are to be clipped. Only marked ones have further neighbors.
+   are all cells, or marked ones, which are `listed`, as ~i if they are to be clipped. Only these have further
+   neighbors.
 
    `old_corners` and `old_keys`: the triples, from 2 old_starts[i] on, and keys of the previous cells; none if not
    `known`. Cells are written to their previous places, and those with more faces behind all these, from report[1] on.
@@ -195,7 +216,7 @@ kernel void update_cells(const int size, const int which, global const int *list
                          global uint *keys, global int *changed, global int *more, global int *marks PERIOD_ARGS)
 {
     WORK_ITEM(item);
-    if (which != ALL_CELLS && (item >= report[REPORT_MARKED] || report[REPORT_MARKED] > size))
+    if (which == MARKED_CELLS && (item >= report[REPORT_MARKED] || report[REPORT_MARKED] > size))
         return;
     const int what = which == ALL_CELLS ? item : listed[item], i = max(what, ~what);
     const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS};
@@ -223,8 +244,11 @@ kernel void update_cells(const int size, const int which, global const int *list
         uint old[MOST_FACES], next[MOST_FACES];
         cell.corners = has_corners ? cell.corners : 0;
         find_edges(&cell, old);
+        link_corners(&cell, &work.links);
         if (!(flips && repair_corners(&cell, &work.links, listed_before))) {
             list_planes(&cell, i, x, added, &in); /* flips may have removed faces */
+            cell.corners = 0;
+            link_corners(&cell, &work.links);
             done = walk_corners(&cell, &work.links);
         }
         if (done) {

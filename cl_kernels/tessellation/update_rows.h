@@ -3,9 +3,14 @@
 #include "tessellation/corner_shares.h"
 
 #define ALL_FACES (-1)
+#define MORE 8 /* room for further neighbors of a cell */
+#define NO_NEIGHBOR INT_MIN
 
-/* Which cells an update makes: all; those that are marked, with further neighbors; else (2) those that teams have left.
- */
+/* Marks of a cell: it must be updated again with further neighbors, or clipped. */
+#define UPDATE_AGAIN 1
+#define CLIP_ANEW 2
+
+/* Which cells an update makes: all; or those that are marked, with further neighbors. */
 #define ALL_CELLS 0
 #define MARKED_CELLS 1
 
@@ -54,4 +59,30 @@ inline bool has_nearest_images(REAL reach2, const rows_t *in)
     nearest = nearest && !(PERIOD(a) > 0 && 16 * reach2 >= PERIOD(a) * PERIOD(a));
 #endif
     return nearest;
+}
+
+inline bool names_neighbor(int label, int i, const rows_t *in)
+{
+    bool found = false;
+    const int end = in->starts[i + 1];
+    for (int k = in->starts[i]; k < end; ++k)
+        found |= in->neighbors[k] == label;
+    return found;
+}
+
+/* Make `label` a further neighbor of i, unless it was one; i is clipped if there is no room. */
+inline void add_neighbor(int i, int label, const rows_t *in, global int *marks)
+{
+    if (i < 0 || names_neighbor(label, i, in))
+        return;
+    for (int k = 0; k < MORE; ++k) {
+        const int known = atomic_cmpxchg(in->more + MORE * i + k, NO_NEIGHBOR, label);
+        if (known == label)
+            return;
+        if (known == NO_NEIGHBOR) {
+            atomic_or(marks + i, UPDATE_AGAIN);
+            return;
+        }
+    }
+    atomic_or(marks + i, CLIP_ANEW);
 }

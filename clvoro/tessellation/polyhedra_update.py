@@ -28,8 +28,8 @@ MAX_ROUNDS = 8
 """Most rounds of making cells again; after that the diagram is built from scratch."""
 MAX_SHARE = 0.5
 """Largest share of cells to make again in one round. Beyond it a new diagram costs less."""
-ALL_CELLS, MARKED_CELLS, LEFT_CELLS = 0, 1, 2
-"""Which cells `update_cells` updates: all, those marked by a check, or those that teams have left."""
+ALL_CELLS, MARKED_CELLS = 0, 1
+"""Which cells `update_cells` updates: all, or those marked by a check."""
 SPARE = 0.25
 """Room for cells that gain faces, over the half-faces of the previous diagram."""
 
@@ -88,17 +88,17 @@ class PolyhedraUpdate:
         most = int(MAX_SHARE * n)
         if n != self._n:
             self._n, self._expected, self._clips = n, [most], False
+        by_team = None if self._team is None else self._team.get()
         rounds = _Rounds(
-            self.engine, self._kernels, self._scan, self._report, cells, box, points, previous
-        )
-        team = self._team if previous.vertices else None
-        rounds.update_all(None if team is None else team.get())
+            self.engine, self._kernels, by_team, self._scan, self._report, cells, box, points, previous
+        )  # fmt: skip
+        rounds.update(n, ALL_CELLS)
         done, sizes = 0, self._expected
         clipped, final = False, not self._clips
         while True:
             for size in sizes[: MAX_ROUNDS - done]:
                 rounds.list_marked(done, size)
-                rounds.update_marked(size)
+                rounds.update(size, MARKED_CELLS)
                 done += 1
             matching = None
             if final:
@@ -144,6 +144,7 @@ class _Rounds:
         self,
         engine: Engine,
         kernels: Kernels,
+        by_team: cl.Kernel | None,
         scan: Scan,
         report: cla.Array,
         cells: Polyhedra,
@@ -152,6 +153,7 @@ class _Rounds:
         previous: Tessellation,
     ) -> None:
         self._engine, self._kernels, self._scan, self._report = engine, kernels, scan, report
+        self._by_team = by_team
         self._n, before = previous.n, len(previous.neighbors)
         n, most = previous.n, max(int(MAX_SHARE * previous.n), 1)
         self.room = int((1 + SPARE) * before) + 64
@@ -169,26 +171,16 @@ class _Rounds:
             kernels.begin_cell_updates, n, np.int32(before), np.int32(REPORT_SIZE), report, self._marks, self._more
         )  # fmt: skip
 
-    def update_all(self, by_teams: cl.Kernel | None) -> None:
-        """Update all cells: with a kernel, teams those that keep their vertices, and single work-items the others."""
-        which = ALL_CELLS if by_teams is None else LEFT_CELLS
-        if by_teams is not None:
-            self._engine.run(
-                by_teams, TEAM * self._n, np.int32(self._n), self._listed, *self._fixed, *self._engine.period_args,
-                group=TEAM,
-            )  # fmt: skip
-        self._update(self._n, which)
-
-    def update_marked(self, most: int) -> None:
-        """Update the listed cells, if they are not more than `most`."""
-        self._update(most, MARKED_CELLS)
-
-    def _update(self, size: int, which: int) -> None:
-        """Update `which` cells, at most `size`, and check them."""
-        self._engine.run_each(
-            self._kernels.update_cells, size, np.int32(which), self._listed, self._further, *self._fixed, self._more,
-            self._marks, *self._engine.period_args,
+    def update(self, size: int, which: int) -> None:
+        """Update all cells, or those listed if they are not more than `size`, and check them."""
+        engine = self._engine
+        args = (
+            np.int32(which), self._listed, self._further, *self._fixed, self._more, self._marks, *engine.period_args,
         )  # fmt: skip
+        if self._by_team is not None:
+            engine.run(self._by_team, TEAM * size, np.int32(size), *args, group=TEAM)
+        else:
+            engine.run_each(self._kernels.update_cells, size, *args)
         self.check()
 
     def check(self) -> None:
