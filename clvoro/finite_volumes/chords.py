@@ -14,7 +14,7 @@ import numpy as np
 
 from ..mesh.straightening import SIDE_TURN
 
-_FILLED = 0.25
+FILLED = 0.25
 """A kink into the cell is cut off if it is nearer than this to the chord, over the size of the cell."""
 _CUT = 0.03
 """The same for a kink out of the cell."""
@@ -137,7 +137,7 @@ class _Kinks:
         self.can_go = ~lines.fixed[self.items]
         self.can_go[np.diff(self.row, prepend=-1) > 0] = False
         self.can_go[np.diff(self.row, append=len(lines.sizes)) > 0] = False
-        self.limit = (_FILLED * lines.sizes)[self.row]
+        self.limit = (FILLED * lines.sizes)[self.row]
 
     def _triangles(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the distances of `some` items from the chords without them, and the areas of the triangles."""

@@ -167,7 +167,7 @@ def make_solver_mesh(
     """
     from .collapse import collapse_short
     from .convex_corners import join_faces, move_concave_points
-    from .relaxation import relax_points
+    from .repair.relaxation import relax_points
     from .short_edges import collapse_short_edges
     from .straight_walls import straight_walls
 

@@ -7,8 +7,9 @@ import pytest
 import shapely
 
 import clvoro
-from clvoro.finite_volumes import relaxation, short_edges
+from clvoro.finite_volumes import short_edges
 from clvoro.finite_volumes.prisms import cell_loops
+from clvoro.finite_volumes.repair import relaxation
 from tests.finite_volumes.test_straight_walls import ELL, circle, concave_by, polygons
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.finite_volumes.patch import take_patch
-from clvoro.finite_volumes.patch_descent import Descent
-from clvoro.finite_volumes.patch_figures import LENGTH_GOAL
-from clvoro.finite_volumes.patch_slopes import slopes
+from clvoro.finite_volumes.repair.descent import Descent
+from clvoro.finite_volumes.repair.figures import LENGTH_GOAL
+from clvoro.finite_volumes.repair.patch import take_patch
+from clvoro.finite_volumes.repair.slopes import slopes
 
 
 @pytest.fixture(scope="module")

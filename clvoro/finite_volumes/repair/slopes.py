@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mesh.connectivity import take_rows
-from .patch_figures import (
+from ...mesh.connectivity import take_rows
+from .figures import (
     ANGLE_GOAL,
     AREA_WEIGHT,
     DETERMINANT_GOAL,

@@ -1,7 +1,7 @@
 """Points of a patch moved so that its faces are less skew and nearer to orthogonal: a least-squares problem.
 
-Points on walls slide along the boundary or stay. The sum of squares is that of `patch_figures`; its derivatives are
-those of `patch_slopes`. Whether a patch becomes better is decided by its price, the sum of what is beyond the limits.
+Points on walls slide along the boundary or stay. The sum of squares is that of `figures`; its derivatives are
+those of `slopes`. Whether a patch becomes better is decided by its price, the sum of what is beyond the limits.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse
 
-from ..geometry.ring_coordinate import RingCoordinate
-from ..mesh.connectivity import following
+from ...geometry.ring_coordinate import RingCoordinate
+from ...mesh.connectivity import following
+from .figures import LENGTH_GOAL, Cells
 from .patch import BORDER, Patch, cell_sides
-from .patch_figures import LENGTH_GOAL, Cells
-from .patch_slopes import slopes
+from .slopes import slopes
 
 STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell."""
@@ -23,10 +23,12 @@ _SHORT = 0.05
 """A shorter face raises the price of the patch. Lengths are relative to the smaller of its two cells."""
 LEAST_DETERMINANT = 3e-3
 """A cell with a smaller determinant raises the price of the patch. OpenFOAM refuses cells below 1e-3."""
+_REFUSED_DETERMINANT = 1.1e-3
 _MOST_EXCESS = 4
 """Faces that exceed a limit by more than this times it have the same price."""
-_INVERTED_PRICE, _CONCAVE_PRICE = 100.0, 3.0
-"""Prices of a cell without a positive area, and of a concave corner for each radian."""
+_INVERTED_PRICE, _CONCAVE_PRICE, _CUT_PRICE = 100.0, 3.0, 0.5
+"""Prices of a cell without a positive area, of a concave corner for each radian, and of a corner that is cut off for
+the square of its distance from the chord over the size of the cell."""
 _MOVE_WEIGHT = 0.1
 _STEP = 1e-6
 """Step of differences along the boundary, over the width of a cell."""
@@ -52,6 +54,8 @@ class Descent:
         What is beyond the limits in each cell and at its faces.
     bad : (n,) bool
         Whether a cell or one of its faces is beyond a limit; short faces are not counted.
+    refused : (n,) bool
+        Cells that are concave, have no area, or have a determinant that OpenFOAM refuses.
     face_prices, lengths : (f,) float
         Of ``cells.faces``.
     sides : (k,) int
@@ -100,8 +104,9 @@ class Descent:
 
     @property
     def price(self) -> float:
-        """Sum of the prices of all cells."""
-        return float(self.prices.sum())
+        """Sum of the prices of all cells, and of corners of walls that have been cut off."""
+        cuts = sum(_CUT_PRICE * (cut.far / cut.size) ** 2 for cut in self.patch.cuts)
+        return float(self.prices.sum()) + cuts
 
     def _set_prices(self) -> None:
         c, (angle, skewness) = self.cells, self.patch.limits
@@ -116,6 +121,8 @@ class Descent:
         prices += now.determinant < LEAST_DETERMINANT
         prices += _INVERTED_PRICE * (now.area <= 0)
         self.bad = prices > 0
+        self.refused = np.bincount(c.row, self.bent, n) > 0
+        self.refused |= (now.determinant < _REFUSED_DETERMINANT) | (now.area <= 0)
         self.bad[c.owner[beyond]] = self.bad[c.neighbor[beyond]] = True
         prices += (np.bincount(c.owner, excess, n) + np.bincount(c.neighbor, excess, n)) / 2
         self.prices, self.face_prices, self.lengths = prices, excess, now.length

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mesh.connectivity import following, take_rows
+from ...mesh.connectivity import following, take_rows
 
 LENGTH_GOAL = 0.15
 """Length of a face over the size of its smaller cell that is aimed at.

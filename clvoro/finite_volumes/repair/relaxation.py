@@ -12,17 +12,21 @@ import threading
 import numpy as np
 import scipy.sparse
 
-from ..geometry.polygon import Polygon
-from ..geometry.ring_coordinate import RingCoordinate
-from ..mesh.connectivity import following
-from .geometry import polygon_centroids, turns
+from ...arguments import format_point, warn
+from ...errors import MismatchWarning
+from ...geometry.polygon import Polygon
+from ...geometry.ring_coordinate import RingCoordinate
+from ...mesh.connectivity import following
+from ..chords import FILLED
+from ..geometry import polygon_centroids, turns
+from ..prisms import simple_loops
+from ..short_edges import CORNER, point_kinds
+from ..solver_mesh import SolverMesh
+from .descent import LEAST_DETERMINANT, STRAIGHT, Descent
+from .figures import face_figures
 from .patch import LIMITS, Patch, part_of, put_back, take_patch
-from .patch_descent import LEAST_DETERMINANT, STRAIGHT, Descent
-from .patch_figures import face_figures
-from .prisms import simple_loops
 from .reconnection import repaired
-from .short_edges import CORNER, point_kinds
-from .solver_mesh import SolverMesh
+from .wall_corners import Cut, Walls
 
 _RINGS = 5
 """Rings of cells around those beyond a limit that make a patch."""
@@ -67,6 +71,8 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
     region = _grown(loops, bad)
     around, groups = take_patch(mesh, region), _connected_parts(mesh, region, bad)
     around.limits = limits
+    on_walls = slice(mesh.inner, mesh.outer)
+    walls = Walls(mesh.points[mesh.corners.reshape(-1, 2)[on_walls]], mesh.owner[on_walls], parts)
     made = []
     # The last bits of sums in BLAS depend on its number of threads.
     with _BLAS, threadpool_limits(1, user_api="blas"):
@@ -76,19 +82,40 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
             patch = _with_positions(patch, ring, kinds)
             given = Descent.of(patch)
             if given is not None and given.bad.any():
-                better = _improved(given, ring, straight)
+                better = _improved(given, ring, walls if straight else None)
                 made += [better.patch] * (better.price < given.price)
+    _report([cut for patch in made for cut in patch.cuts])
     return put_back(mesh, made) if made else mesh
 
 
-def _improved(given: Descent, ring: RingCoordinate | None, faces: bool) -> Descent:
-    """Return a patch of lower price, the same if there is none; its `faces` connect other cells only if true."""
+def _report(cuts: list[Cut]) -> None:
+    """Warn of corners of walls that were cut off, if one of them is far from its chord."""
+    far = max(cuts, key=lambda cut: cut.far / cut.size, default=None)
+    if far is None or far.far <= FILLED * far.size:
+        return
+    what = (
+        "1 corner of the boundary is"
+        if len(cuts) == 1
+        else f"{len(cuts)} corners of the boundary are"
+    )
+    warn(
+        f"{what} cut off, because no convex cells fit there, as the one at {format_point(np.array(far[:2]))}, which is "
+        f"{far.far:.3g} from the wall, where cells are {far.size:.3g} wide; use smaller cells there",
+        MismatchWarning,
+    )
+
+
+def _improved(given: Descent, ring: RingCoordinate | None, walls: Walls | None) -> Descent:
+    """Return a patch of lower price, the same if there is none; faces connect other cells if there are `walls`."""
     for rings in _TRIES:
         if not given.bad.any():
             return given
         made = given.solve(given.near(given.bad, rings), ring, False, _STEPS)
         given = made if made.price < given.price else given
-    return repaired(given, ring) if faces else given
+    if walls is None:
+        return given
+    given = repaired(given, ring)
+    return repaired(given, ring, walls) if given.refused.any() else given
 
 
 def _limited(mesh: SolverMesh) -> tuple[tuple[float, float], np.ndarray] | None:

@@ -7,10 +7,10 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import clvoro
-from clvoro.finite_volumes import relaxation
 from clvoro.finite_volumes.geometry import polygon_areas
-from clvoro.finite_volumes.patch import LIMITS
-from clvoro.finite_volumes.relaxation import face_measures, relax_points
+from clvoro.finite_volumes.repair import relaxation
+from clvoro.finite_volumes.repair.patch import LIMITS
+from clvoro.finite_volumes.repair.relaxation import face_measures, relax_points
 from clvoro.finite_volumes.solver_mesh import SolverMesh
 from tests.finite_volumes.test_straight_walls import concave_by, polygons
 

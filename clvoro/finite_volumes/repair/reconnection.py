@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
-from ..geometry.ring_coordinate import RingCoordinate
+from ...geometry.ring_coordinate import RingCoordinate
+from .descent import Descent
+from .figures import LENGTH_GOAL
 from .patch import BORDER, Patch, part_of, restored
-from .patch_descent import Descent
-from .patch_figures import LENGTH_GOAL
+from .wall_corners import WallCorners, Walls
 
 _OPENED = 0.25
 """Length of a new face over the size of its smallest cell."""
@@ -38,22 +40,29 @@ _MOST = 100
 """Most places that are regarded in a patch, the same ones again included."""
 
 
-def repaired(given: Descent, ring: RingCoordinate | None) -> Descent:
-    """Return a patch of lower price: place by place points move, also along walls, and faces change."""
+def repaired(given: Descent, ring: RingCoordinate | None, walls: Walls | None = None) -> Descent:
+    """Return a patch of lower price: place by place points move, also along walls, and faces change.
+
+    With the `walls` of the mesh only cells are regarded that OpenFOAM refuses, and corners of walls can be cut off.
+    """
     left = np.ones(len(given.prices), bool)
     for _ in range(_MOST):
-        if not (left & given.bad).any():
+        bad = given.bad if walls is None else given.refused
+        if not (left & bad).any():
             break
         worst = np.zeros(len(left), bool)
-        worst[np.argmax(np.where(left & given.bad, given.prices, 0))] = True
-        focus = given.near(worst, 2) & given.bad
+        worst[np.argmax(np.where(left & bad, given.prices, 0))] = True
+        focus = given.near(worst, 2) & bad
         chosen = given.near(focus, _RINGS)
         local = Descent.of(part_of(given.patch, chosen), given.goals[chosen])
         assert local is not None
         near = focus[chosen]
         best = _settled(local, near, ring, _TRIES, _STEPS)
         if best.prices[best.near(near, 2) & best.bad].sum() > _SMALL:
-            best = _changed(best, near, ring)
+            beside = walls and walls.beside(given.patch.cells[chosen], local.patch.points)
+            best = _changed(best, near, ring, beside)
+        if walls is not None and best.refused.sum() >= local.refused.sum():
+            best = local
         if local.price - best.price < _GAIN * given.prices[focus].sum():
             left &= ~focus
         if best is not local:
@@ -63,12 +72,14 @@ def repaired(given: Descent, ring: RingCoordinate | None) -> Descent:
     return given
 
 
-def _changed(given: Descent, focus: np.ndarray, ring: RingCoordinate | None) -> Descent:
+def _changed(
+    given: Descent, focus: np.ndarray, ring: RingCoordinate | None, walls: Walls | None
+) -> Descent:
     """Return the best of a patch and those with one change for the cells `focus` (n,) bool; if none helps, with two."""
-    first = _best_changes(given, focus, ring)
+    first = _best_changes(given, focus, ring, walls)
     enough = given.price - _GAIN * given.prices[focus].sum()
     if first and first[0].price > enough:
-        second = [_best_changes(made, focus, ring)[:1] for made in first]
+        second = [_best_changes(made, focus, ring, walls)[:1] for made in first]
         first = sorted([*first, *(made for some in second for made in some)], key=_price)
     return min([given, *first[:1]], key=_price)
 
@@ -77,7 +88,9 @@ def _price(given: Descent) -> float:
     return given.price
 
 
-def _best_changes(given: Descent, focus: np.ndarray, ring: RingCoordinate | None) -> list[Descent]:
+def _best_changes(
+    given: Descent, focus: np.ndarray, ring: RingCoordinate | None, walls: Walls | None
+) -> list[Descent]:
     """Return the best of the patches with one change for the cells `focus` (n,) bool, the best one first."""
     c = given.cells
     bent = np.zeros(len(given.patch.points), bool)
@@ -91,11 +104,13 @@ def _best_changes(given: Descent, focus: np.ndarray, ring: RingCoordinate | None
     tried |= c.wall & beside[c.ends].any(axis=1)
     connections = _Connections(given, ring)
     found: list[Descent] = []
-    for face in c.faces[tried].tolist():
-        for patch in connections.changes(face):
-            made = Descent.of(patch, given.goals)
-            if made is not None:
-                found.append(_settled(made, focus, ring, (1,), _FIRST_STEPS))
+    changes = [connections.changes(face) for face in c.faces[tried].tolist()]
+    if walls is not None:
+        changes.append(WallCorners(given, walls).changes(given.near(focus, 1)))
+    for patch in chain.from_iterable(changes):
+        made = Descent.of(patch, given.goals)
+        if made is not None:
+            found.append(_settled(made, focus, ring, (1,), _FIRST_STEPS))
     good = _each_settled(sorted(found, key=_price)[:_GOOD], focus, ring, (1,), _SECOND_STEPS)
     return _each_settled(good[:_BEST], focus, ring, (2, 3), _STEPS)
 

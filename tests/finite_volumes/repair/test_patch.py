@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.finite_volumes.patch import BORDER, cell_sides, part_of, put_back, restored, take_patch
-from clvoro.finite_volumes.patch_descent import Descent
 from clvoro.finite_volumes.prisms import simple_loops
-from clvoro.finite_volumes.relaxation import _with_positions
+from clvoro.finite_volumes.repair.descent import Descent
+from clvoro.finite_volumes.repair.patch import (
+    BORDER,
+    cell_sides,
+    part_of,
+    put_back,
+    restored,
+    take_patch,
+)
+from clvoro.finite_volumes.repair.relaxation import _with_positions
 from clvoro.finite_volumes.short_edges import collapse_short_edges, point_kinds
 from clvoro.geometry.ring_coordinate import RingCoordinate
 from tests.finite_volumes.test_straight_walls import ELL, circle

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .solver_mesh import SolverMesh, compact
+from ..solver_mesh import SolverMesh, compact
+
+if TYPE_CHECKING:
+    from .wall_corners import Cut
 
 BORDER = np.iinfo(np.int32).min
 """In place of the neighbor of a face that stays: the cell behind it is not in the patch."""
@@ -24,7 +28,7 @@ class Patch:
         Their indices in the mesh, ascending.
     points : (v, 2) float64
     ids : (v,) int64
-        Index of each point in the mesh.
+        Index of each point in the mesh; -1 for a new one.
     ends : (f, 2) int64
         Points of each face; the owner is on the left of the way from the first to the second.
     owner, neighbor : (f,) int64
@@ -41,6 +45,8 @@ class Patch:
         Position of each point on a wall along the boundary; NaN for others.
     limits : (float, float)
         Non-orthogonality in radians and skewness beyond which faces are bad.
+    cuts : tuple of Cut
+        Corners of walls that have been cut off.
     """
 
     cells: np.ndarray
@@ -55,6 +61,7 @@ class Patch:
     fixed: np.ndarray
     positions: np.ndarray
     limits: tuple[float, float] = LIMITS
+    cuts: tuple[Cut, ...] = ()
 
     @property
     def walls(self) -> np.ndarray:
@@ -119,25 +126,43 @@ def restored(patch: Patch, part: Patch) -> Patch:
     whole &= np.where(patch.neighbor >= 0, within[np.maximum(patch.neighbor, 0)], True)
     kept, rows = ~whole | (patch.neighbor == BORDER), part.neighbor != BORDER
     other = np.where(part.neighbor >= 0, part.cells[np.maximum(part.neighbor, 0)], part.neighbor)
-    points, positions = patch.points.copy(), patch.positions.copy()
-    points[part.ids], positions[part.ids] = part.points, part.positions
+    ids, more = _numbered(part.ids, len(patch.points))
+    points, positions = (
+        np.pad(patch.points, ((0, more), (0, 0))),
+        np.pad(patch.positions, (0, more)),
+    )
+    points[ids], positions[ids] = part.points, part.positions
     return replace(
         patch,
         points=points,
+        ids=np.pad(patch.ids, (0, more), constant_values=-1),
+        held=np.pad(patch.held, (0, more)),
+        fixed=np.pad(patch.fixed, (0, more)),
         positions=positions,
-        ends=np.concatenate([patch.ends[kept], part.ids[part.ends[rows]]]),
+        ends=np.concatenate([patch.ends[kept], ids[part.ends[rows]]]),
         owner=np.concatenate([patch.owner[kept], part.cells[part.owner[rows]]]),
         neighbor=np.concatenate([patch.neighbor[kept], other[rows]]),
         half_face=np.concatenate([patch.half_face[kept], part.half_face[rows]]),
         aim=np.concatenate([patch.aim[kept], part.aim[rows]]),
+        cuts=patch.cuts + part.cuts,
     )
+
+
+def _numbered(ids: np.ndarray, count: int) -> tuple[np.ndarray, int]:
+    """Return `ids` (v,) with numbers from `count` on for new points, and how many these are."""
+    new = np.flatnonzero(ids < 0)
+    made = ids.copy()
+    made[new] = count + np.arange(len(new))
+    return made, len(new)
 
 
 def put_back(mesh: SolverMesh, patches: list[Patch]) -> SolverMesh:
     """Return `mesh` with the faces and points of `patches`, which have no cell in common."""
-    points, of = mesh.points.copy(), np.full(len(mesh), -1)
+    new = [int((patch.ids < 0).sum()) for patch in patches]
+    points, of, ids = np.pad(mesh.points, ((0, sum(new)), (0, 0))), np.full(len(mesh), -1), []
     for i, patch in enumerate(patches):
-        points[patch.ids] = patch.points
+        ids.append(_numbered(patch.ids, len(mesh.points) + sum(new[:i]))[0])
+        points[ids[-1]] = patch.points
         of[patch.cells] = i
     n = mesh.outer
     here, there = mesh.owner[:n], mesh.neighbor[:n]
@@ -145,11 +170,11 @@ def put_back(mesh: SolverMesh, patches: list[Patch]) -> SolverMesh:
     kept = np.flatnonzero(~within | (of[here] < 0))
     all_corners = mesh.corners.reshape(-1, 2)
     columns = [(all_corners[kept], here[kept], there[kept], mesh.half_face[kept])]
-    for p in patches:
+    for p, numbers in zip(patches, ids, strict=True):
         rows = p.neighbor != BORDER
         other = np.where(p.neighbor >= 0, p.cells[np.maximum(p.neighbor, 0)], p.neighbor)
         columns.append(
-            (p.ids[p.ends[rows]], p.cells[p.owner[rows]], other[rows], p.half_face[rows])
+            (numbers[p.ends[rows]], p.cells[p.owner[rows]], other[rows], p.half_face[rows])
         )
     ends, owner, neighbor, half = (np.concatenate(x) for x in zip(*columns, strict=True))
     wall = neighbor < 0

@@ -5,13 +5,13 @@ import pytest
 import shapely
 
 import clvoro
-from clvoro.finite_volumes import relaxation
-from clvoro.finite_volumes.patch import take_patch
-from clvoro.finite_volumes.patch_descent import Descent
-from clvoro.finite_volumes.reconnection import _Connections
-from clvoro.finite_volumes.relaxation import relax_points
+from clvoro.finite_volumes.repair import relaxation
+from clvoro.finite_volumes.repair.descent import Descent
+from clvoro.finite_volumes.repair.patch import take_patch
+from clvoro.finite_volumes.repair.reconnection import _Connections
+from clvoro.finite_volumes.repair.relaxation import relax_points
 from clvoro.finite_volumes.solver_mesh import SolverMesh
-from tests.finite_volumes.test_patch import with_positions
+from tests.finite_volumes.repair.test_patch import with_positions
 from tests.finite_volumes.test_straight_walls import concave_by, polygons
 
 # A coast with spits, bays and an island, about as fine as the cells.
