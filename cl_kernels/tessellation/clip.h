@@ -35,11 +35,16 @@ inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const
 {
     if (label_p < 0 || label_q < 0)
         return q;
+    /* Most are surely not near each other. Their planes say so without a look at their positions. */
+    const REAL near2 = NEAR_EACH_OTHER * SQUARE_OF(p);
+    const REAL e0 = q.s0 - p.s0, e1 = q.s1 - p.s1, e2 = q.s2 - p.s2;
+    if (e0 * e0 + e1 * e1 + e2 * e2 > 2 * near2)
+        return q;
     const REAL4 w = (REAL4)(points[STRIDE * label_q] - points[STRIDE * label_p],
                             points[STRIDE * label_q + 1] - points[STRIDE * label_p + 1],
                             points[STRIDE * label_q + 2] - points[STRIDE * label_p + 2], 0);
     const REAL w2 = w.s0 * w.s0 + w.s1 * w.s1 + w.s2 * w.s2;
-    if (w2 > NEAR_EACH_OTHER * SQUARE_OF(p))
+    if (w2 > near2)
         return q;
     const REAL level = (w2 - (WEIGHT(points, label_q) - WEIGHT(points, label_p))) / 2;
     return (REAL4)(w.s0, w.s1, w.s2, w.s0 * p.s0 + w.s1 * p.s1 + w.s2 * p.s2 + level);

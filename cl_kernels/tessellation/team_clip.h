@@ -10,6 +10,8 @@
 /* What a team has in local memory. */
 typedef struct {
     cell_t cell;
+    REAL4 ways[TEAM];              /* of the next items: the vectors to them, and their squares */
+    int labels[TEAM];              /* and their generators */
     int places[BATCH];             /* items that may cut the cell */
     uchar sorted[BATCH];           /* their numbers, the nearest first */
     uchar shells[BATCH];           /* of each, its shell */

@@ -41,22 +41,24 @@ inline int team_clip_batch(local shared_t *at, team_t *team, known_t *known, REA
     for (int begin = 0; begin < count; begin += TEAM) {
         const int k = begin + lane;
         const int q = at->places[at->sorted[min(k, count - 1)]];
-        const REAL d2 = vector_to_item(q, x, in).s3;
+        at->ways[lane] = vector_to_item(q, x, in);
+        at->labels[lane] = in->items[q];
+        TEAM_SYNC();
         /* The generators that can still cut; after each cut there are fewer. */
-        uint left = team_ballot(team, k < count && d2 < 4 * known->reach2);
+        uint left = team_ballot(team, k < count && at->ways[lane].s3 < 4 * known->reach2);
         while (left != 0) {
             const int next = 31 - (int)clz(left & -left);
             left &= left - 1;
-            const int item = at->places[at->sorted[begin + next]];
-            const REAL4 d = vector_to_item(item, x, in);
+            const REAL4 d = at->ways[next];
             if (d.s3 == 0)
                 return FLAG_COINCIDE;
-            const int what = team_clip(at, team, known, d, d.s3, in->items[item], warm, in->points);
+            const int what = team_clip(at, team, known, d, d.s3, at->labels[next], warm, in->points);
             if (what >= CLIP_FULL)
                 return flag_of(what);
             if (what == CLIP_CUT)
-                left &= team_ballot(team, d2 < 4 * known->reach2);
+                left &= team_ballot(team, at->ways[lane].s3 < 4 * known->reach2);
         }
+        TEAM_SYNC();
     }
     return 0;
 }
