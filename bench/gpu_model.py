@@ -13,7 +13,7 @@ is full. Kernels above the limits `--registers` and `--private` are in the table
 
 "steps" models the time of a step, and of a new diagram of random points, on an H200 from launches, which are counted on
 this device in the groups that a GPU takes (`--measured-at` cells), and from the instructions and bytes that each kernel
-executes, which Oclgrind has counted (`gpu_counts.json`; `--count` writes it where Oclgrind is installed: see
+executes, which Oclgrind has counted (`gpu_counts.json`; `--count 2,3` writes it where Oclgrind is installed: see
 CONTRIBUTING.md). In 3D teams build and update cells, as on NVIDIA's GPUs. A kernel takes the largest of five times:
 "instructions" and "real" (those in float64) at the device's rates, with the share of lanes that work; "access", its
 reads and writes at a quarter of the coalesced rate; "memory", bytes that miss the caches at 70 % of the bandwidth, or
@@ -112,8 +112,8 @@ ALU_WARPS, MEMORY_WARPS = 16, 32
 """Resident warps from which on arithmetic, and reads of memory, hide their latencies."""
 WORKING, WORKING_IN_CLIPS, WORKING_IN_TEAMS = 0.7, 0.1, 0.33
 """Share of the lanes of a warp that work: in clips loops of neighboring cells differ in length, and in teams members
-wait for others. With these shares the model takes as long as was measured for a diagram of 10^7 random cells in 2D and
-for the clip of 10^6 by teams in 3D."""
+wait for others. With these shares the model took as long as was measured for a diagram of 10^7 random cells in 2D and
+for the clip of 10^6 by teams in 3D, whose kernel has changed since."""
 LANES_PER_CYCLE = 8
 """Accesses of memory per cycle of a multiprocessor: 32 if all were coalesced."""
 CYCLES, CYCLES_OF_ACCESS = 6, 100
