@@ -179,7 +179,7 @@ def test_teams_by_warp_instructions(ctx, dtype, tmp_path):
     """PoCL never builds these programs. Five teams fit in the least local memory of a multiprocessor, 48 kB."""
     room = {"clip_polyhedra_by_teams": 7168, "update_cells_by_teams": 9216}
     for source in gpu_programs.team_programs(ctx, dtype, warps=True):
-        assembly, _ = compile_for("NVIDIA", source, tmp_path)
+        assembly, _ = compile_for("NVIDIA", gpu_programs.static(source), tmp_path)
         assert "redux.sync" in assembly
         assert "barrier" not in assembly
         check_figures("NVIDIA", [source], tmp_path, LIMITS)
