@@ -233,12 +233,15 @@ inline int team_clip(local shared_t *at, team_t *team, known_t *known, REAL4 d, 
         link_vertex(cell, edge.s2, edge.s1, v);
     }
     TEAM_SYNC();
+    /* Compilers write a number of a vector by writing all four: so no two members may write to one at a time. */
+    int next = 0;
     if (lane < edges) {
-        const int next = cell->rim.edges[cell->rim.edge_after[edge.s1]].s3;
-        cell->links[v].s0 = edge.s2;
-        cell->links[v].s1 = next;
-        cell->links[next].s2 = v;
+        next = cell->rim.edges[cell->rim.edge_after[edge.s1]].s3;
+        cell->links[v] = (INDEX4)(edge.s2, next, 0, 0);
     }
+    TEAM_SYNC();
+    if (lane < edges)
+        cell->links[next].s2 = v;
     TEAM_SYNC();
     if (gone > edges) { /* fill the gaps from the end */
         if (lane == 0) {
