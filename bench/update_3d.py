@@ -20,7 +20,6 @@ them; and of the steps with new diagrams. Early and late steps are the first and
 
 from __future__ import annotations
 
-import collections
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -182,7 +181,8 @@ class Shares:
         ) -> Tessellation | None:
             if not self.kind:
                 return update(own, cells, box, points, previous, clip)
-            n, found = previous.n, collections.Counter(kind=self.kind, cells=previous.n)
+            n = previous.n
+            found: dict[str, Any] = {"kind": self.kind, "cells": n} | dict.fromkeys(self.NAMES, 0.0)
             self.steps.append(found)
             # The graph is overwritten by the next one.
             before = replace(
@@ -227,7 +227,11 @@ class Shares:
 
 def shares_of(adapter: clvoro.Adapter, n: int, periodic: bool) -> list[list[str]]:
     """Return the rows of the table of shares: those of a run, on its finest level."""
-    shares, box, step = Shares(), clvoro.Box((0, 0, 0), (1, 1, 1), periodic=periodic), Loop.step
+    shares, box, step = (
+        Shares(),
+        clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(periodic,) * 3),
+        Loop.step,
+    )
     field = test_field("S1")
 
     def stepped(loop: Loop, action: Any) -> None:
