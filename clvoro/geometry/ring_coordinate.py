@@ -17,11 +17,11 @@ class RingCoordinate:
         self.lengths = np.hypot(*self.along.T)
         self.begins = np.concatenate([[0.0], np.cumsum(self.lengths)])
         self.ring_starts = o.ring_starts.astype(np.int64)
+        self.first_positions = self.begins[self.ring_starts[1:-1]]
 
     def _rings(self, s: np.ndarray) -> np.ndarray:
         """Return the ring of each position, (k,) int."""
-        firsts = self.begins[self.ring_starts[1:-1]]
-        return np.searchsorted(firsts, s, side="right")
+        return self.first_positions.searchsorted(s, side="right")
 
     def moved(self, s: np.ndarray, by: np.ndarray) -> np.ndarray:
         """Return where positions `s` (k,) get when they move by lengths `by` (..., k) along their rings."""
@@ -37,8 +37,8 @@ class RingCoordinate:
 
     def edges(self, s: np.ndarray) -> np.ndarray:
         """Return the place of the edge at each position."""
-        found = np.searchsorted(self.begins, s, side="right") - 1
-        return np.clip(found, 0, len(self.lengths) - 1)
+        found = self.begins.searchsorted(s, side="right") - 1
+        return np.minimum(np.maximum(found, 0), len(self.lengths) - 1)
 
     def points(self, s: np.ndarray) -> np.ndarray:
         """Return the points at positions (...,): (..., 2), on curves if the boundary has some."""

@@ -13,7 +13,7 @@ import scipy.sparse
 
 from ...geometry.ring_coordinate import RingCoordinate
 from ...mesh.connectivity import following
-from .figures import LENGTH_GOAL, Cells
+from .figures import LENGTH_GOAL, Cells, Figures
 from .patch import BORDER, Patch, cell_sides
 from .slopes import slopes
 
@@ -211,10 +211,12 @@ class _Motion:
         found = np.zeros((2, 2, len(self.active)))
         found[0, 0] = found[1, 1] = self.scale
         if self.slides.size:
-            aside = moves.copy()
-            aside[self.slides, 0] += _STEP
-            at = self.active[self.slides]
-            found[:, 0, self.slides] = (self.placed(aside) - self.placed(moves))[:, at] / _STEP
+            here = moves[self.slides, 0]
+            far = np.stack([here + _STEP, here]) * self.scale[self.slides]
+            assert self.ring is not None
+            s = self.ring.moved(self.patch.positions[self.active[self.slides]], far)
+            there, here = self.ring.points(s)
+            found[:, 0, self.slides] = (there - here).T / _STEP
             found[:, 1, self.slides] = 0
         return found
 
@@ -223,21 +225,23 @@ def _minimum(cells: Cells, motion: _Motion, steps: int) -> np.ndarray:
     """Return the moves (m, 2) after some steps of Levenberg and Marquardt towards a minimum of the sum of squares."""
     m = len(motion.active)
     moves = np.zeros((m, 2))
-    terms = cells.terms(*motion.placed(moves))
+    at = cells.figures(*motion.placed(moves))
+    terms = cells.terms(at)
     cost, damping, left = float(terms @ terms), _DAMPING, steps
     while left:
-        equations = _Equations(cells, motion, moves, terms)
+        equations = _Equations(cells, motion, moves, at, terms)
         while left:
             left -= 1
             tried = moves - equations.solve(damping)
-            now = cells.terms(*motion.placed(tried))
+            there = cells.figures(*motion.placed(tried))
+            now = cells.terms(there)
             lower = cost - float(now @ now) - _MOVE_WEIGHT**2 * float((tried * tried).sum())
             if lower > 0:
                 break
             damping *= _RISE
         else:
             break
-        moves, terms, cost = tried, now, cost - lower
+        moves, at, terms, cost = tried, there, now, cost - lower
         damping /= _FALL
         if lower < _TOLERANCE * cost:
             break
@@ -247,17 +251,20 @@ def _minimum(cells: Cells, motion: _Motion, steps: int) -> np.ndarray:
 class _Equations:
     """The normal equations for a step from `moves` (m, 2)."""
 
-    def __init__(self, cells: Cells, motion: _Motion, moves: np.ndarray, terms: np.ndarray) -> None:
+    def __init__(
+        self, cells: Cells, motion: _Motion, moves: np.ndarray, at: Figures, terms: np.ndarray
+    ) -> None:
         v, m = len(motion.patch.points), len(motion.active)
         number = np.full(v, -1)
         number[motion.active] = np.arange(m)
-        found = slopes(cells, *motion.placed(moves))
-        used = np.flatnonzero(number[found.points] >= 0)
-        rows, points = found.terms[used], number[found.points[used]]
+        found = slopes(cells, at)
+        points = number[found.points]
+        used = (points >= 0).nonzero()[0]
+        rows, points = found.terms[used], points[used]
         frames = motion.frames(moves)[:, :, points]
         values = (found.x[used] * frames[0] + found.y[used] * frames[1]).ravel()
         columns, k = np.concatenate([2 * points, 2 * points + 1]), 2 * m
-        rows = np.tile(rows, 2)
+        rows = np.concatenate([rows, rows])
         self.gradient = np.bincount(columns, values * terms[rows], k)
         self.gradient += _MOVE_WEIGHT**2 * moves.ravel()
         if k <= _MOST_DENSE:

@@ -45,6 +45,20 @@ class Figures(NamedTuple):
         Of cells.
     turn : (k,) float
         Angles to the left in the corners of cells.
+    x, y : (v,) float
+        Coordinates of the points.
+    px, py, qx, qy : (k,) float
+        Each corner of a cell and the next one, relative to the origin of the cell.
+    twice : (k,) float
+        Twice the areas of the triangles between them and the origin.
+    double : (n,) float
+        Twice the area of each cell; infinite if it is not positive.
+    centers : (2, n) float
+        Centroids relative to the origins.
+    span : (f,) float
+        Lengths of the faces.
+    ux, uy : (k,) float
+        The way from each corner to the next one; 0 on walls.
     """
 
     angle: np.ndarray
@@ -53,6 +67,18 @@ class Figures(NamedTuple):
     area: np.ndarray
     determinant: np.ndarray
     turn: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    px: np.ndarray
+    py: np.ndarray
+    qx: np.ndarray
+    qy: np.ndarray
+    twice: np.ndarray
+    double: np.ndarray
+    centers: np.ndarray
+    span: np.ndarray
+    ux: np.ndarray
+    uy: np.ndarray
 
 
 def face_figures(
@@ -127,7 +153,7 @@ class Cells:
     origin: np.ndarray
 
     def __post_init__(self) -> None:
-        self.after = following(self.starts)
+        self.after, self.counts = following(self.starts), np.diff(self.starts)
         self.before = np.empty_like(self.after)
         self.before[self.after] = np.arange(len(self.after))
         self.origin_of_corner = self.origin[self.row].T
@@ -149,20 +175,22 @@ class Cells:
     def figures(self, x: np.ndarray, y: np.ndarray) -> Figures:
         """Return the figures for points with these coordinates, (v,) each."""
         first, after = self.starts[:-1], self.after
-        px, py = (z[self.loop] - o for z, o in zip((x, y), self.origin_of_corner, strict=True))
+        ox, oy = self.origin_of_corner
+        px, py = x[self.loop] - ox, y[self.loop] - oy
         qx, qy = px[after], py[after]
         twice = px * qy - py * qx
         double = np.add.reduceat(twice, first)
-        safe = 3 * np.where(double > 0, double, np.inf)
-        centers = tuple(
-            o + np.add.reduceat(twice * z, first) / safe
-            for z, o in zip((px + qx, py + qy), self.origin.T, strict=True)
-        )
+        positive = np.where(double > 0, double, np.inf)
+        centers = np.empty((2, len(double)))
+        np.add.reduceat(twice * (px + qx), first, out=centers[0])
+        np.add.reduceat(twice * (py + qy), first, out=centers[1])
+        centers /= 3 * positive
+        cx, cy = centers + self.origin.T
         a, b = self.ends.T
         angle, skewness, length = face_figures(
             (x[a], y[a], x[b], y[b]),
-            tuple(c[self.owner] for c in centers),
-            tuple(c[self.neighbor] for c in centers),
+            (cx[self.owner], cy[self.owner]),
+            (cx[self.neighbor], cy[self.neighbor]),
             self.wall,
         )
         ux, uy = qx - px, qy - py
@@ -173,11 +201,13 @@ class Cells:
         xx, xy, yy = (np.add.reduceat(z, first) for z in (ux * ux, ux * uy, uy * uy))
         mean = np.add.reduceat(np.sqrt(ux * ux + uy * uy), first) / self.sides
         determinant = (xx * yy - xy * xy) / (8 * np.maximum(mean, 1e-75) ** 4)
-        return Figures(angle, skewness, length / self.smaller, double / 2, determinant, turn)
+        return Figures(
+            angle, skewness, length / self.smaller, double / 2, determinant, turn, x, y, px, py, qx, qy,
+            twice, positive, centers, length, ux, uy,
+        )  # fmt: skip
 
-    def terms(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def terms(self, now: Figures) -> np.ndarray:
         """Return the terms of the sum of squares but those of the moves, (3 f + 2 n + k,)."""
-        now = self.figures(x, y)
         terms = (
             np.maximum(now.angle - ANGLE_GOAL, 0),
             SKEW_WEIGHT * np.maximum(now.skewness - SKEWNESS_GOAL, 0),

@@ -37,6 +37,8 @@ _MOST, _SHARE = 50, 0.005
 """If more faces are bad than this number, and than this share, the next limits hold. Then the time for the repair
 remains a small part of that of a run."""
 _LIMITS = (LIMITS, (np.radians(30), 2.5), (np.radians(45), 3.0))
+_MOST_REFUSED = 50
+"""Walls change if at most this many cells are refused after other attempts, or the repair would take long in vain."""
 _NOT_ADAPTED = 0.12
 """Nothing changes if more faces than this share are bad by the first limits: the generators were not adapted."""
 
@@ -73,7 +75,7 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
     around.limits = limits
     on_walls = slice(mesh.inner, mesh.outer)
     walls = Walls(mesh.points[mesh.corners.reshape(-1, 2)[on_walls]], mesh.owner[on_walls], parts)
-    made = []
+    tried: list[tuple[float, Descent]] = []
     # The last bits of sums in BLAS depend on its number of threads.
     with _BLAS, threadpool_limits(1, user_api="blas"):
         for cells in groups:
@@ -82,8 +84,14 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
             patch = _with_positions(patch, ring, kinds)
             given = Descent.of(patch)
             if given is not None and given.bad.any():
-                better = _improved(given, ring, walls if straight else None)
-                made += [better.patch] * (better.price < given.price)
+                tried.append((given.price, _improved(given, ring, straight)))
+        refused = sum(int(better.refused.sum()) for _, better in tried)
+        if straight and refused <= _MOST_REFUSED:
+            tried = [
+                (price, repaired(better, ring, walls) if better.refused.any() else better)
+                for price, better in tried
+            ]
+    made = [better.patch for price, better in tried if better.price < price]
     _report([cut for patch in made for cut in patch.cuts])
     return put_back(mesh, made) if made else mesh
 
@@ -105,17 +113,14 @@ def _report(cuts: list[Cut]) -> None:
     )
 
 
-def _improved(given: Descent, ring: RingCoordinate | None, walls: Walls | None) -> Descent:
-    """Return a patch of lower price, the same if there is none; faces connect other cells if there are `walls`."""
+def _improved(given: Descent, ring: RingCoordinate | None, faces: bool) -> Descent:
+    """Return a patch of lower price, the same if there is none; its `faces` connect other cells only if true."""
     for rings in _TRIES:
         if not given.bad.any():
             return given
         made = given.solve(given.near(given.bad, rings), ring, False, _STEPS)
         given = made if made.price < given.price else given
-    if walls is None:
-        return given
-    given = repaired(given, ring)
-    return repaired(given, ring, walls) if given.refused.any() else given
+    return repaired(given, ring) if faces else given
 
 
 def _limited(mesh: SolverMesh) -> tuple[tuple[float, float], np.ndarray] | None:

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...mesh.connectivity import take_rows
 from .figures import (
     ANGLE_GOAL,
     AREA_WEIGHT,
@@ -18,6 +17,7 @@ from .figures import (
     TURN_GOAL,
     TURN_WEIGHT,
     Cells,
+    Figures,
     face_figures,
 )
 
@@ -41,13 +41,12 @@ class Slopes(NamedTuple):
     y: np.ndarray
 
 
-def slopes(cells: Cells, x: np.ndarray, y: np.ndarray) -> Slopes:
-    """Return the derivatives of ``cells.terms(x, y)`` other than 0."""
-    c, f, n = cells, len(cells.faces), len(cells.area)
-    px, py = (z[c.loop] - o for z, o in zip((x, y), c.origin_of_corner, strict=True))
-    made = _Slopes(c, px, py)
+def slopes(cells: Cells, now: Figures) -> Slopes:
+    """Return the derivatives of ``cells.terms(now)`` other than 0."""
+    f, n = len(cells.faces), len(cells.area)
+    made = _Slopes(cells, now)
     parts = [
-        made.of_faces(x, y),
+        made.of_faces(),
         made.of_areas(3 * f),
         made.of_determinants(3 * f + n),
         made.of_turns(3 * f + 2 * n),
@@ -60,61 +59,50 @@ class _Slopes:
 
     Attributes
     ----------
-    px, py, qx, qy, ox, oy : (k,) float
-        Each corner, the next and the previous one, relative to the origin of the cell.
-    double : (n,) float
-        Twice the area of each cell; infinite if it is not positive.
-    centers : (2, n) float
-        Centroids relative to the origins.
+    now : Figures
+    ox, oy : (k,) float
+        The previous corner of each one, relative to the origin of the cell.
     """
 
-    def __init__(self, cells: Cells, px: np.ndarray, py: np.ndarray) -> None:
-        self.cells, self.px, self.py = cells, px, py
-        self.qx, self.qy = px[cells.after], py[cells.after]
-        self.ox, self.oy = px[cells.before], py[cells.before]
-        self.twice = px * self.qy - py * self.qx
-        first = cells.starts[:-1]
-        double = np.add.reduceat(self.twice, first)
-        self.double = np.where(double > 0, double, np.inf)
-        sums = [np.add.reduceat(self.twice * z, first) for z in (px + self.qx, py + self.qy)]
-        self.centers = np.stack(sums) / (3 * self.double)
+    def __init__(self, cells: Cells, now: Figures) -> None:
+        self.cells, self.now = cells, now
+        self.ox, self.oy = now.px[cells.before], now.py[cells.before]
 
     def of_areas(self, term: int) -> Slopes:
         """Return the derivatives of the terms for areas; `term` is the number of the first one."""
         c = self.cells
         weight = AREA_WEIGHT / 2 / c.area[c.row]
         return Slopes(
-            term + c.row, c.loop, weight * (self.qy - self.oy), weight * (self.ox - self.qx)
+            term + c.row, c.loop, weight * (self.now.qy - self.oy), weight * (self.ox - self.now.qx)
         )
 
-    def of_faces(self, x: np.ndarray, y: np.ndarray) -> Slopes:
+    def of_faces(self) -> Slopes:
         """Return the derivatives of the terms of faces."""
-        c, f = self.cells, len(self.cells.faces)
-        centers = self.centers + c.origin.T
-        a, b = c.ends.T
-        at = np.stack([
-            x[a], y[a], x[b], y[b], *centers[:, c.owner], *centers[:, c.neighbor],
-        ])  # fmt: skip
-        now = face_figures(tuple(at[:4]), tuple(at[4:6]), tuple(at[6:]), c.wall)
-        beyond = np.stack([now[0] > ANGLE_GOAL, now[1] > SKEWNESS_GOAL, now[2] / c.smaller < c.aim])
-        rows = np.flatnonzero(beyond.any(axis=0))
+        c, f, now = self.cells, len(self.cells.faces), self.now
+        beyond = np.stack(
+            [now.angle > ANGLE_GOAL, now.skewness > SKEWNESS_GOAL, now.length < c.aim]
+        )
+        rows = beyond.any(axis=0).nonzero()[0]
+        (a, b), owner, neighbor = c.ends[rows].T, c.owner[rows], c.neighbor[rows]
+        centers = now.centers + c.origin.T
+        at = np.empty((8, len(rows)))
+        at[0], at[1], at[2], at[3] = now.x[a], now.y[a], now.x[b], now.y[b]
+        at[4:6], at[6:] = centers[:, owner], centers[:, neighbor]
         # Differences by the eight coordinates on which the figures of a face depend.
         step = _STEP * c.smaller[rows]
-        aside = at[:, None, rows] + np.eye(8)[:, :, None] * step
+        aside = at[:, None] + np.eye(8)[:, :, None] * step
         moved = face_figures(tuple(aside[:4]), tuple(aside[4:6]), tuple(aside[6:]), c.wall[rows])
         parts, terms, cells, by = [], [], [], []
         sign = (1.0, SKEW_WEIGHT, -LENGTH_WEIGHT / c.smaller[rows])
-        for kind in range(3):
-            slope = sign[kind] * (moved[kind] - now[kind][rows]) / step
-            used = np.flatnonzero(beyond[kind, rows])
-            slope, faces = slope[:, used], rows[used]
-            for end in range(2):
-                parts.append(
-                    Slopes(kind * f + faces, c.ends[faces, end], *slope[2 * end : 2 * end + 2])
-                )
+        for kind, figure in enumerate((now.angle, now.skewness, now.span)):
+            used = beyond[kind, rows].nonzero()[0]
+            term = kind * f + rows[used]
+            slope = (sign[kind] * (moved[kind] - figure[rows]) / step)[:, used]
+            parts.append(Slopes(term, a[used], slope[0], slope[1]))
+            parts.append(Slopes(term, b[used], slope[2], slope[3]))
             if kind < 2:
-                terms += [kind * f + faces] * 2
-                cells += [c.owner[faces], c.neighbor[faces]]
+                terms += [term, term]
+                cells += [owner[used], neighbor[used]]
                 by += [slope[4:6], slope[6:8]]
         by_centroids = np.concatenate(by, axis=1)
         parts.append(
@@ -127,15 +115,17 @@ class _Slopes:
     ) -> Slopes:
         """Return the derivatives of terms whose derivatives by the centroids of `cells` are known, (m,) each."""
         c = self.cells
-        starts, at = take_rows(c.starts, np.arange(len(c.loop)), cells)
-        which = np.repeat(np.arange(len(cells)), np.diff(starts))
-        px, py, qx, qy, ox, oy = (
-            z[at] for z in (self.px, self.py, self.qx, self.qy, self.ox, self.oy)
-        )
-        both = self.twice[at] + self.twice[c.before[at]]
+        now, counts = self.now, c.counts[cells]
+        which = np.repeat(np.arange(len(cells)), counts)
+        begin = c.starts[cells] - np.cumsum(counts) + counts
+        at = begin[which] + np.arange(len(which))
+        px, py, qx, qy = now.px[at], now.py[at], now.qx[at], now.qy[at]
+        ox, oy = self.ox[at], self.oy[at]
+        both = now.twice[at] + now.twice[c.before[at]]
         next_x, next_y, last_x, last_y = px + qx, py + qy, ox + px, oy + py
         area_x, area_y = qy - oy, ox - qx
-        (center_x, center_y), double = self.centers[:, c.row[at]], self.double[c.row[at]]
+        cell = cells[which]
+        (center_x, center_y), double = now.centers[:, cell], now.double[cell]
         xx = qy * next_x - oy * last_x + both - 3 * center_x * area_x
         xy = ox * last_x - qx * next_x - 3 * center_x * area_y
         yx = qy * next_y - oy * last_y - 3 * center_y * area_x
@@ -145,14 +135,16 @@ class _Slopes:
 
     def of_determinants(self, term: int) -> Slopes:
         """Return the derivatives of the terms for determinants; `term` is the number of the first one."""
-        c, first = self.cells, self.cells.starts[:-1]
-        ux, uy = (self.qx - self.px) * c.between, (self.qy - self.py) * c.between
+        c, first, now = self.cells, self.cells.starts[:-1], self.now
+        determinant, ux, uy = now.determinant, now.ux, now.uy
+        low = (determinant < DETERMINANT_GOAL) & (determinant > 0)
+        if not low.any():
+            none = np.zeros(0, np.int64)
+            return Slopes(none, none, np.zeros(0), np.zeros(0))
         xx, xy, yy = (np.add.reduceat(z, first) for z in (ux * ux, ux * uy, uy * uy))
         length = np.sqrt(ux * ux + uy * uy)
         mean = np.maximum(np.add.reduceat(length, first) / c.sides, 1e-75)
-        determinant = (xx * yy - xy * xy) / (8 * mean**4)
-        low = (determinant < DETERMINANT_GOAL) & (determinant > 0)
-        at = np.flatnonzero(low[c.row])
+        at = low[c.row].nonzero()[0]
         row, ux, uy = c.row[at], ux[at], uy[at]
         mean, determinant = mean[row], determinant[row]
         scale = 4 * determinant / (mean * c.sides[row] * np.maximum(length[at], 1e-300))
@@ -166,12 +158,12 @@ class _Slopes:
     def of_turns(self, term: int) -> Slopes:
         """Return the derivatives of the terms for turns in corners; `term` is the number of the first one."""
         c = self.cells
-        ux, uy, vx, vy = self.px - self.ox, self.py - self.oy, self.qx - self.px, self.qy - self.py
-        turn = np.arctan2(ux * vy - uy * vx, ux * vx + uy * vy)
-        at = np.flatnonzero((turn < TURN_GOAL) & ~c.bound)
+        now = self.now
+        at = ((now.turn < TURN_GOAL) & ~c.bound).nonzero()[0]
+        px, py = now.px[at], now.py[at]
         u, v = (
-            np.stack([-p[at], q[at]]) / np.maximum(p[at] ** 2 + q[at] ** 2, 1e-300)
-            for p, q in ((uy, ux), (vy, vx))
+            np.stack([-p, q]) / np.maximum(p**2 + q**2, 1e-300)
+            for p, q in ((py - self.oy[at], px - self.ox[at]), (now.qy[at] - py, now.qx[at] - px))
         )
         points = np.concatenate([c.loop[c.after[at]], c.loop[c.before[at]], c.loop[at]])
         slope = -TURN_WEIGHT * np.concatenate([v, u, -u - v], axis=1)

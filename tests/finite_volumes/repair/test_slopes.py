@@ -29,11 +29,11 @@ def patch(ctx):
 
 def test_slopes_are_differences(patch):
     cells, x, y = patch
-    terms = cells.terms(x, y)
+    terms = cells.terms(cells.figures(x, y))
     f, n = len(cells.faces), len(cells.area)
     starts = [0, f, 2 * f, 3 * f, 3 * f + n, 3 * f + 2 * n, len(terms)]
     found, known = np.zeros((2, 2, len(terms), len(x)))
-    made = slopes(cells, x, y)
+    made = slopes(cells, cells.figures(x, y))
     for axis, part in enumerate((made.x, made.y)):
         np.add.at(found[axis], (made.terms, made.points), part)
     step = 1e-6
@@ -41,9 +41,9 @@ def test_slopes_are_differences(patch):
         for p in range(len(x)):
             aside = np.array([x, y])
             aside[axis, p] += step
-            ahead = cells.terms(*aside)
+            ahead = cells.terms(cells.figures(*aside))
             aside[axis, p] -= 2 * step
-            known[axis, :, p] = (ahead - cells.terms(*aside)) / (2 * step)
+            known[axis, :, p] = (ahead - cells.terms(cells.figures(*aside))) / (2 * step)
     for first, last in pairwise(starts):
         part, exact = found[:, first:last], known[:, first:last]
         scale = np.abs(exact).max()
