@@ -82,7 +82,7 @@ class _Slopes:
         beyond = np.stack(
             [now.angle > ANGLE_GOAL, now.skewness > SKEWNESS_GOAL, now.length < c.aim]
         )
-        rows = beyond.any(axis=0).nonzero()[0]
+        rows = np.flatnonzero(beyond.any(axis=0))
         (a, b), owner, neighbor = c.ends[rows].T, c.owner[rows], c.neighbor[rows]
         centers = now.centers + c.origin.T
         at = np.empty((8, len(rows)))

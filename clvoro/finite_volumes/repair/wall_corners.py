@@ -217,7 +217,9 @@ class WallCorners:
         size = float(self.sizes[p.owner[faces[0]]])
         if far > _FARTHEST * size or self._obstructed((a, point, b), x):
             return
-        yield replace(_without(p, point), cuts=(*p.cuts, Cut(*p.points[point].tolist(), far, size)))
+        yield replace(
+            _without(p, point), cuts=(*p.cuts, Cut(float(x[1, 0]), float(x[1, 1]), far, size))
+        )
 
     def _obstructed(self, corners: tuple[int, int, int], x: np.ndarray) -> bool:
         """Return whether another wall meets the triangle `x` (3, 2) of the points `corners`."""
