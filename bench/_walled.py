@@ -194,6 +194,13 @@ def city() -> Setup:
     return Setup(clvoro.Polygon(_rectangle(0, 0, 1.4, 1.4), houses), 0.025, {})
 
 
+def ponds() -> Setup:
+    """Return a lake and four ponds beside it, of 1111 and 44 cells each."""
+    corners = [(0.0, 0.0, 1.0), *((1.2, 0.25 * k, 0.2) for k in range(4))]
+    pieces = [[_rectangle(x, y, x + a, y + a)] for x, y, a in corners]
+    return Setup(clvoro.Polygon.from_pieces(pieces), 0.03, {})
+
+
 def box() -> Setup:
     """Return a plain box in 2D."""
     return Setup(clvoro.Box((0, 0), (2.5, 1.5)), test_field("F1"), {})
@@ -223,6 +230,6 @@ WALLED: dict[str, Callable[[], Setup]] = {
     "channel, layers": lambda: channel(layers=True), "wing": wing, "wing, layers": lambda: wing(1e-4),
     "three wings": three_wings, "three wings, layers": lambda: three_wings(1e-4),
     "L": l_shape, "T": t_shape, "comb": comb, "gear": gear, "slit": slit, "needle": needle,
-    "step": step, "city": city, "periodic channel": periodic_channel,
+    "step": step, "city": city, "ponds": ponds, "periodic channel": periodic_channel,
     "periodic channel 3D": periodic_channel_3d, "S1": sphere("S1"), "S2": sphere("S2"), "S3": sphere("S3"),
 }  # fmt: skip

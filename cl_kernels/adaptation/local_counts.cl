@@ -11,18 +11,22 @@
    correct the number of all generators. */
 #include "adaptation/site_key.h"
 
-/* Sites: inner cells with |phi + offset| above `least`, which are not `blocked`. The largest comes first; for insertion
-   large cells of many faces are preferred, for deletion small ones of few faces. */
+/* |phi| that a site at a wall has to have beyond that of an inner one: in passages one or two cells wide there are no
+   others. */
+#define WALL_COST R(1)
+
+/* Sites: cells with |phi + offset| above `least`, which are not `blocked`. The largest comes first; inner cells are
+   preferred, for insertion large ones of many faces, for deletion small ones of few faces. */
 kernel void score_potential(const int size, global const int *starts, global const int *neighbors,
                             global const REAL *log_ratio, global const REAL *potential, const REAL offset,
                             const REAL least, global const ulong *blocked, global ulong *keys)
 {
     WORK_ITEM(i);
     const REAL phi = potential[i] + offset, sign = phi > 0 ? 1 : -1;
-    bool site = fabs(phi) > least && blocked[i] == 0;
-    for (int k = starts[i]; k < starts[i + 1] && site; ++k)
-        site = neighbors[k] >= 0;
-    const REAL magnitude = fabs(phi) + sign * need_of_split(log_ratio[i], starts[i + 1] - starts[i]);
+    bool site = fabs(phi) > least && blocked[i] == 0, inner = true;
+    for (int k = starts[i]; k < starts[i + 1] && inner; ++k)
+        inner = neighbors[k] >= 0;
+    const REAL magnitude = fabs(phi) + sign * need_of_split(log_ratio[i], starts[i + 1] - starts[i]) - (inner ? 0 : WALL_COST);
     keys[i] = site && magnitude > 0 ? site_key(magnitude, i) : 0;
 }
 

@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from ..tessellation.device_diagram import Tessellation
 
 
+def has_pieces(domain: Domain) -> bool:
+    """Return whether a domain has several pieces."""
+    return isinstance(domain, Polygon) and domain.n_pieces > 1
+
+
 def balance_components(
     domain: Domain, t: Tessellation, source: cla.Array, weights: cla.Array
 ) -> None:
@@ -29,7 +34,7 @@ def balance_components(
         Right side, changed in place. It may be longer than n.
     weights : (n,) real, device
     """
-    if not isinstance(domain, Polygon) or domain.n_pieces == 1:
+    if not has_pieces(domain):
         return
     component = connected_components(t)
     values, weight = source[: t.n].get(), weights[: t.n].get().astype(float)
@@ -46,7 +51,7 @@ def fit_components(domain: Domain, t: Tessellation, prescribed: cla.Array) -> bo
 
     Return False, and do nothing, if the domain has one piece.
     """
-    if not isinstance(domain, Polygon) or domain.n_pieces == 1:
+    if not has_pieces(domain):
         return False
     component = connected_components(t)
     volumes, wanted = t.volumes.get().astype(float), prescribed.get().astype(float)

@@ -6,7 +6,7 @@ import pytest
 
 import clvoro
 from clvoro.adaptation import local_counts
-from clvoro.adaptation.plan.actions import BalanceCounts, Refine
+from clvoro.adaptation.plan.actions import BalanceCounts, Refine, RepairCells
 from clvoro.adaptation.plan.schedule import adaptive_schedule
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
@@ -119,13 +119,40 @@ def test_balanced_rooms_do_not_change(ctx):
     assert np.array_equal(mesh.points.get(), before)
 
 
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_each_piece_gets_its_cells(ctx, real):
+    """Two pieces have too many and too few cells, 199 of 200; no displacement could even this out."""
+    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
+    domain = clvoro.Polygon.from_pieces([[square], [square + np.array(RIGHT)]])
+    rng = np.random.default_rng(43)
+    points = np.concatenate([grid(LEFT, 1, (10, 9), rng), grid(RIGHT, 1, (11, 10), rng)[1:]])
+    mesh = make_mesh(ctx, domain, points, real=real)
+    # There is room for about five changes at once.
+    mesh.balance_counts()
+    mesh.balance_counts()
+    origin, scale = mesh.domain.frame
+    x = mesh.to_host(mesh.points, scale)[:, 0] + origin[0]
+    assert [(x < 1).sum(), (x > 1.4).sum()] == pytest.approx([100, 100], abs=1)
+
+
+def test_cells_at_walls_are_split(ctx):
+    """A passage one cell wide has no other sites: 30 cells fit, and 20 are there, all in its right half."""
+    passage = clvoro.Polygon([(0, 0), (3, 0), (3, 0.1), (0, 0.1)])
+    points = np.column_stack([1.5 + 0.075 * (np.arange(20) + 0.5), np.full(20, 0.05)])
+    mesh = make_mesh(ctx, passage, points)
+    inserted, _ = mesh.balance_counts()
+    assert inserted >= 2
+
+
 @pytest.mark.parametrize("levels", [0, 2])
 def test_only_narrow_parts_in_the_plane_are_balanced(levels):
-    """Before each refinement, which multiplies what a part lacks, and before polishing."""
-    for dim, narrow, expected in ((2, True, 1 + levels), (2, False, 0), (3, True, 0)):
+    """Before each refinement, which multiplies what a part lacks, before polishing, and after each repair."""
+    for dim, narrow, expected in ((2, True, 4 + levels), (2, False, 0), (3, True, 0)):
         schedule = adaptive_schedule(dim, "default", levels, True, narrow_parts=narrow)
         at = [k for k, action in enumerate(schedule) if action == BalanceCounts()]
         assert len(at) == expected
         assert [schedule[k + 1] for k in at[:levels]] == [Refine()] * len(at[:levels])
+        repairs = [isinstance(schedule[k - 1], RepairCells) for k in at[levels:]]
+        assert repairs == [False, True, True, True][: len(repairs)]
         near = adaptive_schedule(dim, "default", 0, True, near=True, narrow_parts=narrow)
         assert near.count(BalanceCounts()) == min(expected, 1)

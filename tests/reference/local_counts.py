@@ -44,22 +44,24 @@ def changes(cells: Cells, held: np.ndarray) -> np.ndarray:
     """Return where to insert (1) and where to delete (-1), (n,) int; not at or beside generators that are `held`."""
     n, rings = len(cells.weight), cells.rings
     found, blocked = np.zeros(n, int), np.zeros(n, bool)
-    closed = cells.walled | ((rings <= 1) & held).any(axis=1)
+    closed = ((rings <= 1) & held).any(axis=1)
     phi = cells.potential(cells.weight - 1)
     need = np.log(cells.weight) + 0.2 * (cells.faces - 6)
     while True:
-        missing = (cells.weight - 1 - found).sum()
-        offset = np.clip(
-            stage.OFFSET_PER_CELL * missing, -stage.LARGEST_OFFSET, stage.LARGEST_OFFSET
-        )
+        offset = np.zeros(n)
+        for i, piece in enumerate(np.isfinite(rings)):
+            lacking = (cells.weight - 1 - found)[piece].sum()
+            each = 0.25 if piece.all() else min(max(900 / piece.sum(), 0.25), 2)
+            offset[i] = min(max(each * lacking, -3), 3) - phi[piece].mean()
         sign = np.where(phi + offset > 0, 1, -1)
-        magnitude = np.abs(phi + offset) + sign * need
+        magnitude = np.abs(phi + offset) + sign * need - cells.walled
         near = ((rings <= stage.BLOCKED_RINGS) & blocked).any(axis=1)
         magnitude[closed | near | (np.abs(phi + offset) <= stage.LEAST_GAIN)] = 0
         within = np.where(rings <= stage.SITE_RINGS, magnitude, 0).max(axis=1)
         sites = (magnitude > 0) & (magnitude == within)
         after = cells.potential(cells.weight - 1 - found - np.where(sites, sign, 0))
-        gain = sign * ((phi + after) / 2 + offset)
+        shift = [phi[piece].mean() - after[piece].mean() for piece in np.isfinite(rings)]
+        gain = sign * ((phi + after + shift) / 2 + offset)
         accepted = sites & (gain >= stage.LEAST_GAIN)
         if not accepted.any():
             return found
