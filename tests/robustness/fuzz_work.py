@@ -124,6 +124,8 @@ def try_layers(rng: np.random.Generator) -> str:
     options["effort"] = "fast"
     if not wild:
         options.pop("n_cells", None)  # may be fewer than the rows
+        if options.get("method") in ("mmpde", "monge-ampere"):
+            del options["method"]  # starts from a lattice, without layers
     result = adapter(real).run(domain, some_size(rng, domain, wild), layers=layers, **options)
     rows, free = place_layers(domain, layers), free_domain(domain, layers)
     # Coordinates of the device are relative to the frame, those of the host to 0.
