@@ -72,7 +72,7 @@ def simplify(
 
 def pieces_of(domain: Polygon) -> list[tuple[list[np.ndarray], dict[str, list[int]]]]:
     """Return the rings of each piece, and the names of its edges but for those of rings without a name."""
-    found = []
+    found, rings = [], domain.rings
     for piece in range(domain.n_pieces):
         rows = np.flatnonzero(domain.piece_of_ring == piece)
         edges = slice(domain.ring_starts[rows[0]], domain.ring_starts[rows[-1] + 1])
@@ -81,7 +81,7 @@ def pieces_of(domain: Polygon) -> list[tuple[list[np.ndarray], dict[str, list[in
             name = domain.boundaries.names[part]
             if DEFAULT_NAME.fullmatch(name) is None:
                 names[name] = np.flatnonzero(index == part).tolist()
-        found.append(([domain.rings[row] for row in rows], names))
+        found.append(([rings[row] for row in rows], names))
     return found
 
 
