@@ -60,7 +60,8 @@ plain = engines.Engine.kernels, kernel_objects.set_changed, cl.enqueue_nd_range_
 def kernels(engine, stage, defines=None, prelude=""):
     taken = plain[0](engine, stage, defines, prelude)
     kinds.append(prebuild.kind_of(engine))
-    made[id(taken)] = taken, (stage, {{k: str(v) for k, v in (defines or {{}}).items()}}), prelude
+    single = {{"REAL": "float"}} if engine.real == np.float32 else {{}}
+    made[id(taken)] = taken, (stage, single | {{k: str(v) for k, v in (defines or {{}}).items()}}), prelude
     return taken
 def getattribute(taken, name):
     kernel = old(taken, name)

@@ -82,7 +82,7 @@ def test_repaired_meshes_are_accepted_and_whole(ctx, seed):
 @pytest.mark.slow
 def test_points_alone_do_not_suffice(ctx, monkeypatch):
     """Without other connections some of these meshes remain beyond the limits."""
-    monkeypatch.setattr(relaxation, "repaired", lambda given, ring: given)
+    monkeypatch.setattr(relaxation, "repaired", lambda given, *_: given)
     measures = [coast(ctx, seed).solver_mesh().measures for seed in (0, 2)]
     assert any(
         m.concave.any() or m.non_orthogonality.max() > 20 or m.skewness.max() > 2 for m in measures
