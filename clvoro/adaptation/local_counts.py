@@ -28,31 +28,32 @@ LEAST_GAIN = 2.0
 river of `bench/solver_ready.py`, exact, have no squeezed cells at walls (by a prototype in NumPy, two starts each). In
 most open domains there is no site where 2 is to be gained."""
 SITE_RINGS, BLOCKED_RINGS = 12, 3
-"""Rings of cells between sites of one round, and of different rounds. With 6 or 8 rings there are up to 1.2 times as
-many changes, some of which undo others. Where a part lacks more cells than there is room for, the next balance adds
-them, when cells have moved."""
+"""Least number of rings of cells between two sites of the same round, and of different rounds. With 6 or 8 rings there
+are up to 1.2 times as many changes, some of which undo others. Where a part lacks more cells than there is room for,
+the next balance adds them, when cells have moved."""
 LEAST_CHANGES = 1e-4
 """Share of the cells that a round has to insert or delete, if there is to be another one. With at most 30 rounds, 239,
 533 and 529 cells at walls of Lake Huron, Chesapeake Bay and Stockholm in `bench/coasts.py`, exact, have Q below 0.75,
 now 7, 64 and 165. Rounds until no site gains enough take 1.5 times as long in Chesapeake Bay, for as many cells."""
 LEAST_OFFSET, PIECE, LARGEST_OFFSET = 0.25, 900.0, 3.0
-"""Added to the potential for each cell that a piece of the domain lacks: `PIECE` over its number of cells, at least the
-first number and at most `LEAST_GAIN`, and only the first number in domains of one piece; and the largest sum. It favors
-insertions. In a piece of few cells each cell that is missing is inserted; elsewhere eight may be missing."""
+"""The offset of the potential for each cell that a piece of the domain lacks is `PIECE` over the number of its cells,
+at least `LEAST_OFFSET` and at most `LEAST_GAIN`. In domains of one piece it is `LEAST_OFFSET`. The whole offset is at
+most `LARGEST_OFFSET`. It favors insertions: in a piece of few cells each missing cell is inserted; elsewhere eight may
+be missing."""
 TOLERANCE = 3e-2
 """Relative residual of the potential. Solves take 0.7 times the time of 1e-2, for as many squeezed cells."""
 
 
 def offset_of(missing: np.ndarray | float, cells: np.ndarray | float) -> np.ndarray:
-    """Return the offset of the potential in pieces of `cells` cells that lack `missing` more: arrays or numbers."""
+    """Return the offset of the potential in a piece that has `cells` cells and lacks `missing` more."""
     each = np.clip(PIECE / cells, LEAST_OFFSET, LEAST_GAIN)
     return np.clip(each * missing, -LARGEST_OFFSET, LARGEST_OFFSET)
 
 
 class Pieces:
-    """The pieces of a domain: each has a potential of its own, of which the constant is free, and lacks cells or not.
+    """The pieces of a domain, and how many cells each of them requires.
 
-    The work is done on the host.
+    The potential of each piece has a free constant, which is set here. The work is done on the host.
     """
 
     def __init__(self, mesh: MeshState, w: CellWeights) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
@@ -227,15 +226,8 @@ def _draw(
         ax.add_collection(drawn, autolim=False)
     else:
         drawn = pixels.add_image(
-            ax,
-            diagram,
-            view.lower,
-            view.upper,
-            values,
-            scheme,
-            ends,
-            partial(_locate, diagram, view),
-        )
+            ax, diagram, view.lower, view.upper, values, scheme, ends, view.directions
+        )  # fmt: skip
         wide = np.maximum.reduceat(widths > 0, diagram.neighbor_starts[:-1])
         polygons = view.polygons(diagram, cells[wide[cells]] if edges else cells[:0])
     if edges:
@@ -244,14 +236,6 @@ def _draw(
         for artist in (*ax.collections, *ax.images):
             artist.set_clip_path(Circle((0, 0), 1, transform=ax.transData))
     return drawn
-
-
-def _locate(diagram: Diagram, view: Orthographic | Plate, places: np.ndarray) -> np.ndarray:
-    """Return the cells at positions (k, 2) in the picture; -1 beside the globe."""
-    inside, directions = view.directions(places)
-    cells = np.full(len(places), -1)
-    cells[inside] = diagram.locate(directions)
-    return cells
 
 
 def _has_tiny(ax: Any, diagram: Diagram, view: Orthographic | Plate, cells: np.ndarray) -> bool:

@@ -19,20 +19,21 @@ PER_INCH = 200
 _RIM = 3
 """Pixels outside of the domain, that far from it, have the color of the nearest pixel inside."""
 
-Locate = Callable[[np.ndarray], np.ndarray]
+Positions = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
-_last: WeakKeyDictionary[Diagram, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
-"""Pixels of the last image of a diagram, and their cells: a report shows the same part in several colors."""
+_last: WeakKeyDictionary[Diagram, tuple[np.ndarray, ...]] = WeakKeyDictionary()
+"""Of the last image of each diagram: which pixels show the mesh, their positions, and their cells. A report shows the
+same part in several colors, and finds the cells once."""
 
 
 def add_image(
     ax: Any, diagram: Diagram, lower: np.ndarray, upper: np.ndarray, values: np.ndarray,
-    scheme: Coloring, limits: tuple[float, float], locate: Locate | None = None,
+    scheme: Coloring, limits: tuple[float, float], positions: Positions | None = None,
 ) -> Any:  # fmt: skip
-    """Add an image of the rectangle from `lower` to `upper`, and return it.
+    """Add an image of the mesh in the rectangle from `lower` to `upper` of the picture, and return it.
 
-    `values` (n,) are those of the cells. `locate` returns the cells at positions (k, 2) in the picture, -1 where there
-    is none; by default ``diagram.locate``.
+    `values` (n,) are those of the cells. `positions` returns for places (k, 2) in the picture which of them show the
+    mesh, (k,) bool, and where those are in the domain, (j, d). By default a place is its own position.
     """
     extent = np.subtract(upper, lower)
     box = ax.get_position()
@@ -40,12 +41,14 @@ def add_image(
     counts = np.maximum(np.ceil(PER_INCH * min(inches / extent) * extent), 2).astype(int)
     x, y = (lower[a] + extent[a] * (np.arange(counts[a]) + 0.5) / counts[a] for a in (0, 1))
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    inside, at = (np.ones(len(places), bool), places) if positions is None else positions(places)
     known = _last.get(diagram)
-    if known is None or not np.array_equal(known[0], places):
-        cells = (locate or diagram.locate)(places).reshape(len(y), len(x))
-        known = _last[diagram] = places, _with_rim(cells)
+    if known is None or not all(map(np.array_equal, known, (inside, at))):
+        cells = np.full(len(places), -1)
+        cells[inside] = diagram.locate(at)
+        known = _last[diagram] = inside, at, _with_rim(cells.reshape(len(y), len(x)))
     # -1 leads to the last place.
-    shown = np.append(without_ends(values), np.nan)[known[1]]
+    shown = np.append(without_ends(values), np.nan)[known[2]]
     return ax.imshow(
         np.ma.masked_invalid(shown),
         extent=(lower[0], upper[0], lower[1], upper[1]),
@@ -58,7 +61,7 @@ def add_image(
 
 
 def _with_rim(cells: np.ndarray) -> np.ndarray:
-    """Return an array of cells in which pixels of -1 that are near others have the nearest cell."""
+    """Return the cells of pixels, -1 where there is none, with the nearest cell at pixels just outside of the mesh."""
     outside = cells < 0
     if not outside.any() or outside.all():
         return cells

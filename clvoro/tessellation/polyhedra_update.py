@@ -172,7 +172,7 @@ class _Rounds:
         )  # fmt: skip
 
     def update(self, size: int, which: int) -> None:
-        """Update all cells, or those listed if they are not more than `size`, and check them."""
+        """Update and check all cells, or the listed ones. If more than `size` are listed, do nothing."""
         engine = self._engine
         args = (
             np.int32(which), self._listed, self._further, *self._fixed, self._more, self._marks, *engine.period_args,

@@ -277,6 +277,9 @@ def test_pixels_show_the_cells_they_are_in(mesh, monkeypatch):
     around = mesh.diagram.locate(SPHERE.positions([(-45, 40)]))[0]
     near = np.linalg.norm(mesh.points - mesh.points[around], axis=1) < 0.4
     assert near[int(shown[tuple(middle)])]
+    # From another side, the same pixels show other cells.
+    (image,) = mesh.plot(own, center=(135, -40)).axes[0].images
+    assert not near[int(image.get_array()[tuple(middle)])]
 
 
 def test_center(mesh, adapter):

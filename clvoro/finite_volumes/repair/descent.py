@@ -24,6 +24,7 @@ _SHORT = 0.05
 LEAST_DETERMINANT = 3e-3
 """A cell with a smaller determinant raises the price of the patch. OpenFOAM refuses cells below 1e-3."""
 _REFUSED_DETERMINANT = 1.1e-3
+"""A cell with a smaller determinant counts as refused."""
 _MOST_EXCESS = 4
 """Faces that exceed a limit by more than this times it have the same price."""
 _INVERTED_PRICE, _CONCAVE_PRICE, _CUT_PRICE = 100.0, 3.0, 0.5
@@ -104,7 +105,7 @@ class Descent:
 
     @property
     def price(self) -> float:
-        """Sum of the prices of all cells, and of corners of walls that have been cut off."""
+        """Sum of the prices of all cells and of all corners that have been cut off."""
         cuts = sum(_CUT_PRICE * (cut.far / cut.size) ** 2 for cut in self.patch.cuts)
         return float(self.prices.sum()) + cuts
 

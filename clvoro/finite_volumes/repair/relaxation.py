@@ -97,7 +97,7 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
 
 
 def _report(cuts: list[Cut]) -> None:
-    """Warn of corners of walls that were cut off, if one of them is far from its chord."""
+    """Warn if a corner of a wall that was cut off is far from the new wall face."""
     far = max(cuts, key=lambda cut: cut.far / cut.size, default=None)
     if far is None or far.far <= FILLED * far.size:
         return

@@ -72,7 +72,7 @@ class Walls:
 
 
 class WallCorners:
-    """Changes of a patch at its walls where a cell is concave, or has no two neighbors.
+    """Changes of a patch at its walls, for cells that are concave or have fewer than two neighbors.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class WallCorners:
         return int(p.neighbor[face] if p.owner[face] == cell else p.owner[face])
 
     def _entered(self, point: int, face: int) -> Iterator[Patch]:
-        """Yield the patch in which the next face end along the wall, beyond `face`, is in a corner."""
+        """Yield the patch after the nearest face end along the wall, on the side of `face`, has moved into a corner."""
         p = self.patch
         cell, taken, end = int(p.owner[face]), [face], int(p.ends[face].sum()) - point
         while self._bound(p, end) and len(taken) < _STEPS:
@@ -135,7 +135,7 @@ class WallCorners:
         yield self._smooth(made, [end])
 
     def _with_walls(self, faces: list[int], cell: int) -> Patch:
-        """Return the patch in which a cell has other wall faces, too."""
+        """Return a copy of the patch in which the wall faces `faces` belong to `cell`."""
         p = self.patch
         made = replace(
             p,
@@ -236,7 +236,7 @@ class WallCorners:
 
 
 def _without(patch: Patch, point: int) -> Patch:
-    """Return a patch with one wall face in place of the two at a point."""
+    """Return the patch without a point of the wall: its two wall faces become one."""
     p = patch
     first, last = np.flatnonzero((p.ends == point).any(axis=1)).tolist()
     if p.ends[first, 1] != point:
