@@ -120,8 +120,14 @@ def polygon_sides(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     begin, end = np.concatenate([a, b[:k]]), np.concatenate([b, a[:k]])
     base = np.zeros(len(mesh), np.int64)
     base[cell] = begin
-    origins = mesh.points[base]
-    return cell, mesh.points[begin] - origins[cell], mesh.points[end] - origins[cell], origins
+    origins = mesh.points.take(base, axis=0)
+    near = origins.take(cell, axis=0)
+    return (
+        cell,
+        mesh.points.take(begin, axis=0) - near,
+        mesh.points.take(end, axis=0) - near,
+        origins,
+    )
 
 
 def polygon_areas(mesh: SolverMesh) -> np.ndarray:

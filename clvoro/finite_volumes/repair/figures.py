@@ -1,4 +1,4 @@
-"""Figures of patches, and the terms of the sum of squares that `Descent` minimizes.
+"""Figures of patches, and the terms of the sum of squares that `PricedPatch` minimizes.
 
 The sum is
 
@@ -170,6 +170,25 @@ class Cells:
             starts, self.loop[at], place[self.row[at]], self.between[at], self.bound[at],
             self.faces[faces], self.ends[faces], place[self.owner[faces]], place[self.neighbor[faces]],
             self.wall[faces], self.aim[faces], self.area[cells], self.size[cells], self.origin[cells],
+        )  # fmt: skip
+
+    @classmethod
+    def joined(cls, parts: list[Cells], begins: list[int]) -> Cells:
+        """Return the cells of all `parts`; points of a part are counted from its number in `begins` on."""
+        cells = np.cumsum([0] + [len(p.area) for p in parts]).tolist()
+        corners = np.cumsum([0] + [len(p.loop) for p in parts]).tolist()
+
+        def all_of(name: str, add: list[int] | None = None) -> np.ndarray:
+            arrays = [getattr(p, name) for p in parts]
+            if add is not None:
+                arrays = [x + i for x, i in zip(arrays, add, strict=False)]
+            return np.concatenate(arrays)
+
+        starts = [p.starts[:-1] + i for p, i in zip(parts, corners, strict=False)]
+        return cls(
+            np.concatenate([*starts, corners[-1:]]), all_of("loop", begins), all_of("row", cells), all_of("between"),
+            all_of("bound"), all_of("faces"), all_of("ends", begins), all_of("owner", cells), all_of("neighbor", cells),
+            all_of("wall"), all_of("aim"), all_of("area"), all_of("size"), all_of("origin"),
         )  # fmt: skip
 
     def figures(self, x: np.ndarray, y: np.ndarray) -> Figures:

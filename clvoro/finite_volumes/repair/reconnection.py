@@ -14,9 +14,10 @@ from itertools import chain
 import numpy as np
 
 from ...geometry.ring_coordinate import RingCoordinate
-from .descent import Descent
 from .figures import LENGTH_GOAL
 from .patch import BORDER, Patch, part_of, restored
+from .pricing import PricedPatch
+from .tasks import Move, Task, in_step
 from .wall_corners import WallCorners, Walls
 
 _OPENED = 0.25
@@ -40,8 +41,10 @@ _MOST = 100
 """Most places that are regarded in a patch, the same ones again included."""
 
 
-def repaired(given: Descent, ring: RingCoordinate | None, walls: Walls | None = None) -> Descent:
-    """Return a patch of lower price: place by place points move, also along walls, and faces change.
+def repaired(
+    given: PricedPatch, ring: RingCoordinate | None, walls: Walls | None = None
+) -> Task[PricedPatch]:
+    """Find a patch of lower price: place by place points move, also along walls, and faces change.
 
     With the `walls` of the mesh only cells are regarded that OpenFOAM refuses, and corners of walls can be cut off.
     """
@@ -54,44 +57,44 @@ def repaired(given: Descent, ring: RingCoordinate | None, walls: Walls | None = 
         worst[np.argmax(np.where(left & bad, given.prices, 0))] = True
         focus = given.near(worst, 2) & bad
         chosen = given.near(focus, _RINGS)
-        local = Descent.of(part_of(given.patch, chosen), given.goals[chosen])
+        local = PricedPatch.of(part_of(given.patch, chosen), given.goals[chosen])
         assert local is not None
         near = focus[chosen]
-        best = _settled(local, near, ring, _TRIES, _STEPS)
+        best = yield from _settled(local, near, _TRIES, _STEPS)
         if best.prices[best.near(near, 2) & best.bad].sum() > _SMALL:
             beside = walls and walls.beside(given.patch.cells[chosen], local.patch.points)
-            best = _changed(best, near, ring, beside)
+            best = yield from _changed(best, near, ring, beside)
         if walls is not None and best.refused.sum() >= local.refused.sum():
             best = local
         if local.price - best.price < _GAIN * given.prices[focus].sum():
             left &= ~focus
         if best is not local:
-            made = Descent.of(restored(given.patch, best.patch), given.goals)
+            made = PricedPatch.of(restored(given.patch, best.patch), given.goals)
             assert made is not None
             given = made
     return given
 
 
 def _changed(
-    given: Descent, focus: np.ndarray, ring: RingCoordinate | None, walls: Walls | None
-) -> Descent:
-    """Return the best of a patch and those with one change for the cells `focus` (n,) bool; if none helps, with two."""
-    first = _best_changes(given, focus, ring, walls)
+    given: PricedPatch, focus: np.ndarray, ring: RingCoordinate | None, walls: Walls | None
+) -> Task[PricedPatch]:
+    """Find the best of a patch and those with one change for the cells `focus` (n,) bool; if none helps, with two."""
+    first = yield from _best_changes(given, focus, ring, walls)
     enough = given.price - _GAIN * given.prices[focus].sum()
     if first and first[0].price > enough:
-        second = [_best_changes(made, focus, ring, walls)[:1] for made in first]
-        first = sorted([*first, *(made for some in second for made in some)], key=_price)
+        second = yield from in_step([_best_changes(made, focus, ring, walls) for made in first])
+        first = sorted([*first, *(made for some in second for made in some[:1])], key=_price)
     return min([given, *first[:1]], key=_price)
 
 
-def _price(given: Descent) -> float:
+def _price(given: PricedPatch) -> float:
     return given.price
 
 
 def _best_changes(
-    given: Descent, focus: np.ndarray, ring: RingCoordinate | None, walls: Walls | None
-) -> list[Descent]:
-    """Return the best of the patches with one change for the cells `focus` (n,) bool, the best one first."""
+    given: PricedPatch, focus: np.ndarray, ring: RingCoordinate | None, walls: Walls | None
+) -> Task[list[PricedPatch]]:
+    """Find the best of the patches with one change for the cells `focus` (n,) bool, the best one first."""
     c = given.cells
     bent = np.zeros(len(given.patch.points), bool)
     bent[c.loop[given.bent]] = True
@@ -103,47 +106,38 @@ def _best_changes(
     beside[c.loop[(narrow & focus)[c.row]]] = True
     tried |= c.wall & beside[c.ends].any(axis=1)
     connections = _Connections(given, ring)
-    found: list[Descent] = []
     changes = [connections.changes(face) for face in c.faces[tried].tolist()]
     if walls is not None:
         changes.append(WallCorners(given, walls).changes(given.near(focus, 1)))
-    for patch in chain.from_iterable(changes):
-        made = Descent.of(patch, given.goals)
-        if made is not None:
-            found.append(_settled(made, focus, ring, (1,), _FIRST_STEPS))
-    good = _each_settled(sorted(found, key=_price)[:_GOOD], focus, ring, (1,), _SECOND_STEPS)
-    return _each_settled(good[:_BEST], focus, ring, (2, 3), _STEPS)
+    made = [PricedPatch.of(patch, given.goals) for patch in chain.from_iterable(changes)]
+    found = yield from in_step(
+        [_settled(patch, focus, (1,), _FIRST_STEPS) for patch in made if patch is not None]
+    )
+    good = yield from _each_settled(sorted(found, key=_price)[:_GOOD], focus, (1,), _SECOND_STEPS)
+    return (yield from _each_settled(good[:_BEST], focus, (2, 3), _STEPS))
 
 
 def _each_settled(
-    some: list[Descent],
-    focus: np.ndarray,
-    ring: RingCoordinate | None,
-    rings: tuple[int, ...],
-    steps: int,
-) -> list[Descent]:
-    """Return patches after moves of points, see `_settled`, up to the first one without a bad cell, the best first."""
-    found: list[Descent] = []
+    some: list[PricedPatch], focus: np.ndarray, rings: tuple[int, ...], steps: int
+) -> Task[list[PricedPatch]]:
+    """Find patches after moves of points, see `_settled`, up to the first one without a bad cell, the best first."""
+    found: list[PricedPatch] = []
     for made in some:
-        found.append(_settled(made, focus, ring, rings, steps))
+        found.append((yield from _settled(made, focus, rings, steps)))
         if not found[-1].bad.any():
             break
     return sorted(found, key=_price)
 
 
 def _settled(
-    made: Descent,
-    focus: np.ndarray,
-    ring: RingCoordinate | None,
-    rings: tuple[int, ...],
-    steps: int,
-) -> Descent:
-    """Return the patch after moves of the points near the cells that have a price, and near `focus` (n,) bool."""
+    made: PricedPatch, focus: np.ndarray, rings: tuple[int, ...], steps: int
+) -> Task[PricedPatch]:
+    """Find the patch after moves of the points near the cells that have a price, and near `focus` (n,) bool."""
     for k in rings:
         priced = (made.prices > 0) & made.near(focus, 2)
         if not priced.any():
             break
-        now = made.solve(made.near(priced, k), ring, True, steps)
+        (now,) = yield [Move(made, made.near(priced, k), True, steps)]
         made = now if now.price < made.price else made
     return made
 
@@ -151,7 +145,7 @@ def _settled(
 class _Connections:
     """What can become of the faces of a patch."""
 
-    def __init__(self, given: Descent, ring: RingCoordinate | None) -> None:
+    def __init__(self, given: PricedPatch, ring: RingCoordinate | None) -> None:
         self.patch, self.ring, self.sizes = given.patch, ring, given.goals[:, 1]
         self.on_wall = self.patch.on_walls
         self.faces_at: list[list[int]] = [[] for _ in self.patch.points]

@@ -1,7 +1,7 @@
 """Repair of a solver mesh in 2D, where faces are skew or far from orthogonal, or cells not convex.
 
 Around each such place a patch of cells is improved: first its points inside move, then those on walls slide along the
-boundary, and if that is not enough faces are connected in another way; see `Descent` and `repaired`. Corners of the
+boundary, and if that is not enough faces are connected in another way; see `moves` and `repaired`. Corners of the
 domain, points where the name of the boundary changes, and points at seams stay.
 """
 
@@ -22,10 +22,11 @@ from ..geometry import polygon_centroids, turns
 from ..prisms import simple_loops
 from ..short_edges import CORNER, point_kinds
 from ..solver_mesh import SolverMesh
-from .descent import LEAST_DETERMINANT, STRAIGHT, Descent
 from .figures import face_figures
 from .patch import LIMITS, Patch, part_of, put_back, take_patch
+from .pricing import LEAST_DETERMINANT, STRAIGHT, PricedPatch
 from .reconnection import repaired
+from .tasks import Move, Task, carried_out, in_step
 from .wall_corners import Cut, Walls
 
 _RINGS = 5
@@ -75,23 +76,15 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
     around.limits = limits
     on_walls = slice(mesh.inner, mesh.outer)
     walls = Walls(mesh.points[mesh.corners.reshape(-1, 2)[on_walls]], mesh.owner[on_walls], parts)
-    tried: list[tuple[float, Descent]] = []
+    patches = [_with_positions(_patch_of(around, cells), ring, kinds) for cells in groups]
+    given = [made for made in map(PricedPatch.of, patches) if made is not None and made.bad.any()]
     # The last bits of sums in BLAS depend on its number of threads.
     with _BLAS, threadpool_limits(1, user_api="blas"):
-        for cells in groups:
-            patch = part_of(around, cells[around.cells])
-            patch.cells, patch.ids = around.cells[patch.cells], around.ids[patch.ids]
-            patch = _with_positions(patch, ring, kinds)
-            given = Descent.of(patch)
-            if given is not None and given.bad.any():
-                tried.append((given.price, _improved(given, ring, straight)))
-        refused = sum(int(better.refused.sum()) for _, better in tried)
-        if straight and refused <= _MOST_REFUSED:
-            tried = [
-                (price, repaired(better, ring, walls) if better.refused.any() else better)
-                for price, better in tried
-            ]
-    made = [better.patch for price, better in tried if better.price < price]
+        better = carried_out(in_step([_improved(patch, ring, straight) for patch in given]), ring)
+        refused = sum(int(patch.refused.sum()) for patch in better)
+        if straight and 0 < refused <= _MOST_REFUSED:
+            better = carried_out(in_step([repaired(patch, ring, walls) for patch in better]), ring)
+    made = [b.patch for a, b in zip(given, better, strict=True) if b.price < a.price]
     _report([cut for patch in made for cut in patch.cuts])
     return put_back(mesh, made) if made else mesh
 
@@ -113,14 +106,14 @@ def _report(cuts: list[Cut]) -> None:
     )
 
 
-def _improved(given: Descent, ring: RingCoordinate | None, faces: bool) -> Descent:
-    """Return a patch of lower price, the same if there is none; its `faces` connect other cells only if true."""
+def _improved(given: PricedPatch, ring: RingCoordinate | None, faces: bool) -> Task[PricedPatch]:
+    """Find a patch of lower price, the same if there is none; its `faces` connect other cells only if true."""
     for rings in _TRIES:
         if not given.bad.any():
             return given
-        made = given.solve(given.near(given.bad, rings), ring, False, _STEPS)
+        (made,) = yield [Move(given, given.near(given.bad, rings), False, _STEPS)]
         given = made if made.price < given.price else given
-    return repaired(given, ring) if faces else given
+    return (yield from repaired(given, ring)) if faces else given
 
 
 def _limited(mesh: SolverMesh) -> tuple[tuple[float, float], np.ndarray] | None:
@@ -188,6 +181,13 @@ def _connected_parts(mesh: SolverMesh, region: np.ndarray, bad: np.ndarray) -> l
     graph = scipy.sparse.coo_array((np.ones(len(pairs[0])), pairs), (n, n))
     part = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     return [part == k for k in np.unique(part[bad])]
+
+
+def _patch_of(around: Patch, cells: np.ndarray) -> Patch:
+    """Return the `cells` (n,) bool of the mesh that are in the patch `around`, as a patch of the mesh."""
+    patch = part_of(around, cells[around.cells])
+    patch.cells, patch.ids = around.cells[patch.cells], around.ids[patch.ids]
+    return patch
 
 
 def _with_positions(patch: Patch, ring: RingCoordinate | None, kinds: np.ndarray) -> Patch:

@@ -17,7 +17,7 @@ from .figures import LENGTH_GOAL
 from .patch import Patch
 
 if TYPE_CHECKING:
-    from .descent import Descent
+    from .pricing import PricedPatch
 
 _STEPS = 4
 """Most wall faces that go to another cell at a time."""
@@ -76,13 +76,13 @@ class WallCorners:
 
     Attributes
     ----------
-    given : Descent
+    given : PricedPatch
     patch : Patch
     walls : Walls
         Those of other cells.
     """
 
-    def __init__(self, given: Descent, walls: Walls) -> None:
+    def __init__(self, given: PricedPatch, walls: Walls) -> None:
         self.given, self.patch, self.walls = given, given.patch, walls
         self.sizes, self.is_wall = given.goals[:, 1], given.patch.walls
         self.faces_at: list[list[int]] = [[] for _ in self.patch.points]

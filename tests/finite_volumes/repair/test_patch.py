@@ -7,7 +7,6 @@ import pytest
 
 import clvoro
 from clvoro.finite_volumes.prisms import simple_loops
-from clvoro.finite_volumes.repair.descent import Descent
 from clvoro.finite_volumes.repair.patch import (
     BORDER,
     cell_sides,
@@ -16,7 +15,9 @@ from clvoro.finite_volumes.repair.patch import (
     restored,
     take_patch,
 )
+from clvoro.finite_volumes.repair.pricing import PricedPatch
 from clvoro.finite_volumes.repair.relaxation import _with_positions
+from clvoro.finite_volumes.repair.tasks import Move, moved
 from clvoro.finite_volumes.short_edges import collapse_short_edges, point_kinds
 from clvoro.geometry.ring_coordinate import RingCoordinate
 from tests.finite_volumes.test_straight_walls import ELL, circle
@@ -133,7 +134,7 @@ def test_cells_that_are_no_rings_have_no_sides(mesh):
 
 
 def test_figures_are_those_of_the_solver_mesh(mesh):
-    given = Descent.of(take_patch(mesh, np.ones(len(mesh), bool)))
+    given = PricedPatch.of(take_patch(mesh, np.ones(len(mesh), bool)))
     now, measures = given.cells.figures(*given.patch.points.T), mesh.measures
     assert np.array_equal(given.cells.faces, np.arange(mesh.outer))
     # OpenFOAM's centroids of concave cells are not exact.
@@ -176,18 +177,18 @@ def test_positions_run_along_the_rings(domain):
 @pytest.mark.sparse(2)
 def test_points_slide_along_the_boundary_and_fixed_ones_stay(mesh):
     patch, ring = with_positions(mesh, take_patch(mesh, np.ones(len(mesh), bool)))
-    given = Descent.of(patch)
+    given = PricedPatch.of(patch)
     assert given.bad.any()
-    made = given.solve(given.near(given.bad, 3), ring, True, 12)
+    (made,) = moved([Move(given, given.near(given.bad, 3), True, 12)], ring)
     assert made.price < given.price
     after, at = made.patch, np.flatnonzero(patch.on_walls)
-    moved = (after.points != patch.points).any(axis=1)
-    assert not moved[patch.fixed & patch.on_walls].any()
-    assert moved[~patch.on_walls & ~patch.held].any()
+    changed = (after.points != patch.points).any(axis=1)
+    assert not changed[patch.fixed & patch.on_walls].any()
+    assert changed[~patch.on_walls & ~patch.held].any()
     if ring is None:
-        assert not moved[at].any()
+        assert not changed[at].any()
         return
-    assert moved[at].any()
+    assert changed[at].any()
     np.testing.assert_allclose(ring.points(after.positions[at]), after.points[at], atol=1e-7)
     corners = point_kinds(mesh, mesh.domain.boundaries.index)[patch.ids] == 2
-    assert not moved[corners].any()
+    assert not changed[corners].any()

@@ -6,8 +6,8 @@ import shapely
 
 import clvoro
 from clvoro.finite_volumes.repair import relaxation
-from clvoro.finite_volumes.repair.descent import Descent
 from clvoro.finite_volumes.repair.patch import take_patch
+from clvoro.finite_volumes.repair.pricing import PricedPatch
 from clvoro.finite_volumes.repair.reconnection import _Connections
 from clvoro.finite_volumes.repair.relaxation import relax_points
 from clvoro.finite_volumes.solver_mesh import SolverMesh
@@ -93,13 +93,13 @@ def test_all_changes_of_faces_keep_the_mesh_consistent(ctx):
     """Each change gives cells that are simple rings, with the same sum of areas as their outline."""
     mesh = unrepaired(coast(ctx, 1))
     patch, ring = with_positions(mesh, take_patch(mesh, np.ones(len(mesh), bool)))
-    given = Descent.of(patch)
+    given = PricedPatch.of(patch)
     connections, count = _Connections(given, ring), {-1: 0, 0: 0}
     for face in given.cells.faces.tolist():
         for made in connections.changes(face):
             fewer = len(made.owner) - len(patch.owner)
             count[fewer] += 1
-            changed = Descent.of(made, given.goals)
+            changed = PricedPatch.of(made, given.goals)
             if changed is None:
                 continue
             inner = made.neighbor >= 0

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.finite_volumes.repair.descent import Descent
 from clvoro.finite_volumes.repair.figures import LENGTH_GOAL
 from clvoro.finite_volumes.repair.patch import take_patch
+from clvoro.finite_volumes.repair.pricing import PricedPatch
 from clvoro.finite_volumes.repair.slopes import slopes
 
 
@@ -21,7 +21,7 @@ def patch(ctx):
     points = np.concatenate([rng.random((50, 2)), passage])
     diagram = clvoro.Adapter(ctx).diagram(domain, points[domain.contains(points)])
     mesh = diagram.solver_mesh(collapse=False)
-    given = Descent.of(take_patch(mesh, np.ones(len(mesh), bool)))
+    given = PricedPatch.of(take_patch(mesh, np.ones(len(mesh), bool)))
     x, y = given.patch.points.T + rng.normal(0, 0.002, given.patch.points.T.shape)
     given.cells.aim = np.full(len(given.cells.faces), LENGTH_GOAL)
     return given.cells, x, y

@@ -10,8 +10,8 @@ import shapely
 import clvoro
 from clvoro.errors import MismatchWarning
 from clvoro.finite_volumes.repair import relaxation
-from clvoro.finite_volumes.repair.descent import Descent
 from clvoro.finite_volumes.repair.patch import put_back, restored, take_patch
+from clvoro.finite_volumes.repair.pricing import PricedPatch
 from clvoro.finite_volumes.repair.wall_corners import WallCorners, Walls, _meet
 from tests.finite_volumes.repair.test_patch import with_positions
 from tests.finite_volumes.repair.test_reconnection import coast, unrepaired
@@ -93,11 +93,11 @@ def test_refused_cells_become_accepted(ctx, name, monkeypatch):
         assert not (mesh.points == place.cut).all(axis=1).any()
     # Without changes of walls it is refused.
     usual = relaxation.repaired
-    monkeypatch.setattr(
-        relaxation,
-        "repaired",
-        lambda given, ring, walls=None: given if walls else usual(given, ring),
-    )
+
+    def repaired(given, ring, walls=None):
+        return given if walls else (yield from usual(given, ring))
+
+    monkeypatch.setattr(relaxation, "repaired", repaired)
     before = diagram.check(solver="openfoam")
     assert not before
     assert not before[place.refused].ok
@@ -108,14 +108,14 @@ def test_all_changes_of_walls_keep_the_mesh_consistent(ctx):
     mesh = unrepaired(coast(ctx, 1))
     every = np.ones(len(mesh), bool)
     patch, _ = with_positions(mesh, take_patch(mesh, every))
-    given = Descent.of(patch)
+    given = PricedPatch.of(patch)
     # Also corners that are convex.
     given.bent = np.ones(len(given.bent), bool)
     walls = Walls(np.empty((0, 2, 2)), np.empty(0, int), mesh.domain.boundaries.index)
     parts = mesh.domain.boundaries.index
     count = {-1: 0, 0: 0, 1: 0}
     for made in WallCorners(given, walls).changes(every):
-        changed = Descent.of(made, given.goals)
+        changed = PricedPatch.of(made, given.goals)
         if changed is None:
             continue
         count[int(np.clip(len(made.owner) - len(patch.owner), -1, 1))] += 1
@@ -150,7 +150,7 @@ def test_corners_are_not_cut_off_through_another_wall(ctx):
     mesh = unrepaired(diagram)
     every = np.ones(len(mesh), bool)
     patch, _ = with_positions(mesh, take_patch(mesh, every))
-    given = Descent.of(patch)
+    given = PricedPatch.of(patch)
     pond = np.array([[(-0.4, -0.06), (-0.36, 0.02)]])
     beside = pond - 0.6
     cuts = []
