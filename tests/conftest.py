@@ -60,8 +60,11 @@ def invokers_in_memory():
         yield
 
 
-UNOPTIMIZED = re.compile("-D(REAL=float|PERIODIC|POLYGON|SPHERE|WEIGHTED)")
-"""Macros of programs that the fast tests build without optimization: all but those for boxes with walls in float64."""
+UNOPTIMIZED = re.compile(
+    "-D(REAL=float|PERIODIC|POLYGON|SPHERE|WEIGHTED|(CELL|FACE)_CAPACITY=(?!24$|32$)|GROUP_SIZE=(?!1$))"
+)
+"""Macros of programs that the fast tests build without optimization: all but those for boxes with walls in float64, for
+single work-items and cells of the first capacities."""
 
 
 @pytest.fixture(scope="session", autouse=True)

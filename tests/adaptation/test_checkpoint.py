@@ -115,14 +115,14 @@ LONG_LIVED = {
     ),
     "adaptive in 3D": (BOX_3D, SIZE_3D, {"method": "adaptive", "effort": "fast"}),
 }
-QUICK = ("coupled", "multigrid"), ("adaptive in 3D", "jacobi")
+QUICK = ("coupled", "multigrid")
+"""The case of the fast tests. `test_resumed_runs_end_the_same` resumes in 3D."""
 
 
-@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("kind", "solver"),
     [
-        pytest.param(*case, marks=() if case in QUICK else pytest.mark.slow)
+        pytest.param(*case, marks=() if case == QUICK else pytest.mark.slow)
         for case in product(LONG_LIVED, ("multigrid", "jacobi"))
     ],
 )

@@ -18,6 +18,8 @@ from clvoro.sizing import Sizing
 from tests.robustness.gpu_like import groups
 
 WARM_UP, STEPS = 4, 2
+FEW = 4000
+"""Cells of the fast tests: more than one work-group iterates for."""
 LAUNCHES = {(2, 10**4): 60, (3, 10**4): 60, (2, 10**6): 66, (3, 10**6): 110}
 """Most launches of a step, by dimension and number of cells; of an exact one, without its iterations."""
 ITERATION = 2
@@ -54,8 +56,8 @@ def near_lattice(dim, n):
 @pytest.mark.parametrize(
     ("dim", "n", "group"),
     [
-        pytest.param(2, 10**4, None, id="2D, 10,000"),
-        pytest.param(3, 10**4, None, id="3D, 10,000"),
+        pytest.param(2, FEW, None, id="2D"),
+        pytest.param(3, FEW, None, id="3D"),
         *(
             pytest.param(dim, n, 128, id=f"{dim}D, {n:,}, as a GPU", marks=pytest.mark.slow)
             for n in (10**4, 10**6)

@@ -29,9 +29,20 @@ def field(dim, moved=0.0, factor=1.0):
     )
 
 
+class ByDimension(dict):
+    """Makes a mesh when its dimension is first looked up."""
+
+    def __init__(self, make):
+        self.make = make
+
+    def __missing__(self, dim):
+        self[dim] = self.make(dim)
+        return self[dim]
+
+
 @pytest.fixture(scope="module")
 def first(adapter):
-    return {dim: adapter.run(BOXES[dim], field(dim), seed=4) for dim in (2, 3)}
+    return ByDimension(lambda dim: adapter.run(BOXES[dim], field(dim), seed=4))
 
 
 def steps_to_tolerance(history):

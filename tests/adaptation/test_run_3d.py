@@ -42,7 +42,7 @@ def second_moment(cell, x):
 # Every method.
 
 
-@pytest.mark.sparse(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_every_method(adapter, adapter32, dtype, method):
@@ -55,7 +55,7 @@ def test_every_method(adapter, adapter32, dtype, method):
     assert h["mean_quality"][-1] > h["mean_quality"][0] or method == "poisson"
 
 
-@pytest.mark.sparse(4)
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_uniform_start_and_count(adapter, method):
     result = adapter.run(
@@ -274,7 +274,8 @@ def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
     check(result, SMALL)
 
 
-@pytest.mark.parametrize("levels", [0, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("levels", [0, 2])
 def test_levels(adapter, levels):
     result = adapter.run(
         BOX, S1, options=clvoro.MultilevelOptions(levels=levels), effort="fast", seed=16
@@ -421,7 +422,7 @@ def test_points_on_walls_edges_and_corners(adapter):
     weights = np.where((points == 0) | (points == 1), 0.5, 1).prod(axis=1)
     assert diagram.volumes == pytest.approx(weights / 27, rel=1e-12)
     for method in runs.FROM_POINTS:
-        result = adapter.run(BOX, 0.25, points, method=method, effort="fast", max_steps=12)
+        result = adapter.run(BOX, 0.25, points, method=method, effort="fast", max_steps=6)
         check(result, sizing.Constant(0.25))
 
 

@@ -321,7 +321,7 @@ def test_intersections_in_one_plane_and_at_common_corners():
 
 
 def test_self_intersection_names_two_triangles():
-    first, second = torus(24, 12), torus(16, 10, center=(4.5, 0, 10.8))
+    first, second = torus(16, 8), torus(12, 8, center=(4.5, 0, 10.8))
     vertices = np.vstack([first[0], second[0]])
     triangles = np.vstack([first[1], second[1] + len(first[0])])
     surface = sizing.Surface(vertices, triangles, name="parts")

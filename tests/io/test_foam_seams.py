@@ -58,6 +58,7 @@ def test_cells_are_whole_and_closed(result, mesh):
     assert volumes.sum() == pytest.approx(box.measure * depth, rel=1e-12)
 
 
+@pytest.mark.sparse(2)
 def test_there_is_one_pair_of_patches_for_each_periodic_direction(result, mesh):
     box = result.diagram.domain
     axes = [axis for axis, is_periodic in zip("xyz", box.periodic, strict=False) if is_periodic]

@@ -13,7 +13,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import clvoro
@@ -105,6 +105,7 @@ def assert_same_array(x, y):
 # --- npz ---
 
 
+@settings(max_examples=30)
 @given(n=st.integers(1, 30), seed=st.integers(0, 10**6))
 def test_npz_returns_what_was_saved(tmp_path_factory, n, seed):
     path = tmp_path_factory.mktemp("npz") / "mesh.npz"

@@ -614,9 +614,11 @@ def test_size_is_evaluated_inside_only(result) -> None:
     assert all(pixel(figure, place) != [255, 255, 255] for place in kept)
 
 
-def test_boundary_cells_are_reported_separately(result, tmp_path) -> None:
+def test_boundary_cells_are_reported_separately(result, tmp_path, monkeypatch) -> None:
+    """With the figures of all pictures, which are not rendered."""
     pytest.importorskip("matplotlib")
     from clvoro.mesh.summary import boundary_line, summary
+    from clvoro.plotting import page as module
     from clvoro.plotting import write_report
 
     d = result.diagram
@@ -633,6 +635,7 @@ def test_boundary_cells_are_reported_separately(result, tmp_path) -> None:
     assert f"{sum(touching)} boundary cells: mean |e|" in boundary_line(result)
     assert 0 < s["corner_cells"] < s["boundary_cells"]
     assert f"; {s['corner_cells']} of them at corners: mean |e|" in boundary_line(result)
+    monkeypatch.setattr(module, "render", lambda *_: b"")
     page = write_report(result, tmp_path, size=size)[0].read_text()
     assert "Cells on the boundary" in page
     assert f"<td>{sum(touching)}</td>" in page

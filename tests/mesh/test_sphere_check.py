@@ -37,12 +37,12 @@ def icosahedron():
 POINTS = {
     "icosahedron": icosahedron(),
     "few": scattered(60, seed=4),
-    "many": scattered(3000),
-    "cluster": clustered(3000),
+    "many": scattered(1000),
+    "cluster": clustered(1000),
 }
 
 
-@pytest.mark.sparse(8)
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("radius", [1.0, EARTH.radius, 1e-3])
 @pytest.mark.parametrize("name", list(POINTS))
@@ -56,9 +56,9 @@ def test_right_diagrams_pass(ctx, dtype, radius, name):
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
 def result(ctx, request):
-    points = scattered(800)
+    points = scattered(400)
     adapter = clvoro.Adapter(ctx, request.param)
-    return adapter.run(EARTH, 8e5, points=points, n_cells=800, method="lloyd", max_steps=3)
+    return adapter.run(EARTH, 1.1e6, points=points, n_cells=400, method="lloyd", max_steps=3)
 
 
 @pytest.mark.sparse(1)

@@ -123,6 +123,7 @@ def test_summaries_repeat_bit_by_bit(engine):
     assert summaries.read()["a"] == summaries.read()["b"]
 
 
+@pytest.mark.sparse(12)
 @pytest.mark.parametrize("n", [1, 7, 8, 5000])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_lengths(ctx, engine, dim, n):

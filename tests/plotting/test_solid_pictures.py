@@ -286,7 +286,8 @@ def test_few_cells(tmp_path, n):
 @pytest.fixture(scope="module")
 def periodic(ctx):
     box = Box((-1, 0, 2), (1, 1, 3.5), periodic=(True, True, False))
-    return Adapter(ctx).run(box, 0.2, method="lloyd", max_steps=4, seed=4411)
+    points = np.random.default_rng(4411).uniform(LOWER, UPPER, (150, 3))
+    return solids.solid_result(Adapter(ctx).diagram(box, points))
 
 
 def clipped_area(section, lower, upper, right, up):

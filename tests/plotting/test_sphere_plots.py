@@ -57,7 +57,7 @@ def mesh(adapter):
         angle = np.arccos(np.clip(x @ SPHERE.positions([(-45, 40)])[0] / SPHERE.radius**2, -1, 1))
         return 0.12 + 0.1 * angle
 
-    return adapter.run(SPHERE, size)
+    return adapter.run(SPHERE, size, effort="fast")
 
 
 @pytest.fixture(scope="module")

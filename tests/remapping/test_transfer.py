@@ -159,7 +159,7 @@ def corners(diagram, i):
 @DIMS
 @pytest.mark.parametrize("way", ["first", "second", "limited"])
 def test_matches_plain_clipping(mesh, adapter, dim, way):
-    old, new = mesh(dim, 23, 5821), mesh(dim, 19 if dim == 2 else 9, 7717)
+    old, new = mesh(dim, 23, 5821), mesh(dim, 19 if dim == 2 else 5, 7717)
     q = np.random.default_rng(311).normal(size=23)
     volumes, moments = overlaps(old, new)
     if dim == 3:

@@ -16,6 +16,7 @@ from tests.reference import diagrams as reference
 from tests.reference import patch
 
 N = 60
+SOME = range(0, N, 3)
 SLOPE = np.array([0.9, -1.4])
 
 
@@ -101,22 +102,22 @@ def assembled(engine, points):
 
 @pytest.fixture(scope="module")
 def differences(points):
-    """dr/dx by central differences of new diagrams, (n, n, 2)."""
-    step, J = 1e-6, np.zeros((N, N, 2))
-    for j in range(N):
+    """dr/dx of the generators `SOME` by central differences of new diagrams, (n, k, 2)."""
+    step, J = 1e-6, np.zeros((N, len(SOME), 2))
+    for k, j in enumerate(SOME):
         for a in range(2):
             ahead, behind = points.copy(), points.copy()
             ahead[j, a] += step
             behind[j, a] -= step
-            J[:, j, a] = (log_ratios(ahead) - log_ratios(behind)) / (2 * step)
+            J[:, k, a] = (log_ratios(ahead) - log_ratios(behind)) / (2 * step)
     return J
 
 
 @pytest.mark.sparse(1)
 def test_derivative(assembled, differences):
-    """Every cell by every generator, walls included; the field's own gradient is on the diagonal."""
+    """Every cell by every third generator, walls included; the field's own gradient is on the diagonal."""
     # Volumes of 0.01 to 1e-13 of the box over a step of 1e-6; single precision is finer.
-    assert pytest.approx(differences, abs=1e-4) == assembled.derivative()
+    assert pytest.approx(differences, abs=1e-4) == assembled.derivative()[:, SOME]
     assert np.abs(assembled.derivative()).max() > 5
 
 

@@ -522,7 +522,7 @@ def test_update_gives_up_on_coincident_generators(engine):
 
 
 @given(st.integers(0, 2**31), st.floats(1e-7, 1.0), st.integers(3, 60))
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_any_motion(ctx, seed, share, n):
     engine = patch.make_engine(ctx)
     rng = np.random.default_rng(seed)

@@ -44,11 +44,11 @@ def random_case(dim, n, spread, seed=31, periodic=False):
 @pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
 def test_cells_are_those_of_the_definition(ctx, dim, real, periodic):
     adapter = clvoro.Adapter(ctx, real)
-    box, points, weights = random_case(dim, 50, 3.0, periodic=periodic)
+    box, points, weights = random_case(dim, 50 if dim == 2 else 30, 3.0, periodic=periodic)
     d = adapter.power_diagram(box, points, weights)
     volumes, centroids = power_cells(box, points, weights)
     noise = 2e3 * np.finfo(adapter.dtype).eps * max(np.abs(box.upper))
-    assert 5 < len(d.empty_cells) < 25
+    assert 2 < len(d.empty_cells) < len(points) / 2
     assert d.empty_cells.tolist() == np.flatnonzero(volumes == 0).tolist()
     np.testing.assert_allclose(d.volumes, volumes, atol=noise)
     filled = volumes > 1e-3 * volumes.mean()
@@ -113,11 +113,11 @@ def test_images_carry_the_weights_of_their_generators(ctx, dim):
 def test_weights_of_a_moved_periodic_diagram(ctx):
     """Weights with a smooth wave along x move the cells: the generators do not lie in them."""
     rng, box = np.random.default_rng(5), clvoro.Box((0, 0), (1, 1), periodic=True)
-    points = rng.random((2000, 2))
+    points = rng.random((800, 2))
     weights = 0.05 * np.sin(2 * np.pi * points[:, 0])
     d = clvoro.Adapter(ctx).power_diagram(box, points, weights)
     away = np.abs(d.centroids - points)[:, 0]
-    assert away.max() > 0.1  # five spacings; half the derivative of the weights is 0.16
+    assert away.max() > 0.1  # three spacings; half the derivative of the weights is 0.16
     np.testing.assert_allclose(d.volumes, power_cells(box, points, weights)[0], atol=1e-12)
     assert d.check(), d.check()
 

@@ -84,8 +84,8 @@ def test_gradient(ctx, bad_cell_weight):
     h = np.random.default_rng(6).uniform(0.05, 0.2, N)
     u = descend(patch.make_engine(ctx), points, h, bad_cell_weight, rate=0.3, max_displacement=1e9)
     omega = 1 - bad_cell_weight * np.log(qualities(points)[:, 0])
-    # Every second one, from the walls to the middle.
-    some = np.argsort(np.minimum(points, patch.BOX.upper - points).min(axis=1))[::2]
+    # Every third one, from the walls to the middle.
+    some = np.argsort(np.minimum(points, patch.BOX.upper - points).min(axis=1))[::3]
     gradient = gradient_of(lambda x: energy(x, omega), points, some)
     expected = (-0.3 * h[:, None] ** 2 * gradient)[some]
     # Central differences: rounding of E (about 100 (1 + bad_cell_weight)) over the step, curvature times its square.
@@ -105,7 +105,7 @@ def test_gradient_in_a_polygon(ctx):
     n, cells = len(points), polygon_voronoi(domain, points)
     around = [i for i in range(n) if {(i, -7), (i, -8), (i, -9)} <= set(cells.lengths)]
     assert around
-    some = sorted({*around, *range(0, n, 2)})
+    some = sorted({*around, *range(0, n, 3)})
     # A piece that goes to another cell would make the energy not differentiable.
     assert all(piece.root == piece.home for piece in cells.pieces)
     real = np.dtype("float64")
@@ -282,16 +282,16 @@ def test_short_edges_grow(ctx, real):
 
 
 @pytest.mark.sparse(1)
-@pytest.mark.parametrize("settings", [{"effort": "fast"}, {}, {"method": "exact"}], ids=str)
-def test_runs_have_no_short_edges(ctx, settings):
-    """A steep field: without the energy about one run of five has an edge of 0.04 h or less."""
+@pytest.mark.parametrize(
+    ("settings", "seed"), [({"effort": "fast"}, 5), ({}, 16), ({"method": "exact"}, 14)]
+)
+def test_runs_have_no_short_edges(ctx, settings, seed):
+    """A steep field, and starts from which runs without the energy end with an edge of 0.02 h or less."""
     field = clvoro.sizing.Distance(clvoro.sizing.Circle((0.5, 0.4), 0.2), h_min=0.012, slope=0.3)
-    adapter = clvoro.Adapter(ctx)
-    for seed in range(4):
-        result = adapter.run(patch.BOX, field, seed=seed, **settings)
-        h, d = result.target_size, result.diagram
-        for i, j, length in edges_of(d):
-            assert (1 if i == j else 2) * length > 0.05 * (h[i] + h[j]) / 2
+    result = clvoro.Adapter(ctx).run(patch.BOX, field, seed=seed, **settings)
+    h = result.target_size
+    for i, j, length in edges_of(result.diagram):
+        assert (1 if i == j else 2) * length > 0.05 * (h[i] + h[j]) / 2
 
 
 def test_descends(ctx):

@@ -15,7 +15,7 @@ from tests.reference import patch
 BOX = Box((0, 0, 0), (1, 0.75, 0.9))
 """Its frame is the unit cube's: normalized coordinates are physical ones."""
 N, H, RATE, WEIGHT = 20, 0.3, 0.01, 5.0
-MOVED = 3
+MOVED = 2
 """Generators whose gradient is compared."""
 KEPT = 7.0
 """The displacement of a cell whose vertices are not known, because a face is near round-off."""

@@ -448,7 +448,7 @@ def test_resume(double, tmp_path):
             steps.append(row["step"])
             return len(steps) == 6
 
-        options = {"seed": 2, "effort": "fast"}
+        options = {"seed": 2, "effort": "fast", "max_steps": 12}
         whole = double.run(box, size, **options)
         file = tmp_path / f"{box.dim}.checkpoint"
         double.run(box, size, callback=stop, checkpoint=file, **options)
