@@ -3,7 +3,7 @@
    sees what lies beyond. Work-items run one after the other; those of a group at once, as threads, where barriers may
    be met. For every job it prints its name, how many bytes of integers differ from what the device had written, the
    largest relative difference of real numbers, and how many bytes were written that depend on uninitialized memory. A
-   job is what `write_job` of sanitized.py says. */
+   job is what `write_job` of sanitized.py says. After the relative difference comes the absolute one of that buffer. */
 #define _GNU_SOURCE
 #include <math.h>
 #include <pthread.h>
@@ -130,8 +130,9 @@ static double real_number(const char *at, int64_t bytes)
 }
 
 /* The largest difference of real numbers of so many bytes over the largest number that is expected; infinity where one
-   is no number and the other is. What stands in for an array that is not used may end within a number. */
-static double difference(const char *expected, const char *found, int64_t size, int64_t bytes)
+   is no number and the other is. What stands in for an array that is not used may end within a number. `absolute`
+   becomes the difference itself. */
+static double difference(const char *expected, const char *found, int64_t size, int64_t bytes, double *absolute)
 {
     double most = 0, largest = 0;
     for (int64_t k = 0; k + bytes <= size; k += bytes) {
@@ -141,6 +142,7 @@ static double difference(const char *expected, const char *found, int64_t size, 
         if (x != y && !(isnan(x) && isnan(y)))
             most = fmax(most, isfinite(x - y) ? fabs(x - y) : INFINITY);
     }
+    *absolute = most;
     return most == 0 ? 0 : most / largest;
 }
 
@@ -178,7 +180,7 @@ static void run_job(const char *path)
     for (size_t k = 0; k < groups; ++k)
         run_group(FORWARDS ? k : groups - 1 - k, kernel->launch, args, at_once);
     int64_t differing = 0, unwritten = 0;
-    double most = 0;
+    double most = 0, absolute = 0;
     for (int64_t b = 0; b < n_buffers; ++b) {
 #ifdef MEMORY_SANITIZER
         const intptr_t at = __msan_test_shadow(buffers[b], sizes[b]);
@@ -187,13 +189,17 @@ static void run_job(const char *path)
         __msan_unpoison(buffers[b], sizes[b]);
 #endif
         char *expected = read_block(file, sizes[b]);
-        if (reals[b])
-            most = fmax(most, difference(expected, buffers[b], sizes[b], reals[b]));
+        if (reals[b]) {
+            double own;
+            const double ratio = difference(expected, buffers[b], sizes[b], reals[b], &own);
+            absolute = ratio > most ? own : absolute;
+            most = fmax(most, ratio);
+        }
         for (int64_t k = 0; !reals[b] && k < sizes[b]; ++k)
             differing += expected[k] != buffers[b][k];
         free(expected);
     }
-    printf("%s %lld %.3g %lld\n", path, (long long)differing, most, (long long)unwritten);
+    printf("%s %lld %.3g %.3g %lld\n", path, (long long)differing, most, absolute, (long long)unwritten);
     fflush(stdout);
     for (int64_t a = 0; a < n_args; ++a)
         if (of[a] < 0)

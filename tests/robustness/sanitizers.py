@@ -265,12 +265,13 @@ class Outcome:
     """How the repetition of one launch ended.
 
     Bytes of integers that differ from the device's, largest difference of real numbers over the largest of their
-    buffer, and bytes written that depend on uninitialized memory.
+    buffer and this difference itself, and bytes written that depend on uninitialized memory.
     """
 
     kernel: str
     differing: int
     difference: float
+    absolute: float
     unwritten: int
 
 
@@ -283,9 +284,11 @@ def repeat(program: Program, sanitizer: str, folder: Path) -> tuple[list[Outcome
     )  # fmt: skip
     outcomes = []
     for line in done.stdout.splitlines():
-        path, differing, difference, unwritten = line.rsplit(" ", 3)
+        path, differing, difference, absolute, unwritten = line.rsplit(" ", 4)
         kernel = ".".join(Path(path).name.split(".")[:2])
-        outcomes.append(Outcome(kernel, int(differing), float(difference), int(unwritten)))
+        outcomes.append(
+            Outcome(kernel, int(differing), float(difference), float(absolute), int(unwritten))
+        )
     said = done.stderr.strip()
     if done.returncode and not said:
         said = f"ended with {done.returncode}"

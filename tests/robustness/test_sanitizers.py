@@ -71,7 +71,7 @@ def harmless(ctx, tmp_path_factory):
 @pytest.mark.parametrize("sanitizer", list(TRAPS))
 def test_what_is_right_passes(harmless, built, sanitizer):
     outcomes, said = sanitized.repeat(harmless, sanitizer, built)
-    assert outcomes == [sanitized.Outcome("trap.trap", 0, 0.0, 0)]
+    assert outcomes == [sanitized.Outcome("trap.trap", 0, 0.0, 0.0, 0)]
     assert said == ""
 
 
@@ -99,6 +99,10 @@ FUNCTIONS = {
 """Kernels with functions that OpenCL does not ask to be rounded correctly (as log, cbrt, cos): libraries differ."""
 ROUNDINGS = 128
 """Over the largest number of an array: small size errors, and slopes, are differences of nearly equal numbers."""
+OF_ROOTS = {"metric.evaluate_metric"}
+"""Kernels that write relative errors of roots of volumes. All of them are round-off where volumes are prescribed."""
+ROUNDINGS_OF_ROOTS = 4
+"""OpenCL's cube root may be wrong by 2 ulp, that of C is by 1, and the division rounds."""
 IN_SINGLE = {"volume_projection.assemble_projection"}
 """Of these kernels, those that compute in single precision for generators of any precision."""
 ORDERED = {
@@ -138,4 +142,9 @@ def test_nothing_is_found(ctx, request, tmp_path, built, name, variant):
                 assert outcome.differing == 0, outcome
                 real = np.float32 if single or outcome.kernel in IN_SINGLE else np.float64
                 allowed = ROUNDINGS * np.finfo(real).eps if outcome.kernel in FUNCTIONS else 0
+                if (
+                    outcome.kernel in OF_ROOTS
+                    and outcome.absolute <= ROUNDINGS_OF_ROOTS * np.finfo(real).eps
+                ):
+                    continue
                 assert outcome.difference <= allowed, outcome
