@@ -98,7 +98,7 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
 
 /* Write the faces from `place` on, and the moments of the cell of generator i, from its sums. False if a face has no
    more area than round-off. */
-inline bool write_measures(const corners_t *cell, const sums_t *sums, int i, int place, const measured_t *out)
+inline bool write_measures(const CORNERS *cell, const sums_t *sums, int i, int place, const measured_t *out)
 {
     REAL4 first = 0;
     REAL volume = 0;

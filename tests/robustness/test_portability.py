@@ -108,6 +108,16 @@ def test_kernels_compile_for_gpus(ctx, dtype, tmp_path):
             assert not missing, f"{source.name} for {target} calls {missing} without a body"
 
 
+@needs_clang
+def test_kernels_of_first_runs_compile_with_generic_pointers(ctx, tmp_path):
+    """As in OpenCL 3.0, for example by PoCL 5: a pointer to private memory says so before it is passed on."""
+    sources = gpu_programs.programs_of_a_first_run(ctx, 3, "float64")
+    assert "tessellation/polyhedra_update.cl" in {source.name for source in sources}
+    compiled = partial(compile_for, "generic", folder=tmp_path, optimize="-O0")
+    for source, (_, said) in each(compiled, sources):
+        assert not said, f"{source.name}: {said[:2000]}"
+
+
 def test_functions_are_static_on_gpus(ctx, monkeypatch):
     """PoCL inlines all functions only if they are not static."""
     texts, plain = [], cl.Program
