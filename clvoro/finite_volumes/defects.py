@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mesh.connectivity import take_rows
-from .geometry import cell_geometry, face_geometry, lengths, smaller_size
-from .seams import unpack
+from ..mesh.connectivity import distinct, take_rows
+from .geometry import cell_geometry, cross_rows, face_geometry, lengths, smaller_size
 
 if TYPE_CHECKING:
+    from .merging import Cells
     from .neighborhood import Neighborhood
 
 _WORSE = 0.02
@@ -100,43 +100,50 @@ def find_defects(
     x = w.positions(around.corners, around.codes)
     if targets is not None:
         moved = np.flatnonzero(around.new >= 0)
-        x[moved] = targets[around.new[moved]] + unpack(around.codes[moved]) * w.extent
+        x[moved] = targets[around.new[moved]] + w.offsets(around.codes[moved])
     with np.errstate(invalid="ignore", divide="ignore"):
         shapes = _shapes(around, x)
-        h = smaller_size(w.owner[around.faces], w.neighbor[around.faces], w.sizes)
-        large = lengths(shapes.areas) >= w.small * h**2
-        changed = around.alive & (around.set_of_face >= 0)
-        wrong = changed & ~(shapes.flatness >= limits.flatness)
-        wrong |= changed & _bad_tetrahedra(around, x, shapes)
-        arms = shapes.seen - shapes.middles.take(around.side_cell, axis=0)
-        low = ~(np.einsum("ij,ij->i", shapes.outward, arms) > 0)
-        wrong[around.side_face[low]] |= changed[around.side_face[low]]
-        sets = around.set_of_face
+        wrong = around.alive & ~(shapes.flatness >= limits.flatness)
+        wrong |= around.alive & _bad_tetrahedra(around, x, shapes)
+        star = around.star
+        arms = shapes.seen[star] - shapes.middles.take(around.side_cell[star], axis=0)
+        low = ~(np.einsum("ij,ij->i", shapes.outward[star], arms) > 0)
+        wrong[around.side_star[star[low]]] = True
+        large = _large(w, around.faces, shapes.areas)
+        sets, part = around.set_of_face, around.set_of_cell
         count = np.bincount(sets[wrong], minlength=around.k)
         serious = np.bincount(sets[wrong & large], minlength=around.k)
-        part = around.set_of_cell
         count += np.bincount(part[~(shapes.volumes > 0)], minlength=around.k)
         pairs = concave_pairs(
-            shapes.seen, shapes.outward, around.side_cell, len(around.cells), limits.concavity,
-            changed[around.side_face], large[around.side_face],
-        )  # fmt: skip
-        count += np.bincount(part, pairs[0], around.k).astype(np.int64)
-        serious += np.bincount(part, pairs[1], around.k).astype(np.int64)
+            shapes.seen, shapes.outward, around.side_starts, limits.concavity, around.side_star >= 0
+        )
+        sets = part[around.side_cell[pairs[0]]]
+        large = _large(w, around.side_face[pairs], shapes.outward[pairs]).all(axis=0)
+        count += np.bincount(sets, minlength=around.k)
+        serious += np.bincount(sets[large], minlength=around.k)
         angle, skewness = _quality(around, x, shapes)
     return Defects(count, serious, angle, skewness)
+
+
+def _large(whole: Cells, faces: np.ndarray, areas: np.ndarray) -> np.ndarray:
+    """Return which of `faces`, whose areas (..., 3) are given, are not small."""
+    h = smaller_size(whole.owner[faces], whole.neighbor[faces], whole.sizes)
+    return np.linalg.norm(areas, axis=-1) >= whole.small * h**2
 
 
 def _shapes(around: Neighborhood, x: np.ndarray) -> _Shapes:
     """Return centers and areas of the faces with corners at `x` (k, 3), and of the cells."""
     f, rows = len(around.faces), np.flatnonzero(around.alive)
     starts = np.append(around.starts[rows], len(x))
-    centers, areas = np.full((f, 3), np.nan), np.full((f, 3), np.nan)
+    centers, areas = np.full((2, f, 3), np.nan)
     centers[rows], areas[rows] = face_geometry(x, starts, np.arange(len(x)))
-    about = np.cross(x.take(around.after, axis=0) - x, centers.take(around.face, axis=0) - x)
+    about = cross_rows(x.take(around.after, axis=0) - x, centers.take(around.face, axis=0) - x)
     spread = 0.5 * np.bincount(around.face, lengths(about), f)
-    side = around.side_face
-    seen = centers.take(side, axis=0) - unpack(around.side_code) * around.whole.extent
-    outward = areas.take(side, axis=0) * around.side_sign[:, None]
+    seen, outward = (kept.copy() for kept in around.kept_geometry)
+    side = around.side_star[around.star]
+    codes, sign = around.side_code[around.star], around.side_sign[around.star]
+    seen[around.star] = centers.take(side, axis=0) - around.whole.offsets(codes)
+    outward[around.star] = areas.take(side, axis=0) * sign[:, None]
     none = np.zeros(0, np.int64)
     middles, volumes = cell_geometry(seen, outward, around.side_cell, none, len(around.cells))
     flatness = lengths(areas) / spread
@@ -148,22 +155,21 @@ def _bad_tetrahedra(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> np.
 
     Its triangles are those about its center, and the fan about one of its corners, whichever will do.
     """
-    rows = np.flatnonzero(around.set_of_face[around.side_face] >= 0)
-    face = around.side_face[rows]
-    origins = shapes.middles[around.side_cell[rows]]
-    origins = origins + unpack(around.side_code[rows]) * around.whole.extent
-    counts = np.diff(around.starts)
+    rows = around.star
+    face = around.side_star[rows]
+    origins = shapes.middles[around.side_cell[rows]] + around.whole.offsets(around.side_code[rows])
+    counts = np.diff(around.starts)[face]
     fans = np.zeros(len(around.corners))
     bad = np.zeros(len(around.faces), bool)
-    for n in np.unique(counts[face]).tolist():
-        these = counts[face] == n
+    for n in distinct(counts).tolist():
+        these = np.flatnonzero(counts == n)
         f, sign = face[these], around.side_sign[rows[these], None]
         places = around.starts[f][:, None] + np.arange(n)
-        y = x[places] - origins[these][:, None]
-        normal = np.cross(y, np.roll(y, -1, axis=1))
+        y = x.take(places, axis=0) - origins[these][:, None]
+        normal = cross_rows(y, y.take(np.arange(1, n + 1) % n, axis=1))
         about = np.einsum("mnk,mk->mn", normal, shapes.centers[f] - origins[these]) * sign
         bad[f[~(about > 0).all(axis=1)]] = True
-        volume = np.einsum("mbk,mik->mbi", y, normal) * sign[:, :, None]
+        volume = y @ normal.transpose(0, 2, 1) * sign[:, :, None]
         volume[:, np.arange(n), np.arange(n)] = np.inf
         volume[:, np.arange(n), np.arange(n) - 1] = np.inf
         least = volume.min(axis=2) > _THIN * about.sum(axis=1)[:, None]
@@ -175,14 +181,13 @@ def _bad_tetrahedra(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> np.
 def _quality(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest non-orthogonality, in degrees, and skewness of the faces of each set, (k,) float each."""
     w, middles = around.whole, shapes.middles
-    rows = np.flatnonzero(around.alive & (around.set_of_face >= 0))
+    rows = np.flatnonzero(around.alive)
     faces = around.faces[rows]
     center, area = shapes.centers[rows], shapes.areas[rows]
     area = area / np.linalg.norm(area, axis=1, keepdims=True)
-    own = middles[around.local(w.owner[faces])]
+    own, other = middles[around.cells_of_face[rows].T]
     inner = w.neighbor[faces] >= 0
-    other = middles[around.local(np.maximum(w.neighbor[faces], 0))]
-    other += unpack(w.face_codes[faces]) * w.extent
+    other = other + w.offsets(w.face_codes[faces])
     to_face = center - own
     height = np.einsum("ij,ij->i", area, to_face)
     d = np.where(inner[:, None], other - own, height[:, None] * area)
@@ -203,15 +208,9 @@ def _quality(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> tuple[np.n
 
 
 def concave_pairs(
-    centers: np.ndarray,
-    areas: np.ndarray,
-    cell: np.ndarray,
-    cells: int,
-    limit: float,
-    changed: np.ndarray,
-    large: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each cell the number of pairs of faces that checkMesh takes for concave, and of large ones, (n,) int.
+    centers: np.ndarray, areas: np.ndarray, starts: np.ndarray, limit: float, changed: np.ndarray
+) -> np.ndarray:
+    """Return the pairs of faces of a cell that checkMesh takes for concave, (2, p) int.
 
     Checked is the cosine of the outward normal of a face and the direction from its center to that of another face.
 
@@ -219,30 +218,30 @@ def concave_pairs(
     ----------
     centers, areas : (k, 3) float
         Of each face as seen from a cell; areas point outward.
-    cell : (k,) int
+    starts : (n + 1,) int
+        Rows of the faces of each cell.
     limit : float
         The largest cosine.
-    changed, large : (k,) bool
-        One face of a pair is changed; both are large.
+    changed : (k,) bool
+        One face of a pair is changed.
     """
-    pairs, large_pairs = np.zeros(cells, np.int64), np.zeros(cells, np.int64)
-    order = np.argsort(cell, kind="stable")
-    counts = np.bincount(cell, minlength=cells)
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    for k in np.unique(counts).tolist():
-        rows = np.flatnonzero(counts == k)
-        places = order[starts[rows][:, None] + np.arange(k)]
-        c, s, new = centers[places], areas[places], changed[places]
-        c = c - c.mean(axis=1, keepdims=True)
-        s = s / np.linalg.norm(s, axis=2, keepdims=True)
-        height = s @ c.transpose(0, 2, 1) - np.einsum("mij,mij->mi", s, c)[:, :, None]
-        squares = np.einsum("mij,mij->mi", c, c)
-        far = squares[:, :, None] + squares[:, None, :] - 2 * c @ c.transpose(0, 2, 1)
-        steep = height > limit * np.sqrt(np.maximum(far, 0))
-        steep &= new[:, :, None] | new[:, None, :]
-        steep[:, np.arange(k), np.arange(k)] = False
-        m, i, j = np.nonzero(steep)
-        pairs += np.bincount(rows[m], minlength=cells)
-        both = large[places[m, i]] & large[places[m, j]]
-        large_pairs += np.bincount(rows[m[both]], minlength=cells)
-    return pairs, large_pairs
+    found = [np.zeros((2, 0), np.int64)]
+    normals = areas / lengths(areas)[:, None]
+    counts = np.diff(starts)
+    for k in distinct(counts).tolist():
+        places = starts[:-1][counts == k, None] + np.arange(k)
+        c, s = centers.take(places, axis=0), normals.take(places, axis=0)
+        c -= c.mean(axis=1, keepdims=True)
+        height = s @ c.transpose(0, 2, 1)
+        own = np.einsum("mij,mij->mi", s, c)
+        # Few pairs are this near to a plane: only these are computed.
+        reach = 2 * np.sqrt(np.einsum("mij,mij->mi", c, c).max(axis=1))
+        own += min(limit, -1e-12) * reach[:, None]
+        m, i, j = np.nonzero(height > own[:, :, None])
+        found.append(np.stack([places[m, i], places[m, j]]))
+    i, j = np.concatenate(found, axis=1)
+    near = (i != j) & (changed[i] | changed[j])
+    i, j = i[near], j[near]
+    line = centers[j] - centers[i]
+    steep = np.einsum("ij,ij->i", normals[i], line) > limit * lengths(line)
+    return np.stack([i[steep], j[steep]])

@@ -72,7 +72,7 @@ def _geometry(here: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndar
     there = here.take(following(starts), axis=0)
     means = np.add.reduceat(here, starts[:-1]) / counts[:, None]
     middle = np.repeat(means, counts, axis=0)
-    normals = np.cross(there - here, middle - here)
+    normals = cross_rows(there - here, middle - here)
     weights = lengths(normals)
     total = np.add.reduceat(weights, starts[:-1])
     # Relative to the mean, so that little is lost in cancellation.
@@ -159,6 +159,14 @@ def turns(corners: np.ndarray, after: np.ndarray) -> np.ndarray:
     behind = np.empty_like(ahead)
     behind[after] = ahead
     return np.arctan2(cross(behind, ahead), (behind * ahead).sum(axis=1))
+
+
+def cross_rows(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the cross products of the rows of `a` and `b`, (..., 3) each, with the bits of `np.cross` but faster."""
+    found = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        found[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
+    return found
 
 
 def lengths(vectors: np.ndarray) -> np.ndarray:

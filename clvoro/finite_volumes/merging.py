@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse
 
-from ..mesh.connectivity import take_rows
+from ..mesh.connectivity import distinct, take_rows
 from .defects import Defects, Limits, find_defects
-from .geometry import lengths, sum_rows
+from .geometry import face_geometry, lengths, sum_rows
 from .independent import independent
 from .neighborhood import Neighborhood
 from .seams import unpack
@@ -125,22 +125,38 @@ class Cells:
         wall_of = np.repeat(-1 - self.neighbor[outer], self.count[outer])
         np.bitwise_or.at(self.walls, take_rows(starts, self.corners, outer)[1], 1 << wall_of)
         self.at_vertex = _inverse(starts, self.corners, v)
-        sides = np.where(self.neighbor >= 0, 2, 1)
         both = np.stack([self.owner, self.neighbor], axis=1).ravel()
-        self.at_cell = _inverse(np.concatenate([[0], np.cumsum(sides)]), both[both >= 0], self.n)
+        sides = np.concatenate([[0], np.cumsum(both >= 0)])
+        self.at_cell = _inverse(sides, both[both >= 0], self.n)
         self.next = np.full(v, -1)  # vertices that have been merged, as linked lists
         self.last = np.arange(v)
         self.now = np.arange(v)  # the vertex that each vertex has become, and where its image is
         self.now_code = np.zeros(v, np.int64)
         self.touched = np.zeros(self.n, bool)
+        self.changed = np.zeros(len(self.owner), bool)
+        self._known = np.zeros(len(self.owner), bool)  # faces whose geometry is
+        self._centers, self._areas = np.empty((2, len(self.owner), 3))
+        self._places = [np.full(k, -1) for k in (v, self.n, len(self.owner))]
 
     # Positions.
 
     def positions(self, vertices: np.ndarray, codes: np.ndarray) -> np.ndarray:
         """Return the positions of images of vertices, (k, 3)."""
-        if not codes.any():
-            return self.points.take(vertices, axis=0)
-        return self.points.take(vertices, axis=0) + unpack(codes) * self.extent
+        return self.points.take(vertices, axis=0) + self.offsets(codes)
+
+    def offsets(self, codes: np.ndarray) -> np.ndarray:
+        """Return packed offsets as vectors, (k, 3), or (1, 3) if all are 0."""
+        return unpack(codes) * self.extent if codes.any() else np.zeros((1, 3))
+
+    def geometry(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return centers and areas of `faces` as their owners see them, (k, 3) each."""
+        new = distinct(faces[~self._known[faces]])
+        if len(new):
+            starts, places = self.face_corners(new)
+            x = self.positions(self.corners[places], self.codes[places])
+            self._centers[new], self._areas[new] = face_geometry(x, starts, np.arange(len(x)))
+            self._known[new] = True
+        return self._centers.take(faces, axis=0), self._areas.take(faces, axis=0)
 
     def face_corners(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return starts and places of the corners of `faces`."""
@@ -150,8 +166,16 @@ class Cells:
 
     def faces_of(self, cells: np.ndarray) -> np.ndarray:
         """Return the faces of some cells, ascending."""
-        faces = np.unique(take_rows(*self.at_cell, cells)[1])
+        faces = distinct(take_rows(*self.at_cell, cells)[1] // 2)
         return faces[self.count[faces] > 0]
+
+    def find(self, kind: int, items: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the place of each of `values` among `items`, -1 for others; of vertices (0), cells (1) or faces (2)."""
+        places = self._places[kind]
+        places[items] = np.arange(len(items))
+        found = places.take(values)
+        places[items] = -1
+        return found
 
     # Merging.
 
@@ -159,14 +183,14 @@ class Cells:
         """Merge each set that leaves all cells valid; return how many do. Each merge removes a vertex."""
         done = 0
         while len((merges := self._current(merges)).sets):
-            sets, faces = self._star(merges)
+            rows, faces = self._star(merges)
             cells = np.concatenate([self.owner[faces], self.neighbor[faces]])
-            sets = np.concatenate([sets, sets])[cells >= 0]
+            sets = np.concatenate([rows, rows])[cells >= 0]
             cells = cells[cells >= 0]
             chosen = independent(sets, cells, merges.priority, self.n)
-            part = chosen[sets]
+            part = chosen[rows]
             rank = np.cumsum(chosen) - 1
-            done += self._try(merges.take(np.flatnonzero(chosen)), rank[sets[part]], cells[part])
+            done += self._try(merges.take(np.flatnonzero(chosen)), rank[rows[part]], faces[part])
             merges = merges.take(np.flatnonzero(~chosen))
         return done
 
@@ -214,24 +238,23 @@ class Cells:
         there = self.count[star] > 0
         return rows[there], star[there]
 
-    def _try(self, merges: Merges, sets: np.ndarray, cells: np.ndarray) -> int:
+    def _try(self, merges: Merges, sets: np.ndarray, faces: np.ndarray) -> int:
         """Merge those of the sets that leave their cells valid; no two sets have a cell in common."""
-        pairs = np.unique(sets * self.n + cells)
-        sets, cells = np.divmod(pairs, self.n)
+        sets, faces = np.divmod(distinct(sets * len(self.owner) + faces), len(self.owner))
         k = len(merges.priority)
         done = 0
         for first in range(0, k, _CHUNK):
             begin, end = np.searchsorted(sets, [first, first + _CHUNK])
             part = merges.take(np.arange(first, min(first + _CHUNK, k)))
-            done += self._try_some(part, sets[begin:end] - first, cells[begin:end])
+            done += self._try_some(part, sets[begin:end] - first, faces[begin:end])
         return done
 
-    def _try_some(self, merges: Merges, sets: np.ndarray, cells: np.ndarray) -> int:
-        """Merge those of the sets that leave their cells valid, given pairs of set and cell."""
+    def _try_some(self, merges: Merges, sets: np.ndarray, faces: np.ndarray) -> int:
+        """Merge those of the sets that leave their cells valid, given all pairs of a set and a face at its vertices."""
         targets = self._targets(merges)
         finite = np.ones(len(merges.priority), bool)
         finite[merges.sets[~np.isfinite(targets[:, 0, 0])]] = False
-        around = Neighborhood(self, merges, cells, sets)
+        around = Neighborhood(self, merges, sets, faces)
         good = around.is_manifold() & finite
         most = Defects.allowed(around.k, self.limits)
         fits = good & (find_defects(around, self.limits, targets[:, 0]) <= most)
@@ -244,11 +267,11 @@ class Cells:
         targets = targets[np.isin(merges.sets, rows)]
         rank = np.full(around.k, -1)
         rank[rows] = np.arange(len(rows))
-        merges, cells, sets = merges.take(rows), cells[rank[sets] >= 0], rank[sets]
+        merges, faces, sets = merges.take(rows), faces[rank[sets] >= 0], rank[sets]
         sets = sets[sets >= 0]
-        before = find_defects(Neighborhood(self, merges, cells, sets, merged=False), self.limits)
+        before = find_defects(Neighborhood(self, merges, sets, faces, merged=False), self.limits)
         most = before.worsened(Defects.allowed(len(rows), self.limits))
-        around, left = Neighborhood(self, merges, cells, sets), np.ones(len(rows), bool)
+        around, left = Neighborhood(self, merges, sets, faces), np.ones(len(rows), bool)
         for attempt in range(targets.shape[1]):
             tried = left.copy()
             tried[merges.sets[~np.isfinite(targets[:, attempt, 0])]] = False
@@ -306,7 +329,7 @@ class Cells:
             one = rank[rows] == step
             self.next[self.last[into[one]]] = gone[one]
             self.last[into[one]] = self.last[gone[one]]
-        mine = done[around.set_of_face] & (around.set_of_face >= 0)
+        mine = done[around.set_of_face]
         faces = around.faces[mine]
         starts, places = take_rows(
             around.starts, np.arange(len(around.corners)), np.flatnonzero(mine)
@@ -315,6 +338,7 @@ class Cells:
         there = self.face_corners(faces)[1]
         self.corners[there] = around.corners[places]
         self.codes[there] = around.codes[places]
+        self.changed[faces], self._known[faces] = True, False
         self.touched[around.cells[done[around.set_of_cell]]] = True
 
 

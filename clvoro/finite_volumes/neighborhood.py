@@ -1,26 +1,25 @@
-"""The 3D cells around vertices that merge, and the check that the merge keeps their topology."""
+"""The 3D faces and cells around vertices that merge, and the check that the merge keeps their topology."""
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mesh.connectivity import following, take_rows
+from ..mesh.connectivity import distinct, following, take_rows
 
 if TYPE_CHECKING:
     from .merging import Cells, Merges
 
 
 class Neighborhood:
-    """The cells around some sets of vertices, with their faces as they are after the merge.
+    """The faces with a vertex of some sets, as they are after the merge, and all cells of these faces.
 
     Attributes
     ----------
-    cells, set_of_cell : (c,) int
-        The cells, and for each one the set of vertices whose merge changes it.
     faces, set_of_face : (f,) int
-        All faces of the cells, and the set with one of their vertices, or -1.
+        The faces, and for each one the set that has one of its vertices.
     alive : (f,) bool
         Faces that keep at least three corners.
     starts : (f + 1,) int
@@ -30,8 +29,15 @@ class Neighborhood:
         Group of each corner that is a merged vertex; -1 for others.
     after, before : (k,) int
         Place of the next and of the previous corner of the same face.
+    cells, set_of_cell : (c,) int
+        The cells, and for each one the set of vertices whose merge changes it.
+    cells_of_face : (f, 2) int
+        Owner and neighbor of each face as indices into `cells`; -1 on walls.
+    side_starts : (c + 1,) int
     side_face, side_cell : (s,) int
-        Each face with each cell of the neighborhood that has it, as indices into `faces` and `cells`.
+        The faces of each cell, those that no merge changes included, as indices into those of `whole`; the cell.
+    side_star : (s,) int
+        Those of `faces` as indices into them; -1 for others.
     side_sign : (s,) float
         1 for the owner, -1 for the neighbor.
     side_code : (s,) int
@@ -42,87 +48,121 @@ class Neighborhood:
         self,
         whole: Cells,
         merges: Merges,
-        cells: np.ndarray,
-        set_of_cell: np.ndarray,
+        sets: np.ndarray,
+        faces: np.ndarray,
         merged: bool = True,
     ) -> None:
-        self.whole, self.cells, self.set_of_cell = whole, cells, set_of_cell
+        self.whole, self.faces, self.set_of_face = whole, faces, sets
         self.k, self.set_of_group = len(merges.priority), merges.sets
-        self.faces = whole.faces_of(cells)
-        old_starts, places = whole.face_corners(self.faces)
+        old_starts, places = whole.face_corners(faces)
         corners, codes = whole.corners[places], whole.codes[places]
-        face = np.repeat(np.arange(len(self.faces)), np.diff(old_starts))
-        member = _Lookup(merges.vertices)
-        at = member(corners)
-        moved = at >= 0
-        group = merges.group[at]
-        self.set_of_face = np.full(len(self.faces), -1)
-        self.set_of_face[face[moved]] = merges.sets[group[moved]]
+        face = np.repeat(np.arange(len(faces)), np.diff(old_starts))
+        at = whole.find(0, merges.vertices, corners)
+        moved = np.flatnonzero(at >= 0)
+        at, new = at[moved], np.full(len(corners), -1)
+        new[moved] = merges.group[at]
+        self._were = face[moved], corners[moved], codes[moved]
         if merged:
-            corners[moved] = merges.heads[group[moved]]
-            codes[moved] -= merges.codes[at[moved]]
-        new = np.where(moved, group, -1)
+            corners[moved] = merges.heads[new[moved]]
+            codes[moved] -= merges.codes[at]
         # A repeated corner is given once. Faces with fewer than three corners vanish.
         follow = following(old_starts)
         kept = (corners != corners[follow]) | (codes != codes[follow])
-        counts = np.bincount(face[kept], minlength=len(self.faces))
+        counts = np.bincount(face[kept], minlength=len(faces))
         self.alive = counts >= 3
         kept &= self.alive[face]
-        self.starts = np.concatenate([[0], np.cumsum(np.where(self.alive, counts, 0))])
+        counts[~self.alive] = 0
+        self._lost = np.diff(old_starts) - counts
+        self.starts = np.concatenate([[0], np.cumsum(counts)])
         self.corners, self.codes, self.face = corners[kept], codes[kept], face[kept]
         self.new = new[kept]
         self.after = following(self.starts)
         self.before = np.empty_like(self.after)
         self.before[self.after] = np.arange(len(self.after))
-        # Each face as a cell of the neighborhood sees it.
-        local = self.local = _Lookup(cells)
-        owner, neighbor = whole.owner[self.faces], whole.neighbor[self.faces]
-        rows = np.flatnonzero(self.alive)
-        here = local(owner[rows])
-        there = np.where(neighbor[rows] >= 0, local(np.maximum(neighbor[rows], 0)), -1)
-        self.side_face = np.concatenate([rows[here >= 0], rows[there >= 0]])
-        self.side_cell = np.concatenate([here[here >= 0], there[there >= 0]])
-        self.side_sign = np.repeat([1.0, -1.0], [np.sum(here >= 0), np.sum(there >= 0)])
-        self.side_code = np.where(
-            self.side_sign > 0, 0, whole.face_codes[self.faces[self.side_face]]
-        )
+        both = np.stack([whole.owner[faces], whole.neighbor[faces]], axis=1)
+        inner = both >= 0
+        self.cells = distinct(both[inner])
+        self.cells_of_face = np.where(inner, whole.find(1, self.cells, both), -1)
+        self.set_of_cell = np.empty_like(self.cells)
+        for column in self.cells_of_face.T:
+            self.set_of_cell[column[column >= 0]] = sets[column >= 0]
+        # All faces as each cell sees them.
+        starts, sides = take_rows(*whole.at_cell, self.cells)
+        side_face = sides // 2
+        star = whole.find(2, faces, side_face)
+        rows = np.flatnonzero(np.where(star < 0, whole.count[side_face] > 0, self.alive[star]))
+        self.side_face, self.side_star = side_face[rows], star[rows]
+        self.side_cell = np.repeat(np.arange(len(self.cells)), np.diff(starts))[rows]
+        counts = np.bincount(self.side_cell, minlength=len(self.cells))
+        self.side_starts = np.concatenate([[0], np.cumsum(counts)])
+        back = sides[rows] % 2
+        self.side_sign = 1.0 - 2 * back
+        self.side_code = back * whole.face_codes[self.side_face]
+
+    @cached_property
+    def star(self) -> np.ndarray:
+        """Sides of the faces that have a vertex of a set."""
+        return np.flatnonzero(self.side_star >= 0)
+
+    @cached_property
+    def kept_geometry(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centers and outward areas of the sides that no merge changes, (s, 3) each; nan for others."""
+        kept = self.side_star < 0
+        seen, outward = np.full((2, len(kept), 3), np.nan)
+        centers, areas = self.whole.geometry(self.side_face[kept])
+        seen[kept] = centers - self.whole.offsets(self.side_code[kept])
+        outward[kept] = areas * self.side_sign[kept, None]
+        return seen, outward
 
     def _bad(self, sets: np.ndarray) -> np.ndarray:
         """Return which sets occur in `sets`, (k,) bool."""
-        return np.bincount(sets[sets >= 0], minlength=self.k) > 0
+        return np.bincount(sets, minlength=self.k) > 0
 
     def is_manifold(self) -> np.ndarray:
         """Return which merges leave the cells topological balls that meet in faces, edges and vertices, (k,) bool."""
         bad = self._bad(self.set_of_group[self._repeated()])
-        # Euler's formula for each cell, and two faces at each edge of it.
-        starts, place = take_rows(self.starts, np.arange(len(self.corners)), self.side_face)
-        side = np.repeat(np.arange(len(self.side_face)), np.diff(starts))
-        cell = self.side_cell[side]
-        m = len(self.cells)
-        vertex = _number(cell, self.corners[place], self.codes[place] - self.side_code[side])
-        after = following(starts)
-        low, high = np.minimum(vertex, vertex[after]), np.maximum(vertex, vertex[after])
-        edges, times = np.unique(low * (vertex.max(initial=0) + 1) + high, return_counts=True)
-        cell_of_vertex = np.zeros(vertex.max(initial=-1) + 1, np.int64)
-        cell_of_vertex[vertex] = cell
-        cell_of_edge = cell_of_vertex[edges // (vertex.max(initial=0) + 1)]
-        faces = np.bincount(self.side_cell, minlength=m)
-        euler = (
-            np.bincount(cell_of_vertex, minlength=m)
-            - np.bincount(cell_of_edge, minlength=m)
-            + faces
-        )
-        wrong = (euler != 2) | (faces < 4)
-        wrong[cell_of_edge[times != 2]] = True
-        bad |= self._bad(self.set_of_cell[wrong])
+        bad |= self._bad(self.set_of_cell[self._not_balls()])
         return ~(bad | self._bad(self.set_of_group[self._pinched()]))
+
+    def _not_balls(self) -> np.ndarray:
+        """Return which cells are no balls, (c,) bool: if edges at merged vertices have not two faces, and by Euler."""
+        m = len(self.cells)
+        # Corners with a merged vertex, of each side.
+        corner = np.flatnonzero(self.new >= 0)
+        starts = np.searchsorted(self.face[corner], np.arange(len(self.faces) + 1))
+        starts, corner = take_rows(starts, corner, self.side_star[self.star])
+        side = self.star[np.repeat(np.arange(len(starts) - 1), np.diff(starts))]
+        cell = self.side_cell[side]
+        hub = _pack_keys(cell, self.new[corner], self.codes[corner] - self.side_code[side])
+        ends = np.concatenate([self.after[corner], self.before[corner]])
+        codes = self.codes[ends] - np.tile(self.codes[corner], 2)
+        spokes = _pack_keys(np.tile(hub, 2), self.corners[ends], codes)
+        order = np.argsort(spokes, kind="stable")
+        numbers = _runs(spokes[order])
+        times = np.bincount(numbers)[numbers]
+        wrong = np.zeros(m, bool)
+        wrong[np.tile(cell, 2)[order[times != 2]]] = True
+        # Euler's formula holds before: vertices - edges + faces does not change.
+        vertices = _count_unique(cell, hub, m)
+        twice = np.zeros(m, np.int64)
+        lost = self._lost - 2 * ~self.alive
+        for column in self.cells_of_face.T:
+            twice += np.bincount(column[column >= 0], lost[column >= 0], m).astype(np.int64)
+        face, corner, code = self._were
+        own, other = self.cells_of_face[face].T
+        inner = other >= 0
+        cell = np.concatenate([own, other[inner]])
+        codes = np.concatenate([code, (code - self.whole.face_codes[self.faces[face]])[inner]])
+        were = _pack_keys(cell, np.concatenate([corner, corner[inner]]), codes)
+        vertices -= _count_unique(cell, were, m)
+        return wrong | (2 * vertices + twice != 0) | (np.diff(self.side_starts) < 4)
 
     def _repeated(self) -> np.ndarray:
         """Return the groups whose vertex occurs twice in a face."""
         rows = np.flatnonzero(self.new >= 0)
-        number = _number(self.face[rows], self.new[rows], self.codes[rows])
-        twice = np.bincount(number)[number] > 1
-        return self.new[rows[twice]]
+        key = _pack_keys(self.face[rows], self.new[rows], self.codes[rows])
+        order = np.argsort(key, kind="stable")
+        return self.new[rows[order[1:][np.diff(key[order]) == 0]]]
 
     def _pinched(self) -> np.ndarray:
         """Return the groups of which two faces share several paths, or whose vertex is not inside a ball of cells."""
@@ -132,17 +172,21 @@ class Neighborhood:
         starts, place = take_rows(self.starts, np.arange(len(self.corners)), faces)
         counts = np.diff(starts)
         row = np.repeat(np.arange(len(rows)), counts)
-        number = _number(
+        key = _pack_keys(
             groups[row], self.corners[place], self.codes[place] - self.codes[rows[row]]
         )
+        order = np.argsort(key, kind="stable")
+        number = np.empty_like(order)
+        number[order] = _runs(key[order])
         side = np.sort(np.stack([number, number[following(starts)]]), axis=0)
         f, g = len(rows), len(self.set_of_group)
-        pairs = _pairs(number, row)
+        away = np.flatnonzero(place != rows[row])  # all faces share the vertex itself
+        pairs = _pairs(number[away], row[away])
         key, points = np.unique(pairs[0] * f + pairs[1], return_counts=True)
-        pairs = _pairs(_number(*side), row)
+        pairs = _pairs(_pack_keys(*side), row)
         sides = np.bincount(np.searchsorted(key, pairs[0] * f + pairs[1]), minlength=len(key))
         one, other = key // max(f, 1), key % max(f, 1)
-        split = (points - sides != 1) | (points >= np.minimum(counts[one], counts[other]))
+        split = (points != sides) | (points + 1 >= np.minimum(counts[one], counts[other]))
         wrong = [groups[one[split]]]
         beside = (place == self.after[rows[row]]) | (place == self.before[rows[row]])
         # Around the vertex: edges - faces + cells = 2, the outside of the domain included.
@@ -152,50 +196,45 @@ class Neighborhood:
         cell_groups = np.concatenate([groups, groups[inner]])
         cells = np.concatenate([w.owner[f], w.neighbor[f][inner]])
         frames = np.concatenate([-self.codes[rows], (w.face_codes[f] - self.codes[rows])[inner]])
-        around = _count_unique(cell_groups, _number(cells, frames), g)
+        around = _count_unique(cell_groups, _pack_keys(cells, frames), g)
         outside = np.bincount(groups[~inner], minlength=g) > 0
         euler = edges - np.bincount(groups, minlength=g) + around + outside
         wrong.append(np.flatnonzero(euler != 2))
         return np.concatenate(wrong)
 
 
-class _Lookup:
-    """The place of a value in an array without duplicates."""
-
-    def __init__(self, entries: np.ndarray) -> None:
-        self.order = np.argsort(entries, kind="stable")
-        self.sorted = entries[self.order]
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Return the place of each of `values` (k,), -1 for those that the array does not have."""
-        if not len(self.sorted):
-            return np.full(len(values), -1)
-        at = np.minimum(np.searchsorted(self.sorted, values), len(self.sorted) - 1)
-        return np.where(self.sorted[at] == values, self.order[at], -1)
+def _runs(values: np.ndarray) -> np.ndarray:
+    """Return the number of each run of equal `values`, (k,) int, ascending from 0."""
+    new = np.zeros(len(values), np.int64)
+    new[1:] = values[1:] != values[:-1]
+    return np.cumsum(new)
 
 
-def _number(*keys: np.ndarray) -> np.ndarray:
-    """Return equal numbers for equal keys, ascending."""
-    order = np.lexsort(keys[::-1])
-    new = np.zeros(len(order), bool)
-    new[:1] = True
+def _pack_keys(*keys: np.ndarray) -> np.ndarray:
+    """Return one integer for each row of `keys`, equal for equal rows and in their order."""
+    packed, span = np.zeros(len(keys[0]), np.int64), 1
     for key in keys:
-        new[1:] |= key[order[1:]] != key[order[:-1]]
-    numbers = np.empty(len(order), np.int64)
-    numbers[order] = np.cumsum(new) - 1
-    return numbers
+        low, high = int(key.min(initial=0)), int(key.max(initial=0))
+        if span * (high - low + 1) > 1 << 62:
+            packed = np.unique(packed, return_inverse=True)[1]
+            span = len(packed)
+        packed = packed * (high - low + 1) + (key - low)
+        span *= high - low + 1
+    return packed
 
 
 def _count_unique(sets: np.ndarray, numbers: np.ndarray, k: int) -> np.ndarray:
     """Return how many different numbers each set has, (k,) int."""
-    pairs = np.unique(sets * (numbers.max(initial=0) + 1) + numbers)
-    return np.bincount(pairs // (numbers.max(initial=0) + 1), minlength=k)
+    rows = np.lexsort((numbers, sets))
+    new = np.ones(len(rows), bool)
+    new[1:] = (np.diff(sets[rows]) != 0) | (np.diff(numbers[rows]) != 0)
+    return np.bincount(sets[rows[new]], minlength=k)
 
 
 def _pairs(groups: np.ndarray, items: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs of items in the same group, the lesser item first."""
-    order = np.lexsort((items, groups))
-    groups, items = groups[order], items[order]
+    """Return all pairs of items in the same group, the lesser item first; `items` ascend."""
+    order = np.argsort(groups, kind="stable")
+    groups, items = _runs(groups[order]), items[order]
     counts = np.bincount(groups)
     later = np.cumsum(counts)[groups] - np.arange(len(groups)) - 1
     first = np.repeat(np.arange(len(groups)), later)
