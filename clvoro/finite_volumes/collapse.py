@@ -6,9 +6,10 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from ..mesh.connectivity import following, take_rows
+from ..mesh.connectivity import distinct, following, take_rows
+from ..mesh.diagram import Diagram
 from .defects import Limits
-from .geometry import lengths, smaller_size, sum_rows
+from .geometry import cross_rows, lengths, smaller_size, sum_rows
 from .merging import Cells, Merges
 from .seams import pack, unpack
 from .solver_mesh import SolverMesh
@@ -27,17 +28,16 @@ _LONGEST = 0.25
 """Longest edge that is collapsed, if it is the shortest of a small face."""
 LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, skewness=3))
 """Tried in turn, the later ones where short edges or small faces are left."""
-_CHUNK = 1 << 13
-"""Faces that are scanned at a time."""
+_CHUNK = 1 << 11
+"""Faces that are read at a time: their arrays fit the caches."""
+_SURE = 1.05
+"""How much longer sides and larger faces are suspects: as they move a little, and the diagram has its own areas."""
 
 
-def collapse_short(
-    mesh: SolverMesh,
-    sizes: np.ndarray,
-    centroids: np.ndarray | None = None,
-    limits: Limits | None = None,
-) -> SolverMesh:
+def collapse_short(mesh: SolverMesh, diagram: Diagram) -> SolverMesh:
     """Return `mesh` without edges shorter than 0.02 h and faces smaller than 0.001 h^2, where its cells stay valid.
+
+    Faces smaller than 0.02 h^2 whose skewness exceeds 1.8 are collapsed, too.
 
     The ends of an edge, or the corners of a face, become one point: their mean, or one of them. Points on walls, edges
     and corners of the box stay on them, and images of a point move together. The cells therefore still fill the domain.
@@ -47,31 +47,53 @@ def collapse_short(
     Parameters
     ----------
     mesh : SolverMesh
-        In 3D.
-    sizes : (n,) float
-        h of each cell, in the domain's unit of length.
-    centroids : (n, 3) float, optional
-        Of the cells. If given, faces smaller than 0.02 h^2 whose skewness exceeds 1.8 are collapsed, too.
-    limits : Limits, optional
-        By default those of `LIMITS` in turn.
+        Of the diagram, in 3D.
+    diagram : Diagram
     """
-    cells, faces = _fold(mesh, sizes)
-    cells.centroids = centroids
-    pending = _flagged(cells, np.arange(len(cells.owner)))
-    for cells.limits in LIMITS if limits is None else (limits,):
+    suspects = _suspects(mesh, diagram)
+    if not suspects.any():
+        return mesh
+    cells, faces = _fold(mesh, diagram)
+    pending = _flagged(cells, np.flatnonzero(suspects[faces]))
+    for cells.limits in LIMITS:
         active = pending
         while len(active):
-            cells.touched[:] = False
+            cells.touched[:], cells.changed[:] = False, False
             for kind in (_Scan.clusters, _Scan.small_faces, _Scan.slivers, _Scan.edges):
                 cells.merge(kind(_Scan(cells, active)))
             # Where nothing has changed, another try is in vain.
-            active = _flagged(cells, cells.faces_of(np.flatnonzero(cells.touched)))
-            pending = np.union1d(pending, active)
+            again = cells.changed.copy()
+            again[pending] |= cells.is_touched(pending)
+            active = _flagged(cells, np.flatnonzero(again))
+            pending = distinct(np.concatenate([pending, active]))
         pending = _flagged(cells, pending)
     return mesh if (cells.now == np.arange(len(cells.now))).all() else _unfold(mesh, cells, faces)
 
 
-def _fold(mesh: SolverMesh, sizes: np.ndarray) -> tuple[Cells, np.ndarray]:
+def _suspects(mesh: SolverMesh, diagram: Diagram) -> np.ndarray:
+    """Return which faces may be skewed, be small or have a short side, (f,) bool: all that do, and a few others.
+
+    All faces are read here, and never again. Their areas are those of the diagram.
+    """
+    h = smaller_size(mesh.owner, mesh.neighbor, np.cbrt(diagram.volumes))
+    found = diagram.face_measures[mesh.half_face] < _SURE * _SKEWED_FACE * h**2
+    limit, columns = (_SURE * SHORT_EDGE * h) ** 2, np.ascontiguousarray(mesh.points.T)
+    for first in range(0, len(found), _CHUNK):
+        starts = mesh.starts[first : first + _CHUNK + 1]
+        corners, starts = mesh.corners[starts[0] : starts[-1]], starts - starts[0]
+        squares, step = np.zeros((2, len(corners)))
+        for x in columns:
+            here = x.take(corners)
+            np.subtract(here[1:], here[:-1], out=step[:-1])
+            step[starts[1:] - 1] = here[starts[:-1]] - here[starts[1:] - 1]
+            step *= step
+            squares += step
+        part = slice(first, first + _CHUNK)
+        found[part] |= np.minimum.reduceat(squares, starts[:-1]) < limit[part]
+    return found
+
+
+def _fold(mesh: SolverMesh, diagram: Diagram) -> tuple[Cells, np.ndarray]:
     """Return the cells of `mesh` with faces at seams and images of points once; the faces of `mesh` that they have."""
     upper = np.flatnonzero((mesh.twin < 0) | (mesh.twin > np.arange(len(mesh.twin))))
     points, extent = mesh.points, np.asarray(mesh.domain.extent, float)
@@ -85,7 +107,7 @@ def _fold(mesh: SolverMesh, sizes: np.ndarray) -> tuple[Cells, np.ndarray]:
         starts, corners, codes = mesh.starts, mesh.corners, np.zeros(len(mesh.corners), np.int64)
     cells = Cells(
         points, starts, corners, codes, mesh.owner[upper], mesh.neighbor[upper],
-        pack(mesh.shift[upper]), extent, sizes, SMALL_FACE,
+        pack(mesh.shift[upper]), extent, np.cbrt(diagram.volumes), diagram.centroids, SMALL_FACE,
     )  # fmt: skip
     for wall in np.unique(-1 - mesh.neighbor[mesh.neighbor < 0]).tolist():
         axis, upper_side = divmod(wall, 2)
@@ -108,7 +130,7 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
     lower = place[left] < 0
     source = place[np.where(lower, mesh.twin[left], left)]
     starts, where = cells.face_corners(source)
-    corners, points = cells.corners[where], cells.points
+    corners, points = cells.corners.take(where), cells.points
     if len(seam):
         _, where = take_rows(starts, where, np.arange(len(left)), lower)
         shift = np.repeat(np.where(lower, cells.face_codes[source], 0), np.diff(starts))
@@ -123,13 +145,10 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
 
 def _flagged(cells: Cells, faces: np.ndarray) -> np.ndarray:
     """Return those of `faces` that are small or have a short side."""
-    parts = [np.zeros(0, np.int64)]
-    for first in range(0, len(faces), _CHUNK):
-        scan = _Scan(cells, faces[first : first + _CHUNK])
-        flagged = scan.small.copy()
-        flagged[np.searchsorted(scan.starts, np.flatnonzero(scan.short), "right") - 1] = True
-        parts.append(scan.faces[flagged])
-    return np.concatenate(parts)
+    scan = _Scan(cells, faces)
+    flagged = scan.small.copy()
+    flagged[np.searchsorted(scan.starts, np.flatnonzero(scan.short), "right") - 1] = True
+    return scan.faces[flagged]
 
 
 class _Scan:
@@ -162,24 +181,19 @@ class _Scan:
         self.length, self.h = lengths(x.take(after, axis=0) - x), h[face]
         self.short = self.length < SHORT_EDGE * self.h
         away = x - x.take(self.starts[face], axis=0)
-        twice = sum_rows(face, np.cross(away, away.take(after, axis=0)), len(self.faces))
+        twice = sum_rows(face, cross_rows(away, away.take(after, axis=0)), len(self.faces))
         area = lengths(twice) / 2
         self.small = area < SMALL_FACE * h**2
-        if cells.centroids is not None:
-            rows = ~self.small & (area < _SKEWED_FACE * h**2)
-            rows &= cells.neighbor[self.faces] >= 0
-            skewness = self._skewness(np.flatnonzero(rows), x, twice, cells.centroids)
-            self.small[rows] = skewness > SKEWED
+        rows = ~self.small & (area < _SKEWED_FACE * h**2) & (cells.neighbor[self.faces] >= 0)
+        self.small[rows] = self._skewness(np.flatnonzero(rows), x, twice) > SKEWED
 
-    def _skewness(
-        self, rows: np.ndarray, x: np.ndarray, normals: np.ndarray, centroids: np.ndarray
-    ) -> np.ndarray:
+    def _skewness(self, rows: np.ndarray, x: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return the approximate skewness of some of the faces, all between two cells."""
         c, faces = self.cells, self.faces[rows]
         starts, places = take_rows(self.starts, np.arange(len(x)), rows)
         face = np.repeat(np.arange(len(rows)), np.diff(starts))
         center = sum_rows(face, x[places], len(rows)) / np.diff(starts)[:, None]
-        own, other = centroids[c.owner[faces]], centroids[c.neighbor[faces]]
+        own, other = c.centroids[c.owner[faces]], c.centroids[c.neighbor[faces]]
         line = other + unpack(c.face_codes[faces]) * c.extent - own
         arm, n = center - own, normals[rows]
         share = np.einsum("ij,ij->i", n, arm) / np.einsum("ij,ij->i", n, line)

@@ -94,8 +94,10 @@ class Cells:
         Packed offset of the neighbor's image.
     touched : (n,) bool
         Cells that a merge has changed.
-    centroids : (n, 3) float, or None
+    centroids : (n, 3) float
         Where the cells had their centroids before all merges.
+    changed : (f,) bool
+        Faces that a merge has changed.
     """
 
     def __init__(
@@ -109,6 +111,7 @@ class Cells:
         face_codes: np.ndarray,
         extent: np.ndarray,
         sizes: np.ndarray,
+        centroids: np.ndarray,
         small: float,
     ) -> None:
         self.points, self.extent = np.array(points, float), np.asarray(extent, float)
@@ -116,9 +119,8 @@ class Cells:
         self.corners, self.codes = corners.astype(np.int64), codes
         self.owner, self.neighbor = owner.astype(np.int64), neighbor.astype(np.int64)
         self.face_codes, self.n = face_codes, len(sizes)
-        self.sizes, self.small = sizes, small
+        self.sizes, self.centroids, self.small = sizes, centroids, small
         self.limits = Limits()
-        self.centroids: np.ndarray | None = None
         v = len(points)
         self.walls = np.zeros(v, np.int64)
         outer = np.flatnonzero(self.neighbor < 0)
@@ -134,8 +136,6 @@ class Cells:
         self.now_code = np.zeros(v, np.int64)
         self.touched = np.zeros(self.n, bool)
         self.changed = np.zeros(len(self.owner), bool)
-        self._known = np.zeros(len(self.owner), bool)  # faces whose geometry is
-        self._centers, self._areas = np.empty((2, len(self.owner), 3))
         self._places = [np.full(k, -1) for k in (v, self.n, len(self.owner))]
 
     # Positions.
@@ -150,13 +150,12 @@ class Cells:
 
     def geometry(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return centers and areas of `faces` as their owners see them, (k, 3) each."""
-        new = distinct(faces[~self._known[faces]])
-        if len(new):
-            starts, places = self.face_corners(new)
-            x = self.positions(self.corners[places], self.codes[places])
-            self._centers[new], self._areas[new] = face_geometry(x, starts, np.arange(len(x)))
-            self._known[new] = True
-        return self._centers.take(faces, axis=0), self._areas.take(faces, axis=0)
+        once = distinct(faces)
+        starts, places = self.face_corners(once)
+        x = self.positions(self.corners[places], self.codes[places])
+        centers, areas = face_geometry(x, starts, np.arange(len(x)))
+        at = self.find(2, once, faces)
+        return centers.take(at, axis=0), areas.take(at, axis=0)
 
     def face_corners(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return starts and places of the corners of `faces`."""
@@ -164,10 +163,10 @@ class Cells:
         starts = np.concatenate([[0], np.cumsum(counts)])
         return starts, np.arange(starts[-1]) + np.repeat(self.begin[faces] - starts[:-1], counts)
 
-    def faces_of(self, cells: np.ndarray) -> np.ndarray:
-        """Return the faces of some cells, ascending."""
-        faces = distinct(take_rows(*self.at_cell, cells)[1] // 2)
-        return faces[self.count[faces] > 0]
+    def is_touched(self, faces: np.ndarray) -> np.ndarray:
+        """Return which of some faces have a cell that a merge has changed."""
+        neighbor = self.neighbor[faces]
+        return self.touched[self.owner[faces]] | ((neighbor >= 0) & self.touched[neighbor])
 
     def find(self, kind: int, items: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the place of each of `values` among `items`, -1 for others; of vertices (0), cells (1) or faces (2)."""
@@ -338,7 +337,7 @@ class Cells:
         there = self.face_corners(faces)[1]
         self.corners[there] = around.corners[places]
         self.codes[there] = around.codes[places]
-        self.changed[faces], self._known[faces] = True, False
+        self.changed[faces] = True
         self.touched[around.cells[done[around.set_of_cell]]] = True
 
 

@@ -202,7 +202,7 @@ def make_solver_mesh(
     if collapse and mesh.dim == 2:
         mesh = relax_points(mesh, parts, straight)
     if collapse and mesh.dim == 3:
-        mesh = collapse_short(mesh, np.cbrt(diagram.volumes), diagram.centroids)
+        mesh = collapse_short(mesh, diagram)
     mesh = compact(mesh)
     if straight and abs(mesh.area_change) > _LARGE_CHANGE:
         warn(
