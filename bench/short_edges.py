@@ -74,7 +74,7 @@ def measure(diagram: clvoro.Diagram) -> dict[str, Any]:
     """Collapse the short edges of a diagram; return the figures."""
     before, h = diagram.solver_mesh(collapse=False), np.cbrt(diagram.volumes)
     begin = time.process_time()
-    after = collapse_short(before, h, diagram.centroids)
+    after = collapse_short(before, diagram)
     seconds = time.process_time() - begin
     files = [_seconds_to_file(diagram, binary) for binary in (False, True)]
     (edges, faces), left = count_short(before, h), count_short(after, h)

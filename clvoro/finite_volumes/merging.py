@@ -169,7 +169,7 @@ class Cells:
         return self.touched[self.owner[faces]] | ((neighbor >= 0) & self.touched[neighbor])
 
     def find(self, kind: int, items: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the place of each of `values` among `items`, -1 for others; of vertices (0), cells (1) or faces (2)."""
+        """Return the place of each of `values` among `items`, or -1: of vertices (0), cells (1) or faces (2)."""
         places = self._places[kind]
         places[items] = np.arange(len(items))
         found = places.take(values)

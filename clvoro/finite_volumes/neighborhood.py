@@ -232,11 +232,12 @@ def _count_unique(sets: np.ndarray, numbers: np.ndarray, k: int) -> np.ndarray:
 
 
 def _pairs(groups: np.ndarray, items: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs of items in the same group, the lesser item first; `items` ascend."""
+    """Return all pairs of different items in the same group, the lesser item first; `items` ascend."""
     order = np.argsort(groups, kind="stable")
     groups, items = _runs(groups[order]), items[order]
     counts = np.bincount(groups)
     later = np.cumsum(counts)[groups] - np.arange(len(groups)) - 1
     first = np.repeat(np.arange(len(groups)), later)
     second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
-    return items[first], items[second]
+    one, other = items[first], items[second]
+    return one[one != other], other[one != other]

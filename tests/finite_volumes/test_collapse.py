@@ -185,7 +185,7 @@ def test_merges_are_those_of_a_slow_reference():
     """Merge one pair of vertices, near or far, connected or not: it is valid exactly if the reference says so."""
     rng = np.random.default_rng(12)
     diagram = solid_diagram((0, 0, 0), (1, 1, 1), rng.random((25, 3)))
-    mesh, h = diagram.solver_mesh(collapse=False), np.cbrt(diagram.volumes)
+    mesh = diagram.solver_mesh(collapse=False)
     whole = polyhedra.Mesh.of(mesh)
     ends = np.stack([mesh.corners, mesh.corners[following(mesh.starts)]], axis=1)
     ends = np.unique(np.sort(ends, axis=1), axis=0)
@@ -197,7 +197,7 @@ def test_merges_are_those_of_a_slow_reference():
     ]
     limits, verdicts = Limits(non_orthogonality=60, skewness=4), []
     for a, b in [*ends.tolist(), *np.array(apart).tolist()]:
-        cells, _ = collapse._fold(mesh, h)
+        cells, _ = collapse._fold(mesh, diagram)
         cells.limits = limits
         walls = cells.walls.copy()
         did = cells.merge(one_edge(cells, a, b))
@@ -237,7 +237,19 @@ def test_merges_are_those_of_a_slow_reference():
 def test_clear_meshes_are_left_alone():
     diagram = solid_diagram((0, 0, 0), (1, 1, 1), lattice(2, 0))
     mesh = diagram.solver_mesh(collapse=False)
-    assert collapse_short(mesh, np.cbrt(diagram.volumes)) is mesh
+    assert collapse_short(mesh, diagram) is mesh
+
+
+@pytest.mark.sparse(2)
+def test_suspects_are_all_that_would_be_flagged(meshes):
+    """The screening against a scan of all faces."""
+    diagram, before, _ = meshes
+    cells, faces = collapse._fold(before, diagram)
+    flagged = faces[collapse._flagged(cells, np.arange(len(cells.owner)))]
+    suspects = collapse._suspects(before, diagram)
+    assert len(flagged)
+    assert suspects[flagged].all()
+    assert np.count_nonzero(~suspects) > 0
 
 
 def test_offsets_are_packed():
