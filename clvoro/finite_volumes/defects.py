@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mesh.connectivity import distinct, take_rows
+from ..mesh.connectivity import distinct, following, take_rows
 from .geometry import cell_geometry, cross_rows, face_geometry, lengths, smaller_size
 
 if TYPE_CHECKING:
@@ -155,27 +155,29 @@ def _bad_tetrahedra(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> np.
 
     Its triangles are those about its center, and the fan about one of its corners, whichever will do.
     """
-    rows = around.star
-    face = around.side_star[rows]
-    origins = shapes.middles[around.side_cell[rows]] + around.whole.offsets(around.side_code[rows])
-    counts = np.diff(around.starts)[face]
-    fans = np.zeros(len(around.corners))
-    bad = np.zeros(len(around.faces), bool)
-    for n in distinct(counts).tolist():
-        these = np.flatnonzero(counts == n)
-        f, sign = face[these], around.side_sign[rows[these], None]
-        places = around.starts[f][:, None] + np.arange(n)
-        y = x.take(places, axis=0) - origins[these][:, None]
-        normal = cross_rows(y, y.take(np.arange(1, n + 1) % n, axis=1))
-        about = np.einsum("mnk,mk->mn", normal, shapes.centers[f] - origins[these]) * sign
-        bad[f[~(about > 0).all(axis=1)]] = True
-        volume = y @ normal.transpose(0, 2, 1) * sign[:, :, None]
-        volume[:, np.arange(n), np.arange(n)] = np.inf
-        volume[:, np.arange(n), np.arange(n) - 1] = np.inf
-        least = volume.min(axis=2) > _THIN * about.sum(axis=1)[:, None]
-        np.add.at(fans, places[~least], 1)
-    some = np.bincount(around.face[fans == 0], minlength=len(around.faces)) > 0
-    return bad | ~(some | ~around.alive)
+    face, sign = around.side_star[around.star], around.side_sign[around.star]
+    origins = shapes.middles[around.side_cell[around.star]]
+    origins = origins + around.whole.offsets(around.side_code[around.star])
+    starts, place = take_rows(around.starts, np.arange(len(x)), face)
+    side, after = np.repeat(np.arange(len(face)), np.diff(starts)), following(starts)
+    y = x.take(place, axis=0) - origins.take(side, axis=0)
+    normal = cross_rows(y, y.take(after, axis=0)) * sign[side, None]
+    height = shapes.centers[face] - origins
+    about = np.einsum("ij,ij->i", normal, height.take(side, axis=0))
+    bad = around.alive.copy()
+    least = (_THIN * np.bincount(side, about, len(face)))[side]
+    begin, end, corner = starts[:-1][side], starts[1:][side], np.arange(len(place))
+    rows, tip = corner, 0
+    while len(rows):  # fans about the first corner; where this will not do, about the second one, and so on
+        top = begin[rows] + tip
+        flat = ~(np.einsum("ij,ij->i", normal[rows], y.take(top, axis=0)) > least[rows])
+        flat &= (rows != top) & (after[rows] != top)
+        bad[face[side[rows]]] = False
+        bad[face[side[rows[flat]]]] = True
+        tip += 1
+        rows = rows[bad[face[side[rows]]] & (begin[rows] + tip < end[rows])]
+    bad[face[side[~(about > 0)]]] = True
+    return bad
 
 
 def _quality(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> tuple[np.ndarray, np.ndarray]:
@@ -228,16 +230,19 @@ def concave_pairs(
     found = [np.zeros((2, 0), np.int64)]
     normals = areas / lengths(areas)[:, None]
     counts = np.diff(starts)
-    for k in distinct(counts).tolist():
-        places = starts[:-1][counts == k, None] + np.arange(k)
+    wide = -(counts // -4) * 4  # cells are compared together that have about as many faces
+    for k in distinct(wide).tolist():
+        rows = np.flatnonzero(wide == k)
+        within = np.arange(k) < counts[rows, None]
+        places = starts[rows, None] + np.where(within, np.arange(k), 0)
         c, s = centers.take(places, axis=0), normals.take(places, axis=0)
         c -= c.mean(axis=1, keepdims=True)
-        height = s @ c.transpose(0, 2, 1)
+        s[~within] = np.nan
         own = np.einsum("mij,mij->mi", s, c)
         # Few pairs are this near to a plane: only these are computed.
         reach = 2 * np.sqrt(np.einsum("mij,mij->mi", c, c).max(axis=1))
         own += min(limit, -1e-12) * reach[:, None]
-        m, i, j = np.nonzero(height > own[:, :, None])
+        m, i, j = np.nonzero((s @ c.transpose(0, 2, 1) > own[:, :, None]) & within[:, None, :])
         found.append(np.stack([places[m, i], places[m, j]]))
     i, j = np.concatenate(found, axis=1)
     near = (i != j) & (changed[i] | changed[j])
