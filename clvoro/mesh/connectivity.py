@@ -60,9 +60,11 @@ def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """
     n, dim = len(diagram), diagram.domain.dim
     i, j = face_owners(diagram)[faces].astype(np.int64), diagram.neighbors[faces].astype(np.int64)
-    codes = (diagram.shifts[faces] + 1) @ 3 ** np.arange(dim)
-    here = (i * n + j) * 3**dim + codes
-    there = (j * n + i) * 3**dim + (3**dim - 1 - codes)
+    here, there = i * n + j, j * n + i
+    if any(diagram.domain.periodic):
+        codes = (diagram.shifts[faces] + 1) @ 3 ** np.arange(dim)
+        here = here * 3**dim + codes
+        there = there * 3**dim + (3**dim - 1 - codes)
     if not isinstance(diagram.domain, Polygon):
         return here, there
     begin, end = face_ends(diagram)[faces].T
@@ -122,13 +124,13 @@ def take_rows(
 
     Where `backwards` (bool, one per row) is set, the items of a row are reversed, but the first stays first.
     """
-    counts = np.diff(starts)[rows]
+    begin, counts = starts[:-1][rows], np.diff(starts)[rows]
     taken = np.concatenate([[0], np.cumsum(counts)])
-    within = np.arange(taken[-1]) - np.repeat(taken[:-1], counts)
+    places = np.arange(taken[-1]) + np.repeat(begin - taken[:-1], counts)
     if backwards is not None and backwards.any():
-        turned = np.repeat(backwards, counts) & (within > 0)
-        within = np.where(turned, np.repeat(counts, counts) - within, within)
-    return taken, items[np.repeat(starts[:-1][rows], counts) + within]
+        turned = np.repeat(backwards, counts) & (places > np.repeat(begin, counts))
+        places = np.where(turned, np.repeat(2 * begin + counts, counts) - places, places)
+    return taken, items[places]
 
 
 def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
@@ -202,23 +204,24 @@ def face_topology(diagram: Diagram) -> FaceTopology:
     starts, corners = face_corners(diagram)
     filled = np.diff(starts) > 0
     inner = np.flatnonzero(filled & (neighbor >= 0))
-    low = np.minimum(owner[inner], neighbor[inner]).astype(np.int64)
-    high = np.maximum(owner[inner], neighbor[inner])
-    # Of two half-faces the one of the lower cell comes first.
+    # Of two half-faces that of the lower cell is taken, or that which is there.
     here, there = face_keys(diagram, inner)
-    flipped = here > there
-    key = np.minimum(here, there) * 2 + flipped
-    order = np.argsort(key, kind="stable")
-    pair = key[order] // 2
-    order = order[np.concatenate([[True], pair[1:] != pair[:-1]])] if len(order) else order
+    first, second = np.flatnonzero(here < there), np.flatnonzero(here > there)
+    key = here[first]
+    if not np.array_equal(np.sort(key), np.sort(there[second])):
+        second = second[~np.isin(there[second], key)]
+        first, key = np.concatenate([first, second]), np.concatenate([key, there[second]])
+    chosen = first[np.argsort(key, kind="stable")]
+    inner, flipped = inner[chosen], here[chosen] > there[chosen]
     outer = np.flatnonzero(filled & (neighbor < 0))
     outer = outer[np.lexsort((owner[outer], -neighbor[outer]))]
-    rows = np.concatenate([inner[order], outer])
-    backwards = np.concatenate([flipped[order], np.zeros(len(outer), bool)])
+    rows = np.concatenate([inner, outer])
+    one, other = owner[inner], neighbor[inner]
+    backwards = np.concatenate([flipped, np.zeros(len(outer), bool)])
     taken, vertices = take_rows(starts, corners, rows, backwards)
     return FaceTopology(
-        np.concatenate([low[order], owner[outer]]).astype(np.int32),
-        np.concatenate([high[order], neighbor[outer]]).astype(np.int32),
+        np.concatenate([np.minimum(one, other), owner[outer]]).astype(np.int32),
+        np.concatenate([np.maximum(one, other), neighbor[outer]]).astype(np.int32),
         rows,
         taken,
         vertices,
