@@ -88,8 +88,9 @@ def _suspects(mesh: SolverMesh, diagram: Diagram) -> np.ndarray:
             step[starts[1:] - 1] = here[starts[:-1]] - here[starts[1:] - 1]
             step *= step
             squares += step
-        part = slice(first, first + _CHUNK)
-        found[part] |= np.minimum.reduceat(squares, starts[:-1]) < limit[part]
+        limits = np.repeat(limit[first : first + _CHUNK], np.diff(starts))
+        short = np.flatnonzero(squares < limits)
+        found[first + np.searchsorted(starts, short, "right") - 1] = True
     return found
 
 

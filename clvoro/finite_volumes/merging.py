@@ -161,7 +161,9 @@ class Cells:
         """Return starts and places of the corners of `faces`."""
         counts = self.count[faces]
         starts = np.concatenate([[0], np.cumsum(counts)])
-        return starts, np.arange(starts[-1]) + np.repeat(self.begin[faces] - starts[:-1], counts)
+        places = np.repeat(self.begin[faces] - starts[:-1], counts)
+        places += np.arange(len(places))
+        return starts, places
 
     def is_touched(self, faces: np.ndarray) -> np.ndarray:
         """Return which of some faces have a cell that a merge has changed."""

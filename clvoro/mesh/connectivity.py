@@ -126,7 +126,8 @@ def take_rows(
     """
     begin, counts = starts[:-1][rows], np.diff(starts)[rows]
     taken = np.concatenate([[0], np.cumsum(counts)])
-    places = np.arange(taken[-1]) + np.repeat(begin - taken[:-1], counts)
+    places = np.repeat(begin - taken[:-1], counts)
+    places += np.arange(len(places))
     if backwards is not None and backwards.any():
         turned = np.repeat(backwards, counts) & (places > np.repeat(begin, counts))
         places = np.where(turned, np.repeat(2 * begin + counts, counts) - places, places)
