@@ -168,7 +168,8 @@ def _bad_tetrahedra(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> np.
     least = (_THIN * np.bincount(side, about, len(face)))[side]
     begin, end, corner = starts[:-1][side], starts[1:][side], np.arange(len(place))
     rows, tip = corner, 0
-    while len(rows):  # fans about the first corner; where this will not do, about the second one, and so on
+    # Fans about the first corner; where this will not do, about the second one, and so on.
+    while len(rows):
         top = begin[rows] + tip
         flat = ~(np.einsum("ij,ij->i", normal[rows], y.take(top, axis=0)) > least[rows])
         flat &= (rows != top) & (after[rows] != top)
