@@ -35,7 +35,7 @@ LIMITS = {
     "measure_cells": (192, 512),
     "descend_quality": (144, 512),
     "clip_polyhedra": (224, 5760),
-    "clip_polyhedra_by_teams": (176, 320),
+    "clip_polyhedra_by_teams": (192, 320),
     "update_cells_by_teams": (176, 448),
     "update_cells": (160, 5632),
     "descend_surface": (176, 2112),
