@@ -202,8 +202,9 @@ class MeshOutput:
             corner of the domain than 0.4 of the smaller cell moves into it. Faces of different names remain
             apart. The change of area is the mesh's `area_change`.
         collapse : bool
-            Whether the ends of short faces become one point: in 2D of faces shorter than 0.02 (on walls 0.05) times
-            the width of the thinner cell, while cells remain convex. Corners and ends of names stay in place. In 3D
+            Whether the ends of short faces become one point: in 2D of faces shorter than 0.055 times the size of
+            the smaller cell and 0.2 times the width of the thinner one, while cells remain convex. Corners and ends
+            of names stay in place. In 3D
             edges shorter than 0.02 h and faces smaller than 0.001 h^2 are collapsed, with h the cube root of the
             smaller cell's volume; so are faces smaller than 0.02 h^2 whose skewness exceeds 1.8. Faces may then be
             slightly warped: their flatness is at least 0.95. Points on the box stay on it, so that the cells still fill
