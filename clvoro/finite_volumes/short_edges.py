@@ -138,6 +138,10 @@ class _Round:
         kept = self.into[corners] != self.into[corners[following(before)]]
         left = np.bincount(row, kept, len(touched)).astype(int)
         after, corners = np.concatenate([[0], np.cumsum(left)]), self.into[corners[kept]]
+        # Beside an island a cell would touch itself if it has both ends of the face, but not the face.
+        key = np.sort(row[kept] * len(self.mesh.points) + corners)
+        simple = left >= 3
+        simple[key[1:][np.diff(key) == 0] // len(self.mesh.points)] = False
         p, q = self.mesh.points[self.a], self.mesh.points[self.b]
         kind, other = self.kind[self.a], self.kind[self.b]
         done, target = np.zeros(len(self.faces), bool), p.copy()
@@ -148,7 +152,7 @@ class _Round:
             (q, kind <= other),
         ):
             turn = _least_turns(self._moved(choice)[corners], after)
-            good = (left >= 3) & (turn >= np.minimum(least, _STRAIGHT))
+            good = simple & (turn >= np.minimum(least, _STRAIGHT))
             accepted = allowed & ~done & (np.bincount(face, ~good, len(done)) == 0)
             target[accepted] = choice[accepted]
             done |= accepted

@@ -40,6 +40,11 @@ remains a small part of that of a run."""
 _LIMITS = (LIMITS, (np.radians(30), 2.5), (np.radians(45), 3.0))
 _MOST_REFUSED = 50
 """Walls change if at most this many cells are refused after other attempts, or the repair would take long in vain."""
+_MOST_PLACES, _PLACES_SHARE = 200, 0.005
+"""Faces are connected in another way if at most this many cells, or this share of all, are bad after points have moved.
+
+A place takes up to a quarter of a second. On coasts with more features than cells 3 to 10 % are bad, and most
+remain so."""
 _NOT_ADAPTED = 0.12
 """Nothing changes if more faces than this share are bad by the first limits: the generators were not adapted."""
 
@@ -80,7 +85,9 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
     given = [made for made in map(PricedPatch.of, patches) if made is not None and made.bad.any()]
     # The last bits of sums in BLAS depend on its number of threads.
     with _BLAS, threadpool_limits(1, user_api="blas"):
-        better = carried_out(in_step([_improved(patch, ring, straight) for patch in given]), ring)
+        better = carried_out(in_step([_moved(patch) for patch in given]), ring)
+        if straight and _are_few(better, max(_MOST_PLACES, int(_PLACES_SHARE * len(mesh)))):
+            better = carried_out(in_step([repaired(patch, ring) for patch in better]), ring)
         refused = sum(int(patch.refused.sum()) for patch in better)
         if straight and 0 < refused <= _MOST_REFUSED:
             better = carried_out(in_step([repaired(patch, ring, walls) for patch in better]), ring)
@@ -106,14 +113,32 @@ def _report(cuts: list[Cut]) -> None:
     )
 
 
-def _improved(given: PricedPatch, ring: RingCoordinate | None, faces: bool) -> Task[PricedPatch]:
-    """Find a patch of lower price, the same if there is none; its `faces` connect other cells only if true."""
+def _moved(given: PricedPatch) -> Task[PricedPatch]:
+    """Find a patch of lower price after moves of its points inside, the same if there is none."""
     for rings in _TRIES:
         if not given.bad.any():
-            return given
+            break
         (made,) = yield [Move(given, given.near(given.bad, rings), False, _STEPS)]
         given = made if made.price < given.price else given
-    return (yield from repaired(given, ring)) if faces else given
+    return given
+
+
+def _are_few(patches: list[PricedPatch], most: int) -> bool:
+    """Return whether at most so many cells of `patches` are bad; warn if not."""
+    count = sum(int(patch.bad.sum()) for patch in patches)
+    if count <= most:
+        return True
+    patch = max(patches, key=lambda patch: patch.prices.max())
+    c, worst = patch.cells, int(np.argmax(patch.prices))
+    place = patch.patch.points[c.loop[c.row == worst]].mean(axis=0)
+    warn(
+        f"{count} cells of the mesh for solvers are concave, or have skew faces or faces far from orthogonal, as the "
+        f"one at {format_point(place)}, and are left so: a repair would take minutes, and most of them would remain. "
+        "The boundary has features smaller than the cells; drop these first, as domain.simplified(1.5 * h) does with h "
+        "the size of the cells there, or use smaller cells",
+        MismatchWarning,
+    )
+    return False
 
 
 def _limited(mesh: SolverMesh) -> tuple[tuple[float, float], np.ndarray] | None:

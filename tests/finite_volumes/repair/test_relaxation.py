@@ -1,5 +1,7 @@
 """Points that move away from skew faces and faces far from orthogonal."""
 
+import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -103,6 +105,28 @@ def test_points_far_from_bad_faces_stay(ctx):
     moved = np.hypot(*(relaxed.points - pulled.points).T)
     assert moved[p] > 0.005
     assert moved[np.hypot(*(mesh.points - mesh.points[p]).T) > 0.5].max() == 0
+
+
+def test_faces_remain_where_too_many_cells_are_bad(mesh, monkeypatch):
+    """Points move all the same, and a warning says where and what helps."""
+    parts = mesh.domain.boundaries.index
+    points = mesh.points.copy()
+    at = int(np.argmin(np.hypot(*(points - 0.25).T)))
+    points[at] += 0.05  # cells there are inverted
+    pulled = replace(mesh, points=points)
+    monkeypatch.setattr(relaxation, "_TRIES", ())
+    for most, few in ((100, True), (0, False)):
+        monkeypatch.setattr(relaxation, "_MOST_PLACES", most)
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            made = relax_points(pulled, parts)
+        assert (face_measures(made)[0].max() < np.radians(20)) == few
+        assert [bool(WARNED.search(str(w.message))) for w in seen] == ([] if few else [True])
+
+
+WARNED = re.compile(
+    r"^\d+ cells of the mesh .* at \(0\.[23].*, 0\.[23].*\), .*simplified\(1\.5 \* h\)"
+)
 
 
 def test_a_mesh_that_was_not_adapted_is_left_alone(ctx):
