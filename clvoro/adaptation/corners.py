@@ -165,22 +165,22 @@ def _bend(ring: np.ndarray, turned: np.ndarray, reach: np.ndarray) -> np.ndarray
 
 
 def _spaced(x: np.ndarray, bend: np.ndarray, h: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Return those of the vertices `order` that are far enough from all earlier ones that are kept."""
+    """Return those of the vertices `order` that are far enough from all earlier ones that are kept.
+
+    Only around those that are kept others are searched: on a fine coast most are not.
+    """
     if not len(order):
         return order
-    tree = KDTree(x[order])
-    near = tree.query_ball_point(x[order], SPACING * h[order])
-    kept = np.zeros(len(order), bool)
-    for k, (i, others) in enumerate(zip(order, near, strict=True)):
-        kept[k] = True
-        for m in others:
-            j = order[m]
-            if kept[m] and m != k:
-                fan = SPACING - FAN * (bend[i] + bend[j]) / 2
-                limit = max(fan, LEAST_SPACING) * min(h[i], h[j])
-                if np.hypot(*(x[i] - x[j])) < limit:
-                    kept[k] = False
-                    break
+    x, bend, h = x[order], bend[order], h[order]
+    tree, kept = KDTree(x), np.ones(len(order), bool)
+    for k in range(len(order)):
+        if not kept[k]:
+            continue
+        near = np.array(tree.query_ball_point(x[k], SPACING * h[k]))
+        near = near[near > k]
+        fan = SPACING - FAN * (bend[near] + bend[k]) / 2
+        limit = np.maximum(fan, LEAST_SPACING) * np.minimum(h[near], h[k])
+        kept[near[np.hypot(*(x[near] - x[k]).T) < limit]] = False
     return order[kept]
 
 

@@ -87,9 +87,9 @@ def _without_islands(mesh: SolverMesh, domain: Polygon, parts: np.ndarray) -> So
     within[ring[named & ~left[parts[edge]]]] = False
     if not within.any():
         return mesh
-    extents = [np.ptp(domain.rings[k], axis=0).max() for k in np.flatnonzero(within)]
-    k = int(np.flatnonzero(within)[np.argmax(extents)])
-    count, place = int(within.sum()), format_point(domain.rings[k].mean(axis=0))
+    dropped = [x for x, here in zip(domain.rings, within, strict=True) if here]
+    extents = [np.ptp(x, axis=0).max() for x in dropped]
+    count, place = len(dropped), format_point(dropped[int(np.argmax(extents))].mean(axis=0))
     what = "1 island lies within one cell and is"
     if count > 1:
         what = f"{count} islands lie within one cell each and are"

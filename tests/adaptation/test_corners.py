@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial import KDTree
 
 import clvoro
+from clvoro.adaptation import corners
 from clvoro.adaptation.corners import find_corners
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
@@ -34,6 +35,23 @@ def ring(k, r):
 def corners_of(domain, h=H):
     groups = find_corners(domain, np.full(len(domain.oriented.vertices), h))
     return groups, domain.oriented.vertices[groups.vertices]
+
+
+def test_vertices_near_an_earlier_one_that_is_kept_are_left_out():
+    """Against all pairs."""
+    rng = np.random.default_rng(2)
+    x, bend, h = rng.random((300, 2)), rng.uniform(0, 3, 300), rng.uniform(0.03, 0.2, 300)
+    order, kept = rng.permutation(300)[:250], []
+    for i in order:
+        limits = (
+            max(corners.SPACING - corners.FAN * (bend[i] + bend[j]) / 2, corners.LEAST_SPACING)
+            * min(h[i], h[j])
+            for j in kept
+        )
+        if all(np.hypot(*(x[i] - x[j])) >= far for far, j in zip(limits, kept, strict=True)):
+            kept.append(i)
+    assert 50 < len(kept) < 200
+    np.testing.assert_array_equal(corners._spaced(x, bend, h, order), kept)
 
 
 @pytest.mark.parametrize(
