@@ -33,14 +33,13 @@ def near_edges(count):
     return points
 
 
-BODY, FACE = ((0, 0, 0), (0.5, 0.5, 0.5)), ((0, 0, 0), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0))
+BODY = ((0, 0, 0), (0.5, 0.5, 0.5))
 POINTS = {
     "random": np.random.default_rng(5).random((400, 3)),
     "cubic": lattice(5, 1e-9),
     "cubic, rough": lattice(5, 1e-3),
     "cubic, loose": lattice(5, 2e-2),
     "body-centered": lattice(4, 1e-9, BODY),
-    "face-centered": lattice(4, 1e-6, FACE),
     "edges": near_edges(150),
 }
 PERIODIC = {"closed": False, "periodic": True, "channel": (True, False, False)}
