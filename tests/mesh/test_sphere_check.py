@@ -173,7 +173,7 @@ DAMAGE = {
     "wrong centroids": ({"centroids": swap(4, 5)}, {"centroids"}),
     "wrong face centroids": ({"face_centroids": swap(0, 2)}, {"face centroids"}),
     "swapped neighbors": ({"neighbors": swap(0, 2)}, {"vertices once", "faces outward"}),
-    "one-sided neighbor": ({"neighbors": lambda x: put(0, (x[0] + 400) % 800)(x)}, {"graph symmetric"}),
+    "one-sided neighbor": ({"neighbors": lambda x: put(0, (x[0] + 200) % 400)(x)}, {"graph symmetric"}),
     "wall": ({"neighbors": put(3, -1)}, {"neighbors exist"}),
     "shift": ({"shifts": put((3, 0), 1)}, {"shifts"}),
     "corner of another vertex": ({"cell_vertices": put(0, 700)}, {"vertices once", "nearest generators"}),
