@@ -31,7 +31,7 @@ LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, s
 _CHUNK = 1 << 11
 """Faces that are read at a time: their arrays fit the caches."""
 _SURE = 1.05
-"""How much longer sides and larger faces are suspects: as they move a little, and the diagram has its own areas."""
+"""Margin of the suspects: areas of the diagram differ a little from those of the mesh."""
 
 
 def collapse_short(mesh: SolverMesh, diagram: Diagram) -> SolverMesh:
@@ -71,7 +71,7 @@ def collapse_short(mesh: SolverMesh, diagram: Diagram) -> SolverMesh:
 
 
 def _suspects(mesh: SolverMesh, diagram: Diagram) -> np.ndarray:
-    """Return which faces may be skewed, be small or have a short side, (f,) bool: all that do, and a few others.
+    """Return a mask (f,) of the faces that may be small or skew, or have a short side: all of them, and a few others.
 
     All faces are read here, and never again. Their areas are those of the diagram.
     """

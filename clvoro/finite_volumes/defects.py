@@ -104,7 +104,7 @@ def find_defects(
     with np.errstate(invalid="ignore", divide="ignore"):
         shapes = _shapes(around, x)
         wrong = around.alive & ~(shapes.flatness >= limits.flatness)
-        wrong |= around.alive & _bad_tetrahedra(around, x, shapes)
+        wrong |= _bad_tetrahedra(around, x, shapes)
         star = around.star
         arms = shapes.seen[star] - shapes.middles.take(around.side_cell[star], axis=0)
         low = ~(np.einsum("ij,ij->i", shapes.outward[star], arms) > 0)

@@ -16,7 +16,7 @@ from ..mesh.connectivity import distinct, take_rows
 from .defects import Defects, Limits, find_defects
 from .geometry import face_geometry, lengths, sum_rows
 from .independent import independent
-from .neighborhood import Neighborhood
+from .neighborhood import FACES, Neighborhood
 from .seams import unpack
 
 _TRIES = 4
@@ -149,12 +149,12 @@ class Cells:
         return unpack(codes) * self.extent if codes.any() else np.zeros((1, 3))
 
     def geometry(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return centers and areas of `faces` as their owners see them, (k, 3) each."""
+        """Return the centers and area vectors of `faces`, (k, 3) each, on the owner's side of periodic seams."""
         once = distinct(faces)
         starts, places = self.face_corners(once)
         x = self.positions(self.corners[places], self.codes[places])
         centers, areas = face_geometry(x, starts, np.arange(len(x)))
-        at = self.find(2, once, faces)
+        at = self.find(FACES, once, faces)
         return centers.take(at, axis=0), areas.take(at, axis=0)
 
     def face_corners(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +171,7 @@ class Cells:
         return self.touched[self.owner[faces]] | ((neighbor >= 0) & self.touched[neighbor])
 
     def find(self, kind: int, items: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the place of each of `values` among `items`, or -1: of vertices (0), cells (1) or faces (2)."""
+        """Return the place of each of `values` in `items`, or -1; `kind` is VERTICES, CELLS or FACES."""
         places = self._places[kind]
         places[items] = np.arange(len(items))
         found = places.take(values)

@@ -1,4 +1,4 @@
-"""The 3D faces and cells around vertices that merge, and the check that the merge keeps their topology."""
+"""Faces and cells around vertices that are to be merged in 3D, and whether the cells remain topological balls."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from ..mesh.connectivity import distinct, following, take_rows
 
 if TYPE_CHECKING:
     from .merging import Cells, Merges
+
+VERTICES, CELLS, FACES = range(3)
+"""Kinds of items of a mesh; see `Cells.find`."""
 
 
 class Neighborhood:
@@ -57,7 +60,7 @@ class Neighborhood:
         old_starts, places = whole.face_corners(faces)
         corners, codes = whole.corners[places], whole.codes[places]
         face = np.repeat(np.arange(len(faces)), np.diff(old_starts))
-        at = whole.find(0, merges.vertices, corners)
+        at = whole.find(VERTICES, merges.vertices, corners)
         moved = np.flatnonzero(at >= 0)
         at, new = at[moved], np.full(len(corners), -1)
         new[moved] = merges.group[at]
@@ -82,14 +85,14 @@ class Neighborhood:
         both = np.stack([whole.owner[faces], whole.neighbor[faces]], axis=1)
         inner = both >= 0
         self.cells = distinct(both[inner])
-        self.cells_of_face = np.where(inner, whole.find(1, self.cells, both), -1)
+        self.cells_of_face = np.where(inner, whole.find(CELLS, self.cells, both), -1)
         self.set_of_cell = np.empty_like(self.cells)
         for column in self.cells_of_face.T:
             self.set_of_cell[column[column >= 0]] = sets[column >= 0]
         # All faces as each cell sees them.
         starts, sides = take_rows(*whole.at_cell, self.cells)
         side_face = sides // 2
-        star = whole.find(2, faces, side_face)
+        star = whole.find(FACES, faces, side_face)
         rows = np.flatnonzero(np.where(star < 0, whole.count[side_face] > 0, self.alive[star]))
         self.side_face, self.side_star = side_face[rows], star[rows]
         self.side_cell = np.repeat(np.arange(len(self.cells)), np.diff(starts))[rows]
@@ -125,7 +128,7 @@ class Neighborhood:
         return ~(bad | self._bad(self.set_of_group[self._pinched()]))
 
     def _not_balls(self) -> np.ndarray:
-        """Return which cells are no balls, (c,) bool: if edges at merged vertices have not two faces, and by Euler."""
+        """Return which cells are no topological balls, (c,) bool, by Euler's formula and the two faces at each edge."""
         m = len(self.cells)
         # Corners with a merged vertex, of each side.
         corner = np.flatnonzero(self.new >= 0)
@@ -211,7 +214,7 @@ def _runs(values: np.ndarray) -> np.ndarray:
 
 
 def _pack_keys(*keys: np.ndarray) -> np.ndarray:
-    """Return one integer for each row of `keys`, equal for equal rows and in their order."""
+    """Return one integer for each tuple of entries of `keys`, (k,): equal for equal tuples, and in their order."""
     packed, span = np.zeros(len(keys[0]), np.int64), 1
     for key in keys:
         low, high = int(key.min(initial=0)), int(key.max(initial=0))

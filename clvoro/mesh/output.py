@@ -204,9 +204,9 @@ class MeshOutput:
         collapse : bool
             Whether the ends of short faces become one point: in 2D of faces shorter than 0.055 times the size of
             the smaller cell and 0.2 times the width of the thinner one, while cells remain convex. Corners and ends
-            of names stay in place. In 3D
-            edges shorter than 0.02 h and faces smaller than 0.001 h^2 are collapsed, with h the cube root of the
-            smaller cell's volume; so are faces smaller than 0.02 h^2 whose skewness exceeds 1.8. Faces may then be
+            of names stay in place. In 3D edges shorter than 0.02 h and faces smaller than 0.001 h^2 are collapsed,
+            with h the cube root of the smaller cell's volume; so are faces smaller than 0.02 h^2 whose skewness
+            exceeds 1.8. Faces may then be
             slightly warped: their flatness is at least 0.95. Points on the box stay on it, so that the cells still fill
             it. What would make a cell concave is left as it is. In 2D, skew faces, faces far from orthogonal and
             cells that are not convex are then repaired: points around them move, those on straight walls along the

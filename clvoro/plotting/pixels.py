@@ -22,8 +22,8 @@ _RIM = 3
 Positions = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 _last: WeakKeyDictionary[Diagram, tuple[np.ndarray, ...]] = WeakKeyDictionary()
-"""Of the last image of each diagram: which pixels show the mesh, their positions, and their cells. A report shows the
-same part in several colors, and finds the cells once."""
+"""For the last image of each diagram: which pixels show the mesh, their positions, and their cells. A report shows the
+same part in several colors, so the cells are found once."""
 
 
 def add_image(

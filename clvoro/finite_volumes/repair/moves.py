@@ -1,8 +1,8 @@
-"""Moves of points that make faces less skew and nearer to orthogonal: least-squares problems, many at once.
+"""Move points so that faces become less skew and closer to orthogonal.
 
-Points on walls slide along the boundary or stay. The sum of squares is that of `figures`; its derivatives are those of
-`slopes`. Problems do not depend on one another. They are solved together, because a call of NumPy for one of them
-takes longer than its arithmetic.
+The points of each patch are found by nonlinear least squares, with the terms of `figures` and the derivatives of
+`slopes`. Points on walls slide along the boundary or stay. Many patches are solved in one go: they are independent, but
+a patch is so small that calling NumPy for it alone takes longer than its arithmetic.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .slopes import slopes
 
 _MOVE_WEIGHT = 0.1
 _STEP = 1e-6
-"""Step of differences along the boundary, over the width of a cell."""
+"""Step of the finite differences along the boundary, relative to the width of a cell."""
 _TOLERANCE = 1e-3
 """Relative change of the sum of squares at which the moves end."""
 _DAMPING, _RISE, _FALL = 1.0, 5.0, 5.0
@@ -96,10 +96,10 @@ class Problem:
         return found
 
 
-def least(
+def minimize(
     problems: Sequence[Problem], steps: Sequence[int], ring: RingCoordinate | None
 ) -> list[np.ndarray]:
-    """Return moves (m, 2) for each problem, after some steps of Levenberg and Marquardt towards its minimum.
+    """Lower the sum of squares of each problem by some steps of Levenberg and Marquardt; return its moves, (m, 2).
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def least(
 
 
 class _Search:
-    """The way towards the minimum of one problem.
+    """The state of the minimization of one problem.
 
     Attributes
     ----------
@@ -139,40 +139,42 @@ class _Search:
     cost : float
         Sum of squares there.
     matrix, gradient
-        The normal equations there.
+        The normal equations there, with the weight of moves and the last damping.
+    entries, places, diagonal
+        The matrix as one array, where its diagonal lies there, and the diagonal without damping.
     """
 
     def __init__(self, problem: Problem, left: int) -> None:
         self.problem, self.left = problem, left
         self.moves = np.zeros((len(problem.active), 2))
-        self.cost, self.damping, self.added = np.inf, _DAMPING, 0.0
+        self.cost, self.damping = np.inf, _DAMPING
         self.matrix: np.ndarray | scipy.sparse.csc_array
 
     def set_equations(
         self, jacobian: np.ndarray | scipy.sparse.csr_array, gradient: np.ndarray
     ) -> None:
         """Take the derivatives of the terms at `moves`, (t, 2 m), and half of those of the sum of squares, (2 m,)."""
-        k = len(gradient)
-        self.gradient, self.added = gradient + _MOVE_WEIGHT**2 * self.moves.ravel(), 0.0
+        k, weight = len(gradient), _MOVE_WEIGHT**2
+        self.gradient = gradient + weight * self.moves.ravel()
         product = jacobian.T @ jacobian
         if isinstance(product, np.ndarray):
             self.matrix = product
-            self.entries, self.diagonal = product.reshape(-1), np.arange(k) * (k + 1)
+            self.entries, self.places = product.reshape(-1), np.arange(k) * (k + 1)
+            self.entries[self.places] += weight
         else:
-            self.matrix = scipy.sparse.csc_array(product + scipy.sparse.eye_array(k))
+            self.matrix = scipy.sparse.csc_array(product + scipy.sparse.eye_array(k) * weight)
             self.matrix.sort_indices()
             self.entries = self.matrix.data
             column = np.repeat(np.arange(k), np.diff(self.matrix.indptr))
-            self.diagonal = np.flatnonzero(self.matrix.indices == column)
-            self.added = 1.0
+            self.places = np.flatnonzero(self.matrix.indices == column)
+        self.diagonal = self.entries[self.places]
 
     def step(self) -> np.ndarray:
         """Return the step (m, 2) of Levenberg and Marquardt; NaN if the equations have no solution."""
         from scipy.linalg.lapack import dposv
         from scipy.sparse.linalg import splu
 
-        self.entries[self.diagonal] += self.damping + _MOVE_WEIGHT**2 - self.added
-        self.added = self.damping + _MOVE_WEIGHT**2
+        self.entries[self.places] = self.diagonal + self.damping
         found = np.full(len(self.gradient), np.nan)
         if isinstance(self.matrix, np.ndarray):
             _, solution, failed = dposv(self.matrix, self.gradient)

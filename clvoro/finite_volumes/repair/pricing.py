@@ -1,4 +1,4 @@
-"""A patch and its price, the sum of what is beyond the limits. It decides whether a change is for the better."""
+"""A patch and its price: how far its cells and faces are beyond the limits. A change is kept if the price falls."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LEAST_DETERMINANT = 3e-3
 _REFUSED_DETERMINANT = 1.1e-3
 """A cell with a smaller determinant counts as refused."""
 _MOST_EXCESS = 4
-"""Faces that exceed a limit by more than this times it have the same price."""
+"""The price of a face grows until the face exceeds a limit by this many times the limit."""
 _INVERTED_PRICE, _CONCAVE_PRICE, _CUT_PRICE = 100.0, 3.0, 0.5
 """Prices of a cell without a positive area, of a concave corner for each radian, and of a corner that is cut off for
 the square of its distance from the chord over the size of the cell."""
@@ -85,7 +85,7 @@ class PricedPatch:
 
     @classmethod
     def of(cls, patch: Patch, goals: np.ndarray | None = None) -> PricedPatch | None:
-        """Return the descent of a patch, None if a cell is no simple ring."""
+        """Return `patch` with its prices; None if a cell is not a simple polygon."""
         sides = cell_sides(patch)
         return None if sides is None else cls(patch, sides, goals)
 
@@ -115,7 +115,7 @@ class PricedPatch:
         self.prices, self.face_prices, self.lengths = prices, excess, now.length
 
     def near(self, chosen: np.ndarray, rings: int) -> np.ndarray:
-        """Return the cells `chosen` (n,) bool and some rings of cells around them, (n,) bool."""
+        """Return a mask (n,) of the cells `chosen` (n,) bool and of some rings of cells around them."""
         c, near = self.cells, chosen.copy()
         for _ in range(rings):
             touched = np.zeros(len(self.patch.points), bool)
@@ -124,7 +124,7 @@ class PricedPatch:
         return near
 
     def problem(self, near: np.ndarray, slide: bool) -> Problem | None:
-        """Return the problem of moving the points of the cells `near` (n,) bool; None if all of them stay.
+        """Return the least-squares problem for the points of the cells `near` (n,) bool; None if no point can move.
 
         Points on walls `slide` along the boundary or stay.
         """
@@ -155,7 +155,7 @@ class PricedPatch:
     def moved(
         self, problem: Problem, moves: np.ndarray, ring: RingCoordinate | None
     ) -> PricedPatch:
-        """Return the descent after the `moves` (m, 2) of the points of `problem`, on walls along `ring`."""
+        """Return the patch after the `moves` (m, 2) of the points of `problem`. Those on walls slide along `ring`."""
         points, positions = self.patch.points.copy(), self.patch.positions.copy()
         points[problem.active] = problem.placed(moves, ring)[:, problem.active].T
         slides = problem.slides

@@ -120,7 +120,7 @@ def _best_changes(
 def _each_settled(
     some: list[PricedPatch], focus: np.ndarray, rings: tuple[int, ...], steps: int
 ) -> Task[list[PricedPatch]]:
-    """Find patches after moves of points, see `_settled`, up to the first one without a bad cell, the best first."""
+    """Settle patches one by one up to the first without a bad cell; return them with the lowest price first."""
     found: list[PricedPatch] = []
     for made in some:
         found.append((yield from _settled(made, focus, rings, steps)))
@@ -132,7 +132,7 @@ def _each_settled(
 def _settled(
     made: PricedPatch, focus: np.ndarray, rings: tuple[int, ...], steps: int
 ) -> Task[PricedPatch]:
-    """Find the patch after moves of the points near the cells that have a price, and near `focus` (n,) bool."""
+    """Return the patch after moves of points at and around the cells near `focus` (n,) bool that have a price."""
     for k in rings:
         priced = (made.prices > 0) & made.near(focus, 2)
         if not priced.any():

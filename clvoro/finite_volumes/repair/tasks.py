@@ -1,4 +1,4 @@
-"""Repairs of several patches in step, so that the moves that they wait for are found together.
+"""Repair several patches in step, so that all moves that they wait for are found in one go.
 
 A task is a generator. It yields the moves that it needs next, receives the patches after these moves, and returns its
 result.
@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from ...geometry.ring_coordinate import RingCoordinate
-from .moves import least
+from .moves import minimize
 from .pricing import PricedPatch
 
 _T = TypeVar("_T")
@@ -45,7 +45,7 @@ def moved(moves: Sequence[Move], ring: RingCoordinate | None) -> list[PricedPatc
     """Return the patch after each of the `moves`; points on walls slide along `ring`."""
     problems = [move.patch.problem(move.near, move.slide) for move in moves]
     posed = [(p, move.steps) for p, move in zip(problems, moves, strict=True) if p is not None]
-    found = iter(least(*zip(*posed, strict=True), ring) if posed else ())
+    found = iter(minimize(*zip(*posed, strict=True), ring) if posed else ())
     return [
         move.patch if p is None else move.patch.moved(p, next(found), ring)
         for p, move in zip(problems, moves, strict=True)

@@ -117,7 +117,7 @@ class WallCorners:
         return int(p.neighbor[face] if p.owner[face] == cell else p.owner[face])
 
     def _entered(self, point: int, face: int) -> Iterator[Patch]:
-        """Yield the patch after the nearest face end along the wall, on the side of `face`, has moved into a corner."""
+        """Yield the patch in which the next face end along the wall, beyond `face`, has moved into corner `point`."""
         p = self.patch
         cell, taken, end = int(p.owner[face]), [face], int(p.ends[face].sum()) - point
         while self._bound(p, end) and len(taken) < _STEPS:

@@ -63,7 +63,7 @@ def test_moves_end_near_the_minimum(patches):
         at = problem.cells.figures(*problem.placed(flat.reshape(-1, 2), ring))
         return np.concatenate([problem.cells.terms(at), moves._MOVE_WEIGHT * flat])
 
-    (found,) = moves.least([problem], [100], ring)
+    (found,) = moves.minimize([problem], [100], ring)
     start = np.zeros(found.size)
     known = scipy.optimize.least_squares(residuals, start)
     cost, first = (float(residuals(m) @ residuals(m)) for m in (found.ravel(), start))
