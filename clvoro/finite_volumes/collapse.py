@@ -6,13 +6,13 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from ..mesh.connectivity import distinct, following, take_rows
+from ..mesh.connectivity import distinct, following, slices, take_ranges, take_rows
 from ..mesh.diagram import Diagram
 from .defects import Limits
-from .geometry import cross_rows, lengths, smaller_size, sum_rows
+from .geometry import cross_columns, dots, lengths, smaller_size, sum_columns
 from .merging import Cells, Merges
-from .seams import pack, unpack
-from .solver_mesh import SolverMesh
+from .seams import pack
+from .solver_mesh import SolverMesh, compact
 
 SHORT_EDGE = 0.02
 """Edges shorter than this share of h, the cube root of a cell's volume, are collapsed."""
@@ -28,7 +28,7 @@ _LONGEST = 0.25
 """Longest edge that is collapsed, if it is the shortest of a small face."""
 LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, skewness=3))
 """Tried in turn, the later ones where short edges or small faces are left."""
-_CHUNK = 1 << 11
+_CHUNK = 1 << 12
 """Faces that are read at a time: their arrays fit the caches."""
 _SURE = 1.05
 """Margin of the suspects: areas of the diagram differ a little from those of the mesh."""
@@ -52,22 +52,26 @@ def collapse_short(mesh: SolverMesh, diagram: Diagram) -> SolverMesh:
     """
     suspects = _suspects(mesh, diagram)
     if not suspects.any():
-        return mesh
+        return compact(mesh)
     cells, faces = _fold(mesh, diagram)
-    pending = _flagged(cells, np.flatnonzero(suspects[faces]))
+    scan = _Scan(cells, np.flatnonzero(suspects[faces]))
+    cells.prepare(scan.vertices)
     for cells.limits in LIMITS:
-        active = pending
+        pending = active = scan.flagged
         while len(active):
             cells.touched[:], cells.changed[:] = False, False
             for kind in (_Scan.clusters, _Scan.small_faces, _Scan.slivers, _Scan.edges):
-                cells.merge(kind(_Scan(cells, active)))
+                if cells.merge(kind(scan)):
+                    scan = _Scan(cells, active)
             # Where nothing has changed, another try is in vain.
             again = cells.changed.copy()
             again[pending] |= cells.is_touched(pending)
-            active = _flagged(cells, np.flatnonzero(again))
+            scan = _Scan(cells, np.flatnonzero(again))
+            active = scan.flagged
             pending = distinct(np.concatenate([pending, active]))
-        pending = _flagged(cells, pending)
-    return mesh if (cells.now == np.arange(len(cells.now))).all() else _unfold(mesh, cells, faces)
+        scan = _Scan(cells, pending)
+    unchanged = (cells.now == np.arange(len(cells.now))).all()
+    return compact(mesh) if unchanged else _unfold(mesh, cells, faces)
 
 
 def _suspects(mesh: SolverMesh, diagram: Diagram) -> np.ndarray:
@@ -78,19 +82,21 @@ def _suspects(mesh: SolverMesh, diagram: Diagram) -> np.ndarray:
     h = smaller_size(mesh.owner, mesh.neighbor, np.cbrt(diagram.volumes))
     found = diagram.face_measures[mesh.half_face] < _SURE * _SKEWED_FACE * h**2
     limit, columns = (_SURE * SHORT_EDGE * h) ** 2, np.ascontiguousarray(mesh.points.T)
-    for first in range(0, len(found), _CHUNK):
-        starts = mesh.starts[first : first + _CHUNK + 1]
+    for part in slices(len(found), _CHUNK):
+        starts = mesh.starts[part.start : part.stop + 1]
         corners, starts = mesh.corners[starts[0] : starts[-1]], starts - starts[0]
+        head, last = starts[:-1], starts[1:] - 1
         squares, step = np.zeros((2, len(corners)))
         for x in columns:
             here = x.take(corners)
             np.subtract(here[1:], here[:-1], out=step[:-1])
-            step[starts[1:] - 1] = here[starts[:-1]] - here[starts[1:] - 1]
+            step[last] = here[head] - here[last]
             step *= step
             squares += step
-        limits = np.repeat(limit[first : first + _CHUNK], np.diff(starts))
-        short = np.flatnonzero(squares < limits)
-        found[first + np.searchsorted(starts, short, "right") - 1] = True
+        limits = limit[part]
+        short = np.flatnonzero(squares < limits.max())
+        rows = np.searchsorted(starts, short, "right") - 1
+        found[part.start + rows[squares[short] < limits[rows]]] = True
     return found
 
 
@@ -105,7 +111,7 @@ def _fold(mesh: SolverMesh, diagram: Diagram) -> tuple[Cells, np.ndarray]:
         codes = pack(np.rint(away))[corners]
         points, corners = points[first], classes[corners]
     else:
-        starts, corners, codes = mesh.starts, mesh.corners, np.zeros(len(mesh.corners), np.int64)
+        starts, corners, codes = mesh.starts, mesh.corners, np.broadcast_to(0, len(mesh.corners))
     cells = Cells(
         points, starts, corners, codes, mesh.owner[upper], mesh.neighbor[upper],
         pack(mesh.shift[upper]), extent, np.cbrt(diagram.volumes), diagram.centroids, SMALL_FACE,
@@ -130,26 +136,18 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
     place[upper] = np.arange(len(upper))
     lower = place[left] < 0
     source = place[np.where(lower, mesh.twin[left], left)]
-    starts, where = cells.face_corners(source)
-    corners, points = cells.corners.take(where), cells.points
+    begin, counts, points = cells.begin[source], cells.count[source], cells.points
+    starts, corners = take_ranges(begin, counts, cells.corners)
     if len(seam):
-        _, where = take_rows(starts, where, np.arange(len(left)), lower)
+        _, where = take_ranges(begin, counts, np.arange(len(cells.corners)), lower)
         shift = np.repeat(np.where(lower, cells.face_codes[source], 0), np.diff(starts))
         vertices, codes = cells.corners[where], cells.codes[where] - shift
         order = np.lexsort((codes, vertices))
         new = np.ones(len(order), bool)
         new[1:] = (np.diff(vertices[order]) != 0) | (np.diff(codes[order]) != 0)
         corners[order] = np.cumsum(new) - 1
-        points = cells.positions(vertices[order][new], codes[order][new])
+        points = cells.positions(vertices[order][new], codes[order][new]).T
     return mesh.take_faces(left, points=points, starts=starts, corners=corners)
-
-
-def _flagged(cells: Cells, faces: np.ndarray) -> np.ndarray:
-    """Return those of `faces` that are small or have a short side."""
-    scan = _Scan(cells, faces)
-    flagged = scan.small.copy()
-    flagged[np.searchsorted(scan.starts, np.flatnonzero(scan.short), "right") - 1] = True
-    return scan.faces[flagged]
 
 
 class _Scan:
@@ -176,34 +174,43 @@ class _Scan:
         x = cells.positions(cells.corners[places], cells.codes[places])
         after = following(self.starts)
         h = smaller_size(cells.owner[self.faces], cells.neighbor[self.faces], cells.sizes)
-        self.begin = cells.corners[places]
+        self.begin = cells.corners[places].astype(np.int64)
         self.end = self.begin[after]
         self.code = cells.codes[places][after] - cells.codes[places]
-        self.length, self.h = lengths(x.take(after, axis=0) - x), h[face]
+        self.length, self.h = lengths(x.take(after, axis=1) - x), h[face]
         self.short = self.length < SHORT_EDGE * self.h
-        away = x - x.take(self.starts[face], axis=0)
-        twice = sum_rows(face, cross_rows(away, away.take(after, axis=0)), len(self.faces))
+        away = x - x.take(self.starts[face], axis=1)
+        twice = sum_columns(face, cross_columns(away, away.take(after, axis=1)), len(self.faces))
         area = lengths(twice) / 2
         self.small = area < SMALL_FACE * h**2
         rows = ~self.small & (area < _SKEWED_FACE * h**2) & (cells.neighbor[self.faces] >= 0)
         self.small[rows] = self._skewness(np.flatnonzero(rows), x, twice) > SKEWED
 
+    @property
+    def flagged(self) -> np.ndarray:
+        """Those of the faces that are small or have a short side."""
+        found = self.small.copy()
+        found[np.searchsorted(self.starts, np.flatnonzero(self.short), "right") - 1] = True
+        return self.faces[found]
+
+    @property
+    def vertices(self) -> np.ndarray:
+        """The ends of short sides, and the corners of small faces."""
+        wanted = np.repeat(self.small, np.diff(self.starts)) | self.short
+        return distinct(np.concatenate([self.begin[wanted], self.end[self.short]]))
+
     def _skewness(self, rows: np.ndarray, x: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return the approximate skewness of some of the faces, all between two cells."""
         c, faces = self.cells, self.faces[rows]
-        starts, places = take_rows(self.starts, np.arange(len(x)), rows)
+        starts, places = take_rows(self.starts, np.arange(x.shape[1]), rows)
         face = np.repeat(np.arange(len(rows)), np.diff(starts))
-        center = sum_rows(face, x[places], len(rows)) / np.diff(starts)[:, None]
-        own, other = c.centroids[c.owner[faces]], c.centroids[c.neighbor[faces]]
-        line = other + unpack(c.face_codes[faces]) * c.extent - own
-        arm, n = center - own, normals[rows]
-        share = np.einsum("ij,ij->i", n, arm) / np.einsum("ij,ij->i", n, line)
-        off = arm - share[:, None] * line
+        x, n = x.take(places, axis=1), normals[:, rows]
+        center = sum_columns(face, x, len(rows)) / np.diff(starts)
+        own, other = c.centroids[c.owner[faces]].T, c.centroids[c.neighbor[faces]].T
+        line, arm = other + c.offsets(c.face_codes[faces]) - own, center - own
+        off = arm - dots(n, arm) / dots(n, line) * line
         size = np.maximum(lengths(off), 1e-300)
-        along = np.einsum(
-            "ij,ij->i", x.take(places, axis=0) - center.take(face, axis=0),
-            (off / size[:, None]).take(face, axis=0),
-        )  # fmt: skip
+        along = dots(x - center.take(face, axis=1), (off / size).take(face, axis=1))
         reach = 0.2 * lengths(line)
         np.maximum.at(reach, face, np.abs(along))
         return size / reach
@@ -275,7 +282,7 @@ class _Scan:
         steps = np.rint(away / self.cells.extent)
         away -= steps * self.cells.extent
         width = np.zeros(g)
-        np.maximum.at(width, group, lengths(away))
+        np.maximum.at(width, group, lengths(away.T))
         k = int(sets.max(initial=-1)) + 1
         extent, size = np.zeros(k), np.full(k, np.inf)
         np.maximum.at(extent, sets, width)

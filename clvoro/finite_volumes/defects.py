@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mesh.connectivity import distinct, following, take_rows
-from .geometry import cell_geometry, cross_rows, face_geometry, lengths, smaller_size
+from .geometry import cross_columns, dots, lengths, loop_geometry, pyramid_sums, smaller_size
 
 if TYPE_CHECKING:
     from .merging import Cells
@@ -81,7 +81,10 @@ class Defects:
 
 @dataclass(frozen=True)
 class _Shapes:
-    """Faces and cells of a neighborhood: `seen` and `outward` are centers and areas of faces as each cell sees them."""
+    """Faces and cells of a neighborhood: `seen` and `outward` are centers and areas of faces as each cell sees them.
+
+    Vectors are columns, (3, k).
+    """
 
     centers: np.ndarray
     areas: np.ndarray
@@ -100,14 +103,14 @@ def find_defects(
     x = w.positions(around.corners, around.codes)
     if targets is not None:
         moved = np.flatnonzero(around.new >= 0)
-        x[moved] = targets[around.new[moved]] + w.offsets(around.codes[moved])
+        x[:, moved] = targets.T.take(around.new[moved], axis=1) + w.offsets(around.codes[moved])
     with np.errstate(invalid="ignore", divide="ignore"):
         shapes = _shapes(around, x)
         wrong = around.alive & ~(shapes.flatness >= limits.flatness)
         wrong |= _bad_tetrahedra(around, x, shapes)
         star = around.star
-        arms = shapes.seen[star] - shapes.middles.take(around.side_cell[star], axis=0)
-        low = ~(np.einsum("ij,ij->i", shapes.outward[star], arms) > 0)
+        arms = shapes.seen[:, star] - shapes.middles.take(around.side_cell[star], axis=1)
+        low = ~(dots(shapes.outward[:, star], arms) > 0)
         wrong[around.side_star[star[low]]] = True
         large = _large(w, around.faces, shapes.areas)
         sets, part = around.set_of_face, around.set_of_cell
@@ -118,7 +121,7 @@ def find_defects(
             shapes.seen, shapes.outward, around.side_starts, limits.concavity, around.side_star >= 0
         )
         sets = part[around.side_cell[pairs[0]]]
-        large = _large(w, around.side_face[pairs], shapes.outward[pairs]).all(axis=0)
+        large = _large(w, around.side_face[pairs], shapes.outward[:, pairs]).all(axis=0)
         count += np.bincount(sets, minlength=around.k)
         serious += np.bincount(sets[large], minlength=around.k)
         angle, skewness = _quality(around, x, shapes)
@@ -126,28 +129,25 @@ def find_defects(
 
 
 def _large(whole: Cells, faces: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """Return which of `faces`, whose areas (..., 3) are given, are not small."""
+    """Return which of `faces`, whose areas (3, ...) are given, are not small."""
     h = smaller_size(whole.owner[faces], whole.neighbor[faces], whole.sizes)
-    return np.linalg.norm(areas, axis=-1) >= whole.small * h**2
+    return np.sqrt((areas**2).sum(axis=0)) >= whole.small * h**2
 
 
 def _shapes(around: Neighborhood, x: np.ndarray) -> _Shapes:
-    """Return centers and areas of the faces with corners at `x` (k, 3), and of the cells."""
+    """Return centers and areas of the faces with corners at `x` (3, k), and of the cells."""
     f, rows = len(around.faces), np.flatnonzero(around.alive)
-    starts = np.append(around.starts[rows], len(x))
-    centers, areas = np.full((2, f, 3), np.nan)
-    centers[rows], areas[rows] = face_geometry(x, starts, np.arange(len(x)))
-    about = cross_rows(x.take(around.after, axis=0) - x, centers.take(around.face, axis=0) - x)
+    centers, areas = np.full((2, 3, f), np.nan)
+    centers[:, rows], areas[:, rows] = loop_geometry(x, np.append(around.starts[rows], x.shape[1]))
+    about = cross_columns(x.take(around.after, axis=1) - x, centers.take(around.face, axis=1) - x)
     spread = 0.5 * np.bincount(around.face, lengths(about), f)
     seen, outward = (kept.copy() for kept in around.kept_geometry)
     side = around.side_star[around.star]
     codes, sign = around.side_code[around.star], around.side_sign[around.star]
-    seen[around.star] = centers.take(side, axis=0) - around.whole.offsets(codes)
-    outward[around.star] = areas.take(side, axis=0) * sign[:, None]
-    none = np.zeros(0, np.int64)
-    middles, volumes = cell_geometry(seen, outward, around.side_cell, none, len(around.cells))
-    flatness = lengths(areas) / spread
-    return _Shapes(centers, areas, flatness, seen, outward, middles, volumes)
+    seen[:, around.star] = centers.take(side, axis=1) - around.whole.offsets(codes)
+    outward[:, around.star] = areas.take(side, axis=1) * sign
+    middles, volumes = pyramid_sums(seen, outward, around.side_cell, len(around.cells))
+    return _Shapes(centers, areas, lengths(areas) / spread, seen, outward, middles, volumes)
 
 
 def _bad_tetrahedra(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> np.ndarray:
@@ -156,14 +156,14 @@ def _bad_tetrahedra(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> np.
     Its triangles are those about its center, and the fan about one of its corners, whichever will do.
     """
     face, sign = around.side_star[around.star], around.side_sign[around.star]
-    origins = shapes.middles[around.side_cell[around.star]]
+    origins = shapes.middles.take(around.side_cell[around.star], axis=1)
     origins = origins + around.whole.offsets(around.side_code[around.star])
-    starts, place = take_rows(around.starts, np.arange(len(x)), face)
+    starts, place = take_rows(around.starts, np.arange(x.shape[1]), face)
     side, after = np.repeat(np.arange(len(face)), np.diff(starts)), following(starts)
-    y = x.take(place, axis=0) - origins.take(side, axis=0)
-    normal = cross_rows(y, y.take(after, axis=0)) * sign[side, None]
-    height = shapes.centers[face] - origins
-    about = np.einsum("ij,ij->i", normal, height.take(side, axis=0))
+    y = x.take(place, axis=1) - origins.take(side, axis=1)
+    normal = cross_columns(y, y.take(after, axis=1)) * sign[side]
+    height = shapes.centers.take(face, axis=1) - origins
+    about = dots(normal, height.take(side, axis=1))
     bad = around.alive.copy()
     least = (_THIN * np.bincount(side, about, len(face)))[side]
     begin, end, corner = starts[:-1][side], starts[1:][side], np.arange(len(place))
@@ -171,7 +171,7 @@ def _bad_tetrahedra(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> np.
     # Fans about the first corner; where this will not do, about the second one, and so on.
     while len(rows):
         top = begin[rows] + tip
-        flat = ~(np.einsum("ij,ij->i", normal[rows], y.take(top, axis=0)) > least[rows])
+        flat = ~(dots(normal.take(rows, axis=1), y.take(top, axis=1)) > least[rows])
         flat &= (rows != top) & (after[rows] != top)
         bad[face[side[rows]]] = False
         bad[face[side[rows[flat]]]] = True
@@ -186,24 +186,26 @@ def _quality(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> tuple[np.n
     w, middles = around.whole, shapes.middles
     rows = np.flatnonzero(around.alive)
     faces = around.faces[rows]
-    center, area = shapes.centers[rows], shapes.areas[rows]
-    area = area / np.linalg.norm(area, axis=1, keepdims=True)
-    own, other = middles[around.cells_of_face[rows].T]
+    center, area = shapes.centers.take(rows, axis=1), shapes.areas.take(rows, axis=1)
+    area = area / lengths(area)
+    own, other = (middles.take(cells, axis=1) for cells in around.cells_of_face[rows].T)
     inner = w.neighbor[faces] >= 0
     other = other + w.offsets(w.face_codes[faces])
     to_face = center - own
-    height = np.einsum("ij,ij->i", area, to_face)
-    d = np.where(inner[:, None], other - own, height[:, None] * area)
-    across = np.einsum("ij,ij->i", area, d)
+    height = dots(area, to_face)
+    d = np.where(inner, other - own, height * area)
+    across = dots(area, d)
     length = lengths(d)
     angle = np.degrees(np.arccos(np.clip(across / length, -1, 1)))
-    off = to_face - (height / across)[:, None] * d
+    off = to_face - (height / across) * d
     size = lengths(off)
-    along = off / np.maximum(size, 1e-300)[:, None]
+    along = off / np.maximum(size, 1e-300)
     starts, place = take_rows(around.starts, np.arange(len(around.corners)), rows)
     row = np.repeat(np.arange(len(rows)), np.diff(starts))
     reach = np.where(inner, 0.2, 0.4) * length
-    np.maximum.at(reach, row, np.abs(np.einsum("ij,ij->i", along[row], x[place] - center[row])))
+    arms = x.take(place, axis=1) - center.take(row, axis=1)
+    extent = np.abs(dots(along.take(row, axis=1), arms))
+    reach = np.maximum(reach, np.maximum.reduceat(extent, starts[:-1]))
     worst = np.zeros((2, around.k))
     np.maximum.at(worst[0], around.set_of_face[rows], angle)
     np.maximum.at(worst[1], around.set_of_face[rows], size / reach)
@@ -219,7 +221,7 @@ def concave_pairs(
 
     Parameters
     ----------
-    centers, areas : (k, 3) float
+    centers, areas : (3, k) float
         Of each face as seen from a cell; areas point outward.
     starts : (n + 1,) int
         Rows of the faces of each cell.
@@ -229,25 +231,28 @@ def concave_pairs(
         One face of a pair is changed.
     """
     found = [np.zeros((2, 0), np.int64)]
-    normals = areas / lengths(areas)[:, None]
+    normals = areas / lengths(areas)
     counts = np.diff(starts)
     wide = -(counts // -4) * 4  # cells are compared together that have about as many faces
     for k in distinct(wide).tolist():
         rows = np.flatnonzero(wide == k)
         within = np.arange(k) < counts[rows, None]
         places = starts[rows, None] + np.where(within, np.arange(k), 0)
-        c, s = centers.take(places, axis=0), normals.take(places, axis=0)
-        c -= c.mean(axis=1, keepdims=True)
-        s[~within] = np.nan
-        own = np.einsum("mij,mij->mi", s, c)
+        c, s = centers.take(places, axis=1), normals.take(places, axis=1)
+        c -= c.mean(axis=2, keepdims=True)
+        s[:, ~within] = np.nan
+        own = (s * c).sum(axis=0)
         # Few pairs are this near to a plane: only these are computed.
-        reach = 2 * np.sqrt(np.einsum("mij,mij->mi", c, c).max(axis=1))
+        reach = 2 * np.sqrt((c * c).sum(axis=0).max(axis=1))
         own += min(limit, -1e-12) * reach[:, None]
-        m, i, j = np.nonzero((s @ c.transpose(0, 2, 1) > own[:, :, None]) & within[:, None, :])
-        found.append(np.stack([places[m, i], places[m, j]]))
+        c[:, ~within] = np.nan
+        products = np.matmul(s.transpose(1, 2, 0), c.transpose(1, 0, 2))
+        pairs = np.flatnonzero(products > own[:, :, None])
+        first = pairs // k
+        found.append(np.stack([places.ravel()[first], places[first // k, pairs % k]]))
     i, j = np.concatenate(found, axis=1)
     near = (i != j) & (changed[i] | changed[j])
     i, j = i[near], j[near]
-    line = centers[j] - centers[i]
-    steep = np.einsum("ij,ij->i", normals[i], line) > limit * lengths(line)
+    line = centers[:, j] - centers[:, i]
+    steep = dots(normals[:, i], line) > limit * lengths(line)
     return np.stack([i[steep], j[steep]])

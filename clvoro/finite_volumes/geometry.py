@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _TINY = 1e-150
 """OpenFOAM's ROOTVSMALL, which keeps quotients finite."""
-_CHUNK = 1 << 13
+_CHUNK = 1 << 11
 """Faces that are evaluated at a time: their arrays fit the caches."""
 
 
@@ -56,29 +56,31 @@ def face_geometry(
         Corners of each face, at least three.
     """
     f = len(starts) - 1
-    centers, areas = np.empty((f, 3)), np.empty((f, 3))
+    centers, areas = np.empty((2, f, 3))
     for first in range(0, f, _CHUNK):
         end = min(first + _CHUNK, f)
-        part = corners[starts[first] : starts[end]]
-        here = points.take(part, axis=0)
-        faces = starts[first : end + 1] - starts[first]
-        centers[first:end], areas[first:end] = _geometry(here, faces)
+        here = points.take(corners[starts[first] : starts[end]], axis=0).T
+        made = loop_geometry(np.ascontiguousarray(here), starts[first : end + 1] - starts[first])
+        centers[first:end], areas[first:end] = made[0].T, made[1].T
     return centers, areas
 
 
-def _geometry(here: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return centers and area vectors of faces whose corners are `here` (k, 3)."""
-    counts = np.diff(starts)
-    there = here.take(following(starts), axis=0)
-    means = np.add.reduceat(here, starts[:-1]) / counts[:, None]
-    middle = np.repeat(means, counts, axis=0)
-    normals = cross_rows(there - here, middle - here)
+def loop_geometry(here: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return centers and area vectors of faces whose corners are the columns of `here` (3, k): (3, f) each.
+
+    Column by column NumPy takes a third of the time that it takes row by row.
+    """
+    counts, first, after = np.diff(starts), starts[:-1], following(starts)
+    there = here.take(after, axis=1)
+    means = np.add.reduceat(here, first, axis=1) / counts
+    middle = np.repeat(means, counts, axis=1)
+    normals = cross_columns(there - here, middle - here)
     weights = lengths(normals)
-    total = np.add.reduceat(weights, starts[:-1])
+    total = np.add.reduceat(weights, first)
     # Relative to the mean, so that little is lost in cancellation.
-    moments = np.add.reduceat(weights[:, None] * (here + there - 2 * middle), starts[:-1])
-    centers = means + moments / np.maximum(3 * total, _TINY)[:, None]
-    return centers, np.add.reduceat(normals, starts[:-1]) / 2
+    moments = np.add.reduceat(weights * (here + there - 2 * middle), first, axis=1)
+    centers = means + moments / np.maximum(3 * total, _TINY)
+    return centers, np.add.reduceat(normals, first, axis=1) / 2
 
 
 def cell_geometry(
@@ -96,16 +98,27 @@ def cell_geometry(
     """
     cell = np.concatenate([owner, neighbor])
     k = len(neighbor)
-    middles = np.concatenate([centers, centers[:k]])
-    outward = np.concatenate([areas, -areas[:k]])
+    middles = np.concatenate([centers, centers[:k]]).T
+    outward = np.concatenate([areas, -areas[:k]]).T
+    found, volumes = pyramid_sums(middles, outward, cell, cells)
+    return np.ascontiguousarray(found.T), volumes
+
+
+def pyramid_sums(
+    centers: np.ndarray, areas: np.ndarray, cell: np.ndarray, cells: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return centroids (3, n) and volumes (n,) of cells from the centers and outward areas (3, k) of their faces.
+
+    `cell` (k,) is the cell of each face.
+    """
     counts = np.maximum(np.bincount(cell, minlength=cells), 1)
-    means = sum_rows(cell, middles, cells) / counts[:, None]
-    arms = middles - means[cell]
-    thrice = np.einsum("ij,ij->i", outward, arms)
+    means = sum_columns(cell, centers, cells) / counts
+    arms = centers - means.take(cell, axis=1)
+    thrice = dots(areas, arms)
     volumes = np.bincount(cell, thrice, cells)
-    moments = sum_rows(cell, thrice[:, None] * arms, cells)
+    moments = sum_columns(cell, thrice * arms, cells)
     safe = np.where(np.abs(volumes) > _TINY**2, volumes, np.inf)
-    return means + 0.75 * moments / safe[:, None], volumes / 3
+    return means + 0.75 * moments / safe, volumes / 3
 
 
 def polygon_sides(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -161,22 +174,33 @@ def turns(corners: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.arctan2(cross(behind, ahead), (behind * ahead).sum(axis=1))
 
 
-def cross_rows(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross products of the rows of `a` and `b`, (..., 3) each, with the bits of `np.cross` but faster."""
+def cross_columns(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the cross products of the columns of `a` and `b`, (3, k) each."""
     found = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        found[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
+    for row, (i, j) in zip(found, ((1, 2), (2, 0), (0, 1)), strict=True):
+        np.multiply(a[i], b[j], out=row)
+        row -= a[j] * b[i]
     return found
 
 
+def dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the dot products of the columns of `a` and `b`, (d, k) each: (k,)."""
+    return np.einsum("ij,ij->j", a, b)
+
+
 def lengths(vectors: np.ndarray) -> np.ndarray:
-    """Return the length of each of `vectors` (k, d), (k,)."""
-    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    """Return the length of each column of `vectors` (d, k), (k,)."""
+    return np.sqrt(dots(vectors, vectors))
+
+
+def sum_columns(places: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Return for each place the sum of its `values` (d, k): (d, count)."""
+    return np.stack([np.bincount(places, row, count) for row in values])
 
 
 def sum_rows(places: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Return for each place the sum of its `values` (k, d): (count, d)."""
-    return np.stack([np.bincount(places, column, count) for column in values.T], axis=1)
+    return np.ascontiguousarray(sum_columns(places, values.T, count).T)
 
 
 def smaller_size(owner: np.ndarray, neighbor: np.ndarray, sizes: np.ndarray) -> np.ndarray:

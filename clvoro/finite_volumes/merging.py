@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse
 
-from ..mesh.connectivity import distinct, take_rows
+from ..mesh.connectivity import distinct, inverse, slices, take_rows
 from .defects import Defects, Limits, find_defects
-from .geometry import face_geometry, lengths, sum_rows
+from .geometry import lengths, loop_geometry, sum_columns
 from .independent import independent
 from .neighborhood import FACES, Neighborhood
 from .seams import unpack
@@ -73,6 +72,36 @@ class Merges:
         )  # fmt: skip
 
 
+class _Finder:
+    """The rows of a ragged array that have an item. They are found for the items that are looked for, not for all.
+
+    Parameters
+    ----------
+    starts : (r + 1,) int or None
+        None if each item is a row.
+    items : (k,) int
+        -1 for none.
+    size : int
+        Number of different items.
+    """
+
+    def __init__(self, starts: np.ndarray | None, items: np.ndarray, size: int) -> None:
+        self.starts, self.items = starts, items
+        self.known = np.zeros(size + 1, bool)  # the last one is that of item -1
+
+    def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return for each item in `wanted` its rows, ascending, as ragged rows."""
+        if not self.known[wanted].all():
+            self.known[wanted] = True
+            rows = np.flatnonzero(self.known[self.items])
+            items = self.items[rows]
+            if self.starts is not None:
+                rows = np.searchsorted(self.starts, rows, "right") - 1
+            places, order = inverse(np.arange(len(rows) + 1), items, len(self.known) - 1)
+            self.rows = places, rows[order]
+        return take_rows(*self.rows, wanted)
+
+
 class Cells:
     """Polyhedral cells in 3D whose vertices can be merged.
 
@@ -116,7 +145,7 @@ class Cells:
     ) -> None:
         self.points, self.extent = np.array(points, float), np.asarray(extent, float)
         self.begin, self.count = starts[:-1].copy(), np.diff(starts)
-        self.corners, self.codes = corners.astype(np.int64), codes
+        self.corners, self.codes = corners.copy(), codes
         self.owner, self.neighbor = owner.astype(np.int64), neighbor.astype(np.int64)
         self.face_codes, self.n = face_codes, len(sizes)
         self.sizes, self.centroids, self.small = sizes, centroids, small
@@ -126,10 +155,9 @@ class Cells:
         outer = np.flatnonzero(self.neighbor < 0)
         wall_of = np.repeat(-1 - self.neighbor[outer], self.count[outer])
         np.bitwise_or.at(self.walls, take_rows(starts, self.corners, outer)[1], 1 << wall_of)
-        self.at_vertex = _inverse(starts, self.corners, v)
-        both = np.stack([self.owner, self.neighbor], axis=1).ravel()
-        sides = np.concatenate([[0], np.cumsum(both >= 0)])
-        self.at_cell = _inverse(sides, both[both >= 0], self.n)
+        self.at_vertex = _Finder(starts, corners, v)
+        both = np.stack([self.owner, np.maximum(self.neighbor, -1)], axis=1).ravel()
+        self.at_cell = _Finder(None, both, self.n)
         self.next = np.full(v, -1)  # vertices that have been merged, as linked lists
         self.last = np.arange(v)
         self.now = np.arange(v)  # the vertex that each vertex has become, and where its image is
@@ -141,21 +169,23 @@ class Cells:
     # Positions.
 
     def positions(self, vertices: np.ndarray, codes: np.ndarray) -> np.ndarray:
-        """Return the positions of images of vertices, (k, 3)."""
-        return self.points.take(vertices, axis=0) + self.offsets(codes)
+        """Return the positions of images of vertices, (3, k)."""
+        return self.points.take(vertices, axis=0).T + self.offsets(codes)
 
     def offsets(self, codes: np.ndarray) -> np.ndarray:
-        """Return packed offsets as vectors, (k, 3), or (1, 3) if all are 0."""
-        return unpack(codes) * self.extent if codes.any() else np.zeros((1, 3))
+        """Return packed offsets as vectors, (3, k), or (3, 1) if all are 0."""
+        return (unpack(codes) * self.extent).T if codes.any() else np.zeros((3, 1))
 
     def geometry(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the centers and area vectors of `faces`, (k, 3) each, on the owner's side of periodic seams."""
+        """Return the centers and area vectors of `faces`, (3, k) each, on the owner's side of periodic seams."""
         once = distinct(faces)
-        starts, places = self.face_corners(once)
-        x = self.positions(self.corners[places], self.codes[places])
-        centers, areas = face_geometry(x, starts, np.arange(len(x)))
+        centers, areas = np.empty((2, 3, len(once)))
+        for part in slices(len(once), 1 << 11):
+            starts, places = self.face_corners(once[part])
+            x = self.positions(self.corners[places], self.codes[places])
+            centers[:, part], areas[:, part] = loop_geometry(x, starts)
         at = self.find(FACES, once, faces)
-        return centers.take(at, axis=0), areas.take(at, axis=0)
+        return centers.take(at, axis=1), areas.take(at, axis=1)
 
     def face_corners(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return starts and places of the corners of `faces`."""
@@ -179,6 +209,13 @@ class Cells:
         return found
 
     # Merging.
+
+    def prepare(self, vertices: np.ndarray) -> None:
+        """Find the faces at `vertices`, and those of the cells around, at once."""
+        around = self.at_vertex.find(vertices)[1]
+        there = np.zeros(self.n + 1, bool)
+        there[self.owner[around]] = there[np.maximum(self.neighbor[around], -1)] = True
+        self.at_cell.find(np.flatnonzero(there[:-1]))
 
     def merge(self, merges: Merges) -> int:
         """Merge each set that leaves all cells valid; return how many do. Each merge removes a vertex."""
@@ -216,7 +253,7 @@ class Cells:
         sets = merges.sets[kept]
         made = Merges(starts, vertices, codes, sets, merges.priority, merges.reach)
         x = self.positions(vertices, codes)
-        away = lengths(x - x[starts[:-1]][made.group])
+        away = lengths(x - x[:, starts[:-1]][:, made.group])
         of = sets[made.group]
         key = np.sort(of * v + vertices)  # a vertex in two groups of a set
         wrong = np.concatenate([of[away > merges.reach[of]], key[1:][np.diff(key) == 0] // v])
@@ -229,7 +266,7 @@ class Cells:
         sets, vertices = merges.sets[merges.group], merges.vertices
         found: list[tuple[np.ndarray, np.ndarray]] = []
         while len(vertices):
-            starts, faces = take_rows(*self.at_vertex, vertices)
+            starts, faces = self.at_vertex.find(vertices)
             found.append((np.repeat(sets, np.diff(starts)), faces))
             vertices = self.next[vertices]
             sets, vertices = sets[vertices >= 0], vertices[vertices >= 0]
@@ -289,9 +326,9 @@ class Cells:
         On walls vertices stay on the walls. A group is left out if no vertex of it is on all of its walls.
         """
         group, g = merges.group, len(merges.sets)
-        x = self.positions(merges.vertices, merges.codes)
+        x = self.positions(merges.vertices, merges.codes).T
         size = np.diff(merges.starts)
-        mean = sum_rows(group, x, g) / size[:, None]
+        mean = sum_columns(group, x.T, g).T / size[:, None]
         walls = np.bitwise_or.reduceat(self.walls[merges.vertices], merges.starts[:-1])
         complete = self.walls[merges.vertices] == walls[group]
         targets = np.full((g, 1 + _TRIES, 3), np.nan)
@@ -338,14 +375,7 @@ class Cells:
         self.count[faces] = np.diff(starts)
         there = self.face_corners(faces)[1]
         self.corners[there] = around.corners[places]
-        self.codes[there] = around.codes[places]
+        if self.codes.flags.writeable:  # else there are no images
+            self.codes[there] = around.codes[places]
         self.changed[faces] = True
         self.touched[around.cells[done[around.set_of_cell]]] = True
-
-
-def _inverse(starts: np.ndarray, items: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each of `size` items the rows of the ragged array `starts` and `items` that have it, also ragged."""
-    rows = scipy.sparse.csc_array(
-        (np.ones(len(items), np.int8), items, starts), (size, len(starts) - 1)
-    ).tocsr()
-    return rows.indptr, rows.indices

@@ -90,7 +90,7 @@ class Neighborhood:
         for column in self.cells_of_face.T:
             self.set_of_cell[column[column >= 0]] = sets[column >= 0]
         # All faces as each cell sees them.
-        starts, sides = take_rows(*whole.at_cell, self.cells)
+        starts, sides = whole.at_cell.find(self.cells)
         side_face = sides // 2
         star = whole.find(FACES, faces, side_face)
         rows = np.flatnonzero(np.where(star < 0, whole.count[side_face] > 0, self.alive[star]))
@@ -109,12 +109,12 @@ class Neighborhood:
 
     @cached_property
     def kept_geometry(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centers and outward areas of the sides that no merge changes, (s, 3) each; nan for others."""
+        """Centers and outward areas of the sides that no merge changes, (3, s) each; nan for others."""
         kept = self.side_star < 0
-        seen, outward = np.full((2, len(kept), 3), np.nan)
+        seen, outward = np.full((2, 3, len(kept)), np.nan)
         centers, areas = self.whole.geometry(self.side_face[kept])
-        seen[kept] = centers - self.whole.offsets(self.side_code[kept])
-        outward[kept] = areas * self.side_sign[kept, None]
+        seen[:, kept] = centers - self.whole.offsets(self.side_code[kept])
+        outward[:, kept] = areas * self.side_sign[kept]
         return seen, outward
 
     def _bad(self, sets: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from ..errors import InputError, MismatchWarning
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
-from ..mesh.connectivity import following, take_rows
+from ..mesh.connectivity import following, slices, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import Sealed
 from .geometry import face_geometry
@@ -182,27 +182,28 @@ def make_solver_mesh(
     mesh = SolverMesh(
         domain=diagram.domain,
         cells=len(diagram),
-        points=diagram.vertices.astype(np.float64),
-        starts=faces.starts.astype(np.int64),
-        corners=faces.corners.astype(np.int64),
+        points=diagram.vertices.astype(np.float64, copy=False),
+        starts=faces.starts.astype(np.int64, copy=False),
+        corners=faces.corners,
         owner=faces.owner,
         neighbor=faces.neighbor,
         twin=twin,
         shift=shift,
         half_face=faces.rows,
     )
+    if mesh.dim == 3:
+        return collapse_short(mesh, diagram) if collapse else compact(mesh)
+    mesh = compact(mesh)
     parts = diagram.domain.boundaries.index if parts is None else parts
     straight = walls == "straight" and isinstance(diagram.domain, Polygon)
     if straight:
         mesh = straight_walls(join_faces(mesh), diagram, parts)
-    if collapse and mesh.dim == 2:
+    if collapse:
         mesh = collapse_short_edges(mesh, parts)
     if straight:
         mesh = move_concave_points(mesh)
-    if collapse and mesh.dim == 2:
+    if collapse:
         mesh = relax_points(mesh, parts, straight)
-    if collapse and mesh.dim == 3:
-        mesh = collapse_short(mesh, diagram)
     mesh = compact(mesh)
     if straight and abs(mesh.area_change) > _LARGE_CHANGE:
         warn(
@@ -228,10 +229,13 @@ def check_not_sphere(diagram: Diagram, why: str, instead: str) -> None:
 
 
 def compact(mesh: SolverMesh) -> SolverMesh:
-    """Return `mesh` without points that no face has."""
+    """Return `mesh` without points that no face has, and with corners as int64."""
     used = np.zeros(len(mesh.points), bool)
-    used[mesh.corners] = True
-    if used.all():
+    for part in slices(len(mesh.corners)):
+        used[mesh.corners[part]] = True
+    if used.all() and mesh.corners.dtype == np.int64:
         return mesh
-    place = np.cumsum(used) - 1
-    return replace(mesh, points=mesh.points[used], corners=place[mesh.corners])
+    place, corners = np.cumsum(used) - 1, np.empty(len(mesh.corners), np.int64)
+    for part in slices(len(corners)):
+        corners[part] = place.take(mesh.corners[part])
+    return replace(mesh, points=mesh.points[used], corners=corners)

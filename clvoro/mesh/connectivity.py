@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -117,6 +118,16 @@ def distinct(values: np.ndarray) -> np.ndarray:
     return values[new]
 
 
+def inverse(starts: np.ndarray, items: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each of `size` items the rows of the ragged array `starts` and `items` that have it, also ragged."""
+    import scipy.sparse
+
+    rows = scipy.sparse.csc_array(
+        (np.ones(len(items), np.int8), items, starts), (size, len(starts) - 1)
+    ).tocsr()
+    return rows.indptr, rows.indices
+
+
 def take_rows(
     starts: np.ndarray, items: np.ndarray, rows: np.ndarray, backwards: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -124,14 +135,32 @@ def take_rows(
 
     Where `backwards` (bool, one per row) is set, the items of a row are reversed, but the first stays first.
     """
-    begin, counts = starts[:-1][rows], np.diff(starts)[rows]
-    taken = np.concatenate([[0], np.cumsum(counts)])
-    places = np.repeat(begin - taken[:-1], counts)
-    places += np.arange(len(places))
-    if backwards is not None and backwards.any():
-        turned = np.repeat(backwards, counts) & (places > np.repeat(begin, counts))
-        places = np.where(turned, np.repeat(2 * begin + counts, counts) - places, places)
-    return taken, items[places]
+    begin = starts[:-1][rows]
+    return take_ranges(begin, starts[1:][rows] - begin, items, backwards)
+
+
+def take_ranges(
+    begin: np.ndarray, counts: np.ndarray, items: np.ndarray, backwards: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return `counts` of `items` from `begin` on for each row, as starts and items; see `take_rows`."""
+    taken = np.zeros(len(counts) + 1, np.int64)
+    np.cumsum(counts, out=taken[1:])
+    found = np.empty((taken[-1], *items.shape[1:]), items.dtype)
+    for part in slices(len(counts)):
+        first, end = int(taken[part.start]), int(taken[part.stop])
+        base, many = begin[part], counts[part]
+        places = np.repeat(base - taken[part], many)
+        places += np.arange(first, end)
+        if backwards is not None and backwards[part].any():
+            turned = np.repeat(backwards[part], many) & (places > np.repeat(base, many))
+            places = np.where(turned, np.repeat(2 * base + many, many) - places, places)
+        found[first:end] = items.take(places, axis=0)
+    return taken, found
+
+
+def slices(count: int, size: int = 1 << 14) -> Iterator[slice]:
+    """Cut `count` rows into parts whose arrays fit the caches: large arrays cost a system call and cleared memory."""
+    return (slice(k, min(k + size, count)) for k in range(0, count, size))
 
 
 def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
@@ -146,7 +175,11 @@ def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
         least, starts, corners = 2, 2 * np.arange(len(ends) + 1), ends.ravel()
     else:
         least, starts, corners = 3, diagram.face_vertex_starts, diagram.face_vertices
-    kept = corners != corners[following(starts)]
+    kept = np.empty(len(corners), bool)
+    np.not_equal(corners[1:], corners[:-1], out=kept[:-1])
+    filled = np.flatnonzero(starts[1:] > starts[:-1])
+    last = starts[1:][filled] - 1
+    kept[last] = corners[last] != corners[starts[filled]]
     if kept.all() and (np.diff(starts) >= least).all():
         return starts, corners
     rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
@@ -208,11 +241,16 @@ def face_topology(diagram: Diagram) -> FaceTopology:
     # Of two half-faces that of the lower cell is taken, or that which is there.
     here, there = face_keys(diagram, inner)
     first, second = np.flatnonzero(here < there), np.flatnonzero(here > there)
-    key = here[first]
-    if not np.array_equal(np.sort(key), np.sort(there[second])):
-        second = second[~np.isin(there[second], key)]
+    key, other = here[first], there[second]
+    order = np.argsort(key, kind="stable")
+    # Keys in the order of the cells are nearly sorted, which is fast to complete.
+    by_cell = inverse(np.arange(len(second) + 1), neighbor[inner[second]], len(diagram))[1]
+    nearly = other[by_cell]
+    if not np.array_equal(key[order], np.sort(nearly, kind="stable")):
+        second = second[~np.isin(other, key)]
         first, key = np.concatenate([first, second]), np.concatenate([key, there[second]])
-    chosen = first[np.argsort(key, kind="stable")]
+        order = np.argsort(key, kind="stable")
+    chosen = first[order]
     inner, flipped = inner[chosen], here[chosen] > there[chosen]
     outer = np.flatnonzero(filled & (neighbor < 0))
     outer = outer[np.lexsort((owner[outer], -neighbor[outer]))]

@@ -244,7 +244,7 @@ def test_suspects_are_all_that_would_be_flagged(meshes):
     """The screening against a scan of all faces."""
     diagram, before, _ = meshes
     cells, faces = collapse._fold(before, diagram)
-    flagged = faces[collapse._flagged(cells, np.arange(len(cells.owner)))]
+    flagged = faces[collapse._Scan(cells, np.arange(len(cells.owner))).flagged]
     suspects = collapse._suspects(before, diagram)
     assert len(flagged)
     assert suspects[flagged].all()
