@@ -11,8 +11,10 @@ import numpy as np
 
 from ..finite_volumes.solver_mesh import WallShape
 from ..geometry.boundary_names import Walls
+from ..mesh.connectivity import slices
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import Contents
+from .number_text import decimals, integers, joined
 from .polymesh import PatchType, PolyMesh, poly_mesh
 
 _FILES = {
@@ -23,7 +25,7 @@ _FILES = {
     "faces": "faceList",
 }
 _BYTE_ORDER = {"little": "LSB", "big": "MSB"}[sys.byteorder]
-_CHUNK = 1 << 16
+_CHUNK = 1 << 14
 
 
 def write_foam(
@@ -79,7 +81,7 @@ def write_foam(
             "owner": _text(len(mesh.owner), _labels(mesh.owner)),
             "neighbour": _text(len(mesh.neighbor), _labels(mesh.neighbor)),
         }
-    lists["boundary"] = _text(len(mesh.patches), [_boundary(mesh)])
+    lists["boundary"] = _text(len(mesh.patches), [_boundary(mesh).encode("ascii")])
     # `faces` is moved last: a case without it is recognized as incomplete.
     with atomic_folder(folder / "faces") as target:
         for name in _FILES:
@@ -109,37 +111,35 @@ def _bytes(values: np.ndarray, dtype: type) -> Iterator[bytes]:
         yield b")\n"
 
 
-def _text(count: int, body: Iterable[str]) -> Iterator[bytes]:
+def _text(count: int, body: Iterable[bytes]) -> Iterator[bytes]:
     yield b"%d\n(\n" % count
-    for part in body:
-        yield part.encode("ascii")
+    yield from body
     yield b")\n"
 
 
-def _chunks(count: int) -> Iterator[slice]:
-    """Cut `count` rows into parts: text takes ten times the memory of numbers."""
-    return (slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK))
+def _labels(values: np.ndarray) -> Iterator[bytes]:
+    return (joined(integers(values[part]), b"\n") for part in slices(len(values), _CHUNK))
 
 
-def _labels(values: np.ndarray) -> Iterator[str]:
-    for part in _chunks(len(values)):
-        rows = values[part].tolist()
-        yield "%d\n" * len(rows) % tuple(rows)
+def _vectors(values: np.ndarray) -> Iterator[bytes]:
+    for part in slices(len(values), _CHUNK):
+        x, y, z = (decimals(column) for column in values[part].T)
+        yield joined(b"(", x, b" ", y, b" ", z, b")\n")
 
 
-def _vectors(values: np.ndarray) -> Iterator[str]:
-    for part in _chunks(len(values)):
-        rows = values[part]
-        # repr is the shortest text that is read as the same number.
-        yield "(%r %r %r)\n" * len(rows) % tuple(rows.ravel().tolist())
-
-
-def _faces(starts: np.ndarray, corners: np.ndarray) -> Iterator[str]:
-    sides = np.diff(starts)
-    forms = [f"{k}({' '.join(['%d'] * k)})\n" for k in range(int(sides.max(initial=0)) + 1)]
-    for part in _chunks(len(sides)):
-        form = "".join([forms[k] for k in sides[part].tolist()])
-        yield form % tuple(corners[starts[part.start] : starts[part.stop]].tolist())
+def _faces(starts: np.ndarray, corners: np.ndarray) -> Iterator[bytes]:
+    for part in slices(len(starts) - 1, _CHUNK):
+        own = starts[part.start : part.stop + 1] - starts[part.start]
+        text = integers(corners[starts[part.start] : starts[part.stop]])
+        counts = integers(np.diff(own))
+        before, after = (
+            np.zeros((len(text), counts.shape[1] + 1), np.uint8),
+            np.zeros((len(text), 2), np.uint8),
+        )
+        before[own[:-1], :-1], before[own[:-1], -1] = counts, ord("(")
+        after[:, 0] = ord(" ")
+        after[own[1:] - 1] = np.frombuffer(b")\n", np.uint8)
+        yield joined(before, text, after)
 
 
 def _boundary(mesh: PolyMesh) -> str:
