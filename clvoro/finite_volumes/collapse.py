@@ -108,13 +108,14 @@ def _fold(mesh: SolverMesh, diagram: Diagram) -> tuple[Cells, np.ndarray]:
         starts, corners = take_rows(mesh.starts, mesh.corners, upper)
         _, first, classes = np.unique(mesh.images, return_index=True, return_inverse=True)
         away = np.where(mesh.domain.periodic, (points - points[first[classes]]) / extent, 0)
-        codes = pack(np.rint(away))[corners]
-        points, corners = points[first], classes[corners]
+        codes, face_codes = pack(np.rint(away))[corners], pack(mesh.shift[upper])
+        points, corners = points[first], classes[corners].astype(np.int32)
     else:
-        starts, corners, codes = mesh.starts, mesh.corners, np.broadcast_to(0, len(mesh.corners))
+        starts, corners = mesh.starts, mesh.corners
+        codes, face_codes = (np.broadcast_to(0, len(of)) for of in (corners, upper))
     cells = Cells(
-        points, starts, corners, codes, mesh.owner[upper], mesh.neighbor[upper],
-        pack(mesh.shift[upper]), extent, np.cbrt(diagram.volumes), diagram.centroids, SMALL_FACE,
+        points, starts, corners, codes, mesh.owner[upper], mesh.neighbor[upper], face_codes,
+        diagram, mesh.half_face[upper], SMALL_FACE,
     )  # fmt: skip
     for wall in np.unique(-1 - mesh.neighbor[mesh.neighbor < 0]).tolist():
         axis, upper_side = divmod(wall, 2)

@@ -11,11 +11,12 @@ from functools import cached_property
 
 import numpy as np
 
-from ..mesh.connectivity import distinct, inverse, slices, take_rows
+from ..mesh.connectivity import distinct, inverse, take_rows
+from ..mesh.diagram import Diagram
 from .defects import Defects, Limits, find_defects
 from .geometry import lengths, loop_geometry, sum_columns
 from .independent import independent
-from .neighborhood import FACES, Neighborhood
+from .neighborhood import Neighborhood
 from .seams import unpack
 
 _TRIES = 4
@@ -125,8 +126,8 @@ class Cells:
         Cells that a merge has changed.
     centroids : (n, 3) float
         Where the cells had their centroids before all merges.
-    changed : (f,) bool
-        Faces that a merge has changed.
+    changed, edited : (f,) bool
+        Faces that a merge has changed, in this round and in any.
     """
 
     def __init__(
@@ -138,17 +139,17 @@ class Cells:
         owner: np.ndarray,
         neighbor: np.ndarray,
         face_codes: np.ndarray,
-        extent: np.ndarray,
-        sizes: np.ndarray,
-        centroids: np.ndarray,
+        diagram: Diagram,
+        half_face: np.ndarray,
         small: float,
     ) -> None:
-        self.points, self.extent = np.array(points, float), np.asarray(extent, float)
+        self.points, self.extent = np.array(points, float), np.asarray(diagram.domain.extent, float)
+        self.diagram, self.half_face = diagram, half_face
         self.begin, self.count = starts[:-1].copy(), np.diff(starts)
         self.corners, self.codes = corners.copy(), codes
         self.owner, self.neighbor = owner.astype(np.int64), neighbor.astype(np.int64)
-        self.face_codes, self.n = face_codes, len(sizes)
-        self.sizes, self.centroids, self.small = sizes, centroids, small
+        self.face_codes, self.n = face_codes, len(diagram)
+        self.sizes, self.centroids, self.small = np.cbrt(diagram.volumes), diagram.centroids, small
         self.limits = Limits()
         v = len(points)
         self.walls = np.zeros(v, np.int64)
@@ -163,29 +164,38 @@ class Cells:
         self.now = np.arange(v)  # the vertex that each vertex has become, and where its image is
         self.now_code = np.zeros(v, np.int64)
         self.touched = np.zeros(self.n, bool)
-        self.changed = np.zeros(len(self.owner), bool)
+        self.changed, self.edited = np.zeros((2, len(self.owner)), bool)
         self._places = [np.full(k, -1) for k in (v, self.n, len(self.owner))]
 
     # Positions.
 
     def positions(self, vertices: np.ndarray, codes: np.ndarray) -> np.ndarray:
         """Return the positions of images of vertices, (3, k)."""
-        return self.points.take(vertices, axis=0).T + self.offsets(codes)
+        return np.ascontiguousarray(self.points.take(vertices, axis=0).T) + self.offsets(codes)
 
     def offsets(self, codes: np.ndarray) -> np.ndarray:
         """Return packed offsets as vectors, (3, k), or (3, 1) if all are 0."""
         return (unpack(codes) * self.extent).T if codes.any() else np.zeros((3, 1))
 
     def geometry(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the centers and area vectors of `faces`, (3, k) each, on the owner's side of periodic seams."""
-        once = distinct(faces)
-        centers, areas = np.empty((2, 3, len(once)))
-        for part in slices(len(once), 1 << 11):
-            starts, places = self.face_corners(once[part])
-            x = self.positions(self.corners[places], self.codes[places])
-            centers[:, part], areas[:, part] = loop_geometry(x, starts)
-        at = self.find(FACES, once, faces)
-        return centers.take(at, axis=1), areas.take(at, axis=1)
+        """Return the centers and area vectors of `faces`, (3, k) each, on the owner's side of periodic seams.
+
+        Those of faces that no merge has changed are the diagram's, up to round-off.
+        """
+        d, half, i, j = self.diagram, self.half_face[faces], self.owner[faces], self.neighbor[faces]
+        normals = d.points.take(np.maximum(j, 0), axis=0).T + self.offsets(self.face_codes[faces])
+        normals -= d.points.take(i, axis=0).T
+        wall = np.flatnonzero(j < 0)
+        axis, upper = np.divmod(-1 - j[wall], 2)
+        normals[:, wall] = 0
+        normals[axis, wall] = 2 * upper - 1
+        normals *= d.face_measures.take(half) / lengths(normals)
+        centers = np.ascontiguousarray(d.face_centroids.take(half, axis=0).T)
+        rows = np.flatnonzero(self.edited[faces])
+        starts, places = self.face_corners(faces[rows])
+        x = self.positions(self.corners[places], self.codes[places])
+        centers[:, rows], normals[:, rows] = loop_geometry(x, starts)
+        return centers, normals
 
     def face_corners(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return starts and places of the corners of `faces`."""
@@ -377,5 +387,5 @@ class Cells:
         self.corners[there] = around.corners[places]
         if self.codes.flags.writeable:  # else there are no images
             self.codes[there] = around.codes[places]
-        self.changed[faces] = True
+        self.changed[faces] = self.edited[faces] = True
         self.touched[around.cells[done[around.set_of_cell]]] = True

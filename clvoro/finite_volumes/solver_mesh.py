@@ -44,7 +44,7 @@ class SolverMesh(Sealed):
     points : (v, d) float64
         Corners of faces. At seams each image is a separate point.
     starts : (f + 1,) int64
-    corners : (k,) int64
+    corners : (k,) int64, in 3D int32
         Corners of face i, ``corners[starts[i]:starts[i + 1]]``. In 2D the owner lies to the left of the way from the
         first corner to the second. In 3D the order is counter-clockwise as seen from outside of the owner. At a seam
         the corners of the lower face are the images of those of the upper face, in opposite order; in 3D the
@@ -184,7 +184,7 @@ def make_solver_mesh(
         cells=len(diagram),
         points=diagram.vertices.astype(np.float64, copy=False),
         starts=faces.starts.astype(np.int64, copy=False),
-        corners=faces.corners,
+        corners=faces.corners.astype(np.int64 if diagram.domain.dim == 2 else np.int32, copy=False),
         owner=faces.owner,
         neighbor=faces.neighbor,
         twin=twin,
@@ -193,7 +193,6 @@ def make_solver_mesh(
     )
     if mesh.dim == 3:
         return collapse_short(mesh, diagram) if collapse else compact(mesh)
-    mesh = compact(mesh)
     parts = diagram.domain.boundaries.index if parts is None else parts
     straight = walls == "straight" and isinstance(diagram.domain, Polygon)
     if straight:
@@ -229,13 +228,13 @@ def check_not_sphere(diagram: Diagram, why: str, instead: str) -> None:
 
 
 def compact(mesh: SolverMesh) -> SolverMesh:
-    """Return `mesh` without points that no face has, and with corners as int64."""
+    """Return `mesh` without points that no face has."""
     used = np.zeros(len(mesh.points), bool)
     for part in slices(len(mesh.corners)):
         used[mesh.corners[part]] = True
-    if used.all() and mesh.corners.dtype == np.int64:
+    if used.all():
         return mesh
-    place, corners = np.cumsum(used) - 1, np.empty(len(mesh.corners), np.int64)
+    place, corners = np.cumsum(used) - 1, np.empty_like(mesh.corners)
     for part in slices(len(corners)):
         corners[part] = place.take(mesh.corners[part])
-    return replace(mesh, points=mesh.points[used], corners=corners)
+    return replace(mesh, points=mesh.points.take(np.flatnonzero(used), axis=0), corners=corners)
