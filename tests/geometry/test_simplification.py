@@ -6,7 +6,8 @@ import shapely
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
-from clvoro.geometry import simplification
+from clvoro.geometry.simplification.narrow import narrow_parts
+from clvoro.geometry.simplification.triangles import Triangles, divided_boundary
 
 BOX = [(0, 0), (1, 0), (1, 1), (0, 1)]
 H = 0.1
@@ -87,22 +88,64 @@ def test_vertices_are_thinned():
     assert len(found.vertices) < len(domain.simplified(H).vertices) < 250
 
 
-@pytest.mark.parametrize("land", [False, True])
-@pytest.mark.parametrize("scale", [1, 0.25])
-def test_large_coasts_are_dilated_in_parts(monkeypatch, land, scale):
-    """Narrow parts are those of the coast in one piece, but for what dilations round off."""
+def triangles_of(domain, h):
+    boundary = divided_boundary(domain, lambda x: np.full(len(x), h))
+    return Triangles(*boundary, lambda x: shapely.contains_xy(domain.geometry, *x.T))
+
+
+def archipelago():
     middles = np.mgrid[-0.6:0.7:0.2, -0.6:0.7:0.2].reshape(2, -1).T
-    islands = [c + 0.03 * rough(20, k) for k, c in enumerate(middles)]
-    water = clvoro.Polygon(rough(900, 4), islands).geometry
+    return clvoro.Polygon(rough(900, 4), [c + 0.03 * rough(20, k) for k, c in enumerate(middles)])
 
-    def narrow_parts(most):
-        monkeypatch.setattr(simplification, "_MOST_CORNERS", most)
-        return simplification._narrow_parts(water, [(0.05, None)], scale, land)
 
-    found, wanted = narrow_parts(200), narrow_parts(10**9)
-    assert len(found) == len(wanted) > 100
-    found, wanted = shapely.union_all(found), shapely.union_all(wanted)
-    assert found.symmetric_difference(wanted).area < 1e-6 * wanted.area
+def test_edges_are_sides_of_triangles():
+    domain = archipelago()
+    found = triangles_of(domain, 0.05)
+    sides = np.concatenate([np.roll(found.corners, k, axis=1)[:, :2] for k in range(3)])
+    assert {*map(tuple, found.edges.tolist())} <= {*map(tuple, sides.tolist())}
+    assert found.area[found.water].sum() == pytest.approx(domain.measure, rel=1e-12)
+    middles = found.x[found.corners].mean(axis=1)
+    np.testing.assert_array_equal(found.water, shapely.contains_xy(domain.geometry, *middles.T))
+    ends = found.x[found.edges]
+    assert domain.boundary_distance(ends.mean(axis=1)).max() < 1e-12
+
+
+@pytest.mark.parametrize("land", [False, True])
+def test_narrow_parts(land):
+    """Triangles cover what dilations and erosions leave; areas are those beside discs."""
+    domain, h = archipelago(), 0.05
+    triangles, water = triangles_of(domain, h), domain.geometry
+    parts = narrow_parts(triangles, not land, 1)
+    covered = shapely.union_all(shapely.polygons(triangles.x[triangles.corners[parts.row]]))
+    radius = (1 if land else -1) * h / 2
+    opened = water.buffer(radius, quad_segs=64).buffer(-radius, quad_segs=64)
+    wanted = opened.difference(water) if land else water.difference(opened)
+    # Edges are up to h / 3 long, so that the discs may reach over them a little.
+    assert wanted.difference(covered).area < 0.003 * wanted.area
+    assert parts.area.sum() == pytest.approx(wanted.area, rel=0.03)
+    assert parts.count > 100
+
+
+def test_water_that_touches_itself():
+    """A cape ends above a narrow bay, which is filled: each lake has its own corner there."""
+    shore = [(0, 0), (0.96, 0), (0.96, -0.3), (1.04, -0.3), (1.04, 0), (2, 0)]
+    cape = [(2, 1), (1.1, 1), (1, 0.01), (0.9, 1), (0, 1)]
+    found = clvoro.Polygon(shore + cape).simplified(H)
+    assert found.n_pieces == 2
+    left, right = (piece.geometry for piece in found.split())
+    assert 0 < left.distance(right) < 0.1 * H
+    assert found.measure == pytest.approx(1.9, abs=0.02)
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-6, 1e-9])
+def test_thin_walls(width):
+    """Walls far thinner than the edges that divide the boundary."""
+    walls = [rectangle(0.2, 0.5, 0.6, width), rectangle(0.5, 0.2, width, 0.6)]
+    domain = clvoro.Polygon.from_shapely(shapely.Polygon(BOX).difference(joined(*walls)))
+    found = domain.simplified(H)
+    assert found.measure == pytest.approx(1, abs=2 * width)
+    assert found.n_pieces == 1
+    assert len(found.ring_starts) == 3 or width < 1e-3 * H
 
 
 def test_pieces():
