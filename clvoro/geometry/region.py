@@ -146,6 +146,13 @@ class Region(Domain):
         begin, end = oriented.vertices[edge], oriented.vertices[oriented.next_vertex[edge]]
         return np.where(edge >= 0, oriented.edge_numbers[edge], -1), project(points, begin, end)
 
+    def edges_within(
+        self, points: np.ndarray, distance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return pairs of rows of `points` (n, 2) and of oriented edges that are nearer than `distance` (n,)."""
+        found = self._edges.query(shapely.points(points), predicate="dwithin", distance=distance)
+        return found[0], found[1]
+
     def is_slit(self, points: np.ndarray, within: float) -> np.ndarray:
         """Return for each of `points` (n, 2) whether separate parts of the boundary are within `within`; (n,) bool."""
         rows, edges = self._edges.query(

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..geometry.polygon import Polygon
 
@@ -21,7 +22,6 @@ CORNER = math.radians(30)
 _FAN = math.radians(7.5)  # between the directions from a corner
 _PER_RADIUS = 4  # samples of an edge per radius of the balls at it
 _MAX_SAMPLES = 2048  # of one edge
-_ROUNDS = 40
 _TIP = 6.0  # sizes of boundary between the walls of a tip or a bay, at most
 _DEAD_END, _LONGEST = (
     4.0,
@@ -200,25 +200,54 @@ def _balls(
     radius = np.full(n, most / (2 * math.sin(FACING / 2)))
     touched = points.copy()
     met = np.zeros(n, bool)
-    active = np.arange(n)
-    for _ in range(_ROUNDS):
-        if not active.size:
-            break
+    # First until no vertex is inside: the search for a vertex is much faster than that for an edge.
+    vertices = domain.oriented.vertices
+    tree, active = cKDTree(vertices), np.arange(n)
+    while active.size:
         center = points[active] + radius[active, None] * normal[active]
-        _, nearest = domain.nearest_edge(center)
-        inside = np.hypot(*(nearest - center).T) < radius[active] * (1 - _CLOSE)
-        across = nearest - points[active]
+        distance, nearest = tree.query(center)
+        across = vertices[nearest] - points[active]
         along = (across * normal[active]).sum(axis=1)
-        inside &= along > 0
+        inside = (distance < radius[active] * (1 - _CLOSE)) & (along > 0)
         active, across, along = active[inside], across[inside], along[inside]
         radius[active] = (across**2).sum(axis=1) / (2 * along)
-        touched[active], met[active] = nearest[inside], True
+        touched[active], met[active] = points[active] + across, True
+    center = points + radius[:, None] * normal
+    ball, edge = domain.edges_within(center, radius * (1 - _CLOSE))
+    place, shrunk = _touched(domain, points[ball], normal[ball], edge)
+    order = np.lexsort((shrunk, ball))
+    first = order[np.unique(ball[order], return_index=True)[1]]
+    first = first[np.isfinite(shrunk[first])]
+    radius[ball[first]], touched[ball[first]], met[ball[first]] = shrunk[first], place[first], True
     center = points + radius[:, None] * normal
     away = touched - center
     facing = -(away * normal).sum(axis=1) <= math.cos(FACING) * np.hypot(*away.T)
     wide = np.hypot(*(touched - points).T) > most
     radius[~met | ~facing | wide] = math.inf
     return points, touched, radius
+
+
+def _touched(
+    domain: Polygon, points: np.ndarray, normal: np.ndarray, edge: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where balls that grow from `points` along `normal` first touch oriented edges, and their radii.
+
+    A ball of radius r touches a line at the distance d, with the unit normal m towards the point, if d + r m.n = r.
+    """
+    begin = domain.oriented.vertices[edge]
+    way = domain.oriented.vertices[domain.oriented.next_vertex[edge]] - begin
+    length = np.hypot(*way.T)
+    facing = np.column_stack([-way[:, 1], way[:, 0]]) / length[:, None]
+    off = points - begin
+    distance, slant = (off * facing).sum(axis=1), (normal * facing).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        radius = np.abs(distance) / (1 - np.copysign(slant, distance * slant))
+        center = off + radius[:, None] * normal
+        share = np.clip((center * way).sum(axis=1) / length**2, 0, 1)
+        across = share[:, None] * way - off
+        along = (across * normal).sum(axis=1)
+        radius = np.where(along > 0, (across**2).sum(axis=1) / (2 * along), math.inf)
+    return points + across, radius
 
 
 def radii_of_curvature(domain: Polygon) -> np.ndarray:
