@@ -131,23 +131,26 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
     kept[upper] = alive
     seam = upper[mesh.twin[upper] >= 0]
     kept[mesh.twin[seam]] = kept[seam]
-    left = np.flatnonzero(kept)
-    # The lower face at a seam has the corners of the upper one in opposite order.
-    place = np.full(len(mesh.owner), -1)
-    place[upper] = np.arange(len(upper))
-    lower = place[left] < 0
-    source = place[np.where(lower, mesh.twin[left], left)]
-    begin, counts, points = cells.begin[source], cells.count[source], cells.points
-    starts, corners = take_ranges(begin, counts, cells.corners)
+    left, points = np.flatnonzero(kept), cells.points
     if len(seam):
-        _, where = take_ranges(begin, counts, np.arange(len(cells.corners)), lower)
+        # The lower face at a seam has the corners of the upper one in opposite order.
+        place = np.full(len(mesh.owner), -1)
+        place[upper] = np.arange(len(upper))
+        lower = place[left] < 0
+        source = place[np.where(lower, mesh.twin[left], left)]
+        starts, where = take_ranges(
+            cells.begin[source], cells.count[source], np.arange(len(cells.corners)), lower
+        )
         shift = np.repeat(np.where(lower, cells.face_codes[source], 0), np.diff(starts))
         vertices, codes = cells.corners[where], cells.codes[where] - shift
         order = np.lexsort((codes, vertices))
         new = np.ones(len(order), bool)
         new[1:] = (np.diff(vertices[order]) != 0) | (np.diff(codes[order]) != 0)
+        corners = np.empty_like(vertices)
         corners[order] = np.cumsum(new) - 1
         points = cells.positions(vertices[order][new], codes[order][new]).T
+    else:
+        starts, corners = take_ranges(cells.begin[left], cells.count[left], cells.corners)
     return mesh.take_faces(left, points=points, starts=starts, corners=corners)
 
 

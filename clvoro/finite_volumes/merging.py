@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..mesh.connectivity import distinct, inverse, take_rows
+from ..mesh.connectivity import distinct, take_ranges, take_rows
 from ..mesh.diagram import Diagram
 from .defects import Defects, Limits, find_defects
 from .geometry import lengths, loop_geometry, sum_columns
@@ -88,19 +88,23 @@ class _Finder:
 
     def __init__(self, starts: np.ndarray | None, items: np.ndarray, size: int) -> None:
         self.starts, self.items = starts, items
-        self.known = np.zeros(size + 1, bool)  # the last one is that of item -1
+        self.begin, self.count = np.full(size + 1, -1), np.zeros(size + 1, np.int64)
+        self.rows = np.zeros(0, np.int64)
 
     def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return for each item in `wanted` its rows, ascending, as ragged rows."""
-        if not self.known[wanted].all():
-            self.known[wanted] = True
-            rows = np.flatnonzero(self.known[self.items])
+        new = distinct(wanted[self.begin[wanted] < 0])
+        if len(new):
+            is_new = np.zeros(len(self.begin), bool)  # the last one is that of item -1
+            is_new[new] = True
+            rows = np.flatnonzero(is_new[self.items])
             items = self.items[rows]
             if self.starts is not None:
                 rows = np.searchsorted(self.starts, rows, "right") - 1
-            places, order = inverse(np.arange(len(rows) + 1), items, len(self.known) - 1)
-            self.rows = places, rows[order]
-        return take_rows(*self.rows, wanted)
+            counts = np.bincount(items, minlength=len(self.count))[new]
+            self.begin[new], self.count[new] = len(self.rows) + np.cumsum(counts) - counts, counts
+            self.rows = np.concatenate([self.rows, rows[np.argsort(items, kind="stable")]])
+        return take_ranges(self.begin[wanted], self.count[wanted], self.rows)
 
 
 class Cells:

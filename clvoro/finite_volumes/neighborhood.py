@@ -199,7 +199,7 @@ class Neighborhood:
         cell_groups = np.concatenate([groups, groups[inner]])
         cells = np.concatenate([w.owner[f], w.neighbor[f][inner]])
         frames = np.concatenate([-self.codes[rows], (w.face_codes[f] - self.codes[rows])[inner]])
-        around = _count_unique(cell_groups, _pack_keys(cells, frames), g)
+        around = _count_unique(cell_groups, _pack_keys(cell_groups, cells, frames), g)
         outside = np.bincount(groups[~inner], minlength=g) > 0
         euler = edges - np.bincount(groups, minlength=g) + around + outside
         wrong.append(np.flatnonzero(euler != 2))
@@ -226,12 +226,10 @@ def _pack_keys(*keys: np.ndarray) -> np.ndarray:
     return packed
 
 
-def _count_unique(sets: np.ndarray, numbers: np.ndarray, k: int) -> np.ndarray:
-    """Return how many different numbers each set has, (k,) int."""
-    rows = np.lexsort((numbers, sets))
-    new = np.ones(len(rows), bool)
-    new[1:] = (np.diff(sets[rows]) != 0) | (np.diff(numbers[rows]) != 0)
-    return np.bincount(sets[rows[new]], minlength=k)
+def _count_unique(sets: np.ndarray, keys: np.ndarray, k: int) -> np.ndarray:
+    """Return how many different `keys` each set has, (k,) int; sets have no key in common."""
+    first = np.unique(keys, return_index=True)[1]
+    return np.bincount(sets[first], minlength=k)
 
 
 def _pairs(groups: np.ndarray, items: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
