@@ -81,22 +81,25 @@ def _suspects(mesh: SolverMesh, diagram: Diagram) -> np.ndarray:
     """
     h = smaller_size(mesh.owner, mesh.neighbor, np.cbrt(diagram.volumes))
     found = diagram.face_measures[mesh.half_face] < _SURE * _SKEWED_FACE * h**2
-    limit, columns = (_SURE * SHORT_EDGE * h) ** 2, np.ascontiguousarray(mesh.points.T)
+    limit, (x, *others) = (_SURE * SHORT_EDGE * h) ** 2, np.ascontiguousarray(mesh.points.T)
     for part in slices(len(found), _CHUNK):
         starts = mesh.starts[part.start : part.stop + 1]
-        corners, starts = mesh.corners[starts[0] : starts[-1]], starts - starts[0]
+        begin, starts = mesh.corners[starts[0] : starts[-1]], starts - starts[0]
         head, last = starts[:-1], starts[1:] - 1
-        squares, step = np.zeros((2, len(corners)))
-        for x in columns:
-            here = x.take(corners)
-            np.subtract(here[1:], here[:-1], out=step[:-1])
-            step[last] = here[head] - here[last]
-            step *= step
-            squares += step
-        limits = limit[part]
-        short = np.flatnonzero(squares < limits.max())
-        rows = np.searchsorted(starts, short, "right") - 1
-        found[part.start + rows[squares[short] < limits[rows]]] = True
+        end, step, here = np.empty_like(begin), np.empty(len(begin)), x.take(begin)
+        end[:-1], end[last] = begin[1:], begin[head]
+        np.subtract(here[1:], here[:-1], out=step[:-1])
+        step[last] = here[head] - here[last]
+        step *= step
+        limits, most = limit[part], limit[part].max()
+        # Few sides are short along the first axis: the other axes are read for these.
+        near = np.flatnonzero(step < most)
+        begin, end, squares = begin[near], end[near], step[near]
+        for y in others:
+            squares += (y.take(end) - y.take(begin)) ** 2
+        near, squares = near[squares < most], squares[squares < most]
+        rows = np.searchsorted(starts, near, "right") - 1
+        found[part.start + rows[squares < limits[rows]]] = True
     return found
 
 
