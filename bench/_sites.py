@@ -1,4 +1,4 @@
-"""Domains with walls as users have them: a harbor, a river, tubes, streets, a motor."""
+"""Domains with walls as users have them: a harbor, a river, tubes, streets, a motor, a mask."""
 
 from __future__ import annotations
 
@@ -110,6 +110,20 @@ def motor() -> Site:
     return Site(domain, sizing.FeatureSize(domain, 4, growth=1.2, h_min=0.006, h_max=0.03), {})
 
 
+def mask(seed: int = 3) -> Site:
+    """Return the water of a raster, along the edges of its pixels, with cells of one and a half pixels."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(60) + 0.5, np.arange(60) + 0.5)
+    height = np.zeros_like(x)
+    for _ in range(40):
+        a, b = rng.normal(0, 0.25, 2)
+        height += np.cos(a * x + b * y + rng.uniform(0, 2 * np.pi)) / (1 + 8 * np.hypot(a, b))
+    rows, columns = np.nonzero(height > np.quantile(height, 0.25))
+    water = shapely.union_all(shapely.box(columns, rows, columns + 1, rows + 1))
+    return Site(_largest(water.simplify(0)), 1.5, {})
+
+
 SITES: dict[str, Callable[[], Site]] = {
     "harbor": harbor, "river": river, "tubes, layers": tubes, "streets": streets, "motor": motor,
+    "mask": mask,
 }  # fmt: skip

@@ -15,7 +15,9 @@ from scipy.spatial import KDTree
 
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
+from ..geometry.rings import OrientedRings
 from ..geometry.tips import WIDEST, find_tips
+from ..mesh.straightening import cross
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 from .motion import Moving
@@ -28,6 +30,10 @@ SHARP_TURN, LEAST_TURN = np.radians(20), np.radians(30)
 SPACING, LEAST_SPACING, FAN = 1.1, 0.15, 0.5
 """Spacing of corners over h: ``SPACING - FAN * turn``, for the mean turn of two corners, but at least `LEAST_SPACING`.
 Cells fan out around a corner, so sharp corners may be close to each other."""
+POCKETS, POCKET_SPACING = (0.01, 0.35), 0.75
+"""Areas over h^2, inside the domain, between the boundary and the segment from one corner to another. No cell fits in
+such a pocket, as on a staircase: its corners are at least `POCKET_SPACING` apart, over h. On a smaller one the boundary
+is straight."""
 JOINED = 1.6
 """Distance over h, the larger one of both, up to which two corners may share a generator. They belong to the same group
 then."""
@@ -87,7 +93,7 @@ def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) ->
     """Return the re-entrant corners of `domain` that matter for cells of size `h` (k,) at its vertices.
 
     Corners that are not on the boundary of `free`, the part of the domain without layers, are left out. Of corners
-    nearer to each other than `SPACING` the sharper one is kept.
+    that are too near to each other (`SPACING`, `POCKET_SPACING`) the sharper one is kept.
     """
     oriented = domain.oriented
     x, turns = oriented.vertices, oriented.turns
@@ -99,7 +105,7 @@ def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) ->
     sharp = sharp[_is_free(domain, free, x[sharp])]
     # The sharpest first: `_spaced` leaves out vertices that are too close to an earlier one.
     order = sharp[np.lexsort((sharp, turns[sharp].round(9), -bend[sharp].round(9)))]
-    kept = np.sort(_spaced(x, bend, h, order))
+    kept = np.sort(_spaced(oriented, bend, h, order))
     directions, angles, slack = _walls(domain, kept, h)
     tips, *shape = find_tips(domain, h, kept)
     bare = _is_free(domain, free, x[tips])
@@ -164,24 +170,55 @@ def _bend(ring: np.ndarray, turned: np.ndarray, reach: np.ndarray) -> np.ndarray
     return np.where((angle < np.pi / 2) & (turned < -np.pi / 3), 2 * np.pi, angle) - np.pi
 
 
-def _spaced(x: np.ndarray, bend: np.ndarray, h: np.ndarray, order: np.ndarray) -> np.ndarray:
+def _spaced(rings: OrientedRings, bend: np.ndarray, h: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Return those of the vertices `order` that are far enough from all earlier ones that are kept.
 
     Only around those that are kept others are searched: on a fine coast most are not.
     """
     if not len(order):
         return order
-    x, bend, h = x[order], bend[order], h[order]
+    x, bend, h = rings.vertices[order], bend[order], h[order]
+    pockets = _Pockets(rings)
     tree, kept = KDTree(x), np.ones(len(order), bool)
     for k in range(len(order)):
         if not kept[k]:
             continue
         near = np.array(tree.query_ball_point(x[k], SPACING * h[k]))
         near = near[near > k]
+        size = np.minimum(h[near], h[k])
+        gap = np.hypot(*(x[near] - x[k]).T) / size
+        near, size, gap = near[gap < SPACING], size[gap < SPACING], gap[gap < SPACING]
         fan = SPACING - FAN * (bend[near] + bend[k]) / 2
-        limit = np.maximum(fan, LEAST_SPACING) * np.minimum(h[near], h[k])
-        kept[near[np.hypot(*(x[near] - x[k]).T) < limit]] = False
+        area = pockets.areas(order[k], order[near]) / size**2
+        pocket = (area > POCKETS[0]) & (area < POCKETS[1])
+        least = np.maximum(fan, np.where(pocket, POCKET_SPACING, LEAST_SPACING))
+        kept[near[gap < least]] = False
     return order[kept]
+
+
+class _Pockets:
+    """Areas between the boundary and the segment from one of its vertices to another."""
+
+    def __init__(self, rings: OrientedRings) -> None:
+        first = rings.ring_starts[:-1]
+        self._ring = np.repeat(np.arange(len(first)), np.diff(rings.ring_starts))
+        self._x = rings.vertices - rings.vertices[first[self._ring]]
+        # Twice the areas of the triangles of all edges with the first vertex of their ring.
+        sums = np.concatenate([[0], np.cumsum(cross(self._x, self._x[rings.next_vertex]))])
+        self._sums = sums[:-1] - sums[first[self._ring]]
+        self._whole = np.diff(sums[rings.ring_starts])
+
+    def areas(self, v: int, others: np.ndarray) -> np.ndarray:
+        """Return the areas for vertex `v` and each of `others` (k,), (k,); positive where the domain is between.
+
+        The smaller one on both ways along the ring counts. It is infinite for vertices of other rings.
+        """
+        ring, x, sums = self._ring[v], self._x, self._sums
+        ahead = sums[others] - sums[v] + np.where(others < v, self._whole[ring], 0)
+        ahead += cross(x[others], x[None, v])
+        behind = self._whole[ring] - ahead
+        area = np.where(np.abs(ahead) < np.abs(behind), ahead, behind) / 2
+        return np.where(self._ring[others] == ring, area, np.inf)
 
 
 def _walls(
