@@ -93,8 +93,7 @@ def take_step(mesh: MeshState, method: Method) -> int:
     with mesh.engine.workspace.frame():
         solution = method.displace(mesh)
         method.move(mesh)
-    mesh.update(check=False)
-    mesh.read_summaries()
+    mesh.update()
     return solution.iterations if solution else 0
 
 

@@ -51,6 +51,7 @@ from clvoro.opencl.engine import Engine
 from clvoro.opencl.profile import Profile, profiled_queue
 from clvoro.sizing import Sizing
 from clvoro.solvers.linear_system import Solution
+from clvoro.tessellation.device_diagram import Follow, Tessellation
 
 CELLS_OF_F2 = 22972
 SOLVERS = ("poisson", "multigrid", "aggregation", "conjugate_gradient", "volume_projection")
@@ -155,15 +156,19 @@ def take_steps(
     spent = 0.0
     solutions: list[Solution | None] = []
 
-    def tessellate(*args: Any, **named: Any) -> Any:
+    def tessellate(*args: Any, follow: Follow, **named: Any) -> Any:
         nonlocal spent
         kept: list[Any] = []
-        spent = timed(lambda: kept.append(original(*args, **named)))
-        return kept[0]
+        after = 0.0
 
-    def finish() -> None:
-        mesh.update()
-        mesh.read_summaries()
+        def timed_follow(t: Tessellation, report: Any) -> list[int]:
+            nonlocal after
+            found: list[list[int]] = []
+            after += timed(lambda: found.append(follow(t, report)))
+            return found[0]
+
+        spent = timed(lambda: kept.append(original(*args, follow=timed_follow, **named))) - after
+        return kept[0]
 
     tessellator.tessellate = tessellate  # type: ignore[method-assign]
     try:
@@ -171,7 +176,7 @@ def take_steps(
             with mesh.engine.workspace.frame():
                 parts["displace"].append(timed(lambda: solutions.append(method.displace(mesh))))
                 moving = timed(lambda: method.move(mesh))
-            rest = moving + timed(finish)
+            rest = moving + timed(mesh.update)
             parts["diagram"].append(spent)
             parts["rest"].append(rest - spent)
     finally:

@@ -253,9 +253,10 @@ kernel void summarize_lengths(global const REAL *u, global const REAL *v, global
 }
 
 /* One work-group per slot. If bit `slot` of `which` is set, out[4 slot ...] = sum, sum of magnitudes, minimum, maximum.
-   If `noted`, the first number of `note` follows the last slot: the host reads all in one transfer. */
-kernel void combine_blocks(global const summary_t *partials, const int groups, const int which, const int noted,
-                           global const int *note, global REAL *out, global int *behind)
+   The first numbers of two arrays follow the last slot: the host reads all in one transfer. */
+kernel void combine_blocks(global const summary_t *partials, const int groups, const int which, const int first_count,
+                           global const int *first, const int second_count, global const int *second, global REAL *out,
+                           global int *behind)
 {
     GROUP_SUMMARIES(shares);
     const int slot = get_group_id(0), t = get_local_id(0), size = get_num_groups(0);
@@ -273,8 +274,10 @@ kernel void combine_blocks(global const summary_t *partials, const int groups, c
         put[2] = all.least;
         put[3] = all.largest;
     }
-    if (noted && t == 0 && slot == 0)
-        behind[4 * size * (int)(sizeof(REAL) / sizeof(int))] = note[0];
+    global int *notes = behind + 4 * size * (int)(sizeof(REAL) / sizeof(int));
+    const int count = slot == 0 ? first_count + second_count : 0;
+    for (int k = t; k < count; k += GROUP_SIZE)
+        notes[k] = k < first_count ? first[k] : second[k - first_count];
 }
 
 /* Row p of `out` is row items[p] of `rows`; a row has `words` 32-bit words of any type. */

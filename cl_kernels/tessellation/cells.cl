@@ -232,14 +232,18 @@ kernel void match_polygon_faces(const int size, global const int *places, global
    offsets (n, 2)            centroid - x_i, the Lloyd displacement (the paper's 2.2)
    covariances (n, 3)        xx, xy, yy of the second moments about the centroid, per unit area
 
-   With IN_LANES, each work-item takes LANES generators. */
+   With IN_LANES, each work-item takes LANES generators. With `ahead` this and `copy_graph` do nothing unless the flags
+   say that the rows are right, and that there is room for their faces. */
 kernel void measure_cells(const int size, global const int *places, global const int *slots,
                           global const int *slot_counts, global const int *old_starts, global const int *old_neighbors,
                           global const uint *keep, global const int *starts, global const REAL *points,
-                          const REAL4 box_lower, const REAL4 box_upper, global int *neighbors,
-                          global FACE *face_measures, global FACE *face_centroids, global REAL *volumes,
-                          global REAL *offsets, global REAL *covariances)
+                          const REAL4 box_lower, const REAL4 box_upper, const int ahead, const int room,
+                          global const int *flags, global int *neighbors, global FACE *face_measures,
+                          global FACE *face_centroids, global REAL *volumes, global REAL *offsets,
+                          global REAL *covariances)
 {
+    if (ahead && !are_right(flags, room))
+        return;
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
@@ -413,11 +417,13 @@ kernel void drop_loops(const int size, global const int *places, global const in
 }
 
 /* The starts of n rows, and their neighbors if `whole`, to their place, once nothing is read from there any more. */
-kernel void copy_graph(const int n, const int whole, global const int *starts, global const int *neighbors,
-                       global int *starts_to, global int *neighbors_to)
+kernel void copy_graph(const int n, const int whole, const int ahead, const int room, global const int *flags,
+                       global const int *starts, global const int *neighbors, global int *starts_to,
+                       global int *neighbors_to)
 {
-    const int faces = whole ? starts[n] : 0;
-    for (BLOCK_LOOP(i, n + 1))
+    const bool right = !ahead || are_right(flags, room);
+    const int rows = right ? n + 1 : 0, faces = right && whole ? starts[n] : 0;
+    for (BLOCK_LOOP(i, rows))
         starts_to[i] = starts[i];
     for (BLOCK_LOOP(k, faces))
         neighbors_to[k] = neighbors[k];

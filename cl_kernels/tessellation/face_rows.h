@@ -13,6 +13,7 @@
    next spare slot. flags[4]: number of slots. flags[5]: faces no longer than round-off stay. flags[6]: number of
    half-faces. flags[7]: number of marked cells; while there are any, rows are not matched. flags[8 + r]: number of
    cells clipped before round r of an update. */
+#define FLAG_FACES 6
 #define FLAG_MARKED 7
 #define FLAG_CLIPPED 8
 #define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than the spare slots hold */
@@ -20,6 +21,13 @@
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */
 #define FLAG_LOOPED 32   /* faces cross */
 #define FLAG_OPEN 64     /* a cell on the sphere is not enclosed by generators */
+
+/* Whether matched rows are those of a diagram with room for `room` half-faces, without a doubt. */
+inline bool are_right(global const int *flags, int room)
+{
+    return flags[0] == 0 && flags[1] == 0 && flags[3] <= flags[4] && flags[FLAG_MARKED] == 0 &&
+           flags[FLAG_FACES] <= room;
+}
 
 #define ELSEWHERE INT_MAX
 

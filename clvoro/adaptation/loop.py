@@ -186,8 +186,7 @@ class Loop:
                 self.final = self.displacements()
             action.method.move(self.mesh)
             self.mesh.walls.adjust(self.mesh)
-        # The next row of the history checks the sizes, too, unless they are scaled before.
-        self.mesh.update(check=self.fixed_count is not None)
+        self.mesh.update()
         for _ in range(action.openings):
             self.obtuse, opened = self.mesh.open_triangles()
             if not opened:
@@ -344,7 +343,7 @@ class Loop:
     def add_row(self, progress: float) -> None:
         """Append a row to the history."""
         mesh = self.mesh
-        s, n, labeled = mesh.read_summaries(), mesh.n, mesh.next_label
+        s, n, labeled = mesh.summaries.read(), mesh.n, mesh.next_label
         row: dict[str, float] = dict.fromkeys(HISTORY_DTYPE.fields or (), 0)
         row |= {"step": self.steps, "level": self.level, "cells": n, "progress": progress}
         row |= self.qualities(s)
@@ -424,7 +423,7 @@ class Loop:
                 final = self.displacements()
         if mesh.finalize():
             # Faces shorter than round-off may have changed, and with them the quality.
-            for name, value in self.qualities(mesh.read_summaries()).items():
+            for name, value in self.qualities(mesh.summaries.read()).items():
                 self.rows[-1][name] = value
         labels = mesh.ordered(mesh.labels)
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])

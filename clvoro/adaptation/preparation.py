@@ -399,7 +399,7 @@ class Preparation:
     def _is_near(self, mesh: MeshState) -> bool:
         n, n_cells = mesh.n, self.options.n_cells
         missing = mesh.missing_cells() if n_cells is None else float(n_cells - n)
-        s = mesh.read_summaries()
+        s = mesh.summaries.read()
         return is_near(
             self.domain.cell_dim, self.options.effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n
         )  # fmt: skip

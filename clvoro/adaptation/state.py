@@ -13,9 +13,9 @@ import pyopencl.array as cla
 from ..geometry.box import Domain
 from ..mesh.diagram import Diagram
 from ..opencl.device_array import buffer_of
-from ..opencl.primitives import Summary
 from ..sizing import Sizing
 from ..tessellation.bins import BinnedPoints
+from ..tessellation.device_diagram import Tessellation
 from ..tessellation.power import PowerTessellator
 from ..tessellation.readback.diagram import fetch_diagram
 from ..tessellation.tessellator import Tessellator
@@ -65,7 +65,7 @@ class MeshState(MeshArrays):
         self.power: PowerTessellator | None = None
         self.follows_log_ratio = False
         self.taken = np.full(setup.first_row, -1, np.int32)
-        self._log_ratio_error: float | None = None
+        self._knows_log_ratio = False
         if isinstance(start, Arrays):
             self._data, self.next_label = start, len(start.generators)
             return
@@ -143,10 +143,11 @@ class MeshState(MeshArrays):
         stages.bins.clear()
         self.engine.workspace.clear()
 
-    def update(
-        self, first: bool = False, binned: BinnedPoints | None = None, *, check: bool = True
-    ) -> None:
-        """Tessellate the present points, and evaluate size, error and quality.
+    def update(self, first: bool = False, binned: BinnedPoints | None = None) -> None:
+        """Tessellate the present points, evaluate size, error and quality, and read the summaries.
+
+        An update of the last diagram is evaluated before the host knows whether it is right. All that the host needs is
+        read in one transfer: the report of the update, the summaries, and whether all sizes are valid.
 
         Parameters
         ----------
@@ -154,8 +155,6 @@ class MeshState(MeshArrays):
             There is no earlier diagram to compare neighbors with.
         binned : BinnedPoints, optional
             The points in their bins, if the caller has them.
-        check : bool
-            Check the sizes. Otherwise the next `read_summaries` does.
 
         Raises
         ------
@@ -170,17 +169,19 @@ class MeshState(MeshArrays):
         previous = data.tessellation
         if previous is not None and previous.weighted is not None:
             previous = None
+
+        def evaluate(t: Tessellation, report: cla.Array | None) -> list[int]:
+            data.tessellation = t
+            if report is None and self.engine.cell_dim == 2:
+                # The next diagrams are usually updated from this one.
+                stages.bins.clear()
+            self.sizing.evaluate(self.points, self.n, self.h, self.size_factor)
+            self.compare_and_evaluate(first)
+            return self._read(report)
+
         data.tessellation = self.tessellator.tessellate(
-            self.points, self.n, previous, binned=binned
+            self.points, self.n, previous, binned=binned, follow=evaluate
         )
-        if self.engine.cell_dim == 2:
-            # The next diagrams are usually updated from this one.
-            stages.bins.clear()
-        self.sizing.evaluate(self.points, self.n, self.h, self.size_factor)
-        self.compare_and_evaluate(first)
-        # An invalid size must be reported before it causes other errors, in the solver for instance.
-        if check:
-            self.sizing.check(self.points, self.h, self.size_factor)
 
     def compare_and_evaluate(self, first: bool = False) -> None:
         """Compare the neighbors with those of the last diagram, and evaluate error and quality."""
@@ -205,7 +206,7 @@ class MeshState(MeshArrays):
             own = {"error": self.error, "quality": self.quality, "energy": energy}
             if self.follows_log_ratio:
                 own["log_ratio"] = self.stages.density.cell_weights(self.t, self.h).log_ratio
-            self._log_ratio_error = None
+            self._knows_log_ratio = self.follows_log_ratio
             self.summaries.collect_all({**own, **(others or {})}, self.n)
 
     def move_by_displacements(self) -> None:
@@ -225,17 +226,12 @@ class MeshState(MeshArrays):
         """Evaluate density, log ratios and, as `lloyd`, weighted centroids: see `Density.lloyd_weights`."""
         return self.stages.density.lloyd_weights(self.t, self.h, self.lloyd, gradient, log_ratio)
 
-    def _summarize_log_ratio(self, w: CellWeights) -> Summary:
-        self.summaries.collect("log_ratio", w.log_ratio, self.n)
-        return self.summaries.read_one("log_ratio")
-
     def mean_log_ratio_error(self, w: CellWeights) -> float:
         """Return the mean of |log(L / h)|."""
-        if self._log_ratio_error is None:
-            self._log_ratio_error = (
-                self._summarize_log_ratio(w).magnitude / self.n / self.engine.cell_dim
-            )
-        return self._log_ratio_error
+        if not self._knows_log_ratio:
+            self.summaries.collect("log_ratio", w.log_ratio, self.n)
+        self._knows_log_ratio = True
+        return self.summaries.read_one("log_ratio").magnitude / self.n / self.engine.cell_dim
 
     def missing_cells(self, w: CellWeights | None = None) -> float:
         """Return how many more cells the size field requires; negative if there are too many.
@@ -251,7 +247,8 @@ class MeshState(MeshArrays):
         """Scale the size field by the factor that makes the mean of log(L / h) zero."""
         with self.engine.workspace.frame():
             w = self.stages.density.cell_weights(self.t, self.h)
-            factor = math.exp(self._summarize_log_ratio(w).sum / self.n / self.engine.cell_dim)
+            self.summaries.collect("log_ratio", w.log_ratio, self.n)
+        factor = math.exp(self.summaries.read_one("log_ratio").sum / self.n / self.engine.cell_dim)
         self.size_factor *= factor
         self.stages.metric.scale_sizes(factor, self.h)
         self.evaluate_metric()
@@ -344,19 +341,15 @@ class MeshState(MeshArrays):
         self.update()
         return count, True
 
-    def read_summaries(self) -> dict[str, Summary]:
-        """Read the summaries of the mesh and of the last step: the scalars that the host needs.
-
-        Raises
-        ------
-        SizeFieldError
-            If a size is not positive and finite, and `update` has not checked it.
-        """
-        summaries, first = self.summaries.read_with(self.sizing.invalid_index)
+    def _read(self, report: cla.Array | None) -> list[int]:
+        """Read the summaries and the numbers of the report of a diagram, and check the sizes."""
+        given = [] if report is None else [report]
+        invalid = self.sizing.invalid_index
+        if invalid is None:
+            return self.summaries.read_with(*given)
+        first, *numbers = self.summaries.read_with(invalid, *given)
         self.sizing.check(self.points, self.h, self.size_factor, first)
-        if self.follows_log_ratio:
-            self._log_ratio_error = summaries["log_ratio"].magnitude / self.n / self.engine.cell_dim
-        return summaries
+        return numbers
 
     def refined_count(self) -> int:
         """Return the number of generators after `refine`."""

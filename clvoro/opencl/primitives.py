@@ -19,8 +19,8 @@ from .engine import Engine
 
 AT_ONCE = 8
 """Largest number of arrays that one launch summarizes."""
-
-
+MOST_NOTES = 20
+"""Largest number of integers that are read together with summaries."""
 FEW = 8192
 """Up to this many numbers one work-group scans in the time of two launches."""
 
@@ -87,9 +87,10 @@ class Summaries:
         self._partials = engine.empty(6 * engine.groups * len(names))
         self._slots_of: dict[tuple[str, ...], tuple[np.ndarray, int]] = {}
         self._pending = 0
-        # An integer follows the summaries; the host reads it in the same transfer.
+        self._known: dict[str, Summary] | None = None
+        # Integers follow the summaries; the host reads them in the same transfer.
         size = 4 * len(names) * engine.real.itemsize
-        self._record = engine.zeros(size + np.dtype(np.int32).itemsize, np.uint8)
+        self._record = engine.zeros(size + MOST_NOTES * np.dtype(np.int32).itemsize, np.uint8)
         shape = (len(names), 4)
         self._values = make_array(engine.queue, shape, engine.real, buffer_of(self._record))
 
@@ -109,7 +110,7 @@ class Summaries:
         self.engine.run_blocks(
             self._kernels.summarize_blocks, *given, *spare, len(given), n, slots, self._partials,
         )  # fmt: skip
-        self._pending |= which
+        self._pending, self._known = self._pending | which, None
 
     def collect_lengths(
         self, names: tuple[str, str], u: cla.Array, v: cla.Array, unit: cla.Array
@@ -119,41 +120,47 @@ class Summaries:
         self.engine.run_blocks(
             self._kernels.summarize_lengths, u, v, unit, len(unit), one, two, self._partials
         )
-        self._pending |= 1 << one | 1 << two
+        self._pending, self._known = self._pending | 1 << one | 1 << two, None
 
     @property
     def values(self) -> cla.Array:
         """The device array of summaries: for each name the sum, the sum of magnitudes, minimum and maximum."""
         if self._pending:
-            self._combine(None)
+            self._combine()
+        self._known = None
         return self._values
 
-    def _combine(self, note: cla.Array | None) -> None:
-        """Combine the partial summaries, and write the first number of `note` after them."""
+    def _combine(self, *notes: cla.Array) -> None:
+        """Combine the partial summaries, and write the numbers of at most two arrays behind them."""
+        counts, arrays = [*map(len, notes), 0, 0], [*notes, self._record, self._record]
         self.engine.run_groups(
             self._kernels.combine_blocks, len(self.slots), self._partials, self.engine.groups, self._pending,
-            int(note is not None), self._record if note is None else note, self._values, self._record,
+            counts[0], arrays[0], counts[1], arrays[1], self._values, self._record,
         )  # fmt: skip
         self._pending = 0
 
     def read_one(self, name: str) -> Summary:
-        """Fetch one slot."""
+        """Return one slot."""
+        if self._known is not None:
+            return self._known[name]
         slot = self.slots[name]
         return Summary(*map(float, self.values[slot : slot + 1].get()[0]))
 
     def read(self) -> dict[str, Summary]:
-        """Fetch every slot, in one transfer."""
-        return self.read_with(None)[0]
+        """Return every slot. They are fetched in one transfer, once until something is collected."""
+        if self._known is None:
+            self.read_with()
+        return self._known or {}
 
-    def read_with(self, other: cla.Array | None) -> tuple[dict[str, Summary], int]:
-        """Fetch every slot and the first number of `other`, int32, in one transfer; the number is 0 without `other`."""
-        if self._pending or other is not None:
-            self._combine(other)
-        size = self._values.nbytes
+    def read_with(self, *notes: cla.Array) -> list[int]:
+        """Fetch every slot, for `read`, and the numbers of at most two arrays, int32, in one transfer; return these."""
+        if self._pending or notes:
+            self._combine(*notes)
+        size, count = self._values.nbytes, sum(map(len, notes))
         host = self._record.get()
         rows = host[:size].view(self.engine.real).reshape(-1, 4).tolist()
-        summaries = {name: Summary._make(rows[slot]) for name, slot in self.slots.items()}
-        return summaries, int(host[size:].view(np.int32)[0])
+        self._known = {name: Summary._make(rows[slot]) for name, slot in self.slots.items()}
+        return host[size:].view(np.int32)[:count].tolist()
 
 
 class Gather:

@@ -112,12 +112,8 @@ class Cells:
             self._n = n
 
     def _reserve_faces(self, n: int, m: int) -> None:
-        """Allocate the arrays for `m` half-faces of `n` cells.
-
-        Cells and walls are the nodes of a planar graph with at most 3 (n + 4) - 6 edges. An edge has two half-faces, or
-        one at a wall. Round-off may add some where many generators lie on a circle.
-        """
-        most = max(m, 6 * n + 12)
+        """Allocate the arrays for `m` half-faces of `n` cells."""
+        most = max(m, most_faces(n))
         if most > self._room:
             engine, d = self.engine, self.engine.dim
             self._of_faces: dict[str, cla.Array] = {}
@@ -184,7 +180,7 @@ class Cells:
                 t = None
                 if not flags & ~DOUBT:
                     old = rows.places, rows.places
-                    t = self._measure(rows, box, points, n, *old, m, flags, exact)
+                    t = self.measure(rows, box, points, n, *old, m, flags, exact)
                 if t is not None:
                     return t
                 if flags & OPEN:
@@ -234,37 +230,6 @@ class Cells:
         """Return what else the search for neighbors of the first `total` points needs."""
         return ()
 
-    def match_update(
-        self,
-        rows: FaceRows,
-        box: ClipBox,
-        points: cla.Array,
-        previous: Tessellation,
-        fits: cla.Array,
-    ) -> list[int]:
-        """Match the rows of `previous`, replaced by `rows` where these have a slot; return the flags.
-
-        While cells are marked nothing is done. `fits` (n,) is 1 for a row if every neighbor lists the generator between
-        the correct two neighbors; it becomes 0 where a face due to round-off is dropped.
-        """
-        old = previous.starts, previous.neighbors
-        self._enqueue_match(rows, box, points, previous.n, *old, exact=False, fits=fits)
-        return self._flags.get().tolist()
-
-    def complete(
-        self,
-        rows: FaceRows,
-        box: ClipBox,
-        points: cla.Array,
-        previous: Tessellation,
-        found: Sequence[int],
-    ) -> Tessellation | None:
-        """Return the diagram of the rows matched by `match_update` with the flags `found`; None if they are wrong."""
-        n, old, (flags, m) = previous.n, (previous.starts, previous.neighbors), _verdict(found)
-        if flags & ~DOUBT:
-            return None
-        return self._measure(rows, box, points, n, *old, m, flags, exact=False)
-
     def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
         """Return `t`, a diagram of `box`, with face measures and centroids in full precision, in new arrays."""
         if t.face_measures.dtype == self.engine.real:
@@ -279,7 +244,7 @@ class Cells:
 
     def _read_flags(self) -> tuple[int, int]:
         """Return the flags and the number of half-faces. `CROWDED`: there were too few spare slots."""
-        return _verdict(self._flags.get().tolist())
+        return verdict(self._flags.get().tolist())
 
     def _match(
         self,
@@ -290,13 +255,12 @@ class Cells:
         old_starts: cla.Array,
         old_neighbors: cla.Array,
         exact: bool,
-        fits: cla.Array | None = None,
     ) -> tuple[int, int]:
         """Make the rows symmetric; return the flags and the number of half-faces."""
-        self._enqueue_match(rows, box, points, n, old_starts, old_neighbors, exact, fits)
+        self.enqueue_match(rows, box, points, n, old_starts, old_neighbors, exact)
         return self._read_flags()
 
-    def _enqueue_match(
+    def enqueue_match(
         self,
         rows: FaceRows,
         box: ClipBox,
@@ -305,8 +269,13 @@ class Cells:
         old_starts: cla.Array,
         old_neighbors: cla.Array,
         exact: bool,
-        fits: cla.Array | None,
+        fits: cla.Array | None = None,
     ) -> None:
+        """Make the rows symmetric, and count their faces.
+
+        While cells are marked nothing is done. `fits` (n,), in an update, is 1 for a row if every neighbor lists the
+        generator between the correct two neighbors; it becomes 0 where a face due to round-off is dropped.
+        """
         engine, starts = self.engine, rows.starts
         engine.run_each(
             self._kernels.match_polygon_faces, n, rows.places, rows.slots, rows.counts, old_starts,
@@ -320,7 +289,7 @@ class Cells:
         """Set `rows.starts` and the number of half-faces from the lengths of `n` rows."""
         self._scan.exclusive(counts, rows.starts, n, total=(rows.flags, FACES))
 
-    def _measure(
+    def measure(
         self,
         rows: FaceRows,
         box: ClipBox,
@@ -331,17 +300,22 @@ class Cells:
         m: int,
         flags: int,
         exact: bool,
+        ahead: bool = False,
     ) -> Tessellation | None:
-        """Write graph and measures of the rows; return None if doubtful cells are inconsistent."""
+        """Write graph and measures of the rows; return None if doubtful cells are inconsistent.
+
+        With `ahead` the flags are not known. Nothing is written unless they are 0, and there are at most `m` faces.
+        """
         engine, corners, starts = self.engine, box.device_corners(self.engine.real), rows.starts
         self._reserve_faces(n, m)
         new, faces = self._views, self._of_faces
         # The new graph may overwrite the previous one directly only if no row is read from there and no check follows.
         direct = old_starts is rows.places and not flags & DOUBT
         neighbors = faces["neighbors"] if direct else engine.scratch(m, np.int32)
+        unless = int(ahead), m, rows.flags
         engine.run(
             self._kernels.measure_cells, -(-n // self.lanes), n, rows.places, rows.slots,
-            rows.counts, old_starts, old_neighbors, rows.keep, starts, points, *corners,
+            rows.counts, old_starts, old_neighbors, rows.keep, starts, points, *corners, *unless,
             neighbors, faces["face_measures"], faces["face_centroids"], new["volumes"],
             new["offsets"], new["covariances"],
         )  # fmt: skip
@@ -357,8 +331,8 @@ class Cells:
                 return None
         whole = int(not direct)
         engine.run_blocks(
-            self._kernels.copy_graph, n, whole, starts, neighbors, new["starts"], faces["neighbors"]
-        )
+            self._kernels.copy_graph, n, whole, *unless, starts, neighbors, new["starts"], faces["neighbors"]
+        )  # fmt: skip
         return Tessellation(
             n=n, points=points, starts=new["starts"], neighbors=faces["neighbors"],
             face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=new["volumes"],
@@ -385,7 +359,7 @@ class Cells:
         flags, m = self._read_flags()
         if flags & ~DOUBT:
             return None
-        return self._measure(rows, box, points, n, rows.places, rows.places, m, flags, exact)
+        return self.measure(rows, box, points, n, rows.places, rows.places, m, flags, exact)
 
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
@@ -442,7 +416,16 @@ class Cells:
         self._enlarged_for = n
 
 
-def _verdict(flags: Sequence[int]) -> tuple[int, int]:
+def most_faces(n: int) -> int:
+    """Return the most half-faces of `n` cells without round-off.
+
+    Cells and walls are the nodes of a planar graph with at most 3 (n + 4) - 6 edges. An edge has two half-faces, or one
+    at a wall. Round-off may add some where many generators lie on a circle.
+    """
+    return 6 * n + 12
+
+
+def verdict(flags: Sequence[int]) -> tuple[int, int]:
     """Return the error bits and the number of half-faces."""
     wrong, doubtful, _, spare, slots = flags[:5]
     wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)

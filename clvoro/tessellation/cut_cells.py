@@ -128,7 +128,7 @@ class Matching:
     report: cla.Array
     arrays: dict[str, Any] = field(default_factory=dict)
 
-    def tessellation(self, flags: int) -> Tessellation:
+    def tessellation(self, flags: int = 0) -> Tessellation:
         """Return the diagram. `flags` are those of the report."""
         cells = self.cut.cells
         return Tessellation(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pyopencl.array as cla
@@ -161,6 +162,17 @@ class Tessellation:
     def sites(self) -> cla.Array:
         """The generators as kernels of the tessellation take them: with weights in a power diagram."""
         return self.points if self.weighted is None else self.weighted
+
+
+Follow: TypeAlias = Callable[[Tessellation, cla.Array | None], list[int]]
+"""What a caller does with a diagram. It enqueues work, reads its results together with the report (int32), and returns
+the numbers of the report. These tell whether the diagram is right. If it is not, its graph is that of the diagram
+before, and the caller is called again. Without a report the diagram is right. The last call is with the result."""
+
+
+def read_report(_: Tessellation, report: cla.Array | None) -> list[int]:
+    """Return the numbers of the report; see `Follow`."""
+    return [] if report is None else report.get().tolist()
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ import pyopencl.array as cla
 from ..geometry.box import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from .cells import CLIPPED, FLAGS, MARKED, Cells
-from .device_diagram import Tessellation
+from .cells import CLIPPED, FLAGS, MARKED, Cells, most_faces, verdict
+from .device_diagram import DOUBT, Follow, Tessellation, read_report
 from .face_rows import spare_slots
 from .rounds import with_room
 
@@ -48,21 +48,32 @@ class IncrementalUpdate:
         self._last: ReferenceType[Tessellation] | None = None
 
     def update(
-        self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation
+        self,
+        cells: Cells,
+        box: ClipBox,
+        points: cla.Array,
+        previous: Tessellation,
+        follow: Follow = read_report,
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, d), the new positions of the generators of `previous`.
 
-        The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the flags.
+        The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the flags. See
+        `Follow` for what is called with the diagram.
 
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
         """
         with self.engine.workspace.frame():
-            t = self._update(cells, box, points, previous)
+            t = self._update(cells, box, points, previous, follow)
         self._last = None if t is None else ref(t)
         return t
 
     def _update(
-        self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation
+        self,
+        cells: Cells,
+        box: ClipBox,
+        points: cla.Array,
+        previous: Tessellation,
+        follow: Follow,
     ) -> Tessellation | None:
         engine, n = self.engine, previous.n
         key = tuple(cells.defines.values())
@@ -116,13 +127,24 @@ class IncrementalUpdate:
                     *corners, marks, self._fits,
                 )  # fmt: skip
             self._scan.exclusive(marks, sums, n, total=(rows.flags, MARKED))
-            found = cells.match_update(rows, box, points, previous, self._fits)
+            given = rows, box, points, n, *old
+            cells.enqueue_match(*given, exact=False, fits=self._fits)
+            t = cells.measure(*given, most_faces(n), 0, exact=False, ahead=True)
+            assert t is not None
+            found = follow(t, rows.flags)
             sums_of_rounds = found[CLIPPED : CLIPPED + done + len(expected) + 1]
             clipped = [after - before for before, after in pairwise(sums_of_rounds)]
             done, left = sum(count > 0 for count in clipped), found[MARKED]
             if left == 0:
                 self._expected = with_room(clipped[:done], first_most)
-                return cells.complete(rows, box, points, previous, found)
+                flags, m = verdict(found)
+                if flags & ~DOUBT:
+                    return None
+                if flags or m > most_faces(n):
+                    t = cells.measure(*given, m, flags, exact=False)
+                    if t is not None:
+                        follow(t, None)
+                return t
             in_all = most if done else first_most
             if found[2] > most_wrong or sum(clipped) + left > in_all or done >= MAX_ROUNDS - 1:
                 return None

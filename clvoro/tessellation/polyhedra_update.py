@@ -14,7 +14,7 @@ from ..opencl.kernels import Kernels
 from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
 from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_MARKED, REPORT_SIZE, CutCells
-from .device_diagram import ROUGH_SHARE, Tessellation
+from .device_diagram import ROUGH_SHARE, Follow, Tessellation, read_report
 from .polyhedra import Polyhedra
 from .rounds import with_room
 from .teams import TEAM, TeamKernel, are_for, has_warps, team_defines
@@ -74,6 +74,7 @@ class PolyhedraUpdate:
         points: cla.Array,
         previous: Tessellation,
         clip: Callable[[CutCells, cla.Array, int], None],
+        follow: Follow = read_report,
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, 3), the new positions of the generators of `previous`.
 
@@ -82,7 +83,8 @@ class PolyhedraUpdate:
         The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the report.
 
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
-        `clip` clips unfinished cells; it gets the report and the number of faces so far.
+        `clip` clips unfinished cells; it gets the report and the number of faces so far. See `Follow` for what is
+        called with the diagram.
         """
         n, before = previous.n, len(previous.neighbors)
         most = int(MAX_SHARE * n)
@@ -105,7 +107,9 @@ class PolyhedraUpdate:
                 matching = cells.match(
                     rounds.cut, self._report, points, self._share, before, folded=True
                 )
-            found = self._report.get().tolist()
+                found = follow(matching.tessellation(), self._report)
+            else:
+                found = self._report.get().tolist()
             flags, used, left, marked, kept = found[:REPORT_LISTED]
             if flags & ~HARMLESS or max(left, marked) > most:
                 return None
@@ -127,6 +131,7 @@ class PolyhedraUpdate:
                 continue
             if kept > len(matching.arrays["neighbors"]):
                 cells.place(matching, kept)
+                follow(matching.tessellation(), None)
             return matching.tessellation(flags)
 
 

@@ -50,4 +50,4 @@ class PowerCells(Cells):
         flags, m = self._match(rows, box, points, n, *same, exact)
         if flags & ~DOUBT:
             return None
-        return self._measure(rows, box, points, n, *same, m, flags, exact)
+        return self.measure(rows, box, points, n, *same, m, flags, exact)

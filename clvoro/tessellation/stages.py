@@ -13,7 +13,7 @@ from ..opencl.primitives import Gather
 from .bins import BinnedPoints, Bins
 from .cells import Cells
 from .clipped.trim import Trim
-from .device_diagram import Tessellation
+from .device_diagram import Follow, Tessellation, read_report
 from .incremental import IncrementalUpdate
 from .periodic.folded import FoldedCells, FoldedPowerCells
 from .periodic.ghost_images import GhostImages
@@ -86,6 +86,7 @@ def tessellate_box(
     previous: Tessellation | None,
     exact: bool,
     binned: BinnedPoints | None = None,
+    follow: Follow = read_report,
 ) -> Tessellation:
     """Tessellate the clip box of `domain`; see `Tessellator.tessellate`."""
     cells = stages.cells
@@ -94,14 +95,15 @@ def tessellate_box(
         if previous is not None and not exact:
             t = stages.polyhedra_update.update(
                 cells, domain, points, previous,
-                lambda cut, report, _: cells.clip_rest(cut, report, domain, points, bins(), previous),
+                lambda cut, report, _: cells.clip_rest(cut, report, domain, points, bins(), previous), follow,
             )  # fmt: skip
             if t is not None:
                 return t
-        binned = bins()
-        return cells.tessellate(domain, points, n, binned, previous, exact)
+        t = cells.tessellate(domain, points, n, bins(), previous, exact)
+        follow(t, None)
+        return t
     if previous is not None and not exact:
-        t = stages.incremental.update(cells, domain, points, previous)
+        t = stages.incremental.update(cells, domain, points, previous, follow)
         if t is not None:
             return t
         # Free the work arrays of the steps, because the bins need memory.
@@ -109,4 +111,6 @@ def tessellate_box(
     if binned is None:
         binned = stages.bins.build(domain, points, n)
         stages.bins.clear_work()
-    return cells.tessellate(domain, points, n, binned, exact)
+    t = cells.tessellate(domain, points, n, binned, exact)
+    follow(t, None)
+    return t

@@ -13,7 +13,7 @@ from ..geometry.box import Box, Domain
 from ..geometry.polygon import Polygon
 from .bins import BinnedPoints
 from .clipped.polygonal import PolygonTessellator
-from .device_diagram import CloseError, Tessellation
+from .device_diagram import CloseError, Follow, Tessellation, read_report
 from .periodic.periodic_tessellator import ExtendedDiagram, PeriodicTessellator
 from .polyhedra import Polyhedra
 from .stages import TessellationStages, tessellate_box
@@ -112,6 +112,7 @@ class Tessellator:
         previous: Tessellation | None = None,
         exact: bool = False,
         binned: BinnedPoints | None = None,
+        follow: Follow = read_report,
     ) -> Tessellation:
         """Tessellate by the first `n` of `points` (n, d), in normalized coordinates.
 
@@ -123,6 +124,8 @@ class Tessellator:
             Reject generators so close that round-off makes a share of a cell uncertain; see `Cells.tessellate`.
         binned : BinnedPoints, optional
             The generators in bins, if they are known.
+        follow : callable, optional
+            See `Follow`.
 
         Raises
         ------
@@ -131,12 +134,17 @@ class Tessellator:
         """
         with self._in_units():
             if self.periodic is not None:
-                return self.periodic.tessellate(
+                t = self.periodic.tessellate(
                     points, n, previous, exact, not exact, keep_extended=exact
                 )
-            if self._polygon is not None:
-                return self._polygon.tessellate(points, n, previous, exact, binned)
-            return tessellate_box(self.stages, self.domain, points, n, previous, exact, binned)
+            elif self._polygon is not None:
+                t = self._polygon.tessellate(points, n, previous, exact, binned)
+            else:
+                return tessellate_box(
+                    self.stages, self.domain, points, n, previous, exact, binned, follow
+                )
+        follow(t, None)
+        return t
 
     @contextmanager
     def _in_units(self) -> Iterator[None]:

@@ -88,8 +88,7 @@ def check_steps(adapter, dim, n, group):
                 with engine.workspace.frame():
                     solution = method.displace(mesh)
                     method.move(mesh)
-                mesh.update(check=False)
-                mesh.read_summaries()
+                mesh.update()
                 if k >= WARM_UP:
                     reads.append(tally.reads - before)
                     iterations += solution.iterations if solution else 0

@@ -79,18 +79,22 @@ def test_summaries_of_many_arrays_agree_with_single_ones(engine, count):
     assert len({expected[name].sum for name in arrays}) == count
 
 
-def test_summaries_are_read_together_with_an_integer(engine):
+def test_summaries_are_read_together_with_integers(engine):
     """Slots keep their values until they are collected again. A slot that was never collected holds zeros."""
     rng, n = np.random.default_rng(8), 500
     arrays = {name: rng.normal(size=n).astype(engine.real) for name in "abc"}
-    summaries, note = Summaries(engine, "zabc"), engine.upload([-7, 5], np.int32)
+    summaries, notes = (
+        Summaries(engine, "zabc"),
+        [engine.upload(k, np.int32) for k in ([-7], [5, 4])],
+    )
     for name, array in arrays.items():
         summaries.collect(name, engine.upload(array), n)
         assert summaries.read_one(name).largest == array.max()
     summaries.collect("b", engine.upload(2 * arrays["b"]), n)
     values = summaries.values.get()
-    found, first = summaries.read_with(note)
-    assert first == -7
+    assert summaries.read_with(*notes) == [-7, 5, 4]
+    assert summaries.read_with(notes[1]) == [5, 4]
+    found = summaries.read()
     assert found["z"] == (0, 0, 0, 0)
     for name, factor in (("a", 1), ("b", 2), ("c", 1)):
         assert found[name].least == factor * arrays[name].min()
