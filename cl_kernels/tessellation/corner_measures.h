@@ -3,8 +3,9 @@
 #include "tessellation/corner_shares.h"
 
 /* Area and centroid of a face from triangles around its first vertex: as accurate as the vertices, also for small
-   faces. `far2` becomes the squared distance of the farthest vertex. */
-inline REAL4 measure_flat(const CORNERS *cell, int f, REAL4 normal, REAL *far2)
+   faces. `wide`: the area is more than round-off. In double precision the face may be as small as it likes, but not too
+   slim; in single precision vertices are not accurate enough to measure small faces. */
+inline REAL4 measure_flat(const CORNERS *cell, int f, REAL4 normal, bool *wide)
 {
     /* For each vertex of the face, the faces before and after it. */
     uchar ins[MOST_FACES], outs[MOST_FACES], at[MOST_FACES];
@@ -18,20 +19,21 @@ inline REAL4 measure_flat(const CORNERS *cell, int f, REAL4 normal, REAL *far2)
     }
     const REAL4 first = CORNER_PLACE(cell, at[0]);
     REAL4 before = 0, sum = 0;
-    REAL twice = 0;
-    *far2 = dot(first, first);
+    REAL twice = 0, far2 = dot(first, first), width2 = 0;
     for (int k = 0, steps = 1; steps < n; ++steps) {
         int next = 0;
         while (next < n - 1 && ins[next] != outs[k])
             ++next;
         const REAL4 y = CORNER_PLACE(cell, at[next]), after = y - first;
-        *far2 = fmax(*far2, dot(y, y));
+        far2 = fmax(far2, dot(y, y));
+        width2 = fmax(width2, dot(after, after));
         const REAL weight = dot(normal, cross(before, after));
         twice += weight;
         sum += weight * (before + after);
         before = after;
         k = next;
     }
+    *wide = twice / 2 > LEAST_AREA * (IS_DOUBLE ? sqrt(far2 * width2) : far2);
     const REAL4 centroid = first + sum / (3 * twice);
     return (REAL4)(twice / 2, centroid.s0, centroid.s1, centroid.s2);
 }
@@ -64,11 +66,9 @@ inline void measure_face(face_t *face, const CORNERS *cell, int f, REAL4 plane, 
     REAL4 centroid = (moment / sum.s0 + foot) / 3;
     centroid += (1 - 2 * dot(centroid, p)) * foot;
     if (!(face->area > FLAT_AREA * reach2)) {
-        REAL far2;
-        const REAL4 flat = measure_flat(cell, f, p * length, &far2);
+        const REAL4 flat = measure_flat(cell, f, p * length, &face->wide);
         face->area = flat.s0;
         centroid = (REAL4)(flat.s1, flat.s2, flat.s3, 0);
-        face->wide = face->area > LEAST_AREA * far2;
     }
     face->centroid = centroid;
     /* Shares omit twice the square of the foot, and its products with f and v. */

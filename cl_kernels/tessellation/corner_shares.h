@@ -11,7 +11,7 @@
 /* Largest product y.p - 1/2 of a vertex that lies in its cell up to round-off; least squared volume spanned by the
    directions of its three faces; least squared area spanned by those of two, as measures have errors of eps over their
    angle; least squared distance of a neighbor, as a share of that of the farthest vertex; least area of a face, as a
-   share of the squared distance of its farthest vertex. */
+   share of the distance of its farthest vertex times its width, or that distance (see `measure_flat`). */
 #if IS_DOUBLE
 #define BEYOND_NOISE R(1e-12)
 #define LEAST_SINE2 R(1e-10)
