@@ -207,8 +207,7 @@ kernel void begin_cell_updates(const int size, const int used, const int report_
 
    `old_corners` and `old_keys`: the triples, from 2 old_starts[i] on, and keys of the previous cells; none if not
    `known`. Cells are written to their previous places, and those with more faces behind all these, from report[1] on.
-   changed[i]: the set of its faces that neighbors must be compared with. If more cells are listed than `size`, nothing
-   is done. */
+   changed[i]: the set of its faces that neighbors must be compared with. */
 kernel void update_cells(const int size, const int which, global const int *listed, global const int *further,
                          global const int *old_starts, global const int *old_neighbors, const int known,
                          global const uchar4 *old_corners, global const uint *old_keys, global const REAL *points,
@@ -216,8 +215,10 @@ kernel void update_cells(const int size, const int which, global const int *list
                          global uint *keys, global int *changed, global int *more, global int *marks PERIOD_ARGS)
 {
     WORK_ITEM(item);
-    if (which == MARKED_CELLS && (item >= report[REPORT_MARKED] || report[REPORT_MARKED] > size))
+    if (which == MARKED_CELLS && item >= report[REPORT_PLACED])
         return;
+    if (item == 0)
+        report[REPORT_MARKED] = 0; /* they are counted again */
     const int what = which == ALL_CELLS ? item : listed[item], i = max(what, ~what);
     const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS};
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
@@ -281,16 +282,33 @@ kernel void update_cells(const int size, const int which, global const int *list
     }
 }
 
+/* Mark a cell, and count it if it is the first time. */
+inline void mark_counted(int i, int mark, global int *marks, global int *report)
+{
+    if (!(atomic_or(marks + i, mark | COUNTED) & COUNTED))
+        atomic_inc(report + REPORT_MARKED);
+}
+
 /* Per generator i with a changed cell: compare its faces with those of its neighbors. Cells that differ are marked.
    Faces with the keys of the previous diagram agree with neighbors that have these, too; others compare them. Two cells
    that compare all faces do it once. Unfinished cells are compared when they are known; none are if the faces of some
-   cells are missing, as there is only room for `room`. */
-kernel void check_cells(const int size, const int room, global const int *report, global const int *row_places,
+   cells are missing, as there is only room for `room`: FLAG_FULL. Marked and unfinished cells are counted. */
+kernel void check_cells(const int size, const int room, global int *report, global const int *row_places,
                         global const int *row_counts, global const int *labels, global const REAL *measures,
                         global const uint *keys, global const int *changed, global int *marks)
 {
     WORK_ITEM(i);
-    if (!changed[i] || row_counts[i] == UNFINISHED || report[REPORT_FACES] > room)
+    const bool full = report[REPORT_FACES] > room;
+    if (i == 0) {
+        report[REPORT_PLACED] = 0; /* for the next round */
+        if (full)
+            atomic_or(report + REPORT_FLAGS, FLAG_FULL);
+    }
+    if (atomic_or(marks + i, 0))
+        mark_counted(i, 0, marks, report);
+    if (row_counts[i] == UNFINISHED)
+        atomic_inc(report + REPORT_UNFINISHED);
+    if (!changed[i] || row_counts[i] == UNFINISHED || full)
         return;
     const int n = COUNT_OF(row_counts[i]), begin = row_places[i];
     const bool certain = (row_counts[i] & CERTAIN) != 0, all = changed[i] == ALL_FACES;
@@ -317,30 +335,18 @@ kernel void check_cells(const int size, const int room, global const int *report
         if (same || ((atomic_or(marks + i, 0) | atomic_or(marks + j, 0)) & UPDATE_AGAIN))
             continue;
         if (certain)
-            atomic_or(marks + i, CLIP_ANEW);
+            mark_counted(i, CLIP_ANEW, marks, report);
         if (other_certain)
-            atomic_or(marks + j, CLIP_ANEW);
+            mark_counted(j, CLIP_ANEW, marks, report);
     }
 }
 
-/* Per generator i: whether it is marked. Unfinished cells are counted. FLAG_FULL: there are more than `room` faces. */
-kernel void flag_marked_cells(const int size, const int room, global const int *marks, global const int *row_counts,
-                              global int *flags, global int *report)
-{
-    WORK_ITEM(i);
-    if (i == 0 && report[REPORT_FACES] > room)
-        atomic_or(report + REPORT_FLAGS, FLAG_FULL);
-    flags[i] = marks[i] != 0;
-    if (row_counts[i] == UNFINISHED)
-        atomic_inc(report + REPORT_UNFINISHED);
-}
-
 /* Per generator i: list it with its further neighbors if it is marked, as ~i if it is to be clipped, and remove the
-   mark; `sums` are the exclusive prefix sums of the flags. No cell is changed now, but for those to be clipped. Nothing
-   is done if there are more than `most` marked ones. `round` numbers the launches. */
-kernel void list_marked_cells(const int size, const int most, const int round, global const int *sums,
-                              global const int *more, global const int *row_counts, global int *marks,
-                              global int *changed, global int *listed, global int *further, global int *report)
+   mark. The order of the list depends on that of the work-items, the cells do not. No cell is changed now, but for
+   those to be clipped. Nothing is done if there are more than `most` marked ones. `round` numbers the launches. */
+kernel void list_marked_cells(const int size, const int most, const int round, global const int *more,
+                              global const int *row_counts, global int *marks, global int *changed, global int *listed,
+                              global int *further, global int *report)
 {
     WORK_ITEM(i);
     if (i == 0)
@@ -352,7 +358,7 @@ kernel void list_marked_cells(const int size, const int most, const int round, g
     changed[i] = row_counts[i] == UNFINISHED ? ALL_FACES : 0;
     if (!marks[i])
         return;
-    const int to = sums[i];
+    const int to = atomic_inc(report + REPORT_PLACED);
     listed[to] = marks[i] & CLIP_ANEW ? ~i : i;
     for (int k = 0; k < MORE; ++k)
         further[MORE * to + k] = more[MORE * i + k];

@@ -254,7 +254,7 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
     local team_cell_t *at = &shared;
     local corners_t *cell = &at->cell;
     const int item = get_global_id(0) / TEAM, lane = get_local_id(0) % TEAM;
-    if (item >= size || (which == MARKED_CELLS && (item >= report[REPORT_MARKED] || report[REPORT_MARKED] > size)))
+    if (item >= size || (which == MARKED_CELLS && item >= report[REPORT_PLACED]))
         return;
     const int what = which == ALL_CELLS ? item : listed[item], i = max(what, ~what);
     const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS};
@@ -262,6 +262,8 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
     team_t team = {at->words, lane, 0};
     if (lane < 3)
         at->words[lane] = 0;
+    if (item == 0 && lane == 0)
+        report[REPORT_MARKED] = 0; /* they are counted again */
     if (lane == 0) {
         row_counts[i] = UNFINISHED;
         changed[i] = ALL_FACES;

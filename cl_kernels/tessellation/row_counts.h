@@ -30,7 +30,8 @@
 #define REPORT_UNFINISHED 2
 #define REPORT_MARKED 3
 #define REPORT_KEPT 4
-#define REPORT_LISTED 5 /* number of cells that each round of an update repeats, from here on */
+#define REPORT_LISTED 5  /* number of cells that each round of an update repeats, from here on */
+#define REPORT_PLACED 13 /* number of listed cells */
 
 /* Bits of the error word. */
 #define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */

@@ -6,9 +6,10 @@
 #define MORE 8 /* room for further neighbors of a cell */
 #define NO_NEIGHBOR INT_MIN
 
-/* Marks of a cell: it must be updated again with further neighbors, or clipped. */
+/* Marks of a cell: it must be updated again with further neighbors, or clipped; it has been counted. */
 #define UPDATE_AGAIN 1
 #define CLIP_ANEW 2
+#define COUNTED 4
 
 /* Which cells an update makes: all; or those that are marked, with further neighbors. */
 #define ALL_CELLS 0

@@ -22,7 +22,7 @@ LEAST_SPACE, SPACE_PER_CELL, MOST_SPACE = 2**20, 64, 2**26
 """Bytes of global memory for cells with more than `FACE_CAPACITY` faces while they are clipped, a few at a time."""
 REPORT_SIZE = 16
 """Numbers of the report of kernels; see tessellation/row_counts.h."""
-REPORT_FACES, REPORT_UNFINISHED, REPORT_MARKED, REPORT_KEPT, REPORT_LISTED = 1, 2, 3, 4, 5
+REPORT_FACES, REPORT_KEPT, REPORT_LISTED = 1, 4, 5
 
 
 def clipping_space(n: float) -> float:

@@ -11,9 +11,8 @@ import pyopencl.array as cla
 from ..geometry.box import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
-from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
-from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_MARKED, REPORT_SIZE, CutCells
+from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_SIZE, CutCells
 from .device_diagram import ROUGH_SHARE, Follow, Tessellation, read_report
 from .polyhedra import Polyhedra
 from .rounds import with_room
@@ -54,7 +53,6 @@ class PolyhedraUpdate:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._scan = Scan(engine)
         self._kernels = engine.kernels("tessellation/polyhedra_update")
         self._team: TeamKernel | None = None
         if are_for(engine):
@@ -92,7 +90,7 @@ class PolyhedraUpdate:
             self._n, self._expected, self._clips = n, [most], False
         by_team = None if self._team is None else self._team.get()
         rounds = _Rounds(
-            self.engine, self._kernels, by_team, self._scan, self._report, cells, box, points, previous
+            self.engine, self._kernels, by_team, self._report, cells, box, points, previous
         )  # fmt: skip
         rounds.update(n, ALL_CELLS)
         done, sizes = 0, self._expected
@@ -150,23 +148,22 @@ class _Rounds:
         engine: Engine,
         kernels: Kernels,
         by_team: cl.Kernel | None,
-        scan: Scan,
         report: cla.Array,
         cells: Polyhedra,
         box: ClipBox,
         points: cla.Array,
         previous: Tessellation,
     ) -> None:
-        self._engine, self._kernels, self._scan, self._report = engine, kernels, scan, report
+        self._engine, self._kernels, self._report = engine, kernels, report
         self._by_team = by_team
         self._n, before = previous.n, len(previous.neighbors)
         n, most = previous.n, max(int(MAX_SHARE * previous.n), 1)
         self.room = int((1 + SPARE) * before) + 64
         self.cut = cells.take_cells(n, self.room)
         self._changed, self._marks, self._listed = (engine.scratch(n, np.int32) for _ in range(3))
-        self._sums, self._more = engine.scratch(n + 1, np.int32), engine.scratch(n * MORE, np.int32)
+        self._more = engine.scratch(n * MORE, np.int32)
         self._further = engine.scratch(most * MORE, np.int32)
-        old = previous.vertices or (self._listed, self._sums)
+        old = previous.vertices or (self._listed, self._listed)
         self._fixed = (
             previous.starts, previous.neighbors, np.int32(bool(previous.vertices)), *old, points,
             *box.device_corners(engine.real), np.int32(self.room), *self.cut.output(report), self.cut.keys,
@@ -177,7 +174,7 @@ class _Rounds:
         )  # fmt: skip
 
     def update(self, size: int, which: int) -> None:
-        """Update and check all cells, or the listed ones. If more than `size` are listed, do nothing."""
+        """Update and check all cells, or the listed ones, at most `size`."""
         engine = self._engine
         args = (
             np.int32(which), self._listed, self._further, *self._fixed, self._more, self._marks, *engine.period_args,
@@ -196,14 +193,10 @@ class _Rounds:
             k.check_cells, self._n, room, self._report, cut.places, cut.counts, cut.labels, cut.measures, cut.keys,
             self._changed, self._marks,
         )  # fmt: skip
-        engine.run_each(
-            k.flag_marked_cells, self._n, room, self._marks, cut.counts, self._sums, self._report
-        )
-        self._scan.exclusive(self._sums, self._sums, self._n, total=(self._report, REPORT_MARKED))
 
     def list_marked(self, number: int, most: int) -> None:
         """List the marked cells, if they are not more than `most`."""
         self._engine.run_each(
-            self._kernels.list_marked_cells, self._n, np.int32(most), np.int32(number), self._sums, self._more,
-            self.cut.counts, self._marks, self._changed, self._listed, self._further, self._report,
+            self._kernels.list_marked_cells, self._n, np.int32(most), np.int32(number), self._more, self.cut.counts,
+            self._marks, self._changed, self._listed, self._further, self._report,
         )  # fmt: skip
