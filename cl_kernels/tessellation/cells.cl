@@ -144,18 +144,21 @@ inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *point
    cells, the generators are too close (from far away, two generators one ulp apart have the same bisector): a flag is
    set. Faces with generators without a row are not checked.
 
-   If `repaired`, fits[i] is 1 for rows that are consistent with all neighbors; otherwise it is not read. While
-   cells are marked, all rows are empty. */
+   If `repaired`, fits[i] is 1 for rows that are consistent with all neighbors; otherwise it is not read, nor are marks.
+   While cells are marked, all rows are empty, and the marked cells are counted. */
 kernel void match_polygon_faces(const int size, global const int *places, global const int *slots,
                                 global const int *slot_counts, global const int *old_starts,
                                 global const int *old_neighbors, global const REAL *points, const REAL4 box_lower,
-                                const REAL4 box_upper, const int repaired, const REAL share, global int *fits,
-                                global uint *keep, global int *counts, global int *flags)
+                                const REAL4 box_upper, const int repaired, const REAL share, global const int *marks,
+                                global int *fits, global uint *keep, global int *counts, global int *flags)
 {
     WORK_ITEM(i);
     counts[i] = 0;
-    if (flags[FLAG_MARKED])
+    if (flags[FLAG_MARKED]) {
+        if (marks[i])
+            atomic_inc(flags + FLAG_LEFT);
         return;
+    }
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
     int n;
     global const int *row = face_row(&rows, i, &n);

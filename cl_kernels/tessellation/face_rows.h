@@ -11,11 +11,12 @@
 
 /* flags[0]: error bits, below. flags[1]: not 0 if there are doubtful cells. flags[2]: wrong rows of a sample. flags[3]:
    next spare slot. flags[4]: number of slots. flags[5]: faces no longer than round-off stay. flags[6]: number of
-   half-faces. flags[7]: number of marked cells; while there are any, rows are not matched. flags[8 + r]: number of
-   cells clipped before round r of an update. */
+   half-faces. flags[7]: whether cells are marked; while they are, rows are not matched. flags[8 + r]: number of
+   cells clipped before round r of an update. flags[15]: number of cells that are still marked. */
 #define FLAG_FACES 6
 #define FLAG_MARKED 7
 #define FLAG_CLIPPED 8
+#define FLAG_LEFT 15
 #define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than the spare slots hold */
 #define FLAG_COINCIDE 2  /* two generators at the same place */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */

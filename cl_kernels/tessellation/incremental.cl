@@ -163,6 +163,8 @@ kernel void check_rows(const int size, const int stride, const int rest, const i
         return;
     const int found = check_row(item, starts, neighbors, points, lower, upper, fits, marks);
 #endif
+    if (found)
+        atomic_or(flags + FLAG_MARKED, 1);
     if (found && stride > 1 && !rest)
         atomic_add(flags + 2, found);
 }
@@ -196,8 +198,10 @@ kernel void list_marked(const int size, const int round, const int most, const i
         return;
     const int base = flags[FLAG_CLIPPED + round], count = sums[size];
     const bool over = count > most || base + count > most_in_all || flags[2] > most_wrong;
-    if (i == 0)
+    if (i == 0) {
         flags[FLAG_CLIPPED + round + 1] = over ? base : base + count;
+        flags[FLAG_LEFT] = 0;
+    }
     if (!over && marks[i])
         listed[sums[i]] = i;
 }
@@ -283,29 +287,33 @@ kernel void clip_marked(const int size, global const int *listed, const int roun
             atomic_and(fits + row[k], 0);
 }
 
-/* Per listed generator: replace its old row by the new one, which is consistent until a neighbor finds otherwise. */
-kernel void place_clipped(const int size, global const int *listed, const int round, global const int *flags,
+/* Per listed generator: replace its old row by the new one, which is consistent until a neighbor finds otherwise. No
+   cell is marked any more. */
+kernel void place_clipped(const int size, global const int *listed, const int round, global int *flags,
                           global const int *slots, global const int *slot_counts, global int *places, global int *marks,
                           global int *fits)
 {
     WORK_ITEM(w);
     if (w >= count_of_round(round, flags))
         return;
+    if (w == 0)
+        flags[FLAG_MARKED] = 0;
     const int place = flags[FLAG_CLIPPED + round] + w;
     places[listed[w]] = slot_counts[place] == ELSEWHERE ? slots[place * SLOT] : place;
     marks[listed[w]] = 0;
     fits[listed[w]] = 1;
 }
 
-inline void mark_both(int i, int j, global int *marks)
+inline void mark_both(int i, int j, global int *marks, global int *flags)
 {
     atomic_or(marks + i, 1);
     atomic_or(marks + j, 1);
+    atomic_or(flags + FLAG_MARKED, 1);
 }
 
 /* Per listed generator: mark it and its neighbors where they are inconsistent. Cells that were not clipped have been
    checked against each other before. */
-kernel void check_clipped(const int size, global const int *listed, const int round, global const int *flags,
+kernel void check_clipped(const int size, global const int *listed, const int round, global int *flags,
                           global const int *places, global const int *slots, global const int *slot_counts,
                           global const int *old_starts, global const int *old_neighbors, global const REAL *points,
                           const REAL4 box_lower, const REAL4 box_upper, global int *marks, global int *fits)
@@ -332,7 +340,7 @@ kernel void check_clipped(const int size, global const int *listed, const int ro
         const REAL2 u = corner(i, x, a, j, points, lower, upper), v = corner(i, x, j, b, points, lower, upper);
         const REAL2 d = face_direction(j, x, points);
         if (!fits_neighbor(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper))
-            mark_both(i, j, marks);
+            mark_both(i, j, marks, flags);
     }
     /* Neighbors of the previous row are marked, too: they may still list i. */
     const int end = old_starts[i + 1];
@@ -347,6 +355,6 @@ kernel void check_clipped(const int size, global const int *listed, const int ro
             continue;
         atomic_and(fits + j, 0);
         if (!is_doubtful_row(&rows, j)) /* else its faces are matched with those of its neighbors */
-            mark_both(i, j, marks);
+            mark_both(i, j, marks, flags);
     }
 }

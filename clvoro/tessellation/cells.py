@@ -39,8 +39,8 @@ ROW_CAPACITY = SLOT
 LARGEST_ROW, LARGEST_ELSEWHERE = 4096, 512
 """Largest row capacity: on CPUs in boxes, and elsewhere. On a GPU every work-item has private memory of that size; in a
 polygon, clipping such a cell by as many edges takes minutes."""
-FLAGS, FACES, MARKED, CLIPPED = 16, 6, 7, 8
-"""Number of flags, and those that `face_rows.h` calls half-faces, marked cells and clipped cells."""
+FLAGS, FACES, CLIPPED, LEFT = 16, 6, 8, 15
+"""Number of flags, and those that `face_rows.h` calls half-faces, clipped cells, and cells that are still marked."""
 LANES, EIGHTS = 8, 16
 """Cells that one work-item of a CPU builds at once in vector lanes, and number of such batches in `hulls.cl`."""
 FIRST_REACH = 1.9
@@ -269,19 +269,21 @@ class Cells:
         old_starts: cla.Array,
         old_neighbors: cla.Array,
         exact: bool,
+        marks: cla.Array | None = None,
         fits: cla.Array | None = None,
     ) -> None:
         """Make the rows symmetric, and count their faces.
 
-        While cells are marked nothing is done. `fits` (n,), in an update, is 1 for a row if every neighbor lists the
-        generator between the correct two neighbors; it becomes 0 where a face due to round-off is dropped.
+        In an update nothing is done while cells are marked, by `marks` (n,). `fits` (n,) is 1 for a row if every
+        neighbor lists the generator between the correct two neighbors; it becomes 0 where a face due to round-off is
+        dropped.
         """
         engine, starts = self.engine, rows.starts
         engine.run_each(
             self._kernels.match_polygon_faces, n, rows.places, rows.slots, rows.counts, old_starts,
             old_neighbors, points, *box.device_corners(engine.real),
-            int(fits is not None), self._share(exact), rows.places if fits is None else fits,
-            rows.keep, starts, rows.flags,
+            int(fits is not None), self._share(exact), rows.places if marks is None else marks,
+            rows.places if fits is None else fits, rows.keep, starts, rows.flags,
         )  # fmt: skip
         self._count(rows, starts, n)
 

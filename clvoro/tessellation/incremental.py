@@ -13,7 +13,7 @@ import pyopencl.array as cla
 from ..geometry.box import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from .cells import CLIPPED, FLAGS, MARKED, Cells, most_faces, verdict
+from .cells import CLIPPED, FLAGS, LEFT, Cells, most_faces, verdict
 from .device_diagram import DOUBT, Follow, Tessellation, read_report
 from .face_rows import spare_slots
 from .rounds import with_room
@@ -126,15 +126,14 @@ class IncrementalUpdate:
                     k.check_clipped, size, *this, rows.flags, rows.places, rows.slots, rows.counts, *old, points,
                     *corners, marks, self._fits,
                 )  # fmt: skip
-            self._scan.exclusive(marks, sums, n, total=(rows.flags, MARKED))
             given = rows, box, points, n, *old
-            cells.enqueue_match(*given, exact=False, fits=self._fits)
+            cells.enqueue_match(*given, exact=False, marks=marks, fits=self._fits)
             t = cells.measure(*given, most_faces(n), 0, exact=False, ahead=True)
             assert t is not None
             found = follow(t, rows.flags)
             sums_of_rounds = found[CLIPPED : CLIPPED + done + len(expected) + 1]
             clipped = [after - before for before, after in pairwise(sums_of_rounds)]
-            done, left = sum(count > 0 for count in clipped), found[MARKED]
+            done, left = sum(count > 0 for count in clipped), found[LEFT]
             if left == 0:
                 self._expected = with_room(clipped[:done], first_most)
                 flags, m = verdict(found)
