@@ -57,8 +57,8 @@ import clvoro
 from clvoro.opencl import engine as engines, kernels as kernel_objects, prebuild
 made, launches, programs, kinds = {{}}, {{}}, [], []
 plain = engines.Engine.kernels, kernel_objects.set_changed, cl.enqueue_nd_range_kernel
-def kernels(engine, stage, defines=None, prelude=""):
-    taken = plain[0](engine, stage, defines, prelude)
+def kernels(engine, stage, defines=None, prelude="", **options):
+    taken = plain[0](engine, stage, defines, prelude, **options)
     kinds.append(prebuild.kind_of(engine))
     single = {{"REAL": "float"}} if engine.real == np.float32 else {{}}
     made[id(taken)] = taken, (stage, single | {{k: str(v) for k, v in (defines or {{}}).items()}}), prelude

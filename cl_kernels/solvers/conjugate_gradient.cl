@@ -13,7 +13,7 @@
    With `center` the null space of A is the constants. Round-off in the mean of r is then removed one iteration later;
    otherwise the residual could not fall below it.
 
-   partial: 11 rows, named below. Residual norms, gammas and sums of r alternate between two rows.
+   partial: 12 rows, named below. Residual norms, gammas and sums of r alternate between two rows.
 
    There is one kernel per step. `solve_by_group` does all steps in one work-group, for few unknowns. */
 #include "opencl/real.h"
@@ -36,6 +36,7 @@
 #define GAMMA(k) (6 + ((k)&1))
 #define SUM_R(k) (8 + ((k)&1))
 #define START 10
+#define SUM_X 11
 
 /* The sums and the maximum that center and scale r = b - w; r = b if the start is zero (`from_zero`). */
 inline void add_right_sides(int n, int from_zero, global const REAL *b, global const STORE *w, global REAL *partial,
@@ -72,7 +73,7 @@ inline void set_residual(int n, int from_zero, int center, global const REAL *b,
     const REAL mean_r = center ? total_sum(ROW(START), scratch) / n : 0;
     const REAL max_b = total_max(ROW(MAX_B), scratch);
     const int exponent = max_b > 0 && max_b <= REAL_MAX ? clamp(-ilogb(max_b), -EXPONENT_LIMIT, EXPONENT_LIMIT) : 0;
-    Sum norm_b = SUM_ZERO, norm_r = SUM_ZERO, sum_r = SUM_ZERO;
+    Sum norm_b = SUM_ZERO, norm_r = SUM_ZERO, sum_r = SUM_ZERO, sum_x = SUM_ZERO;
     for (BLOCK_LOOP(i, n)) {
         const REAL bi = ldexp(b[i] - mean_b, exponent);
         const STORE ri = ldexp((from_zero ? b[i] : b[i] - w[i]) - mean_r, exponent);
@@ -80,6 +81,7 @@ inline void set_residual(int n, int from_zero, int center, global const REAL *b,
         p[i] = 0;
         if (from_zero)
             x[i] = 0;
+        sum_add(&sum_x, x[i]);
         sum_add(&norm_b, bi * bi);
         sum_add(&norm_r, (REAL)ri * ri);
         sum_add(&sum_r, ri);
@@ -87,6 +89,7 @@ inline void set_residual(int n, int from_zero, int center, global const REAL *b,
     PUT(NORM_B, norm_b.value);
     PUT(NORM_R(0), norm_r.value);
     PUT(SUM_R(0), sum_r.value);
+    PUT(SUM_X, sum_x.value);
     if (get_global_id(0) == 0) {
         const REAL taken = ldexp(mean_b, exponent);
         state[1] = ldexp(R(1), -exponent);
@@ -266,6 +269,14 @@ kernel void record_norm(global const int *counts, global const REAL *partial, gl
     }
 }
 
+/* Row SUM_X of partial = sum x, for `center_solution`, unless the iteration is over. */
+inline void put_sum_of_solution(const Step *s, const Sum *sum_x, global REAL *partial, local REAL *scratch)
+{
+    const REAL sum = group_sum(sum_x->value, scratch);
+    if (s->end > 0 && get_local_id(0) == 0)
+        ROW(SUM_X)[get_group_id(0)] = sum;
+}
+
 /* x += alpha p, r -= alpha q. */
 kernel void update_solution(global int *counts, int n, int center, global const STORE *p, global const STORE *q,
                             global REAL *x, global STORE *r, global REAL *partial, global REAL *state,
@@ -274,16 +285,19 @@ kernel void update_solution(global int *counts, int n, int center, global const 
     local REAL scratch[GROUP_SIZE];
     const int k = number_of_update(counts);
     const Step s = step_length(k, n, center, partial, state, record, scratch);
-    Sum norm = SUM_ZERO, sum = SUM_ZERO;
+    Sum norm = SUM_ZERO, sum = SUM_ZERO, sum_x = SUM_ZERO;
     for (BLOCK_LOOP(i, s.end)) {
         const STORE ri = r[i] - s.mean - s.alpha * q[i];
-        x[i] += s.alpha_x * p[i];
+        const REAL xi = x[i] + s.alpha_x * p[i];
+        x[i] = xi;
+        sum_add(&sum_x, xi);
         r[i] = ri;
         sum_add(&norm, (REAL)ri * ri);
         sum_add(&sum, ri);
     }
     PUT(NORM_R(k + 1), norm.value);
     PUT(SUM_R(k + 1), sum.value);
+    put_sum_of_solution(&s, &sum_x, partial, scratch);
 }
 
 /* x += alpha p, r -= alpha q, u = D^-1 r, and gamma of the next iteration. */
@@ -292,10 +306,12 @@ inline void step_jacobi(int k, int n, int center, global const STORE *inverse_di
                         global REAL *state, global REAL *record, local REAL *scratch)
 {
     const Step s = step_length(k, n, center, partial, state, record, scratch);
-    Sum norm = SUM_ZERO, gamma = SUM_ZERO, sum = SUM_ZERO;
+    Sum norm = SUM_ZERO, gamma = SUM_ZERO, sum = SUM_ZERO, sum_x = SUM_ZERO;
     for (BLOCK_LOOP(i, s.end)) {
         const STORE ri = r[i] - s.mean - s.alpha * q[i], ui = inverse_diagonal[i] * ri;
-        x[i] += s.alpha_x * p[i];
+        const REAL xi = x[i] + s.alpha_x * p[i];
+        x[i] = xi;
+        sum_add(&sum_x, xi);
         r[i] = ri;
         u[i] = ui;
         sum_add(&norm, (REAL)ri * ri);
@@ -305,6 +321,7 @@ inline void step_jacobi(int k, int n, int center, global const STORE *inverse_di
     PUT(NORM_R(k + 1), norm.value);
     PUT(SUM_R(k + 1), sum.value);
     PUT(GAMMA(k + 1), gamma.value);
+    put_sum_of_solution(&s, &sum_x, partial, scratch);
 }
 
 kernel void update_solution_jacobi(global int *counts, int n, int center, global const STORE *inverse_diagonal,
@@ -315,21 +332,11 @@ kernel void update_solution_jacobi(global int *counts, int n, int center, global
     step_jacobi(number_of_update(counts), n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
 }
 
-/* Partial sums of x, for `center_solution`. */
-kernel void sum_solution(int n, global const REAL *x, global REAL *partial)
-{
-    local REAL scratch[GROUP_SIZE];
-    Sum sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, n))
-        sum_add(&sum, x[i]);
-    PUT(SUM_B, sum.value);
-}
-
 /* x -= mean x. */
 kernel void center_solution(int n, global REAL *x, global const REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
-    const REAL mean = total_sum(ROW(SUM_B), scratch) / n;
+    const REAL mean = total_sum(ROW(SUM_X), scratch) / n;
     for (BLOCK_LOOP(i, n))
         x[i] -= mean;
 }

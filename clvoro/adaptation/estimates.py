@@ -20,7 +20,7 @@ from .forecast import IMAGE_REACH, expected_boundary_cells
 MAX_CELLS = 100_000_000
 """Limit of the 32-bit indices into rows of neighbors."""
 SPHERE = "sphere"
-PEAK: dict[int | str, tuple[int, int]] = {2: (28, 80), 3: (140, 280), SPHERE: (33, 90)}
+PEAK: dict[int | str, tuple[int, int]] = {2: (26, 86), 3: (140, 280), SPHERE: (33, 90)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, and on a sphere (bench/memory.py)."""
 TRIMMED_PEAK = (68, 79)
 """The same in polygons, where the boundary trims cells and faces are in full precision."""

@@ -116,6 +116,8 @@ class WeightedMethod:
     """Clip to k min(L, h), because cells can still be much smaller than a new, coarse target size."""
     lloyd: bool = True
     """Move to the centroids, too. Else the Poisson displacement alone corrects the sizes."""
+    max_cycles: int | None = None
+    """Most cycles of multigrid; see `Poisson.solve`."""
 
     def displace(self, mesh: MeshState) -> Solution:
         """Evaluate the weighted Lloyd displacement and the correction."""
@@ -136,7 +138,7 @@ class WeightedMethod:
             # The labels are a new array whenever the order changes.
             solution = poisson.solve(
                 laplacian, mesh.source, mesh.potential, tolerance=self.tolerance,
-                ordering=mesh.labels, from_zero=True,
+                ordering=mesh.labels, from_zero=True, max_cycles=self.max_cycles,
             )  # fmt: skip
         motion.compute_potential_gradient(t, mesh.potential, mesh.correction)
         mesh.summarize_displacements()

@@ -16,7 +16,7 @@ from ..opencl.workspace import framed
 from .linear_system import BreakdownError, Limits, Operator, Precondition, Solution
 
 # Rows of the partial sums (as in conjugate_gradient.cl) and columns of the record (as in partial_sums.h).
-CURVATURE, _GAMMA, _ROWS = 3, 6, 11
+CURVATURE, _GAMMA, _ROWS = 3, 6, 12
 RECORD_NORM, RECORD_RUNNING, RECORD_CURVATURE = 0, 2, 3
 _STATE = 8
 _FIRST_READ = 32
@@ -38,7 +38,7 @@ class ConjugateGradient:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._ahead = 8
+        self._ahead = 4
         self._kernels: dict[np.dtype, Kernels] = {}
         self.partial = engine.zeros(_ROWS * engine.groups)
         """Partial sums, one row per quantity."""
@@ -127,8 +127,10 @@ class ConjugateGradient:
                 residual = -1.0
                 continue
             iterations, begun = iterations + done, False
-            if not limits.verify and self._final <= limits.tolerance:
-                residual, reason = self._final, "converged"
+            over = self._final <= limits.tolerance or iterations >= limits.max_iterations
+            if over and not limits.verify:
+                residual = self._final
+                reason = "converged" if residual <= limits.tolerance else reason
                 break
             before, residual = residual, system.measure()
             # A restart gains digits only if the recurrence was the limit, not the precision of x.
@@ -231,9 +233,9 @@ class ConjugateGradient:
             unknown = False
             stop = self._read_record(np.array(rows), done, tolerance, history)
             if stop is not None:
-                self._ahead = max(stop + 1, 8)
+                self._ahead = max(stop + 1, 4)
                 return stop
-            residual = history.pop()  # the next iteration records it again
+            self._final = residual = history.pop()  # the next iteration records it again
             done = end
             rate = math.log(first / residual) / done if residual < first else 0.0
             left = math.log(residual / tolerance) / rate if rate > 0 else limits.lookahead
@@ -367,8 +369,7 @@ class _System:
 
     def center(self) -> None:
         """Subtract its mean from x."""
-        for kernel in (self._kernels.sum_solution, self._kernels.center_solution):
-            self._launch(kernel, self._size, self._x, self._tail[0])
+        self._launch(self._kernels.center_solution, self._size, self._x, self._tail[0])
 
     def _dot_product(self, row: int, a: cla.Array, b: cla.Array) -> None:
         self._launch(self._kernels.dot_product, self._size, np.int32(row), a, b, self._tail[0])

@@ -23,8 +23,9 @@ _CENTER, _RADIUS = (2 + _LOWEST) / 2, (2 - _LOWEST) / 2
 _EARLY = np.float32(1 / (_CENTER - _RADIUS * math.sqrt(0.5)))
 _LATE = np.float32(1 / (_CENTER + _RADIUS * math.sqrt(0.5)))
 _NO_DAMPING = np.float32(0)
-_COARSE = "cycle_by_group"
-"""Kernel of one work-group."""
+_COARSE, _COARSE_FACTOR = "cycle_by_group", 4
+"""Kernel of one work-group; where a launch does several steps, this group has so many times as many work-items as
+others, for levels of so many times as many cells."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,9 @@ class Cycle:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._one_group_limit = one_group_limit(engine)
         self.merged = engine.group_size > 1
+        self._factor_of_group = _COARSE_FACTOR if self.merged else 1
+        self._one_group_limit = self._factor_of_group * one_group_limit(engine)
         self._room = NamedArrays(engine)
         self._kernels: dict[tuple[object, ...], cl.Kernel] = {}
         self.clear()
@@ -121,7 +123,9 @@ class Cycle:
         key = (depth, name, turn, self._source)
         if key not in self._kernels:
             defines = {"SOURCE": self.engine.name_of(self._source)}
-            self._kernels[key] = getattr(self.engine.kernels("solvers/multigrid", defines), name)
+            group = self.engine.group_size * (self._factor_of_group if name == _COARSE else 1)
+            kernels = self.engine.kernels("solvers/multigrid", defines, group_size=group)
+            self._kernels[key] = getattr(kernels, name)
         kernel = self._kernels[key]
         bind(kernel, (np.int32(size), *args))
         if name == _COARSE:

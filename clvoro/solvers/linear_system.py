@@ -95,7 +95,7 @@ class Limits:
     max_iterations : int
     lookahead : int
         Iterations to enqueue at most before the host reads the record. The first read is after as many as the last
-        solve took, but at least 8, if that is less.
+        solve took, but at least 4, if that is less.
     verify : bool
         Evaluate the true residual at the end. Otherwise that of the recurrence is trusted.
     """

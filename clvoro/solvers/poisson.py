@@ -278,6 +278,7 @@ class Poisson:
         preconditioner: str = "auto",
         ordering: object = None,
         from_zero: bool = False,
+        max_cycles: int | None = None,
     ) -> Solution:
         """Solve A phi = b, the paper's (3.2) integrated over the cells; phi has mean zero.
 
@@ -303,6 +304,8 @@ class Poisson:
             little. The coarse levels of the multigrid are then reused.
         from_zero : bool
             Start from zero and ignore `potential`.
+        max_cycles : int, optional
+            Most iterations with multigrid, whatever their residual.
 
         Returns
         -------
@@ -338,7 +341,8 @@ class Poisson:
         if preconditioner == "jacobi":
             most = max_jacobi_iterations(n) if max_iterations is None else max_iterations
             return self._solve_jacobi(system, most, from_zero)
-        return self._solve_multigrid(system, max_iterations, ordering, from_zero)
+        most = max_iterations if max_cycles is None else max_cycles
+        return self._solve_multigrid(system, most, ordering, from_zero)
 
     def _solve_jacobi(self, system: _System, max_iterations: int, from_zero: bool) -> Solution:
         with self.engine.workspace.frame():

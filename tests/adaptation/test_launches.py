@@ -20,8 +20,8 @@ from tests.robustness.gpu_like import groups
 WARM_UP, STEPS = 4, 2
 FEW = 4000
 """Cells of the fast tests: more than one work-group iterates for."""
-LAUNCHES = {(2, 10**4): 60, (3, 10**4): 60, (2, 10**6): 66, (3, 10**6): 110}
-"""Most launches of a step, by dimension and number of cells; of an exact one, without its iterations."""
+LAUNCHES = 60
+"""Most launches of a step; of an exact one, without its iterations."""
 ITERATION = 2
 """Launches of an iteration of an exact step."""
 SOLVERS = ("multigrid", "conjugate_gradient", "volume_projection", "poisson", "aggregation")
@@ -95,13 +95,13 @@ def check_steps(adapter, dim, n, group):
         solving = sum(c for (stage, _), c in tally.calls.items() if stage.split("/")[-1] in SOLVERS)
         kind = f"{type(method).__name__} {is_exact(method)} {getattr(method, 'descent', '')}"
         name = f"{kind} {reads} {iterations} {tally.launches} {solving}"
-        # Of the solver, the diagram, and the summaries; some more where cells in 3D must be clipped anew, as in each
-        # step of a million cells.
-        assert min(reads) <= (6 if dim == 3 and n > 10**5 else 3), name
-        assert max(reads) <= (4 if dim == 2 else 7), name
-        assert (tally.launches - solving) / STEPS <= (40 if max(reads) <= 3 else 55), name
+        # Of the solver, and of the diagram with the summaries. More cells than in the last step may need one more round
+        # of an update, and a solve more iterations.
+        assert min(reads) <= 2, name
+        assert max(reads) <= 4, name
+        assert (tally.launches - solving) / STEPS <= (35 if max(reads) == 2 else 45), name
         if group:
             spent = tally.launches - is_exact(method) * ITERATION * iterations
-            assert spent / STEPS <= LAUNCHES[dim, n], name
-        assert tally.writes / STEPS <= (2 if max(reads) > 4 else 0), name
+            assert spent / STEPS <= LAUNCHES, name
+        assert tally.writes == 0, name
         assert tally.bytes_read / STEPS < 4000, name
