@@ -163,13 +163,15 @@ class Cells:
         self.at_vertex = _Finder(starts, corners, v)
         both = np.stack([self.owner, np.maximum(self.neighbor, -1)], axis=1).ravel()
         self.at_cell = _Finder(None, both, self.n)
-        self.next = np.full(v, -1)  # vertices that have been merged, as linked lists
-        self.last = np.arange(v)
-        self.now = np.arange(v)  # the vertex that each vertex has become, and where its image is
+        self.next = np.full(v, -1, np.int32)  # vertices that have been merged, as linked lists
+        self.last = np.arange(v, dtype=np.int32)
+        self.now = (
+            self.last.copy()
+        )  # the vertex that each vertex has become, and where its image is
         self.now_code = np.zeros(v, np.int64)
         self.touched = np.zeros(self.n, bool)
         self.changed, self.edited = np.zeros((2, len(self.owner)), bool)
-        self._places = [np.full(k, -1) for k in (v, self.n, len(self.owner))]
+        self._places = [np.full(k, -1, np.int32) for k in (v, self.n, len(self.owner))]
 
     # Positions.
 
