@@ -16,6 +16,7 @@ Fields: S1, S2 and S3 of the other benches; `spheres`, sizes by the distance to 
 
 from __future__ import annotations
 
+import copy
 import tempfile
 import time
 from pathlib import Path
@@ -64,6 +65,7 @@ def count_short(mesh: SolverMesh, sizes: np.ndarray) -> tuple[int, int]:
 
 def _seconds_to_file(diagram: clvoro.Diagram, binary: bool) -> float:
     """Return the processor time of the mesh for solvers and its files."""
+    diagram = copy.copy(diagram)  # which has not made the mesh yet
     with tempfile.TemporaryDirectory() as folder:
         begin = time.process_time()
         diagram.save(Path(folder) / "polyMesh", binary=binary)

@@ -59,15 +59,15 @@ def figures_of(verdict: Verdict) -> dict[str, Any]:
 
 def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
     """Write the mesh, check it, and return its figures."""
+    begin = time.process_time()
+    solver = result.solver_mesh().measures
+    seconds = time.process_time() - begin
     try:
         result.save(case / "constant" / "polyMesh")
         verdict = check_case(case)
         (case / "checkMesh.log").write_text(verdict.text)
     except InputError as error:  # a cell that goes around an island is no polygon
         verdict = Verdict(False, (str(error),), "")
-    begin = time.process_time()
-    solver = result.solver_mesh().measures
-    seconds = time.process_time() - begin
     d = result.diagram
     inner = off_walls(d)
     wall, e = ~inner, np.abs(result.size_error)

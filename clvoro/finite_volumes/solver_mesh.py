@@ -163,14 +163,9 @@ def make_solver_mesh(
 ) -> SolverMesh:
     """Return `diagram` as a solver sees it; see `Diagram.solver_mesh`.
 
+    The diagram keeps meshes with `collapse`, which take the longest, so that one is made once to be checked and saved.
     `parts` (k,) int is the index of the named part of the boundary of each wall, if it is not the domain's.
     """
-    from .collapse import collapse_short
-    from .convex_corners import join_faces, move_concave_points
-    from .repair.relaxation import relax_points
-    from .short_edges import collapse_short_edges
-    from .straight_walls import straight_walls
-
     check_choice("walls", walls, ("straight", "exact"))
     diagram.demand_cells("solver_mesh")
     check_not_sphere(
@@ -178,6 +173,24 @@ def make_solver_mesh(
         "meshes for solvers have cells in the plane or polyhedra",
         "use the diagram itself, as diagram.faces, or a file with walls='exact'",
     )
+    parts = diagram.domain.boundaries.index if parts is None else parts
+    if not collapse:
+        return _made(diagram, walls, collapse, parts)
+    kept: dict[tuple[str, bytes], SolverMesh] = vars(diagram).setdefault("_solver_meshes", {})
+    key = (walls, parts.tobytes()) if diagram.domain.dim == 2 else ("", b"")
+    if key not in kept:
+        kept[key] = _made(diagram, walls, collapse, parts)
+    return kept[key]
+
+
+def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray) -> SolverMesh:
+    """Make the mesh of `make_solver_mesh`."""
+    from .collapse import collapse_short
+    from .convex_corners import join_faces, move_concave_points
+    from .repair.relaxation import relax_points
+    from .short_edges import collapse_short_edges
+    from .straight_walls import straight_walls
+
     faces, twin, shift = faces_with_seams(diagram)
     mesh = SolverMesh(
         domain=diagram.domain,
@@ -193,7 +206,6 @@ def make_solver_mesh(
     )
     if mesh.dim == 3:
         return collapse_short(mesh, diagram) if collapse else compact(mesh)
-    parts = diagram.domain.boundaries.index if parts is None else parts
     straight = walls == "straight" and isinstance(diagram.domain, Polygon)
     if straight:
         mesh = straight_walls(join_faces(mesh), diagram, parts)

@@ -1,5 +1,7 @@
 """Criteria of solvers: values, limits, places; the report as text."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -76,8 +78,11 @@ def test_a_cell_around_an_island_is_the_only_finding(ctx):
         mesh = diagram.solver_mesh()
     assert set(-1 - mesh.neighbor[mesh.inner :]) == set(range(4))
     assert mesh.area_change == pytest.approx(1 / domain.measure - 1, rel=1e-12)
-    with pytest.warns(MismatchWarning, match="1 island"):
+    with warnings.catch_warnings():  # the mesh is kept, and warned of once
+        warnings.simplefilter("error")
         assert diagram.check(solver="openfoam")["concavity"].ok
+        assert diagram.solver_mesh() is mesh
+    assert diagram.solver_mesh("exact") is not mesh
 
 
 def test_two_regions_are_reported_but_accepted(ctx):

@@ -1,5 +1,7 @@
 """Faces that connect other cells, where points alone do not help."""
 
+import copy
+
 import numpy as np
 import pytest
 import shapely
@@ -37,7 +39,7 @@ def coast(ctx, seed: int) -> clvoro.Diagram:
 def unrepaired(diagram) -> SolverMesh:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(relaxation, "relax_points", lambda mesh, *_: mesh)
-        return diagram.solver_mesh()
+        return copy.copy(diagram).solver_mesh()
 
 
 def lengths_of_parts(mesh) -> np.ndarray:
