@@ -191,8 +191,9 @@ class MeshOutput:
     def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> SolverMesh:
         """Return the mesh as a finite-volume solver sees it: points, and each face with corners, owner and neighbor.
 
-        With `collapse` the diagram keeps it, so that `check` and `save` do not make it again. Solvers reject or mistrust cells that are not convex, and faces that are much smaller than their cells. The
-        diagram itself has such cells where the boundary has corners or is finer than the mesh.
+        Solvers reject or mistrust cells that are not convex, and faces that are much smaller than their cells. The
+        diagram itself has such cells where the boundary has corners or is finer than the mesh. With `collapse` the
+        diagram keeps the mesh, so that `check` and `save` do not make it again.
 
         Parameters
         ----------
