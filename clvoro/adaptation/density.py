@@ -53,9 +53,12 @@ class Density:
         self._kernels = engine.kernels("adaptation/density")
         self._partial = engine.empty(2 * engine.groups)
 
-    def cell_weights(self, t: Tessellation, h: cla.Array) -> CellWeights:
-        """Return density, weight and log ratio of the cells of `t` for sizes `h` (n,)."""
-        w = CellWeights(*(self.engine.scratch(t.n) for _ in range(3)))
+    def cell_weights(
+        self, t: Tessellation, h: cla.Array, log_ratio: cla.Array | None = None
+    ) -> CellWeights:
+        """Return density, weight and log ratio, in the given array, of the cells of `t` for sizes `h` (n,)."""
+        log_ratio = self.engine.scratch(t.n) if log_ratio is None else log_ratio
+        w = CellWeights(self.engine.scratch(t.n), self.engine.scratch(t.n), log_ratio)
         with self.engine.workspace.frame():
             self._evaluate(t, h, w)
         return w

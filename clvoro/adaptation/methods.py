@@ -23,6 +23,7 @@ from ..geometry.polygon import Polygon
 from ..solvers.components import balance_components
 from ..solvers.linear_system import Limits, Solution
 from ..solvers.volume_projection import Penalty, Targets
+from .density import CellWeights
 from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod
 from .state import MeshState
@@ -254,7 +255,12 @@ class ProjectedMethod:
         mesh.allocate_step()
         gradient, log_ratio = mesh.engine.scratch(mesh.points.shape), mesh.engine.scratch(mesh.n)
         with mesh.engine.workspace.frame():
-            w = mesh.lloyd_weights(gradient, log_ratio)
+            still = relaxation == momentum == 0
+            if self.gradient_from_field and (still or self.descent in ("quality", "edges")):
+                # Weighted centroids are not needed, either.
+                w: CellWeights = stages.density.cell_weights(t, mesh.h, log_ratio)
+            else:
+                w = mesh.lloyd_weights(gradient, log_ratio)
             mesh.follows_log_ratio = self.error_target > 0 or self.careful
             if self.error_target and self.steps > 2:
                 self._control_penalty(mesh.mean_log_ratio_error(w))
@@ -277,7 +283,10 @@ class ProjectedMethod:
                     quality_weight=float(self.descent == "quality"), bad_cell_weight=bad_cell_weight,
                     rate=self.rate,
                 )  # fmt: skip
-            stages.motion.add_momentum(relaxation, mesh.lloyd, mesh.velocity, momentum)
+            if still:
+                mesh.lloyd.fill(0)
+            else:
+                stages.motion.add_momentum(relaxation, mesh.lloyd, mesh.velocity, momentum)
             mesh.zero_fixed(mesh.lloyd)
             if self.descent == "quality":
                 mesh.walls.constrain(mesh, mesh.lloyd)
