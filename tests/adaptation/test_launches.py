@@ -20,8 +20,9 @@ from tests.robustness.gpu_like import groups
 WARM_UP, STEPS = 4, 2
 FEW = 4000
 """Cells of the fast tests: more than one work-group iterates for."""
-LAUNCHES = 60
-"""Most launches of a step; of an exact one, without its iterations."""
+LAUNCHES, MORE = 60, 16
+"""Most launches of a step; of an exact one, without its iterations. And those of each further read: a round of an
+update, with all that is evaluated again."""
 ITERATION = 2
 """Launches of an iteration of an exact step."""
 SOLVERS = ("multigrid", "conjugate_gradient", "volume_projection", "poisson", "aggregation")
@@ -102,6 +103,6 @@ def check_steps(adapter, dim, n, group):
         assert (tally.launches - solving) / STEPS <= (35 if max(reads) == 2 else 45), name
         if group:
             spent = tally.launches - is_exact(method) * ITERATION * iterations
-            assert spent / STEPS <= LAUNCHES, name
+            assert spent <= LAUNCHES * STEPS + MORE * (sum(reads) - 2 * STEPS), name
         assert tally.writes == 0, name
         assert tally.bytes_read / STEPS < 4000, name
