@@ -8,13 +8,13 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+import orjson
 
 from ..finite_volumes.solver_mesh import WallShape
 from ..geometry.boundary_names import Walls
 from ..mesh.connectivity import slices
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import Contents
-from .number_text import decimals, integers, joined
 from .polymesh import PatchType, PolyMesh, poly_mesh
 
 _FILES = {
@@ -118,28 +118,35 @@ def _text(count: int, body: Iterable[bytes]) -> Iterator[bytes]:
 
 
 def _labels(values: np.ndarray) -> Iterator[bytes]:
-    return (joined(integers(values[part]), b"\n") for part in slices(len(values), _CHUNK))
+    for part in slices(len(values), _CHUNK):
+        yield _numbers(values[part]).replace(b",", b"\n") + b"\n"
 
 
 def _vectors(values: np.ndarray) -> Iterator[bytes]:
     for part in slices(len(values), _CHUNK):
-        x, y, z = (decimals(column) for column in values[part].T)
-        yield joined(b"(", x, b" ", y, b" ", z, b")\n")
+        rows = _numbers(values[part])[1:-1]
+        yield b"(" + rows.replace(b"],[", b")\n(").replace(b",", b" ") + b")\n"
 
 
 def _faces(starts: np.ndarray, corners: np.ndarray) -> Iterator[bytes]:
+    """Yield for each face its number of corners, and the corners in parentheses."""
     for part in slices(len(starts) - 1, _CHUNK):
-        own = starts[part.start : part.stop + 1] - starts[part.start]
-        text = integers(corners[starts[part.start] : starts[part.stop]])
-        counts = integers(np.diff(own))
-        before, after = (
-            np.zeros((len(text), counts.shape[1] + 1), np.uint8),
-            np.zeros((len(text), 2), np.uint8),
-        )
-        before[own[:-1], :-1], before[own[:-1], -1] = counts, ord("(")
-        after[:, 0] = ord(" ")
-        after[own[1:] - 1] = np.frombuffer(b")\n", np.uint8)
-        yield joined(before, text, after)
+        own = starts[part.start : part.stop + 1]
+        # No label is negative: -1 stands for the opening parenthesis, and -2 for the closing one.
+        count = np.diff(own)
+        begin = own[:-1] - own[0] + 3 * np.arange(len(count))
+        numbers = np.full(own[-1] - own[0] + 3 * len(count), -1, np.int64)
+        numbers[begin], numbers[begin + count + 2] = count, -2
+        kept = np.ones(len(numbers), bool)
+        kept[begin] = kept[begin + 1] = kept[begin + count + 2] = False
+        numbers[kept] = corners[own[0] : own[-1]]
+        text = _numbers(numbers) + b","
+        yield text.replace(b",-1,", b"(").replace(b",-2,", b")\n").replace(b",", b" ")
+
+
+def _numbers(values: np.ndarray) -> bytes:
+    """Return the text of an array, with commas and the brackets of rows; numbers are read back as the same ones."""
+    return orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)[1:-1]
 
 
 def _boundary(mesh: PolyMesh) -> str:
