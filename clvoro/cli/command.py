@@ -9,6 +9,7 @@ import argparse
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -299,8 +300,10 @@ def _version() -> str:
 def _run(arguments: argparse.Namespace) -> int:
     from .cases import load_case
     from .jobs import Job
+    from .progress import during
 
-    case = load_case(arguments.case)
+    work = f"{Path(arguments.case).stem}: preparing the domain"
+    case = during(work, arguments.quiet, lambda: load_case(arguments.case))
     methods = [] if arguments.method is None else arguments.method.split(",")
     case = case.with_run(
         method=methods[0] if len(methods) == 1 else None,
@@ -350,13 +353,11 @@ def _readable(name: str) -> str:
 
 def _convert(arguments: argparse.Namespace) -> int:
     from ..io import load, save
+    from .progress import during
 
-    save(
-        load(_readable(arguments.mesh)),
-        arguments.out,
-        convention=arguments.convention,
-        walls=arguments.walls,
-    )
+    mesh = load(_readable(arguments.mesh))
+    write = partial(save, mesh, convention=arguments.convention, walls=arguments.walls)
+    during(f"writing {arguments.out}", False, lambda: write(arguments.out))
     print(f"written: {arguments.out}")
     return OK
 
@@ -365,11 +366,13 @@ def _check(arguments: argparse.Namespace) -> int:
     import json
 
     from ..io import load
+    from .progress import during
 
     code = OK
     for name in arguments.files:
         try:
-            report = load(_readable(name)).check(arguments.solver, walls=arguments.walls)
+            check = partial(load(_readable(name)).check, arguments.solver, walls=arguments.walls)
+            report = during(f"{name}: checking", False, check)
         except InputError as error:  # the other files are checked all the same
             code = _complain(error, BAD_INPUT)
             continue

@@ -32,6 +32,7 @@ from ..opencl.profile import Profile
 from .cases import Case
 from .formats import MESH_FILES, PLANE
 from .outputs import check_folder, do_all, refuse_own_files, require_plots
+from .progress import Progress, during
 from .sequence import frames_line, run_frames
 
 _REPEATED = (
@@ -107,8 +108,9 @@ class Job:
         """
         from .. import Adapter, create_context
 
-        arguments, size = self.case.run_arguments(), self.case.size_field()
+        arguments = self.case.run_arguments()
         self._refuse_unknown(arguments)
+        size = self._during("preparing the size field", self.case.size_field)
         warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
         self._refuse_formats()
         files = self._checkpoints()
@@ -164,8 +166,6 @@ class Job:
         settings: dict[str, Any],
         files: Checkpoint | None,
     ) -> Result:
-        from .progress import Progress
-
         # Settings that only other methods of the case use are left out.
         used = {k: v for k, v in settings.items() if uses(method or Options.method, k)}
         arguments = arguments_of_run(used)
@@ -200,6 +200,9 @@ class Job:
         if result.stop_reason == INTERRUPTED:
             self.interrupted = True
         return replace(result, stop_reason=INTERRUPTED) if self.interrupted else result
+
+    def _during(self, work: str, task: Callable[[], Any]) -> Any:
+        return during(f"{self.case.name}: {work}", self.quiet, task)
 
     def _now_and_then(self) -> Callable[[str], None]:
         """Return a function that prints a progress text, but not too often."""
@@ -310,7 +313,9 @@ class Job:
         for kind in self.mesh_formats:
             name, convention = MESH_FILES[kind]
             walls = self.walls if kind == "foam" else None
-            tasks.append(partial(save, main, self.out / name, convention=convention, walls=walls))
+            write = partial(save, main, self.out / name, convention=convention, walls=walls)
+            work = "solver mesh" if kind == "foam" else name
+            tasks.append(partial(self._during, f"writing the {work}", write))
         for other, result in others:
             tasks.append(partial(save, result, self.out / f"mesh-{other}.npz"))
             tasks.append(partial(write_history, result, self.out / f"history-{other}.csv"))
@@ -371,10 +376,12 @@ class Job:
         *_, main = results.values()
         walls = self.walls or "straight"
         assert self.solver is not None
-        report = main.check(self.solver, walls=walls)
+        report = self._during("checking the mesh", partial(main.check, self.solver, walls=walls))
         # OpenFOAM cannot hold cells around islands.
         simple = report.criteria[0].name != "cells around islands"
-        verdict = run_check_mesh(main, walls) if simple else None
+        verdict = (
+            self._during("checkMesh", partial(run_check_mesh, main, walls)) if simple else None
+        )
         self.rejected = not (report.ok if verdict is None else verdict.ok)
         if simple and verdict is None:
             warnings.warn(

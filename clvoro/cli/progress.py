@@ -1,12 +1,14 @@
-"""The progress of a run: one line that changes in place, or a new line from time to time."""
+"""The progress of a run: one line that changes in place, or a new line from time to time. Names of other long work."""
 
 from __future__ import annotations
 
 import shutil
 import sys
+import threading
 import time
 from collections import deque
-from typing import Any, TextIO
+from collections.abc import Callable
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
@@ -14,8 +16,24 @@ EVERY = 5.0
 """Seconds between new lines in a file or a pipe."""
 REFRESH = 0.1
 """Seconds between changes of the line on a terminal."""
+LONG = 2.0
+"""Seconds after which work outside of a run is named."""
 PACED = 4
 """Steps before the remaining time is shown: the first ones build kernels."""
+
+T = TypeVar("T")
+
+
+def during(text: str, quiet: bool, task: Callable[[], T]) -> T:
+    """Return what `task` returns; print `text` on the standard error if it takes long, unless `quiet`."""
+    timer = threading.Timer(LONG, lambda: print(text, file=sys.stderr, flush=True))
+    timer.daemon = True
+    if not quiet:
+        timer.start()
+    try:
+        return task()
+    finally:
+        timer.cancel()
 
 
 class Progress:

@@ -8,6 +8,8 @@ import re
 import signal
 import subprocess
 import sys
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -483,6 +485,18 @@ def test_a_line_that_stays(monkeypatch, kind):
     text = stream.getvalue()
     assert re.search(r"takes \[1\] MiB\S*\s*\n", text)
     assert kind != "log" or text == "takes [1] MiB\n"
+
+
+def test_work_that_takes_long_is_named(monkeypatch, capsys):
+    assert progress.during("short", False, lambda: 3) == 3
+    monkeypatch.setattr(progress, "LONG", 0.0)
+    begun = threading.Event()
+    monkeypatch.setattr(
+        progress, "print", lambda *a, **k: (print(*a, **k), begun.set()), raising=False
+    )
+    assert progress.during("long", False, lambda: begun.wait(10))
+    progress.during("quiet", True, lambda: time.sleep(0.01))
+    assert capsys.readouterr() == ("", "long\n")
 
 
 def test_log_gets_a_line_now_and_then(monkeypatch):
