@@ -62,7 +62,8 @@ class Parts:
         if rows.size:
             x = self.triangles.x[self.triangles.corners[self.row[rows]]].reshape(-1, 2)
             _, index = np.unique(self.part[rows], return_inverse=True)
-            around = shapely.oriented_envelope(shapely.multipoints(x, indices=np.repeat(index, 3)))
+            points = shapely.multipoints(x, indices=np.repeat(index, 3))
+            around = np.asarray(shapely.oriented_envelope(points))
             corners, part = shapely.get_coordinates(around, return_index=True)
             sides, same = np.hypot(*np.diff(corners, axis=0).T), part[1:] == part[:-1]
             longest = np.zeros(len(around))
