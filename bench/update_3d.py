@@ -47,7 +47,7 @@ from clvoro.adaptation.loop import Loop
 from clvoro.adaptation.sampling.start import count_cells
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation import polyhedra_update
-from clvoro.tessellation.cut_cells import REPORT_LISTED, REPORT_UNFINISHED
+from clvoro.tessellation.cut_cells import REPORT_LISTED
 from clvoro.tessellation.device_diagram import Tessellation
 from clvoro.tessellation.polyhedra_update import ALL_CELLS, MAX_ROUNDS, PolyhedraUpdate
 from clvoro.tessellation.stages import TessellationStages, tessellate_box
@@ -178,9 +178,10 @@ class Shares:
             points: Any,
             previous: Tessellation,
             clip: Any,
+            *follow: Any,
         ) -> Tessellation | None:
             if not self.kind:
-                return update(own, cells, box, points, previous, clip)
+                return update(own, cells, box, points, previous, clip, *follow)
             n = previous.n
             found: dict[str, Any] = {"kind": self.kind, "cells": n} | dict.fromkeys(self.NAMES, 0.0)
             self.steps.append(found)
@@ -190,10 +191,10 @@ class Shares:
             )
 
             def clipped(cut: Any, report: Any, used: int) -> None:
-                found["clipped"] += int(report.get()[REPORT_UNFINISHED]) / n
+                found["clipped"] += np.count_nonzero(cut.counts.get() < 0) / n
                 clip(cut, report, used)
 
-            t = update(own, cells, box, points, previous, clipped)
+            t = update(own, cells, box, points, previous, clipped, *follow)
             found["anew"] = t is None
             if t is not None:
                 report = own._report.get()
