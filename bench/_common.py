@@ -1,6 +1,6 @@
 """What the benches share: options, the test fields, the figures of a mesh, tables.
 
-Importing it makes `clvoro` importable from the checkout that holds `bench/`, installed or not.
+Importing it makes `clvoro` that of the checkout that holds `bench/`, even where another one is installed.
 """
 
 from __future__ import annotations
@@ -18,11 +18,8 @@ from typing import Any
 
 import numpy as np
 
-try:
-    import clvoro
-except ModuleNotFoundError:
-    sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-    import clvoro
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import clvoro
 from clvoro import sizing
 
 PICTURES = Path(__file__).resolve().parent / "pictures"

@@ -39,10 +39,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from _common import counts, heading, make_adapter, markdown, names, parser
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import _gpu_steps as gpu_steps
+from _common import counts, heading, make_adapter, markdown, names, parser
 
 from tests.robustness import gpu_programs
 from tests.robustness.gpu_like import groups

@@ -11,11 +11,9 @@ Work-groups, merged kernels and preconditioners are those of a GPU on any device
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,8 +39,6 @@ from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.hooks import Tally, watching
 from clvoro.sizing import Sizing
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from tests.robustness.gpu_like import groups
 
 FIELDS = {2: "F2", 3: "S1"}
