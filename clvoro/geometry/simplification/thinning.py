@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from typing import TYPE_CHECKING
@@ -67,14 +68,14 @@ def large_pieces(triangles: Triangles) -> list[list[tuple[np.ndarray, np.ndarray
     piece_of = np.zeros(len(corners), np.int64)
     piece_of[pieces.row] = pieces.part
     found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    following, left = after.tolist(), np.ones(len(after), bool)
+    following, left = after.tolist(), [True] * len(after)
     for first in range(len(left)):
-        if left[first]:
-            ring, at = [first], following[first]
-            while at != first:
-                ring.append(at)
-                at = following[at]
-            left[ring] = False
+        ring, at = [], first
+        while left[at]:
+            left[at] = False
+            ring.append(at)
+            at = following[at]
+        if ring:
             row = np.array(ring)[kept[ring]]
             found.setdefault(int(piece_of[t[first]]), []).append((x[row], h[row]))
     return [sorted(rings, key=lambda ring: -_area(ring[0])) for rings in found.values()]
@@ -105,49 +106,55 @@ def thinned(
     domain: Polygon, water: list[list[tuple[np.ndarray, np.ndarray]]], tolerance: float
 ) -> tuple[list[list[np.ndarray]], dict[str, list[int]]]:
     """Return the rings of pieces of `water` with fewer vertices, and the edges of each name."""
-    pieces = [[_Ring(domain, *ring) for ring in piece] for piece in water]
-    rows: list[list[np.ndarray]] = []
+    rings = [_Ring(domain, *ring, tolerance) for piece in water for ring in piece]
+    first = np.cumsum([0] + [len(piece) for piece in water])
     for k in range(_TRIES):
-        share = tolerance / 2**k if k < _TRIES - 1 else 0.0
-        rows = [[ring.kept(share) for ring in piece] for piece in pieces]
-        made = [
-            shapely.Polygon(piece[0].x[own[0]], [r.x[o] for r, o in zip(piece[1:], own[1:], strict=True)])
-            for piece, own in zip(pieces, rows, strict=True)
-        ]  # fmt: skip
-        if shapely.MultiPolygon(made).is_valid:
+        rows = [ring.kept() for ring in rings]
+        thin = [ring.x[row] for ring, row in zip(rings, rows, strict=True)]
+        pieces = [thin[i:j] for i, j in itertools.pairwise(first)]
+        if shapely.MultiPolygon([(p[0], p[1:]) for p in pieces]).is_valid:
             break
+        crossing = _crossing(thin)
+        if k == _TRIES - 2 or not crossing.any():
+            crossing[:] = True
+        ends = np.cumsum([len(row) for row in rows])[:-1]
+        for ring, row, again in zip(rings, rows, np.split(crossing, ends), strict=True):
+            ring.share[again[np.searchsorted(row, np.arange(len(ring.x)), "right") - 1]] = -1
     names: dict[str, list[int]] = {}
-    named = set(domain.boundaries.names) - {
-        n for n in domain.boundaries.names if DEFAULT_NAME.fullmatch(n)
-    }
-    named |= set(domain.names or ()) & set(domain.boundaries.names)
-    edge = 0
-    for ring, own in (
-        (r, o) for p, q in zip(pieces, rows, strict=True) for r, o in zip(p, q, strict=True)
-    ):
-        for part in ring.part[own].tolist():
-            name = domain.boundaries.names[part]
-            if name in named:
-                names.setdefault(name, []).append(edge)
-            edge += 1
-    return [
-        [r.x[o] for r, o in zip(p, q, strict=True)] for p, q in zip(pieces, rows, strict=True)
-    ], names
+    given = domain.boundaries.names
+    named = {n for n in given if not DEFAULT_NAME.fullmatch(n) or n in (domain.names or ())}
+    parts = np.concatenate([ring.part[row] for ring, row in zip(rings, rows, strict=True)])
+    for edge, part in enumerate(parts.tolist()):
+        if given[part] in named:
+            names.setdefault(given[part], []).append(edge)
+    return pieces, names
+
+
+def _crossing(rings: list[np.ndarray]) -> np.ndarray:
+    """Return which edges of all rings touch another edge than those next to them."""
+    ends = np.concatenate([np.stack([x, np.roll(x, -1, axis=0)], axis=1) for x in rings])
+    ring = np.repeat(np.arange(len(rings)), [len(x) for x in rings])
+    after = np.arange(1, len(ends) + 1)
+    last = np.flatnonzero(np.diff(ring, append=-1))
+    after[last] = np.append(0, last[:-1] + 1)
+    lines = shapely.linestrings(ends)
+    a, b = shapely.STRtree(lines).query(lines, predicate="intersects")
+    found = np.zeros(len(ends), bool)
+    found[a[(a != b) & (after[a] != b) & (after[b] != a)]] = True
+    return found
 
 
 class _Ring:
-    """One ring (k, 2) with the size at each vertex and the named part of each edge."""
+    """One ring (k, 2) with the size at each vertex, the share of it that is tolerated, and the part of each edge."""
 
-    def __init__(self, domain: Polygon, x: np.ndarray, h: np.ndarray) -> None:
-        self.x, self.h = x, h
+    def __init__(self, domain: Polygon, x: np.ndarray, h: np.ndarray, tolerance: float) -> None:
+        self.x, self.h, self.share = x, h, np.full(len(x), tolerance or -1.0)
         edges, _ = domain.nearest_edge((x + np.roll(x, -1, axis=0)) / 2)
         self.part = domain.boundaries.index[edges]
 
-    def kept(self, share: float) -> np.ndarray:
+    def kept(self) -> np.ndarray:
         """Return the vertices, ascending, from whose polyline all others are at most `share` times the size away."""
         k = len(self.x)
-        if share == 0:
-            return np.arange(k)
         ends = np.flatnonzero(self.part != np.roll(self.part, 1))
         if len(ends) < 2:
             # A vertex of the convex hull, and the one that is farthest from it.
@@ -155,6 +162,7 @@ class _Ring:
             first = int(ends[0]) if len(ends) else int(np.argmax(np.hypot(*(self.x - center).T)))
             far = int(np.argmax(np.hypot(*(self.x - self.x[first]).T)))
             ends = np.unique([first, far])
+        ends = np.union1d(ends, np.flatnonzero(self.share < 0))
         rows = np.setdiff1d(np.arange(ends[0], ends[0] + k), ends)
         ends = np.append(ends, ends[0] + k)
         while len(rows):  # between kept vertices that are too far from each other
@@ -163,13 +171,13 @@ class _Ring:
             along, way = self.x[ends[part] % k] - begin, self.x[rows % k] - begin
             square = np.maximum((along**2).sum(axis=1), 1e-300)
             t = np.clip((way * along).sum(axis=1) / square, 0, 1)
-            off = np.hypot(*(way - t[:, None] * along).T) / self.h[rows % k]
+            off = np.hypot(*(way - t[:, None] * along).T) / self.h[rows % k] - self.share[rows % k]
             first = np.flatnonzero(np.diff(part, prepend=0))
             number = np.cumsum(np.diff(part, prepend=0) > 0) - 1
             worst = np.maximum.reduceat(off, first)[number]
-            far = np.flatnonzero((off == worst) & (off > share))
+            far = np.flatnonzero((off == worst) & (off > 0))
             far = far[np.unique(number[far], return_index=True)[1]]
-            again = worst > share
+            again = worst > 0
             again[far] = False
             ends, rows = np.sort(np.append(ends, rows[far])), rows[again]
         kept = np.zeros(k, bool)
