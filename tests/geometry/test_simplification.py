@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
@@ -50,6 +51,60 @@ def test_narrow_bays_are_filled(depth):
     found = with_bay(0.07, depth).simplified(H)
     assert found.measure == pytest.approx(1, abs=2e-3)
     assert found.upper[0] < 1 + H / 2
+
+
+def narrow_area(domain, h):
+    """Return the area over h^2 that an erosion by 0.45 h and a dilation take away, but for corners."""
+    water = domain.geometry
+    opened = water.buffer(-0.45 * h, quad_segs=32).buffer(0.452 * h, quad_segs=32)
+    area = shapely.area(shapely.get_parts(water.difference(opened))) / h**2
+    return area[area > 0.15].sum()
+
+
+@pytest.mark.parametrize("angle", [0, 17])
+def test_channels_with_long_edges(angle):
+    """Lakes in a row. The channels between them are 30 cells long, and their edges as well."""
+    for width, pieces in ((0.5, 2), (0.9, 2), (0.98, 2), (1.02, 1)):
+        y = width * H / 2
+        parts = rectangle(-1, -1, 1, 2), rectangle(-0.1, -y, 3.2, 2 * y), rectangle(3, -0.7, 1, 1.9)
+        lakes = shapely.affinity.rotate(joined(*parts), angle, origin=(0, 0))
+        found = clvoro.Polygon.from_shapely(lakes).simplified(H)
+        assert found.n_pieces == pieces
+        if pieces == 2:
+            assert found.measure == pytest.approx(3.9, abs=1e-3)
+
+
+@pytest.mark.parametrize("width", [1e-2, 1e-6, 1e-9])
+def test_slits(width):
+    """A rock beside the shore is joined to it, however thin the slit between them is."""
+    rock = rectangle(width * H, 0.4, 0.3, 0.3)
+    found = clvoro.Polygon(BOX, [rock]).simplified(H)
+    assert len(found.ring_starts) == 2
+    assert found.measure == pytest.approx(0.91, abs=1e-2)
+
+
+def test_no_narrow_water_is_left():
+    """Combs, snowflakes and porous media: what shapely finds to be too narrow."""
+    teeth = [rectangle(0.24 * k, 0, 0.09, 0.3 + 0.05 * k) for k in range(10)]
+    comb = shapely.affinity.rotate(joined(rectangle(0, -0.5, 2.4, 0.51), *teeth), 31)
+    turn, step = np.exp(1j * np.pi / 3), np.exp(-2j * np.pi / 3)
+    flake = step ** np.arange(3)
+    for _ in range(4):
+        side = (np.roll(flake, -1) - flake) / 3
+        flake = np.stack(
+            [flake, flake + side, flake + side * (1 + turn), flake + 2 * side], 1
+        ).ravel()
+    middles = np.random.default_rng(3).uniform(0.2, 2, (60, 2))
+    rocks = shapely.buffer(shapely.points(middles), 0.09, quad_segs=10)
+    pores = shapely.box(0, 0, 2.2, 2.2).difference(shapely.union_all(rocks))
+    for shape in (comb, shapely.Polygon(np.column_stack([flake.real, flake.imag])), pores):
+        parts = [part for part in shapely.get_parts(shape) if part.area > H**2]
+        domain = clvoro.Polygon.from_shapely(shapely.MultiPolygon(parts))
+        found = domain.simplified(H)
+        assert found.geometry.is_valid
+        assert narrow_area(domain, H) > 0.5
+        assert narrow_area(found, H) < 0.25
+        assert (shapely.area(shapely.get_parts(found.geometry)) > 3.8 * H**2).all()
 
 
 def test_channels_divide_the_domain():

@@ -83,7 +83,8 @@ def narrow_parts(triangles: Triangles, water: bool, scale: float) -> Parts:
     is_narrow = side.prod(axis=1) < 4 * triangles.area * disc
     parts = Parts(triangles, is_narrow & (triangles.water == water))
     t, k = np.nonzero(parts.rim)
-    half, r = 0.5 * side[parts.row][t, k], disc[parts.row][t]
+    r = disc[parts.row][t]
+    half = np.minimum(0.5 * side[parts.row][t, k], r)
     beyond = r**2 * np.arcsin(half / r) - half * np.sqrt(r**2 - half**2)
     parts.area -= np.bincount(parts.part[t], beyond, parts.count)
     return parts
@@ -94,9 +95,7 @@ def narrow_water(triangles: Triangles, scale: float) -> np.ndarray:
     parts = narrow_parts(triangles, True, scale)
     h = scale * parts.h
     large = parts.area > LEAST_PART * h**2
-    if scale == SCALES[-1]:
-        large |= parts.extents(~large) > LONGEST_PART * h
-    return parts.chosen(large)
+    return parts.chosen(large | (parts.extents(~large) > LONGEST_PART * h))
 
 
 def small_islands(triangles: Triangles) -> np.ndarray:

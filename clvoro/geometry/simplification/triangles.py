@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,12 @@ if TYPE_CHECKING:
     from ..polygon import Polygon
 
 _LONGEST_EDGE = 0.5
-"""Over h, where another edge is nearer than h. Circumcircles in a channel are at most 12 % larger than it is wide."""
+"""Over h, where another edge is nearer than h. Shorter edges stay as they are."""
+_LONGEST_FACING = 0.2
+"""Over h, for parts of longer edges that face an edge nearly h away. In a channel that is w wide, circumcircles of
+parts of length s have diameters of up to sqrt(w^2 + s^2): all less than h if w is 0.97 h."""
+_NEARLY = math.sqrt(1 - _LONGEST_EDGE**2)
+"""Over h. In a channel narrower than that, parts of h / 2 are short enough."""
 _SHORTEST_EDGE = 1e-3
 """Over h. Shorter edges are not divided, even if they are no sides of triangles."""
 _GABRIEL_ROUNDS = 4
@@ -32,43 +38,56 @@ def divided_boundary(
     row = row.reshape(-1)  # NumPy 2.0 keeps the axis
     edges = np.column_stack([row, row[oriented.next_vertex]])
     h, n = sizes(x), len(x)
-    lines = shapely.linestrings(x[edges])
-    tree, own = shapely.STRtree(np.asarray(lines)), np.arange(len(edges))
-    again = np.ones(len(edges), bool)
+    lines, way = np.asarray(shapely.linestrings(x[edges])), np.diff(x[edges], axis=1)[:, 0]
+    way /= np.hypot(*way.T)[:, None]
+    tree, own = shapely.STRtree(lines), np.arange(len(edges))
+    again = shapely.length(lines) > _LONGEST_EDGE * h[edges].mean(axis=1)
     while again.any():
         begin, end = x[edges[again]].swapaxes(0, 1)
         size = h[edges[again]].mean(axis=1)
-        long = np.flatnonzero(np.hypot(*(end - begin).T) > _LONGEST_EDGE * size)
+        length = np.hypot(*(end - begin).T)
+        long = np.flatnonzero(length > _LONGEST_FACING * size)
         found = shapely.linestrings(np.stack([begin, end], axis=1)[long])
         at, other = tree.query(found, predicate="dwithin", distance=size[long])
-        near = np.unique(at[other != own[again][long][at]])
+        row = long[at]
+        facing = ((end - begin)[row] * way[other]).sum(axis=1) < -0.9 * length[row]
+        facing &= shapely.distance(found[at], lines[other]) > _NEARLY * size[row]
+        near = length[row] > np.where(facing, _LONGEST_FACING, _LONGEST_EDGE) * size[row]
+        near &= other != own[again][row]
         split = np.zeros(len(edges), bool)
-        split[np.flatnonzero(again)[long[near]]] = True
+        split[np.flatnonzero(again)[row[near]]] = True
         made, x = _split(x, edges[split], n)
         h = np.concatenate([h, sizes(x[len(h) :])])
         edges = np.concatenate([edges[~split], made])
         own = np.concatenate([own[~split], np.tile(own[split], 2)])
         again = np.arange(len(edges)) >= len(edges) - len(made)
-    # Edges with another point in the circle around them are often no sides of triangles.
+    # An edge is divided at the foot of the nearest point in the circle around it. Then the triangles between two walls
+    # are not obtuse, however thin a slit is.
     for _ in range(_GABRIEL_ROUNDS):
         begin, end = x[edges].swapaxes(0, 1)
-        nearest, _ = scipy.spatial.KDTree(x).query((begin + end) / 2)
+        nearest, point = scipy.spatial.KDTree(x).query((begin + end) / 2)
         split = nearest < (1 - 1e-9) * np.hypot(*(end - begin).T) / 2
-        made, x = _split(x, edges[split], n)
+        way = (end - begin)[split]
+        share = ((x[point] - begin)[split] * way).sum(axis=1) / (way**2).sum(axis=1)
+        made, x = _split(x, edges[split], n, share)
         edges = np.concatenate([edges[~split], made])
     return x, np.concatenate([h, sizes(x[len(h) :])]), edges, n
 
 
-def _split(x: np.ndarray, edges: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the halves of edges, and all points.
+def _split(
+    x: np.ndarray, edges: np.ndarray, n: int, share: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parts of edges, (2 k, 2), and all points. Edges are divided at shares of their lengths, (k,).
 
-    Beside one of the first `n` points an edge is divided at a distance that is a power of two. Then the parts of two
-    edges that meet there are equally long, and a small angle does not take endless rounds (Ruppert 1995).
+    Without shares these are halves, but beside one of the first `n` points an edge is divided at a distance that is a
+    power of two. Then the parts of two edges that meet there are equally long, and a small angle does not take endless
+    rounds (Ruppert 1995).
     """
     a, b = edges.T
-    length = np.hypot(*(x[b] - x[a]).T)
-    share = np.exp2(np.floor(np.log2(length / 1.5))) / length
-    share = np.where((a < n) == (b < n), 0.5, np.where(a < n, share, 1 - share))
+    if share is None:
+        length = np.hypot(*(x[b] - x[a]).T)
+        share = np.exp2(np.floor(np.log2(length / 1.5))) / length
+        share = np.where((a < n) == (b < n), 0.5, np.where(a < n, share, 1 - share))
     middle = len(x) + np.arange(len(edges))
     halves = np.concatenate([np.column_stack([a, middle]), np.column_stack([middle, b])])
     return halves, np.concatenate([x, x[a] + share[:, None] * (x[b] - x[a])])
