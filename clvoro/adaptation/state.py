@@ -342,7 +342,7 @@ class MeshState(MeshArrays):
         return count, True
 
     def _read(self, report: cla.Array | None) -> list[int]:
-        """Read the summaries and the numbers of the report of a diagram, and check the sizes."""
+        """Read the summaries and the report of a diagram in one transfer, check the sizes, and return the report."""
         given = [] if report is None else [report]
         invalid = self.sizing.invalid_index
         if invalid is None:

@@ -129,7 +129,7 @@ def find_defects(
 
 
 def _large(whole: Cells, faces: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """Return which of `faces`, whose areas (3, ...) are given, are not small."""
+    """Return which of `faces` are at least as large as the limit. `areas` (3, ...) are their area vectors."""
     h = smaller_size(whole.owner[faces], whole.neighbor[faces], whole.sizes)
     return np.sqrt((areas**2).sum(axis=0)) >= whole.small * h**2
 

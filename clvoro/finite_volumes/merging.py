@@ -217,7 +217,7 @@ class Cells:
         return self.touched[self.owner[faces]] | ((neighbor >= 0) & self.touched[neighbor])
 
     def find(self, kind: int, items: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the place of each of `values` in `items`, or -1; `kind` is VERTICES, CELLS or FACES."""
+        """Return the index in `items` of each of `values`, or -1. `kind` is VERTICES, CELLS or FACES."""
         places = self._places[kind]
         places[items] = np.arange(len(items))
         found = places.take(values)
@@ -227,7 +227,7 @@ class Cells:
     # Merging.
 
     def prepare(self, vertices: np.ndarray) -> None:
-        """Find the faces at `vertices`, and those of the cells around, at once."""
+        """Look up the faces at `vertices`, and all faces of the cells there, before merges ask for each."""
         around = self.at_vertex.find(vertices)[1]
         there = np.zeros(self.n + 1, bool)
         there[self.owner[around]] = there[np.maximum(self.neighbor[around], -1)] = True

@@ -184,7 +184,7 @@ def make_solver_mesh(
 
 
 def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray) -> SolverMesh:
-    """Make the mesh of `make_solver_mesh`."""
+    """Take the faces of `diagram`, straighten its walls, collapse short faces, and repair bad cells."""
     from .collapse import collapse_short
     from .convex_corners import join_faces, move_concave_points
     from .repair.relaxation import relax_points

@@ -142,7 +142,7 @@ def take_rows(
 def take_ranges(
     begin: np.ndarray, counts: np.ndarray, items: np.ndarray, backwards: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `counts` of `items` from `begin` on for each row, as starts and items; see `take_rows`."""
+    """Return rows of `items`: row i has ``counts[i]`` of them, from ``begin[i]`` on; see `take_rows`."""
     taken = np.zeros(len(counts) + 1, np.int64)
     np.cumsum(counts, out=taken[1:])
     found = np.empty((taken[-1], *items.shape[1:]), items.dtype)

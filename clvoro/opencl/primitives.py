@@ -131,7 +131,7 @@ class Summaries:
         return self._values
 
     def _combine(self, *notes: cla.Array) -> None:
-        """Combine the partial summaries, and write the numbers of at most two arrays behind them."""
+        """Combine the partial summaries. The record also gets at most two int32 arrays, so that one read has all."""
         counts, arrays = [*map(len, notes), 0, 0], [*notes, self._record, self._record]
         self.engine.run_groups(
             self._kernels.combine_blocks, len(self.slots), self._partials, self.engine.groups, self._pending,
@@ -140,20 +140,20 @@ class Summaries:
         self._pending = 0
 
     def read_one(self, name: str) -> Summary:
-        """Return one slot."""
+        """Return the summary with this name."""
         if self._known is not None:
             return self._known[name]
         slot = self.slots[name]
         return Summary(*map(float, self.values[slot : slot + 1].get()[0]))
 
     def read(self) -> dict[str, Summary]:
-        """Return every slot. They are fetched in one transfer, once until something is collected."""
+        """Return all summaries. They are read in one transfer, and kept until something is collected."""
         if self._known is None:
             self.read_with()
         return self._known or {}
 
     def read_with(self, *notes: cla.Array) -> list[int]:
-        """Fetch every slot, for `read`, and the numbers of at most two arrays, int32, in one transfer; return these."""
+        """Read all summaries, for `read`, and at most two int32 arrays in one transfer; return these numbers."""
         if self._pending or notes:
             self._combine(*notes)
         size, count = self._values.nbytes, sum(map(len, notes))

@@ -419,10 +419,10 @@ class Cells:
 
 
 def most_faces(n: int) -> int:
-    """Return the most half-faces of `n` cells without round-off.
+    """Return an upper bound of the number of half-faces of `n` cells.
 
     Cells and walls are the nodes of a planar graph with at most 3 (n + 4) - 6 edges. An edge has two half-faces, or one
-    at a wall. Round-off may add some where many generators lie on a circle.
+    at a wall. Round-off may add more where many generators lie on a circle.
     """
     return 6 * n + 12
 

@@ -171,7 +171,7 @@ before, and the caller is called again. Without a report the diagram is right. T
 
 
 def read_report(_: Tessellation, report: cla.Array | None) -> list[int]:
-    """Return the numbers of the report; see `Follow`."""
+    """Read the report, and do nothing else: the simplest `Follow`."""
     return [] if report is None else report.get().tolist()
 
 

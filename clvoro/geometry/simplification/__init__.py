@@ -1,4 +1,4 @@
-"""Polygons without what is smaller than a cell: narrow bays and channels filled, small islands dropped, edges thinned.
+"""Simplify polygons: fill bays and channels that are narrower than a cell, drop small islands, remove vertices.
 
 What a disc of the diameter h cannot reach from inside is narrower than h. These places are the Delaunay triangles of
 points on the boundary whose circumcircles are smaller than that disc (alpha shapes: Edelsbrunner, Kirkpatrick, Seidel

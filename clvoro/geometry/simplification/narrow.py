@@ -11,7 +11,8 @@ from .triangles import Triangles, components, keys_of
 LEAST_PART = 0.12
 """Least area over h^2 of a narrow part that is filled or dropped. Corners of more than 70 degrees have less."""
 SCALES = 1, 0.5, 0.25, 0.125
-"""Multiples of the size for which narrow parts are searched: a slit has little area, but not for its width."""
+"""Narrow parts are found for these multiples of the size. A thin slit has a small area compared with h^2, but a large
+one compared with the square of its width."""
 LONGEST_PART = 1.25
 """Extent over the least scale of h beyond which a narrow part is filled, whatever its area."""
 
@@ -49,7 +50,7 @@ class Parts:
         return np.bincount(self.part, values, self.count)
 
     def chosen(self, parts: np.ndarray) -> np.ndarray:
-        """Return which triangles are in some of the parts."""
+        """Return which triangles, (t,) bool, belong to the chosen `parts`, (count,) bool."""
         found = np.zeros(len(self.triangles.corners), bool)
         found[self.row[parts[self.part]]] = True
         return found

@@ -131,7 +131,7 @@ def thinned(
 
 
 def _crossing(rings: list[np.ndarray]) -> np.ndarray:
-    """Return which edges of all rings touch another edge than those next to them."""
+    """Return which edges of all rings, (k,) bool, touch an edge that does not follow or precede them."""
     ends = np.concatenate([np.stack([x, np.roll(x, -1, axis=0)], axis=1) for x in rings])
     ring = np.repeat(np.arange(len(rings)), [len(x) for x in rings])
     after = np.arange(1, len(ends) + 1)
@@ -145,7 +145,7 @@ def _crossing(rings: list[np.ndarray]) -> np.ndarray:
 
 
 class _Ring:
-    """One ring (k, 2) with the size at each vertex, the share of it that is tolerated, and the part of each edge."""
+    """One ring (k, 2). Vertices have a size, and a tolerance as a share of it; edges have a named part."""
 
     def __init__(self, domain: Polygon, x: np.ndarray, h: np.ndarray, tolerance: float) -> None:
         self.x, self.h, self.share = x, h, np.full(len(x), tolerance or -1.0)
