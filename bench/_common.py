@@ -45,8 +45,7 @@ def test_field(name: str) -> sizing.Field:
     if name == "circles":
         large, small = sizing.Circle((0.7, 0.75), 0.35), sizing.Circle((1.8, 0.75), 0.2)
         return sizing.minimum(
-            sizing.Distance(large, h_min=0.012, slope=0.12),
-            sizing.Distance(small, h_min=0.006, slope=0.12),
+            sizing.Distance(large, h_min=0.012, slope=0.12), sizing.Distance(small, h_min=0.006, slope=0.12)
         )
     if name == "steep circles":
         return sizing.minimum(
@@ -82,12 +81,8 @@ def domain_of(name: str) -> clvoro.Box:
 def parser(doc: str | None) -> argparse.ArgumentParser:
     """Return a parser that knows --device, --dtype and --json; `doc` is the script's docstring."""
     title, _, rest = (doc or "").partition("\n")
-    made = argparse.ArgumentParser(
-        description=title, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    made.add_argument(
-        "--device", metavar="NAME", help="as for clvoro run: gpu, part of a name, 0:0"
-    )
+    made = argparse.ArgumentParser(description=title, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--device", metavar="NAME", help="as for clvoro run: gpu, part of a name, 0:0")
     made.add_argument("--dtype", choices=("float64", "float32"), default="float64")
     made.add_argument("--json", action="store_true", help="print one JSON object per line instead")
     return made
@@ -111,9 +106,7 @@ def make_adapter(options: argparse.Namespace) -> clvoro.Adapter:
         raise SystemExit(f"{type(error).__name__}: {error}") from error
 
 
-def clock_of(
-    options: argparse.Namespace, adapter: clvoro.Adapter | None = None
-) -> Callable[[], float]:
+def clock_of(options: argparse.Namespace, adapter: clvoro.Adapter | None = None) -> Callable[[], float]:
     """Return the clock: the wall clock, or with `--processor-time` the processor time of this process.
 
     Processor time is divided by the compute units of the adapter's device. On an idle machine both are equal if all
@@ -125,9 +118,7 @@ def clock_of(
     return lambda: time.process_time() / units
 
 
-def best(
-    repeat: int, function: Callable[[], Any], clock: Callable[[], float] = time.perf_counter
-) -> tuple[float, Any]:
+def best(repeat: int, function: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> tuple[float, Any]:
     """Return the least of `repeat` times of `function` by `clock`, and its last result."""
     times = []
     for _ in range(repeat):
@@ -246,9 +237,7 @@ class Report:
         Header of each column, and what it shows of a record.
     """
 
-    def __init__(
-        self, as_json: bool, columns: Mapping[str, Callable[[dict[str, Any]], object]]
-    ) -> None:
+    def __init__(self, as_json: bool, columns: Mapping[str, Callable[[dict[str, Any]], object]]) -> None:
         self.as_json, self.columns = as_json, columns
         self.records: list[dict[str, Any]] = []
 

@@ -43,9 +43,7 @@ COUNTED_AT = {2: (300, 1200), 3: (128, 432)}
 times the cells. Kernels with as many work-items for any number of cells have a fixed part, from both numbers."""
 COUNTED_GROUP, COUNTED_ITEMS = 128, 16 * 128
 """Work-items of a group, and of all groups of a block-wise kernel, where Oclgrind counts."""
-FREE = re.compile(
-    r"phi|alloca|bitcast|ret|br|fence|unreachable|call (llvm\.(lifetime|dbg|assume)|(?!_Z|llvm))"
-)
+FREE = re.compile(r"phi|alloca|bitcast|ret|br|fence|unreachable|call (llvm\.(lifetime|dbg|assume)|(?!_Z|llvm))")
 """Instructions of LLVM that cost a GPU little or nothing after its compiler has inlined all calls."""
 SLOW = {
     "fdiv": 10,
@@ -90,10 +88,7 @@ class Run:
         warm_up: int | None = None,
     ) -> None:
         engine = Engine(adapter.ctx, adapter.queue, dim, adapter.dtype)
-        box, points = (
-            clvoro.Box((0,) * dim, (1,) * dim),
-            lattice(dim, n) if points is None else points,
-        )
+        box, points = (clvoro.Box((0,) * dim, (1,) * dim), lattice(dim, n) if points is None else points)
         size = Sizing(engine, box, len(points) ** (-1 / dim))
         # The hooks also note the sizes of buffers that are bound before the commands count.
         with hooks.watching(engine.queue, Tally()):
@@ -145,24 +140,18 @@ class Commands:
         return sum(k.calls for k in self.launches.values()) + self.copies
 
 
-def commands(
-    run: Run, part: str, repeat: int = 2, part_of: Callable[[], None] | None = None
-) -> Commands:
+def commands(run: Run, part: str, repeat: int = 2, part_of: Callable[[], None] | None = None) -> Commands:
     """Return what a step or a diagram enqueues, the mean of `repeat`."""
     found = Commands(run.n, collections.defaultdict(Launches))
     enqueue, share = cl.enqueue_nd_range_kernel, 1 / repeat
 
-    def noted(
-        queue: cl.CommandQueue, kernel: cl.Kernel, size: Any, group: Any, *rest: Any, **more: Any
-    ) -> Any:
+    def noted(queue: cl.CommandQueue, kernel: cl.Kernel, size: Any, group: Any, *rest: Any, **more: Any) -> Any:
         row = found.launches[kernel.function_name]
         row.items += share * size[0]
         row.group = group[0]
         return enqueue(queue, kernel, size, group, *rest, **more)
 
-    def watch(
-        event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False
-    ) -> None:
+    def watch(event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False) -> None:
         if stage != hooks.MEMORY:
             row = found.launches[name]
             row.calls += share
@@ -277,9 +266,7 @@ def count_in_this_process(dim: int, kind: str, n: int) -> None:
                     items = commands(run, name, 1, part).launches
                 print("=== end", flush=True)
                 sized = {k: {"items": v.items, "calls": v.calls} for k, v in items.items()}
-                counted = {
-                    k: float(v) for step in shares.steps for k, v in step.items() if k != "kind"
-                }
+                counted = {k: float(v) for step in shares.steps for k, v in step.items() if k != "kind"}
                 record = {"part": name, "cells": run.n, "kernels": sized, "shares": counted}
                 print("@@@" + json.dumps(record), flush=True)
 
@@ -291,8 +278,10 @@ def counted(dim: int, kind: str) -> dict[str, Any]:
     def simulate(n: int) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, __file__.replace("_gpu_steps", "gpu_model"), "--count-one", f"{dim},{kind},{n}"],
-            capture_output=True, text=True, env={**os.environ, "OCLGRIND_INST_COUNTS": "1"},
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            env={**os.environ, "OCLGRIND_INST_COUNTS": "1"},
+        )
 
     with ThreadPoolExecutor() as pool:
         all_done = list(pool.map(simulate, COUNTED_AT[dim]))
@@ -327,9 +316,7 @@ def save_counts(dims: list[int]) -> None:
 def load_counts() -> dict[str, dict[str, list[dict[str, Any]]]]:
     """Return the work of each kernel, by kind of step, part and number of cells, as `COUNTS` holds it."""
     if not COUNTS.exists():
-        raise SystemExit(
-            f"{COUNTS} is missing: run gpu_model.py --count where Oclgrind is installed"
-        )
+        raise SystemExit(f"{COUNTS} is missing: run gpu_model.py --count where Oclgrind is installed")
     found = json.loads(COUNTS.read_text())
     for parts in found.values():
         for pair in parts.values():
@@ -342,8 +329,5 @@ def load_counts() -> dict[str, dict[str, list[dict[str, Any]]]]:
 @contextlib.contextmanager
 def gpu_groups() -> Iterator[None]:
     """Work in the groups of an H200, and precondition by multigrid as for millions of cells."""
-    with (
-        groups(128, 512),
-        mock.patch.object(poisson, "expected_costs", return_value=(1.0, 0.0)),
-    ):
+    with groups(128, 512), mock.patch.object(poisson, "expected_costs", return_value=(1.0, 0.0)):
         yield

@@ -25,7 +25,10 @@ PLACES: dict[str, list[tuple[Any, str]]] = {
     "commands: copies, reads, fills": [(cl, "enqueue_copy"), (cl, "enqueue_fill")],
     "arguments of kernels": [(engine, "bind"), (launch, "bind")],
     "making arrays": [
-        (device_array, "make_array"), (engine, "make_array"), (workspace, "make_array"), (workspace.Workspace, "take"),
+        (device_array, "make_array"),
+        (engine, "make_array"),
+        (workspace, "make_array"),
+        (workspace.Workspace, "take"),
         (device_array.DeviceArray, "__getitem__"),
     ],
     "preparation, start": [(run, "Preparation"), (preparation.Preparation, "mesh")],
@@ -34,7 +37,7 @@ PLACES: dict[str, list[tuple[Any, str]]] = {
     "insertion, deletion, refinement": [(loop.Loop, name) for name in ("insert_delete", "correct_count", "refine")],
     "result": [(loop.Loop, "result")],
     "reading the diagram": [(lazy_arrays.LazyArrays, "__getattr__")],
-}  # fmt: skip
+}
 """Functions by part. A function's time does not include that of other parts that it calls."""
 
 
@@ -72,8 +75,6 @@ def host_parts() -> Iterator[Parts]:
     with ExitStack() as stack:
         for part, places in PLACES.items():
             for place, name in places:
-                stack.enter_context(
-                    patch.object(place, name, parts.timed(part, getattr(place, name)))
-                )
+                stack.enter_context(patch.object(place, name, parts.timed(part, getattr(place, name))))
         yield parts
     assert original == (kernels.bind, device_array.make_array)

@@ -57,9 +57,7 @@ def _divide_and_delete(diagram: clvoro.Diagram, h: np.ndarray) -> np.ndarray:
         # Divide across the longest way to a neighbor: a quarter of it on either side.
         ways = points[around] - points[i]
         way = ways[np.argmax(np.linalg.norm(ways, axis=1))] / 4
-        both = np.clip(
-            [points[i] + way, points[i] - way], diagram.domain.lower, diagram.domain.upper
-        )
+        both = np.clip([points[i] + way, points[i] - way], diagram.domain.lower, diagram.domain.upper)
         moved[i] = both[0]
         inserted.append(both[1])
     return np.concatenate([np.delete(moved, deleted, axis=0), np.array(inserted).reshape(-1, d)])

@@ -38,11 +38,7 @@ def even(domain: Any, **options: Any) -> Callable[[int], Kind]:
 def of(domain: Any, field: Any, **options: Any) -> Callable[[int], Kind]:
     """Return runs of a field, or a formula, scaled to the number of cells."""
     field = sizing.Expression(field) if isinstance(field, str) else field
-    return lambda n: (
-        domain,
-        field * (count_cells(field, domain) / n) ** (1 / domain.cell_dim),
-        options,
-    )
+    return lambda n: (domain, field * (count_cells(field, domain) / n) ** (1 / domain.cell_dim), options)
 
 
 def layered(domain: Any) -> Callable[[int], Kind]:
@@ -85,42 +81,60 @@ SPHERE = sizing.Distance(sizing.Ball((0.5, 0.5, 0.4), 0.25), h_min=0.045, slope=
 SHORE = sizing.Distance(COAST.boundary(), h_min=0.002, slope=0.5)
 JUMP = "x < 0.5 ? 1.0 : 10.0"
 STRIPS = {
-    "strip": "x < 0.02 ? 1.0 : 32.0", "thin strip": "x < 0.01 ? 1.0 : 40.0",
-    "strip inside": "fabs(x - 0.5) < 0.02 ? 1.0 : 20.0", "two strips": "x < 0.02 || y < 0.02 ? 1.0 : 23.0",
-    "corner": "x < 0.1 && y < 0.1 ? 1.0 : 44.0", "diagonal": "fabs(x - y) < 0.015 ? 1.0 : 23.0",
+    "strip": "x < 0.02 ? 1.0 : 32.0",
+    "thin strip": "x < 0.01 ? 1.0 : 40.0",
+    "strip inside": "fabs(x - 0.5) < 0.02 ? 1.0 : 20.0",
+    "two strips": "x < 0.02 || y < 0.02 ? 1.0 : 23.0",
+    "corner": "x < 0.1 && y < 0.1 ? 1.0 : 44.0",
+    "diagonal": "fabs(x - y) < 0.015 ? 1.0 : 23.0",
     "ring": "fabs(hypot(x - 0.5, y - 0.5) - 0.3) < 0.01 ? 1.0 : 23.0",
-    "many strips": "sin(60 * x) > 0.95 ? 1.0 : 16.0", "a row": "fabs(x - 0.5) < 0.00016 ? 1.0 : 250.0",
-}  # fmt: skip
+    "many strips": "sin(60 * x) > 0.95 ? 1.0 : 16.0",
+    "a row": "fabs(x - 0.5) < 0.00016 ? 1.0 : 250.0",
+}
 """Narrow strips of fine cells in a unit square, along walls or seams, and across them."""
 SLAB = "x < 0.1 ? 1.0 : 6.7"
 
 KINDS: dict[str, Callable[[int], Kind]] = {
-    "square": even(SQUARE), "square, exact": even(SQUARE, method="exact"),
-    "square, best": even(SQUARE, effort="best"), "square, fast": even(SQUARE, effort="fast"),
+    "square": even(SQUARE),
+    "square, exact": even(SQUARE, method="exact"),
+    "square, best": even(SQUARE, effort="best"),
+    "square, fast": even(SQUARE, effort="fast"),
     "square, uniform start": even(SQUARE, points="uniform"),
     **{f"square, {m}": even(SQUARE, method=m, max_steps=12) for m in METHODS},
     "square, count held": lambda n: (SQUARE, sizing.Expression("0.01 + 0.1 * x"), {"n_cells": n}),
-    "square, from as many points": from_points(1), "square, from few points": from_points(1 / 16),
+    "square, from as many points": from_points(1),
+    "square, from few points": from_points(1 / 16),
     "square, from many points": from_points(2),
     "square, points kept": from_points(1, method="coupled", max_steps=12),
-    "square, layers": layered(SQUARE), "square, callable": of_callable,
+    "square, layers": layered(SQUARE),
+    "square, callable": of_callable,
     "square, raster": of(SQUARE, sizing.Raster(1 + 0.5 * RANDOM.random((400, 400)), (0, 0), (1, 1))),
     "square, scattered": of(SQUARE, sizing.Scattered(RANDOM.random((20000, 2)), 1 + RANDOM.random(20000))),
     "square, graded": graded(SQUARE, JUMP),
     "square, polyline": of(SQUARE, sizing.Distance(sizing.Polyline(CURVE), h_min=0.004, slope=0.2)),
     **{f"square, {name}": of(SQUARE, formula) for name, formula in STRIPS.items()},
     "lake, strip at the shore": of(LAKE, "x < 0.12 ? 1.0 : 30.0"),
-    "lake": even(LAKE), "lake, coupled": even(LAKE, method="coupled", max_steps=12),
-    "lake, layers": layered(LAKE), "coast": even(COAST), "coast, fine at the shore": of(COAST, SHORE),
-    "periodic": even(PERIODIC), "periodic, coupled": even(PERIODIC, method="coupled", max_steps=12),
+    "lake": even(LAKE),
+    "lake, coupled": even(LAKE, method="coupled", max_steps=12),
+    "lake, layers": layered(LAKE),
+    "coast": even(COAST),
+    "coast, fine at the shore": of(COAST, SHORE),
+    "periodic": even(PERIODIC),
+    "periodic, coupled": even(PERIODIC, method="coupled", max_steps=12),
     "periodic, jump at a seam": of(PERIODIC, JUMP),
     "periodic, jumps beside seams": of(PERIODIC, "(x - 0.1) * (x - 0.6) < 0 ? 1.0 : 10.0"),
     **{f"periodic, {name}": of(PERIODIC, formula) for name, formula in STRIPS.items()},
-    "cube, slab": of(CUBE, SLAB), "periodic cube, slab": of(PERIODIC_CUBE, SLAB),
-    "cube": even(CUBE), "cube, exact": even(CUBE, method="exact"),
+    "cube, slab": of(CUBE, SLAB),
+    "periodic cube, slab": of(PERIODIC_CUBE, SLAB),
+    "cube": even(CUBE),
+    "cube, exact": even(CUBE, method="exact"),
     "cube, coupled": even(CUBE, method="coupled", max_steps=6),
-    "cube, fast": even(CUBE, effort="fast"), "cube, graded": graded(CUBE, "x < 0.5 ? 1.0 : 5.0"),
-    "sphere": even(GLOBE), "sphere, exact": even(GLOBE, method="exact"),
-    "sphere, coupled": even(GLOBE, method="coupled", max_steps=12), "sphere, caps": of(GLOBE, CAPS),
-    "cube, sphere": of(CUBE, SPHERE), "periodic cube": even(PERIODIC_CUBE),
-}  # fmt: skip
+    "cube, fast": even(CUBE, effort="fast"),
+    "cube, graded": graded(CUBE, "x < 0.5 ? 1.0 : 5.0"),
+    "sphere": even(GLOBE),
+    "sphere, exact": even(GLOBE, method="exact"),
+    "sphere, coupled": even(GLOBE, method="coupled", max_steps=12),
+    "sphere, caps": of(GLOBE, CAPS),
+    "cube, sphere": of(CUBE, SPHERE),
+    "periodic cube": even(PERIODIC_CUBE),
+}

@@ -34,9 +34,7 @@ def text_of(entries: Mapping[str, Any], indent: int = 0) -> str:
 
 def header(kind: str, name: str) -> str:
     """Write the first lines of a file."""
-    return text_of(
-        {"FoamFile": {"version": "2.0", "format": "ascii", "class": kind, "object": name}}
-    )
+    return text_of({"FoamFile": {"version": "2.0", "format": "ascii", "class": kind, "object": name}})
 
 
 def nonuniform(values: np.ndarray) -> str:
@@ -151,7 +149,7 @@ def write_prisms(
         ("faces", "faceList", rows),
         ("owner", "labelList", list(map(str, owner))),
         ("neighbour", "labelList", [str(row[1]) for row in inner]),
-    ):  # fmt: skip
+    ):
         text = "\n".join([str(len(lines)), "(", *lines, ")", ""])
         (folder / name).write_text(header(kind, name) + text)
     text = f"{len(kinds)}\n(\n{described})\n"
@@ -182,7 +180,7 @@ class Case:
         environment = {"WM_PROJECT_DIR": HOME, **os.environ}
         done = subprocess.run(
             [program, *options], cwd=self.folder, env=environment, capture_output=True, text=True, check=False
-        )  # fmt: skip
+        )
         if done.returncode:
             raise RuntimeError(f"{program} failed: {(done.stdout + done.stderr)[-2000:]}")
         return done.stdout
@@ -201,4 +199,4 @@ class Case:
         text = (max(times, key=lambda p: float(p.name)) / name).read_text()
         text = text[text.index("internalField") : text.index("boundaryField")]
         values = np.array(re.sub(r"[()]", " ", text[text.index("(") : text.rindex(")")]).split())
-        return values.astype(float) if "<scalar>" in text else values.astype(float).reshape(-1, 3)[:, :2]  # fmt: skip
+        return values.astype(float) if "<scalar>" in text else values.astype(float).reshape(-1, 3)[:, :2]

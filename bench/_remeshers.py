@@ -34,9 +34,7 @@ class MissingPeerError(Exception):
 
 def grid(domain: clvoro.Box, counts: np.ndarray) -> np.ndarray:
     """Return the points (n, d) of a grid over the box, walls included."""
-    axes = [
-        np.linspace(a, b, k) for a, b, k in zip(domain.lower, domain.upper, counts, strict=True)
-    ]
+    axes = [np.linspace(a, b, k) for a, b, k in zip(domain.lower, domain.upper, counts, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, domain.dim)
 
 
@@ -58,19 +56,19 @@ def vertices_gmsh(domain: clvoro.Box, size: sizing.Field, edge: float) -> tuple[
         steps = np.append(extent / (counts - 1), [1.0] * flat)
         header = np.append(domain.lower, [0.0] * flat), steps
         numbers = np.append(counts, [1] * flat).astype(np.int32)
-        file.write_bytes(
-            b"".join(a.astype(float).tobytes() for a in header)
-            + numbers.tobytes()
-            + values.tobytes()
-        )
+        file.write_bytes(b"".join(a.astype(float).tobytes() for a in header) + numbers.tobytes() + values.tobytes())
         start = time.process_time()
         gmsh.initialize(interruptible=False)
         try:
             for name, value in (
-                ("General.Terminal", 0), ("General.NumThreads", 1), ("Mesh.Algorithm", 6), ("Mesh.Algorithm3D", 10),
-                ("Mesh.MeshSizeFromPoints", 0), ("Mesh.MeshSizeFromCurvature", 0),
+                ("General.Terminal", 0),
+                ("General.NumThreads", 1),
+                ("Mesh.Algorithm", 6),
+                ("Mesh.Algorithm3D", 10),
+                ("Mesh.MeshSizeFromPoints", 0),
+                ("Mesh.MeshSizeFromCurvature", 0),
                 ("Mesh.MeshSizeExtendFromBoundary", 0),
-            ):  # fmt: skip
+            ):
                 gmsh.option.setNumber(name, value)
             gmsh.model.add("box")
             if d == 2:
@@ -139,18 +137,14 @@ def _oriented(vertices: np.ndarray, simplices: np.ndarray) -> np.ndarray:
     corners = vertices[simplices]
     volume = np.linalg.det(corners[:, 1:] - corners[:, :1])
     least = 1e-9 * np.abs(volume).max()
-    turned = np.where(
-        (volume < 0)[:, None], simplices[:, [1, 0, *range(2, simplices.shape[1])]], simplices
-    )
+    turned = np.where((volume < 0)[:, None], simplices[:, [1, 0, *range(2, simplices.shape[1])]], simplices)
     return turned[np.abs(volume) > least]
 
 
 Mesher = Callable[[clvoro.Box, sizing.Field, float], tuple[np.ndarray, float]]
 
 
-def remesh(
-    mesher: Mesher, domain: clvoro.Box, size: sizing.Field, count: int
-) -> tuple[np.ndarray, float]:
+def remesh(mesher: Mesher, domain: clvoro.Box, size: sizing.Field, count: int) -> tuple[np.ndarray, float]:
     """Return about `count` vertices (n, d) of a mesher, and the seconds of its last call."""
     edge = EDGE[domain.dim]
     for _ in range(ROUNDS):

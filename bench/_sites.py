@@ -36,9 +36,7 @@ def harbor() -> Site:
     at = [(560 + 30 * i, 420 + 30 * j) for i in range(4) for j in range(3)]
     piles = [Point(place).buffer(3, quad_segs=4) for place in at]
     water = shapely.Polygon(shore).difference(shapely.union_all([*piers, breakwater, ramp, *piles]))
-    size = sizing.Distance(
-        [sizing.Circle(place, 3) for place in at], h_min=2.5, slope=0.12, h_max=14
-    )
+    size = sizing.Distance([sizing.Circle(place, 3) for place in at], h_min=2.5, slope=0.12, h_max=14)
     return Site(_largest(water), size, {})
 
 
@@ -60,8 +58,7 @@ def river() -> Site:
     turn = np.arange(24) * (2 * np.pi / 24)
     oval = np.column_stack([np.cos(turn), np.sin(turn)])
     islands = [
-        placed(k, oval * (a, b) * (1 + 0.15 * rng.normal(size=24))[:, None])
-        for k, a, b in ((20, 40, 9), (60, 30, 7))
+        placed(k, oval * (a, b) * (1 + 0.15 * rng.normal(size=24))[:, None]) for k, a, b in ((20, 40, 9), (60, 30, 7))
     ]
     pier = np.array([(-9, 0), (-6, -1.5), (6, -1.5), (9, 0), (6, 1.5), (-6, 1.5)], float)
     piers = [placed(40, pier, off) for off in (-16, 0, 16)]
@@ -85,11 +82,7 @@ def tubes() -> Site:
 
 def streets() -> Site:
     """Return the air between blocks that two avenues cut at acute angles."""
-    blocks = [
-        box(40 + 115 * x, 30 + 88 * y, 130 + 115 * x, 96 + 88 * y)
-        for x in range(3)
-        for y in range(3)
-    ]
+    blocks = [box(40 + 115 * x, 30 + 88 * y, 130 + 115 * x, 96 + 88 * y) for x in range(3) for y in range(3)]
     avenues = [
         LineString([(-10, 20), (410, 290)]).buffer(11, cap_style="flat"),
         LineString([(60, 320), (330, -20)]).buffer(7, cap_style="flat"),
@@ -124,6 +117,10 @@ def mask(seed: int = 3) -> Site:
 
 
 SITES: dict[str, Callable[[], Site]] = {
-    "harbor": harbor, "river": river, "tubes, layers": tubes, "streets": streets, "motor": motor,
+    "harbor": harbor,
+    "river": river,
+    "tubes, layers": tubes,
+    "streets": streets,
+    "motor": motor,
     "mask": mask,
-}  # fmt: skip
+}

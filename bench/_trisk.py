@@ -42,9 +42,7 @@ def unit(x: np.ndarray) -> np.ndarray:
     return x / np.linalg.norm(x, axis=1, keepdims=True)
 
 
-def pair_half_faces(
-    cells: np.ndarray, neighbors: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pair_half_faces(cells: np.ndarray, neighbors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return for each edge its half-face of the lower cell (m,), and for each half-face its edge and its sign (2 m,).
 
     The sign is 1 on the half-face whose cell is the edge's first.
@@ -143,9 +141,7 @@ def mesh_of(diagram: clvoro.Diagram) -> Mesh:
     starts = np.asarray(diagram.neighbor_starts, int)
     vertex = np.asarray(diagram.cell_vertices, int)
     if not (np.bincount(vertex, minlength=len(corners)) == 3).all():
-        raise ValueError(
-            "a vertex has other than three cells; expected generators in general position"
-        )
+        raise ValueError("a vertex has other than three cells; expected generators in general position")
     cells, neighbors = np.repeat(np.arange(len(points)), np.diff(starts)), diagram.neighbors
     first, edge_of, sign = pair_half_faces(cells, np.asarray(neighbors, int))
     after = next_in_cell(starts)
@@ -155,9 +151,7 @@ def mesh_of(diagram: clvoro.Diagram) -> Mesh:
     dc = radius * arcs(*points[edge_cells.T])
     dv = radius * arcs(*corners[edge_vertices.T])
     if (dv < SHORTEST_EDGE * dc).any():
-        raise ValueError(
-            f"a face is shorter than {SHORTEST_EDGE:g} of the distance of its generators"
-        )
+        raise ValueError(f"a face is shorter than {SHORTEST_EDGE:g} of the distance of its generators")
 
     # A kite is two triangles: from the crossing of the face that ends at the corner, and of the one that begins there.
     x, middle = points[cells], crossings[edge_of]
@@ -165,14 +159,25 @@ def mesh_of(diagram: clvoro.Diagram) -> Mesh:
     np.add.at(kites, after, signed_areas(x, middle, corners[vertex[after]]))
     kites *= radius**2
     return Mesh(
-        radius, points, corners, crossings, starts, edge_of, sign, edge_cells, edge_vertices, dc, dv,
-        vertex, kites, np.add.reduceat(kites, starts[:-1]), np.bincount(vertex, kites),
-    )  # fmt: skip
+        radius,
+        points,
+        corners,
+        crossings,
+        starts,
+        edge_of,
+        sign,
+        edge_cells,
+        edge_vertices,
+        dc,
+        dv,
+        vertex,
+        kites,
+        np.add.reduceat(kites, starts[:-1]),
+        np.bincount(vertex, kites),
+    )
 
 
-def sparse_matrix(
-    values: np.ndarray, rows: np.ndarray, columns: np.ndarray, *shape: int
-) -> sparse.csr_array:
+def sparse_matrix(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, *shape: int) -> sparse.csr_array:
     """Return a sparse matrix. With indices of 32 bits a product reads a quarter less."""
     indices = rows.astype(np.int32), columns.astype(np.int32)
     return sparse.csr_array((values, indices), shape=shape)
@@ -242,9 +247,7 @@ class Operators:
         self.cell_to_edge = sparse_matrix(half, both, pairs, m, n)
         self.vertex_to_edge = sparse_matrix(half, both, ends, m, v)
         vertex = mesh.corner_vertex
-        self.cell_to_vertex = sparse_matrix(
-            mesh.kites / mesh.vertex_areas[vertex], vertex, cell, v, n
-        )
+        self.cell_to_vertex = sparse_matrix(mesh.kites / mesh.vertex_areas[vertex], vertex, cell, v, n)
         self.vertex_to_cell = sparse_matrix(mesh.kites / area, cell, vertex, n, v)
 
 
@@ -265,12 +268,7 @@ class ShallowWater:
     """
 
     def __init__(
-        self,
-        mesh: Mesh,
-        gravity: float,
-        coriolis: np.ndarray,
-        bottom: np.ndarray,
-        upwinding: float = 0.0,
+        self, mesh: Mesh, gravity: float, coriolis: np.ndarray, bottom: np.ndarray, upwinding: float = 0.0
     ) -> None:
         self.mesh, self.operators = mesh, Operators(mesh)
         self.gravity, self.coriolis, self.bottom = gravity, coriolis, bottom
@@ -286,9 +284,7 @@ class ShallowWater:
         turn = self.operators.tangential
         return 0.5 * (q * (turn @ flux) + turn @ (q * flux))
 
-    def tendency(
-        self, h: np.ndarray, u: np.ndarray, dt: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def tendency(self, h: np.ndarray, u: np.ndarray, dt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Return dh/dt (n,) and du/dt (m,); `dt` matters with upwinding only."""
         o = self.operators
         flux = (o.cell_to_edge @ h) * u
@@ -296,8 +292,7 @@ class ShallowWater:
         q = o.vertex_to_edge @ vertex_q
         if self.upwinding:
             q = q - self.upwinding * dt * (
-                u * (o.grad @ (o.vertex_to_cell @ vertex_q))
-                + (o.tangential @ u) * (o.along @ vertex_q)
+                u * (o.grad @ (o.vertex_to_cell @ vertex_q)) + (o.tangential @ u) * (o.along @ vertex_q)
             )
         bernoulli = self.gravity * (h + self.bottom) + o.kinetic @ (u * u)
         return -(o.div @ flux), self.coriolis_force(q, flux) - o.grad @ bernoulli
@@ -364,9 +359,7 @@ def balances(model: ShallowWater, h: np.ndarray, u: np.ndarray, seed: int = 0) -
     turned = o.curl @ (o.tangential @ flow)
     return {
         "mass_rate": float(abs(mesh.cell_areas @ dh) / (2 * through.sum())),
-        "coriolis_work": float(
-            abs(mesh.edge_areas @ (flux * force)) / (mesh.edge_areas @ np.abs(flux * force))
-        ),
+        "coriolis_work": float(abs(mesh.edge_areas @ (flux * force)) / (mesh.edge_areas @ np.abs(flux * force))),
         "energy_rate": float(abs(energy_rate) / (by_forces.sum() + np.abs(carried).sum())),
         "dual_divergence": relative(turned + o.cell_to_vertex @ (o.div @ flow), flow),
         "geostrophic": relative(o.curl @ (o.tangential @ rotating), rotating),

@@ -129,12 +129,7 @@ KINDS = {
         "across-seams": one_rounding,
         "alone": alone,
     },
-    3: {
-        "clusters": clusters_in_space,
-        "spheres": spheres,
-        "rings": rings,
-        "lines": lines_in_space,
-    },
+    3: {"clusters": clusters_in_space, "spheres": spheres, "rings": rings, "lines": lines_in_space},
 }
 
 
@@ -157,8 +152,7 @@ def main() -> int:
     options_of.set_defaults(dtype=None)
     options = options_of.parse_args()
     columns = {
-        name: lambda r, name=name: r[name]
-        for name in ("generators", "dtype", "sets", "meshes", "refused", "wrong")
+        name: lambda r, name=name: r[name] for name in ("generators", "dtype", "sets", "meshes", "refused", "wrong")
     }
     report, refusals = Report(options.json, columns), {}
     precisions = [options.dtype] if options.dtype else ["float64", "float32"]
@@ -175,9 +169,7 @@ def main() -> int:
                 except clvoro.ClvoroError as error:
                     found["refused"] += 1
                     refusals.setdefault(f"{kind}, {options.dtype}", []).append(error)
-            report.add(
-                {"generators": kind, "dtype": options.dtype, "sets": options.sets, **found}, kind
-            )
+            report.add({"generators": kind, "dtype": options.dtype, "sets": options.sets, **found}, kind)
     title = f"{options.sets} sets each. {date.today()}, {device_name(adapter)}."
     report.finish(title)
     for which, errors in refusals.items():

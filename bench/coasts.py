@@ -37,9 +37,7 @@ from clvoro import sizing
 RADIUS = 6371.0
 """Of the earth, in kilometers."""
 LEAST_QUALITY = 0.75
-RUNS = {
-    "fast": {"effort": "fast"}, "default": {}, "best": {"effort": "best"}, "exact": {"method": "exact"},
-}  # fmt: skip
+RUNS = {"fast": {"effort": "fast"}, "default": {}, "best": {"effort": "best"}, "exact": {"method": "exact"}}
 
 
 class Place(NamedTuple):
@@ -97,9 +95,7 @@ class Coasts:
         """Return the union of all polygons of a level within a box."""
         west, south, east, north = box.bounds
         found = []
-        for i in np.flatnonzero(
-            (self.level == level) & (self.south < north) & (self.north > south)
-        ):
+        for i in np.flatnonzero((self.level == level) & (self.south < north) & (self.north > south)):
             x = self.points[self.begin[i] // 8 :][: self.count[i]].astype(float)
             if x[:, 0].min() < east and x[:, 0].max() > west and len(x) > 3:
                 shape = shapely.Polygon(x)
@@ -149,9 +145,7 @@ def size_of(domain: clvoro.Polygon, place: Place, coarse: float) -> sizing.Field
     """Return the size field of a domain, in kilometers."""
     h_min, h_max = coarse * place.h_min, coarse * place.h_max
     if place.across:
-        return sizing.FeatureSize(
-            domain, place.across, growth=place.growth, h_min=h_min, h_max=h_max
-        )
+        return sizing.FeatureSize(domain, place.across, growth=place.growth, h_min=h_min, h_max=h_max)
     return sizing.Distance(domain.boundary("coast"), h_min, growth=place.growth, h_max=h_max)
 
 
@@ -172,10 +166,7 @@ def draw(result: clvoro.Result, place: Place, path: Path) -> None:
         for ax in figure.subplots(1, 2, width_ratios=[1, 1.5], squeeze=False)[0]:
             plot_cells(result, "size", ax=ax, key=False)
             ax.set(xticks=[], yticks=[], ylabel="", xlabel=f"{len(result.points):,} cells")
-        west, south, east, north = place.view or (
-            *result.diagram.domain.lower,
-            *result.diagram.domain.upper,
-        )
+        west, south, east, north = place.view or (*result.diagram.domain.lower, *result.diagram.domain.upper)
         ax.set(xlim=(west, east), ylim=(south, north), xlabel=f"{east - west:.0f} km")
         figure.savefig(path, dpi=115)
 
@@ -239,14 +230,14 @@ def main() -> None:
                     options.pictures.mkdir(parents=True, exist_ok=True)
                     draw(result, place, options.pictures / f"{label}.png")
                 more = {
-                    "edges": len(domain.vertices), "seconds": seconds, "simplified_seconds": spent,
+                    "edges": len(domain.vertices),
+                    "seconds": seconds,
+                    "simplified_seconds": spent,
                     "warnings": [str(w.message) for w in seen],
-                }  # fmt: skip
+                }
                 verdict = "OK" if row["ok"] else row["complaints"]
                 shown = f"{name}, {kind}"
-                report.add(
-                    {"coast": shown, "run": run, **more, **row}, f"{shown}, {run}: {verdict}"
-                )
+                report.add({"coast": shown, "run": run, **more, **row}, f"{shown}, {run}: {verdict}")
     good = sum(row["ok"] for row in report.records)
     report.finish(heading(adapter, f"{good} of {len(report.records)} meshes pass checkMesh"))
 

@@ -66,41 +66,31 @@ class Row:
     targets: dict[str, float] = field(default_factory=dict)
 
 
-DEFAULT = {
-    "mean_error": 0.004, "max_error": 0.04, "mean_quality": 0.990, "min_quality": 0.92, "work": 100,
-}  # fmt: skip
+DEFAULT = {"mean_error": 0.004, "max_error": 0.04, "mean_quality": 0.990, "min_quality": 0.92, "work": 100}
 EXACT = {
-    "mean_deviation": 1e-4, "max_deviation": 2e-3, "mean_quality": 0.986, "min_quality": 0.85,
-    "exact_steps": 8, "exact_iterations": 50,
-}  # fmt: skip
-SOLID_DEFAULT = {
-    "mean_error": 0.012, "max_error": 0.08, "mean_quality_all": 0.69, "finest_steps": 12,
-}  # fmt: skip
-SOLID_EXACT = {
-    "mean_deviation": 3e-4, "max_deviation": 5e-3, "mean_quality_all": 0.67, "finest_steps": 15,
-}  # fmt: skip
+    "mean_deviation": 1e-4,
+    "max_deviation": 2e-3,
+    "mean_quality": 0.986,
+    "min_quality": 0.85,
+    "exact_steps": 8,
+    "exact_iterations": 50,
+}
+SOLID_DEFAULT = {"mean_error": 0.012, "max_error": 0.08, "mean_quality_all": 0.69, "finest_steps": 12}
+SOLID_EXACT = {"mean_deviation": 3e-4, "max_deviation": 5e-3, "mean_quality_all": 0.67, "finest_steps": 15}
 WEIGHTED = {"method": "weighted", "options": clvoro.PaperOptions(tol=0)}
 
 ROWS = (
     Row("weighted", ("F1",), {**WEIGHTED, "max_steps": 8}, {"mean_error": 0.030}),
     Row(
-        "weighted-uniform", ("F1",),
+        "weighted-uniform",
+        ("F1",),
         {**WEIGHTED, "points": "uniform", "options": clvoro.PaperOptions(tol=0, k=1.0), "max_steps": 20},
         {"mean_error": 0.035},
     ),
-    Row(
-        "default", ("F1",), {},
-        {"mean_error": 0.002, "max_error": 0.02, "mean_quality": 0.967, "min_quality": 0.85},
-    ),
+    Row("default", ("F1",), {}, {"mean_error": 0.002, "max_error": 0.02, "mean_quality": 0.967, "min_quality": 0.85}),
     Row("default", ("F2", "F3", "F4"), {}, DEFAULT),
-    Row(
-        "best", ("F3",), {"effort": "best"},
-        {"mean_error": 0.004, "mean_quality": 0.994, "min_quality": 0.96},
-    ),
-    Row(
-        "fast", ("F2", "F3", "F4"), {"effort": "fast"},
-        {"mean_error": 0.006, "mean_quality": 0.975, "work": 15},
-    ),
+    Row("best", ("F3",), {"effort": "best"}, {"mean_error": 0.004, "mean_quality": 0.994, "min_quality": 0.96}),
+    Row("fast", ("F2", "F3", "F4"), {"effort": "fast"}, {"mean_error": 0.006, "mean_quality": 0.975, "work": 15}),
     Row("exact", ("F1",), {"method": "exact"}, {"max_deviation": 1e-3, "mean_quality": 0.965}),
     Row("exact", ("F2", "F3", "F4"), {"method": "exact"}, EXACT),
     Row("fast", ("S1", "S2", "S3"), {"effort": "fast"}),
@@ -109,7 +99,7 @@ ROWS = (
     Row("best", ("S2", "S3"), {"effort": "best"}),
     Row("exact", ("S1",), {"method": "exact"}),
     Row("exact", ("S2", "S3"), {"method": "exact"}, SOLID_EXACT),
-)  # fmt: skip
+)
 
 
 def is_solid(name: str) -> bool:
@@ -169,9 +159,7 @@ COLUMNS = {
     "max |e|": show("max_error", ".5f"),
     "mean Q": show("mean_quality", ".4f"),
     "min Q": show("min_quality", ".3f"),
-    "all Q": lambda r: (
-        f"{show('mean_quality_all', '.4f')(r)} / {show('min_quality_all', '.3f')(r)}"
-    ),
+    "all Q": lambda r: f"{show('mean_quality_all', '.4f')(r)} / {show('min_quality_all', '.3f')(r)}",
     "six-sided": show("six_sided", ".1%"),
     "mean |L/h-1|": show("mean_deviation", ".1e"),
     "max |L/h-1|": show("max_deviation", ".1e"),
@@ -198,11 +186,7 @@ SOLID_COLUMNS = {
 
 def no_more_steps(records: list[dict[str, Any]]) -> None:
     """Mark a row on S3 as failed if it took more steps of the finest level than on S2."""
-    most = {
-        r["row"]: max(run["finest_steps"] for run in r["runs"])
-        for r in records
-        if r["field"] == "S2"
-    }
+    most = {r["row"]: max(run["finest_steps"] for run in r["runs"]) for r in records if r["field"] == "S2"}
     for record in records:
         steps = max(run["finest_steps"] for run in record["runs"])
         if record["field"] == "S3" and steps > most.get(record["row"], steps):
@@ -218,9 +202,14 @@ def judge(row: Row, name: str, runs: list[dict[str, float]]) -> dict[str, Any]:
         if bad:
             missed.append(f"{figure} ({bad} of {len(runs)})" if len(runs) > 1 else figure)
     return {
-        "row": row.name, "field": name, "arguments": row.arguments, "targets": row.targets,
-        "runs": runs, "holds": not missed, "missed": missed,
-    }  # fmt: skip
+        "row": row.name,
+        "field": name,
+        "arguments": row.arguments,
+        "targets": row.targets,
+        "runs": runs,
+        "holds": not missed,
+        "missed": missed,
+    }
 
 
 def main() -> int:
@@ -232,10 +221,7 @@ def main() -> int:
     options_of.add_argument("--seeds", type=int, default=1, metavar="N", help="random starts (1)")
     options_of.add_argument("--large", action="store_true", help="also F4, a million cells")
     options = options_of.parse_args()
-    for what, given, allowed in (
-        ("row", options.rows, known),
-        ("field", options.fields, fields),
-    ):
+    for what, given, allowed in (("row", options.rows, known), ("field", options.fields, fields)):
         if unknown := sorted(set(given) - set(allowed)):
             options_of.error(f"no {what} {', '.join(unknown)}; there are {', '.join(allowed)}")
 
@@ -249,9 +235,7 @@ def main() -> int:
             asked = row.name in options.rows and name in options.fields
             if not asked or (name in LARGE and not options.large):
                 continue
-            runs = [
-                measure(adapter, row, name, FIRST_SEED + 17 * k) for k in range(options.seeds)
-            ]  # fmt: skip
+            runs = [measure(adapter, row, name, FIRST_SEED + 17 * k) for k in range(options.seeds)]
             record = judge(row, name, runs)
             report = solid if is_solid(name) else flat
             report.add(record, f"{row.name} on {name}: {'yes' if record['holds'] else 'no'}")

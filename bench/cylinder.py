@@ -114,9 +114,7 @@ def mesh_clvoro(layers: bool, effort: str, mirrored: bool = False) -> Callable[.
             lower = adapter.run(_lower_part(), field, effort=effort, layers=rows, seed=seed)
             made = adapter.diagram(domain, _with_mirror_images(lower.points))
         else:
-            made = adapter.run(
-                domain, field, n_cells=n_cells, effort=effort, layers=rows, seed=seed
-            )
+            made = adapter.run(domain, field, n_cells=n_cells, effort=effort, layers=rows, seed=seed)
         types = {name: "patch" for name, kind in PATCHES.items() if kind == "patch"}
         made.save(case.folder / "constant" / "polyMesh", types=types, thickness=THICKNESS)
 
@@ -152,9 +150,7 @@ def mesh_gmsh(quadrangles: bool, mirrored: bool = False) -> Callable[..., None]:
         # An equilateral triangle of area h^2 has edges of 1.52 h.
         factor, field = (1.0 if quadrangles else 1.52), scaled(size, n_cells)
         for _ in range(4):
-            points, cells = _gmsh(
-                gmsh, field, factor, quadrangles, CENTER[1] if mirrored else HEIGHT
-            )
+            points, cells = _gmsh(gmsh, field, factor, quadrangles, CENTER[1] if mirrored else HEIGHT)
             if mirrored:
                 points, cells = _with_mirrored_cells(points, cells)
             if abs(len(cells) / n_cells - 1) < 0.01:
@@ -172,10 +168,14 @@ def _gmsh(
     gmsh.initialize(interruptible=False)
     try:
         options = {
-            "General.Terminal": 0, "General.NumThreads": 1, "Mesh.Algorithm": 8 if quadrangles else 6,
-            "Mesh.MeshSizeFromPoints": 0, "Mesh.MeshSizeFromCurvature": 0,
-            "Mesh.MeshSizeExtendFromBoundary": 0, "Mesh.RecombineAll": int(quadrangles),
-        }  # fmt: skip
+            "General.Terminal": 0,
+            "General.NumThreads": 1,
+            "Mesh.Algorithm": 8 if quadrangles else 6,
+            "Mesh.MeshSizeFromPoints": 0,
+            "Mesh.MeshSizeFromCurvature": 0,
+            "Mesh.MeshSizeExtendFromBoundary": 0,
+            "Mesh.RecombineAll": int(quadrangles),
+        }
         for name, value in options.items():
             gmsh.option.setNumber(name, value)
         gmsh.model.add("channel")
@@ -183,9 +183,7 @@ def _gmsh(
         disk = gmsh.model.occ.addDisk(*CENTER, 0, RADIUS, RADIUS)
         gmsh.model.occ.cut([(2, channel)], [(2, disk)])
         gmsh.model.occ.synchronize()
-        gmsh.model.mesh.setSizeCallback(
-            lambda dim, tag, x, y, z, h: factor * float(field(np.array([[x, y]]))[0])
-        )
+        gmsh.model.mesh.setSizeCallback(lambda dim, tag, x, y, z, h: factor * float(field(np.array([[x, y]]))[0]))
         gmsh.model.mesh.generate(2)
         tags, coordinates, _ = gmsh.model.mesh.getNodes()
         kinds, _, nodes = gmsh.model.mesh.getElements(2)
@@ -204,9 +202,7 @@ def _gmsh(
     return points[used], [np.searchsorted(used, cell) for cell in cells]
 
 
-def _with_mirrored_cells(
-    points: np.ndarray, cells: list[np.ndarray]
-) -> tuple[np.ndarray, list[np.ndarray]]:
+def _with_mirrored_cells(points: np.ndarray, cells: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return a mesh of the lower part with its image above the axis, as `_with_mirror_images` places it."""
     off = points[:, 1] < CENTER[1] - 1e-9
     image = np.arange(len(points))
@@ -250,16 +246,16 @@ def mesh_blocks(case: Case, _: clvoro.Adapter, size: Size, n_cells: int, seed: i
         for z, shift in ((0.0, 0), (THICKNESS, v)):
             arcs.append(f"arc {4 + a + shift} {4 + (a + 1) % 4 + shift} ({x} {y} {z})")
     faces = {
-        "walls": sides((0, 1), (2, 3), (1, 8), (9, 2)), "outlet": sides((8, 9)), "inlet": sides((3, 0)),
+        "walls": sides((0, 1), (2, 3), (1, 8), (9, 2)),
+        "outlet": sides((8, 9)),
+        "inlet": sides((3, 0)),
         "cylinder": sides((4, 5), (5, 6), (6, 7), (7, 4)),
         "back": " ".join(f"({joined(b)})" for b in bottoms),
         "front": " ".join(f"({joined(b, v)})" for b in bottoms),
-    }  # fmt: skip
+    }
     kinds = {**PATCHES, "back": "empty", "front": "empty"}
     patches = "".join(text_of({k: {"type": kinds[k], "faces": f"({f})"}}) for k, f in faces.items())
-    blocks = " ".join(
-        f"hex ({joined(b)} {joined(b, v)}) {c}" for b, c in zip(bottoms, cells, strict=True)
-    )
+    blocks = " ".join(f"hex ({joined(b)} {joined(b, v)}) {c}" for b, c in zip(bottoms, cells, strict=True))
     corners = " ".join(f"({x!r} {y!r} {z})" for z in (0.0, THICKNESS) for x, y in flat)
     text = f"vertices ({corners});\nblocks ({blocks});\nedges ({' '.join(arcs)});\nboundary ({patches});\n"
     case.write("system/controlDict", {"deltaT": 1, "endTime": 1, "writeInterval": 1})
@@ -302,59 +298,106 @@ def write_case(
     inlet[:, 0] = 6 * mean / HEIGHT**2 * (primitive[1] - primitive[0]) / (y[1] - y[0])
     flat, closed = {"type": "empty"}, {"type": "zeroGradient"}
     fields = {
-        "U": ("[0 1 -1 0 0 0 0]", f"uniform ({mean} 0 0)", {
-            "inlet": {"type": "fixedValue", "value": nonuniform(inlet)}, "outlet": closed,
-            "walls": {"type": "noSlip"}, "cylinder": {"type": "noSlip"},
-        }),
-        "p": ("[0 2 -2 0 0 0 0]", "uniform 0", {
-            "inlet": closed, "outlet": {"type": "fixedValue", "value": "uniform 0"},
-            "walls": closed, "cylinder": closed,
-        }),
-    }  # fmt: skip
+        "U": (
+            "[0 1 -1 0 0 0 0]",
+            f"uniform ({mean} 0 0)",
+            {
+                "inlet": {"type": "fixedValue", "value": nonuniform(inlet)},
+                "outlet": closed,
+                "walls": {"type": "noSlip"},
+                "cylinder": {"type": "noSlip"},
+            },
+        ),
+        "p": (
+            "[0 2 -2 0 0 0 0]",
+            "uniform 0",
+            {
+                "inlet": closed,
+                "outlet": {"type": "fixedValue", "value": "uniform 0"},
+                "walls": closed,
+                "cylinder": closed,
+            },
+        ),
+    }
     for k, (name, (dimensions, value, patches)) in enumerate(fields.items()):
         values = value if start is None else nonuniform(start[k])
-        case.write(f"0/{name}", {
-            "dimensions": dimensions, "internalField": values,
-            "boundaryField": {**patches, "back": flat, "front": flat},
-        })  # fmt: skip
+        case.write(
+            f"0/{name}",
+            {
+                "dimensions": dimensions,
+                "internalField": values,
+                "boundaryField": {**patches, "back": flat, "front": flat},
+            },
+        )
     case.write("constant/transportProperties", {"transportModel": "Newtonian", "nu": VISCOSITY})
     case.write("constant/turbulenceProperties", {"simulationType": "laminar"})
     scheme = {"linear": "Gauss linear", "linearUpwind": "Gauss linearUpwind grad(U)"}[convection]
-    case.write("system/fvSchemes", {
-        "ddtSchemes": {"default": "steadyState" if steady else "backward"},
-        # Forces on the body are exact only if the pressure's gradient conserves momentum.
-        "gradSchemes": {"default": "leastSquares", "grad(p)": "Gauss linear"},
-        "divSchemes": {
-            "default": "none", "div(phi,U)": f"bounded {scheme}" if steady else scheme,
-            "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
+    case.write(
+        "system/fvSchemes",
+        {
+            "ddtSchemes": {"default": "steadyState" if steady else "backward"},
+            # Forces on the body are exact only if the pressure's gradient conserves momentum.
+            "gradSchemes": {"default": "leastSquares", "grad(p)": "Gauss linear"},
+            "divSchemes": {
+                "default": "none",
+                "div(phi,U)": f"bounded {scheme}" if steady else scheme,
+                "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
+            },
+            "laplacianSchemes": {"default": "Gauss linear corrected"},
+            "interpolationSchemes": {"default": "linear"},
+            "snGradSchemes": {"default": "corrected"},
         },
-        "laplacianSchemes": {"default": "Gauss linear corrected"},
-        "interpolationSchemes": {"default": "linear"},
-        "snGradSchemes": {"default": "corrected"},
-    })  # fmt: skip
+    )
     tolerance = 1e-12 if steady else 1e-7
     multigrid = {"solver": "GAMG", "smoother": "GaussSeidel"}
     gradients = {"solver": "PCG", "preconditioner": "DIC"}
     pressure = {**(multigrid if steady else gradients), "tolerance": tolerance, "relTol": 0.05}
-    velocity = {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": tolerance, "relTol": 0.05}  # fmt: skip
-    case.write("system/fvSolution", {
-        "solvers": {
-            "p": pressure, "pFinal": {**pressure, "relTol": 0}, "U": velocity, "UFinal": {**velocity, "relTol": 0},
+    velocity = {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": tolerance, "relTol": 0.05}
+    case.write(
+        "system/fvSolution",
+        {
+            "solvers": {
+                "p": pressure,
+                "pFinal": {**pressure, "relTol": 0},
+                "U": velocity,
+                "UFinal": {**velocity, "relTol": 0},
+            },
+            "SIMPLE": {"consistent": "yes", "residualControl": {"p": 1e-7, "U": 1e-7}},
+            "PIMPLE": {"nOuterCorrectors": 2, "nCorrectors": 2, "nNonOrthogonalCorrectors": 0},
+            "relaxationFactors": {"equations": {"U": 0.9}} if steady else {"equations": {'".*"': 1}},
         },
-        "SIMPLE": {"consistent": "yes", "residualControl": {"p": 1e-7, "U": 1e-7}},
-        "PIMPLE": {"nOuterCorrectors": 2, "nCorrectors": 2, "nNonOrthogonalCorrectors": 0},
-        "relaxationFactors": {"equations": {"U": 0.9}} if steady else {"equations": {'".*"': 1}},
-    })  # fmt: skip
+    )
     end, step = times
-    case.write("system/controlDict", {
-        "startFrom": "startTime", "startTime": 0, "stopAt": "endTime", "endTime": end, "deltaT": step,
-        "writeControl": "runTime", "writeInterval": end, "writeFormat": "ascii", "writePrecision": 12,
-        "functions": {"forces": {
-            "type": "forceCoeffs", "libs": '("libforces.so")', "patches": "(cylinder)", "rho": "rhoInf", "rhoInf": 1,
-            "liftDir": "(0 1 0)", "dragDir": "(1 0 0)", "pitchAxis": "(0 0 1)", "CofR": "(0.2 0.2 0)",
-            "magUInf": mean, "lRef": 2 * RADIUS, "Aref": 2 * RADIUS * THICKNESS,
-        }},
-    })  # fmt: skip
+    case.write(
+        "system/controlDict",
+        {
+            "startFrom": "startTime",
+            "startTime": 0,
+            "stopAt": "endTime",
+            "endTime": end,
+            "deltaT": step,
+            "writeControl": "runTime",
+            "writeInterval": end,
+            "writeFormat": "ascii",
+            "writePrecision": 12,
+            "functions": {
+                "forces": {
+                    "type": "forceCoeffs",
+                    "libs": '("libforces.so")',
+                    "patches": "(cylinder)",
+                    "rho": "rhoInf",
+                    "rhoInf": 1,
+                    "liftDir": "(0 1 0)",
+                    "dragDir": "(1 0 0)",
+                    "pitchAxis": "(0 0 1)",
+                    "CofR": "(0.2 0.2 0)",
+                    "magUInf": mean,
+                    "lRef": 2 * RADIUS,
+                    "Aref": 2 * RADIUS * THICKNESS,
+                }
+            },
+        },
+    )
 
 
 def value_at(point: tuple[float, float], centroids: np.ndarray, values: np.ndarray) -> float:
@@ -373,13 +416,13 @@ def steady_flow(case: Case, mesh: PlaneMesh, convection: str) -> dict[str, float
     write_case(case, mesh, 20, convection)
     case.run("simpleFoam")
     forces, pressure = case.table("forces", "coefficient.dat"), case.field("p")
-    front, rear = (
-        value_at((x, 0.2), mesh.centroids, pressure) for x in (0.2 - RADIUS, 0.2 + RADIUS)
-    )
+    front, rear = (value_at((x, 0.2), mesh.centroids, pressure) for x in (0.2 - RADIUS, 0.2 + RADIUS))
     return {
-        "drag": float(forces["Cd"][-1]), "lift": float(forces["Cl"][-1]), "pressure": front - rear,
+        "drag": float(forces["Cd"][-1]),
+        "lift": float(forces["Cl"][-1]),
+        "pressure": front - rear,
         "steps": float(forces["Time"][-1]),
-    }  # fmt: skip
+    }
 
 
 class Shedding:
@@ -407,9 +450,11 @@ class Shedding:
         crossings = time_[rises] + share * (time_[rises + 1] - time_[rises])
         period = float(np.diff(crossings).mean())
         return {
-            "drag": float(forces["Cd"][late].max()), "lift": float(lift[late].max()),
-            "strouhal": 2 * RADIUS / period, "steps": float(len(time_)),
-        }  # fmt: skip
+            "drag": float(forces["Cd"][late].max()),
+            "lift": float(lift[late].max()),
+            "strouhal": 2 * RADIUS / period,
+            "steps": float(len(time_)),
+        }
 
 
 def picture(case: Case, mesh: PlaneMesh, path: Path, title: str) -> None:
@@ -424,7 +469,7 @@ def picture(case: Case, mesh: PlaneMesh, path: Path, title: str) -> None:
     figure, (whole, near) = plt.subplots(2, 1, figsize=(9, 7), height_ratios=(2, 5))
     for axes in (whole, near):
         edge = "none" if axes is whole else "0.25"
-        drawn = PolyCollection(mesh.polygons, array=speed, edgecolor=edge, linewidth=0.3, cmap="viridis")  # fmt: skip
+        drawn = PolyCollection(mesh.polygons, array=speed, edgecolor=edge, linewidth=0.3, cmap="viridis")
         if axes is whole:
             drawn.set_edgecolor("face")
         axes.add_collection(drawn)
@@ -463,13 +508,9 @@ def main() -> None:
     options_of = parser(__doc__)
     options_of.add_argument("--reynolds", type=int, choices=(20, 100), default=20)
     options_of.add_argument("--cells", type=counts, default=None, metavar="LIST")
-    options_of.add_argument(
-        "--meshers", default=";".join(MESHERS), metavar="NAMES", help="separated by semicolons"
-    )
+    options_of.add_argument("--meshers", default=";".join(MESHERS), metavar="NAMES", help="separated by semicolons")
     options_of.add_argument("--samples", type=int, default=1)
-    options_of.add_argument(
-        "--convection", choices=("linear", "linearUpwind"), default="linearUpwind"
-    )
+    options_of.add_argument("--convection", choices=("linear", "linearUpwind"), default="linearUpwind")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = options_of.parse_args()
     re_ = options.reynolds
@@ -502,11 +543,7 @@ def main() -> None:
                         break
                     mesh = PlaneMesh(case.folder)
                     start = time.perf_counter()
-                    flow = (
-                        steady_flow(case, mesh, convection)
-                        if re_ == 20
-                        else shedding.flow(case, mesh, convection)
-                    )
+                    flow = steady_flow(case, mesh, convection) if re_ == 20 else shedding.flow(case, mesh, convection)
                     found = {**flow, **(errors(flow) if re_ == 20 else {}), "cells": len(mesh)}
                     found["seconds"] = time.perf_counter() - start
                     for key, value in found.items():

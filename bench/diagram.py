@@ -87,9 +87,7 @@ def hexagonal(n: int, rng: np.random.Generator) -> np.ndarray:
     a = math.sqrt(2 / (math.sqrt(3) * n))
     rows, columns = round(1 / (a * math.sqrt(0.75))), round(1 / a)
     y, x = np.mgrid[0:rows, 0:columns].astype(float)
-    p = np.column_stack([
-        ((x + 0.5 * (y % 2) + 0.25) / columns).ravel(), ((y + 0.5) / rows).ravel()
-    ])  # fmt: skip
+    p = np.column_stack([((x + 0.5 * (y % 2) + 0.25) / columns).ravel(), ((y + 0.5) / rows).ravel()])
     p += JITTER * a * (rng.random(p.shape) - 0.5) * 2
     return rng.permutation(np.clip(p, 0, 1))
 
@@ -137,11 +135,7 @@ SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
 SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, cubed_3d, radial_3d, core_3d, bcc_3d)}
 
 
-KERNELS = {
-    "clip": ("walk", "wrap", "clip", "check", "list", "place"),
-    "match": ("match",),
-    "measure": ("measure",),
-}
+KERNELS = {"clip": ("walk", "wrap", "clip", "check", "list", "place"), "match": ("match",), "measure": ("measure",)}
 """Columns, each with the beginnings of the names of its kernels."""
 
 
@@ -210,12 +204,8 @@ class Tessellator:
         moved = np.clip(moved, 0, 1)
         self.places = [self.points, self.engine.upload(moved)]
         # Capacities grow in a new diagram, not in an update.
-        self.cells.tessellate(
-            self.box, self.places[1], self.n, self.bins.build(self.box, self.places[1], self.n)
-        )
-        self.t = self.cells.tessellate(
-            self.box, self.points, self.n, self.bins.build(self.box, self.points, self.n)
-        )
+        self.cells.tessellate(self.box, self.places[1], self.n, self.bins.build(self.box, self.places[1], self.n))
+        self.t = self.cells.tessellate(self.box, self.points, self.n, self.bins.build(self.box, self.points, self.n))
 
     def diagram_warm(self) -> None:
         """Update the diagram to the moved generators, back, and so on."""
@@ -232,16 +222,12 @@ class Tessellator:
         self.t = t
 
 
-def kernel_times(
-    queue: Any, repeat: int, function: Callable[[], object], clock: Clock | None
-) -> dict[str, float]:
+def kernel_times(queue: Any, repeat: int, function: Callable[[], object], clock: Clock | None) -> dict[str, float]:
     """Median times of the kernels of "diagram": the device's own, or by `clock`, one by one."""
     function()
     times: dict[str, list[float]] = {name: [] for name in KERNELS}
     for _ in range(repeat):
-        costs = (
-            device_times(queue, function) if clock is None else own_times(queue, function, clock)
-        )
+        costs = device_times(queue, function) if clock is None else own_times(queue, function, clock)
         for name, seen in times.items():
             seen.append(sum(s for kernel, s in costs if kernel.startswith(KERNELS[name])))
     return {name: statistics.median(seen) for name, seen in times.items()}
@@ -273,9 +259,7 @@ def sets_of(options: argparse.Namespace) -> dict[str, Callable[..., np.ndarray]]
     return SETS if options.dim == 2 else SETS_3D
 
 
-def measure(
-    adapter: clvoro.Adapter, name: str, n: int, options: argparse.Namespace
-) -> list[dict[str, Any]]:
+def measure(adapter: clvoro.Adapter, name: str, n: int, options: argparse.Namespace) -> list[dict[str, Any]]:
     """Return the records of one set: cold and warm."""
     rng = np.random.default_rng(SEED + n)
     points = sets_of(options)[name](n, rng).astype(adapter.dtype)
@@ -300,13 +284,17 @@ def measure(
 
     n = len(points)
     records = []
-    for start, seconds, binning, kernels in (
-        ("cold", cold, bins, cold_kernels), ("warm", warm, 0.0, warm_kernels),
-    ):  # fmt: skip
+    for start, seconds, binning, kernels in (("cold", cold, bins, cold_kernels), ("warm", warm, 0.0, warm_kernels)):
         record: dict[str, Any] = {
-            "set": name, "cells": n, "start": start, "bins": binning, "diagram": seconds, **kernels,
-            "clip_rate": n / kernels["clip"], "graph_rate": n / (binning + seconds),
-        }  # fmt: skip
+            "set": name,
+            "cells": n,
+            "start": start,
+            "bins": binning,
+            "diagram": seconds,
+            **kernels,
+            "clip_rate": n / kernels["clip"],
+            "graph_rate": n / (binning + seconds),
+        }
         if start == "cold":
             record |= {"order": order, "whole_rate": n / (order + seconds)}
         records.append(record)
@@ -352,9 +340,13 @@ def comparisons(records: list[dict[str, Any]]) -> list[list[str]]:
             mine = [r for r in records if r["set"] == name and r["start"] == start]
             last = mine[-1]
             base = next(
-                (r for r in records if r["set"] == "uniform" and r["start"] == start
-                 and abs(r["cells"] / last["cells"] - 1) < 0.05), None,
-            )  # fmt: skip
+                (
+                    r
+                    for r in records
+                    if r["set"] == "uniform" and r["start"] == start and abs(r["cells"] / last["cells"] - 1) < 0.05
+                ),
+                None,
+            )
             clip = f"{base['clip_rate'] / last['clip_rate']:.2f}" if base else ""
             graph = f"{base['graph_rate'] / last['graph_rate']:.2f}" if base else ""
             slope = ""
@@ -370,9 +362,7 @@ def main() -> None:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[10**4, 10**5, 10**6, 4 * 10**6])
     options_of.add_argument("--dim", type=int, choices=(2, 3), default=2)
-    options_of.add_argument(
-        "--sets", type=names, help=f"{', '.join(SETS)}; in 3D {', '.join(SETS_3D)}"
-    )
+    options_of.add_argument("--sets", type=names, help=f"{', '.join(SETS)}; in 3D {', '.join(SETS_3D)}")
     options_of.add_argument("--repeat", type=int, default=5)
     options_of.add_argument("--scipy", action="store_true")
     options_of.add_argument("--processor-time", action="store_true")
@@ -394,8 +384,14 @@ def main() -> None:
                 print(f"{name} {n:,}: {error}", file=sys.stderr)
     report.finish(heading(adapter, f"Diagram alone, medians of {options.repeat}"))
     if not options.json:
-        header = ["points", "start", "cells", "clip: cost per cell / uniform's",
-                  "bins to graph: the same", "slope of time against cells"]  # fmt: skip
+        header = [
+            "points",
+            "start",
+            "cells",
+            "clip: cost per cell / uniform's",
+            "bins to graph: the same",
+            "slope of time against cells",
+        ]
         print(markdown(header, comparisons(report.records)))
 
 

@@ -48,13 +48,7 @@ def channel() -> Example:
     walls = [(0, 0), (2, 0), (2, 1.2), (0, 1.2)]
     domain = clvoro.Polygon(walls, [wing])
     layers = clvoro.Layers(0.008, count=4, growth=1.3, spacing=0.022, edges="hole-1")
-    return Example(
-        "layers=Layers(0.008, count=4, ...)",
-        domain,
-        0.07,
-        {"layers": layers},
-        ((0.2, 0.3), (1.3, 0.96)),
-    )
+    return Example("layers=Layers(0.008, count=4, ...)", domain, 0.07, {"layers": layers}, ((0.2, 0.3), (1.3, 0.96)))
 
 
 def spots() -> Example:
@@ -99,21 +93,18 @@ def main() -> None:
     report = Report(
         options.json,
         {
-            "domain": lambda r: r["domain"], "cells": lambda r: r["cells"],
-            "mean e": lambda r: f"{r['mean_error']:.4f}", "max e": lambda r: f"{r['max_error']:.3f}",
-            "Q": lambda r: f"{r['mean_quality']:.4f}", "min Q": lambda r: f"{r['min_quality']:.3f}",
+            "domain": lambda r: r["domain"],
+            "cells": lambda r: r["cells"],
+            "mean e": lambda r: f"{r['mean_error']:.4f}",
+            "max e": lambda r: f"{r['max_error']:.3f}",
+            "Q": lambda r: f"{r['mean_quality']:.4f}",
+            "min Q": lambda r: f"{r['min_quality']:.3f}",
             "all Q": lambda r: f"{r['mean_quality_all']:.4f}",
         },
-    )  # fmt: skip
+    )
     results = []
     for example in (shore(), channel(), spots()):
-        result = adapter.run(
-            example.domain,
-            example.size,
-            effort=options.effort,
-            seed=FIRST_SEED,
-            **example.arguments,
-        )
+        result = adapter.run(example.domain, example.size, effort=options.effort, seed=FIRST_SEED, **example.arguments)
         found = figures(result.diagram, result.target_size, result.quality)
         report.add({"domain": example.title, **found}, example.title)
         results.append((example, result))

@@ -19,17 +19,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import (
-    BOX,
-    FIRST_SEED,
-    Report,
-    figures,
-    heading,
-    make_adapter,
-    names,
-    parser,
-    test_field,
-)
+from _common import BOX, FIRST_SEED, Report, figures, heading, make_adapter, names, parser, test_field
 from domains import spots
 from polygon import lake
 
@@ -136,10 +126,21 @@ def measure(adapter: clvoro.Adapter, name: str, effort: str, seed: int) -> dict[
 
 SMALLEST = ("shortest_face", "shortest_wall")
 FORMS = {
-    "cells": ".0f", "mean_error": ".4f", "max_error": ".3f", "mean_quality": ".4f", "min_quality": ".3f",
-    "min_quality_all": ".3f", "seconds": ".1f", "below_percent": ".3f", "far_below": ".0f", "percentile_0.1": ".4f",
-    "percentile_1": ".3f", "percentile_10": ".3f", "shortest_face": ".1e", "shortest_wall": ".1e",
-}  # fmt: skip
+    "cells": ".0f",
+    "mean_error": ".4f",
+    "max_error": ".3f",
+    "mean_quality": ".4f",
+    "min_quality": ".3f",
+    "min_quality_all": ".3f",
+    "seconds": ".1f",
+    "below_percent": ".3f",
+    "far_below": ".0f",
+    "percentile_0.1": ".4f",
+    "percentile_1": ".3f",
+    "percentile_10": ".3f",
+    "shortest_face": ".1e",
+    "shortest_wall": ".1e",
+}
 
 
 def main() -> None:
@@ -159,10 +160,7 @@ def main() -> None:
     for name in options.only:
         for effort in options.efforts:
             runs = [measure(adapter, name, effort, FIRST_SEED + s) for s in range(options.seeds)]
-            record = {
-                key: (min if key in SMALLEST else statistics.median)([r[key] for r in runs])
-                for key in runs[0]
-            }
+            record = {key: (min if key in SMALLEST else statistics.median)([r[key] for r in runs]) for key in runs[0]}
             report.add({"case": name, "effort": effort, **record}, f"{name}, {effort}")
     report.finish(heading(adapter, "Short edges"))
 

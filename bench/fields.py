@@ -43,13 +43,9 @@ def circle_line(center: tuple[float, float], radius: float) -> np.ndarray:
 
 
 def distance_to_polygon() -> Example:
-    corners = [
-        (0.35, 0.25), (1.1, 0.2), (1.2, 0.45), (0.8, 0.5), (1.05, 0.8), (0.5, 0.8), (0.6, 0.5),
-    ]  # fmt: skip
+    corners = [(0.35, 0.25), (1.1, 0.2), (1.2, 0.45), (0.8, 0.5), (1.05, 0.8), (0.5, 0.8), (0.6, 0.5)]
     size = sizing.Distance(sizing.ClosedPolyline(corners), h_min=0.013, growth=1.2, h_max=0.11)
-    return Example(
-        "Distance(ClosedPolyline(...), growth=1.2)", size, [np.array([*corners, corners[0]])]
-    )
+    return Example("Distance(ClosedPolyline(...), growth=1.2)", size, [np.array([*corners, corners[0]])])
 
 
 def raster_with_gaps() -> Example:
@@ -61,9 +57,10 @@ def raster_with_gaps() -> Example:
         values[np.hypot(x - center[0], y - center[1]) < radius] = np.nan
     size = sizing.Graded(sizing.Raster(values, BOX.lower, BOX.upper, missing="nearest"), growth=1.2)
     return Example(
-        'Graded(Raster(h, ..., missing="nearest"))', size,
+        'Graded(Raster(h, ..., missing="nearest"))',
+        size,
         dashed=[circle_line(center, radius) for center, radius in holes],
-    )  # fmt: skip
+    )
 
 
 def graded_jump() -> Example:
@@ -84,15 +81,9 @@ def from_solution(kind: str) -> Example:
     layer = np.column_stack([along, wave(along)])
     if kind == "hessian":
         size = sizing.hessian_size(values, BOX.lower, BOX.upper, n_cells=1100, h_max=0.12)
-        return Example(
-            "Graded(hessian_size(u, ...), growth=1.3)",
-            sizing.Graded(size, growth=1.3),
-            dashed=[layer],
-        )
+        return Example("Graded(hessian_size(u, ...), growth=1.3)", sizing.Graded(size, growth=1.3), dashed=[layer])
     size = sizing.gradient_size(values, BOX.lower, BOX.upper, eps=0.45, h_max=0.12)
-    return Example(
-        "Graded(gradient_size(u, ...), growth=1.2)", sizing.Graded(size, growth=1.2), dashed=[layer]
-    )
+    return Example("Graded(gradient_size(u, ...), growth=1.2)", sizing.Graded(size, growth=1.2), dashed=[layer])
 
 
 def composition() -> Example:
@@ -103,16 +94,19 @@ def composition() -> Example:
     behind = sizing.Distance(sizing.Segment(*wake), h_min=0.022, growth=1.15, h_max=0.1)
     size = sizing.minimum(near, behind, sizing.Expression("0.05 + 0.03 * x"))
     return Example(
-        "minimum(wing, wake, background)", size, [np.vstack([wing.vertices, wing.vertices[:1]])],
-        [np.array(wake)],
-    )  # fmt: skip
+        "minimum(wing, wake, background)", size, [np.vstack([wing.vertices, wing.vertices[:1]])], [np.array(wake)]
+    )
 
 
 def examples() -> list[Example]:
     return [
-        distance_to_polygon(), raster_with_gaps(), graded_jump(),
-        from_solution("hessian"), from_solution("gradient"), composition(),
-    ]  # fmt: skip
+        distance_to_polygon(),
+        raster_with_gaps(),
+        graded_jump(),
+        from_solution("hessian"),
+        from_solution("gradient"),
+        composition(),
+    ]
 
 
 def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
@@ -136,14 +130,18 @@ def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
             ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
             ax.set_title(example.title, family="monospace", fontsize=8.5, loc="left")
             ax.text(
-                0.985, 0.03, f"{len(result.points):,} cells", transform=ax.transAxes, ha="right",
-                fontsize=8, bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
-            )  # fmt: skip
+                0.985,
+                0.03,
+                f"{len(result.points):,} cells",
+                transform=ax.transAxes,
+                ha="right",
+                fontsize=8,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
+            )
         everything = np.concatenate([result.target_size for _, result in results])
         add_color_bar(
-            axes[0].collections[0], axes, scheme, everything, LIMITS,
-            location="bottom", shrink=0.5, aspect=50,
-        )  # fmt: skip
+            axes[0].collections[0], axes, scheme, everything, LIMITS, location="bottom", shrink=0.5, aspect=50
+        )
         figure.savefig(path, dpi=150, pil_kwargs={"optimize": True})
 
 
@@ -172,12 +170,13 @@ def main(arguments: list[str] | None = None) -> int:
         results.append((example, result))
         report.add(
             {
-                "field": example.title, "least": float(result.target_size.min()),
+                "field": example.title,
+                "least": float(result.target_size.min()),
                 "most": float(result.target_size.max()),
                 **figures(result.diagram, result.target_size, result.quality),
             },
             example.title,
-        )  # fmt: skip
+        )
     options.out.mkdir(parents=True, exist_ok=True)
     draw(results, options.out / "fields.png")
     report.finish(heading(adapter, "Meshes of the size fields"))

@@ -20,16 +20,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-KINDS = {
-    "2D box": ("clvoro.Box((0, 0), (1, 1))", 0.04),
-    "3D box": ("clvoro.Box((0, 0, 0), (1, 1, 1))", 0.1),
-}
+KINDS = {"2D box": ("clvoro.Box((0, 0), (1, 1))", 0.04), "3D box": ("clvoro.Box((0, 0, 0), (1, 1, 1))", 0.1)}
 RECORDED = {
     **KINDS,
-    "2D polygon": (
-        "clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.4, 1), (0.4, 0.5), (0, 0.5)])",
-        0.04,
-    ),
+    "2D polygon": ("clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.4, 1), (0.4, 0.5), (0, 0.5)])", 0.04),
     "2D periodic": ("clvoro.Box((0, 0), (1, 1), periodic=True)", 0.04),
     "3D periodic": ("clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)", 0.1),
     "sphere": ("clvoro.Sphere(1.0)", 0.08),
@@ -95,20 +89,11 @@ PLACE = ROOT / "clvoro" / "opencl" / "first_kernels.json"
 
 def in_process(code: str, cache: str | None) -> object:
     """Run `code` in a separate process, with kernel caches in `cache`; return what it prints."""
-    env = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
-    }
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     if cache is not None:
-        env |= {
-            "POCL_CACHE_DIR": f"{cache}/pocl",
-            "XDG_CACHE_HOME": cache,
-            "CUDA_CACHE_PATH": f"{cache}/cuda",
-        }
+        env |= {"POCL_CACHE_DIR": f"{cache}/pocl", "XDG_CACHE_HOME": cache, "CUDA_CACHE_PATH": f"{cache}/cuda"}
         Path(cache, "pocl").mkdir(exist_ok=True)
-    ended = subprocess.run(
-        [sys.executable, "-c", code], env=env, check=True, capture_output=True, text=True
-    )
+    ended = subprocess.run([sys.executable, "-c", code], env=env, check=True, capture_output=True, text=True)
     return json.loads(ended.stdout.splitlines()[-1])
 
 
@@ -133,15 +118,11 @@ def write_record() -> None:
 
 def main() -> None:
     """Print the medians, or write the record."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeat", type=int, default=3, help="processes for each kind (3)")
     parser.add_argument("--warm", action="store_true", help="with full caches as well")
     parser.add_argument("--record", action="store_true", help="write the record of kernels")
-    parser.add_argument(
-        "--json", action="store_true", help="print one JSON object per line instead"
-    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object per line instead")
     options = parser.parse_args()
     if options.record:
         write_record()
@@ -159,10 +140,7 @@ def main() -> None:
         for state, runs in found.items():
             if not runs:
                 continue
-            wall, busy = (
-                {name: statistics.median(r[name][i] for r in runs) for name in runs[0]}
-                for i in (0, 1)
-            )
+            wall, busy = ({name: statistics.median(r[name][i] for r in runs) for name in runs[0]} for i in (0, 1))
             total, used = (sum(x[name] for name in ("adapter", "run")) for x in (wall, busy))
             if options.json:
                 print(json.dumps({"kind": kind, "cache": state, **wall, "processor": used}))

@@ -25,7 +25,7 @@ from clvoro import sizing
 COUNT = 40
 BASIN = clvoro.Polygon(
     [(0, 0), (900, -150), (1800, 50), (2700, -100), (3500, 100), (3600, 1500), (2400, 2300), (600, 2100), (-200, 900)]
-)  # fmt: skip
+)
 WELLS = np.array([(900, 500), (1400, 700), (1900, 500), (2400, 700)])
 KINDS: dict[str, tuple[clvoro.Box | clvoro.Polygon, Any]] = {
     "box": (clvoro.Box((0, 0), (1, 1)), sizing.Expression("0.008 + 0.02 * x")),
@@ -36,9 +36,7 @@ KINDS: dict[str, tuple[clvoro.Box | clvoro.Polygon, Any]] = {
     "polygon": (BASIN, sizing.Expression("30 + 0.01 * fmax(x, 0.0)")),
     "wells": (
         BASIN,
-        sizing.minimum(
-            *(sizing.Distance(sizing.Circle(w, 1), h_min=6, growth=1.15, h_max=120) for w in WELLS)
-        ),
+        sizing.minimum(*(sizing.Distance(sizing.Circle(w, 1), h_min=6, growth=1.15, h_max=120) for w in WELLS)),
     ),
     "3D": (clvoro.Box((0, 0, 0), (1, 1, 1)), sizing.Expression("0.05 + 0.03 * x")),
 }
@@ -70,10 +68,7 @@ def main() -> int:
         warnings.simplefilter("ignore", clvoro.errors.MismatchWarning)
         for case, domain, fixed, h in near_cases():
             along = h * np.eye(domain.dim)[0]
-            meshes = [
-                adapter.run(domain, h, fixed=fixed + 0.4 * k * along, seed=s)
-                for k, s in enumerate(seeds)
-            ]
+            meshes = [adapter.run(domain, h, fixed=fixed + 0.4 * k * along, seed=s) for k, s in enumerate(seeds)]
             add(report, case, meshes, "fixed", "beside")
         report.finish(heading(adapter, "Generators near a wall or near each other"))
         return 0
@@ -132,9 +127,16 @@ def add(report: Report, case: str, meshes: list[clvoro.Result], *parts: str) -> 
             found.append(np.column_stack([np.abs(mesh.size_error), mesh.quality, off])[of])
         e, q, off = np.concatenate(found).T
         record = {
-            "case": case, "part": part, "cells": len(meshes[0]), "mean_error": e.mean(), "max_error": e.max(),
-            "mean_quality": q.mean(), "min_quality": q.min(), "mean_off": off.mean(), "max_off": off.max(),
-        }  # fmt: skip
+            "case": case,
+            "part": part,
+            "cells": len(meshes[0]),
+            "mean_error": e.mean(),
+            "max_error": e.max(),
+            "mean_quality": q.mean(),
+            "min_quality": q.min(),
+            "mean_off": off.mean(),
+            "max_off": off.max(),
+        }
         report.add(record, f"{case}: {part}")
 
 

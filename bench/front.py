@@ -32,19 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import (
-    BOX,
-    FIRST_SEED,
-    PICTURES,
-    Report,
-    figures,
-    heading,
-    make_adapter,
-    parser,
-    shown,
-    test_field,
-    work,
-)
+from _common import BOX, FIRST_SEED, PICTURES, Report, figures, heading, make_adapter, parser, shown, test_field, work
 from _remeshers import MissingPeerError, vertices_gmsh
 from peers import judge, mesh_peer
 
@@ -54,11 +42,7 @@ FIELDS = ("F3", "circles", "ridge")
 REPEATED = 100
 """Steps of the methods that repeat one kind of step."""
 
-NOTES = (
-    ("JIGSAW", 0.0185, 0.9944),
-    ("JIGSAW, 64 passes", 0.0270, 0.9961),
-    ("MMG2D", 0.056, 0.965),
-)
+NOTES = (("JIGSAW", 0.0185, 0.9944), ("JIGSAW, 64 passes", 0.0270, 0.9961), ("MMG2D", 0.056, 0.965))
 """Published meshers on this field: name, mean |e|, mean Q. Given, not measured by this script."""
 
 ERROR_TARGETS = {
@@ -88,9 +72,7 @@ slopes from 0.15 to 0.25), so that we compare on a field that is less steep and 
 
 SMOOTH = {"mean_error": 0.004, "mean_quality": 0.99, "min_quality": 0.92}
 STEEP = {"mean_error": 0.015, "mean_quality": 0.985, "min_quality": 0.92}
-CHOSEN = {
-    "F2": SMOOTH, "F3": SMOOTH, "circles": STEEP, "ridge": STEEP, "steep circles": STEEP, "steep ridge": STEEP,
-}  # fmt: skip
+CHOSEN = {"F2": SMOOTH, "F3": SMOOTH, "circles": STEEP, "ridge": STEEP, "steep circles": STEEP, "steep ridge": STEEP}
 """Goals of runs without any argument."""
 LARGEST_ERROR = 0.25
 
@@ -108,11 +90,7 @@ def plan(best: bool) -> list[tuple[str, str, dict[str, Any]]]:
     points: list[tuple[str, str, dict[str, Any]]] = []
     for method in ("lloyd", "weighted-lloyd", "poisson", "coupled", "weighted"):
         points.append(
-            (
-                method,
-                method,
-                {"method": method, "max_steps": REPEATED, "options": clvoro.PaperOptions(tol=0)},
-            )
+            (method, method, {"method": method, "max_steps": REPEATED, "options": clvoro.PaperOptions(tol=0)})
         )
     efforts = [e for e in ERROR_TARGETS if best or e != "best"]
     for effort in efforts:
@@ -126,12 +104,7 @@ def plan(best: bool) -> list[tuple[str, str, dict[str, Any]]]:
 
 
 def measure(
-    adapter: clvoro.Adapter,
-    field: str,
-    group: str,
-    name: str,
-    arguments: dict[str, Any],
-    seeds: int,
+    adapter: clvoro.Adapter, field: str, group: str, name: str, arguments: dict[str, Any], seeds: int
 ) -> tuple[dict[str, Any], clvoro.Result]:
     """Return the record of one point, medians over the seeds, and the first seed's result."""
     runs, first = [], None
@@ -140,10 +113,9 @@ def measure(
         result = adapter.run(BOX, test_field(field), seed=FIRST_SEED + 17 * k, **arguments)
         seconds = time.perf_counter() - start
         first = first or result
-        runs.append({
-            **figures(result.diagram, result.target_size, result.quality), **work(result.history),
-            "seconds": seconds,
-        })  # fmt: skip
+        runs.append(
+            {**figures(result.diagram, result.target_size, result.quality), **work(result.history), "seconds": seconds}
+        )
     medians = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
     assert first is not None
     return {"group": group, "name": name, **medians}, first
@@ -189,34 +161,57 @@ def draw_front(records: list[dict[str, Any]], path: Path, caption: str) -> None:
             if group.startswith("adaptive"):
                 line = sorted(mine, key=lambda r: r["mean_error"])
                 ax.plot(
-                    [r["mean_error"] for r in line], [1 - r["mean_quality"] for r in line],
-                    color=color, linewidth=1, alpha=0.6, zorder=2,
-                )  # fmt: skip
+                    [r["mean_error"] for r in line],
+                    [1 - r["mean_quality"] for r in line],
+                    color=color,
+                    linewidth=1,
+                    alpha=0.6,
+                    zorder=2,
+                )
             for k, r in enumerate(mine):
                 own = not group.startswith("adaptive") or "target" not in r["name"]
                 # The paper's methods are drawn larger: theirs may lie under another marker.
                 ax.scatter(
-                    r["mean_error"], 1 - r["mean_quality"], marker=marker,
+                    r["mean_error"],
+                    1 - r["mean_quality"],
+                    marker=marker,
                     s=18 if not own else 90 if group in PAPER else 46,
-                    color=color, edgecolor="white", linewidth=0.6, zorder=4 if own else 3,
+                    color=color,
+                    edgecolor="white",
+                    linewidth=0.6,
+                    zorder=4 if own else 3,
                     label=label if k == 0 else None,
-                )  # fmt: skip
+                )
         for k, (name, error, quality) in enumerate(NOTES):
             ax.scatter(
-                error, 1 - quality, marker="*", s=90, facecolor="none", edgecolor="#1A1A1A",
-                linewidth=0.9, zorder=3,
+                error,
+                1 - quality,
+                marker="*",
+                s=90,
+                facecolor="none",
+                edgecolor="#1A1A1A",
+                linewidth=0.9,
+                zorder=3,
                 label="notes: given figures,\nnot measured here*" if k == 0 else None,
-            )  # fmt: skip
+            )
             ax.annotate(
-                name.replace(", ", ",\n"), (error, 1 - quality), xytext=(8, 0),
-                textcoords="offset points", fontsize=7.5, va="center",
-            )  # fmt: skip
+                name.replace(", ", ",\n"),
+                (error, 1 - quality),
+                xytext=(8, 0),
+                textcoords="offset points",
+                fontsize=7.5,
+                va="center",
+            )
         for r in records:
             if r["group"] == "exact":
                 ax.annotate(
-                    r["name"].split()[-1], (r["mean_error"], 1 - r["mean_quality"]),
-                    xytext=(6, 2), textcoords="offset points", fontsize=7, color="#8A4A73",
-                )  # fmt: skip
+                    r["name"].split()[-1],
+                    (r["mean_error"], 1 - r["mean_quality"]),
+                    xytext=(6, 2),
+                    textcoords="offset points",
+                    fontsize=7,
+                    color="#8A4A73",
+                )
         ax.set_xscale("log")
         ax.set_xlim(right=0.3)
         ax.set_yscale("log")
@@ -226,16 +221,24 @@ def draw_front(records: list[dict[str, Any]], path: Path, caption: str) -> None:
         ax.grid(which="minor", linewidth=0.25, alpha=0.25)
         ax.set_axisbelow(True)
         ax.annotate(
-            "better", xy=(0.015, 0.02), xytext=(0.085, 0.095), xycoords="axes fraction",
-            textcoords="axes fraction", fontsize=8, color="#777777",
+            "better",
+            xy=(0.015, 0.02),
+            xytext=(0.085, 0.095),
+            xycoords="axes fraction",
+            textcoords="axes fraction",
+            fontsize=8,
+            color="#777777",
             arrowprops={"arrowstyle": "->", "color": "#777777", "linewidth": 0.8},
-        )  # fmt: skip
+        )
         ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, labelspacing=0.7)
         ax.set_title(caption, loc="left", fontsize=8)
         figure.supxlabel(
             "* e after one global factor on h. Every other point is measured by this script: "
-            "absolute size field, but one factor for Gmsh.", fontsize=7, x=0.01, ha="left",
-        )  # fmt: skip
+            "absolute size field, but one factor for Gmsh.",
+            fontsize=7,
+            x=0.01,
+            ha="left",
+        )
         figure.savefig(path, dpi=220)
 
 
@@ -264,8 +267,9 @@ def draw_defects(results: dict[str, clvoro.Result], path: Path) -> None:
                 f"({'abcd'[k]}) {title}: {f['six_sided']:.1%} six-sided\n"
                 f"mean |e| {error:.4f}, mean Q {f['mean_quality']:.4f}, "
                 f"min Q {f['min_quality']:.2f}",
-                fontsize=8, loc="left",
-            )  # fmt: skip
+                fontsize=8,
+                loc="left",
+            )
         for ax in axes[len(panels) :]:
             ax.set_axis_off()
         colors = COLORINGS["sides"].color_map.colors
@@ -275,15 +279,16 @@ def draw_defects(results: dict[str, clvoro.Result], path: Path) -> None:
                 Patch(facecolor=c, edgecolor="#1A1A1A", linewidth=0.4, label=label)
                 for c, label in zip(colors, labels, strict=True)
             ],
-            loc="outside lower center", ncols=5, frameon=False, handlelength=1.2,
-        )  # fmt: skip
+            loc="outside lower center",
+            ncols=5,
+            frameon=False,
+            handlelength=1.2,
+        )
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=300)
     # Few colors: a palette makes the file several times smaller.
     with Image.open(drawn) as image:
-        image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE).save(
-            path, optimize=True, dpi=(300, 300)
-        )
+        image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE).save(path, optimize=True, dpi=(300, 300))
 
 
 COLUMNS = {
@@ -299,9 +304,7 @@ COLUMNS = {
 }
 
 
-def run_all(
-    adapter: clvoro.Adapter, options: argparse.Namespace, report: Report
-) -> dict[str, clvoro.Result]:
+def run_all(adapter: clvoro.Adapter, options: argparse.Namespace, report: Report) -> dict[str, clvoro.Result]:
     kept: dict[str, clvoro.Result] = {}
     drawn = {key for key, _ in DEFECTS}
     for group, name, arguments in plan(options.best):
@@ -325,9 +328,7 @@ def goal_runs(best: bool) -> list[tuple[str, str, dict[str, Any], dict[str, floa
             aimed = {"effort": effort, "options": clvoro.MultilevelOptions(error_target=target)}
             passes = "64 passes" if effort == "best" else "default"
             goals = {"mean_error": error / 2, "mean_quality": mean, "min_quality": least}
-            runs.append(
-                (field, f"{effort}, target {target:g}, against JIGSAW, {passes}", aimed, goals)
-            )
+            runs.append((field, f"{effort}, target {target:g}, against JIGSAW, {passes}", aimed, goals))
     return runs
 
 
@@ -363,12 +364,8 @@ def main() -> int:
     options_of = parser(__doc__)
     options_of.add_argument("--field", choices=FIELDS, default="F3")
     options_of.add_argument("--seeds", type=int, default=1, metavar="N", help="medians over N (1)")
-    options_of.add_argument(
-        "--best", action=argparse.BooleanOptionalAction, default=True, help='effort "best" too'
-    )
-    options_of.add_argument(
-        "--goals", action="store_true", help="compare with the goals on several fields"
-    )
+    options_of.add_argument("--best", action=argparse.BooleanOptionalAction, default=True, help='effort "best" too')
+    options_of.add_argument("--goals", action="store_true", help="compare with the goals on several fields")
     options_of.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
     options_of.add_argument("--records", type=Path, metavar="FILE")
     options = options_of.parse_args()
@@ -390,9 +387,10 @@ def main() -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         cells = statistics.median(r["cells"] for r in report.records)
         draw_front(
-            report.records, options.out / "front.png",
+            report.records,
+            options.out / "front.png",
             f"F3: sizes 1 : 7.5, {cells:,.0f} cells. Small markers: runs with an error_target",
-        )  # fmt: skip
+        )
         if results:
             draw_defects(results, options.out / "defects.png")
     report.finish(heading(adapter, f"Size against quality on {options.field}"))

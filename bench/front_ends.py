@@ -20,18 +20,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from _common import (
-    BOX,
-    FIRST_SEED,
-    Report,
-    figures,
-    heading,
-    make_adapter,
-    names,
-    parser,
-    shown,
-    test_field,
-)
+from _common import BOX, FIRST_SEED, Report, figures, heading, make_adapter, names, parser, shown, test_field
 from scipy.fft import dctn, idctn
 from scipy.interpolate import RectBivariateSpline
 
@@ -52,9 +41,7 @@ def smoothed(field: clvoro.sizing.Field, change: float) -> Callable[[np.ndarray]
     places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     log_h = np.log(np.asarray(field(places.reshape(-1, 2)))).reshape(GRID)
     modes = dctn(log_h, norm="ortho")
-    k2 = np.add.outer(
-        *((np.pi * np.arange(n) / length) ** 2 for n, length in zip(GRID, extent, strict=True))
-    )
+    k2 = np.add.outer(*((np.pi * np.arange(n) / length) ** 2 for n, length in zip(GRID, extent, strict=True)))
 
     def apply(strength: float) -> tuple[float, np.ndarray]:
         made = idctn(modes / (1 + strength * k2**2), norm="ortho")
@@ -68,14 +55,10 @@ def smoothed(field: clvoro.sizing.Field, change: float) -> Callable[[np.ndarray]
     return lambda p: np.exp(spline.ev(p[:, 0], p[:, 1]))
 
 
-def runs_on(
-    adapter: clvoro.Adapter, field: clvoro.sizing.Field
-) -> dict[str, Callable[[], clvoro.Result]]:
+def runs_on(adapter: clvoro.Adapter, field: clvoro.sizing.Field) -> dict[str, Callable[[], clvoro.Result]]:
     """Return the runs of a field by name."""
 
-    def adapt(
-        size: Any, target: float, free: efforts.Effort | None = None, **more: Any
-    ) -> clvoro.Result:
+    def adapt(size: Any, target: float, free: efforts.Effort | None = None, **more: Any) -> clvoro.Result:
         kept = efforts.EFFORTS["default"]
         try:
             efforts.EFFORTS["default"] = free or kept
@@ -85,9 +68,7 @@ def runs_on(
             efforts.EFFORTS["default"] = kept
 
     unbound = replace(
-        efforts.EFFORTS["default"],
-        loose=efforts.LoosePolish(0.0, STEPS, 0.9),
-        largest_log_ratio_scale=math.inf,
+        efforts.EFFORTS["default"], loose=efforts.LoosePolish(0.0, STEPS, 0.9), largest_log_ratio_scale=math.inf
     )
     lloyd = {"max_steps": STEPS, "options": clvoro.PaperOptions(tol=0)}
     return {
@@ -99,7 +80,7 @@ def runs_on(
             f"smoothed by {change:g}": lambda change=change: adapt(smoothed(field, change), SMOOTHED_TARGET)
             for change in CHANGES
         },
-    }  # fmt: skip
+    }
 
 
 COLUMNS = {

@@ -15,17 +15,7 @@ from __future__ import annotations
 import statistics
 import time
 
-from _common import (
-    BOX,
-    FIRST_SEED,
-    Report,
-    figures,
-    heading,
-    make_adapter,
-    parser,
-    shown,
-    test_field,
-)
+from _common import BOX, FIRST_SEED, Report, figures, heading, make_adapter, parser, shown, test_field
 
 import clvoro
 
@@ -68,12 +58,16 @@ def main() -> None:
     report = Report(options.json, COLUMNS)
     for (effort, target, peer), mesh, taken in zip(RUNS, meshes, times, strict=True):
         ratio = statistics.median(t / unit for t, unit in zip(taken, times[0], strict=True))
-        report.add({
-            "run": effort if target is None else f"{effort}, target {target:g}",
-            **figures(mesh.diagram, mesh.target_size, mesh.quality), "seconds": statistics.median(taken),
-            "ratio": ratio, "against": "" if peer is None else f"{peer[0]}, {peer[1]:g} s",
-            "over": None if peer is None else ratio * YARDSTICK / peer[1],
-        })  # fmt: skip
+        report.add(
+            {
+                "run": effort if target is None else f"{effort}, target {target:g}",
+                **figures(mesh.diagram, mesh.target_size, mesh.quality),
+                "seconds": statistics.median(taken),
+                "ratio": ratio,
+                "against": "" if peer is None else f"{peer[0]}, {peer[1]:g} s",
+                "over": None if peer is None else ratio * YARDSTICK / peer[1],
+            }
+        )
     report.finish(heading(adapter, "Two circles: time in units of the default"))
 
 

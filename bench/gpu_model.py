@@ -93,9 +93,17 @@ class Device(NamedTuple):
 
 
 H200 = Device(
-    "H200", units=132, warps=64, registers=65536, clock=1.98e9, bandwidth=0.7 * 4.8e12, cached=5.5e12, flops=34e12,
-    first_cache=192e3, second_cache=50e6,
-)  # fmt: skip
+    "H200",
+    units=132,
+    warps=64,
+    registers=65536,
+    clock=1.98e9,
+    bandwidth=0.7 * 4.8e12,
+    cached=5.5e12,
+    flops=34e12,
+    first_cache=192e3,
+    second_cache=50e6,
+)
 LAUNCH, MOVE = 40e-6, 57e-6
 """Seconds of the host for a launch, with its arguments and the Python around it, and for a copy, fill or read.
 
@@ -133,17 +141,20 @@ def kernel_records(adapter_of: dict[str, object]) -> list[dict[str, object]]:
                 if gpu_programs.can_measure(vendor)
             }
         if not by_vendor:
-            raise SystemExit(
-                "neither clang, libclc and ptxas nor clang and libclc are installed; see --help"
-            )
+            raise SystemExit("neither clang, libclc and ptxas nor clang and libclc are installed; see --help")
         for i, source in enumerate(sources):
             found = {vendor: answers[i][1] for vendor, answers in by_vendor.items()}
             for kernel in next(iter(found.values())):
-                records.append({
-                    "file": source.name.removesuffix(".cl"), "kernel": kernel, "dim": source.macro("DIM") or "-",
-                    "dtype": dtype, "options": source.options,
-                    **{vendor: each[kernel]._asdict() for vendor, each in found.items()},
-                })  # fmt: skip
+                records.append(
+                    {
+                        "file": source.name.removesuffix(".cl"),
+                        "kernel": kernel,
+                        "dim": source.macro("DIM") or "-",
+                        "dtype": dtype,
+                        "options": source.options,
+                        **{vendor: each[kernel]._asdict() for vendor, each in found.items()},
+                    }
+                )
     return records
 
 
@@ -160,24 +171,21 @@ def largest(records: list[dict]) -> list[dict]:
 
 
 def _row(r: dict) -> list[str]:
-    own = [
-        r["file"].rpartition("/")[2] + "." + r["kernel"],
-        r["dim"],
-        r["dtype"][5:],
-        str(r["variants"]),
-    ]
+    own = [r["file"].rpartition("/")[2] + "." + r["kernel"], r["dim"], r["dtype"][5:], str(r["variants"])]
     nvidia, amd = r.get("NVIDIA"), r.get("AMD")
     if nvidia:
         resident = H200.units * H200.warps * 32 * nvidia["private"] / 2**30
         own += [
-            str(nvidia["registers"]), str(nvidia["spills"]), f"{nvidia['private']:,}", f"{nvidia['local']:,}",
-            str(H200.resident_warps(nvidia["registers"], nvidia["local"])), f"{resident:.2f} GiB",
-        ]  # fmt: skip
+            str(nvidia["registers"]),
+            str(nvidia["spills"]),
+            f"{nvidia['private']:,}",
+            f"{nvidia['local']:,}",
+            str(H200.resident_warps(nvidia["registers"], nvidia["local"])),
+            f"{resident:.2f} GiB",
+        ]
     else:
         own += ["-"] * 6
-    return own + (
-        [str(amd["registers"]), str(amd["spills"]), f"{amd['private']:,}"] if amd else ["-"] * 3
-    )
+    return own + ([str(amd["registers"]), str(amd["spills"]), f"{amd['private']:,}"] if amd else ["-"] * 3)
 
 
 def kernel_table(rows: list[dict], registers: int, private: int, everything: bool) -> str:
@@ -185,9 +193,7 @@ def kernel_table(rows: list[dict], registers: int, private: int, everything: boo
 
     def is_large(r: dict) -> bool:
         figures = [r[v] for v in gpu_programs.FIGURES if v in r]
-        return any(
-            f["registers"] > registers or f["private"] > private or f["spills"] for f in figures
-        )
+        return any(f["registers"] > registers or f["private"] > private or f["spills"] for f in figures)
 
     shown = [r for r in rows if everything or is_large(r)]
     rest = [r for r in rows if not (everything or is_large(r))]
@@ -198,16 +204,23 @@ def kernel_table(rows: list[dict], registers: int, private: int, everything: boo
         most = {v: {k: max(r[v][k] for r in rest) for k in rest[0][v]} for v in vendors}
         name = f"the other {len({(r['file'], r['kernel']) for r in rest})} kernels, largest"
         total = sum(r["variants"] for r in rest)
-        lines.append(
-            _row(
-                {"file": "", "kernel": name, "dim": "", "dtype": " " * 5, "variants": total, **most}
-            )
-        )
+        lines.append(_row({"file": "", "kernel": name, "dim": "", "dtype": " " * 5, "variants": total, **most}))
         lines[-1][0] = name
     header = [
-        "kernel", "dim", "bits", "variants", "registers", "spills", "private", "local", "warps", "resident",
-        "VGPRs", "AMD spills", "AMD private",
-    ]  # fmt: skip
+        "kernel",
+        "dim",
+        "bits",
+        "variants",
+        "registers",
+        "spills",
+        "private",
+        "local",
+        "warps",
+        "resident",
+        "VGPRs",
+        "AMD spills",
+        "AMD private",
+    ]
     return markdown(header, lines)
 
 
@@ -233,19 +246,14 @@ class Term(NamedTuple):
         return max(self._fields[2:], key=lambda name: getattr(self, name))
 
 
-def work_of(
-    pair: list[dict[str, Any]], kernel: str, items: float, n: float, calls: float
-) -> dict[str, float] | None:
+def work_of(pair: list[dict[str, Any]], kernel: str, items: float, n: float, calls: float) -> dict[str, float] | None:
     """Return the work of one of `calls` over `items` work-items for `n` cells, from that counted at two sizes."""
     few, many = (each["kernels"][kernel] for each in pair)
     names_of = [name for name in many if name not in ("launches", "items")]
     if kernel.startswith("update_cells"):
         # Launches have room for more cells than are updated again: the work of all launches is that of the cells.
         return {k: many[k] / pair[1]["cells"] * n / calls for k in names_of}
-    (_, f), (j, g) = (
-        (w["items"] / w["launches"], {k: w[k] / w["launches"] for k in names_of})
-        for w in (few, many)
-    )
+    (_, f), (j, g) = ((w["items"] / w["launches"], {k: w[k] / w["launches"] for k in names_of}) for w in (few, many))
     if not is_fixed(pair, kernel):
         return {k: g[k] / j * items for k in names_of}
     # Each work-item has a fixed share, and its part of the cells.
@@ -257,11 +265,7 @@ def work_of(
 def is_fixed(pair: list[dict[str, Any]], kernel: str) -> bool:
     """Return whether `kernel` has as many work-items for any number of cells: it works in blocks, or in one group."""
     sizes = [w["items"] / w["launches"] for w in (each["kernels"][kernel] for each in pair)]
-    return sizes[0] == sizes[1] and sizes[0] in (
-        gpu_steps.COUNTED_ITEMS,
-        gpu_steps.COUNTED_GROUP,
-        1,
-    )
+    return sizes[0] == sizes[1] and sizes[0] in (gpu_steps.COUNTED_ITEMS, gpu_steps.COUNTED_GROUP, 1)
 
 
 def term(
@@ -278,8 +282,7 @@ def term(
     private = figures.private if figures else 0
     units = min(device.units, max(items / launches.group, 1))
     warps = min(
-        device.resident_warps(registers, figures.local if figures else 0, launches.group),
-        max(items / 32 / units, 1),
+        device.resident_warps(registers, figures.local if figures else 0, launches.group), max(items / 32 / units, 1)
     )
     working = WORKING_IN_CLIPS if kernel.startswith("clip_") else WORKING
     if kernel.endswith("_by_teams"):
@@ -302,22 +305,15 @@ def term(
                 work["instructions"] / (128 * rate),
                 work["real"] / (rate / device.clock * device.flops / 2 / device.units),
                 work["accesses"] / (LANES_PER_CYCLE * units * device.clock),
-                max(
-                    moved / (device.bandwidth * share), (loaded + spilled) / (device.cached * share)
-                ),
-                (CYCLES * work["instructions"] + CYCLES_OF_ACCESS * work["accesses"])
-                / items
-                / device.clock,
+                max(moved / (device.bandwidth * share), (loaded + spilled) / (device.cached * share)),
+                (CYCLES * work["instructions"] + CYCLES_OF_ACCESS * work["accesses"]) / items / device.clock,
             )
         ),
     )
 
 
 def modeled(
-    found: gpu_steps.Commands,
-    pair: list[dict[str, Any]],
-    figures: dict[str, gpu_programs.Figures],
-    n: float,
+    found: gpu_steps.Commands, pair: list[dict[str, Any]], figures: dict[str, gpu_programs.Figures], n: float
 ) -> tuple[list[Term], list[str]]:
     """Return the times of the kernels of a step of `n` cells on an H200, and kernels that were not counted."""
     terms, missing = [], []
@@ -333,9 +329,7 @@ def modeled(
     return sorted(terms, key=lambda t: -t.total), missing
 
 
-def step_records(
-    adapter: Any, sizes: list[int], measured_at: dict[int, int]
-) -> list[dict[str, Any]]:
+def step_records(adapter: Any, sizes: list[int], measured_at: dict[int, int]) -> list[dict[str, Any]]:
     """Return the modeled time of each kind of step and of a new diagram, in 2D and 3D."""
     counted = gpu_steps.load_counts()
     records = []
@@ -363,18 +357,25 @@ def step_records(
                 moves = found.copies + found.reads
                 host = LAUNCH * (found.count - found.copies) + MOVE * moves
                 total = max(device, host)
-                records.append({
-                    "dim": dim, "part": kind if part == "step" else "new diagram", "cells": n, "seconds": total,
-                    "device": device, "host": host, "launches": found.count, "reads": found.reads, "rate": n / total,
-                    "missing": missing,
-                    "kernels": [{**t._asdict(), "total": t.total, "limit": t.limit} for t in terms],
-                })  # fmt: skip
+                records.append(
+                    {
+                        "dim": dim,
+                        "part": kind if part == "step" else "new diagram",
+                        "cells": n,
+                        "seconds": total,
+                        "device": device,
+                        "host": host,
+                        "launches": found.count,
+                        "reads": found.reads,
+                        "rate": n / total,
+                        "missing": missing,
+                        "kernels": [{**t._asdict(), "total": t.total, "limit": t.limit} for t in terms],
+                    }
+                )
     return records
 
 
-def path_records(
-    adapter: Any, measured_at: dict[int, int], repeat: int = 3
-) -> list[dict[str, Any]]:
+def path_records(adapter: Any, measured_at: dict[int, int], repeat: int = 3) -> list[dict[str, Any]]:
     """Return the processor time of steps and new diagrams on a CPU, as it works and in a GPU's groups, by turns."""
     records = []
     for dim, kind in gpu_steps.COUNTED:
@@ -395,10 +396,14 @@ def path_records(
                     run.parts[part]()
                     queue.finish()
                     seconds[name].append(time.process_time() - start)
-            records.append({
-                "dim": dim, "part": kind if part == "step" else "new diagram", "cells": runs["own"].n,
-                **{str(name): statistics.median(each) for name, each in seconds.items()},
-            })  # fmt: skip
+            records.append(
+                {
+                    "dim": dim,
+                    "part": kind if part == "step" else "new diagram",
+                    "cells": runs["own"].n,
+                    **{str(name): statistics.median(each) for name, each in seconds.items()},
+                }
+            )
     return records
 
 
@@ -406,25 +411,34 @@ def step_tables(records: list[dict[str, Any]]) -> str:
     """Return the table of times, and that of the longest kernels at the largest size."""
     rows = [
         [
-            f"{r['part']}, {r['dim']}D", f"{r['cells']:.0e}".replace("+0", ""), f"{r['launches']:.0f}",
-            f"{r['reads']:.0f}", f"{1e3 * r['device']:.2f}", f"{1e3 * r['host']:.2f}", f"{1e-6 * r['rate']:.0f}",
+            f"{r['part']}, {r['dim']}D",
+            f"{r['cells']:.0e}".replace("+0", ""),
+            f"{r['launches']:.0f}",
+            f"{r['reads']:.0f}",
+            f"{1e3 * r['device']:.2f}",
+            f"{1e3 * r['host']:.2f}",
+            f"{1e-6 * r['rate']:.0f}",
         ]
         for r in records
-    ]  # fmt: skip
-    text = markdown(
-        ["part", "cells", "launches", "reads", "kernels, ms", "host, ms", "M cells/s"], rows
-    )
+    ]
+    text = markdown(["part", "cells", "launches", "reads", "kernels, ms", "host, ms", "M cells/s"], rows)
     largest_n = max(r["cells"] for r in records)
     lines = []
     for r in records:
         if r["cells"] == largest_n:
             for k in r["kernels"][:4]:
                 share = k["total"] / r["device"]
-                lines.append([
-                    f"{r['part']}, {r['dim']}D", k["kernel"], f"{k['calls']:.0f}", f"{1e3 * k['total']:.2f}",
-                    f"{share:.0%}", k["limit"],
-                    *(f"{1e3 * k[name]:.2f}" for name in Term._fields[2:]),
-                ])  # fmt: skip
+                lines.append(
+                    [
+                        f"{r['part']}, {r['dim']}D",
+                        k["kernel"],
+                        f"{k['calls']:.0f}",
+                        f"{1e3 * k['total']:.2f}",
+                        f"{share:.0%}",
+                        k["limit"],
+                        *(f"{1e3 * k[name]:.2f}" for name in Term._fields[2:]),
+                    ]
+                )
     header = ["part", "kernel", "calls", "ms", "share", "limit", *Term._fields[2:]]
     missing = sorted({kernel for r in records for kernel in r["missing"]})
     note = f"\n\nNot counted: {', '.join(missing)}." if missing else ""
@@ -433,23 +447,21 @@ def step_tables(records: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     options_of = parser(__doc__)
-    options_of.add_argument(
-        "--parts", type=names, default=["kernels", "steps"], help="kernels, steps"
-    )
+    options_of.add_argument("--parts", type=names, default=["kernels", "steps"], help="kernels, steps")
     options_of.add_argument("--dtypes", type=names, default=list(DTYPES))
     options_of.add_argument("--all", action="store_true", help="show every kernel")
     options_of.add_argument("--registers", type=int, default=128)
     options_of.add_argument("--private", type=int, default=512, metavar="BYTES")
     options_of.add_argument("--sizes", type=counts, default=[10**6, 10**7], help="of the model")
     options_of.add_argument(
-        "--measured-at", type=counts, default=[10**5, 3 * 10**4], metavar="N,N",
-        help="cells of the meshes whose launches are counted, in 2D and 3D",
-    )  # fmt: skip
-    options_of.add_argument(
-        "--count",
+        "--measured-at",
         type=counts,
-        metavar="DIMS",
-        help=f"write {gpu_steps.COUNTS.name}, by Oclgrind: 2,3",
+        default=[10**5, 3 * 10**4],
+        metavar="N,N",
+        help="cells of the meshes whose launches are counted, in 2D and 3D",
+    )
+    options_of.add_argument(
+        "--count", type=counts, metavar="DIMS", help=f"write {gpu_steps.COUNTS.name}, by Oclgrind: 2,3"
     )
     options_of.add_argument("--count-one", type=names, help=argparse.SUPPRESS)
     options = options_of.parse_args()
@@ -480,19 +492,12 @@ def main() -> None:
         else:
             print(
                 "\n"
-                + heading(
-                    adapter,
-                    "Milliseconds of processor time as a CPU works, and in the groups of a GPU",
-                )
+                + heading(adapter, "Milliseconds of processor time as a CPU works, and in the groups of a GPU")
                 + "\n"
             )
             columns = ["own", *map(str, GROUPS)]
             lines = [
-                [
-                    f"{r['part']}, {r['dim']}D",
-                    f"{r['cells']:,}",
-                    *(f"{1e3 * r[c]:.0f}" for c in columns),
-                ]
+                [f"{r['part']}, {r['dim']}D", f"{r['cells']:,}", *(f"{1e3 * r[c]:.0f}" for c in columns)]
                 for r in records
             ]
             print(markdown(["part", "cells", "own groups", *(f"{g} items" for g in GROUPS)], lines))
@@ -501,9 +506,7 @@ def main() -> None:
         if options.json:
             print(*map(json.dumps, records), sep="\n")
         else:
-            print(
-                "\n" + heading(adapter, "Model of an H200; launches counted on this device") + "\n"
-            )
+            print("\n" + heading(adapter, "Model of an H200; launches counted on this device") + "\n")
             print(step_tables(records))
 
 

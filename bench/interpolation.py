@@ -88,9 +88,7 @@ def interpolation_error(
     return {"l1": first, "l2": math.sqrt(second), "largest": largest}
 
 
-def adapted_size(
-    u: Callable[[np.ndarray], np.ndarray], n: int, p: float, growth: float, h_max: float
-) -> sizing.Field:
+def adapted_size(u: Callable[[np.ndarray], np.ndarray], n: int, p: float, growth: float, h_max: float) -> sizing.Field:
     """Return the size field by the Hessian of `u`."""
     along = np.linspace(0, 1, RASTER)
     values = u(np.stack(np.meshgrid(along, along), axis=-1))
@@ -139,11 +137,14 @@ def main(arguments: list[str] | None = None) -> int:
             start = time.perf_counter()
             result = adapter.run(BOX, field, n_cells=n, effort=options.effort, seed=FIRST_SEED)
             record: dict[str, Any] = {
-                "mesh": name, "cells": len(result.points), "seconds": time.perf_counter() - start,
-                "least": float(result.target_size.min()), "most": float(result.target_size.max()),
+                "mesh": name,
+                "cells": len(result.points),
+                "seconds": time.perf_counter() - start,
+                "least": float(result.target_size.min()),
+                "most": float(result.target_size.max()),
                 "quality": float(result.quality.mean()),
                 **interpolation_error(result.diagram, u, 0.5 / options.steepness),
-            }  # fmt: skip
+            }
             uniform = uniform or record
             last = before.get(name)
             for norm in ("l1", "l2"):

@@ -18,16 +18,7 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from _common import (
-    Report,
-    counts,
-    domain_of,
-    heading,
-    make_adapter,
-    markdown,
-    parser,
-    test_field,
-)
+from _common import Report, counts, domain_of, heading, make_adapter, markdown, parser, test_field
 
 import clvoro
 from clvoro.adaptation.methods import Method, ProjectedMethod, WeightedMethod
@@ -65,9 +56,7 @@ def name_of(method: Method) -> str:
     assert isinstance(method, ProjectedMethod)
     if method.gradient_from_field:
         return "exact"
-    return {"lloyd": "glide", "quality": "polish", "edges": "separate", "surface": "polish"}[
-        method.descent
-    ]
+    return {"lloyd": "glide", "quality": "polish", "edges": "separate", "surface": "polish"}[method.descent]
 
 
 @contextmanager
@@ -104,16 +93,19 @@ def measure(
         tally.calls.clear()
         tally.bytes.clear()
         iterations = sum(take_step(mesh, method) for _ in range(STEPS))
-    kernels = {
-        f"{stage.split('/')[-1]}.{name}": k / STEPS for (stage, name), k in tally.calls.items()
-    }
+    kernels = {f"{stage.split('/')[-1]}.{name}": k / STEPS for (stage, name), k in tally.calls.items()}
     return {
-        "dim": domain.dim, "cells": mesh.n, "iterations": iterations / STEPS, "launches": tally.launches / STEPS,
-        "reads": tally.reads / STEPS, "writes": tally.writes / STEPS, "bytes": tally.bytes_read / STEPS,
+        "dim": domain.dim,
+        "cells": mesh.n,
+        "iterations": iterations / STEPS,
+        "launches": tally.launches / STEPS,
+        "reads": tally.reads / STEPS,
+        "writes": tally.writes / STEPS,
+        "bytes": tally.bytes_read / STEPS,
         "solve": sum(k for name, k in kernels.items() if name.startswith(SOLVERS)),
         "set_up": sum(k for name, k in kernels.items() if name.startswith(SET_UP)),
         "kernels": kernels,
-    }  # fmt: skip
+    }
 
 
 COLUMNS = {

@@ -28,9 +28,7 @@ COLUMNS = {
     "min Q": lambda r: f"{r['min_quality']:.2f}",
     "accepted": lambda r: f"{r['accepted']:.0f} of {r['masks']}",
 }
-MEANS = [
-    "boundary_mean_error", "inner_mean_error", "boundary_mean_quality", "inner_mean_quality", "min_quality"
-]  # fmt: skip
+MEANS = ["boundary_mean_error", "inner_mean_error", "boundary_mean_quality", "inner_mean_quality", "min_quality"]
 
 
 def main() -> None:

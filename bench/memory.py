@@ -29,17 +29,7 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from _common import (
-    FIRST_SEED,
-    Report,
-    counts,
-    domain_of,
-    heading,
-    make_adapter,
-    names,
-    parser,
-    test_field,
-)
+from _common import FIRST_SEED, Report, counts, domain_of, heading, make_adapter, names, parser, test_field
 from _kinds import CUBE, KINDS, SQUARE, Kind
 
 import clvoro
@@ -114,9 +104,7 @@ def counted_buffers(ledger: Ledger) -> Iterator[None]:
         cl.Buffer = plain  # type: ignore[misc]
 
 
-def peaks(
-    options: Any, work: Callable[[clvoro.Adapter], clvoro.Diagram]
-) -> tuple[clvoro.Diagram, dict[str, int], int]:
+def peaks(options: Any, work: Callable[[clvoro.Adapter], clvoro.Diagram]) -> tuple[clvoro.Diagram, dict[str, int], int]:
     """Do `work` with a new adapter; return its diagram and two peaks in bytes.
 
     The first is that of `work`, by stage, the second that of reading all arrays.
@@ -148,11 +136,17 @@ def measure(options: Any, name: str, n: int, method: str, effort: str) -> dict[s
     cells, run_peak = len(diagram), sum(run.values())
     told = make_adapter(options).memory_needed(domain, field, method=method)
     return {
-        "field": name, "dim": domain.dim, "cells": cells, "method": method, "effort": effort,
-        "run": run_peak / cells, "output": output / cells, "estimate": told / cells,
+        "field": name,
+        "dim": domain.dim,
+        "cells": cells,
+        "method": method,
+        "effort": effort,
+        "run": run_peak / cells,
+        "output": output / cells,
+        "estimate": told / cells,
         "held": max(run_peak, output) / told,
         "stages": {stage: size / cells for stage, size in Counter(run).most_common()},
-    }  # fmt: skip
+    }
 
 
 def measure_kind(options: Any, kind: Kind) -> dict[str, Any]:
@@ -184,9 +178,12 @@ def resumed(options: Any, n: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         file, size = Path(folder) / "state", n**-0.5
         make_adapter(options).run(
-            SQUARE, size, seed=FIRST_SEED, checkpoint=clvoro.Checkpoint(file, every=1e9),
+            SQUARE,
+            size,
+            seed=FIRST_SEED,
+            checkpoint=clvoro.Checkpoint(file, every=1e9),
             callback=lambda row: row["level"] == 0 and row["progress"] > 0.5,
-        )  # fmt: skip
+        )
         return measure_kind(options, (SQUARE, size, {"checkpoint": clvoro.Checkpoint(resume=file)}))
 
 
@@ -202,14 +199,7 @@ def transferred(options: Any, n: int) -> dict[str, Any]:
     engine = Engine(adapter.ctx, adapter.queue, 2, np.dtype("float64" if double else "float32"))
     told = transfer_bytes(engine, *sizes, 1, 2)
     held = ledger.peak / told
-    return {
-        "cells": n,
-        "estimate": told / n,
-        "preparation": 0.0,
-        "run": held,
-        "output": 0.0,
-        "held": held,
-    }
+    return {"cells": n, "estimate": told / n, "preparation": 0.0, "run": held, "output": 0.0, "held": held}
 
 
 OTHERS = {"resumed": resumed, "transfer": transferred}
@@ -222,10 +212,7 @@ def show_kinds(options: Any) -> None:
         "kind": lambda r: r["kind"],
         "cells": lambda r: r["cells"],
         "estimate": lambda r: f"{r['estimate']:.0f}",
-        **{
-            name: lambda r, name=name: f"{r[name]:.2f}"
-            for name in ("preparation", "run", "output", "held")
-        },
+        **{name: lambda r, name=name: f"{r[name]:.2f}" for name in ("preparation", "run", "output", "held")},
     }
     report = Report(options.json, columns)
     for name in (*KINDS, *OTHERS):
@@ -239,12 +226,7 @@ def show_kinds(options: Any) -> None:
                 print(f"{name}, {n} cells: {error}", file=sys.stderr)
                 continue
             report.add({"kind": name, **found}, name)
-    report.finish(
-        heading(
-            make_adapter(options),
-            "Estimate of the device memory, bytes per cell, and its share in use",
-        )
-    )
+    report.finish(heading(make_adapter(options), "Estimate of the device memory, bytes per cell, and its share in use"))
 
 
 def main() -> int:

@@ -80,8 +80,14 @@ def repeated(method: str, **more: Any) -> dict[str, Any]:
 
 
 GRAY, BLUE, SKY, ORANGE, GREEN, PINK, RED = (
-    "#555555", "#0072B2", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D55E00",
-)  # fmt: skip
+    "#555555",
+    "#0072B2",
+    "#56B4E9",
+    "#E69F00",
+    "#009E73",
+    "#CC79A7",
+    "#D55E00",
+)
 WAYS = (
     Way("insertion and deletion", "2.3.1", "P", ORANGE),
     Way("weighted-lloyd", "2.3.2", "v", SKY, repeated("weighted-lloyd")),
@@ -134,9 +140,13 @@ def judge(diagram: clvoro.Diagram, h: np.ndarray) -> dict[str, float]:
     common = float(np.exp(np.log(diagram.volumes ** (1 / d) / h)[off_walls(diagram)].mean()))
     found = figures(diagram, h * common, quality_of(diagram))
     return {
-        "cells": len(diagram), "mean_error": found["mean_error_inner"], "max_error": found["max_error_inner"],
-        "mean_quality": found["mean_quality"], "min_quality": found["min_quality"], "factor": common,
-    }  # fmt: skip
+        "cells": len(diagram),
+        "mean_error": found["mean_error_inner"],
+        "max_error": found["max_error_inner"],
+        "mean_quality": found["mean_quality"],
+        "min_quality": found["min_quality"],
+        "factor": common,
+    }
 
 
 def measure(
@@ -149,12 +159,7 @@ def measure(
     MissingPeerError
     """
     domain, size = domain_of("F1" if name == "paper" else name), field_of(name) * factor
-    record: dict[str, Any] = {
-        "field": name,
-        "method": way.name,
-        "source": way.source,
-        "scale": factor,
-    }
+    record: dict[str, Any] = {"field": name, "method": way.name, "source": way.source, "scale": factor}
     if way.arguments is not None:
         arguments, start = dict(way.arguments), "density"
         if name == "paper" and way.source == "the paper":
@@ -169,9 +174,7 @@ def measure(
         points, steps, changes = insert_delete_smooth(adapter, domain, size, FIRST_SEED)
         record |= {"seconds": time.process_time() - begun, "steps": steps, "changes": changes}
     else:
-        points, record["seconds"] = remesh(
-            MESHERS[way.name], domain, size, round(count_cells(size, domain))
-        )
+        points, record["seconds"] = remesh(MESHERS[way.name], domain, size, round(count_cells(size, domain)))
     diagram = adapter.diagram(domain, points)
     return {**record, **judge(diagram, np.asarray(size(points)))}, diagram
 
@@ -207,10 +210,7 @@ def compact(records: list[dict[str, Any]]) -> str:
     def cell(r: dict[str, Any] | None) -> str:
         if r is None:
             return ""
-        mean, least = (
-            f"{r[key]:.{digits}f}".lstrip("0")
-            for key, digits in (("mean_quality", 3), ("min_quality", 2))
-        )
+        mean, least = (f"{r[key]:.{digits}f}".lstrip("0") for key, digits in (("mean_quality", 3), ("min_quality", 2)))
         text = f"{100 * r['mean_error']:.1f} %<br>{mean} / {least}"
         return text.replace(" ", "\N{NO-BREAK SPACE}")
 
@@ -230,29 +230,37 @@ def growth(records: list[dict[str, Any]]) -> str:
     rows = []
     for way in WAYS:
         pair = [
-            r for scale in (1, GROWTH_FACTOR) for r in records
+            r
+            for scale in (1, GROWTH_FACTOR)
+            for r in records
             if (r["method"], r["field"], r["scale"], r["source"] == "given") == (way.name, GROWTH_FIELD, scale, False)
-        ]  # fmt: skip
+        ]
         if len(pair) == 2:
             small, large = pair
             times, cells = large["seconds"] / small["seconds"], large["cells"] / small["cells"]
             texts = [
                 f"{small[key]:{form}} → {large[key]:{form}}" if small.get(key) is not None else ""
                 for key, form in (
-                    ("cells", ",.0f"), ("seconds", ".2f"), ("steps", ".0f"), ("mean_error", ".4f"),
+                    ("cells", ",.0f"),
+                    ("seconds", ".2f"),
+                    ("steps", ".0f"),
+                    ("mean_error", ".4f"),
                     ("min_quality", ".3f"),
                 )
-            ]  # fmt: skip
-            rows.append(
-                [way.name, *texts[:2], f"{math.log(times) / math.log(cells):.2f}", *texts[2:]]
-            )
+            ]
+            rows.append([way.name, *texts[:2], f"{math.log(times) / math.log(cells):.2f}", *texts[2:]])
     return markdown(["method", "cells", "CPU s", "exponent", "steps", "mean |e|", "min Q"], rows)
 
 
 TITLES = {
-    "paper": "the paper's case", "F2": "F2, sizes 1 : 60", "F3": "F3, with a cap", "circles": "two circles, a kink",
-    "ridge": "a sine ridge", "corner": "a corner singularity", "S2": "S2, in 3D",
-}  # fmt: skip
+    "paper": "the paper's case",
+    "F2": "F2, sizes 1 : 60",
+    "F3": "F3, with a cap",
+    "circles": "two circles, a kink",
+    "ridge": "a sine ridge",
+    "corner": "a corner singularity",
+    "S2": "S2, in 3D",
+}
 
 
 def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> None:
@@ -275,18 +283,18 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
                         continue
                     hollow = way.source == "given"
                     ax.scatter(
-                        max(r["mean_error"], LEFT), 1 - r["mean_quality"], marker=way.marker, s=34, zorder=3,
+                        max(r["mean_error"], LEFT),
+                        1 - r["mean_quality"],
+                        marker=way.marker,
+                        s=34,
+                        zorder=3,
                         linewidth=0.8,
-                        color=None if hollow else way.color, facecolor="none" if hollow else None,
+                        color=None if hollow else way.color,
+                        facecolor="none" if hollow else None,
                         edgecolor=way.color if hollow else None,
-                    )  # fmt: skip
+                    )
             solid = name.startswith("S")
-            ax.set(
-                xscale="log",
-                yscale="linear" if solid else "log",
-                title=TITLES[name],
-                xlim=(0.7 * LEFT, 2),
-            )
+            ax.set(xscale="log", yscale="linear" if solid else "log", title=TITLES[name], xlim=(0.7 * LEFT, 2))
             ax.set_ylim(*((0.2, 0.5) if solid else (0.002, 0.4)))
             if not solid:
                 ax.yaxis.set_minor_formatter(NullFormatter())
@@ -297,13 +305,20 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
         axes[7].set_axis_off()
         present = {r["method"] for r in records}
         handles = [
-            Line2D([], [], linestyle="", marker=w.marker, markersize=5, color=w.color, label=w.name,
-                   markerfacecolor="none" if w.source == "given" else w.color)
-            for w in WAYS if w.name in present and w.name != "JIGSAW, 64 passes"
-        ]  # fmt: skip
-        axes[7].legend(
-            handles=handles, loc="center", frameon=False, fontsize=6.8, labelspacing=0.35
-        )
+            Line2D(
+                [],
+                [],
+                linestyle="",
+                marker=w.marker,
+                markersize=5,
+                color=w.color,
+                label=w.name,
+                markerfacecolor="none" if w.source == "given" else w.color,
+            )
+            for w in WAYS
+            if w.name in present and w.name != "JIGSAW, 64 passes"
+        ]
+        axes[7].legend(handles=handles, loc="center", frameon=False, fontsize=6.8, labelspacing=0.35)
         for k in (0, 4):
             axes[k].set_ylabel("1 − mean quality Q [–]", fontsize=8)
         for k in range(3, 7):
@@ -317,9 +332,7 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=220)
     with Image.open(drawn) as image:
-        image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE).save(
-            path, optimize=True, dpi=(220, 220)
-        )
+        image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE).save(path, optimize=True, dpi=(220, 220))
 
 
 def run_all(adapter: clvoro.Adapter, options: Any) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -330,9 +343,10 @@ def run_all(adapter: clvoro.Adapter, options: Any) -> tuple[list[dict[str, Any]]
         for way in ways:  # builds the kernels
             if way.arguments is not None:
                 adapter.run(
-                    domain_of("S1" if d == 3 else "F1"), test_field("S1" if d == 3 else "F1"),
+                    domain_of("S1" if d == 3 else "F1"),
+                    test_field("S1" if d == 3 else "F1"),
                     **{**way.arguments, "max_steps": 12, "options": None},
-                )  # fmt: skip
+                )
     plan = [(name, 1.0) for name in options.fields]
     if not options.fast and GROWTH_FIELD in options.fields:
         plan.append((GROWTH_FIELD, GROWTH_FACTOR))
@@ -350,11 +364,7 @@ def run_all(adapter: clvoro.Adapter, options: Any) -> tuple[list[dict[str, Any]]
             records.append(record)
             if (name, factor) == (GROWTH_FIELD, 1) and way.name in DRAWN:
                 meshes[way.name] = mesh
-            print(
-                f"{name} x {factor:g}, {way.name}: {record['seconds']:.1f} s",
-                file=sys.stderr,
-                flush=True,
-            )
+            print(f"{name} x {factor:g}, {way.name}: {record['seconds']:.1f} s", file=sys.stderr, flush=True)
     return records, meshes
 
 
@@ -363,10 +373,7 @@ def main() -> None:
     known = [way.name for way in WAYS]
     options_of.add_argument("--fields", type=names, help=", ".join(FIELDS))
     options_of.add_argument(
-        "--methods",
-        type=lambda text: [m.strip() for m in text.split(";")],
-        default=known,
-        help="; ".join(known),
+        "--methods", type=lambda text: [m.strip() for m in text.split(";")], default=known, help="; ".join(known)
     )
     options_of.add_argument("--fast", action="store_true", help="a few minutes less; see above")
     options_of.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
@@ -375,10 +382,7 @@ def main() -> None:
     options.fields = options.fields or list(SMALL if options.fast else FIELDS)
     if options.fast:
         options.methods = [name for name in options.methods if name != "adaptive, best"]
-    for what, asked, allowed in (
-        ("field", options.fields, FIELDS),
-        ("method", options.methods, known),
-    ):
+    for what, asked, allowed in (("field", options.fields, FIELDS), ("method", options.methods, known)):
         if unknown := sorted(set(asked) - set(allowed)):
             options_of.error(f"no {what} {', '.join(unknown)}; there are {'; '.join(allowed)}")
     adapter = make_adapter(options)

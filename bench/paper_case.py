@@ -134,9 +134,7 @@ def balance(r: Mapping[str, Result]) -> dict[str, float]:
         "mean |Lloyd|/h": float(np.linalg.norm(lloyd, axis=1).mean()),
         "mean |Poisson|/h": float(np.linalg.norm(poisson, axis=1).mean()),
         "mean |sum|/h": float(np.linalg.norm(lloyd + poisson, axis=1).mean()),
-        "correlation": float(
-            (lloyd * poisson).sum() / np.sqrt((lloyd**2).sum() * (poisson**2).sum())
-        ),
+        "correlation": float((lloyd * poisson).sum() / np.sqrt((lloyd**2).sum() * (poisson**2).sum())),
     }
 
 
@@ -154,19 +152,13 @@ CLAIMS = (
     Claim(
         "Poisson only: the target is reached, but with irregular, poorly shaped cells",
         poor,
-        lambda m: (
-            m["mean |e|"] < 0.1 * m["mean |e| at the start"]
-            and m["mean Q"] < m["mean Q of lloyd"] - 0.1
-        ),
+        lambda m: m["mean |e|"] < 0.1 * m["mean |e| at the start"] and m["mean Q"] < m["mean Q of lloyd"] - 0.1,
         "less than a tenth of the initial error, mean Q more than 0.1 under Lloyd's",
     ),
     Claim(
         "Coupled: conforms to the target with much better cells",
         both,
-        lambda m: (
-            m["mean |e|"] <= 1.1 * m["mean |e| of poisson"]
-            and m["mean Q"] > m["mean Q of poisson"] + 0.1
-        ),
+        lambda m: m["mean |e|"] <= 1.1 * m["mean |e| of poisson"] and m["mean Q"] > m["mean Q of poisson"] + 0.1,
         "error at most 1.1 times Poisson's, mean Q more than 0.1 above its",
     ),
     Claim(
@@ -206,11 +198,16 @@ def run_methods(adapter: clvoro.Adapter, seed: int, steps: int, k: float) -> dic
     case = load_case("paper")
     return {
         method: adapter.run(
-            case.domain, case.size_field(), method=method, points="uniform", max_steps=steps,
-            options=clvoro.PaperOptions(tol=0, k=k), seed=seed,
+            case.domain,
+            case.size_field(),
+            method=method,
+            points="uniform",
+            max_steps=steps,
+            options=clvoro.PaperOptions(tol=0, k=k),
+            seed=seed,
         )
         for method in METHODS
-    }  # fmt: skip
+    }
 
 
 def judge(runs: list[dict[str, Result]]) -> list[dict]:
@@ -230,8 +227,10 @@ def judge(runs: list[dict[str, Result]]) -> list[dict]:
 
 
 def print_table(runs: list[dict[str, Result]], verdicts: list[dict]) -> None:
-    print(f"{'start':>5} {'method':8} {'cells':>6} {'steps':>5} {'mean |e|':>9} {'max |e|':>8} "
-          f"{'mean Q':>7} {'min Q':>6} {'seconds':>8}")  # fmt: skip
+    print(
+        f"{'start':>5} {'method':8} {'cells':>6} {'steps':>5} {'mean |e|':>9} {'max |e|':>8} "
+        f"{'mean Q':>7} {'min Q':>6} {'seconds':>8}"
+    )
     for number, results in enumerate(runs, start=1):
         for method, result in results.items():
             s = summary(result)
@@ -260,9 +259,7 @@ def print_markdown(runs: list[dict[str, Result]], verdicts: list[dict]) -> None:
     for method in METHODS:
         s = [summary(results[method]) for results in runs]
         forms = (("mean_error", ".3f"), ("max_error", ".2f"), ("mean_quality", ".3f"))
-        cells = [
-            span([v[name] for v in s], form) for name, form in (*forms, ("min_quality", ".2f"))
-        ]
+        cells = [span([v[name] for v in s], form) for name, form in (*forms, ("min_quality", ".2f"))]
         print(f"| {method} | " + " | ".join(cells) + " |")
     print("\n| The paper's claim | measured | |\n|---|---|---|")
     for verdict in verdicts:
@@ -283,10 +280,7 @@ def main() -> int:
     arguments = options.parse_args()
 
     adapter = make_adapter(arguments)
-    runs = [
-        run_methods(adapter, FIRST_SEED + 17 * n, arguments.steps, arguments.k)
-        for n in range(arguments.seeds)
-    ]
+    runs = [run_methods(adapter, FIRST_SEED + 17 * n, arguments.steps, arguments.k) for n in range(arguments.seeds)]
     verdicts = judge(runs)
     if arguments.json:
         figures = [{m: summary(r) for m, r in results.items()} for results in runs]
@@ -302,12 +296,8 @@ def main() -> int:
 
         case = load_case("paper")
         points = runs[0]["coupled"].initial.points
-        initial = adapter.run(
-            case.domain, case.size_field(), points=points, method="lloyd", max_steps=0
-        )
-        write_report(
-            runs[0], arguments.pictures, initial=initial, size=case.size_field(), title=case.title
-        )
+        initial = adapter.run(case.domain, case.size_field(), points=points, method="lloyd", max_steps=0)
+        write_report(runs[0], arguments.pictures, initial=initial, size=case.size_field(), title=case.title)
     return 0 if all(all(v["holds"]) for v in verdicts) else 1
 
 

@@ -134,17 +134,26 @@ def diagram_voropp(_: clvoro.Adapter, points: np.ndarray) -> float:
         source, program, data = (Path(folder, name) for name in ("peer.cc", "peer", "points"))
         source.write_text(VOROPP)
         built = subprocess.run(
-            ["g++", "-O3", "-march=native", f"-DDIM={points.shape[1]}", "-I/usr/include/voro++",
-             source, "-o", program, "-lvoro++"], capture_output=True, check=False,
-        )  # fmt: skip
+            [
+                "g++",
+                "-O3",
+                "-march=native",
+                f"-DDIM={points.shape[1]}",
+                "-I/usr/include/voro++",
+                source,
+                "-o",
+                program,
+                "-lvoro++",
+            ],
+            capture_output=True,
+            check=False,
+        )
         if built.returncode:
             raise MissingPeerError("voro++-dev (Debian, Ubuntu)")
         points.astype(np.float64).tofile(data)
         seconds = []
         for _ in range(2):
-            run = subprocess.run(
-                [program, data, str(len(points))], capture_output=True, text=True, check=True
-            )
+            run = subprocess.run([program, data, str(len(points))], capture_output=True, text=True, check=True)
             taken, area, _ = map(float, run.stdout.split())
             if abs(area - 1) > 1e-6:
                 raise RuntimeError(f"Voro++'s cells measure {area}, expected 1")
@@ -166,9 +175,7 @@ DIAGRAMS = {
 def mesh_clvoro(effort: str) -> Callable[[clvoro.Adapter, float], tuple[np.ndarray, float]]:
     def mesh(adapter: clvoro.Adapter, factor: float) -> tuple[np.ndarray, float]:
         start = time.perf_counter()
-        points = adapter.run(
-            BOX, test_field("F3") * factor, effort=effort, seed=FIRST_SEED
-        ).points  # fmt: skip
+        points = adapter.run(BOX, test_field("F3") * factor, effort=effort, seed=FIRST_SEED).points
         return points, time.perf_counter() - start
 
     return mesh
@@ -242,10 +249,16 @@ def compare_diagrams(adapter: clvoro.Adapter, options: argparse.Namespace) -> No
                     continue
                 ours = ours or seconds
                 report.add(
-                    {"peer": peer, "set": name, "cells": len(points), "seconds": seconds,
-                     "rate": len(points) / seconds, "ratio": seconds / ours},
+                    {
+                        "peer": peer,
+                        "set": name,
+                        "cells": len(points),
+                        "seconds": seconds,
+                        "rate": len(points) / seconds,
+                        "ratio": seconds / ours,
+                    },
                     f"{peer}, {name}, {n:,}",
-                )  # fmt: skip
+                )
     report.finish(heading(adapter, "Diagrams against peers"))
 
 
@@ -260,10 +273,15 @@ def compare_meshes(adapter: clvoro.Adapter, options: argparse.Namespace) -> None
                 print(f"{peer} left out: needs {error}", file=sys.stderr)
                 continue
             report.add(
-                {"peer": peer, "scale": factor, **judge(adapter, points, factor),
-                 "seconds": seconds, "per_cell": seconds / len(points)},
+                {
+                    "peer": peer,
+                    "scale": factor,
+                    **judge(adapter, points, factor),
+                    "seconds": seconds,
+                    "per_cell": seconds / len(points),
+                },
                 f"{peer}, F3 x {factor:g}",
-            )  # fmt: skip
+            )
     report.finish(heading(adapter, "Meshes against peers; cells off the walls"))
 
 
@@ -272,19 +290,17 @@ def main() -> None:
     options_of.add_argument("--sizes", type=counts, default=[10**5, 10**6])
     options_of.add_argument("--dim", type=int, choices=(2, 3), default=2)
     options_of.add_argument("--sets", type=names, help="default uniform,cubed; in 3D uniform,core")
-    options_of.add_argument(
-        "--factors", type=lambda text: [float(f) for f in names(text)], default=[1.0, 0.5, 0.25]
-    )
+    options_of.add_argument("--factors", type=lambda text: [float(f) for f in names(text)], default=[1.0, 0.5, 0.25])
     options_of.add_argument("--skip", choices=("diagrams", "meshes"))
     options_of.add_argument(
-        "--slow-up-to", type=float, default=1e5, metavar="N",
-        help="largest graded set for Voro++, whose uniform bins collapse on it, and largest set in "
-        "3D for SciPy (1e5)",
-    )  # fmt: skip
-    options = options_of.parse_args()
-    options.sets = options.sets or (
-        ["uniform", "cubed"] if options.dim == 2 else ["uniform", "core"]
+        "--slow-up-to",
+        type=float,
+        default=1e5,
+        metavar="N",
+        help="largest graded set for Voro++, whose uniform bins collapse on it, and largest set in 3D for SciPy (1e5)",
     )
+    options = options_of.parse_args()
+    options.sets = options.sets or (["uniform", "cubed"] if options.dim == 2 else ["uniform", "core"])
     adapter = make_adapter(options)
     if options.skip != "diagrams":
         compare_diagrams(adapter, options)

@@ -52,8 +52,7 @@ def main(argv: list[str] | None = None) -> int:
             "images": lambda r: f"{r['images']:.2f}",
             **{
                 f"{name}: walls, periodic, ratio": lambda r, name=name: (
-                    f"{r['walls'][name]:.2f}, {r['periodic'][name]:.2f}, "
-                    f"{r['periodic'][name] / r['walls'][name]:.2f}"
+                    f"{r['walls'][name]:.2f}, {r['periodic'][name]:.2f}, {r['periodic'][name] / r['walls'][name]:.2f}"
                 )
                 for name in figures
             },
@@ -103,9 +102,12 @@ def channel(adapter: clvoro.Adapter, dim: int, n: int) -> dict:
         inside = ((moved >= -wide) & (moved <= 1 + wide)).all(axis=1)
         one += int(inside.sum()) if any(step) else 0
     return {
-        "dim": dim, "cells": n, "images": images.count / n - 1, "one margin": one / n,
+        "dim": dim,
+        "cells": n,
+        "images": images.count / n - 1,
+        "one margin": one / n,
         "expected": expected_images(box, size, n, density_tree(size, box)),
-    }  # fmt: skip
+    }
 
 
 def measure(
@@ -122,10 +124,7 @@ def measure(
     moves = [
         engine.upload(box.place(moved, adapter.dtype))
         for moved in (
-            np.clip(
-                points + k * 0.005 * n ** (-1 / dim) * (2 * rng.random((n, dim)) - 1), 0, 1 - 1e-9
-            )
-            for k in (0, 1)
+            np.clip(points + k * 0.005 * n ** (-1 / dim) * (2 * rng.random((n, dim)) - 1), 0, 1 - 1e-9) for k in (0, 1)
         )
     ]
     tessellator = Tessellator(stages, box)

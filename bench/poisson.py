@@ -54,9 +54,7 @@ def make_graph(adapter: clvoro.Adapter, n: int, mesh: str) -> clvoro.Diagram:
         def size(x):
             return (0.05 + np.hypot(x[:, 0], x[:, 1])) / np.sqrt(n)
 
-        points = adapter.run(
-            box, size, n_cells=n, max_steps=10, options=clvoro.PaperOptions(tol=0), seed=n
-        ).points
+        points = adapter.run(box, size, n_cells=n, max_steps=10, options=clvoro.PaperOptions(tol=0), seed=n).points
     return adapter.diagram(box, points[morton_order(points)])
 
 
@@ -87,9 +85,7 @@ def ours(
 
     def solve():
         phi.fill(0)
-        return poisson.solve(
-            laplacian, rhs, phi, preconditioner=method, tolerance=tolerance, max_iterations=20000
-        )
+        return poisson.solve(laplacian, rhs, phi, preconditioner=method, tolerance=tolerance, max_iterations=20000)
 
     set_up()
     seconds_set_up, laplacian = best(repeat, set_up, clock)
@@ -110,9 +106,7 @@ def matrix(diagram: clvoro.Diagram) -> sp.csr_matrix:
     return sp.csr_matrix(sp.diags(np.asarray(W.sum(axis=1)).ravel()) - W)
 
 
-def with_pyamg(
-    A: sp.csr_matrix, b: np.ndarray, tolerance: float, repeat: int, clock: Callable[[], float]
-) -> Outcome:
+def with_pyamg(A: sp.csr_matrix, b: np.ndarray, tolerance: float, repeat: int, clock: Callable[[], float]) -> Outcome:
     # One addition to the diagonal makes the matrix definite, as pyamg needs it, and leaves x_0 = 0.
     A = A.copy()
     A[0, 0] *= 2
@@ -178,10 +172,16 @@ def main() -> None:
         total = sum(rows["multigrid"][2:])
         for method, (iterations, residual, set_up, solve) in rows.items():
             record = {
-                "cells": len(diagram), "mesh": options.mesh, "dtype": options.dtype, "method": method,
-                "iterations": iterations, "residual": float(residual), "set_up": set_up, "solve": solve,
+                "cells": len(diagram),
+                "mesh": options.mesh,
+                "dtype": options.dtype,
+                "method": method,
+                "iterations": iterations,
+                "residual": float(residual),
+                "set_up": set_up,
+                "solve": solve,
                 "ratio": (set_up + solve) / total,
-            }  # fmt: skip
+            }
             report.add(record, f"{n:,} {method}")
     report.finish(heading(adapter, f"Poisson on {options.mesh} meshes"))
 

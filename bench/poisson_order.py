@@ -60,9 +60,7 @@ def corner() -> Problem:
 
 def island() -> Problem:
     """Return a lake with a triangular island."""
-    domain = clvoro.Polygon(
-        [(0, 0), (2, 0.1), (2.2, 1.2), (1, 1.6), (-0.1, 1)], [[(0.7, 0.5), (1.4, 0.6), (0.9, 1.0)]]
-    )
+    domain = clvoro.Polygon([(0, 0), (2, 0.1), (2.2, 1.2), (1, 1.6), (-0.1, 1)], [[(0.7, 0.5), (1.4, 0.6), (0.9, 1.0)]])
     size = sizing.Distance(domain.boundary("hole-1"), h_min=0.04, slope=0.15, h_max=0.15)
     return Problem(domain, size)
 
@@ -82,8 +80,12 @@ def cube() -> Problem:
 
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
-    "box": box, "corner": corner, "island": island, "circle": circle, "cube": cube,
-}  # fmt: skip
+    "box": box,
+    "corner": corner,
+    "island": island,
+    "circle": circle,
+    "cube": cube,
+}
 
 
 def exact(x: np.ndarray) -> np.ndarray:
@@ -112,9 +114,7 @@ def source(x: np.ndarray) -> np.ndarray:
     return (WAVE[:d] ** 2).sum() * waves - np.exp(x[:, 0] / 2) / 4
 
 
-def solve(
-    mesh: clvoro.Diagram, faces: TwoPointFaces, f: np.ndarray, mixed: bool, place: str
-) -> np.ndarray:
+def solve(mesh: clvoro.Diagram, faces: TwoPointFaces, f: np.ndarray, mixed: bool, place: str) -> np.ndarray:
     """Return the unknowns at the generators, (n,)."""
     n = len(mesh)
     inner = faces.neighbor >= 0
@@ -139,9 +139,7 @@ def solve(
     return found
 
 
-def measure(
-    result: clvoro.Result, walls: str, conditions: str, where: str, place: str
-) -> dict[str, Any]:
+def measure(result: clvoro.Result, walls: str, conditions: str, where: str, place: str) -> dict[str, Any]:
     """Solve on one mesh; return the errors."""
     mesh = result.diagram
     faces = two_point_faces(mesh.solver_mesh(walls, collapse=False), mesh.points)
@@ -163,8 +161,7 @@ def orders(rows: list[dict[str, Any]], dim: int) -> dict[str, float] | None:
         return None
     size = np.log([row["cells"] ** (-1 / dim) for row in rows])
     return {
-        name: float(np.polyfit(size, np.log([row[name] for row in rows]), 1)[0])
-        for name in ("max", "at_walls", "l2")
+        name: float(np.polyfit(size, np.log([row[name] for row in rows]), 1)[0]) for name in ("max", "at_walls", "l2")
     }
 
 
@@ -190,12 +187,7 @@ def main() -> None:
     options_of.add_argument("--only", default=",".join(PROBLEMS), metavar="NAMES")
     options_of.add_argument("--levels", type=int, default=4, help="one less in 3D")
     options_of.add_argument("--effort", default="default")
-    choices = {
-        "walls": "straight",
-        "conditions": "Dirichlet,mixed",
-        "source": "mean",
-        "place": "foot",
-    }
+    choices = {"walls": "straight", "conditions": "Dirichlet,mixed", "source": "mean", "place": "foot"}
     for name, value in choices.items():
         options_of.add_argument(f"--{name}", default=value, metavar="NAMES")
     options = options_of.parse_args()

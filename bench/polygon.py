@@ -44,22 +44,17 @@ from clvoro.tessellation.tessellator import Tessellator
 
 MOST_RATIO = 1.3
 SMOOTH = {"mean_error": 0.006, "max_error": 0.06, "mean_quality": 0.980, "boundary_error": 0.006}
-KINKED = {
-    "mean_error": 0.015, "max_error": 0.25, "mean_quality": 0.985, "min_quality": 0.92, "boundary_error": 0.006,
-}  # fmt: skip
+KINKED = {"mean_error": 0.015, "max_error": 0.25, "mean_quality": 0.985, "min_quality": 0.92, "boundary_error": 0.006}
 MESHES = (
     ("fast", "F2", {"effort": "fast"}, {"mean_error": 0.009, "mean_quality": 0.965}),
     ("default", "F2", {}, SMOOTH),
     ("default", "F3", {}, SMOOTH),
-    ("exact", "F2", {"method": "exact"},
-     {"mean_deviation": 1.5e-4, "max_deviation": 3e-3, "mean_quality": 0.976}),
+    ("exact", "F2", {"method": "exact"}, {"mean_deviation": 1.5e-4, "max_deviation": 3e-3, "mean_quality": 0.976}),
     *(("default", field, {}, KINKED) for field in ("circles", "ridge", "steep circles", "steep ridge")),
-)  # fmt: skip
+)
 
 
-def coast(
-    k: int, seed: int, center: tuple[float, float], radii: tuple[float, float], rough: float
-) -> np.ndarray:
+def coast(k: int, seed: int, center: tuple[float, float], radii: tuple[float, float], rough: float) -> np.ndarray:
     """Return a closed curve of `k` corners, a rough ellipse: a random Fourier series of falling amplitude."""
     rng = np.random.Generator(np.random.PCG64(seed))
     t = 2 * np.pi * np.arange(k) / k
@@ -125,28 +120,25 @@ def cost(adapter: clvoro.Adapter, n: int, edges: int, runs: int, report: Report)
         medians = {name: statistics.median(values) for name, values in taken.items()}
         for name, seconds in medians.items():
             ratio = seconds / medians["box"]
-            report.add(
-                {"diagram": what, "domain": name, "cells": n, "seconds": seconds, "ratio": ratio}
-            )
+            report.add({"diagram": what, "domain": name, "cells": n, "seconds": seconds, "ratio": ratio})
         good &= repaired or ratio <= MOST_RATIO
     return good
 
 
-def measure(
-    adapter: clvoro.Adapter, domain: clvoro.Polygon, field: str, **arguments: Any
-) -> dict[str, Any]:
+def measure(adapter: clvoro.Adapter, domain: clvoro.Polygon, field: str, **arguments: Any) -> dict[str, Any]:
     """Return the figures of one run."""
     begin = time.perf_counter()
     result = adapter.run(domain, test_field(field), **arguments)
     boundary = ~off_walls(result.diagram)
     return {
-        **figures(result.diagram, result.target_size, result.quality), "seconds": time.perf_counter() - begin,
+        **figures(result.diagram, result.target_size, result.quality),
+        "seconds": time.perf_counter() - begin,
         "boundary_cells": int(boundary.sum()),
         "boundary_error": float(np.abs(result.size_error[boundary]).mean()),
         "boundary_quality": float(result.quality[boundary].mean()),
         "boundary_least": float(result.quality[boundary].min()),
         "sum": float(result.diagram.volumes.sum() / domain.measure - 1),
-    }  # fmt: skip
+    }
 
 
 def meshes(adapter: clvoro.Adapter, edges: int, seeds: int, report: Report) -> bool:
@@ -154,14 +146,11 @@ def meshes(adapter: clvoro.Adapter, edges: int, seeds: int, report: Report) -> b
     domain, good = lake(edges), True
     for name, field, arguments, targets in MESHES:
         runs = [measure(adapter, domain, field, seed=seed, **arguments) for seed in range(seeds)]
-        found = {
-            key: type(runs[0][key])(statistics.median(run[key] for run in runs)) for key in runs[0]
-        }
+        found = {key: type(runs[0][key])(statistics.median(run[key] for run in runs)) for key in runs[0]}
         record: dict[str, Any] = {"row": name, "field": field, **found}
         missed = [
-            key for key, bound in targets.items()
-            if (record[key] < bound if "quality" in key else record[key] > bound)
-        ]  # fmt: skip
+            key for key, bound in targets.items() if (record[key] < bound if "quality" in key else record[key] > bound)
+        ]
         record["missed"] = ", ".join(missed)
         good &= not missed
         report.add(record, f"{name} {field}: {found['cells']} cells")
@@ -182,22 +171,27 @@ def main() -> int:
         table = Report(
             options.json,
             {
-                "diagram": lambda r: r["diagram"], "domain": lambda r: r["domain"],
-                "cells": lambda r: r["cells"], "s": lambda r: f"{r['seconds']:.3f}",
+                "diagram": lambda r: r["diagram"],
+                "domain": lambda r: r["domain"],
+                "cells": lambda r: r["cells"],
+                "s": lambda r: f"{r['seconds']:.3f}",
                 "over the box": lambda r: f"{r['ratio']:.2f}",
             },
-        )  # fmt: skip
+        )
         good &= cost(adapter, options.cells, options.edges, options.runs, table)
         table.finish(heading(adapter, "Diagrams of a box and of a polygon"))
     if "meshes" in options.only:
         table = Report(
             options.json,
             {
-                "run": lambda r: f"{r['row']} {r['field']}", "cells": lambda r: r["cells"],
-                "mean e": lambda r: f"{r['mean_error']:.4f}", "max e": lambda r: f"{r['max_error']:.3f}",
+                "run": lambda r: f"{r['row']} {r['field']}",
+                "cells": lambda r: r["cells"],
+                "mean e": lambda r: f"{r['mean_error']:.4f}",
+                "max e": lambda r: f"{r['max_error']:.3f}",
                 "mean deviation": lambda r: f"{r['mean_deviation']:.1e}",
                 "max deviation": lambda r: f"{r['max_deviation']:.1e}",
-                "Q": lambda r: f"{r['mean_quality']:.4f}", "min Q": lambda r: f"{r['min_quality']:.3f}",
+                "Q": lambda r: f"{r['mean_quality']:.4f}",
+                "min Q": lambda r: f"{r['min_quality']:.3f}",
                 "boundary": lambda r: r["boundary_cells"],
                 "its mean e": lambda r: f"{r['boundary_error']:.4f}",
                 "its Q": lambda r: f"{r['boundary_quality']:.4f}",
@@ -205,7 +199,7 @@ def main() -> int:
                 "s": lambda r: f"{r['seconds']:.1f}",
                 "missed": lambda r: r["missed"] or "-",
             },
-        )  # fmt: skip
+        )
         good &= meshes(adapter, options.edges, options.seeds, table)
         table.finish(f"Meshes of a polygon of {options.edges} edges, {device_name(adapter)}")
     return 0 if good else 1

@@ -24,18 +24,7 @@ from argparse import Namespace
 from typing import Any
 
 import numpy as np
-from _common import (
-    BOX,
-    CUBE,
-    FIRST_SEED,
-    Report,
-    counts,
-    figures,
-    heading,
-    make_adapter,
-    names,
-    parser,
-)
+from _common import BOX, CUBE, FIRST_SEED, Report, counts, figures, heading, make_adapter, names, parser
 
 import clvoro
 from clvoro import sizing
@@ -94,17 +83,13 @@ def noise(options: Namespace) -> None:
             moved = adapter.diagram(box, np.clip(result.points + by, box.lower, box.upper))
             length = moved.volumes ** (1 / box.dim)
             change = (length - h) / np.minimum(length, h) - result.size_error
-            print(
-                f"{box.dim}D, off by up to {off} h: e changes by {np.abs(change).mean() / (2 * off):.3f} spacings"
-            )
+            print(f"{box.dim}D, off by up to {off} h: e changes by {np.abs(change).mean() / (2 * off):.3f} spacings")
 
 
 def main() -> int:
     options_of = parser(__doc__)
     options_of.add_argument("--fields", type=names, default=["circle", "point"])
-    options_of.add_argument(
-        "--sizes", type=counts, default=[10_000, 100_000], help="cells (1e4,1e5)"
-    )
+    options_of.add_argument("--sizes", type=counts, default=[10_000, 100_000], help="cells (1e4,1e5)")
     options_of.add_argument("--efforts", type=names, default=["fast"])
     options_of.add_argument("--grading", type=float, default=1000.0, help="largest over least size")
     options_of.add_argument("--seeds", type=int, default=1, help="random starts of each run (1)")
@@ -115,9 +100,7 @@ def main() -> int:
         return 0
 
     def pair(figure: str, digits: int) -> Any:
-        return lambda r: " / ".join(
-            f"{r[f'{real}_{figure}']:.{digits}f}" for real in ("float64", "float32")
-        )
+        return lambda r: " / ".join(f"{r[f'{real}_{figure}']:.{digits}f}" for real in ("float64", "float32"))
 
     columns = {
         "field": lambda r: r["field"],
@@ -141,9 +124,7 @@ def main() -> int:
                 record = measure(options, name, n, effort)
                 report.add(record)
                 good &= record["fits"] or record["warned"]
-    report.finish(
-        heading(make_adapter(Namespace(device=options.device, dtype="float32")), "Precision")
-    )
+    report.finish(heading(make_adapter(Namespace(device=options.device, dtype="float32")), "Precision"))
     return 0 if good else 1
 
 

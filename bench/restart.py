@@ -50,12 +50,17 @@ def peak(x: np.ndarray) -> np.ndarray:
 def figures_of(result: Any, quality: float, seconds: float) -> dict[str, Any]:
     history, error = result.history, np.abs(result.size_error)
     return {
-        "cells": len(result.points), "seconds": seconds, "steps": int(history["step"][-1]),
-        "start_error": float(history["mean_error"][0]), "start_max": float(history["max_error"][0]),
+        "cells": len(result.points),
+        "seconds": seconds,
+        "steps": int(history["step"][-1]),
+        "start_error": float(history["mean_error"][0]),
+        "start_max": float(history["max_error"][0]),
         "to_tolerance": to_tolerance(history, quality),
-        "mean_error": float(error.mean()), "max_error": float(error.max()),
-        "mean_quality": float(result.quality.mean()), "min_quality": float(result.quality.min()),
-    }  # fmt: skip
+        "mean_error": float(error.mean()),
+        "max_error": float(error.max()),
+        "mean_quality": float(result.quality.mean()),
+        "min_quality": float(result.quality.min()),
+    }
 
 
 COLUMNS = {
@@ -96,9 +101,8 @@ def main(arguments: list[str] | None = None) -> int:
             by = min(k, options.moves) * options.by * 0.002 * factor
             start = time.perf_counter()
             new = adapter.run(
-                BOX, moved_field(by, factor), result.points if warm else None, effort=options.effort,
-                seed=FIRST_SEED,
-            )  # fmt: skip
+                BOX, moved_field(by, factor), result.points if warm else None, effort=options.effort, seed=FIRST_SEED
+            )
             seconds = time.perf_counter() - start
             if warm:
                 values = result.transfer(values, new, order=2, adapter=adapter)
@@ -107,11 +111,12 @@ def main(arguments: list[str] | None = None) -> int:
                 mass = new.diagram.volumes @ values
             result = new
             record = {
-                "factor": factor, "run": f"moved {k}" if warm else "cold",
+                "factor": factor,
+                "run": f"moved {k}" if warm else "cold",
                 **figures_of(result, quality, seconds),
                 "carried": float(values.max()),
                 "mass": abs(float(result.diagram.volumes @ values / mass - 1)),
-            }  # fmt: skip
+            }
             if warm:
                 taken = record["to_tolerance"]
                 slowest = max(slowest, sys.maxsize if taken is None else taken)

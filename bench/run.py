@@ -56,9 +56,7 @@ BEFORE = 40_000
 """Cells of a first run, which builds kernels: enough for levels, multigrid and all parts of larger runs."""
 
 
-def run_once(
-    adapter: clvoro.Adapter, n: int, effort: str, method: str
-) -> tuple[clvoro.Result, float]:
+def run_once(adapter: clvoro.Adapter, n: int, effort: str, method: str) -> tuple[clvoro.Result, float]:
     """Run from nothing to NumPy arrays of the finished mesh; return it and the seconds."""
     field = test_field("F2") * (CELLS_OF_F2 / n) ** 0.5
     start = time.perf_counter()
@@ -81,12 +79,17 @@ def measure(
     # Time between two rows of the finest level, reorganizing included.
     between = np.diff(history["seconds"])[finest[1:] & finest[:-1]]
     record: dict[str, Any] = {
-        "method": method, "effort": effort, "seconds": seconds, "host_seconds": host,
-        "per_cell": seconds / len(result.points), "per_step": seconds / max(cost["work"], 1e-300),
+        "method": method,
+        "effort": effort,
+        "seconds": seconds,
+        "host_seconds": host,
+        "per_cell": seconds / len(result.points),
+        "per_step": seconds / max(cost["work"], 1e-300),
         "finest_step": statistics.median(between) if len(between) else float("nan"),
-        **figures(result.diagram, result.target_size, result.quality), **cost,
+        **figures(result.diagram, result.target_size, result.quality),
+        **cost,
         "iterations": int(history["iterations"].sum()),
-    }  # fmt: skip
+    }
     if profiled:
         with Profile(adapter) as profile:
             _, again = run_once(adapter, n, effort, method)
@@ -98,18 +101,13 @@ def measure(
             "outside_share": 1 - total / again,
             "solve_share": profile.of(*SOLVERS) / total,
             "diagram_share": profile.of(*TESSELLATION) / total,
-            "programs": {
-                name: cost.seconds / total for name, cost in sorted(profile.stages().items())
-            },
+            "programs": {name: cost.seconds / total for name, cost in sorted(profile.stages().items())},
         }
     if by_parts:
         with host_parts() as parts:
             timed = parts.timed(REST, run_once)
             timed(adapter, n, effort, method)
-        record["parts"] = {
-            name: {"calls": parts.calls[name], "seconds": parts.seconds[name]}
-            for name in parts.seconds
-        }
+        record["parts"] = {name: {"calls": parts.calls[name], "seconds": parts.seconds[name]} for name in parts.seconds}
     return record
 
 
@@ -143,10 +141,14 @@ def scaling(records: list[dict[str, Any]]) -> list[list[str]]:
             continue
         n, t = np.log([r["cells"] for r in mine]), np.log([r["seconds"] for r in mine])
         costs = [r["per_cell"] for r in mine]
-        rows.append([
-            *kind, f"{np.polyfit(n, t, 1)[0]:.3f}", f"{costs[-1] / costs[-2]:.2f}",
-            f"{mine[-2]['cells']:,} to {mine[-1]['cells']:,}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                *kind,
+                f"{np.polyfit(n, t, 1)[0]:.3f}",
+                f"{costs[-1] / costs[-2]:.2f}",
+                f"{mine[-2]['cells']:,} to {mine[-1]['cells']:,}",
+            ]
+        )
     return rows
 
 
@@ -168,9 +170,7 @@ def shares_of_the_host(records: list[dict[str, Any]]) -> list[list[str]]:
     for kind in dict.fromkeys((r["method"], r["effort"]) for r in records):
         mine = [r for r in records if (r["method"], r["effort"]) == kind and "parts" in r]
         for name, part in mine[-1]["parts"].items() if mine else ():
-            rows.append([
-                *kind, f"{mine[-1]['cells']:,}", name, f"{part['calls']:,}", f"{part['seconds']:.2f}",
-            ])  # fmt: skip
+            rows.append([*kind, f"{mine[-1]['cells']:,}", name, f"{part['calls']:,}", f"{part['seconds']:.2f}"])
     return rows
 
 
@@ -180,12 +180,9 @@ def main() -> None:
     options_of.add_argument("--efforts", type=names, default=["fast", "default"])
     options_of.add_argument("--methods", type=names, default=["adaptive"])
     options_of.add_argument(
-        "--profile", action=argparse.BooleanOptionalAction, default=True,
-        help="run once more for the shares",
-    )  # fmt: skip
-    options_of.add_argument(
-        "--parts", action="store_true", help="run once more for the parts of the host's work"
+        "--profile", action=argparse.BooleanOptionalAction, default=True, help="run once more for the shares"
     )
+    options_of.add_argument("--parts", action="store_true", help="run once more for the parts of the host's work")
     options = options_of.parse_args()
 
     adapter = make_adapter(options)
@@ -202,15 +199,17 @@ def main() -> None:
                 report.add(record, f"{method} {effort} {n:,}: {record['seconds']:.1f} s")
     report.finish(heading(adapter, "Whole runs"))
     if not options.json:
-        header = ["method", "effort", "slope of time against cells",
-                  "time per cell: last / last but one", "cells"]  # fmt: skip
+        header = ["method", "effort", "slope of time against cells", "time per cell: last / last but one", "cells"]
         print(markdown(header, scaling(report.records)) + "\n")
         if options.profile:
-            print(markdown(["method", "effort", "cells", "share of device time"],
-                           programs(report.records)) + "\n")  # fmt: skip
+            print(markdown(["method", "effort", "cells", "share of device time"], programs(report.records)) + "\n")
         if options.parts:
-            print(markdown(["method", "effort", "cells", "part of the host's work", "calls", "seconds"],
-                           shares_of_the_host(report.records)))  # fmt: skip
+            print(
+                markdown(
+                    ["method", "effort", "cells", "part of the host's work", "calls", "seconds"],
+                    shares_of_the_host(report.records),
+                )
+            )
 
 
 if __name__ == "__main__":

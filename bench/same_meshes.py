@@ -133,17 +133,9 @@ def resumed(domain: Any, size: Any, rows: int, **options: Any) -> Run:
 
         with tempfile.TemporaryDirectory() as folder:
             state = Path(folder) / "state"
-            once = adapted(
-                domain,
-                size,
-                callback=stop,
-                checkpoint=clvoro.Checkpoint(state, every=1e9),
-                **options,
-            )
+            once = adapted(domain, size, callback=stop, checkpoint=clvoro.Checkpoint(state, every=1e9), **options)
             once(adapter)
-            return adapted(domain, size, checkpoint=clvoro.Checkpoint(resume=state), **options)(
-                adapter
-            )
+            return adapted(domain, size, checkpoint=clvoro.Checkpoint(resume=state), **options)(adapter)
 
     return run
 
@@ -181,15 +173,9 @@ LAKE = clvoro.Polygon(ring(120), [TRIANGLE, TRIANGLE * 0.5 + (0.1, 0.3)])
 LAKE_REVERSED = clvoro.Polygon(ring(120)[::-1], [TRIANGLE])
 COAST = clvoro.Polygon(ring(1500), [TRIANGLE])
 PIECES = clvoro.Polygon.from_pieces(
-    [
-        [[(0, 0), (1, 0), (1, 1), (0, 1)], TRIANGLE],
-        [np.add(ring(60), (1.2, 0))],
-        [[(0.2, 1.1), (1, 1.1), (0.6, 1.6)]],
-    ]
+    [[[(0, 0), (1, 0), (1, 1), (0, 1)], TRIANGLE], [np.add(ring(60), (1.2, 0))], [[(0.2, 1.1), (1, 1.1), (0.6, 1.6)]]]
 )
-SLIT = clvoro.Polygon(
-    [(0, 0), (2, 0), (2, 1), (0, 1)], [[(0.4, 0.5), (1.6, 0.5), (1.6, 0.5001), (0.4, 0.5001)]]
-)
+SLIT = clvoro.Polygon([(0, 0), (2, 0), (2, 1), (0, 1)], [[(0.4, 0.5), (1.6, 0.5), (1.6, 0.5001), (0.4, 0.5001)]])
 L_SHAPE = clvoro.Polygon([(0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
 PUBLISHED = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")
 
@@ -199,28 +185,17 @@ def box_cases() -> Iterator[Case]:
         yield Case(f"2D box, {effort}", adapted(BOX, circle(h), effort=effort))
     for method in PUBLISHED:
         yield Case(f"2D box, {method}", adapted(BOX, circle(0.02), method=method, max_steps=12))
-    yield Case(
-        "2D box, two levels",
-        adapted(BOX, circle(0.015), options=clvoro.MultilevelOptions(levels=1)),
-    )
+    yield Case("2D box, two levels", adapted(BOX, circle(0.015), options=clvoro.MultilevelOptions(levels=1)))
     yield Case("2D box, exact", adapted(BOX, circle(0.03), method="exact"))
-    yield Case(
-        "2D box, number of cells",
-        adapted(BOX, circle(0.03), n_cells=900, method="exact", effort="fast"),
-    )
+    yield Case("2D box, number of cells", adapted(BOX, circle(0.03), n_cells=900, method="exact", effort="fast"))
     yield Case("2D box, uniform start", adapted(BOX, circle(0.03), points="uniform", effort="fast"))
     yield Case("2D box", adapted(BOX, circle(0.03)), "float32")
-    yield Case(
-        "2D box, coupled", adapted(BOX, circle(0.02), method="coupled", max_steps=12), "float32"
-    )
+    yield Case("2D box, coupled", adapted(BOX, circle(0.02), method="coupled", max_steps=12), "float32")
     for effort, h in (("fast", 0.05), ("default", 0.07), ("best", 0.11)):
         yield Case(f"3D box, {effort}", adapted(CUBE, sphere(h), effort=effort))
     for method in PUBLISHED:
         yield Case(f"3D box, {method}", adapted(CUBE, sphere(0.09), method=method, max_steps=4))
-    yield Case(
-        "3D box, two levels",
-        adapted(CUBE, sphere(0.06), options=clvoro.MultilevelOptions(levels=1)),
-    )
+    yield Case("3D box, two levels", adapted(CUBE, sphere(0.06), options=clvoro.MultilevelOptions(levels=1)))
     yield Case("3D box, exact", adapted(CUBE, sphere(0.09), method="exact", effort="fast"))
     yield Case("3D box, fast", adapted(CUBE, sphere(0.08), effort="fast"), "float32")
 
@@ -233,8 +208,7 @@ def periodic_cases() -> Iterator[Case]:
         yield Case("3D periodic", adapted(PERIODIC_CUBE, ball, effort="fast"), dtype)
     yield Case("2D periodic, exact", adapted(PERIODIC, spot, method="exact"))
     yield Case(
-        "2D periodic, three levels",
-        adapted(PERIODIC, 0.02, options=clvoro.MultilevelOptions(levels=2), effort="fast"),
+        "2D periodic, three levels", adapted(PERIODIC, 0.02, options=clvoro.MultilevelOptions(levels=2), effort="fast")
     )
     yield Case(
         "3D periodic, two levels",
@@ -251,10 +225,7 @@ def polygon_cases() -> Iterator[Case]:
     shore = sizing.Distance(COAST.boundary(), h_min=0.012, slope=0.3)
     yield Case("polygon, outer ring clockwise", adapted(LAKE_REVERSED, 0.03))
     yield Case("polygon, exact", adapted(LAKE, 0.03, method="exact", effort="fast"))
-    yield Case(
-        "polygon, two levels",
-        adapted(LAKE, 0.015, options=clvoro.MultilevelOptions(levels=1), effort="fast"),
-    )
+    yield Case("polygon, two levels", adapted(LAKE, 0.015, options=clvoro.MultilevelOptions(levels=1), effort="fast"))
     yield Case("polygon, coupled", adapted(LAKE, 0.03, method="coupled", max_steps=12))
     yield Case("polygon, edges finer than cells", adapted(COAST, shore, effort="fast"))
     yield Case("polygon, several pieces", adapted(PIECES, 0.04, effort="fast"))
@@ -269,9 +240,7 @@ def layer_cases() -> Iterator[Case]:
     yield Case("layers, one wall", adapted(SQUARE, 0.05, layers=below))
     yield Case("layers, 2D periodic channel", adapted(CHANNEL, 0.06, layers=rows, effort="fast"))
     yield Case("layers, polygon", adapted(LAKE, 0.04, layers=rows, effort="fast"))
-    yield Case(
-        "layers, re-entrant corner", adapted(L_SHAPE, 0.05, layers=rows, effort="fast"), "float32"
-    )
+    yield Case("layers, re-entrant corner", adapted(L_SHAPE, 0.05, layers=rows, effort="fast"), "float32")
 
 
 def size_cases() -> Iterator[Case]:
@@ -285,16 +254,12 @@ def size_cases() -> Iterator[Case]:
     solid = sizing.Surface(corners, [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
     fields = {
         "number": 0.03,
-        "growth and h_max": sizing.Distance(
-            sizing.Segment((0.2, 0.2), (0.7, 0.9)), 0.015, growth=1.2, h_max=0.05
-        ),
+        "growth and h_max": sizing.Distance(sizing.Segment((0.2, 0.2), (0.7, 0.9)), 0.015, growth=1.2, h_max=0.05),
         "polyline": sizing.Distance(sizing.Polyline(curve), h_min=0.015, slope=0.2),
         "expression": sizing.Expression("0.02 + 0.3 * fabs(hypot(x - 0.4, y - 0.6) - 0.3)"),
         "graded": sizing.Graded(jump, 1.2),
         "raster": raster,
-        "scattered": sizing.Scattered(
-            rng.random((300, 2)), 0.03 + 0.02 * rng.random(300), (0, 0), (1, 1)
-        ),
+        "scattered": sizing.Scattered(rng.random((300, 2)), 0.03 + 0.02 * rng.random(300), (0, 0), (1, 1)),
         "callable": lambda p: 0.02 + 0.05 * p[:, 0],
         "minimum": sizing.minimum(raster, lambda p: 0.02 + 0.05 * p[:, 1]),
         "hessian": sizing.hessian_size(front, (0, 0), (1, 1), n_cells=1000),
@@ -319,17 +284,11 @@ def sequel_cases() -> Iterator[Case]:
     some, few, some_3d = rng.random((1000, 2)), rng.random((100, 2)), rng.random((600, 3))
     yield Case("given points, any", adapted(SQUARE, 0.03, points=some, effort="fast"))
     yield Case("given points, few", adapted(SQUARE, 0.03, points=few, effort="fast"))
-    yield Case(
-        "given points, lloyd", adapted(SQUARE, 0.03, points=some, method="lloyd", max_steps=5)
-    )
-    yield Case(
-        "given points, no step", adapted(SQUARE, 0.03, points=some, method="coupled", max_steps=0)
-    )
+    yield Case("given points, lloyd", adapted(SQUARE, 0.03, points=some, method="lloyd", max_steps=5))
+    yield Case("given points, no step", adapted(SQUARE, 0.03, points=some, method="coupled", max_steps=0))
     yield Case("given points in 3D, any", adapted(CUBE, 0.12, points=some_3d, effort="fast"))
     yield Case("warm start, 2D", adapted_again(BOX, circle(0.03), circle(0.03, x=0.96)))
-    yield Case(
-        "warm start, 3D", adapted_again(CUBE, sphere(0.09), sphere(0.09, x=0.55), effort="fast")
-    )
+    yield Case("warm start, 3D", adapted_again(CUBE, sphere(0.09), sphere(0.09, x=0.55), effort="fast"))
     fine, coarse = circle(0.03), circle(0.05, x=1.2)
     for order in (1, 2):
         yield Case(f"transfer, 2D, order {order}", transferred(BOX, fine, coarse, order=order))
@@ -337,9 +296,7 @@ def sequel_cases() -> Iterator[Case]:
     yield Case("transfer, polygon", transferred(LAKE, 0.05, 0.04, order=2))
     yield Case("transfer, 3D", transferred(CUBE, sphere(0.12), sphere(0.1, x=0.6), order=2))
     yield Case("resumed, 2D", resumed(BOX, circle(0.05), rows=30, effort="fast"))
-    yield Case(
-        "resumed, 2D, coupled", resumed(BOX, circle(0.05), rows=4, method="coupled", max_steps=9)
-    )
+    yield Case("resumed, 2D, coupled", resumed(BOX, circle(0.05), rows=4, method="coupled", max_steps=9))
     yield Case("resumed, 3D", resumed(CUBE, sphere(0.12), rows=20, effort="fast"))
 
 
@@ -402,9 +359,7 @@ def diagram_cases() -> Iterator[Case]:
 
 
 def cases() -> Iterator[Case]:
-    for group in (
-        diagram_cases, box_cases, periodic_cases, polygon_cases, layer_cases, size_cases, sequel_cases,
-    ):  # fmt: skip
+    for group in (diagram_cases, box_cases, periodic_cases, polygon_cases, layer_cases, size_cases, sequel_cases):
         for case in group():
             yield Case(f"{case.label}, {case.dtype}", case.run, case.dtype)
 
@@ -443,11 +398,7 @@ def difference(new: np.ndarray, old: np.ndarray) -> str:
 
 
 def differences(
-    label: str,
-    new: Mapping[str, Any],
-    old: Mapping[str, Any],
-    arrays: Arrays,
-    stored: Mapping[str, np.ndarray],
+    label: str, new: Mapping[str, Any], old: Mapping[str, Any], arrays: Arrays, stored: Mapping[str, np.ndarray]
 ) -> Iterator[str]:
     """Yield one line for each array whose hash differs."""
     if "error" in new or "error" in old:
@@ -507,9 +458,7 @@ def make_options() -> argparse.ArgumentParser:
     made.set_defaults(dtype=None)
     made.add_argument("--save", type=Path, metavar="FILE.json", help="write the hashes")
     made.add_argument("--arrays", action="store_true", help="with --save: write the arrays, too")
-    made.add_argument(
-        "--compare", type=Path, metavar="FILE.json", help="print what differs from that file"
-    )
+    made.add_argument("--compare", type=Path, metavar="FILE.json", help="print what differs from that file")
     made.add_argument("--only", default="", metavar="SUBSTRING", help="of the names of runs")
     return made
 

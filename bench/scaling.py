@@ -82,8 +82,7 @@ def measure(options: Any) -> list[dict[str, Any]]:
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         for record in map(json.loads, done.stdout.splitlines()):
             found += [
-                {"curve": name, "cells": record["cells"], "seconds": seconds}
-                for name, seconds in points_of(record)
+                {"curve": name, "cells": record["cells"], "seconds": seconds} for name, seconds in points_of(record)
             ]
     return found
 
@@ -118,9 +117,8 @@ def draw(curves: dict[str, list[tuple[int, float]]], title: str, path: Path) -> 
     x = np.array([low, high])
     ax.loglog(x, rate * x, color="0.85", lw=1, zorder=0)
     ax.annotate(
-        "slope 1", (x[1], rate * x[1]), (-4, -26), textcoords="offset points",
-        color="0.6", ha="right", va="top",
-    )  # fmt: skip
+        "slope 1", (x[1], rate * x[1]), (-4, -26), textcoords="offset points", color="0.6", ha="right", va="top"
+    )
     ax.set_xlim(low, high)
     ax.set_xlabel("cells")
     ax.set_ylabel("seconds")
@@ -154,20 +152,21 @@ def main() -> None:
     for point in found:
         curves[point["curve"]].append((point["cells"], point["seconds"]))
 
-    report = Report(options.json, {
-        "curve": lambda r: r["curve"],
-        "from": lambda r: f"{r['cells'][0]:,}",
-        "to": lambda r: f"{r['cells'][-1]:,}",
-        "seconds at the largest": lambda r: f"{r['seconds'][-1]:.3g}",
-        "us per cell there": lambda r: f"{1e6 * r['seconds'][-1] / r['cells'][-1]:.3g}",
-        "slope": lambda r: "" if r["slope"] is None else f"{r['slope']:.2f}",
-    })  # fmt: skip
+    report = Report(
+        options.json,
+        {
+            "curve": lambda r: r["curve"],
+            "from": lambda r: f"{r['cells'][0]:,}",
+            "to": lambda r: f"{r['cells'][-1]:,}",
+            "seconds at the largest": lambda r: f"{r['seconds'][-1]:.3g}",
+            "us per cell there": lambda r: f"{1e6 * r['seconds'][-1] / r['cells'][-1]:.3g}",
+            "slope": lambda r: "" if r["slope"] is None else f"{r['slope']:.2f}",
+        },
+    )
     for name in (*OURS, *PEERS):
         if name in curves:
             cells, seconds = zip(*sorted(curves[name]), strict=True)
-            report.add({
-                "curve": name, "cells": cells, "seconds": seconds, "slope": slope_of(curves[name]),
-            })  # fmt: skip
+            report.add({"curve": name, "cells": cells, "seconds": seconds, "slope": slope_of(curves[name])})
     draw(curves, title, options.out / "scaling.png")
     report.finish(title)
 

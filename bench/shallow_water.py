@@ -41,16 +41,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from _common import (
-    FIRST_SEED,
-    Report,
-    counts,
-    heading,
-    make_adapter,
-    names,
-    parser,
-    shown,
-)  # fmt: skip
+from _common import FIRST_SEED, Report, counts, heading, make_adapter, names, parser, shown
 from _trisk import Mesh, ShallowWater, balances, mesh_of, unit
 from scipy.spatial import cKDTree
 
@@ -89,9 +80,7 @@ def set_up(number: int, mesh: Mesh, alpha: float) -> Case:
     """
     lean = math.radians(alpha) if number == 2 else 0.0
     axis = np.array([-math.sin(lean), 0.0, math.cos(lean)])
-    speed, level = (
-        (2 * math.pi * RADIUS / (12 * DAY), 2.94e4 / GRAVITY) if number == 2 else (20.0, 5960.0)
-    )
+    speed, level = (2 * math.pi * RADIUS / (12 * DAY), 2.94e4 / GRAVITY) if number == 2 else (20.0, 5960.0)
     sine = mesh.points @ axis
     bottom = mountain(mesh) if number == 5 else np.zeros(len(sine))
     surface = level - (RADIUS * ROTATION * speed + speed**2 / 2) / GRAVITY * sine**2
@@ -127,10 +116,7 @@ def bisected_icosahedron(n: int) -> np.ndarray:
         raise ValueError(f"no icosahedral mesh has {n} cells; expected 10 4^k + 2, such as 2562")
     golden = (1 + math.sqrt(5)) / 2
     corners = [
-        np.roll((first, second, 0.0), k)
-        for k in range(3)
-        for first in (-1.0, 1.0)
-        for second in (-golden, golden)
+        np.roll((first, second, 0.0), k) for k in range(3) for first in (-1.0, 1.0) for second in (-golden, golden)
     ]
     points = unit(np.array(corners))
     for _ in range(levels):
@@ -222,9 +208,7 @@ def measure(
     days = options.days or DAYS[number]
     h, u, record = integrate(model, case, days * DAY, options.courant)
     about = {"case": number, "mesh": kind, "cells": len(h)}
-    record = {
-        **about, "days": days, "dx_min": float(mesh.dc.min()) / 1e3, "dx": float(mesh.dc.mean()) / 1e3, **record,
-    }  # fmt: skip
+    record = {**about, "days": days, "dx_min": float(mesh.dc.min()) / 1e3, "dx": float(mesh.dc.mean()) / 1e3, **record}
     if case.steady:
         record |= norms(mesh.cell_areas, h - case.h, case.h)
     return record, h + case.bottom, {**about, **balances(model, h, u)}
@@ -258,10 +242,13 @@ def measure_truncation(kind: str, diagram: clvoro.Diagram, alpha: float) -> dict
         "tangential": (found - sign * tangential) / rms(tangential, everywhere),
     }
     return {
-        "case": 2, "mesh": kind, "cells": len(odd), "odd": int(odd.sum()),
+        "case": 2,
+        "mesh": kind,
+        "cells": len(odd),
+        "odd": int(odd.sum()),
         "share": float(areas[at_odd].sum() / areas.sum()),
         **{name: (rms(x, at_odd), rms(x, ~at_odd)) for name, x in errors.items()},
-    }  # fmt: skip
+    }
 
 
 def compare(runs: list[tuple[dict[str, Any], Mesh, np.ndarray]]) -> None:
@@ -320,10 +307,7 @@ OF_TRUNCATION = {
     },
 }
 BALANCES = ("mass_rate", "coriolis_work", "energy_rate", "dual_divergence", "geostrophic")
-OF_BALANCES = {
-    **common_columns(),
-    **{name.replace("_", " "): shown(name, ".0e") for name in BALANCES},
-}
+OF_BALANCES = {**common_columns(), **{name.replace("_", " "): shown(name, ".0e") for name in BALANCES}}
 
 
 def plan(options: argparse.Namespace) -> list[tuple[str, int, list[int]]]:

@@ -20,18 +20,7 @@ import time
 from typing import Any
 
 import numpy as np
-from _common import (
-    CUBE,
-    FIRST_SEED,
-    Report,
-    domain_of,
-    figures,
-    heading,
-    make_adapter,
-    names,
-    parser,
-    test_field,
-)
+from _common import CUBE, FIRST_SEED, Report, domain_of, figures, heading, make_adapter, names, parser, test_field
 from lattice import body_centered
 from scipy.spatial import ConvexHull, KDTree, Voronoi
 from scipy.spatial.transform import Rotation
@@ -42,9 +31,7 @@ from clvoro import sizing
 PARTS = ("lattices", "strain", "grains", "growth", "fields", "filled")
 BCC = np.array([[0, 0, 0], [2, 2, 2]]) / 4
 FCC = np.array([[0, 0, 0], [2, 2, 0], [2, 0, 2], [0, 2, 2]]) / 4
-A15 = np.array(
-    [[0, 0, 0], [2, 2, 2], [1, 2, 0], [3, 2, 0], [0, 1, 2], [0, 3, 2], [2, 0, 1], [2, 0, 3]]
-) / 4  # fmt: skip
+A15 = np.array([[0, 0, 0], [2, 2, 2], [1, 2, 0], [3, 2, 0], [0, 1, 2], [0, 3, 2], [2, 0, 1], [2, 0, 3]]) / 4
 STRAINS = (0.02, 0.05, 0.1, 0.2)
 GRAINS = (8, 32, 128)
 SLOPES = (0.01, 0.02, 0.05)
@@ -72,9 +59,11 @@ def of_lattice(sites: np.ndarray, stretch: np.ndarray) -> dict[str, float]:
     quality, volume = lattice_cells(sites, stretch).T
     error = np.abs(np.cbrt(volume / volume.mean()) - 1)
     return {
-        "mean_error": error.mean(), "max_error": error.max(), "mean_quality": quality.mean(),
+        "mean_error": error.mean(),
+        "max_error": error.max(),
+        "mean_quality": quality.mean(),
         "min_quality": quality.min(),
-    }  # fmt: skip
+    }
 
 
 def relaxed_seeds(count: int, seed: int) -> np.ndarray:
@@ -88,9 +77,7 @@ def relaxed_seeds(count: int, seed: int) -> np.ndarray:
     return seeds
 
 
-def conformal(
-    lattice: np.ndarray, center: np.ndarray, h: float, slope: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def conformal(lattice: np.ndarray, center: np.ndarray, h: float, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Map `lattice` (k, 3) to places around `center`; return them and the size there.
 
     x = center + h (y - b |y|^2) / D, D = 1 - 2 b.y + |b|^2 |y|^2, b = slope / 2 is conformal, with the factor h / D:
@@ -122,11 +109,7 @@ def fill(seeds: np.ndarray, field: Any, seed: int, reach: float) -> np.ndarray:
             own = ((x > margin) & (x < 1 - margin)).all(axis=1)
             own = np.flatnonzero(own)
             own = own[tree.query(x[own])[1] == k]
-            h *= (
-                float(np.exp(np.mean(np.log(np.asarray(field(x[own])) / size[own]))))
-                if not last
-                else 1
-            )
+            h *= float(np.exp(np.mean(np.log(np.asarray(field(x[own])) / size[own])))) if not last else 1
         parts.append(x[own])
     points = np.concatenate(parts)
     grain = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
@@ -158,9 +141,7 @@ def starts(part: str, n: int) -> list[tuple[str, str, Any, dict[str, Any]]]:
         runs = [("constant", "lattice", field, {"points": lattice, "options": LEVELS})]
         for count in GRAINS:
             points = fill(relaxed_seeds(count, FIRST_SEED), field, FIRST_SEED, 1.8 / size)
-            runs.append(
-                ("constant", f"{count} grains", field, {"points": points, "options": LEVELS})
-            )
+            runs.append(("constant", f"{count} grains", field, {"points": points, "options": LEVELS}))
         return [*runs, ("constant", "random", field, {**at_random, "options": LEVELS})]
     if part == "growth":
         runs = []
@@ -190,11 +171,7 @@ COLUMNS = {
     "max |e|": lambda r: f"{r['max_error']:.3f}",
     "mean Q": lambda r: f"{r['mean_quality']:.4f}",
     "min Q": lambda r: f"{r['min_quality']:.3f}",
-    "all Q": lambda r: (
-        f"{r['mean_quality_all']:.4f} / {r['min_quality_all']:.3f}"
-        if "mean_quality_all" in r
-        else ""
-    ),
+    "all Q": lambda r: f"{r['mean_quality_all']:.4f} / {r['min_quality_all']:.3f}" if "mean_quality_all" in r else "",
     "seconds": lambda r: f"{r['seconds']:.1f}" if "seconds" in r else "",
 }
 
@@ -231,7 +208,7 @@ def main() -> int:
                 report.add(
                     {"part": part, "case": case, "start": start, "effort": effort, **made},
                     f"{part} {case} {start} {effort}",
-                )  # fmt: skip
+                )
     report.finish(heading(adapter, "Bounds of the quality in 3D (seconds of processor time)"))
     return 0
 

@@ -81,16 +81,18 @@ def main() -> None:
         bound = [best_quality(angle, n) for n in (3, 4, 5)]
         wedge = clvoro.Polygon([(0, 0), (1, 0), (np.cos(angle), np.sin(angle))])
         size = (wedge.measure / 400) ** 0.5
-        for run, settings in (
-            ("default", {}), ("best", {"effort": "best"}), ("exact", {"method": "exact"}),
-        ):  # fmt: skip
+        for run, settings in (("default", {}), ("best", {"effort": "best"}), ("exact", {"method": "exact"})):
             result = adapter.run(wedge, size, seed=FIRST_SEED, **settings)
             solver = result.measures.solver.summary()
             found = {
-                "angle": degrees, "bound": bound, "run": run, "quality": float(result.quality.min()),
-                "non_orthogonality": solver["max_non_orthogonality"], "skewness": solver["max_skewness"],
+                "angle": degrees,
+                "bound": bound,
+                "run": run,
+                "quality": float(result.quality.min()),
+                "non_orthogonality": solver["max_non_orthogonality"],
+                "skewness": solver["max_skewness"],
                 "accepted": bool(result.check(solver="openfoam")),
-            }  # fmt: skip
+            }
             report.add(found, f"{degrees} degrees, {run}")
     report.finish(heading(adapter, "Sharp corners"))
 

@@ -32,8 +32,11 @@ from clvoro.finite_volumes.geometry import smaller_size
 from clvoro.finite_volumes.solver_mesh import SolverMesh
 
 ROWS: dict[str, dict[str, Any]] = {
-    "fast": {"effort": "fast"}, "default": {}, "best": {"effort": "best"}, "exact": {"method": "exact"},
-}  # fmt: skip
+    "fast": {"effort": "fast"},
+    "default": {},
+    "best": {"effort": "best"},
+    "exact": {"method": "exact"},
+}
 
 
 def setup(name: str) -> tuple[clvoro.Box, Any]:
@@ -83,16 +86,20 @@ def measure(diagram: clvoro.Diagram) -> dict[str, Any]:
     volumes = after.measures.geometry.volumes
     all_edges = len(before.corners) / 3  # nearly all have three faces
     return {
-        "cells": len(diagram), "seconds": seconds, "files": files, "edges": edges / all_edges,
+        "cells": len(diagram),
+        "seconds": seconds,
+        "files": files,
+        "edges": edges / all_edges,
         "faces": faces / len(before.owner),
-        "edges_left": left[0], "faces_left": left[1],
+        "edges_left": left[0],
+        "faces_left": left[1],
         "flatness": float(after.measures.flatness.min()),
         "change": float(np.abs(volumes / diagram.volumes - 1).max()),
         "total": float(abs(volumes.sum() / diagram.domain.measure - 1)),
         "angles": [float(m.measures.non_orthogonality.max()) for m in (before, after)],
         "skewness": [float(m.measures.skewness.max()) for m in (before, after)],
         "ok": bool(diagram.check(solver="openfoam")),
-    }  # fmt: skip
+    }
 
 
 COLUMNS = {
@@ -128,9 +135,7 @@ def main() -> None:
             begin = time.process_time()
             diagram = adapter.run(box, size, seed=FIRST_SEED, **ROWS[row]).diagram
             run = time.process_time() - begin
-            report.add(
-                {"field": name, "row": row, "run": run, **measure(diagram)}, f"{name}, {row}"
-            )
+            report.add({"field": name, "row": row, "run": run, **measure(diagram)}, f"{name}, {row}")
     report.finish(heading(adapter, "Short edges and small faces of 3D meshes"))
 
 

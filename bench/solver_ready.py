@@ -76,12 +76,16 @@ def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
         return float(getattr(values[part], how)()) if part.any() else float("nan")
 
     return {
-        "cells": len(d), "solver_mesh_seconds": seconds, **figures_of(verdict),
+        "cells": len(d),
+        "solver_mesh_seconds": seconds,
+        **figures_of(verdict),
         "concave_degrees": float(solver.concavity.max()),
         "shortest": float(solver.shortest_edge.min()),
-        "wall_error": of(e, wall, "mean"), "wall_quality": of(result.quality, wall, "min"),
-        "inner_error": of(e, inner, "mean"), "inner_quality": of(result.quality, inner, "mean"),
-    }  # fmt: skip
+        "wall_error": of(e, wall, "mean"),
+        "wall_quality": of(result.quality, wall, "min"),
+        "inner_error": of(e, inner, "mean"),
+        "inner_quality": of(result.quality, inner, "mean"),
+    }
 
 
 COLUMNS = {
@@ -101,9 +105,16 @@ COLUMNS = {
 
 
 WORST = {
-    "non_orthogonality": max, "skewness": max, "concave": max, "concave_degrees": max, "shortest": min,
-    "wall_error": max, "wall_quality": min, "inner_error": max, "inner_quality": min,
-}  # fmt: skip
+    "non_orthogonality": max,
+    "skewness": max,
+    "concave": max,
+    "concave_degrees": max,
+    "shortest": min,
+    "wall_error": max,
+    "wall_quality": min,
+    "inner_error": max,
+    "inner_quality": min,
+}
 SEED_COLUMNS = {
     "domain": lambda r: r["domain"],
     "run": lambda r: r["run"],
@@ -121,13 +132,16 @@ def over_seeds(rows: list[dict[str, Any]]) -> dict[str, Any]:
     refused = [f"seed {r['seed']}: {r['complaints'][:60]}" for r in rows if not r["ok"]]
     times = ("seconds", "solver_mesh_seconds")
     return {
-        "domain": rows[0]["domain"], "run": rows[0]["run"], "meshes": len(rows),
-        "accepted": len(rows) - len(refused), "ok": not refused,
+        "domain": rows[0]["domain"],
+        "run": rows[0]["run"],
+        "meshes": len(rows),
+        "accepted": len(rows) - len(refused),
+        "ok": not refused,
         "within": sum(r["ok"] and r["non_orthogonality"] <= 20 and r["skewness"] <= 2 for r in rows),
         **{name: worst(r[name] for r in rows) for name, worst in WORST.items()},
         **{name: sum(r[name] for r in rows) / len(rows) for name in times},
         "refused": "; ".join(refused),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:
@@ -136,12 +150,8 @@ def main() -> None:
     options_of.add_argument("--only", default="", metavar="NAMES", help=", ".join(DOMAINS))
     options_of.add_argument("--effort", default="default,best", metavar="NAMES")
     options_of.add_argument("--exact", action="store_true", help="also runs with method='exact'")
-    options_of.add_argument(
-        "--seeds", default="", metavar="NUMBERS", help="one run with each; N for 1 to N"
-    )
-    options_of.add_argument(
-        "--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log"
-    )
+    options_of.add_argument("--seeds", default="", metavar="NUMBERS", help="one run with each; N for 1 to N")
+    options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw each 2D mesh")
     options = options_of.parse_args()
     if shutil.which("checkMesh") is None:
@@ -171,9 +181,7 @@ def main() -> None:
                 part = "" if seed is None else f"-{seed}"
                 label = f"{name}-{run}{part}".replace(", ", "-").replace(" ", "-")
                 with tempfile.TemporaryDirectory() as folder:
-                    row = measure(
-                        result, Path(folder) if options.keep is None else options.keep / label
-                    )
+                    row = measure(result, Path(folder) if options.keep is None else options.keep / label)
                 if options.pictures is not None and domain.dim == 2:
                     options.pictures.mkdir(parents=True, exist_ok=True)
                     figure = result.plot(title=f"{name}, {run}")

@@ -50,23 +50,26 @@ def steep(growth: float) -> sizing.Field:
 
 
 GRADED = {
-    "1 : 9, growth 1.1": nested(1.1), "1 : 9, growth 1.2": nested(1.2),
-    "1 : 64, growth 1.1": steep(1.1), "1 : 64, growth 1.2": steep(1.2),
-}  # fmt: skip
+    "1 : 9, growth 1.1": nested(1.1),
+    "1 : 9, growth 1.2": nested(1.2),
+    "1 : 64, growth 1.1": steep(1.1),
+    "1 : 64, growth 1.2": steep(1.2),
+}
 
 
 def shape(result: clvoro.Result) -> dict[str, Any]:
     """Return sizes and shapes of a mesh, with those for C grids on a sphere."""
     error, quality = np.abs(result.size_error), result.quality
     found = {
-        "cells": len(result.diagram), "mean_error": error.mean(), "max_error": error.max(),
-        "mean_quality": quality.mean(), "min_quality": quality.min(),
-    }  # fmt: skip
+        "cells": len(result.diagram),
+        "mean_error": error.mean(),
+        "max_error": error.max(),
+        "mean_quality": quality.mean(),
+        "min_quality": quality.min(),
+    }
     if isinstance(result.diagram.domain, clvoro.Sphere):
         grid = result.measures.c_grid.summary()
-        found |= {
-            k: grid[k] for k in ("obtuse", "max_angle", "mean_edge_offset", "max_edge_offset")
-        }
+        found |= {k: grid[k] for k in ("obtuse", "max_angle", "mean_edge_offset", "max_edge_offset")}
     return {k: float(v) for k, v in found.items()}
 
 
@@ -87,9 +90,7 @@ def icosahedral(adapter: clvoro.Adapter, n: int) -> dict[str, Any] | None:
         return None
     points = EARTH.icosahedral_points(level)
     begin, work = time.perf_counter(), time.process_time()
-    result = adapter.run(
-        EARTH, (EARTH.measure / n) ** 0.5, points=points, method="lloyd", max_steps=LLOYD_STEPS
-    )
+    result = adapter.run(EARTH, (EARTH.measure / n) ** 0.5, points=points, method="lloyd", max_steps=LLOYD_STEPS)
     seconds, work = time.perf_counter() - begin, time.process_time() - work
     return {"seconds": seconds, "processor_seconds": work, **shape(result)}
 
@@ -106,8 +107,9 @@ def compare_openings(options: Any) -> None:
     adapter = make_adapter(options)
     kinds: list[tuple[str, Any, dict[str, Any]]] = [
         *((f"equal, {n}", 1e6, {"n_cells": n}) for n in (642, 2562, 10_242)),
-        ("two caps, growth 1.1", coarse(1.1), {}), ("two caps, growth 1.2", coarse(1.2), {}),
-    ]  # fmt: skip
+        ("two caps, growth 1.1", coarse(1.1), {}),
+        ("two caps, growth 1.2", coarse(1.2), {}),
+    ]
     columns = {
         "mesh": lambda r: r["mesh"],
         "method, effort": lambda r: f"{r['method']}, {r['effort']}",
@@ -120,16 +122,19 @@ def compare_openings(options: Any) -> None:
     }
     report, most = Report(options.json, columns), preparation.OPENINGS
     ways: list[tuple[Any, Any]] = [
-        ("exact", "default"), ("adaptive", "fast"), ("exact", "fast"), ("adaptive", "default"), ("adaptive", "best")
-    ]  # fmt: skip
+        ("exact", "default"),
+        ("adaptive", "fast"),
+        ("exact", "fast"),
+        ("adaptive", "default"),
+        ("adaptive", "best"),
+    ]
     for method, effort in ways:
         for name, size, given in kinds:
             row: dict[str, Any] = {"mesh": name, "method": method, "effort": effort, "runs": SEEDS}
             for way, openings in (("without", 0), ("with", most)):
                 preparation.OPENINGS = openings
                 results = [
-                    adapter.run(EARTH, size, method=method, effort=effort, seed=seed, **given)
-                    for seed in range(SEEDS)
+                    adapter.run(EARTH, size, method=method, effort=effort, seed=seed, **given) for seed in range(SEEDS)
                 ]
                 grids = [result.measures.c_grid for result in results]
                 error = np.concatenate([np.abs(result.size_error) for result in results])
@@ -161,9 +166,7 @@ def compare_precisions(options: Any) -> None:
         "edges that only one has": lambda r: f"{r['different']:.0f}",
         "missing vertices": lambda r: f"{r['merged']:.0f}",
         "shortest edge / h": lambda r: f"{r['shortest']:.3f}",
-        "relative difference of edges, mean, largest": lambda r: (
-            f"{r['mean']:.1e}, {r['largest']:.1e}"
-        ),
+        "relative difference of edges, mean, largest": lambda r: f"{r['mean']:.1e}, {r['largest']:.1e}",
     }
     report = Report(options.json, columns)
     for n in options.sizes:
@@ -173,10 +176,13 @@ def compare_precisions(options: Any) -> None:
         _, one, other = np.intersect1d(*keys, return_indices=True)
         off = np.abs(lengths[0][one] / lengths[1][other] - 1)
         row = {
-            "cells": n, "different": len(keys[0]) + len(keys[1]) - 2 * len(one),
-            "merged": 2 * n - 4 - len(made.vertices), "mean": off.mean(), "largest": off.max(),
+            "cells": n,
+            "different": len(keys[0]) + len(keys[1]) - 2 * len(one),
+            "merged": 2 * n - 4 - len(made.vertices),
+            "mean": off.mean(),
+            "largest": off.max(),
             "shortest": lengths[1].min() / (EARTH.measure / n) ** 0.5,
-        }  # fmt: skip
+        }
         report.add({k: float(v) for k, v in row.items()}, f"float32, {n}")
     report.finish(heading(single, "Edges of float32 meshes"))
 
@@ -239,9 +245,7 @@ def main() -> int:
         "mean, min Q": lambda r: f"{r['mean_quality']:.4f}, {r['min_quality']:.3f}",
         "obtuse": lambda r: f"{r['obtuse']:.0f}" if "obtuse" in r else "",
         "max angle": lambda r: f"{r['max_angle']:.1f}" if "obtuse" in r else "",
-        "edge offset": lambda r: (
-            f"{r['mean_edge_offset']:.4f}, {r['max_edge_offset']:.3f}" if "obtuse" in r else ""
-        ),
+        "edge offset": lambda r: f"{r['mean_edge_offset']:.4f}, {r['max_edge_offset']:.3f}" if "obtuse" in r else "",
     }
     report = Report(options.json, columns)
     for n in options.sizes:
@@ -254,10 +258,7 @@ def main() -> int:
                 report.add({"mesh": "square", "effort": effort, **row}, f"square, {n}")
         peer = icosahedral(adapter, n)
         if peer is not None:
-            report.add(
-                {"mesh": "icosahedral", "effort": f"lloyd, {LLOYD_STEPS}", **peer},
-                f"icosahedral, {n}",
-            )
+            report.add({"mesh": "icosahedral", "effort": f"lloyd, {LLOYD_STEPS}", **peer}, f"icosahedral, {n}")
     for name, size in GRADED.items() if options.graded else ():
         for effort in options.efforts:
             row = timed(adapter, EARTH, size, effort=effort, seed=FIRST_SEED)

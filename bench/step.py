@@ -28,18 +28,7 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from _common import (
-    BOX,
-    Report,
-    clock_of,
-    counts,
-    heading,
-    make_adapter,
-    markdown,
-    names,
-    parser,
-    test_field,
-)
+from _common import BOX, Report, clock_of, counts, heading, make_adapter, markdown, names, parser, test_field
 
 import clvoro
 from clvoro.adaptation.methods import Method, ProjectedMethod, WeightedMethod
@@ -60,9 +49,7 @@ WARM_UP = 4
 
 def kinds() -> dict[str, Callable[[], Method]]:
     """Return functions that create the methods of the steps of a default run on its finest level."""
-    steps = [
-        a.method for a in adaptive_schedule(2, "default", 1, exact=False) if isinstance(a, Step)
-    ]
+    steps = [a.method for a in adaptive_schedule(2, "default", 1, exact=False) if isinstance(a, Step)]
     projected = {m.descent: m for m in steps if isinstance(m, ProjectedMethod)}
     coupled = [m for m in steps if isinstance(m, WeightedMethod)]
     last = {"weighted": coupled[-1], "glide": projected["lloyd"], "polish": projected["quality"]}
@@ -127,9 +114,7 @@ def peak_operations(adapter: clvoro.Adapter) -> float:
     return items * 4096 * 8 * 8 * 2 / best
 
 
-def fresh_mesh(
-    adapter: clvoro.Adapter, queue: cl.CommandQueue, points: np.ndarray, n: int
-) -> MeshState:
+def fresh_mesh(adapter: clvoro.Adapter, queue: cl.CommandQueue, points: np.ndarray, n: int) -> MeshState:
     engine = Engine(adapter.ctx, queue, 2, adapter.dtype)
     field = test_field("F2") * (CELLS_OF_F2 / n) ** 0.5
     origin, scale = BOX.frame
@@ -185,12 +170,7 @@ def take_steps(
 
 
 def measure(
-    adapter: clvoro.Adapter,
-    kind: str,
-    points: np.ndarray,
-    n: int,
-    repeat: int,
-    clock: Callable[[], float],
+    adapter: clvoro.Adapter, kind: str, points: np.ndarray, n: int, repeat: int, clock: Callable[[], float]
 ) -> dict[str, Any]:
     mesh, method = fresh_mesh(adapter, adapter.queue, points, n), KINDS[kind]()
     take_steps(mesh, method, WARM_UP, clock)
@@ -216,14 +196,17 @@ def measure(
     ]
     read = sum(span.read for span in profile.spans) / repeat
     return {
-        "kind": kind, "cells": mesh.n, **parts, "step": sum(parts.values()),
-        "solve": profile.of(*SOLVERS) / repeat, "cold": statistics.median(cold), "read": read,
+        "kind": kind,
+        "cells": mesh.n,
+        **parts,
+        "step": sum(parts.values()),
+        "solve": profile.of(*SOLVERS) / repeat,
+        "cold": statistics.median(cold),
+        "read": read,
         "rate": mesh.n / parts["diagram"],
-        "kernels": {
-            name: (cost.seconds / calls, calls / repeat) for name, cost, calls in counted
-        },
+        "kernels": {name: (cost.seconds / calls, calls / repeat) for name, cost, calls in counted},
         "bandwidth": profile.bandwidth,
-    }  # fmt: skip
+    }
 
 
 def ms(figure: str) -> Callable[[dict[str, Any]], str]:
@@ -258,10 +241,18 @@ def limits(records: list[dict[str, Any]], peak: float, real: int) -> list[list[s
         size = reals * real + integers * 4
         memory = size / record["bandwidth"] / per_cell
         arithmetic = operations / peak / per_cell
-        rows.append([
-            name, record["kind"], f"{calls:.1f}", f"{1e9 * per_cell:.1f}", str(size),
-            str(operations), f"{memory:.0%}", f"{arithmetic:.0%}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                name,
+                record["kind"],
+                f"{calls:.1f}",
+                f"{1e9 * per_cell:.1f}",
+                str(size),
+                str(operations),
+                f"{memory:.0%}",
+                f"{arithmetic:.0%}",
+            ]
+        )
     return rows
 
 
@@ -271,9 +262,10 @@ def main() -> None:
     options_of.add_argument("--kinds", type=names, default=list(KINDS), help=", ".join(KINDS))
     options_of.add_argument("--repeat", type=int, default=7)
     options_of.add_argument(
-        "--processor-time", action="store_true",
+        "--processor-time",
+        action="store_true",
         help="the process's processor time over the device's units in the place of the clock's, where others use them",
-    )  # fmt: skip
+    )
     options = options_of.parse_args()
     if unknown := set(options.kinds) - set(KINDS):
         options_of.error(f"no step {', '.join(unknown)}; there are {', '.join(KINDS)}")
@@ -291,11 +283,17 @@ def main() -> None:
     if not options.json:
         peak = peak_operations(adapter)
         bandwidth = report.records[-1]["bandwidth"]
-        print(
-            f"Copying moves {1e-9 * bandwidth:.1f} GB/s, multiply-adds reach {1e-9 * peak:.0f} Gflop/s.\n"
-        )
-        header = ["kernel", "step", "calls a step", "ns per cell", "bytes needed", "operations",
-                  "memory: share of the time", "arithmetic"]  # fmt: skip
+        print(f"Copying moves {1e-9 * bandwidth:.1f} GB/s, multiply-adds reach {1e-9 * peak:.0f} Gflop/s.\n")
+        header = [
+            "kernel",
+            "step",
+            "calls a step",
+            "ns per cell",
+            "bytes needed",
+            "operations",
+            "memory: share of the time",
+            "arithmetic",
+        ]
         print(markdown(header, limits(report.records, peak, adapter.dtype.itemsize)))
 
 

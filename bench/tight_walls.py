@@ -83,9 +83,12 @@ def measure(result: clvoro.Result) -> dict[str, Any]:
         return float(e[rows].mean()) if rows.size else float("nan")
 
     return {
-        "wall": len(wall), "low": int((q[wall] < LEAST_QUALITY).sum()),
+        "wall": len(wall),
+        "low": int((q[wall] < LEAST_QUALITY).sum()),
         "narrow": int((q[wall[narrow]] < LEAST_QUALITY).sum()),
-        "sharp": int(sharp.sum()), "rough": int(rough.sum()), "elsewhere": int(left.sum()),
+        "sharp": int(sharp.sum()),
+        "rough": int(rough.sum()),
+        "elsewhere": int(left.sum()),
         "error": [mean(wall), *map(mean, parts)],
         "quality": [float(q[rows].min()) if rows.size else float("nan") for rows in parts],
         "corners": len(parts[0]),
@@ -93,7 +96,7 @@ def measure(result: clvoro.Result) -> dict[str, Any]:
             {"at": d.points[i].tolist(), "h": h[i], "quality": q[i], "straight": s, "angle": angle}
             for i, s, angle in zip(rest[left], straight[left], angles[left], strict=True)
         ],
-    }  # fmt: skip
+    }
 
 
 COLUMNS = {

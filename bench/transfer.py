@@ -24,11 +24,7 @@ from _common import FIRST_SEED, Report, counts, heading, make_adapter, parser
 
 import clvoro
 
-WAYS: dict[str, dict[str, Any]] = {
-    "1": {"order": 1},
-    "2": {"order": 2},
-    "2 free": {"order": 2, "limited": False},
-}
+WAYS: dict[str, dict[str, Any]] = {"1": {"order": 1}, "2": {"order": 2}, "2 free": {"order": 2, "limited": False}}
 
 
 def smooth(x: np.ndarray) -> np.ndarray:
@@ -44,11 +40,7 @@ def make_mesh(
     box = clvoro.Box((0,) * dim, (1,) * dim)
     rng, globe = np.random.default_rng(seed), clvoro.Sphere(1.0)
     if random:
-        made = (
-            adapter.diagram(globe, rng.normal(size=(n, 3)))
-            if sphere
-            else adapter.diagram(box, rng.random((n, dim)))
-        )
+        made = adapter.diagram(globe, rng.normal(size=(n, 3))) if sphere else adapter.diagram(box, rng.random((n, dim)))
     elif sphere:
         made = adapter.run(globe, 1.0, n_cells=n, effort="fast", seed=seed).diagram
     else:
@@ -59,11 +51,7 @@ def make_mesh(
 
 
 def measure(
-    old: clvoro.Diagram,
-    new: clvoro.Diagram,
-    adapter: clvoro.Adapter,
-    repeat: int,
-    way: dict[str, Any],
+    old: clvoro.Diagram, new: clvoro.Diagram, adapter: clvoro.Adapter, repeat: int, way: dict[str, Any]
 ) -> dict[str, float]:
     """Carry the function over `repeat` times."""
     values = smooth(old.centroids)
@@ -75,11 +63,13 @@ def measure(
     error = np.abs(carried - smooth(new.centroids))
     mass = float(new.volumes @ carried - old.volumes @ values)
     return {
-        "cells": len(new), "per_second": len(new) / statistics.median(seconds),
-        "error": float(new.volumes @ error / new.volumes.sum()), "max_error": float(error.max()),
+        "cells": len(new),
+        "per_second": len(new) / statistics.median(seconds),
+        "error": float(new.volumes @ error / new.volumes.sum()),
+        "max_error": float(error.max()),
         "mass": abs(mass) / float(old.volumes @ np.abs(values)),
         "beyond": max(carried.max() - values.max(), values.min() - carried.min(), 0.0),
-    }  # fmt: skip
+    }
 
 
 def shown(figure: str, form: str) -> Callable[[dict[str, Any]], str]:
@@ -112,10 +102,7 @@ def main(arguments: list[str] | None = None) -> int:
     for dim in [2] if options.sphere else options.dims:
         before: dict[str, tuple[int, float]] = {}
         for n in options.sizes:
-            old, new = (
-                make_mesh(adapter, dim, n, FIRST_SEED + k, options.random, options.sphere)
-                for k in range(2)
-            )
+            old, new = (make_mesh(adapter, dim, n, FIRST_SEED + k, options.random, options.sphere) for k in range(2))
             for name, way in WAYS.items():
                 record: dict[str, Any] = {"dim": dim, "way": name, "rate": None}
                 record |= measure(old, new, adapter, options.repeat, way)

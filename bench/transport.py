@@ -80,20 +80,10 @@ def draw(adapter: clvoro.Adapter, folder: Path) -> None:
     box, n = clvoro.Box((0, 0), (1, 1)), 400
     points = np.random.default_rng(SEED).random((n, 2))
     equal_cells = adapter.transport(box, points, np.full(n, 1 / n)).diagram
-    panels = {
-        "Voronoi cells": adapter.diagram(box, points),
-        "power cells of equal area": equal_cells,
-    }
+    panels = {"Voronoi cells": adapter.diagram(box, points), "power cells of equal area": equal_cells}
     figure, axes = plt.subplots(1, 2, figsize=(10, 5), layout="constrained")
     for ax, (title, diagram) in zip(axes, panels.items(), strict=True):
-        diagram.plot(
-            diagram.volumes * n,
-            ax=ax,
-            limits=(-0.5, 2.2),
-            key=False,
-            title=title,
-            label="area over mean",
-        )
+        diagram.plot(diagram.volumes * n, ax=ax, limits=(-0.5, 2.2), key=False, title=title, label="area over mean")
         ways = np.stack([points, diagram.centroids])
         ax.plot(ways[..., 0], ways[..., 1], "-", color=LINE, linewidth=1)
         ax.plot(*points.T, ".", color=LINE, markersize=4)
@@ -114,10 +104,7 @@ def main(arguments: list[str] | None = None) -> None:
         "cube": (clvoro.Box((0, 0, 0), (1, 1, 1)), options.sizes_3d),
         "lake": (lake().domain, options.sizes_lake),
         "torus": (clvoro.Box((0, 0), (1, 1), periodic=True), options.sizes_periodic),
-        "torus in 3D": (
-            clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True),
-            [n // 10 for n in options.sizes_periodic],
-        ),
+        "torus in 3D": (clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), [n // 10 for n in options.sizes_periodic]),
     }
     for name, (domain, sizes) in domains.items():
         for n in sizes:
@@ -127,9 +114,7 @@ def main(arguments: list[str] | None = None) -> None:
                 volumes *= domain.measure / volumes.sum()
                 adapter.transport(domain, points, volumes, max_steps=1)  # builds the kernels
                 seconds, found = best(
-                    options.repeat,
-                    lambda d=domain, p=points, v=volumes: adapter.transport(d, p, v),
-                    clock,
+                    options.repeat, lambda d=domain, p=points, v=volumes: adapter.transport(d, p, v), clock
                 )
                 inside = found.diagram.locate(points) == np.arange(n)
                 damped = ", ".join(f"{s:g}" for s in found.shares[found.shares < 1])

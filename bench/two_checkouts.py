@@ -85,18 +85,12 @@ def seconds_of(checkout: Path, name: str, runs: int) -> tuple[float, ...]:
     They are those of all threads, and of the host.
     """
     coarser = 2 if name in LARGE else 1
-    code = CHILD.format(
-        checkout=str(checkout), run={**RUNS, **LARGE}[name], runs=runs, coarser=coarser
-    )
+    code = CHILD.format(checkout=str(checkout), run={**RUNS, **LARGE}[name], runs=runs, coarser=coarser)
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
     if done.returncode:
         raise SystemExit(f"{checkout}: {done.stderr.strip().splitlines()[-1]}")
-    return tuple(
-        statistics.median(map(float, line.split())) for line in done.stdout.strip().splitlines()
-    )
+    return tuple(statistics.median(map(float, line.split())) for line in done.stdout.strip().splitlines())
 
 
 COLUMNS = {
@@ -131,8 +125,7 @@ def main() -> None:
         options_of.error(f"no run {', '.join(unknown)}; there are {'; '.join([*RUNS, *LARGE])}")
     for name in chosen:
         pairs = [
-            (seconds_of(other, name, options.runs), seconds_of(HERE, name, options.runs))
-            for _ in range(options.repeat)
+            (seconds_of(other, name, options.runs), seconds_of(HERE, name, options.runs)) for _ in range(options.repeat)
         ]
         record: dict[str, Any] = {"run": name}
         for k, prefix in enumerate(("", "host_")):
@@ -140,9 +133,7 @@ def main() -> None:
             ratios = [b / a for a, b in zip(theirs, ours, strict=True)]
             record |= {f"{prefix}other": theirs, f"{prefix}this": ours, f"{prefix}ratios": ratios}
         report.add(record, name)
-    report.finish(
-        f"Runs of this checkout against {json.dumps(options.other.name)}, in processor seconds."
-    )
+    report.finish(f"Runs of this checkout against {json.dumps(options.other.name)}, in processor seconds.")
 
 
 if __name__ == "__main__":

@@ -16,18 +16,7 @@ from argparse import Namespace
 from typing import Any
 
 import numpy as np
-from _common import (
-    FIRST_SEED,
-    Report,
-    counts,
-    device_name,
-    domain_of,
-    figures,
-    make_adapter,
-    names,
-    parser,
-    test_field,
-)
+from _common import FIRST_SEED, Report, counts, device_name, domain_of, figures, make_adapter, names, parser, test_field
 
 import clvoro
 from clvoro.adaptation.sampling.start import count_cells
@@ -52,34 +41,26 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
     box, field = domain_of(name), test_field(name)
     field = field * (count_cells(field, box) / n) ** (1 / box.dim)
     points = np.random.default_rng(FIRST_SEED).random((n, box.dim)) * box.extent
-    one, other = (
-        make_adapter(Namespace(device=device, dtype=options.dtype)) for device in options.devices
-    )
+    one, other = (make_adapter(Namespace(device=device, dtype=options.dtype)) for device in options.devices)
     eps = float(np.finfo(options.dtype).eps)
     same = {"dim": box.dim, "dtype": options.dtype}
 
     a, b = (adapter.diagram(box, points) for adapter in (one, other))
     graph = bool(np.array_equal(a.neighbors, b.neighbors))
     off = float(np.abs(a.volumes - b.volumes).max() / a.volumes.mean())
-    records = [
-        {**same, "what": "diagram", "cells": n, "graph": graph, "off": off, "in_eps": off / eps}
-    ]
+    records = [{**same, "what": "diagram", "cells": n, "graph": graph, "off": off, "in_eps": off / eps}]
 
     a, b = (
         adapter.run(
-            box,
-            field,
-            method="weighted",
-            max_steps=STEPS,
-            options=clvoro.PaperOptions(tol=0.0),
-            seed=FIRST_SEED,
+            box, field, method="weighted", max_steps=STEPS, options=clvoro.PaperOptions(tol=0.0), seed=FIRST_SEED
         )
         for adapter in (one, other)
     )
     off = float((np.linalg.norm(a.points - b.points, axis=1) / a.target_size).max())
     graph = bool(np.array_equal(a.diagram.neighbors, b.diagram.neighbors))
-    records.append({**same, "what": f"{STEPS} steps", "cells": len(a.points), "graph": graph, "off": off,
-                    "in_eps": off / eps})  # fmt: skip
+    records.append(
+        {**same, "what": f"{STEPS} steps", "cells": len(a.points), "graph": graph, "off": off, "in_eps": off / eps}
+    )
 
     for effort in () if options.no_runs else ("fast", "default"):
         found = []
@@ -87,11 +68,16 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
             result = adapter.run(box, field, effort=effort, seed=FIRST_SEED)
             found.append(figures(result.diagram, result.target_size, result.quality))
         a, b = found
-        records.append({
-            **same, "what": effort, "cells": int(a["cells"]), "cells_off": int(abs(a["cells"] - b["cells"])),
-            "mean_error": [a["mean_error"], b["mean_error"]],
-            "mean_quality": [a["mean_quality_all"], b["mean_quality_all"]],
-        })  # fmt: skip
+        records.append(
+            {
+                **same,
+                "what": effort,
+                "cells": int(a["cells"]),
+                "cells_off": int(abs(a["cells"] - b["cells"])),
+                "mean_error": [a["mean_error"], b["mean_error"]],
+                "mean_quality": [a["mean_quality_all"], b["mean_quality_all"]],
+            }
+        )
     return records
 
 
@@ -124,9 +110,7 @@ def main() -> int | str:
     columns = {
         "dim": lambda r: r["dim"],
         "what": lambda r: r["what"],
-        "cells": lambda r: (
-            f"{r['cells']:,}" + (f" +- {r['cells_off']}" if r.get("cells_off") else "")
-        ),
+        "cells": lambda r: f"{r['cells']:,}" + (f" +- {r['cells_off']}" if r.get("cells_off") else ""),
         "same graph": either("graph", lambda same: "yes" if same else "no"),
         "off": either("off", "{:.1e}".format),
         "in eps": either("in_eps", "{:.0f}".format),
@@ -140,9 +124,7 @@ def main() -> int | str:
             for record in compare(options, name, n):
                 report.add(record)
                 agree &= good(record)
-    report.finish(
-        f"{' and '.join(map(device_name, devices))}, clvoro {clvoro.__version__}, {options.dtype}."
-    )
+    report.finish(f"{' and '.join(map(device_name, devices))}, clvoro {clvoro.__version__}, {options.dtype}.")
     return 0 if agree else 1
 
 

@@ -28,18 +28,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from _common import (
-    CUBE,
-    Report,
-    clock_of,
-    counts,
-    heading,
-    make_adapter,
-    markdown,
-    names,
-    parser,
-    test_field,
-)  # fmt: skip
+from _common import CUBE, Report, clock_of, counts, heading, make_adapter, markdown, names, parser, test_field
 from launches import name_of
 
 import clvoro
@@ -87,9 +76,7 @@ def rows_of(t: Tessellation) -> np.ndarray:
     return np.sort(cell * (t.n + 8) + t.neighbors.get()[: starts[-1]] + 6)
 
 
-def moves(
-    adapter: clvoro.Adapter, n: int, options: Any, clock: Callable[[], float]
-) -> list[dict[str, Any]]:
+def moves(adapter: clvoro.Adapter, n: int, options: Any, clock: Callable[[], float]) -> list[dict[str, Any]]:
     rng = np.random.default_rng(SEED)
     ours, anew = Diagrams(adapter), Diagrams(adapter)
     x = along_curve(rng.random((n, 3)))
@@ -113,15 +100,13 @@ def moves(
                 other = np.setxor1d(before, rows_of(t), assume_unique=True)
                 changed += len(np.unique(other // (n + 8))) / n / options.repeat
         update, new = spent / options.repeat
-        found.append({
-            "cells": n, "move": share, "changed": changed, "update": update, "new": new, "factor": new / update,
-        })  # fmt: skip
+        found.append(
+            {"cells": n, "move": share, "changed": changed, "update": update, "new": new, "factor": new / update}
+        )
     return found
 
 
-def run(
-    adapter: clvoro.Adapter, factor: float, updated: bool, clock: Callable[[], float]
-) -> dict[str, Any]:
+def run(adapter: clvoro.Adapter, factor: float, updated: bool, clock: Callable[[], float]) -> dict[str, Any]:
     """One whole run, and the seconds of its diagrams."""
     update, tessellate, spent = PolyhedraUpdate.update, Tessellator.tessellate, 0.0
 
@@ -145,9 +130,13 @@ def run(
     finally:
         Tessellator.tessellate, PolyhedraUpdate.update = tessellate, update  # type: ignore[method-assign]
     return {
-        "cells": len(result.points), "move": "run, updated" if updated else "run, anew", "run": seconds,
-        "diagrams": spent, "error": float(np.abs(result.size_error).mean()), "quality": float(result.quality.mean()),
-    }  # fmt: skip
+        "cells": len(result.points),
+        "move": "run, updated" if updated else "run, anew",
+        "run": seconds,
+        "diagrams": spent,
+        "error": float(np.abs(result.size_error).mean()),
+        "quality": float(result.quality.mean()),
+    }
 
 
 class Shares:
@@ -164,7 +153,7 @@ class Shares:
         updated = [step for step in steps if not step["anew"]]
         return {name: float(np.mean([step[name] for step in updated])) for name in self.NAMES[:-1]} | {
             "anew": 1 - len(updated) / len(steps)
-        }  # fmt: skip
+        }
 
     @contextmanager
     def counting(self) -> Iterator[None]:
@@ -172,13 +161,7 @@ class Shares:
         update, update_round = PolyhedraUpdate.update, polyhedra_update._Rounds.update
 
         def updated(
-            own: PolyhedraUpdate,
-            cells: Any,
-            box: Any,
-            points: Any,
-            previous: Tessellation,
-            clip: Any,
-            *follow: Any,
+            own: PolyhedraUpdate, cells: Any, box: Any, points: Any, previous: Tessellation, clip: Any, *follow: Any
         ) -> Tessellation | None:
             if not self.kind:
                 return update(own, cells, box, points, previous, clip, *follow)
@@ -186,9 +169,7 @@ class Shares:
             found: dict[str, Any] = {"kind": self.kind, "cells": n} | dict.fromkeys(self.NAMES, 0.0)
             self.steps.append(found)
             # The graph is overwritten by the next one.
-            before = replace(
-                previous, starts=previous.starts.copy(), neighbors=previous.neighbors.copy()
-            )
+            before = replace(previous, starts=previous.starts.copy(), neighbors=previous.neighbors.copy())
 
             def clipped(cut: Any, report: Any, used: int) -> None:
                 found["clipped"] += np.count_nonzero(cut.counts.get() < 0) / n
@@ -228,11 +209,7 @@ class Shares:
 
 def shares_of(adapter: clvoro.Adapter, n: int, periodic: bool) -> list[list[str]]:
     """Return the rows of the table of shares: those of a run, on its finest level."""
-    shares, box, step = (
-        Shares(),
-        clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(periodic,) * 3),
-        Loop.step,
-    )
+    shares, box, step = (Shares(), clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(periodic,) * 3), Loop.step)
     field = test_field("S1")
 
     def stepped(loop: Loop, action: Any) -> None:
@@ -249,10 +226,15 @@ def shares_of(adapter: clvoro.Adapter, n: int, periodic: bool) -> list[list[str]
         for when, part in (("early", steps[:half]), ("late", steps[half:])):
             if part:
                 means = shares.mean(part)
-                rows.append([
-                    f"{kind}, {when}", f"{part[-1]['cells']:,}", "yes" if periodic else "no", str(len(part)),
-                    *(f"{means[name]:.1%}" for name in shares.NAMES),
-                ])  # fmt: skip
+                rows.append(
+                    [
+                        f"{kind}, {when}",
+                        f"{part[-1]['cells']:,}",
+                        "yes" if periodic else "no",
+                        str(len(part)),
+                        *(f"{means[name]:.1%}" for name in shares.NAMES),
+                    ]
+                )
     return rows
 
 
@@ -278,12 +260,21 @@ def main() -> None:
         print(markdown(header, rows))
         return
     clock = clock_of(options, adapter)
-    report = Report(options.json, {
-        "cells": shown("cells", ","), "move, spacings": lambda r: r["move"], "cells changed": shown("changed", ".0%"),
-        "update s": shown("update", ".3f"), "new s": shown("new", ".3f"), "new / update": shown("factor", ".2f"),
-        "run s": shown("run", ".2f"), "its diagrams s": shown("diagrams", ".2f"), "mean e": shown("error", ".5f"),
-        "mean Q": shown("quality", ".4f"),
-    })  # fmt: skip
+    report = Report(
+        options.json,
+        {
+            "cells": shown("cells", ","),
+            "move, spacings": lambda r: r["move"],
+            "cells changed": shown("changed", ".0%"),
+            "update s": shown("update", ".3f"),
+            "new s": shown("new", ".3f"),
+            "new / update": shown("factor", ".2f"),
+            "run s": shown("run", ".2f"),
+            "its diagrams s": shown("diagrams", ".2f"),
+            "mean e": shown("error", ".5f"),
+            "mean Q": shown("quality", ".4f"),
+        },
+    )
     for n in options.sizes:
         began = time.perf_counter()
         for record in moves(adapter, n, options, clock):

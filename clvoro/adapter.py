@@ -33,7 +33,7 @@ from .adaptation.transport.given import power_diagram_of, transport_to
 from .arguments import Naming, check_choice, check_points
 from .errors import InputError, InputTypeError, Interrupted, MemoryLimitError
 from .geometry.boundary_layers import Layers
-from .geometry.box import Domain
+from .geometry.domain import Domain
 from .mesh.diagram import Diagram
 from .mesh.results import Result
 from .mesh.transported import Transported
@@ -89,9 +89,7 @@ class Adapter:
     """
 
     def __init__(
-        self,
-        ctx: cl.Context | None = None,
-        dtype: Literal["float64", "float32"] | DTypeLike = "float64",
+        self, ctx: cl.Context | None = None, dtype: Literal["float64", "float32"] | DTypeLike = "float64"
     ) -> None:
         try:
             real = np.dtype(dtype)  # type: ignore[arg-type]
@@ -261,9 +259,7 @@ class Adapter:
     ) -> Transported:
         """Return the power diagram of `points` whose cells have `volumes`; see `clvoro.transport`."""
         with self._alone():
-            return transport_to(
-                self._stages_for(domain), domain, points, volumes, tolerance, max_steps
-            )
+            return transport_to(self._stages_for(domain), domain, points, volumes, tolerance, max_steps)
 
     def run(
         self,
@@ -370,10 +366,15 @@ class Adapter:
         """
         start, given = split_start(points)
         merged = Options(
-            method=method, start=start, effort=effort, seed=seed, max_steps=max_steps, n_cells=n_cells,
+            method=method,
+            start=start,
+            effort=effort,
+            seed=seed,
+            max_steps=max_steps,
+            n_cells=n_cells,
             layers=layers,  # type: ignore[arg-type]
             **special(options),
-        )  # fmt: skip
+        )
         check_choice("on_interrupt", on_interrupt, ("raise", "return"))
         check_run(domain, size, callback)
         files = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
@@ -385,15 +386,7 @@ class Adapter:
             wells = check_fixed(fixed, domain, self.dtype)
             with noticed_builds(stages.engine, self.on_build) as notice:
                 result = run_adaptation(
-                    stages,
-                    domain,
-                    size,
-                    host,
-                    wells,
-                    merged,
-                    files,
-                    self._shown(callback, notice),
-                    self.on_memory,
+                    stages, domain, size, host, wells, merged, files, self._shown(callback, notice), self.on_memory
                 )
         if result.stop_reason == INTERRUPTED and on_interrupt == "raise":
             raise Interrupted(result)
@@ -439,9 +432,12 @@ class Adapter:
         """
         start, given = split_start(points)
         merged = Options(
-            method=method, start=start, n_cells=n_cells, **special(options),
+            method=method,
+            start=start,
+            n_cells=n_cells,
+            **special(options),
             layers=layers,  # type: ignore[arg-type]
-        )  # fmt: skip
+        )
         with self._alone():
             stages = self._stages_for(domain)
             host = None if given is None else check_points(given, domain)

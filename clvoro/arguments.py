@@ -14,7 +14,7 @@ import numpy as np
 from .errors import InputError, InputTypeError
 
 if TYPE_CHECKING:
-    from .geometry.box import Domain
+    from .geometry.domain import Domain
 
 
 def warn(message: str, category: type[Warning]) -> None:
@@ -75,8 +75,7 @@ def check_rows(name: str, value: object, d: int) -> np.ndarray:
     """
     if np.ma.is_masked(value):
         raise InputError(
-            f"{name} has {np.ma.count_masked(value)} masked numbers, expected none; pass "
-            "numpy.ma.compress_rows(array)"
+            f"{name} has {np.ma.count_masked(value)} masked numbers, expected none; pass numpy.ma.compress_rows(array)"
         )
     expected = f"expected an array of real numbers of shape (n, {d}), one row per point"
     try:
@@ -107,9 +106,7 @@ def check_rows(name: str, value: object, d: int) -> np.ndarray:
             remedy = f"points have {d} coordinates here"
         if array.ndim == 1:
             one = len(array) == d
-            remedy = (
-                "pass [point] for a single one" if one else "pass numpy.column_stack([x, y]), say"
-            )
+            remedy = "pass [point] for a single one" if one else "pass numpy.column_stack([x, y]), say"
         raise InputError(f"{name} has shape {array.shape}, expected (n, {d}); {remedy}")
     return array.astype(np.float64)
 
@@ -161,15 +158,11 @@ def coincident_pair(points: np.ndarray) -> tuple[int, int] | None:
     return i, j
 
 
-def check_integer(
-    name: str, value: object, least: int, most: float = 2**63 - 1, beside: str = ""
-) -> int:
+def check_integer(name: str, value: object, least: int, most: float = 2**63 - 1, beside: str = "") -> int:
     """Return `value` as an int from `least` to `most`; errors name the values that are allowed `beside` integers."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         expected = f"an integer or {beside}" if beside else "an integer"
-        raise InputTypeError(
-            f"{name} is {value!r} of type {type(value).__name__}, expected {expected}"
-        )
+        raise InputTypeError(f"{name} is {value!r} of type {type(value).__name__}, expected {expected}")
     if value < least:
         raise InputError(f"{name} is {value}, expected at least {least}")
     if value > most:
@@ -177,18 +170,14 @@ def check_integer(
     return int(value)
 
 
-def check_number(
-    name: str, value: object, *, above: float = -np.inf, least: float = -np.inf
-) -> float:
+def check_number(name: str, value: object, *, above: float = -np.inf, least: float = -np.inf) -> float:
     """Return `value` as a finite float > `above` and >= `least`."""
     try:
         if isinstance(value, str | bytes):  # float() would accept them
             raise TypeError
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
-        raise InputTypeError(
-            f"{name} is {value!r} of type {type(value).__name__}, expected a number"
-        ) from None
+        raise InputTypeError(f"{name} is {value!r} of type {type(value).__name__}, expected a number") from None
     except OverflowError:
         number = np.inf
     if not np.isfinite(number) or number <= above or number < least:

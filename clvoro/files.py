@@ -31,9 +31,7 @@ def open_plain(path: str | PathLike[str]) -> BufferedReader:
     _check_plain(path, os.stat(path))  # first, because some devices react to being opened
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NOWAIT))
     try:
-        _check_plain(
-            path, os.fstat(file.fileno())
-        )  # again, because the file may have been replaced
+        _check_plain(path, os.fstat(file.fileno()))  # again, because the file may have been replaced
     except OSError:
         file.close()
         raise
@@ -78,6 +76,4 @@ def _check_plain(path: str | PathLike[str], found: os.stat_result) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fsdecode(path))
     if not stat.S_ISREG(found.st_mode):
-        raise OSError(
-            errno.EINVAL, "it is a pipe, socket or device, not a regular file", os.fsdecode(path)
-        )
+        raise OSError(errno.EINVAL, "it is a pipe, socket or device, not a regular file", os.fsdecode(path))

@@ -37,12 +37,15 @@ if TYPE_CHECKING:
     from .geometry.polygon import Polygon
 
     Area = (
-        Polygon | shapely.Geometry | str | PathLike[str] | Mapping[str, Any] | np.ndarray
+        Polygon
+        | shapely.Geometry
+        | str
+        | PathLike[str]
+        | Mapping[str, Any]
+        | np.ndarray
         | Callable[[np.ndarray], ArrayLike]
-    )  # fmt: skip
-    Lines = (
-        ArrayLike | Sequence[ArrayLike] | shapely.Geometry | str | PathLike[str] | Mapping[str, Any]
     )
+    Lines = ArrayLike | Sequence[ArrayLike] | shapely.Geometry | str | PathLike[str] | Mapping[str, Any]
 
 __all__ = ["crossed", "inside", "ocean", "rings"]
 
@@ -252,9 +255,7 @@ def rings(mesh: Result | Diagram, keep: ArrayLike, count: int = 7) -> np.ndarray
 def _diagram_of(mesh: object) -> tuple[Diagram, Sphere]:
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     if not isinstance(diagram, Diagram):
-        raise InputTypeError(
-            f"mesh is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram"
-        )
+        raise InputTypeError(f"mesh is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram")
     if not isinstance(diagram.domain, Sphere):
         raise InputError(f"mesh is in {diagram.domain}, expected a mesh on a clvoro.Sphere")
     return diagram, diagram.domain
@@ -288,9 +289,7 @@ def _crossed(diagram: Diagram, sphere: Sphere, name: str, lines: Any) -> list[np
     return found
 
 
-def _widened(
-    diagram: Diagram, sphere: Sphere, water: np.ndarray, blocked: np.ndarray
-) -> np.ndarray:
+def _widened(diagram: Diagram, sphere: Sphere, water: np.ndarray, blocked: np.ndarray) -> np.ndarray:
     found, left = widen_straits(diagram, water, blocked)
     if len(left):
         lon, lat = sphere.lonlat(diagram.points[left[:1]])[0]

@@ -12,7 +12,7 @@ from .adaptation.options import EffortName, MethodName, Start
 from .adapter import Adapter
 from .errors import DeviceError
 from .geometry.boundary_layers import Layers
-from .geometry.box import Domain
+from .geometry.domain import Domain
 from .mesh.diagram import Diagram
 from .mesh.results import Result
 from .mesh.transported import Transported
@@ -105,9 +105,8 @@ def adapt(
     (True, True)
     """
     return shared_adapter().run(
-        domain, size, points, method, n_cells, effort=effort, layers=layers, fixed=fixed, seed=seed,
-        callback=callback,
-    )  # fmt: skip
+        domain, size, points, method, n_cells, effort=effort, layers=layers, fixed=fixed, seed=seed, callback=callback
+    )
 
 
 def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
@@ -158,12 +157,7 @@ def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diag
 
 
 def transport(
-    domain: Domain,
-    points: ArrayLike,
-    volumes: ArrayLike,
-    *,
-    tolerance: float | None = None,
-    max_steps: int = 100,
+    domain: Domain, points: ArrayLike, volumes: ArrayLike, *, tolerance: float | None = None, max_steps: int = 100
 ) -> Transported:
     """Find the weights with which the cells of a power diagram have prescribed `volumes`, on the best device.
 
@@ -206,9 +200,7 @@ def transport(
     >>> found.diagram.volumes.round(9).tolist(), found.converged
     ([0.2, 0.3, 0.5], True)
     """
-    return shared_adapter().transport(
-        domain, points, volumes, tolerance=tolerance, max_steps=max_steps
-    )
+    return shared_adapter().transport(domain, points, volumes, tolerance=tolerance, max_steps=max_steps)
 
 
 def voronoi(domain: Domain, points: ArrayLike) -> Diagram:

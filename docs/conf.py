@@ -55,9 +55,7 @@ sphinx_gallery_conf = {
     "gallery_dirs": "gallery",
     "filename_pattern": r"\.py$",
     "ignore_pattern": r"__init__",
-    "subsection_order": [
-        str(Path("examples") / name) for name in ("flow", "water", "moving", "space", "method")
-    ],
+    "subsection_order": [str(Path("examples") / name) for name in ("flow", "water", "moving", "space", "method")],
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
     "remove_config_comments": True,
@@ -110,9 +108,7 @@ def _block_math(translator, node):
     from docutils import nodes
 
     number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
-    translator.body.append(
-        f'<div class="formula">{number}{_mathml(node.astext(), block=True)}</div>'
-    )
+    translator.body.append(f'<div class="formula">{number}{_mathml(node.astext(), block=True)}</div>')
     raise nodes.SkipNode
 
 

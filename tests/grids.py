@@ -32,9 +32,7 @@ def points_to_leave(items: Iterable[pytest.Item]) -> Iterator[pytest.Item]:
         kept = 0
         while left:
             # The point with most new values; among equals, the one whose values are rarest so far.
-            item, point = min(
-                left, key=lambda p: (sum(v in used for v in p[1]), sum(used[v] for v in p[1]))
-            )
+            item, point = min(left, key=lambda p: (sum(v in used for v in p[1]), sum(used[v] for v in p[1])))
             if all(v in used for v in point) if most[name] is None else kept == most[name]:
                 yield from (item for item, _ in left)
                 break

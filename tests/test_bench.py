@@ -15,9 +15,7 @@ pytestmark = pytest.mark.skipif(not BENCH.is_dir(), reason="the tests lie outsid
 
 def records(script, *options, code=0):
     """Run a script; return what it prints with --json."""
-    done = subprocess.run(
-        [sys.executable, str(BENCH / script), "--json", *options], capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, str(BENCH / script), "--json", *options], capture_output=True, text=True)
     assert done.returncode == code, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()]
 
@@ -95,9 +93,8 @@ def test_poisson_order():
 def test_shallow_water():
     # The script itself fails if a run is unstable, or a balance is not round-off.
     rows = records(
-        "shallow_water.py", "--quick", "--reference", "10242",
-        "--meshes", "uniform,uniform+2,icosahedral+50",
-    )  # fmt: skip
+        "shallow_water.py", "--quick", "--reference", "10242", "--meshes", "uniform,uniform+2,icosahedral+50"
+    )
     runs = [r for r in rows if "stable" in r]
     assert len(runs) == 13
     assert len(rows) == 26
@@ -133,9 +130,7 @@ def test_methods():
 
 @pytest.mark.slow
 def test_a_table_is_markdown():
-    command = [
-        sys.executable, str(BENCH / "transfer.py"), "--sizes", "300", "--dims", "3", "--repeat", "1",
-    ]  # fmt: skip
+    command = [sys.executable, str(BENCH / "transfer.py"), "--sizes", "300", "--dims", "3", "--repeat", "1"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if line.startswith("|")]
@@ -147,15 +142,7 @@ def test_a_table_is_markdown():
 def test_scaling(tmp_path):
     pytest.importorskip("matplotlib")
     rows = records(
-        "scaling.py",
-        "--sizes",
-        "500,1e3",
-        "--solid-sizes",
-        "500,1e3",
-        "--run-sizes",
-        "500,1e3",
-        "--out",
-        str(tmp_path),
+        "scaling.py", "--sizes", "500,1e3", "--solid-sizes", "500,1e3", "--run-sizes", "500,1e3", "--out", str(tmp_path)
     )
     names = {r["curve"] for r in rows}
     assert {"diagram", "next diagram", "3D diagram", "Poisson", "fast run", "default run"} <= names
@@ -166,9 +153,7 @@ def test_scaling(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="needs OpenFOAM")
 def test_cylinder():
-    rows = records(
-        "cylinder.py", "--cells", "1500", "--meshers", "clvoro; clvoro, layers; blockMesh"
-    )
+    rows = records("cylinder.py", "--cells", "1500", "--meshers", "clvoro; clvoro, layers; blockMesh")
     assert [r["mesher"] for r in rows] == ["clvoro", "clvoro, layers", "blockMesh"]
     # In percent: 0.1, 0.1 and 0.6 for drag, and at most 3 for the pressure difference.
     assert all(abs(r["drag"][0]) < 0.8 for r in rows)
@@ -197,9 +182,7 @@ def test_masks():
 @pytest.mark.slow
 def test_truncation_of_trisk():
     """Near pentagons the gradient of the kinetic energy is off by a constant over dx, and elsewhere by less."""
-    coarse, fine = records(
-        "shallow_water.py", "--truncation", "--cells", "642,2562", "--meshes", "icosahedral+50"
-    )
+    coarse, fine = records("shallow_water.py", "--truncation", "--cells", "642,2562", "--meshes", "icosahedral+50")
     assert coarse["odd"] == fine["odd"] == 12
     assert fine["kinetic"][0] > 1.6 * coarse["kinetic"][0]
     assert fine["kinetic"][1] < 0.2 * fine["kinetic"][0]

@@ -17,10 +17,7 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 pytestmark = pytest.mark.skipif(not DOCS.is_dir(), reason="the tests lie outside a source tree")
 PAGES = {p.relative_to(DOCS).as_posix(): p.read_text() for p in sorted(DOCS.rglob("*.md"))}
-OWN = {
-    **PAGES,
-    **{n: (ROOT / n).read_text() for n in ("README.md", "CONTRIBUTING.md") if (ROOT / n).is_file()},
-}
+OWN = {**PAGES, **{n: (ROOT / n).read_text() for n in ("README.md", "CONTRIBUTING.md") if (ROOT / n).is_file()}}
 SOLVERS = ("fipy", "flopy")
 """Programs that pages and examples import, of the extra `solvers`."""
 EXAMPLES = sorted((DOCS / "examples").rglob("*.py"))
@@ -39,9 +36,7 @@ def blocks(page, language):
 
 def rows(page):
     """Return the cells of all table rows of a page, but for heads and rules."""
-    lines = [
-        line.strip("| ").split(" | ") for line in PAGES[page].splitlines() if line.startswith("| ")
-    ]
+    lines = [line.strip("| ").split(" | ") for line in PAGES[page].splitlines() if line.startswith("| ")]
     return [[cell.strip(" |") for cell in line] for line in lines]
 
 
@@ -77,15 +72,11 @@ def test_example_runs_and_draws(example, tmp_path):
         "if isinstance(w, type) and issubclass(w, Warning)]; "
         "runpy.run_path(sys.argv[1]); assert pyplot.get_fignums()"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(example)], cwd=tmp_path, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", code, str(example)], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-    "option", sorted(set(re.findall(r"`(--[a-z-]+)", PAGES.get("guide/command_line.md", ""))))
-)
+@pytest.mark.parametrize("option", sorted(set(re.findall(r"`(--[a-z-]+)", PAGES.get("guide/command_line.md", "")))))
 def test_options_of_the_command_exist(option, capsys):
     with pytest.raises(SystemExit):
         command.main(["run", "--help"])
@@ -155,9 +146,7 @@ def test_every_equation_of_the_method_has_its_place():
 def test_architecture_lists_the_packages_in_their_order():
     from tests.test_layout import ORDER
 
-    listed = [
-        row[0].strip("`") for row in rows("developer/architecture.md") if row[0].startswith("`")
-    ]
+    listed = [row[0].strip("`") for row in rows("developer/architecture.md") if row[0].startswith("`")]
     folders = {p.parent.name for p in (ROOT / "clvoro").glob("*/__init__.py")}
     assert listed == [name for name in ORDER if name in folders]
     picture = (DOCS / "developer" / "packages.svg").read_text()
@@ -172,13 +161,9 @@ def test_links_and_commands_lead_somewhere(page):
         assert (folder / target).exists(), target
     for target in re.findall(r"\{doc\}`(?:[^`<]*<)?([^`>]+)>?`", text):
         made = "gallery/" in target  # when the site is built, from the examples
-        path = folder / (
-            target.replace("gallery/", "examples/") + ".py" if made else f"{target}.md"
-        )
+        path = folder / (target.replace("gallery/", "examples/") + ".py" if made else f"{target}.md")
         assert path.is_file() or path.with_suffix(".rst").is_file(), target
-    for script in re.findall(r"python (bench/\w+\.py)", text) + re.findall(
-        r"(tests/[\w/]+\.py)", text
-    ):
+    for script in re.findall(r"python (bench/\w+\.py)", text) + re.findall(r"(tests/[\w/]+\.py)", text):
         assert (ROOT / script).is_file(), script
     for module in re.findall(r"-m (tests\.[\w.]+)", text):
         assert (ROOT / (module.replace(".", "/") + ".py")).is_file(), module
@@ -187,9 +172,5 @@ def test_links_and_commands_lead_somewhere(page):
 def test_public_names_are_in_the_reference():
     listed = "".join(p.read_text() for p in (DOCS / "api").glob("*.rst"))
     names = set(re.findall(r"^   (?:clvoro\.)?(?:\w+\.)*(\w+)$", listed, re.MULTILINE))
-    assert (
-        set(clvoro.__all__)
-        - {"curves", "profile", "regions", "sizing", "ClvoroError", "Interrupted"}
-        <= names
-    )
+    assert set(clvoro.__all__) - {"curves", "profile", "regions", "sizing", "ClvoroError", "Interrupted"} <= names
     assert {n for n in clvoro.sizing.__all__ if n not in ("Sizing", "generate_code")} <= names

@@ -43,9 +43,7 @@ def prose_of(path, text):
         tokens = tokenize.generate_tokens(io.StringIO(text).readline)
         return [(t.start[0], t.string) for t in tokens if t.type in kinds]
     if path.suffix in (".md", ".rst"):
-        text = re.sub(
-            r"```.*?```|``?[^`\n]*``?", lambda m: "\n" * m[0].count("\n"), text, flags=re.DOTALL
-        )
+        text = re.sub(r"```.*?```|``?[^`\n]*``?", lambda m: "\n" * m[0].count("\n"), text, flags=re.DOTALL)
     return list(enumerate(text.splitlines(), 1))
 
 
@@ -78,9 +76,8 @@ def findings(path, name):
 def tracked():
     """Return the names of all text files under version control."""
     listed = subprocess.run(
-        ["git", "-C", str(ROOT), "ls-files", "-co", "--exclude-standard"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        ["git", "-C", str(ROOT), "ls-files", "-co", "--exclude-standard"], capture_output=True, text=True, check=False
+    )
     if listed.returncode:  # no checkout
         names = [p.relative_to(ROOT).as_posix() for p in ROOT.rglob("*") if p.is_file()]
         skipped = ("build/", ".venv/", "docs/gallery/", "docs/api/generated/")
@@ -114,9 +111,7 @@ def test_check_finds_what_it_looks_for(tmp_path):
     ]
     module = tmp_path / "module.py"
     module.write_text('"""One\n\nmade by hand."""\nself.told = 1\n')
-    assert findings(module, "docs/module.py") == [
-        "docs/module.py:3: 'made by', use the field's word"
-    ]
+    assert findings(module, "docs/module.py") == ["docs/module.py:3: 'made by', use the field's word"]
     assert findings(module, f"{ROUGH[0]}module.py") == []
     module.write_text("<" * 7 + " HEAD\n")
     assert findings(module, "clvoro/module.py") == ["clvoro/module.py:1: a conflict that git left"]

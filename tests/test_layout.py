@@ -21,10 +21,28 @@ HOUSE = PACKAGE.parent
 CLANG_FORMAT = "14"
 """The version whose style is the kernels': others break some lines elsewhere."""
 ORDER = (
-    "errors", "arguments", "files", "opencl", "geometry", "curves", "mesh", "regions", "finite_volumes", "io", "sizing",
-    "tessellation", "solvers", "adaptation", "remapping", "plotting", "adapter", "shared", "__init__", "cli",
+    "errors",
+    "arguments",
+    "files",
+    "opencl",
+    "geometry",
+    "curves",
+    "mesh",
+    "regions",
+    "finite_volumes",
+    "io",
+    "sizing",
+    "tessellation",
+    "solvers",
+    "adaptation",
+    "remapping",
+    "plotting",
+    "adapter",
+    "shared",
+    "__init__",
+    "cli",
     "__main__",
-)  # fmt: skip
+)
 """Packages and root modules: each imports only from those before it."""
 UPWARD = {
     ("mesh.diagram", "finite_volumes"),
@@ -189,11 +207,7 @@ def test_folders_stay_small():
 
 
 def test_kernels_and_tests_have_the_folders_of_the_package():
-    packages = {
-        path.relative_to(PACKAGE).as_posix()
-        for path in PACKAGE.rglob("*")
-        if (path / "__init__.py").is_file()
-    }
+    packages = {path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*") if (path / "__init__.py").is_file()}
     kernels = {path.parent.relative_to(KERNELS).as_posix() for path in SOURCES}
     assert kernels - {"simd"} <= packages
     tests = {path.parent.relative_to(HERE).as_posix() for path in HERE.rglob("test_*.py")}
@@ -204,18 +218,10 @@ def test_modules_with_kernels_use_no_others():
     """But for what they hand on (data, constants), and for those that consist of others (`PARTS`)."""
     trees = modules()
     makers = {  # classes that have kernels
-        name: {
-            node.name
-            for node in tree.body
-            if isinstance(node, ast.ClassDef) and ".kernels(" in ast.unparse(node)
-        }
+        name: {node.name for node in tree.body if isinstance(node, ast.ClassDef) and ".kernels(" in ast.unparse(node)}
         for name, tree in trees.items()
     }
-    makers = {
-        name: classes
-        for name, classes in makers.items()
-        if classes and not name.startswith("opencl")
-    }
+    makers = {name: classes for name, classes in makers.items() if classes and not name.startswith("opencl")}
     seen = set()
     for name in makers:
         for other, taken in imports(name, trees[name], trees).items():
@@ -295,9 +301,7 @@ def test_kernels_are_those_that_python_asks_for():
                     assert node.attr in known, f"{module} asks for {node.attr}"
         for stage in built:
             asked[stage] |= names
-    asked["opencl/copy"] = kernels_of(
-        "opencl/copy"
-    )  # the only one: the profile takes what there is
+    asked["opencl/copy"] = kernels_of("opencl/copy")  # the only one: the profile takes what there is
     for stage in stages():
         assert kernels_of(stage), stage
         assert kernels_of(stage) <= asked[stage], f"{stage}: nobody asks for these"
@@ -344,10 +348,7 @@ def test_no_kernel_returns_before_a_barrier():
                 # What a function that waits has found may be returned.
                 before = re.sub(r"\breturn\b[^;]*$", "", body[: calls[-1]])
                 assert not returns.search(before), (stage, name)
-    assert {
-        ("solvers/conjugate_gradient", "solve_by_group"),
-        ("solvers/poisson", "subtract_mean_source"),
-    } <= checked
+    assert {("solvers/conjugate_gradient", "solve_by_group"), ("solvers/poisson", "subtract_mean_source")} <= checked
 
 
 def test_kernels_are_formatted():
@@ -359,10 +360,7 @@ def test_kernels_are_formatted():
     if re.search(rf"version {CLANG_FORMAT}\.", said) is None:
         pytest.skip(f"needs clang-format {CLANG_FORMAT}, this is {said.strip()}")
     done = subprocess.run(
-        ["clang-format", "--dry-run", "--Werror", *map(str, SOURCES)],
-        cwd=HOUSE,
-        capture_output=True,
-        text=True,
+        ["clang-format", "--dry-run", "--Werror", *map(str, SOURCES)], cwd=HOUSE, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
 

@@ -26,9 +26,7 @@ assert abs(diagram.volumes.sum() - 1) < 1e-12  # float64; 60 terms
 print(kernel_folder())
 """
 
-pytestmark = pytest.mark.skipif(
-    not (ROOT / "pyproject.toml").is_file(), reason="the tests lie outside a source tree"
-)
+pytestmark = pytest.mark.skipif(not (ROOT / "pyproject.toml").is_file(), reason="the tests lie outside a source tree")
 
 
 def shipped(folder):
@@ -50,11 +48,7 @@ def run_program(python, cwd, **environment):
     """Run PROGRAM far from the checkout; return the folder of its kernels."""
     inherited = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     done = subprocess.run(
-        [str(python), "-c", PROGRAM],
-        cwd=cwd,
-        env={**inherited, **environment},
-        capture_output=True,
-        text=True,
+        [str(python), "-c", PROGRAM], cwd=cwd, env={**inherited, **environment}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     return Path(done.stdout.strip())

@@ -16,9 +16,7 @@ from clvoro.mesh.straits import narrow_cells, widen_straits
 from tests.reference.spheres import grid_of_rings, random_points
 
 EARTH = clvoro.Sphere()
-BLOB = np.array(
-    [(-20, -35), (15, -50), (40, -10), (55, 20), (30, 12), (10, 45), (-35, 30), (-5, 0)]
-)
+BLOB = np.array([(-20, -35), (15, -50), (40, -10), (55, 20), (30, 12), (10, 45), (-35, 30), (-5, 0)])
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +71,7 @@ def test_rings_cross_the_date_line(globe, lonlat, by, order):
 
 def test_positions_may_be_on_both_sides_of_the_date_line(globe, lonlat):
     ring = [(170, -30), (180, -30), (-180, -30), (-160, -30), (-160, 20), (-180, 25), (180, 25)]
-    expected = by_rays(
-        np.array([(170, -30), (200, -30), (200, 20), (180, 25)]), moved(turned(lonlat, 180), 180)
-    )
+    expected = by_rays(np.array([(170, -30), (200, -30), (200, 20), (180, 25)]), moved(turned(lonlat, 180), 180))
     assert expected.sum() > 50
     assert np.array_equal(regions.inside(globe, shapely.Polygon(ring)), expected)
 
@@ -87,9 +83,7 @@ def test_rings_around_a_pole(globe, lonlat, pole, order):
     lon = np.arange(-175, 180, 10.0)
     ring = np.column_stack([lon, pole * (60 + 10 * np.sin(np.radians(3 * lon)))])[::order]
     edge = np.interp(
-        lonlat[:, 0],
-        [*(lon - 360), *lon, *(lon + 360)],
-        np.tile(60 + 10 * np.sin(np.radians(3 * lon)), 3),
+        lonlat[:, 0], [*(lon - 360), *lon, *(lon + 360)], np.tile(60 + 10 * np.sin(np.radians(3 * lon)), 3)
     )
     expected = pole * lonlat[:, 1] > edge
     assert np.array_equal(regions.inside(globe, shapely.Polygon(ring)), expected)
@@ -97,14 +91,8 @@ def test_rings_around_a_pole(globe, lonlat, pole, order):
     lon = lon[::order]
     for height in (60, -20):
         wavy = pole * (height + 10 * np.sin(np.radians(3 * np.arange(-180, 181, 10))))
-        closed = [
-            *np.column_stack([np.arange(-180.0, 181, 10), wavy]),
-            (180, 90 * pole),
-            (-180, 90 * pole),
-        ]
-        inside = pole * lonlat[:, 1] > pole * np.interp(
-            lonlat[:, 0], np.arange(-180, 181, 10), wavy
-        )
+        closed = [*np.column_stack([np.arange(-180.0, 181, 10), wavy]), (180, 90 * pole), (-180, 90 * pole)]
+        inside = pole * lonlat[:, 1] > pole * np.interp(lonlat[:, 0], np.arange(-180, 181, 10), wavy)
         assert np.array_equal(regions.inside(globe, shapely.Polygon(closed[::order])), inside)
 
 
@@ -133,12 +121,26 @@ def test_all_kinds_of_land_are_the_same(globe, lonlat, tmp_path):
     expected = (by_rays(BLOB, lonlat) & ~by_rays(hole, lonlat)) | by_rays(other, lonlat)
     geojson = {"type": "Feature", "properties": {}, "geometry": shapely.geometry.mapping(shape)}
     path = tmp_path / "land.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [geojson],
-        "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}}))  # fmt: skip
+    path.write_text(
+        json.dumps(
+            {
+                "type": "FeatureCollection",
+                "features": [geojson],
+                "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}},
+            }
+        )
+    )
     lands = [
-        shape, clvoro.Polygon.from_shapely(shape), geojson, path, str(path), path.read_text(), expected,
-        expected.tolist(), lambda x: expected[shapely.STRtree(shapely.points(lonlat)).nearest(shapely.points(x))],
-    ]  # fmt: skip
+        shape,
+        clvoro.Polygon.from_shapely(shape),
+        geojson,
+        path,
+        str(path),
+        path.read_text(),
+        expected,
+        expected.tolist(),
+        lambda x: expected[shapely.STRtree(shapely.points(lonlat)).nearest(shapely.points(x))],
+    ]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for land in lands:
@@ -149,9 +151,7 @@ def test_all_kinds_of_land_are_the_same(globe, lonlat, tmp_path):
 
 
 @pytest.mark.sparse(1)
-@pytest.mark.parametrize(
-    "line", [[(-30, -20), (50, 40), (20, 70)], [(150, 10), (-160, -35)]], ids=str
-)
+@pytest.mark.parametrize("line", [[(-30, -20), (50, 40), (20, 70)], [(150, 10), (-160, -35)]], ids=str)
 def test_lines_cross_the_cells_of_their_points(globe, line):
     """The cells that hold 400,000 points of the line; which cell that is, SciPy's tree says."""
     x = np.array(line, float)
@@ -171,8 +171,10 @@ def test_all_kinds_of_lines_are_the_same(globe, tmp_path):
     path = tmp_path / "lines.geojson"
     path.write_text(json.dumps(shapely.geometry.mapping(shape)))
     lines = [shapely.LineString(one), shapely.LineString(two)]
-    collection = {"type": "FeatureCollection", "features": [
-        {"type": "Feature", "geometry": shapely.geometry.mapping(line)} for line in lines]}  # fmt: skip
+    collection = {
+        "type": "FeatureCollection",
+        "features": [{"type": "Feature", "geometry": shapely.geometry.mapping(line)} for line in lines],
+    }
     for given in (shape, path, [one, two], [np.array(one), two], lines, collection):
         assert np.array_equal(regions.crossed(globe, given), expected)
 
@@ -180,12 +182,7 @@ def test_all_kinds_of_lines_are_the_same(globe, tmp_path):
 def test_lines_through_vertices_are_a_cell_wide(ctx):
     """Cells of longitudes and latitudes: on a diagonal they touch in vertices only."""
     globe = clvoro.Adapter(ctx).diagram(EARTH, grid_of_rings())
-    for line in (
-        [(-40, -20), (0, 20)],
-        [(-35, -25), (35, 45)],
-        [(-45, 5), (45, 5)],
-        [(5, -80), (5, 80)],
-    ):
+    for line in ([(-40, -20), (0, 20)], [(-35, -25), (35, 45)], [(-45, 5), (45, 5)], [(5, -80), (5, 80)]):
         found = np.flatnonzero(regions.crossed(globe, line))
         assert len(found) > 5
         assert connected_components(globe.adjacency[found][:, found])[0] == 1
@@ -221,9 +218,7 @@ def test_lakes_are_removed(globe, lonlat):
 def test_the_largest_part_is_that_with_the_largest_area(ctx):
     """Many small cells in the lake, few in the ocean."""
     rng = np.random.default_rng(3)
-    fine = EARTH.positions(
-        np.column_stack([rng.uniform(-35, 35, 2000), rng.uniform(-25, 25, 2000)])
-    )
+    fine = EARTH.positions(np.column_stack([rng.uniform(-35, 35, 2000), rng.uniform(-25, 25, 2000)]))
     points = np.concatenate([fine, random_points(600, 4) * EARTH.radius])
     globe = clvoro.Adapter(ctx).diagram(EARTH, points)
     kept = regions.ocean(globe, RING)
@@ -301,15 +296,9 @@ def test_widening_keeps_land_bridges_and_islands(globe, seed):
 def test_straits_between_blockages_stay(globe):
     """Land on both sides of a passage has to stay."""
     beside = [[(-6, 12), (-6, 45)], [(6, 12), (6, 45)], [(-1, 50), (-14, 50)]]
-    with pytest.warns(
-        MismatchWarning, match=r"remain one cell wide.*first one is at longitude [-\d]"
-    ):
+    with pytest.warns(MismatchWarning, match=r"remain one cell wide.*first one is at longitude [-\d]"):
         kept = regions.ocean(
-            globe,
-            RING,
-            passages=STRAITS[:1],
-            blockages=[*beside, [(0, 12), (0, 45)]],
-            straits="widen",
+            globe, RING, passages=STRAITS[:1], blockages=[*beside, [(0, 12), (0, 45)]], straits="widen"
         )
     blocked = regions.crossed(globe, beside) & ~regions.crossed(globe, STRAITS[:1])
     assert not kept[blocked].any()
@@ -326,9 +315,7 @@ def test_a_passage_into_a_lake_is_warned_of(globe):
 def test_rings_of_neighbors(globe):
     keep = regions.inside(globe, shapely.Polygon(BLOB))
     ring = regions.rings(globe, keep, 4)
-    steps = shortest_path(globe.adjacency, unweighted=True, indices=np.flatnonzero(keep)).min(
-        axis=0
-    )
+    steps = shortest_path(globe.adjacency, unweighted=True, indices=np.flatnonzero(keep)).min(axis=0)
     assert np.array_equal(ring, np.where(steps <= 4, steps, -1))
     assert regions.rings(globe, keep).max() == 7
     # In a part of the mesh there are no rings beyond its boundary.
@@ -370,7 +357,7 @@ def test_parts_have_parts(globe):
         (None, InputTypeError, "land is a NoneType"),
     ],
     ids=lambda x: None,
-)  # fmt: skip
+)
 def test_wrong_land_is_refused(globe, land, kind, message):
     with pytest.raises(kind, match=message):
         regions.ocean(globe, land)

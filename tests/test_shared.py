@@ -21,9 +21,7 @@ def test_adapt_is_a_run():
 
 def test_voronoi_is_a_diagram():
     points = np.random.default_rng(1).random((30, 2))
-    assert np.array_equal(
-        clvoro.voronoi(BOX, points).volumes, clvoro.Adapter().diagram(BOX, points).volumes
-    )
+    assert np.array_equal(clvoro.voronoi(BOX, points).volumes, clvoro.Adapter().diagram(BOX, points).volumes)
     with pytest.raises(InputError, match="outside"):
         clvoro.voronoi(BOX, points + 1)
 

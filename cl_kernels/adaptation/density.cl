@@ -53,14 +53,14 @@ inline void weighted_offset(const int i, const REAL *gradient, const REAL *site,
                             global const REAL *covariances, global REAL *lloyd)
 {
     REAL g[CELL_DIM];
-    EACH_COMPONENT(a)
-    g[a] = -(CELL_DIM + 2) * gradient[a];
+    EACH_COMPONENT (a)
+        g[a] = -(CELL_DIM + 2) * gradient[a];
 #if CELL_DIM == 2
     const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
 #ifdef SPHERE
     const REAL along[2] = {xx * g[0] + xy * g[1], xy * g[0] + yy * g[1]};
-    EACH_AXIS(a)
-    lloyd[3 * i + a] = offsets[3 * i + a] + SPATIAL(site, along, a);
+    EACH_AXIS (a)
+        lloyd[3 * i + a] = offsets[3 * i + a] + SPATIAL(site, along, a);
 #else
     lloyd[2 * i] = offsets[2 * i] + xx * g[0] + xy * g[1];
     lloyd[2 * i + 1] = offsets[2 * i + 1] + xy * g[0] + yy * g[1];
@@ -83,11 +83,10 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
     WORK_ITEM(i);
     MANY(REAL) sums[CELL_DIM][CELL_DIM], rises[CELL_DIM];
     REAL m[CELL_DIM][CELL_DIM], b[CELL_DIM], g[CELL_DIM];
-    EACH_COMPONENT(p)
-    {
+    EACH_COMPONENT (p) {
         rises[p] = 0;
-        EACH_COMPONENT(q)
-        sums[p][q] = 0;
+        EACH_COMPONENT (q)
+            sums[p][q] = 0;
     }
 #ifdef SPHERE
     SITE(site, i, points);
@@ -99,32 +98,30 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
         const MANY(int) facing = TAKE(int, neighbors, k, faces), counts = INSIDE(k, end) & (facing >= 0);
         const MANY(int) j = CHOOSE(int, counts, facing, i);
         MANY(REAL) d[DIM], d2 = 0;
-        EACH_AXIS(a)
-        d[a] = nearest_images(PICK(REAL, points, j, DIM, a) - points[DIM * i + a], PERIOD(a));
+        EACH_AXIS (a)
+            d[a] = nearest_images(PICK(REAL, points, j, DIM, a) - points[DIM * i + a], PERIOD(a));
 #ifdef SPHERE
         const MANY(REAL) one = ALONG(MANY(REAL), site + 3, d), two = ALONG(MANY(REAL), site + 6, d);
         d[0] = one;
         d[1] = two;
 #endif
-        EACH_COMPONENT(a)
-        d2 += d[a] * d[a];
+        EACH_COMPONENT (a)
+            d2 += d[a] * d[a];
         /* Walls have distance 1 and no difference. */
         const MANY(REAL) weight = 1 / CHOOSE(REAL, counts, d2, 1), rise = PICK(REAL, log_h, j, 1, 0) - log_h[i];
-        EACH_COMPONENT(p)
-        {
+        EACH_COMPONENT (p) {
             const MANY(REAL) weighted = d[p] * weight;
             rises[p] += weighted * rise;
-            EACH_COMPONENT(q)
-            if (q >= p)
-                sums[p][q] += weighted * d[q];
+            EACH_COMPONENT (q)
+                if (q >= p)
+                    sums[p][q] += weighted * d[q];
         }
     }
-    EACH_COMPONENT(p)
-    {
+    EACH_COMPONENT (p) {
         b[p] = SUM(REAL, rises[p]);
-        EACH_COMPONENT(q)
-        if (q >= p)
-            m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
+        EACH_COMPONENT (q)
+            if (q >= p)
+                m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
     }
     /* The gradient is 0 if neighbors are too few or collinear. Division by infinity, because PoCL 6 with LLVM 18
        crashes on a branch here. */
@@ -151,8 +148,8 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
         (b[0] * c2 + b[1] * (m[0][1] * m[2][0] - m[0][0] * m[2][1]) + b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) /
         over;
 #endif
-    EACH_AXIS(a)
-    gradient[DIM * i + a] = SPATIAL(site, g, a);
+    EACH_AXIS (a)
+        gradient[DIM * i + a] = SPATIAL(site, g, a);
     weighted_offset(i, g, site, offsets, covariances, lloyd);
 }
 

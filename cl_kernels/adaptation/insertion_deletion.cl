@@ -82,8 +82,8 @@ inline float4 add_strains(float4 sum, int i, int size, global const int *starts,
     for (int k = starts[i]; k < end; k += AT_ONCE) {
         const MANY(int) inside = INSIDE(k, end), j = TAKE(int, neighbors, k, faces);
         MANY(float) y[3], p[3], q[3];
-        EACH_AXIS(axis)
-        y[axis] = CONVERT(float, PICK(REAL, points, j, 3, axis));
+        EACH_AXIS (axis)
+            y[axis] = CONVERT(float, PICK(REAL, points, j, 3, axis));
         FLOAT_TANGENTS(MANY(float), y, p, q);
         const MANY(float) a = ALONG(MANY(float), e, p), b = ALONG(MANY(float), f, p);
         const MANY(float) c = ALONG(MANY(float), e, q), d = ALONG(MANY(float), f, q);
@@ -392,8 +392,7 @@ kernel void apply_changes(const int size, global const int *place, global const 
     const bool kept = place[i + 1] > place[i], born = birth_place[i + 1] > birth_place[i];
     REAL x[DIM], y[DIM], child[DIM];
     bool moved = false;
-    EACH_AXIS(a)
-    {
+    EACH_AXIS (a) {
         x[a] = points[DIM * i + a];
         y[a] = x[a] + shifts[DIM * i + a];
         child[a] = x[a] + births[DIM * i + a];
@@ -411,8 +410,7 @@ kernel void apply_changes(const int size, global const int *place, global const 
 #endif
     if (kept) {
         const int p = place[i];
-        EACH_AXIS(a)
-        {
+        EACH_AXIS (a) {
             new_points[DIM * p + a] = y[a];
             new_velocity[DIM * p + a] = moved ? 0 : velocity[DIM * i + a];
         }
@@ -422,8 +420,7 @@ kernel void apply_changes(const int size, global const int *place, global const 
     }
     if (born) {
         const int q = place[size] + birth_place[i];
-        EACH_AXIS(a)
-        {
+        EACH_AXIS (a) {
             new_points[DIM * q + a] = child[a];
             new_velocity[DIM * q + a] = 0;
         }

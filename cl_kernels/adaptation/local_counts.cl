@@ -1,5 +1,5 @@
-/* Parts of a domain with too many or too few generators, by the potential of the displacements that would even this out.
-   One work-item per generator.
+/* Parts of a domain with too many or too few generators, by the potential of the displacements that would even this
+   out. One work-item per generator.
 
    Cell i should have V_i rho_i generators, and has one. Displacements u = -grad phi carry the surplus away if
 
@@ -26,7 +26,8 @@ kernel void score_potential(const int size, global const int *starts, global con
     bool site = fabs(phi) > least && blocked[i] == 0, inner = true;
     for (int k = starts[i]; k < starts[i + 1] && inner; ++k)
         inner = neighbors[k] >= 0;
-    const REAL magnitude = fabs(phi) + sign * need_of_split(log_ratio[i], starts[i + 1] - starts[i]) - (inner ? 0 : WALL_COST);
+    const REAL magnitude =
+        fabs(phi) + sign * need_of_split(log_ratio[i], starts[i + 1] - starts[i]) - (inner ? 0 : WALL_COST);
     keys[i] = site && magnitude > 0 ? site_key(magnitude, i) : 0;
 }
 

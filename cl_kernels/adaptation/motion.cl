@@ -18,17 +18,16 @@ kernel void compute_potential_gradient(const int size, global const int *starts,
         if (j < 0)
             continue;
         REAL d2 = 0;
-        EACH_AXIS(a)
-        {
+        EACH_AXIS (a) {
             const REAL d = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
             d2 += d * d;
         }
         const REAL flux = face_measures[k] / sqrt(d2) * (psi[j] - psi[i]);
-        EACH_AXIS(a)
-        sum[a] += flux * face_centroids[DIM * k + a];
+        EACH_AXIS (a)
+            sum[a] += flux * face_centroids[DIM * k + a];
     }
-    EACH_AXIS(a)
-    u[DIM * i + a] = sum[a] / volumes[i];
+    EACH_AXIS (a)
+        u[DIM * i + a] = sum[a] / volumes[i];
 }
 
 /* u = alpha u with alpha = min(limit, k / max_i(|u_i| / h_i)), the paper's (3.5). summaries[4 slot + 3] is the maximum.
@@ -39,8 +38,8 @@ kernel void relax_correction(const int size, global const REAL *summaries, const
     WORK_ITEM(i);
     const REAL fastest = summaries[4 * slot + 3];
     const REAL alpha = fastest * limit > k ? k / fastest : limit;
-    EACH_AXIS(a)
-    u[DIM * i + a] *= alpha;
+    EACH_AXIS (a)
+        u[DIM * i + a] *= alpha;
 }
 
 /* x += a lloyd + b correction, the paper's (3.4), clipped to clip h_i (clip = 0: not clipped), and kept in the domain.
@@ -52,23 +51,20 @@ kernel void move_generators(const int size, global const REAL *lloyd, const REAL
     WORK_ITEM(i);
     REAL d[DIM], x[DIM], y[DIM];
     REAL d2 = 0;
-    EACH_AXIS(c)
-    {
+    EACH_AXIS (c) {
         d[c] = a * lloyd[DIM * i + c] + b * correction[DIM * i + c];
         d2 += d[c] * d[c];
     }
     const REAL longest = clip * h[i];
     const REAL scale = clip > 0 && d2 > longest * longest ? longest / sqrt(d2) : 1;
-    EACH_AXIS(c)
-    {
+    EACH_AXIS (c) {
         x[c] = points[DIM * i + c];
         y[c] = x[c] + scale * d[c];
     }
     /* Fixed generators may be outside of the part of the domain in which the others move. */
     if (d2 > 0)
         reflect_inside(x, y, DOMAIN);
-    EACH_AXIS(c)
-    {
+    EACH_AXIS (c) {
         points[DIM * i + c] = y[c];
         velocity[DIM * i + c] = DIFFERENCE(c, x[c], y[c]);
     }
@@ -80,8 +76,8 @@ kernel void zero_fixed_displacements(const int size, global const int *labels, c
 {
     WORK_ITEM(i);
     if (labels[i] < fixed)
-        EACH_AXIS(a)
-    displacement[DIM * i + a] = 0;
+        EACH_AXIS (a)
+            displacement[DIM * i + a] = 0;
 }
 
 /* lloyd = factor lloyd + share velocity. */
@@ -89,6 +85,6 @@ kernel void add_momentum(const int size, const REAL factor, global const REAL *v
                          global REAL *lloyd)
 {
     WORK_ITEM(i);
-    EACH_AXIS(a)
-    lloyd[DIM * i + a] = factor * lloyd[DIM * i + a] + share * velocity[DIM * i + a];
+    EACH_AXIS (a)
+        lloyd[DIM * i + a] = factor * lloyd[DIM * i + a] + share * velocity[DIM * i + a];
 }

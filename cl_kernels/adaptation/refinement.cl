@@ -120,11 +120,11 @@ kernel void place_new_generators(const int size, global const int *starts, globa
         } else if (has_midpoint(i, j, face_measures[k], volumes[i])) {
 #ifdef SPHERE
             REAL middle[3];
-            EACH_AXIS(a)
-            middle[a] = points[3 * i + a] + points[3 * j + a];
+            EACH_AXIS (a)
+                middle[a] = points[3 * i + a] + points[3 * j + a];
             onto_sphere(middle);
-            EACH_AXIS(a)
-            child[a] = middle[a];
+            EACH_AXIS (a)
+                child[a] = middle[a];
 #else
             for (int a = 0; a < DIM; ++a)
                 child[a] = PLACED(a, points[DIM * i + a] + DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2);

@@ -75,8 +75,8 @@ inline void put_vector(const REAL *x, REAL2 v, int k, global REAL *array)
 {
     REAL d[3];
     in_space(x, v, d);
-    EACH_AXIS(a)
-    array[3 * k + a] = d[a];
+    EACH_AXIS (a)
+        array[3 * k + a] = d[a];
 }
 #else
 #define VECTOR_TO(x, j, points)                                                                                        \
@@ -95,16 +95,16 @@ inline void put_vector(const REAL *x, REAL2 v, int k, global REAL *array)
 inline void onto_sphere(REAL *y)
 {
     const REAL length = sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2]);
-    EACH_AXIS(a)
-    y[a] /= length;
+    EACH_AXIS (a)
+        y[a] /= length;
 }
 #elif !defined(POLYGON)
 /* Move the target y of a generator at x into the domain: to the nearest wall, or to its image along a period. */
 inline void keep_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
-    EACH_AXIS(a)
-    y[a] = PERIOD(a) > 0 ? wrapped(y[a], PERIOD(a)) : clamp(y[a], lower[a], upper[a]);
+    EACH_AXIS (a)
+        y[a] = PERIOD(a) > 0 ? wrapped(y[a], PERIOD(a)) : clamp(y[a], lower[a], upper[a]);
 }
 
 /* As keep_inside_box, but mirrors y at the wall, so that no two generators coincide on it. A step is at most as long as
@@ -112,8 +112,7 @@ inline void keep_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 inline void reflect_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
-    EACH_AXIS(a)
-    {
+    EACH_AXIS (a) {
         if (PERIOD(a) > 0)
             continue;
         const REAL most = upper[a] - lower[a];

@@ -75,8 +75,8 @@ inline void keep_inside_polygon(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     const REAL t = exit_parameter(x, y, DOMAIN);
     if (t <= 1)
-        EACH_AXIS(a)
-    y[a] = x[a] + t / 2 * (y[a] - x[a]);
+        EACH_AXIS (a)
+            y[a] = x[a] + t / 2 * (y[a] - x[a]);
 }
 
 /* As keep_inside_polygon, but mirrors y at the edge, unless the path to the mirror image leaves the domain. */

@@ -18,8 +18,8 @@
 
 inline void place_site(REAL *x, int i, global const REAL *points)
 {
-    EACH_AXIS(a)
-    x[a] = points[3 * i + a];
+    EACH_AXIS (a)
+        x[a] = points[3 * i + a];
     /* Without a branch and without cancellation (Duff et al. 2017, Building an orthonormal basis, revisited). */
     const REAL sign = x[2] < 0 ? -1 : 1, s = -1 / (sign + x[2]), t = x[0] * x[1] * s;
     x[3] = 1 + sign * x[0] * x[0] * s;
@@ -54,8 +54,8 @@ inline REAL2 along_tangents(const REAL *x, const REAL *d)
 /* The vector in space of p in the tangent plane. */
 inline void in_space(const REAL *x, REAL2 p, REAL *d)
 {
-    EACH_AXIS(a)
-    d[a] = x[3 + a] * p.s0 + x[6 + a] * p.s1;
+    EACH_AXIS (a)
+        d[a] = x[3 + a] * p.s0 + x[6 + a] * p.s1;
 }
 
 /* From the site to generator j in its stereographic projection from the antipode, whose scale is 1 at the site. The
@@ -76,8 +76,7 @@ inline REAL2 seen_from(const REAL *to, const REAL *from, REAL2 p)
     in_space(from, p, y);
     REAL height = 1, gap2 = 0;
     /* The difference of the positions is exact, their product is not. */
-    EACH_AXIS(a)
-    {
+    EACH_AXIS (a) {
         const REAL apart = from[a] - to[a];
         gap2 += apart * apart;
         d[a] = y[a] + apart;
@@ -91,8 +90,8 @@ inline void on_sphere(const REAL *x, REAL2 p, REAL *d)
 {
     const REAL p2 = dot(p, p), l = sqrt(1 + p2), sink = p2 / (l * (1 + l)); /* 1 - 1 / l */
     in_space(x, p / l, d);
-    EACH_AXIS(a)
-    d[a] -= sink * x[a];
+    EACH_AXIS (a)
+        d[a] -= sink * x[a];
 }
 #elif defined(WEIGHTED)
 #define SITE_SIZE 3

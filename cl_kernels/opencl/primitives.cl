@@ -145,8 +145,8 @@ inline void add_value(summary_t *a, REAL value)
 inline REAL length_over(int i, global const REAL *u, global const REAL *h)
 {
     REAL square = 0;
-    EACH_AXIS(a)
-    square += u[DIM * i + a] * u[DIM * i + a];
+    EACH_AXIS (a)
+        square += u[DIM * i + a] * u[DIM * i + a];
     return sqrt(square) / h[i];
 }
 
@@ -194,8 +194,7 @@ ADD_RUN(add_run, EIGHT_VALUES, ONE_VALUE, global const REAL *values)
 inline REAL8 eight_lengths(int i, global const REAL *u, global const REAL *h)
 {
     REAL8 square = 0;
-    EACH_AXIS(a)
-    {
+    EACH_AXIS (a) {
         const REAL8 part = EIGHT_COMPONENTS(u, i, a);
         square += part * part;
     }

@@ -292,7 +292,7 @@ inline REAL measure_piece(private piece_t *piece, private REAL4 *centroid)
     const INDEX *start = face_starts(piece);
     REAL sum = 0;
     REAL4 first = 0;
-    for (EACH_FACE(piece, f)) {
+    for (EACH_FACE (piece, f)) {
         const REAL4 a = corner_of(piece, start[f]) - o;
         int v = vertex_after(piece, start[f], f);
         REAL4 b = corner_of(piece, v) - o;

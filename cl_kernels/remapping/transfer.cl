@@ -179,7 +179,7 @@ kernel void transfer_cell_data(const int size, const int first, global const int
                 low[to] = fmin(low[to], least[from]);
                 high[to] = fmax(high[to], most[from]);
             }
-            for (EACH_FACE(&piece, f))
+            for (EACH_FACE (&piece, f))
                 room = room && (face_label(&piece, f) < 0 || visit(&seen, face_label(&piece, f)));
         }
         if (!room) {

@@ -94,8 +94,7 @@ inline void measure_sphere_outlines(const measures_t *to, eight_rows_t *all, con
             to->face_centroids[3 * (start + k) + 2] = LANE((const FACE *)heights, k, lane);
         }
         to->volumes[i] = LANE(results, 0, lane);
-        EACH_AXIS(a)
-        {
+        EACH_AXIS (a) {
             to->offsets[3 * i + a] = LANE(results, 1 + a, lane);
             to->covariances[3 * i + a] = LANE(results, 4 + a, lane);
         }

@@ -73,8 +73,7 @@ kernel void assemble_laplacian(int n, int weighted, global const int *starts, gl
         if (SEVERAL && find_entry(j, i, last, starts, neighbors) < k)
             continue;
         REAL square = 0;
-        EACH_AXIS(a)
-        {
+        EACH_AXIS (a) {
             const REAL d = DIFFERENCE(a, points[i * DIM + a], points[j * DIM + a]);
             square += d * d;
         }

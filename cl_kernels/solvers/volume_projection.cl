@@ -98,10 +98,10 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
         float diagonal = 0, least_quality = quality[i];
         bool on_wall = false;
         const bool is_fixed = fixed > 0 && labels[i] < fixed;
-        EACH_AXIS(a)
-        x[a] = points[DIM * i + a];
-        EACH_COMPONENT(c)
-        self[c] = 0;
+        EACH_AXIS (a)
+            x[a] = points[DIM * i + a];
+        EACH_COMPONENT (c)
+            self[c] = 0;
 #ifdef SPHERE
         const float at[3] = {x[0], x[1], x[2]};
         float one[3], two[3];
@@ -116,8 +116,7 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
 #ifdef SPHERE
             MANY(float) there_at[DIM];
 #endif
-            EACH_AXIS(a)
-            {
+            EACH_AXIS (a) {
                 const MANY(REAL) xj = PICK(REAL, points, j, DIM, a);
                 d[a] = CONVERT(float, nearest_images(xj - x[a], PERIOD(a)) * unit);
                 d2 += d[a] * d[a];
@@ -133,8 +132,7 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
             MANY(int) fixed_there = 0;
             if (fixed > 0)
                 fixed_there = PICK(int, labels, j, 1, 0) < fixed;
-            EACH_AXIS(a)
-            {
+            EACH_AXIS (a) {
                 const MANY(float) m =
                     CONVERT(float, CONVERT(REAL, TAKE_ROWS(FACE, face_centroids, a, k, faces)) * unit);
                 middle[a] = select((MANY(float))(0), m, counts);
@@ -149,8 +147,7 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
 #else
             const MANY(float) *own_side = middle, *other_side = other;
 #endif
-            EACH_COMPONENT(c)
-            {
+            EACH_COMPONENT (c) {
                 square += other_side[c] * other_side[c];
                 self[c] += SUM(float, here *own_side[c]);
                 put_float(select(other_side[c] * ratio, (MANY(float))(0), fixed_there), rows + c * room, k, end, until);
@@ -162,22 +159,19 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
                 least_quality = fmin(least_quality, least_float(CONVERT(float, PICK(REAL, quality, j, 1, 0))));
         }
         float slope[DIM], moved[DIM];
-        EACH_AXIS(a)
-        {
+        EACH_AXIS (a) {
             slope[a] = gradient[DIM * i + a] * hi;
             moved[a] = displacement[DIM * i + a] * unit;
         }
 #ifdef SPHERE
         const float along[4] = {ALONG(float, one, slope), ALONG(float, two, slope), ALONG(float, one, moved),
                                 ALONG(float, two, moved)};
-        EACH_COMPONENT(c)
-        {
+        EACH_COMPONENT (c) {
             slope[c] = along[c];
             moved[c] = along[2 + c];
         }
 #endif
-        EACH_COMPONENT(c)
-        {
+        EACH_COMPONENT (c) {
             /* A fixed generator changes neither its volume nor its size. */
             const float t = is_fixed ? 0 : self[c] - CELL_DIM * slope[c];
             change += t * moved[c];
@@ -253,19 +247,18 @@ inline void step_projection_direction(int k, const iteration_t *it, local REAL *
     for (BLOCK_LOOP(i, end)) {
         const STORE zi = it->z[i], pi = k > start ? zi + beta * it->p[i] : zi;
         STORE sum[CELL_DIM];
-        EACH_COMPONENT(a)
-        sum[a] = it->own[CELL_DIM * i + a] * zi + (k > start ? beta * it->s[CELL_DIM * i + a] : 0);
+        EACH_COMPONENT (a)
+            sum[a] = it->own[CELL_DIM * i + a] * zi + (k > start ? beta * it->s[CELL_DIM * i + a] : 0);
         const int end_of_row = it->starts[i + 1];
         for (int f = it->starts[i]; f < end_of_row; f += AT_ONCE) {
             const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
             const MANY(STORE) zj = PICK(STORE, it->z, j, 1, 0);
-            EACH_COMPONENT(a)
-            sum[a] += SUM(STORE, DERIVATIVE(it->columns, f, a) * zj);
+            EACH_COMPONENT (a)
+                sum[a] += SUM(STORE, DERIVATIVE(it->columns, f, a) * zj);
         }
         it->p[i] = pi;
         REAL product = (REAL)it->eps[i] * pi * pi;
-        EACH_COMPONENT(a)
-        {
+        EACH_COMPONENT (a) {
             it->s[CELL_DIM * i + a] = sum[a];
             product += (REAL)sum[a] * sum[a];
         }
@@ -291,8 +284,7 @@ inline void step_projection(int k, const iteration_t *it, local REAL *scratch)
         const STORE pi = it->p[i];
         STORE q = it->eps[i] * pi;
         it->y[i] = (k > 0 ? it->y[i] : 0) + alpha * pi;
-        EACH_COMPONENT(a)
-        {
+        EACH_COMPONENT (a) {
             const STORE si = it->s[CELL_DIM * i + a];
             q += it->own[CELL_DIM * i + a] * si;
             it->u[CELL_DIM * i + a] = (k > 0 ? it->u[CELL_DIM * i + a] : 0) - alpha * si;
@@ -301,8 +293,8 @@ inline void step_projection(int k, const iteration_t *it, local REAL *scratch)
         for (int f = it->starts[i]; f < end_of_row; f += AT_ONCE) {
             const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
             MANY(STORE) sum = 0;
-            EACH_COMPONENT(a)
-            sum += DERIVATIVE(it->rows, f, a) * PICK(STORE, it->s, j, CELL_DIM, a);
+            EACH_COMPONENT (a)
+                sum += DERIVATIVE(it->rows, f, a) * PICK(STORE, it->s, j, CELL_DIM, a);
             q += SUM(STORE, sum);
         }
         const STORE ri = it->r[i] - alpha * q, zi = it->inverse_diagonal[i] * ri;
@@ -354,10 +346,10 @@ kernel void write_correction(const int size, global const STORE *u, global const
     const float x[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
     float e[3], f[3];
     FLOAT_TANGENTS(float, x, e, f);
-    EACH_AXIS(a)
-    correction[3 * i + a] = h[i] * (u[2 * i] * e[a] + u[2 * i + 1] * f[a]);
+    EACH_AXIS (a)
+        correction[3 * i + a] = h[i] * (u[2 * i] * e[a] + u[2 * i + 1] * f[a]);
 #else
-    EACH_AXIS(a)
-    correction[DIM * i + a] = h[i] * u[DIM * i + a];
+    EACH_AXIS (a)
+        correction[DIM * i + a] = h[i] * u[DIM * i + a];
 #endif
 }

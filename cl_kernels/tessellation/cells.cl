@@ -281,8 +281,8 @@ kernel void measure_faces(const int size, global const int *starts, global const
         const REAL2 w = k == end - 1 ? origin : corner(i, x, neighbors[k], neighbors[k + 1], points, lower, upper);
         REAL middle[DIM];
         measures[k] = measure_face(x, v, w, middle);
-        EACH_AXIS(a)
-        centroids[DIM * k + a] = middle[a];
+        EACH_AXIS (a)
+            centroids[DIM * k + a] = middle[a];
         v = w;
     }
 }

@@ -77,8 +77,8 @@ inline void write_empty_cell(int i, global int *row_places, global int *row_coun
 {
     row_places[i] = row_counts[i] = 0;
     volumes[i] = 0;
-    EACH_AXIS(a)
-    offsets[3 * i + a] = covariances[6 * i + a] = covariances[6 * i + 3 + a] = 0;
+    EACH_AXIS (a)
+        offsets[3 * i + a] = covariances[6 * i + a] = covariances[6 * i + 3 + a] = 0;
 }
 
 /* The radius that the search of a cell must cover, for its present vertices. */
@@ -111,8 +111,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
 {
     TAKE_CELL(cell);
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
-    EACH_CELL(p)
-    {
+    EACH_CELL (p) {
         const int i = items[p];
         if (i >= rows || (again && row_counts[i] != UNFINISHED))
             continue;

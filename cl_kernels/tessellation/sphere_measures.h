@@ -80,8 +80,8 @@ inline arc_t measure_arc(corner_t from, corner_t to)
 /* The vector from the site at x to the middle of an edge. */
 inline void middle_of_arc(const REAL *x, const arc_t *edge, REAL *d)
 {
-    EACH_AXIS(a)
-    d[a] = fma(x[3 + a], edge->middle.s0, fma(x[6 + a], edge->middle.s1, edge->rise * x[a]));
+    EACH_AXIS (a)
+        d[a] = fma(x[3 + a], edge->middle.s0, fma(x[6 + a], edge->middle.s1, edge->rise * x[a]));
 }
 
 /* Length and middle of the face from p to q of the cell at x, relative to it. */
@@ -120,15 +120,15 @@ inline void measure_sphere_cell(const measures_t *to, int i, const int *faces, i
             middle_of_arc(x, &edge, d);
             to->neighbors[start + k] = faces[k];
             to->face_measures[start + k] = edge.arc;
-            EACH_AXIS(a)
-            to->face_centroids[3 * (start + k) + a] = d[a];
+            EACH_AXIS (a)
+                to->face_centroids[3 * (start + k) + a] = d[a];
             from = next;
         }
     }
     on_sphere(x, radial > 0 ? tangential / radial : (REAL2)(0), d);
     to->volumes[i] = area;
-    EACH_AXIS(a)
-    to->offsets[3 * i + a] = d[a];
+    EACH_AXIS (a)
+        to->offsets[3 * i + a] = d[a];
     const REAL3 m = second_moments(&moments);
     to->covariances[3 * i] = m.s0;
     to->covariances[3 * i + 1] = m.s1;

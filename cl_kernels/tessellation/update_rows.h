@@ -56,8 +56,8 @@ inline bool has_nearest_images(REAL reach2, const rows_t *in)
     bool nearest = true;
 #ifdef PERIODIC
     const REAL4 periods = in->periods;
-    EACH_AXIS(a)
-    nearest = nearest && !(PERIOD(a) > 0 && 16 * reach2 >= PERIOD(a) * PERIOD(a));
+    EACH_AXIS (a)
+        nearest = nearest && !(PERIOD(a) > 0 && 16 * reach2 >= PERIOD(a) * PERIOD(a));
 #endif
     return nearest;
 }

@@ -45,8 +45,8 @@ kernel void place_polygon_vertices(const int size, global const REAL *points, co
 #ifdef SPHERE
             REAL d[3];
             on_sphere(x, y, d);
-            EACH_AXIS(a)
-            vertices[3 * v + a] = x[a] + d[a];
+            EACH_AXIS (a)
+                vertices[3 * v + a] = x[a] + d[a];
 #else
             vertices[2 * v] = clamp(x[0] + y.s0, lower[0], upper[0]);
             vertices[2 * v + 1] = clamp(x[1] + y.s1, lower[1], upper[1]);

@@ -6,8 +6,8 @@ kernel void collect_weights(const int size, global const REAL *points, const REA
 {
     WORK_ITEM(i);
     REAL x[DIM];
-    EACH_AXIS(a)
-    x[a] = points[STRIDE * i + a];
+    EACH_AXIS (a)
+        x[a] = points[STRIDE * i + a];
     atomic_max(keys + tile_index(tile_of(x, tiles_from, side), side), key_of_weight(WEIGHT(points, i)));
 }
 

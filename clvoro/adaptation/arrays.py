@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyopencl.array as cla
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..sizing import Sizing
@@ -19,10 +19,7 @@ from .insertion_deletion import Generators
 from .motion import Moving
 from .stages import Stages
 
-SUMMARIES = (
-    "error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio",
-    "weight",
-)  # fmt: skip
+SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio", "weight")
 
 
 @dataclass
@@ -37,11 +34,7 @@ class CellArrays:
 
     @classmethod
     def empty(
-        cls,
-        engine: Engine,
-        n: int,
-        h: cla.Array | None = None,
-        potential: cla.Array | None = None,
+        cls, engine: Engine, n: int, h: cla.Array | None = None, potential: cla.Array | None = None
     ) -> CellArrays:
         """Return new arrays for `n` cells. Only the potential is read before it is written, and starts from 0."""
         return cls(

@@ -32,9 +32,7 @@ if TYPE_CHECKING:
 FORMAT, VERSION = "clvoro-checkpoint", 9
 MESH = ("points", "labels", "velocity", "signatures", "ever_changed", "h", "potential")
 PER_FACE = ("neighbors", "face_measures", "face_centroids")
-DIAGRAM = (
-    "starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances",
-)  # fmt: skip
+DIAGRAM = ("starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances")
 VERTICES = {"triples": 2, "keys": 1}
 """Arrays of a diagram in 3D that will be updated, and their entries per face. They may be longer than that."""
 
@@ -95,9 +93,7 @@ class Checkpointer:
         Before it begins.
     """
 
-    def __init__(
-        self, path: str | PathLike[str], every: float, fingerprint: dict, schedule: list[Action]
-    ) -> None:
+    def __init__(self, path: str | PathLike[str], every: float, fingerprint: dict, schedule: list[Action]) -> None:
         from ..io import check_writable
 
         path = check_path("checkpoint", path)
@@ -119,10 +115,7 @@ class Checkpointer:
         try:
             self.write(loop)
         except OutputError as error:
-            warn(
-                f"{error}. The run continues without this checkpoint; the last one is unchanged",
-                CheckpointWarning,
-            )
+            warn(f"{error}. The run continues without this checkpoint; the last one is unchanged", CheckpointWarning)
         self._last = time.monotonic()
 
     def write(self, loop: Loop) -> None:
@@ -160,14 +153,20 @@ class Checkpointer:
                     arrays[f"{part}.{field.name}"] = getattr(getattr(loop, part), field.name)
         arrays["history"] = np.concatenate(loop.rows)
         state = {
-            "position": loop.position, "level": loop.level, "n_start": loop.n_start, "started": loop.started,
-            "steps": loop.steps, "next_label": mesh.next_label, "spare": len(t.neighbors) - m,
+            "position": loop.position,
+            "level": loop.level,
+            "n_start": loop.n_start,
+            "started": loop.started,
+            "steps": loop.steps,
+            "next_label": mesh.next_label,
+            "spare": len(t.neighbors) - m,
             "size_factor": float(mesh.size_factor).hex(),
             "elapsed": time.perf_counter() - loop.began,
             "methods": [state_of(method) for method in methods_of(loop.schedule)],
-            "capacities": capacities_of(mesh.stages), "levels": loop.levels,
+            "capacities": capacities_of(mesh.stages),
+            "levels": loop.levels,
             "seam_cells": 0 if periodic is None else periodic.halo.cells,
-        }  # fmt: skip
+        }
         about = {"fingerprint": self.fingerprint, "schedule": self.schedule, "state": state}
         arrays["about"] = np.array(json.dumps(about))
         write_arrays(self.path, FORMAT, VERSION, arrays, compress=False)

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import KDTree
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.rings import OrientedRings
 from ..geometry.tips import WIDEST, find_tips
@@ -111,9 +111,7 @@ def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) ->
     bare = _is_free(domain, free, x[tips])
     tips, shape = tips[bare], [values[bare] for values in shape]
     kept = np.concatenate([tips, kept])  # in each group the tips come first
-    directions, angles = (
-        np.concatenate(pair) for pair in zip(shape[:2], (directions, angles), strict=True)
-    )
+    directions, angles = (np.concatenate(pair) for pair in zip(shape[:2], (directions, angles), strict=True))
     slack = np.concatenate([np.zeros(len(tips)), slack])
     size = np.concatenate([shape[2], h[kept[len(tips) :]]])
     groups = _grouped(x[kept], size)
@@ -123,9 +121,16 @@ def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) ->
     vertices = kept[order]
     other_starts, others = _others(x[vertices], size[order], starts)
     return CornerGroups(
-        vertices, starts, directions[order], angles[order], slack[order], size[order], other_starts, others,
+        vertices,
+        starts,
+        directions[order],
+        angles[order],
+        slack[order],
+        size[order],
+        other_starts,
+        others,
         _wall_corners(domain, vertices, WALL_REACH * h),
-    )  # fmt: skip
+    )
 
 
 def _is_free(domain: Polygon, free: Polygon | None, points: np.ndarray) -> np.ndarray:
@@ -221,9 +226,7 @@ class _Pockets:
         return np.where(self._ring[others] == ring, area, np.inf)
 
 
-def _walls(
-    domain: Polygon, corners: np.ndarray, h: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _walls(domain: Polygon, corners: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return direction, interior angle and slack of each corner."""
     oriented = domain.oriented
     ring_of = np.searchsorted(oriented.ring_starts, corners, side="right") - 1
@@ -288,10 +291,7 @@ def _others(x: np.ndarray, h: np.ndarray, starts: np.ndarray) -> tuple[np.ndarra
         away = (pair < starts[group]) | (pair >= starts[group + 1])
         found = np.split(pair[away], np.searchsorted(group[away], np.arange(1, len(starts) - 1)))
     counts = [len(f) for f in found]
-    return (
-        np.cumsum([0, *counts]).astype(np.int32),
-        np.concatenate([np.empty(0, int), *found]).astype(np.int32),
-    )
+    return (np.cumsum([0, *counts]).astype(np.int32), np.concatenate([np.empty(0, int), *found]).astype(np.int32))
 
 
 def _wall_corners(domain: Polygon, corners: np.ndarray, reach: np.ndarray) -> np.ndarray:
@@ -345,10 +345,13 @@ class Corners:
         self._kernels = engine.kernels(
             "adaptation/corners",
             {
-                "MOST_IN_GROUP": MOST_IN_GROUP, "MOST_MOVED": MOST_MOVED, "CANDIDATE_REACH": CANDIDATE_REACH,
-                "FARTHEST_REACH": FARTHEST_REACH, "WIDEST_TIP": float(WIDEST),
+                "MOST_IN_GROUP": MOST_IN_GROUP,
+                "MOST_MOVED": MOST_MOVED,
+                "CANDIDATE_REACH": CANDIDATE_REACH,
+                "FARTHEST_REACH": FARTHEST_REACH,
+                "WIDEST_TIP": float(WIDEST),
             },
-        )  # fmt: skip
+        )
 
     def share(self, placed: PlacedCorners, free: Domain, t: Tessellation, moving: Moving) -> None:
         """Move generators so that a face ends in every corner.
@@ -367,14 +370,37 @@ class Corners:
         p.seeds.fill(0x7FFFFFFF)
         for find_cells in (False, True):
             engine.run_each(
-                k.find_seeds, chords.touched_count, np.int32(find_cells), chords.touched, np.int32(t.n), t.starts,
-                t.neighbors, t.points, p.wall_corners, p.corners, p.nearest, p.seeds,
-            )  # fmt: skip
+                k.find_seeds,
+                chords.touched_count,
+                np.int32(find_cells),
+                chords.touched,
+                np.int32(t.n),
+                t.starts,
+                t.neighbors,
+                t.points,
+                p.wall_corners,
+                p.corners,
+                p.nearest,
+                p.seeds,
+            )
         engine.run_each(
-            k.share_corners, p.groups, t.starts, t.neighbors, np.int32(t.n), moving.points, moving.labels,
-            np.int32(moving.fixed), p.starts, p.corners, p.shapes, p.other_starts, p.others, p.seeds,
-            *free.device_args(engine), p.moved, p.targets, group=GROUP,
-        )  # fmt: skip
-        engine.run_each(
-            k.move_to_corners, p.groups * MOST_MOVED, p.moved, p.targets, moving.points, moving.velocity
-        )  # fmt: skip
+            k.share_corners,
+            p.groups,
+            t.starts,
+            t.neighbors,
+            np.int32(t.n),
+            moving.points,
+            moving.labels,
+            np.int32(moving.fixed),
+            p.starts,
+            p.corners,
+            p.shapes,
+            p.other_starts,
+            p.others,
+            p.seeds,
+            *free.device_args(engine),
+            p.moved,
+            p.targets,
+            group=GROUP,
+        )
+        engine.run_each(k.move_to_corners, p.groups * MOST_MOVED, p.moved, p.targets, moving.points, moving.velocity)

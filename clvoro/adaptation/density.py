@@ -53,9 +53,7 @@ class Density:
         self._kernels = engine.kernels("adaptation/density")
         self._partial = engine.empty(2 * engine.groups)
 
-    def cell_weights(
-        self, t: Tessellation, h: cla.Array, log_ratio: cla.Array | None = None
-    ) -> CellWeights:
+    def cell_weights(self, t: Tessellation, h: cla.Array, log_ratio: cla.Array | None = None) -> CellWeights:
         """Return density, weight and log ratio, in the given array, of the cells of `t` for sizes `h` (n,)."""
         log_ratio = self.engine.scratch(t.n) if log_ratio is None else log_ratio
         w = CellWeights(self.engine.scratch(t.n), self.engine.scratch(t.n), log_ratio)
@@ -67,9 +65,8 @@ class Density:
         """Write the weights; return log h (n,)."""
         log_h = self.engine.scratch(t.n)
         self.engine.run(
-            self._kernels.evaluate_density, -(-t.n // 4), t.n, t.volumes, h, w.density,
-            w.weight, w.log_ratio, log_h,
-        )  # fmt: skip
+            self._kernels.evaluate_density, -(-t.n // 4), t.n, t.volumes, h, w.density, w.weight, w.log_ratio, log_h
+        )
         return log_h
 
     def lloyd_weights(
@@ -89,9 +86,18 @@ class Density:
         with engine.workspace.frame():
             log_h = self._evaluate(t, h, w)
             engine.run_each(
-                k.fit_gradient, t.n, t.starts, t.neighbors, t.points, log_h, t.offsets, t.covariances,
-                gradient, lloyd, *engine.period_args,
-            )  # fmt: skip
+                k.fit_gradient,
+                t.n,
+                t.starts,
+                t.neighbors,
+                t.points,
+                log_h,
+                t.offsets,
+                t.covariances,
+                gradient,
+                lloyd,
+                *engine.period_args,
+            )
         return w
 
     def sum_log_ratio(self, w: CellWeights) -> cla.Array:
@@ -100,7 +106,5 @@ class Density:
         The ratio of both is the weighted mean of the log ratios. The next call overwrites the sums.
         """
         size = len(w.log_ratio)
-        self.engine.run_blocks(
-            self._kernels.sum_log_ratio, size, w.weight, w.log_ratio, self._partial
-        )
+        self.engine.run_blocks(self._kernels.sum_log_ratio, size, w.weight, w.log_ratio, self._partial)
         return self._partial

@@ -9,15 +9,9 @@ import numpy as np
 import shapely
 
 from ..arguments import format_point, warn
-from ..errors import (
-    InputError,
-    MismatchWarning,
-    ObtuseTrianglesWarning,
-    PrecisionWarning,
-    SizeErrorWarning,
-)
+from ..errors import InputError, MismatchWarning, ObtuseTrianglesWarning, PrecisionWarning, SizeErrorWarning
 from ..geometry.boundary_layers import Layers, columns_of
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
 from ..mesh.connectivity import face_ends, face_owners
@@ -152,22 +146,13 @@ def warn_of_errors(result: Result) -> None:
     if mean < max(MEAN_ERROR, aimed or 0.0) and largest < LARGEST_ERROR:
         return
     diagram, sizes = result.diagram, result.target_size
-    wanted, made = (
-        float(sizes[worst]),
-        float(diagram.volumes[worst]) ** (1 / diagram.domain.cell_dim),
-    )
+    wanted, made = (float(sizes[worst]), float(diagram.volumes[worst]) ** (1 / diagram.domain.cell_dim))
     if len(diagram) == 1 and 2 * made**diagram.domain.cell_dim < wanted**diagram.domain.cell_dim:
         return  # `CoarseSizeWarning` says it before the run
     place = _place(diagram.domain, result.points[worst])
     near = [worst, *_ring(diagram, worst)]
-    steep = any(
-        abs(math.log(sizes[j] / sizes[i])) > math.log(STEEP)
-        for i in near
-        for j in _ring(diagram, i)
-    )
-    if steep and any(
-        diagram.shifts[slice(*diagram.neighbor_starts[i : i + 2])].any() for i in near
-    ):
+    steep = any(abs(math.log(sizes[j] / sizes[i])) > math.log(STEEP) for i in near for j in _ring(diagram, i))
+    if steep and any(diagram.shifts[slice(*diagram.neighbor_starts[i : i + 2])].any() for i in near):
         why = (
             "sizes jump at a seam of the periodic box: a field must have the period of the box; repeat its shapes one "
             "period away"
@@ -251,9 +236,7 @@ def warn_of_obtuse_triangles(result: Result) -> None:
     )
 
 
-def check_precision(
-    sizing: Sizing, domain: Domain, points: np.ndarray, factor: float = 1.0
-) -> float:
+def check_precision(sizing: Sizing, domain: Domain, points: np.ndarray, factor: float = 1.0) -> float:
     """Raise or warn if the device's precision does not resolve the sizes of `sizing` times `factor`.
 
     Positions in the domain's frame are rounded to multiples of 2^-24 (in single precision).

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import MemoryLimitError
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..opencl import memory_limits
 from ..opencl.engine import Engine
@@ -26,21 +26,13 @@ TRIMMED_PEAK = (68, 79)
 """The same in polygons, where the boundary trims cells and faces are in full precision."""
 BOUNDARY_PEAK, EDGE_PEAK = (100, 187), (22, 20)
 """The same in addition per cell at the boundary, with its ghost generators, and per edge of the boundary."""
-OUTPUT: dict[int | str, dict[int, int]] = {
-    2: {8: 340, 4: 220}, 3: {8: 3600, 4: 2850}, SPHERE: {8: 450, 4: 275},
-}  # fmt: skip
+OUTPUT: dict[int | str, dict[int, int]] = {2: {8: 340, 4: 220}, 3: {8: 3600, 4: 2850}, SPHERE: {8: 450, 4: 275}}
 """Bytes per cell while the final diagram is read, with vertices, by dimension and size of a real."""
 TRIMMED_OUTPUT, BOUNDARY_OUTPUT, EDGE_OUTPUT = {8: 535, 4: 330}, {8: 1200, 4: 780}, {8: 65, 4: 38}
 """The same in polygons: per cell, and in addition per cell at the boundary and per edge."""
-DIAGRAM: dict[int | str, dict[int, int]] = {
-    2: {8: 700, 4: 440}, 3: {8: 4700, 4: 3400}, SPHERE: {8: 890, 4: 610},
-}  # fmt: skip
+DIAGRAM: dict[int | str, dict[int, int]] = {2: {8: 700, 4: 440}, 3: {8: 4700, 4: 3400}, SPHERE: {8: 890, 4: 610}}
 """Bytes per cell of one diagram of random generators, until it is computed and read."""
-TRIMMED_DIAGRAM, BOUNDARY_DIAGRAM, EDGE_DIAGRAM = (
-    {8: 1110, 4: 735},
-    {8: 750, 4: 530},
-    {8: 260, 4: 170},
-)
+TRIMMED_DIAGRAM, BOUNDARY_DIAGRAM, EDGE_DIAGRAM = ({8: 1110, 4: 735}, {8: 750, 4: 530}, {8: 260, 4: 170})
 """The same in polygons, without ghost generators."""
 FOLDED = {2: (9, 57), 3: (0, 0)}
 """Reals and integers per cell (not per image) in addition in periodic boxes."""
@@ -58,9 +50,7 @@ TRIMMED_POWER_DIAGRAM = {8: 1520, 4: 1020}
 """The same in polygons."""
 FOLDED_POWER_DIAGRAM = {2: {8: 600, 4: 520}, 3: {8: 6700, 4: 5400}}
 """The same in periodic boxes: what is added per cell. Large weights need more ghost images."""
-LARGEST: dict[int | str, dict[int, int]] = {
-    2: {8: 105, 4: 90}, 3: {8: 610, 4: 310}, SPHERE: {8: 150, 4: 90},
-}  # fmt: skip
+LARGEST: dict[int | str, dict[int, int]] = {2: {8: 105, 4: 90}, 3: {8: 610, 4: 310}, SPHERE: {8: 150, 4: 90}}
 """Bytes per cell or image of the largest array, of a run or of one diagram."""
 TRIMMED_LARGEST = {8: 130, 4: 90}
 """The same in polygons."""
@@ -171,9 +161,7 @@ def estimate_memory(
     return max(peak + fixed_bytes(engine, n), output) + extras.field_bytes
 
 
-def largest_array(
-    engine: Engine, n: float, domain: Domain | None = None, extras: Extras | None = None
-) -> float:
+def largest_array(engine: Engine, n: float, domain: Domain | None = None, extras: Extras | None = None) -> float:
     """Return the size of the largest array of a run of `n` cells, or of one diagram, in bytes."""
     extras = Extras() if extras is None else extras
     n, real = n * (1 + extras.surplus), engine.real.itemsize
@@ -218,10 +206,7 @@ def check_memory(
             f"{in_bytes(needed)}, and the device has {in_bytes(available)}). Do h and the domain have the same unit "
             "of length? If so, use a larger size or a smaller n_cells"
         )
-    largest, most = (
-        largest_array(engine, n, domain, extras),
-        memory_limits.largest_allocation(device),
-    )
+    largest, most = (largest_array(engine, n, domain, extras), memory_limits.largest_allocation(device))
     remedy = (
         "Do h and the domain have the same unit of length? If so, use a larger size, n_cells, dtype='float32' or "
         "another device"

@@ -9,15 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 
 
 def run_fingerprint(
-    domain: Domain,
-    options: dict[str, Any],
-    dtype: np.dtype,
-    points: np.ndarray | None,
-    fixed: np.ndarray | None = None,
+    domain: Domain, options: dict[str, Any], dtype: np.dtype, points: np.ndarray | None, fixed: np.ndarray | None = None
 ) -> dict[str, Any]:
     """Return plain values that identify a run. A checkpoint of another run is rejected."""
     return {

@@ -12,7 +12,8 @@ from scipy.spatial import KDTree
 
 from ..arguments import check_points, coincident_pair, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
-from ..geometry.box import Box, Domain
+from ..geometry.box import Box
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import read_only
@@ -38,9 +39,7 @@ def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
     if fixed is None:
         return np.empty((0, domain.dim))
     if isinstance(fixed, str | bool):
-        raise InputTypeError(
-            f"fixed is {fixed!r}, expected positions of generators, an array of shape (k, d)"
-        )
+        raise InputTypeError(f"fixed is {fixed!r}, expected positions of generators, an array of shape (k, d)")
     if not len(domain.check_rows("fixed", fixed)):
         return np.empty((0, domain.dim))
     array = check_points(fixed, domain, "fixed")
@@ -56,9 +55,7 @@ def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
     return array
 
 
-def check_room(
-    points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarray, h: np.ndarray
-) -> None:
+def check_room(points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarray, h: np.ndarray) -> None:
     """Check that cells of the sizes `h` (k,) around `points` (k, d) have room.
 
     Parameters
@@ -134,11 +131,7 @@ def in_frame(points: np.ndarray, domain: Domain) -> tuple[np.ndarray, np.ndarray
 
 
 def take_places(
-    points: np.ndarray,
-    labels: np.ndarray,
-    fixed: np.ndarray,
-    domain: Domain,
-    n_fixed: int,
+    points: np.ndarray, labels: np.ndarray, fixed: np.ndarray, domain: Domain, n_fixed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return generators and labels in which those at `fixed` (k, d) have taken the places of the nearest others.
 

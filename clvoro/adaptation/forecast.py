@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..tessellation.periodic.halo import block_counts
 from .sampling.quadrature import DensityTree
@@ -52,12 +52,7 @@ def sample_cells(domain: Domain, tree: DensityTree, count: int) -> np.ndarray:
     return places[domain.contains(places)]
 
 
-def expected_images(
-    domain: Domain,
-    size: Callable[[np.ndarray], np.ndarray],
-    n: float,
-    tree: DensityTree,
-) -> float:
+def expected_images(domain: Domain, size: Callable[[np.ndarray], np.ndarray], n: float, tree: DensityTree) -> float:
     """Return the expected ghost images per generator in a periodic box of `n` cells.
 
     They are counted in a sample: points across a periodic boundary that are not deeper than the halo of their block.
@@ -96,10 +91,7 @@ def expected_images(
 
 
 def _expected_halo_depths(
-    domain: Domain,
-    size: Callable[[np.ndarray], np.ndarray],
-    count: int,
-    jumps: float,
+    domain: Domain, size: Callable[[np.ndarray], np.ndarray], count: int, jumps: float
 ) -> dict[tuple[int, int], np.ndarray]:
     """Return the expected depth of the halo at both ends (-1, 1) of each periodic axis, for `count` blocks per axis.
 
@@ -142,10 +134,7 @@ def _expected_halo_depths(
 
 
 def expected_surplus(
-    domain: Domain,
-    size: Callable[[np.ndarray], np.ndarray],
-    tree: DensityTree,
-    reach: float,
+    domain: Domain, size: Callable[[np.ndarray], np.ndarray], tree: DensityTree, reach: float
 ) -> float:
     """Return the temporary cells of a run beyond the integral of h^-d, as a share of it.
 
@@ -165,9 +154,7 @@ def expected_surplus(
     return float(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * steep)))
 
 
-def _steepness(
-    domain: Domain, size: Callable[[np.ndarray], np.ndarray], places: np.ndarray, reach: float
-) -> float:
+def _steepness(domain: Domain, size: Callable[[np.ndarray], np.ndarray], places: np.ndarray, reach: float) -> float:
     """Return the mean steepness, from 0 to 1, of the sizes around `places` (k, d) at a distance of `reach` h."""
     if not len(places):
         return 0.0

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..opencl.device_array import read_number
 from ..opencl.engine import Engine
 from ..opencl.primitives import NamedArrays, Scan
@@ -204,16 +204,22 @@ class InsertionDeletion:
         marks = _Marks.clean(self._room, n, engine.dim)
         self._labels, self._fixed = generators.labels, fixed
         keys = self._room("keys", size=n, dtype=np.uint64)
-        engine.run_each(
-            k.score_bad_cells, n, t.starts, t.neighbors, quality, engine.real.type(deficit), keys
-        )
+        engine.run_each(k.score_bad_cells, n, t.starts, t.neighbors, quality, engine.real.type(deficit), keys)
         self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, PAIR_RINGS)
         self._limit(chosen, n, most)
         engine.run_each(
-            k.mark_bad_cells, n, chosen, t.starts, np.int32(6 if split else 7), t.points,
-            t.offsets, t.covariances, t.volumes, *marks.arrays,
-        )  # fmt: skip
+            k.mark_bad_cells,
+            n,
+            chosen,
+            t.starts,
+            np.int32(6 if split else 7),
+            t.points,
+            t.offsets,
+            t.covariances,
+            t.volumes,
+            *marks.arrays,
+        )
         self._room.clear("keys", "spread", "chosen", "latest")
         return self._apply(domain, t, generators, marks, next_label)
 
@@ -231,9 +237,16 @@ class InsertionDeletion:
         self._labels, self._fixed = generators.labels, fixed
         for sign, chosen in zip((1, -1), sites, strict=True):
             engine.run_each(
-                self._kernels.mark_split_delete, t.n, chosen, engine.real.type(sign), t.points, t.offsets,
-                t.covariances, t.volumes, *marks.arrays,
-            )  # fmt: skip
+                self._kernels.mark_split_delete,
+                t.n,
+                chosen,
+                engine.real.type(sign),
+                t.points,
+                t.offsets,
+                t.covariances,
+                t.volumes,
+                *marks.arrays,
+            )
         return self._apply(domain, t, generators, marks, next_label)
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
@@ -242,23 +255,19 @@ class InsertionDeletion:
         kinds = self._room("kinds", size=2 * n, dtype=np.int32)
         raw, once = (self._room("strain", turn, size=4 * n, dtype=np.float32) for turn in range(2))
         engine.run_each(
-            k.measure_strain, n, t.starts, t.neighbors, t.points, h, kinds, raw, *t.outlines,
-            *engine.period_args,
-        )  # fmt: skip
+            k.measure_strain, n, t.starts, t.neighbors, t.points, h, kinds, raw, *t.outlines, *engine.period_args
+        )
         engine.run_each(k.average_strain, n, t.starts, t.neighbors, t.points, raw, once)
         engine.run_each(k.average_strain, n, t.starts, t.neighbors, t.points, once, raw)
         return kinds, once, raw
 
-    def _nucleate(
-        self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int
-    ) -> None:
+    def _nucleate(self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int) -> None:
         """Mark at most `nuclei` insertions and as many mergers where the perfect lattice is strained most."""
         engine, k, n = self.engine, self._kernels, t.n
         keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(
-            k.score_strain, n, t.starts, t.neighbors, kinds, strain,
-            engine.real.type(NUCLEATION_STRAIN), keys,
-        )  # fmt: skip
+            k.score_strain, n, t.starts, t.neighbors, kinds, strain, engine.real.type(NUCLEATION_STRAIN), keys
+        )
         self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, NUCLEUS_RINGS)
         self._limit(chosen, n, 2 * nuclei)
@@ -266,9 +275,17 @@ class InsertionDeletion:
         engine.run_each(k.flag_sites, n, chosen, ranks)
         self._scan.exclusive(ranks, ranks, n)
         engine.run_each(
-            k.mark_nuclei, n, chosen, ranks, t.starts, t.neighbors, t.points, *marks.arrays,
-            marks.busy, *engine.period_args,
-        )  # fmt: skip
+            k.mark_nuclei,
+            n,
+            chosen,
+            ranks,
+            t.starts,
+            t.neighbors,
+            t.points,
+            *marks.arrays,
+            marks.busy,
+            *engine.period_args,
+        )
 
     def _climb(
         self,
@@ -291,9 +308,19 @@ class InsertionDeletion:
         pull = self._room("pull", size=n)
         keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(
-            k.score_pairs, n, t.starts, t.neighbors, t.points, kinds, strain,
-            np.int32(change.climb_strain <= CLIMB_STRAIN), partners, pull, keys, *engine.period_args,
-        )  # fmt: skip
+            k.score_pairs,
+            n,
+            t.starts,
+            t.neighbors,
+            t.points,
+            kinds,
+            strain,
+            np.int32(change.climb_strain <= CLIMB_STRAIN),
+            partners,
+            pull,
+            keys,
+            *engine.period_args,
+        )
         self._drop_fixed(t, keys, neighbors=True)
         if change.nuclei:
             engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, PAIR_RINGS), keys)
@@ -306,14 +333,23 @@ class InsertionDeletion:
         order = np.argsort(np.abs(shifts), kind="stable")
         best = order[np.argmin(np.abs(changes[order] - need))]
         engine.run_each(
-            k.mark_pairs, n, chosen, pull, kinds, partners, strain_limit, real(shifts[best]),
-            t.points, local_length, *marks.arrays, marks.busy, *engine.period_args,
-        )  # fmt: skip
+            k.mark_pairs,
+            n,
+            chosen,
+            pull,
+            kinds,
+            partners,
+            strain_limit,
+            real(shifts[best]),
+            t.points,
+            local_length,
+            *marks.arrays,
+            marks.busy,
+            *engine.period_args,
+        )
         return int(changes[best])
 
-    def _split_or_delete(
-        self, t: Tessellation, log_ratio: cla.Array, marks: _Marks, rest: int
-    ) -> None:
+    def _split_or_delete(self, t: Tessellation, log_ratio: cla.Array, marks: _Marks, rest: int) -> None:
         """Mark about `rest` of the largest cells to split, or -rest of the smallest to delete, relative to h."""
         engine, k, n = self.engine, self._kernels, t.n
         sign = engine.real.type(math.copysign(1, rest))
@@ -324,17 +360,22 @@ class InsertionDeletion:
         chosen = self._choose(t, keys, LOG_RATIO_RINGS)
         self._limit(chosen, n, rest if rest > 0 else min(-rest, n - 1))
         engine.run_each(
-            k.mark_split_delete, n, chosen, sign, t.points, t.offsets, t.covariances, t.volumes,
-            *marks.arrays,
-        )  # fmt: skip
+            k.mark_split_delete, n, chosen, sign, t.points, t.offsets, t.covariances, t.volumes, *marks.arrays
+        )
 
     def _drop_fixed(self, t: Tessellation, keys: cla.Array, neighbors: bool) -> None:
         """Remove sites at fixed generators and, with `neighbors`, next to them."""
         if self._fixed:
             self.engine.run_each(
-                self._kernels.drop_fixed_sites, t.n, t.starts, t.neighbors, self._labels,
-                np.int32(self._fixed), np.int32(neighbors), keys,
-            )  # fmt: skip
+                self._kernels.drop_fixed_sites,
+                t.n,
+                t.starts,
+                t.neighbors,
+                self._labels,
+                np.int32(self._fixed),
+                np.int32(neighbors),
+                keys,
+            )
 
     def spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
         """Return the largest key within `rings` rings of each generator."""
@@ -345,17 +386,13 @@ class InsertionDeletion:
             source, into, other = into, other, into
         return source
 
-    def choose_once(
-        self, t: Tessellation, keys: cla.Array, rings: int, labels: cla.Array, fixed: int
-    ) -> cla.Array:
+    def choose_once(self, t: Tessellation, keys: cla.Array, rings: int, labels: cla.Array, fixed: int) -> cla.Array:
         """Return the keys of the sites that are the strongest within `rings` rings, away from fixed generators."""
         self._labels, self._fixed = labels, fixed
         self._drop_fixed(t, keys, neighbors=True)
         return self._choose(t, keys, rings, rounds=1)
 
-    def _choose(
-        self, t: Tessellation, keys: cla.Array, rings: int, rounds: int = ROUNDS
-    ) -> cla.Array:
+    def _choose(self, t: Tessellation, keys: cla.Array, rings: int, rounds: int = ROUNDS) -> cla.Array:
         """Return the keys of the strongest sites that are `rings` rings apart. `keys` is overwritten."""
         engine, k, n = self.engine, self._kernels, t.n
         chosen = self._room.zeros("chosen", size=n, dtype=np.uint64)
@@ -387,12 +424,7 @@ class InsertionDeletion:
         engine.run_each(k.limit_sites, n, np.uint64(min(least, 2**64 - 1)), chosen)
 
     def _apply(
-        self,
-        domain: Domain,
-        t: Tessellation,
-        generators: Generators,
-        marks: _Marks,
-        next_label: int,
+        self, domain: Domain, t: Tessellation, generators: Generators, marks: _Marks, next_label: int
     ) -> Outcome | None:
         """Carry out the marked changes."""
         engine, n = self.engine, t.n
@@ -403,16 +435,37 @@ class InsertionDeletion:
         if m == 0 or (deleted == 0 and inserted == 0):
             return None
         new = Generators(
-            engine.empty((m, engine.dim)), engine.empty(m, np.int32), engine.empty((m, engine.dim)),
-            engine.empty(m, np.uint64), engine.empty(m),
-        )  # fmt: skip
+            engine.empty((m, engine.dim)),
+            engine.empty(m, np.int32),
+            engine.empty((m, engine.dim)),
+            engine.empty(m, np.uint64),
+            engine.empty(m),
+        )
         engine.run_each(
-            self._kernels.apply_changes, n, marks.kept, marks.born, np.int32(next_label), np.int32(self._fixed),
-            *domain.device_args(engine), t.points, generators.labels, generators.velocity,
-            generators.signatures, generators.ever_changed, marks.shifts, marks.births, new.points, new.labels,
-            new.velocity, new.signatures, new.ever_changed, t.starts, t.neighbors, t.face_centroids,
+            self._kernels.apply_changes,
+            n,
+            marks.kept,
+            marks.born,
+            np.int32(next_label),
+            np.int32(self._fixed),
+            *domain.device_args(engine),
+            t.points,
+            generators.labels,
+            generators.velocity,
+            generators.signatures,
+            generators.ever_changed,
+            marks.shifts,
+            marks.births,
+            new.points,
+            new.labels,
+            new.velocity,
+            new.signatures,
+            new.ever_changed,
+            t.starts,
+            t.neighbors,
+            t.face_centroids,
             *t.outlines,
-        )  # fmt: skip
+        )
         return Outcome(new, inserted, deleted)
 
 

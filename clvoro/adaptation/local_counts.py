@@ -93,35 +93,47 @@ class LocalCounts:
             array.fill(0)
         missing, total = mesh.missing_cells(w), 0
         pieces = Pieces(mesh, w) if has_pieces(mesh.domain) else None
-        laplacian = poisson.assemble(
-            t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=TOLERANCE
-        )
+        laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=TOLERANCE)
         for turn in count():
             offset = real(offset_of(missing, math.inf) if pieces is None else 0)
             if turn:
                 if pieces is not None:
                     pieces.offset(potential, changes)
                 engine.run_each(
-                    k.score_potential, n, t.starts, t.neighbors, w.log_ratio, potential, offset, real(LEAST_GAIN),
-                    selection.spread(t, blocked, BLOCKED_RINGS), keys,
-                )  # fmt: skip
+                    k.score_potential,
+                    n,
+                    t.starts,
+                    t.neighbors,
+                    w.log_ratio,
+                    potential,
+                    offset,
+                    real(LEAST_GAIN),
+                    selection.spread(t, blocked, BLOCKED_RINGS),
+                    keys,
+                )
                 chosen = selection.choose_once(t, keys, SITE_RINGS, mesh.labels, mesh.fixed)
-            engine.run_each(
-                k.try_changes, n, w.weight, changes, chosen, potential, offset, before, source
-            )
+            engine.run_each(k.try_changes, n, w.weight, changes, chosen, potential, offset, before, source)
             balance_components(mesh.domain, t, source, w.weight)
             poisson.solve(
                 laplacian, source, potential, tolerance=TOLERANCE, preconditioner="multigrid", from_zero=turn == 0
-            )  # fmt: skip
+            )
             if turn == 0:
                 continue
             if pieces is not None:
                 pieces.offset(potential, changes)
             self._accepted.fill(0)
             engine.run_each(
-                k.accept_changes, n, chosen, before, potential, offset, real(LEAST_GAIN), changes, blocked,
+                k.accept_changes,
+                n,
+                chosen,
+                before,
+                potential,
+                offset,
+                real(LEAST_GAIN),
+                changes,
+                blocked,
                 self._accepted,
-            )  # fmt: skip
+            )
             inserted, deleted = map(int, read_numbers(self._accepted, 0, 2))
             missing, total = missing - inserted + deleted, total + inserted + deleted
             if inserted + deleted <= LEAST_CHANGES * n:
@@ -131,7 +143,5 @@ class LocalCounts:
     def sites(self, changes: cla.Array, sign: int) -> cla.Array:
         """Return 1 where `changes` (n,) have this sign, and 0 elsewhere: (n,) uint64 in the workspace."""
         found = self.engine.scratch(len(changes), np.uint64)
-        self.engine.run_each(
-            self._kernels.select_changes, len(changes), changes, np.int32(sign), found
-        )
+        self.engine.run_each(self._kernels.select_changes, len(changes), changes, np.int32(sign), found)
         return found

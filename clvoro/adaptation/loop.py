@@ -87,11 +87,7 @@ class Loop:
         checkpoint: Checkpointer | None = None,
         progress: Progress | None = None,
     ) -> None:
-        p = (
-            Progress(levels, mesh.n, mesh.next_label, mesh.next_label)
-            if progress is None
-            else progress
-        )
+        p = Progress(levels, mesh.n, mesh.next_label, mesh.next_label) if progress is None else progress
         self.mesh, self.schedule, self.levels, self.checkpoint = mesh, schedule, levels, checkpoint
         self.level, self.position, self.begun, self.steps = p.level, p.position, p.steps, p.steps
         self.n_start, self.started, self.labeled = p.n_start, p.started, p.labeled
@@ -223,9 +219,7 @@ class Loop:
         self.mesh.stages.clear("poisson")
         nuclei = round(action.nuclei * self.mesh.n)
         max_cells = math.inf if self.fixed_count is not None else self.max_cells()
-        self.mesh.insert_delete(
-            nuclei, self.fixed_count, climb_strain=action.climb_strain, most=max_cells
-        )
+        self.mesh.insert_delete(nuclei, self.fixed_count, climb_strain=action.climb_strain, most=max_cells)
 
     def repair_cells(self, action: RepairCells) -> None:
         """Delete or split the worst cells."""

@@ -79,9 +79,7 @@ class PublishedMethod:
         poisson.subtract_mean_source(mesh.error, t.volumes, mesh.source)
         balance_components(mesh.domain, t, mesh.source, t.volumes)
         with mesh.engine.workspace.frame():
-            laplacian = poisson.assemble(
-                t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=r.tolerance
-            )
+            laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=r.tolerance)
             solution = poisson.solve(
                 laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, ordering=mesh.labels
             )
@@ -97,9 +95,15 @@ class PublishedMethod:
         """Move by the displacements that the method uses."""
         mesh.zero_fixed(mesh.lloyd)
         mesh.stages.motion.move_generators(
-            mesh.free, mesh.points, mesh.lloyd, float(self.lloyd), mesh.correction,
-            float(self.poisson), mesh.h, mesh.velocity,
-        )  # fmt: skip
+            mesh.free,
+            mesh.points,
+            mesh.lloyd,
+            float(self.lloyd),
+            mesh.correction,
+            float(self.poisson),
+            mesh.h,
+            mesh.velocity,
+        )
 
 
 @dataclass(frozen=True)
@@ -133,14 +137,18 @@ class WeightedMethod:
         balance_components(mesh.domain, t, mesh.source, w.weight)
         with mesh.engine.workspace.frame():
             laplacian = poisson.assemble(
-                t.starts, t.neighbors, t.face_measures, mesh.points, w.density,
-                tolerance=self.tolerance,
-            )  # fmt: skip
+                t.starts, t.neighbors, t.face_measures, mesh.points, w.density, tolerance=self.tolerance
+            )
             # The labels are a new array whenever the order changes.
             solution = poisson.solve(
-                laplacian, mesh.source, mesh.potential, tolerance=self.tolerance,
-                ordering=mesh.labels, from_zero=True, max_cycles=self.max_cycles,
-            )  # fmt: skip
+                laplacian,
+                mesh.source,
+                mesh.potential,
+                tolerance=self.tolerance,
+                ordering=mesh.labels,
+                from_zero=True,
+                max_cycles=self.max_cycles,
+            )
         motion.compute_potential_gradient(t, mesh.potential, mesh.correction)
         mesh.summarize_displacements()
         mesh.zero_fixed(mesh.correction)
@@ -149,9 +157,16 @@ class WeightedMethod:
     def move(self, mesh: MeshState) -> None:
         """Move by both, at most by k h."""
         mesh.stages.motion.move_generators(
-            mesh.free, mesh.points, mesh.lloyd, float(self.lloyd), mesh.correction, float(self.poisson),
-            mesh.local_length if self.cautious else mesh.h, mesh.velocity, clip=self.k,
-        )  # fmt: skip
+            mesh.free,
+            mesh.points,
+            mesh.lloyd,
+            float(self.lloyd),
+            mesh.correction,
+            float(self.poisson),
+            mesh.local_length if self.cautious else mesh.h,
+            mesh.velocity,
+            clip=self.k,
+        )
 
 
 AT_WALLS = 2.0
@@ -247,10 +262,7 @@ class ProjectedMethod:
         stages, t = mesh.stages, mesh.t
         relaxation, momentum, bad_cell_weight = self.relaxation, self.momentum, self.bad_cell_weight
         if mesh.walls.thin:
-            relaxation, momentum = (
-                min(relaxation, self.calm_relaxation),
-                min(momentum, CALM_MOMENTUM),
-            )
+            relaxation, momentum = (min(relaxation, self.calm_relaxation), min(momentum, CALM_MOMENTUM))
             bad_cell_weight = min(bad_cell_weight, CALM_BAD_CELL_WEIGHT)
         mesh.allocate_step()
         gradient, log_ratio = mesh.engine.scratch(mesh.points.shape), mesh.engine.scratch(mesh.n)
@@ -274,15 +286,18 @@ class ProjectedMethod:
                 mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
             if self.descent == "surface" and t.vertices:
                 stages.surface_descent.descend(
-                    t, mesh.local_length, mesh.quality, mesh.lloyd, bad_cell_weight=self.bad_cell_weight,
-                    rate=self.rate,
-                )  # fmt: skip
+                    t, mesh.local_length, mesh.quality, mesh.lloyd, bad_cell_weight=self.bad_cell_weight, rate=self.rate
+                )
             elif self.descent in ("quality", "edges"):
                 stages.quality_descent.descend(
-                    t, mesh.local_length, mesh.quality, mesh.lloyd,
-                    quality_weight=float(self.descent == "quality"), bad_cell_weight=bad_cell_weight,
+                    t,
+                    mesh.local_length,
+                    mesh.quality,
+                    mesh.lloyd,
+                    quality_weight=float(self.descent == "quality"),
+                    bad_cell_weight=bad_cell_weight,
                     rate=self.rate,
-                )  # fmt: skip
+                )
             if still:
                 mesh.lloyd.fill(0)
             else:
@@ -295,16 +310,20 @@ class ProjectedMethod:
         if not warm:
             mesh.multipliers = mesh.engine.zeros(mesh.n, np.float32)
         at_walls, most = (
-            (AT_WALLS, MOST_AT_WALLS)
-            if isinstance(mesh.domain, Polygon)
-            else (AT_WALLS_OF_BOXES, math.inf)
+            (AT_WALLS, MOST_AT_WALLS) if isinstance(mesh.domain, Polygon) else (AT_WALLS_OF_BOXES, math.inf)
         )
         solution = stages.volume_projection.project(
-            t, Targets(mesh.local_length, gradient, log_ratio, mesh.quality, sums), mesh.lloyd, mesh.correction,
+            t,
+            Targets(mesh.local_length, gradient, log_ratio, mesh.quality, sums),
+            mesh.lloyd,
+            mesh.correction,
             Penalty(penalty, self.quality_scale, self.log_ratio_scale, at_walls, self.power, most),
-            Limits(self.tolerance, self.iterations), labels=mesh.labels, fixed=mesh.fixed,
-            start=mesh.multipliers, warm=warm,
-        )  # fmt: skip
+            Limits(self.tolerance, self.iterations),
+            labels=mesh.labels,
+            fixed=mesh.fixed,
+            start=mesh.multipliers,
+            warm=warm,
+        )
         mesh.summarize_displacements()
         return solution
 
@@ -318,9 +337,8 @@ class ProjectedMethod:
     def move(self, mesh: MeshState) -> None:
         """Move by both, at most by k h."""
         mesh.stages.motion.move_generators(
-            mesh.free, mesh.points, mesh.lloyd, 1.0, mesh.correction, 1.0, mesh.local_length,
-            mesh.velocity, clip=self.k,
-        )  # fmt: skip
+            mesh.free, mesh.points, mesh.lloyd, 1.0, mesh.correction, 1.0, mesh.local_length, mesh.velocity, clip=self.k
+        )
 
 
 PUBLISHED = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")

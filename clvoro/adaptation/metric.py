@@ -30,9 +30,20 @@ class Metric:
         exact = t.face_measures.dtype == self.engine.real
         kernels = self._exact if exact else self._kernels
         self.engine.run_each(
-            kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, t.offsets,
-            t.covariances, h, error, quality, energy, local_length, *t.outlines,
-        )  # fmt: skip
+            kernels.evaluate_metric,
+            t.n,
+            t.volumes,
+            t.starts,
+            t.face_measures,
+            t.offsets,
+            t.covariances,
+            h,
+            error,
+            quality,
+            energy,
+            local_length,
+            *t.outlines,
+        )
 
     def compare_neighbors(
         self,
@@ -48,22 +59,21 @@ class Metric:
         `signatures` (n,) uint64 are the hashes to compare; with `first` they are only set.
         """
         self.engine.run_each(
-            self._kernels.compare_neighbors, t.n, t.starts, t.neighbors, labels, np.int32(first),
-            signatures, changed, ever_changed,
-        )  # fmt: skip
-
-    def set_fixed_sizes(
-        self, labels: cla.Array, first: int, fixed: int, volumes: cla.Array, h: cla.Array
-    ) -> None:
-        """Set `h` (n,) to the present size of cells whose label is at least `first` and below `fixed`."""
-        self.engine.run_each(
-            self._kernels.set_fixed_sizes,
-            len(h),
+            self._kernels.compare_neighbors,
+            t.n,
+            t.starts,
+            t.neighbors,
             labels,
             np.int32(first),
-            np.int32(fixed),
-            volumes,
-            h,
+            signatures,
+            changed,
+            ever_changed,
+        )
+
+    def set_fixed_sizes(self, labels: cla.Array, first: int, fixed: int, volumes: cla.Array, h: cla.Array) -> None:
+        """Set `h` (n,) to the present size of cells whose label is at least `first` and below `fixed`."""
+        self.engine.run_each(
+            self._kernels.set_fixed_sizes, len(h), labels, np.int32(first), np.int32(fixed), volumes, h
         )
 
     def scale_sizes(self, factor: float, h: cla.Array) -> None:

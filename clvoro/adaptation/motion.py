@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..tessellation.device_diagram import Tessellation
@@ -41,13 +41,20 @@ class Motion:
     def compute_potential_gradient(self, t: Tessellation, psi: cla.Array, u: cla.Array) -> None:
         """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d)."""
         self.engine.run_each(
-            self._kernels.compute_potential_gradient, t.n, t.starts, t.neighbors, t.face_measures,
-            t.face_centroids, t.volumes, t.points, psi, u, *self.engine.period_args,
-        )  # fmt: skip
+            self._kernels.compute_potential_gradient,
+            t.n,
+            t.starts,
+            t.neighbors,
+            t.face_measures,
+            t.face_centroids,
+            t.volumes,
+            t.points,
+            psi,
+            u,
+            *self.engine.period_args,
+        )
 
-    def relax_correction(
-        self, summaries: Summaries, name: str, limit: float, k: float, u: cla.Array
-    ) -> None:
+    def relax_correction(self, summaries: Summaries, name: str, limit: float, k: float, u: cla.Array) -> None:
         """Scale `u` (n, d) by alpha = min(limit, k / max(|u| / h)), the paper's (3.5).
 
         The summary `name` of |u| / h must have been collected.
@@ -55,7 +62,7 @@ class Motion:
         real = self.engine.real.type
         self.engine.run_each(
             self._kernels.relax_correction, len(u), summaries.values, summaries.slots[name], real(limit), real(k), u
-        )  # fmt: skip
+        )
 
     def move_generators(
         self,
@@ -75,27 +82,24 @@ class Motion:
         """
         real = self.engine.real.type
         self.engine.run_each(
-            self._kernels.move_generators, h.shape[0], lloyd, real(a), correction, real(b), h,
-            real(clip), *domain.device_args(self.engine), points, velocity,
-        )  # fmt: skip
-
-    def zero_fixed_displacements(
-        self, labels: cla.Array, fixed: int, displacement: cla.Array
-    ) -> None:
-        """Set `displacement` (n, d) to 0 for generators whose label is below `fixed`."""
-        self.engine.run_each(
-            self._kernels.zero_fixed_displacements,
-            len(labels),
-            labels,
-            np.int32(fixed),
-            displacement,
+            self._kernels.move_generators,
+            h.shape[0],
+            lloyd,
+            real(a),
+            correction,
+            real(b),
+            h,
+            real(clip),
+            *domain.device_args(self.engine),
+            points,
+            velocity,
         )
 
-    def add_momentum(
-        self, factor: float, lloyd: cla.Array, velocity: cla.Array, share: float
-    ) -> None:
+    def zero_fixed_displacements(self, labels: cla.Array, fixed: int, displacement: cla.Array) -> None:
+        """Set `displacement` (n, d) to 0 for generators whose label is below `fixed`."""
+        self.engine.run_each(self._kernels.zero_fixed_displacements, len(labels), labels, np.int32(fixed), displacement)
+
+    def add_momentum(self, factor: float, lloyd: cla.Array, velocity: cla.Array, share: float) -> None:
         """Set `lloyd` (n, d) to ``factor * lloyd + share * velocity``."""
         real = self.engine.real.type
-        self.engine.run_each(
-            self._kernels.add_momentum, lloyd.shape[0], real(factor), velocity, real(share), lloyd
-        )
+        self.engine.run_each(self._kernels.add_momentum, lloyd.shape[0], real(factor), velocity, real(share), lloyd)

@@ -20,9 +20,17 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 MethodName = Literal[
-    "adaptive", "exact", "transport", "lloyd", "poisson", "coupled", "weighted-lloyd", "weighted", "mmpde",
+    "adaptive",
+    "exact",
+    "transport",
+    "lloyd",
+    "poisson",
+    "coupled",
+    "weighted-lloyd",
+    "weighted",
+    "mmpde",
     "monge-ampere",
-]  # fmt: skip
+]
 EffortName = Literal["fast", "default", "best"]
 Start = Literal["density", "uniform"]
 METHODS, EFFORTS, STARTS = get_args(MethodName), get_args(EffortName), get_args(Start)
@@ -196,11 +204,7 @@ class Checkpoint:
         """The file to continue from now, if any."""
         if not isinstance(self.resume, bool):
             return self.resume
-        return (
-            self.path
-            if self.resume and os.path.exists(check_path("checkpoint", self.path))
-            else None
-        )
+        return self.path if self.resume and os.path.exists(check_path("checkpoint", self.path)) else None
 
 
 @dataclass(frozen=True)
@@ -238,13 +242,9 @@ class Options:
         layers: object = self.layers  # the caller may give one Layers
         if not isinstance(layers, Layers | Sequence):
             hint = f"; write clvoro.Layers({layers!r})" if isinstance(layers, Real) else ""
-            raise InputTypeError(
-                f"layers is {layers!r}, expected clvoro.Layers or a sequence of them{hint}"
-            )
+            raise InputTypeError(f"layers is {layers!r}, expected clvoro.Layers or a sequence of them{hint}")
         _check_numbers(self)
-        object.__setattr__(
-            self, "layers", (layers,) if isinstance(layers, Layers) else tuple(layers)
-        )
+        object.__setattr__(self, "layers", (layers,) if isinstance(layers, Layers) else tuple(layers))
         if self.layers and self.method == "transport":
             raise InputError(
                 "layers are given with the method transport, expected none: the cells of a power diagram do not keep "

@@ -9,7 +9,8 @@ import numpy as np
 from ..arguments import Naming, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
 from ..geometry.boundary_layers import apart_from, count_rows, free_domain, place_layers
-from ..geometry.box import Box, Domain
+from ..geometry.box import Box
+from ..geometry.domain import Domain
 from ..geometry.geojson import may_be_degrees
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
@@ -21,12 +22,7 @@ from ..sizing.on_domain import on_domain
 from ..tessellation.power import require_power_domain
 from .arrays import Setup
 from .descent.quality_descent import OPENINGS
-from .diagnostics import (
-    check_precision,
-    narrow_parts,
-    warn_of_mismatches,
-    warn_of_narrow_parts,
-)
+from .diagnostics import check_precision, narrow_parts, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import Extras, check_memory
 from .fixed_points import check_room, take_places
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
@@ -156,9 +152,7 @@ class Preparation:
         if self._tree is not None and required * self.factor**-domain.cell_dim >= 0.5:
             warn_of_narrow_parts(domain, lambda x: self.factor * self.sizing(x))
         if len(self.fixed):
-            check_room(
-                self.fixed, domain, self.free, self.rows, self.factor * self.sizing(self.fixed)
-            )
+            check_room(self.fixed, domain, self.free, self.rows, self.factor * self.sizing(self.fixed))
         self.lattice = lattice_points(domain, self.target) if options.method in MOVING else None
         self.steep = self._measure_steepness()
         self.levels = 0
@@ -172,9 +166,7 @@ class Preparation:
     def setup(self) -> Setup:
         """What all levels have in common."""
         n_fixed = len(self.fixed) + len(self.rows)
-        return Setup(
-            self.stages, self.domain, self.sizing, self.free, n_fixed, self.fixed, self.factor
-        )
+        return Setup(self.stages, self.domain, self.sizing, self.free, n_fixed, self.fixed, self.factor)
 
     def _place_layers(self, field: Field) -> Field:
         """Place the generators of the layers, and return the size field limited beside them."""
@@ -211,11 +203,7 @@ class Preparation:
                 )
         least = LEAST_ADAPTED if self.options.multilevel else LEAST_ON_SPHERE
         if self.target < least:
-            given = (
-                f"n_cells is {n_cells}"
-                if n_cells
-                else f"the size field requires {required:.2g} cells on {sphere}"
-            )
+            given = f"n_cells is {n_cells}" if n_cells else f"the size field requires {required:.2g} cells on {sphere}"
             fewer = f"; method='lloyd' makes {LEAST_ON_SPHERE} or more" if n_cells else ""
             raise InputError(
                 f"{given}, expected at least {least} cells, on all sides of the sphere; use smaller sizes, in the unit "
@@ -254,9 +242,7 @@ class Preparation:
         field_bytes = sizing.device_bytes + sizing.bytes_for(most)
         self._check_memory(most, Extras(images, 0.0, field_bytes, 0.0))
         if isinstance(domain, Polygon) and not fixed_count:
-            boundary = expected_boundary_cells(
-                domain, lambda p: (required / most) ** 0.5 * sizing(p)
-            )
+            boundary = expected_boundary_cells(domain, lambda p: (required / most) ** 0.5 * sizing(p))
         needed = self._check_memory(most, Extras(images, surplus, field_bytes, boundary))
         # For few cells, the preparation may have taken more than the run.
         return max(needed, float(sizing.peak_bytes))
@@ -272,11 +258,7 @@ class Preparation:
         That is in 3D, on spheres, with few cells, which only serve a tight target, and with exact sizes.
         """
         tree, domain = self._tree, self.domain
-        plane = (
-            isinstance(domain, Box | Polygon)
-            and domain.dim == 2
-            and auto_levels(self.target, 2) > 0
-        )
+        plane = isinstance(domain, Box | Polygon) and domain.dim == 2 and auto_levels(self.target, 2) > 0
         if tree is None or self.options.method != "adaptive" or not plane:
             return 0.0
         share = steep_share(self.factor * tree.slopes_of_size, tree.cells)
@@ -345,9 +327,7 @@ class Preparation:
         labels = np.arange(setup.first_row, setup.first_row + len(host), dtype=np.int32)
         taken = np.full(len(self.fixed), -1, np.int32)
         if len(taken) and self.levels == 0:
-            placed, labels, taken = take_places(
-                placed, labels, self.fixed, self.domain, setup.fixed
-            )
+            placed, labels, taken = take_places(placed, labels, self.fixed, self.domain, setup.fixed)
         with Naming(host, self.domain, real):
             start = {"points": upload(placed), "labels": upload(labels, np.int32)}
             mesh = MeshState(setup, self.factor * 2.0**self.levels, start)
@@ -370,15 +350,19 @@ class Preparation:
         near = self.may_need_correction_only and mesh is not None and self._is_near(mesh)
         dim, effort = self.domain.cell_dim, options.effort
         self._smooth_target = choose_error_target(dim, effort, self.levels, near)
-        self.error_target = options.error_target or choose_error_target(
-            dim, effort, self.levels, near, self.steep
-        )
+        self.error_target = options.error_target or choose_error_target(dim, effort, self.levels, near, self.steep)
         exact = options.method in ("exact", "transport")
         schedule = adaptive_schedule(
-            dim, effort, self.levels, exact, self.error_target, warm=self.points is not None, near=near,
+            dim,
+            effort,
+            self.levels,
+            exact,
+            self.error_target,
+            warm=self.points is not None,
+            near=near,
             openings=OPENINGS if isinstance(self.domain, Sphere) else 0,  # models there have C grids
             narrow_parts=isinstance(self.domain, Polygon),
-        )  # fmt: skip
+        )
         if options.method == "transport":
             schedule.append(Prescribe(MOVES))
         return schedule
@@ -402,7 +386,7 @@ class Preparation:
         s = mesh.summaries.read()
         return is_near(
             self.domain.cell_dim, self.options.effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n
-        )  # fmt: skip
+        )
 
 
 def _check_moving(domain: Domain, points: np.ndarray | None, options: Options) -> None:

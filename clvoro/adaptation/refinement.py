@@ -6,7 +6,7 @@ import numpy as np
 import pyopencl.array as cla
 from scipy.spatial import KDTree
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
@@ -35,12 +35,7 @@ class Refinement:
         self._kernels = engine.kernels("adaptation/refinement", {"SHORT_FACE": SHORT_FACE})
 
     def refine(
-        self,
-        domain: Domain,
-        t: Tessellation,
-        h: cla.Array,
-        labels: cla.Array | None = None,
-        fixed: int = 0,
+        self, domain: Domain, t: Tessellation, h: cla.Array, labels: cla.Array | None = None, fixed: int = 0
     ) -> cla.Array:
         """Return about 2^d times as many generators, (n', d): those of `t`, then the new ones.
 
@@ -57,10 +52,22 @@ class Refinement:
         starts = self._child_starts(t, *fixed_args)
         finer = engine.empty((n + int(starts[n].get()), engine.dim))
         engine.run_each(
-            k.place_new_generators, n, t.starts, t.neighbors, t.face_measures, t.volumes, t.points, *fixed_args, h,
-            np.int32(n), *domain.device_args(engine), starts, finer,
-            t.face_centroids, *t.outlines,
-        )  # fmt: skip
+            k.place_new_generators,
+            n,
+            t.starts,
+            t.neighbors,
+            t.face_measures,
+            t.volumes,
+            t.points,
+            *fixed_args,
+            h,
+            np.int32(n),
+            *domain.device_args(engine),
+            starts,
+            finer,
+            t.face_centroids,
+            *t.outlines,
+        )
         # Several cells that are much larger than the edges of the boundary can bring one at the same corner.
         if isinstance(domain, Polygon) and len(finer) <= most_checked(domain):
             return self._without_coincident(finer, n)
@@ -69,9 +76,7 @@ class Refinement:
     def _without_coincident(self, finer: cla.Array, n: int) -> cla.Array:
         """Return the generators without new ones (from row `n` on) that coincide with others."""
         host = finer.get()
-        pairs = KDTree(host).query_pairs(
-            COINCIDENT * np.finfo(host.dtype).eps, output_type="ndarray"
-        )
+        pairs = KDTree(host).query_pairs(COINCIDENT * np.finfo(host.dtype).eps, output_type="ndarray")
         close = np.unique(pairs.max(axis=1))
         close = close[close >= n]
         return self.engine.upload(np.delete(host, close, axis=0)) if len(close) else finer
@@ -84,8 +89,15 @@ class Refinement:
         """Return the prefix sums (n + 1,) int32 of the numbers of new generators."""
         starts = self.engine.empty(t.n + 1, np.int32)
         self.engine.run_each(
-            self._kernels.count_new_generators, t.n, t.starts, t.neighbors, t.face_measures, t.volumes,
-            labels, fixed, starts,
-        )  # fmt: skip
+            self._kernels.count_new_generators,
+            t.n,
+            t.starts,
+            t.neighbors,
+            t.face_measures,
+            t.volumes,
+            labels,
+            fixed,
+            starts,
+        )
         self._scan.exclusive(starts, starts, t.n)
         return starts

@@ -18,17 +18,7 @@ from ..tessellation.cells import Cells
 from ..tessellation.periodic.halo import block_count
 from ..tessellation.polyhedra_update import are_triples
 from .arrays import SUMMARIES, Setup
-from .checkpoint import (
-    DIAGRAM,
-    FORMAT,
-    MESH,
-    VERSION,
-    VERTICES,
-    Progress,
-    capacities_of,
-    methods_of,
-    state_of,
-)
+from .checkpoint import DIAGRAM, FORMAT, MESH, VERSION, VERTICES, Progress, capacities_of, methods_of, state_of
 from .fingerprint import domain_name, schedule_digest
 from .insertion_deletion import Generators
 from .plan.actions import Action, Step
@@ -36,18 +26,9 @@ from .stages import Stages
 from .state import MeshState
 
 if TYPE_CHECKING:
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
 
-_COUNTS = (
-    "position",
-    "level",
-    "n_start",
-    "started",
-    "steps",
-    "next_label",
-    "spare",
-    "seam_cells",
-)
+_COUNTS = ("position", "level", "n_start", "started", "steps", "next_label", "spare", "seam_cells")
 
 
 class Saved:
@@ -94,17 +75,8 @@ class Saved:
             self._check(d, int(domain["walls"]), real, spherical)
             if any(domain["periodic"]):
                 self._check_seams(d)
-        except (
-            KeyError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            IndexError,
-            RecursionError,
-        ) as error:
-            raise InputError(
-                f"cannot resume from {self.name}: it is damaged ({error!r:.200})"
-            ) from error
+        except (KeyError, ValueError, TypeError, AttributeError, IndexError, RecursionError) as error:
+            raise InputError(f"cannot resume from {self.name}: it is damaged ({error!r:.200})") from error
 
     def _check(self, d: int, walls: int, real: np.dtype, spherical: bool) -> None:
         """Check everything that the device uses as an index or divides by."""
@@ -113,16 +85,19 @@ class Saved:
         shapes: dict[str, tuple[tuple[int, ...], Any]] = {
             **{f"mesh.{name}": ((n,), real) for name in MESH},
             **{f"mesh.{name}": ((n, d), real) for name in ("points", "velocity")},
-            "mesh.labels": ((n,), np.int32), "mesh.signatures": ((n,), np.uint64),
-            "diagram.starts": ((n + 1,), np.int32), "diagram.neighbors": ((m,), np.int32),
+            "mesh.labels": ((n,), np.int32),
+            "mesh.signatures": ((n,), np.uint64),
+            "diagram.starts": ((n + 1,), np.int32),
+            "diagram.neighbors": ((m,), np.int32),
             "diagram.face_measures": ((m,), a["diagram.face_measures"].dtype),
             "diagram.face_centroids": ((m, d), a["diagram.face_measures"].dtype),
-            "diagram.volumes": ((n,), real), "diagram.offsets": ((n, d), real),
+            "diagram.volumes": ((n,), real),
+            "diagram.offsets": ((n, d), real),
             "diagram.covariances": ((n, 3 if spherical or d == 2 else 6), real),
             "summaries": ((len(SUMMARIES), 4), real),
             "history": ((len(a["history"]),), HISTORY_DTYPE),
             "taken": ((len(a["taken"]),), np.int32),
-        }  # fmt: skip
+        }
         if "multipliers" in a:
             shapes["multipliers"] = ((n,), np.float32)
         if d == 3 and "vertices.triples" in a:
@@ -132,12 +107,7 @@ class Saved:
             if a[name].shape != shape or a[name].dtype != dtype:
                 raise ValueError(f"{name} is {a[name].dtype} {a[name].shape}, expected {shape}")
         starts, neighbors, labels = a["diagram.starts"], a["diagram.neighbors"], a["mesh.labels"]
-        if (
-            n == 0
-            or starts[0] != 0
-            or starts[-1] != m
-            or (np.diff(starts) < (3 if spherical else d + 1)).any()
-        ):
+        if n == 0 or starts[0] != 0 or starts[-1] != m or (np.diff(starts) < (3 if spherical else d + 1)).any():
             raise ValueError("starts")
         if not (-walls <= neighbors.min() and neighbors.max() < n):
             raise ValueError("neighbors")
@@ -187,11 +157,7 @@ class Saved:
                 f"{now}; use the settings of that run, or start again without resume"
             )
 
-    def restore(
-        self,
-        setup: Setup,
-        schedule: list[Action],
-    ) -> MeshState:
+    def restore(self, setup: Setup, schedule: list[Action]) -> MeshState:
         """Return the mesh of the saved run, for a loop over `schedule`.
 
         Raises
@@ -231,15 +197,11 @@ class Saved:
             periodic.halo.cells = state["seam_cells"]
         mesh.evaluate_metric()
         mesh.summaries.values.set(a["summaries"])
-        levels = {
-            k.removeprefix("multigrid."): v for k, v in a.items() if k.startswith("multigrid.")
-        }
+        levels = {k.removeprefix("multigrid."): v for k, v in a.items() if k.startswith("multigrid.")}
         try:
             stages.poisson.restore(levels, mesh.labels, mesh.n)
         except (KeyError, ValueError, TypeError) as error:
-            raise InputError(
-                f"cannot resume from {self.name}: it is damaged ({error!r:.200})"
-            ) from error
+            raise InputError(f"cannot resume from {self.name}: it is damaged ({error!r:.200})") from error
         return mesh
 
     def _compare_sizes(self, now: np.ndarray, domain: Domain, moving: np.ndarray) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arguments import check_callable
 from ..errors import InputTypeError
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..mesh.results import Result
 from ..tessellation.periodic.periodic_tessellator import FewCellsError
 from .checkpoint import Checkpointer
@@ -33,9 +33,7 @@ def check_run(domain: object, size: object, callback: Callable[[np.void], object
             f"callback is {callback!r} of type {type(callback).__name__}, expected a function of a row of the history"
         )
     if callback is not None:
-        check_callable(
-            "callback", callback, "a row of the history", "write lambda row: callback(...)"
-        )
+        check_callable("callback", callback, "a row of the history", "write lambda row: callback(...)")
     if isinstance(size, Domain) and not isinstance(domain, Domain):
         raise InputTypeError(
             f"size is the domain {size!r}, and domain is a {type(domain).__name__}; exchange them: run(domain, size)"
@@ -75,9 +73,7 @@ def run_adaptation(
         try:
             loop = _start(prepared, fingerprint, saved, files, callback)
             result = loop.run(
-                options.n_cells if options.multilevel else None,
-                float(prepared.target),
-                _settings(prepared),
+                options.n_cells if options.multilevel else None, float(prepared.target), _settings(prepared)
             )
             _note_end_of_trade(result, options)
             return result

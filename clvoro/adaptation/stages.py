@@ -40,8 +40,19 @@ class Stages(TessellationStages):
     local_counts: LocalCounts
 
     CLASSES: ClassVar[dict[str, type]] = {
-        **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson, "transport": Transport,
-        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "mmpde": Mmpde,
-        "corners": Corners, "thin_walls": ThinWalls, "refinement": Refinement, "insertion_deletion": InsertionDeletion,
-        "surface_descent": SurfaceDescent, "local_counts": LocalCounts,
-    }  # fmt: skip
+        **TessellationStages.CLASSES,
+        "metric": Metric,
+        "density": Density,
+        "poisson": Poisson,
+        "transport": Transport,
+        "volume_projection": VolumeProjection,
+        "quality_descent": QualityDescent,
+        "motion": Motion,
+        "mmpde": Mmpde,
+        "corners": Corners,
+        "thin_walls": ThinWalls,
+        "refinement": Refinement,
+        "insertion_deletion": InsertionDeletion,
+        "surface_descent": SurfaceDescent,
+        "local_counts": LocalCounts,
+    }

@@ -10,7 +10,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..opencl.device_array import buffer_of
 from ..sizing import Sizing
@@ -54,11 +54,7 @@ class MeshState(MeshArrays):
     """
 
     def __init__(
-        self,
-        setup: Setup,
-        size_factor: float,
-        start: dict[str, cla.Array] | Arrays,
-        coarser: Tessellator | None = None,
+        self, setup: Setup, size_factor: float, start: dict[str, cla.Array] | Arrays, coarser: Tessellator | None = None
     ) -> None:
         super().__init__(setup, size_factor)
         self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser)
@@ -179,9 +175,7 @@ class MeshState(MeshArrays):
             self.compare_and_evaluate(first)
             return self._read(report)
 
-        data.tessellation = self.tessellator.tessellate(
-            self.points, self.n, previous, binned=binned, follow=evaluate
-        )
+        data.tessellation = self.tessellator.tessellate(self.points, self.n, previous, binned=binned, follow=evaluate)
 
     def compare_and_evaluate(self, first: bool = False) -> None:
         """Compare the neighbors with those of the last diagram, and evaluate error and quality."""
@@ -195,14 +189,10 @@ class MeshState(MeshArrays):
     def evaluate_metric(self, others: Mapping[str, cla.Array] | None = None) -> None:
         """Evaluate and summarize error and quality, and summarize `others` by name."""
         if self.fixed > self.setup.first_row:
-            self.stages.metric.set_fixed_sizes(
-                self.labels, self.setup.first_row, self.fixed, self.t.volumes, self.h
-            )
+            self.stages.metric.set_fixed_sizes(self.labels, self.setup.first_row, self.fixed, self.t.volumes, self.h)
         with self.engine.workspace.frame():
             energy = self.engine.scratch(self.n)
-            self.stages.metric.evaluate(
-                self.t, self.h, self.error, self.quality, energy, self.local_length
-            )
+            self.stages.metric.evaluate(self.t, self.h, self.error, self.quality, energy, self.local_length)
             own = {"error": self.error, "quality": self.quality, "energy": energy}
             if self.follows_log_ratio:
                 own["log_ratio"] = self.stages.density.cell_weights(self.t, self.h).log_ratio
@@ -220,9 +210,7 @@ class MeshState(MeshArrays):
         if self.fixed:
             self.stages.motion.zero_fixed_displacements(self.labels, self.fixed, displacement)
 
-    def lloyd_weights(
-        self, gradient: cla.Array | None = None, log_ratio: cla.Array | None = None
-    ) -> LloydWeights:
+    def lloyd_weights(self, gradient: cla.Array | None = None, log_ratio: cla.Array | None = None) -> LloydWeights:
         """Evaluate density, log ratios and, as `lloyd`, weighted centroids: see `Density.lloyd_weights`."""
         return self.stages.density.lloyd_weights(self.t, self.h, self.lloyd, gradient, log_ratio)
 
@@ -272,10 +260,14 @@ class MeshState(MeshArrays):
             missing = self.missing_cells(w) if n_cells is None else float(n_cells - self.n)
             missing = min(missing, most - self.n)
             new = self.stages.insertion_deletion.insert_delete(
-                self.free, self.t, CellSizes(self.h, self.local_length, w.log_ratio),
-                self._data.generators, self.next_label,
-                Change(missing, nuclei, climb, climb_strain), self.fixed,
-            )  # fmt: skip
+                self.free,
+                self.t,
+                CellSizes(self.h, self.local_length, w.log_ratio),
+                self._data.generators,
+                self.next_label,
+                Change(missing, nuclei, climb, climb_strain),
+                self.fixed,
+            )
         rows, counts = _take_apart(new)
         del new, w
         return self._replace(rows, counts)
@@ -284,9 +276,8 @@ class MeshState(MeshArrays):
         """Delete or split the worst cells (see `InsertionDeletion.repair_cells`); return the numbers of both."""
         self.engine.workspace.clear()
         new = self.stages.insertion_deletion.repair_cells(
-            self.free, self.t, self.quality, self._data.generators, self.next_label, deficit, split,
-            self.fixed,
-        )  # fmt: skip
+            self.free, self.t, self.quality, self._data.generators, self.next_label, deficit, split, self.fixed
+        )
         rows, counts = _take_apart(new)
         del new
         return self._replace(rows, counts)
@@ -303,10 +294,7 @@ class MeshState(MeshArrays):
             w = stages.density.cell_weights(self.t, self.h)
             changes = engine.scratch(self.n, np.int32)
             if stages.local_counts.choose(self, w, changes):
-                sites = (
-                    stages.local_counts.sites(changes, 1),
-                    stages.local_counts.sites(changes, -1),
-                )
+                sites = (stages.local_counts.sites(changes, 1), stages.local_counts.sites(changes, -1))
                 new = stages.insertion_deletion.split_delete(
                     self.free, self.t, self._data.generators, self.next_label, sites, self.fixed
                 )
@@ -337,7 +325,7 @@ class MeshState(MeshArrays):
             self.zero_fixed(displacement)
             self.stages.motion.move_generators(
                 self.free, self.points, displacement, 1.0, displacement, 0.0, self.local_length, self.velocity, clip=0.5
-            )  # fmt: skip
+            )
         self.update()
         return count, True
 
@@ -366,12 +354,11 @@ class MeshState(MeshArrays):
         start, n = {"points": finer}, len(finer)
         del finer
         start["labels"] = self.engine.upload(
-            np.arange(self.next_label - self.n, self.next_label - self.n + n, dtype=np.int32),
-            np.int32,
+            np.arange(self.next_label - self.n, self.next_label - self.n + n, dtype=np.int32), np.int32
         )
         cl.enqueue_copy(
             self.engine.queue, buffer_of(start["labels"]), buffer_of(self.labels), byte_count=self.labels.nbytes
-        )  # fmt: skip
+        )
         taken = self.taken
         if finest and len(taken):
             host = start["points"].get(), start["labels"].get()
@@ -410,9 +397,7 @@ class MeshState(MeshArrays):
         if self.t.weighted is not None and self.power is not None:
             engine = self.power.stages.engine
         self.stages.release()
-        return fetch_diagram(
-            engine, self.domain, self.t, self.labels, copy=False, extended=self._extended
-        )
+        return fetch_diagram(engine, self.domain, self.t, self.labels, copy=False, extended=self._extended)
 
 
 def _take_apart(new: Outcome | None) -> tuple[dict[str, cla.Array], tuple[int, int]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyopencl.array as cla
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
@@ -59,9 +59,21 @@ class ThinWalls:
         with engine.workspace.frame():
             partners, targets = engine.scratch(u, np.int32), engine.scratch((2 * u, 2))
             engine.run_each(
-                k.find_partners, u, chords.touched, n, convex.starts, convex.neighbors, t.starts, t.neighbors,
-                moving.points, h, moving.labels, np.int32(moving.fixed), *args, partners,
-            )  # fmt: skip
+                k.find_partners,
+                u,
+                chords.touched,
+                n,
+                convex.starts,
+                convex.neighbors,
+                t.starts,
+                t.neighbors,
+                moving.points,
+                h,
+                moving.labels,
+                np.int32(moving.fixed),
+                *args,
+                partners,
+            )
             engine.run_each(
                 k.place_pairs,
                 u,
@@ -80,4 +92,4 @@ class ThinWalls:
             )
             engine.run_each(
                 k.move_pairs, u, chords.touched, n, chords.slots, partners, targets, moving.points, moving.velocity
-            )  # fmt: skip
+            )

@@ -79,9 +79,7 @@ class Walls:
         engine = mesh.engine
         with engine.workspace.frame():
             ahead = engine.scratch(mesh.points.shape)
-            cl.enqueue_copy(
-                engine.queue, buffer_of(ahead), buffer_of(mesh.points), byte_count=ahead.nbytes
-            )
+            cl.enqueue_copy(engine.queue, buffer_of(ahead), buffer_of(mesh.points), byte_count=ahead.nbytes)
             mesh.stages.motion.add_momentum(1.0, ahead, displacement, 1.0)
             moving = Moving(ahead, displacement, mesh.labels, mesh.fixed)
             mesh.stages.corners.share(self.corners, self.free, mesh.t, moving)

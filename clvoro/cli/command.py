@@ -13,15 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..errors import (
-    Aborted,
-    BuildError,
-    ClvoroError,
-    DeviceError,
-    InputError,
-    InputTypeError,
-    OutputError,
-)
+from ..errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, InputTypeError, OutputError
 from .formats import MESH_FILES
 from .streams import steady_streams
 
@@ -91,9 +83,7 @@ def _add_run(commands: Any) -> None:
 
 
 def _add_settings(run: Any) -> None:
-    run.add_argument(
-        "--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices"
-    )
+    run.add_argument("--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices")
     run.add_argument(
         "--method",
         metavar="M",
@@ -101,50 +91,31 @@ def _add_settings(run: Any) -> None:
         "poisson, weighted-lloyd, weighted, mmpde, monge-ampere; or several: lloyd,coupled",
     )
     run.add_argument(
-        "--effort",
-        choices=("fast", "default", "best"),
-        help="work against quality (adaptive, exact, transport)",
+        "--effort", choices=("fast", "default", "best"), help="work against quality (adaptive, exact, transport)"
     )
     run.add_argument(
         "--levels",
         metavar="N",
         help="number of coarser levels to start from, or auto (the default; adaptive, exact, transport)",
     )
-    run.add_argument(
-        "--start", choices=("density", "uniform"), help="random start: by h^-d, or uniform"
-    )
+    run.add_argument("--start", choices=("density", "uniform"), help="random start: by h^-d, or uniform")
     run.add_argument("--cells", metavar="N", type=int, help="number of cells (default: from h)")
     run.add_argument("--steps", metavar="N", type=int, help="largest number of steps")
     repeated = "(methods of one kind of step)"
-    run.add_argument(
-        "--tol", type=float, metavar="T", help=f"stop when gains fall below this share {repeated}"
-    )
-    run.add_argument(
-        "--k", type=float, metavar="K", help=f"largest displacement over h in a step {repeated}"
-    )
+    run.add_argument("--tol", type=float, metavar="T", help=f"stop when gains fall below this share {repeated}")
+    run.add_argument("--k", type=float, metavar="K", help=f"largest displacement over h in a step {repeated}")
     run.add_argument("--seed", type=int, metavar="S", help="seed of the random start")
     run.add_argument("--dtype", choices=("float64", "float32"), help="precision on the device")
 
 
 def _add_checkpoints(run: Any) -> None:
-    run.add_argument(
-        "--checkpoint", metavar="FILE", type=_path, help="write the state of the run there"
-    )
-    run.add_argument(
-        "--checkpoint-every",
-        metavar="SECONDS",
-        type=float,
-        help="time between checkpoints (default: 60)",
-    )
-    run.add_argument(
-        "--resume", metavar="FILE", type=_path, help="continue from a checkpoint of the same case"
-    )
+    run.add_argument("--checkpoint", metavar="FILE", type=_path, help="write the state of the run there")
+    run.add_argument("--checkpoint-every", metavar="SECONDS", type=float, help="time between checkpoints (default: 60)")
+    run.add_argument("--resume", metavar="FILE", type=_path, help="continue from a checkpoint of the same case")
 
 
 def _add_output(run: Any) -> None:
-    run.add_argument(
-        "--out", metavar="DIR", type=_path, help="output folder (default: out/NAME of the case)"
-    )
+    run.add_argument("--out", metavar="DIR", type=_path, help="output folder (default: out/NAME of the case)")
     run.add_argument(
         "--format",
         metavar="LIST",
@@ -166,9 +137,7 @@ def _add_output(run: Any) -> None:
         choices=("png", "pdf", "svg"),
         help="kind of picture files, may be repeated (default: png)",
     )
-    run.add_argument(
-        "--profile", action="store_true", help="print where the time goes, by stage and by kernel"
-    )
+    run.add_argument("--profile", action="store_true", help="print where the time goes, by stage and by kernel")
     run.add_argument("--quiet", "-q", action="store_true", help="print errors only")
     run.add_argument("--json", action="store_true", help="print one JSON object per finished run")
 
@@ -192,9 +161,7 @@ def _add_convert(commands: Any) -> None:
     convert.add_argument("mesh", metavar="MESH", help="mesh.npz, mesh.vtu, or mesh.nc on a sphere")
     convert.add_argument("out", metavar="OUT", type=_path, help="file to write")
     convert.add_argument(
-        "--convention",
-        choices=("ugrid", "mpas", "scrip"),
-        help="content of a .nc file (default: ugrid)",
+        "--convention", choices=("ugrid", "mpas", "scrip"), help="content of a .nc file (default: ugrid)"
     )
     _add_walls(convert, more="; of a .vtu file: as in the domain is the default")
 
@@ -209,9 +176,7 @@ def _add_check(commands: Any) -> None:
         "Exit code 0: all is right; 1: something is wrong; 2: a file cannot be read.",
     )
     check.set_defaults(work=_check)
-    check.add_argument(
-        "files", metavar="FILE", nargs="+", help="mesh.npz, mesh.vtu, or mesh.nc on a sphere"
-    )
+    check.add_argument("files", metavar="FILE", nargs="+", help="mesh.npz, mesh.vtu, or mesh.nc on a sphere")
     check.add_argument(
         "--for",
         dest="solver",
@@ -402,7 +367,5 @@ def _cases(arguments: argparse.Namespace) -> int:
     elif arguments.case in known:
         print(known[arguments.case], end="")
     else:
-        raise InputError(
-            f"case is {arguments.case!r}, expected one of the built-in cases {', '.join(known)}"
-        )
+        raise InputError(f"case is {arguments.case!r}, expected one of the built-in cases {', '.join(known)}")
     return OK

@@ -35,10 +35,7 @@ from .outputs import check_folder, do_all, refuse_own_files, require_plots
 from .progress import Progress, during
 from .sequence import frames_line, run_frames
 
-_REPEATED = (
-    "effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k",
-    "seed", "dtype",
-)  # fmt: skip
+_REPEATED = ("effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k", "seed", "dtype")
 """Settings that `case.toml` of the output fixes, so that other defaults of later versions do not change the run."""
 
 _MANY = 5000
@@ -148,9 +145,8 @@ class Job:
             if self.case.frames > 1 and not self.interrupted:
                 *_, last = results.values()
                 frames = run_frames(
-                    self.case, adapter, last, self.out, lambda: self.interrupted, self.report,
-                    self._now_and_then(),
-                )  # fmt: skip
+                    self.case, adapter, last, self.out, lambda: self.interrupted, self.report, self._now_and_then()
+                )
         self._summarize(results, where, profiles)
         if self.solver is not None:
             self._check_for_solver(results)
@@ -159,12 +155,7 @@ class Job:
         return self.interrupted
 
     def _run_one(
-        self,
-        adapter: Any,
-        size: Any,
-        method: str | None,
-        settings: dict[str, Any],
-        files: Checkpoint | None,
+        self, adapter: Any, size: Any, method: str | None, settings: dict[str, Any], files: Checkpoint | None
     ) -> Result:
         # Settings that only other methods of the case use are left out.
         used = {k: v for k, v in settings.items() if uses(method or Options.method, k)}
@@ -194,7 +185,7 @@ class Job:
             try:
                 result: Result = adapter.run(
                     self.case.domain, size, callback=callback, checkpoint=files, on_interrupt="return", **arguments
-                )  # fmt: skip
+                )
             finally:
                 adapter.on_memory = adapter.on_build = None
         if result.stop_reason == INTERRUPTED:
@@ -223,8 +214,7 @@ class Job:
         for name in arguments:
             if name not in known:
                 raise InputError(
-                    f"{self.case.name}: run.{name} is not a setting of this version of clvoro; "
-                    "leave it out"
+                    f"{self.case.name}: run.{name} is not a setting of this version of clvoro; leave it out"
                 )
 
     def _refuse_formats(self) -> None:
@@ -233,9 +223,7 @@ class Job:
             raise InputError(
                 f"walls is {self.walls!r}, and no mesh is written for OpenFOAM; add --format foam, or leave it out"
             )
-        if isinstance(self.case.domain, Sphere) and (
-            self.solver is not None or "foam" in self.mesh_formats
-        ):
+        if isinstance(self.case.domain, Sphere) and (self.solver is not None or "foam" in self.mesh_formats):
             what = "format foam" if self.solver is None else f"check-solver {self.solver}"
             raise InputError(
                 f"{self.case.name}: {what} is for meshes in boxes and polygons, and the domain is a sphere; expected "
@@ -253,16 +241,10 @@ class Job:
 
     def _checkpoints(self) -> Checkpoint | None:
         """Return the checkpoint of the run, if any."""
-        given = {
-            "checkpoint": self.checkpoint,
-            "checkpoint_every": self.checkpoint_every,
-            "resume": self.resume,
-        }
+        given = {"checkpoint": self.checkpoint, "checkpoint_every": self.checkpoint_every, "resume": self.resume}
         given = {name: value for name, value in given.items() if value is not None}
         if "checkpoint_every" in given and self.checkpoint is None:
-            raise InputError(
-                "checkpoint_every is given, and no checkpoint; say which file: --checkpoint FILE"
-            )
+            raise InputError("checkpoint_every is given, and no checkpoint; say which file: --checkpoint FILE")
         if given and len(self.case.methods) > 1:
             raise InputError(
                 f"{self.case.name}: {next(iter(given))} is for a run of one method, and the case has "
@@ -279,10 +261,7 @@ class Job:
             if self.interrupted:
                 raise Aborted
             self.interrupted = True
-            print(
-                "\nclvoro: stopping after this step; once more to quit without writing",
-                file=sys.stderr,
-            )
+            print("\nclvoro: stopping after this step; once more to quit without writing", file=sys.stderr)
 
         previous = {}
         try:
@@ -320,21 +299,14 @@ class Job:
             tasks.append(partial(save, result, self.out / f"mesh-{other}.npz"))
             tasks.append(partial(write_history, result, self.out / f"history-{other}.csv"))
         note = "; interrupted: the mesh beside it is that of an earlier step" * self.interrupted
-        header = (
-            f"Written by clvoro {__version__} on {where}{note}.",
-            "Repeat it with: clvoro run case.toml",
-        )
+        header = (f"Written by clvoro {__version__} on {where}{note}.", "Repeat it with: clvoro run case.toml")
         repeatable = self._repeatable(results)
         tasks.append(partial(repeatable.write, self.out, header))
         if self.report:
-            tasks.append(
-                lambda: self._report(adapter, size, results, where, repeatable.text(header))
-            )
+            tasks.append(lambda: self._report(adapter, size, results, where, repeatable.text(header)))
         do_all(tasks)
 
-    def _report(
-        self, adapter: Any, size: Any, results: dict[str, Result], where: str, case: str
-    ) -> None:
+    def _report(self, adapter: Any, size: Any, results: dict[str, Result], where: str, case: str) -> None:
         from ..plotting import write_report
 
         *_, main = results.values()
@@ -379,9 +351,7 @@ class Job:
         report = self._during("checking the mesh", partial(main.check, self.solver, walls=walls))
         # OpenFOAM cannot hold cells around islands.
         simple = report.criteria[0].name != "cells around islands"
-        verdict = (
-            self._during("checkMesh", partial(run_check_mesh, main, walls)) if simple else None
-        )
+        verdict = self._during("checkMesh", partial(run_check_mesh, main, walls)) if simple else None
         self.rejected = not (report.ok if verdict is None else verdict.ok)
         if simple and verdict is None:
             warnings.warn(
@@ -414,9 +384,7 @@ class Job:
                 entry["profile"] = profile.as_dict()
             print(json.dumps(entry, default=_plain), flush=True)
 
-    def _summarize(
-        self, results: dict[str, Result], where: str, profiles: dict[str, Profile]
-    ) -> None:
+    def _summarize(self, results: dict[str, Result], where: str, profiles: dict[str, Profile]) -> None:
         """Print a table."""
         if self.quiet or self.as_json:
             return

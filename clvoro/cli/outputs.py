@@ -71,8 +71,7 @@ def require_plots() -> None:
         matplotlib.use("agg")
     except ModuleNotFoundError as error:
         raise ClvoroError(
-            "the report needs Matplotlib, which is not installed; pip install 'clvoro[plot]', "
-            "or run with --no-report"
+            "the report needs Matplotlib, which is not installed; pip install 'clvoro[plot]', or run with --no-report"
         ) from error
     except Exception as error:  # for example broken settings
         raise ClvoroError(

@@ -20,17 +20,7 @@ if TYPE_CHECKING:
 
 _KEPT = ("n_cells", "max_steps", "tol", "alpha", "k", "seed", "effort", "error_target", "fixed")
 """Settings of the run that later frames keep."""
-COLUMNS = (
-    "frame",
-    "time",
-    "cells",
-    "steps",
-    "mean_error",
-    "max_error",
-    "mean_quality",
-    "min_quality",
-    "seconds",
-)
+COLUMNS = ("frame", "time", "cells", "steps", "mean_error", "max_error", "mean_quality", "min_quality", "seconds")
 PICTURED = 6
 
 
@@ -69,9 +59,13 @@ def run_frames(
                     break
                 tell(f"frame {frame + 1} of {case.frames}")
                 result = adapter.run(
-                    case.domain, case.size_field(time), points=result.points,
-                    callback=lambda _: stop(), on_interrupt="return", **arguments,
-                )  # fmt: skip
+                    case.domain,
+                    case.size_field(time),
+                    points=result.points,
+                    callback=lambda _: stop(),
+                    on_interrupt="return",
+                    **arguments,
+                )
             save(result, folder / f"mesh-{frame:03d}.vtu")
             rows.append(_row(frame, time, result))
             if pictures and frame in wanted:
@@ -92,11 +86,16 @@ def _write_rows(rows: list[dict[str, Any]], path: Path) -> None:
 def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
     error, history = np.abs(result.size_error), result.history
     return {
-        "frame": frame, "time": time, "cells": len(error), "steps": int(history["step"][-1]),
-        "mean_error": error.mean(), "max_error": error.max(),
-        "mean_quality": result.quality.mean(), "min_quality": result.quality.min(),
+        "frame": frame,
+        "time": time,
+        "cells": len(error),
+        "steps": int(history["step"][-1]),
+        "mean_error": error.mean(),
+        "max_error": error.max(),
+        "mean_quality": result.quality.mean(),
+        "min_quality": result.quality.min(),
         "seconds": float(history["seconds"][-1]),
-    }  # fmt: skip
+    }
 
 
 def _draw(shown: Mapping[float, Result], path: Path) -> None:

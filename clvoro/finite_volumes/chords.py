@@ -181,9 +181,7 @@ class _Kinks:
         far[going], area[going] = self._triangles(going)
         while going.size:
             row = self.row[going]
-            miss = np.where(
-                far[going] <= self.limit[going], np.abs(lost[row] + area[going]), np.inf
-            )
+            miss = np.where(far[going] <= self.limit[going], np.abs(lost[row] + area[going]), np.inf)
             best = least_of_rows(row, miss)
             best = best[miss[best] < np.abs(lost[row[best]])]
             best, going = going[best], _of_lines(going, row, row[best])
@@ -268,9 +266,7 @@ def skewness(a: np.ndarray, b: np.ndarray, centroids: np.ndarray) -> np.ndarray:
     return off / np.maximum(np.maximum(length / 2, 0.4 * height), 1e-300)
 
 
-def concave_prices(
-    lines: Lines, kept: np.ndarray, behind: np.ndarray, ahead: np.ndarray
-) -> np.ndarray:
+def concave_prices(lines: Lines, kept: np.ndarray, behind: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """Return the price of each line, (l,), for the corners at which its cell is not convex.
 
     Parameters

@@ -117,9 +117,17 @@ def _fold(mesh: SolverMesh, diagram: Diagram) -> tuple[Cells, np.ndarray]:
         starts, corners = mesh.starts, mesh.corners
         codes, face_codes = (np.broadcast_to(0, len(of)) for of in (corners, upper))
     cells = Cells(
-        points, starts, corners, codes, mesh.owner[upper], mesh.neighbor[upper], face_codes,
-        diagram, mesh.half_face[upper], SMALL_FACE,
-    )  # fmt: skip
+        points,
+        starts,
+        corners,
+        codes,
+        mesh.owner[upper],
+        mesh.neighbor[upper],
+        face_codes,
+        diagram,
+        mesh.half_face[upper],
+        SMALL_FACE,
+    )
     for wall in np.unique(-1 - mesh.neighbor[mesh.neighbor < 0]).tolist():
         axis, upper_side = divmod(wall, 2)
         plane = (mesh.domain.upper if upper_side else mesh.domain.lower)[axis]
@@ -141,9 +149,7 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
         place[upper] = np.arange(len(upper))
         lower = place[left] < 0
         source = place[np.where(lower, mesh.twin[left], left)]
-        starts, where = take_ranges(
-            cells.begin[source], cells.count[source], np.arange(len(cells.corners)), lower
-        )
+        starts, where = take_ranges(cells.begin[source], cells.count[source], np.arange(len(cells.corners)), lower)
         shift = np.repeat(np.where(lower, cells.face_codes[source], 0), np.diff(starts))
         vertices, codes = cells.corners[where], cells.codes[where] - shift
         order = np.lexsort((codes, vertices))
@@ -264,9 +270,7 @@ class _Scan:
         rows = np.flatnonzero(self.short & ((left < 3) & several)[face])
         i, j, set_of = self.begin[rows], self.end[rows], face[rows]
         apart = np.ones(len(rows), bool)  # sides that begin where another one ends are clusters
-        apart[np.isin(set_of * len(self.cells.points) + i, set_of * len(self.cells.points) + j)] = (
-            False
-        )
+        apart[np.isin(set_of * len(self.cells.points) + i, set_of * len(self.cells.points) + j)] = False
         good = np.bincount(set_of[~apart], minlength=len(self.faces)) == 0
         rows, pairs = rows[good[set_of]], np.stack([i, j], axis=1)[good[set_of]]
         sets = np.unique(face[rows], return_inverse=True)[1]

@@ -58,9 +58,7 @@ class Criterion:
         return replace(self, place=tuple(lonlat.tolist()), unit="°")
 
     def __str__(self) -> str:
-        verdict = (
-            "ok" if self.ok else f"{self.count} fail" if self.demanded else f"{self.count} warn"
-        )
+        verdict = "ok" if self.ok else f"{self.count} fail" if self.demanded else f"{self.count} warn"
         limit = f"{'<=' if self.above else '>='} {self.limit:.4g}"
         where = ""
         if self.place is not None:
@@ -138,6 +136,4 @@ class Rows:
             worst = int(np.flatnonzero(bad)[0])
         cell = worst if self.cells is None else int(self.cells[worst])
         place = tuple(self.places[worst, : self.dim].tolist())
-        return Criterion(
-            name, float(values[worst]), limit, above, demanded, int(bad.sum()), cell, place
-        )
+        return Criterion(name, float(values[worst]), limit, above, demanded, int(bad.sum()), cell, place)

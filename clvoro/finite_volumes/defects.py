@@ -95,9 +95,7 @@ class _Shapes:
     volumes: np.ndarray
 
 
-def find_defects(
-    around: Neighborhood, limits: Limits, targets: np.ndarray | None = None
-) -> Defects:
+def find_defects(around: Neighborhood, limits: Limits, targets: np.ndarray | None = None) -> Defects:
     """Return what is wrong with the cells if the vertices of each group meet in `targets` (g, 3)."""
     w = around.whole
     x = w.positions(around.corners, around.codes)
@@ -117,9 +115,7 @@ def find_defects(
         count = np.bincount(sets[wrong], minlength=around.k)
         serious = np.bincount(sets[wrong & large], minlength=around.k)
         count += np.bincount(part[~(shapes.volumes > 0)], minlength=around.k)
-        pairs = concave_pairs(
-            shapes.seen, shapes.outward, around.side_starts, limits.concavity, around.side_star >= 0
-        )
+        pairs = concave_pairs(shapes.seen, shapes.outward, around.side_starts, limits.concavity, around.side_star >= 0)
         sets = part[around.side_cell[pairs[0]]]
         large = _large(w, around.side_face[pairs], shapes.outward[:, pairs]).all(axis=0)
         count += np.bincount(sets, minlength=around.k)

@@ -33,9 +33,7 @@ _MOST_CENTROID_OFFSET = 0.1
 C grids take the value at the generator for the mean over the cell, which is of second order at the centroid only."""
 
 
-def check_for_solver(
-    diagram: Diagram, solver: Solver = "openfoam", walls: WallShape | None = None
-) -> SolverReport:
+def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallShape | None = None) -> SolverReport:
     """Check `diagram`, as it is written for a solver, by that solver's criteria; see `Diagram.check`.
 
     Raises
@@ -47,9 +45,7 @@ def check_for_solver(
     check_choice("solver", solver, ("openfoam", "mpas"))
     if solver == "mpas":
         if walls is not None:
-            raise InputError(
-                f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out"
-            )
+            raise InputError(f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out")
         faces, domain, made = int(diagram.faces.owner.size), diagram.domain, _mpas(diagram)
         if isinstance(domain, Sphere):
             made = [criterion.on_sphere(domain) for criterion in made]
@@ -61,9 +57,7 @@ def check_for_solver(
         )
     walls = "straight" if walls is None else walls
     mesh = make_solver_mesh(diagram, walls, walls == "straight")
-    return SolverReport(
-        solver, tuple(_openfoam(mesh)), len(mesh), len(mesh.owner), mesh.area_change
-    )
+    return SolverReport(solver, tuple(_openfoam(mesh)), len(mesh), len(mesh.owner), mesh.area_change)
 
 
 def _openfoam(mesh: SolverMesh) -> list[Criterion]:
@@ -72,17 +66,9 @@ def _openfoam(mesh: SolverMesh) -> list[Criterion]:
         broken = simple_loops(mesh)[2]
         if broken.size:
             cell = int(broken[0])
-            place = (
-                mesh.points[mesh.corners.reshape(-1, 2)[mesh.owner == cell]]
-                .reshape(-1, 2)
-                .mean(axis=0)
-            )
+            place = mesh.points[mesh.corners.reshape(-1, 2)[mesh.owner == cell]].reshape(-1, 2).mean(axis=0)
             here = tuple(place.tolist())
-            return [
-                Criterion(
-                    "cells around islands", len(broken), 0, True, True, len(broken), cell, here
-                )
-            ]
+            return [Criterion("cells around islands", len(broken), 0, True, True, len(broken), cell, here)]
     m = mesh.measures
     g, owner = m.geometry, m.cells.owner
     coupled = m.coupled

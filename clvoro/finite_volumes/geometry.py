@@ -44,9 +44,7 @@ class Geometry(Sealed):
     volumes: np.ndarray
 
 
-def face_geometry(
-    points: np.ndarray, starts: np.ndarray, corners: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def face_geometry(points: np.ndarray, starts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centers and area vectors of faces, (f, 3) each.
 
     Parameters
@@ -104,9 +102,7 @@ def cell_geometry(
     return np.ascontiguousarray(found.T), volumes
 
 
-def pyramid_sums(
-    centers: np.ndarray, areas: np.ndarray, cell: np.ndarray, cells: int
-) -> tuple[np.ndarray, np.ndarray]:
+def pyramid_sums(centers: np.ndarray, areas: np.ndarray, cell: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """Return centroids (3, n) and volumes (n,) of cells from the centers and outward areas (3, k) of their faces.
 
     `cell` (k,) is the cell of each face.
@@ -135,12 +131,7 @@ def polygon_sides(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     base[cell] = begin
     origins = mesh.points.take(base, axis=0)
     near = origins.take(cell, axis=0)
-    return (
-        cell,
-        mesh.points.take(begin, axis=0) - near,
-        mesh.points.take(end, axis=0) - near,
-        origins,
-    )
+    return (cell, mesh.points.take(begin, axis=0) - near, mesh.points.take(end, axis=0) - near, origins)
 
 
 def polygon_areas(mesh: SolverMesh) -> np.ndarray:

@@ -102,9 +102,7 @@ class SolverMeasures:
         size = np.linalg.norm(offset, axis=1)
         direction = offset / (size + _TINY)[:, None]
         face = np.repeat(np.arange(len(g.centers)), np.diff(p.starts))
-        reach = np.abs(
-            np.einsum("ij,ij->i", p.points[p.corners] - g.centers[face], direction[face])
-        )
+        reach = np.abs(np.einsum("ij,ij->i", p.points[p.corners] - g.centers[face], direction[face]))
         extent = np.maximum(np.maximum.reduceat(reach, p.starts[:-1]), least)
         return size / (extent + _TINY)
 
@@ -206,9 +204,7 @@ class SolverMeasures:
             before = ends[first - 1] if first else 0
             last = max(int(np.searchsorted(ends, before + _PAIRS)), first + 1)
             rows = np.arange(first, last)
-            a = np.repeat(
-                np.arange(starts[first], starts[last]), np.repeat(counts[rows], counts[rows])
-            )
+            a = np.repeat(np.arange(starts[first], starts[last]), np.repeat(counts[rows], counts[rows]))
             squares = counts[rows] ** 2
             base = np.repeat(np.cumsum(squares) - squares, squares)
             size = np.repeat(counts[rows], squares)
@@ -299,9 +295,7 @@ class SolverMeasures:
             foot = p.points[p.corners[p.starts[left[row]] + base]]
             fine = _positive(a[items], b[items], foot, tips[0, left[row]], 0)
             two = np.isfinite(tips[1, left[row], 0])
-            fine[two] &= _positive(
-                a[items[two]], b[items[two]], foot[two], tips[1, left[row[two]]], 1
-            )
+            fine[two] &= _positive(a[items[two]], b[items[two]], foot[two], tips[1, left[row[two]]], 1)
             failed = left[np.bincount(row, ~fine, len(left)) > 0]
             base += 1
             ended = counts[failed] <= base
@@ -370,10 +364,7 @@ class SolverMeasures:
             "max_concavity": float(self.concavity.max(initial=0)),
             "concave_cells": int(self.concave.sum()),
         }
-        for name, values in (
-            ("edge", self.shortest_edge),
-            ("face", self.smallest_face),
-        ):
+        for name, values in (("edge", self.shortest_edge), ("face", self.smallest_face)):
             found[f"min_{name}"] = float(values.min(initial=np.inf))
             for share in (0.1, 1, 10):
                 found[f"{name}_percentile_{share:g}"] = float(np.percentile(values, share))
@@ -387,9 +378,7 @@ def _mean_angle(degrees: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(np.cos(np.radians(degrees)).mean(), -1, 1))))
 
 
-def _positive(
-    a: np.ndarray, b: np.ndarray, c: np.ndarray, tip: np.ndarray, side: int
-) -> np.ndarray:
+def _positive(a: np.ndarray, b: np.ndarray, c: np.ndarray, tip: np.ndarray, side: int) -> np.ndarray:
     """Return whether tetrahedra have a volume above OpenFOAM's least quality, on the side 0 (owner) or 1, (k,).
 
     The quality is the volume over that of the regular tetrahedron with the same circumsphere, the limit 1e-30.

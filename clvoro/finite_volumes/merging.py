@@ -68,9 +68,13 @@ class Merges:
         groups = np.flatnonzero(rank[self.sets] >= 0)
         starts, places = take_rows(self.starts, np.arange(len(self.vertices)), groups)
         return Merges(
-            starts, self.vertices[places], self.codes[places], rank[self.sets[groups]],
-            self.priority[rows], self.reach[rows],
-        )  # fmt: skip
+            starts,
+            self.vertices[places],
+            self.codes[places],
+            rank[self.sets[groups]],
+            self.priority[rows],
+            self.reach[rows],
+        )
 
 
 class _Finder:
@@ -165,9 +169,7 @@ class Cells:
         self.at_cell = _Finder(None, both, self.n)
         self.next = np.full(v, -1, np.int32)  # vertices that have been merged, as linked lists
         self.last = np.arange(v, dtype=np.int32)
-        self.now = (
-            self.last.copy()
-        )  # the vertex that each vertex has become, and where its image is
+        self.now = self.last.copy()  # the vertex that each vertex has become, and where its image is
         self.now_code = np.zeros(v, np.int64)
         self.touched = np.zeros(self.n, bool)
         self.changed, self.edited = np.zeros((2, len(self.owner)), bool)
@@ -366,9 +368,7 @@ class Cells:
         targets[anchor < 0] = np.nan
         return targets
 
-    def _commit(
-        self, merges: Merges, around: Neighborhood, done: np.ndarray, targets: np.ndarray
-    ) -> None:
+    def _commit(self, merges: Merges, around: Neighborhood, done: np.ndarray, targets: np.ndarray) -> None:
         """Merge the sets `done` (k,) bool, whose vertices meet in `targets` (g, 3)."""
         yes, heads = done[merges.sets], merges.heads
         walls = np.bitwise_or.reduceat(self.walls[merges.vertices], merges.starts[:-1])
@@ -385,9 +385,7 @@ class Cells:
             self.last[into[one]] = self.last[gone[one]]
         mine = done[around.set_of_face]
         faces = around.faces[mine]
-        starts, places = take_rows(
-            around.starts, np.arange(len(around.corners)), np.flatnonzero(mine)
-        )
+        starts, places = take_rows(around.starts, np.arange(len(around.corners)), np.flatnonzero(mine))
         self.count[faces] = np.diff(starts)
         there = self.face_corners(faces)[1]
         self.corners[there] = around.corners[places]

@@ -47,14 +47,7 @@ class Neighborhood:
         Packed offset of the face as seen from that cell.
     """
 
-    def __init__(
-        self,
-        whole: Cells,
-        merges: Merges,
-        sets: np.ndarray,
-        faces: np.ndarray,
-        merged: bool = True,
-    ) -> None:
+    def __init__(self, whole: Cells, merges: Merges, sets: np.ndarray, faces: np.ndarray, merged: bool = True) -> None:
         self.whole, self.faces, self.set_of_face = whole, faces, sets
         self.k, self.set_of_group = len(merges.priority), merges.sets
         old_starts, places = whole.face_corners(faces)
@@ -175,9 +168,7 @@ class Neighborhood:
         starts, place = take_rows(self.starts, np.arange(len(self.corners)), faces)
         counts = np.diff(starts)
         row = np.repeat(np.arange(len(rows)), counts)
-        key = _pack_keys(
-            groups[row], self.corners[place], self.codes[place] - self.codes[rows[row]]
-        )
+        key = _pack_keys(groups[row], self.corners[place], self.codes[place] - self.codes[rows[row]])
         order = np.argsort(key, kind="stable")
         number = np.empty_like(order)
         number[order] = _runs(key[order])

@@ -52,9 +52,7 @@ def polyhedra(mesh: SolverMesh, thickness: float | None = None) -> Polyhedra:
     """
     if mesh.dim == 3:
         if thickness is not None:
-            raise InputError(
-                "thickness is for meshes in 2D, and the mesh has 3 dimensions; leave it out"
-            )
+            raise InputError("thickness is for meshes in 2D, and the mesh has 3 dimensions; leave it out")
         return Polyhedra(mesh.points, mesh.starts, mesh.corners, mesh.owner)
     height = (
         float(np.sqrt(mesh.domain.measure / len(mesh)))

@@ -5,14 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import ClvoroError
-from ..mesh.connectivity import (
-    FaceTopology,
-    face_corners,
-    face_keys,
-    face_owners,
-    face_topology,
-    take_rows,
-)
+from ..mesh.connectivity import FaceTopology, face_corners, face_keys, face_owners, face_topology, take_rows
 from ..mesh.diagram import Diagram
 
 _BASE = 64
@@ -43,9 +36,7 @@ def faces_with_seams(diagram: Diagram) -> tuple[FaceTopology, np.ndarray, np.nda
     upper = np.flatnonzero(is_upper)[np.lexsort((here[is_upper], axis[is_upper]))]
     lower = np.flatnonzero(~is_upper)[np.lexsort((there[~is_upper], axis[~is_upper]))]
     sides = np.diff(starts)[rows]
-    if not (
-        np.array_equal(here[upper], there[lower]) and np.array_equal(sides[upper], sides[lower])
-    ):
+    if not (np.array_equal(here[upper], there[lower]) and np.array_equal(sides[upper], sides[lower])):
         raise ClvoroError(
             "the two sides of a seam have different faces, because some are as short as round-off; use dtype='float64'"
         )
@@ -74,18 +65,12 @@ def faces_with_seams(diagram: Diagram) -> tuple[FaceTopology, np.ndarray, np.nda
     if diagram.domain.dim == 3:
         period = shift * np.array(diagram.domain.extent)
         aligned = align_seams(diagram.vertices, seams.starts, seams.corners, twins, period)
-        seams = FaceTopology(
-            seams.owner, seams.neighbor, seams.rows, seams.starts, aligned, seams.flipped
-        )
+        seams = FaceTopology(seams.owner, seams.neighbor, seams.rows, seams.starts, aligned, seams.flipped)
     return seams, twins, shift.astype(np.int8)
 
 
 def align_seams(
-    points: np.ndarray,
-    starts: np.ndarray,
-    corners: np.ndarray,
-    twin: np.ndarray,
-    period: np.ndarray,
+    points: np.ndarray, starts: np.ndarray, corners: np.ndarray, twin: np.ndarray, period: np.ndarray
 ) -> np.ndarray:
     """Return the corners of all faces; at seams the first corner of a lower face is the image of that of its twin.
 

@@ -105,9 +105,7 @@ class _Round:
         moving = np.zeros(classes, bool)
         moving[ends] = True
         rows = np.flatnonzero(moving[self.images[self.loop]])
-        of_class, cells = np.divmod(
-            np.unique(self.images[self.loop[rows]] * n + self.cell[rows]), n
-        )
+        of_class, cells = np.divmod(np.unique(self.images[self.loop[rows]] * n + self.cell[rows]), n)
         starts, touched = take_rows(np.searchsorted(of_class, np.arange(classes + 1)), cells, ends)
         ranks = np.repeat(np.tile(np.arange(len(faces)), 2), np.diff(starts))
         return faces[independent(ranks, touched, np.arange(len(faces)), n)]
@@ -169,9 +167,7 @@ class _Round:
 
     def collapsed(self, target: np.ndarray, done: np.ndarray) -> SolverMesh:
         """Return the mesh in which both ends of the faces `done` (e,) are at `target` (e, 2)."""
-        into = np.where(
-            (self.face_of >= 0) & done[self.face_of], self.into, np.arange(len(self.into))
-        )
+        into = np.where((self.face_of >= 0) & done[self.face_of], self.into, np.arange(len(self.into)))
         ends = into[self.mesh.corners].reshape(-1, 2)
         made = replace(self.mesh, points=self._moved(target, done), corners=ends.ravel())
         return made.take_faces(ends[:, 0] != ends[:, 1])
@@ -192,9 +188,7 @@ def _lengths_over_limits(mesh: SolverMesh, broken: np.ndarray) -> np.ndarray:
     return lengths / np.maximum(smaller_size(mesh.owner, mesh.neighbor, limit), 1e-300)
 
 
-def point_kinds(
-    mesh: SolverMesh, parts: np.ndarray, images: np.ndarray | None = None
-) -> np.ndarray:
+def point_kinds(mesh: SolverMesh, parts: np.ndarray, images: np.ndarray | None = None) -> np.ndarray:
     """Return whether each point is free, on a wall, or fixed in a corner, (v,) int.
 
     `images` (v,) int is the class of each point, if points are periodic images of one another.
@@ -210,9 +204,7 @@ def point_kinds(
     ahead[images[a]] = np.column_stack([along, part])
     behind[images[b]] = np.column_stack([along, part])
     met = np.bincount(images[a], minlength=classes) + np.bincount(images[b], minlength=classes)
-    turn = np.abs(
-        np.arctan2(cross(behind[:, :2], ahead[:, :2]), (behind[:, :2] * ahead[:, :2]).sum(axis=1))
-    )
+    turn = np.abs(np.arctan2(cross(behind[:, :2], ahead[:, :2]), (behind[:, :2] * ahead[:, :2]).sum(axis=1)))
     smooth = (met == 2) & (turn < WALL_CORNER) & (ahead[:, 2] == behind[:, 2])
     return np.where(met == 0, _FREE, np.where(smooth, _WALL, CORNER))[images]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arguments import check_choice, warn
 from ..errors import InputError, MismatchWarning
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
 from ..mesh.connectivity import following, slices, take_rows
@@ -146,9 +146,7 @@ class SolverMesh(Sealed):
         upper = np.flatnonzero(self.twin > np.arange(len(self.twin)))
         v = len(self.points)
         _, there = take_rows(self.starts, self.corners, upper)
-        counts, back = take_rows(
-            self.starts, self.corners, self.twin[upper], np.ones(len(upper), bool)
-        )
+        counts, back = take_rows(self.starts, self.corners, self.twin[upper], np.ones(len(upper), bool))
         if self.dim == 2:
             back = back[following(counts)]
         graph = scipy.sparse.coo_array((np.ones(len(there)), (there, back)), (v, v))
@@ -156,10 +154,7 @@ class SolverMesh(Sealed):
 
 
 def make_solver_mesh(
-    diagram: Diagram,
-    walls: WallShape = "straight",
-    collapse: bool = True,
-    parts: np.ndarray | None = None,
+    diagram: Diagram, walls: WallShape = "straight", collapse: bool = True, parts: np.ndarray | None = None
 ) -> SolverMesh:
     """Return `diagram` as a solver sees it; see `Diagram.solver_mesh`.
 
@@ -234,9 +229,7 @@ def check_not_sphere(diagram: Diagram, why: str, instead: str) -> None:
         Says `why`, and what to do `instead`.
     """
     if isinstance(diagram.domain, Sphere):
-        raise InputError(
-            f"{why}, and the cells on {diagram.domain} are pieces of a curved surface; {instead}"
-        )
+        raise InputError(f"{why}, and the cells on {diagram.domain} are pieces of a curved surface; {instead}")
 
 
 def compact(mesh: SolverMesh) -> SolverMesh:

@@ -72,10 +72,7 @@ def _without_islands(mesh: SolverMesh, domain: Polygon, parts: np.ndarray) -> So
     """
     walls = np.arange(mesh.inner, mesh.outer)
     edge, owner = -1 - mesh.neighbor[walls], mesh.owner[walls].astype(np.int64)
-    ring, rings = (
-        np.searchsorted(domain.ring_starts, edge, "right") - 1,
-        len(domain.ring_starts) - 1,
-    )
+    ring, rings = (np.searchsorted(domain.ring_starts, edge, "right") - 1, len(domain.ring_starts) - 1)
     least, most = np.full(rings, len(mesh)), np.full(rings, -1)
     np.minimum.at(least, ring, owner)
     np.maximum.at(most, ring, owner)
@@ -206,9 +203,7 @@ class _Ends:
         """Return the runs before and after `runs`, both of whose ends can move."""
         return self.walls.one[self.ends_of[0, runs]], self.walls.two[self.ends_of[1, runs]]
 
-    def _ways(
-        self, run: np.ndarray, begin: np.ndarray, counts: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
+    def _ways(self, run: np.ndarray, begin: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return for `counts` faces from each place on: the row, the number from 0, and the length up to their end."""
         starts = np.cumsum(counts) - counts
         row = np.repeat(np.arange(len(run)), counts)
@@ -228,10 +223,7 @@ class _Ends:
         np.maximum.at(total, row, way)
         before = np.stack([row, k + 1 - (place - first)[row]]), total[row] - way
         row, k, way = self._ways(two, self.begin[two], self.end[two] - self.begin[two])
-        (row, by), way = (
-            np.concatenate(z, axis=-1)
-            for z in zip(before, (np.stack([row, k + 1]), way), strict=True)
-        )
+        (row, by), way = (np.concatenate(z, axis=-1) for z in zip(before, (np.stack([row, k + 1]), way), strict=True))
         # Each run keeps a face.
         room = by != (self.end[two] - self.begin[two])[row]
         near = np.flatnonzero((way <= reach[row]) & (by != 0) & room)
@@ -271,9 +263,7 @@ class _Ends:
         )
         self._keep_best(len(w.one) + runs, row, by, gain, lines)
 
-    def _keep_best(
-        self, places: np.ndarray, row: np.ndarray, by: np.ndarray, gain: np.ndarray, lines: tuple
-    ) -> None:
+    def _keep_best(self, places: np.ndarray, row: np.ndarray, by: np.ndarray, gain: np.ndarray, lines: tuple) -> None:
         """Keep the best move of each row in `places`, after the costs of new lines are taken from its gain.
 
         A line is a run, where it begins and ends, and how both move with `by`. Costs are not negative, so moves

@@ -156,9 +156,7 @@ class WallRuns:
         rows = np.flatnonzero((place >= 0) & joined & self.known[two] & (one != two))
         return one[rows], two[rows], face[rows], side[rows]
 
-    def lines(
-        self, run: np.ndarray, begin: np.ndarray, end: np.ndarray
-    ) -> tuple[Lines, np.ndarray, np.ndarray]:
+    def lines(self, run: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[Lines, np.ndarray, np.ndarray]:
         """Return the lines of runs between two places, their points, and the wall face that begins in each point.
 
         For the last point of a line it is the face that ends there. A line with `begin` = `end` is one point.

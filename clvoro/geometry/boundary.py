@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .box import Domain
+from .domain import Domain
 from .polygon import Polygon
 
 

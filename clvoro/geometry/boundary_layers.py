@@ -12,7 +12,8 @@ from scipy.spatial import KDTree
 from ..arguments import check_integer, check_number
 from ..errors import InputError, InputTypeError
 from .boundary_names import Walls
-from .box import Box, Domain
+from .box import Box
+from .domain import Domain
 from .layer_columns import Chain, count_columns, count_fan, find_chains, place_columns, place_fan
 from .polygon import Polygon
 
@@ -144,10 +145,7 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
                 fan = place_fan(chain, layer.width, y)
                 apart = chain.fan * y / max(len(fan) - 1, 1)
                 found += [feet + y * normals, fan]
-                limits += [
-                    np.full(len(feet), _NEAR * near),
-                    np.full(len(fan), _NEAR * min(near, apart)),
-                ]
+                limits += [np.full(len(feet), _NEAR * near), np.full(len(fan), _NEAR * min(near, apart))]
                 walls.append(np.full(len(feet) + len(fan), y))
     points, limit, wall = (np.concatenate(x) for x in (found, limits, walls))
     kept = polygon.contains(points)
@@ -155,11 +153,7 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     kept[kept] = _distances(points[kept], segments) >= _OWN * wall[kept]
     points, limit = points[kept], limit[kept]
     # In every chain the nearest rows to the wall come first. Of two generators too near, drop the later one.
-    close = (
-        KDTree(points).query_pairs(limit.max(), output_type="ndarray")
-        if len(points)
-        else np.empty((0, 2), int)
-    )
+    close = KDTree(points).query_pairs(limit.max(), output_type="ndarray") if len(points) else np.empty((0, 2), int)
     apart = np.hypot(*(points[close[:, 0]] - points[close[:, 1]]).T)
     close = close[apart < np.minimum(limit[close[:, 0]], limit[close[:, 1]])]
     gone = np.zeros(len(points), bool)
@@ -201,9 +195,7 @@ def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
     if isinstance(domain, Polygon):
         return domain, domain.oriented.edge_numbers
     if not isinstance(domain, Box) or domain.dim != 2 or all(domain.periodic):
-        raise InputTypeError(
-            f"layers are for a Box with walls or a Polygon in 2D, not for {domain}"
-        )
+        raise InputTypeError(f"layers are for a Box with walls or a Polygon in 2D, not for {domain}")
     (a, b), (c, d) = domain.lower, domain.upper
     return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.array([2, 1, 3, 0])
 
@@ -295,16 +287,14 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
     polygon, _ = as_polygon(domain)
     # Merged to long lines first: the strips around thousands of short edges would overlap many times.
     strips = [
-        shapely.line_merge(
-            shapely.union_all(np.asarray(shapely.linestrings(chosen_segments(domain, layer))))
-        ).buffer(distance)
+        shapely.line_merge(shapely.union_all(np.asarray(shapely.linestrings(chosen_segments(domain, layer))))).buffer(
+            distance
+        )
         for layer, distance in zip(layers, distances, strict=True)
     ]
     left = polygon.geometry.difference(shapely.union_all(strips))
     # Where a strip ends beside a corner, an edge as short as round-off may remain.
-    left = shapely.make_valid(
-        shapely.remove_repeated_points(left, _SHORT * float(domain.extent.max()))
-    )
+    left = shapely.make_valid(shapely.remove_repeated_points(left, _SHORT * float(domain.extent.max())))
     every = [part for some in shapely.get_parts(left) for part in shapely.get_parts(some)]
     parts = [part for part in every if part.area > 1e-6 * domain.measure]
     if not parts:

@@ -106,9 +106,7 @@ class BoundaryNames:
                 raise InputError(
                     f"{what} has {self.kind} {twice[0]} both in {other!r} and in {name!r}, expected in one of them"
                 )
-            if name in self.names and not np.array_equal(
-                chosen, np.flatnonzero(self.index == self.names.index(name))
-            ):
+            if name in self.names and not np.array_equal(chosen, np.flatnonzero(self.index == self.names.index(name))):
                 raise InputError(
                     f"{what} has the name {name!r}, which other {self.kind}s already have; choose another name"
                 )
@@ -121,16 +119,12 @@ class BoundaryNames:
 
     def _part(self, what: str, name: str) -> list[int]:
         if name not in self.names:
-            raise InputError(
-                f"{what} is {name!r:.60}, expected the name of a boundary: {_listed(self.names)}"
-            )
+            raise InputError(f"{what} is {name!r:.60}, expected the name of a boundary: {_listed(self.names)}")
         return np.flatnonzero(self.index == self.names.index(name)).tolist()
 
     def _wall(self, what: str, number: int) -> int:
         if not 0 <= number < len(self.index):
-            raise InputError(
-                f"{what} has {self.kind} {number:.12g}, expected numbers from 0 to {len(self.index) - 1}"
-            )
+            raise InputError(f"{what} has {self.kind} {number:.12g}, expected numbers from 0 to {len(self.index) - 1}")
         if self.index[number] < 0:
             raise InputError(
                 f"{what} has {self.kind} {number}, which is periodic, expected one of "

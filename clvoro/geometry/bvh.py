@@ -66,10 +66,7 @@ class Tree:
         return order
 
     def nearest2(
-        self,
-        points: np.ndarray,
-        bound2: np.ndarray,
-        distance2: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        self, points: np.ndarray, bound2: np.ndarray, distance2: Callable[[np.ndarray, np.ndarray], np.ndarray]
     ) -> np.ndarray:
         """Return the smallest squared distance of each of `points` to the items, but at most `bound2`, (n,).
 

@@ -39,9 +39,7 @@ class CurvedEdges:
     @classmethod
     def straight(cls, count: int) -> CurvedEdges:
         """Return `count` straight edges."""
-        return cls(
-            (), np.full(count, -1, np.int32), np.full(count, -1, np.int32), np.zeros((count, 2))
-        )
+        return cls((), np.full(count, -1, np.int32), np.full(count, -1, np.int32), np.zeros((count, 2)))
 
     @classmethod
     def join(cls, parts: Sequence[CurvedEdges]) -> CurvedEdges:
@@ -57,9 +55,7 @@ class CurvedEdges:
             np.concatenate([part.ends for part in parts]),
         )
 
-    def nearest(
-        self, points: np.ndarray, edges: np.ndarray, begins: np.ndarray, ends: np.ndarray
-    ) -> np.ndarray:
+    def nearest(self, points: np.ndarray, edges: np.ndarray, begins: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Return the nearest points (n, 2) to `points` on the parts of curves that `edges` (n,) stand for.
 
         Points of straight edges are returned as they are. `begins` and `ends`, (n, 2) each, are the vertices of the
@@ -93,9 +89,7 @@ class CurvedEdges:
                 {
                     "curve": curve.describe(),
                     "edges": [int(edges[0]), len(edges)],
-                    "parameters": [
-                        [*self.ends[e, 0].tolist(), float(self.ends[e[-1], 1])] for e in spans
-                    ],
+                    "parameters": [[*self.ends[e, 0].tolist(), float(self.ends[e[-1], 1])] for e in spans],
                 }
             )
         return found
@@ -119,14 +113,10 @@ class CurvedEdges:
                 if first < 0 or not 0 < count == len(edges) or (made.curve[edges] >= 0).any():
                     raise ValueError("edges")
                 made.curve[edges] = c
-                for s, (span, given) in enumerate(
-                    zip(curve.spans, item["parameters"], strict=True)
-                ):
+                for s, (span, given) in enumerate(zip(curve.spans, item["parameters"], strict=True)):
                     t = np.array(given, float)
                     mine, edges = edges[: len(t) - 1], edges[len(t) - 1 :]
-                    if not (
-                        t.ndim == 1 and 2 <= len(t) == len(mine) + 1 and (np.diff(t) > 0).all()
-                    ):
+                    if not (t.ndim == 1 and 2 <= len(t) == len(mine) + 1 and (np.diff(t) > 0).all()):
                         raise ValueError("parameters")
                     if not (t[0] == span.begin and t[-1] == span.end):
                         raise ValueError("parameters")
@@ -138,17 +128,13 @@ class CurvedEdges:
         except (InputError, InputTypeError):
             raise
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise InputError(
-                f"the description of a Polygon's curves is damaged ({error})"
-            ) from error
+            raise InputError(f"the description of a Polygon's curves is damaged ({error})") from error
         return cls(tuple(curves), made.curve, made.span, made.ends)
 
 
 def has_curves(ring: object) -> bool:
     """Return whether `ring` is a curve or a list with curves in it."""
-    return isinstance(ring, Curve) or (
-        isinstance(ring, list | tuple) and any(isinstance(item, Curve) for item in ring)
-    )
+    return isinstance(ring, Curve) or (isinstance(ring, list | tuple) and any(isinstance(item, Curve) for item in ring))
 
 
 def unroll(ring: Any, name: str) -> tuple[np.ndarray, CurvedEdges]:
@@ -226,10 +212,7 @@ def _edges_of(curve: Curve) -> CurvedEdges:
     if extra and not curve.closed:
         numbers[-1] = -1
     return CurvedEdges(
-        (curve,),
-        numbers,
-        np.append(spans, [-1] * extra).astype(np.int32),
-        np.concatenate([t, np.zeros((extra, 2))]),
+        (curve,), numbers, np.append(spans, [-1] * extra).astype(np.int32), np.concatenate([t, np.zeros((extra, 2))])
     )
 
 

@@ -59,9 +59,11 @@ class DevicePolygon(Region):
             # The round-off of a generator on an edge: that of the device and that of the domain.
             frame[3] = _BEHIND * float(np.finfo(engine.real).eps) + self._rounding / scale
             there[engine.real] = (
-                frame.astype(engine.real), shape, engine.upload(starts, np.int32),
+                frame.astype(engine.real),
+                shape,
+                engine.upload(starts, np.int32),
                 engine.upload(np.concatenate([begins, ends], axis=1)[listed].ravel()),
-            )  # fmt: skip
+            )
         return *self.device_corners(engine.real), *there[engine.real]
 
     @cached_property

@@ -9,9 +9,7 @@ LEAST_SIDE, LARGEST_SIDE = 32, 1024
 """Bins along the longer side. Small bins are fast to search; empty ones cost only memory."""
 
 
-def bin_edges(
-    begins: np.ndarray, ends: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def bin_edges(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Sort edges from `begins` to `ends`, (k, 2) each, into bins.
 
     Returns

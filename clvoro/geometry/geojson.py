@@ -19,9 +19,7 @@ from ..errors import InputError, InputTypeError, MismatchWarning
 from ..files import LONGEST_GEOMETRY, read_text
 
 _GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECASE)
-_ALIKE = (
-    0.95  # lengths of degrees of longitude and latitude with at least this ratio count as equal
-)
+_ALIKE = 0.95  # lengths of degrees of longitude and latitude with at least this ratio count as equal
 _FAR = 3  # a domain so many times its extent away from the equator has longitudes and latitudes
 _DEEPEST = 8  # nested parentheses: a MULTIPOLYGON has three, and GEOS uses a stack frame for each
 
@@ -32,9 +30,7 @@ def pieces_of_shape(geometry: Any) -> list[list[np.ndarray]]:
     if kind not in ("Polygon", "MultiPolygon"):
         several = isinstance(geometry, list | tuple | np.ndarray) or kind == "GeometryCollection"
         hint = "; pass shapely.union_all(polygons)" if several else ""
-        raise InputTypeError(
-            f"geometry is a {kind}, expected a shapely Polygon or MultiPolygon{hint}"
-        )
+        raise InputTypeError(f"geometry is a {kind}, expected a shapely Polygon or MultiPolygon{hint}")
     parts = geometry.geoms if kind == "MultiPolygon" else [geometry]
     found = [
         [np.asarray(ring.coords)[:, :2] for ring in (part.exterior, *part.interiors)]
@@ -97,9 +93,7 @@ def read_geojson(source: Any) -> tuple[Any, str]:
     if isinstance(source, Mapping):
         return source, "GeoJSON"
     if not isinstance(source, (str, PathLike)):
-        raise InputTypeError(
-            f"source is a {type(source).__name__}, expected a path, a text or a dict of GeoJSON"
-        )
+        raise InputTypeError(f"source is a {type(source).__name__}, expected a path, a text or a dict of GeoJSON")
     name = "GeoJSON"
     text = source if isinstance(source, str) and source.lstrip().startswith("{") else None
     if text is None:
@@ -109,9 +103,7 @@ def read_geojson(source: Any) -> tuple[Any, str]:
         except (OSError, UnicodeDecodeError) as error:
             foreign = Path(source).suffix.lower() in (".shp", ".gpkg", ".kml")
             hint = "; write Polygon.from_shapely(geopandas.read_file(path).union_all())"
-            raise InputError(
-                f"cannot read {name} ({error}), expected GeoJSON{hint if foreign else ''}"
-            ) from error
+            raise InputError(f"cannot read {name} ({error}), expected GeoJSON{hint if foreign else ''}") from error
     try:
         return json.loads(text), name
     except (ValueError, RecursionError) as error:
@@ -186,9 +178,7 @@ def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
 _MEMBERS = {"FeatureCollection": "features", "GeometryCollection": "geometries"}
 
 
-def _collect(
-    node: object, name: str, pieces: list[list[object]], names: dict[str, list[int]]
-) -> None:
+def _collect(node: object, name: str, pieces: list[list[object]], names: dict[str, list[int]]) -> None:
     """Walk through collections and features; append the rings of each polygon to `pieces`, and add to `names`."""
     kind = node.get("type") if isinstance(node, Mapping) else None
     if not isinstance(node, Mapping) or not isinstance(kind, str):
@@ -198,9 +188,7 @@ def _collect(
             _collect(member, name, pieces, names)
     elif kind == "Feature":
         if node.get("geometry") is None:
-            raise InputError(
-                f"{name} has a Feature without geometry, expected Polygons only; leave it out"
-            )
+            raise InputError(f"{name} has a Feature without geometry, expected Polygons only; leave it out")
         before = len(pieces)
         _collect(node["geometry"], name, pieces, names)
         _add_names(node.get("properties"), name, pieces, before, names)
@@ -212,17 +200,11 @@ def _collect(
                 raise InputError(f"{name} has a MultiPolygon of {piece!r:.40}, expected lists")
             pieces.append([_flat(ring, name) for ring in piece])
     else:
-        raise InputError(
-            f"{name} has a {kind!r:.40}, expected Polygon or MultiPolygon only; leave others out"
-        )
+        raise InputError(f"{name} has a {kind!r:.40}, expected Polygon or MultiPolygon only; leave others out")
 
 
 def _add_names(
-    properties: object,
-    name: str,
-    pieces: list[list[object]],
-    before: int,
-    names: dict[str, list[int]],
+    properties: object, name: str, pieces: list[list[object]], before: int, names: dict[str, list[int]]
 ) -> None:
     """Add the names of a feature's boundaries to `names`; its own pieces follow the first `before` ones."""
     given = properties.get("boundaries") if isinstance(properties, Mapping) else None
@@ -254,16 +236,12 @@ def _flat(ring: object, name: str) -> object:
     for k, p in enumerate(ring):
         # NumPy would convert these to numbers.
         if isinstance(p, (list, tuple)) and any(type(c) in (bool, str) for c in p[:2]):
-            raise InputError(
-                f"{name} has the position {p!r:.60} at {k} of a ring, expected numbers"
-            )
+            raise InputError(f"{name} has the position {p!r:.60} at {k} of a ring, expected numbers")
     return [p[:2] if isinstance(p, (list, tuple)) else p for p in ring]
 
 
 def _list(node: Mapping[str, Any], member: str, name: str) -> Sequence[Any]:
     found = node.get(member)
     if not isinstance(found, (list, tuple)):
-        raise InputError(
-            f"{name} has a {node['type']} with {member} {found!r:.40}, expected a list"
-        )
+        raise InputError(f"{name} has a {node['type']} with {member} {found!r:.40}, expected a list")
     return found

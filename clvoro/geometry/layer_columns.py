@@ -161,11 +161,7 @@ class _Wall:
 
     def stretched_lengths(self) -> np.ndarray:
         """Return the stretched lengths of the edges, (k,)."""
-        return (
-            self.lengths
-            if self.grading is None
-            else np.diff(np.interp(self.reached, *self.grading))
-        )
+        return self.lengths if self.grading is None else np.diff(np.interp(self.reached, *self.grading))
 
     def unstretch(self, at: np.ndarray) -> np.ndarray:
         """Return the lengths along the chain, (n,), of places `at` (n,) in stretched lengths."""
@@ -176,12 +172,7 @@ class _Wall:
 
 
 def _largest_widths(
-    chain: Chain,
-    along: np.ndarray,
-    lengths: np.ndarray,
-    reached: np.ndarray,
-    width: float,
-    height: float,
+    chain: Chain, along: np.ndarray, lengths: np.ndarray, reached: np.ndarray, width: float, height: float
 ) -> np.ndarray:
     """Return the largest width of columns at each corner of the chain, (k + 1,), whatever it is at the others."""
     long = lengths >= _LONG * width
@@ -322,8 +313,6 @@ def place_columns(chain: Chain, width: float, height: float) -> tuple[np.ndarray
     bend = np.minimum(0.5, width / lengths[edge])[:, None]
     to_first, to_last = np.clip(1 - share / bend, 0, 1), np.clip(1 - (1 - share) / bend, 0, 1)
     mixed = (
-        normal[edge]
-        + to_first * (at_corners[edge] - normal[edge])
-        + to_last * (at_corners[edge + 1] - normal[edge])
+        normal[edge] + to_first * (at_corners[edge] - normal[edge]) + to_last * (at_corners[edge + 1] - normal[edge])
     )
     return wall.corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]

@@ -101,9 +101,7 @@ def area_of(name: str, shape: object) -> LonLatArea:
     outer = [_region(name, piece[0]) for piece in checked]
     holes = [_region(name, ring) for piece in checked for ring in piece[1:]]
     piece_of_hole = np.repeat(np.arange(len(checked)), [len(piece) - 1 for piece in checked])
-    return LonLatArea(
-        np.array(outer, object), np.array(holes, object), np.arange(len(outer)), piece_of_hole
-    )
+    return LonLatArea(np.array(outer, object), np.array(holes, object), np.arange(len(outer)), piece_of_hole)
 
 
 def lines_of(name: str, lines: Any) -> list[np.ndarray]:
@@ -129,9 +127,7 @@ def lines_of(name: str, lines: Any) -> list[np.ndarray]:
             parts = [
                 part
                 for line in lines
-                for part in (
-                    _lines_of_shape(name, line) if isinstance(line, shapely.Geometry) else [line]
-                )
+                for part in (_lines_of_shape(name, line) if isinstance(line, shapely.Geometry) else [line])
             ]
     else:
         raise InputTypeError(f"{name} is a {type(lines).__name__}, expected {_LINES}")
@@ -198,9 +194,7 @@ def _region(name: str, ring: np.ndarray) -> shapely.Geometry:
     x = np.concatenate([lon[:1], lon[0] + np.cumsum(steps)])
     turns = round((x[-1] - x[0]) / 360)
     if abs(turns) > 1:
-        raise InputError(
-            f"{name} has a ring that goes around the globe {abs(turns)} times, expected at most once"
-        )
+        raise InputError(f"{name} has a ring that goes around the globe {abs(turns)} times, expected at most once")
     if turns:
         if lat.min() < 0 < lat.max():
             raise InputError(
@@ -255,8 +249,6 @@ def _lines_of_geojson(node: Any, name: str) -> list[object]:
     if kind not in ("LineString", "MultiLineString") or not isinstance(lines, list | tuple):
         raise InputError(f"{name} has {node!r:.60}, expected LineString or MultiLineString only")
     return [
-        [p[:2] if isinstance(p, list | tuple) else p for p in line]
-        if isinstance(line, list | tuple)
-        else line
+        [p[:2] if isinstance(p, list | tuple) else p for p in line] if isinstance(line, list | tuple) else line
         for line in lines
     ]

@@ -86,24 +86,15 @@ class Polygon(DevicePolygon):
     ('outer', 'edge')
     """
 
-    def __init__(
-        self,
-        outer: object,
-        holes: Sequence[object] = (),
-        names: Mapping[str, Walls] | None = None,
-    ):
+    def __init__(self, outer: object, holes: Sequence[object] = (), names: Mapping[str, Walls] | None = None):
         try:
             rings = [outer, *holes]
         except TypeError:
-            raise InputTypeError(
-                f"holes is a {type(holes).__name__}, expected a list of rings"
-            ) from None
+            raise InputTypeError(f"holes is a {type(holes).__name__}, expected a list of rings") from None
         self._build([rings], names)
 
     @classmethod
-    def from_pieces(
-        cls, pieces: Sequence[Sequence[object]], names: Mapping[str, Walls] | None = None
-    ) -> Polygon:
+    def from_pieces(cls, pieces: Sequence[Sequence[object]], names: Mapping[str, Walls] | None = None) -> Polygon:
         """Make a domain of several pieces, each a list of its outer ring and its holes.
 
         Edges are numbered through the rings of the first piece, then of the second one, and so on.
@@ -135,9 +126,7 @@ class Polygon(DevicePolygon):
 
     @classmethod
     def from_geojson(
-        cls,
-        source: str | PathLike[str] | Mapping[str, Any],
-        names: Mapping[str, Walls] | None = None,
+        cls, source: str | PathLike[str] | Mapping[str, Any], names: Mapping[str, Walls] | None = None
     ) -> Polygon:
         """Make a domain of the polygons in GeoJSON.
 
@@ -172,18 +161,13 @@ class Polygon(DevicePolygon):
             raise InputError(f"{source}: {error}") from error
 
     def _build(
-        self,
-        pieces: Sequence[Sequence[object]],
-        names: Mapping[str, Walls] | None,
-        curves: object = None,
+        self, pieces: Sequence[Sequence[object]], names: Mapping[str, Walls] | None, curves: object = None
     ) -> None:
         made = make_rings(pieces)
         rings = [ring for piece in made for ring in piece]
         self.vertices = np.concatenate([ring.given for ring in rings])
         self.ring_starts = np.cumsum([0, *(len(ring.given) for ring in rings)]).astype(np.int32)
-        self.piece_of_ring = np.repeat(
-            np.arange(len(made), dtype=np.int32), [len(piece) for piece in made]
-        )
+        self.piece_of_ring = np.repeat(np.arange(len(made), dtype=np.int32), [len(piece) for piece in made])
         for array in self._arrays():
             array.setflags(write=False)
         self.curved = CurvedEdges.join([ring.curved for ring in rings])
@@ -239,9 +223,7 @@ class Polygon(DevicePolygon):
                 f"edges has dtype {edges.dtype} and shape {edges.shape}, expected integers of shape {points.shape[:1]}"
             )
         if edges.size and not (edges.min() >= 0 and edges.max() < len(self.vertices)):
-            raise InputError(
-                f"edges has {edges.min()} to {edges.max()}, expected 0 to {len(self.vertices) - 1}"
-            )
+            raise InputError(f"edges has {edges.min()} to {edges.max()}, expected 0 to {len(self.vertices) - 1}")
         after = self._next_given[edges]
         return self.curved.nearest(points, edges, self.vertices[edges], self.vertices[after])
 
@@ -407,9 +389,7 @@ class Polygon(DevicePolygon):
         """
         places = np.sort(self.oriented.places[self.boundaries.select(what, walls)])
         if places[-1] < 0:
-            raise InputError(
-                f"{what} has only edges without length, expected at least one with a length"
-            )
+            raise InputError(f"{what} has only edges without length, expected at least one with a length")
         return places[places >= 0].astype(np.int64)
 
     def edge_ends(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,12 +10,10 @@ import numpy as np
 import shapely
 
 from ..arguments import check_rows
-from .box import Domain
+from .domain import Domain
 from .rings import OrientedRings, project
 
-_ROUNDINGS = (
-    8  # tolerance for points on the boundary, in units of round-off of the largest coordinate
-)
+_ROUNDINGS = 8  # tolerance for points on the boundary, in units of round-off of the largest coordinate
 
 
 class Region(Domain):
@@ -41,11 +39,7 @@ class Region(Domain):
         """Each piece as a shapely Polygon."""
         found = []
         for p in range(self.n_pieces):
-            mine = [
-                r
-                for r, piece in zip(self.oriented.rings, self.piece_of_ring, strict=True)
-                if piece == p
-            ]
+            mine = [r for r, piece in zip(self.oriented.rings, self.piece_of_ring, strict=True) if piece == p]
             found.append(shapely.Polygon(mine[0], mine[1:]))
         return found
 
@@ -79,9 +73,7 @@ class Region(Domain):
         near = self.lower - np.full(2, self._rounding), self.upper + np.full(2, self._rounding)
         rest = np.flatnonzero(~inside & ((points >= near[0]) & (points <= near[1])).all(axis=1))
         if rest.size:
-            rows, _ = self._edges.query(
-                shapely.points(points[rest]), predicate="dwithin", distance=self._rounding
-            )
+            rows, _ = self._edges.query(shapely.points(points[rest]), predicate="dwithin", distance=self._rounding)
             inside[rest[rows]] = True
         return inside
 
@@ -93,18 +85,14 @@ class Region(Domain):
         """Return for each of `points` (n, 2) whether it is inside and over `margin` from the boundary; (n,) bool."""
         inside = self.covers(points)
         rows = np.flatnonzero(inside)
-        near, _ = self._edges.query(
-            shapely.points(points[rows]), predicate="dwithin", distance=margin
-        )
+        near, _ = self._edges.query(shapely.points(points[rows]), predicate="dwithin", distance=margin)
         inside[rows[near]] = False
         return inside
 
     def piece_of(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, 2) in the domain the piece that holds it, (n,) int; -1 elsewhere."""
         found = np.full(len(points), -1)
-        rows, pieces = shapely.STRtree(self.pieces).query(
-            shapely.points(points), predicate="intersects"
-        )
+        rows, pieces = shapely.STRtree(self.pieces).query(shapely.points(points), predicate="intersects")
         found[rows] = pieces
         return found
 
@@ -113,9 +101,7 @@ class Region(Domain):
         found = self.piece_of(points)
         rest = np.flatnonzero(found < 0)
         if rest.size:  # outside by round-off
-            edge, _ = self.nearest_edge(
-                points[rest]
-            )  # by the caller's number, as are the starts of rings
+            edge, _ = self.nearest_edge(points[rest])  # by the caller's number, as are the starts of rings
             ring = np.searchsorted(self.ring_starts, edge, side="right") - 1
             found[rest] = self.piece_of_ring[ring]
         return found
@@ -124,9 +110,7 @@ class Region(Domain):
         """Return a point (2,) inside of a piece, not on its boundary."""
         return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces[piece]))[0])
 
-    def nearest_edge(
-        self, points: np.ndarray, within: float | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def nearest_edge(self, points: np.ndarray, within: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the number of the nearest edge to each of `points` (n, 2), and the nearest point on it.
 
         A search radius `within` makes it faster; the number is -1 for points without an edge in that radius.
@@ -139,32 +123,24 @@ class Region(Domain):
         oriented = self.oriented
         points = np.asarray(points, dtype=float)
         edge = np.full(len(points), -1)
-        rows, edges = self._edges.query_nearest(
-            shapely.points(points), max_distance=within, all_matches=False
-        )
+        rows, edges = self._edges.query_nearest(shapely.points(points), max_distance=within, all_matches=False)
         edge[rows] = edges
         begin, end = oriented.vertices[edge], oriented.vertices[oriented.next_vertex[edge]]
         return np.where(edge >= 0, oriented.edge_numbers[edge], -1), project(points, begin, end)
 
-    def edges_within(
-        self, points: np.ndarray, distance: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def edges_within(self, points: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return pairs of rows of `points` (n, 2) and of oriented edges that are nearer than `distance` (n,)."""
         found = self._edges.query(shapely.points(points), predicate="dwithin", distance=distance)
         return found[0], found[1]
 
     def is_slit(self, points: np.ndarray, within: float) -> np.ndarray:
         """Return for each of `points` (n, 2) whether separate parts of the boundary are within `within`; (n,) bool."""
-        rows, edges = self._edges.query(
-            shapely.points(points), predicate="dwithin", distance=within
-        )
+        rows, edges = self._edges.query(shapely.points(points), predicate="dwithin", distance=within)
         following = self.oriented.next_vertex
         after, count = following[edges], len(following)
         on = np.hypot(*(self.oriented.vertices[after] - points[rows]).T) <= within
         on &= np.isin(rows * count + after, rows * count + edges)
-        return np.bincount(rows, minlength=len(points)) > 1 + np.bincount(
-            rows[on], minlength=len(points)
-        )
+        return np.bincount(rows, minlength=len(points)) > 1 + np.bincount(rows[on], minlength=len(points))
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Return the nearest point of the domain to each of `points` (n, 2): the point itself if it is inside."""

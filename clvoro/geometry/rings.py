@@ -19,8 +19,8 @@ import shapely
 from ..arguments import check_rows, format_point
 from ..errors import InputError, InputTypeError
 from .angles import angles
-from .box import LARGEST_EDGE
 from .curved_edges import CurvedEdges, has_curves, unroll
+from .domain import LARGEST_EDGE
 
 SHORTEST_EDGE = 1e-12
 """Shortest edge, as a share of the bounding box's longest edge."""
@@ -156,9 +156,7 @@ def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
             # Checked first: shapely would find an intersection at every edge.
             other = known.setdefault((k > 0, _shape_key(rings[-1][-1].vertices)), name)
             if other != name:
-                raise InputError(
-                    f"Polygon's {name} repeats {_called(other)}; leave one of them out"
-                )
+                raise InputError(f"Polygon's {name} repeats {_called(other)}; leave one of them out")
     flat = [ring for piece in rings for ring in piece]
     for ring in flat:
         _check_area(ring)
@@ -199,9 +197,7 @@ def _cleaned(given: object, name: str) -> Ring:
         given, curved = unroll(given, name)
     hint = _other_maker(given)
     if hint:
-        raise InputTypeError(
-            f"Polygon's {name} is a {type(given).__name__}, expected its vertices (k, 2); {hint}"
-        )
+        raise InputTypeError(f"Polygon's {name} is a {type(given).__name__}, expected its vertices (k, 2); {hint}")
     try:
         array = check_rows(f"Polygon's {name}", given, 2)
     except (InputError, InputTypeError) as error:
@@ -220,9 +216,7 @@ def _cleaned(given: object, name: str) -> Ring:
     long = (array != np.roll(array, -1, axis=0)).any(axis=1)
     vertices = array[long]
     if len(vertices) < 3:
-        raise InputError(
-            f"Polygon's {name} has {len(vertices)} distinct vertices, expected at least 3"
-        )
+        raise InputError(f"Polygon's {name} has {len(vertices)} distinct vertices, expected at least 3")
     return Ring(array, vertices, np.flatnonzero(long), name, curved)
 
 
@@ -338,9 +332,7 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
     where = " and ".join([*there[:_NAMED], *([f"edges of {more} more rings"] if more > 0 else [])])
     remedy = "correct it (shapely.make_valid suggests how)"
     if len(there) > 1:
-        remedy = (
-            "move one of the rings, or unite or cut them in shapely and use Polygon.from_shapely"
-        )
+        remedy = "move one of the rings, or unite or cut them in shapely and use Polygon.from_shapely"
     if shape.geom_type == "MultiPolygon":  # each piece is valid
         remedy = _UNITE
     remedy = _REMEDIES.get(reason, remedy)

@@ -140,10 +140,7 @@ class Edges:
     end: np.ndarray
 
     def __post_init__(self) -> None:
-        begin, end = (
-            coordinates("Edges begin", self.begin, 2),
-            coordinates("Edges end", self.end, 2),
-        )
+        begin, end = (coordinates("Edges begin", self.begin, 2), coordinates("Edges end", self.end, 2))
         if begin.shape != end.shape or not len(begin):
             raise InputError(
                 f"Edges got begins of shape {begin.shape} and ends of shape {end.shape}, expected the same, "
@@ -178,9 +175,7 @@ class Segment:
     def __post_init__(self) -> None:
         a, b = coordinates("Segment a", self.a, 1), coordinates("Segment b", self.b, 1)
         if a.shape != b.shape:
-            raise InputError(
-                f"Segment ends have {a.size} and {b.size} coordinates, expected the same number"
-            )
+            raise InputError(f"Segment ends have {a.size} and {b.size} coordinates, expected the same number")
         object.__setattr__(self, "a", a)
         object.__setattr__(self, "b", b)
 

@@ -14,7 +14,7 @@ from ..arguments import check_integer, check_number, check_rows
 from ..errors import InputError
 from ..opencl.engine import DomainKind
 from .boundary_names import BoundaryNames, Walls
-from .box import LARGEST_EDGE, Domain
+from .domain import LARGEST_EDGE, Domain
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -164,9 +164,7 @@ class Sphere(Domain):
             edges, of = np.unique(pairs, axis=0, return_inverse=True)
             a, b, c = (len(x) + of.reshape(-1, 3)).T
             p, q, r = triangles.T
-            triangles = np.concatenate(
-                [np.column_stack(t) for t in ((p, a, c), (q, b, a), (r, c, b), (a, b, c))]
-            )
+            triangles = np.concatenate([np.column_stack(t) for t in ((p, a, c), (q, b, a), (r, c, b), (a, b, c))])
             middle = x[edges].sum(axis=1)
             x = np.concatenate([x, middle / np.linalg.norm(middle, axis=1)[:, None]])
         return self.radius * x

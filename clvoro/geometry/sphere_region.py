@@ -62,9 +62,7 @@ class SphereRegion(Sphere):
             what = f"SphereRegion {name}"
             points = check_rows(what, getattr(self, name), 3)
             if not len(points) or not (np.isfinite(points).all() and points.any(axis=1).all()):
-                raise InputError(
-                    f"{what} has {len(points)} rows, expected one or more finite positions on the sphere"
-                )
+                raise InputError(f"{what} has {len(points)} rows, expected one or more finite positions on the sphere")
             points = points.copy()
             points.setflags(write=False)
             object.__setattr__(self, name, points)
@@ -72,9 +70,7 @@ class SphereRegion(Sphere):
         object.__setattr__(self, "area", float(self.area))
         whole = Sphere(self.radius).measure
         if self.area > whole * (1 + 1e-6):  # areas of cells may be in single precision
-            raise InputError(
-                f"SphereRegion area is {self.area:g}, expected at most that of the sphere, {whole:g}"
-            )
+            raise InputError(f"SphereRegion area is {self.area:g}, expected at most that of the sphere, {whole:g}")
         object.__setattr__(self, "names", self._checked_names())
 
     def __eq__(self, other: object) -> bool:

@@ -55,9 +55,7 @@ class Surface:
         size = clvoro.sizing.Distance(part, h_min=0.01, growth=1.1, h_max=0.2)
     """
 
-    def __init__(
-        self, vertices: object, triangles: object, name: str = "Surface", join: float = 0.0
-    ):
+    def __init__(self, vertices: object, triangles: object, name: str = "Surface", join: float = 0.0):
         if not (isinstance(join, Real) and 0 <= join < math.inf):
             raise InputError(f"{name} join is {join!r}, expected a finite distance, 0 or more")
         self.name, self.join = name, float(join)
@@ -133,19 +131,14 @@ class Surface:
         except MemoryError:
             raise
         except OSError as error:
-            raise InputError(
-                f"surface file {str(path)!r} cannot be read: {error.strerror or error}"
-            ) from error
-        except (
-            ModuleNotFoundError
-        ) as error:  # trimesh would need a module that guesses the encoding
+            raise InputError(f"surface file {str(path)!r} cannot be read: {error.strerror or error}") from error
+        except ModuleNotFoundError as error:  # trimesh would need a module that guesses the encoding
             raise InputError(
                 f"{str(path)!r} cannot be read as {kind.upper()}: it is damaged or not in UTF-8; export it again"
             ) from error
         except Exception as error:  # trimesh raises many kinds of errors for damaged files
             raise InputError(
-                f"{str(path)!r} cannot be read as {kind.upper()} ({type(error).__name__}: "
-                f"{error}); export it again"
+                f"{str(path)!r} cannot be read as {kind.upper()} ({type(error).__name__}: {error}); export it again"
             ) from error
         if not triangles.size:
             raise InputError(f"{str(path)!r} holds no triangles, expected a surface")
@@ -198,9 +191,7 @@ class Surface:
         merged = self._merged
         whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
         ends = np.stack([merged[whole], np.roll(merged[whole], -1, axis=1)], axis=2).reshape(-1, 2)
-        edges, first, count = np.unique(
-            np.sort(ends, axis=1), axis=0, return_index=True, return_counts=True
-        )
+        edges, first, count = np.unique(np.sort(ends, axis=1), axis=0, return_index=True, return_counts=True)
         return edges, count, 3 * np.flatnonzero(whole)[first // 3] + first % 3
 
     @cached_property
@@ -208,9 +199,7 @@ class Surface:
         """Edges of a single triangle, (k, 2) int, as indices of vertices."""
         _, count, where = self._edges
         triangle, side = np.divmod(where[count == 1], 3)
-        return np.column_stack(
-            [self.triangles[triangle, side], self.triangles[triangle, (side + 1) % 3]]
-        )
+        return np.column_stack([self.triangles[triangle, side], self.triangles[triangle, (side + 1) % 3]])
 
     @property
     def closed(self) -> bool:
@@ -317,9 +306,7 @@ class Surface:
 
         used = self.vertices[np.unique(self.triangles)]
         bound = KDTree(used).query(points)[0] * (1 + 1e-12)
-        return self.tree.nearest2(
-            points, bound**2, lambda x, item: triangle_distance2(x, self.corners[item])
-        )
+        return self.tree.nearest2(points, bound**2, lambda x, item: triangle_distance2(x, self.corners[item]))
 
     def landmarks(self, spacing: float, most: int) -> np.ndarray:
         """Return at most `most` points on the surface, about `spacing` apart."""
@@ -345,11 +332,7 @@ class Surface:
         corners = ((self.corners - origin) / scale).astype(real)
         tree = Tree(corners.min(axis=1), corners.max(axis=1))
         corners = corners[tree.order].astype(float)
-        a, side1, side2 = (
-            corners[:, 0],
-            corners[:, 1] - corners[:, 0],
-            corners[:, 2] - corners[:, 0],
-        )
+        a, side1, side2 = (corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal = np.cross(side1, side2)
         double_area = np.linalg.norm(normal, axis=1)
         length2 = np.column_stack([(v**2).sum(axis=1) for v in (side1, side2, side2 - side1)])

@@ -94,8 +94,5 @@ class Ring:
         here, there = np.arange(len(reach)), np.sort(others)
         ahead = there[np.searchsorted(there, here, side="right") % len(there)]
         behind = there[np.searchsorted(there, here, side="left") - 1]
-        gaps = [
-            (self.at[ahead] - self.at[:-1]) % self.at[-1],
-            (self.at[:-1] - self.at[behind]) % self.at[-1],
-        ]
+        gaps = [(self.at[ahead] - self.at[:-1]) % self.at[-1], (self.at[:-1] - self.at[behind]) % self.at[-1]]
         return np.maximum(*gaps) < reach

@@ -143,9 +143,7 @@ def write_mesh(
         convention, units = for_netcdf["convention"], for_netcdf["units"]
         unit = "m" if units is None else units
         if not isinstance(unit, str) or not unit.isascii() or not unit.strip():
-            raise InputTypeError(
-                f"units is {unit!r:.60}, expected a unit of length, such as 'm' or 'km'"
-            )
+            raise InputTypeError(f"units is {unit!r:.60}, expected a unit of length, such as 'm' or 'km'")
         if unit.startswith("degree") and isinstance(contents.diagram.domain, Sphere):
             raise InputError(
                 f"units is {unit!r:.60}, expected on a sphere the unit of its radius, such as 'm' or 'km'; UGRID has "
@@ -183,9 +181,7 @@ def to_fipy(mesh: Result | Diagram, walls: WallShape = "straight") -> VoronoiMes
     return make_fipy_mesh(diagram, walls)
 
 
-def to_meshio(
-    mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None
-) -> meshio.Mesh:
+def to_meshio(mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None) -> meshio.Mesh:
     """Return a mesh of meshio; see `Diagram.to_meshio`."""
     from .convert import to_meshio
 
@@ -194,9 +190,7 @@ def to_meshio(
     return to_meshio(contents)
 
 
-def to_pyvista(
-    mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None
-) -> pyvista.UnstructuredGrid:
+def to_pyvista(mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None) -> pyvista.UnstructuredGrid:
     """Return an unstructured grid of PyVista; see `Diagram.to_pyvista`."""
     from .convert import to_pyvista
 

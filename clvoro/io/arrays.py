@@ -42,23 +42,15 @@ def explained(path: str | PathLike[str], expected: str) -> Iterator[None]:
             f"cannot load {name}: it is another kind of file, damaged or truncated ({error}), expected {expected}"
         ) from error
     except (zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError) as error:
-        raise InputError(
-            f"cannot load {name}: it is damaged or not from clvoro ({error})"
-        ) from error
+        raise InputError(f"cannot load {name}: it is damaged or not from clvoro ({error})") from error
     except (KeyError, IndexError, TypeError, MemoryError) as error:
-        raise InputError(
-            f"cannot load {name}: it is damaged or not from clvoro ({error!r:.200})"
-        ) from error
+        raise InputError(f"cannot load {name}: it is damaged or not from clvoro ({error!r:.200})") from error
     except OSError as error:
         raise InputError(f"cannot load {name}: {error.strerror or error}") from error
 
 
 def write_arrays(
-    path: str | PathLike[str],
-    kind: str,
-    version: int,
-    arrays: Mapping[str, object],
-    compress: bool = True,
+    path: str | PathLike[str], kind: str, version: int, arrays: Mapping[str, object], compress: bool = True
 ) -> None:
     """Write `arrays` by name, completely or not at all. Equal arrays give equal bytes.
 
@@ -89,11 +81,7 @@ def read_arrays(path: str | PathLike[str], kind: str, version: int) -> dict[str,
     InputError
         If the file is missing, damaged, truncated, of another kind or of a newer version.
     """
-    with (
-        explained(path, f"a {kind}"),
-        open_plain(path) as file,
-        zipfile.ZipFile(file) as archive,
-    ):
+    with explained(path, f"a {kind}"), open_plain(path) as file, zipfile.ZipFile(file) as archive:
         members = list_members(archive, kind, version)
         return {name: read_member(archive, info) for name, info in members.items()}
 
@@ -101,11 +89,7 @@ def read_arrays(path: str | PathLike[str], kind: str, version: int) -> dict[str,
 def is_kind(path: str | PathLike[str], kind: str) -> bool:
     """Return whether `path` is a file of this kind from `write_arrays`, of any version."""
     try:
-        with (
-            explained(path, f"a {kind}"),
-            open_plain(path) as file,
-            zipfile.ZipFile(file) as archive,
-        ):
+        with explained(path, f"a {kind}"), open_plain(path) as file, zipfile.ZipFile(file) as archive:
             found = read_member(archive, archive.getinfo("format.npy"))
             return bool(found.shape == () and found.item() == kind)
     except InputError:
@@ -127,15 +111,11 @@ def list_members(archive: zipfile.ZipFile, kind: str, version: int) -> dict[str,
     if number.item() < 1:
         raise FileError(f"its version is {number.item()}, expected 1 to {version}")
     if number.item() > version:
-        raise FileError(
-            f"its version is {number.item()}, expected at most {version}; install a newer clvoro"
-        )
+        raise FileError(f"its version is {number.item()}, expected at most {version}; install a newer clvoro")
     return members
 
 
-def check_expansion(
-    archive: zipfile.ZipFile, members: Iterable[zipfile.ZipInfo], most: int, least: int
-) -> None:
+def check_expansion(archive: zipfile.ZipFile, members: Iterable[zipfile.ZipInfo], most: int, least: int) -> None:
     """Refuse members whose expanded size is far larger than the file."""
     held = sum(info.file_size for info in members)
     # The compressed sizes in the archive's directory are not trusted.
@@ -176,9 +156,7 @@ def _read(stream: BufferedIOBase, name: str, size: int) -> np.ndarray:
     except Exception as error:  # NumPy parses the header as Python source, which raises many errors
         raise FileError(f"{name} is not an array ({error!s:.200})") from error
     if dtype.hasobject:
-        raise FileError(
-            f"{name} has pickled Python objects, which can run any program; they are never loaded"
-        )
+        raise FileError(f"{name} has pickled Python objects, which can run any program; they are never loaded")
     count = 1
     for extent in shape:  # Python's integers do not overflow
         count *= extent

@@ -110,9 +110,7 @@ def _target(path: Path) -> Path:
     """Return the target of `path` through symbolic links; refuse it if it is not a regular file in a folder."""
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
-        raise OutputError(
-            f"cannot write {path}: there is no folder {target.parent}; create it first"
-        )
+        raise OutputError(f"cannot write {path}: there is no folder {target.parent}; create it first")
     if target.exists() and not stat.S_ISREG(target.stat().st_mode):
         kind = "a folder" if target.is_dir() else "not a regular file"
         raise OutputError(f"cannot write {path}: it is {kind}; choose another name")
@@ -135,8 +133,7 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OutputError(
-            f"cannot write {path}: {error.strerror or error}; choose a place that is writable "
-            "and has space"
+            f"cannot write {path}: {error.strerror or error}; choose a place that is writable and has space"
         ) from error
 
 

@@ -71,9 +71,7 @@ def check_case(case: Path) -> Verdict:
         (case / "system" / file).write_text(head + text + "\n", encoding="ascii")
     settings = {"WM_PROJECT_DIR": str(_DEBIAN)} if _DEBIAN.is_dir() else {}
     command = ["checkMesh", "-allGeometry", "-allTopology", "-case", str(case)]
-    done = subprocess.run(
-        command, env={**settings, **os.environ}, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(command, env={**settings, **os.environ}, capture_output=True, text=True, check=False)
     text = done.stdout + done.stderr
     stars = re.findall(r"^ *\*\*\*(.*)$", text, re.MULTILINE)
     return Verdict("Mesh OK." in text, tuple(line.strip() for line in stars), text)

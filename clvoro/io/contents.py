@@ -18,9 +18,21 @@ if TYPE_CHECKING:
 
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
 OWN = frozenset(
-    ("size", "error", "quality", "volume", "area", "sides", "faces_of_cell", "label", "boundary", "generator", "wall",
-     "weight")
-)  # fmt: skip
+    (
+        "size",
+        "error",
+        "quality",
+        "volume",
+        "area",
+        "sides",
+        "faces_of_cell",
+        "label",
+        "boundary",
+        "generator",
+        "wall",
+        "weight",
+    )
+)
 """Names of clvoro's own cell data in any format."""
 
 
@@ -85,19 +97,13 @@ def _checked(cell_data: object, n: int) -> dict[str, np.ndarray]:
     found = {}
     for name, values in cell_data.items():
         if not isinstance(name, str) or not _WORD.fullmatch(name) or name in OWN:
-            why = (
-                "which clvoro uses itself"
-                if name in OWN
-                else "expected a word of ASCII letters and digits"
-            )
+            why = "which clvoro uses itself" if name in OWN else "expected a word of ASCII letters and digits"
             raise InputError(f"cell_data has the name {name!r:.60}, {why}; choose another name")
         if np.ma.is_masked(values):
             raise InputError(f"cell_data[{name!r}] has masked numbers, expected none; fill them")
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
-            raise InputTypeError(
-                f"cell_data[{name!r}] has dtype {array.dtype}, expected real numbers"
-            )
+            raise InputTypeError(f"cell_data[{name!r}] has dtype {array.dtype}, expected real numbers")
         if array.ndim not in (1, 2) or len(array) != n or 0 in array.shape:
             raise InputError(
                 f"cell_data[{name!r}] has shape {array.shape}, expected ({n},) or ({n}, k): a row per cell"

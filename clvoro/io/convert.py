@@ -21,9 +21,7 @@ _VTK_POLYGON, _VTK_POLYHEDRON = 7, 42
 
 def missing(library: str, extra: str, what: str) -> ClvoroError:
     """Return the error for an optional library that is not installed."""
-    return ClvoroError(
-        f"{what} needs {library}, which is not installed; run `pip install 'clvoro[{extra}]'`"
-    )
+    return ClvoroError(f"{what} needs {library}, which is not installed; run `pip install 'clvoro[{extra}]'`")
 
 
 def to_meshio(contents: Contents, with_data: bool = True) -> meshio.Mesh:
@@ -36,9 +34,7 @@ def to_meshio(contents: Contents, with_data: bool = True) -> meshio.Mesh:
     blocks, rows = _polygons(diagram) if diagram.domain.cell_dim == 2 else _polyhedra(diagram)
     data = cell_data(contents) if with_data else {}
     return meshio.Mesh(
-        in_space(diagram.vertices),
-        blocks,
-        cell_data={name: [_known(v)[k] for k in rows] for name, v in data.items()},
+        in_space(diagram.vertices), blocks, cell_data={name: [_known(v)[k] for k in rows] for name, v in data.items()}
     )
 
 
@@ -78,9 +74,7 @@ def _polygons(diagram: Diagram) -> tuple[list[Any], list[np.ndarray]]:
     return blocks, rows
 
 
-def _polyhedra(
-    diagram: Diagram,
-) -> tuple[list[Any], list[np.ndarray]]:
+def _polyhedra(diagram: Diagram) -> tuple[list[Any], list[np.ndarray]]:
     """Return meshio's blocks in 3D, one per number of corners, and the cells in each."""
     starts = diagram.face_vertex_starts
     faces = np.split(diagram.face_vertices, starts[1:-1])

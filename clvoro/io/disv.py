@@ -63,9 +63,7 @@ class DisvBoundaries(dict[str, DisvBoundary]):
     """Faces on each boundary of the domain, by its name."""
 
     def __missing__(self, name: object) -> DisvBoundary:
-        raise InputError(
-            f"boundaries has no {name!r:.60}, expected the name of a boundary: {', '.join(self)}"
-        )
+        raise InputError(f"boundaries has no {name!r:.60}, expected the name of a boundary: {', '.join(self)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +136,7 @@ def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
             "DISV grids are layers of 2D cells, and this diagram is in 3D; mesh the plane and give MODFLOW the layers"
         )
     if any(domain.periodic):
-        raise InputError(
-            "DISV grids have no periodic sides, and this box has; use a box without periodic directions"
-        )
+        raise InputError("DISV grids have no periodic sides, and this box has; use a box without periodic directions")
     mesh = _without_empty_faces(diagram.solver_mesh(walls, collapse=False))
     starts, loops = cell_loops(mesh)
     cells = np.arange(len(mesh))
@@ -149,8 +145,6 @@ def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
     for k, name in enumerate(domain.boundary_names):
         rows = np.flatnonzero(faces.boundary == k)
         rows = rows[np.argsort(faces.owner[rows], kind="stable")]
-        found[name] = DisvBoundary(
-            faces.owner[rows], faces.area[rows], faces.near[rows], faces.foot[rows]
-        )
+        found[name] = DisvBoundary(faces.owner[rows], faces.area[rows], faces.near[rows], faces.foot[rows])
     starts, corners = take_rows(starts, loops, cells, np.ones(len(cells), bool))
     return Disv(mesh.points, starts, corners, diagram.points.astype(float), found)

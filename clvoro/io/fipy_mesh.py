@@ -31,12 +31,7 @@ class _AtGenerators:
     physicalFaces: dict[str, FaceVariable]  # noqa: N815  (as FiPy's meshes from Gmsh)
 
     def __init__(
-        self,
-        generators: np.ndarray,
-        volumes: np.ndarray,
-        faces: TwoPointFaces,
-        shift: np.ndarray,
-        **arrays: Any,
+        self, generators: np.ndarray, volumes: np.ndarray, faces: TwoPointFaces, shift: np.ndarray, **arrays: Any
     ) -> None:
         self._generators, self._volumes, self._faces = generators, volumes, faces
         self._shift = shift  # (f, d), of the neighbor to its image beside the owner
@@ -124,8 +119,7 @@ def make_fipy_mesh(diagram: Diagram, walls: WallShape) -> VoronoiMesh2D | Vorono
     )
     part = faces.boundary[kept]
     made.physicalFaces = {
-        name: FaceVariable(mesh=made, value=part == k)
-        for k, name in enumerate(domain.boundary_names)
+        name: FaceVariable(mesh=made, value=part == k) for k, name in enumerate(domain.boundary_names)
     }
     return made
 

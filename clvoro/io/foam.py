@@ -61,11 +61,7 @@ def write_foam(
         f"nPoints:{len(mesh.points)} nCells:{len(contents.diagram)} nFaces:{len(mesh.owner)} "
         f"nInternalFaces:{len(mesh.neighbor)}"
     )
-    changed = (
-        f"straight walls change the area by {100 * mesh.area_change:+.3g} %"
-        if mesh.area_change
-        else ""
-    )
+    changed = f"straight walls change the area by {100 * mesh.area_change:+.3g} %" if mesh.area_change else ""
     notes = {"owner": note, "neighbour": note, "points": changed}
     if binary:
         lists = {

@@ -16,8 +16,7 @@ from .convert import to_meshio
 _POLYGONS = {".vtk": True, ".ply": False, ".obj": False}
 
 _SAFE = (
-    ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .nc (QGIS, UGRID, MPAS), .info (METIS), "
-    ".vtk, .ply or .obj"
+    ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .nc (QGIS, UGRID, MPAS), .info (METIS), .vtk, .ply or .obj"
 )
 
 _PICTURE = "it is no mesh file; write mesh.plot().savefig(path)"
@@ -25,10 +24,7 @@ _LAYER = (
     "save as .nc, which QGIS opens as a mesh, or write geopandas.GeoDataFrame(geometry=mesh.to_shapely(), "
     "crs=...).to_file(path)"
 )
-_INSTEAD = {
-    **dict.fromkeys((".png", ".pdf", ".svg"), _PICTURE),
-    **dict.fromkeys((".shp", ".geojson", ".gpkg"), _LAYER),
-}
+_INSTEAD = {**dict.fromkeys((".png", ".pdf", ".svg"), _PICTURE), **dict.fromkeys((".shp", ".geojson", ".gpkg"), _LAYER)}
 
 
 def write_foreign(contents: Contents, path: Path) -> None:
@@ -48,8 +44,7 @@ def write_foreign(contents: Contents, path: Path) -> None:
         mesh = to_meshio(contents, with_data)
     except ClvoroError as error:
         raise InputError(
-            f'cannot write {path}: {suffix} needs meshio; run `pip install "clvoro[formats]"`, or '
-            "save as .vtu or .npz"
+            f'cannot write {path}: {suffix} needs meshio; run `pip install "clvoro[formats]"`, or save as .vtu or .npz'
         ) from error
     # meshio prints warnings to the terminal. Errors are exceptions.
     with atomic_folder(path) as temporary, contextlib.redirect_stdout(io.StringIO()):

@@ -27,9 +27,7 @@ def write_metis(contents: Contents, path: Path) -> None:
         If there are data of the caller, which the format does not hold.
     """
     if contents.extra:
-        raise InputError(
-            f"cannot write cell_data to {path}: a graph for METIS holds none; save as .nc or leave it out"
-        )
+        raise InputError(f"cannot write cell_data to {path}: a graph for METIS holds none; save as .nc or leave it out")
     topology, n = face_topology(contents.diagram), len(contents.diagram)
     i, j = (ends[: topology.inner].astype(np.int64) for ends in (topology.owner, topology.neighbor))
     pairs = np.unique(np.concatenate([i * n + j, j * n + i]))

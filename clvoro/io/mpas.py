@@ -50,11 +50,16 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
         path,
         contents,
         {
-            "nCells": n, "nEdges": e, "nVertices": v, "maxEdges": width, "maxEdges2": 2 * width, "TWO": 2,
+            "nCells": n,
+            "nEdges": e,
+            "nVertices": v,
+            "maxEdges": width,
+            "maxEdges2": 2 * width,
+            "TWO": 2,
             "vertexDegree": degree,
         },
         {**describe(domain), "mesh_spec": "1.0", "Conventions": "MPAS"},
-    )  # fmt: skip
+    )
     places = {
         "Cell": domain.wrap(diagram.points),
         "Edge": shape.edges,
@@ -67,9 +72,7 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
         file.add(f"indexTo{name}ID", plural, np.arange(1, len(points) + 1))
     _add_graph(file, halves, around)
     _add_measures(file, around, shape, unit)
-    weights = find_weights(
-        halves, shape.kites / shape.areas[halves.cell], shape.lengths, shape.distances
-    )
+    weights = find_weights(halves, shape.kites / shape.areas[halves.cell], shape.lengths, shape.distances)
     wide = ("nEdges", "maxEdges2")
     file.add("nEdgesOnEdge", ("nEdges",), weights.counts)
     for name, items in (("edges", weights.edges + 1), ("weights", weights.values)):
@@ -109,10 +112,7 @@ def _add_graph(file: NetCDF, halves: HalfEdges, around: _Around) -> None:
     pairs = {"cells": (halves.cell + 1, across), "vertices": (around.vertex + 1, ends + 1)}
     for name, (one, other) in pairs.items():
         file.add(f"{name}OnEdge", ("nEdges", "TWO"), np.stack([one[first], other[first]], axis=1))
-    at_vertex = {
-        "cells": np.where(corners >= 0, halves.cell[corners] + 1, 0),
-        "edges": around.edges + 1,
-    }
+    at_vertex = {"cells": np.where(corners >= 0, halves.cell[corners] + 1, 0), "edges": around.edges + 1}
     for name, table in at_vertex.items():
         file.add(f"{name}OnVertex", ("nVertices", "vertexDegree"), table)
 

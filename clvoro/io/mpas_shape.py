@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.sphere import Sphere
 from ..geometry.spherical_triangles import triangle_areas
 from ..mesh.connectivity import neighbor_points
@@ -57,14 +57,20 @@ def describe(domain: Domain) -> dict[str, str | np.generic]:
     """Return the attributes of the file that describe the domain."""
     if isinstance(domain, Sphere):
         return {
-            "on_a_sphere": "YES", "sphere_radius": np.float64(domain.radius), "is_periodic": "NO",
-            "x_period": np.float64(0), "y_period": np.float64(0),
-        }  # fmt: skip
+            "on_a_sphere": "YES",
+            "sphere_radius": np.float64(domain.radius),
+            "is_periodic": "NO",
+            "x_period": np.float64(0),
+            "y_period": np.float64(0),
+        }
     periods = np.where(domain.periodic, domain.extent, 0.0)
     return {
-        "on_a_sphere": "NO", "sphere_radius": np.float64(0), "is_periodic": "YES" if periods.any() else "NO",
-        "x_period": periods[0], "y_period": periods[1],
-    }  # fmt: skip
+        "on_a_sphere": "NO",
+        "sphere_radius": np.float64(0),
+        "is_periodic": "YES" if periods.any() else "NO",
+        "x_period": periods[0],
+        "y_period": periods[1],
+    }
 
 
 def coordinates(domain: Domain, points: np.ndarray) -> dict[str, np.ndarray]:
@@ -102,11 +108,14 @@ def _on_sphere(diagram: Diagram, sphere: Sphere, halves: HalfEdges) -> Shape:
     lengths = np.linalg.norm(end[first] - begin[first], axis=1)
     east, north = _east_and_north(sphere, middles)
     return Shape(
-        r * middles, kites, np.bincount(halves.cell, kites, len(diagram)),
-        sphere.arcs(r * lengths), sphere.arcs(r * np.linalg.norm(line, axis=1)),
+        r * middles,
+        kites,
+        np.bincount(halves.cell, kites, len(diagram)),
+        sphere.arcs(r * lengths),
+        sphere.arcs(r * np.linalg.norm(line, axis=1)),
         np.arctan2((line * north).sum(axis=1), (line * east).sum(axis=1)),
         r * np.maximum(np.abs(line).max(axis=0), np.abs(begin - own).max(axis=0)),
-    )  # fmt: skip
+    )
 
 
 def _east_and_north(sphere: Sphere, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,9 +123,7 @@ def _east_and_north(sphere: Sphere, points: np.ndarray) -> tuple[np.ndarray, np.
     lon, lat = np.radians(sphere.lonlat(points)).T
     nothing = np.zeros(len(points))
     east = np.column_stack([-np.sin(lon), np.cos(lon), nothing])
-    return east, np.column_stack(
-        [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
-    )
+    return east, np.column_stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
 
 
 def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
@@ -144,9 +151,14 @@ def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
     outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
     normals = np.where(inner[first][:, None], line[first], outward)
     return Shape(
-        diagram.domain.wrap(own[first] + foot[first]), kites, np.bincount(halves.cell, kites, len(diagram)), lengths,
-        distances, np.arctan2(normals[:, 1], normals[:, 0]), np.abs([begin, line]).max(axis=(0, 1)),
-    )  # fmt: skip
+        diagram.domain.wrap(own[first] + foot[first]),
+        kites,
+        np.bincount(halves.cell, kites, len(diagram)),
+        lengths,
+        distances,
+        np.arctan2(normals[:, 1], normals[:, 0]),
+        np.abs([begin, line]).max(axis=(0, 1)),
+    )
 
 
 def _roundings(diagram: Diagram, distances: np.ndarray) -> np.ndarray:

@@ -48,11 +48,7 @@ class NetCDF:
     """
 
     def __init__(
-        self,
-        path: Path,
-        contents: Contents,
-        dimensions: Mapping[str, int],
-        attributes: Mapping[str, str | np.generic],
+        self, path: Path, contents: Contents, dimensions: Mapping[str, int], attributes: Mapping[str, str | np.generic]
     ) -> None:
         self.path, self.dimensions, self.extra = path, dict(dimensions), contents.extra
         settings = json.dumps(contents.settings, default=repr)
@@ -60,11 +56,7 @@ class NetCDF:
         self._variables: dict[str, _Variable] = {}
 
     def add(
-        self,
-        name: str,
-        dimensions: tuple[str, ...],
-        values: np.ndarray,
-        **attributes: str | np.generic | np.ndarray,
+        self, name: str, dimensions: tuple[str, ...], values: np.ndarray, **attributes: str | np.generic | np.ndarray
     ) -> None:
         """Add a variable of integers or real numbers.
 

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from ..files import open_plain
-from ..geometry.box import Box, Domain
+from ..geometry.box import Box
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
 from ..geometry.sphere_region import SphereRegion
@@ -30,12 +31,7 @@ from .contents import Contents
 
 FORMAT, VERSION = "clvoro-result", 2
 
-_DOMAINS = {
-    "Box": Box,
-    "Polygon": Polygon.described,
-    "Sphere": Sphere,
-    "SphereRegion": SphereRegion,
-}
+_DOMAINS = {"Box": Box, "Polygon": Polygon.described, "Sphere": Sphere, "SphereRegion": SphereRegion}
 _NEEDED = ("about", "points", "target_size", "size_error", "quality", "history", "diagram.points")
 _FIELDS = tuple(field.name for field in dataclasses.fields(Result))
 _FORMER = {"size": "target_size", "error": "size_error"}
@@ -48,20 +44,42 @@ _PARTS = {
 
 # Shape of each array: a letter stands for the same size everywhere (d: dimension).
 _SHAPES = {
-    "points": "nd", "target_size": "n", "size_error": "n", "quality": "n", "history": "h",
-    "diagram.points": "nd", "diagram.volumes": "n", "diagram.centroids": "nd",
-    "diagram.neighbor_starts": "N", "diagram.neighbors": "m", "diagram.shifts": "md", "diagram.face_measures": "m",
-    "diagram.face_centroids": "md", "diagram.vertices": "vd", "diagram.cell_vertex_starts": "N",
-    "diagram.cell_vertices": "c", "diagram.face_vertex_starts": "M", "diagram.face_vertices": "f",
+    "points": "nd",
+    "target_size": "n",
+    "size_error": "n",
+    "quality": "n",
+    "history": "h",
+    "diagram.points": "nd",
+    "diagram.volumes": "n",
+    "diagram.centroids": "nd",
+    "diagram.neighbor_starts": "N",
+    "diagram.neighbors": "m",
+    "diagram.shifts": "md",
+    "diagram.face_measures": "m",
+    "diagram.face_centroids": "md",
+    "diagram.vertices": "vd",
+    "diagram.cell_vertex_starts": "N",
+    "diagram.cell_vertices": "c",
+    "diagram.face_vertex_starts": "M",
+    "diagram.face_vertices": "f",
     "diagram.weights": "n",
-    "initial.points": "ad", "initial.lloyd": "ad", "initial.poisson": "ad",  # before any were inserted
-    "final.points": "nd", "final.lloyd": "nd", "final.poisson": "nd",
-}  # fmt: skip
+    "initial.points": "ad",
+    "initial.lloyd": "ad",
+    "initial.poisson": "ad",  # before any were inserted
+    "final.points": "nd",
+    "final.lloyd": "nd",
+    "final.poisson": "nd",
+}
 
 _INTEGERS = {
-    "diagram.neighbor_starts", "diagram.neighbors", "diagram.shifts", "diagram.cell_vertex_starts",
-    "diagram.cell_vertices", "diagram.face_vertex_starts", "diagram.face_vertices",
-}  # fmt: skip
+    "diagram.neighbor_starts",
+    "diagram.neighbors",
+    "diagram.shifts",
+    "diagram.cell_vertex_starts",
+    "diagram.cell_vertices",
+    "diagram.face_vertex_starts",
+    "diagram.face_vertices",
+}
 
 
 def write_npz(contents: Contents, path: Path) -> None:
@@ -113,9 +131,7 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
                 raise FileError(f"it lacks {', '.join(missing)}")
             parts = (f"{part}.{name}" for part, names in _PARTS.items() for name in names)
             known = ("about", *_FIELDS, *parts)
-            arrays = {
-                name: read_member(archive, members[name]) for name in known if name in members
-            }
+            arrays = {name: read_member(archive, members[name]) for name in known if name in members}
         _check(arrays)
         return _assemble(arrays)
 
@@ -164,9 +180,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
         description = dict(facts["domain"])
         kind = description.pop("kind")
         if kind not in _DOMAINS:
-            raise FileError(
-                f"its domain is a {kind!r:.40}, which this version of clvoro does not have"
-            )
+            raise FileError(f"its domain is a {kind!r:.40}, which this version of clvoro does not have")
         domain = _DOMAINS[kind](**description)
         settings = dict(facts["settings"])
         values = {name: value for name, value in facts["values"].items() if name in _FIELDS}
@@ -188,9 +202,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
     history = np.zeros(len(stored), HISTORY_DTYPE)
     for column in set(stored.dtype.names or ()) & set(HISTORY_DTYPE.names or ()):
         history[column] = stored[column]
-    stored_fields: dict[str, Any] = {
-        name: arrays[name] for name in _FIELDS if name in arrays and name != "history"
-    }
+    stored_fields: dict[str, Any] = {name: arrays[name] for name in _FIELDS if name in arrays and name != "history"}
     return Result(
         **values,
         **stored_fields,

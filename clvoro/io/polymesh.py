@@ -105,9 +105,8 @@ def poly_mesh(
     order[mesh.inner : mesh.outer] = mesh.inner + np.argsort(groups, kind="stable")
     starts, corners = take_rows(cells.starts, cells.corners, order)
     return PolyMesh(
-        cells.points, starts, corners, cells.owner[order], mesh.neighbor[: mesh.inner], made,
-        mesh.area_change,
-    )  # fmt: skip
+        cells.points, starts, corners, cells.owner[order], mesh.neighbor[: mesh.inner], made, mesh.area_change
+    )
 
 
 def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> list[str]:
@@ -121,11 +120,7 @@ def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> lis
         )
     for name, kind in given.items():
         if name not in names:
-            raise InputError(
-                f"types has {name!r:.60}, expected names of patches: {', '.join(names)}"
-            )
+            raise InputError(f"types has {name!r:.60}, expected names of patches: {', '.join(names)}")
         if kind not in known:
-            raise InputError(
-                f"types has {kind!r:.60} for {name}, expected one of {', '.join(known)}"
-            )
+            raise InputError(f"types has {kind!r:.60} for {name}, expected one of {', '.join(known)}")
     return [given.get(name, "wall") for name in names]

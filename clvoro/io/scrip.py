@@ -41,11 +41,7 @@ def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
         path,
         contents,
         {"grid_size": n, "grid_corners": most, "grid_rank": 1},
-        {
-            "title": "Voronoi cells",
-            "Conventions": "SCRIP",
-            "sphere_radius": np.float64(domain.radius),
-        },
+        {"title": "Voronoi cells", "Conventions": "SCRIP", "sphere_radius": np.float64(domain.radius)},
     )
     file.add("grid_dims", ("grid_rank",), np.array([n], np.int32))
     file.add("grid_imask", ("grid_size",), np.ones(n, np.int32), units="unitless")

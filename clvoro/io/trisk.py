@@ -37,9 +37,7 @@ class Weights:
     values: np.ndarray
 
 
-def find_weights(
-    halves: HalfEdges, shares: np.ndarray, lengths: np.ndarray, distances: np.ndarray
-) -> Weights:
+def find_weights(halves: HalfEdges, shares: np.ndarray, lengths: np.ndarray, distances: np.ndarray) -> Weights:
     """Return the weights. The normal of an edge points out of its lower cell.
 
     Parameters

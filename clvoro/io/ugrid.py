@@ -27,12 +27,7 @@ _CONNECTIVITY = {
     "face_face": "faces across the edges of each face",
     "edge_face": "faces on the left and on the right of each edge",
 }
-_FACE_DATA = {
-    "size": "target size",
-    "error": "size error",
-    "quality": "cell quality",
-    "area": "cell area",
-}
+_FACE_DATA = {"size": "target size", "error": "size error", "quality": "cell quality", "area": "cell area"}
 """Names of cell data, and their titles in other programs."""
 _NONE = np.int32(-1)
 
@@ -61,12 +56,17 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     file = NetCDF(path, contents, dimensions, {"Conventions": "CF-1.11 UGRID-1.0"})
     places = ("node", "edge", "face")
     file.add(
-        "mesh", (), np.zeros((), np.int32),
-        cf_role="mesh_topology", long_name="topology of the cells", topology_dimension=np.int32(2),
-        face_dimension="mesh_faces", edge_dimension="mesh_edges",
+        "mesh",
+        (),
+        np.zeros((), np.int32),
+        cf_role="mesh_topology",
+        long_name="topology of the cells",
+        topology_dimension=np.int32(2),
+        face_dimension="mesh_faces",
+        edge_dimension="mesh_edges",
         **{f"{place}_coordinates": f"mesh_{place}_x mesh_{place}_y" for place in places},
         **{f"{name}_connectivity": f"mesh_{name}s" for name in _CONNECTIVITY},
-    )  # fmt: skip
+    )
     ends = np.stack([halves.begin, halves.end], axis=1)[halves.first]
     _add_coordinates(file, diagram, ends, unit)
     _add_connectivity(file, halves, ends, np.diff(starts), corners)
@@ -96,9 +96,13 @@ def _add_coordinates(file: NetCDF, diagram: Diagram, ends: np.ndarray, unit: str
     for place, (what, points) in places.items():
         for axis, values in zip("xy", points.T, strict=True):
             file.add(
-                f"mesh_{place}_{axis}", (f"mesh_{place}s",), values,
-                **_coordinate(axis, unit), long_name=f"{axis} of the {what}", axis=axis.upper(),
-            )  # fmt: skip
+                f"mesh_{place}_{axis}",
+                (f"mesh_{place}s",),
+                values,
+                **_coordinate(axis, unit),
+                long_name=f"{axis} of the {what}",
+                axis=axis.upper(),
+            )
 
 
 def _add_globe(file: NetCDF, sphere: Sphere, unit: str) -> None:
@@ -130,17 +134,25 @@ def _add_connectivity(
 def _add_walls(file: NetCDF, diagram: Diagram, halves: HalfEdges) -> None:
     """Add the number of the wall of each edge, and the name of its boundary as a flag."""
     of_edges: dict[str, str | np.generic] = {
-        "mesh": "mesh", "location": "edge", "coordinates": "mesh_edge_x mesh_edge_y", "_FillValue": _NONE,
-    }  # fmt: skip
+        "mesh": "mesh",
+        "location": "edge",
+        "coordinates": "mesh_edge_x mesh_edge_y",
+        "_FillValue": _NONE,
+    }
     walls = np.maximum(-1 - diagram.neighbors[halves.rows[halves.first]], -1)
     file.add("wall", ("mesh_edges",), walls, long_name="number of the wall of the edge", **of_edges)
     names = diagram.domain.boundary_names
     if names:
         parts = np.where(walls >= 0, diagram.domain.boundary_index[np.maximum(walls, 0)], -1)
         file.add(
-            "boundary", ("mesh_edges",), parts, long_name="boundary that the edge is part of",
-            flag_values=np.arange(len(names), dtype=np.int32), flag_meanings=" ".join(names), **of_edges,
-        )  # fmt: skip
+            "boundary",
+            ("mesh_edges",),
+            parts,
+            long_name="boundary that the edge is part of",
+            flag_values=np.arange(len(names), dtype=np.int32),
+            flag_meanings=" ".join(names),
+            **of_edges,
+        )
 
 
 def _coordinate(axis: str, unit: str) -> dict[str, str]:
@@ -152,8 +164,4 @@ def _coordinate(axis: str, unit: str) -> dict[str, str]:
 
 
 def _role(name: str) -> dict[str, str | np.generic]:
-    return {
-        "cf_role": f"{name}_connectivity",
-        "long_name": _CONNECTIVITY[name],
-        "start_index": np.int32(0),
-    }
+    return {"cf_role": f"{name}_connectivity", "long_name": _CONNECTIVITY[name], "start_index": np.int32(0)}

@@ -18,7 +18,7 @@ import numpy as np
 from ..finite_volumes.geometry import polygon_areas
 from ..finite_volumes.prisms import cell_loops
 from ..finite_volumes.solver_mesh import SolverMesh, WallShape, make_solver_mesh
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
 from ..geometry.sphere_region import SphereRegion
@@ -36,9 +36,7 @@ _BLOCK = 1 << 20
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 
 
-def write_vtu(
-    contents: Contents, path: Path, compress: bool = True, walls: WallShape | None = None
-) -> None:
+def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: WallShape | None = None) -> None:
     """Write the cells as polygons or polyhedra with cell data.
 
     Cell data: `size` (h), `error` (signed) and `quality` of a result; `volume` (area in 2D); `sides` (in 3D
@@ -247,15 +245,11 @@ def largest_boundary(diagram: Diagram) -> np.ndarray:
     walls = np.flatnonzero(diagram.neighbors < 0)
     # Of several entries for a cell the last one remains: that of its largest wall face.
     walls = walls[np.argsort(diagram.face_measures[walls], kind="stable")]
-    found[face_owners(diagram)[walls]] = diagram.domain.boundary_index[
-        -1 - diagram.neighbors[walls]
-    ]
+    found[face_owners(diagram)[walls]] = diagram.domain.boundary_index[-1 - diagram.neighbors[walls]]
     return found
 
 
-def _on_boundaries(
-    domain: Domain, owner: np.ndarray, neighbor: np.ndarray, n: int
-) -> dict[str, np.ndarray]:
+def _on_boundaries(domain: Domain, owner: np.ndarray, neighbor: np.ndarray, n: int) -> dict[str, np.ndarray]:
     """Return for each boundary that the caller has named which of `n` cells have a face on it, (n,) uint8."""
     on_wall = neighbor < 0
     part, cell = domain.boundary_index[-1 - neighbor[on_wall]], owner[on_wall]
@@ -286,10 +280,7 @@ class _Appended:
         label = "" if name is None else f" Name={quoteattr(name)}"
         components += f' NumberOfTuples="{len(data)}"' if tuples else ""
         kind = _TYPES[data.dtype.str[1:]]
-        element = (
-            f'<DataArray type="{kind}"{label}{components} format="appended" '
-            f'offset="{self._offset}"/>'
-        )
+        element = f'<DataArray type="{kind}"{label}{components} format="appended" offset="{self._offset}"/>'
         chunk = _packed(data.tobytes()) if self.compress else _measured(data.tobytes())
         self.chunks.append(chunk)
         self._offset += len(chunk)

@@ -147,15 +147,19 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
     kites = _kites(d, own[corners], *sides) / d.volumes[owner[corners]]
     ratio = d.measures.face_ratio
     return CGridMeasures(
-        angles, corners, kites, np.where(inner, relative, 0.0),
-        np.where(inner, d.face_measures / distance, 0.0), away / np.sqrt(d.volumes), ratio, inner,
+        angles,
+        corners,
+        kites,
+        np.where(inner, relative, 0.0),
+        np.where(inner, d.face_measures / distance, 0.0),
+        away / np.sqrt(d.volumes),
+        ratio,
+        inner,
         *_cells_around(d, corners, after),
-    )  # fmt: skip
+    )
 
 
-def _angles(
-    vertex: np.ndarray, middle: np.ndarray, normal: np.ndarray, distance: np.ndarray
-) -> np.ndarray:
+def _angles(vertex: np.ndarray, middle: np.ndarray, normal: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Return the angles in degrees under which Delaunay edges appear from the circles around their vertices, (k,).
 
     By the inscribed angle theorem this is the angle opposite to the edge in any triangle of generators on the circle.
@@ -171,9 +175,7 @@ def _angles(
     return np.degrees(np.arctan2(distance / 2, height))
 
 
-def _cells_around(
-    d: Diagram, corners: np.ndarray, after: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _cells_around(d: Diagram, corners: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return how many cells meet where half-faces begin, and which corner of a vertex is its first one, (k,) each.
 
     A walk around the vertex needs no numbers of vertices, which differ between images across seams.
@@ -193,9 +195,7 @@ def _cells_around(
     return counts, first
 
 
-def _kites(
-    d: Diagram, own: np.ndarray, before: np.ndarray, vertex: np.ndarray, after: np.ndarray
-) -> np.ndarray:
+def _kites(d: Diagram, own: np.ndarray, before: np.ndarray, vertex: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the signed areas of quadrilaterals own, before, vertex, after, counter-clockwise, (k,)."""
     if isinstance(d.domain, Sphere):
         a, p, v, q = (d.domain.wrap(x) / d.domain.radius for x in (own, before, vertex, after))

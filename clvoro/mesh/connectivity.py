@@ -122,9 +122,7 @@ def inverse(starts: np.ndarray, items: np.ndarray, size: int) -> tuple[np.ndarra
     """Return for each of `size` items the rows of the ragged array `starts` and `items` that have it, also ragged."""
     import scipy.sparse
 
-    rows = scipy.sparse.csc_array(
-        (np.ones(len(items), np.int8), items, starts), (size, len(starts) - 1)
-    ).tocsr()
+    rows = scipy.sparse.csc_array((np.ones(len(items), np.int8), items, starts), (size, len(starts) - 1)).tocsr()
     return rows.indptr, rows.indices
 
 

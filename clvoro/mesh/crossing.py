@@ -66,9 +66,7 @@ def rings_around(diagram: Diagram, inside: np.ndarray, count: int) -> np.ndarray
     return ring
 
 
-def _heights(
-    normal: np.ndarray, begin: np.ndarray, end: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _heights(normal: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances of both ends from the planes with these normals, not negative."""
     a, b = -(normal * begin).sum(axis=1), (normal * end).sum(axis=1)
     return np.maximum(a, 0), np.maximum(b, 0)

@@ -40,6 +40,4 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
     fans = np.maximum(counts - 2, 0)
     apex = np.repeat(first, fans)
     step = 1 + np.arange(len(apex)) - np.repeat(np.cumsum(fans) - fans, fans)
-    return np.column_stack([cells[apex], cells[apex + step], cells[apex + step + 1]]).astype(
-        np.int32
-    )
+    return np.column_stack([cells[apex], cells[apex + step], cells[apex + step + 1]]).astype(np.int32)

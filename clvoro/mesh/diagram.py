@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..adapter import Adapter
     from ..finite_volumes.gate import Solver, SolverReport
     from ..finite_volumes.solver_mesh import WallShape
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
     from .cell import Cell
     from .check.findings import Report
     from .faces import Faces
@@ -296,9 +296,7 @@ class Diagram(LazyArrays, MeshOutput):
     @overload
     def check(self, solver: Solver, *, walls: WallShape | None = None) -> SolverReport: ...
 
-    def check(
-        self, solver: Solver | None = None, *, walls: WallShape | None = None
-    ) -> Report | SolverReport:
+    def check(self, solver: Solver | None = None, *, walls: WallShape | None = None) -> Report | SolverReport:
         """Verify the diagram on the host: graph, faces, volumes, and the Voronoi property.
 
         Parameters
@@ -332,9 +330,7 @@ class Diagram(LazyArrays, MeshOutput):
         """
         if solver is None:
             if walls is not None:
-                raise InputError(
-                    f"walls is {walls!r:.60}, and no solver; say which one: solver='openfoam'"
-                )
+                raise InputError(f"walls is {walls!r:.60}, and no solver; say which one: solver='openfoam'")
             from .check import check_diagram
 
             return check_diagram(self)

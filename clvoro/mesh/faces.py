@@ -132,11 +132,7 @@ def make_faces(diagram: Diagram) -> Faces:
 
 
 def _correct_cut_faces(
-    diagram: Diagram,
-    t: FaceTopology,
-    normal: np.ndarray,
-    distance: np.ndarray,
-    center: np.ndarray,
+    diagram: Diagram, t: FaceTopology, normal: np.ndarray, distance: np.ndarray, center: np.ndarray
 ) -> None:
     """Take the normals of faces that are not on the bisector of their generators from their ends."""
     k = np.flatnonzero(t.neighbor >= 0)

@@ -11,7 +11,7 @@ from ..opencl.probe import check_process
 from .read_only import read_only
 
 if TYPE_CHECKING:
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
 
 
 class LazyArrays:
@@ -26,14 +26,23 @@ class LazyArrays:
     """
 
     _NAMES = (
-        "points", "volumes", "centroids", "neighbor_starts", "neighbors", "shifts",
-        "face_measures", "face_centroids", "vertices", "cell_vertex_starts", "cell_vertices", "face_vertex_starts",
-        "face_vertices", "weights",
-    )  # fmt: skip
+        "points",
+        "volumes",
+        "centroids",
+        "neighbor_starts",
+        "neighbors",
+        "shifts",
+        "face_measures",
+        "face_centroids",
+        "vertices",
+        "cell_vertex_starts",
+        "cell_vertices",
+        "face_vertex_starts",
+        "face_vertices",
+        "weights",
+    )
 
-    def __init__(
-        self, domain: Domain, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]
-    ) -> None:
+    def __init__(self, domain: Domain, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]) -> None:
         self.domain = domain
         self._arrays = {n: a if callable(a) else read_only(a) for n, a in arrays.items()}
 
@@ -43,15 +52,11 @@ class LazyArrays:
             there = "" if name.startswith("_") else f"; it has {', '.join(self._there())}"
             raise AttributeError(f"a Diagram has no {name!r}{there}", name=name, obj=self)
         if name == "shifts" and name not in self._arrays:
-            self._arrays[name] = read_only(
-                np.zeros((len(self.neighbors), self.domain.dim), np.int8)
-            )
+            self._arrays[name] = read_only(np.zeros((len(self.neighbors), self.domain.dim), np.int8))
         if name == "weights" and not self.is_power:
             return read_only(np.zeros(len(self.points)))
         if name not in self._arrays:
-            raise AttributeError(
-                f"a diagram in {self.domain.dim}D has no {name}; it has {', '.join(self._there())}"
-            )
+            raise AttributeError(f"a diagram in {self.domain.dim}D has no {name}; it has {', '.join(self._there())}")
         value = self._arrays[name]
         if callable(value):
             check_process()  # it may still be on a device

@@ -183,10 +183,13 @@ class MeshOutput:
 
         # Not `_self`: `clvoro.io.save` may get an object that is no mesh, which `write_mesh` refuses.
         write_mesh(
-            cast("Result | Diagram", self), path, cell_data, walls,
+            cast("Result | Diagram", self),
+            path,
+            cell_data,
+            walls,
             for_foam={"patches": patches, "types": types, "thickness": thickness, "binary": binary},
             for_netcdf={"convention": convention, "units": units},
-        )  # fmt: skip
+        )
 
     def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> SolverMesh:
         """Return the mesh as a finite-volume solver sees it: points, and each face with corners, owner and neighbor.
@@ -312,14 +315,27 @@ class MeshOutput:
 
         chosen = self.default_color if isinstance(color, str) and color == "default" else color
         return draw_mesh(
-            cast("Result | Diagram", self), chosen, view, label=label, ax=ax, limits=limits,
-            window=window, normal=normal, through=through, cut=cut, angles=angles, projection=projection,
-            center=center, across=across, coasts=coasts, edges=edges, key=key, title=title,
-        )  # fmt: skip
+            cast("Result | Diagram", self),
+            chosen,
+            view,
+            label=label,
+            ax=ax,
+            limits=limits,
+            window=window,
+            normal=normal,
+            through=through,
+            cut=cut,
+            angles=angles,
+            projection=projection,
+            center=center,
+            across=across,
+            coasts=coasts,
+            edges=edges,
+            key=key,
+            title=title,
+        )
 
-    def to_pyvista(
-        self, cell_data: Mapping[str, ArrayLike] | None = None
-    ) -> pyvista.UnstructuredGrid:
+    def to_pyvista(self, cell_data: Mapping[str, ArrayLike] | None = None) -> pyvista.UnstructuredGrid:
         """Return the cells as an unstructured grid of PyVista.
 
         Parameters

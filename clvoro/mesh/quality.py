@@ -122,12 +122,9 @@ class Measures:
         spherical = self.diagram is not None and isinstance(self.diagram.domain, Sphere)
         of_c_grid = self.c_grid.summary() if spherical else {}
         angle, ratio = (
-            values[self.inner] if self.inner.any() else values
-            for values in (self.centroid_angle, self.volume_ratio)
+            values[self.inner] if self.inner.any() else values for values in (self.centroid_angle, self.volume_ratio)
         )
-        skewness = (
-            self.skewness[self.inner] if self.polygonal and self.inner.any() else self.skewness
-        )
+        skewness = self.skewness[self.inner] if self.polygonal and self.inner.any() else self.skewness
         return {
             "mean_faces": float(self.faces.mean()),
             "mean_quality": float(self.quality.mean()),
@@ -203,9 +200,7 @@ def measure_mesh(diagram: Diagram) -> Measures:
     here, there = volumes[owner], np.where(inner, volumes[other], volumes[owner])
     ratio = np.maximum(here, there) / np.minimum(here, there)
     polygonal = isinstance(diagram.domain, Polygon)
-    return Measures(
-        quality, skewness, angle, smallest / largest, ratio, counts, inner, polygonal, diagram
-    )
+    return Measures(quality, skewness, angle, smallest / largest, ratio, counts, inner, polygonal, diagram)
 
 
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:

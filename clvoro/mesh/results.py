@@ -124,9 +124,7 @@ class Result(Sealed, MeshOutput):
     @overload
     def check(self, solver: Solver, *, walls: WallShape | None = None) -> SolverReport: ...
 
-    def check(
-        self, solver: Solver | None = None, *, walls: WallShape | None = None
-    ) -> Report | SolverReport:
+    def check(self, solver: Solver | None = None, *, walls: WallShape | None = None) -> Report | SolverReport:
         """Verify diagram, sizes, error, quality and history on the host, or the mesh of a solver.
 
         See `Diagram.check`.

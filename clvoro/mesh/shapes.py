@@ -32,9 +32,7 @@ def cell_shapes(diagram: Diagram) -> np.ndarray:
     rings = np.full(len(sizes), None, object)
     kept = usable[ring]
     numbers = np.cumsum(usable) - 1
-    rings[usable] = shapely.linearrings(
-        diagram.vertices[ends[place[kept], 0]], indices=numbers[ring[kept]]
-    )
+    rings[usable] = shapely.linearrings(diagram.vertices[ends[place[kept], 0]], indices=numbers[ring[kept]])
     lone = np.bincount(of[usable], minlength=len(diagram))[of] == 1
     cells[of[usable & lone]] = shapely.polygons(rings[usable & lone])
     several = np.flatnonzero(usable & ~lone)
@@ -51,9 +49,7 @@ def _joined(rings: np.ndarray) -> Any:
     outer = shapely.is_ccw(rings)
     parts = [_areas(shapely.make_valid(part)) for part in np.asarray(shapely.polygons(rings))]
     whole = shapely.union_all([p for p, o in zip(parts, outer, strict=True) if o])
-    return shapely.difference(
-        whole, shapely.union_all([p for p, o in zip(parts, outer, strict=True) if not o])
-    )
+    return shapely.difference(whole, shapely.union_all([p for p, o in zip(parts, outer, strict=True) if not o]))
 
 
 def _areas(shape: Any) -> Any:

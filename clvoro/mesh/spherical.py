@@ -32,9 +32,7 @@ def rebuild_on_sphere(diagram: Diagram) -> dict[str, np.ndarray]:
     }
 
 
-def bisector_corners(
-    starts: np.ndarray, normals: np.ndarray, levels: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def bisector_corners(starts: np.ndarray, normals: np.ndarray, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where the bisectors of each cell cross those before them, in the tangent plane at the generator.
 
     Parameters

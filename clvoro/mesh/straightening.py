@@ -131,10 +131,7 @@ def _stretches(
     edges = _places(diagram, domain)
     begins = _beginnings(domain, following, edges, owner)
     onward, of_face, cells = following.tolist(), edges.tolist(), owner.tolist()
-    next_edge, turns = (
-        domain.oriented.next_vertex.tolist(),
-        list(domain.oriented.turns.astype(real)),
-    )
+    next_edge, turns = (domain.oriented.next_vertex.tolist(), list(domain.oriented.turns.astype(real)))
     stretch = np.full(len(edges), -1)
     first: list[int] = []
     final: list[int] = []
@@ -188,9 +185,7 @@ def along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
     return following
 
 
-def _beginnings(
-    domain: Polygon, following: np.ndarray, edges: np.ndarray, owner: np.ndarray
-) -> list[int]:
+def _beginnings(domain: Polygon, following: np.ndarray, edges: np.ndarray, owner: np.ndarray) -> list[int]:
     """Return the half-faces on the boundary with which a cell's part of a ring begins; none for a whole hole."""
     rows = np.flatnonzero(edges >= 0)
     goes_on = rows[following[rows] >= 0]

@@ -18,9 +18,7 @@ def narrow_cells(diagram: Diagram, water: np.ndarray) -> np.ndarray:
     return water & (np.bincount(face_owners(diagram), ends, len(diagram)) >= 2)
 
 
-def widen_straits(
-    diagram: Diagram, water: np.ndarray, fixed: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def widen_straits(diagram: Diagram, water: np.ndarray, fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return `water` with more cells, so that no strait is a single cell wide, and the cells where that is impossible.
 
     Beside a narrow cell one run of land between two runs of water becomes water, the shortest one that can. A land cell
@@ -71,9 +69,7 @@ def _land_runs(ring: list[int], wet: np.ndarray) -> list[list[int]]:
     return runs
 
 
-def _flood(
-    run: list[int], wet: np.ndarray, fixed: np.ndarray, starts: list[int], neighbors: np.ndarray
-) -> bool:
+def _flood(run: list[int], wet: np.ndarray, fixed: np.ndarray, starts: list[int], neighbors: np.ndarray) -> bool:
     """Make a run of land cells water, from its begin on; if one of them must stay land, change nothing."""
     done: list[int] = []
     for cell in run:

@@ -61,9 +61,7 @@ def check_mask(name: str, mask: object, n: int) -> np.ndarray:
     array = np.asarray(mask)
     if array.dtype != bool:
         remedy = f"; write {name} == 1, or use np.isin" if array.dtype.kind in "iuf" else ""
-        raise InputTypeError(
-            f"{name} has dtype {array.dtype}, expected an array of {n} bool, one per cell{remedy}"
-        )
+        raise InputTypeError(f"{name} has dtype {array.dtype}, expected an array of {n} bool, one per cell{remedy}")
     if array.shape != (n,):
         grid = "; for a mask on a grid pass a function of longitude and latitude that looks it up"
         raise InputError(

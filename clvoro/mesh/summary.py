@@ -15,9 +15,7 @@ def summary(result: Result) -> dict[str, Any]:
     """Return the figures of a run; see `Result.summary`."""
     error, history = np.abs(result.size_error), result.history
     parts = beside_boundary(result) if isinstance(result.diagram.domain, Polygon) else {}
-    apart = {
-        f"{part}_{name}": value for part, some in parts.items() for name, value in some.items()
-    }
+    apart = {f"{part}_{name}": value for part, some in parts.items() for name, value in some.items()}
     return {
         "cells": len(result.points),
         "steps": int(history["step"][-1]) if len(history) else 0,

@@ -127,15 +127,11 @@ def tabulate(profile: Profile) -> str:
     for name, spans in groups.items():
         cells = max(s.cells or 0 for s in spans)
         read = statistics.median(s.read for s in spans)
-        notes.append(
-            f"{name}: {len(spans)} steps, up to {cells} cells; the host read {read:.0f} bytes a step"
-        )
+        notes.append(f"{name}: {len(spans)} steps, up to {cells} cells; the host read {read:.0f} bytes a step")
     return "\n".join([_aligned(stages), "", _aligned(kernels), "", *notes])
 
 
-def _kernel_row(
-    cost: Cost, time_of: Callable[[float], list[str]], moving: Callable[[Cost], list[str]]
-) -> list[str]:
+def _kernel_row(cost: Cost, time_of: Callable[[float], list[str]], moving: Callable[[Cost], list[str]]) -> list[str]:
     calls = max(cost.calls, 1)
     moved = "-" if cost.rate is None else f"{1e-6 * cost.bytes / calls:.3f}"
     per_call = [f"{1e6 * cost.seconds / calls:.1f}", moved]
@@ -146,9 +142,8 @@ def _aligned(rows: list[list[str]]) -> str:
     """Return `rows` as text: the first column to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
-        "  ".join([
-            row[0].ljust(widths[0]),
-            *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
-        ])
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        )
         for row in rows
-    )  # fmt: skip
+    )

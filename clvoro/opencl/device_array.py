@@ -19,9 +19,19 @@ import pyopencl.array as cla
 from .memory_limits import check_allocation
 
 _ATTRIBUTES = {
-    "queue", "context", "shape", "dtype", "strides", "events", "nbytes", "size", "allocator", "base_data", "offset",
+    "queue",
+    "context",
+    "shape",
+    "dtype",
+    "strides",
+    "events",
+    "nbytes",
+    "size",
+    "allocator",
+    "base_data",
+    "offset",
     "_flags",
-}  # fmt: skip
+}
 """What PyOpenCL's constructor sets."""
 
 
@@ -86,9 +96,7 @@ class DeviceArray(cla.Array):
             return make_array(queue, (), self.dtype, buffer, offset)
         return super().__getitem__(index)
 
-    def get(
-        self, queue: cl.CommandQueue | None = None, ary: np.ndarray | None = None
-    ) -> np.ndarray:
+    def get(self, queue: cl.CommandQueue | None = None, ary: np.ndarray | None = None) -> np.ndarray:
         """Fetch the content."""
         if queue is not None or ary is not None or not self.size:
             return super().get(queue, ary)

@@ -222,9 +222,7 @@ def format_devices(devices: Sequence[DeviceInfo]) -> str:
     if any(d.default for d in devices):
         lines.append("* is the default.")
     elif os.environ.get("PYOPENCL_CTX"):
-        lines.append(
-            f"PYOPENCL_CTX={os.environ['PYOPENCL_CTX']!r} does not select a working device."
-        )
+        lines.append(f"PYOPENCL_CTX={os.environ['PYOPENCL_CTX']!r} does not select a working device.")
     else:
         lines.append(f"There is no default: {INSTALL_HINT}.")
     return "\n".join(lines)
@@ -357,9 +355,7 @@ def _try_device(device: cl.Device, fp64: bool) -> tuple[cl.Context | None, str]:
     return (None, reason) if reason else (ctx, "")
 
 
-def _default_index(
-    found: Iterable[_Candidate], reasons: dict[str, str], avoid: Iterable[str]
-) -> str | None:
+def _default_index(found: Iterable[_Candidate], reasons: dict[str, str], avoid: Iterable[str]) -> str | None:
     """Return the index of the device that `create_context()` takes.
 
     `avoid` has names of platforms that must not be queried.

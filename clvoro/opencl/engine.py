@@ -45,8 +45,11 @@ class DomainKind(NamedTuple):
     def defines(self) -> dict[str, object]:
         """Macros for kernels; see geometry/domain.h."""
         macros = {
-            "PERIODIC": self.periodic, "POLYGON": self.polygonal, "SPHERE": self.spherical, "WEIGHTED": self.weighted,
-        }  # fmt: skip
+            "PERIODIC": self.periodic,
+            "POLYGON": self.polygonal,
+            "SPHERE": self.spherical,
+            "WEIGHTED": self.weighted,
+        }
         return {name: 1 for name, is_set in macros.items() if is_set}
 
 
@@ -131,16 +134,26 @@ class Engine:
     def single(self) -> Engine:
         """Return an engine in float32 that shares workspace and kernels with this one."""
         return Engine(
-            self.ctx, self.queue, self.dim, np.dtype(np.float32), self.domain_kind, workspace=self.workspace,
+            self.ctx,
+            self.queue,
+            self.dim,
+            np.dtype(np.float32),
+            self.domain_kind,
+            workspace=self.workspace,
             pool=self.pool,
-        )  # fmt: skip
+        )
 
     def weighted(self) -> Engine:
         """Return an engine for power diagrams that shares workspace and kernels with this one."""
         return Engine(
-            self.ctx, self.queue, self.dim, self.real, self.domain_kind._replace(weighted=True),
-            workspace=self.workspace, pool=self.pool,
-        )  # fmt: skip
+            self.ctx,
+            self.queue,
+            self.dim,
+            self.real,
+            self.domain_kind._replace(weighted=True),
+            workspace=self.workspace,
+            pool=self.pool,
+        )
 
     @property
     def site_size(self) -> int:
@@ -169,11 +182,7 @@ class Engine:
         return "double" if real == np.float64 else "float"
 
     def kernels(
-        self,
-        stage: str,
-        defines: Mapping[str, object] | None = None,
-        prelude: str = "",
-        group_size: int | None = None,
+        self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = "", group_size: int | None = None
     ) -> Kernels:
         """Return the kernels of `cl_kernels/<stage>.cl`; see `Kernels`.
 
@@ -191,8 +200,10 @@ class Engine:
         # Called through the module, because tests replace the function.
         return Kernels(
             lambda size: program.build_program(self.ctx, name, {**full, "GROUP_SIZE": size}, prelude),
-            stage, self.pool, group_size or self.group_size,
-        )  # fmt: skip
+            stage,
+            self.pool,
+            group_size or self.group_size,
+        )
 
     def all_defines(self, stage: str, defines: Mapping[str, object]) -> dict[str, object]:
         """Return `defines` and those macros of the engine that `cl_kernels/<stage>.cl` names."""
@@ -200,13 +211,9 @@ class Engine:
         text = program.source_text(f"{stage}.cl")
         optional = {"FACE": self.name_of(self.face), **self.domain_kind.defines}
         named = {name: value for name, value in optional.items() if name in text}
-        return {
-            "DIM": self.dim, "REAL": self.name_of(self.real), "GROUP_SIZE": self.group_size, **named, **defines,
-        }  # fmt: skip
+        return {"DIM": self.dim, "REAL": self.name_of(self.real), "GROUP_SIZE": self.group_size, **named, **defines}
 
-    def run(
-        self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None
-    ) -> cl.Event:
+    def run(self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None) -> cl.Event:
         """Enqueue `kernel` over at least `size` work-items; arrays are passed as their buffers.
 
         `size` is rounded up to whole work-groups of `group` items, or fewer if the device requires it. The kernel must
@@ -228,9 +235,7 @@ class Engine:
             return enqueue_ranges(self.queue, kernel, items, group, range_of(kernel))
         return cl.enqueue_nd_range_kernel(self.queue, kernel, (items,), (group,))
 
-    def run_each(
-        self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None
-    ) -> cl.Event:
+    def run_each(self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None) -> cl.Event:
         """Enqueue `kernel` over `size` work-items; `size` is its first argument (see WORK_ITEM in opencl/real.h)."""
         size = int(size)
         return self.run(kernel, size, size, *args, group=group)

@@ -27,9 +27,7 @@ ARRAYS = "arrays"
 class Watcher(Protocol):
     """Called with each event, its stage and kernel, its bytes if known, and whether it has ended."""
 
-    def __call__(
-        self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False
-    ) -> None:
+    def __call__(self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False) -> None:
         """Take one event."""
         ...
 
@@ -47,9 +45,7 @@ class Tally:
         self.calls: Counter[tuple[str, str]] = Counter()
         self.bytes: Counter[tuple[str, str]] = Counter()
 
-    def __call__(
-        self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False
-    ) -> None:
+    def __call__(self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False) -> None:
         """Count one command."""
         self.calls[stage, name] += 1
         self.bytes[stage, name] += moved or 0
@@ -112,9 +108,7 @@ def _enqueue_kernel(queue: cl.CommandQueue, kernel: cl.Kernel, *args: Any, **opt
     return event
 
 
-def _call_kernel(
-    kernel: cl.Kernel, queue: cl.CommandQueue, size: Any, group: Any, *args: Any, **options: Any
-) -> Any:
+def _call_kernel(kernel: cl.Kernel, queue: cl.CommandQueue, size: Any, group: Any, *args: Any, **options: Any) -> Any:
     event = _original["__call__"](kernel, queue, size, group, *args, **options)
     for watch in _of(queue):
         stage = getattr(kernel, "stage", ARRAYS)
@@ -150,9 +144,7 @@ def _enqueue_copy(queue: cl.CommandQueue, dest: Any, src: Any, **options: Any) -
     return event
 
 
-def _enqueue_fill(
-    queue: cl.CommandQueue, dest: Any, pattern: Any, size: int, *args: Any, **options: Any
-) -> Any:
+def _enqueue_fill(queue: cl.CommandQueue, dest: Any, pattern: Any, size: int, *args: Any, **options: Any) -> Any:
     event = _original["enqueue_fill"](queue, dest, pattern, size, *args, **options)
     for watch in _of(queue):
         watch(event, MEMORY, "fill", size)

@@ -97,9 +97,7 @@ class Kernels(SimpleNamespace):
         built again for smaller ones.
     """
 
-    def __init__(
-        self, build: Callable[[int], cl.Program], stage: str, pool: KernelPool, group_size: int = 1
-    ) -> None:
+    def __init__(self, build: Callable[[int], cl.Program], stage: str, pool: KernelPool, group_size: int = 1) -> None:
         super().__init__(_build=build, _stage=stage, _pool=pool, _group_size=group_size)
 
     def __getattr__(self, name: str) -> cl.Kernel:
@@ -144,9 +142,7 @@ def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:
         pairs = enumerate(zip(key, before, strict=True))
         changed = [k for k, (new, old) in pairs if new is not old and new != old]
     elif len(args) != kernel.num_args:
-        raise TypeError(
-            f"{kernel.function_name} got {len(args)} arguments, expected {kernel.num_args}"
-        )
+        raise TypeError(f"{kernel.function_name} got {len(args)} arguments, expected {kernel.num_args}")
     kernel.bound = None  # type: ignore[attr-defined]
     set_changed(kernel, args, changed)
     kernel.bound = key  # type: ignore[attr-defined]
@@ -182,7 +178,5 @@ def set_changed(kernel: cl.Kernel, args: Sequence[Any], changed: Iterable[int]) 
             kernel.set_arg(k, a)
 
 
-_set_number: Callable[[cl.Kernel, int, Any], None] = getattr(
-    cl.Kernel, "_set_arg_buf", cl.Kernel.set_arg
-)
+_set_number: Callable[[cl.Kernel, int, Any], None] = getattr(cl.Kernel, "_set_arg_buf", cl.Kernel.set_arg)
 """Sets a number or vector. `set_arg` first tries all other types, which takes ten times as long as a launch."""

@@ -60,9 +60,7 @@ class Launch:
         Number of work-groups, by default the engine's.
     """
 
-    def __init__(
-        self, engine: Engine, kernel: cl.Kernel, *args: object, groups: int | None = None
-    ) -> None:
+    def __init__(self, engine: Engine, kernel: cl.Kernel, *args: object, groups: int | None = None) -> None:
         self._args, self._kernel = args, kernel
         self._bind()
         self._queue = engine.queue

@@ -128,9 +128,7 @@ def _work(engine: Engine, recorded: dict) -> Work:
             text, more = shorten(text)
             options = (*options, *more)
         programs.append((text, options))
-    launches = [
-        Launch(places[index], *rest) for index, *rest in recorded["launches"] if index in places
-    ]
+    launches = [Launch(places[index], *rest) for index, *rest in recorded["launches"] if index in places]
     return Work(programs, launches)
 
 
@@ -170,8 +168,10 @@ def _start(device: cl.Device) -> None:
         with contextlib.suppress(OSError, ValueError):
             worker = subprocess.Popen(
                 [sys.executable, "-c", code, *map(str, index)],
-                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            )  # fmt: skip
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
             _workers.append(worker)
             _waiting.append(worker)
     if _workers:

@@ -34,12 +34,7 @@ class Scan:
         self._sums = engine.empty(engine.groups, np.int32)
 
     def exclusive(
-        self,
-        values: cla.Array,
-        out: cla.Array,
-        n: int,
-        first: int = 0,
-        total: tuple[cla.Array, int] | None = None,
+        self, values: cla.Array, out: cla.Array, n: int, first: int = 0, total: tuple[cla.Array, int] | None = None
     ) -> None:
         """Write the n + 1 exclusive prefix sums of ``values[first : first + n]`` to ``out[: n + 1]``.
 
@@ -107,19 +102,13 @@ class Summaries:
             vector = np.array(slots + [0] * len(spare), np.int32)
             self._slots_of[names] = vector, sum(1 << slot for slot in slots)
         slots, which = self._slots_of[names]
-        self.engine.run_blocks(
-            self._kernels.summarize_blocks, *given, *spare, len(given), n, slots, self._partials,
-        )  # fmt: skip
+        self.engine.run_blocks(self._kernels.summarize_blocks, *given, *spare, len(given), n, slots, self._partials)
         self._pending, self._known = self._pending | which, None
 
-    def collect_lengths(
-        self, names: tuple[str, str], u: cla.Array, v: cla.Array, unit: cla.Array
-    ) -> None:
+    def collect_lengths(self, names: tuple[str, str], u: cla.Array, v: cla.Array, unit: cla.Array) -> None:
         """Summarize the lengths of `u` and `v`, (n, d), over `unit` (n,) into the slots of two names."""
         one, two = (self.slots[name] for name in names)
-        self.engine.run_blocks(
-            self._kernels.summarize_lengths, u, v, unit, len(unit), one, two, self._partials
-        )
+        self.engine.run_blocks(self._kernels.summarize_lengths, u, v, unit, len(unit), one, two, self._partials)
         self._pending, self._known = self._pending | 1 << one | 1 << two, None
 
     @property
@@ -134,9 +123,18 @@ class Summaries:
         """Combine the partial summaries. The record also gets at most two int32 arrays, so that one read has all."""
         counts, arrays = [*map(len, notes), 0, 0], [*notes, self._record, self._record]
         self.engine.run_groups(
-            self._kernels.combine_blocks, len(self.slots), self._partials, self.engine.groups, self._pending,
-            counts[0], arrays[0], counts[1], arrays[1], self._values, self._record,
-        )  # fmt: skip
+            self._kernels.combine_blocks,
+            len(self.slots),
+            self._partials,
+            self.engine.groups,
+            self._pending,
+            counts[0],
+            arrays[0],
+            counts[1],
+            arrays[1],
+            self._values,
+            self._record,
+        )
         self._pending = 0
 
     def read_one(self, name: str) -> Summary:
@@ -174,9 +172,7 @@ class Gather:
         """Return a new array whose row p is ``array[items[p]]``."""
         shape = (items.shape[0], *array.shape[1:])
         out = self.engine.empty(shape, array.dtype)
-        self.engine.run_each(
-            self._kernels.gather_rows, shape[0], items, array, _words_of(array), out
-        )
+        self.engine.run_each(self._kernels.gather_rows, shape[0], items, array, _words_of(array), out)
         return out
 
     def lists(self, lists: Lists, array: cla.Array, names: cla.Array | None = None) -> cla.Array:

@@ -105,9 +105,7 @@ class Profile:
 
     # Called by the hooks and by the run.
 
-    def _add(
-        self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False
-    ) -> None:
+    def _add(self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False) -> None:
         """Record a command; `moved` are its bytes, if known, and `done` is True if it has ended."""
         entry = (event, (stage, name), moved, self._span)
         if done:
@@ -210,16 +208,12 @@ class Profile:
             "building": self.building,
             "bandwidth": self.bandwidth,
             "stages": [{"stage": name, **figures(cost)} for name, cost in self.stages().items()],
-            "kernels": [
-                {"stage": stage, "kernel": name, **figures(cost)}
-                for (stage, name), cost in self.ranked()
-            ],
+            "kernels": [{"stage": stage, "kernel": name, **figures(cost)} for (stage, name), cost in self.ranked()],
             "spans": [
-                {"step": s.step, "level": s.level, "cells": s.cells, "wall": s.wall,
-                 "stages": dict(s.stages)}
+                {"step": s.step, "level": s.level, "cells": s.cells, "wall": s.wall, "stages": dict(s.stages)}
                 for s in self.spans
             ],
-        }  # fmt: skip
+        }
 
     def table(self) -> str:
         """Return stages and kernels as tables in plain text."""
@@ -229,8 +223,7 @@ class Profile:
     def _require_closed(self) -> None:
         if not self.spans or self.spans[-1].step is not None:
             raise InputError(
-                "the profile is open or has never been opened, expected a closed one; use it after "
-                "the `with` block"
+                "the profile is open or has never been opened, expected a closed one; use it after the `with` block"
             )
 
     def ranked(self) -> list[tuple[tuple[str, str], Cost]]:

@@ -70,9 +70,7 @@ def _paste(name: str, seen: set[str]) -> str:
     return "\n".join(lines)
 
 
-def build_program(
-    ctx: cl.Context, name: str, defines: Mapping[str, object], prelude: str
-) -> cl.Program:
+def build_program(ctx: cl.Context, name: str, defines: Mapping[str, object], prelude: str) -> cl.Program:
     """Build `cl_kernels/<name>` after `prelude`; the same text on the same context is built once.
 
     Raises
@@ -108,9 +106,7 @@ def _build_once(ctx: cl.Context, text: str, options: tuple[str, ...]) -> cl.Prog
     return program
 
 
-def build_in_threads(
-    ctx: cl.Context, programs: Iterable[tuple[str, tuple[str, ...]]], threads: int
-) -> None:
+def build_in_threads(ctx: cl.Context, programs: Iterable[tuple[str, tuple[str, ...]]], threads: int) -> None:
     """Begin to build `programs`, (text, options), in their order.
 
     `build_program` waits for a program that a thread builds, and builds others itself.
@@ -159,17 +155,13 @@ def _silenced() -> Iterator[None]:
                     warnings.filters.remove(_IGNORED)  # type: ignore[attr-defined]
 
 
-def program_text(
-    name: str, defines: Mapping[str, object], prelude: str
-) -> tuple[str, tuple[str, ...]]:
+def program_text(name: str, defines: Mapping[str, object], prelude: str) -> tuple[str, tuple[str, ...]]:
     """Return the text of the program in `cl_kernels/<name>` after `prelude`, and its options."""
     options = tuple(f"-D{key}={value}" for key, value in sorted(defines.items()))
     return prelude + "\n" + source_text(name), options
 
 
-def compile_text(
-    ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True
-) -> cl.Program:
+def compile_text(ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True) -> cl.Program:
     """Build `text`; if `short`, with the declarations of `shorten`."""
     device = ctx.devices[0]
     options = (*options, *device_options(device))

@@ -45,9 +45,7 @@ class Range:
         self.known = True
 
 
-def enqueue_ranges(
-    queue: cl.CommandQueue, kernel: cl.Kernel, items: int, group: int, limit: Range
-) -> cl.Event:
+def enqueue_ranges(queue: cl.CommandQueue, kernel: cl.Kernel, items: int, group: int, limit: Range) -> cl.Event:
     """Enqueue `kernel` over `items` work-items, whole work-groups of `group`, in ranges within `limit`."""
     begin = 0
     while True:

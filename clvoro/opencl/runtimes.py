@@ -58,9 +58,7 @@ def provide_cache() -> Path | None:
     """
     if not sys.platform.startswith("linux"):
         return None
-    with contextlib.suppress(
-        OSError, RuntimeError
-    ):  # the folder cannot be made, or the user has no home
+    with contextlib.suppress(OSError, RuntimeError):  # the folder cannot be made, or the user has no home
         place = cache_home()
         place.mkdir(parents=True, exist_ok=True)
         if _has_room(place):

@@ -5,9 +5,7 @@ from ..errors import ClvoroError
 try:
     import matplotlib  # noqa: F401
 except ModuleNotFoundError as error:
-    raise ClvoroError(
-        "pictures need Matplotlib, which is not installed; pip install 'clvoro[plot]'"
-    ) from error
+    raise ClvoroError("pictures need Matplotlib, which is not installed; pip install 'clvoro[plot]'") from error
 
 from .boundary import plot_boundaries
 from .cells import plot_cells, plot_size

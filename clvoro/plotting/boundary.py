@@ -10,7 +10,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
 from ..errors import InputError
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.shapes import Edges
 from .style import METHOD_COLORS, WIDTH, frame_domain, interactive_figure, single_height, styled
@@ -56,20 +56,19 @@ def plot_boundaries(domain: Domain, ax: Any = None, *, numbers: bool = False) ->
             color = METHOD_COLORS[k % len(METHOD_COLORS)]
             style = _DASHES[k // len(METHOD_COLORS) % len(_DASHES)]
             lines = LineCollection(
-                segments,
-                colors=color,
-                linestyles=style,
-                linewidths=2,
-                label=name,
-                zorder=3,
-                clip_on=False,
+                segments, colors=color, linestyles=style, linewidths=2, label=name, zorder=3, clip_on=False
             )
             ax.add_collection(lines, autolim=False)
             for wall, segment in zip(walls, segments, strict=True) if numbers else ():
                 ax.annotate(
-                    str(wall), segment.mean(axis=0), color=color, zorder=4, ha="center", va="center",
+                    str(wall),
+                    segment.mean(axis=0),
+                    color=color,
+                    zorder=4,
+                    ha="center",
+                    va="center",
                     bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
-                )  # fmt: skip
+                )
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, frameon=False)
     return ax.figure
 

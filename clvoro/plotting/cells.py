@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..arguments import format_point
 from ..errors import InputError
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
@@ -124,9 +124,7 @@ def draw_cells(
     """Add the filled polygons of the cells `shown` (indices), moved by `offsets`, to `ax`."""
     starts, corners = diagram.cell_vertex_starts, diagram.vertices[diagram.cell_vertices]
     bridged = np.diff(starts) > np.diff(diagram.neighbor_starts)
-    polygons = [
-        corners[starts[i] : starts[i + 1]] + by for i, by in zip(shown, offsets, strict=True)
-    ]
+    polygons = [corners[starts[i] : starts[i + 1]] + by for i, by in zip(shown, offsets, strict=True)]
     cells = PolyCollection(
         polygons,
         array=without_ends(values[shown]),
@@ -142,9 +140,7 @@ def draw_cells(
     return cells
 
 
-def draw_edges(
-    ax: Any, diagram: Diagram, shown: np.ndarray, offsets: np.ndarray, extent: np.ndarray
-) -> None:
+def draw_edges(ax: Any, diagram: Diagram, shown: np.ndarray, offsets: np.ndarray, extent: np.ndarray) -> None:
     """Add each face once, as a line; its width follows the size of its cells."""
     neighbors, owner = diagram.neighbors, face_owners(diagram)
     if not len(shown):
@@ -159,18 +155,10 @@ def draw_edges(
     first, last = (np.searchsorted(shown[order], owner, side) for side in ("left", "right"))
     counts = np.where(wanted, last - first, 0)  # images of the face's cell that are shown
     once = np.repeat(np.arange(len(owner)), counts)
-    image = order[
-        np.repeat(first, counts)
-        + np.arange(len(once))
-        - np.repeat(np.cumsum(counts) - counts, counts)
-    ]
+    image = order[np.repeat(first, counts) + np.arange(len(once)) - np.repeat(np.cumsum(counts) - counts, counts)]
     ends = diagram.vertices[face_ends(diagram)[once]] + offsets[image][:, None, :]
     lines = LineCollection(
-        list(ends),
-        colors=colors[once],
-        linewidths=thin[once],
-        capstyle="round",
-        rasterized=len(once) > 9000,
+        list(ends), colors=colors[once], linewidths=thin[once], capstyle="round", rasterized=len(once) > 9000
     )
     ax.add_collection(lines, autolim=False)
 
@@ -216,14 +204,10 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
         For a 3D domain.
     """
     if domain.dim != 2:
-        raise InputError(
-            f"the size field is drawn on 2D domains, and {domain} is in 3D; draw a slice of a mesh"
-        )
+        raise InputError(f"the size field is drawn on 2D domains, and {domain} is in 3D; draw a slice of a mesh")
     scheme = COLORINGS["size"]
     extent = domain.extent
-    counts = np.maximum(
-        (extent * np.sqrt(60_000 / max(domain.measure, extent.prod() / 8))).astype(int), 2
-    )
+    counts = np.maximum((extent * np.sqrt(60_000 / max(domain.measure, extent.prod() / 8))).astype(int), 2)
     x, y = (np.linspace(domain.lower[a], domain.upper[a], counts[a]) for a in (0, 1))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     shown, places = _inside(domain, points, 2 * float(np.hypot(*(extent / counts))))
@@ -267,9 +251,7 @@ def _inside(domain: Domain, points: np.ndarray, reach: float) -> tuple[np.ndarra
     return shown, points[shown]
 
 
-def _cells_in(
-    diagram: Diagram, lower: np.ndarray, upper: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _cells_in(diagram: Diagram, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (k,) of the cells, or of their images, that reach into the window, and offsets (k, 2)."""
     starts = diagram.cell_vertex_starts[:-1]
     corners = diagram.vertices[diagram.cell_vertices]
@@ -280,9 +262,7 @@ def _cells_in(
         by = step * diagram.domain.extent
         # An image must reach in by more than round-off.
         slack = 1e-9 * diagram.domain.extent * any(step)
-        seen = np.flatnonzero(
-            ((high + by >= lower + slack) & (low + by <= upper - slack)).all(axis=1)
-        )
+        seen = np.flatnonzero(((high + by >= lower + slack) & (low + by <= upper - slack)).all(axis=1))
         cells.append(seen)
         offsets.append(np.broadcast_to(by, (len(seen), 2)))
     return np.concatenate(cells), np.concatenate(offsets)

@@ -8,16 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import (
-    BoundaryNorm,
-    LinearSegmentedColormap,
-    ListedColormap,
-    LogNorm,
-    Normalize,
-)
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap, LogNorm, Normalize
 
 from ..errors import InputError, InputTypeError
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
@@ -40,9 +34,7 @@ _FAR = 3.0
 """Values of the caller are cut from the color scale if the scale would be that many times as long with them."""
 
 # Blue and red around white, without the darkest tenth at either end: faces must stay visible.
-_DIVERGING = LinearSegmentedColormap.from_list(
-    "error", colormaps["RdBu_r"](np.linspace(0.09, 0.91, 65))
-)
+_DIVERGING = LinearSegmentedColormap.from_list("error", colormaps["RdBu_r"](np.linspace(0.09, 0.91, 65)))
 
 
 @dataclass(frozen=True)
@@ -117,19 +109,10 @@ def _most(values: np.ndarray) -> tuple[float, float]:
 
 COLORINGS = {
     "error": Coloring(
-        "metric error $e$ [–]   (< 0 too small, > 0 too large)",
-        lambda r: r.size_error,
-        _DIVERGING,
-        _symmetric,
+        "metric error $e$ [–]   (< 0 too small, > 0 too large)", lambda r: r.size_error, _DIVERGING, _symmetric
     ),
     "quality": Coloring("cell quality $Q$ [–]", lambda r: r.quality, "viridis", _up_to_one),
-    "size": Coloring(
-        "target size $h$",
-        lambda r: r.target_size,
-        "viridis",
-        _span,
-        logarithmic=True,
-    ),
+    "size": Coloring("target size $h$", lambda r: r.target_size, "viridis", _span, logarithmic=True),
     "sides": Coloring(
         "number of sides",
         lambda r: np.clip(count_sides(r.diagram), 4, 8),
@@ -138,28 +121,15 @@ COLORINGS = {
         classes=tuple(f"{label} sides" for label in _SIDES_LABELS),
     ),
     "skewness": Coloring(
-        "skewness of the worst face [–]",
-        lambda r: r.measures.worst_of_cell("skewness"),
-        "viridis_r",
-        _from_zero,
+        "skewness of the worst face [–]", lambda r: r.measures.worst_of_cell("skewness"), "viridis_r", _from_zero
     ),
-    "volume": Coloring(
-        "area of the cell",
-        lambda r: r.diagram.volumes,
-        "viridis",
-        _span,
-        logarithmic=True,
-    ),
+    "volume": Coloring("area of the cell", lambda r: r.diagram.volumes, "viridis", _span, logarithmic=True),
 }
 """The quantities that `plot_cells` knows."""
 
 _SOLID_COLORINGS = {
     **COLORINGS,
-    "quality": replace(
-        COLORINGS["quality"],
-        label=r"cell quality $Q = 36\pi V^2 / S^3$ [–]",
-        limits=_around_most,
-    ),
+    "quality": replace(COLORINGS["quality"], label=r"cell quality $Q = 36\pi V^2 / S^3$ [–]", limits=_around_most),
     "sides": Coloring(
         "number of faces",
         lambda r: np.clip(np.diff(r.diagram.neighbor_starts), 12, 16),
@@ -206,9 +176,7 @@ def picture_of(mesh: Result | Diagram) -> Result:
     if isinstance(mesh, Diagram):
         return cast("Result", DiagramPicture(mesh))
     if not isinstance(mesh, Result | DiagramPicture):
-        raise InputTypeError(
-            f"mesh is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram"
-        )
+        raise InputTypeError(f"mesh is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram")
     return mesh
 
 

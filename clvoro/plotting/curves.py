@@ -52,9 +52,7 @@ def plot_history(results: Mapping[str, Result], figure: Any = None) -> Any:
         ]
         if any(np.diff(result.history["level"]).any() for result in results.values()):
             handles.append(Line2D([], [], color="#444444", lw=0.7, ls=":", label="finer level"))
-        figure.legend(
-            handles=handles, loc="outside upper center", ncols=len(handles), frameon=False
-        )
+        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
     return figure
 
 
@@ -121,10 +119,7 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
         for axes_row, (when, field) in zip(axes, rows, strict=True):
             field = _inside(field, lower, upper)
             factors = _magnifications(field)
-            halves = (
-                ("Lloyd", field.lloyd, METHOD_COLORS[0]),
-                ("Poisson", field.poisson, "#B34700"),
-            )
+            halves = (("Lloyd", field.lloyd, METHOD_COLORS[0]), ("Poisson", field.poisson, "#B34700"))
             for ax, factor, (name, arrows, color) in zip(axes_row, factors, halves, strict=True):
                 word = "magnified" if factor > 1 else "reduced"
                 note = "to scale" if factor == 1 else f"{word} × {factor:g}"

@@ -29,11 +29,7 @@ def view_axes(view: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.nda
     """Return the picture's unit vectors: to the right, up, and towards the viewer."""
     azimuth, elevation = (math.radians(angle) for angle in view)
     towards = np.array(
-        [
-            math.cos(elevation) * math.cos(azimuth),
-            math.cos(elevation) * math.sin(azimuth),
-            math.sin(elevation),
-        ]
+        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     )
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     return right, np.cross(towards, right), towards
@@ -49,9 +45,7 @@ def kept_cells(diagram: Diagram, cut: Any, through: np.ndarray, towards: np.ndar
     return cut if cut.dtype == bool else (diagram.points - through) @ cut <= 0
 
 
-def visible_faces(
-    diagram: Diagram, kept: np.ndarray, towards: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def visible_faces(diagram: Diagram, kept: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the faces (half-faces) of the kept cells that face the viewer, and their normals, the farthest first."""
     owner, neighbor = face_owners(diagram), diagram.neighbors
     # The cell across the seam of a periodic box lies on the other side of the picture.
@@ -106,9 +100,7 @@ def draw_cutaway(
 
     frame = _outline(diagram)
     drawn = np.stack([frame @ right, frame @ up], axis=-1)
-    extremes = np.concatenate(
-        [drawn.reshape(-1, 2), flat]
-    )  # cells of periodic boxes reach beyond the box
+    extremes = np.concatenate([drawn.reshape(-1, 2), flat])  # cells of periodic boxes reach beyond the box
     lower, upper = extremes.min(axis=0), extremes.max(axis=0)
     margin = 0.02 * (upper - lower).max()
     ax.set_aspect("equal")
@@ -143,18 +135,11 @@ def _outline(diagram: Diagram) -> np.ndarray:
     """Return the edges of the domain, (12, 2, 3)."""
     corners = np.array(np.meshgrid(*np.transpose([diagram.domain.lower, diagram.domain.upper])))
     corners = corners.reshape(3, -1).T
-    pairs = [
-        (a, b)
-        for i, a in enumerate(corners)
-        for b in corners[i + 1 :]
-        if np.count_nonzero(a != b) == 1
-    ]
+    pairs = [(a, b) for i, a in enumerate(corners) for b in corners[i + 1 :] if np.count_nonzero(a != b) == 1]
     return np.array(pairs)
 
 
-def _label_axes(
-    ax: Any, diagram: Diagram, right: np.ndarray, up: np.ndarray, towards: np.ndarray
-) -> None:
+def _label_axes(ax: Any, diagram: Diagram, right: np.ndarray, up: np.ndarray, towards: np.ndarray) -> None:
     """Write the name and range of each axis beside an edge on the outline of the picture."""
     box = np.array([diagram.domain.lower, diagram.domain.upper])
     center = box.mean(axis=0)

@@ -32,20 +32,7 @@ _FADE = 0.8
 _WIDE_LABELS = 0.35
 """Additional width of the labels of degrees and of large sizes beside a map, inches."""
 _CENTER = (0.0, 25.0)  # of the picture of a uniform mesh
-_STEPS = (
-    0.01,
-    0.02,
-    0.05,
-    0.1,
-    0.2,
-    0.5,
-    1,
-    2,
-    5,
-    10,
-    15,
-    30,
-)  # of meridians and parallels, degrees
+_STEPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30)  # of meridians and parallels, degrees
 _OUTLINE = {"edgecolor": "#1A1A1A", "linewidth": 0.8}
 
 
@@ -151,14 +138,10 @@ def default_center(result: Result) -> tuple[float, float]:
     return lon, lat
 
 
-def _view(
-    result: Result, projection: Any, center: Any, across: Any, window: Any
-) -> Orthographic | Plate:
+def _view(result: Result, projection: Any, center: Any, across: Any, window: Any) -> Orthographic | Plate:
     """Return the projection with the shown part, or raise InputError."""
     if not isinstance(projection, str) or projection not in get_args(Projection):
-        raise InputError(
-            f"projection is {projection!r:.60}, expected one of {', '.join(get_args(Projection))}"
-        )
+        raise InputError(f"projection is {projection!r:.60}, expected one of {', '.join(get_args(Projection))}")
     point = default_center(result) if center is None else _pair("center", center)
     if projection == "plate":
         if across is not None:
@@ -208,9 +191,14 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
 
 
 def _draw(
-    ax: Any, diagram: Diagram, view: Orthographic | Plate, values: np.ndarray, scheme: Coloring,
-    ends: tuple[float, float], edges: bool,
-) -> Any:  # fmt: skip
+    ax: Any,
+    diagram: Diagram,
+    view: Orthographic | Plate,
+    values: np.ndarray,
+    scheme: Coloring,
+    ends: tuple[float, float],
+    edges: bool,
+) -> Any:
     """Add the cells, and edges where they are wide enough; return the mappable for a color bar."""
     radius = cast("Sphere", diagram.domain).radius
     points = diagram.points / radius
@@ -225,9 +213,7 @@ def _draw(
         drawn: Any = _filled(polygons, values, scheme, ends)
         ax.add_collection(drawn, autolim=False)
     else:
-        drawn = pixels.add_image(
-            ax, diagram, view.lower, view.upper, values, scheme, ends, view.directions
-        )  # fmt: skip
+        drawn = pixels.add_image(ax, diagram, view.lower, view.upper, values, scheme, ends, view.directions)
         wide = np.maximum.reduceat(widths > 0, diagram.neighbor_starts[:-1])
         polygons = view.polygons(diagram, cells[wide[cells]] if edges else cells[:0])
     if edges:
@@ -251,9 +237,7 @@ def _lengths(diagram: Diagram, view: Orthographic | Plate) -> np.ndarray:
     return np.sqrt(diagram.volumes) / cast("Sphere", diagram.domain).radius * view.unit
 
 
-def _filled(
-    polygons: Polygons, values: np.ndarray, scheme: Coloring, ends: tuple[float, float]
-) -> PolyCollection:
+def _filled(polygons: Polygons, values: np.ndarray, scheme: Coloring, ends: tuple[float, float]) -> PolyCollection:
     return PolyCollection(
         np.split(polygons.corners, polygons.starts[1:-1]) if len(polygons.cells) else [],
         array=without_ends(values[polygons.cells]),
@@ -265,9 +249,7 @@ def _filled(
     )
 
 
-def _face_style(
-    ax: Any, diagram: Diagram, view: Orthographic | Plate
-) -> tuple[np.ndarray, np.ndarray]:
+def _face_style(ax: Any, diagram: Diagram, view: Orthographic | Plate) -> tuple[np.ndarray, np.ndarray]:
     """Return line widths (m,) and colors (m, 4) of half-faces; 0 where a line would be too thin.
 
     Of two half-faces one has a width.
@@ -323,16 +305,10 @@ def _draw_graticule(ax: Any, view: Orthographic | Plate) -> None:
         parts = view.lines(unit_vectors((-180, lat) + fine * (360, 0)))
         lines += parts
         ticks["y"] += [(y, _degrees(lat, "NS")) for p in parts for y in _crossings(p, 0, view)]
-    ax.add_collection(
-        LineCollection(lines, colors="#1A1A1A", linewidths=0.35, alpha=0.35, zorder=2.2),
-        autolim=False,
-    )
+    ax.add_collection(LineCollection(lines, colors="#1A1A1A", linewidths=0.35, alpha=0.35, zorder=2.2), autolim=False)
     if isinstance(view, Plate):
         inside = [lon for lon in lons if view.lower[0] <= lon <= view.upper[0]]
-        ticks = {
-            "x": [(lon, _degrees(lon, "EW")) for lon in inside],
-            "y": [(lat, _degrees(lat, "NS")) for lat in lats],
-        }
+        ticks = {"x": [(lon, _degrees(lon, "EW")) for lon in inside], "y": [(lat, _degrees(lat, "NS")) for lat in lats]}
     sizes = view.upper - view.lower
     for axis, room, size in ((ax.xaxis, 0.1, sizes[0]), (ax.yaxis, 0.05, sizes[1])):
         shown = _apart(ticks[axis.axis_name], room * size)
@@ -356,9 +332,7 @@ def _apart(ticks: list[tuple[float, str]], least: float) -> list[tuple[float, st
     return kept
 
 
-def _shown_degrees(
-    view: Orthographic | Plate, steps: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray]:
+def _shown_degrees(view: Orthographic | Plate, steps: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Return longitudes and latitudes, multiples of `steps`, of lines that may be in the picture."""
     if isinstance(view, Plate):
         ranges = np.transpose([view.lower, view.upper])

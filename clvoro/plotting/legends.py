@@ -23,12 +23,7 @@ _BELOW_TICKS = 26  # from the axes to a legend below their numbers, points
 
 
 def add_key(
-    cells: Any,
-    axes: Any,
-    scheme: Coloring,
-    values: np.ndarray,
-    limits: tuple[float, float],
-    below: bool = False,
+    cells: Any, axes: Any, scheme: Coloring, values: np.ndarray, limits: tuple[float, float], below: bool = False
 ) -> None:
     """Add a color bar, or the legend of classes, beside or below `axes` (one or several)."""
     if scheme.classes:
@@ -38,19 +33,11 @@ def add_key(
 
 
 def add_color_bar(
-    cells: Any,
-    axes: Any,
-    scheme: Coloring,
-    values: np.ndarray,
-    limits: tuple[float, float],
-    **options: Any,
+    cells: Any, axes: Any, scheme: Coloring, values: np.ndarray, limits: tuple[float, float], **options: Any
 ) -> None:
     """Add the scale beside `axes` (one or several), with arrows where values lie beyond it."""
     low, high = limits
-    below, above = (
-        bool((values < low * (1 - 1e-9 * np.sign(low))).any()),
-        bool((values > high).any()),
-    )
+    below, above = (bool((values < low * (1 - 1e-9 * np.sign(low))).any()), bool((values > high).any()))
     extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
     several = isinstance(axes, (list, np.ndarray))
     figure = (axes[0] if several else axes).figure
@@ -74,9 +61,7 @@ def add_color_bar(
         bar.locator = _RoundSteps()
     if scheme.logarithmic:
         # Where the ends are close, two digits would be the same at all ticks.
-        digits = (
-            2 if high > 2 * low else 2 + int(np.ceil(np.log10(high / max(high - low, 1e-9 * high))))
-        )
+        digits = 2 if high > 2 * low else 2 + int(np.ceil(np.log10(high / max(high - low, 1e-9 * high))))
         bar.formatter = FuncFormatter(lambda t, _: short(t / scheme.unit, digits))
     bar.update_ticks()
 
@@ -152,21 +137,12 @@ def round_numbers(low: float, high: float) -> list[float]:
     return [t for t in numbers if low * 0.999 <= t <= high * 1.001]
 
 
-def _add_classes(
-    axes: Any, scheme: Coloring, values: np.ndarray, limits: tuple[float, float]
-) -> None:
+def _add_classes(axes: Any, scheme: Coloring, values: np.ndarray, limits: tuple[float, float]) -> None:
     """Write the classes and their shares of all cells below the picture."""
     first = round(limits[0] + 0.5)
     handles = [
-        Patch(
-            facecolor=color,
-            edgecolor="#1A1A1A",
-            linewidth=0.4,
-            label=f"{label}: {_share(values == number)}",
-        )
-        for number, (color, label) in enumerate(
-            zip(scheme.color_map.colors, scheme.classes, strict=True), start=first
-        )
+        Patch(facecolor=color, edgecolor="#1A1A1A", linewidth=0.4, label=f"{label}: {_share(values == number)}")
+        for number, (color, label) in enumerate(zip(scheme.color_map.colors, scheme.classes, strict=True), start=first)
         if (values == number).any()
     ]
     options: dict[str, Any] = {
@@ -181,9 +157,8 @@ def _add_classes(
         return
     down = ScaledTranslation(0, -_BELOW_TICKS / 72, axes.figure.dpi_scale_trans)
     axes.legend(
-        loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=axes.transAxes + down,
-        borderaxespad=0, **options,
-    )  # fmt: skip
+        loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=axes.transAxes + down, borderaxespad=0, **options
+    )
 
 
 def _share(marks: np.ndarray) -> str:

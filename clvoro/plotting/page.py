@@ -118,11 +118,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _page(
-    results: Mapping[str, Result],
-    title: str,
-    case: str,
-    facts: Mapping[str, str],
-    figures: Sequence[tuple[str, bytes]],
+    results: Mapping[str, Result], title: str, case: str, facts: Mapping[str, str], figures: Sequence[tuple[str, bytes]]
 ) -> str:
     name, main = list(results.items())[-1]
     numbers = summary(main)
@@ -137,22 +133,17 @@ def _page(
     }
     cards = "".join(f"<div><dt>{_safe(k)}</dt><dd>{_safe(v)}</dd></div>" for k, v in head.items())
     if main.size_factor != 1:
-        facts = {
-            **facts,
-            "size field scaled by": f"{main.size_factor:.4g} to fit the number of cells",
-        }
+        facts = {**facts, "size field scaled by": f"{main.size_factor:.4g} to fit the number of cells"}
     if numbers["trade"]:
         facts = {**facts, "sizes and shape": numbers["trade"]}
     words = "; ".join([f"method {name}", *(f"{k} {v}" for k, v in facts.items())])
     parts = [
         f"<h1>{_safe(title)}</h1><p class=what>{_safe(words)}</p><dl>{cards}</dl>",
-        f"<h2>Runs</h2>{_table(results, name)}" if len(results) > 1 else
-        f"<p>Stopped: {_safe(main.stop_reason)}.</p>",
-        f"<h2>Cells on the boundary</h2>{_apart(results, name)}"
-        if isinstance(main.diagram.domain, Polygon) else "",
+        f"<h2>Runs</h2>{_table(results, name)}" if len(results) > 1 else f"<p>Stopped: {_safe(main.stop_reason)}.</p>",
+        f"<h2>Cells on the boundary</h2>{_apart(results, name)}" if isinstance(main.diagram.domain, Polygon) else "",
         f"<h2>Measures for finite volumes</h2>{_measures(name, main)}",
         "<h2>Pictures</h2>",
-    ]  # fmt: skip
+    ]
     for caption, png in figures:
         data = base64.b64encode(png).decode()
         parts.append(
@@ -180,11 +171,7 @@ def _measures(name: str, result: Result) -> str:
         ("skewness", s["mean_skewness"], s["max_skewness"]),
         ("angle of centroids [°]", s["mean_centroid_angle"], s["max_centroid_angle"]),
         ("smallest over largest face of a cell", s["mean_face_ratio"], s["min_face_ratio"]),
-        (
-            "volumes of neighbors, larger over smaller",
-            s["mean_volume_ratio"],
-            s["max_volume_ratio"],
-        ),
+        ("volumes of neighbors, larger over smaller", s["mean_volume_ratio"], s["max_volume_ratio"]),
     )
     body = "".join(
         f"<tr><td>{_safe(what)}</td><td>{mean:.4g}</td><td>{'' if worst is None else f'{worst:.3g}'}</td></tr>"
@@ -203,17 +190,8 @@ def _apart(results: Mapping[str, Result], main: str) -> str:
     rows = []
     for method, result in results.items():
         for part, s in beside_boundary(result).items():
-            numbers = (
-                f"{s['mean_error']:.4f}",
-                f"{s['mean_quality']:.4f}",
-                f"{s['min_quality']:.3f}",
-            )
-            texts = (
-                method,
-                f"{part} cells",
-                str(s["cells"]),
-                *(numbers if s["cells"] else ("–",) * 3),
-            )
+            numbers = (f"{s['mean_error']:.4f}", f"{s['mean_quality']:.4f}", f"{s['min_quality']:.3f}")
+            texts = (method, f"{part} cells", str(s["cells"]), *(numbers if s["cells"] else ("–",) * 3))
             columns = "".join(f"<td>{_safe(t)}</td>" for t in texts)
             rows.append(f"<tr{' class=main' if method == main else ''}>{columns}</tr>")
     names = ("method", "", "number", "mean |e|", "mean Q", "min Q")
@@ -227,10 +205,15 @@ def _table(results: Mapping[str, Result], main: str) -> str:
     for method, result in results.items():
         s = summary(result)
         texts = (
-            method, str(s["steps"]), f"{s['mean_error']:.4f}", f"{s['max_error']:.3f}",
-            f"{s['mean_quality']:.4f}", f"{s['min_quality']:.3f}", f"{s['seconds']:.2f}",
+            method,
+            str(s["steps"]),
+            f"{s['mean_error']:.4f}",
+            f"{s['max_error']:.3f}",
+            f"{s['mean_quality']:.4f}",
+            f"{s['min_quality']:.3f}",
+            f"{s['seconds']:.2f}",
             s["stop_reason"],
-        )  # fmt: skip
+        )
         columns = "".join(f"<td>{_safe(t)}</td>" for t in texts)
         rows.append(f"<tr{' class=main' if method == main else ''}>{columns}</tr>")
     head = "".join(f"<th>{_safe(n)}</th>" for n in names)

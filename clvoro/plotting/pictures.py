@@ -30,9 +30,7 @@ MANY_SOLID_CELLS = 20_000
 
 
 def pictures_of(
-    results: Mapping[str, Result],
-    initial: Result | None = None,
-    size: Callable[[np.ndarray], np.ndarray] | None = None,
+    results: Mapping[str, Result], initial: Result | None = None, size: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> list[Picture]:
     """List the pictures of `results`; nothing is drawn yet.
 
@@ -71,16 +69,13 @@ def pictures_of(
         pictures.append(
             (
                 "displacements",
-                f"The two halves of a step's displacements ({name}): Lloyd's and the Poisson "
-                "correction's.",
+                f"The two halves of a step's displacements ({name}): Lloyd's and the Poisson correction's.",
                 lambda: plot_displacements(main, new_figure(WIDTH, height)),
             )
         )
     pictures.append(("sides", f"Cells by number of sides ({name}).", lambda: _one(main, "sides")))
     if len(main.points) > 3000:
-        pictures.append(
-            ("closer", f"Where the cells are smallest ({name}).", lambda: _closer(main))
-        )
+        pictures.append(("closer", f"Where the cells are smallest ({name}).", lambda: _closer(main)))
     return pictures
 
 
@@ -92,11 +87,7 @@ def _solid_pictures(panels: Mapping[str, Result], history: Picture) -> list[Pict
         return lambda: new_slices(main, color)
 
     pictures: list[Picture] = [
-        (
-            "size",
-            "Target size h at the generators, on planes through the smallest cells.",
-            slices("size"),
-        ),
+        ("size", "Target size h at the generators, on planes through the smallest cells.", slices("size")),
         ("cells", f"The mesh ({name}), colored by metric error.", slices("error")),
         ("cutaway", f"A view into the mesh ({name}).", lambda: _cutaway(main)),
         (
@@ -111,16 +102,13 @@ def _solid_pictures(panels: Mapping[str, Result], history: Picture) -> list[Pict
         history,
         (
             "distributions",
-            f"Cells ({name}) by metric error, quality and number of faces; faces by skewness. "
-            "Dashed: the mean.",
+            f"Cells ({name}) by metric error, quality and number of faces; faces by skewness. Dashed: the mean.",
             lambda: plot_distributions(main, new_figure(WIDTH, 4.2)),
         ),
         ("sides", f"Cells by number of faces ({name}).", slices("sides")),
     ]
     if len(main.points) > MANY_SOLID_CELLS:
-        pictures.append(
-            ("closer", f"Where the cells are smallest ({name}).", lambda: _closer_slice(main))
-        )
+        pictures.append(("closer", f"Where the cells are smallest ({name}).", lambda: _closer_slice(main)))
     return pictures
 
 
@@ -133,11 +121,7 @@ def _globe_pictures(panels: Mapping[str, Result], history: Picture) -> list[Pict
 
     pictures: list[Picture] = [
         ("size", "Target size h, where cells are smallest.", globe("size", edges=False)),
-        (
-            "plate",
-            "Target size h against longitude and latitude.",
-            globe("size", projection="plate", edges=False),
-        ),
+        ("plate", "Target size h against longitude and latitude.", globe("size", projection="plate", edges=False)),
         ("cells", f"The mesh ({name}), colored by metric error.", globe("error")),
     ]
     if len(panels) == 1:
@@ -147,9 +131,7 @@ def _globe_pictures(panels: Mapping[str, Result], history: Picture) -> list[Pict
         pictures += _comparisons(panels)
     pictures += [history, ("sides", f"Cells by number of sides ({name}).", globe("sides"))]
     if len(main.points) > 3000:
-        pictures.append(
-            ("closer", f"Where the cells are smallest ({name}).", lambda: _closer_globe(main))
-        )
+        pictures.append(("closer", f"Where the cells are smallest ({name}).", lambda: _closer_globe(main)))
     return pictures
 
 
@@ -194,10 +176,14 @@ def _closer_slice(result: Result) -> Any:
         figure = new_figure(WIDTH, (WIDTH - 1.3) * float(span[1] / span[0]) + 0.6)
     name = "xyz"[normal]
     return plot_slice(
-        result, "quality", figure.add_subplot(), normal=name, through=center,
+        result,
+        "quality",
+        figure.add_subplot(),
+        normal=name,
+        through=center,
         window=(corner, corner + span),
         title=f"{across} $h_\\mathrm{{min}}$ across, ${name} = {center[normal]:.3g}$",
-    )  # fmt: skip
+    )
 
 
 def _largest_section(result: Result) -> int:
@@ -227,14 +213,7 @@ def render(figure: Any, kind: str = "png", dpi: int = 170) -> bytes:
     with styled(), io.BytesIO() as buffer:
         # Without date and version: the same run gives the same file.
         metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
-        figure.savefig(
-            buffer,
-            format=kind,
-            dpi=dpi,
-            bbox_inches="tight",
-            pad_inches=0.04,
-            metadata=metadata[kind],
-        )
+        figure.savefig(buffer, format=kind, dpi=dpi, bbox_inches="tight", pad_inches=0.04, metadata=metadata[kind])
         return buffer.getvalue()
 
 
@@ -302,9 +281,7 @@ def _closer(result: Result) -> Any:
     return _two_closer(result, draw_part, 0.8)
 
 
-def _two_closer(
-    result: Result, draw_part: Callable[[Any, int, tuple[float, float]], None], ratio: float = 1.0
-) -> Any:
+def _two_closer(result: Result, draw_part: Callable[[Any, int, tuple[float, float]], None], ratio: float = 1.0) -> Any:
     """Draw two closer views, colored by quality; `ratio` is that of height and width."""
     with styled():
         figure = new_figure(WIDTH, WIDTH / 2 * ratio + 0.75)
@@ -314,10 +291,6 @@ def _two_closer(
             draw_part(ax, across, limits)
             ax.set_title(f"{across} $h_\\mathrm{{min}}$ across, where $h$ is smallest")
         scheme = coloring("quality")
-        cells = next(
-            c for c in (*axes[1].collections, *axes[1].images) if c.get_array() is not None
-        )
-        add_color_bar(
-            cells, axes, scheme, result.quality, limits, location="bottom", shrink=0.6, aspect=45,
-        )  # fmt: skip
+        cells = next(c for c in (*axes[1].collections, *axes[1].images) if c.get_array() is not None)
+        add_color_bar(cells, axes, scheme, result.quality, limits, location="bottom", shrink=0.6, aspect=45)
     return figure

@@ -27,9 +27,15 @@ same part in several colors, so the cells are found once."""
 
 
 def add_image(
-    ax: Any, diagram: Diagram, lower: np.ndarray, upper: np.ndarray, values: np.ndarray,
-    scheme: Coloring, limits: tuple[float, float], positions: Positions | None = None,
-) -> Any:  # fmt: skip
+    ax: Any,
+    diagram: Diagram,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    values: np.ndarray,
+    scheme: Coloring,
+    limits: tuple[float, float],
+    positions: Positions | None = None,
+) -> Any:
     """Add an image of the mesh in the rectangle from `lower` to `upper` of the picture, and return it.
 
     `values` (n,) are those of the cells. `positions` returns for places (k, 2) in the picture which of them show the
@@ -65,7 +71,5 @@ def _with_rim(cells: np.ndarray) -> np.ndarray:
     outside = cells < 0
     if not outside.any() or outside.all():
         return cells
-    distances, nearest = cast(
-        "tuple[np.ndarray, np.ndarray]", distance_transform_edt(outside, return_indices=True)
-    )
+    distances, nearest = cast("tuple[np.ndarray, np.ndarray]", distance_transform_edt(outside, return_indices=True))
     return np.where(distances <= _RIM, cells[tuple(nearest)], -1)

@@ -159,10 +159,7 @@ class Plate:
 
     def reaches(self, points: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Return whether cells around unit vectors (n, 3), with corners within `radii`, may be shown; (n,) bool."""
-        lat, reach = (
-            directions(points)[:, 1],
-            60 * radii,
-        )  # the angle over a chord is up to pi / 2 times as long
+        lat, reach = (directions(points)[:, 1], 60 * radii)  # the angle over a chord is up to pi / 2 times as long
         return (lat > self.lower[1] - 1.5 * reach) & (lat < self.upper[1] + 1.5 * reach)
 
     def foreshortening(self, points: np.ndarray) -> np.ndarray:
@@ -202,9 +199,7 @@ class Plate:
         parts = []
         for by in 360.0 * np.arange(-3, 4):
             # An image must reach in by more than round-off.
-            inside = (high[:, 0] + by > self.lower[0] + 1e-9) & (
-                low[:, 0] + by < self.upper[0] - 1e-9
-            )
+            inside = (high[:, 0] + by > self.lower[0] + 1e-9) & (low[:, 0] + by < self.upper[0] - 1e-9)
             rows = np.flatnonzero(seen & inside)
             starts, places = take_rows(one.starts, np.arange(len(one.corners)), rows)
             corners = one.corners[places] + (by, 0.0)
@@ -270,9 +265,7 @@ def outlines(
 def _arcs(diagram: Diagram, cells: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return begin, middle and end of the faces of `cells`, (f, 3) unit vectors each, starts, and half-faces (f,)."""
     radius = cast("Sphere", diagram.domain).radius
-    starts, rows = take_rows(
-        diagram.cell_vertex_starts, np.arange(len(diagram.cell_vertices)), cells
-    )
+    starts, rows = take_rows(diagram.cell_vertex_starts, np.arange(len(diagram.cell_vertices)), cells)
     begin = diagram.vertices[diagram.cell_vertices[rows]] / radius
     return begin, diagram.face_centroids[rows] / radius, begin[following(starts)], starts, rows
 

@@ -100,9 +100,7 @@ def _cut(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> Section:
     ups = np.flatnonzero(~above & above[nexts])
     downs = np.flatnonzero(above & ~above[nexts])
     # A face is convex: the plane enters and leaves it once. Faces bent by round-off are skipped.
-    entered, left = (
-        np.bincount(face[places], minlength=len(starts) - 1) for places in (ups, downs)
-    )
+    entered, left = (np.bincount(face[places], minlength=len(starts) - 1) for places in (ups, downs))
     sound = (entered == 1) & (left == 1)
     ups, downs = ups[sound[face[ups]]], downs[sound[face[downs]]]
     rows = face[ups]
@@ -133,20 +131,14 @@ def plane_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 
 
-def _crossings(
-    vertices: np.ndarray, height: np.ndarray, below: np.ndarray, above: np.ndarray
-) -> np.ndarray:
+def _crossings(vertices: np.ndarray, height: np.ndarray, below: np.ndarray, above: np.ndarray) -> np.ndarray:
     """Return the intersections of the plane with edges between vertices below and above it."""
     t = height[below] / (height[below] - height[above])
     return vertices[below] + t[:, None] * (vertices[above] - vertices[below])
 
 
 def _around(
-    middles: np.ndarray,
-    owner: np.ndarray,
-    first: np.ndarray,
-    counts: np.ndarray,
-    normal: np.ndarray,
+    middles: np.ndarray, owner: np.ndarray, first: np.ndarray, counts: np.ndarray, normal: np.ndarray
 ) -> np.ndarray:
     """Return the order of the sides of convex polygons, polygon by polygon, by the angles of their midpoints."""
     if not len(owner):

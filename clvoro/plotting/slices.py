@@ -17,16 +17,7 @@ from .colors import Color, Coloring, cell_norm, coloring_of, picture_of, without
 from .cutaway import draw_cutaway
 from .legends import add_key
 from .section import Section, cut_cells, plane_axes
-from .style import (
-    WIDTH,
-    corners_of,
-    ends_of,
-    frame_domain,
-    interactive_figure,
-    new_figure,
-    nice,
-    styled,
-)
+from .style import WIDTH, corners_of, ends_of, frame_domain, interactive_figure, new_figure, nice, styled
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -34,9 +25,7 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 def require_space(diagram: Diagram) -> None:
     """Raise InputError unless the diagram is three-dimensional."""
     if diagram.domain.cell_dim != 3:
-        raise InputError(
-            "slices and cut-away views need cells in 3D, and these are in 2D; call result.plot()"
-        )
+        raise InputError("slices and cut-away views need cells in 3D, and these are in 2D; call result.plot()")
 
 
 def focus(result: Result) -> np.ndarray:
@@ -115,14 +104,10 @@ def plot_slice(
         raise InputError(f"through has shape {point.shape}, expected 3 coordinates")
     section = cut_cells(diagram, direction, point)
     if not len(section.cells):
-        raise InputError(
-            f"the plane through {point.tolist()} does not intersect {diagram.domain}; give a point inside"
-        )
+        raise InputError(f"the plane through {point.tolist()} does not intersect {diagram.domain}; give a point inside")
     right, up = plane_axes(direction)
     flat = np.stack([section.corners @ right, section.corners @ up], axis=1)
-    lower, upper = (
-        _shown_part(diagram, flat, direction, right, up) if window is None else corners_of(window)
-    )
+    lower, upper = _shown_part(diagram, flat, direction, right, up) if window is None else corners_of(window)
     values = scheme.values(result)
     with styled():
         if ax is None:
@@ -207,9 +192,7 @@ def plot_slices(
         grid = figure.add_gridspec(rows, columns, width_ratios=widths, height_ratios=heights)
         axes = [figure.add_subplot(grid[k // columns, k % columns]) for k in range(rows * columns)]
         for ax, normal in zip(axes, normals, strict=False):
-            plot_slice(
-                result, color, ax, normal=normal, through=point, limits=ends, key=False
-            )  # fmt: skip
+            plot_slice(result, color, ax, normal=normal, through=point, limits=ends, key=False)
             ax.locator_params(nbins=5)
         if len(normals) == 3:
             draw_cutaway(axes[3], result, values, scheme, ends, through=point, labels=False)
@@ -247,12 +230,7 @@ def _panels(diagram: Diagram) -> tuple[list[str], int, list[tuple[float, float]]
 
 
 def _draw_section(
-    ax: Any,
-    section: Section,
-    flat: np.ndarray,
-    values: np.ndarray,
-    scheme: Coloring,
-    limits: tuple[float, float],
+    ax: Any, section: Section, flat: np.ndarray, values: np.ndarray, scheme: Coloring, limits: tuple[float, float]
 ) -> PolyCollection:
     """Add the filled polygons, an outline in their own color hiding the seams."""
     cells = PolyCollection(
@@ -269,11 +247,7 @@ def _draw_section(
 
 
 def _draw_sides(
-    ax: Any,
-    diagram: Diagram,
-    section: Section,
-    axes: tuple[np.ndarray, np.ndarray],
-    extent: np.ndarray,
+    ax: Any, diagram: Diagram, section: Section, axes: tuple[np.ndarray, np.ndarray], extent: np.ndarray
 ) -> None:
     """Add each side once, as a line; its width follows the size of its cells."""
     owner, neighbor = face_owners(diagram)[section.rows], diagram.neighbors[section.rows]
@@ -288,11 +262,7 @@ def _draw_sides(
     lines = np.stack([section.edges[once] @ axes[0], section.edges[once] @ axes[1]], axis=-1)
     ax.add_collection(
         LineCollection(
-            list(lines),
-            colors=colors[once],
-            linewidths=widths[once],
-            capstyle="round",
-            rasterized=len(once) > 9000,
+            list(lines), colors=colors[once], linewidths=widths[once], capstyle="round", rasterized=len(once) > 9000
         ),
         autolim=False,
     )

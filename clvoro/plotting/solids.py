@@ -47,8 +47,12 @@ def draw_mesh(mesh: Result | Diagram, color: Color | ArrayLike, view: Any, **opt
         raise InputError(f"view is {view!r}, expected one of {', '.join(get_args(View))}")
     kind = "sphere" if isinstance(domain, Sphere) else "2D" if flat else view or "slices"
     pictures = {
-        "2D": plot_cells, "slices": plot_slices, "slice": plot_slice, "cutaway": plot_cutaway, "sphere": plot_globe,
-    }  # fmt: skip
+        "2D": plot_cells,
+        "slices": plot_slices,
+        "slice": plot_slice,
+        "cutaway": plot_cutaway,
+        "sphere": plot_globe,
+    }
     known = {name: signature(draw).parameters for name, draw in pictures.items()}
     given = {}
     for name, value in options.items():
@@ -114,9 +118,7 @@ def plot_cutaway(
     with styled():
         if ax is None:
             ax = interactive_figure(WIDTH, cutaway_height(result, angles)).add_subplot()
-        shown = draw_cutaway(
-            ax, result, values, scheme, ends, through=point, cut=what, view=angles, edges=edges
-        )  # fmt: skip
+        shown = draw_cutaway(ax, result, values, scheme, ends, through=point, cut=what, view=angles, edges=edges)
         if title is not None:
             ax.set_title(title)
         if key:
@@ -183,9 +185,7 @@ def plot_distributions(result: Result, figure: Any = None) -> Any:
             if not isinstance(color_map, Colormap):
                 color_map = colormaps[color_map]
             norm = cell_norm(scheme, limits)
-            shown = (
-                np.clip(middles, limits[0] + 0.5, limits[1] - 0.5) if scheme.classes else middles
-            )
+            shown = np.clip(middles, limits[0] + 0.5, limits[1] - 0.5) if scheme.classes else middles
             ax.bar(
                 middles,
                 100 * counts / max(len(values), 1),

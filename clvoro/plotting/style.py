@@ -101,9 +101,7 @@ def corners_of(window: Any) -> tuple[np.ndarray, np.ndarray]:
     except (TypeError, ValueError):
         corners = np.empty(0)
     if corners.shape != (2, 2) or not (corners[0] < corners[1]).all():
-        raise InputError(
-            f"window is {window!r:.80}, expected two corners ((x, y), (x, y)), the lower left one first"
-        )
+        raise InputError(f"window is {window!r:.80}, expected two corners ((x, y), (x, y)), the lower left one first")
     return corners[0], corners[1]
 
 
@@ -118,9 +116,7 @@ def ends_of(limits: Any) -> tuple[float, float]:
     return low, high
 
 
-def grid_height(
-    lower: Any, upper: Any, rows: int, columns: int, extra: float, each: float
-) -> float:
+def grid_height(lower: Any, upper: Any, rows: int, columns: int, extra: float, each: float) -> float:
     """Height of a picture of `rows` x `columns` domains: `each` inches more per row."""
     extent = np.subtract(upper, lower)
     return float(rows * (WIDTH / columns * extent[1] / extent[0] * 0.96 + each) + extra)

@@ -66,9 +66,7 @@ def transfer_values(
             ctx = _default_context() if adapter is None else adapter.ctx
             means, low, high = _transfer_on_device(ctx, *task)
     bounded = order == 1 or bool(limited)
-    conserved = _conserve_mass(
-        columns / scale, source.volumes, means, target.volumes, low, high, bounded
-    )
+    conserved = _conserve_mass(columns / scale, source.volumes, means, target.volumes, low, high, bounded)
     return (conserved * scale).reshape(len(target), *given.shape[1:])
 
 
@@ -78,9 +76,7 @@ def _diagram(name: str, mesh: object) -> Diagram:
     if isinstance(diagram, Diagram):
         diagram.demand_voronoi("transfer")
         return diagram
-    raise InputTypeError(
-        f"{name} is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram"
-    )
+    raise InputTypeError(f"{name} is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram")
 
 
 def _checked(values: ArrayLike, n: int) -> np.ndarray:
@@ -100,11 +96,7 @@ def _checked(values: ArrayLike, n: int) -> np.ndarray:
         transposed = array.ndim == 2 and array.shape[1] == n
         raise InputError(
             f"values has shape {array.shape}, expected ({n},) or ({n}, k): a row for each cell of the mesh; "
-            + (
-                "pass values.T"
-                if transposed
-                else "call transfer() of the mesh that the values belong to"
-            )
+            + ("pass values.T" if transposed else "call transfer() of the mesh that the values belong to")
         )
     array = array.astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(array.reshape(n, -1)).all(axis=1))
@@ -123,12 +115,7 @@ def _default_context() -> cl.Context:
 
 
 def _transfer_on_device(
-    ctx: cl.Context,
-    source: Diagram,
-    target: Diagram,
-    columns: np.ndarray,
-    order: int,
-    limited: bool,
+    ctx: cl.Context, source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return means over the new cells and bounds of the old data in them, (n, width) float64 each."""
     queue = cl.CommandQueue(ctx)

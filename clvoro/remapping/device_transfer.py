@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..errors import ClvoroError, InputError
-from ..geometry.box import ClipBox
+from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..tessellation.bins import BinnedPoints
 
@@ -73,9 +73,14 @@ class CellData:
         """CELL_DATA_ARGS of `transfer.cl`."""
         slopes = self.values if self.slopes is None else self.slopes
         return (
-            np.int32(self.values.shape[1]), self.values, self.least, self.most, self.centroids,
-            np.int32(self.slopes is not None), slopes,
-        )  # fmt: skip
+            np.int32(self.values.shape[1]),
+            self.values,
+            self.least,
+            self.most,
+            self.centroids,
+            np.int32(self.slopes is not None),
+            slopes,
+        )
 
 
 @dataclass(frozen=True)
@@ -97,9 +102,7 @@ class TransferredData:
     covered: np.ndarray
 
 
-def transfer_bytes(
-    engine: Engine, old: tuple[int, int], new: tuple[int, int], width: int, order: int
-) -> float:
+def transfer_bytes(engine: Engine, old: tuple[int, int], new: tuple[int, int], width: int, order: int) -> float:
     """Estimate the device memory in bytes that a transfer of `width` columns needs.
 
     The estimate assumes that each new cell overlaps about the same number of old cells. The lists of old cells never
@@ -170,23 +173,29 @@ class ConservativeTransfer:
         status = engine.empty(n, np.int32)
         while True:
             engine.run_each(
-                self._kernels.fit_slopes, n, np.int32(width), graph.points, graph.starts,
-                graph.neighbors, *box.device_corners(engine.real), centroids, values,
-                np.int32(limited), slopes, least, most, status, group=self._group,
-            )  # fmt: skip
+                self._kernels.fit_slopes,
+                n,
+                np.int32(width),
+                graph.points,
+                graph.starts,
+                graph.neighbors,
+                *box.device_corners(engine.real),
+                centroids,
+                values,
+                np.int32(limited),
+                slopes,
+                least,
+                most,
+                status,
+                group=self._group,
+            )
             large = self._cells_to_enlarge(status.get(), "the diagram of the values")
             if not large.size:
                 return CellData(values, least, most, centroids, slopes)
             self._enlarge(int(large[0]))
 
     def transfer(
-        self,
-        box: ClipBox,
-        old: CellGraph,
-        binned: BinnedPoints,
-        data: CellData,
-        new: CellGraph,
-        order: cla.Array,
+        self, box: ClipBox, old: CellGraph, binned: BinnedPoints, data: CellData, new: CellGraph, order: cla.Array
     ) -> TransferredData:
         """Return the means of `data` of the old cells over the new cells.
 
@@ -215,13 +224,34 @@ class ConservativeTransfer:
             tables = engine.empty(chunk * 2 * capacity, np.int32)
             for first in range(0, count, chunk):
                 engine.run_each(
-                    self._kernels.transfer_cell_data, min(chunk, count - first), np.int32(first), todo,
-                    np.int32(capacity), queues, tables, new.points, new.starts, new.neighbors,
-                    np.int32(old.n), old.points, old.starts, old.neighbors, binned.items,
-                    binned.bins, binned.grid_frames, binned.grid_shapes,
-                    *box.device_corners(engine.real), *data.kernel_args, means, low, high, volumes,
-                    covered, status, group=self._group,
-                )  # fmt: skip
+                    self._kernels.transfer_cell_data,
+                    min(chunk, count - first),
+                    np.int32(first),
+                    todo,
+                    np.int32(capacity),
+                    queues,
+                    tables,
+                    new.points,
+                    new.starts,
+                    new.neighbors,
+                    np.int32(old.n),
+                    old.points,
+                    old.starts,
+                    old.neighbors,
+                    binned.items,
+                    binned.bins,
+                    binned.grid_frames,
+                    binned.grid_shapes,
+                    *box.device_corners(engine.real),
+                    *data.kernel_args,
+                    means,
+                    low,
+                    high,
+                    volumes,
+                    covered,
+                    status,
+                    group=self._group,
+                )
             outcome = status.get()
             large = self._cells_to_enlarge(outcome, "one of the diagrams")
             full = np.flatnonzero(outcome == LIST_FULL)

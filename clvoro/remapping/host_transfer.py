@@ -81,12 +81,7 @@ class CellSums:
     """
 
     def __init__(
-        self,
-        n: int,
-        columns: np.ndarray,
-        slopes: np.ndarray | None,
-        least: np.ndarray,
-        most: np.ndarray,
+        self, n: int, columns: np.ndarray, slopes: np.ndarray | None, least: np.ndarray, most: np.ndarray
     ) -> None:
         self.columns, self.slopes, self.least, self.most = columns, slopes, least, most
         shape = n, columns.shape[1]
@@ -107,17 +102,10 @@ class CellSums:
 
     def results(self) -> tuple[np.ndarray, ...]:
         """Return means, low, high and covered; see `transfer_on_host`."""
-        return (
-            self.mass / np.maximum(self.covered, TINY)[:, None],
-            self.low,
-            self.high,
-            self.covered,
-        )
+        return (self.mass / np.maximum(self.covered, TINY)[:, None], self.low, self.high, self.covered)
 
 
-def _images(
-    diagram: Diagram, cells: np.ndarray, bounds: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _images(diagram: Diagram, cells: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return `cells` and their periodic images that overlap `bounds`.
 
     Returns
@@ -143,9 +131,7 @@ def _images(
     return np.concatenate(shapes), np.concatenate(rows), np.concatenate(offsets)
 
 
-def fit_slopes(
-    diagram: Diagram, columns: np.ndarray, limited: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fit_slopes(diagram: Diagram, columns: np.ndarray, limited: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit slopes (n, width, 2) to the neighbors' values, and return the bounds of these values, (n, width) each.
 
     The kernel `fit_slopes` in transfer.cl gives the formulas.

@@ -46,8 +46,7 @@ def transfer_on_sphere(
     seen = front
     while front.size:
         found = [
-            _add_pairs(sums, new, old, means, front[first : first + PAIRS])
-            for first in range(0, len(front), PAIRS)
+            _add_pairs(sums, new, old, means, front[first : first + PAIRS]) for first in range(0, len(front), PAIRS)
         ]
         front = np.unique(np.concatenate(found))
         places = np.minimum(np.searchsorted(seen, front), len(seen) - 1)
@@ -69,13 +68,7 @@ def _require_areas(name: str, diagram: Diagram, areas: np.ndarray) -> None:
         )
 
 
-def _add_pairs(
-    sums: CellSums,
-    new: TangentCells,
-    old: TangentCells,
-    means: np.ndarray,
-    keys: np.ndarray,
-) -> np.ndarray:
+def _add_pairs(sums: CellSums, new: TangentCells, old: TangentCells, means: np.ndarray, keys: np.ndarray) -> np.ndarray:
     """Add the intersections of pairs of cells, and return the keys of the pairs behind their edges.
 
     The key of a new cell i and an old cell j is i n + j.

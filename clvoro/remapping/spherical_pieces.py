@@ -62,9 +62,7 @@ class Pieces:
         part = slice(starts[0], starts[-1])
         return Pieces(starts - starts[0], self.corners[part], self.labels[part])
 
-    def cut(
-        self, normals: np.ndarray, levels: np.ndarray, depths: np.ndarray, labels: np.ndarray
-    ) -> Pieces:
+    def cut(self, normals: np.ndarray, levels: np.ndarray, depths: np.ndarray, labels: np.ndarray) -> Pieces:
         """Keep u.normal <= level of each polygon.
 
         Parameters
@@ -117,9 +115,7 @@ class Pieces:
         # Of the vectors v x w the parts with x add up to zero. Without them small cells lose no digits.
         a, b = -dot(u, u) / (p * (1 + p)), -dot(w, w) / (q * (1 + q))
         u, w = u / p[:, None], w / q[:, None]
-        small = np.column_stack(
-            [u[:, 1] * b - a * w[:, 1], a * w[:, 0] - u[:, 0] * b, _cross(u, w)]
-        )
+        small = np.column_stack([u[:, 1] * b - a * w[:, 1], a * w[:, 0] - u[:, 0] * b, _cross(u, w)])
         terms = (small + excess[:, None] * cross) / 2
         integral = np.column_stack([np.bincount(owner, t, n) for t in terms.T])
         integral[:, 2] -= area
@@ -187,9 +183,7 @@ class TangentCells:
         one, two, three = (components[:, a, None] * axes[a][cells] for a in range(3))
         return one + two + three
 
-    def intersections(
-        self, i: np.ndarray, old: TangentCells, j: np.ndarray
-    ) -> tuple[np.ndarray, Pieces]:
+    def intersections(self, i: np.ndarray, old: TangentCells, j: np.ndarray) -> tuple[np.ndarray, Pieces]:
         """Intersect cells i (k,) with cells j (k,) of `old`.
 
         Returns

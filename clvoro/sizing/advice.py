@@ -14,7 +14,7 @@ from ..geometry.polygon import Polygon
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
 
 _MAX_CELLS = 1e6
 """A proposed lower bound of h leads to at most so many cells, even if h has that value everywhere."""
@@ -64,10 +64,7 @@ def covered_share(domain: Domain, lower: ArrayLike, upper: ArrayLike) -> float:
     begin, end = np.array(domain.lower), np.array(domain.upper)
     if ((high < begin) | (low > end)).any():
         return 0.0
-    low, high = (
-        np.where(flat, begin, np.maximum(low, begin)),
-        np.where(flat, end, np.minimum(high, end)),
-    )
+    low, high = (np.where(flat, begin, np.maximum(low, begin)), np.where(flat, end, np.minimum(high, end)))
     if isinstance(domain, Polygon):
         inside = shapely.intersection(domain.geometry, shapely.box(*low, *high))
         return float(inside.area / domain.measure)
@@ -75,11 +72,7 @@ def covered_share(domain: Domain, lower: ArrayLike, upper: ArrayLike) -> float:
 
 
 def coverage_warnings(
-    what: str,
-    domain: Domain,
-    lower: Sequence[float] | np.ndarray,
-    upper: Sequence[float] | np.ndarray,
-    remedy: str,
+    what: str, domain: Domain, lower: Sequence[float] | np.ndarray, upper: Sequence[float] | np.ndarray, remedy: str
 ) -> list[str]:
     """Return a warning if `what`, with values from `lower` to `upper`, covers little of `domain`; else nothing."""
     share = covered_share(domain, lower, upper)

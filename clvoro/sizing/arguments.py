@@ -40,9 +40,7 @@ def check_slope(what: str, growth: object, slope: object) -> float:
         If both or none are given, or the value is out of range.
     """
     if (growth is None) == (slope is None):
-        raise InputError(
-            f"{what} got growth={growth} and slope={slope}, expected exactly one of them"
-        )
+        raise InputError(f"{what} got growth={growth} and slope={slope}, expected exactly one of them")
     if growth is not None:
         rate = check_positive(f"{what} growth", growth)
         if not 1 <= rate <= _MAX_GROWTH:

@@ -13,7 +13,7 @@ from ..opencl.program import source_text
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike
 
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
     from ..opencl.engine import Engine
     from .field import Field
 
@@ -145,8 +145,7 @@ def generate_code(
     result = field._emit(writer)
     if writer._stored >= 2**31:
         raise InputError(
-            f"the size field holds {writer._stored} numbers, expected fewer than 2^31; "
-            "use a coarser Raster"
+            f"the size field holds {writer._stored} numbers, expected fewer than 2^31; use a coarser Raster"
         )
     body = "\n".join(f"    {line}" for line in writer.statements)
     plane = _plane_text(writer.functions, writer.dim) if writer.functions else ""

@@ -12,8 +12,9 @@ import shapely
 
 from ..errors import InputError, InputTypeError
 from ..geometry import curves
-from ..geometry.box import Box, Domain
+from ..geometry.box import Box
 from ..geometry.bvh import Tree
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.shapes import Circle, ClosedPolyline, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface, box_surface
@@ -210,8 +211,7 @@ class Distance(Field):
         reach = 1.01 * (h_max - h_min) / self.slope if self.slope > 0 else math.inf
         law = writer.store(h_min, self.slope, h_max, reach * reach)
         best2 = f"data[{law + 3}]"
-        groups = [(_TRIANGLE, *s.packed(writer.origin, writer.scale, writer.real))
-                  for s in self.surfaces]  # fmt: skip
+        groups = [(_TRIANGLE, *s.packed(writer.origin, writer.scale, writer.real)) for s in self.surfaces]
         if len(self._begin):
             groups.insert(0, self._packed_curves(writer))
         for kind, items, tree in groups:
@@ -220,9 +220,7 @@ class Distance(Field):
                 call = f"size_nearest_few(x, data + {at}, {tree.n}, {kind}, {best2})"
             else:
                 at = writer.store(tree.boxes, items)
-                call = (
-                    f"size_nearest_tree(x, data + {at}, {tree.n}, {tree.levels}, {kind}, {best2})"
-                )
+                call = f"size_nearest_tree(x, data + {at}, {tree.n}, {tree.levels}, {kind}, {best2})"
             best2 = writer.variable(call)
         return self._finish(writer, best2, law)
 
@@ -247,10 +245,7 @@ class Distance(Field):
         return kind, np.column_stack([begin, vector, inverse, radius]), tree
 
     def __repr__(self) -> str:
-        return (
-            f"Distance({len(self.shapes)} shapes, h_min={self.h_min:g}, slope={self.slope:g}, "
-            f"h_max={self.h_max:g})"
-        )
+        return f"Distance({len(self.shapes)} shapes, h_min={self.h_min:g}, slope={self.slope:g}, h_max={self.h_max:g})"
 
 
 def _plain(shape: Shape) -> Curve | Surface:
@@ -265,9 +260,7 @@ def _plain(shape: Shape) -> Curve | Surface:
     return ClosedPolyline(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]))
 
 
-def _item_boxes(
-    begin: np.ndarray, end: np.ndarray, radius: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _item_boxes(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # Negative radii are left out: distances to boxes stay lower bounds. Round-off of center -+ radius can shorten the
     # box of a circle by an ulp, so boxes are widened.
     wide = (np.maximum(radius, 0) * (1 + 4 * np.finfo(radius.dtype).eps))[:, None]

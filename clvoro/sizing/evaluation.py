@@ -16,7 +16,7 @@ from .on_domain import on_domain
 if TYPE_CHECKING:
     import pyopencl.array as cla
 
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
     from ..opencl.engine import Engine
 
 _ALL_VALID = np.iinfo(np.int32).max
@@ -64,9 +64,7 @@ class Sizing:
         If the dimensions of field and domain differ.
     """
 
-    def __init__(
-        self, engine: Engine, domain: Domain, field: object, gradient_step: float | None = None
-    ):
+    def __init__(self, engine: Engine, domain: Domain, field: object, gradient_step: float | None = None):
         self.engine, self.domain, self.field = engine, domain, on_domain(as_field(field), domain)
         self.field.check_dim(domain.dim)
         self._origin, self._scale = domain.frame
@@ -76,16 +74,15 @@ class Sizing:
         self._parts: list[Sizing] = []
         self._peak_bytes = 0
         if self.field.on_device:
-            self.prelude, numbers, self._peak_bytes = generate_code(
-                self.field, domain, engine.real, engine
-            )
+            self.prelude, numbers, self._peak_bytes = generate_code(self.field, domain, engine.real, engine)
             self.data = engine.upload(numbers)
             self._invalid = engine.upload([_ALL_VALID], np.int32)
             step = self._step(engine.real)
             self._kernels = engine.kernels(
-                "sizing/size_field", defines={"GRADIENT_STEP": repr(step), "MAX_SIZE": repr(MAX_SIZE)},
+                "sizing/size_field",
+                defines={"GRADIENT_STEP": repr(step), "MAX_SIZE": repr(MAX_SIZE)},
                 prelude=self.prelude,
-            )  # fmt: skip
+            )
         else:
             # A callable is evaluated in float64, the fields that it is combined with in the device's precision.
             self._host_step = self._step(np.float64)
@@ -115,13 +112,9 @@ class Sizing:
             h = self._on_host(self._physical(points[:n].get())) / self._scale
             h_out[:n].set(real(factor) * h.astype(self.engine.real))
             return
-        self.engine.run_each(
-            self._kernels.evaluate_size, n, points, self.data, real(factor), h_out, self._invalid
-        )
+        self.engine.run_each(self._kernels.evaluate_size, n, points, self.data, real(factor), h_out, self._invalid)
 
-    def evaluate_with_gradient(
-        self, points: cla.Array, n: int, h_out: cla.Array, grad_out: cla.Array
-    ) -> None:
+    def evaluate_with_gradient(self, points: cla.Array, n: int, h_out: cla.Array, grad_out: cla.Array) -> None:
         """Write h' into `h_out` (>= n,) and the normalized grad log h into `grad_out` (>= n, d).
 
         Central differences over a small share of h. Both sample points stay inside the domain's bounding box.
@@ -146,18 +139,22 @@ class Sizing:
             grad_out[:n].set(gradient.astype(self.engine.real))
             return
         self.engine.run_each(
-            self._kernels.evaluate_size_gradient, n, points, self.data,
-            *self.domain.device_args(self.engine), h_out, grad_out, self._invalid,
-        )  # fmt: skip
+            self._kernels.evaluate_size_gradient,
+            n,
+            points,
+            self.data,
+            *self.domain.device_args(self.engine),
+            h_out,
+            grad_out,
+            self._invalid,
+        )
 
     @property
     def invalid_index(self) -> cla.Array | None:
         """The integer on the device that `check` reads: the first point with an invalid size. None on the host."""
         return None if self._kernels is None else self._invalid
 
-    def check(
-        self, points: cla.Array, h: cla.Array, factor: float = 1.0, first: int | None = None
-    ) -> None:
+    def check(self, points: cla.Array, h: cla.Array, factor: float = 1.0, first: int | None = None) -> None:
         """Raise if an evaluation since the last check gave a value that is not positive and finite.
 
         Parameters

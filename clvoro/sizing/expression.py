@@ -46,8 +46,22 @@ _FUNCTIONS = {
     **{
         name: _Function(1, name, getattr(np, name))
         for name in (
-            "fabs", "sqrt", "cbrt", "exp", "exp2", "log", "log2", "log10", "sin", "cos", "tan",
-            "sinh", "cosh", "tanh", "floor", "ceil",
+            "fabs",
+            "sqrt",
+            "cbrt",
+            "exp",
+            "exp2",
+            "log",
+            "log2",
+            "log10",
+            "sin",
+            "cos",
+            "tan",
+            "sinh",
+            "cosh",
+            "tanh",
+            "floor",
+            "ceil",
         )
     },
     "abs": _Function(1, "fabs", np.abs),
@@ -66,20 +80,26 @@ _FUNCTIONS = {
     "mix": _Function(3, "mix", lambda a, b, t: a + (b - a) * t),
     "step": _Function(2, "step", lambda edge, v: np.where(v < edge, 0.0, 1.0)),
     "smoothstep": _Function(3, "smoothstep", _smoothstep),
-}  # fmt: skip
+}
 
 # Precedence of the binary operators, as in C.
-_PRECEDENCE = {
-    "||": 1, "&&": 2, "==": 3, "!=": 3, "<": 4, ">": 4, "<=": 4, ">=": 4,
-    "+": 5, "-": 5, "*": 6, "/": 6,
-}  # fmt: skip
+_PRECEDENCE = {"||": 1, "&&": 2, "==": 3, "!=": 3, "<": 4, ">": 4, "<=": 4, ">=": 4, "+": 5, "-": 5, "*": 6, "/": 6}
 _TRUTH = frozenset(("||", "&&", "==", "!=", "<", ">", "<=", ">="))
 
 _NUMPY = {
-    "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide,
-    "<": np.less, ">": np.greater, "<=": np.less_equal, ">=": np.greater_equal,
-    "==": np.equal, "!=": np.not_equal, "&&": np.logical_and, "||": np.logical_or,
-}  # fmt: skip
+    "+": np.add,
+    "-": np.subtract,
+    "*": np.multiply,
+    "/": np.divide,
+    "<": np.less,
+    ">": np.greater,
+    "<=": np.less_equal,
+    ">=": np.greater_equal,
+    "==": np.equal,
+    "!=": np.not_equal,
+    "&&": np.logical_and,
+    "||": np.logical_or,
+}
 
 
 class _Node(NamedTuple):
@@ -128,9 +148,7 @@ class Expression(Field):
         self._axes = 1 + max((n.value for n in self._nodes if n.kind == "axis"), default=-1)
         used = {word for kind, word, _ in parser.tokens if kind == "name" and word in _AXES}
         if used & _DEGREES and used - _DEGREES:
-            raise InputError(
-                f"Expression {text!r} has {', '.join(sorted(used))}, expected lon and lat, or x, y and z"
-            )
+            raise InputError(f"Expression {text!r} has {', '.join(sorted(used))}, expected lon and lat, or x, y and z")
         self.dim = 2 if used & _DEGREES else 3 if self._axes == 3 else None
         self.parts = 1 + len(self._nodes) // _OPERATIONS
 
@@ -204,8 +222,7 @@ class _Parser:
         self.text = text
         if len(text) > _MAX_LENGTH:
             raise InputError(
-                f"Expression has {len(text)} characters, expected at most {_MAX_LENGTH}; "
-                "use a Raster instead"
+                f"Expression has {len(text)} characters, expected at most {_MAX_LENGTH}; use a Raster instead"
             )
         self.tokens = self._tokens()
         self.at = 0
@@ -348,8 +365,5 @@ class _Parser:
         self._need(")")
         expected = _FUNCTIONS[word].arguments
         if len(arguments) != expected:
-            self._fail(
-                f"{word} got {len(arguments)} arguments, expected {expected}",
-                self.tokens[begin][2],
-            )
+            self._fail(f"{word} got {len(arguments)} arguments, expected {expected}", self.tokens[begin][2])
         return self._add("call", word, *arguments)

@@ -17,7 +17,7 @@ from .field import Constant, Field
 from .gaps import find_gaps, radii_of_curvature
 
 if TYPE_CHECKING:
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
     from .codegen import CodeWriter
 
 _FINEST, _COARSEST = 1e-3, 0.1  # of the domain's longest side, by default
@@ -94,28 +94,18 @@ class FeatureSize(Field):
         slope: float | None = None,
     ):
         if not isinstance(domain, Polygon):
-            raise InputTypeError(
-                f"FeatureSize domain is a {type(domain).__name__}, expected a clvoro.Polygon"
-            )
+            raise InputTypeError(f"FeatureSize domain is a {type(domain).__name__}, expected a clvoro.Polygon")
         self.domain, longest = domain, float(domain.extent.max())
         self.cells_across = check_positive("FeatureSize cells_across", cells_across)
-        self.slope = check_slope(
-            "FeatureSize", 1.2 if growth is None and slope is None else growth, slope
-        )
+        self.slope = check_slope("FeatureSize", 1.2 if growth is None and slope is None else growth, slope)
         if self.slope == 0:
             raise InputError("FeatureSize got no growth, expected growth above 1 or slope above 0")
-        self.h_min = check_positive(
-            "FeatureSize h_min", _FINEST * longest if h_min is None else h_min
-        )
+        self.h_min = check_positive("FeatureSize h_min", _FINEST * longest if h_min is None else h_min)
         usual = max(_COARSEST * longest, self.h_min)
         self.h_max = check_positive("FeatureSize h_max", usual if h_max is None else h_max)
         if self.h_max < self.h_min:
-            raise InputError(
-                f"FeatureSize h_max is {self.h_max:g}, expected at least h_min = {self.h_min:g}"
-            )
-        self.curvature = (
-            0.0 if curvature == 0 else check_positive("FeatureSize curvature", curvature)
-        )
+            raise InputError(f"FeatureSize h_max is {self.h_max:g}, expected at least h_min = {self.h_min:g}")
+        self.curvature = 0.0 if curvature == 0 else check_positive("FeatureSize curvature", curvature)
         self.sources = self._find()
         begin, end, size = self.sources
         if len(size):
@@ -152,9 +142,7 @@ class FeatureSize(Field):
         """Return a warning if the polygon does not overlap `domain`."""
         if covered_share(domain, self.domain.lower, self.domain.upper) > 0:
             return []
-        return [
-            f"{self!r} does not overlap the domain {domain!r}; expected a FeatureSize of the domain that is meshed"
-        ]
+        return [f"{self!r} does not overlap the domain {domain!r}; expected a FeatureSize of the domain that is meshed"]
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return self._field._evaluate(points)

@@ -14,7 +14,7 @@ from ..errors import InputError, InputTypeError
 from .arguments import check_positive
 
 if TYPE_CHECKING:
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
     from .codegen import CodeWriter
 
 _MAX_PARTS = 256  # kernels of 200 parts take 3 s to build, kernels of 400 parts 20 s
@@ -68,14 +68,11 @@ class Field:
             array = np.asarray(points, dtype=float)
         except (TypeError, ValueError) as error:
             raise InputTypeError(
-                f"points of a size field are {type(points).__name__}, expected numbers of "
-                "shape (n, d)"
+                f"points of a size field are {type(points).__name__}, expected numbers of shape (n, d)"
             ) from error
         if array.ndim != 2 or array.shape[1] not in (2, 3):
             hint = "; pass points.T" if array.ndim == 2 and array.shape[0] in (2, 3) else ""
-            raise InputError(
-                f"points of a size field have shape {array.shape}, expected (n, 2) or (n, 3){hint}"
-            )
+            raise InputError(f"points of a size field have shape {array.shape}, expected (n, 2) or (n, 3){hint}")
         self.check_dim(array.shape[1])
         return self._evaluate(array)
 
@@ -164,9 +161,7 @@ class Field:
 
     __gt__ = __le__ = __ge__ = __lt__
 
-    def __array_ufunc__(
-        self, ufunc: np.ufunc, method: str, *inputs: object, **options: object
-    ) -> Field:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: object, **options: object) -> Field:
         """Combine fields by NumPy's functions for ``+``, ``*``, ``/`` and `minimum` and `maximum`; reject others."""
         if ufunc in (np.subtract, np.negative):
             self.__sub__(None)

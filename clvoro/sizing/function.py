@@ -30,13 +30,14 @@ class Function(Field):
     def __init__(self, function: Callable[[np.ndarray], object]):
         if not callable(function):
             raise InputTypeError(
-                f"Function got {type(function).__name__}, expected a callable "
-                "h(points (n, d)) -> (n,)"
+                f"Function got {type(function).__name__}, expected a callable h(points (n, d)) -> (n,)"
             )
         check_callable(
-            "size", function, "points (n, d)",
+            "size",
+            function,
+            "points (n, d)",
             "write lambda points: h(points[:, 0], points[:, 1]) around a function of x and y",
-        )  # fmt: skip
+        )
         self.function = function
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
@@ -76,15 +77,11 @@ class Function(Field):
                 hint = "return its only column, sizes[:, 0]"
             elif sizes.shape == points.shape[1:]:
                 hint = "it must be vectorized: points[:, 0] are all x, points[0] is a point"
-            raise InputError(
-                f"{self!r} returned shape {sizes.shape} for {n} points, expected ({n},); {hint}"
-            )
+            raise InputError(f"{self!r} returned shape {sizes.shape} for {n} points, expected ({n},); {hint}")
         return sizes.astype(float)
 
     def _emit(self, writer: CodeWriter) -> str:
-        raise InputError(
-            f"{self!r} runs on the host and has no device form; use Expression, Raster or Distance"
-        )
+        raise InputError(f"{self!r} runs on the host and has no device form; use Expression, Raster or Distance")
 
     def __repr__(self) -> str:
         return f"Function({getattr(self.function, '__name__', type(self.function).__name__)})"

@@ -23,10 +23,7 @@ _FAN = math.radians(7.5)  # between the directions from a corner
 _PER_RADIUS = 4  # samples of an edge per radius of the balls at it
 _MAX_SAMPLES = 2048  # of one edge
 _TIP = 6.0  # sizes of boundary between the walls of a tip or a bay, at most
-_DEAD_END, _LONGEST = (
-    4.0,
-    12.0,
-)  # sizes of boundary between the walls of a dead end: at least, and at most
+_DEAD_END, _LONGEST = (4.0, 12.0)  # sizes of boundary between the walls of a dead end: at least, and at most
 _PARTS = 256  # of the domain, in which the size hardly changes
 _MOST_WALL_SAMPLES = 20_000
 _CLOSE = 1e-9
@@ -166,23 +163,17 @@ def _wall_samples(
     return points, normals, _ring_lengths(domain)[1][row] + t * length[row], size(points)
 
 
-def _from_corners(
-    domain: Polygon, normal: np.ndarray, most: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _from_corners(domain: Polygon, normal: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:
     """Return chords from reentrant corners (more than 180 degrees inside the domain)."""
     before = np.empty(len(normal), np.int64)
     before[domain.oriented.next_vertex] = np.arange(len(normal))
     first = normal[before]
-    turn = np.arctan2(
-        first[:, 0] * normal[:, 1] - first[:, 1] * normal[:, 0], (first * normal).sum(axis=1)
-    )
+    turn = np.arctan2(first[:, 0] * normal[:, 1] - first[:, 1] * normal[:, 0], (first * normal).sum(axis=1))
     rows = np.flatnonzero(turn < -_FAN)
     counts = np.ceil(-turn[rows] / _FAN).astype(np.int64) - 1
     row = np.repeat(rows, counts)
     step = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
-    angle = np.arctan2(first[row, 1], first[row, 0]) + turn[row] * step / np.repeat(
-        counts + 1, counts
-    )
+    angle = np.arctan2(first[row, 1], first[row, 0]) + turn[row] * step / np.repeat(counts + 1, counts)
     direction = np.column_stack([np.cos(angle), np.sin(angle)])
     begin, end, radius = _balls(domain, domain.oriented.vertices[row], direction, most)
     return begin[np.isfinite(radius)], end[np.isfinite(radius)]
@@ -262,9 +253,7 @@ def radii_of_curvature(domain: Polygon) -> np.ndarray:
     before = np.empty(len(edge), np.int64)
     before[following] = np.arange(len(edge))
     last = edge[before]
-    turn = np.abs(
-        np.arctan2(last[:, 0] * edge[:, 1] - last[:, 1] * edge[:, 0], (last * edge).sum(axis=1))
-    )
+    turn = np.abs(np.arctan2(last[:, 0] * edge[:, 1] - last[:, 1] * edge[:, 0], (last * edge).sum(axis=1)))
     smooth = (turn > 1e-9) & (turn <= CORNER)
     radius = np.full(len(edge), math.inf)
     shorter = np.minimum(length, length[before])

@@ -41,9 +41,7 @@ class Gradation:
         defines: dict[str, object] = {"TILE": self._tile, **({"GLOBE": 1} if globe else {})}
         self._kernels = engine.kernels("sizing/gradation", defines=defines)
 
-    def sweep_tiles(
-        self, values: cla.Array, counts: Sequence[int], spacing: Sequence[float], slope: float
-    ) -> int:
+    def sweep_tiles(self, values: cla.Array, counts: Sequence[int], spacing: Sequence[float], slope: float) -> int:
         """Replace `values` by the largest values below them with |grad| <= `slope`, to first order.
 
         Fast sweeping within tiles, which become active in the order of their values.
@@ -87,17 +85,24 @@ class Gradation:
                 front = [engine.real.type(begin + (1 + k // 2) * rise) for k in range(_PASSES)]
             for k in range(_PASSES):
                 engine.run_each(
-                    kernels.sweep_tiles, n, *nodes, *steps, np.int32(k % 2), growth, front[k],
-                    active, next_active, lowest, values,
-                )  # fmt: skip
+                    kernels.sweep_tiles,
+                    n,
+                    *nodes,
+                    *steps,
+                    np.int32(k % 2),
+                    growth,
+                    front[k],
+                    active,
+                    next_active,
+                    lowest,
+                    values,
+                )
                 active.fill(np.int32(0))
                 active, next_active = next_active, active
             passes += _PASSES
 
     @staticmethod
-    def _least_active(
-        active: np.ndarray, lowest: np.ndarray, tiles: tuple[int, ...]
-    ) -> float | None:
+    def _least_active(active: np.ndarray, lowest: np.ndarray, tiles: tuple[int, ...]) -> float | None:
         """Return the smallest value in active tiles and their neighbors; None if no tile is active."""
         if not active.any():
             return None

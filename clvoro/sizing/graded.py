@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError, InputTypeError, MemoryLimitError
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..opencl.engine import WALLED_BOX, DomainKind, Engine
 from ..opencl.host_memory import host_memory
@@ -89,9 +89,7 @@ class Graded(Field):
         self.slope = check_slope("Graded", growth, slope)
         self.on_sphere = self.field.on_sphere
         if box is not None and not isinstance(box, Domain):
-            raise InputTypeError(
-                f"Graded box is {type(box).__name__}, expected a clvoro.Box or clvoro.Polygon"
-            )
+            raise InputTypeError(f"Graded box is {type(box).__name__}, expected a clvoro.Box or clvoro.Polygon")
         if box is not None:
             self.field.check_dim(box.dim)
         self.box, self.dim = box, self.field.dim if box is None else box.dim
@@ -111,8 +109,7 @@ class Graded(Field):
         box = self.box or domain or self._latest
         if box is None:
             raise InputError(
-                f"{self!r} has no domain to be computed on; pass box=, such as "
-                "Graded(field, 1.2, box=domain)"
+                f"{self!r} has no domain to be computed on; pass box=, such as Graded(field, 1.2, box=domain)"
             )
         self._latest = box
         known = [raster for (b, _), raster in self._rasters.items() if b == box]
@@ -134,9 +131,7 @@ class Graded(Field):
     def warnings(self, domain: Domain) -> list[str]:  # noqa: D102
         found = self.field.warnings(domain if self.box is None else self.box)
         if self.box is not None:
-            found += coverage_warnings(
-                repr(self), domain, self.box.lower, self.box.upper, "give a larger box"
-            )
+            found += coverage_warnings(repr(self), domain, self.box.lower, self.box.upper, "give a larger box")
         return found
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
@@ -177,18 +172,12 @@ class Graded(Field):
         on_device = engine.upload(values / scale)
         self._peak_bytes = max(peak_bytes, on_device.nbytes)
         spacing = box.extent / (counts - 1)
-        Gradation(engine).sweep_tiles(
-            on_device, counts.tolist(), (spacing / scale).tolist(), self.slope
-        )
+        Gradation(engine).sweep_tiles(on_device, counts.tolist(), (spacing / scale).tolist(), self.slope)
         limited = np.minimum(on_device.get().astype(float) * scale, values)
         return Raster(limited.reshape(counts[::-1]), box.lower, box.upper)
 
     def _at_nodes(
-        self,
-        box: Domain,
-        evaluate: Callable[[np.ndarray], np.ndarray],
-        nodes: np.ndarray,
-        axes: list[np.ndarray],
+        self, box: Domain, evaluate: Callable[[np.ndarray], np.ndarray], nodes: np.ndarray, axes: list[np.ndarray]
     ) -> np.ndarray:
         """Return the field at nodes (n, d); infinite at those outside the domain.
 
@@ -211,9 +200,7 @@ class Graded(Field):
             values[out[near]] = h[np.count_nonzero(inside) :] + self.slope * away
         return values
 
-    def _counts(
-        self, box: Domain, evaluate: Callable[[np.ndarray], np.ndarray], at_marks: np.ndarray
-    ) -> np.ndarray:
+    def _counts(self, box: Domain, evaluate: Callable[[np.ndarray], np.ndarray], at_marks: np.ndarray) -> np.ndarray:
         """Return the numbers of nodes along the axes."""
         if isinstance(self.resolution, tuple):
             return np.array(self.resolution)
@@ -256,12 +243,7 @@ class Graded(Field):
                 )
 
     def _seed(
-        self,
-        values: np.ndarray,
-        counts: np.ndarray,
-        axes: list[np.ndarray],
-        marks: np.ndarray,
-        at_marks: np.ndarray,
+        self, values: np.ndarray, counts: np.ndarray, axes: list[np.ndarray], marks: np.ndarray, at_marks: np.ndarray
     ) -> None:
         """Lower the nodes around each landmark to the values that it allows."""
         first = [
@@ -280,10 +262,7 @@ class Graded(Field):
 
 def _axes(box: Domain, counts: np.ndarray) -> list[np.ndarray]:
     """Return the coordinates of the nodes along each axis."""
-    return [
-        np.linspace(low, high, n)
-        for low, high, n in zip(box.lower, box.upper, counts.tolist(), strict=True)
-    ]
+    return [np.linspace(low, high, n) for low, high, n in zip(box.lower, box.upper, counts.tolist(), strict=True)]
 
 
 def _along(box: Domain, spacing: float) -> np.ndarray:
@@ -296,13 +275,10 @@ def _check_resolution(resolution: int | Sequence[int], dim: int | None) -> int |
     if given.dtype.kind not in "iu":
         raise InputTypeError(f"Graded resolution is {resolution!r}, expected integers")
     if given.ndim > 1 or (given.ndim and given.size not in ((dim,) if dim else (2, 3))):
-        raise InputError(
-            f"Graded resolution has shape {given.shape}, expected one number of nodes or one per axis"
-        )
+        raise InputError(f"Graded resolution has shape {given.shape}, expected one number of nodes or one per axis")
     if given.min() < 2 or np.prod(given, dtype=float) > _MAX_NODES_GIVEN:
         raise InputError(
-            f"Graded resolution is {resolution!r}, expected at least 2 nodes along each axis and "
-            "fewer than 2^31 in all"
+            f"Graded resolution is {resolution!r}, expected at least 2 nodes along each axis and fewer than 2^31 in all"
         )
     return tuple(given.tolist()) if given.ndim else int(given)
 

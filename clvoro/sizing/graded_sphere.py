@@ -18,7 +18,7 @@ from .lonlat import LonLat
 from .raster import Raster
 
 if TYPE_CHECKING:
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
     from .codegen import CodeWriter
 
 _PROBES = 1 << 13
@@ -108,9 +108,7 @@ class ArcGraded(Field):
         self._seed(sphere, values, nx, marks, at_marks)
         peak_bytes = evaluate.peak_bytes
         del evaluate  # frees its memory
-        plane = Engine(
-            engine.ctx, engine.queue, 2, engine.real, workspace=engine.workspace, pool=engine.pool
-        )
+        plane = Engine(engine.ctx, engine.queue, 2, engine.real, workspace=engine.workspace, pool=engine.pool)
         on_device = plane.upload(values / sphere.radius)
         self.given._peak_bytes = max(peak_bytes, on_device.nbytes)
         Gradation(plane, globe=True).sweep_tiles(
@@ -119,9 +117,7 @@ class ArcGraded(Field):
         limited = np.minimum(on_device.get().astype(float) * sphere.radius, values)
         return Raster(limited.reshape(ny, nx), (-180, -90), (180, 90), at="centers")
 
-    def _columns(
-        self, sphere: Sphere, evaluate: Callable[[np.ndarray], np.ndarray], at_marks: np.ndarray
-    ) -> int:
+    def _columns(self, sphere: Sphere, evaluate: Callable[[np.ndarray], np.ndarray], at_marks: np.ndarray) -> int:
         """Return the number of nodes along the equator."""
         if isinstance(self.given.resolution, int):
             return globe_columns(self.given.resolution)
@@ -132,9 +128,7 @@ class ArcGraded(Field):
             columns = globe_columns(columns - 64)
         return columns
 
-    def _seed(
-        self, sphere: Sphere, values: np.ndarray, nx: int, marks: np.ndarray, at_marks: np.ndarray
-    ) -> None:
+    def _seed(self, sphere: Sphere, values: np.ndarray, nx: int, marks: np.ndarray, at_marks: np.ndarray) -> None:
         """Lower the nodes around each landmark to the values that it allows."""
         ny, spacing = nx // 2, 360 / nx
         lon, lat = sphere.lonlat(marks).T

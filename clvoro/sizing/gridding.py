@@ -39,9 +39,7 @@ def fill_missing(what: str, values: Any, missing: str, spacing: np.ndarray) -> n
     if array.dtype.kind not in "fiu":
         raise InputTypeError(f"{what} are of type {array.dtype}, expected real numbers")
     if array.ndim not in (2, 3) or array.size == 0:
-        raise InputError(
-            f"{what} have shape {array.shape}, expected (ny, nx) or (nz, ny, nx), not empty"
-        )
+        raise InputError(f"{what} have shape {array.shape}, expected (ny, nx) or (nz, ny, nx), not empty")
     array = array.astype(float)
     gaps = np.isnan(array) | mask
     infinite = np.argwhere(np.isinf(array) & ~mask)
@@ -60,9 +58,7 @@ def fill_missing(what: str, values: Any, missing: str, spacing: np.ndarray) -> n
         raise InputError(f"{what} are all missing, {gaps.size} of them; expected some numbers")
     from scipy.ndimage import distance_transform_edt
 
-    found: Any = distance_transform_edt(
-        gaps, sampling=spacing[::-1], return_distances=False, return_indices=True
-    )
+    found: Any = distance_transform_edt(gaps, sampling=spacing[::-1], return_distances=False, return_indices=True)
     return array[tuple(found)]
 
 
@@ -80,9 +76,7 @@ def grid_scattered(
     if given.dtype.kind not in "fiu":
         raise InputTypeError(f"Scattered values are of type {given.dtype}, expected real numbers")
     if given.shape != (len(x),):
-        raise InputError(
-            f"Scattered values have shape {given.shape} for {len(x)} points, expected ({len(x)},)"
-        )
+        raise InputError(f"Scattered values have shape {given.shape} for {len(x)} points, expected ({len(x)},)")
     if not len(x):
         raise InputError("Scattered got no points, expected at least one")
     bad = np.flatnonzero(~np.isfinite(given))
@@ -110,10 +104,7 @@ def grid_scattered(
         )
     extent = high - low
     if resolution is None:
-        spacing = max(
-            0.5 * (np.prod(extent) / len(x)) ** (1 / d),
-            1.05 * (np.prod(extent) / _MAX_NODES) ** (1 / d),
-        )
+        spacing = max(0.5 * (np.prod(extent) / len(x)) ** (1 / d), 1.05 * (np.prod(extent) / _MAX_NODES) ** (1 / d))
         counts = np.maximum(np.ceil(extent / spacing).astype(int), 1) + 1
     else:
         asked = np.asarray(resolution)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..geometry.boundary_layers import Layers, chosen_segments, outer_segments
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.shapes import Edges
 from .distance import Distance
 from .field import Field, as_field, minimum

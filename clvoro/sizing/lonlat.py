@@ -10,7 +10,8 @@ import numpy as np
 
 from ..arguments import check_number
 from ..errors import InputError, InputTypeError
-from ..geometry.box import Box, Domain
+from ..geometry.box import Box
+from ..geometry.domain import Domain
 from ..geometry.lonlat_shapes import check_lonlat, warn_of_radians
 from ..geometry.sphere import Sphere, directions
 from .arguments import check_positive, check_slope
@@ -145,9 +146,7 @@ def _closed(raster: Raster, nodes: np.ndarray, spacing: float) -> Raster:
         half = (north - south) / len(values) / 2
         values = np.pad(values, ((1, 1), (0, 0)), mode="edge")
         south, north = south - half, north + half
-    return Raster(
-        values, (nodes[0] - spacing, south), (nodes[0] + 360, north), outside=raster.outside
-    )
+    return Raster(values, (nodes[0] - spacing, south), (nodes[0] + 360, north), outside=raster.outside)
 
 
 class ArcDistance(Distance):
@@ -184,9 +183,7 @@ class ArcDistance(Distance):
         return super()._finish(writer, writer.variable(f"{arc} * {arc}"), law)
 
 
-def _degree_lines(
-    begin: np.ndarray, end: np.ndarray, radius: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _degree_lines(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return segments (m, 2) each in degrees; a circle of `radius` degrees becomes a closed polyline."""
     found = [(begin[radius == 0], end[radius == 0])]
     turn = np.linspace(0, 2 * np.pi, 721)
@@ -256,17 +253,13 @@ class Caps(Field):
     ) -> None:
         self.sphere = Sphere() if sphere is None else sphere
         if not isinstance(self.sphere, Sphere):
-            raise InputTypeError(
-                f"Caps sphere is {type(sphere).__name__}, expected a clvoro.Sphere"
-            )
+            raise InputTypeError(f"Caps sphere is {type(sphere).__name__}, expected a clvoro.Sphere")
         self.slope = check_slope("Caps", growth, slope)
         self.h_max = check_positive("Caps h_max", h_max)
         rows = []
         for k, region in enumerate(regions):
             if not isinstance(region, (tuple, list)) or len(region) != 3:
-                raise InputTypeError(
-                    f"Caps regions[{k}] is {region!r}, expected ((longitude, latitude), radius, size)"
-                )
+                raise InputTypeError(f"Caps regions[{k}] is {region!r}, expected ((longitude, latitude), radius, size)")
             center = self.sphere.positions([region[0]])[0] / self.sphere.radius
             radius = check_number(f"Caps regions[{k}] radius", region[1], least=0)
             rows.append([*center, radius, check_positive(f"Caps regions[{k}] size", region[2])])

@@ -51,8 +51,7 @@ def lonlat_grid(array: Any, missing: str = "error") -> Grid:
     what = _describe(array)
     lon_name, lat_name = (_coordinate(array, axis, what) for axis in _NAMES)
     lon, lat = (
-        _degrees(array.coords[name], axis, what)
-        for axis, name in zip(_NAMES, (lon_name, lat_name), strict=True)
+        _degrees(array.coords[name], axis, what) for axis, name in zip(_NAMES, (lon_name, lat_name), strict=True)
     )
     _refuse_radians(array, lon_name, lat_name, lon, lat, what)
     values = _in_order(array, array.coords[lat_name].dims[0], array.coords[lon_name].dims[0], what)
@@ -79,9 +78,7 @@ def _describe(array: Any) -> str:
     """Return the name of a DataArray for errors; raise if it is something else."""
     if hasattr(array, "data_vars"):
         names = ", ".join(map(str, array.data_vars))
-        raise InputTypeError(
-            f"from_xarray got a Dataset of {names:.200}, expected one of its arrays: dataset['NAME']"
-        )
+        raise InputTypeError(f"from_xarray got a Dataset of {names:.200}, expected one of its arrays: dataset['NAME']")
     if not all(hasattr(array, name) for name in ("dims", "coords", "values")):
         raise InputTypeError(
             f"from_xarray got {type(array).__name__}, expected an xarray.DataArray; write "
@@ -137,18 +134,16 @@ def _degrees(coordinate: Any, axis: str, what: str) -> np.ndarray:
     return degrees
 
 
-def _refuse_radians(
-    array: Any, lon_name: str, lat_name: str, lon: np.ndarray, lat: np.ndarray, what: str
-) -> None:
+def _refuse_radians(array: Any, lon_name: str, lat_name: str, lon: np.ndarray, lat: np.ndarray, what: str) -> None:
     """Raise an error for coordinates without a unit that go around the sphere or from pole to pole in radians."""
     if _attribute(array.coords[lon_name], "units") or _attribute(array.coords[lat_name], "units"):
         return
     small = np.abs(lat).max() <= math.pi / 2 + 1e-3 and np.abs(lon).max() <= 2 * math.pi + 1e-3
     width = np.ptp(lon) * len(lon) / (len(lon) - 1)
     height = np.ptp(lat) * len(lat) / (len(lat) - 1)
-    whole = (
-        abs(np.ptp(lon) - 2 * math.pi) < 0.01 or abs(width - 2 * math.pi) < 0.01
-    ) or (abs(np.ptp(lat) - math.pi) < 0.01 or abs(height - math.pi) < 0.01)  # fmt: skip
+    whole = (abs(np.ptp(lon) - 2 * math.pi) < 0.01 or abs(width - 2 * math.pi) < 0.01) or (
+        abs(np.ptp(lat) - math.pi) < 0.01 or abs(height - math.pi) < 0.01
+    )
     if small and whole:
         raise InputError(
             f"the coordinates of {what} go from {lon.min():.6g} to {lon.max():.6g} and from {lat.min():.6g} to "
@@ -163,9 +158,7 @@ def _in_order(array: Any, rows: str, columns: str, what: str) -> np.ndarray:
     dims, sizes = list(array.dims), dict(zip(array.dims, values.shape, strict=True))
     for name, at in (("latitude", rows), ("longitude", columns)):
         if at not in sizes:
-            raise InputError(
-                f"{what} has the dimensions {', '.join(map(str, dims))}, expected one along its {name}"
-            )
+            raise InputError(f"{what} has the dimensions {', '.join(map(str, dims))}, expected one along its {name}")
     further = [name for name in dims if name not in (rows, columns)]
     for name in further:
         if sizes[name] != 1:
@@ -178,9 +171,7 @@ def _in_order(array: Any, rows: str, columns: str, what: str) -> np.ndarray:
     return kept if left == [rows, columns] else kept.T
 
 
-def _increasing(
-    degrees: np.ndarray, values: np.ndarray, axis: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _increasing(degrees: np.ndarray, values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Return coordinates in increasing order, and values to match; longitudes may jump by 360 degrees."""
     steps = np.diff(degrees)
     if axis == 1 and not ((steps > 0).all() or (steps < 0).all()):
@@ -210,9 +201,7 @@ def _check_range(lon: np.ndarray, lat: np.ndarray, lon_name: str, lat_name: str,
         )
 
 
-def _filled(
-    what: str, values: np.ndarray, missing: str, lon: np.ndarray, lat: np.ndarray, around: bool
-) -> np.ndarray:
+def _filled(what: str, values: np.ndarray, missing: str, lon: np.ndarray, lat: np.ndarray, around: bool) -> np.ndarray:
     """Return the values without missing ones; see `fill_missing`."""
     spacing = np.array([np.ptp(lon) / (len(lon) - 1), np.ptp(lat) / (len(lat) - 1)])
     gaps = values.dtype.kind == "f" and bool(np.isnan(np.ma.getdata(values)).any())
@@ -252,9 +241,7 @@ def _resampled(
     for axis, degrees, count in ((1, lon, counts[0]), (0, lat, counts[1])):
         if _uniform(degrees):
             continue
-        place = np.interp(
-            np.linspace(degrees[0], degrees[-1], count), degrees, np.arange(len(degrees))
-        )
+        place = np.interp(np.linspace(degrees[0], degrees[-1], count), degrees, np.arange(len(degrees)))
         first = np.minimum(place.astype(int), len(degrees) - 2)
         weight = (place - first)[:, None] if axis == 0 else place - first
         below, above = (np.take(values, first + k, axis) for k in (0, 1))

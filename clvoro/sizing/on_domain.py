@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..geometry.sphere import Sphere
 from .distance import Distance
 from .field import Combined, Field, Scaled

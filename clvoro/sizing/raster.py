@@ -19,7 +19,7 @@ from .lonlat_grid import lonlat_grid
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
     from .codegen import CodeWriter
 
 _MANY, _WITHIN = 8, 0.1
@@ -88,9 +88,7 @@ class Raster(Field):
         self.dim = self.values.ndim
 
     @classmethod
-    def from_xarray(
-        cls, array: Any, *, missing: str = "error", outside: str | None = None
-    ) -> Raster:
+    def from_xarray(cls, array: Any, *, missing: str = "error", outside: str | None = None) -> Raster:
         """Return the raster of an xarray.DataArray of longitude and latitude in degrees.
 
         On a `clvoro.Sphere` a raster that goes around it is periodic. xarray itself is not needed: any object with
@@ -147,9 +145,7 @@ class Raster(Field):
             shape = (*low.shape[:axis], -1, tile, *low.shape[axis + 1 :])
             low, where = low.reshape(shape), where.reshape(shape)
             least = np.expand_dims(low.argmin(axis=axis + 1), axis + 1)
-            low, where = (
-                np.take_along_axis(a, least, axis + 1).squeeze(axis + 1) for a in (low, where)
-            )
+            low, where = (np.take_along_axis(a, least, axis + 1).squeeze(axis + 1) for a in (low, where))
         gain, origin = self._index_map()
         index = np.stack(np.unravel_index(where.ravel(), self.values.shape)[::-1], axis=1)
         points = origin + np.divide(index, gain, out=np.zeros(index.shape), where=gain > 0)
@@ -283,9 +279,7 @@ def check_box(
         If they do not match the shape, or are not in order.
     """
     if len(shape) not in (2, 3) or 0 in shape:
-        raise InputError(
-            f"{what} values have shape {shape}, expected (ny, nx) or (nz, ny, nx), not empty"
-        )
+        raise InputError(f"{what} values have shape {shape}, expected (ny, nx) or (nz, ny, nx), not empty")
     low, high = (np.asarray(c, dtype=float) for c in (lower, upper))
     d = len(shape)
     if low.shape != (d,) or high.shape != (d,):

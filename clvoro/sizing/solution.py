@@ -97,9 +97,7 @@ def hessian_size(
         size = Graded(hessian_size(u, (0, 0), (1, 1), n_cells=5000, h_max=0.1), growth=1.2)
         clvoro.Adapter().run(clvoro.Box((0, 0), (1, 1)), size, n_cells=5000).plot("size")
     """
-    u, corners, spacing = _check_solution(
-        "hessian_size", values, lower, upper, at, missing, least=3
-    )
+    u, corners, spacing = _check_solution("hessian_size", values, lower, upper, at, missing, least=3)
     if not (isinstance(p, Real) and p >= 1):
         raise InputError(f"hessian_size p is {p!r}, expected at least 1; math.inf is allowed")
     d = u.ndim
@@ -122,9 +120,7 @@ def hessian_size(
         factor = math.sqrt(8 * wanted / (largest * norm)) if largest > 0 else math.inf
     else:
         factor = None
-    return _sizes_from_profile(
-        "hessian_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at
-    )
+    return _sizes_from_profile("hessian_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at)
 
 
 def gradient_size(
@@ -169,9 +165,7 @@ def gradient_size(
 
         size = gradient_size(temperature, (0, 0), (2, 1), eps=2.0, h_max=0.1)
     """
-    u, corners, spacing = _check_solution(
-        "gradient_size", values, lower, upper, at, missing, least=2
-    )
+    u, corners, spacing = _check_solution("gradient_size", values, lower, upper, at, missing, least=2)
     slopes = np.gradient(u, *spacing[::-1])
     steep = np.sqrt(sum(s**2 for s in slopes))
     largest = float(steep.max())
@@ -181,19 +175,11 @@ def gradient_size(
     factor = None
     if eps is not None:
         factor = wanted / largest if largest > 0 else math.inf
-    return _sizes_from_profile(
-        "gradient_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at
-    )
+    return _sizes_from_profile("gradient_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at)
 
 
 def _check_solution(
-    what: str,
-    values: ArrayLike,
-    lower: ArrayLike,
-    upper: ArrayLike,
-    at: str,
-    missing: str,
-    least: int,
+    what: str, values: ArrayLike, lower: ArrayLike, upper: ArrayLike, at: str, missing: str, least: int
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Return the checked values, the corners and the spacing of the values along x, y (, z)."""
     shape = np.shape(values)
@@ -201,8 +187,7 @@ def _check_solution(
     counts = np.array(shape[::-1])
     if counts.min(initial=least) < least:
         raise InputError(
-            f"{what} values have shape {shape}, expected at least {least} along each axis; "
-            "derivatives need neighbors"
+            f"{what} values have shape {shape}, expected at least {least} along each axis; derivatives need neighbors"
         )
     spacing = (high - low) / (counts - 1 if at == "nodes" else counts)
     return fill_missing(f"{what} values", values, missing, spacing), (low, high), spacing
@@ -236,9 +221,7 @@ def _weights(shape: tuple[int, ...], spacing: np.ndarray, at: str) -> np.ndarray
 
 def _check_one_of(what: str, n_cells: object, eps: object) -> float:
     if (n_cells is None) == (eps is None):
-        raise InputError(
-            f"{what} got n_cells={n_cells} and eps={eps}, expected exactly one of them"
-        )
+        raise InputError(f"{what} got n_cells={n_cells} and eps={eps}, expected exactly one of them")
     name = "eps" if n_cells is None else "n_cells"
     return check_positive(f"{what} {name}", eps if n_cells is None else n_cells)
 
@@ -259,9 +242,7 @@ def _sizes_from_profile(
         if not isinstance(bound, Real) or isinstance(bound, bool):
             raise InputTypeError(f"{what} {name} is {bound!r}, expected a number")
     if not (0 <= h_min <= h_max and h_min < math.inf and h_max > 0):
-        raise InputError(
-            f"{what} got h_min={h_min} and h_max={h_max}, expected 0 <= h_min <= h_max"
-        )
+        raise InputError(f"{what} got h_min={h_min} and h_max={h_max}, expected 0 <= h_min <= h_max")
     if n_cells is not None and not np.isfinite(profile).any():
         raise InputError(
             f"{what} values have no derivatives other than 0, so n_cells={n_cells:g} cannot be "

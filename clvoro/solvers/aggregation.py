@@ -140,11 +140,7 @@ class Aggregation:
         if not same_exponent:
             partial = self._room("largest", source, size=self.engine.groups, dtype=source)
             self.engine.run_blocks(
-                kernels.find_largest_weight,
-                np.int32(len(graph)),
-                graph.starts,
-                graph.weights,
-                partial,
+                kernels.find_largest_weight, np.int32(len(graph)), graph.starts, graph.weights, partial
             )
             largest = float(partial.get().max())
             self.exponent = -math.frexp(largest)[1] if 0 < largest < math.inf else 0
@@ -195,13 +191,17 @@ class Aggregation:
         self._run_rows(self._kernels.invert_row_sums, graph, sums)
         return sums
 
-    def _choose(
-        self, graph: Graph, matched: int, sums: cla.Array, mate: cla.Array, choice: cla.Array
-    ) -> None:
+    def _choose(self, graph: Graph, matched: int, sums: cla.Array, mate: cla.Array, choice: cla.Array) -> None:
         self._run(
-            self._kernels.choose_neighbor, len(graph), np.int32(len(graph)), np.int32(matched),
-            *graph.rows, sums, mate, choice,
-        )  # fmt: skip
+            self._kernels.choose_neighbor,
+            len(graph),
+            np.int32(len(graph)),
+            np.int32(matched),
+            *graph.rows,
+            sums,
+            mate,
+            choice,
+        )
 
     def _match(self, graph: Graph, sums: cla.Array, mate: cla.Array, choice: cla.Array) -> None:
         """Do one round of matching."""
@@ -212,16 +212,12 @@ class Aggregation:
     def _pair_inverse(self, graph: Graph, mate: cla.Array, level: int) -> PairInverse:
         n, room = len(graph), self._room
         pairs = PairInverse(
-            room(level, "partner", size=n, dtype=np.int32),
-            room(level, "own", size=n),
-            room(level, "both", size=n),
+            room(level, "partner", size=n, dtype=np.int32), room(level, "own", size=n), room(level, "both", size=n)
         )
         self._run_rows(self._kernels.invert_pair_blocks, graph, mate, *pairs.blocks)
         return pairs
 
-    def _aggregate(
-        self, graph: Graph, level: int | None = None
-    ) -> tuple[PairInverse | None, Aggregates]:
+    def _aggregate(self, graph: Graph, level: int | None = None) -> tuple[PairInverse | None, Aggregates]:
         """Do one pass: return the smoother (if a `level` is given) and the aggregates, in the workspace."""
         run, k, n, scratch = self._run, self._kernels, len(graph), self.engine.scratch
         size, ints = np.int32(n), np.int32
@@ -245,12 +241,7 @@ class Aggregation:
         return inverse, Aggregates(aggregate, starts[: count + 1], members)
 
     def _list(
-        self,
-        kernel: cl.Kernel,
-        count: int,
-        lists: tuple[cla.Array, ...],
-        starts: cla.Array,
-        members: cla.Array,
+        self, kernel: cl.Kernel, count: int, lists: tuple[cla.Array, ...], starts: cla.Array, members: cla.Array
     ) -> None:
         """List the members of `count` aggregates: count them, then write them."""
         number = np.int32(count)
@@ -258,9 +249,7 @@ class Aggregation:
         self._scan.exclusive(starts, starts, count)
         self._run(kernel, count, number, np.int32(1), *lists, members)
 
-    def _coarse_graph(
-        self, graph: Graph, aggregates: Aggregates, factor: float, level: int | None = None
-    ) -> Graph:
+    def _coarse_graph(self, graph: Graph, aggregates: Aggregates, factor: float, level: int | None = None) -> Graph:
         """Return the graph of `aggregates`, weights times `factor`: kept for `level`, else in the workspace."""
         run, k, count = self._run, self._kernels, len(aggregates)
 
@@ -291,9 +280,7 @@ class Aggregation:
             room(level, "starts", size=count + 1, dtype=np.int32),
             room(level, "members", size=n, dtype=np.int32),
         )
-        self._run(
-            self._kernels.compose_aggregates, n, np.int32(n), inner.aggregate, outer.aggregate, both.aggregate
-        )  # fmt: skip
+        self._run(self._kernels.compose_aggregates, n, np.int32(n), inner.aggregate, outer.aggregate, both.aggregate)
         lists = (outer.starts, outer.members, inner.starts, inner.members, both.starts)
         self._list(self._kernels.compose_members, count, lists, both.starts, both.members)
         return both

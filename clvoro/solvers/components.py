@@ -11,7 +11,7 @@ from ..geometry.polygon import Polygon
 if TYPE_CHECKING:
     import pyopencl.array as cla
 
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
     from ..tessellation.device_diagram import Tessellation
 
 
@@ -20,9 +20,7 @@ def has_pieces(domain: Domain) -> bool:
     return isinstance(domain, Polygon) and domain.n_pieces > 1
 
 
-def balance_components(
-    domain: Domain, t: Tessellation, source: cla.Array, weights: cla.Array
-) -> None:
+def balance_components(domain: Domain, t: Tessellation, source: cla.Array, weights: cla.Array) -> None:
     """Subtract from `source` its mean in each connected component, so that it sums up to 0 there.
 
     The right side is source_i = weight_i (s_i - mean s). The null space of the operator has one constant per component.

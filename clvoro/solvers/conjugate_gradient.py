@@ -101,9 +101,7 @@ class ConjugateGradient:
             self._group_state = self.engine.zeros(_STATE + 4 * (limits.max_iterations + 1))
         if operator.rows is not None and isinstance(precondition, cla.Array):
             if len(rhs) <= self._one_group_limit:
-                return self._solve_by_group(
-                    operator, rhs, x, precondition, limits, from_zero, store
-                )
+                return self._solve_by_group(operator, rhs, x, precondition, limits, from_zero, store)
         system = _System(self, operator, rhs, x, precondition, limits.tolerance, store)
         iterations, history, reason = 0, [], "max_iterations"
         # From zero the relative residual is 1; the host reads the norm of b with the first iterations.
@@ -157,18 +155,25 @@ class ConjugateGradient:
         engine, real, tolerance = self.engine, self.engine.real.type, limits.tolerance
         vectors = (engine.scratch(len(rhs), store) for _ in range(4))
         assert operator.rows is not None
-        given = (
-            *operator.rows, inverse_diagonal, rhs, x, *vectors, self.partial, self._group_state
-        )  # fmt: skip
+        given = (*operator.rows, inverse_diagonal, rhs, x, *vectors, self.partial, self._group_state)
         size, center = np.int32(len(rhs)), np.int32(operator.singular)
         kernel = self.kernels_in(store).solve_by_group
         done, history, stagnated = 0, [], math.inf
         while True:
             left = limits.max_iterations - done
             Launch(
-                engine, kernel, size, np.int32(from_zero), center, np.int32(left), real(0.95 * tolerance),
-                real(tolerance), real(min(stagnated, float(np.finfo(real).max))), *given, groups=1,
-            )()  # fmt: skip
+                engine,
+                kernel,
+                size,
+                np.int32(from_zero),
+                center,
+                np.int32(left),
+                real(0.95 * tolerance),
+                real(tolerance),
+                real(min(stagnated, float(np.finfo(real).max))),
+                *given,
+                groups=1,
+            )()
             host = self._group_state[: _STATE + 4 * min(left, _FIRST_READ)].get()
             residual = self.relative_residual(host[2], *host[4:6])
             if residual < 0:
@@ -204,13 +209,7 @@ class ConjugateGradient:
         return math.sqrt(norm_r / norm_b)
 
     def _iterate(
-        self,
-        system: _System,
-        begun: int,
-        limits: Limits,
-        residual: float,
-        history: list[float],
-        unknown: bool,
+        self, system: _System, begun: int, limits: Limits, residual: float, history: list[float], unknown: bool
     ) -> int | None:
         """Iterate from the present residual until a stop, or up to `max_iterations`; return the number of iterations.
 
@@ -225,9 +224,7 @@ class ConjugateGradient:
             for k in range(done, end):
                 system.iterate(k)
             system.record_norm()
-            *rows, (removed, norm_b, *_) = (
-                self.record[4 * done : 4 * (end + 2)].get().reshape(-1, 4)
-            )
+            *rows, (removed, norm_b, *_) = self.record[4 * done : 4 * (end + 2)].get().reshape(-1, 4)
             if unknown and self.relative_residual(removed, norm_b, rows[0][RECORD_NORM]) < 0:
                 return None
             unknown = False
@@ -242,9 +239,7 @@ class ConjugateGradient:
             ahead = min(max(math.ceil(left), 1), limits.lookahead)
         return done
 
-    def _read_record(
-        self, record: np.ndarray, begin: int, tolerance: float, history: list[float]
-    ) -> int | None:
+    def _read_record(self, record: np.ndarray, begin: int, tolerance: float, history: list[float]) -> int | None:
         """Append the record from iteration `begin` on to `history`; return the iteration that stopped, if any."""
         self._final = math.inf
         for k, row in enumerate(record.reshape(-1, 4).astype(np.float64), start=begin):
@@ -256,9 +251,7 @@ class ConjugateGradient:
             history.append(residual)
         return None
 
-    def _check_stop(
-        self, k: int, row: np.ndarray, residual: float, tolerance: float, history: list[float]
-    ) -> None:
+    def _check_stop(self, k: int, row: np.ndarray, residual: float, tolerance: float, history: list[float]) -> None:
         """Raise if iteration `k` stopped neither at the tolerance nor at the limit of the precision."""
         if residual <= tolerance:
             return
@@ -305,17 +298,13 @@ class _System:
         for p, old in (directions[::-1], directions):
             if self._merged:
                 assert operator.rows is not None
-                direction = (
-                    k.apply_to_direction, first, self._size, limit, *operator.rows, self._u, old, p, self._q
-                )  # fmt: skip
+                direction = (k.apply_to_direction, first, self._size, limit, *operator.rows, self._u, old, p, self._q)
             else:
                 direction = k.update_direction, first, self._size, limit, self._u, p
             self._find_direction.append(Launch(self._engine, *direction, *self._tail))
             vectors = p, self._q, x, self._r
             if isinstance(precondition, cla.Array):
-                solution = (
-                    k.update_solution_jacobi, first, self._size, self._center, precondition, *vectors, self._u
-                )  # fmt: skip
+                solution = (k.update_solution_jacobi, first, self._size, self._center, precondition, *vectors, self._u)
             else:
                 solution = k.update_solution, first, self._size, self._center, *vectors
             self._update_solution.append(Launch(self._engine, *solution, *self._tail))
@@ -324,9 +313,7 @@ class _System:
         """Do the same as `start`, and return the relative norm of r; negative if b is zero."""
         self.start(from_zero)
         partial, state, _ = self._tail
-        self._launch_one_group(
-            self._kernels.read_norms, partial, state, np.int32(self._engine.groups)
-        )
+        self._launch_one_group(self._kernels.read_norms, partial, state, np.int32(self._engine.groups))
         _, _, removed, _, *norms = state.get()
         return self._solver.relative_residual(removed, *norms)
 
@@ -338,16 +325,26 @@ class _System:
         partial, state, _ = self._tail
         self._launch(k.sum_right_sides, self._size, anew, self._rhs, self._q, partial)
         self._launch(
-            k.start_residual, self._size, anew, self._center, self._rhs, self._q, self._x, self._r, self._p, partial,
-            state, self._solver.counts,
-        )  # fmt: skip
+            k.start_residual,
+            self._size,
+            anew,
+            self._center,
+            self._rhs,
+            self._q,
+            self._x,
+            self._r,
+            self._p,
+            partial,
+            state,
+            self._solver.counts,
+        )
 
     def begin(self) -> None:
         """Precondition the first residual."""
         if isinstance(self._precondition, cla.Array):
             self._launch(
                 self._kernels.precondition_jacobi, self._size, self._precondition, self._r, self._u, self._tail[0]
-            )  # fmt: skip
+            )
 
     def iterate(self, k: int) -> None:
         """Enqueue iteration k."""

@@ -162,9 +162,7 @@ class Cycle:
         blocks = self._levels[depth].pairs.blocks
         if r is not None:
             self._add(depth, "smooth_from_zero_rounded", n, _NO_DAMPING, *blocks, r, b, x)
-        self._add(
-            depth, _COARSE, len(levels), _LATE, _EARLY, *self._pack(levels), self._factor, b, x
-        )
+        self._add(depth, _COARSE, len(levels), _LATE, _EARLY, *self._pack(levels), self._factor, b, x)
         if u is not None:
             self._add(depth, "smooth_into", n, _NO_DAMPING, *blocks, b, x, u)
 
@@ -186,24 +184,23 @@ class Cycle:
             n, groups = len(level), level.aggregates
             starts, columns, weights = level.graph.rows
             partner, own, both = level.pairs.blocks
-            lists = (
-                (None,) * 3 if groups is None else (groups.aggregate, groups.starts, groups.members)
-            )
+            lists = (None,) * 3 if groups is None else (groups.aggregate, groups.starts, groups.members)
             ints = [place(array, np.int32) for array in (starts, columns, partner, *lists)]
             reals = [place(array, np.float32) for array in (weights, own, both)]
             reals += [place(None, np.float32, n) for _ in range(3)]
             rows.append([n, 0 if groups is None else len(groups), *ints, *reals])
         engine = self.engine
         table = engine.upload(rows, np.int32)
-        to = {
-            dtype: self._room("packed", dtype, size=size, dtype=dtype)
-            for dtype, size in sizes.items()
-        }
+        to = {dtype: self._room("packed", dtype, size=size, dtype=dtype) for dtype, size in sizes.items()}
         for dtype, start, array in parts:
             cl.enqueue_copy(
-                engine.queue, to[dtype].base_data, array.base_data, byte_count=array.nbytes,
-                src_offset=array.offset, dst_offset=4 * start,
-            )  # fmt: skip
+                engine.queue,
+                to[dtype].base_data,
+                array.base_data,
+                byte_count=array.nbytes,
+                src_offset=array.offset,
+                dst_offset=4 * start,
+            )
         self._packed = list(levels), (table, *to.values())
         return self._packed[1]
 

@@ -56,9 +56,7 @@ class _SavedLevel:
             _require(weights.shape == columns.shape and weights.dtype == np.float32)
             _require(bool((weights >= 0).all() and np.isfinite(weights).all()))
         if f"{depth}.aggregate" in arrays:
-            aggregate, starts, members = aggregates = tuple(
-                arrays[f"{depth}.{k}"] for k in _AGGREGATES
-            )
+            aggregate, starts, members = aggregates = tuple(arrays[f"{depth}.{k}"] for k in _AGGREGATES)
             count = len(starts) - 1
             _require(0 < count < n and depth < _MAX_LEVELS)
             _require(_are_starts(starts, count, n) and _is_within(aggregate, n, count))
@@ -216,9 +214,7 @@ class Multigrid:
             graph = Graph(*(single.upload(a, d) for a, d in zip(level.graph, "iif", strict=True)))
         else:
             graph = Graph(single.empty(n + 1, np.int32), single.empty(1, np.int32), single.empty(1))
-        pairs = PairInverse(
-            single.upload(level.partner, np.int32), single.empty(n), single.empty(n)
-        )
+        pairs = PairInverse(single.upload(level.partner, np.int32), single.empty(n), single.empty(n))
         if level.graph:
             self._aggregation.update_pairs(graph, pairs)
         if not level.aggregates:

@@ -33,11 +33,7 @@ _PRECONDITIONERS = ("auto", "jacobi", "multigrid")
 
 
 def expected_costs(
-    n: int,
-    dim: int,
-    tolerance: float,
-    one_group: bool = False,
-    factors: CostFactors = COSTS_ON_CPU,
+    n: int, dim: int, tolerance: float, one_group: bool = False, factors: CostFactors = COSTS_ON_CPU
 ) -> tuple[float, float]:
     """Return the expected costs of a solve with Jacobi's preconditioner and with multigrid, set-up included.
 
@@ -179,10 +175,18 @@ class Poisson:
         weights = engine.scratch(len(neighbors), store)
         weights.fill(0)
         engine.run(
-            self._kernels_in(store, face_measures.dtype).assemble_laplacian, n, np.int32(n),
-            np.int32(density is not None), starts, neighbors, face_measures, points,
-            points if density is None else density, weights, *self.engine.period_args,
-        )  # fmt: skip
+            self._kernels_in(store, face_measures.dtype).assemble_laplacian,
+            n,
+            np.int32(n),
+            np.int32(density is not None),
+            starts,
+            neighbors,
+            face_measures,
+            points,
+            points if density is None else density,
+            weights,
+            *self.engine.period_args,
+        )
         return Laplacian(starts, neighbors, weights)
 
     def inverse_diagonal(self, laplacian: Laplacian) -> cla.Array:
@@ -190,14 +194,11 @@ class Poisson:
         n, store = len(laplacian), laplacian.weights.dtype
         inverse = self.engine.scratch(n, store)
         self.engine.run(
-            self._kernels_in(store).invert_diagonal, n, np.int32(n), laplacian.starts,
-            laplacian.weights, inverse,
-        )  # fmt: skip
+            self._kernels_in(store).invert_diagonal, n, np.int32(n), laplacian.starts, laplacian.weights, inverse
+        )
         return inverse
 
-    def subtract_mean_source(
-        self, source: cla.Array, volumes: cla.Array, rhs: cla.Array
-    ) -> cla.Array:
+    def subtract_mean_source(self, source: cla.Array, volumes: cla.Array, rhs: cla.Array) -> cla.Array:
         """Set rhs_i = V_i (s_i - mean s), mean s = sum V s / sum V, so that its sum is 0.
 
         The equation with zero flux through all walls has solutions only for such right sides.
@@ -322,21 +323,15 @@ class Poisson:
         _check("rhs", rhs, (n,))
         _check("potential", potential, (n,))
         if preconditioner not in _PRECONDITIONERS:
-            raise InputError(
-                f"preconditioner got {preconditioner!r}, expected one of {_PRECONDITIONERS}"
-            )
+            raise InputError(f"preconditioner got {preconditioner!r}, expected one of {_PRECONDITIONERS}")
         if not tolerance > 0:
             raise InputError(f"tolerance got {tolerance!r}, expected a number > 0, such as 1e-8")
-        operator = Operator(
-            self._apply_of(laplacian), writes_curvature=True, singular=True, rows=laplacian.rows
-        )
+        operator = Operator(self._apply_of(laplacian), writes_curvature=True, singular=True, rows=laplacian.rows)
         system = _System(laplacian, operator, rhs, potential, tolerance)
         if preconditioner == "auto":
             one_group = n <= one_group_limit(self.engine)
             factors = cost_factors(self.engine.queue.device)
-            jacobi, multigrid = expected_costs(
-                n, self.engine.cell_dim, tolerance, one_group, factors
-            )
+            jacobi, multigrid = expected_costs(n, self.engine.cell_dim, tolerance, one_group, factors)
             preconditioner = "multigrid" if multigrid < jacobi else "jacobi"
         if preconditioner == "jacobi":
             most = max_jacobi_iterations(n) if max_iterations is None else max_iterations
@@ -401,9 +396,14 @@ class Poisson:
         verify = system.tolerance < SINGLE_PRECISION_TOLERANCE
         limits = Limits(system.tolerance, max_iterations, lookahead, verify)
         return self._conjugate_gradient.solve(
-            system.operator, system.rhs, system.potential, precondition, limits,
-            from_zero=from_zero, store=system.laplacian.weights.dtype,
-        )  # fmt: skip
+            system.operator,
+            system.rhs,
+            system.potential,
+            precondition,
+            limits,
+            from_zero=from_zero,
+            store=system.laplacian.weights.dtype,
+        )
 
     def _apply_of(self, laplacian: Laplacian) -> Callable[[cla.Array, cla.Array], None]:
         """Return a function that enqueues y = A x. It sets the kernel's arguments only when they change."""

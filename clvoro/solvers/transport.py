@@ -141,9 +141,7 @@ class Transport:
             while new is None and share > LEAST_SHARE:
                 share /= 2
                 stepped = engine.empty(n)
-                engine.run_each(
-                    self._kernels.step_weights, n, engine.real.type(share), now.weights, step, stepped
-                )  # fmt: skip
+                engine.run_each(self._kernels.step_weights, n, engine.real.type(share), now.weights, step, stepped)
                 new = evaluate(stepped, least)
                 if new is not None and (new.least < least or new.norm > (1 - share / 2) * now.norm):
                     new = None
@@ -165,9 +163,7 @@ class Transport:
         engine = self.engine
         self._summaries.collect("volume", prescribed, len(prescribed))
         factor = power.volume / self._summaries.read_one("volume").sum
-        engine.run_each(
-            self._kernels.scale_volumes, len(prescribed), engine.real.type(factor), prescribed
-        )
+        engine.run_each(self._kernels.scale_volumes, len(prescribed), engine.real.type(factor), prescribed)
         return factor
 
     def _evaluate(
@@ -185,16 +181,10 @@ class Transport:
         if t is None:
             return None
         rhs, square, relative = (engine.empty(n) for _ in range(3))
-        engine.run_each(
-            self._kernels.compare_volumes, n, t.volumes, prescribed, rhs, square, relative
-        )
-        self._summaries.collect_all(
-            {"volume": t.volumes, "square": square, "relative": relative}, n
-        )
+        engine.run_each(self._kernels.compare_volumes, n, t.volumes, prescribed, rhs, square, relative)
+        self._summaries.collect_all({"volume": t.volumes, "square": square, "relative": relative}, n)
         s = self._summaries.read()
-        return _State(
-            weights, t, rhs, relative, s["square"].sum ** 0.5, s["relative"].peak, s["volume"].least
-        )
+        return _State(weights, t, rhs, relative, s["square"].sum ** 0.5, s["relative"].peak, s["volume"].least)
 
     def _newton_step(
         self, power: PowerTessellator, now: _State, points: cla.Array, ordering: object
@@ -204,9 +194,7 @@ class Transport:
         step = engine.empty(len(points))
         with engine.workspace.frame():
             measures = power.laplacian_measures(t)
-            laplacian = self._poisson.assemble(
-                t.starts, t.neighbors, measures, points, tolerance=tolerance
-            )
+            laplacian = self._poisson.assemble(t.starts, t.neighbors, measures, points, tolerance=tolerance)
             solution = self._poisson.solve(
                 laplacian, now.rhs, step, tolerance=tolerance, ordering=ordering, from_zero=True
             )

@@ -175,23 +175,68 @@ class VolumeProjection:
         v, k = self._reserve(n, m, store, most), self._kernels_in(store)
         start = engine.scratch(n, np.float32) if start is None else start
         groups = 1 if n <= self._one_group_limit else engine.groups
-        sums = (
-            (self._partial, 0) if targets.sums is None else (targets.sums, len(targets.sums) // 2)
-        )
+        sums = (self._partial, 0) if targets.sums is None else (targets.sums, len(targets.sums) // 2)
         Launch(
-            engine, k.assemble_projection, n, m, t.starts, t.neighbors, t.face_measures,
-            t.face_centroids, t.volumes, t.points, targets.gradient, targets.h, targets.quality,
-            targets.log_ratio, displacement, real(penalty.eps), real(penalty.quality_scale),
+            engine,
+            k.assemble_projection,
+            n,
+            m,
+            t.starts,
+            t.neighbors,
+            t.face_measures,
+            t.face_centroids,
+            t.volumes,
+            t.points,
+            targets.gradient,
+            targets.h,
+            targets.quality,
+            targets.log_ratio,
+            displacement,
+            real(penalty.eps),
+            real(penalty.quality_scale),
             real(min(penalty.eps, penalty.most_at_walls)),
-            real(penalty.at_walls * penalty.quality_scale), real(penalty.log_ratio_scale),
-            penalty.power, v.rows, v.columns, v.own,
-            v.eps, v.inverse, v.r, v.z, self._partial, self._counts, *sums,
-            t.starts if labels is None else labels, fixed, int(warm), start, *engine.period_args, groups=groups,
-        )()  # fmt: skip
+            real(penalty.at_walls * penalty.quality_scale),
+            real(penalty.log_ratio_scale),
+            penalty.power,
+            v.rows,
+            v.columns,
+            v.own,
+            v.eps,
+            v.inverse,
+            v.r,
+            v.z,
+            self._partial,
+            self._counts,
+            *sums,
+            t.starts if labels is None else labels,
+            fixed,
+            int(warm),
+            start,
+            *engine.period_args,
+            groups=groups,
+        )()
         iteration = (
-            n, most, m, int(warm), real(tolerance), t.starts, t.neighbors,
-            v.rows, v.columns, v.own, v.eps, v.inverse, v.p, v.s, v.u, v.y, v.r, v.z, self._partial, self._record,
-        )  # fmt: skip
+            n,
+            most,
+            m,
+            int(warm),
+            real(tolerance),
+            t.starts,
+            t.neighbors,
+            v.rows,
+            v.columns,
+            v.own,
+            v.eps,
+            v.inverse,
+            v.p,
+            v.s,
+            v.u,
+            v.y,
+            v.r,
+            v.z,
+            self._partial,
+            self._record,
+        )
         if groups == 1:
             Launch(engine, k.project_by_group, *iteration, groups=1)()
             rows = self._read(most)

@@ -9,7 +9,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 from numpy.typing import DTypeLike
 
-from ..geometry.box import ClipBox
+from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
@@ -123,17 +123,13 @@ class Bins:
         grown = self.engine.zeros(size, dtype)
         old = getattr(self, name, None)
         if old is not None:
-            cl.enqueue_copy(
-                self.engine.queue, buffer_of(grown), buffer_of(old), byte_count=old.nbytes
-            )
+            cl.enqueue_copy(self.engine.queue, buffer_of(grown), buffer_of(old), byte_count=old.nbytes)
         return grown
 
     def _clear(self, array: cla.Array, first: int, count: int) -> None:
         """Write zeros by a fill command, which is several times as fast as a kernel."""
         size = array.dtype.itemsize
-        cl.enqueue_fill(
-            self.engine.queue, buffer_of(array), _ZERO, count * size, offset=first * size
-        )
+        cl.enqueue_fill(self.engine.queue, buffer_of(array), _ZERO, count * size, offset=first * size)
 
     def clear(self) -> None:
         """Free all buffers."""
@@ -168,23 +164,26 @@ class Bins:
         self._frames[:4] = frame
         self._shapes[:4] = shape
         self._clear(self._grid_of, 0, root_bins)
-        engine.run_each(
-            k.count_root, n, points, frame, shape, self._keys, self._ranks, self._counts
-        )
+        engine.run_each(k.count_root, n, points, frame, shape, self._keys, self._ranks, self._counts)
         begin, size, grids = 0, root_bins, 1
         for level in range(MAX_LEVELS):
             end, may_divide = begin + size, np.int32(level < MAX_LEVELS - 1)
-            engine.run_each(
-                k.plan_children, size, self._counts, np.int32(begin), may_divide, self._flags,
-                self._sizes,
-            )  # fmt: skip
+            engine.run_each(k.plan_children, size, self._counts, np.int32(begin), may_divide, self._flags, self._sizes)
             for place, values in enumerate((self._flags, self._sizes)):
                 self._scan.exclusive(values, values, size, total=(self._found, place))
             self._scan.exclusive(self._counts, self._starts, size, first=begin)
             engine.run_each(
-                k.place_bins, size, self._starts, np.int32(begin), self._grid_of, self._shapes,
-                self._grid_items, np.int32(grids), self._flags, self._bins,
-            )  # fmt: skip
+                k.place_bins,
+                size,
+                self._starts,
+                np.int32(begin),
+                self._grid_of,
+                self._shapes,
+                self._grid_items,
+                np.int32(grids),
+                self._flags,
+                self._bins,
+            )
             new_grids, new_bins = map(int, self._found.get())
             if new_grids == 0:
                 break
@@ -192,26 +191,47 @@ class Bins:
             self._reserve(n, end + new_bins)
             self._clear(self._counts, end, new_bins)
             engine.run_each(
-                k.make_grids, size, self._bins, self._counts, np.int32(begin), np.int32(end),
-                child_firsts, self._grid_of, self._frames, self._shapes, self._grid_items,
-            )  # fmt: skip
+                k.make_grids,
+                size,
+                self._bins,
+                self._counts,
+                np.int32(begin),
+                np.int32(end),
+                child_firsts,
+                self._grid_of,
+                self._frames,
+                self._shapes,
+                self._grid_items,
+            )
             engine.run_each(
-                k.count_in_child_bins, n, points, self._bins, self._frames, self._shapes,
-                self._keys, self._ranks, self._counts,
-            )  # fmt: skip
+                k.count_in_child_bins,
+                n,
+                points,
+                self._bins,
+                self._frames,
+                self._shapes,
+                self._keys,
+                self._ranks,
+                self._counts,
+            )
             begin, size, grids = end, new_bins, grids + new_grids
         total = begin + size
         engine.run_each(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
         spacing = self._ranks.view(np.float32)  # the ranks are no longer needed
         engine.run_each(
-            k.sort_bins, total, self._bins, self._grid_of, self._frames, self._shapes, self._items,
-            self._reach, spacing,
-        )  # fmt: skip
+            k.sort_bins, total, self._bins, self._grid_of, self._frames, self._shapes, self._items, self._reach, spacing
+        )
         engine.run_each(k.gather_items, n, self._items, points, self._points)
         return BinnedPoints(
-            self._items, self._points, self._reach, spacing, self._bins, self._frames, self._shapes,
+            self._items,
+            self._points,
+            self._reach,
+            spacing,
+            self._bins,
+            self._frames,
+            self._shapes,
             tuple(int(side) for side in sides),
-        )  # fmt: skip
+        )
 
     def renumber(self, binned: BinnedPoints, n: int) -> None:
         """Update `binned` after its `n` generators have been sorted into its order: item p is now generator p.

@@ -11,7 +11,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..errors import ClvoroError, MemoryLimitError
-from ..geometry.box import ClipBox
+from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
@@ -74,9 +74,7 @@ class Cells:
         engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
         in_lanes = engine.group_size == 1 and engine.real == np.float64
         self.lanes = LANES if in_lanes else 1
-        self._kernels = engine.kernels(
-            "tessellation/cells", {**defines, "IN_LANES": int(self.lanes > 1)}
-        )
+        self._kernels = engine.kernels("tessellation/cells", {**defines, "IN_LANES": int(self.lanes > 1)})
         self._hulls = None
         if self.lanes > 1 and self.searches:
             hulls = {"SLOT": SLOT, "MAX_DEPTH": MAX_LEVELS, "EIGHTS": EIGHTS}
@@ -85,11 +83,7 @@ class Cells:
     @property
     def defines(self) -> dict[str, object]:
         """The capacities, for building kernels that work on the rows."""
-        return {
-            "CELL_CAPACITY": self.cell_capacity,
-            "ROW_CAPACITY": self.row_capacity,
-            "SLOT": SLOT,
-        }
+        return {"CELL_CAPACITY": self.cell_capacity, "ROW_CAPACITY": self.row_capacity, "SLOT": SLOT}
 
     def _reserve(self, n: int) -> None:
         """Allocate the arrays per cell for `n` generators."""
@@ -106,8 +100,7 @@ class Cells:
             self._capacity, self._room, self._n = n, 0, -1
         if n != self._n:
             self._views = {
-                name: array[: n + 1] if name == "starts" else array[:n]
-                for name, array in self._of_cells.items()
+                name: array[: n + 1] if name == "starts" else array[:n] for name, array in self._of_cells.items()
             }
             self._n = n
 
@@ -124,9 +117,7 @@ class Cells:
             }
             self._room = most
 
-    def restore(
-        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
-    ) -> Tessellation:
+    def restore(self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int) -> Tessellation:
         """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces."""
         n, m = len(points), len(saved["neighbors"])
         self._reserve(n)
@@ -191,14 +182,7 @@ class Cells:
                 whole = True
 
     def _clip(
-        self,
-        rows: FaceRows,
-        box: ClipBox,
-        points: cla.Array,
-        total: int,
-        n: int,
-        binned: BinnedPoints,
-        exact: bool,
+        self, rows: FaceRows, box: ClipBox, points: cla.Array, total: int, n: int, binned: BinnedPoints, exact: bool
     ) -> tuple[int, int]:
         """Build and match the rows of the first `n` of `total` generators; return as `_match` does."""
         engine, corners = self.engine, box.device_corners(self.engine.real)
@@ -208,15 +192,38 @@ class Cells:
         bounds = self._search_bounds(box, points, total)
         if hulls is not None:
             engine.run_each(
-                hulls.wrap_all_hulls, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
-                binned.items, binned.spacing, *search, *corners, engine.real.type(FIRST_REACH),
-                rows.slots, rows.counts, rows.places, group=1,
-            )  # fmt: skip
+                hulls.wrap_all_hulls,
+                -(-total // (LANES * EIGHTS)),
+                np.int32(total),
+                np.int32(n),
+                binned.points,
+                binned.items,
+                binned.spacing,
+                *search,
+                *corners,
+                engine.real.type(FIRST_REACH),
+                rows.slots,
+                rows.counts,
+                rows.places,
+                group=1,
+            )
         while True:
             engine.run_each(
-                self._kernels.clip_polygons, total, np.int32(n), binned.points, binned.items, *search,
-                points, *corners, np.int32(some), rows.slots, rows.counts, rows.places, rows.flags, *bounds,
-            )  # fmt: skip
+                self._kernels.clip_polygons,
+                total,
+                np.int32(n),
+                binned.points,
+                binned.items,
+                *search,
+                points,
+                *corners,
+                np.int32(some),
+                rows.slots,
+                rows.counts,
+                rows.places,
+                rows.flags,
+                *bounds,
+            )
             # Every row is new.
             found = self._match(rows, box, points, n, rows.places, rows.places, exact)
             if not found[0] & FULL or found[0] & CROWDED:
@@ -237,9 +244,15 @@ class Cells:
         engine, m = self.engine, len(t.neighbors)
         measures, centroids = engine.empty(m), engine.empty((m, engine.dim))
         engine.run_each(
-            self._kernels.measure_faces, t.n, t.starts, t.neighbors, t.sites,
-            *box.device_corners(engine.real), measures, centroids,
-        )  # fmt: skip
+            self._kernels.measure_faces,
+            t.n,
+            t.starts,
+            t.neighbors,
+            t.sites,
+            *box.device_corners(engine.real),
+            measures,
+            centroids,
+        )
         return replace(t, face_measures=measures, face_centroids=centroids)
 
     def _read_flags(self) -> tuple[int, int]:
@@ -280,11 +293,23 @@ class Cells:
         """
         engine, starts = self.engine, rows.starts
         engine.run_each(
-            self._kernels.match_polygon_faces, n, rows.places, rows.slots, rows.counts, old_starts,
-            old_neighbors, points, *box.device_corners(engine.real),
-            int(fits is not None), self._share(exact), rows.places if marks is None else marks,
-            rows.places if fits is None else fits, rows.keep, starts, rows.flags,
-        )  # fmt: skip
+            self._kernels.match_polygon_faces,
+            n,
+            rows.places,
+            rows.slots,
+            rows.counts,
+            old_starts,
+            old_neighbors,
+            points,
+            *box.device_corners(engine.real),
+            int(fits is not None),
+            self._share(exact),
+            rows.places if marks is None else marks,
+            rows.places if fits is None else fits,
+            rows.keep,
+            starts,
+            rows.flags,
+        )
         self._count(rows, starts, n)
 
     def _count(self, rows: FaceRows, counts: cla.Array, n: int) -> None:
@@ -316,16 +341,40 @@ class Cells:
         neighbors = faces["neighbors"] if direct else engine.scratch(m, np.int32)
         unless = int(ahead), m, rows.flags
         engine.run(
-            self._kernels.measure_cells, -(-n // self.lanes), n, rows.places, rows.slots,
-            rows.counts, old_starts, old_neighbors, rows.keep, starts, points, *corners, *unless,
-            neighbors, faces["face_measures"], faces["face_centroids"], new["volumes"],
-            new["offsets"], new["covariances"],
-        )  # fmt: skip
+            self._kernels.measure_cells,
+            -(-n // self.lanes),
+            n,
+            rows.places,
+            rows.slots,
+            rows.counts,
+            old_starts,
+            old_neighbors,
+            rows.keep,
+            starts,
+            points,
+            *corners,
+            *unless,
+            neighbors,
+            faces["face_measures"],
+            faces["face_centroids"],
+            new["volumes"],
+            new["offsets"],
+            new["covariances"],
+        )
         if flags & DOUBT:
             engine.run_each(
-                self._kernels.check_doubtful, n, rows.places, rows.counts, starts, neighbors,
-                new["volumes"], points, *corners, self._share(exact), rows.flags,
-            )  # fmt: skip
+                self._kernels.check_doubtful,
+                n,
+                rows.places,
+                rows.counts,
+                starts,
+                neighbors,
+                new["volumes"],
+                points,
+                *corners,
+                self._share(exact),
+                rows.flags,
+            )
             wrong = self._read_flags()[0] & ~DOUBT
             if wrong & LOOPED and old_starts is rows.places:
                 return self._measure_without_loops(rows, box, points, n, neighbors, exact)
@@ -334,29 +383,28 @@ class Cells:
         whole = int(not direct)
         engine.run_blocks(
             self._kernels.copy_graph, n, whole, *unless, starts, neighbors, new["starts"], faces["neighbors"]
-        )  # fmt: skip
+        )
         return Tessellation(
-            n=n, points=points, starts=new["starts"], neighbors=faces["neighbors"],
-            face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=new["volumes"],
-            offsets=new["offsets"], covariances=new["covariances"],
-        )  # fmt: skip
+            n=n,
+            points=points,
+            starts=new["starts"],
+            neighbors=faces["neighbors"],
+            face_measures=faces["face_measures"],
+            face_centroids=faces["face_centroids"],
+            volumes=new["volumes"],
+            offsets=new["offsets"],
+            covariances=new["covariances"],
+        )
 
     def _measure_without_loops(
-        self,
-        rows: FaceRows,
-        box: ClipBox,
-        points: cla.Array,
-        n: int,
-        neighbors: cla.Array,
-        exact: bool,
+        self, rows: FaceRows, box: ClipBox, points: cla.Array, n: int, neighbors: cla.Array, exact: bool
     ) -> Tessellation | None:
         """Measure again without the crossing faces of the graph (`rows.starts`, `neighbors`)."""
         counts = self.engine.scratch(n + 1, np.int32)
         self._reset_flags(n, len(rows.counts), byte_count=4)
         self.engine.run_each(
-            self._kernels.drop_loops, n, rows.places, rows.counts, rows.starts, neighbors, rows.keep, counts,
-            rows.flags,
-        )  # fmt: skip
+            self._kernels.drop_loops, n, rows.places, rows.counts, rows.starts, neighbors, rows.keep, counts, rows.flags
+        )
         self._count(rows, counts, n)
         flags, m = self._read_flags()
         if flags & ~DOUBT:
@@ -367,12 +415,7 @@ class Cells:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
 
     def take_rows(
-        self,
-        n: int,
-        slots: int | None = None,
-        spare: int = 0,
-        whole: bool = False,
-        reset: bool = True,
+        self, n: int, slots: int | None = None, spare: int = 0, whole: bool = False, reset: bool = True
     ) -> FaceRows:
         """Return `n` empty rows of faces, of which `slots` (by default all) may be new; `reset` the flags.
 
@@ -388,10 +431,13 @@ class Cells:
         if reset:
             self._reset_flags(first, slots, whole)
         return FaceRows(
-            engine.scratch(slots * SLOT, np.int32), engine.scratch(slots, np.int32),
-            engine.scratch(slots, np.uint32), engine.scratch(n, np.int32), engine.scratch(n + 1, np.int32),
+            engine.scratch(slots * SLOT, np.int32),
+            engine.scratch(slots, np.int32),
+            engine.scratch(slots, np.uint32),
+            engine.scratch(n, np.int32),
+            engine.scratch(n + 1, np.int32),
             self._flags,
-        )  # fmt: skip
+        )
 
     def _reset_flags(self, first: int, slots: int, whole: bool = False, **part: Any) -> None:
         """Reset the flags, or a part of them; `first` and `slots` are the range of the spare slots."""

@@ -99,9 +99,16 @@ class CutCells:
         cells = self.cells["volumes"], self.cells["offsets"], self.cells["covariances"]
         keep, corners = self.corners is not None, report if self.corners is None else self.corners
         return (
-            self.places, self.counts, self.labels, self.measures, self.centroids, *cells, report,
-            np.int32(keep), corners,
-        )  # fmt: skip
+            self.places,
+            self.counts,
+            self.labels,
+            self.measures,
+            self.centroids,
+            *cells,
+            report,
+            np.int32(keep),
+            corners,
+        )
 
 
 @dataclass
@@ -132,6 +139,11 @@ class Matching:
         """Return the diagram. `flags` are those of the report."""
         cells = self.cut.cells
         return Tessellation(
-            n=len(self.cut.counts), points=self.points, **self.arrays, volumes=cells["volumes"],
-            offsets=cells["offsets"], covariances=cells["covariances"], round_off=flags & (NARROW | UNEVEN),
-        )  # fmt: skip
+            n=len(self.cut.counts),
+            points=self.points,
+            **self.arrays,
+            volumes=cells["volumes"],
+            offsets=cells["offsets"],
+            covariances=cells["covariances"],
+            round_off=flags & (NARROW | UNEVEN),
+        )

@@ -16,7 +16,7 @@ from ..geometry.sphere import directions, farthest_place
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from ..geometry.box import Domain
+    from ..geometry.domain import Domain
     from .clipped.trim import Trimmed
 
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
@@ -42,9 +42,7 @@ class OpenCellError(InputError):
         there = np.abs(directions(points)).max(axis=0)
         hint = ""
         if len(points) > 1 and (there <= (2 * np.pi + 1e-6, np.pi / 2 + 1e-6)).all():
-            hint = (
-                "; longitudes and latitudes look like radians, expected degrees: use numpy.degrees"
-            )
+            hint = "; longitudes and latitudes look like radians, expected degrees: use numpy.degrees"
         super().__init__(
             f"the {len(points)} generators on the sphere leave a half of it free: there is none within {away:.0f} "
             f"degrees of longitude {lon:.0f}, latitude {lat:.0f}; expected at least four, on all sides of the sphere "
@@ -190,9 +188,7 @@ class NeighborRows:
     neighbors: cla.Array
 
 
-def restored(
-    points: cla.Array, arrays: Mapping[str, cla.Array], saved: Mapping[str, np.ndarray]
-) -> Tessellation:
+def restored(points: cla.Array, arrays: Mapping[str, cla.Array], saved: Mapping[str, np.ndarray]) -> Tessellation:
     """Return the diagram of `points` with `saved` copied into `arrays`, by the names of the fields of `Tessellation`.
 
     Arrays may have more rows; these become zero.

@@ -10,7 +10,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ..geometry.box import ClipBox
+from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 from .cells import CLIPPED, FLAGS, LEFT, Cells, most_faces, verdict
@@ -48,12 +48,7 @@ class IncrementalUpdate:
         self._last: ReferenceType[Tessellation] | None = None
 
     def update(
-        self,
-        cells: Cells,
-        box: ClipBox,
-        points: cla.Array,
-        previous: Tessellation,
-        follow: Follow = read_report,
+        self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation, follow: Follow = read_report
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, d), the new positions of the generators of `previous`.
 
@@ -68,20 +63,13 @@ class IncrementalUpdate:
         return t
 
     def _update(
-        self,
-        cells: Cells,
-        box: ClipBox,
-        points: cla.Array,
-        previous: Tessellation,
-        follow: Follow,
+        self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation, follow: Follow
     ) -> Tessellation | None:
         engine, n = self.engine, previous.n
         key = tuple(cells.defines.values())
         if key not in self._kernels:
             in_lanes = int(cells.lanes > 1)
-            self._kernels[key] = engine.kernels(
-                "tessellation/incremental", {**cells.defines, "IN_LANES": in_lanes}
-            )
+            self._kernels[key] = engine.kernels("tessellation/incremental", {**cells.defines, "IN_LANES": in_lanes})
         k = self._kernels[key]
         if n != self._n:
             self._n, self._fits = n, engine.empty(n, np.int32)
@@ -96,9 +84,7 @@ class IncrementalUpdate:
         corners = box.device_corners(engine.real)
         old = (previous.starts, previous.neighbors)
         most_wrong = int(WRONG_SHARE * n / SAMPLE) if n >= SAMPLED_FROM else n
-        engine.run_each(
-            k.begin_update, n, marks, rows.places, rows.flags, FLAGS, most, most + spare
-        )
+        engine.run_each(k.begin_update, n, marks, rows.places, rows.flags, FLAGS, most, most + spare)
         check = most_wrong, *old, points, *corners, self._fits, marks, rows.flags
         self._check(k.check_rows, -(-n // cells.lanes), n, check)
         done, expected = 0, [first_most] if self._expected is None else self._expected
@@ -111,21 +97,51 @@ class IncrementalUpdate:
                 few = FEW if cells.lanes > 1 and number == 0 else n + 1
                 if few <= size:
                     engine.run_each(
-                        k.wrap_marked, -(-size // cells.lanes), few, rows.flags, listed, rows.places, rows.slots,
-                        rows.counts, *old, points, *corners, group=1,
-                    )  # fmt: skip
+                        k.wrap_marked,
+                        -(-size // cells.lanes),
+                        few,
+                        rows.flags,
+                        listed,
+                        rows.places,
+                        rows.slots,
+                        rows.counts,
+                        *old,
+                        points,
+                        *corners,
+                        group=1,
+                    )
                 this = listed, number
                 engine.run_each(
-                    k.clip_marked, size, *this, few, rows.places, rows.slots, rows.counts, *old, points, *corners,
-                    self._fits, rows.flags,
-                )  # fmt: skip
+                    k.clip_marked,
+                    size,
+                    *this,
+                    few,
+                    rows.places,
+                    rows.slots,
+                    rows.counts,
+                    *old,
+                    points,
+                    *corners,
+                    self._fits,
+                    rows.flags,
+                )
                 engine.run_each(
-                    k.place_clipped, size, *this, rows.flags, rows.slots, rows.counts, rows.places, marks, self._fits,
-                )  # fmt: skip
+                    k.place_clipped, size, *this, rows.flags, rows.slots, rows.counts, rows.places, marks, self._fits
+                )
                 engine.run_each(
-                    k.check_clipped, size, *this, rows.flags, rows.places, rows.slots, rows.counts, *old, points,
-                    *corners, marks, self._fits,
-                )  # fmt: skip
+                    k.check_clipped,
+                    size,
+                    *this,
+                    rows.flags,
+                    rows.places,
+                    rows.slots,
+                    rows.counts,
+                    *old,
+                    points,
+                    *corners,
+                    marks,
+                    self._fits,
+                )
             given = rows, box, points, n, *old
             cells.enqueue_match(*given, exact=False, marks=marks, fits=self._fits)
             t = cells.measure(*given, most_faces(n), 0, exact=False, ahead=True)

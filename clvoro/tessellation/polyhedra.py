@@ -12,7 +12,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..errors import ClvoroError, MemoryLimitError
-from ..geometry.box import ClipBox
+from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
@@ -31,15 +31,7 @@ from .cut_cells import (
     capacity_defines,
     clip_each,
 )
-from .device_diagram import (
-    EXACT_SHARE,
-    FULL,
-    ROUGH_SHARE,
-    CloseError,
-    NeighborRows,
-    Tessellation,
-    restored,
-)
+from .device_diagram import EXACT_SHARE, FULL, ROUGH_SHARE, CloseError, NeighborRows, Tessellation, restored
 from .periodic.halo import halo_defines
 from .teams import TEAM, TeamKernel, are_for_new_cells, has_warps, team_defines
 from .weight_bounds import WeightBounds
@@ -69,17 +61,13 @@ class Polyhedra:
         self._team: TeamKernel | None = None
         if are_for_new_cells(engine):
             by_teams = engine.kernels(
-                "tessellation/polyhedra_by_teams",
-                team_defines(has_warps(engine.queue.device)),
-                group_size=TEAM,
+                "tessellation/polyhedra_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
             )
             self._team = TeamKernel(engine.queue.device, by_teams, "clip_polyhedra_by_teams")
         self._wrap = None
         self._bounds = WeightBounds(engine) if engine.domain_kind.weighted else None
         if self._bounds is None and engine.group_size == 1 and engine.real == np.float64:
-            defines = {
-                "STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine),
-            }  # fmt: skip
+            defines = {"STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine)}
             self._walks = engine.kernels("simd/walks", defines)
             self._wrap = self._walks.walk_all_cells
         self._report = engine.empty(REPORT_SIZE, np.int32)
@@ -88,9 +76,7 @@ class Polyhedra:
 
     def _kernels(self, capacity: int) -> SimpleNamespace:
         if capacity not in self._programs:
-            defines = {
-                "MAX_DEPTH": MAX_LEVELS, **capacity_defines(self.engine, capacity), **halo_defines(self.engine),
-            }  # fmt: skip
+            defines = {"MAX_DEPTH": MAX_LEVELS, **capacity_defines(self.engine, capacity), **halo_defines(self.engine)}
             self._programs[capacity] = self.engine.kernels("tessellation/polyhedra", defines)
         return self._programs[capacity]
 
@@ -113,9 +99,7 @@ class Polyhedra:
         """Return the arrays per cell for `n` cells."""
         self._reserve_cells(n)
         if n != self._rows:
-            self._of_rows = {
-                name: a[: n + (name == "starts")] for name, a in self._of_cells.items()
-            }
+            self._of_rows = {name: a[: n + (name == "starts")] for name, a in self._of_cells.items()}
             self._rows = n
         return self._of_rows
 
@@ -145,17 +129,11 @@ class Polyhedra:
         """Return arrays for the vertices of a diagram with `m` half-faces; see `Tessellation.vertices`."""
         if self._of_vertices is None or len(self._of_vertices[1]) < m:
             self._of_vertices = None
-            self._of_vertices = (
-                self.engine.empty(2 * m, np.uint32), self.engine.empty(m, np.uint32),
-            )  # fmt: skip
+            self._of_vertices = (self.engine.empty(2 * m, np.uint32), self.engine.empty(m, np.uint32))
         return self._of_vertices
 
     def restore(
-        self,
-        points: cla.Array,
-        saved: Mapping[str, np.ndarray],
-        spare: int,
-        vertices: Sequence[np.ndarray] = (),
+        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int, vertices: Sequence[np.ndarray] = ()
     ) -> Tessellation:
         """Return the `saved` diagram of `points` (n, 3), with room for `spare` more half-faces."""
         n, m = len(points), len(saved["neighbors"]) + spare
@@ -224,9 +202,7 @@ class Polyhedra:
 
     def _begin_anew(self, binned: BinnedPoints, first: cla.Array, n: int) -> None:
         """Restore the search radii, so that the last bits of the result do not depend on earlier attempts."""
-        cl.enqueue_copy(
-            self.engine.queue, buffer_of(binned.reach), buffer_of(first), byte_count=4 * n
-        )
+        cl.enqueue_copy(self.engine.queue, buffer_of(binned.reach), buffer_of(first), byte_count=4 * n)
 
     def _cut(
         self,
@@ -253,11 +229,7 @@ class Polyhedra:
         lower, upper = box.device_corners(engine.real)
         cells = self._cell_rows(rows)
         warm = previous is not None and previous.n == rows
-        old = (
-            (previous.starts, previous.neighbors)
-            if previous is not None and warm
-            else (counts, counts)
-        )
+        old = (previous.starts, previous.neighbors) if previous is not None and warm else (counts, counts)
         capacity, again, walk = FACE_CAPACITY, False, self._wrap
         first_reach = engine.real.type(FIRST_REACH)
         self._begin_report()
@@ -270,15 +242,38 @@ class Polyhedra:
                 with engine.workspace.frame():
                     order = self._ordered(binned, rows)
                     engine.run_each(
-                        walk, -(-rows // STRETCH), np.int32(rows), order, binned.points,
-                        binned.items, binned.spacing, *search, lower, upper, first_reach, room,
-                        *written, *halo_args, group=1,
-                    )  # fmt: skip
+                        walk,
+                        -(-rows // STRETCH),
+                        np.int32(rows),
+                        order,
+                        binned.points,
+                        binned.items,
+                        binned.spacing,
+                        *search,
+                        lower,
+                        upper,
+                        first_reach,
+                        room,
+                        *written,
+                        *halo_args,
+                        group=1,
+                    )
             some = np.int32(again or walk is not None)
             cell_args = (
-                np.int32(rows), binned.points, binned.items, *search, points, lower, upper,
-                np.int32(warm), *old, some, room, share, *written,
-            )  # fmt: skip
+                np.int32(rows),
+                binned.points,
+                binned.items,
+                *search,
+                points,
+                lower,
+                upper,
+                np.int32(warm),
+                *old,
+                some,
+                room,
+                share,
+                *written,
+            )
             by_team = None if some or self._team is None else self._team.get()
             if by_team is not None:
                 engine.run(by_team, TEAM * n, np.int32(n), *cell_args, group=TEAM)
@@ -319,9 +314,7 @@ class Polyhedra:
         scratch = self.engine.scratch
         places, counts, labels = (scratch(size, np.int32) for size in (n, n, m))
         corners, keys = scratch(2 * m, np.uint32), scratch(m, np.uint32)
-        return CutCells(
-            places, counts, labels, scratch(m), scratch((m, 3)), cells, m, corners, keys
-        )
+        return CutCells(places, counts, labels, scratch(m), scratch((m, 3)), cells, m, corners, keys)
 
     def clip_rest(
         self,
@@ -340,19 +333,25 @@ class Polyhedra:
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         share, old = engine.real.type(ROUGH_SHARE), (previous.starts, previous.neighbors)
         engine.run_each(
-            self._kernels(FACE_CAPACITY).clip_polyhedra, size, np.int32(rows), binned.points, binned.items, *search,
-            points, *box.device_corners(engine.real), np.int32(1), *old, np.int32(1), np.int32(len(cut.labels)), share,
-            *cut.output(report), *halo_args,
-        )  # fmt: skip
+            self._kernels(FACE_CAPACITY).clip_polyhedra,
+            size,
+            np.int32(rows),
+            binned.points,
+            binned.items,
+            *search,
+            points,
+            *box.device_corners(engine.real),
+            np.int32(1),
+            *old,
+            np.int32(1),
+            np.int32(len(cut.labels)),
+            share,
+            *cut.output(report),
+            *halo_args,
+        )
 
     def match(
-        self,
-        cut: CutCells,
-        report: cla.Array,
-        points: cla.Array,
-        share: np.floating,
-        m: int,
-        folded: bool = False,
+        self, cut: CutCells, report: cla.Array, points: cla.Array, share: np.floating, m: int, folded: bool = False
     ) -> Matching:
         """Keep the faces that both cells have, and sort them by rows, if there are at most `m` or room for them.
 
@@ -366,9 +365,20 @@ class Polyhedra:
         starts, kept = engine.scratch(rows + 1, np.int32), engine.scratch(cut.m, np.uint8)
         args = engine.period_args
         engine.run_each(
-            k.match_polyhedron_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cut.cells["volumes"],
-            points, share, kept, starts, report, *(args if folded else tuple(0 * arg for arg in args)),
-        )  # fmt: skip
+            k.match_polyhedron_faces,
+            rows,
+            cut.places,
+            cut.counts,
+            cut.labels,
+            cut.measures,
+            cut.cells["volumes"],
+            points,
+            share,
+            kept,
+            starts,
+            report,
+            *(args if folded else tuple(0 * arg for arg in args)),
+        )
         self._scan.exclusive(starts, starts, rows, total=(report, REPORT_KEPT))
         matching = Matching(cut, points, kept, starts, report)
         self.place(matching, m)
@@ -385,18 +395,43 @@ class Polyhedra:
         with engine.workspace.frame():
             neighbors = engine.scratch(min(cut.m, int(room)), np.int32)
             engine.run_each(
-                k.place_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cut.centroids, matching.kept,
-                report, room, starts, neighbors, faces["face_measures"], faces["face_centroids"],
-            )  # fmt: skip
+                k.place_faces,
+                rows,
+                cut.places,
+                cut.counts,
+                cut.labels,
+                cut.measures,
+                cut.centroids,
+                matching.kept,
+                report,
+                room,
+                starts,
+                neighbors,
+                faces["face_measures"],
+                faces["face_centroids"],
+            )
             engine.run_each(
-                k.put_rows, rows, cut.places, cut.counts, report, room, starts, neighbors, np.int32(with_corners),
-                *((cut.corners, cut.keys) if with_corners else (report, report)), of_rows, faces["neighbors"],
+                k.put_rows,
+                rows,
+                cut.places,
+                cut.counts,
+                report,
+                room,
+                starts,
+                neighbors,
+                np.int32(with_corners),
+                *((cut.corners, cut.keys) if with_corners else (report, report)),
+                of_rows,
+                faces["neighbors"],
                 *(vertices or (report, report)),
-            )  # fmt: skip
+            )
         matching.arrays = {
-            "starts": of_rows, "neighbors": faces["neighbors"], "face_measures": faces["face_measures"],
-            "face_centroids": faces["face_centroids"], "vertices": vertices,
-        }  # fmt: skip
+            "starts": of_rows,
+            "neighbors": faces["neighbors"],
+            "face_measures": faces["face_measures"],
+            "face_centroids": faces["face_centroids"],
+            "vertices": vertices,
+        }
 
     def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:
         """Return the items of the first `rows` generators in an order that keeps neighbors close."""

@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ..geometry.box import ClipBox
+from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.workspace import framed
@@ -38,9 +38,7 @@ def are_triples(starts: np.ndarray, saved: np.ndarray) -> bool:
     triples = saved.view(np.uint8).reshape(-1, 4)
     counts = np.diff(starts)
     known = triples[2 * starts[:-1], 3] != NO_CORNERS
-    used = np.arange(len(triples)) - np.repeat(2 * starts[:-1], 2 * counts) < np.repeat(
-        2 * counts - 4, 2 * counts
-    )
+    used = np.arange(len(triples)) - np.repeat(2 * starts[:-1], 2 * counts) < np.repeat(2 * counts - 4, 2 * counts)
     limits = np.repeat(np.where(known, counts, 256), 2 * counts)
     return bool((~used | (triples[:, :3].max(axis=1) < limits)).all())
 
@@ -58,7 +56,7 @@ class PolyhedraUpdate:
         if are_for(engine):
             by_teams = engine.kernels(
                 "tessellation/polyhedra_update_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
-            )  # fmt: skip
+            )
             self._team = TeamKernel(engine.queue.device, by_teams, "update_cells_by_teams")
         self._report = engine.empty(REPORT_SIZE, np.int32)
         self._share = engine.real.type(ROUGH_SHARE)
@@ -89,9 +87,7 @@ class PolyhedraUpdate:
         if n != self._n:
             self._n, self._expected, self._clips = n, [most], False
         by_team = None if self._team is None else self._team.get()
-        rounds = _Rounds(
-            self.engine, self._kernels, by_team, self._report, cells, box, points, previous
-        )  # fmt: skip
+        rounds = _Rounds(self.engine, self._kernels, by_team, self._report, cells, box, points, previous)
         rounds.update(n, ALL_CELLS)
         done, sizes = 0, self._expected
         clipped, final = False, not self._clips
@@ -102,9 +98,7 @@ class PolyhedraUpdate:
                 done += 1
             matching = None
             if final:
-                matching = cells.match(
-                    rounds.cut, self._report, points, self._share, before, folded=True
-                )
+                matching = cells.match(rounds.cut, self._report, points, self._share, before, folded=True)
                 found = follow(matching.tessellation(), self._report)
             else:
                 found = self._report.get().tolist()
@@ -165,20 +159,33 @@ class _Rounds:
         self._further = engine.scratch(most * MORE, np.int32)
         old = previous.vertices or (self._listed, self._listed)
         self._fixed = (
-            previous.starts, previous.neighbors, np.int32(bool(previous.vertices)), *old, points,
-            *box.device_corners(engine.real), np.int32(self.room), *self.cut.output(report), self.cut.keys,
+            previous.starts,
+            previous.neighbors,
+            np.int32(bool(previous.vertices)),
+            *old,
+            points,
+            *box.device_corners(engine.real),
+            np.int32(self.room),
+            *self.cut.output(report),
+            self.cut.keys,
             self._changed,
-        )  # fmt: skip
+        )
         engine.run_each(
             kernels.begin_cell_updates, n, np.int32(before), np.int32(REPORT_SIZE), report, self._marks, self._more
-        )  # fmt: skip
+        )
 
     def update(self, size: int, which: int) -> None:
         """Update and check all cells, or the listed ones, at most `size`."""
         engine = self._engine
         args = (
-            np.int32(which), self._listed, self._further, *self._fixed, self._more, self._marks, *engine.period_args,
-        )  # fmt: skip
+            np.int32(which),
+            self._listed,
+            self._further,
+            *self._fixed,
+            self._more,
+            self._marks,
+            *engine.period_args,
+        )
         if self._by_team is not None:
             engine.run(self._by_team, TEAM * size, np.int32(size), *args, group=TEAM)
         else:
@@ -190,13 +197,31 @@ class _Rounds:
         engine, k, cut = self._engine, self._kernels, self.cut
         room = np.int32(self.room)
         engine.run_each(
-            k.check_cells, self._n, room, self._report, cut.places, cut.counts, cut.labels, cut.measures, cut.keys,
-            self._changed, self._marks,
-        )  # fmt: skip
+            k.check_cells,
+            self._n,
+            room,
+            self._report,
+            cut.places,
+            cut.counts,
+            cut.labels,
+            cut.measures,
+            cut.keys,
+            self._changed,
+            self._marks,
+        )
 
     def list_marked(self, number: int, most: int) -> None:
         """List the marked cells, if they are not more than `most`."""
         self._engine.run_each(
-            self._kernels.list_marked_cells, self._n, np.int32(most), np.int32(number), self._more, self.cut.counts,
-            self._marks, self._changed, self._listed, self._further, self._report,
-        )  # fmt: skip
+            self._kernels.list_marked_cells,
+            self._n,
+            np.int32(most),
+            np.int32(number),
+            self._more,
+            self.cut.counts,
+            self._marks,
+            self._changed,
+            self._listed,
+            self._further,
+            self._report,
+        )

@@ -12,7 +12,8 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..errors import InputError
-from ..geometry.box import Box, Domain
+from ..geometry.box import Box
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..opencl.primitives import Summaries
 from .clipped.polygonal import PolygonTessellator
@@ -126,14 +127,10 @@ class PowerTessellator:
         assert isinstance(clipped, Tessellation)
         return clipped
 
-    def _from_nothing(
-        self, weighted: cla.Array, n: int, exact: bool, complete: bool
-    ) -> Tessellation:
+    def _from_nothing(self, weighted: cla.Array, n: int, exact: bool, complete: bool) -> Tessellation:
         stages = self.stages
         if self._periodic is not None:
-            return self._periodic.tessellate(
-                weighted, n, None, exact, nearest=False, keep_extended=complete
-            )
+            return self._periodic.tessellate(weighted, n, None, exact, nearest=False, keep_extended=complete)
         binned = stages.bins.build(self.domain, weighted, n)
         return stages.cells.tessellate(self.domain, weighted, n, binned, exact=exact)
 

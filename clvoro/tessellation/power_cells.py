@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pyopencl.array as cla
 
-from ..geometry.box import ClipBox
+from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.workspace import framed
 from .bins import MAX_LEVELS
@@ -43,9 +43,16 @@ class PowerCells(Cells):
         self._reserve(n)
         rows = self.take_rows(n, spare=spare_slots(n))
         self.engine.run_each(
-            self._kernels.clip_by_rings, n, points, *box.device_corners(self.engine.real), *old, rows.slots,
-            rows.counts, rows.places, rows.flags,
-        )  # fmt: skip
+            self._kernels.clip_by_rings,
+            n,
+            points,
+            *box.device_corners(self.engine.real),
+            *old,
+            rows.slots,
+            rows.counts,
+            rows.places,
+            rows.flags,
+        )
         same = rows.places, rows.places
         flags, m = self._match(rows, box, points, n, *same, exact)
         if flags & ~DOUBT:

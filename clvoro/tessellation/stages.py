@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import pyopencl.array as cla
 
-from ..geometry.box import Domain
+from ..geometry.domain import Domain
 from ..opencl.engine import Engine
 from ..opencl.primitives import Gather
 from .bins import BinnedPoints, Bins
@@ -35,10 +35,15 @@ class TessellationStages:
     gather: Gather
 
     CLASSES: ClassVar[dict[str, type]] = {
-        "bins": Bins, "cells": Cells, "incremental": IncrementalUpdate,
-        "polyhedra_update": PolyhedraUpdate, "ghost_images": GhostImages,
-        "folded_cells": FoldedCells, "trim": Trim, "gather": Gather,
-    }  # fmt: skip
+        "bins": Bins,
+        "cells": Cells,
+        "incremental": IncrementalUpdate,
+        "polyhedra_update": PolyhedraUpdate,
+        "ghost_images": GhostImages,
+        "folded_cells": FoldedCells,
+        "trim": Trim,
+        "gather": Gather,
+    }
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -94,9 +99,13 @@ def tessellate_box(
         bins = cache(lambda: stages.bins.build(domain, points, n) if binned is None else binned)
         if previous is not None and not exact:
             t = stages.polyhedra_update.update(
-                cells, domain, points, previous,
-                lambda cut, report, _: cells.clip_rest(cut, report, domain, points, bins(), previous), follow,
-            )  # fmt: skip
+                cells,
+                domain,
+                points,
+                previous,
+                lambda cut, report, _: cells.clip_rest(cut, report, domain, points, bins(), previous),
+                follow,
+            )
             if t is not None:
                 return t
         t = cells.tessellate(domain, points, n, bins(), previous, exact)

@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pyopencl.array as cla
 
-from ..geometry.box import Box, Domain
+from ..geometry.box import Box
+from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from .bins import BinnedPoints
 from .clipped.polygonal import PolygonTessellator
@@ -44,9 +45,7 @@ class Tessellator:
         if isinstance(domain, Box) and any(domain.periodic):
             known = None if coarser is None or coarser.periodic is None else coarser.periodic.halo
             self.periodic = PeriodicTessellator(stages, domain, known)
-        self._polygon = (
-            PolygonTessellator(stages, domain, spacing) if isinstance(domain, Polygon) else None
-        )
+        self._polygon = PolygonTessellator(stages, domain, spacing) if isinstance(domain, Polygon) else None
 
     @property
     def extended(self) -> ExtendedDiagram | None:
@@ -76,11 +75,7 @@ class Tessellator:
         return t, None
 
     def restore(
-        self,
-        points: cla.Array,
-        saved: Mapping[str, np.ndarray],
-        spare: int,
-        vertices: Sequence[np.ndarray] = (),
+        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int, vertices: Sequence[np.ndarray] = ()
     ) -> Tessellation:
         """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces.
 
@@ -134,15 +129,11 @@ class Tessellator:
         """
         with self._in_units():
             if self.periodic is not None:
-                t = self.periodic.tessellate(
-                    points, n, previous, exact, not exact, keep_extended=exact
-                )
+                t = self.periodic.tessellate(points, n, previous, exact, not exact, keep_extended=exact)
             elif self._polygon is not None:
                 t = self._polygon.tessellate(points, n, previous, exact, binned)
             else:
-                return tessellate_box(
-                    self.stages, self.domain, points, n, previous, exact, binned, follow
-                )
+                return tessellate_box(self.stages, self.domain, points, n, previous, exact, binned, follow)
         follow(t, None)
         return t
 

@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..errors import ClvoroError
-from ..geometry.box import ClipBox
+from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 from .device_diagram import Tessellation
@@ -66,7 +66,15 @@ class VertexNumbering:
             )
         cell_vertices, positions = engine.empty(m, np.int32), engine.empty((count, engine.dim))
         engine.run_each(
-            k.place_polygon_vertices, t.n, t.sites, *box.device_corners(engine.real), t.starts,
-            t.neighbors, owners, ids, cell_vertices, positions,
-        )  # fmt: skip
+            k.place_polygon_vertices,
+            t.n,
+            t.sites,
+            *box.device_corners(engine.real),
+            t.starts,
+            t.neighbors,
+            owners,
+            ids,
+            cell_vertices,
+            positions,
+        )
         return Vertices(count, positions, cell_vertices)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyopencl.array as cla
 
-from ..geometry.box import ClipBox
+from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 
 OCCUPANCY = 8

@@ -16,7 +16,7 @@ ROWS = [
     [("mesh", "Diagram, Result, checks")],
     [("geometry", "domains, shapes, layers")],
     [("opencl", "devices, kernels, arrays")],
-]  # fmt: skip
+]
 FILLS = ["#f2f6fb", "#e8eef7", "#dbe7f5", "#cfe0f2", "#c3d9ef", "#b7d2ec", "#abcbe9", "#9fc4e6"]
 
 

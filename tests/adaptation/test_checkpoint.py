@@ -26,16 +26,8 @@ BOX = clvoro.Box((0, 0), (2.5, 1.5))
 SIZE = clvoro.sizing.Expression("0.06 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)")
 RUNS = {
     "coupled": {"method": "coupled", "max_steps": 9},
-    "adaptive": {
-        "method": "adaptive",
-        "effort": "fast",
-        "options": clvoro.MultilevelOptions(levels=1),
-    },
-    "fixed": {
-        "effort": "fast",
-        "options": clvoro.MultilevelOptions(levels=1),
-        "fixed": [(0.4, 0.4), (1.7, 1.1)],
-    },
+    "adaptive": {"method": "adaptive", "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)},
+    "fixed": {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1), "fixed": [(0.4, 0.4), (1.7, 1.1)]},
     "mmpde": {"method": "mmpde", "max_steps": 9},
     "in 3D": {"method": "exact", "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)},
     "monge-ampere": {"method": "monge-ampere", "max_steps": 9},
@@ -67,11 +59,7 @@ def assert_same(a, b):
         for name in ("points", "lloyd", "poisson"):
             one, other = (getattr(getattr(r, part), name) for r in (a, b))
             assert np.array_equal(one, other), (part, name)
-    assert (a.converged, a.stop_reason, a.size_factor) == (
-        b.converged,
-        b.stop_reason,
-        b.size_factor,
-    )
+    assert (a.converged, a.stop_reason, a.size_factor) == (b.converged, b.stop_reason, b.size_factor)
     assert a.settings == b.settings
 
 
@@ -85,8 +73,8 @@ def test_resumed_runs_end_the_same(ctx, tmp_path, dtype, kind):
     for stop in (1, 2 * rows // 3):
         path = tmp_path / "state"
         stopped = clvoro.Adapter(ctx, dtype).run(
-            box, size, seed=5, callback=stop_after(stop), checkpoint=clvoro.Checkpoint(path, every=1e9), **RUNS[kind],
-        )  # fmt: skip
+            box, size, seed=5, callback=stop_after(stop), checkpoint=clvoro.Checkpoint(path, every=1e9), **RUNS[kind]
+        )
         assert stopped.stop_reason == "stopped by the callback"
         resumed = clvoro.Adapter(ctx, dtype).run(
             box, size, seed=5, checkpoint=clvoro.Checkpoint(resume=path), **RUNS[kind]
@@ -97,16 +85,8 @@ def test_resumed_runs_end_the_same(ctx, tmp_path, dtype, kind):
 
 LONG_LIVED = {
     "coupled": (BOX, SIZE, {"method": "coupled", "max_steps": 7}),
-    "weighted": (
-        BOX,
-        SIZE,
-        {"method": "weighted", "max_steps": 7, "options": clvoro.PaperOptions(tol=0.0)},
-    ),
-    "adaptive": (
-        BOX,
-        SIZE,
-        {"method": "adaptive", "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)},
-    ),
+    "weighted": (BOX, SIZE, {"method": "weighted", "max_steps": 7, "options": clvoro.PaperOptions(tol=0.0)}),
+    "adaptive": (BOX, SIZE, {"method": "adaptive", "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}),
     "coupled in 3D": (BOX_3D, SIZE_3D, {"method": "coupled", "max_steps": 5}),
     "weighted in 3D": (
         BOX_3D,
@@ -135,15 +115,12 @@ def test_resumed_runs_continue_with_the_same_solver(ctx, tmp_path, monkeypatch, 
     for stop in sorted({1, 2, rows // 3, rows - 2}):
         clvoro.Adapter(ctx).run(
             box, size, seed=5, callback=stop_after(stop), checkpoint=clvoro.Checkpoint(path, every=1e9), **options
-        )  # fmt: skip
+        )
         levels = [name for name in Saved(path).arrays if name.startswith("multigrid.")]
         assert bool(levels) or solver == "jacobi" or kind.startswith("adaptive")
         assert not levels or solver == "multigrid"
         assert_same(
-            clvoro.Adapter(ctx).run(
-                box, size, seed=5, checkpoint=clvoro.Checkpoint(resume=path), **options
-            ),
-            whole,
+            clvoro.Adapter(ctx).run(box, size, seed=5, checkpoint=clvoro.Checkpoint(resume=path), **options), whole
         )
 
 
@@ -151,27 +128,17 @@ def test_writing_checkpoints_changes_nothing(ctx, tmp_path):
     options = {"method": "adaptive", "effort": "fast", "seed": 8}
     path = tmp_path / "state"
     plain = clvoro.Adapter(ctx).run(BOX, SIZE, **options)
-    written = clvoro.Adapter(ctx).run(
-        BOX, SIZE, checkpoint=clvoro.Checkpoint(path, every=0), **options
-    )
+    written = clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(path, every=0), **options)
     assert_same(plain, written)
     # The last one is at the end of the plan: only the arrays must be read.
-    assert_same(
-        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options),
-        plain,
-    )
+    assert_same(clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options), plain)
     assert os.listdir(tmp_path) == ["state"]
 
 
 def test_own_points_and_callables(ctx, tmp_path):
     points = np.random.default_rng(12).random((200, 2)) * BOX.extent
     path = tmp_path / "state"
-    options = {
-        "points": points,
-        "method": "weighted",
-        "max_steps": 8,
-        "options": clvoro.PaperOptions(tol=0.0),
-    }
+    options = {"points": points, "method": "weighted", "max_steps": 8, "options": clvoro.PaperOptions(tol=0.0)}
 
     def size(x):
         return 0.1 + 0.02 * x[:, 0]
@@ -179,10 +146,7 @@ def test_own_points_and_callables(ctx, tmp_path):
     whole = clvoro.Adapter(ctx).run(BOX, size, **options)
     stop = {"callback": stop_after(4), "checkpoint": path}
     clvoro.Adapter(ctx).run(BOX, size, **stop, **options)
-    assert_same(
-        clvoro.Adapter(ctx).run(BOX, size, checkpoint=clvoro.Checkpoint(resume=path), **options),
-        whole,
-    )
+    assert_same(clvoro.Adapter(ctx).run(BOX, size, checkpoint=clvoro.Checkpoint(resume=path), **options), whole)
 
 
 @pytest.mark.slow
@@ -194,10 +158,7 @@ def test_resume_with_far_fewer_cells_than_at_the_start(ctx, tmp_path):
     stop = {"callback": stop_after(3), "checkpoint": path}
     stopped = clvoro.Adapter(ctx).run(square, 0.25, **stop, **options)
     assert len(stopped.points) < 30
-    assert_same(
-        clvoro.Adapter(ctx).run(square, 0.25, checkpoint=clvoro.Checkpoint(resume=path), **options),
-        whole,
-    )
+    assert_same(clvoro.Adapter(ctx).run(square, 0.25, checkpoint=clvoro.Checkpoint(resume=path), **options), whole)
 
 
 @pytest.mark.sparse(1)
@@ -206,27 +167,19 @@ def test_stopped_before_the_first_step(ctx, tmp_path, kind):
     box, size = (BOX_3D, SIZE_3D) if kind == "in 3D" else (BOX, SIZE)
     path, options = tmp_path / "state", RUNS[kind]
     clvoro.Adapter(ctx).run(box, size, callback=stop_after(0), checkpoint=path, **options)
-    resumed = clvoro.Adapter(ctx).run(
-        box, size, checkpoint=clvoro.Checkpoint(resume=path), **options
-    )
+    resumed = clvoro.Adapter(ctx).run(box, size, checkpoint=clvoro.Checkpoint(resume=path), **options)
     assert_same(resumed, clvoro.Adapter(ctx).run(box, size, **options))
 
 
 def test_resume_at_the_end_of_the_run(ctx, tmp_path):
     """A callback stops in the row that would end the run as stalled. Resumed, the run ends there, too."""
-    path, options = (
-        tmp_path / "state",
-        {"method": "coupled", "options": clvoro.PaperOptions(tol=0.5)},
-    )
+    path, options = (tmp_path / "state", {"method": "coupled", "options": clvoro.PaperOptions(tol=0.5)})
     whole = clvoro.Adapter(ctx).run(BOX, SIZE, **options)
     assert whole.stop_reason == STALLED
     rows = len(whole.history) - 1
     assert rows < 100
     clvoro.Adapter(ctx).run(BOX, SIZE, callback=stop_after(rows), checkpoint=path, **options)
-    assert_same(
-        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options),
-        whole,
-    )
+    assert_same(clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options), whole)
 
 
 @pytest.mark.sparse(1)
@@ -248,10 +201,7 @@ def test_after_something_larger(ctx, tmp_path, square, before):
             adapter.run(square, 8000 ** (-1 / square.dim), method="lloyd", callback=fail)
     adapter.run(square, size, callback=stop_after(3), checkpoint=path, **options)
     whole = clvoro.Adapter(ctx).run(square, size, **options)
-    assert_same(
-        clvoro.Adapter(ctx).run(square, size, checkpoint=clvoro.Checkpoint(resume=path), **options),
-        whole,
-    )
+    assert_same(clvoro.Adapter(ctx).run(square, size, checkpoint=clvoro.Checkpoint(resume=path), **options), whole)
 
 
 @pytest.fixture(scope="module")
@@ -277,28 +227,19 @@ OTHERS = {
 def test_other_settings_are_rejected(ctx, saved, name):
     path, options = saved
     with pytest.raises(InputError, match=rf"cannot resume.*{name} = "):
-        clvoro.Adapter(ctx).run(
-            BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **{**options, **OTHERS[name]}
-        )
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **{**options, **OTHERS[name]})
 
 
 def test_other_domains_precisions_and_fields_are_rejected(ctx, saved):
     path, options = saved
     with pytest.raises(InputError, match="domain = "):
         clvoro.Adapter(ctx).run(
-            clvoro.Box((0, 0), (2.5, 1.6)),
-            SIZE,
-            checkpoint=clvoro.Checkpoint(resume=path),
-            **options,
+            clvoro.Box((0, 0), (2.5, 1.6)), SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options
         )
     with pytest.raises(InputError, match="dtype = float64"):
-        clvoro.Adapter(ctx, "float32").run(
-            BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options
-        )
+        clvoro.Adapter(ctx, "float32").run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options)
     with pytest.raises(InputError, match=r"size field differs.*this field's is [0-9]"):
-        clvoro.Adapter(ctx).run(
-            BOX, 1.0001 * SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options
-        )
+        clvoro.Adapter(ctx).run(BOX, 1.0001 * SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options)
     with pytest.raises(InputError, match=r"checkpoint is .*, a folder"):
         clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path.parent, **options)
     with pytest.raises(InputError, match="no folder"):
@@ -414,9 +355,7 @@ def test_damaged_checkpoints_are_rejected(ctx, saved, tmp_path, name):
     path, options = saved
     rewrite(path, tmp_path / "state", DAMAGED[name])
     with pytest.raises(InputError, match="cannot resume"):
-        clvoro.Adapter(ctx).run(
-            BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=tmp_path / "state"), **options
-        )
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=tmp_path / "state"), **options)
 
 
 def flipped(data):
@@ -427,13 +366,7 @@ def flipped(data):
 
 def test_truncated_and_foreign_files_are_rejected(saved, tmp_path):
     data = saved[0].read_bytes()
-    for content in (
-        data[:-100],
-        data[: len(data) // 2],
-        b"",
-        b"PK\x03\x04",
-        flipped(data),
-    ):
+    for content in (data[:-100], data[: len(data) // 2], b"", b"PK\x03\x04", flipped(data)):
         (tmp_path / "state").write_bytes(content)
         with pytest.raises(InputError, match="cannot load"):
             Saved(tmp_path / "state")

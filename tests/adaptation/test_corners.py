@@ -23,9 +23,7 @@ L = clvoro.Polygon([(0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
 WEDGE = clvoro.Polygon([(0, 0), (1, 0), (1, 0.42), (0.5, 0.5), (1, 0.55), (1, 1), (0, 1)])
 ISLAND = clvoro.Polygon(SQUARE, [[(0.42, 0.45), (0.6, 0.42), (0.52, 0.6)]])
 POST = clvoro.Polygon(SQUARE, [[(0.45, 0.3), (0.53, 0.3), (0.53, 0.7), (0.45, 0.7)]])
-TWO = clvoro.Polygon.from_pieces(
-    [[L.vertices], [np.array([(1.2, 0), (2, 0), (1.8, 0.3), (2, 1), (1.2, 1)])]]
-)
+TWO = clvoro.Polygon.from_pieces([[L.vertices], [np.array([(1.2, 0), (2, 0), (1.8, 0.3), (2, 1), (1.2, 1)])]])
 
 
 def ring(k, r):
@@ -142,9 +140,7 @@ def over(x, most):
 def cost_of(chosen, d, a, angle):
     margin = min(MARGIN, (2 * np.pi - angle) / 4 + 0.01)
     widest, r = np.pi - margin, d[list(chosen)].mean()
-    cost = sum(
-        (d[p] - r) ** 2 if p in chosen else over(OTHERS * r, d[p]) ** 2 for p in range(len(d))
-    )
+    cost = sum((d[p] - r) ** 2 if p in chosen else over(OTHERS * r, d[p]) ** 2 for p in range(len(d)))
     own = a[list(chosen)]
     faces = np.concatenate([[0], (own[1:] + own[:-1]) / 2, [angle]])
     for width in np.diff(faces):
@@ -175,9 +171,7 @@ def shared(domain, points, h):
     chosen = list(min(choices, key=lambda c: cost_of(c, d, a, angle)))
     new, margin = points.copy(), min(MARGIN, (2 * np.pi - angle) / 4)
     mean = (a[chosen[0]] + a[chosen[-1]]) / 2
-    turn = np.clip(
-        np.clip(mean, angle - np.pi + margin, np.pi - margin) - mean, -MOST_TURN, MOST_TURN
-    )
+    turn = np.clip(np.clip(mean, angle - np.pi + margin, np.pi - margin) - mean, -MOST_TURN, MOST_TURN)
     a[chosen] += turn
     new[near[chosen]] = turn_all(new[near[chosen]], corner, turn)
     for side, pair in ((0, chosen[:2]), (1, chosen[-2:])):
@@ -342,10 +336,7 @@ def test_projection_at_a_tip(ctx, real):
 def test_wide_tips(ctx):
     """In the bay two generators get the same distance from its end only if the first one has a single neighbor."""
     others = [(0.2, 0.2), (0.8, 0.2), (0.5, 0.7)]
-    for behind, equal in (
-        ([(0.44, 0.06), (0.55, 0.07)], False),
-        ([(0.5, 0.05), (0.52, 0.12)], True),
-    ):
+    for behind, equal in (([(0.44, 0.06), (0.55, 0.07)], False), ([(0.5, 0.05), (0.52, 0.12)], True)):
         moved, _ = project(ctx, BAY, np.array([(0.5, -0.07), *behind, *others]))
         away = np.hypot(*(moved[1:3] - (0.5, -0.14)).T)
         assert (np.ptp(away) < 1e-9) == equal
@@ -353,14 +344,10 @@ def test_wide_tips(ctx):
 
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("degrees", [12, 20, 30, 42])
-@pytest.mark.parametrize(
-    ("method", "effort"), [("adaptive", "fast"), ("adaptive", "default"), ("exact", "default")]
-)
+@pytest.mark.parametrize(("method", "effort"), [("adaptive", "fast"), ("adaptive", "default"), ("exact", "default")])
 def test_cells_in_tips_have_two_neighbors(degrees, method, effort, adapter):
     domain = wedge(degrees)
-    result = adapter.run(
-        domain, np.sqrt(domain.measure / 150), method=method, effort=effort, seed=2
-    )
+    result = adapter.run(domain, np.sqrt(domain.measure / 150), method=method, effort=effort, seed=2)
     assert result.check(solver="openfoam")
     assert (np.bincount(result.diagram.adjacency.nonzero()[0]) > 1).all()
 

@@ -12,9 +12,7 @@ N = 250
 
 
 @pytest.fixture(
-    scope="module",
-    params=[("float64", None), ("float32", None), ("float64", 16)],
-    ids=["float64", "float32", "gpu"],
+    scope="module", params=[("float64", None), ("float32", None), ("float64", 16)], ids=["float64", "float32", "gpu"]
 )
 def engine(ctx, request):
     real, group_size = request.param
@@ -78,10 +76,16 @@ def test_gradient_in_three_dimensions(ctx):
     slope = np.array([0.4, -1.7, 0.9])
     zeros = engine.zeros((150, 6))
     t = Tessellation(
-        n=150, points=engine.upload(points), starts=engine.upload(starts, np.int32),
-        neighbors=engine.upload(neighbors, np.int32), face_measures=engine.upload(measures),
-        face_centroids=zeros, volumes=engine.upload(volumes), offsets=engine.zeros((150, 3)), covariances=zeros,
-    )  # fmt: skip
+        n=150,
+        points=engine.upload(points),
+        starts=engine.upload(starts, np.int32),
+        neighbors=engine.upload(neighbors, np.int32),
+        face_measures=engine.upload(measures),
+        face_centroids=zeros,
+        volumes=engine.upload(volumes),
+        offsets=engine.zeros((150, 3)),
+        covariances=zeros,
+    )
     h = 0.1 * np.exp(points @ slope)
     w = Density(engine).lloyd_weights(t, engine.upload(h))
     assert np.abs(w.gradient.get() - slope).max() < 1e-9
@@ -100,9 +104,7 @@ def test_gradient_in_three_dimensions(ctx):
 def test_gradient_without_enough_neighbors_is_zero(engine, points):
     """One cell, two cells and collinear cells give the gradient 0."""
     points = np.array(points)
-    w = Density(engine).lloyd_weights(
-        patch.tessellate(engine, points), engine.upload(0.1 + 0.3 * points[:, 0])
-    )
+    w = Density(engine).lloyd_weights(patch.tessellate(engine, points), engine.upload(0.1 + 0.3 * points[:, 0]))
     assert not w.gradient.get().any()
     assert np.isfinite(w.lloyd.get()).all()
 

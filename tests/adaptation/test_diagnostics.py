@@ -34,49 +34,99 @@ SPREAD = np.random.default_rng(3).random((50, 2))
 FIELDS = {
     # name: (domain, the mistake, what it says, the right use beside it)
     "circle in millimeters": (
-        BOX, near(sizing.Circle((900, 400), 200)), "change nothing", near(sizing.Circle((0.9, 0.4), 0.2))),
+        BOX,
+        near(sizing.Circle((900, 400), 200)),
+        "change nothing",
+        near(sizing.Circle((0.9, 0.4), 0.2)),
+    ),
     "segment beside the domain": (
-        BOX, near(sizing.Segment((0, 2), (2, 2))), "change nothing", near(sizing.Segment((0, 1.7), (2, 1.7)))),
+        BOX,
+        near(sizing.Segment((0, 2), (2, 2))),
+        "change nothing",
+        near(sizing.Segment((0, 1.7), (2, 1.7))),
+    ),
     "no upper bound, but far": (
-        BOX, near(sizing.Circle((900, 400), 200), growth=1.0001, h_max=np.inf), "times its diagonal",
-        near(sizing.Circle((9, 4), 2), growth=1.0001, h_max=np.inf)),
-    "circle all around": (
-        BOX, near(sizing.Circle((1, 0.5), 9)), "change nothing", near(sizing.Circle((1, 0.5), 1.5))),
+        BOX,
+        near(sizing.Circle((900, 400), 200), growth=1.0001, h_max=np.inf),
+        "times its diagonal",
+        near(sizing.Circle((9, 4), 2), growth=1.0001, h_max=np.inf),
+    ),
+    "circle all around": (BOX, near(sizing.Circle((1, 0.5), 9)), "change nothing", near(sizing.Circle((1, 0.5), 1.5))),
     "one shape of two": (
-        BOX, near([sizing.Circle((900, 400), 200), sizing.Circle((800, 400), 2)]), "change nothing",
-        near([sizing.Circle((900, 400), 200), sizing.Circle((0.9, 0.4), 0.2)])),
+        BOX,
+        near([sizing.Circle((900, 400), 200), sizing.Circle((800, 400), 2)]),
+        "change nothing",
+        near([sizing.Circle((900, 400), 200), sizing.Circle((0.9, 0.4), 0.2)]),
+    ),
     "within others": (
-        BOX, sizing.Graded(2 * sizing.minimum(near(sizing.Circle((900, 400), 200)), 0.1), growth=1.2), "change nothing",
-        sizing.Graded(2 * sizing.minimum(near(sizing.Circle((0.9, 0.4), 0.2)), 0.1), growth=1.2)),
+        BOX,
+        sizing.Graded(2 * sizing.minimum(near(sizing.Circle((900, 400), 200)), 0.1), growth=1.2),
+        "change nothing",
+        sizing.Graded(2 * sizing.minimum(near(sizing.Circle((0.9, 0.4), 0.2)), 0.1), growth=1.2),
+    ),
     "part in millimeters": (CUBE, near(body(200, (400, 400, 400))), "change nothing", near(body(0.2))),
     "part in kilometers": (CUBE, near(body(2e-4)), "less than a cell", near(body(0.06))),
     "raster of another place": (
-        BOX, sizing.Raster(VALUES, (-9, -9), (0.2, 0.9)), "covers 0.09 of",
-        sizing.Raster(VALUES, (-9, -9), (1.2, 0.9))),
+        BOX,
+        sizing.Raster(VALUES, (-9, -9), (0.2, 0.9)),
+        "covers 0.09 of",
+        sizing.Raster(VALUES, (-9, -9), (1.2, 0.9)),
+    ),
     "raster in millimeters": (
-        BOX, sizing.Raster(VALUES, (0, 0), (2000, 1000)), "lies between two values",
-        sizing.Raster(VALUES, (0, 0), (20, 10))),
+        BOX,
+        sizing.Raster(VALUES, (0, 0), (2000, 1000)),
+        "lies between two values",
+        sizing.Raster(VALUES, (0, 0), (20, 10)),
+    ),
     "raster that is meant so": (
-        BOX, sizing.Raster(VALUES, (0, 0), (0.2, 0.1)), "covers 0.01 of",
-        sizing.Raster(VALUES, (0, 0), (0.2, 0.1), outside="nearest")),
+        BOX,
+        sizing.Raster(VALUES, (0, 0), (0.2, 0.1)),
+        "covers 0.01 of",
+        sizing.Raster(VALUES, (0, 0), (0.2, 0.1), outside="nearest"),
+    ),
     "raster of a polygon": (
-        SHORE, sizing.Raster(VALUES, (0, 0), (0.9, 1)), "covers 0.45 of", sizing.Raster(VALUES, (0, 0), (1.1, 1))),
+        SHORE,
+        sizing.Raster(VALUES, (0, 0), (0.9, 1)),
+        "covers 0.45 of",
+        sizing.Raster(VALUES, (0, 0), (1.1, 1)),
+    ),
     "few values": (
-        BOX, sizing.Raster(VALUES, (0, 0), (0.2, 0.1)), "covers", sizing.Raster([[0.1, 0.2]], (0, 0), (2000, 1000))),
+        BOX,
+        sizing.Raster(VALUES, (0, 0), (0.2, 0.1)),
+        "covers",
+        sizing.Raster([[0.1, 0.2]], (0, 0), (2000, 1000)),
+    ),
     "growth limited elsewhere": (
-        BOX, sizing.Graded(0.2, growth=1.2, box=clvoro.Box((0, 0), (0.5, 1))), "covers 0.25 of",
-        sizing.Graded(0.2, growth=1.2, box=clvoro.Box((0, 0), (1.5, 1)))),
+        BOX,
+        sizing.Graded(0.2, growth=1.2, box=clvoro.Box((0, 0), (0.5, 1))),
+        "covers 0.25 of",
+        sizing.Graded(0.2, growth=1.2, box=clvoro.Box((0, 0), (1.5, 1))),
+    ),
     "data in a corner": (
-        BOX, sizing.Scattered(0.3 * SPREAD, SPREAD[:, 0] + 1, BOX.lower, BOX.upper), "Scattered of 50 points covers",
-        sizing.Scattered(SPREAD * (2, 1), SPREAD[:, 0] + 1, BOX.lower, BOX.upper)),
+        BOX,
+        sizing.Scattered(0.3 * SPREAD, SPREAD[:, 0] + 1, BOX.lower, BOX.upper),
+        "Scattered of 50 points covers",
+        sizing.Scattered(SPREAD * (2, 1), SPREAD[:, 0] + 1, BOX.lower, BOX.upper),
+    ),
     "a profile": (
-        BOX, sizing.Scattered(0.3 * SPREAD, SPREAD[:, 0] + 1), "covers",
-        sizing.Scattered(np.column_stack([2 * SPREAD[:, 0], np.full(50, 0.5)]), SPREAD[:, 0] + 1, BOX.lower, BOX.upper,
-                         method="nearest")),
+        BOX,
+        sizing.Scattered(0.3 * SPREAD, SPREAD[:, 0] + 1),
+        "covers",
+        sizing.Scattered(
+            np.column_stack([2 * SPREAD[:, 0], np.full(50, 0.5)]),
+            SPREAD[:, 0] + 1,
+            BOX.lower,
+            BOX.upper,
+            method="nearest",
+        ),
+    ),
     "features of another domain": (
-        clvoro.Polygon([(5, 0), (6, 0), (6, 1)]), sizing.FeatureSize(SHORE), "does not overlap", sizing.FeatureSize(
-            clvoro.Polygon([(5, 0), (6, 0), (6, 1)]))),
-}  # fmt: skip
+        clvoro.Polygon([(5, 0), (6, 0), (6, 1)]),
+        sizing.FeatureSize(SHORE),
+        "does not overlap",
+        sizing.FeatureSize(clvoro.Polygon([(5, 0), (6, 0), (6, 1)])),
+    ),
+}
 
 
 @pytest.mark.parametrize("name", list(FIELDS))
@@ -97,13 +147,9 @@ def test_far_shapes_are_detected_safely():
     said = 0
     for _ in range(300):
         corners = rng.uniform(-4, 4, (3, 2))
-        shape = [sizing.Circle(corners[0], rng.uniform(0, 6)), sizing.Polyline(corners)][
-            rng.integers(2)
-        ]
+        shape = [sizing.Circle(corners[0], rng.uniform(0, 6)), sizing.Polyline(corners)][rng.integers(2)]
         field = near(shape, growth=rng.uniform(1.02, 2))
-        x = np.concatenate(
-            [rng.uniform(BOX.lower, BOX.upper, (3000, 2)), [(0, 0), (2, 0), (2, 1), (0, 1)]]
-        )
+        x = np.concatenate([rng.uniform(BOX.lower, BOX.upper, (3000, 2)), [(0, 0), (2, 0), (2, 1), (0, 1)]])
         if field.warnings(BOX):
             said += 1
             assert (field(x) == field.h_max).all()
@@ -156,9 +202,7 @@ def lake(latitude, crs):
     return {"type": "Polygon", "coordinates": [ring], **named}
 
 
-@pytest.mark.parametrize(
-    "crs", ["urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326", "urn:ogc:def:crs:EPSG::4326", None]
-)
+@pytest.mark.parametrize("crs", ["urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326", "urn:ogc:def:crs:EPSG::4326", None])
 def test_longitudes_and_latitudes(tmp_path, crs):
     path = tmp_path / "lake.geojson"
     path.write_text(json.dumps(lake(46.2, crs)))
@@ -169,13 +213,7 @@ def test_longitudes_and_latitudes(tmp_path, crs):
 
 @pytest.mark.parametrize(
     ("latitude", "crs"),
-    [
-        (0.2, None),
-        (460.2, None),
-        (46.2, "urn:ogc:def:crs:EPSG::25832"),
-        (460.2, "EPSG:4326"),
-        (3.0, "EPSG:4326"),
-    ],
+    [(0.2, None), (460.2, None), (46.2, "urn:ogc:def:crs:EPSG::25832"), (460.2, "EPSG:4326"), (3.0, "EPSG:4326")],
 )
 def test_no_warning_for_projected_coordinates(latitude, crs):
     with warnings.catch_warnings():
@@ -208,9 +246,7 @@ effort = "fast"
 @pytest.mark.parametrize(("center", "said"), [("900, 400", True), ("0.9, 0.4", False)])
 def test_the_command_line_warns(tmp_path, capfd, center, said):
     (tmp_path / "c.toml").write_text(CASE.replace("CENTER", center))
-    code = cli.main(
-        ["run", str(tmp_path / "c.toml"), "--out", str(tmp_path / "out"), "--no-report", "--quiet"]
-    )
+    code = cli.main(["run", str(tmp_path / "c.toml"), "--out", str(tmp_path / "out"), "--no-report", "--quiet"])
     errors = capfd.readouterr().err
     assert code == 0
     assert ("warning: the shapes of Distance" in errors) == said
@@ -254,8 +290,7 @@ def test_size_errors_in_polygons_have_a_remedy():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "effort"),
-    [("adaptive", "fast"), pytest.param("exact", "default", marks=pytest.mark.slow)],
+    ("method", "effort"), [("adaptive", "fast"), pytest.param("exact", "default", marks=pytest.mark.slow)]
 )
 def test_warning_of_size_errors(ctx, method, effort):
     """The run ends, although the number of cells oscillates, and the warning has the worst cell."""
@@ -271,46 +306,19 @@ def test_warning_of_size_errors(ctx, method, effort):
         warnings.simplefilter("error", SizeErrorWarning)
         adapter.run(square, sizing.Graded(JUMP, growth=1.2), method=method, effort=effort, seed=1)
         # No warning for unfinished runs, or for methods that do not promise to meet the sizes.
-        adapter.run(
-            square,
-            JUMP,
-            method=method,
-            effort="fast",
-            seed=1,
-            callback=lambda row: row["step"] == 9,
-        )
+        adapter.run(square, JUMP, method=method, effort="fast", seed=1, callback=lambda row: row["step"] == 9)
         adapter.run(square, JUMP, method="lloyd", max_steps=2, seed=1)
 
 
 # --- domains that are narrower than cells
 
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
-STRAIT = [
-    (0, 0),
-    (1, 0),
-    (1, 0.49),
-    (2, 0.48),
-    (2, 0),
-    (3, 0),
-    (3, 1),
-    (2, 1),
-    (2, 0.5),
-    (1, 0.5),
-    (1, 1),
-    (0, 1),
-]
+STRAIT = [(0, 0), (1, 0), (1, 0.49), (2, 0.48), (2, 0), (3, 0), (3, 1), (2, 1), (2, 0.5), (1, 0.5), (1, 1), (0, 1)]
 
 
 def bay(width, depth):
     """Return a square with a bay above."""
-    return [
-        *SQUARE[:3],
-        (0.5 + width, 1),
-        (0.5 + width, 1 + depth),
-        (0.5, 1 + depth),
-        (0.5, 1),
-        (0, 1),
-    ]
+    return [*SQUARE[:3], (0.5 + width, 1), (0.5 + width, 1 + depth), (0.5, 1 + depth), (0.5, 1), (0, 1)]
 
 
 ISLAND = [(0.01, 0.3), (0.3, 0.3), (0.3, 0.7), (0.02, 0.7)]
@@ -321,12 +329,18 @@ NARROW = {
     "island": (clvoro.Polygon(SQUARE, [ISLAND]), 0.05, 0.01, ((0.005, 0.3), (0.006, 0.35))),
     "islands": (
         clvoro.Polygon(SQUARE, [clvoro.curves.circle((0.3, 0.5), 0.1), clvoro.curves.circle((0.51, 0.5), 0.1)]),
-        0.05, 0.01, ((0.405, 0.49), (0.405, 0.51))),
+        0.05,
+        0.01,
+        ((0.405, 0.49), (0.405, 0.51)),
+    ),
     "needle": (clvoro.Polygon([(0, 0), (1, 0), (1, 0.01)]), 0.05, None, ((0.15, 0), (0.2, 0.002))),
     "corner of 30 degrees": (clvoro.Polygon([(0, 0), (1, 0), (1, math.tan(math.pi / 6))]), 0.02, None, None),
     "short bay": (
         clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.52, 1), (0.52, 1.1), (0.5, 1.1), (0.5, 1), (0, 1)]),
-        0.1, None, None),
+        0.1,
+        None,
+        None,
+    ),
     "bay of depth 1.5": (clvoro.Polygon(bay(0.08, 0.15)), 0.1, None, None),
     "wide bay": (clvoro.Polygon(bay(0.12, 0.5)), 0.1, None, None),
     "thin hole": (clvoro.Polygon(SQUARE, [[(0.3, 0.5), (0.7, 0.499), (0.7, 0.501)]]), 0.1, None, None),
@@ -334,7 +348,7 @@ NARROW = {
     "box": (clvoro.Box((0, 0), (8, 0.1)), 0.4, 0.1, ((4, 0.05), (4, 0.05))),
     "periodic box": (clvoro.Box((0, 0), (8, 0.1), periodic=(False, True)), 0.4, None, None),
     "box in 3D": (clvoro.Box((0, 0, 0), (2, 2, 0.1)), 0.3, 0.1, ((1, 1, 0.05), (1, 1, 0.05))),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("domain", "h", "width", "line"), NARROW.values(), ids=NARROW)
@@ -346,9 +360,7 @@ def test_narrow_parts(domain, h, width, line):
         assert not caught
         return
     (message,) = [str(w.message) for w in caught]
-    found, place = re.search(
-        r"half a cell: (\S+) wide at \((.*)\), where the size field is ", message
-    ).groups()
+    found, place = re.search(r"half a cell: (\S+) wide at \((.*)\), where the size field is ", message).groups()
     assert width is None or float(found) == pytest.approx(width, rel=0.06)
     place = np.array(place.split(", "), float)
     low, high = np.array(line)
@@ -359,10 +371,7 @@ def test_narrow_parts(domain, h, width, line):
 
 @pytest.mark.parametrize(
     ("domain", "width"),
-    [
-        (clvoro.Polygon(bay(0.07, 0.3)), 0.07),
-        (clvoro.Polygon([(0, 0), (1, 0), (1, math.tan(math.radians(20)))]), None),
-    ],
+    [(clvoro.Polygon(bay(0.07, 0.3)), 0.07), (clvoro.Polygon([(0, 0), (1, 0), (1, math.tan(math.radians(20)))]), None)],
     ids=["bay", "corner of 20 degrees"],
 )
 def test_dead_ends(domain, width):

@@ -72,10 +72,7 @@ def test_figures_match_measured_buffers(bench, dim, field, n, real):
     options = Namespace(device=None, dtype=real.name)
     found = bench.measure(options, field, n, "adaptive", "default")
     reals, integers = PEAK[dim]
-    expected = {
-        "run": reals * real.itemsize + 4 * integers,
-        "output": OUTPUT[dim][real.itemsize],
-    }
+    expected = {"run": reals * real.itemsize + 4 * integers, "output": OUTPUT[dim][real.itemsize]}
     for name, bytes_ in expected.items():
         assert 0.9 <= found[name] / bytes_ <= 1.1, (
             f"{name} in {dim}D, {real}: {found[name]:.0f} bytes per cell, expected {bytes_}"
@@ -97,7 +94,7 @@ def test_figures_match_measured_buffers(bench, dim, field, n, real):
             if (name, real) != ("jump", "float64")
         ],
     ],
-)  # fmt: skip
+)
 def test_steep_sizes_are_allowed_for(bench, name, real):
     """The estimate covers the additional generators; see `LEAST_HELD`."""
     found = bench.measure(Namespace(device=None, dtype=real), name, 6000, "adaptive", "default")
@@ -113,9 +110,7 @@ def test_thin_boxes_take_no_more(bench, extent):
     size = (box.measure / 5000) ** (1 / box.dim)
     options = Namespace(device=None, dtype="float64")
     with pytest.warns(SizeErrorWarning):  # across it there is one cell, larger than it is thin
-        _, run, output = bench.peaks(
-            options, lambda a: a.run(box, size, effort="fast", seed=1).diagram
-        )
+        _, run, output = bench.peaks(options, lambda a: a.run(box, size, effort="fast", seed=1).diagram)
     assert max(sum(run.values()), output) <= 1.1 * clvoro.Adapter().memory_needed(box, size)
 
 
@@ -152,16 +147,13 @@ KINDS = {
 @pytest.mark.slow
 @needs_bench
 @pytest.mark.parametrize("real", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
-@pytest.mark.parametrize(
-    "name", [pytest.param(k, marks=() if k == "polygon" else pytest.mark.slow) for k in KINDS]
-)
+@pytest.mark.parametrize("name", [pytest.param(k, marks=() if k == "polygon" else pytest.mark.slow) for k in KINDS])
 def test_estimate_of_any_kind_of_run(bench, name, real):
     domain, size, more = KINDS[name]
     given = more(domain, size)
     steps = {"max_steps": 15} if name == "coupled" else {}
     diagram, run, output = bench.peaks(
-        Namespace(device=None, dtype=real),
-        lambda adapter: adapter.run(domain, size, seed=1, **given, **steps).diagram,
+        Namespace(device=None, dtype=real), lambda adapter: adapter.run(domain, size, seed=1, **given, **steps).diagram
     )
     estimate = clvoro.Adapter(dtype=real).memory_needed(domain, size, **given)
     held = max(sum(run.values()), output) / estimate
@@ -180,29 +172,24 @@ GOING_ON = {
 
 @pytest.mark.slow
 @needs_bench
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(k, marks=() if k == "square" else pytest.mark.slow) for k in GOING_ON],
-)
+@pytest.mark.parametrize("name", [pytest.param(k, marks=() if k == "square" else pytest.mark.slow) for k in GOING_ON])
 def test_estimate_of_resumed_runs(bench, name, tmp_path):
     """From a checkpoint on the finest level."""
     domain, size = GOING_ON[name]
     real = "float32" if "single" in name else "float64"
     file, given = tmp_path / "state", {"seed": 1, "effort": "fast"}
     clvoro.Adapter(dtype=real).run(
-        domain, size, checkpoint=clvoro.Checkpoint(file, every=1e9), **given,
+        domain,
+        size,
+        checkpoint=clvoro.Checkpoint(file, every=1e9),
+        **given,
         callback=lambda row: row["level"] == 0 and row["progress"] > 0.5,
-    )  # fmt: skip
+    )
     ledger, estimate = bench.Ledger(), []
     with bench.counted_buffers(ledger):
         adapter = clvoro.Adapter(dtype=real)
         adapter.on_memory = estimate.append
-        adapter.run(
-            domain,
-            size,
-            checkpoint=clvoro.Checkpoint(tmp_path / "next", every=0, resume=file),
-            **given,
-        )
+        adapter.run(domain, size, checkpoint=clvoro.Checkpoint(tmp_path / "next", every=0, resume=file), **given)
     assert 0 < ledger.peak / estimate[0] <= 1.1
 
 
@@ -233,11 +220,7 @@ def test_estimate_of_one_diagram(bench, ctx, name, real):
     assert 0.85 <= held <= 1.1
 
 
-SHORES = {
-    "few cells": (300, 100, 0.0),
-    "many edges": (1500, 1500, 0.0),
-    "refined shore": (500, 100, 0.5),
-}
+SHORES = {"few cells": (300, 100, 0.0), "many edges": (1500, 1500, 0.0), "refined shore": (500, 100, 0.5)}
 """Of polygons: cells, edges, and the slope by which sizes grow from the boundary."""
 
 
@@ -248,10 +231,7 @@ def blob(edges):
 
 
 @needs_bench
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(k, marks=() if k == "few cells" else pytest.mark.slow) for k in SHORES],
-)
+@pytest.mark.parametrize("name", [pytest.param(k, marks=() if k == "few cells" else pytest.mark.slow) for k in SHORES])
 def test_boundaries_are_allowed_for(bench, name):
     """Cells that a boundary passes through, with sentinels beyond, take three times as much as others."""
     n, edges, slope = SHORES[name]
@@ -339,9 +319,7 @@ STRIPS = {
 def test_estimate_with_strips(bench, name, real):
     """Beside jumps a part of the estimate is not used, most where few cells lie between them."""
     domain, formula = STRIPS[name]
-    held, estimate = held_and_estimate(
-        bench, domain, sizing.Expression(formula), real, effort="fast"
-    )
+    held, estimate = held_and_estimate(bench, domain, sizing.Expression(formula), real, effort="fast")
     # What balls reach beyond two seams depends on where single coarse cells come to lie.
     assert (0.4 if name == "corner of seams" else LEAST_HELD) <= held / estimate <= 1.1
 
@@ -362,10 +340,7 @@ def test_estimate_does_not_depend_on_the_position_of_the_periodic_boundary():
     """Images by balls alone where cells are alike; of a strip all cells wherever it meets a seam."""
     for box in (TORUS, clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)):
         d, n = box.dim, 20000
-        even, deep = (
-            density_tree(sizing.Constant(1.0), box),
-            IMAGE_REACH[box.dim] * n ** (-1 / box.dim),
-        )
+        even, deep = (density_tree(sizing.Constant(1.0), box), IMAGE_REACH[box.dim] * n ** (-1 / box.dim))
         found = expected_images(box, sizing.Constant(1.0), n, even)
         # A sample of 16,384 cells, of which a tenth lies in each margin.
         assert found == pytest.approx((1 + 2 * deep) ** d - 1, rel=0.03)
@@ -377,20 +352,14 @@ def test_estimate_does_not_depend_on_the_position_of_the_periodic_boundary():
         images.append(expected_images(TORUS, strip, tree.integral, tree))
     # Two of eight cells across are near a jump, on either side; the sample may be off by a tenth.
     share = 4 / 8 * (STEEP_TO - STEEP_FROM)
-    assert surpluses == pytest.approx(
-        [MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * share))] * 4, rel=0.1
-    )
+    assert surpluses == pytest.approx([MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * share))] * 4, rel=0.1)
     assert images[0] < 0.5
     assert 1 < min(images[1:]) <= max(images[1:]) < 1.1 * min(images[1:]) < 2
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("dim", "formula", "n"),
-    [
-        (2, "sin(60 * x) > 0.95 ? 1.0 : 16.0", 1500),
-        (3, "sin(20 * x) > 0.9 ? 1.0 : 8.0", 1500),
-    ],
+    ("dim", "formula", "n"), [(2, "sin(60 * x) > 0.95 ? 1.0 : 16.0", 1500), (3, "sin(20 * x) > 0.9 ? 1.0 : 8.0", 1500)]
 )
 def test_surplus_bounds_the_cells_at_jumps(ctx, dim, formula, n):
     """Cells beside a jump ask for others there, which ask for more; two levels, of which each has its bound."""
@@ -414,10 +383,7 @@ def test_estimate_includes_the_size_field(bench):
     """Also those that are a part of what the host evaluates, and those that others are computed from."""
     values = np.random.default_rng(1).random((400, 400))
     raster = sizing.Raster(0.02 + 0.02 * values, (0, 0), (1, 1))
-    for size in (
-        sizing.minimum(raster, lambda p: np.full(len(p), 0.03)),
-        sizing.Graded(raster, 1.2, resolution=40),
-    ):
+    for size in (sizing.minimum(raster, lambda p: np.full(len(p), 0.03)), sizing.Graded(raster, 1.2, resolution=40)):
         held, estimate = held_and_estimate(bench, SQUARE, size, effort="fast")
         assert 8 * values.size < held
         assert 0.85 <= held / estimate <= 1.1
@@ -425,9 +391,7 @@ def test_estimate_includes_the_size_field(bench):
 
 @pytest.mark.sparse(1)
 @needs_bench
-@pytest.mark.parametrize(
-    ("dim", "old", "new", "order"), [(2, 2000, 2000, 1), (2, 4000, 100, 2), (3, 300, 900, 2)]
-)
+@pytest.mark.parametrize(("dim", "old", "new", "order"), [(2, 2000, 2000, 1), (2, 4000, 100, 2), (3, 300, 900, 2)])
 def test_transfers_hold_what_is_told(bench, ctx, monkeypatch, dim, old, new, order):
     domain = clvoro.Box((0,) * dim, (1,) * dim)
     rng, adapter = np.random.default_rng(1), clvoro.Adapter(ctx)
@@ -468,9 +432,7 @@ def test_what_is_told_before_a_run(ctx, tmp_path, monkeypatch, capsys):
     # Mostly the record of iterations, 8 numbers for each, and on a GPU what its many work-items need.
     engine = Engine(ctx, adapter.queue, 2, np.dtype(np.float64))
     assert 1 <= fixed / (64 * (500 + 30 * 77)) < 1.5 or engine.groups > 64
-    assert adapter.memory_needed(SQUARE, 0.01, n_cells=20000) == pytest.approx(
-        2e4 * each + fixed, rel=2e-3
-    )
+    assert adapter.memory_needed(SQUARE, 0.01, n_cells=20000) == pytest.approx(2e4 * each + fixed, rel=2e-3)
     jump = sizing.Expression("x < 0.5 ? 0.01 : 0.1")
     assert adapter.memory_needed(SQUARE, jump) > 1.05 * plain * count_cells(jump, SQUARE) / 1e4
     # A raster lies on the device, too.
@@ -479,9 +441,7 @@ def test_what_is_told_before_a_run(ctx, tmp_path, monkeypatch, capsys):
     with pytest.raises(MemoryLimitError, match="GiB"):
         adapter.memory_needed(SQUARE, 1e-6)
     case = tmp_path / "case.toml"
-    case.write_text(
-        '[domain]\nlower = [0, 0]\nupper = [1, 1]\n[size]\nkind = "constant"\nvalue = 0.1\n'
-    )
+    case.write_text('[domain]\nlower = [0, 0]\nupper = [1, 1]\n[size]\nkind = "constant"\nvalue = 0.1\n')
     call = ["run", str(case), "--out", str(tmp_path / "out"), "--no-report", "--steps", "1"]
     assert cli.main(call) == 0
     assert "takes" not in capsys.readouterr().err
@@ -512,10 +472,7 @@ PERIODIC = {
 
 @needs_bench
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("dim", "n", "field"),
-    [pytest.param(*case, id=name) for name, case in PERIODIC.items()],
-)
+@pytest.mark.parametrize(("dim", "n", "field"), [pytest.param(*case, id=name) for name, case in PERIODIC.items()])
 def test_estimate_of_periodic_boxes(bench, monkeypatch, ctx, dim, n, field):
     """The estimate of images follows from the size field. Output may need a quarter less."""
     box = clvoro.Box((0,) * dim, (1,) * dim, periodic=True)
@@ -555,9 +512,7 @@ def test_what_does_not_fit_is_refused(ctx, dim, real):
     with pytest.raises(MemoryLimitError, match="GiB"):
         check_memory(engine, 1.01 * fits)
     with pytest.raises(MemoryLimitError, match="GiB"):
-        clvoro.Adapter(ctx, real).run(
-            clvoro.Box((0,) * dim, (1,) * dim), 0.1, n_cells=int(1.01 * fits)
-        )
+        clvoro.Adapter(ctx, real).run(clvoro.Box((0,) * dim, (1,) * dim), 0.1, n_cells=int(1.01 * fits))
 
 
 @pytest.fixture

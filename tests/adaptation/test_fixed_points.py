@@ -79,9 +79,7 @@ def test_published_methods_keep_them_and_the_number_of_cells(adapter, method):
 
 
 def test_they_are_the_same_bits_from_run_to_run_and_in_a_warm_start(adapter):
-    first, second = (
-        adapter.run(BOX, 0.06, fixed=WELLS, effort="fast", options=DEEP) for _ in range(2)
-    )
+    first, second = (adapter.run(BOX, 0.06, fixed=WELLS, effort="fast", options=DEEP) for _ in range(2))
     assert np.array_equal(first.points, second.points)
     after = adapter.run(BOX, 0.0601, first.points, fixed=WELLS, effort="fast")
     assert np.array_equal(after.points[: len(WELLS)], WELLS)
@@ -107,9 +105,7 @@ def test_places_are_taken_in_the_order_of_distances(domain):
     points, fixed = rng.random((60, 2)) * (2, 1), rng.random((6, 2)) * (0.3, 1)
     labels = rng.permutation(60).astype(np.int32) + 6
     extent, rows = np.array(domain.extent), 12
-    new, names, taken = take_places(
-        domain.place(points, np.dtype(float)), labels, fixed, domain, rows
-    )
+    new, names, taken = take_places(domain.place(points, np.dtype(float)), labels, fixed, domain, rows)
     d = points[:, None] - fixed
     d -= np.rint(d / extent) * extent * np.array(domain.periodic)
     distance = np.linalg.norm(d, axis=2)
@@ -148,7 +144,7 @@ def test_places_behind_a_wall_are_not_taken():
         (WELLS, {"method": "lloyd", "points": WELLS[:2]}, "the number of points is 2, but 4"),
         ([(0.5, 0.03)], {"layers": clvoro.Layers(0.02, 2, spacing=0.04)}, r"fixed\[0\] .*in the layers"),
     ],
-)  # fmt: skip
+)
 def test_bad_positions_are_refused_with_the_place(adapter, fixed, more, text):
     with pytest.raises(InputError, match=text):
         adapter.run(BOX, 0.1, fixed=fixed, **more)
@@ -168,7 +164,7 @@ def test_what_are_no_positions_is_refused_and_none_are_allowed(adapter):
         ([(1.5, 0.5), (0.5, 0.5), (0.53, 0.5)], r"fixed\[1\] .*0.03 from fixed\[2\], .*at most 0.075"),
         ([(1.5, 0.5), (0.5, 0.2), (0.4, 0.2)], None),
     ],
-)  # fmt: skip
+)
 def test_positions_that_are_near_each_other_or_a_wall_give_a_warning(adapter, fixed, text):
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")

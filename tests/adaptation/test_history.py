@@ -35,9 +35,14 @@ def test_diagram_is_computed_again_at_the_end(ctx, dtype):
         rows = []
         points = middles + 3 * eps * np.random.default_rng(seed).standard_normal((144, 2))
         result = adapter.run(
-            clvoro.Box((0, 0), (1, 1), periodic=True), 1 / 12, points, method="lloyd", max_steps=3,
-            options=clvoro.PaperOptions(tol=0), callback=lambda row, rows=rows: rows.append(row),
-        )  # fmt: skip
+            clvoro.Box((0, 0), (1, 1), periodic=True),
+            1 / 12,
+            points,
+            method="lloyd",
+            max_steps=3,
+            options=clvoro.PaperOptions(tol=0),
+            callback=lambda row, rows=rows: rows.append(row),
+        )
         result.check().demand()
         assert len(result.history) == len(rows) == 4
         others += abs(rows[-1]["mean_quality"] - result.quality.mean()) > 1e-4
@@ -46,8 +51,7 @@ def test_diagram_is_computed_again_at_the_end(ctx, dtype):
 
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize(
-    ("kind", "levels", "stopped"),
-    [(kind, 0, 0) for kind in DOMAINS] + [("flat", 0, 1), ("flat", 1, 0), ("flat", 1, 1)],
+    ("kind", "levels", "stopped"), [(kind, 0, 0) for kind in DOMAINS] + [("flat", 0, 1), ("flat", 1, 0), ("flat", 1, 1)]
 )
 def test_sizes_are_scaled_after_the_last_row(adapter, kind, levels, stopped):
     """Before the first step, and on coarser levels, sizes are not scaled yet."""
@@ -120,20 +124,11 @@ class Pressed:
 
 RUNS = {
     "counted": (FLAT, {"n_cells": 260, "options": clvoro.MultilevelOptions(levels=1)}),
-    "exact": (
-        FLAT,
-        {"method": "exact", "options": clvoro.MultilevelOptions(levels=0), "max_steps": 20},
-    ),
+    "exact": (FLAT, {"method": "exact", "options": clvoro.MultilevelOptions(levels=0), "max_steps": 20}),
     "coupled": (HOUSE, {"method": "coupled", "max_steps": 6}),
-    "torus": (
-        TORUS,
-        {"options": clvoro.MultilevelOptions(levels=0), "n_cells": 260, "max_steps": 15},
-    ),
+    "torus": (TORUS, {"options": clvoro.MultilevelOptions(levels=0), "n_cells": 260, "max_steps": 15}),
     "solid": (SOLID, {"options": clvoro.MultilevelOptions(levels=1), "max_steps": 42}),
-    "layers": (
-        FLAT,
-        {"layers": clvoro.Layers(0.03, count=2), "options": clvoro.MultilevelOptions(levels=1)},
-    ),
+    "layers": (FLAT, {"layers": clvoro.Layers(0.03, count=2), "options": clvoro.MultilevelOptions(levels=1)}),
 }
 
 

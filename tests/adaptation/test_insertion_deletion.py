@@ -44,16 +44,17 @@ class Sweep:
         local_length = np.minimum(self.h, np.sqrt(self.host.volumes))
         self.log_ratio = np.log(self.host.volumes / self.h**2)
         rows = Generators(
-            self.t.points, engine.upload(self.labels, np.int32), engine.upload(self.velocity),
-            engine.upload(self.signatures, np.uint64), engine.upload(self.ever_changed),
-        )  # fmt: skip
+            self.t.points,
+            engine.upload(self.labels, np.int32),
+            engine.upload(self.velocity),
+            engine.upload(self.signatures, np.uint64),
+            engine.upload(self.ever_changed),
+        )
         self.first_new = 5 * n
         control = control or InsertionDeletion(engine)
         if "quality" in options:
             quality = engine.upload(options.pop("quality"))
-            self.new = control.repair_cells(
-                patch.BOX, self.t, quality, rows, self.first_new, **options
-            )
+            self.new = control.repair_cells(patch.BOX, self.t, quality, rows, self.first_new, **options)
         else:
             sizes = CellSizes(*map(engine.upload, (self.h, local_length, self.log_ratio)))
             fixed = options.pop("fixed", 0)
@@ -75,9 +76,7 @@ class Sweep:
         assert np.array_equal(born, self.first_new + np.arange(self.new.inserted))
         assert patch.BOX.contains(self.new_points).all()
         row = {label: i for i, label in enumerate(self.labels)}
-        self.rows = np.array(
-            [row[label] for label in labels[old]], int
-        )  # the row of each old generator before
+        self.rows = np.array([row[label] for label in labels[old]], int)  # the row of each old generator before
         self.deleted = np.setdiff1d(np.arange(self.n), self.rows)
         assert len(self.deleted) == self.new.deleted
         moved = (self.new_points[old] != self.points[self.rows]).any(axis=1)
@@ -208,12 +207,7 @@ def test_two_pairs_of_opposite_strain_both_climb(engine):
         d = points - [x + 0.25 * a, 0.375 + 0.2 * a]
         angle = np.arctan2(d[:, 1], d[:, 0])
         shift[:, 0] += sign * a / (2 * np.pi) * (angle + np.sin(2 * angle) * 3 / 8)
-        shift[:, 1] -= (
-            sign
-            * a
-            / (2 * np.pi)
-            * (np.log((d**2).sum(axis=1) / a**2) / 8 + np.cos(2 * angle) * 3 / 8)
-        )
+        shift[:, 1] -= sign * a / (2 * np.pi) * (np.log((d**2).sum(axis=1) / a**2) / 8 + np.cos(2 * angle) * 3 / 8)
     points = points + shift
     wide = 1 + 0.06 * np.sin(2 * np.pi * points[:, 0])
     points[:, 0] -= 0.06 / (2 * np.pi) * np.cos(2 * np.pi * points[:, 0])
@@ -290,12 +284,8 @@ def test_limit_keeps_the_strongest(engine):
     spans = [10**6, 300, 40, 1]
     for trial in range(24):
         n = int(rng.integers(1, 400))
-        bits = np.float32(rng.uniform(0.1, 4)).view(np.uint32) + rng.integers(
-            0, spans[trial % 4], n
-        )
-        keys = (bits.astype(np.uint64) << np.uint64(32)) | (0x7FFFFFFF - np.arange(n)).astype(
-            np.uint64
-        )
+        bits = np.float32(rng.uniform(0.1, 4)).view(np.uint32) + rng.integers(0, spans[trial % 4], n)
+        keys = (bits.astype(np.uint64) << np.uint64(32)) | (0x7FFFFFFF - np.arange(n)).astype(np.uint64)
         keys[rng.random(n) < 0.3] = 0
         most = int(rng.integers(0, n + 3))
         chosen = engine.upload(keys, np.uint64)
@@ -318,12 +308,7 @@ def test_dislocations_nucleate_under_strain(engine):
     sweep = Sweep(engine, strained(), h, 0.0, nuclei=2, climb_strain=QUIET)
     assert 2 <= sweep.new.inserted + sweep.new.deleted <= 4
     assert abs(sweep.new.inserted - sweep.new.deleted) <= 1
-    edges = [
-        (sweep.points[i], sweep.points[j])
-        for i in range(sweep.n)
-        for j in sweep.neighbors(i)
-        if j > i
-    ]
+    edges = [(sweep.points[i], sweep.points[j]) for i in range(sweep.n) for j in sweep.neighbors(i) if j > i]
     middles = np.array([(p + q) / 2 for p, q in edges])
     lengths = np.array([np.linalg.norm(p - q) for p, q in edges])
     sites = []
@@ -333,12 +318,7 @@ def test_dislocations_nucleate_under_strain(engine):
         # Its site is one of its ends, all of whose edges are shorter (longer).
         ends = [np.flatnonzero((sweep.points == p).all(axis=1))[0] for p in edges[k]]
         around = [
-            lengths[
-                [
-                    np.array_equal(p, sweep.points[e]) or np.array_equal(q, sweep.points[e])
-                    for p, q in edges
-                ]
-            ]
+            lengths[[np.array_equal(p, sweep.points[e]) or np.array_equal(q, sweep.points[e]) for p, q in edges]]
             for e in ends
         ]
         best = [(own.max() if longest else own.min()) for own in around]
@@ -352,10 +332,7 @@ def test_dislocations_nucleate_under_strain(engine):
 
 
 def test_no_nucleation_without_strain(engine):
-    assert (
-        Sweep(engine, strained(stretch=0.0), 0.04 * H / A, 0.0, nuclei=5, climb_strain=QUIET).new
-        is None
-    )
+    assert Sweep(engine, strained(stretch=0.0), 0.04 * H / A, 0.0, nuclei=5, climb_strain=QUIET).new is None
 
 
 @pytest.mark.sparse(1)
@@ -364,17 +341,11 @@ def test_repeated_runs_give_the_same_bits(ctx, real):
     engine = patch.make_engine(ctx, real)
     points = patch.random_points(700, 12).astype(real).astype(float)
     used = InsertionDeletion(engine)
-    sweeps = [
-        Sweep(engine, points, 0.033, 20.0, control, nuclei=3) for control in (None, used, used)
-    ]
+    sweeps = [Sweep(engine, points, 0.033, 20.0, control, nuclei=3) for control in (None, used, used)]
     for sweep in sweeps[1:]:
         assert sweep.new.inserted == sweeps[0].new.inserted > 3
-        assert np.array_equal(
-            sweep.new.generators.points.get(), sweeps[0].new.generators.points.get()
-        )
-        assert np.array_equal(
-            sweep.new.generators.labels.get(), sweeps[0].new.generators.labels.get()
-        )
+        assert np.array_equal(sweep.new.generators.points.get(), sweeps[0].new.generators.points.get())
+        assert np.array_equal(sweep.new.generators.labels.get(), sweeps[0].new.generators.labels.get())
 
 
 SPOTS = {(0.2, 0.2): 0.9, (0.8, 0.2): 0.8, (0.2, 0.6): 0.93, (0.8, 0.6): 0.95}
@@ -396,9 +367,7 @@ class TestMend:
     @pytest.mark.parametrize("split", [False, True])
     def test_bad_cells_are_repaired(self, engine, split):
         points, quality, sites = self.lattice(SPOTS)
-        sweep = Sweep(
-            engine, points, 0.02, 0.0, quality=quality, deficit=0.06, split=split, share=0.1
-        )
+        sweep = Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, split=split, share=0.1)
         changed, others = (sweep.moved, sweep.deleted) if split else (sweep.deleted, sweep.moved)
         assert sorted(changed) == sorted(sites[:3])
         assert len(others) == 0
@@ -414,37 +383,24 @@ class TestMend:
         for i in (five, seven):
             poor = quality.copy()
             poor[i] = 0.9
-            sweep = Sweep(
-                engine, points, 0.02, 0.0, quality=poor, deficit=0.06, split=split, share=0.1
-            )
-            assert (sweep.deleted.tolist(), sweep.moved.tolist()) == (
-                ([five], []) if i == five else ([], [seven])
-            )
+            sweep = Sweep(engine, points, 0.02, 0.0, quality=poor, deficit=0.06, split=split, share=0.1)
+            assert (sweep.deleted.tolist(), sweep.moved.tolist()) == (([five], []) if i == five else ([], [seven]))
 
     def test_repair_takes_a_share_of_the_worst_cells(self, engine):
         points, quality, sites = self.lattice(SPOTS)
         n = len(points)
         for most in (1, 2):
-            sweep = Sweep(
-                engine, points, 0.02, 0.0, quality=quality, deficit=0.01, share=(most + 0.5) / n
-            )
+            sweep = Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.01, share=(most + 0.5) / n)
             assert sorted(sweep.deleted) == sorted([sites[1], sites[0]][:most])
         assert n * REPAIRED_SHARE > 1
-        assert (
-            Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.01, share=0.9 / n).new
-            is None
-        )
+        assert Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.01, share=0.9 / n).new is None
 
     def test_good_cells_and_cells_at_walls_are_not_repaired(self, engine):
         points, quality, _ = self.lattice({})
-        assert (
-            Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0).new is None
-        )
+        assert Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0).new is None
         host = patch.fetch(patch.tessellate(engine, points))
         quality[host.owners[host.neighbors < 0]] = 0.5
-        assert (
-            Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0).new is None
-        )
+        assert Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0).new is None
 
     def test_four_and_eight_sided_cells_are_always_repaired(self, engine):
         """Chosen sites are far from each other. All others have a chosen one within a few rings."""
@@ -468,14 +424,8 @@ class TestMend:
         beside = min(j for j in sweep.neighbors(sites[1]) if j >= 0)
         for held in (sites[1], beside):
             fixed = int(sweep.labels[held]) + 1
-            again = Sweep(
-                engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0, fixed=fixed
-            )
+            again = Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0, fixed=fixed)
             still = again.labels < fixed
-            free = [
-                i
-                for i in sites[:3]
-                if not still[[i, *(j for j in again.neighbors(i) if j >= 0)]].any()
-            ]
+            free = [i for i in sites[:3] if not still[[i, *(j for j in again.neighbors(i) if j >= 0)]].any()]
             assert sites[1] not in free
             assert sorted([] if again.new is None else again.deleted) == sorted(free)

@@ -40,9 +40,7 @@ def methods(dim):
         for a in adaptive_schedule(dim, "default", 1, exact=exact)
         if isinstance(a, Step)
     ]
-    found = {
-        (type(m), getattr(m, "descent", getattr(m, "lloyd", None)), is_exact(m)): m for m in steps
-    }
+    found = {(type(m), getattr(m, "descent", getattr(m, "lloyd", None)), is_exact(m)): m for m in steps}
     return [replace(method) for method in found.values()]
 
 
@@ -80,9 +78,7 @@ def check_steps(adapter, dim, n, group):
     engine._divides = False
     for method in methods(dim):
         tally, reads, iterations = Tally(), [], 0
-        mesh = MeshState.create(
-            Stages(engine), box, Sizing(engine, box, spacing), engine.upload(points)
-        )
+        mesh = MeshState.create(Stages(engine), box, Sizing(engine, box, spacing), engine.upload(points))
         for k in range(WARM_UP + STEPS):
             with watching(engine.queue, tally) if k >= WARM_UP else watching(engine.queue, Tally()):
                 before = tally.reads

@@ -21,9 +21,7 @@ ROOMS = np.array([(0, 0), (1, 0), *NECK, (1, 1), (0, 1)], float)
 """Two rooms of 100 cells each, joined by a neck that is three cells wide and four long."""
 DOMAINS = {
     "rooms": clvoro.Polygon(ROOMS),
-    "and a piece": clvoro.Polygon.from_pieces(
-        [[ROOMS], [np.array([(3, 0), (3.6, 0), (3.6, 0.6), (3, 0.6)])]]
-    ),
+    "and a piece": clvoro.Polygon.from_pieces([[ROOMS], [np.array([(3, 0), (3.6, 0), (3.6, 0.6), (3, 0.6)])]]),
 }
 
 
@@ -36,9 +34,7 @@ def grid(corner, size, counts, rng):
 def unbalanced(left, right, pieces=False):
     """Return generators of both rooms, with `left` and `right` (columns, rows) of them."""
     rng = np.random.default_rng(41)
-    parts = [
-        grid(LEFT, 1, left, rng), grid(RIGHT, 1, right, rng), grid((1, 0.35), (0.4, 0.3), (4, 3), rng)
-    ]  # fmt: skip
+    parts = [grid(LEFT, 1, left, rng), grid(RIGHT, 1, right, rng), grid((1, 0.35), (0.4, 0.3), (4, 3), rng)]
     return np.concatenate([*parts, grid(APART, 0.6, (7, 7), rng)] if pieces else parts)
 
 

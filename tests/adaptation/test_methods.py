@@ -34,9 +34,7 @@ def stages(ctx):
 def make_mesh(stages, points=None, field=FIELD):
     points = patch.relaxed_points(N, 5005, steps=2) if points is None else points
     engine = stages.engine
-    mesh = MeshState.create(
-        stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points)
-    )
+    mesh = MeshState.create(stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points))
     return mesh, patch.fetch(mesh.t)
 
 
@@ -52,18 +50,14 @@ def gradient(host, psi):
 
 
 def solve(host, rhs, density=None):
-    A = graphs.laplacian_matrix(
-        host.points, host.starts, host.neighbors, host.face_measures, density
-    )
+    A = graphs.laplacian_matrix(host.points, host.starts, host.neighbors, host.face_measures, density)
     return np.linalg.lstsq(A.toarray(), rhs, rcond=None)[0]
 
 
 def test_published_displacements(stages):
     """Lloyd: centroid - x. Poisson: -div grad psi = e, its volume-weighted mean removed, u = alpha grad psi."""
     mesh, host = make_mesh(stages)
-    method = PublishedMethod(
-        Relaxation(alpha=1.7, k=0.4, tolerance=1e-12), lloyd=True, poisson=True
-    )
+    method = PublishedMethod(Relaxation(alpha=1.7, k=0.4, tolerance=1e-12), lloyd=True, poisson=True)
     solution = method.displace(mesh)
     assert solution.converged
     assert mesh.lloyd.get() == pytest.approx(host.offsets)
@@ -93,9 +87,7 @@ def test_alpha_is_the_dimension_by_default(stages):
     assert mesh.correction.get() == pytest.approx(2 * one, rel=1e-2, abs=1e-3 * np.abs(one).max())
 
 
-@pytest.mark.parametrize(
-    ("name", "a", "b"), [("lloyd", 1, 0), ("poisson", 0, 1), ("coupled", 1, 1)]
-)
+@pytest.mark.parametrize(("name", "a", "b"), [("lloyd", 1, 0), ("poisson", 0, 1), ("coupled", 1, 1)])
 def test_published_moves(stages, name, a, b):
     mesh, host = make_mesh(stages)
     method = make_method(name, Relaxation(k=0.3))
@@ -151,12 +143,7 @@ def test_perfect_mesh_does_not_change(stages, name):
     method = {
         "glide": ProjectedMethod("lloyd", 1.3, 0.7),
         "polish": ProjectedMethod(
-            "quality",
-            0.0,
-            penalty=0.3,
-            quality_scale=0.03,
-            log_ratio_scale=0.02,
-            error_target=0.002,
+            "quality", 0.0, penalty=0.3, quality_scale=0.03, log_ratio_scale=0.02, error_target=0.002
         ),
     }.get(name) or make_method(name, Relaxation())
     for _ in range(5):
@@ -177,13 +164,16 @@ def test_projected_displacements(stages):
     expected = 1.3 * lloyd + 0.6 * velocity
     correction = stages.engine.empty((N, 2))
     stages.volume_projection.project(
-        mesh.t, Targets(mesh.local_length, w.gradient, w.log_ratio, mesh.quality, sums),
-        stages.engine.upload(expected), correction,
-        Penalty(0.2, 0.1, 0.3, AT_WALLS_OF_BOXES), Limits(1e-2, 25),
-    )  # fmt: skip
-    ProjectedMethod(
-        "lloyd", 1.3, 0.6, penalty=0.2, quality_scale=0.1, log_ratio_scale=0.3, iterations=25
-    ).displace(mesh)
+        mesh.t,
+        Targets(mesh.local_length, w.gradient, w.log_ratio, mesh.quality, sums),
+        stages.engine.upload(expected),
+        correction,
+        Penalty(0.2, 0.1, 0.3, AT_WALLS_OF_BOXES),
+        Limits(1e-2, 25),
+    )
+    ProjectedMethod("lloyd", 1.3, 0.6, penalty=0.2, quality_scale=0.1, log_ratio_scale=0.3, iterations=25).displace(
+        mesh
+    )
     assert mesh.lloyd.get() == pytest.approx(expected, abs=1e-15)
     assert np.array_equal(mesh.correction.get(), correction.get())
     assert np.abs(r).max() > 0.1
@@ -194,15 +184,8 @@ def test_penalty_is_controlled_to_the_error_target(stages):
     mesh, host = make_mesh(stages)
     h = FIELD(host.points)
     error = np.abs(np.log(np.sqrt(host.volumes) / h)).mean()
-    assert mesh.mean_log_ratio_error(stages.density.cell_weights(mesh.t, mesh.h)) == pytest.approx(
-        error, rel=1e-9
-    )
-    for aim, factor in (
-        (error / 1.2, 1 / 1.2),
-        (error / 50, 0.75),
-        (1.1 * error, 1.1),
-        (50 * error, 1.33),
-    ):
+    assert mesh.mean_log_ratio_error(stages.density.cell_weights(mesh.t, mesh.h)) == pytest.approx(error, rel=1e-9)
+    for aim, factor in ((error / 1.2, 1 / 1.2), (error / 50, 0.75), (1.1 * error, 1.1), (50 * error, 1.33)):
         method = ProjectedMethod(penalty=0.1, error_target=aim)
         for _ in range(3):
             method.displace(mesh)
@@ -237,13 +220,7 @@ def test_invalid_size_is_reported_as_in_the_field(stages, value):
     engine = stages.engine
     printed = {"0.0": "0", "0.0/0.0": "nan"}.get(value, value)
     with pytest.raises(SizeFieldError, match=rf"is -?{printed} at \(0\.8, 0\.6\)"):
-        MeshState.create(
-            stages,
-            patch.BOX,
-            Sizing(engine, patch.BOX, field),
-            engine.upload(points),
-            size_factor=8,
-        )
+        MeshState.create(stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points), size_factor=8)
 
 
 def test_updates_check_sizes(stages):

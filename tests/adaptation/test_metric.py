@@ -52,9 +52,7 @@ def test_definitions(engine):
         length = np.sqrt(cell.area)
         smaller = min(length, h[i])
         both.add(length < h[i])
-        assert error[i] == pytest.approx(
-            (length - h[i]) / smaller, abs=close["rel"] * length / smaller
-        )
+        assert error[i] == pytest.approx((length - h[i]) / smaller, abs=close["rel"] * length / smaller)
         assert reach[i] == pytest.approx(smaller, **close)
         perimeter = np.hypot(*(np.roll(cell.polygon, -1, axis=0) - cell.polygon).T).sum()
         n = len(cell.neighbors)
@@ -68,9 +66,7 @@ def test_squares(engine):
     """A square is as good as four sides allow, Q = 1; its energy is h^4 / 6."""
     a = 0.125
     xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
-    error, quality, energy, _ = evaluate(
-        engine, patch.tessellate(engine, (xy + 0.5) * a), np.full(48, a)
-    )
+    error, quality, energy, _ = evaluate(engine, patch.tessellate(engine, (xy + 0.5) * a), np.full(48, a))
     eps = float(np.finfo(engine.real).eps)
     assert np.abs(error).max() < 16 * eps
     assert np.abs(quality - 1).max() < 16 * eps
@@ -90,10 +86,16 @@ def test_three_dimensions(ctx):
     h = np.array([0.1, 0.2, 0.3, 0.2, 0.5])
     empty = engine.zeros(1)
     t = Tessellation(
-        n=5, points=empty, starts=engine.upload(np.arange(6) * 6, np.int32), neighbors=empty,
-        face_measures=engine.upload(faces.ravel()), face_centroids=empty, volumes=engine.upload(volumes),
-        offsets=engine.upload(offsets), covariances=engine.upload(covariances),
-    )  # fmt: skip
+        n=5,
+        points=empty,
+        starts=engine.upload(np.arange(6) * 6, np.int32),
+        neighbors=empty,
+        face_measures=engine.upload(faces.ravel()),
+        face_centroids=empty,
+        volumes=engine.upload(volumes),
+        offsets=engine.upload(offsets),
+        covariances=engine.upload(covariances),
+    )
     error, quality, energy, _ = evaluate(engine, t, h)
     length = np.cbrt(volumes)
     assert error == pytest.approx((length - h) / np.minimum(length, h), rel=1e-13)
@@ -105,9 +107,7 @@ def test_three_dimensions(ctx):
 def neighbor_sets(t, labels):
     host = patch.fetch(t)
     return {
-        labels[i]: {
-            labels[j] if j >= 0 else j for j in host.neighbors[host.starts[i] : host.starts[i + 1]]
-        }
+        labels[i]: {labels[j] if j >= 0 else j for j in host.neighbors[host.starts[i] : host.starts[i + 1]]}
         for i in range(t.n)
     }
 
@@ -122,9 +122,7 @@ def test_compare_neighbors(ctx):
 
     def compare(points, labels, first):
         t = patch.tessellate(engine, points)
-        metric.compare_neighbors(
-            t, engine.upload(labels, np.int32), first, signatures, changed, ever
-        )
+        metric.compare_neighbors(t, engine.upload(labels, np.int32), first, signatures, changed, ever)
         return neighbor_sets(t, labels), changed.get(), ever.get()
 
     before, now, so_far = compare(points, labels, True)

@@ -83,7 +83,7 @@ def refused(call, *parts, kind=ClvoroError):
         (sizing.Circle((0.5, 0.5), 0.1), InputTypeError, ("sizing.Distance(shape",)),
         (BOX, InputTypeError, ("sizing.Distance(shape",)),
     ],
-)  # fmt: skip
+)
 def test_sizes(adapter, size, kind, parts):
     refused(lambda: adapter.run(BOX, size), *parts, kind=kind)
 
@@ -118,10 +118,7 @@ def test_sizes_that_are_no_numbers(adapter):
         (lambda p: np.nan * p[:, 0], "numpy.nan_to_num"),
         (sizing.Expression("sqrt(x - 1)"), "fmax(x, 0)"),
     ):
-        for call in (
-            partial(adapter.run, BOX, field),
-            partial(DensityTree, sizing.as_field(field), BOX),
-        ):
+        for call in (partial(adapter.run, BOX, field), partial(DensityTree, sizing.as_field(field), BOX)):
             with pytest.raises(SizeFieldError, match="is nan at") as caught:
                 call()
             assert remedy in str(caught.value)
@@ -148,12 +145,7 @@ def test_a_size_function_may_change_its_argument(adapter):
         points *= 2
         return 0.1 + 0.05 * points[:, 0]
 
-    options = {
-        "points": POINTS,
-        "method": "weighted",
-        "max_steps": 3,
-        "options": clvoro.PaperOptions(tol=0),
-    }
+    options = {"points": POINTS, "method": "weighted", "max_steps": 3, "options": clvoro.PaperOptions(tol=0)}
     spoilt = adapter.run(BOX, spoils, **options)
     clean = adapter.run(BOX, lambda p: 0.1 + 0.05 * (2 * p)[:, 0], **options)
     assert np.array_equal(spoilt.points, clean.points)
@@ -163,9 +155,12 @@ def test_accepted_size_functions(adapter):
     def given(points, scale=0.2):
         return scale + 0 * points[:, 0]
 
-    for size in (given, lambda *points: given(*points), lambda p: Foreign(given(p)), np.vectorize(
-        lambda p: 0.2, signature="(d)->()"
-    )):  # fmt: skip
+    for size in (
+        given,
+        lambda *points: given(*points),
+        lambda p: Foreign(given(p)),
+        np.vectorize(lambda p: 0.2, signature="(d)->()"),
+    ):
         made = adapter.run(BOX, size, points=POINTS, method="lloyd", max_steps=0)
         assert (made.target_size == 0.2).all()
 
@@ -173,11 +168,16 @@ def test_accepted_size_functions(adapter):
 @pytest.mark.parametrize(
     ("combine", "part"),
     [
-        (lambda f: f - f, "no -"), (lambda f: 1 - f, "no -"), (lambda f: f - 0.1, "no -"), (lambda f: -f, "no -"),
-        (lambda f: f**2, "no **"), (lambda f: min(f, 0.1), "minimum("), (lambda f: max(0.1, f), "minimum("),
+        (lambda f: f - f, "no -"),
+        (lambda f: 1 - f, "no -"),
+        (lambda f: f - 0.1, "no -"),
+        (lambda f: -f, "no -"),
+        (lambda f: f**2, "no **"),
+        (lambda f: min(f, 0.1), "minimum("),
+        (lambda f: max(0.1, f), "minimum("),
         (lambda f: np.array([0.1]) - f, "no -"),
     ],
-)  # fmt: skip
+)
 def test_unsupported_arithmetic_of_size_fields(combine, part):
     for field in (sizing.Constant(0.1), sizing.Expression("0.1 + x"), sizing.Function(np.sum)):
         refused(lambda f=field: combine(f), repr(field), part, kind=InputTypeError)
@@ -206,7 +206,7 @@ def test_resolutions_of_graded_fields(adapter):
         (None, InputTypeError, ("points is a NoneType",)),
         (Foreign(POINTS, refuses=True), InputTypeError, ("call detach() first",)),
     ],
-)  # fmt: skip
+)
 def test_points(adapter, points, kind, parts):
     refused(lambda: adapter.diagram(BOX, points), *parts, kind=kind)
 
@@ -251,24 +251,18 @@ def test_other_arguments(adapter):
         (lambda: clvoro.Polygon(SQUARE).boundary([]), ("at least one",)),
         (lambda: clvoro.Polygon.from_geojson({"type": "Point"}), ("leave others out",)),
     ],
-)  # fmt: skip
+)
 def test_polygons(make, parts):
     refused(make, *parts)
 
 
 @pytest.mark.parametrize("domain", [BOX, clvoro.Polygon(SQUARE)])
 def test_places_in_domains(domain):
-    for points in (
-        [(0.5, 0.5), (2, 0)],
-        Foreign([(0.5, 0.5), (2, 0)]),
-        np.array([(0.5, 0.5), (2, 0)], np.float32),
-    ):
+    for points in ([(0.5, 0.5), (2, 0)], Foreign([(0.5, 0.5), (2, 0)]), np.array([(0.5, 0.5), (2, 0)], np.float32)):
         assert domain.contains(points).tolist() == [True, False]
     assert domain.contains([(np.nan, 0)]).tolist() == [False]
     assert domain.contains([]).shape == (0,)
-    refused(
-        lambda: domain.contains((0.5, 0.5)), "points has shape (2,)", "[point]", kind=InputError
-    )
+    refused(lambda: domain.contains((0.5, 0.5)), "points has shape (2,)", "[point]", kind=InputError)
     refused(lambda: domain.contains(np.zeros((3, 4, 2))), "shape (3, 4, 2)", kind=InputError)
     refused(lambda: domain.contains("in"), "points is a str", kind=InputTypeError)
 
@@ -292,10 +286,7 @@ def test_paths(adapter, result, path):
     refused(lambda: clvoro.load(path), "name of a file")
     if path is not None:
         refused(lambda: adapter.run(BOX, 0.2, checkpoint=path), "name of a file")
-        refused(
-            lambda: adapter.run(BOX, 0.2, checkpoint=clvoro.Checkpoint(resume=path)),
-            "name of a file",
-        )
+        refused(lambda: adapter.run(BOX, 0.2, checkpoint=clvoro.Checkpoint(resume=path)), "name of a file")
 
 
 def test_versions_of_files(result, tmp_path):
@@ -309,14 +300,10 @@ def test_versions_of_files(result, tmp_path):
 def test_names_of_arrays(adapter, result):
     with pytest.raises(AttributeError, match="a Diagram has no 'areas'; it has points, volumes, "):
         _ = result.diagram.areas
-    with pytest.raises(
-        AttributeError, match=r"a diagram in 2D has no face_vertices; it has .*cell_vertices$"
-    ):
+    with pytest.raises(AttributeError, match=r"a diagram in 2D has no face_vertices; it has .*cell_vertices$"):
         _ = result.diagram.face_vertices
     solid = adapter.diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), [(0.5, 0.5, 0.5)])
-    with pytest.raises(
-        AttributeError, match=r"a diagram in 3D has no cell_vertices; it has .*face_vertices$"
-    ):
+    with pytest.raises(AttributeError, match=r"a diagram in 3D has no cell_vertices; it has .*face_vertices$"):
         _ = solid.cell_vertices
     assert not hasattr(copy.copy(result.diagram), "_cells")
 
@@ -383,7 +370,7 @@ max_steps = 1
         (CASE + "[layers]\nheight = 0.01\n", ("layers", "double brackets")),
         (CASE.replace("constant", "expression").replace("value = 0.3", 'expression = "0.1 + x^2"'), ("pow(a, b)",)),
     ],
-)  # fmt: skip
+)
 def test_cases(tmp_path, monkeypatch, capsys, text, parts):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.toml").write_text(text)
@@ -443,8 +430,6 @@ def test_slab_too_thin_for_the_precision(ctx):
     """Its generators are far apart in the physical domain, so the message must not call them too close."""
     slab = clvoro.Box((0, 0, 0), (1e-6, 1, 1))
     points = np.random.default_rng(1).random((200, 3)) * slab.extent
-    with pytest.raises(
-        InputError, match=r"1e-06 thin.*use dtype='float64', or give it a thickness"
-    ):
+    with pytest.raises(InputError, match=r"1e-06 thin.*use dtype='float64', or give it a thickness"):
         clvoro.Adapter(ctx, "float32").diagram(slab, points)
     assert clvoro.Adapter(ctx).diagram(slab, points).check()

@@ -52,9 +52,7 @@ def test_gradient_is_the_sum_over_faces(ctx):
     psi = rng.normal(size=N)
     u = follow(engine, t, psi)
     expected = np.zeros((N, 2))
-    for i, j, length, m in zip(
-        host.owners, host.neighbors, host.face_measures, host.face_centroids, strict=True
-    ):
+    for i, j, length, m in zip(host.owners, host.neighbors, host.face_measures, host.face_centroids, strict=True):
         if j >= 0:
             distance = np.linalg.norm(host.points[j] - host.points[i])
             expected[i] += length / distance * (psi[j] - psi[i]) * m / host.volumes[i]
@@ -90,9 +88,8 @@ def move(engine, box, points, lloyd, a, correction, b, h, clip):
     on_device = engine.upload(points)
     velocity = engine.empty(points.shape)
     Motion(engine).move_generators(
-        box, on_device, engine.upload(lloyd), a, engine.upload(correction), b, engine.upload(h), velocity,
-        clip=clip,
-    )  # fmt: skip
+        box, on_device, engine.upload(lloyd), a, engine.upload(correction), b, engine.upload(h), velocity, clip=clip
+    )
     return on_device.get(), velocity.get()
 
 

@@ -103,9 +103,7 @@ def test_values_without_effect_cause_no_warning(adapter):
         adapter.run(BOX, 0.4, effort="fast", options=PaperOptions(tol=0))
         adapter.run(BOX, 0.4, method="lloyd", max_steps=0, options=MultilevelOptions(levels=0))
         adapter.memory_needed(BOX, 0.1, method="lloyd")
-    with pytest.warns(
-        UnusedOptionWarning, match="it is for adaptive, exact, transport; leave it out"
-    ):
+    with pytest.warns(UnusedOptionWarning, match="it is for adaptive, exact, transport; leave it out"):
         adapter.memory_needed(BOX, 0.1, method="lloyd", options=MultilevelOptions(levels=2))
 
 
@@ -143,7 +141,7 @@ def test_options_of_a_kind(adapter):
 
 
 def test_levels(adapter, tmp_path, capsys):
-    with pytest.raises(InputTypeError, match="levels is '2' of type str, expected an integer or 'auto'"):  # fmt: skip
+    with pytest.raises(InputTypeError, match="levels is '2' of type str, expected an integer or 'auto'"):
         MultilevelOptions(levels="2")
     with pytest.raises(InputError, match="levels is -1, expected at least 0"):
         MultilevelOptions(levels=-1)
@@ -176,7 +174,7 @@ def run(folder, text, *options):
         ('effort = "fast"\nerror_target = 0.1', ["--method", "lloyd", "--k", "0.7"], []),
         ('methods = ["lloyd", "coupled"]\nk = 0.7\ntol = 0.1', ["--method", "adaptive"], []),
     ],
-)  # fmt: skip
+)
 def test_cases(tmp_path, capsys, run_table, options, warned):
     assert run(tmp_path, CASE + run_table, *options) == cli.OK
     lines = capsys.readouterr().err.splitlines()

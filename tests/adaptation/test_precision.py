@@ -57,9 +57,7 @@ def test_warnings_and_errors_at_the_bounds(ctx, real):
 
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("noise", [1e-2, 1e-1])
-@pytest.mark.parametrize(
-    ("box", "h"), [(clvoro.Box((0, 0), (1, 1)), 0.05), (clvoro.Box((0,) * 3, (1,) * 3), 0.15)]
-)
+@pytest.mark.parametrize(("box", "h"), [(clvoro.Box((0, 0), (1, 1)), 0.05), (clvoro.Box((0,) * 3, (1,) * 3), 0.15)])
 def test_what_rounding_adds(ctx, box, h, noise):
     """Changes of up to half a spacing cost `ROUND_OFF_ERROR` on uniform meshes, to a third."""
     adapter = clvoro.Adapter(ctx)
@@ -68,9 +66,7 @@ def test_what_rounding_adds(ctx, box, h, noise):
     moved = adapter.diagram(box, np.clip(result.points + by, box.lower, box.upper))
     length = moved.volumes ** (1 / box.dim)
     change = np.abs((length - h) / np.minimum(length, h) - result.size_error).mean()
-    assert (
-        0.6 * diagnostics.ROUND_OFF_ERROR < change / (2 * noise) < 1.1 * diagnostics.ROUND_OFF_ERROR
-    )
+    assert 0.6 * diagnostics.ROUND_OFF_ERROR < change / (2 * noise) < 1.1 * diagnostics.ROUND_OFF_ERROR
 
 
 def test_runs_say_it_before_they_begin(ctx):
@@ -109,16 +105,12 @@ def test_single_precision_with_sizes_1_to_1000(ctx):
 def test_edges_on_a_sphere_in_single_precision(ctx):
     """Corners are rounded to 2^-24 of the radius, and the shortest edges are 0.13 h: at 5e-3 they lose four digits."""
     sphere = clvoro.Sphere(2)
-    engine = Engine(
-        ctx, cl.CommandQueue(ctx), 3, np.dtype(np.float32), sphere.kind(np.dtype(np.float32))
-    )
+    engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(np.float32), sphere.kind(np.dtype(np.float32)))
     points = sphere.spiral_points(200)
     limit = 2 * 2**-24 / (1e-4 * 0.13)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         diagnostics.check_precision(Sizing(engine, sphere, 1.02 * limit), sphere, points)
     half = Expression(f"z > 0 ? {0.5 * limit} : {2 * limit}")
-    with pytest.warns(
-        PrecisionWarning, match=r"off by up to 0\.0002 .* in 50% of the cells .*dtype='float64'"
-    ):
+    with pytest.warns(PrecisionWarning, match=r"off by up to 0\.0002 .* in 50% of the cells .*dtype='float64'"):
         diagnostics.check_precision(Sizing(engine, sphere, half), sphere, points)

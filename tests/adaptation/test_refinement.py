@@ -145,9 +145,7 @@ def test_a_lattice_is_carried_over(ctx):
     inside = ((finer > 1.5 * a) & (finer < np.array(BOX.upper) - 1.5 * a)).all(axis=1)
     assert inside.sum() > 300
     assert (np.diff(host.starts)[inside] == 6).all()
-    assert host.volumes[inside] == pytest.approx(
-        np.full(inside.sum(), (a / 2) ** 2 * np.sqrt(3) / 2)
-    )
+    assert host.volumes[inside] == pytest.approx(np.full(inside.sum(), (a / 2) ** 2 * np.sqrt(3) / 2))
 
 
 def test_squares_get_no_point_twice(ctx):

@@ -34,7 +34,7 @@ def mesh(ctx):
         (lambda a: a.run(BOX, sizing.Raster(-9999 * np.ones((2, 2)), (0, 0), (1, 1))), "make it NaN"),
         (lambda a: sizing.Expression("x % 2"), "fmod(a, b)"),
     ],
-)  # fmt: skip
+)
 def test_mistakes_and_remedies(ctx, call, remedy: str) -> None:
     with pytest.raises(ClvoroError, match=re.escape(remedy)):
         call(clvoro.Adapter(ctx))

@@ -9,9 +9,7 @@ from clvoro.adaptation.plan.efforts import EFFORTS, is_near
 from clvoro.adaptation.plan.schedule import adaptive_schedule
 
 BOXES = {2: Box((0, 0), (1, 0.8)), 3: Box((0, 0, 0), (1, 0.8, 0.7))}
-SHORT = {
-    dim: len(adaptive_schedule(dim, "default", 0, False, warm=True, near=True)) for dim in (2, 3)
-}
+SHORT = {dim: len(adaptive_schedule(dim, "default", 0, False, warm=True, near=True)) for dim in (2, 3)}
 
 
 @pytest.fixture(scope="module")
@@ -21,12 +19,8 @@ def adapter(ctx):
 
 def field(dim, moved=0.0, factor=1.0):
     if dim == 2:
-        return (
-            sizing.Distance(sizing.Circle((0.4 + moved, 0.4), 0.2), h_min=0.006, slope=0.1) * factor
-        )
-    return (
-        sizing.Distance(sizing.Ball((0.4 + moved, 0.4, 0.35), 0.2), h_min=0.05, slope=0.15) * factor
-    )
+        return sizing.Distance(sizing.Circle((0.4 + moved, 0.4), 0.2), h_min=0.006, slope=0.1) * factor
+    return sizing.Distance(sizing.Ball((0.4 + moved, 0.4, 0.35), 0.2), h_min=0.05, slope=0.15) * factor
 
 
 class ByDimension(dict):
@@ -110,9 +104,12 @@ def test_resumes_bit_for_bit(adapter, first, tmp_path):
     path, size = tmp_path / "state", field(2, 0.012)
     whole = adapter.run(BOXES[2], size, first[2].points)
     adapter.run(
-        BOXES[2], size, first[2].points, checkpoint=clvoro.Checkpoint(path, every=0),
+        BOXES[2],
+        size,
+        first[2].points,
+        checkpoint=clvoro.Checkpoint(path, every=0),
         callback=lambda row: row["step"] == 6,
-    )  # fmt: skip
+    )
     rest = adapter.run(BOXES[2], size, first[2].points, checkpoint=clvoro.Checkpoint(resume=path))
     np.testing.assert_array_equal(rest.points, whole.points)
     np.testing.assert_array_equal(rest.history["mean_error"], whole.history["mean_error"])

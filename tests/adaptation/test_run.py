@@ -8,14 +8,7 @@ import shapely
 
 import clvoro
 from clvoro import sizing
-from clvoro.errors import (
-    ClvoroError,
-    CoarseSizeWarning,
-    InputError,
-    InputTypeError,
-    MemoryLimitError,
-    SizeFieldError,
-)
+from clvoro.errors import ClvoroError, CoarseSizeWarning, InputError, InputTypeError, MemoryLimitError, SizeFieldError
 from tests.reference import diagrams as reference
 from tests.reference import runs
 
@@ -39,9 +32,7 @@ def check(result, field, box=BOX, real="float64"):
 def test_row_i_is_the_callers_generator(adapter):
     """One step of Lloyd's takes every generator to the centroid of its own cell."""
     points = random_points(400, 5)
-    result = adapter.run(
-        BOX, 0.1, points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0)
-    )
+    result = adapter.run(BOX, 0.1, points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0))
     cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
     assert result.points == pytest.approx(np.array([c.centroid for c in cells]), abs=1e-12)
     assert np.array_equal(result.initial.points, points)
@@ -52,9 +43,7 @@ def test_row_i_is_the_callers_generator(adapter):
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_no_steps(adapter, method):
     points = random_points(300, 6)
-    result = adapter.run(
-        BOX, F1, points, method=method, max_steps=0, options=clvoro.MultilevelOptions(levels=0)
-    )
+    result = adapter.run(BOX, F1, points, method=method, max_steps=0, options=clvoro.MultilevelOptions(levels=0))
     assert np.array_equal(result.points, points)
     assert len(result.history) == 1
     assert (result.converged, result.stop_reason) == (False, "max_steps reached")
@@ -71,9 +60,7 @@ def test_warm_start(adapter, method):
     five = adapter.run(BOX, F1, points, max_steps=5, **options)
     again = adapter.run(BOX, F1, five.points, max_steps=5, **options)
     assert again.points == pytest.approx(ten.points, abs=1e-10)
-    assert again.history["mean_error"][0] == pytest.approx(
-        five.history["mean_error"][-1], rel=1e-10
-    )
+    assert again.history["mean_error"][0] == pytest.approx(five.history["mean_error"][-1], rel=1e-10)
     assert ten.settings["start"] == "points"
 
 
@@ -108,9 +95,8 @@ def test_one_call_at_a_time(adapter):
     other = clvoro.Adapter()
     plain = adapter.run(BOX, F1, method="coupled", max_steps=4)
     drawn = adapter.run(
-        BOX, F1, method="coupled", max_steps=4,
-        callback=lambda row: len(other.diagram(BOX, random_points(50, 1))) == 0,
-    )  # fmt: skip
+        BOX, F1, method="coupled", max_steps=4, callback=lambda row: len(other.diagram(BOX, random_points(50, 1))) == 0
+    )
     assert np.array_equal(plain.points, drawn.points)
 
 
@@ -148,9 +134,7 @@ def test_repeated_runs_give_the_same_bits(adapter, options):
 
 @pytest.mark.parametrize("start", ["density", "uniform"])
 def test_seed(adapter, start):
-    a, b = (
-        adapter.run(BOX, F1, points=start, method="lloyd", max_steps=0, seed=s) for s in (271, 272)
-    )
+    a, b = (adapter.run(BOX, F1, points=start, method="lloyd", max_steps=0, seed=s) for s in (271, 272))
     assert a.points.shape == b.points.shape
     assert (a.points != b.points).all()
 
@@ -173,12 +157,7 @@ def test_units_do_not_matter(adapter, method, steps, off):
 
 
 def test_callable_and_device_field_agree(adapter):
-    options = {
-        "method": "coupled",
-        "max_steps": 6,
-        "seed": 3,
-        "options": clvoro.PaperOptions(tol=0),
-    }
+    options = {"method": "coupled", "max_steps": 6, "seed": 3, "options": clvoro.PaperOptions(tol=0)}
     device = adapter.run(BOX, F1, **options)
     host = adapter.run(BOX, lambda points: F1(points), points=device.initial.points, **options)
     assert host.points == pytest.approx(device.points, abs=1e-6)
@@ -193,9 +172,7 @@ def second_moment(polygon, x):
 
 
 def test_history_of_the_published_method(adapter):
-    result = adapter.run(
-        BOX, F1, method="coupled", seed=77, max_steps=15, options=clvoro.PaperOptions(tol=0)
-    )
+    result = adapter.run(BOX, F1, method="coupled", seed=77, max_steps=15, options=clvoro.PaperOptions(tol=0))
     h = result.history
     check(result, F1)
     assert len(h) == 16
@@ -212,9 +189,7 @@ def test_history_of_the_published_method(adapter):
     assert (h["iterations"][1:] > 0).all()
     assert (h["residual"][1:] <= 1e-4).all()
     assert np.array_equal(result.final.points, result.points)
-    assert result.final.points + result.final.lloyd == pytest.approx(
-        result.diagram.centroids, abs=1e-12
-    )
+    assert result.final.points + result.final.lloyd == pytest.approx(result.diagram.centroids, abs=1e-12)
     assert h["ever_changed"][0] == h["changed"][0] == 0
     assert (np.diff(h["ever_changed"]) >= 0).all()
     assert (h["ever_changed"] * len(result.points) >= h["changed"] - 1e-9).all()
@@ -225,9 +200,7 @@ def test_history_of_the_published_method(adapter):
 
 
 def test_run_stops_without_progress(adapter):
-    result = adapter.run(
-        BOX, F1, method="coupled", seed=4, max_steps=400, options=clvoro.PaperOptions(tol=0.02)
-    )
+    result = adapter.run(BOX, F1, method="coupled", seed=4, max_steps=400, options=clvoro.PaperOptions(tol=0.02))
     assert result.converged
     assert result.stop_reason == "error and quality no longer improve"
     assert 20 <= result.history["step"][-1] < 200
@@ -255,12 +228,7 @@ LEVELS = {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("options", "rows"),
-    [
-        ({"method": "coupled"}, 1),
-        ({"method": "coupled"}, 6),
-        ({"method": "coupled", "max_steps": 5}, 6),
-        (LEVELS, 4),
-    ],
+    [({"method": "coupled"}, 1), ({"method": "coupled"}, 6), ({"method": "coupled", "max_steps": 5}, 6), (LEVELS, 4)],
 )
 def test_callback(adapter, options, rows):
     """The callback gets all rows of the history and stops the run, also in the last step or on a coarse level."""
@@ -290,8 +258,7 @@ def test_other_values_of_the_callback_do_not_stop(adapter):
 
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize(
-    ("options", "rows"),
-    [({"method": "coupled"}, 1), ({"method": "coupled"}, 5), (LEVELS, 3), ({"effort": "fast"}, 50)],
+    ("options", "rows"), [({"method": "coupled"}, 1), ({"method": "coupled"}, 5), (LEVELS, 3), ({"effort": "fast"}, 50)]
 )
 def test_interruption_keeps_the_mesh(adapter, options, rows):
     seen = []
@@ -338,17 +305,13 @@ def test_max_steps_of_adaptive_runs(adapter):
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 250])
 def test_n_cells_is_held(adapter, method, n):
-    result = adapter.run(
-        BOX, F1, n_cells=n, method=method, effort="fast", max_steps=None if n > 5 else 60
-    )
+    result = adapter.run(BOX, F1, n_cells=n, method=method, effort="fast", max_steps=None if n > 5 else 60)
     assert len(result.points) == n
     check(result, F1)
     if method in REPEATING:
         assert result.size_factor == 1
     else:
-        assert np.log(np.sqrt(result.diagram.volumes) / result.target_size).mean() == pytest.approx(
-            0, abs=1e-9
-        )
+        assert np.log(np.sqrt(result.diagram.volumes) / result.target_size).mean() == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.sparse(1)
@@ -394,9 +357,7 @@ def test_number_of_cells_is_that_of_the_size_field(adapter):
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("levels", [0, 1, 2])
 def test_levels(adapter, levels):
-    result = adapter.run(
-        BOX, F1, options=clvoro.MultilevelOptions(levels=levels), effort="fast", seed=16
-    )
+    result = adapter.run(BOX, F1, options=clvoro.MultilevelOptions(levels=levels), effort="fast", seed=16)
     h = result.history
     assert h["level"][0] == levels
     assert h["cells"][0] == round(588 / 4**levels)
@@ -434,12 +395,7 @@ def figures(result):
     ("options", "error", "quality"),
     [
         (
-            {
-                "method": "coupled",
-                "points": "uniform",
-                "options": clvoro.PaperOptions(tol=0, k=1),
-                "max_steps": 200,
-            },
+            {"method": "coupled", "points": "uniform", "options": clvoro.PaperOptions(tol=0, k=1), "max_steps": 200},
             0.030,
             0.973,
         ),
@@ -463,11 +419,7 @@ def test_published_ordering(adapter):
     """Lloyd's alone never meets the sizes, Poisson's alone meets them with poor cells, coupled does both."""
     start = random_points(588, 18)
     lloyd, poisson, coupled = (
-        figures(
-            adapter.run(
-                BOX, F1, start, method=method, max_steps=100, options=clvoro.PaperOptions(tol=0)
-            )
-        )
+        figures(adapter.run(BOX, F1, start, method=method, max_steps=100, options=clvoro.PaperOptions(tol=0)))
         for method in ("lloyd", "poisson", "coupled")
     )
     assert lloyd[0] > 1
@@ -487,9 +439,7 @@ def test_published_ordering(adapter):
     ],
 )
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_figures_of_adaptive_runs(
-    adapter, adapter32, dtype, options, mean, largest, quality, least
-):
+def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, largest, quality, least):
     """The median of three starts: the largest error of one start depends on one or two cells, and so on round-off."""
     run = (adapter if dtype == "float64" else adapter32).run
     results = [run(BOX, F1, seed=seed, **options) for seed in range(1, 4)]
@@ -506,9 +456,7 @@ def test_final_displacements_are_those_of_the_last_step(adapter):
     """Those of one more step of the same method, if the run was stopped."""
     whole = adapter.run(BOX, F1, seed=9, effort="default")
     steps = whole.history["step"][-1]
-    stopped = adapter.run(
-        BOX, F1, seed=9, effort="default", callback=lambda row: row["step"] == steps - 1
-    )
+    stopped = adapter.run(BOX, F1, seed=9, effort="default", callback=lambda row: row["step"] == steps - 1)
     for result, other in ((whole, stopped), (stopped, stopped)):
         assert np.array_equal(result.final.points, other.points)
         size = F1(result.final.points)
@@ -522,11 +470,7 @@ def test_final_displacements_are_those_of_the_last_step(adapter):
 def test_error_target_trades_sizes_for_quality(adapter):
     """A larger error target gives better cells."""
     tight, loose = (
-        figures(
-            adapter.run(
-                BOX, F1, seed=19, options=clvoro.MultilevelOptions(error_target=target), n_cells=588
-            )
-        )
+        figures(adapter.run(BOX, F1, seed=19, options=clvoro.MultilevelOptions(error_target=target), n_cells=588))
         for target in (0.001, 0.01)
     )
     assert tight[0] < 0.5 * loose[0]
@@ -569,9 +513,7 @@ def test_nasty_fields(adapter, name):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
-@pytest.mark.parametrize(
-    "name", ["ratio 100 across a line", "spike narrower than its own h", "larger than the domain"]
-)
+@pytest.mark.parametrize("name", ["ratio 100 across a line", "spike narrower than its own h", "larger than the domain"])
 @pytest.mark.parametrize("method", ["coupled", "weighted", "exact"])
 def test_nasty_fields_by_other_methods(adapter, adapter32, name, method):
     for run, real in ((adapter.run, "float64"), (adapter32.run, "float32")):
@@ -591,11 +533,7 @@ def test_one_cell_of_the_right_size(adapter):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        (
-            {"method": "best"},
-            InputError,
-            "method is 'best', expected one of adaptive, exact, transport, lloyd",
-        ),
+        ({"method": "best"}, InputError, "method is 'best', expected one of adaptive, exact, transport, lloyd"),
         ({"method": None}, InputError, "method is None"),
         ({"points": "random"}, InputError, "points is 'random', expected one of density, uniform"),
         ({"effort": "most"}, InputError, "effort is 'most', expected one of fast"),
@@ -607,22 +545,10 @@ def test_one_cell_of_the_right_size(adapter):
         ({"max_steps": "9"}, InputTypeError, "max_steps is '9'"),
         ({"seed": -1}, InputError, "seed is -1"),
         ({"seed": 1.5}, InputTypeError, "seed is 1.5"),
-        (
-            {"options": clvoro.MultilevelOptions(levels=5)},
-            InputError,
-            "levels is 5, expected at most 4 for 588 cells",
-        ),
-        (
-            {"options": clvoro.MultilevelOptions(levels=40), "points": random_points(9, 1)},
-            MemoryLimitError,
-            "cells",
-        ),
+        ({"options": clvoro.MultilevelOptions(levels=5)}, InputError, "levels is 5, expected at most 4 for 588 cells"),
+        ({"options": clvoro.MultilevelOptions(levels=40), "points": random_points(9, 1)}, MemoryLimitError, "cells"),
         ({"callback": 5}, InputTypeError, "callback is 5 of type int"),
-        (
-            {"points": random_points(9, 1), "n_cells": 8, "method": "coupled"},
-            InputError,
-            "n_cells is 8, but 9 points",
-        ),
+        ({"points": random_points(9, 1), "n_cells": 8, "method": "coupled"}, InputError, "n_cells is 8, but 9 points"),
         ({"points": np.zeros((4, 3))}, InputError, r"points has shape \(4, 3\)"),
         ({"points": [[0.1, 0.2], [0.1, 0.2]]}, InputError, r"points\[0\] and points\[1\] coincide"),
         ({"points": [[0.1, 2.2]]}, InputError, r"points\[0\] is .*outside"),
@@ -637,17 +563,9 @@ def test_one_cell_of_the_right_size(adapter):
         ({"size": lambda p: 0.1}, ClvoroError, "shape"),
         ({"size": 1e-6}, MemoryLimitError, r"3\.75e\+12 cells.*GiB"),
         ({"n_cells": 10**11}, MemoryLimitError, r"1e\+11 cells.*GiB"),
-        (
-            {"domain": "box"},
-            InputTypeError,
-            "domain is a str, expected .*Box, a clvoro.Polygon or a clvoro.Sphere",
-        ),
+        ({"domain": "box"}, InputTypeError, "domain is a str, expected .*Box, a clvoro.Polygon or a clvoro.Sphere"),
         ({"domain": shapely.box(0, 0, 1, 1)}, InputTypeError, r"Polygon\.from_shapely\(domain\)"),
-        (
-            {"points": np.ma.masked_less(random_points(9, 1), 0.2)},
-            InputError,
-            r"points has \d+ masked numbers",
-        ),
+        ({"points": np.ma.masked_less(random_points(9, 1), 0.2)}, InputError, r"points has \d+ masked numbers"),
         (
             {"size": sizing.Raster(np.ones((3, 3)), (50, 7), (58, 13))},
             InputError,
@@ -670,9 +588,7 @@ def test_bad_corners(corner):
 
 @pytest.mark.parametrize("given", ["gpu", 0])
 def test_bad_context(given):
-    with pytest.raises(
-        InputTypeError, match=r"expected a pyopencl.Context.*create_context\(device"
-    ):
+    with pytest.raises(InputTypeError, match=r"expected a pyopencl.Context.*create_context\(device"):
         clvoro.Adapter(given)
 
 
@@ -682,9 +598,7 @@ def test_sizes_in_another_unit(adapter):
         warnings.simplefilter("error", CoarseSizeWarning)
         adapter.run(BOX, 2.7, effort="fast")  # 0.51 cells
         adapter.run(BOX, 100, effort="fast", n_cells=2)
-    with pytest.warns(
-        CoarseSizeWarning, match=r"0\.00038 cells in a domain of area 3\.75"
-    ) as caught:
+    with pytest.warns(CoarseSizeWarning, match=r"0\.00038 cells in a domain of area 3\.75") as caught:
         assert len(adapter.run(BOX, 100, effort="fast").points) == 1
     assert caught[0].filename == __file__
 
@@ -704,12 +618,5 @@ def test_errors_of_the_field_during_a_run(adapter):
         return np.where(len(seen) > 40, -1.0, 0.1) * np.ones(len(points))
 
     with pytest.raises(SizeFieldError, match=r"-1 at \("):
-        adapter.run(
-            BOX,
-            size,
-            random_points(300, 3),
-            method="lloyd",
-            max_steps=100,
-            options=clvoro.PaperOptions(tol=0),
-        )
+        adapter.run(BOX, size, random_points(300, 3), method="lloyd", max_steps=100, options=clvoro.PaperOptions(tol=0))
     check(adapter.run(BOX, F1, method="lloyd", max_steps=1), F1)

@@ -58,16 +58,7 @@ def test_every_method(adapter, adapter32, dtype, method):
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_uniform_start_and_count(adapter, method):
-    result = adapter.run(
-        BOX,
-        SMALL,
-        method=method,
-        points="uniform",
-        n_cells=300,
-        effort="fast",
-        max_steps=15,
-        seed=5,
-    )
+    result = adapter.run(BOX, SMALL, method=method, points="uniform", n_cells=300, effort="fast", max_steps=15, seed=5)
     assert len(result.points) == 300
     assert result.settings["start"] == "uniform"
     check(result, SMALL)
@@ -79,11 +70,7 @@ def test_figures_of_repeated_steps(adapter):
     start = random_points(500, 18)
     field = S1 * 1.55
     lloyd, poisson, coupled, weighted = (
-        figures(
-            adapter.run(
-                BOX, field, start, method=method, max_steps=60, options=clvoro.PaperOptions(tol=0)
-            )
-        )
+        figures(adapter.run(BOX, field, start, method=method, max_steps=60, options=clvoro.PaperOptions(tol=0)))
         for method in ("lloyd", "poisson", "coupled", "weighted")
     )
     assert lloyd[0] > 3 * coupled[0]
@@ -97,11 +84,7 @@ def test_figures_of_repeated_steps(adapter):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize(
     ("options", "mean", "largest", "quality"),
-    [
-        ({}, 0.004, 0.04, 0.67),
-        ({"effort": "fast"}, 0.015, 0.12, 0.66),
-        ({"method": "exact"}, 3e-4, 5e-3, 0.67),
-    ],
+    [({}, 0.004, 0.04, 0.67), ({"effort": "fast"}, 0.015, 0.12, 0.66), ({"method": "exact"}, 3e-4, 5e-3, 0.67)],
 )
 def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, largest, quality):
     run = (adapter if dtype == "float64" else adapter32).run
@@ -123,24 +106,18 @@ def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, larg
 def test_row_i_is_the_callers_generator(adapter):
     """One step of Lloyd's takes every generator to the centroid of its own cell."""
     points = random_points(250, 5)
-    result = adapter.run(
-        BOX, 0.2, points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0)
-    )
+    result = adapter.run(BOX, 0.2, points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0))
     cells = reference3d.box_voronoi(BOX.lower, BOX.upper, points)
     assert result.points == pytest.approx(np.array([c.centroid for c in cells]), abs=1e-12)
     assert np.array_equal(result.initial.points, points)
-    assert result.history["energy"][0] == pytest.approx(
-        sum(map(second_moment, cells, points)), rel=1e-9
-    )
+    assert result.history["energy"][0] == pytest.approx(sum(map(second_moment, cells, points)), rel=1e-9)
 
 
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_no_steps(adapter, method):
     points = random_points(200, 6)
-    result = adapter.run(
-        BOX, SMALL, points, method=method, max_steps=0, options=clvoro.MultilevelOptions(levels=0)
-    )
+    result = adapter.run(BOX, SMALL, points, method=method, max_steps=0, options=clvoro.MultilevelOptions(levels=0))
     assert np.array_equal(result.points, points)
     assert len(result.history) == 1
     check(result, SMALL)
@@ -181,12 +158,7 @@ def test_origin_names_the_callers_generators(adapter):
         ("float64", {"effort": "fast"}),
         (
             "float32",
-            {
-                "method": "exact",
-                "effort": "fast",
-                "n_cells": 333,
-                "options": clvoro.MultilevelOptions(levels=1),
-            },
+            {"method": "exact", "effort": "fast", "n_cells": 333, "options": clvoro.MultilevelOptions(levels=1)},
         ),
     ],
 )
@@ -205,9 +177,7 @@ def test_units_do_not_matter(adapter):
     """A mesh in millimeters far from the origin is the same mesh."""
     points = random_points(250, 8)
     box = clvoro.Box((40, -7, 3), (40 + 1e-3, -7 + 1e-3, 3 + 1e-3))
-    small = sizing.Distance(
-        sizing.Circle((40 + 0.5e-3, -7 + 0.5e-3, 3 + 0.4e-3), 0.25e-3), 0.08e-3, slope=0.6
-    )
+    small = sizing.Distance(sizing.Circle((40 + 0.5e-3, -7 + 0.5e-3, 3 + 0.4e-3), 0.25e-3), 0.08e-3, slope=0.6)
     options = {"method": "weighted", "max_steps": 5, "options": clvoro.PaperOptions(tol=0)}
     a = adapter.run(BOX, SMALL, points, **options)
     b = adapter.run(box, small, points * 1e-3 + box.lower, **options)
@@ -222,8 +192,7 @@ def test_units_do_not_matter(adapter):
 
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize(
-    ("options", "rows"),
-    [({"method": "coupled"}, 4), ({"options": clvoro.MultilevelOptions(levels=1)}, 6)],
+    ("options", "rows"), [({"method": "coupled"}, 4), ({"options": clvoro.MultilevelOptions(levels=1)}, 6)]
 )
 @pytest.mark.parametrize("how", ["returns True", "is interrupted", "max_steps"])
 def test_stopped(adapter, options, rows, how):
@@ -237,15 +206,14 @@ def test_stopped(adapter, options, rows, how):
         return how == "returns True" and len(seen) == rows
 
     most = {"max_steps": rows - 1} if how == "max_steps" else {}
-    result = adapter.run(
-        BOX, S1, callback=callback, seed=12, effort="fast", on_interrupt="return", **options, **most
-    )
+    result = adapter.run(BOX, S1, callback=callback, seed=12, effort="fast", on_interrupt="return", **options, **most)
     assert len(seen) == rows
     assert not result.converged
     reasons = {
-        "returns True": "stopped by the callback", "is interrupted": "interrupted",
+        "returns True": "stopped by the callback",
+        "is interrupted": "interrupted",
         "max_steps": "max_steps reached",
-    }  # fmt: skip
+    }
     assert result.stop_reason == reasons[how]
     assert len(result.points) == pytest.approx(1778, rel=0.12)
     check(result, S1)
@@ -277,9 +245,7 @@ def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
 @pytest.mark.slow
 @pytest.mark.parametrize("levels", [0, 2])
 def test_levels(adapter, levels):
-    result = adapter.run(
-        BOX, S1, options=clvoro.MultilevelOptions(levels=levels), effort="fast", seed=16
-    )
+    result = adapter.run(BOX, S1, options=clvoro.MultilevelOptions(levels=levels), effort="fast", seed=16)
     h = result.history
     assert h["level"][0] == levels
     assert h["cells"][0] == round(1778 / 8**levels)
@@ -302,9 +268,7 @@ def test_refinement_gives_the_number_of_the_next_level(adapter):
     h = result.history[result.history["level"] == 0]
     assert abs(h["cells"][0] / len(result.points) - 1) < 0.015
     changed = (h["cells"] != h["cells"][0]).any()
-    assert (
-        len(h) == EFFORTS_3D["default"].couple_finest * (1 + changed) + EFFORTS_3D["default"].polish
-    )
+    assert len(h) == EFFORTS_3D["default"].couple_finest * (1 + changed) + EFFORTS_3D["default"].polish
 
 
 @pytest.mark.parametrize(
@@ -339,14 +303,10 @@ FIELDS = {
     "raster": raster,
     "distance": lambda: SMALL,
     "smaller of two": lambda: sizing.minimum(SMALL, 0.2),
-    "segment": lambda: sizing.Distance(
-        sizing.Segment((0.2, 0.2, 0.1), (0.8, 0.7, 0.9)), 0.06, slope=0.35
-    ),
+    "segment": lambda: sizing.Distance(sizing.Segment((0.2, 0.2, 0.1), (0.8, 0.7, 0.9)), 0.06, slope=0.35),
     "jump": lambda: sizing.Expression("x < 0.5 ? 0.12 : 0.4"),
     "jump of 100": lambda: sizing.Expression("x + 0.37*y < 0.2 ? 0.06 : 6.0"),
-    "peak": lambda: sizing.Expression(
-        "0.12 + 2*exp(-60*((x-.5)*(x-.5)+(y-.4)*(y-.4)+(z-.5)*(z-.5)))"
-    ),
+    "peak": lambda: sizing.Expression("0.12 + 2*exp(-60*((x-.5)*(x-.5)+(y-.4)*(y-.4)+(z-.5)*(z-.5)))"),
     "steep": lambda: sizing.Distance(sizing.Circle((0.5, 0.5, 0.4), 0.25), 0.06, slope=3),
     "corner": lambda: sizing.Expression("0.03 + 0.25*sqrt(x*x + y*y + z*z)"),
     "wall": lambda: sizing.Expression("0.06 + 0.4*z"),
@@ -360,13 +320,8 @@ SIMILAR = ("smaller of two", "segment", "jump", "corner", "wall", "about the dom
 
 
 @pytest.mark.sparse(1)
-@pytest.mark.filterwarnings(
-    "ignore::clvoro.errors.CoarseSizeWarning"
-)  # one is larger than the domain
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(k, marks=pytest.mark.slow if k in SIMILAR else ()) for k in FIELDS],
-)
+@pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")  # one is larger than the domain
+@pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow if k in SIMILAR else ()) for k in FIELDS])
 def test_fields(adapter, name):
     field = FIELDS[name]()
     result = adapter.run(BOX, field, effort="fast", seed=20)
@@ -383,12 +338,7 @@ def test_fields(adapter, name):
 
 
 def test_callable_and_device_field_agree(adapter):
-    options = {
-        "method": "coupled",
-        "max_steps": 5,
-        "seed": 3,
-        "options": clvoro.PaperOptions(tol=0),
-    }
+    options = {"method": "coupled", "max_steps": 5, "seed": 3, "options": clvoro.PaperOptions(tol=0)}
     device = adapter.run(BOX, SMALL, **options)
     host = adapter.run(BOX, lambda points: SMALL(points), device.initial.points, **options)
     assert host.points == pytest.approx(device.points, abs=1e-6)
@@ -405,10 +355,7 @@ def test_callable_and_device_field_agree(adapter):
 def test_elongated_boxes(adapter, adapter32, method):
     """A box 20 times as long as it is flat, and a plate one cell thick."""
     plate = clvoro.Box((0, 0, 0), (1, 1, 0.02))
-    for box, field in (
-        (LONG, sizing.Expression("0.13 + 0.03*fabs(x)")),
-        (plate, sizing.Constant(0.04)),
-    ):
+    for box, field in ((LONG, sizing.Expression("0.13 + 0.03*fabs(x)")), (plate, sizing.Constant(0.04))):
         for run, real in ((adapter.run, "float64"), (adapter32.run, "float32")):
             result = run(box, field, method=method, effort="fast", max_steps=16, seed=3)
             check(result, field, box, real)
@@ -431,9 +378,7 @@ def test_lattices_are_left_alone(adapter):
     line = (np.arange(5) + 0.5) / 5
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
     for method in ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"):
-        result = adapter.run(
-            BOX, 0.2, points, method=method, max_steps=3, options=clvoro.PaperOptions(tol=0)
-        )
+        result = adapter.run(BOX, 0.2, points, method=method, max_steps=3, options=clvoro.PaperOptions(tol=0))
         assert result.points == pytest.approx(points, abs=1e-12), method
         assert np.abs(result.size_error).max() < 1e-12
 
@@ -453,10 +398,7 @@ def test_a_lattice_keeps_its_quality(adapter):
     random = adapter.run(BOX, size, n_cells=len(start), seed=5)
     for result in (lattice, random):
         check(result, sizing.Constant(size))
-    inner = [
-        r.quality[((r.points > 0.3) & (r.points < 0.7)).all(axis=1)].mean()
-        for r in (lattice, random)
-    ]
+    inner = [r.quality[((r.points > 0.3) & (r.points < 0.7)).all(axis=1)].mean() for r in (lattice, random)]
     assert inner[0] > 0.745  # walls disturb it a little so far inside
     assert inner[0] > inner[1] + 0.01
 
@@ -474,17 +416,9 @@ def test_a_lattice_keeps_its_quality(adapter):
         ({"size": sizing.Expression("0.3 - z")}, SizeFieldError, r"at \(.*,.*,"),
         ({"size": 1e-4}, MemoryLimitError, r"1e\+12 cells.*GiB"),
         ({"n_cells": 10**10}, MemoryLimitError, r"1e\+10 cells.*GiB"),
-        (
-            {"options": clvoro.MultilevelOptions(levels=6)},
-            InputError,
-            "levels is 6, expected at most",
-        ),
+        ({"options": clvoro.MultilevelOptions(levels=6)}, InputError, "levels is 6, expected at most"),
         ({"size": sizing.Circle((0, 0), 1)}, clvoro.ClvoroError, "size"),
-        (
-            {"size": sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), 0.1, slope=0.1)},
-            clvoro.ClvoroError,
-            "dimension|3",
-        ),
+        ({"size": sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), 0.1, slope=0.1)}, clvoro.ClvoroError, "dimension|3"),
     ],
 )
 def test_bad_input(adapter, change, error, message):

@@ -22,8 +22,10 @@ SIZE = sizing.Caps([((-45, 45), 3e6, 3e5)], h_max=8e5, growth=1.2)
 def angles_of_triangles(diagram):
     x = diagram.points[diagram.triangles()]
     e = [x[:, (k + 1) % 3] - x[:, k] for k in range(3)]
-    cosines = [-(e[k] * e[k - 1]).sum(axis=1) / np.prod([np.linalg.norm(v, axis=1) for v in (e[k], e[k - 1])], axis=0)
-               for k in range(3)]  # fmt: skip
+    cosines = [
+        -(e[k] * e[k - 1]).sum(axis=1) / np.prod([np.linalg.norm(v, axis=1) for v in (e[k], e[k - 1])], axis=0)
+        for k in range(3)
+    ]
     return np.degrees(np.arccos(cosines))
 
 
@@ -38,9 +40,7 @@ def test_few_cells(ctx, method, effort):
 
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
-@pytest.mark.parametrize(
-    ("method", "most", "widest"), [("adaptive", 0.0025, 90), ("exact", 3e-4, 90)]
-)
+@pytest.mark.parametrize(("method", "most", "widest"), [("adaptive", 0.0025, 90), ("exact", 3e-4, 90)])
 def test_sizes_and_shapes(ctx, method, most, widest, real):
     result = clvoro.Adapter(ctx, real).run(EARTH, SIZE, method=method)
     assert np.abs(result.size_error).mean() < most
@@ -49,12 +49,8 @@ def test_sizes_and_shapes(ctx, method, most, widest, real):
     assert result.quality.min() > 0.9
     assert angles_of_triangles(result.diagram).max() < widest
     h = SIZE(result.points)
-    assert result.target_size / result.size_factor == pytest.approx(
-        h, rel=1e-5 if real == "float32" else 1e-12
-    )
-    assert result.size_error == pytest.approx(
-        np.sqrt(result.diagram.volumes) / result.target_size - 1, abs=0.01
-    )
+    assert result.target_size / result.size_factor == pytest.approx(h, rel=1e-5 if real == "float32" else 1e-12)
+    assert result.size_error == pytest.approx(np.sqrt(result.diagram.volumes) / result.target_size - 1, abs=0.01)
     x = result.points / EARTH.radius
     expected = SphericalDiagram(x)
     rounding = 1e-3 if real == "float32" else 1e-10
@@ -98,19 +94,9 @@ def test_icosahedral_start(ctx):
     """Lloyd's method keeps the twelve pentagons and makes the cells equal."""
     start = EARTH.icosahedral_points(4)
     result = clvoro.Adapter(ctx).run(EARTH, 1e6, points=start, method="lloyd", max_steps=50)
-    assert np.bincount(np.diff(result.diagram.neighbor_starts)).tolist() == [
-        0,
-        0,
-        0,
-        0,
-        0,
-        12,
-        2550,
-    ]
+    assert np.bincount(np.diff(result.diagram.neighbor_starts)).tolist() == [0, 0, 0, 0, 0, 12, 2550]
     before = clvoro.Adapter(ctx).diagram(EARTH, start)
-    moved = [
-        np.linalg.norm(d.centroids - d.points, axis=1).mean() for d in (before, result.diagram)
-    ]
+    moved = [np.linalg.norm(d.centroids - d.points, axis=1).mean() for d in (before, result.diagram)]
     assert moved[1] < 0.3 * moved[0]
 
 
@@ -127,13 +113,10 @@ def test_checkpoint(ctx, quick, tmp_path):
     """An interrupted run goes on to the same bits."""
     whole, path = quick, tmp_path / "state"
     part = clvoro.Adapter(ctx).run(
-        EARTH, SIZE, effort="fast", checkpoint=clvoro.Checkpoint(path, every=0),
-        callback=lambda row: row["step"] >= 20,
-    )  # fmt: skip
-    assert len(part.history) < len(whole.history)
-    rest = clvoro.Adapter(ctx).run(
-        EARTH, SIZE, effort="fast", checkpoint=clvoro.Checkpoint(path, resume=True)
+        EARTH, SIZE, effort="fast", checkpoint=clvoro.Checkpoint(path, every=0), callback=lambda row: row["step"] >= 20
     )
+    assert len(part.history) < len(whole.history)
+    rest = clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast", checkpoint=clvoro.Checkpoint(path, resume=True))
     assert np.array_equal(rest.points, whole.points)
 
 

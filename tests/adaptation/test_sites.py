@@ -43,7 +43,7 @@ class Mesh:
         self.walled = np.array([(row < 0).any() for row in self.rows])
         self.kinds = np.stack(
             [rng.choice([-2, -1, 0, 1, 2], N, p=[0.1, 0.35, 0.1, 0.35, 0.1]), rng.choice([0, 0, 1, 2], N)], axis=1
-        )  # fmt: skip
+        )
         self.strain = rng.normal(size=(N, 4)).astype(np.float32)
         self.rng, self.stage = rng, InsertionDeletion(engine)
         self.kernels = self.stage._kernels
@@ -97,9 +97,16 @@ def scored(mesh, at_walls):
     partners, pull = engine.empty(N, np.int32), engine.empty(N)
     keys = engine.empty(N, np.uint64)
     mesh.run(
-        "score_pairs", *mesh.graph, mesh.t.points, mesh.upload(mesh.kinds, np.int32),
-        mesh.upload(mesh.strain, np.float32), np.int32(at_walls), partners, pull, keys,
-    )  # fmt: skip
+        "score_pairs",
+        *mesh.graph,
+        mesh.t.points,
+        mesh.upload(mesh.kinds, np.int32),
+        mesh.upload(mesh.strain, np.float32),
+        np.int32(at_walls),
+        partners,
+        pull,
+        keys,
+    )
     return partners, pull, keys
 
 
@@ -140,13 +147,13 @@ def test_pairs_are_split_or_deleted(mesh):
     pull = mesh.rng.uniform(-0.6, 0.6, N)
     shifts = (np.arange(SHIFTS) - SHIFTS // 2) * SHIFT_STEP
     pairs = [(i, partners[i]) for i in np.flatnonzero(chosen)]
-    changes = np.array(
-        [[change_of(pull[i], mesh.kinds[i], mesh.kinds[j], s) for i, j in pairs] for s in shifts]
-    )
+    changes = np.array([[change_of(pull[i], mesh.kinds[i], mesh.kinds[j], s) for i, j in pairs] for s in shifts])
     given = (
-        mesh.upload(chosen.astype(np.uint64) * 7, np.uint64), mesh.upload(pull, engine.real),
-        mesh.upload(mesh.kinds, np.int32), mesh.upload(partners, np.int32),
-    )  # fmt: skip
+        mesh.upload(chosen.astype(np.uint64) * 7, np.uint64),
+        mesh.upload(pull, engine.real),
+        mesh.upload(mesh.kinds, np.int32),
+        mesh.upload(partners, np.int32),
+    )
     tally = engine.zeros(SHIFTS, np.int32)
     mesh.run("count_pair_changes", *given, CLIMB_STRAIN, tally)
     assert np.array_equal(tally.get(), changes.sum(axis=1))
@@ -156,9 +163,15 @@ def test_pairs_are_split_or_deleted(mesh):
     for m in (0, SHIFTS // 2, SHIFTS - 1):
         marks = mesh.marks()
         mesh.run(
-            "mark_pairs", *given, CLIMB_STRAIN, float(shifts[m]), mesh.t.points, mesh.upload(local_length, engine.real),
-            *marks.arrays, marks.busy,
-        )  # fmt: skip
+            "mark_pairs",
+            *given,
+            CLIMB_STRAIN,
+            float(shifts[m]),
+            mesh.t.points,
+            mesh.upload(local_length, engine.real),
+            *marks.arrays,
+            marks.busy,
+        )
         kept, born, busy = np.ones(N), np.zeros(N), np.zeros(N)
         moved = np.zeros((N, 2))
         for (i, j), change in zip(pairs, changes[m], strict=True):
@@ -168,9 +181,7 @@ def test_pairs_are_split_or_deleted(mesh):
             elif change > 0:
                 d = mesh.way(i, j)
                 born[j] = 1
-                moved[j] = (
-                    SPLIT_DISTANCE * local_length[j] * np.array([-d[1], d[0]]) / np.linalg.norm(d)
-                )
+                moved[j] = SPLIT_DISTANCE * local_length[j] * np.array([-d[1], d[0]]) / np.linalg.norm(d)
         assert np.array_equal(marks.kept.get()[:N], kept)
         assert np.array_equal(marks.born.get()[:N], born)
         assert np.array_equal(marks.busy.get() != 0, busy != 0)
@@ -184,10 +195,7 @@ def test_nuclei_are_sites_in_a_strained_lattice(mesh):
     kinds = np.where(mesh.rng.random((N, 2)) < 0.95, 0, mesh.rng.integers(-1, 3, (N, 2)))
     kinds[mesh.walled, 1] = 1
     keys = engine.empty(N, np.uint64)
-    mesh.run(
-        "score_strain", *mesh.graph, mesh.upload(kinds, np.int32), mesh.upload(mesh.strain, np.float32),
-        0.8, keys,
-    )  # fmt: skip
+    mesh.run("score_strain", *mesh.graph, mesh.upload(kinds, np.int32), mesh.upload(mesh.strain, np.float32), 0.8, keys)
     magnitudes = np.zeros(N)
     for i, row in enumerate(mesh.rows):
         if not kinds[i].any() and not kinds[row].any():
@@ -201,9 +209,14 @@ def test_nuclei_are_sites_in_a_strained_lattice(mesh):
     ranks = np.concatenate([[0], np.cumsum(chosen)])
     marks = mesh.marks()
     mesh.run(
-        "mark_nuclei", mesh.upload(chosen.astype(np.uint64), np.uint64), mesh.upload(ranks, np.int32),
-        *mesh.graph, mesh.t.points, *marks.arrays, marks.busy,
-    )  # fmt: skip
+        "mark_nuclei",
+        mesh.upload(chosen.astype(np.uint64), np.uint64),
+        mesh.upload(ranks, np.int32),
+        *mesh.graph,
+        mesh.t.points,
+        *marks.arrays,
+        marks.busy,
+    )
     kept, born, moved, births = np.ones(N), np.zeros(N), np.zeros((N, 2)), np.zeros((N, 2))
     for i in np.flatnonzero(chosen):
         ways = np.array([mesh.way(i, j) for j in mesh.rows[i]])
@@ -228,9 +241,13 @@ def test_cells_too_large_or_too_small_are_sites(mesh, sign):
     alone = mesh.rng.random(N) < 0.1
     neighbors = np.where(alone[mesh.host.owners], -1, mesh.host.neighbors)
     mesh.run(
-        "score_log_ratio", mesh.t.starts, mesh.upload(neighbors, np.int32),
-        mesh.upload(log_ratio, engine.real), sign, keys,
-    )  # fmt: skip
+        "score_log_ratio",
+        mesh.t.starts,
+        mesh.upload(neighbors, np.int32),
+        mesh.upload(log_ratio, engine.real),
+        sign,
+        keys,
+    )
     faces = np.diff(mesh.host.starts)
     magnitudes = np.clip(2 + sign * (log_ratio + 0.2 * (faces - 6)), 0, 4)
     magnitudes[alone & (sign < 0)] = 0
@@ -259,5 +276,5 @@ def test_sites_at_fixed_generators_are_removed(mesh):
         keys = mesh.upload(first, np.uint64)
         mesh.run(
             "drop_fixed_sites", *mesh.graph, mesh.upload(labels, np.int32), np.int32(fixed), np.int32(around), keys
-        )  # fmt: skip
+        )
         assert np.array_equal(keys.get(), np.where(out, 0, first))

@@ -5,13 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from clvoro.adaptation.density import Density
-from clvoro.adaptation.insertion_deletion import (
-    MAX_CHANGE,
-    CellSizes,
-    Change,
-    Generators,
-    InsertionDeletion,
-)
+from clvoro.adaptation.insertion_deletion import MAX_CHANGE, CellSizes, Change, Generators, InsertionDeletion
 from clvoro.adaptation.metric import Metric
 from clvoro.adaptation.motion import Motion
 from clvoro.adaptation.refinement import Refinement
@@ -165,9 +159,7 @@ def test_potential_solves_the_equation(double):
     flux /= np.linalg.norm(points[i] - points[j], axis=1)
     net = np.bincount(i, flux, minlength=N)
     wanted = host.volumes * (r - np.average(r, weights=host.volumes))
-    off = min(
-        np.abs(net - wanted).max(), np.abs(net + wanted).max()
-    )  # whatever the convention for the sign
+    off = min(np.abs(net - wanted).max(), np.abs(net + wanted).max())  # whatever the convention for the sign
     assert off < 1e-8 * np.abs(wanted).max()
 
 
@@ -191,9 +183,13 @@ def test_projection_uses_the_derivative_of_the_volumes(double):
         ask = size * np.random.default_rng(3).normal(size=60)
         u = double.empty((60, 3))
         solution = VolumeProjection(double).project(
-            t, Targets(*map(double.upload, (h, np.tile(SLOPE, (60, 1)), ask, np.ones(60)))),
-            double.zeros((60, 3)), u, Penalty(1e-9), Limits(1e-11, 2000),
-        )  # fmt: skip
+            t,
+            Targets(*map(double.upload, (h, np.tile(SLOPE, (60, 1)), ask, np.ones(60)))),
+            double.zeros((60, 3)),
+            u,
+            Penalty(1e-9),
+            Limits(1e-11, 2000),
+        )
         assert solution.residual < 1e-9
         change = excess_of(points + u.get()) - base
         left.append(np.abs(change + ask).max())
@@ -254,12 +250,15 @@ class Sweep:
         labels = np.random.default_rng(8).permutation(3 * n)[:n]
         zeros = engine.zeros(n)
         self.new = InsertionDeletion(engine).insert_delete(
-            BOX, t, CellSizes(*map(engine.upload, (np.full(n, h), np.full(n, h), self.log_ratio))),
+            BOX,
+            t,
+            CellSizes(*map(engine.upload, (np.full(n, h), np.full(n, h), self.log_ratio))),
             Generators(
                 t.points, engine.upload(labels, np.int32), engine.zeros((n, 3)), engine.zeros(n, np.uint64), zeros
             ),
-            5 * n, Change(total, climb=False),
-        )  # fmt: skip
+            5 * n,
+            Change(total, climb=False),
+        )
         if self.new is None:
             return
         self.points, found = self.new.generators.points.get(), self.new.generators.labels.get()

@@ -93,9 +93,7 @@ def test_moves(engine, box, clip):
         assert not way.get()[held].any()
     for way, given in zip(ways, (lloyd, correction), strict=True):
         assert np.array_equal(way.get()[~held], given[~held])
-    Motion(engine).move_generators(
-        box, on_device, ways[0], 0.7, ways[1], -1.3, engine.upload(h), velocity, clip=clip
-    )
+    Motion(engine).move_generators(box, on_device, ways[0], 0.7, ways[1], -1.3, engine.upload(h), velocity, clip=clip)
     new, moved = on_device.get(), velocity.get()
     assert np.array_equal(new[held], points[held])
     assert not moved[held].any()
@@ -118,9 +116,8 @@ def test_moves_longer_than_the_domain(engine, box):
     way = np.random.default_rng(5609).normal(0, 1e7, (N, box.dim))
     on_device, none = engine.upload(points), engine.upload(np.zeros_like(way))
     Motion(engine).move_generators(
-        box, on_device, engine.upload(way), 1.0, none, 0.0, engine.upload(np.ones(N)),
-        engine.empty((N, box.dim)),
-    )  # fmt: skip
+        box, on_device, engine.upload(way), 1.0, none, 0.0, engine.upload(np.ones(N)), engine.empty((N, box.dim))
+    )
     new, walls = on_device.get(), ~np.array(box.periodic)
     assert ((new >= 0) & (new <= box.extent)).all()
     assert all(len(np.unique(x)) == N for x in new[:, walls].T)
@@ -133,9 +130,7 @@ def test_sizes_that_are_held(engine, box, t):
     h = lengths / rng.uniform(0.5, 2.5, N)
     on_device = engine.upload(h)
     for _ in range(2):  # again with its own result
-        Metric(engine).set_fixed_sizes(
-            engine.upload(labels, np.int32), 20, 90, t.volumes, on_device
-        )
+        Metric(engine).set_fixed_sizes(engine.upload(labels, np.int32), 20, 90, t.volumes, on_device)
         right = (labels >= 20) & (labels < 90) & (lengths <= 1.5 * h)
         assert 0 < np.count_nonzero(right) < 70
         expected = np.where(right, lengths, h)

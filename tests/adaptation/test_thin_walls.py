@@ -64,9 +64,7 @@ def nearest_images(points, convex, neighbors, half):
     return partners
 
 
-@pytest.mark.parametrize(
-    ("real", "half"), [("float64", 0.001), ("float64", 0.01), ("float32", 0.001)]
-)
+@pytest.mark.parametrize(("real", "half"), [("float64", 0.001), ("float64", 0.01), ("float32", 0.001)])
 def test_pairs(ctx, real, half):
     domain = slit(half)
     rng = np.random.default_rng(7)
@@ -74,7 +72,7 @@ def test_pairs(ctx, real, half):
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.kind(np.dtype(real)))
     mesh = MeshState.create(
         Stages(engine), domain, Sizing(engine, domain, as_field(H)), engine.upload(domain.place(x, engine.real))
-    )  # fmt: skip
+    )
     origin, scale = domain.frame
     order = mesh.labels.get()
     rows = [rows_of(t, order) for t in (mesh.t.trimmed.convex, mesh.t)]
@@ -82,20 +80,14 @@ def test_pairs(ctx, real, half):
     at_wall = order[chords.touched.get()[: chords.touched_count]]
     mesh.stages.thin_walls.pair(mesh.free, mesh.t, mesh.h, mesh.moving)
     partners, expected = nearest_images(x, *rows, half), x.copy()
-    paired = {
-        i for i, j in enumerate(partners)
-        if j >= 0 and partners[j] == i and (i in at_wall or j in at_wall)
-    }  # fmt: skip
+    paired = {i for i, j in enumerate(partners) if j >= 0 and partners[j] == i and (i in at_wall or j in at_wall)}
     pushed = 0
     for i in set(at_wall.tolist()) | paired:
         if i in paired:
             y = x[partners[i]]
             expected[i] += share(x[i], y, half) / 2 * ((1 - y[0], y[1]) - x[i])
             continue
-        pairs = [
-            j for j in across(x, i, rows[0][i])
-            if j in paired and j in at_wall and share(x[i], x[j], half) >= 0
-        ]  # fmt: skip
+        pairs = [j for j in across(x, i, rows[0][i]) if j in paired and j in at_wall and share(x[i], x[j], half) >= 0]
         if len(pairs) > 1:
             mean = np.mean([share(x[i], x[j], half) for j in pairs])
             expected[i, 0] += 0.1 * H * mean * np.sign(x[i, 0] - 0.5)
@@ -118,7 +110,7 @@ def test_sides_of_unlike_size_have_no_pairs(ctx):
         size = as_field(clvoro.sizing.Expression(f"x < 0.5 ? {H} : {H * ratio}"))
         mesh = MeshState.create(
             Stages(engine), SLIT, Sizing(engine, SLIT, size), engine.upload(SLIT.place(x, engine.real))
-        )  # fmt: skip
+        )
         before = mesh.points.get()
         mesh.stages.thin_walls.pair(mesh.free, mesh.t, mesh.h, mesh.moving)
         moved.append((mesh.points.get() != before).any())

@@ -22,15 +22,8 @@ def size(points):
         pytest.param(BOX, size, "float32", marks=pytest.mark.slow),
         (CUBE, 0.16, "float64"),
         (clvoro.Box((0, 0), (1, 1), periodic=True), 0.1, "float64"),
-        pytest.param(
-            clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), 0.16, "float64", marks=pytest.mark.slow
-        ),
-        pytest.param(
-            clvoro.Box((0, 0), (2, 1), periodic=(False, True)),
-            size,
-            "float32",
-            marks=pytest.mark.slow,
-        ),
+        pytest.param(clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), 0.16, "float64", marks=pytest.mark.slow),
+        pytest.param(clvoro.Box((0, 0), (2, 1), periodic=(False, True)), size, "float32", marks=pytest.mark.slow),
         pytest.param(LAKE, size, "float64", marks=pytest.mark.slow),
     ],
 )
@@ -47,9 +40,7 @@ def test_all_cells_have_their_size(ctx, domain, h, real):
     assert result.check(), result.check()
     # The last two rows are the first power diagram, and that after the move to the centroids.
     assert (result.history["max_error"][-2:] < noise).all()
-    assert (
-        np.linalg.norm(result.final.lloyd, axis=1).max() > 0 == np.abs(result.final.poisson).max()
-    )
+    assert np.linalg.norm(result.final.lloyd, axis=1).max() > 0 == np.abs(result.final.poisson).max()
 
 
 @pytest.mark.slow

@@ -60,9 +60,9 @@ def test_kinds_of_size_fields(tmp_path):
     x = points()
     assert field("[size]\nkind = 'constant'\nvalue = 0.3")(x) == pytest.approx(0.3)
     assert Case.from_toml("size = 0.3\n" + HEAD, "my.toml").size_field()(x) == pytest.approx(0.3)
-    assert field("[size]\nkind = 'expression'\nexpression = '0.1 + 0.05 * x * y'")(
-        x
-    ) == pytest.approx(0.1 + 0.05 * x[:, 0] * x[:, 1])
+    assert field("[size]\nkind = 'expression'\nexpression = '0.1 + 0.05 * x * y'")(x) == pytest.approx(
+        0.1 + 0.05 * x[:, 0] * x[:, 1]
+    )
     values = np.random.default_rng(5).random((4, 7)) + 0.5
     np.save(tmp_path / "h.npy", values)
     raster = field("[size]\nkind = 'raster'\nfile = 'h.npy'", tmp_path)
@@ -93,9 +93,7 @@ shapes = [
     ]
     wanted = np.minimum(0.4, sizing.Distance(shapes, 0.01, slope=0.5)(x))
     assert field(tree)(x) == pytest.approx(wanted)
-    assert field(tree.replace('"min"', '"sum"'))(x) == pytest.approx(
-        0.4 + sizing.Distance(shapes, 0.01, slope=0.5)(x)
-    )
+    assert field(tree.replace('"min"', '"sum"'))(x) == pytest.approx(0.4 + sizing.Distance(shapes, 0.01, slope=0.5)(x))
 
 
 def test_kinds_in_space(tmp_path):
@@ -153,10 +151,7 @@ def test_sizes_from_a_solution(tmp_path):
         ("size = 0.1\n[run]\nseed = 1.5", ["run.seed", "1.5", "whole"]),
         ("size = 0.1\n[run]\nstart = 'densty'", ["run.start", "did you mean 'density'"]),
         ("size = 0.1\n[run]\nmethod = 'lloyd'\nmethods = ['lloyd']", ["method and methods"]),
-        (
-            "size = 0.1\n[run]\nmethods = ['lloyd', 'lloyd']",
-            ["run.methods[1]", "'lloyd'", "each name once"],
-        ),
+        ("size = 0.1\n[run]\nmethods = ['lloyd', 'lloyd']", ["run.methods[1]", "'lloyd'", "each name once"]),
         ("size = -0.1", ["size", "-0.1", "above 0"]),
         ("size = nan", ["size", "finite"]),
         ("sise = 0.1", ["'sise'", "did you mean 'size'"]),
@@ -170,13 +165,9 @@ def test_sizes_from_a_solution(tmp_path):
         ("", ["lacks size"]),
         ("[size]\nkind = 'distnce'", ["size.kind", "did you mean 'distance'"]),
         ("[size]\nkind = 'raster'", ["size", "lacks file"]),
+        ("[size]\nkind = 'distance'\nhmin = 0.1\nshapes = []", ["size", "'hmin'", "did you mean 'h_min'"]),
         (
-            "[size]\nkind = 'distance'\nhmin = 0.1\nshapes = []",
-            ["size", "'hmin'", "did you mean 'h_min'"],
-        ),
-        (
-            "[size]\nkind='distance'\nh_min=1\nslope=1\ngrowth=2\nshapes=[{kind='circle',"
-            "center=[0,0],radius=1}]",
+            "[size]\nkind='distance'\nh_min=1\nslope=1\ngrowth=2\nshapes=[{kind='circle',center=[0,0],radius=1}]",
             ["growth, slope", "exactly one"],
         ),
         (
@@ -276,9 +267,7 @@ leaves = (
 keys = st.text(st.characters(blacklist_categories=["Cs"]), max_size=6)
 tables = st.recursive(
     st.dictionaries(keys, leaves, max_size=3),
-    lambda t: st.dictionaries(
-        keys, leaves | t | st.lists(t, max_size=3) | st.lists(leaves, max_size=3), max_size=4
-    ),
+    lambda t: st.dictionaries(keys, leaves | t | st.lists(t, max_size=3) | st.lists(leaves, max_size=3), max_size=4),
     max_leaves=10,
 )
 

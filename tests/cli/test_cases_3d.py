@@ -59,8 +59,7 @@ def call(*arguments):
 
 
 @pytest.mark.parametrize(
-    ("name", "least", "most"),
-    [("sphere", 15e3, 4e4), pytest.param("surface", 2e4, 4e4, marks=pytest.mark.slow)],
+    ("name", "least", "most"), [("sphere", 15e3, 4e4), pytest.param("surface", 2e4, 4e4, marks=pytest.mark.slow)]
 )
 def test_counts(ctx, name, least, most):
     case = load_case(name)
@@ -161,8 +160,7 @@ def test_gap_is_closed_by_join(here):
 
 
 @pytest.mark.parametrize(
-    ("old", "new"),
-    [pytest.param("0.25", "1e-4", marks=pytest.mark.slow), ("slope = 0.3", "slope = 1e-9")],
+    ("old", "new"), [pytest.param("0.25", "1e-4", marks=pytest.mark.slow), ("slope = 0.3", "slope = 1e-9")]
 )
 def test_more_cells_than_memory(here, capsys, old, new):
     """What a run would need is said before it begins."""

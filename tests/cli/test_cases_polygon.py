@@ -29,9 +29,12 @@ def test_domains_from_files_and_from_rings(tmp_path) -> None:
     (tmp_path / "a.geojson").write_text(json.dumps(geometry))
     (tmp_path / "a.wkt").write_text(shapely.Polygon(SQUARE, [HOLE]).wkt)
     for text in (
-        RINGS, "[domain]\npolygon = 'a.geojson'\n", "[domain]\npolygon = 'a.wkt'\n",
-        "[domain]\nkind = 'polygon'\nfile = 'a.geojson'\n", RINGS.replace("outer", "kind = 'polygon'\nouter"),
-    ):  # fmt: skip
+        RINGS,
+        "[domain]\npolygon = 'a.geojson'\n",
+        "[domain]\npolygon = 'a.wkt'\n",
+        "[domain]\nkind = 'polygon'\nfile = 'a.geojson'\n",
+        RINGS.replace("outer", "kind = 'polygon'\nouter"),
+    ):
         case = Case.from_toml(text + SIZE, "my.toml", tmp_path)
         assert case.domain == wanted
         # Written somewhere else, it is the same case with the same file.
@@ -96,9 +99,7 @@ def test_sizes_from_the_boundary() -> None:
         size = Case.from_toml(rings + distance % ", edges = [6]", "my.toml").size_field()
         wanted = sizing.Distance(sizing.Segment(hole[2], hole[3]), 0.01, slope=0.5)
         assert size(x) == pytest.approx(wanted(x))
-    feature = (
-        "\n[size]\nkind = 'feature'\ncells_across = 3\nh_max = 0.5\ngrowth = 1.3\ncurvature = 0\n"
-    )
+    feature = "\n[size]\nkind = 'feature'\ncells_across = 3\nh_max = 0.5\ngrowth = 1.3\ncurvature = 0\n"
     size = Case.from_toml(RINGS + feature, "my.toml").size_field()
     wanted = sizing.FeatureSize(domain, 3, growth=1.3, h_max=0.5, curvature=0)
     assert size(x) == pytest.approx(wanted(x), rel=1e-15)
@@ -119,7 +120,7 @@ def test_sizes_from_the_boundary() -> None:
         ("[domain]\nkind = 'polygon'\nlower = [0, 0]\n", "unknown key 'lower'"),
         ("[domain]\nlower = [0, 0]\nupper = [1, 1]\nouter = [[0, 0], [1, 0], [1, 1]]\n", "both lower, of a box"),
     ],
-)  # fmt: skip
+)
 def test_what_is_refused(text: str, says: str) -> None:
     with pytest.raises(InputError, match=says):
         Case.from_toml(text + SIZE, "my.toml")

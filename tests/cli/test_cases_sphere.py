@@ -81,11 +81,7 @@ fields = [
   { kind = "expression", expression = "100 + abs(lat) + 0.1 * abs(lon)" },
 ]
 """
-    shapes = [
-        sizing.Circle((-120, 10), 0),
-        sizing.Polyline([(170, 0), (190, 40)]),
-        clvoro.Box((40, -30), (50, -20)),
-    ]
+    shapes = [sizing.Circle((-120, 10), 0), sizing.Polyline([(170, 0), (190, 40)]), clvoro.Box((40, -30), (50, -20))]
     size = sizing.minimum(
         sizing.Caps([((10, 20), 300, 50)], 200, slope=0.2, sphere=SPHERE),
         sizing.Distance(shapes, 20, growth=1.2),
@@ -160,7 +156,7 @@ def test_grids_go_with_the_case(tmp_path):
         ("kind='raster'\nfile='cut.nc'", "cut.nc"),
         ("kind='raster'\nfile='absent.nc'", "absent.nc"),
     ],
-)  # fmt: skip
+)
 def test_mistakes_in_sizes(tmp_path, text, message):
     write_netcdf(tmp_path / "h.nc")
     np.save(tmp_path / "h.npy", WAVES)
@@ -184,12 +180,12 @@ def test_files_of_netcdf_4_need_xarray(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[domain]\nradius = 1.0\n", "kind = \"sphere\""),
+        ("[domain]\nradius = 1.0\n", 'kind = "sphere"'),
         ("[domain]\nkind = 'sphere'\nradius = -1\n", "radius is -1"),
         ("[domain]\nkind = 'sphere'\nperiodic = true\n", "'periodic'"),
         ("[domain]\nkind = 'ball'\n", "box, polygon, sphere"),
     ],
-)  # fmt: skip
+)
 def test_mistakes_in_domains(text, message):
     with pytest.raises(InputError, match=message):
         Case.from_toml(f"size = 1\n{text}", "my.toml")
@@ -223,14 +219,7 @@ def test_run_writes_everything(here, capsys):
     assert (len(result.points), result.diagram.domain) == (500, clvoro.Sphere())
     assert json.loads(capsys.readouterr().out)["cells"] == 500
     written = {p.name for p in out.iterdir()}
-    assert {
-        "mesh.vtu",
-        "mesh.nc",
-        "mesh-mpas.nc",
-        "graph.info",
-        "case.toml",
-        "report.html",
-    } <= written
+    assert {"mesh.vtu", "mesh.nc", "mesh-mpas.nc", "graph.info", "case.toml", "report.html"} <= written
     pictures = {p.stem for p in (out / "pictures").iterdir()}
     assert {"size", "plate", "cells", "history", "sides"} <= pictures
     with netcdf_file(out / "mesh-mpas.nc", mmap=False) as file:
@@ -266,7 +255,7 @@ def test_meshes_are_checked_and_converted(here, capsys):
         (("convert", "a/mesh.npz", "a.foam"), "convention='mpas'"),
         (("convert", "a/mesh.npz", "a.nc", "--walls", "exact"), "walls"),
     ],
-)  # fmt: skip
+)
 def test_what_makes_no_sense_on_a_sphere(here, capsys, arguments, message):
     call("run", "small.toml", "--no-report", "--quiet", "--out", "a")
     capsys.readouterr()
@@ -297,9 +286,7 @@ def test_start_from_longitudes_and_latitudes(here):
 @pytest.mark.slow
 @pytest.mark.parametrize("sizes", ["250 + lat * {t}", "300 + 0 * {t}"], ids=["moving", "constant"])
 def test_frames(here, sizes):
-    text = SMALL.replace(
-        "kind = 'constant'\nvalue = 300", f"kind = 'expression'\nexpression = '{sizes}'"
-    )
+    text = SMALL.replace("kind = 'constant'\nvalue = 300", f"kind = 'expression'\nexpression = '{sizes}'")
     (here / "small.toml").write_text(text + "[sequence]\nframes = 2\n")
     assert call("run", "small.toml", "--quiet") == cli.OK
     assert len(list((here / "out/small/frames").iterdir())) == 2

@@ -55,9 +55,15 @@ def test_run_writes_everything(here, capsys, monkeypatch):
     out = here / "out" / "small"
     written = {p.name for p in out.iterdir()}
     assert written == {
-        "mesh.vtu", "mesh.npz", "history.csv", "mesh-lloyd.npz", "history-lloyd.csv", "case.toml",
-        "report.html", "pictures",
-    }  # fmt: skip
+        "mesh.vtu",
+        "mesh.npz",
+        "history.csv",
+        "mesh-lloyd.npz",
+        "history-lloyd.csv",
+        "case.toml",
+        "report.html",
+        "pictures",
+    }
     printed = capsys.readouterr()
     assert printed.err == ""  # no progress in a log before its first time has come
     assert "report.html" in printed.out
@@ -174,10 +180,7 @@ def test_options_override_the_case(here, capsys):
     assert call("run", "small.toml", "--json", "--no-report", *options) == cli.OK
     (line,) = capsys.readouterr().out.splitlines()
     settings = json.loads(line)["settings"]
-    wanted = {
-        "method": "poisson", "n_cells": 33, "max_steps": 2, "start": "density", "seed": 77,
-        "k": 0.25, "tol": 0.5,
-    }  # fmt: skip
+    wanted = {"method": "poisson", "n_cells": 33, "max_steps": 2, "start": "density", "seed": 77, "k": 0.25, "tol": 0.5}
     assert {key: settings[key] for key in wanted} == wanted
     repeat = (here / "out" / "small" / "case.toml").read_text()
     assert 'method = "poisson"' in repeat
@@ -256,9 +259,7 @@ def test_warnings_are_one_line(here, capsys):
     (here / "meters.toml").write_text(text)
     assert call("run", "meters.toml", "--no-report", "--quiet", "--method", "lloyd") == cli.OK
     printed = capsys.readouterr().err
-    assert printed.startswith(
-        "clvoro: warning: h is larger than the domain: the size field requires"
-    )
+    assert printed.startswith("clvoro: warning: h is larger than the domain: the size field requires")
     assert printed.count("\n") == 1
 
 
@@ -297,11 +298,7 @@ def pressing_run(number):
         (["run", "small.toml", "--method", "magic"], cli.BAD_INPUT, "magic"),
         (["run", "small.toml", "--out", "small.toml"], cli.BAD_INPUT, "folder cannot be created"),
         (["run", "small.toml", "--device", "abacus"], cli.NO_DEVICE, "abacus"),
-        (
-            ["cases", "papre"],
-            cli.BAD_INPUT,
-            "airfoil, channel, lake, ocean, paper, sphere, spots, surface",
-        ),
+        (["cases", "papre"], cli.BAD_INPUT, "airfoil, channel, lake, ocean, paper, sphere, spots, surface"),
     ],
 )
 def test_errors_are_one_message(here, capsys, arguments, code, named):
@@ -491,9 +488,7 @@ def test_work_that_takes_long_is_named(monkeypatch, capsys):
     assert progress.during("short", False, lambda: 3) == 3
     monkeypatch.setattr(progress, "LONG", 0.0)
     begun = threading.Event()
-    monkeypatch.setattr(
-        progress, "print", lambda *a, **k: (print(*a, **k), begun.set()), raising=False
-    )
+    monkeypatch.setattr(progress, "print", lambda *a, **k: (print(*a, **k), begun.set()), raising=False)
     assert progress.during("long", False, lambda: begun.wait(10))
     progress.during("quiet", True, lambda: time.sleep(0.01))
     assert capsys.readouterr() == ("", "long\n")

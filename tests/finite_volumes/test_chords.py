@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from clvoro.finite_volumes.chords import (
-    Lines,
-    chord_costs,
-    complex_of,
-    concave_prices,
-    kept_points,
-)
+from clvoro.finite_volumes.chords import Lines, chord_costs, complex_of, concave_prices, kept_points
 from tests.reference import chords as reference
 
 
@@ -37,21 +31,14 @@ def test_many_lines_at_once_have_the_same_chords_and_costs(seed):
     behind, ahead = (rng.uniform(-2, 2, (400, 2)) + 1j * rng.uniform(-2, 2, (400, 2)) for _ in "ab")
     found = kept_points(lines)
     wanted = [reference.kept(*z) for z in zip(rows, fixed, sizes.tolist(), strict=True)]
-    assert np.flatnonzero(found).tolist() == [
-        int(s) + k for s, left in zip(starts, wanted, strict=False) for k in left
-    ]
+    assert np.flatnonzero(found).tolist() == [int(s) + k for s, left in zip(starts, wanted, strict=False) for k in left]
     # Something of every kind happens: stretches end, kinks are dropped, some stay.
     assert found.sum() > 2 * len(rows) - sum(len(row) == 1 for row in rows)
     assert found.sum() < 0.5 * len(found)
-    costs, prices = (
-        chord_costs(lines, found, centroids),
-        concave_prices(lines, found, behind, ahead),
-    )
+    costs, prices = (chord_costs(lines, found, centroids), concave_prices(lines, found, behind, ahead))
     for i, (row, left) in enumerate(zip(rows, wanted, strict=True)):
         point = (centroids[i].real, centroids[i].imag)
-        assert costs[i] == pytest.approx(
-            reference.cost(row, left, sizes[i], point), rel=1e-12, abs=1e-14
-        )
+        assert costs[i] == pytest.approx(reference.cost(row, left, sizes[i], point), rel=1e-12, abs=1e-14)
         way = [(z.real, z.imag) for z in behind[i]] + [row[k] for k in left]
         way += [(z.real, z.imag) for z in ahead[i]]
         assert prices[i] == pytest.approx(reference.concave_price(way, sizes[i]), rel=1e-12)

@@ -105,9 +105,7 @@ def test_walls_edges_and_corners_stay(meshes):
     for k in np.flatnonzero(np.repeat(~np.array(box.periodic), 2)):
         axis, upper = divmod(int(k), 2)
         faces = np.flatnonzero(after.neighbor == -1 - k)
-        corners = np.concatenate(
-            [after.corners[after.starts[f] : after.starts[f + 1]] for f in faces]
-        )
+        corners = np.concatenate([after.corners[after.starts[f] : after.starts[f + 1]] for f in faces])
         plane = (box.upper if upper else box.lower)[axis]
         np.testing.assert_allclose(after.points[corners, axis], plane, rtol=0, atol=1e-15)
         wanted = (1 if upper else -1) * box.measure / box.extent[axis] * np.eye(3)[axis]
@@ -266,6 +264,4 @@ def test_suspects_are_all_that_would_be_flagged(meshes):
 def test_offsets_are_packed():
     offsets = np.array(np.meshgrid(*3 * [range(-2, 3)])).reshape(3, -1).T
     np.testing.assert_array_equal(unpack(pack(offsets)), offsets)
-    np.testing.assert_array_equal(
-        unpack(pack(offsets) - pack(offsets[::-1])), offsets - offsets[::-1]
-    )
+    np.testing.assert_array_equal(unpack(pack(offsets) - pack(offsets[::-1])), offsets - offsets[::-1])

@@ -16,8 +16,16 @@ def square_in_four(middle: tuple[float, float]) -> SolverMesh:
     """The unit square in quarters that meet in `middle`."""
     points = [(0, 0), (0.5, 0), (1, 0), (1, 0.5), (1, 1), (0.5, 1), (0, 1), (0, 0.5), middle]
     inner = [(1, 8, 0, 1), (8, 7, 0, 3), (3, 8, 1, 2), (8, 5, 3, 2)]
-    walls = [(7, 0, 0, -1), (6, 7, 3, -1), (2, 3, 1, -2), (3, 4, 2, -2), (0, 1, 0, -3), (1, 2, 1, -3),
-             (4, 5, 2, -4), (5, 6, 3, -4)]  # fmt: skip
+    walls = [
+        (7, 0, 0, -1),
+        (6, 7, 3, -1),
+        (2, 3, 1, -2),
+        (3, 4, 2, -2),
+        (0, 1, 0, -3),
+        (1, 2, 1, -3),
+        (4, 5, 2, -4),
+        (5, 6, 3, -4),
+    ]
     # The owner is on the left.
     inner = [(a, b, i, j) if i < j else (b, a, j, i) for a, b, i, j in inner]
     return mesh_of(points, inner, walls, 4)
@@ -53,14 +61,7 @@ def slit(ctx) -> clvoro.Diagram:
 def test_two_faces_between_two_cells_become_one():
     points = [(0, 0), (0.5, 0), (1, 0), (1, 1), (0.5, 1), (0, 1), (0.4, 0.5)]
     inner = [(1, 6, 0, 1), (6, 4, 0, 1)]
-    walls = [
-        (5, 0, 0, -1),
-        (2, 3, 1, -2),
-        (0, 1, 0, -3),
-        (1, 2, 1, -3),
-        (3, 4, 1, -4),
-        (4, 5, 0, -4),
-    ]
+    walls = [(5, 0, 0, -1), (2, 3, 1, -2), (0, 1, 0, -3), (1, 2, 1, -3), (3, 4, 1, -4), (4, 5, 0, -4)]
     mesh = mesh_of(points, inner, walls, 2)
     assert [p.area for p in polygons(mesh)] == pytest.approx([0.45, 0.55])
     joined = join_faces(mesh)
@@ -92,15 +93,7 @@ def test_a_point_across_its_cell_moves_to_the_line():
     points = [(0, 0), (1, 0), (1, 1), (0, 1), (0.5, 0.2)]
     points += [(0.5, 0), (1, 0.6), (0, 0.6)]
     inner = [(5, 4, 0, 1), (4, 7, 0, 2), (6, 4, 1, 2)]
-    walls = [
-        (7, 0, 0, -1),
-        (3, 7, 2, -1),
-        (1, 6, 1, -2),
-        (6, 2, 2, -2),
-        (0, 5, 0, -3),
-        (5, 1, 1, -3),
-        (2, 3, 2, -4),
-    ]
+    walls = [(7, 0, 0, -1), (3, 7, 2, -1), (1, 6, 1, -2), (6, 2, 2, -2), (0, 5, 0, -3), (5, 1, 1, -3), (2, 3, 2, -4)]
     mesh = mesh_of(points, inner, walls, 3)
     assert max(concave_by(p) for p in polygons(mesh)) < 0
     bent = mesh_of([*points[:4], (0.5, 0.75), *points[5:]], inner, walls, 3)
@@ -114,15 +107,7 @@ def test_beside_a_corner_on_a_wall_the_next_point_moves():
     """The upper cell has a corner of 184.6 degrees in (1, 0.5), on the wall; the lower one is right of x = 1."""
     points = [(0, 0.5), (1, 0.5), (1, 0), (2, 0), (2, 0.55), (2, 1), (0, 1), (1.5, 0.46)]
     inner = [(1, 7, 0, 1), (7, 4, 0, 1)]
-    walls = [
-        (0, 1, 0, -1),
-        (1, 2, 1, -1),
-        (2, 3, 1, -3),
-        (3, 4, 1, -2),
-        (4, 5, 0, -2),
-        (5, 6, 0, -4),
-        (6, 0, 0, -1),
-    ]
+    walls = [(0, 1, 0, -1), (1, 2, 1, -1), (2, 3, 1, -3), (3, 4, 1, -2), (4, 5, 0, -2), (5, 6, 0, -4), (6, 0, 0, -1)]
     mesh = mesh_of(points, inner, walls, 2)
     assert concave_by(polygons(mesh)[0]) == pytest.approx(np.degrees(np.arctan(0.08)))
     moved = move_concave_points(mesh)

@@ -26,13 +26,9 @@ def diagram_of(name: str, ctx) -> clvoro.Diagram:
     if name == "solid":
         return solids.solid_diagram((0, 0, 0), (1, 1, 1), random_points(150, 3, 5))
     if name in ("corner", "hole"):
-        domain = (
-            clvoro.Polygon(ELL) if name == "corner" else clvoro.Polygon(SQUARE, [circle(40, 0.2)])
-        )
+        domain = clvoro.Polygon(ELL) if name == "corner" else clvoro.Polygon(SQUARE, [circle(40, 0.2)])
         points = shapely.points(random_points(400, 2, 6))
-        inside = points[
-            shapely.contains(shapely.Polygon(domain.rings[0], domain.rings[1:]), points)
-        ]
+        inside = points[shapely.contains(shapely.Polygon(domain.rings[0], domain.rings[1:]), points)]
         return adapter.diagram(domain, shapely.get_coordinates(inside))
     domain = {
         "adapted": clvoro.Box((0, 0), (1, 1)),
@@ -90,10 +86,7 @@ def measured(m: SolverMeasures) -> dict[str, float]:
 @pytest.mark.sparse(2)
 @needs_openfoam
 @pytest.mark.parametrize("walls", ["exact", "straight"])
-@pytest.mark.parametrize(
-    "name",
-    ["adapted", "flat", "periodic", "corner", "hole", "solid", "torus", "adapted solid"],
-)
+@pytest.mark.parametrize("name", ["adapted", "flat", "periodic", "corner", "hole", "solid", "torus", "adapted solid"])
 def test_figures_are_those_of_openfoam(ctx, tmp_path, name, walls):
     diagram = diagram_of(name, ctx)
     text = check_mesh(diagram, tmp_path, walls=walls)

@@ -109,14 +109,9 @@ def test_corners_and_changes_of_names_stay(ctx):
     mesh = clvoro.Adapter(ctx).diagram(domain, points).solver_mesh("exact")
     there = {tuple(p) for p in mesh.points.round(12).tolist()}
     assert {tuple(p) for p in ring.tolist()} <= there
-    parts = [
-        mesh.domain.boundary_names[mesh.domain.boundary_index[-1 - w]]
-        for w in mesh.neighbor[mesh.inner :]
-    ]
+    parts = [mesh.domain.boundary_names[mesh.domain.boundary_index[-1 - w]] for w in mesh.neighbor[mesh.inner :]]
     ends = mesh.points[mesh.corners.reshape(-1, 2)[mesh.inner :]]
-    length = sum(
-        np.hypot(*(b - a)) for (a, b), part in zip(ends, parts, strict=True) if part == "left"
-    )
+    length = sum(np.hypot(*(b - a)) for (a, b), part in zip(ends, parts, strict=True) if part == "left")
     assert length == pytest.approx(0.501)
     assert sum(p.area for p in polygons(mesh)) == pytest.approx(1)
 

@@ -217,16 +217,13 @@ def test_vtu_files_hold_solver_meshes(request, ctx, tmp_path, name):
     sizes.Update()
     grid = sizes.GetOutput()
     data = {
-        key: vtk_to_numpy(grid.GetCellData().GetArray(key))
-        for key in ("volume", "error", "mine", "Area", "Volume")
+        key: vtk_to_numpy(grid.GetCellData().GetArray(key)) for key in ("volume", "error", "mine", "Area", "Volume")
     }
     mesh = result.solver_mesh()
     measured = data["Area" if name == "plane" else "Volume"]
     # In 3D faces are slightly warped, and VTK divides them into other triangles than OpenFOAM.
     assert measured == pytest.approx(data["volume"], rel=1e-6 if name == "plane" else 5e-3)
-    assert data["volume"].sum() == pytest.approx(
-        result.diagram.domain.measure * (1 + mesh.area_change)
-    )
+    assert data["volume"].sum() == pytest.approx(result.diagram.domain.measure * (1 + mesh.area_change))
     assert (data["error"] == result.size_error).all()
     assert (data["mine"] == result.quality).all()
     assert grid.GetNumberOfPoints() == len(mesh.points)
@@ -248,9 +245,7 @@ def test_a_large_change_of_the_area_gives_a_warning():
     disc = clvoro.Polygon(clvoro.curves.circle((0, 0), 1))
     angle = np.arange(6) * (np.pi / 3)
     cells = clvoro.voronoi(disc, 0.5 * np.column_stack([np.cos(angle), np.sin(angle)]))
-    with pytest.warns(
-        clvoro.errors.MismatchWarning, match=r"change the area of the domain by -4\.\d %"
-    ):
+    with pytest.warns(clvoro.errors.MismatchWarning, match=r"change the area of the domain by -4\.\d %"):
         mesh = cells.solver_mesh()
     assert mesh.area_change < -0.04
     cells.solver_mesh(walls="exact")  # no warning

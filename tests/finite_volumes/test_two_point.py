@@ -56,17 +56,13 @@ def test_faces_are_those_of_the_diagram(dim):
     box = clvoro.Box((0,) * dim, (1,) * dim, names={"inlet": "xMin"})
     d = clvoro.voronoi(box, np.random.default_rng(dim).random((60, dim)))
     f = two_point_faces(d.solver_mesh(collapse=False), d.points)
-    there = {
-        (i, j): k for k, (i, j) in enumerate(zip(d.faces.owner, d.faces.neighbor, strict=True))
-    }
+    there = {(i, j): k for k, (i, j) in enumerate(zip(d.faces.owner, d.faces.neighbor, strict=True))}
     rows = [there[i, j] for i, j in zip(f.owner, f.neighbor, strict=True)]
     assert len(rows) == len(there)
     np.testing.assert_allclose(f.area, d.faces.area[rows], rtol=1e-9, atol=1e-14)
     large = f.area > 1e-6
     np.testing.assert_allclose(f.normal[large], d.faces.normal[rows][large], atol=1e-7)
-    np.testing.assert_allclose(
-        (f.near + f.far)[large], d.faces.distance[rows][large], rtol=1e-9, atol=1e-14
-    )
+    np.testing.assert_allclose((f.near + f.far)[large], d.faces.distance[rows][large], rtol=1e-9, atol=1e-14)
     assert np.array_equal(f.boundary, d.faces.boundary[rows])
     # The flux of u = x is exact if u on walls is that of the foot.
     beyond = np.where(f.neighbor >= 0, d.points[f.neighbor, 0], f.foot[:, 0])

@@ -21,9 +21,7 @@ from clvoro.geometry.boundary_layers import (
 from tests.reference import shores
 
 BOX = clvoro.Box((0, 0), (2, 1))
-HOLE = 0.2 * np.stack(
-    [np.cos(np.arange(80) * np.pi / 40), np.sin(np.arange(80) * np.pi / 40)], axis=1
-)
+HOLE = 0.2 * np.stack([np.cos(np.arange(80) * np.pi / 40), np.sin(np.arange(80) * np.pi / 40)], axis=1)
 CHANNEL = clvoro.Polygon([(-1, -0.5), (2, -0.5), (2, 0.5), (-1, 0.5)], [HOLE])
 
 
@@ -67,18 +65,22 @@ def test_layers_of_a_straight_wall_are_rectangles(adapter):
 RAMP = clvoro.Polygon([(0, 0), (0.93, 0), (1.4, 0.12), (2, 0.2), (2, 1), (0, 1)])
 UNEVEN = np.radians([0, 38, 80, 121, 160, 200, 243, 281, 320])  # turns of less than 50 degrees
 RAGGED = clvoro.Polygon(
-    [(-1, -0.7), (1, -0.7), (1, 0.7), (-1, 0.7)],
-    [0.45 * np.column_stack([np.cos(UNEVEN), np.sin(UNEVEN)])],
+    [(-1, -0.7), (1, -0.7), (1, 0.7), (-1, 0.7)], [0.45 * np.column_stack([np.cos(UNEVEN), np.sin(UNEVEN)])]
 )
 
 
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("domain", "edges", "spacing"),
-    [(RAMP, range(3), 0.05), (CHANNEL, range(4, 84), 0.0075), (CHANNEL, range(4, 84), 0.014),
-     (CHANNEL, range(4, 84), 0.034), (RAGGED, range(4, 13), 0.06)],
+    [
+        (RAMP, range(3), 0.05),
+        (CHANNEL, range(4, 84), 0.0075),
+        (CHANNEL, range(4, 84), 0.014),
+        (CHANNEL, range(4, 84), 0.034),
+        (RAGGED, range(4, 13), 0.06),
+    ],
     ids=["ramp", "circle, two to an edge", "circle, one to an edge", "circle, two edges each", "loop"],
-)  # fmt: skip
+)
 def test_corners_of_the_wall_are_corners_of_cells(adapter, domain, edges, spacing):
     """No face on the wall is a sliver that a corner of the wall cuts off."""
     layers = Layers(0.4 * spacing, count=2, spacing=spacing, edges=edges)
@@ -149,9 +151,7 @@ def test_sizes_grow_from_the_layers(adapter):
 def test_no_method_moves_generators_of_layers(adapter, method):
     layers = Layers(0.04, count=2, edges=range(4, 84))
     options = (
-        {"max_steps": 8}
-        if method != "exact"
-        else {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
+        {"max_steps": 8} if method != "exact" else {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
     )
     result = adapter.run(CHANNEL, 0.1, layers=layers, method=method, **options)
     rows, free = place_layers(CHANNEL, [layers]), free_domain(CHANNEL, [layers])
@@ -272,12 +272,13 @@ def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
     whole = adapter.run(CHANNEL, 0.1, **options)
     steps = []
     adapter.run(
-        CHANNEL, 0.1, checkpoint=clvoro.Checkpoint(tmp_path / "half", every=0),
-        callback=lambda row: steps.append(row) or len(steps) == 9, **options,
-    )  # fmt: skip
-    resumed = adapter.run(
-        CHANNEL, 0.1, checkpoint=clvoro.Checkpoint(resume=tmp_path / "half"), **options
+        CHANNEL,
+        0.1,
+        checkpoint=clvoro.Checkpoint(tmp_path / "half", every=0),
+        callback=lambda row: steps.append(row) or len(steps) == 9,
+        **options,
     )
+    resumed = adapter.run(CHANNEL, 0.1, checkpoint=clvoro.Checkpoint(resume=tmp_path / "half"), **options)
     assert np.array_equal(whole.points, resumed.points)
     with pytest.raises(InputError, match="layers"):
         adapter.run(
@@ -295,10 +296,7 @@ def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
         (lambda: Layers(0), "height"),
         (lambda: Layers(0.1, count=0), "count"),
         (lambda: Layers(0.1, growth=0.9), "growth"),
-        (
-            lambda: place_layers(BOX, [Layers(0.1, edges=[4])]),
-            "has side 4, expected numbers from 0 to 3",
-        ),
+        (lambda: place_layers(BOX, [Layers(0.1, edges=[4])]), "has side 4, expected numbers from 0 to 3"),
         (lambda: place_layers(BOX, [Layers(0.1, edges=[])]), "empty"),
         (lambda: free_domain(BOX, [Layers(0.4, edges=[2, 3])]), "no room"),
         (lambda: free_domain(CHANNEL, [Layers(0.4)]), "no room"),
@@ -382,13 +380,7 @@ def test_new_generators_keep_away_from_layers_around_corners(ctx, dtype):
         star = clvoro.Polygon(shores.star(tips, seed, (0.5, 0.5), 0.5))
         layer = clvoro.Layers(0.004, count=2, growth=2.0, spacing=0.03, edges=range(0, tips, 2))
         result = clvoro.Adapter(ctx, dtype).run(
-            star,
-            0.03,
-            layers=layer,
-            options=clvoro.MultilevelOptions(levels=1),
-            effort="fast",
-            max_steps=20,
-            seed=1,
+            star, 0.03, layers=layer, options=clvoro.MultilevelOptions(levels=1), effort="fast", max_steps=20, seed=1
         )
         result.check().demand()
         others = result.points[len(place_layers(star, [layer])) :]

@@ -19,10 +19,7 @@ from tests.io import test_foam
 from tests.io.test_netcdf import read as read_netcdf
 
 OUTER = np.array([(0.0, 0), (4, 0), (4, 3), (2, 3.5), (0, 3)])
-HOLES = [
-    np.array([(1.0, 1), (1.5, 1), (1.25, 1.5)]),
-    np.array([(2.5, 1), (3, 1), (3, 1.5), (2.5, 1.5)]),
-]
+HOLES = [np.array([(1.0, 1), (1.5, 1), (1.25, 1.5)]), np.array([(2.5, 1), (3, 1), (3, 1.5), (2.5, 1.5)])]
 NAMES = {"in--let": [4], "island": range(5, 8), "part": [9, 2]}
 ORIENTATIONS = list(itertools.product((False, True), repeat=3))
 
@@ -34,11 +31,7 @@ def turned(orientation) -> list[np.ndarray]:
 
 def segments(rings) -> list[shapely.LineString]:
     """The edges in the caller's order."""
-    return [
-        shapely.LineString([ring[k], ring[(k + 1) % len(ring)]])
-        for ring in rings
-        for k in range(len(ring))
-    ]
+    return [shapely.LineString([ring[k], ring[(k + 1) % len(ring)]]) for ring in rings for k in range(len(ring))]
 
 
 @pytest.fixture(scope="module", params=ORIENTATIONS, ids=lambda o: "".join("-+"[not b] for b in o))
@@ -52,9 +45,15 @@ def meshed(request, adapter_of_module):
     from clvoro.mesh.results import HISTORY_DTYPE
 
     result = clvoro.Result(
-        points=diagram.points, diagram=diagram, target_size=np.ones(n), size_error=np.zeros(n),
-        quality=np.ones(n), history=np.zeros(0, HISTORY_DTYPE), converged=True, stop_reason="none",
-    )  # fmt: skip
+        points=diagram.points,
+        diagram=diagram,
+        target_size=np.ones(n),
+        size_error=np.zeros(n),
+        quality=np.ones(n),
+        history=np.zeros(0, HISTORY_DTYPE),
+        converged=True,
+        stop_reason="none",
+    )
     return rings, segments(rings), result
 
 
@@ -107,9 +106,7 @@ def test_boundary_layers_and_distances_take_names_and_numbers(meshed) -> None:
 
 def test_layers_stand_on_the_named_walls(meshed) -> None:
     domain, layers = meshed[2].diagram.domain, clvoro.Layers(0.02, count=2, edges="island")
-    away = shapely.distance(
-        shapely.Polygon(HOLES[0]), shapely.points(place_layers(domain, [layers]))
-    )
+    away = shapely.distance(shapely.Polygon(HOLES[0]), shapely.points(place_layers(domain, [layers])))
     assert len(away) > 100
     assert away.max() < layers.rows[-1] * (1 + 1e-12)
 
@@ -130,9 +127,11 @@ def test_openfoam_has_the_names(meshed, tmp_path, walls) -> None:
     domain = result.diagram.domain
     for patches, parts in (
         (None, {name: domain.boundaries.select("", name) for name in domain.boundary_names}),
-        ({"top": [2, 3]}, {"top": [2, 3], "in--let": [4], "island": [5, 6, 7], "part": [9], "outer": [0, 1],
-                           "hole-2": [8, 10, 11]}),
-    ):  # fmt: skip
+        (
+            {"top": [2, 3]},
+            {"top": [2, 3], "in--let": [4], "island": [5, 6, 7], "part": [9], "outer": [0, 1], "hole-2": [8, 10, 11]},
+        ),
+    ):
         result.save(tmp_path / "polyMesh", patches=patches, walls=walls)
         points, faces, *_, written = test_foam.read(tmp_path / "polyMesh")
         assert list(written)[:-2] == list(parts)
@@ -204,10 +203,7 @@ def test_names_of_boxes(adapter_of_module, tmp_path) -> None:
     assert box.boundary_index.tolist() == [0, 2, 1, 1]
     assert box.names == {"inlet": [0], "walls": [2, 3]}
     assert box == clvoro.Box((0, 0), (2, 1))
-    for copy in (
-        pickle.loads(pickle.dumps(box)),
-        clvoro.Box(**json.loads(json.dumps(box.describe()))),
-    ):
+    for copy in (pickle.loads(pickle.dumps(box)), clvoro.Box(**json.loads(json.dumps(box.describe())))):
         assert copy.boundary_names == box.boundary_names
     curve = box.boundary(["inlet", "yMin"] if "yMin" in box.boundary_names else ["inlet", 2])
     assert curve.begin.tolist() == [[0, 1], [0, 0]]
@@ -227,13 +223,7 @@ def test_names_of_boxes(adapter_of_module, tmp_path) -> None:
     assert sorted(ends[:, :, 1].mean(axis=1).tolist()) == [0, 1]
     result = adapter_of_module.run(box, 0.2, method="lloyd", max_steps=1)
     result.save(tmp_path / "polyMesh", patches={"outlet": "xMax"})
-    assert list(test_foam.read(tmp_path / "polyMesh")[-1]) == [
-        "outlet",
-        "inlet",
-        "walls",
-        "back",
-        "front",
-    ]
+    assert list(test_foam.read(tmp_path / "polyMesh")[-1]) == ["outlet", "inlet", "walls", "back", "front"]
 
 
 @pytest.mark.sparse(2)
@@ -269,14 +259,20 @@ SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
         ({"a": [0, 4]}, InputError, r"names\['a'\] has edge 4, expected numbers from 0 to 3"),
         ({"a": [-1]}, InputError, "edge -1, expected"),
         ({"a": [0, 1], "b": [1]}, InputError, "edge 1 both in 'a' and in 'b'"),
-        ({"a": []}, InputError, "empty"), ({"a": "b"}, InputError, "name of a boundary: outer"),
+        ({"a": []}, InputError, "empty"),
+        ({"a": "b"}, InputError, "name of a boundary: outer"),
         ({"outer": [0]}, InputError, "which other edges already have"),
-        ({"a b": 0}, InputError, "name 'a b'"), ({"": 0}, InputError, "name ''"), ({"ä": 0}, InputError, "name 'ä'"),
-        ({1: 0}, InputError, "name 1"), ({"a": 0.5}, InputTypeError, r"names\['a'\] is 0.5"),
-        ({"a": [True]}, InputTypeError, "True"), ({"a": {0: 1}}, InputTypeError, "expected a number or name"),
-        ({"a": np.array([True])}, InputError, "mask of shape"), (["a"], InputTypeError, "expected a mapping"),
+        ({"a b": 0}, InputError, "name 'a b'"),
+        ({"": 0}, InputError, "name ''"),
+        ({"ä": 0}, InputError, "name 'ä'"),
+        ({1: 0}, InputError, "name 1"),
+        ({"a": 0.5}, InputTypeError, r"names\['a'\] is 0.5"),
+        ({"a": [True]}, InputTypeError, "True"),
+        ({"a": {0: 1}}, InputTypeError, "expected a number or name"),
+        ({"a": np.array([True])}, InputError, "mask of shape"),
+        (["a"], InputTypeError, "expected a mapping"),
     ],
-)  # fmt: skip
+)
 def test_wrong_names_are_refused(names, error, says) -> None:
     with pytest.raises(error, match=says):
         clvoro.Polygon(SQUARE, names=names)
@@ -324,9 +320,10 @@ def test_features_name_their_boundaries() -> None:
     def feature(ring, boundaries):
         closed = [*ring, ring[0]]
         return {
-            "type": "Feature", "properties": {"boundaries": boundaries},
+            "type": "Feature",
+            "properties": {"boundaries": boundaries},
             "geometry": {"type": "Polygon", "coordinates": [closed]},
-        }  # fmt: skip
+        }
 
     square = [[0, 0], [1, 0], [1, 1], [0, 1]]
     far = [[x + 5, y] for x, y in square]
@@ -337,9 +334,7 @@ def test_features_name_their_boundaries() -> None:
     assert domain.boundary_index.tolist() == [0, 0, 2, 2, 3, 3, 1, 0]
     assert clvoro.Polygon.from_geojson(source, names={"a": 0}).boundary_names[0] == "a"
     features[1]["properties"] = {"boundaries": {"mouth": [4]}}
-    with pytest.raises(
-        InputError, match="'mouth' with 4, expected numbers of edges of its Feature, 0 to 3"
-    ):
+    with pytest.raises(InputError, match="'mouth' with 4, expected numbers of edges of its Feature, 0 to 3"):
         clvoro.Polygon.from_geojson(source)
     features[1]["properties"] = {"boundaries": "something else"}
     assert clvoro.Polygon.from_geojson(source).boundary_names[0] == "shore"

@@ -115,21 +115,14 @@ def test_symmetric_sections(edge):
     half = Polynomial([0, 2]) * thickness(edge == "blunt")  # dx = 2 s ds
     assert clvoro.Polygon(v).measure == pytest.approx(2 * half.integ()(1), rel=1e-4)
     blunt = np.ptp(v[[0, -1]], axis=0)
-    assert (
-        blunt[1] == pytest.approx(2 * wanted[0])
-        if edge == "blunt"
-        else v[0] == pytest.approx([1, 0])
-    )
+    assert blunt[1] == pytest.approx(2 * wanted[0]) if edge == "blunt" else v[0] == pytest.approx([1, 0])
 
 
 def test_cambered_sections():
     upper, lower = np.split(naca("2410").vertices, [np.hypot(*naca("2410").vertices.T).argmin()])
     # The middle of both sides' points of equal parameter is the camber line.
     x = np.linspace(0, 1, 7)[1:-1] ** 2
-    middle = [
-        0.05 / 4 * (0.8 * u - u**2) * 10 if u < 0.4 else 0.02 / 0.36 * (0.2 + 0.8 * u - u**2)
-        for u in x
-    ]
+    middle = [0.05 / 4 * (0.8 * u - u**2) * 10 if u < 0.4 else 0.02 / 0.36 * (0.2 + 0.8 * u - u**2) for u in x]
     section = naca("2410")
     for u, y in zip(x, middle, strict=True):
         found = []
@@ -171,11 +164,7 @@ def test_splines_keep_corners():
     v = spline(DROP, closed=True, corners=[2, 0]).vertices
     along = np.roll(v, -1, axis=0) - v
     after = np.roll(along, -1, axis=0)
-    turn = np.degrees(
-        np.arctan2(
-            along[:, 0] * after[:, 1] - along[:, 1] * after[:, 0], (along * after).sum(axis=1)
-        )
-    )
+    turn = np.degrees(np.arctan2(along[:, 0] * after[:, 1] - along[:, 1] * after[:, 0], (along * after).sum(axis=1)))
     sharp = v[(np.flatnonzero(np.abs(turn) > 3) + 1) % len(v)]
     assert sorted(map(tuple, sharp.round(12).tolist())) == [(0, 0), (1.6, 0)]
     straight = spline([(0, 0), (1, 0), (1, 1)], corners=[1]).vertices
@@ -273,9 +262,7 @@ def test_points_beside_curves():
 
 def test_equal_domains_have_equal_curves(tmp_path):
     def make(**more):
-        return clvoro.Polygon(
-            BOX, [naca("2412", trailing_edge="blunt", name="wing", **more), circle((0, 2), 1)]
-        )
+        return clvoro.Polygon(BOX, [naca("2412", trailing_edge="blunt", name="wing", **more), circle((0, 2), 1)])
 
     domain = make()
     assert domain == make()
@@ -361,7 +348,7 @@ def test_damaged_descriptions(change):
         (lambda: spline([(0, 0), (1, math.inf)]), r"points\[1\]"),
         (lambda: spline([(0, 0), (1, 0)], corners=[2]), "corners has 2"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_curve(make, says):
     with pytest.raises(InputError, match=says):
         make()
@@ -391,7 +378,7 @@ FIGURE_EIGHT = [(0, 0), (1, 1), (2, 0), (1, 0.2), (0, 1), (-1, 0.5)]
         (BOX, [circle((0, 0), 1), circle((0, 0), 1)], "repeats hole-1"),
         ([(-1e7, -1e7), (1e7, -1e7), (0, 1e7)], [circle((0, 0), 1e-4)], "edge of length .* on circle"),
     ],
-)  # fmt: skip
+)
 def test_refused_rings(outer, holes, says):
     with pytest.raises((InputError, InputTypeError), match=says):
         clvoro.Polygon(outer, holes)

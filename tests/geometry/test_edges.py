@@ -13,17 +13,7 @@ from clvoro.geometry.edge_grid import bin_edges
 from clvoro.opencl.engine import Engine
 from tests.reference.shores import POLYGONS, coast, scattered
 
-NAMES = (
-    "triangle",
-    "burr",
-    "holes",
-    "islands",
-    "fine comb",
-    "slit",
-    "thin slit",
-    "thin spit",
-    "koch",
-)
+NAMES = ("triangle", "burr", "holes", "islands", "fine comb", "slit", "thin slit", "thin spit", "koch")
 
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
@@ -38,9 +28,7 @@ def move(ctx, request):
         n = len(points)
         on_device, zeros = engine.upload(points), engine.zeros((n, 2))
         sizes, velocity = engine.upload(np.ones(n)), engine.empty((n, 2))
-        motion.move_generators(
-            domain, on_device, engine.upload(way), 1.0, zeros, 0.0, sizes, velocity
-        )
+        motion.move_generators(domain, on_device, engine.upload(way), 1.0, zeros, 0.0, sizes, velocity)
         return on_device.get()
 
     moved.real = real
@@ -87,10 +75,7 @@ def test_one_step_agrees_with_shapely(move, name):
         taken = shapely.LineString([x[i].astype(float), y[i]])
         assert not shapely.crosses(taken, shore) or thin, (name, i)
         middle = shapely.Point((y[i] + goal[i]) / 2)  # on the line through the edge
-        a, b = (
-            np.array(e)
-            for e in zip(*edges(domain, origin, scale), strict=True)
-        )  # fmt: skip
+        a, b = (np.array(e) for e in zip(*edges(domain, origin, scale), strict=True))
         e = b - a
         to = [middle.x, middle.y] - a
         off = np.abs(e[:, 0] * to[:, 1] - e[:, 1] * to[:, 0]) / np.hypot(*e.T)
@@ -165,18 +150,10 @@ def test_runs_stay_inside(ctx, method, real):
     domain = clvoro.Polygon(coast(256))
     size = float(np.sqrt(domain.measure / 100))
     result = clvoro.Adapter(ctx, real).run(
-        domain,
-        size,
-        method=method,
-        max_steps=25,
-        seed=7,
-        options=clvoro.PaperOptions(tol=0),
-        effort="fast",
+        domain, size, method=method, max_steps=25, seed=7, options=clvoro.PaperOptions(tol=0), effort="fast"
     )
     assert domain.contains(result.points).all()
-    assert result.diagram.volumes.sum() == pytest.approx(
-        domain.measure, rel=64 * float(np.finfo(real).eps)
-    )
+    assert result.diagram.volumes.sum() == pytest.approx(domain.measure, rel=64 * float(np.finfo(real).eps))
 
 
 def test_refinement_from_generators_on_a_slanted_edge_far_from_0(ctx):
@@ -185,15 +162,8 @@ def test_refinement_from_generators_on_a_slanted_edge_far_from_0(ctx):
     domain, adapter = clvoro.Polygon(vee), clvoro.Adapter(ctx)
     for seed in range(10):
         t = np.random.default_rng(seed).random((3, 1))
-        points = np.concatenate(
-            [vee[0] + t * (vee[1] - vee[0]), vee[1] + (1 - t) * (vee[2] - vee[1])]
-        )
+        points = np.concatenate([vee[0] + t * (vee[1] - vee[0]), vee[1] + (1 - t) * (vee[2] - vee[1])])
         result = adapter.run(
-            domain,
-            0.25,
-            points=points,
-            options=clvoro.MultilevelOptions(levels=1),
-            max_steps=0,
-            method="exact",
+            domain, 0.25, points=points, options=clvoro.MultilevelOptions(levels=1), max_steps=0, method="exact"
         )
         result.check().demand()

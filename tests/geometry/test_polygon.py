@@ -10,7 +10,7 @@ import shapely
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
-from clvoro.geometry.box import LARGEST_EDGE
+from clvoro.geometry.domain import LARGEST_EDGE
 from tests.reference.polygons import HOLE, OTHER, SQUARE, crossings, distances, ragged
 
 
@@ -69,9 +69,7 @@ def test_pieces() -> None:
     assert domain.measure == 11.25
     assert domain.contains(np.array([(1.5, 1.5), (1.05, 1.05), (0.5, 0.5)])).tolist() == [1, 0, 1]
     assert "2 pieces, 1 hole" in repr(domain)
-    touching = clvoro.Polygon.from_pieces(
-        [[SQUARE], [HOLE + np.array([3, 2])]]
-    )  # in the corner (4, 3)
+    touching = clvoro.Polygon.from_pieces([[SQUARE], [HOLE + np.array([3, 2])]])  # in the corner (4, 3)
     assert touching.measure == 13
 
 
@@ -84,10 +82,7 @@ def test_all_sources_give_the_same_domain(tmp_path) -> None:
     assert clvoro.Polygon.from_wkt(shapely.force_3d(whole, 7).wkt) == several
     geometry = shapely.geometry.mapping(whole)
     feature = {"type": "Feature", "properties": {}, "geometry": geometry}
-    features = [
-        {"type": "Feature", "geometry": shapely.geometry.mapping(part), "properties": None}
-        for part in parts
-    ]
+    features = [{"type": "Feature", "geometry": shapely.geometry.mapping(part), "properties": None} for part in parts]
     collection = {"type": "FeatureCollection", "features": features}
     group = {"type": "GeometryCollection", "geometries": [f["geometry"] for f in features]}
     path = tmp_path / "domain.geojson"
@@ -96,9 +91,7 @@ def test_all_sources_give_the_same_domain(tmp_path) -> None:
     for source in sources:
         assert clvoro.Polygon.from_geojson(source) == several
     path.write_text('{"type": "Polygon", "coordinates": [[[0, 0], [2, 2], [2, 0], [0, 2]]]}')
-    with pytest.raises(
-        InputError, match=r"domain\.geojson: Polygon is not valid: Self-intersection"
-    ):
+    with pytest.raises(InputError, match=r"domain\.geojson: Polygon is not valid: Self-intersection"):
         clvoro.Polygon.from_geojson(path)
     assert clvoro.Polygon.from_shapely(parts[0]) == clvoro.Polygon(SQUARE, [HOLE])
 
@@ -108,10 +101,12 @@ def test_equal_domains() -> None:
     assert one == same
     assert hash(one) == hash(same)
     others = [
-        clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE[::-1], [HOLE]),  # other numbers of edges
-        clvoro.Polygon(SQUARE, [HOLE + 1e-15]), clvoro.Box((0, 0), (4, 3)),
+        clvoro.Polygon(SQUARE),
+        clvoro.Polygon(SQUARE[::-1], [HOLE]),  # other numbers of edges
+        clvoro.Polygon(SQUARE, [HOLE + 1e-15]),
+        clvoro.Box((0, 0), (4, 3)),
         clvoro.Polygon.from_pieces([[SQUARE], [HOLE + 9]]),
-    ]  # fmt: skip
+    ]
     assert all(one != other for other in others)
     twice = clvoro.Polygon(SQUARE[::-1], [HOLE])
     for copy in (pickle.loads(pickle.dumps(twice)), clvoro.Polygon.described(**twice.describe())):
@@ -226,7 +221,7 @@ PIECES = lambda *rings: lambda: clvoro.Polygon.from_pieces([[r] for r in rings])
         (lambda: clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": [[3, 4]]}), "shape"),
         (lambda: clvoro.Polygon.from_geojson({"type": "MultiPolygon", "coordinates": [3]}), "MultiPolygon of 3"),
     ],
-)  # fmt: skip
+)
 def test_invalid_polygons_are_refused(make, says: str) -> None:
     with pytest.raises((InputError, InputTypeError), match=says):
         make()
@@ -237,23 +232,27 @@ def test_holes_may_touch_in_points() -> None:
     corner = [(4, 3), (3, 2), (3.5, 2)]  # a corner
     domain = clvoro.Polygon(SQUARE, [touching, corner])
     assert domain.measure == 12 - 0.5 - 0.25
-    assert domain.contains(np.array([(0.0, 1), (4, 3), (0.9, 1.5), (0.1, 1.2)])).tolist() == [
-        1,
-        1,
-        0,
-        1,
-    ]
+    assert domain.contains(np.array([(0.0, 1), (4, 3), (0.9, 1.5), (0.1, 1.2)])).tolist() == [1, 1, 0, 1]
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("edge_numbers", [1, 2]), ("names", {"a": [8]}), ("names", [0]), ("ring_starts", [0, 3, 8]),
-        ("ring_starts", [0, 4, 9]), ("ring_starts", [0, -4, 8]), ("ring_starts", "a"),
-        ("piece_of_ring", [0, 10**9]), ("piece_of_ring", [0, -1]), ("piece_of_ring", []),
-        ("vertices", None), ("vertices", [[0, 0, 0]] * 8), ("vertices", SQUARE.tolist()),
+        ("edge_numbers", [1, 2]),
+        ("names", {"a": [8]}),
+        ("names", [0]),
+        ("ring_starts", [0, 3, 8]),
+        ("ring_starts", [0, 4, 9]),
+        ("ring_starts", [0, -4, 8]),
+        ("ring_starts", "a"),
+        ("piece_of_ring", [0, 10**9]),
+        ("piece_of_ring", [0, -1]),
+        ("piece_of_ring", []),
+        ("vertices", None),
+        ("vertices", [[0, 0, 0]] * 8),
+        ("vertices", SQUARE.tolist()),
     ],
-)  # fmt: skip
+)
 def test_damaged_descriptions_are_refused(name: str, value: object) -> None:
     good = clvoro.Polygon(SQUARE, [HOLE]).describe()
     assert clvoro.Polygon.described(**good).describe() == good
@@ -268,21 +267,33 @@ def result_of(domain: clvoro.Polygon) -> clvoro.Result:
 
     ones, starts = np.ones(1), np.array([0, 1], np.int32)
     arrays = {
-        "points": np.ones((1, 2)), "volumes": ones, "centroids": np.ones((1, 2)), "neighbor_starts": starts,
-        "neighbors": np.array([-8], np.int32), "face_measures": ones, "face_centroids": np.ones((1, 2)),
-        "vertices": np.ones((1, 2)), "cell_vertex_starts": starts, "cell_vertices": np.array([0], np.int32),
-        "face_vertex_starts": np.array([0, 2], np.int32), "face_vertices": np.zeros(2, np.int32),
-    }  # fmt: skip
+        "points": np.ones((1, 2)),
+        "volumes": ones,
+        "centroids": np.ones((1, 2)),
+        "neighbor_starts": starts,
+        "neighbors": np.array([-8], np.int32),
+        "face_measures": ones,
+        "face_centroids": np.ones((1, 2)),
+        "vertices": np.ones((1, 2)),
+        "cell_vertex_starts": starts,
+        "cell_vertices": np.array([0], np.int32),
+        "face_vertex_starts": np.array([0, 2], np.int32),
+        "face_vertices": np.zeros(2, np.int32),
+    }
     return clvoro.Result(
-        points=arrays["points"], diagram=Diagram(domain, arrays), target_size=ones, size_error=ones, quality=ones,
-        history=np.zeros(1, HISTORY_DTYPE), converged=True, stop_reason="none",
-    )  # fmt: skip
+        points=arrays["points"],
+        diagram=Diagram(domain, arrays),
+        target_size=ones,
+        size_error=ones,
+        quality=ones,
+        history=np.zeros(1, HISTORY_DTYPE),
+        converged=True,
+        stop_reason="none",
+    )
 
 
 def test_files_hold_the_domain(tmp_path) -> None:
-    domain = clvoro.Polygon.from_pieces(
-        [[ragged(40)[::-1], ragged(9, radius=0.1)], [SQUARE + np.pi]]
-    )
+    domain = clvoro.Polygon.from_pieces([[ragged(40)[::-1], ragged(9, radius=0.1)], [SQUARE + np.pi]])
     path = tmp_path / "mesh.npz"
     result_of(domain).save(path)
     assert clvoro.load(path).diagram.domain == domain

@@ -30,9 +30,7 @@ def joined(*rings):
 
 
 def with_bay(width, depth):
-    return clvoro.Polygon.from_shapely(
-        joined(BOX, rectangle(0.9, 0.5 - width / 2, 0.1 + depth, width))
-    )
+    return clvoro.Polygon.from_shapely(joined(BOX, rectangle(0.9, 0.5 - width / 2, 0.1 + depth, width)))
 
 
 def test_wide_domains_stay():
@@ -91,9 +89,7 @@ def test_no_narrow_water_is_left():
     flake = step ** np.arange(3)
     for _ in range(4):
         side = (np.roll(flake, -1) - flake) / 3
-        flake = np.stack(
-            [flake, flake + side, flake + side * (1 + turn), flake + 2 * side], 1
-        ).ravel()
+        flake = np.stack([flake, flake + side, flake + side * (1 + turn), flake + 2 * side], 1).ravel()
     middles = np.random.default_rng(3).uniform(0.2, 2, (60, 2))
     rocks = shapely.buffer(shapely.points(middles), 0.09, quad_segs=10)
     pores = shapely.box(0, 0, 2.2, 2.2).difference(shapely.union_all(rocks))
@@ -206,9 +202,7 @@ def test_thin_walls(width):
 def test_pieces():
     """The largest comes first, with its holes and the names of its edges."""
     pond, lake = [rectangle(2, 0, 0.5, 0.5)], [BOX, rectangle(0.4, 0.4, 0.2, 0.1)]
-    domain = clvoro.Polygon.from_pieces(
-        [pond, lake], {"inlet": 1, "dam": [4, 5], "rock": range(8, 12)}
-    )
+    domain = clvoro.Polygon.from_pieces([pond, lake], {"inlet": 1, "dam": [4, 5], "rock": range(8, 12)})
     large, small = domain.split()
     assert (large.measure, small.measure) == (pytest.approx(0.98), pytest.approx(0.25))
     assert large.boundary_names == ("dam", "rock", "outer")
@@ -218,8 +212,11 @@ def test_pieces():
 
 
 def test_names():
-    domain = clvoro.Polygon(rough(600, 2), [rectangle(0, 0, 0.3, 0.3), rectangle(-0.5, 0, 0.02, 0.02)],
-                            names={"open": range(200), "rock": range(604, 608), "house": range(600, 604)})  # fmt: skip
+    domain = clvoro.Polygon(
+        rough(600, 2),
+        [rectangle(0, 0, 0.3, 0.3), rectangle(-0.5, 0, 0.02, 0.02)],
+        names={"open": range(200), "rock": range(604, 608), "house": range(600, 604)},
+    )
     found = domain.simplified(0.06)
     assert found.boundary_names == ("open", "house", "outer")
     middles = np.mean(found.edge_ends(np.arange(len(found.vertices))), axis=0)
@@ -238,16 +235,11 @@ def test_sizes_that_vary():
     """Bays of width 0.06 at both ends: cells are smaller than that at one of them."""
     bays = joined(rectangle(0, 0, 2, 1), rectangle(-0.5, 0.47, 3, 0.06))
     domain = clvoro.Polygon.from_shapely(bays)
-    for size in (
-        clvoro.sizing.Expression("x < 1 ? 0.02 : 0.1"),
-        lambda p: np.where(p[:, 0] < 1, 0.02, 0.1),
-    ):
+    for size in (clvoro.sizing.Expression("x < 1 ? 0.02 : 0.1"), lambda p: np.where(p[:, 0] < 1, 0.02, 0.1)):
         found = domain.simplified(size)
         assert found.lower[0] == pytest.approx(-0.5)
         assert found.upper[0] < 2.05
-    graded = clvoro.sizing.Distance(
-        clvoro.sizing.Circle((-0.5, 0.5), 0.05), h_min=0.02, slope=0.05, h_max=0.2
-    )
+    graded = clvoro.sizing.Distance(clvoro.sizing.Circle((-0.5, 0.5), 0.05), h_min=0.02, slope=0.05, h_max=0.2)
     found = domain.simplified(graded)
     assert found.lower[0] == pytest.approx(-0.5)
     assert found.upper[0] < 2.1

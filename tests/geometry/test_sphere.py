@@ -16,10 +16,7 @@ def test_positions_and_back():
     x = EARTH.positions(lonlat)
     assert np.linalg.norm(x, axis=1) == pytest.approx(np.full(100, EARTH.radius), rel=1e-15)
     assert EARTH.lonlat(x) == pytest.approx(lonlat, abs=1e-12)
-    assert EARTH.positions([(17, 90), (-123, -90)]).tolist() == [
-        [0, 0, EARTH.radius],
-        [0, 0, -EARTH.radius],
-    ]
+    assert EARTH.positions([(17, 90), (-123, -90)]).tolist() == [[0, 0, EARTH.radius], [0, 0, -EARTH.radius]]
     assert EARTH.positions([(190, 10)]) == pytest.approx(EARTH.positions([(-170, 10)]), rel=1e-15)
 
 
@@ -70,7 +67,7 @@ def test_icosahedral_points(k):
         (lambda: clvoro.adapt(EARTH, sizing.Expression("50 + lat / 3"), n_cells=20), "in a mesh of 20 .* more cells"),
         (lambda: clvoro.adapt(EARTH, 2e7), "h is 2e.07 at longitude .*larger than the radius"),
     ],
-)  # fmt: skip
+)
 def test_mistakes(call, message):
     with pytest.raises(ClvoroError, match=message):
         call()

@@ -23,17 +23,30 @@ def torus(n, m, center=(4.0, 0.0, 10.75), radii=(0.5, 0.2)):
     i, j = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
     corner = [((i + a) % n * m + (j + b) % m).ravel() for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
     triangles = np.concatenate(
-        [np.column_stack([corner[0], corner[1], corner[2]]),
-         np.column_stack([corner[0], corner[2], corner[3]])]
-    )  # fmt: skip
+        [np.column_stack([corner[0], corner[1], corner[2]]), np.column_stack([corner[0], corner[2], corner[3]])]
+    )
     return places.reshape(-1, 3) + center, triangles
 
 
 CUBE = (
     np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)], float),
-    np.array([[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4],
-              [2, 6, 7], [2, 7, 3], [0, 4, 6], [0, 6, 2], [1, 3, 7], [1, 7, 5]]),
-)  # fmt: skip
+    np.array(
+        [
+            [0, 2, 3],
+            [0, 3, 1],
+            [4, 5, 7],
+            [4, 7, 6],
+            [0, 1, 5],
+            [0, 5, 4],
+            [2, 6, 7],
+            [2, 7, 3],
+            [0, 4, 6],
+            [0, 6, 2],
+            [1, 3, 7],
+            [1, 7, 5],
+        ]
+    ),
+)
 
 
 def soup(n, seed):
@@ -173,8 +186,7 @@ def test_a_triangulated_ball_needs_as_many_cells_as_a_sphere(engine):
     ball = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], axis=-1)
     i, j = (k.ravel() for k in np.meshgrid(np.arange(n), np.arange(m), indexing="ij"))
     here, there = i * m + j, i * m + (j + 1) % m
-    triangles = np.vstack([np.column_stack([here, here + m, there + m]),
-                           np.column_stack([here, there + m, there])])  # fmt: skip
+    triangles = np.vstack([np.column_stack([here, here + m, there + m]), np.column_stack([here, there + m, there])])
     center = (4.0, 0.0, 10.75)
     # The vertices of a pole differ by round-off.
     surface = sizing.Surface(center + 0.5 * ball.reshape(-1, 3), triangles, join=1e-12)
@@ -226,9 +238,7 @@ def test_closed_surfaces():
     assert whole.closed
     whole.require_closed()
     # The same with separate triangles, and with triangles of two equal corners.
-    apart = sizing.Surface(
-        vertices[triangles].reshape(-1, 3), np.arange(triangles.size).reshape(-1, 3)
-    )
+    apart = sizing.Surface(vertices[triangles].reshape(-1, 3), np.arange(triangles.size).reshape(-1, 3))
     assert apart.closed
     assert sizing.Surface(vertices, np.vstack([triangles, [[3, 3, 9]]])).closed
     holed = sizing.Surface(vertices, triangles[1:], name="part")
@@ -245,9 +255,7 @@ def test_closed_surfaces():
     assert sizing.Surface(*loose, join=1e-8).closed
     with pytest.raises(InputError, match="open"):
         holed.contains([(0, 0, 0)])
-    fins = sizing.Surface(
-        vertices, np.vstack([triangles, [[a, b, 30]], [[a, b, 30]], [[a, b, 30]]])
-    )
+    fins = sizing.Surface(vertices, np.vstack([triangles, [[a, b, 30]], [[a, b, 30]], [[a, b, 30]]]))
     with pytest.raises(InputError, match="odd number of triangles"):
         fins.require_closed()
 
@@ -270,9 +278,7 @@ def test_valid_surfaces_have_no_intersections():
         assert surface.crossings().shape == (0, 2)
         surface.check()
     # Two cubes side by side share a side; boxes in contact do not intersect.
-    shifted = sizing.Surface(
-        np.vstack([CUBE[0], CUBE[0] + (1.0, 1.0, 0)]), np.vstack([CUBE[1], CUBE[1] + 8])
-    )
+    shifted = sizing.Surface(np.vstack([CUBE[0], CUBE[0] + (1.0, 1.0, 0)]), np.vstack([CUBE[1], CUBE[1] + 8]))
     assert len(shifted.crossings()) == 0
 
 
@@ -336,9 +342,7 @@ def test_self_intersection_names_two_triangles():
                     expected.append([p, q])
     assert pairs.tolist() == expected
     p, q = expected[0]
-    with pytest.raises(
-        InputError, match=rf"parts intersects itself: triangles {p}, .* and {q}, .*more"
-    ):
+    with pytest.raises(InputError, match=rf"parts intersects itself: triangles {p}, .* and {q}, .*more"):
         surface.check()
 
 

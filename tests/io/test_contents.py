@@ -15,7 +15,7 @@ DOMAINS = {
     "torus": clvoro.Box((0, 0), (3, 1.5), periodic=True),
     "polygon": clvoro.Polygon([(0, 0), (4, 0), (4, 3), (2, 1), (0, 3)], [[(1, 0.5), (2, 0.5), (2, 0.8)]]),
     "solid": clvoro.Box((0, 0, 5), (1, 2, 6)),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module", params=list(DOMAINS))
@@ -128,7 +128,7 @@ def test_results_of_version_1_are_read(result, tmp_path):
     """Sizes and errors had other names."""
     result.save(tmp_path / "new.npz")
     former = {"target_size.npy": "size.npy", "size_error.npy": "error.npy"}
-    with zipfile.ZipFile(tmp_path / "new.npz") as new, zipfile.ZipFile(tmp_path / "old.npz", "w") as old:  # fmt: skip
+    with zipfile.ZipFile(tmp_path / "new.npz") as new, zipfile.ZipFile(tmp_path / "old.npz", "w") as old:
         for name in new.namelist():
             content = new.read(name)
             if name == "version.npy":
@@ -146,20 +146,18 @@ def test_to_meshio(diagram):
     n = len(diagram)
     mesh = diagram.to_meshio({"row": np.arange(n)})
     seen = []
-    for block, rows, volumes in zip(
-        mesh.cells, mesh.cell_data["row"], mesh.cell_data["volume"], strict=True
-    ):
+    for block, rows, volumes in zip(mesh.cells, mesh.cell_data["row"], mesh.cell_data["volume"], strict=True):
         for cell, row, volume in zip(block.data, rows, volumes, strict=True):
             seen.append(row)
             x0 = np.append(diagram.points[row], 0)[:3]
             if diagram.domain.dim == 2:
                 x = (mesh.points[cell] - x0)[:, :2]
-                found = sum(np.linalg.det([a, b]) / 2 for a, b in zip(x, np.roll(x, -1, 0), strict=True))  # fmt: skip
+                found = sum(np.linalg.det([a, b]) / 2 for a, b in zip(x, np.roll(x, -1, 0), strict=True))
             else:
                 found = 0.0
                 for face in cell:
                     x = mesh.points[face] - x0
-                    found += sum(np.linalg.det([x[0], *x[j : j + 2]]) / 6 for j in range(1, len(x) - 1))  # fmt: skip
+                    found += sum(np.linalg.det([x[0], *x[j : j + 2]]) / 6 for j in range(1, len(x) - 1))
             assert found == pytest.approx(volume, rel=1e-9)
             assert volume == diagram.volumes[row]
     assert sorted(seen) == list(range(n))

@@ -74,9 +74,7 @@ def read(folder):
 def mesh(result, tmp_path):
     folder = tmp_path / "constant" / "polyMesh"
     io.save(result, folder, walls="exact")
-    assert {p.name for p in folder.iterdir()} == {
-        "points", "faces", "owner", "neighbour", "boundary",
-    }  # fmt: skip
+    assert {p.name for p in folder.iterdir()} == {"points", "faces", "owner", "neighbour", "boundary"}
     return read(folder)
 
 
@@ -174,9 +172,7 @@ def read_binary(folder, name):
         if int(count):
             assert (body[:1], body[end + 1 : end + 3]) == (b"(", b")\n")
             body, rest = body[1 : end + 1], body[end + 3 :]
-        arrays.append(
-            np.frombuffer(body if int(count) else b"", item.base).reshape(-1, *item.shape)
-        )
+        arrays.append(np.frombuffer(body if int(count) else b"", item.base).reshape(-1, *item.shape))
         body = rest if int(count) else body
     return fields["class"], arrays
 
@@ -236,9 +232,7 @@ def check_mesh(result, folder, **settings):
     return check_case(folder).text
 
 
-needs_openfoam = pytest.mark.skipif(
-    shutil.which("checkMesh") is None, reason="OpenFOAM is not installed"
-)
+needs_openfoam = pytest.mark.skipif(shutil.which("checkMesh") is None, reason="OpenFOAM is not installed")
 
 
 @pytest.mark.slow
@@ -258,8 +252,13 @@ def test_types_of_patches_are_the_callers(plane, tmp_path):
     patches = read(tmp_path / "polyMesh")[-1]
     kinds = {name: patch[0] for name, patch in patches.items()}
     assert kinds == {
-        "zone": "symmetryPlane", "xMin": "patch", "xMax": "wall", "yMax": "wall", "back": "empty", "front": "empty",
-    }  # fmt: skip
+        "zone": "symmetryPlane",
+        "xMin": "patch",
+        "xMax": "wall",
+        "yMax": "wall",
+        "back": "empty",
+        "front": "empty",
+    }
 
 
 def test_thickness_is_the_callers(plane, tmp_path):
@@ -273,14 +272,8 @@ def test_thickness_is_the_callers(plane, tmp_path):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (
-            {"types": {"yMin": "inlet"}},
-            "types has 'inlet' for yMin, expected one of wall, patch, symmetry",
-        ),
-        (
-            {"types": {"floor": "wall"}},
-            "types has 'floor', expected names of patches: xMin, xMax, yMin, yMax",
-        ),
+        ({"types": {"yMin": "inlet"}}, "types has 'inlet' for yMin, expected one of wall, patch, symmetry"),
+        ({"types": {"floor": "wall"}}, "types has 'floor', expected names of patches: xMin, xMax, yMin, yMax"),
         ({"types": ["wall"]}, "types is .* of type list, expected a mapping"),
         ({"thickness": 0}, "thickness is 0, expected a finite number > 0"),
         ({"thickness": "thin"}, "thickness is 'thin'"),
@@ -317,9 +310,7 @@ def test_failure_leaves_the_old_mesh(solid, tmp_path, monkeypatch):
         patched.setattr(os, "fsync", full)
         with pytest.raises(InputError, match="No space left"):
             io.save(solid, folder)
-    assert {p.name: p.read_text() for p in folder.iterdir()} == {
-        "points": "old", "faces": "old", "cellZones": "old",
-    }  # fmt: skip
+    assert {p.name: p.read_text() for p in folder.iterdir()} == {"points": "old", "faces": "old", "cellZones": "old"}
     io.save(solid, folder)
     assert len(read(folder)[2]) > 0
     assert (folder / "cellZones").read_text() == "old"

@@ -105,9 +105,7 @@ def test_only_walls_are_patches(result, mesh):
     points, faces, _, _, patches = mesh
     box = result.diagram.domain
     walls = {name: patch for name, patch in patches.items() if patch[0] == "wall"}
-    wanted = [
-        f"{'xyz'[a]}{end}" for a in range(box.dim) if not box.periodic[a] for end in ("Min", "Max")
-    ]
+    wanted = [f"{'xyz'[a]}{end}" for a in range(box.dim) if not box.periodic[a] for end in ("Min", "Max")]
     assert list(walls) == wanted
     for name, (_, size, start) in walls.items():
         axis = "xyz".index(name[0])
@@ -130,12 +128,7 @@ def test_names_of_cyclic_patches_are_reserved(ctx, tmp_path):
 def test_as_openfoam_checks_it(result, tmp_path):
     said = check_mesh(result, tmp_path)
     assert "***" not in said.split("Checking topology...")[1].split("Checking geometry...")[0]
-    for line in (
-        "Boundary openness",
-        "Cell volumes",
-        "Face pyramids",
-        "Coupled point location match",
-    ):
+    for line in ("Boundary openness", "Cell volumes", "Face pyramids", "Coupled point location match"):
         assert re.search(f"{line}.*OK", said), line
 
 
@@ -161,17 +154,28 @@ def test_openfoam_conducts_heat_across_the_seams(result, tmp_path):
     sides = " ".join(f"{name} {{ type {kinds[p[0]]}; }}" for name, p in patches.items())
     values = "\n".join(map(repr, before.tolist()))
     files = {
-        "0/T": ("volScalarField", f"dimensions [0 0 0 1 0 0 0]; internalField nonuniform List<scalar> {n} ({values}); "
-                f"boundaryField {{ {sides} }}"),
+        "0/T": (
+            "volScalarField",
+            f"dimensions [0 0 0 1 0 0 0]; internalField nonuniform List<scalar> {n} ({values}); "
+            f"boundaryField {{ {sides} }}",
+        ),
         "constant/transportProperties": ("dictionary", f"DT [0 2 -1 0 0 0 0] {conductivity};"),
-        "system/controlDict": ("dictionary", "startTime 0; endTime 1; deltaT 1; writeControl timeStep; "
-                               "writeInterval 1; writePrecision 16;"),
-        "system/fvSchemes": ("dictionary", "ddtSchemes { default Euler; } gradSchemes { default Gauss linear; } "
-                             "divSchemes { default none; } laplacianSchemes { default Gauss linear uncorrected; } "
-                             "interpolationSchemes { default linear; } snGradSchemes { default uncorrected; }"),
-        "system/fvSolution": ("dictionary", "solvers { T { solver PCG; preconditioner DIC; tolerance 1e-14; relTol 0; "
-                              "} } SIMPLE { nNonOrthogonalCorrectors 0; }"),
-    }  # fmt: skip
+        "system/controlDict": (
+            "dictionary",
+            "startTime 0; endTime 1; deltaT 1; writeControl timeStep; writeInterval 1; writePrecision 16;",
+        ),
+        "system/fvSchemes": (
+            "dictionary",
+            "ddtSchemes { default Euler; } gradSchemes { default Gauss linear; } "
+            "divSchemes { default none; } laplacianSchemes { default Gauss linear uncorrected; } "
+            "interpolationSchemes { default linear; } snGradSchemes { default uncorrected; }",
+        ),
+        "system/fvSolution": (
+            "dictionary",
+            "solvers { T { solver PCG; preconditioner DIC; tolerance 1e-14; relTol 0; "
+            "} } SIMPLE { nNonOrthogonalCorrectors 0; }",
+        ),
+    }
     for name, (kind, text) in files.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         about = f"version 2.0; format ascii; class {kind}; object {name.split('/')[1]};"

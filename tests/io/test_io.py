@@ -140,9 +140,7 @@ def test_npz_knows_every_array_of_a_diagram():
 
 def test_npz_of_a_device_run(tmp_path):
     clvoro = pytest.importorskip("clvoro")
-    ran = clvoro.Adapter().run(
-        BOX, 0.3, n_cells=30, max_steps=2, options=clvoro.PaperOptions(tol=0), seed=331
-    )
+    ran = clvoro.Adapter().run(BOX, 0.3, n_cells=30, max_steps=2, options=clvoro.PaperOptions(tol=0), seed=331)
     ran.save(tmp_path / "mesh.npz")
     assert_equal_results(ran, io.load(tmp_path / "mesh.npz"))
 
@@ -212,10 +210,7 @@ def huge_array():
         ({"size_error": np.zeros(40, int)}, "size_error has dtype"),
         ({"history": np.zeros(3)}, "history has shape"),
         ({"about": np.array("{not json")}, "description is damaged"),
-        (
-            {"about": np.array('{"domain": {"kind": "PeriodicTessellator"}}')},
-            "'PeriodicTessellator'",
-        ),
+        ({"about": np.array('{"domain": {"kind": "PeriodicTessellator"}}')}, "'PeriodicTessellator'"),
         ({"about": np.array("7")}, "description is damaged"),
         ({"about": np.array("[" * 100000)}, "description is damaged"),
         ({"diagram.neighbors": None}, "lacks diagram.neighbors"),
@@ -374,12 +369,7 @@ def test_history_reads_back_exactly(result, tmp_path):
 
 # --- complete or unchanged ---
 
-WRITERS = {
-    "mesh.npz": io.save,
-    "mesh.vtu": io.save,
-    "mesh.vtk": io.save,
-    "history.csv": io.write_history,
-}
+WRITERS = {"mesh.npz": io.save, "mesh.vtu": io.save, "mesh.vtk": io.save, "history.csv": io.write_history}
 
 
 @pytest.mark.parametrize("name", WRITERS)

@@ -67,9 +67,7 @@ def test_topology_names_all_variables(mesh):
         for name in topology[f"{place}_coordinates"].decode().split():
             assert mesh.dimensions_of[name] == (f"mesh_{place}s",)
     tables = [k for k in topology if k.endswith("_connectivity")]
-    assert {"face_node_connectivity", "edge_node_connectivity", "edge_face_connectivity"} < {
-        *tables
-    }
+    assert {"face_node_connectivity", "edge_node_connectivity", "edge_face_connectivity"} < {*tables}
     for role in tables:
         name = topology[role].decode()
         assert mesh.about[name]["cf_role"] == role.encode()
@@ -92,11 +90,7 @@ def test_faces_are_the_cells(result, mesh):
         # Round-off of a dozen products of coordinates below 4.
         assert shoelace(nodes[corners]) == pytest.approx(d.volumes[i], rel=0, abs=1e-14)
     assert np.array_equal(mesh["area"], d.volumes)
-    for name, attribute in (
-        ("size", "target_size"),
-        ("error", "size_error"),
-        ("quality", "quality"),
-    ):
+    for name, attribute in (("size", "target_size"), ("error", "size_error"), ("quality", "quality")):
         assert np.array_equal(mesh[name], getattr(result, attribute))
         assert mesh.about[name]["mesh"] == b"mesh"
         assert mesh.about[name]["location"] == b"face"
@@ -207,13 +201,8 @@ def test_units_are_the_callers(room, tmp_path):
         assert about["quality"]["units"] == b"1"
     room.save(tmp_path / "mesh.nc", units="km", convention="mpas")
     about = read(tmp_path / "mesh.nc").about
-    found = {
-        name: about[name]["units"].decode()
-        for name in ("xCell", "zVertex", "dcEdge", "areaCell", "latEdge")
-    }
-    assert found == {
-        "xCell": "km", "zVertex": "km", "dcEdge": "km", "areaCell": "km2", "latEdge": "rad",
-    }  # fmt: skip
+    found = {name: about[name]["units"].decode() for name in ("xCell", "zVertex", "dcEdge", "areaCell", "latEdge")}
+    assert found == {"xCell": "km", "zVertex": "km", "dcEdge": "km", "areaCell": "km2", "latEdge": "rad"}
     for unit in (3, "", "µm"):
         with pytest.raises(InputTypeError, match="units is"):
             room.save(tmp_path / "mesh.nc", units=unit)
@@ -227,9 +216,7 @@ def test_as_xarray_reads_it(room, tmp_path):
         for engine in ("scipy", "netcdf4"):
             if engine == "netcdf4":
                 pytest.importorskip("netCDF4")
-            with xarray.open_dataset(
-                tmp_path / "mesh.nc", engine=engine, mask_and_scale=False
-            ) as found:
+            with xarray.open_dataset(tmp_path / "mesh.nc", engine=engine, mask_and_scale=False) as found:
                 assert {*found.variables} == {*expected.values}
                 for name, values in expected.values.items():
                     assert np.array_equal(found[name].values, values)

@@ -15,19 +15,35 @@ from tests.reference.netcdf_files import MESHES, made, read, result_of, shoelace
 from tests.reference.shores import blocks, scattered, spit
 
 TABLES = {
-    "cellsOnCell": ("nCells", "maxEdges"), "edgesOnCell": ("nCells", "maxEdges"),
-    "verticesOnCell": ("nCells", "maxEdges"), "nEdgesOnCell": ("nCells",), "cellsOnEdge": ("nEdges", "TWO"),
-    "verticesOnEdge": ("nEdges", "TWO"), "edgesOnEdge": ("nEdges", "maxEdges2"), "nEdgesOnEdge": ("nEdges",),
-    "cellsOnVertex": ("nVertices", "vertexDegree"), "edgesOnVertex": ("nVertices", "vertexDegree"),
-    "indexToCellID": ("nCells",), "indexToEdgeID": ("nEdges",), "indexToVertexID": ("nVertices",),
-}  # fmt: skip
+    "cellsOnCell": ("nCells", "maxEdges"),
+    "edgesOnCell": ("nCells", "maxEdges"),
+    "verticesOnCell": ("nCells", "maxEdges"),
+    "nEdgesOnCell": ("nCells",),
+    "cellsOnEdge": ("nEdges", "TWO"),
+    "verticesOnEdge": ("nEdges", "TWO"),
+    "edgesOnEdge": ("nEdges", "maxEdges2"),
+    "nEdgesOnEdge": ("nEdges",),
+    "cellsOnVertex": ("nVertices", "vertexDegree"),
+    "edgesOnVertex": ("nVertices", "vertexDegree"),
+    "indexToCellID": ("nCells",),
+    "indexToEdgeID": ("nEdges",),
+    "indexToVertexID": ("nVertices",),
+}
 MEASURES = {
-    **{f"{axis}{what}": (many,) for axis in ("x", "y", "z", "lat", "lon")
-       for what, many in (("Cell", "nCells"), ("Edge", "nEdges"), ("Vertex", "nVertices"))},
-    "areaCell": ("nCells",), "areaTriangle": ("nVertices",), "dvEdge": ("nEdges",), "dcEdge": ("nEdges",),
-    "angleEdge": ("nEdges",), "meshDensity": ("nCells",), "kiteAreasOnVertex": ("nVertices", "vertexDegree"),
+    **{
+        f"{axis}{what}": (many,)
+        for axis in ("x", "y", "z", "lat", "lon")
+        for what, many in (("Cell", "nCells"), ("Edge", "nEdges"), ("Vertex", "nVertices"))
+    },
+    "areaCell": ("nCells",),
+    "areaTriangle": ("nVertices",),
+    "dvEdge": ("nEdges",),
+    "dcEdge": ("nEdges",),
+    "angleEdge": ("nEdges",),
+    "meshDensity": ("nCells",),
+    "kiteAreasOnVertex": ("nVertices", "vertexDegree"),
     "weightsOnEdge": ("nEdges", "maxEdges2"),
-}  # fmt: skip
+}
 OFF_BISECTORS = {"shore", "slit"}
 """Domains where cells include parts of other regions, whose edges are on no bisector."""
 
@@ -48,8 +64,7 @@ class Mesh:
         self.edgesOnVertex = [[e for e in row if e >= 0] for row in self["edgesOnVertex"] - 1]
         self.cellsOnVertex = (self["cellsOnVertex"] - 1).tolist()
         self.cell, self.edge, self.vertex = (
-            np.stack([self[f"{axis}{what}"] for axis in "xy"], axis=1)
-            for what in ("Cell", "Edge", "Vertex")
+            np.stack([self[f"{axis}{what}"] for axis in "xy"], axis=1) for what in ("Cell", "Edge", "Vertex")
         )
         self.periods = np.array([self.file.attributes[f"{axis}_period"] for axis in "xy"])
 
@@ -235,9 +250,7 @@ def test_normals_point_from_the_first_cell_to_the_second(mesh):
         assert foot == tight(mesh, line / 2)
         # Orthogonal and right-handed.
         assert along @ line == tight(mesh, 0)
-        assert line[0] * along[1] - line[1] * along[0] == tight(
-            mesh, np.hypot(*along) * np.hypot(*line)
-        )
+        assert line[0] * along[1] - line[1] * along[0] == tight(mesh, np.hypot(*along) * np.hypot(*line))
 
 
 @pytest.mark.sparse(3)
@@ -264,10 +277,8 @@ def test_kites_are_the_parts_of_cells_and_triangles(result, mesh):
             # The kite: vertex, edge, generator, next edge.
             around = [
                 mesh.away(mesh.vertex[v], place)
-                for place in (
-                    mesh.edge[edges[k]], mesh.cell[i], mesh.edge[edges[(k + 1) % len(edges)]],
-                )
-            ]  # fmt: skip
+                for place in (mesh.edge[edges[k]], mesh.cell[i], mesh.edge[edges[(k + 1) % len(edges)]])
+            ]
             assert kites[v, k] == tight(mesh, shoelace(np.array([(0, 0), *around])))
         assert mesh["areaTriangle"][v] == tight(mesh, kites[v].sum())
         if len(edges) == sum(i >= 0 for i in cells) and mesh.name not in OFF_BISECTORS:
@@ -375,9 +386,7 @@ def test_balances_hold_in_single_precision(ctx, tmp_path, name):
     mesh = Mesh(tmp_path / "mesh.nc", name)
     # Round-off of corners is 2^-24 of the frame; cells are 0.1 wide.
     np.testing.assert_allclose(mesh["areaCell"], result.diagram.volumes, rtol=1e-4)
-    kites = np.bincount(
-        np.maximum(mesh["cellsOnVertex"].ravel() - 1, 0), mesh["kiteAreasOnVertex"].ravel()
-    )
+    kites = np.bincount(np.maximum(mesh["cellsOnVertex"].ravel() - 1, 0), mesh["kiteAreasOnVertex"].ravel())
     np.testing.assert_allclose(kites, mesh["areaCell"], rtol=1e-13)
     check_energy(mesh)
     check_divergence(mesh)
@@ -422,10 +431,7 @@ def test_weights_of_regular_hexagons(ctx, tmp_path):
     for e, row in enumerate(mesh["weightsOnEdge"][:, :10]):
         i, j = mesh.cellsOnEdge[e]
         owners = [i] * 5 + [j] * 5
-        signs = [
-            mesh.sign(k, e) * mesh.sign(k, other)
-            for k, other in zip(owners, mesh.edgesOnEdge[e], strict=True)
-        ]
+        signs = [mesh.sign(k, e) * mesh.sign(k, other) for k, other in zip(owners, mesh.edgesOnEdge[e], strict=True)]
         halves = np.array([1, 1, 0, -1, -1] * 2)
         assert row == pytest.approx(expected * halves * signs, abs=1e-14)
     angle = mesh["angleEdge"]
@@ -450,9 +456,15 @@ def test_a_cell_around_an_island_is_refused(ctx, tmp_path):
 
 @pytest.mark.parametrize(
     ("periodic", "nx", "ny", "fits"),
-    [(True, 1, 1, False), (True, 2, 5, False), (True, 5, 2, False), ((True, False), 3, 1, True),
-     ((True, False), 2, 3, False), (True, 3, 3, True)],
-)  # fmt: skip
+    [
+        (True, 1, 1, False),
+        (True, 2, 5, False),
+        (True, 5, 2, False),
+        ((True, False), 3, 1, True),
+        ((True, False), 2, 3, False),
+        (True, 3, 3, True),
+    ],
+)
 def test_places_half_a_period_away_are_refused(ctx, tmp_path, periodic, nx, ny, fits):
     box = clvoro.Box((0, 0), (2, 2), periodic=periodic)
     result = result_of(clvoro.Adapter(ctx).diagram(box, netcdf_files.grid(box, nx, ny)))

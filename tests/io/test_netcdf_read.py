@@ -21,9 +21,7 @@ def result(ctx, request):
 def ocean(ctx):
     """A mesh with a coast and, at longitudes from 100 on, an open boundary."""
     globe = clvoro.Adapter(ctx).diagram(clvoro.Sphere(2), scattered(250))
-    water = globe.subset(
-        ~clvoro.regions.inside(globe, clvoro.Polygon([(-40, -40), (30, -20), (0, 50)]))
-    )
+    water = globe.subset(~clvoro.regions.inside(globe, clvoro.Polygon([(-40, -40), (30, -20), (0, 50)])))
     return result_of(water.subset(globe.domain.lonlat(water.points)[:, 0] < 100, "open"))
 
 
@@ -54,9 +52,7 @@ def same(d, e, eps):
     np.testing.assert_allclose(e.points, d.points, rtol=0, atol=eps * radius)
     assert np.array_equal(e.neighbor_starts, d.neighbor_starts)
     assert np.array_equal(np.maximum(e.neighbors, -1), np.maximum(d.neighbors, -1))
-    np.testing.assert_allclose(
-        e.vertices[e.cell_vertices], d.vertices[d.cell_vertices], rtol=0, atol=eps * radius
-    )
+    np.testing.assert_allclose(e.vertices[e.cell_vertices], d.vertices[d.cell_vertices], rtol=0, atol=eps * radius)
     # Of small cells in the middle of large ones the round-off is that of the positions.
     widths = np.sqrt(d.volumes)
     np.testing.assert_allclose(e.volumes, d.volumes, rtol=0, atol=8 * eps * (radius * widths).max())
@@ -69,9 +65,7 @@ def test_round_trip_of_an_ocean(ocean, tmp_path, convention):
     walls = d.neighbors < 0
     # The generators of removed cells, from faces that may be short.
     behind, expected = (np.asarray(m.domain.beyond)[-1 - m.neighbors[walls]] for m in (e, d))
-    np.testing.assert_allclose(
-        behind, expected, rtol=0, atol=1e-14 if convention == "mpas" else 1e-10
-    )
+    np.testing.assert_allclose(behind, expected, rtol=0, atol=1e-14 if convention == "mpas" else 1e-10)
     assert len(e.domain.beyond) == len(d.domain.beyond)
     assert e.domain.measure == pytest.approx(d.domain.measure, rel=1e-13)
     assert e.check().ok
@@ -88,16 +82,11 @@ def test_saved_again_it_is_the_same(ocean, tmp_path):
 def changed(path, convention, change):
     """Write a mesh, change the variables of its file, and return the path."""
     clvoro.voronoi(EARTH, scattered(150)).save(path / "good.nc", convention=convention)
-    with (
-        netcdf_file(path / "good.nc", mmap=False) as good,
-        netcdf_file(path / "bad.nc", "w") as bad,
-    ):
+    with netcdf_file(path / "good.nc", mmap=False) as good, netcdf_file(path / "bad.nc", "w") as bad:
         for name, length in good.dimensions.items():
             bad.createDimension(name, length)
         attributes = {k: v for k, v in good._attributes.items()}
-        values = {
-            k: (v.data.copy(), v.dimensions, v._attributes) for k, v in good.variables.items()
-        }
+        values = {k: (v.data.copy(), v.dimensions, v._attributes) for k, v in good.variables.items()}
         change(values, attributes)
         for key, value in attributes.items():
             setattr(bad, key, value)
@@ -132,7 +121,7 @@ def put(name, at, value):
         ("ugrid", lambda v, a: v["mesh"][2].update(cf_role="other"), "no mesh by MPAS, UGRID or SCRIP"),
         ("scrip", lambda v, a: v.pop("generator_lon"), "pass the centers to clvoro.voronoi"),
     ],
-)  # fmt: skip
+)
 def test_damaged_files_are_refused(tmp_path, convention, change, message):
     path = changed(tmp_path, convention, change)
     with pytest.raises(InputError, match=rf"cannot read .*bad\.nc: .*({message})"):
@@ -141,11 +130,7 @@ def test_damaged_files_are_refused(tmp_path, convention, change, message):
 
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "mesh.nc"
-    for content, message in (
-        (b"\x89HDF\r\n", "nccopy"),
-        (b"CDF", "damaged or no netCDF-3"),
-        (b"", "damaged"),
-    ):
+    for content, message in ((b"\x89HDF\r\n", "nccopy"), (b"CDF", "damaged or no netCDF-3"), (b"", "damaged")):
         path.write_bytes(content)
         with pytest.raises(InputError, match=rf"cannot read .*mesh\.nc: .*{message}"):
             clvoro.load(path)

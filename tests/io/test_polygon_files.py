@@ -92,9 +92,16 @@ def test_correct_meshes_pass(ctx, name: str, n: int, dtype: str) -> None:
     report = mesh(ctx, DOMAINS[name](), n, dtype).check()
     assert report.ok, report
     expected = {
-        "outlines", "edges covered", "generators in their cells", "volumes sum", "faces closed",
-        "nearest generators", "quality", "faces the same from both sides", "walls",
-    }  # fmt: skip
+        "outlines",
+        "edges covered",
+        "generators in their cells",
+        "volumes sum",
+        "faces closed",
+        "nearest generators",
+        "quality",
+        "faces the same from both sides",
+        "walls",
+    }
     assert expected <= set(report.checked)
     assert report.precision == dtype
 
@@ -117,7 +124,7 @@ SPOILT = {
     "ends": ({"face_vertices": swap(3, 12)}, "graph symmetric"),
     "corners": ({"cell_vertices": swap(3, 12)}, "outlines"),
     "starts": ({"face_vertex_starts": add(3, 1)}, "shapes"),
-}  # fmt: skip
+}
 
 
 def test_a_generator_in_a_corner_where_pieces_touch(ctx) -> None:
@@ -131,8 +138,11 @@ def test_a_generator_in_a_corner_where_pieces_touch(ctx) -> None:
 def test_a_face_as_short_as_round_off_may_be_a_side(ctx) -> None:
     a = np.array([(0, 4), (1, 4), (1, 5), (0, 5)]) / 7
     domain = Polygon.from_pieces([[a], [a + np.array([1, -1]) / 7]])
-    x = [(0.1369047619047619, 0.5718085607390168), (0.14247715354669752, 0.5773809523809523),
-         (0.1488095238095238, 0.571048582118126)]  # fmt: skip
+    x = [
+        (0.1369047619047619, 0.5718085607390168),
+        (0.14247715354669752, 0.5773809523809523),
+        (0.1488095238095238, 0.571048582118126),
+    ]
     made = clvoro.Adapter(ctx).run(domain, 0.05, points=x, method="lloyd", max_steps=0)
     assert made.diagram.face_measures.min() < 1e-14
     assert made.check(), made.check()
@@ -141,12 +151,15 @@ def test_a_face_as_short_as_round_off_may_be_a_side(ctx) -> None:
 def test_sides_in_a_corner_of_two_holes(ctx) -> None:
     """Parts of a cell meet in the corner: the ends of its sides there are ambiguous."""
     holes = [[(0.25, 0.75), (0.5, 0.5), (0.25, 0.25)], [(0.75, 0.75), (0.75, 0.25), (0.5, 0.5)]]
-    x = [(0.5122103171985511, 0.48721031719855123), (0.48778968280144874, 0.48721031719855123),
-         (0.5135252778420708, 0.5142524999357069), (0.5113436115611626, 0.5164341662166151),
-         (0.504798612718438, 0.5229791650593397), (0.5603541682739935, 0.5785347206148953)]  # fmt: skip
-    made = clvoro.Adapter(ctx).run(
-        Polygon(SQUARE, holes), 0.05, points=x, method="lloyd", max_steps=0
-    )
+    x = [
+        (0.5122103171985511, 0.48721031719855123),
+        (0.48778968280144874, 0.48721031719855123),
+        (0.5135252778420708, 0.5142524999357069),
+        (0.5113436115611626, 0.5164341662166151),
+        (0.504798612718438, 0.5229791650593397),
+        (0.5603541682739935, 0.5785347206148953),
+    ]
+    made = clvoro.Adapter(ctx).run(Polygon(SQUARE, holes), 0.05, points=x, method="lloyd", max_steps=0)
     assert made.check(), made.check()
     # Elsewhere they are not: a side more or less is detected.
     quality = made.quality.copy()
@@ -160,9 +173,7 @@ def test_checks_in_any_unit(ctx, scale: float) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         report = (
-            clvoro.Adapter(ctx)
-            .diagram(domain, scattered(Polygon(SQUARE, [SQUARE * 0.2 + 0.3]), 9) * scale)
-            .check()
+            clvoro.Adapter(ctx).diagram(domain, scattered(Polygon(SQUARE, [SQUARE * 0.2 + 0.3]), 9) * scale).check()
         )
     assert report, report
 
@@ -300,9 +311,7 @@ def test_a_bent_side_counts_as_one_straight_side(ctx) -> None:
     a, b = pentagon[1], pentagon[4]
     flat = (a + b) / 2 + (0.5 * np.linalg.norm(a - b) * np.tan(np.radians(14.9)), 0)
     domain = Polygon([flat, a, pentagon[2], pentagon[3], b])
-    result = clvoro.Adapter(ctx).run(
-        domain, 1.0, points=np.array([(0.0, 0.0)]), method="lloyd", max_steps=0
-    )
+    result = clvoro.Adapter(ctx).run(domain, 1.0, points=np.array([(0.0, 0.0)]), method="lloyd", max_steps=0)
     corners = domain.oriented.vertices[(domain.oriented.vertices != flat).any(axis=1)]
     x, y = corners.T
     area = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
@@ -373,7 +382,7 @@ def test_npz_keeps_everything(ctx, tmp_path, name: str) -> None:
         ("diagram.face_vertices", lambda v: v + 10_000, "face_vertices has an index out of"),
         ("diagram.face_vertices", None, "lacks diagram.face_vertices"),
     ],
-)  # fmt: skip
+)
 def test_damaged_npz_is_refused(result, tmp_path, name: str, change, says: str) -> None:
     path = tmp_path / "mesh.npz"
     result.save(path)
@@ -400,9 +409,13 @@ def test_vtu_is_read_back(ctx, tmp_path, name: str) -> None:
     assert e.domain == d.domain
     assert np.array_equal(e.cell_vertices, d.cell_vertices)
     assert np.array_equal(e.neighbor_starts, d.neighbor_starts)
-    rows = [[sorted(zip(m.neighbors[a:b].tolist(), face_ends(m)[a:b].tolist(), strict=True))
-             for a, b in zip(m.neighbor_starts[:-1], m.neighbor_starts[1:], strict=True)]
-            for m in (d, e)]  # fmt: skip
+    rows = [
+        [
+            sorted(zip(m.neighbors[a:b].tolist(), face_ends(m)[a:b].tolist(), strict=True))
+            for a, b in zip(m.neighbor_starts[:-1], m.neighbor_starts[1:], strict=True)
+        ]
+        for m in (d, e)
+    ]
     assert rows[0] == rows[1]
     assert cli.main(["check", str(path)]) == 0
 
@@ -437,10 +450,7 @@ def assert_same_areas(read, d: clvoro.Diagram, slack: float) -> None:
     """Areas of the cells that meshio read."""
     assert sum(len(block) for block in read.cells) == len(d)
     x = read.points[:, :2]
-    areas = [
-        ((z := x[c] @ (1, 1j)).conj() * np.roll(z, -1)).imag.sum() / 2
-        for block in read.cells for c in block.data
-    ]  # fmt: skip
+    areas = [((z := x[c] @ (1, 1j)).conj() * np.roll(z, -1)).imag.sum() / 2 for block in read.cells for c in block.data]
     assert np.sort(areas) == pytest.approx(np.sort(d.volumes), abs=slack)
 
 
@@ -449,9 +459,7 @@ def test_other_programs_read_the_cells(result, tmp_path, name) -> None:
     meshio = pytest.importorskip("meshio")
     result.save(tmp_path / name)
     # The other formats have fewer digits than VTK's.
-    assert_same_areas(
-        meshio.read(tmp_path / name), result.diagram, 1e-13 if name == "mesh.vtk" else 1e-5
-    )
+    assert_same_areas(meshio.read(tmp_path / name), result.diagram, 1e-13 if name == "mesh.vtk" else 1e-5)
 
 
 def test_other_programs_read_a_vtu(result, tmp_path, meshio_for_vtu) -> None:
@@ -507,8 +515,9 @@ def lengths_of(patches: dict, points: np.ndarray, faces: list) -> dict:
     depth = points[:, 2].max()
     area = {
         name: sum(np.linalg.norm(solids.loop_area(points[f])) for f in faces[start : start + count])
-        for name, (kind, count, start) in patches.items() if kind == "wall"
-    }  # fmt: skip
+        for name, (kind, count, start) in patches.items()
+        if kind == "wall"
+    }
     return {name: a / depth for name, a in area.items()}
 
 
@@ -540,13 +549,16 @@ def test_openfoam_patches(pond, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("patches", "says"),
     [
-        ({"a": [99]}, r"patches\['a'\] has edge 99"), ({"a": []}, r"patches\['a'\] is empty"),
-        ({"a": [1], "b": [0, 1]}, "edge 1 both in 'a' and in 'b'"), ({"a b": [1]}, "the name 'a b'"),
+        ({"a": [99]}, r"patches\['a'\] has edge 99"),
+        ({"a": []}, r"patches\['a'\] is empty"),
+        ({"a": [1], "b": [0, 1]}, "edge 1 both in 'a' and in 'b'"),
+        ({"a b": [1]}, "the name 'a b'"),
         ({"outer": [1]}, "the name 'outer', which other edges already have"),
         ([0, 1], r"patches is \[0, 1\] of type list.*'inlet': \[0, 1\]"),
-        ({"a": [0.5]}, r"patches\['a'\] is \[0\.5\]"), ({"a": "01"}, r"patches\['a'\] is '01'"),
+        ({"a": [0.5]}, r"patches\['a'\] is \[0\.5\]"),
+        ({"a": "01"}, r"patches\['a'\] is '01'"),
     ],
-)  # fmt: skip
+)
 def test_wrong_patches_are_refused(pond, tmp_path, patches: object, says: str) -> None:
     with pytest.raises((InputError, InputTypeError), match=says):
         pond.save(tmp_path / "case.foam", patches=patches)
@@ -554,9 +566,7 @@ def test_wrong_patches_are_refused(pond, tmp_path, patches: object, says: str) -
 
 
 def test_cells_around_islands_are_refused_for_openfoam(result, pond, tmp_path) -> None:
-    with pytest.raises(
-        InputError, match=r"cell \d+ \(1 in all\) goes around a part of the boundary"
-    ):
+    with pytest.raises(InputError, match=r"cell \d+ \(1 in all\) goes around a part of the boundary"):
         result.save(tmp_path / "case.foam", walls="exact")
     with pytest.raises(InputError, match="which is for OpenFOAM"):
         pond.save(tmp_path / "mesh.vtu", patches={"a": [1]})
@@ -623,8 +633,7 @@ def test_boundary_cells_are_reported_separately(result, tmp_path, monkeypatch) -
 
     d = result.diagram
     touching = [
-        (d.neighbors[a:b] < 0).any()
-        for a, b in zip(d.neighbor_starts[:-1], d.neighbor_starts[1:], strict=True)
+        (d.neighbors[a:b] < 0).any() for a, b in zip(d.neighbor_starts[:-1], d.neighbor_starts[1:], strict=True)
     ]
     s = summary(result)
     assert (s["boundary_cells"], s["inner_cells"]) == (sum(touching), 60 - sum(touching))
@@ -681,9 +690,7 @@ def test_transfer_is_conservative_and_exact(ctx, name: str) -> None:
 
     rough = np.random.default_rng(7).standard_normal(300)
     for order, limited in ((1, True), (2, True), (2, False)):
-        got = old.transfer(
-            np.column_stack([rough, linear(old), np.full(300, np.pi)]), new, order, limited=limited
-        )
+        got = old.transfer(np.column_stack([rough, linear(old), np.full(300, np.pi)]), new, order, limited=limited)
         assert got.shape == (170, 3)
         for values, column in zip((rough, linear(old)), got.T, strict=False):
             mass = np.abs(old.volumes * values).sum()
@@ -720,9 +727,7 @@ def test_slopes_are_those_of_the_device(ctx) -> None:
     new = np.random.default_rng(11).random((70, 2))
     for limited in (True, False):
         flat, ring_ = (
-            adapter.diagram(domain, points).transfer(
-                values, adapter.diagram(domain, new), 2, limited=limited
-            )
+            adapter.diagram(domain, points).transfer(values, adapter.diagram(domain, new), 2, limited=limited)
             for domain in (box, Polygon(SQUARE))
         )
         # Round-off grows where the fit is ill-conditioned, as for neighbors nearly on a line.

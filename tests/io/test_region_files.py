@@ -48,8 +48,7 @@ class Maps:
 
     def __init__(self, whole, part):
         self.cell, self.edge, self.vertex = (
-            self._found(getattr(whole, what), getattr(part, what))
-            for what in ("cell", "edge", "vertex")
+            self._found(getattr(whole, what), getattr(part, what)) for what in ("cell", "edge", "vertex")
         )
 
     @staticmethod
@@ -126,16 +125,12 @@ def test_mpas_tables_are_culled(globe, files, maps):
                 (whole, old, [number[i] if i >= 0 else -1 for i in whole.cellsOnVertex[old]]),
             )
         )
-        assert mine.items() <= theirs.items() or mine == pytest.approx(
-            {i: theirs[i] for i in mine}, rel=1e-12
-        )
+        assert mine.items() <= theirs.items() or mine == pytest.approx({i: theirs[i] for i in mine}, rel=1e-12)
         missing = np.array(part.cellsOnVertex[v]) < 0
         assert (part["kiteAreasOnVertex"][v][missing] == 0).all()
         assert part["areaTriangle"][v] == pytest.approx(sum(mine.values()), rel=1e-13)
     # Each corner of a kept cell is there once.
-    assert sum(i >= 0 for row in part.cellsOnVertex for i in row) == sum(
-        map(len, part.verticesOnCell)
-    )
+    assert sum(i >= 0 for row in part.cellsOnVertex for i in row) == sum(map(len, part.verticesOnCell))
 
 
 def turned(whole, part, maps):

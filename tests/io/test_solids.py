@@ -117,9 +117,7 @@ def test_faces_once_has_each_face_once(diagram):
     assert len(found) == len(pairs)
     assert set(found) == pairs
     assert found[: faces.inner] == sorted(p for p in pairs if p[1] >= 0)
-    assert found[faces.inner :] == sorted(
-        (p for p in pairs if p[1] < 0), key=lambda p: (-p[1], p[0])
-    )
+    assert found[faces.inner :] == sorted((p for p in pairs if p[1] < 0), key=lambda p: (-p[1], p[0]))
 
 
 def test_a_face_of_one_cell_only_is_reversed(diagram):
@@ -217,11 +215,7 @@ def test_vtu_as_vtk_reads_it(result, tmp_path):
         cell, polygons = grid.GetCell(i), vtk.vtkCellArray()
         for k in range(cell.GetNumberOfFaces()):
             polygons.InsertNextCell(cell.GetFace(k).GetPointIds())
-        surface, triangles, mass = (
-            vtk.vtkPolyData(),
-            vtk.vtkTriangleFilter(),
-            vtk.vtkMassProperties(),
-        )
+        surface, triangles, mass = (vtk.vtkPolyData(), vtk.vtkTriangleFilter(), vtk.vtkMassProperties())
         surface.SetPoints(grid.GetPoints())
         surface.SetPolys(polygons)
         triangles.SetInputData(surface)

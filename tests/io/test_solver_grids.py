@@ -86,9 +86,7 @@ def test_modflow_finds_the_conductances_of_the_diagram(lake, walls):
     assert cut <= 2
     # The boundaries by name are the other edges.
     named = [
-        item
-        for b in disv.boundaries.values()
-        for item in zip(b.cells.tolist(), b.lengths, b.distances, strict=True)
+        item for b in disv.boundaries.values() for item in zip(b.cells.tolist(), b.lengths, b.distances, strict=True)
     ]
     assert len(named) == len(outer)
     if walls == "exact":
@@ -136,14 +134,10 @@ def test_boundaries_have_names_cells_and_lengths(lake):
         assert set(b.cells) <= set(d.faces.owner[faces].tolist()), name
         assert np.array_equal(b.cells, np.sort(b.cells))
         assert b.conductance(2.0) == pytest.approx(2 * b.lengths / b.distances)
-    with pytest.raises(
-        InputError, match="boundaries has no 'inlt', expected the name of a boundary: inlet, "
-    ):
+    with pytest.raises(InputError, match="boundaries has no 'inlt', expected the name of a boundary: inlet, "):
         disv.boundaries["inlt"]
     feet = disv.boundaries["inlet"].feet
-    assert (
-        np.abs(feet[:, 0] * 1 + feet[:, 1] * 0.1).max() < 1e-12
-    )  # on the line from (-0.1, 1) to (0, 0)
+    assert np.abs(feet[:, 0] * 1 + feet[:, 1] * 0.1).max() < 1e-12  # on the line from (-0.1, 1) to (0, 0)
 
 
 def test_flopy_takes_the_grid(lake, tmp_path):
@@ -156,10 +150,7 @@ def test_flopy_takes_the_grid(lake, tmp_path):
     gwf = flopy.mf6.ModflowGwf(sim)
     flopy.mf6.ModflowGwfdisv(gwf, nlay=2, top=10, botm=[5, 0], **disv.gridprops)
     flopy.mf6.ModflowGwfghb(
-        gwf,
-        stress_period_data=[
-            ((0, i), 9.0, c) for i, c in zip(river.cells, river.conductance(1e-3), strict=True)
-        ],
+        gwf, stress_period_data=[((0, i), 9.0, c) for i, c in zip(river.cells, river.conductance(1e-3), strict=True)]
     )
     sim.write_simulation(silent=True)
     again = flopy.mf6.MFSimulation.load(sim_ws=tmp_path, verbosity_level=0).get_model()
@@ -188,9 +179,7 @@ def test_drawdown_of_a_well_is_that_of_theis():
     upper = scipy.sparse.coo_array((c, (i, j)), (n, n))
     flow = (scipy.sparse.diags_array((upper + upper.T).sum(axis=1)) - upper - upper.T).tocsc()
     x = disv.vertices[disv.cell_vertices]
-    after = np.concatenate(
-        [np.roll(np.arange(a, b), -1) for a, b in itertools.pairwise(disv.cell_vertex_starts)]
-    )
+    after = np.concatenate([np.roll(np.arange(a, b), -1) for a, b in itertools.pairwise(disv.cell_vertex_starts)])
     cell = np.repeat(np.arange(n), np.diff(disv.cell_vertex_starts))
     twice = x[after, 0] * x[:, 1] - x[after, 1] * x[:, 0]
     areas = np.bincount(cell, twice, n) / 2
@@ -276,9 +265,7 @@ def test_fipy_orders_the_faces_of_cells(lake):
 
 
 def test_a_missing_fipy_is_named(lake, monkeypatch):
-    for name in [
-        n for n in sys.modules if n == "fipy" or n.startswith(("fipy.", "clvoro.io.fipy"))
-    ]:
+    for name in [n for n in sys.modules if n == "fipy" or n.startswith(("fipy.", "clvoro.io.fipy"))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "fipy", None)
     with pytest.raises(ClvoroError, match=r"needs FiPy.*clvoro\[solvers\]"):
@@ -289,9 +276,7 @@ def test_grids_that_solvers_lack_are_refused():
     cube = clvoro.voronoi(clvoro.Box((0, 0, 0), (1, 1, 1)), [(0.2, 0.5, 0.5), (0.7, 0.5, 0.5)])
     with pytest.raises(InputError, match="layers of 2D cells, and this diagram is in 3D"):
         cube.to_disv()
-    torus = clvoro.voronoi(
-        clvoro.Box((0, 0), (1, 1), periodic=(True, False)), [(0.2, 0.5), (0.7, 0.5)]
-    )
+    torus = clvoro.voronoi(clvoro.Box((0, 0), (1, 1), periodic=(True, False)), [(0.2, 0.5), (0.7, 0.5)])
     with pytest.raises(InputError, match="no periodic sides"):
         torus.to_disv()
     with pytest.raises(InputError, match="walls is 'round'"):
@@ -317,9 +302,7 @@ def test_fipy_joins_the_sides_of_periodic_boxes(dim):
     # The matrix of a step, against that of the diagram.
     u0 = np.cos(2 * np.pi * result.points[:, 0])
     u = fipy.CellVariable(mesh=mesh, value=u0)
-    (fipy.TransientTerm() == fipy.DiffusionTerm(1.0)).solve(
-        u, dt=0.01, solver=fipy.LinearLUSolver()
-    )
+    (fipy.TransientTerm() == fipy.DiffusionTerm(1.0)).solve(u, dt=0.01, solver=fipy.LinearLUSolver())
     f = d.faces
     k, n = f.n_inner, len(d)
     matrix = np.diag(d.volumes / 0.01)
@@ -344,9 +327,7 @@ def test_fipy_refuses_a_cell_beside_its_own_image():
 def test_vtu_has_the_names_of_boundaries(lake, tmp_path, meshio_for_vtu, walls):
     lake.save(tmp_path / "lake.vtu", walls=walls)
     read = meshio_for_vtu.read(tmp_path / "lake.vtu").cell_data
-    assert {name for name in read if name.startswith("boundary:")} == {
-        "boundary:inlet", "boundary:island",
-    }  # fmt: skip
+    assert {name for name in read if name.startswith("boundary:")} == {"boundary:inlet", "boundary:island"}
     label = np.concatenate(read["label"])
     if walls is None:
         f = lake.diagram.faces
@@ -354,9 +335,7 @@ def test_vtu_has_the_names_of_boundaries(lake, tmp_path, meshio_for_vtu, walls):
     else:
         mesh = lake.solver_mesh()
         owner = mesh.owner
-        part = np.where(
-            mesh.neighbor < 0, LAKE.boundary_index[np.maximum(-1 - mesh.neighbor, 0)], -1
-        )
+        part = np.where(mesh.neighbor < 0, LAKE.boundary_index[np.maximum(-1 - mesh.neighbor, 0)], -1)
     for name in ("inlet", "island"):
         marked = label[np.concatenate(read[f"boundary:{name}"]) == 1]
         assert set(marked) == set(owner[part == LAKE.boundary_names.index(name)].tolist())

@@ -25,9 +25,7 @@ def test_to_meshio(mesh):
     found = mesh.to_meshio({"row": np.arange(n)})
     np.testing.assert_array_equal(found.points, mesh.diagram.vertices)
     rows = []
-    for block, numbers, sizes in zip(
-        found.cells, found.cell_data["row"], found.cell_data["size"], strict=True
-    ):
+    for block, numbers, sizes in zip(found.cells, found.cell_data["row"], found.cell_data["size"], strict=True):
         rows += numbers.tolist()
         np.testing.assert_array_equal(sizes, mesh.target_size[numbers])
         for corners, row in zip(block.data, numbers, strict=True):

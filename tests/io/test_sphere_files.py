@@ -39,9 +39,7 @@ def test_scrip(result, tmp_path):
         corners = d.domain.positions(np.column_stack([lon[i], lat[i]]))
         np.testing.assert_allclose(corners, d.vertices[row], rtol=0, atol=eps * d.domain.radius)
     center = np.column_stack([file["grid_center_lon"], file["grid_center_lat"]])
-    np.testing.assert_allclose(
-        d.domain.positions(center), d.centroids, rtol=0, atol=eps * d.domain.radius
-    )
+    np.testing.assert_allclose(d.domain.positions(center), d.centroids, rtol=0, atol=eps * d.domain.radius)
 
 
 def test_scrip_is_for_spheres(tmp_path):
@@ -58,24 +56,17 @@ def test_ugrid_has_degrees(result, tmp_path):
     result.save(tmp_path / "mesh.nc", units="km")
     file, d = read(tmp_path / "mesh.nc"), result.diagram
     for place in ("node", "edge", "face"):
-        for axis, name, units in (
-            ("x", "longitude", "degrees_east"),
-            ("y", "latitude", "degrees_north"),
-        ):
+        for axis, name, units in (("x", "longitude", "degrees_east"), ("y", "latitude", "degrees_north")):
             about = file.about[f"mesh_{place}_{axis}"]
             assert about["standard_name"] == name.encode()
             assert about["units"] == units.encode()
-    positions = {
-        place: d.domain.positions(lonlat(file, place)) for place in ("node", "edge", "face")
-    }
+    positions = {place: d.domain.positions(lonlat(file, place)) for place in ("node", "edge", "face")}
     radius, eps = d.domain.radius, 2e-15 if is_double(result) else 2e-7
     np.testing.assert_allclose(positions["node"] / radius, d.vertices / radius, rtol=0, atol=eps)
     np.testing.assert_allclose(positions["face"] / radius, d.points / radius, rtol=0, atol=eps)
     ends = positions["node"][file["mesh_edge_nodes"]] / radius
     middle = positions["edge"] / radius
-    np.testing.assert_allclose(
-        arcs(middle, ends[:, 0]), arcs(middle, ends[:, 1]), rtol=0, atol=10 * eps
-    )
+    np.testing.assert_allclose(arcs(middle, ends[:, 0]), arcs(middle, ends[:, 1]), rtol=0, atol=10 * eps)
     assert np.array_equal(file["area"], d.volumes)
     assert file.about["area"]["units"] == b"km2"
     assert file.about["area"]["grid_mapping"] == b"globe"
@@ -108,13 +99,8 @@ def test_ugrid_topology_is_that_of_the_cells(result, tmp_path):
         count = len(corners)
         assert file["mesh_face_nodes"][i, :count].tolist() == corners
         assert (file["mesh_face_nodes"][i, count:] == -1).all()
-        assert (
-            file["mesh_face_faces"][i, :count].tolist()
-            == d.neighbors[starts[i] : starts[i + 1]].tolist()
-        )
-        for e, a, b in zip(
-            file["mesh_face_edges"][i], corners, corners[1:] + corners[:1], strict=False
-        ):
+        assert file["mesh_face_faces"][i, :count].tolist() == d.neighbors[starts[i] : starts[i + 1]].tolist()
+        for e, a, b in zip(file["mesh_face_edges"][i], corners, corners[1:] + corners[:1], strict=False):
             assert set(ends[e]) == {a, b}
             # The first face is on the left of the way from the first end to the second.
             assert beside[e, 0 if ends[e].tolist() == [a, b] else 1] == i
@@ -171,7 +157,7 @@ def damaged(path, **changes):
         ({"diagram__points": lambda a: a[:, :2]}, "centroids has shape"),
         ({"diagram__cell_vertices": lambda a: a + 10**6}, "out of range"),
     ],
-)  # fmt: skip
+)
 def test_damaged_npz_is_refused(ctx, tmp_path, changes, message):
     diagram = clvoro.Adapter(ctx).diagram(clvoro.Sphere(1), scattered(150))
     diagram.save(tmp_path / "mesh.npz")
@@ -188,32 +174,18 @@ def test_vtu_reads_back(result, tmp_path):
         assert type(again) is type(mesh)
         one, other = (getattr(m, "diagram", m) for m in (mesh, again))
         assert other.domain == one.domain
-        exact = (
-            "points",
-            "volumes",
-            "neighbor_starts",
-            "neighbors",
-            "vertices",
-            "cell_vertex_starts",
-            "cell_vertices",
-        )
+        exact = ("points", "volumes", "neighbor_starts", "neighbors", "vertices", "cell_vertex_starts", "cell_vertices")
         same_arrays(one, other, exact)
         radius = one.domain.radius
         # The round-off of corners, which are shared in the file, over the width of a cell, 1e-3.
         eps = 1e-13 if is_double(result) else 1e-4
         for name in ("face_measures", "face_centroids", "centroids"):
             np.testing.assert_allclose(
-                getattr(other, name) / radius,
-                getattr(one, name) / radius,
-                rtol=0,
-                atol=eps,
-                err_msg=name,
+                getattr(other, name) / radius, getattr(one, name) / radius, rtol=0, atol=eps, err_msg=name
             )
     for name in ("target_size", "size_error", "quality"):
         result.save(tmp_path / "mesh.vtu")
-        assert np.array_equal(
-            getattr(clvoro.load(tmp_path / "mesh.vtu"), name), getattr(result, name)
-        )
+        assert np.array_equal(getattr(clvoro.load(tmp_path / "mesh.vtu"), name), getattr(result, name))
 
 
 @pytest.mark.parametrize("radius", [1.5, 1 + 1e-4, -1.0, np.nan])
@@ -282,10 +254,7 @@ def test_graph_for_metis_has_the_neighbors(result, tmp_path):
 def test_graph_for_metis_in_other_domains(ctx, tmp_path):
     """No cell is its own neighbor, and two cells that share several faces are neighbors once."""
     torus = clvoro.Box((0, 0), (1, 1), periodic=True)
-    for points, expected in (
-        ([(0.5, 0.5)], [[]]),
-        ([(0.25, 0.5), (0.75, 0.5)], [[1], [0]]),
-    ):
+    for points, expected in (([(0.5, 0.5)], [[]]), ([(0.25, 0.5), (0.75, 0.5)], [[1], [0]])):
         clvoro.Adapter(ctx).diagram(torus, points).save(tmp_path / "a.graph")
         (n, edges), rows = graph(tmp_path / "a.graph")
         assert rows == expected
@@ -322,7 +291,7 @@ def test_graph_for_metis_in_parts(ctx, tmp_path, monkeypatch):
         (lambda d, _: d.to_fipy(), "FiPy .*Sphere.*faces"),
         (lambda d, _: d.to_shapely(), "shapely .*Sphere.*to_pyvista"),
     ],
-)  # fmt: skip
+)
 def test_formats_without_curved_surfaces_are_refused(ctx, tmp_path, work, why, monkeypatch):
     monkeypatch.setitem(sys.modules, "fipy", None)  # the reason is not that it is missing
     diagram = clvoro.Adapter(ctx).diagram(clvoro.Sphere(1), scattered(150))

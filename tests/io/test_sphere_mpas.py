@@ -9,15 +9,7 @@ from scipy.spatial import SphericalVoronoi
 
 import clvoro
 from clvoro.geometry.spherical_triangles import arc_excess, triangle_areas
-from tests.io.test_netcdf_mpas import (
-    MEASURES,
-    TABLES,
-    Mesh,
-    check_divergence,
-    check_energy,
-    matrix,
-    slow_weights,
-)
+from tests.io.test_netcdf_mpas import MEASURES, TABLES, Mesh, check_divergence, check_energy, matrix, slow_weights
 from tests.reference.globes import CASES, arcs, is_double, made, triangles
 
 
@@ -53,14 +45,10 @@ def test_areas_of_triangles(size):
     rng = np.random.default_rng(2)
     a = rng.standard_normal((200, 3))
     a /= np.linalg.norm(a, axis=1)[:, None]
-    b, c = (
-        x / np.linalg.norm(x, axis=1)[:, None] for x in a + size * rng.standard_normal((2, 200, 3))
-    )
+    b, c = (x / np.linalg.norm(x, axis=1)[:, None] for x in a + size * rng.standard_normal((2, 200, 3)))
     # l'Huilier loses digits in the difference of sides: where a triangle is flat.
     scale = size**2
-    np.testing.assert_allclose(
-        triangle_areas(a, b, c), triangles(a, b, c), rtol=0, atol=1e-8 * scale
-    )
+    np.testing.assert_allclose(triangle_areas(a, b, c), triangles(a, b, c), rtol=0, atol=1e-8 * scale)
     assert np.array_equal(np.sign(triangle_areas(a, c, b)), -np.sign(triangle_areas(a, b, c)))
     octant = np.eye(3)[:, None]
     assert triangle_areas(*octant) == pytest.approx(np.pi / 2, rel=1e-15)
@@ -147,9 +135,7 @@ def test_kites_are_spherical_quadrilaterals(mesh):
         before, after = mesh.edge[edges[:, k]], mesh.edge[edges[:, (k + 1) % 3]]
         expected = triangles(place, before, generator) + triangles(place, generator, after)
         # l'Huilier's theorem subtracts sides: it has half of the digits where they are nearly in line.
-        np.testing.assert_allclose(
-            kites[:, k], expected, rtol=1e-7, atol=1e-9 * np.abs(kites).max()
-        )
+        np.testing.assert_allclose(kites[:, k], expected, rtol=1e-7, atol=1e-9 * np.abs(kites).max())
         of_cells += np.bincount(cells[:, k], kites[:, k], mesh.n)
     np.testing.assert_allclose(of_cells, mesh["areaCell"] / mesh.radius**2, rtol=1e-13)
     generators = mesh.cell[cells].swapaxes(0, 1)
@@ -190,9 +176,7 @@ def test_angles_are_from_the_east(mesh):
 
 def test_an_edge_at_a_pole_has_the_east_of_longitude_0(mesh):
     (at_pole,) = np.flatnonzero(mesh["latEdge"] > 1.57)
-    first = np.flatnonzero(
-        np.abs(mesh.cell - (0.3 / 1.09**0.5, 0, 1 / 1.09**0.5)).max(axis=1) < 1e-6
-    )[0]
+    first = np.flatnonzero(np.abs(mesh.cell - (0.3 / 1.09**0.5, 0, 1 / 1.09**0.5)).max(axis=1) < 1e-6)[0]
     assert mesh["lonEdge"][at_pole] == 0
     # From the generator at longitude 0 to that at 180 degrees: to the north.
     assert mesh.cellsOnEdge[at_pole] == [first, first + 1]
@@ -203,9 +187,7 @@ def test_an_edge_at_a_pole_has_the_east_of_longitude_0(mesh):
 def test_tables_are_counter_clockwise(mesh):
     for i in range(mesh.n):
         corners = mesh.vertex[mesh.verticesOnCell[i]]
-        fan = triangles(
-            np.broadcast_to(mesh.cell[i], corners.shape), corners, np.roll(corners, -1, axis=0)
-        )
+        fan = triangles(np.broadcast_to(mesh.cell[i], corners.shape), corners, np.roll(corners, -1, axis=0))
         # The theorem of l'Huilier has half of the digits in flat triangles.
         assert fan.sum() == pytest.approx(mesh["areaCell"][i] / mesh.radius**2, rel=1e-4)
         k = len(corners)
@@ -249,9 +231,7 @@ def test_curl_and_rotated_flow_of_a_potential(mesh):
     ):
         for i, around in enumerate(edges):
             signs = [1 if tables[e][0] == i else -1 for e in around]
-            assert sum(s * values[e] for s, e in zip(signs, around, strict=True)) == pytest.approx(
-                0, abs=1e-13
-            )
+            assert sum(s * values[e] for s, e in zip(signs, around, strict=True)) == pytest.approx(0, abs=1e-13)
 
 
 def test_tangential_velocities_of_a_turning_sphere(ctx, tmp_path):

@@ -29,8 +29,7 @@ def flat_angles(points, triangles):
     a, b, c = points[triangles].transpose(1, 0, 2)
     sides = [np.linalg.norm(x, axis=1) for x in (c - b, a - c, b - a)]
     cosines = [
-        (sides[k - 1] ** 2 + sides[k - 2] ** 2 - sides[k] ** 2) / (2 * sides[k - 1] * sides[k - 2])
-        for k in range(3)
+        (sides[k - 1] ** 2 + sides[k - 2] ** 2 - sides[k] ** 2) / (2 * sides[k - 1] * sides[k - 2]) for k in range(3)
     ]
     return np.degrees(np.arccos(np.stack(cosines, axis=1)))
 
@@ -95,9 +94,7 @@ def test_kites_one_by_one(globe):
 
 
 def test_kites_fill_each_cell(globe):
-    total = np.bincount(
-        face_owners(globe)[measure_c_grid(globe).corners], globe.measures.c_grid.kites
-    )
+    total = np.bincount(face_owners(globe)[measure_c_grid(globe).corners], globe.measures.c_grid.kites)
     assert total == pytest.approx(1, rel=1e-11)
 
 
@@ -129,9 +126,7 @@ def test_angle_of_centroids_is_along_the_sphere(globe):
         i, j = owner[face], d.neighbors[face]
         up = d.points[i] + d.points[j]
         up /= np.linalg.norm(up)
-        line, between = (
-            x - (x @ up) * up for x in (d.points[j] - d.points[i], d.centroids[j] - d.centroids[i])
-        )
+        line, between = (x - (x @ up) * up for x in (d.points[j] - d.points[i], d.centroids[j] - d.centroids[i]))
         cosine = line @ between / np.linalg.norm(line) / np.linalg.norm(between)
         expected = np.degrees(np.arccos(min(cosine, 1)))
         # arccos has the error sqrt(eps) at 0, 1e-6 degrees.
@@ -261,9 +256,7 @@ def test_bisected_icosahedron_is_accepted_for_mpas(ctx, dtype):
 
 
 def test_result_has_the_check_and_the_measures(ctx):
-    result = clvoro.Adapter(ctx, "float64").run(
-        clvoro.Sphere(1.0), 0.3, n_cells=150, method="lloyd", max_steps=5
-    )
+    result = clvoro.Adapter(ctx, "float64").run(clvoro.Sphere(1.0), 0.3, n_cells=150, method="lloyd", max_steps=5)
     assert result.measures.c_grid.angles.size == 3 * (2 * 150 - 4)
     report = result.check(solver="mpas")
     assert report["largest angle of triangle"].value == result.measures.c_grid.angles.max()

@@ -96,10 +96,7 @@ def test_float32_rounds_by_the_cells_not_the_domain(single):
     assert single.check(), single.check()
     widest = int(np.argmax(single.diagram.face_measures))
     for factor in (1.003, 0.997):
-        changed = of_diagram(
-            single,
-            face_measures=lambda m, f=factor: m * np.where(np.arange(len(m)) == widest, f, 1),
-        )
+        changed = of_diagram(single, face_measures=lambda m, f=factor: m * np.where(np.arange(len(m)) == widest, f, 1))
         assert "measures close" in names_of(changed.check())
     quality = single.quality.copy()
     quality[17] *= 1.0001
@@ -141,9 +138,7 @@ def test_vertex_that_is_stored_twice_is_found(kind, request):
         vertices=lambda x: np.concatenate([x, x[[vertex]]]),
         **{corners: lambda c: np.where(one & (c == vertex), len(d.vertices), c)},
     ).check()
-    assert names_of(report) == {"vertices once"} | (
-        {"Euler's formula"} if kind == "flat" else set()
-    )
+    assert names_of(report) == {"vertices once"} | ({"Euler's formula"} if kind == "flat" else set())
 
 
 def test_face_whose_two_ends_have_one_number_is_found(ctx):
@@ -151,18 +146,14 @@ def test_face_whose_two_ends_have_one_number_is_found(ctx):
     points = np.array([[1.0, 0.3], [0.0, 1.3], [-1.0, 0.3], [0.0, -0.7]])
     points[0, 0] += 4e-14
     adapter = clvoro.Adapter(ctx)
-    result = adapter.run(
-        clvoro.Box((-2, -2), (2, 2)), 1.0, points=points, method="lloyd", max_steps=0
-    )
+    result = adapter.run(clvoro.Box((-2, -2), (2, 2)), 1.0, points=points, method="lloyd", max_steps=0)
     d = result.diagram
     assert result.check()
     short = int(np.argmin(d.face_measures))
     assert 0 < d.face_measures[short] < 1e-13
     cell = np.searchsorted(d.neighbor_starts, short, "right") - 1
     begin, end = d.neighbor_starts[cell : cell + 2]
-    one, two = sorted(
-        int(d.cell_vertices[k]) for k in (short, short + 1 if short + 1 < end else begin)
-    )
+    one, two = sorted(int(d.cell_vertices[k]) for k in (short, short + 1 if short + 1 < end else begin))
     report = spoilt(
         result,
         vertices=lambda x: np.delete(x, two, axis=0),
@@ -184,7 +175,7 @@ HISTORIES = {
     "level": ("level", -1, 2, "level in row 2"),
     "coarse": ("level", slice(None), 2, "level 2"),
     "progress": ("progress", 0, 1.5, "progress in row 1"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", list(HISTORIES))
@@ -200,8 +191,12 @@ def test_history_fits_the_mesh(flat, case):
 
 
 def test_factor_of_the_sizes_needs_a_count(flat):
-    for changes in ({"size_factor": 3.0}, {"size_factor": -1.0}, {"size_factor": "much"},
-                    {"settings": {**flat.settings, "size_factor": 3}}):  # fmt: skip
+    for changes in (
+        {"size_factor": 3.0},
+        {"size_factor": -1.0},
+        {"size_factor": "much"},
+        {"settings": {**flat.settings, "size_factor": 3}},
+    ):
         assert names_of(dataclasses.replace(flat, **changes).check()) == {"size factor"}
     counted = dataclasses.replace(flat, size_factor=3.0, settings={**flat.settings, "n_cells": 90})
     assert counted.check()
@@ -209,8 +204,7 @@ def test_factor_of_the_sizes_needs_a_count(flat):
 
 @pytest.mark.parametrize("suffix", ["npz", "vtu"])
 @pytest.mark.parametrize(
-    ("change", "name"),
-    [({"volumes": put(4, -0.1)}, "volumes"), ({"points": put((4, 0), np.nan)}, "finite")],
+    ("change", "name"), [({"volumes": put(4, -0.1)}, "volumes"), ({"points": put((4, 0), np.nan)}, "finite")]
 )
 def test_what_is_no_number_is_told_without_warnings(flat, suffix, change, name, tmp_path, capfd):
     changed, path = of_diagram(flat, **change), str(tmp_path / f"m.{suffix}")
@@ -244,7 +238,7 @@ COMMON = {
     "nan": ({"vertices": put((20, 0), np.nan)}, "finite"),
     "starts": ({"neighbor_starts": put(3, 500)}, "shapes"),
     "short": ({"volumes": lambda v: v[:-1]}, "shapes"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.sparse(1)
@@ -260,9 +254,7 @@ def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):
     for m, spread in ((5, 30), (7, 30), (10, 200 if dtype == "float64" else 60)):
         middles = np.stack(np.meshgrid(*[np.arange(m)] * 3), -1).reshape(-1, 3) + 0.5
         noise = spread * eps * np.random.default_rng(3).standard_normal(middles.shape)
-        result = adapter.run(
-            box, 1 / m, (middles / m + noise) * box.extent, method="lloyd", max_steps=0
-        )
+        result = adapter.run(box, 1 / m, (middles / m + noise) * box.extent, method="lloyd", max_steps=0)
         result.check().demand()
         quality = result.quality.copy()
         quality[17] *= 1 + 2e4 * eps * m
@@ -347,9 +339,7 @@ def test_numbers_of_a_result_are_recomputed(flat, solid, name):
         values = getattr(result, name).copy()
         values[17] *= 1.001
         report = dataclasses.replace(result, **{name: values}).check()
-        assert ("quality" if name == "quality" else "size_error") in {
-            f.name for f in report.findings
-        }
+        assert ("quality" if name == "quality" else "size_error") in {f.name for f in report.findings}
 
 
 @pytest.mark.sparse(2)

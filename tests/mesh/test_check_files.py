@@ -42,14 +42,12 @@ CASES = [
     ("flat", "cell_data", "sides", put(3, 11)),
     ("flat", "cell_data", "generator", put((3, 2), 1e-9)),
     ("flat", "in_space", "Points", put((9, 2), np.nan)),
-]  # fmt: skip
+]
 
 
 @pytest.mark.sparse(4)
 @pytest.mark.parametrize(("kind", "part", "name", "change"), CASES)
-def test_arrays_for_other_programs_have_to_agree(
-    meshes, kind, part, name, change, tmp_path, monkeypatch
-):
+def test_arrays_for_other_programs_have_to_agree(meshes, kind, part, name, change, tmp_path, monkeypatch):
     path = tmp_path / "m.vtu"
     write_vtu(Contents.of(meshes[kind]), path)
     clvoro.load(path)

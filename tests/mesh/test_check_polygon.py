@@ -20,16 +20,7 @@ def adapters(ctx):
 @pytest.mark.parametrize("real", REALS)
 def test_faces_of_pieces_that_went_to_other_cells(adapters, real):
     """Two pieces in a prong belong to cells beside it. The middle of their common face is on another bisector."""
-    gaps = [
-        (0.57, 1),
-        (0.57, 0.1),
-        (0.55, 0.1),
-        (0.55, 1),
-        (0.45, 1),
-        (0.45, 0.1),
-        (0.43, 0.1),
-        (0.43, 1),
-    ]
+    gaps = [(0.57, 1), (0.57, 0.1), (0.55, 0.1), (0.55, 1), (0.45, 1), (0.45, 0.1), (0.43, 0.1), (0.43, 1)]
     domain = clvoro.Polygon([(0, 0), (1, 0), (1, 1), *gaps, (0, 1)])
     for side in (1, -1):
         above, below = (0.5 - 0.04 * side, 0.7), (0.5 + 0.04 * side, 0.4)
@@ -37,9 +28,7 @@ def test_faces_of_pieces_that_went_to_other_cells(adapters, real):
         report = diagram.check()
         assert report, report
         begin, end = diagram.vertices[diagram.face_vertices.reshape(-1, 2)].transpose(1, 0, 2)
-        upright = (
-            np.isclose(begin, end)[:, 0] & (diagram.neighbors >= 0) & (diagram.face_measures > 0.01)
-        )
+        upright = np.isclose(begin, end)[:, 0] & (diagram.neighbors >= 0) & (diagram.face_measures > 0.01)
         middles = np.isclose((begin + end) / 2, (0.5, 0.55)).all(axis=1)
         assert (upright & middles).sum() == 2
         assert Rebuilt(diagram).adopted[upright & middles].all()
@@ -95,9 +84,7 @@ def test_one_generator_on_the_boundary_has_its_precision(adapters):
 def test_pieces_of_one_cell_each_have_no_potential(adapters, method):
     """The source of an isolated cell minus its mean is 0 up to round-off."""
     corner, rng = np.array([(0, 0), (1, 0), (0.3, 0.7)]), np.random.default_rng(5)
-    domain = clvoro.Polygon.from_pieces(
-        [[corner * rng.uniform(0.1, 0.9) + (k % 4, k // 4)] for k in range(12)]
-    )
+    domain = clvoro.Polygon.from_pieces([[corner * rng.uniform(0.1, 0.9) + (k % 4, k // 4)] for k in range(12)])
     points = np.array([domain.inner_point(piece) for piece in range(12)])
     for adapter in adapters.values():
         result = adapter.run(domain, 0.3, points=points, method=method, max_steps=2)

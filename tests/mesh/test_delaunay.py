@@ -60,10 +60,7 @@ def test_squares_of_a_lattice_are_cut_in_two(adapter):
 
 
 def test_around_a_hole(adapter):
-    square, hole = (
-        [(0, 0), (2, 0), (2, 2), (0, 2)],
-        [(0.8, 0.8), (1.2, 0.8), (1.2, 1.2), (0.8, 1.2)],
-    )
+    square, hole = ([(0, 0), (2, 0), (2, 2), (0, 2)], [(0.8, 0.8), (1.2, 0.8), (1.2, 1.2), (0.8, 1.2)])
     domain = clvoro.Polygon(square, [hole])
     points = np.random.default_rng(311).random((900, 2)) * 2
     points = points[domain.contains(points)]

@@ -10,10 +10,23 @@ import clvoro
 from clvoro.errors import InputError, InputTypeError
 
 TEETH = clvoro.Polygon(
-    [(0, 0), (6, 0), (6, 3), (4.1, 3), (4.1, 0.4), (3.9, 0.4), (3.9, 3),
-     (2.1, 3), (2.1, 0.4), (1.9, 0.4), (1.9, 3), (0, 3)],
-    [[(0.5, 1), (1.2, 1), (1.2, 1.7), (0.5, 1.7)]], names={"inlet": 11, "island": "hole-1"},
-)  # fmt: skip
+    [
+        (0, 0),
+        (6, 0),
+        (6, 3),
+        (4.1, 3),
+        (4.1, 0.4),
+        (3.9, 0.4),
+        (3.9, 3),
+        (2.1, 3),
+        (2.1, 0.4),
+        (1.9, 0.4),
+        (1.9, 3),
+        (0, 3),
+    ],
+    [[(0.5, 1), (1.2, 1), (1.2, 1.7), (0.5, 1.7)]],
+    names={"inlet": 11, "island": "hole-1"},
+)
 """Thin walls that cut parts of cells off, and a hole."""
 DOMAINS = {
     "box": (clvoro.Box((-1, 0), (2, 1.5)), 60),
@@ -25,7 +38,7 @@ DOMAINS = {
     "space": (clvoro.Box((0, 0, 5), (1, 2, 6)), 60),
     "periodic space": (clvoro.Box((0, 0, 5), (1, 2, 6), periodic=(True, True, False)), 40),
     "few in periodic space": (clvoro.Box((0, 0, 0), (1, 2, 1), periodic=True), 2),
-}  # fmt: skip
+}
 
 
 def random_points(domain, n, seed=5):
@@ -63,9 +76,7 @@ def test_every_face_is_there_once(case):
     assert (f.neighbor[: f.n_inner] >= f.owner[: f.n_inner]).all()
     assert sorted(f.half_face[f.n_inner :]) == walls
     # A face with almost no measure may exist in one of its cells only.
-    assert abs(2 * f.n_inner - (len(rows) - len(walls))) <= np.count_nonzero(
-        diagram.face_measures < noise
-    )
+    assert abs(2 * f.n_inner - (len(rows) - len(walls))) <= np.count_nonzero(diagram.face_measures < noise)
     np.testing.assert_array_equal(f.area, diagram.face_measures[f.half_face])
     parts = np.zeros(len(diagram))
     np.add.at(parts, f.owner, f.area)
@@ -84,10 +95,7 @@ def test_faces_close_cells(case):
     np.testing.assert_allclose(np.linalg.norm(f.normal, axis=1), 1, atol=1e-12)
     vectors, volumes = np.zeros((len(diagram), d)), np.zeros(len(diagram))
     back = f.center[:inner] - f.shift[:inner] * diagram.domain.extent
-    sides = [
-        (f.owner, f.center, f.normal, f.area),
-        (f.neighbor[:inner], back, -f.normal[:inner], f.area[:inner]),
-    ]
+    sides = [(f.owner, f.center, f.normal, f.area), (f.neighbor[:inner], back, -f.normal[:inner], f.area[:inner])]
     for cell, center, normal, area in sides:
         np.add.at(vectors, cell, area[:, None] * normal)
         arm = ((center - diagram.points[cell]) * normal).sum(axis=1)
@@ -158,7 +166,7 @@ def test_cells(case):
             if x.shape[1] == 2:
                 volume += np.linalg.det(x) / 2
             elif len(x):
-                volume += sum(np.linalg.det([x[0], *x[j : j + 2]]) / 6 for j in range(1, len(x) - 1))  # fmt: skip
+                volume += sum(np.linalg.det([x[0], *x[j : j + 2]]) / 6 for j in range(1, len(x) - 1))
         assert volume == pytest.approx(cell.volume, abs=20 * noise)
     assert diagram.cell(-1).index == len(diagram) - 1
 
@@ -191,9 +199,7 @@ def test_locate(case):
     domain = diagram.domain
     points = random_points(domain, 50, seed=77)
     if isinstance(domain, clvoro.Polygon):
-        expected = [
-            next(i for i in range(len(diagram)) if winds_around(diagram, i, x)) for x in points
-        ]
+        expected = [next(i for i in range(len(diagram)) if winds_around(diagram, i, x)) for x in points]
         assert (expected != nearest(diagram, points)).any()
     else:
         expected = nearest(diagram, points)
@@ -283,7 +289,7 @@ def test_to_shapely(case):
     ],
 )
 def test_bad_arguments(ctx, call, error, message):
-    diagram = clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)])  # fmt: skip
+    diagram = clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)])
     with pytest.raises(error, match=message):
         call(diagram)
 

@@ -172,8 +172,6 @@ def test_line_for_people(solid):
     result = solids.solid_result(solid)
     s = result.measures.summary()
     numbers = [float(x) for x in re.findall(r"[\d.]+", str(result.measures))]
-    names = (
-        "mean_faces", "mean_skewness", "max_skewness", "mean_centroid_angle", "max_centroid_angle",
-    )  # fmt: skip
+    names = ("mean_faces", "mean_skewness", "max_skewness", "mean_centroid_angle", "max_centroid_angle")
     assert numbers == pytest.approx([s[name] for name in names], abs=0.05)
     assert numbers[0] == pytest.approx(len(solid.neighbors) / len(solid), abs=0.005)

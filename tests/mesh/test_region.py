@@ -141,9 +141,7 @@ def test_boundaries_keep_their_names(globe):
     # Selecting at once gives the same cells and the same walls.
     whole = globe.subset((lat < 50) & (lon > -100) & (lat > -50))
     assert np.array_equal(whole.points, three.points)
-    assert np.array_equal(
-        np.sort(whole.domain.beyond, axis=0), np.sort(three.domain.beyond, axis=0)
-    )
+    assert np.array_equal(np.sort(whole.domain.beyond, axis=0), np.sort(three.domain.beyond, axis=0))
 
 
 def test_results_keep_their_data(globe):

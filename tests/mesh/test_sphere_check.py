@@ -91,9 +91,7 @@ def test_arcs_and_centroids_are_those_of_quadrature(ctx):
         arcs = np.arccos((corners * following).sum(axis=1))
         # arccos loses digits at small arcs.
         assert cells.measures[rows] == pytest.approx(arcs, rel=1e-12, abs=1e-8)
-        total = sum(
-            integral_of_position(d.points[i], a, b) for a, b in zip(corners, following, strict=True)
-        )
+        total = sum(integral_of_position(d.points[i], a, b) for a, b in zip(corners, following, strict=True))
         centroid = total / np.linalg.norm(total)
         # Midpoint rule on 4^6 triangles per corner.
         assert d.points[i] + cells.centroids[i] == pytest.approx(centroid, abs=1e-4)
@@ -105,9 +103,7 @@ def integral_of_position(a, b, c, depth=6):
     for _ in range(depth):
         a, b, c = corners.transpose(1, 0, 2)
         ab, bc, ca = (x / np.linalg.norm(x, axis=1)[:, None] for x in (a + b, b + c, c + a))
-        corners = np.concatenate(
-            [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-        )
+        corners = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
     a, b, c = corners.transpose(1, 0, 2)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     middles = a + b + c
@@ -162,10 +158,7 @@ DAMAGE = {
     "wrong area": ({"volumes": scale(5, 1.002)}, {"volumes of the generators"}),
     "very wrong area": ({"volumes": scale(5, 1.3)}, {"volumes", "volumes sum"}),
     "negative area": ({"volumes": scale(5, -1)}, {"volumes", "volumes sum"}),
-    "wrong arc": (
-        {"face_measures": lambda x: scale(int(np.argmax(x)), 1.002)(x)},
-        {"face measures of the generators"},
-    ),
+    "wrong arc": ({"face_measures": lambda x: scale(int(np.argmax(x)), 1.002)(x)}, {"face measures of the generators"}),
     "very wrong arc": (
         {"face_measures": lambda x: scale(int(np.argmax(x)), 1.3)(x)},
         {"face measures", "faces the same from both sides"},
@@ -177,13 +170,10 @@ DAMAGE = {
     "wall": ({"neighbors": put(3, -1)}, {"neighbors exist"}),
     "shift": ({"shifts": put((3, 0), 1)}, {"shifts"}),
     "corner of another vertex": ({"cell_vertices": put(0, 700)}, {"vertices once", "nearest generators"}),
-    "vertex without cell": (
-        {"vertices": lambda x: np.concatenate([x, x[:1]])},
-        {"vertices used", "Euler's formula"},
-    ),
+    "vertex without cell": ({"vertices": lambda x: np.concatenate([x, x[:1]])}, {"vertices used", "Euler's formula"}),
     "not a number": ({"vertices": add((3, 1), np.nan)}, {"finite"}),
     "generators in other rows": ({"points": swap(4, 5)}, {"nearest generators"}),
-}  # fmt: skip
+}
 
 
 @pytest.mark.sparse(14)

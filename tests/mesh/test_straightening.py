@@ -15,18 +15,10 @@ CORNERS = {
         [1, 0, 1, 1, 0, 1, 0],
     ),
     # A face ends in the re-entrant corner.
-    "ell": (
-        ELL,
-        [(x, y) for x in (0.25, 0.75) for y in (0.25, 0.75) if x + y < 1.4],
-        [1, 1, 1],
-    ),
+    "ell": (ELL, [(x, y) for x in (0.25, 0.75) for y in (0.25, 0.75) if x + y < 1.4], [1, 1, 1]),
     # Turns of 9 degrees make corners of cells only if one cell has several of them.
     "round, few cells": (circle(40, 0.4), [(0.3, 0.5), (0.7, 0.5)], [1, 1]),
-    "thin": (
-        [(0, 0), (9, 0), (9, 1), (0, 1)],
-        [(x + 0.5, 0.5) for x in range(9)],
-        [1, *[0] * 7, 1],
-    ),
+    "thin": ([(0, 0), (9, 0), (9, 1), (0, 1)], [(x + 0.5, 0.5) for x in range(9)], [1, *[0] * 7, 1]),
 }
 
 

@@ -29,17 +29,7 @@ SHAPES = [7, (7,), (7, 2), (3, 4, 5), (), (0,), (0, 2), (1,)]
 def test_arrays_agree_with_pyopencl(queue, shape):
     dtype = np.dtype(np.int32)
     mine, plain = make_array(queue, shape, dtype), cla.Array(queue, shape, dtype)
-    for name in (
-        "shape",
-        "dtype",
-        "strides",
-        "size",
-        "nbytes",
-        "offset",
-        "queue",
-        "context",
-        "ndim",
-    ):
+    for name in ("shape", "dtype", "strides", "size", "nbytes", "offset", "queue", "context", "ndim"):
         assert getattr(mine, name) == getattr(plain, name), name
     assert (mine.base_data is None) == (plain.base_data is None)
     assert mine.flags.c_contiguous == plain.flags.c_contiguous
@@ -51,9 +41,18 @@ def test_arrays_agree_with_pyopencl(queue, shape):
 
 
 INDICES = [
-    slice(None), slice(None, 0), slice(None, 3), slice(None, 9), slice(2, 5), slice(None, -2), slice(None, 6, 2),
-    0, 6, -1, np.int64(4),
-]  # fmt: skip
+    slice(None),
+    slice(None, 0),
+    slice(None, 3),
+    slice(None, 9),
+    slice(2, 5),
+    slice(None, -2),
+    slice(None, 6, 2),
+    0,
+    6,
+    -1,
+    np.int64(4),
+]
 
 
 @pytest.mark.usefixtures("quick")

@@ -71,9 +71,7 @@ def test_order_of_choice(machine, devices, broken, expected):
     assert [d.name for d in chosen] == [expected.name]
 
 
-ON_INTEL = FakeDevice(
-    -6, "Portable Computing Language", "cpu-Intel(R) Xeon(R)", CPU, vendor="GenuineIntel"
-)
+ON_INTEL = FakeDevice(-6, "Portable Computing Language", "cpu-Intel(R) Xeon(R)", CPU, vendor="GenuineIntel")
 
 
 @pytest.mark.parametrize("query", ["intel", "Intel(R)", " INTEL "])
@@ -133,7 +131,7 @@ def test_choice_by_name_kind_and_index(machine, query, expected):
         ([POCL], "pocl", "pocl-opencl-icd"),  # and it does not work
         ([SMALL_GPU, INTEL, POCL], "pocl", f"use {INTEL.platform.name} / "),  # the GPU has no float64
     ],
-)  # fmt: skip
+)
 def test_messages_suggest_an_existing_device(machine, monkeypatch, devices, query, remedy):
     monkeypatch.delenv("PYOPENCL_CTX", raising=False)
     machine(*devices, broken=[POCL] if query == "pocl" else [])
@@ -208,11 +206,7 @@ def test_real_devices_are_listed_with_their_verdict(ctx):
     [
         ("x * x", "x * undeclared", "cannot build and run"),
         ("sqrt(x * x)", "0 * sqrt(x * x)", "wrong results"),
-        (
-            "#if PROBE_FP64",
-            "#define fma(a, b, c) ((a)*(b) + (c))\n#if PROBE_FP64",
-            "rounds the product",
-        ),
+        ("#if PROBE_FP64", "#define fma(a, b, c) ((a)*(b) + (c))\n#if PROBE_FP64", "rounds the product"),
         ("return a * b;", "return fma(a, b, (T)1e-7);", "contracts"),
     ],
 )
@@ -231,13 +225,9 @@ def test_probe_detects_broken_runtimes(ctx, monkeypatch, good, bad, verdict):
 def test_probe_detects_contraction(ctx, monkeypatch):
     """PoCL contracts by default where the processor has fma."""
     cpu = Path("/proc/cpuinfo")
-    if ctx.devices[0].platform.name.strip() != program.POCL or " fma " not in (
-        cpu.read_text() if cpu.exists() else ""
-    ):
+    if ctx.devices[0].platform.name.strip() != program.POCL or " fma " not in (cpu.read_text() if cpu.exists() else ""):
         pytest.skip("needs a device that contracts by default")
-    monkeypatch.setattr(
-        _probe, "_PROBE", _probe._PROBE.replace("FP_CONTRACT OFF", "FP_CONTRACT ON")
-    )
+    monkeypatch.setattr(_probe, "_PROBE", _probe._PROBE.replace("FP_CONTRACT OFF", "FP_CONTRACT ON"))
     assert _probe.CONTRACT_OFF in _probe.probe(ctx.devices[0])
     assert _probe.CONTRACT_OFF in program.source_text("opencl/real.h")
 
@@ -254,10 +244,7 @@ def test_quotients_are_rounded_where_the_device_can(monkeypatch):
 def test_options_of_the_device_are_built_with(ctx, monkeypatch):
     monkeypatch.setattr(program, "device_options", lambda _: ("-DFROM_DEVICE=7",))
     built = program.compile_text(ctx, "kernel void put(global int *x) { x[0] = FROM_DEVICE; }", ())
-    assert (
-        built.get_build_info(ctx.devices[0], cl.program_build_info.OPTIONS).count("FROM_DEVICE=7")
-        == 1
-    )
+    assert built.get_build_info(ctx.devices[0], cl.program_build_info.OPTIONS).count("FROM_DEVICE=7") == 1
 
 
 @pytest.mark.slow
@@ -376,11 +363,7 @@ def test_process_gets_a_cache_if_the_users_is_read_only(tmp_path):
     blocked = {"XDG_CACHE_HOME": str(tmp_path / "file" / "cache"), "TMPDIR": str(tmp_path)}
     given = {key: value for key, value in os.environ.items() if key != "POCL_CACHE_DIR"}
     done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        env={**given, **blocked},
-        capture_output=True,
-        text=True,
+        [sys.executable, "-c", code], cwd=ROOT, env={**given, **blocked}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     folder = Path(done.stdout.strip())
@@ -396,7 +379,5 @@ def test_pip_runtime_works_without_others(tmp_path):
     code = "from clvoro.opencl import devices as device; print(device.create_context('intel').devices[0].platform.name)"
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("OCL_", "OPENCL_"))}
     environment["OCL_ICD_VENDORS"] = str(tmp_path)  # no system-wide runtime
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.stdout.strip() == "Intel(R) OpenCL", done.stderr

@@ -57,9 +57,15 @@ def test_changed_arguments_are_set(engine, kernel, settings):
     source = engine.upload(np.arange(8.0))
     first, second = engine.zeros(8), engine.zeros(8)
     cases = [
-        ({}, 0), ({"x": 0.5}, 0.5), ({"x": -0.0}, -1000), ({"x": 0.0}, 0), ({"shift": (1, 2)}, 21),
-        ({"shift": (2, 1)}, 12), ({"n": 3}, 0), ({"n": 4}, 0),
-    ]  # fmt: skip
+        ({}, 0),
+        ({"x": 0.5}, 0.5),
+        ({"x": -0.0}, -1000),
+        ({"x": 0.0}, 0),
+        ({"shift": (1, 2)}, 21),
+        ({"shift": (2, 1)}, 12),
+        ({"n": 3}, 0),
+        ({"n": 4}, 0),
+    ]
     for to in (first, second, first[:5], second[:4], first):
         for how, more in cases:
             to.fill(-5)
@@ -163,7 +169,5 @@ def test_coarse_levels_take_smaller_groups(ctx, monkeypatch):
     result = adapter.run(clvoro.Box((0, 0), (1, 1)), 0.02, seed=1, **method)
     assert result.diagram.volumes.sum() == pytest.approx(1)
     assert np.abs(result.size_error).max() < 1
-    of_one_group = {
-        group for stage, size, group in launched.values() if stage == "multigrid" and size == group
-    }
+    of_one_group = {group for stage, size, group in launched.values() if stage == "multigrid" and size == group}
     assert of_one_group == {8, 32}

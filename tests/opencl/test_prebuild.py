@@ -46,11 +46,7 @@ def engine(ctx):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind",
-    [
-        "2D box",
-        *(pytest.param(k, marks=pytest.mark.slow) for k in first_run.RECORDED if k != "2D box"),
-    ],
+    "kind", ["2D box", *(pytest.param(k, marks=pytest.mark.slow) for k in first_run.RECORDED if k != "2D box")]
 )
 def test_record_has_the_kernels_of_a_run(engine, kind):
     """If this fails: `python bench/first_run.py --record`."""
@@ -68,22 +64,11 @@ def test_record_has_the_kernels_of_a_run(engine, kind):
 def test_workers_build_recorded_kernels_once(engine, tmp_path):
     record = {
         "programs": [["opencl/primitives", {}], ["adaptation/motion", {}]],
-        "launches": [
-            [0, "gather_rows", 64, [4, 0, 0, 4, 0]],
-            [0, "scan_blocks", 1, [0, 4, 4, 0, 0, 0, 4]],
-        ],
+        "launches": [[0, "gather_rows", 64, [4, 0, 0, 4, 0]], [0, "scan_blocks", 1, [0, 4, 4, 0, 0, 0, 4]]],
     }
-    env = {
-        **os.environ,
-        "POCL_CACHE_DIR": str(tmp_path),
-        "PYTHONPATH": str(Path(clvoro.__file__).parents[1]),
-    }
+    env = {**os.environ, "POCL_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(clvoro.__file__).parents[1])}
     ended = subprocess.run(
-        [sys.executable, "-c", BUILD, json.dumps(record)],
-        env=env,
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-c", BUILD, json.dumps(record)], env=env, capture_output=True, text=True, check=True
     )
     counts, codes = json.loads(ended.stdout)
     assert counts == [2, 0]
@@ -95,9 +80,7 @@ def test_workers_build_recorded_kernels_once(engine, tmp_path):
 
 
 def test_workers_share_whole_programs_last_ones_first():
-    launches = [
-        prebuild.Launch(p, name, 1, []) for p, name in [(0, "a"), (1, "b"), (0, "c"), (2, "d")]
-    ]
+    launches = [prebuild.Launch(p, name, 1, []) for p, name in [(0, "a"), (1, "b"), (0, "c"), (2, "d")]]
     names = [[launch.kernel for launch in prebuild._share(launches, i, 2)] for i in range(2)]
     assert names == [["d", "b"], ["c", "a"]]
     assert [launch.kernel for launch in prebuild._share(launches, 0, 1)] == ["d", "c", "b", "a"]
@@ -175,13 +158,7 @@ def test_threads_build_programs_once(ctx, monkeypatch):
     with pytest.raises(cl.RuntimeError, match="wrong"):
         program._build_once(ctx, "wrong", ())
     assert program._build_once(ctx, "last", ()) == "LAST"
-    assert built == [
-        ("first", False),
-        ("second", True),
-        ("wrong", False),
-        ("last", False),
-        ("wrong", True),
-    ]
+    assert built == [("first", False), ("second", True), ("wrong", False), ("last", False), ("wrong", True)]
 
 
 def test_warnings_of_compilers_are_ignored_in_all_threads(recwarn):
@@ -211,9 +188,7 @@ def test_threads_know_the_programs_of_gpus(ctx, monkeypatch, real, kind):
     monkeypatch.setattr(prebuild, "_is_new", lambda *_: True)
     monkeypatch.setattr(prebuild, "_known", set())
     ahead, built, plain = [], set(), program.program_text
-    monkeypatch.setattr(
-        prebuild, "build_in_threads", lambda _, programs, threads: ahead.extend(programs)
-    )
+    monkeypatch.setattr(prebuild, "build_in_threads", lambda _, programs, threads: ahead.extend(programs))
 
     def noted(name, defines, prelude):
         text = plain(name, defines, prelude)

@@ -83,10 +83,7 @@ def test_summaries_are_read_together_with_integers(engine):
     """Slots keep their values until they are collected again. A slot that was never collected holds zeros."""
     rng, n = np.random.default_rng(8), 500
     arrays = {name: rng.normal(size=n).astype(engine.real) for name in "abc"}
-    summaries, notes = (
-        Summaries(engine, "zabc"),
-        [engine.upload(k, np.int32) for k in ([-7], [5, 4])],
-    )
+    summaries, notes = (Summaries(engine, "zabc"), [engine.upload(k, np.int32) for k in ([-7], [5, 4])])
     for name, array in arrays.items():
         summaries.collect(name, engine.upload(array), n)
         assert summaries.read_one(name).largest == array.max()
@@ -185,9 +182,5 @@ def test_gather_lists(scan, dtype, width, n):
     assert np.array_equal(found.get(), items[places].astype(dtype))
     if dtype == np.int32 and width is None:
         names = rng.permutation(n)
-        renamed = Gather(engine).lists(
-            lists, engine.upload(items, dtype), engine.upload(names, dtype)
-        )
-        assert np.array_equal(
-            renamed.get(), np.where(items >= 0, names[np.maximum(items, 0)], items)[places]
-        )
+        renamed = Gather(engine).lists(lists, engine.upload(items, dtype), engine.upload(names, dtype))
+        assert np.array_equal(renamed.get(), np.where(items >= 0, names[np.maximum(items, 0)], items)[places])

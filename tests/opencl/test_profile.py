@@ -18,13 +18,7 @@ from clvoro.opencl.profile import Profile, copy_bandwidth, profiled_queue
 from clvoro.solvers.multigrid import Multigrid
 
 BOX = clvoro.Box((0, 0), (1.4, 1))
-SETTINGS = {
-    "method": "coupled",
-    "max_steps": 5,
-    "options": clvoro.PaperOptions(tol=0),
-    "n_cells": 301,
-    "seed": 6151,
-}
+SETTINGS = {"method": "coupled", "max_steps": 5, "options": clvoro.PaperOptions(tol=0), "n_cells": 301, "seed": 6151}
 
 
 @pytest.fixture(scope="module")
@@ -75,13 +69,7 @@ def test_steps_are_those_of_the_history(run):
     assert taken.spans[-1].step is None
     assert [s.step for s in taken.steps] == [1, 2, 3, 4, 5]
     for span in taken.steps:  # each step solves, moves, and tessellates
-        assert (
-            min(
-                span.stages[name]
-                for name in ("incremental", "cells", "conjugate_gradient", "motion")
-            )
-            > 0
-        )
+        assert min(span.stages[name] for name in ("incremental", "cells", "conjugate_gradient", "motion")) > 0
 
 
 def test_all_kinds_of_commands_are_counted(run, engine):
@@ -153,13 +141,7 @@ def test_calls_and_bytes_of_known_launches(engine):
 def test_times_are_those_of_the_events(engine):
     x = engine.zeros(200_000)
     kernel = engine.kernels("opencl/primitives").summarize_blocks
-    args = (
-        *[x] * 8,
-        np.int32(1),
-        np.int32(len(x)),
-        np.zeros(8, np.int32),
-        engine.empty(6 * engine.groups),
-    )
+    args = (*[x] * 8, np.int32(1), np.int32(len(x)), np.zeros(8, np.int32), engine.empty(6 * engine.groups))
     with Profile(engine.queue) as taken:
         events = [engine.run_blocks(kernel, *args) for _ in range(9)]
     seconds = sum(1e-9 * (e.profile.end - e.profile.start) for e in events)
@@ -170,13 +152,7 @@ def test_times_are_those_of_the_events(engine):
 def test_few_events_are_kept(engine, monkeypatch):
     monkeypatch.setattr(profile, "PENDING", 10)
     x, kernel = engine.zeros(64), engine.kernels("opencl/primitives").summarize_blocks
-    args = (
-        *[x] * 8,
-        np.int32(1),
-        np.int32(64),
-        np.zeros(8, np.int32),
-        engine.empty(6 * engine.groups),
-    )
+    args = (*[x] * 8, np.int32(1), np.int32(64), np.zeros(8, np.int32), engine.empty(6 * engine.groups))
     most = 0
     with Profile(engine.queue) as taken:
         for _ in range(57):

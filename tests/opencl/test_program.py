@@ -100,14 +100,9 @@ def test_short_declarations_have_the_functions_of_formulas(ctx, monkeypatch, rea
 def test_programs_are_the_same_for_all_periods(ctx):
     """Stages and their memory are kept for the last periods only."""
     adapter = clvoro.Adapter(ctx)
-    engines = [
-        adapter._stages_for(clvoro.Box((0, 0, 0), (1, 1, z), periodic=True)).engine
-        for z in (1, 0.9)
-    ]
+    engines = [adapter._stages_for(clvoro.Box((0, 0, 0), (1, 1, z), periodic=True)).engine for z in (1, 0.9)]
     assert len(adapter._stages) == 1
-    assert (
-        adapter._stages_for(clvoro.Box((0, 0, 0), (2, 2, 1.8), periodic=True)).engine is engines[1]
-    )
+    assert adapter._stages_for(clvoro.Box((0, 0, 0), (2, 2, 1.8), periodic=True)).engine is engines[1]
     assert [engine.period_args[0][2] for engine in engines] == pytest.approx([1, 0.9])
     texts = [engine.all_defines("adaptation/motion", {}) for engine in engines]
     assert texts[0] == texts[1]
@@ -127,11 +122,7 @@ def test_binaries_are_kept_where_the_driver_keeps_none(ctx, tmp_path):
     """PyOpenCL does it. PoCL stands for another driver here."""
     kept = []
     for run in range(2):
-        places = {
-            "XDG_CACHE_HOME": tmp_path,
-            "POCL_CACHE_DIR": tmp_path / f"pocl {run}",
-            "POCL_KERNEL_CACHE": 0,
-        }
+        places = {"XDG_CACHE_HOME": tmp_path, "POCL_CACHE_DIR": tmp_path / f"pocl {run}", "POCL_KERNEL_CACHE": 0}
         environment = {**os.environ, **{name: str(value) for name, value in places.items()}}
         subprocess.run([sys.executable, "-c", RUN_WITHOUT_A_CACHE], env=environment, check=True)
         kept.append({path: path.stat().st_mtime for path in tmp_path.glob("pyopencl/**/binary")})

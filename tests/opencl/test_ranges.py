@@ -87,15 +87,7 @@ QUICK = {"coupled": (0.05, WORK[0]), "exact number": (0.1, WORK[2])}
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name",
-    [
-        "plane",
-        *(
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in (*QUICK, *LARGE)
-            if name != "plane"
-        ),
-    ],
+    "name", ["plane", *(pytest.param(name, marks=pytest.mark.slow) for name in (*QUICK, *LARGE) if name != "plane")]
 )
 def test_ranges_change_no_bit(ctx, monkeypatch, name):
     """Runs of all kinds, in ranges of one to many groups: kernels do not depend on the number of a group."""

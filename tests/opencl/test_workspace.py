@@ -81,10 +81,7 @@ def test_frames_take_the_same_memory_in_turn(engine, made):
                 with engine.workspace.frame():
                     take(engine)
     assert len(made) == before
-    once = sum(
-        max(np.prod(shape, dtype=int) * np.dtype(dtype or float).itemsize, 1)
-        for shape, dtype in SHAPES
-    )
+    once = sum(max(np.prod(shape, dtype=int) * np.dtype(dtype or float).itemsize, 1) for shape, dtype in SHAPES)
     # Two of each at a time.
     assert 2 * once <= sum(made) <= 2 * once * (1 + 1 / SPARE) + SMALL
 
@@ -182,16 +179,12 @@ def test_few_views_are_kept(engine):
 
 
 @pytest.mark.sparse(1)
-@pytest.mark.parametrize(
-    "method", [WeightedMethod(tolerance=1e-2), ProjectedMethod(), ProjectedMethod("quality", 0.3)]
-)
+@pytest.mark.parametrize("method", [WeightedMethod(tolerance=1e-2), ProjectedMethod(), ProjectedMethod("quality", 0.3)])
 def test_steps_allocate_nothing(engine, made, method):
     """After two similar steps, a step of displacement, motion, update of the diagram and quality allocates nothing."""
     field = sizing.Expression("0.05 + 0.02 * x")
     points = engine.upload(patch.relaxed_points(500, 3) / patch.BOX.frame[1])
-    mesh = MeshState.create(
-        Stages(engine), patch.BOX, sizing.Sizing(engine, patch.BOX, field), points
-    )
+    mesh = MeshState.create(Stages(engine), patch.BOX, sizing.Sizing(engine, patch.BOX, field), points)
     counts = []
     for _ in range(7):
         with engine.workspace.frame():
@@ -230,20 +223,14 @@ def test_released_stages_leave_no_memory(engine, monkeypatch):
     try:
         size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
         mesh = MeshState.create(stages, patch.BOX, size, engine.upload(host))
-        for method in (
-            PublishedMethod(Relaxation(), True, True),
-            WeightedMethod(),
-            ProjectedMethod(),
-        ):
+        for method in (PublishedMethod(Relaxation(), True, True), WeightedMethod(), ProjectedMethod()):
             with engine.workspace.frame():
                 method.displace(mesh)
                 method.move(mesh)
             mesh.update()
         mesh.insert_delete()
         stages.poisson.set_up_multigrid(
-            stages.poisson.assemble(
-                mesh.t.starts, mesh.t.neighbors, mesh.t.face_measures, mesh.points
-            )
+            stages.poisson.assemble(mesh.t.starts, mesh.t.neighbors, mesh.t.face_measures, mesh.points)
         )
         assert len(alive) > 20
         stages.release()
@@ -259,10 +246,7 @@ def test_kernels_are_not_shared_until_released(engine):
     assert first.scan_blocks is first.scan_blocks
     assert len(held) == 2
     engine.pool.release()
-    third, fourth = (
-        engine.kernels("opencl/primitives"),
-        engine.single().kernels("opencl/primitives"),
-    )
+    third, fourth = (engine.kernels("opencl/primitives"), engine.single().kernels("opencl/primitives"))
     assert third.scan_blocks.int_ptr in held
     assert fourth.scan_blocks.int_ptr not in held  # another program
     with pytest.raises(AttributeError, match="has no kernel nothing"):
@@ -276,9 +260,7 @@ def test_no_buffer_is_larger_than_the_device_allows(engine, made, monkeypatch):
     with engine.workspace.frame():
         engine.scratch(39_990, np.uint8)
     assert made == [40_000]
-    with pytest.raises(
-        MemoryLimitError, match=r"needs 39\.1 KiB, and .* at most 39\.1 KiB for one"
-    ):
+    with pytest.raises(MemoryLimitError, match=r"needs 39\.1 KiB, and .* at most 39\.1 KiB for one"):
         engine.empty(40_001, np.uint8)
     with engine.workspace.frame(), pytest.raises(MemoryLimitError, match="at most"):
         engine.scratch(5001)

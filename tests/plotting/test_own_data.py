@@ -89,9 +89,7 @@ def test_views(diagram):
     else:
         assert diagram.plot(view="slice", normal="x").axes[0].get_xlabel() == "y"
         diagram.plot(view="cutaway", cut=POINTS[:, 0] < 0.5, angles=(30, 30))
-        with pytest.raises(
-            InputError, match="ax is for 2D, slice, cutaway, sphere, and this picture"
-        ):
+        with pytest.raises(InputError, match="ax is for 2D, slice, cutaway, sphere, and this picture"):
             diagram.plot(ax="any")
         with pytest.raises(InputError, match="view is 'all', expected one of slices, slice"):
             diagram.plot(view="all")

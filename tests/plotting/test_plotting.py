@@ -13,15 +13,7 @@ from matplotlib.quiver import Quiver
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.plotting import (
-    page,
-    pixels,
-    plot_cells,
-    plot_displacements,
-    plot_history,
-    plot_size,
-    write_report,
-)
+from clvoro.plotting import page, pixels, plot_cells, plot_displacements, plot_history, plot_size, write_report
 from clvoro.plotting.curves import MOST_ARROWS, _magnifications
 from clvoro.plotting.legends import short
 from clvoro.plotting.pictures import pictures_of, render
@@ -43,13 +35,7 @@ def adapter(ctx):
 def results(adapter):
     return {
         method: adapter.run(
-            BOX,
-            size,
-            method=method,
-            points="uniform",
-            max_steps=6,
-            options=clvoro.PaperOptions(tol=0),
-            seed=4711,
+            BOX, size, method=method, points="uniform", max_steps=6, options=clvoro.PaperOptions(tol=0), seed=4711
         )
         for method in ("lloyd", "coupled")
     }
@@ -156,8 +142,7 @@ def test_axes_of_a_plain_figure_make_room_for_the_color_bar(result):
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0024, "0.0024"), (12345.0, "12000"), (3e-7, "3e−07"), (-0.05, "−0.05"), (2.0, "2")],
+    ("value", "text"), [(0.0024, "0.0024"), (12345.0, "12000"), (3e-7, "3e−07"), (-0.05, "−0.05"), (2.0, "2")]
 )
 def test_numbers_of_a_scale_are_short(value, text):
     assert short(value) == text
@@ -274,12 +259,7 @@ def test_history_is_drawn_as_recorded(results):
 
 def test_displacements_say_their_magnification(result):
     figure = plot_displacements(result)
-    wanted = (
-        result.initial.lloyd,
-        result.initial.poisson,
-        result.final.lloyd,
-        result.final.poisson,
-    )
+    wanted = (result.initial.lloyd, result.initial.poisson, result.final.lloyd, result.final.poisson)
     assert len(figure.axes) == 4
     for ax, vectors in zip(figure.axes, wanted, strict=True):
         (quiver,) = [c for c in ax.collections if isinstance(c, Quiver)]
@@ -295,9 +275,7 @@ def test_displacements_of_a_large_mesh_are_those_in_a_window(result):
     n = MOST_ARROWS + 100
     points = rng.random((n, 2)) * BOX.extent + BOX.lower
     field = clvoro.Displacements(points, 1e-3 * rng.random((n, 2)), 1e-3 * rng.random((n, 2)))
-    large = dataclasses.replace(
-        result, points=points, target_size=np.full(n, 0.004), initial=None, final=field
-    )
+    large = dataclasses.replace(result, points=points, target_size=np.full(n, 0.004), initial=None, final=field)
     lower, upper = window_around_smallest(large, 50)
     figure = plot_displacements(large)
     inside = ((points >= lower) & (points <= upper)).all(axis=1)
@@ -330,14 +308,7 @@ def test_report_holds_its_pictures(results, adapter, tmp_path):
     initial = adapter.run(BOX, size, points=first, max_steps=0)
     title, case, told = "Cells & <size>", '# a "case" <b>', []
     files = write_report(
-        results,
-        tmp_path,
-        initial=initial,
-        size=size,
-        title=title,
-        case=case,
-        formats=("png", "svg"),
-        tell=told.append,
+        results, tmp_path, initial=initial, size=size, title=title, case=case, formats=("png", "svg"), tell=told.append
     )
     assert [line.split(",")[0] for line in told] == [f"picture {k} of 7" for k in range(1, 8)]
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -372,9 +343,7 @@ def test_a_picture_that_fails_costs_no_other(result, tmp_path, monkeypatch):
     def fail():
         raise MemoryError("no room for it")
 
-    broken = [
-        (name, caption, fail if k == 1 else draw) for k, (name, caption, draw) in enumerate(drawn)
-    ]
+    broken = [(name, caption, fail if k == 1 else draw) for k, (name, caption, draw) in enumerate(drawn)]
     monkeypatch.setattr(page, "pictures_of", lambda *_: broken)
     with pytest.raises(MemoryError, match="no room"):
         write_report(result, tmp_path)
@@ -383,9 +352,7 @@ def test_a_picture_that_fails_costs_no_other(result, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "n", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_few_cells_and_no_steps(adapter, tmp_path, n):
     tiny = adapter.run(BOX, 1.0, n_cells=n, max_steps=0, seed=99)
     assert tiny.initial is None

@@ -60,9 +60,7 @@ def test_section_is_that_of_the_cells(result, normal):
     for axis in (right, up):
         assert axis @ normal == pytest.approx(0, abs=1e-14)
     rng = np.random.default_rng(5)
-    places = (
-        point + rng.uniform(-1.5, 1.5, (900, 1)) * right + rng.uniform(-1.5, 1.5, (900, 1)) * up
-    )
+    places = point + rng.uniform(-1.5, 1.5, (900, 1)) * right + rng.uniform(-1.5, 1.5, (900, 1)) * up
     places = places[d.domain.contains(places)]
     assert len(places) > 100
     nearest = cKDTree(d.points).query(places)[1]
@@ -130,9 +128,7 @@ def test_what_is_drawn_last_is_what_the_viewer_sees(result, cut):
     d = result.diagram
     right, up, towards = view_axes(VIEW)
     through = np.array([0.1, 0.5, 2.7])
-    kept = kept_cells(
-        d, cut if cut is None or isinstance(cut, str) else np.array(cut), through, towards
-    )
+    kept = kept_cells(d, cut if cut is None or isinstance(cut, str) else np.array(cut), through, towards)
     assert kept.all() == (cut is None)
     rows, normals = visible_faces(d, kept, towards)
     assert (normals @ towards > 0).all()
@@ -152,9 +148,7 @@ def test_what_is_drawn_last_is_what_the_viewer_sees(result, cut):
         nearest = tree.query(ray)[1]
         first = nearest[kept[nearest]][:1]
         place = (anchor @ right, anchor @ up)
-        drawn = [
-            owner[row] for row, path in zip(rows, paths, strict=True) if path.contains_point(place)
-        ]
+        drawn = [owner[row] for row, path in zip(rows, paths, strict=True) if path.contains_point(place)]
         seen += len(first)
         wrong += len(first) != bool(drawn) or (len(first) and first[0] != drawn[-1])
     assert seen > 40
@@ -182,8 +176,7 @@ def test_cutaway_takes_marks_and_directions(result):
 
 
 @pytest.mark.parametrize(
-    ("cut", "message"),
-    [("w", "cut is 'w'"), (np.ones(3, bool), r"one mark per cell \(150,\)"), ((0, 0, 0), "cut is")],
+    ("cut", "message"), [("w", "cut is 'w'"), (np.ones(3, bool), r"one mark per cell \(150,\)"), ((0, 0, 0), "cut is")]
 )
 def test_bad_cuts_are_named(result, cut, message):
     with pytest.raises(InputError, match=message):
@@ -234,9 +227,7 @@ def test_focus_is_amid_the_smallest_cells_and_inside(result):
     # Half of the smallest cell is 0.21 large: planes lie at multiples of a fifth.
     assert 0.4 < sizes.min() < 1
     assert focus(near) * 5 == pytest.approx(np.round(focus(near) * 5), abs=1e-9)
-    corner = dataclasses.replace(
-        result, target_size=np.linalg.norm(result.points - LOWER, axis=1) ** 3
-    )
+    corner = dataclasses.replace(result, target_size=np.linalg.norm(result.points - LOWER, axis=1) ** 3)
     assert focus(corner) == pytest.approx(np.array(LOWER) + 0.25 * Box(LOWER, UPPER).extent)
     alike = dataclasses.replace(result, target_size=np.ones(150))
     assert focus(alike) == pytest.approx(np.add(LOWER, UPPER) / 2)
@@ -259,9 +250,17 @@ def test_report_of_a_solid(result, tmp_path, monkeypatch):
     files = write_report({"lloyd": first, "coupled": result}, tmp_path, initial=first)
     names = {f.stem for f in files}
     assert names == {
-        "report", "size", "cells", "cutaway", "quality", "diagrams_error", "diagrams_quality", "history",
-        "distributions", "sides",
-    }  # fmt: skip
+        "report",
+        "size",
+        "cells",
+        "cutaway",
+        "quality",
+        "diagrams_error",
+        "diagrams_quality",
+        "history",
+        "distributions",
+        "sides",
+    }
     text = files[0].read_text(encoding="utf-8")
     assert "Measures for finite volumes" in text
     assert f"{result.measures.summary()['mean_skewness']:.4g}" in text
@@ -317,13 +316,8 @@ def test_cutaway_of_a_periodic_box_is_closed(periodic):
     assert d.shifts[rows].any(axis=1).any()
     starts, corners = face_corners(d)
     faces = [d.vertices[corners[starts[r] : starts[r + 1]]] for r in range(len(starts) - 1)]
-    flat = [
-        shapely.Polygon(np.stack([f @ right, f @ up], axis=1)).buffer(0) for f in faces if len(f)
-    ]
-    seen = [
-        shapely.Polygon(np.stack([f @ right, f @ up], axis=1)).buffer(0)
-        for f in (faces[r] for r in rows)
-    ]
+    flat = [shapely.Polygon(np.stack([f @ right, f @ up], axis=1)).buffer(0) for f in faces if len(f)]
+    seen = [shapely.Polygon(np.stack([f @ right, f @ up], axis=1)).buffer(0) for f in (faces[r] for r in rows)]
     assert shapely.union_all(seen).area == pytest.approx(shapely.union_all(flat).area, rel=1e-9)
     for row, normal in zip(rows, normals, strict=True):
         corners = faces[row] - faces[row][0]

@@ -21,15 +21,7 @@ SPHERE = clvoro.Sphere(2.0)
 GRID = [(lon, lat) for lat in (-70, -40, -10, 10, 40, 70) for lon in range(0, 360, 60)]
 """Cells that meet at the poles, and faces along the limits of longitude."""
 ICOSAHEDRON = SPHERE.positions(
-    [
-        (0, 90),
-        *(
-            (72 * k + 36 * (s < 0), s * np.degrees(np.arctan(0.5)))
-            for s in (1, -1)
-            for k in range(5)
-        ),
-        (0, -90),
-    ]
+    [(0, 90), *((72 * k + 36 * (s < 0), s * np.degrees(np.arctan(0.5))) for s in (1, -1) for k in range(5)), (0, -90)]
 )
 """Two cells around the poles, faces of 42 degrees."""
 
@@ -70,16 +62,18 @@ def cube():
     for point, ring in zip(points, found.regions, strict=True):
         a, b = found.vertices[ring[:2]] - point
         rings.append(np.array(ring if np.cross(a, b) @ point > 0 else ring[::-1]))
-    begin, end = (
-        found.vertices[np.concatenate(r)] for r in (rings, [np.roll(r, -1) for r in rings])
-    )
+    begin, end = (found.vertices[np.concatenate(r)] for r in (rings, [np.roll(r, -1) for r in rings]))
     middle = (begin + end) / np.linalg.norm(begin + end, axis=1)[:, None]
     starts = 4 * np.arange(7)
     arrays = {
-        "points": 2 * points, "vertices": 2 * found.vertices, "cell_vertex_starts": starts,
-        "cell_vertices": np.concatenate(rings), "neighbor_starts": starts,
-        "face_measures": 2 * np.arccos((begin * end).sum(axis=1)), "face_centroids": 2 * middle,
-    }  # fmt: skip
+        "points": 2 * points,
+        "vertices": 2 * found.vertices,
+        "cell_vertex_starts": starts,
+        "cell_vertices": np.concatenate(rings),
+        "neighbor_starts": starts,
+        "face_measures": 2 * np.arccos((begin * end).sum(axis=1)),
+        "face_centroids": 2 * middle,
+    }
     return Diagram(SPHERE, arrays)
 
 
@@ -113,13 +107,7 @@ def winding(ring, places):
     return np.round(turns.sum(axis=1) / (2 * np.pi)).astype(int)
 
 
-VIEWS = [
-    Orthographic((-45, 30)),
-    Orthographic((0, 90)),
-    Orthographic((180, 0)),
-    Plate((0, 0)),
-    Plate((-150, 0)),
-]
+VIEWS = [Orthographic((-45, 30)), Orthographic((0, 90)), Orthographic((180, 0)), Plate((0, 0)), Plate((-150, 0))]
 
 
 @pytest.mark.sparse(6)
@@ -135,9 +123,7 @@ def test_polygons_cover_the_picture_once(diagram, view):
     counts, last = np.zeros(len(places), int), np.full(len(places), -1)
     rings = drawn(polygons)
     # The whole disk is drawn below the others.
-    below = np.array(
-        [isinstance(view, Orthographic) and abs(area(r) - np.pi) < 0.01 for r in rings]
-    )
+    below = np.array([isinstance(view, Orthographic) and abs(area(r) - np.pi) < 0.01 for r in rings])
     assert below.sum() <= 1
     for ring, i, under in zip(rings, polygons.cells, below, strict=True):
         around = winding(ring, places)
@@ -167,11 +153,7 @@ def test_copies_at_the_limits_of_longitude(diagram):
 
 
 def test_poles_are_lines(adapter):
-    points = [
-        (0, 90),
-        *[(lon, 20) for lon in range(0, 360, 45)],
-        *[(lon, -50) for lon in range(0, 360, 90)],
-    ]
+    points = [(0, 90), *[(lon, 20) for lon in range(0, 360, 45)], *[(lon, -50) for lon in range(0, 360, 90)]]
     diagram = adapter.diagram(SPHERE, SPHERE.positions(points))
     rings, cells = (lambda p: (drawn(p), p.cells))(Plate((0, 0)).polygons(diagram, np.arange(13)))
     around = [ring for ring, i in zip(rings, cells, strict=True) if i == 0]
@@ -258,9 +240,7 @@ def test_edges_are_drawn_once_and_only_if_legible(mesh):
     lines, _ = collections(mesh.plot(coasts=False), LineCollection)
     off = np.array([np.hypot(*segment.mean(axis=0)) for segment in lines.get_segments()])
     assert off.max() < 0.9999
-    assert np.mean(np.array(lines.get_linewidths())[off > 0.97]) < 0.6 * np.median(
-        lines.get_linewidths()
-    )
+    assert np.mean(np.array(lines.get_linewidths())[off > 0.97]) < 0.6 * np.median(lines.get_linewidths())
 
 
 def test_pixels_show_the_cells_they_are_in(mesh, monkeypatch):
@@ -305,10 +285,7 @@ def test_longitudes_of_windows_go_on(mesh):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"projection": "mercator"},
-            "projection is 'mercator', expected one of orthographic, plate",
-        ),
+        ({"projection": "mercator"}, "projection is 'mercator', expected one of orthographic, plate"),
         ({"center": (0, 100)}, r"center is \(0, 100\), expected a longitude, and then a latitude"),
         ({"center": "here"}, "center is 'here'"),
         ({"across": 0}, "across is 0, expected a finite number > 0"),
@@ -362,12 +339,7 @@ def test_coasts(mesh, monkeypatch):
     assert count == [2, 3]  # by default none on a sphere of this size
     mesh.plot(coasts=True, across=5.0)
     assert asked == ["110m", "10m"]
-    assert [coasts.is_earth(r) for r in (6371229.0, 6371.0, 1.0, 1737400.0)] == [
-        True,
-        True,
-        False,
-        False,
-    ]
+    assert [coasts.is_earth(r) for r in (6371229.0, 6371.0, 1.0, 1737400.0)] == [True, True, False, False]
 
 
 @pytest.mark.sparse(2)

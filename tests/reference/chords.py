@@ -47,11 +47,7 @@ def kept(line: list[Point], fixed: list[bool], size: float) -> list[int]:
 
     while True:
         offsets = [far(k) for k in range(len(left))]
-        drop = [
-            k
-            for k in range(1, len(left) - 1)
-            if offsets[k] < offsets[k - 1] and offsets[k] <= offsets[k + 1]
-        ]
+        drop = [k for k in range(1, len(left) - 1) if offsets[k] < offsets[k - 1] and offsets[k] <= offsets[k + 1]]
         if not drop:
             break
         left = [p for k, p in enumerate(left) if k not in drop]

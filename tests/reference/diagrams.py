@@ -66,10 +66,7 @@ def exact_cells(lower, upper, points) -> list[Cell]:
     cells = []
     for i, x in enumerate(points):
         polygon = [((x0, y0), -3), ((x1, y0), -2), ((x1, y1), -4), ((x0, y1), -1)]
-        order = sorted(
-            range(len(points)),
-            key=lambda j: (points[j][0] - x[0]) ** 2 + (points[j][1] - x[1]) ** 2,
-        )
+        order = sorted(range(len(points)), key=lambda j: (points[j][0] - x[0]) ** 2 + (points[j][1] - x[1]) ** 2)
         for j in order:
             if j != i:
                 polygon = _clip(polygon, x, points[j], j)

@@ -6,9 +6,7 @@ import shapely
 import clvoro
 
 
-def largest_radius(
-    domain: clvoro.Polygon, point: np.ndarray, normal: np.ndarray, most: float
-) -> float:
+def largest_radius(domain: clvoro.Polygon, point: np.ndarray, normal: np.ndarray, most: float) -> float:
     """Return the radius of the largest ball at a point of the boundary, its center along the normal; at most `most`.
 
     Each ball holds the smaller ones.

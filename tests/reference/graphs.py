@@ -46,12 +46,7 @@ def voronoi_graph(points):
         ends = diagram.vertices[np.array(diagram.ridge_vertices)[kept]]
         measures = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     else:
-        measures = np.array(
-            [
-                polygon_area(diagram.vertices[diagram.ridge_vertices[f]])
-                for f in np.flatnonzero(kept)
-            ]
-        )
+        measures = np.array([polygon_area(diagram.vertices[diagram.ridge_vertices[f]]) for f in np.flatnonzero(kept)])
     heights = 0.5 * np.linalg.norm(np.diff(diagram.points[pairs], axis=1)[:, 0], axis=1)
     rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
     columns = np.concatenate([pairs[:, 1], pairs[:, 0]])

@@ -46,15 +46,10 @@ MESHES = {
     "channel": lambda: _random(clvoro.Box((1, 1), (3, 2), periodic=(True, False)), 130),
     "hexagons": lambda: (HEXAGONS, hexagons()),
     "squares": lambda: (ROOM, grid(ROOM, 8, 4)),
-    "squares without walls": lambda: (
-        box := clvoro.Box((0, 0), (5, 5), periodic=True),
-        grid(box, 5, 5),
-    ),
+    "squares without walls": lambda: (box := clvoro.Box((0, 0), (5, 5), periodic=True), grid(box, 5, 5)),
     "shore": lambda: _scattered(clvoro.Polygon(star(60), [ISLAND]), 150),
     "slit": lambda: _scattered(clvoro.Polygon(slit(0.01)), 90),
-    "two pieces": lambda: _scattered(
-        clvoro.Polygon.from_pieces([[star(9)], [star(7, center=(3, 0))]]), 80
-    ),
+    "two pieces": lambda: _scattered(clvoro.Polygon.from_pieces([[star(9)], [star(7, center=(3, 0))]]), 80),
 }
 """Domains and generators. In "shore" and "slit" the boundary divides cells; their far pieces belong to other cells."""
 
@@ -69,10 +64,16 @@ def result_of(diagram: Diagram) -> Result:
     """A Result with `diagram` and made-up data."""
     rng, n = np.random.default_rng(5), len(diagram)
     return Result(
-        points=diagram.points, diagram=diagram, target_size=0.1 + rng.random(n), size_error=rng.standard_normal(n),
-        quality=rng.random(n), history=np.zeros(0, HISTORY_DTYPE), converged=True, stop_reason="made up",
+        points=diagram.points,
+        diagram=diagram,
+        target_size=0.1 + rng.random(n),
+        size_error=rng.standard_normal(n),
+        quality=rng.random(n),
+        history=np.zeros(0, HISTORY_DTYPE),
+        converged=True,
+        stop_reason="made up",
         settings={"name": "é", "seed": 3},
-    )  # fmt: skip
+    )
 
 
 def made(ctx, name: str, dtype: str = "float64") -> Result:

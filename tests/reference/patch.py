@@ -54,9 +54,7 @@ def fetch(t):
     m = int(starts[t.n])
     names = ("neighbors", "face_measures", "face_centroids")
     faces = {name: getattr(t, name).get()[:m] for name in names}
-    cells = {
-        name: getattr(t, name).get() for name in ("points", "volumes", "offsets", "covariances")
-    }
+    cells = {name: getattr(t, name).get() for name in ("points", "volumes", "offsets", "covariances")}
     owners = np.repeat(np.arange(t.n), np.diff(starts))
     return SimpleNamespace(n=t.n, starts=starts, owners=owners, **faces, **cells)
 
@@ -109,10 +107,7 @@ def hexagons(a, box=BOX):
     """Return the points of a hexagonal lattice of spacing `a` that lie in the box, none near a wall."""
     rows = np.arange(a / 4, box.upper[1] - a / 4, a * np.sqrt(3) / 2)
     lines = [
-        np.stack(
-            [x := np.arange(a / 4 + a / 2 * (k % 2), box.upper[0] - a / 8, a), np.full_like(x, y)],
-            1,
-        )
+        np.stack([x := np.arange(a / 4 + a / 2 * (k % 2), box.upper[0] - a / 8, a), np.full_like(x, y)], 1)
         for k, y in enumerate(rows)
     ]
     return np.concatenate(lines)

@@ -122,9 +122,7 @@ def polygon_voronoi(domain, points) -> PolygonCells:
                 if part.geom_type != "LineString" or part.length <= small:
                     continue
                 middle = part.interpolate(0.5, normalized=True)
-                a, b = (
-                    min(mine[c], key=lambda p: pieces[p].shape.distance(middle)) for c in (i, j)
-                )
+                a, b = (min(mine[c], key=lambda p: pieces[p].shape.distance(middle)) for c in (i, j))
                 faces.append((a, b, part.length))
     _adopt(pieces, faces, close, small)
     lengths: dict[tuple[int, int], float] = defaultdict(float)
@@ -190,9 +188,7 @@ def _adopt(pieces, faces, close, small) -> None:
         for a, piece in enumerate(pieces):
             if roots[a] >= 0:
                 continue
-            best = [
-                (length, roots[b]) for length, b in beside[a] if roots[b] >= 0 and pieces[b].touched
-            ]
+            best = [(length, roots[b]) for length, b in beside[a] if roots[b] >= 0 and pieces[b].touched]
             if best:
                 length, piece.root = max(best)
                 if any(root != piece.root and length - other < small for other, root in best):
@@ -224,9 +220,7 @@ def faults(diagram, real: str = "float64") -> list[str]:
     total = d.volumes.sum() - domain.measure
     ends = domain.oriented.vertices[domain.oriented.next_vertex]
     around = float(np.hypot(*(ends - domain.oriented.vertices).T).sum())
-    demand(
-        abs(total) <= slack * (around + size) / 8, f"areas: {total / domain.measure:.3g} too much"
-    )
+    demand(abs(total) <= slack * (around + size) / 8, f"areas: {total / domain.measure:.3g} too much")
     # Far ends of faces between generators that are close to each other round by as much more; where three are, as on a
     # circle around an end, by the square.
     a, b = d.vertices[d.face_vertices.reshape(-1, 2)].transpose(1, 0, 2)
@@ -259,10 +253,7 @@ def faults(diagram, real: str = "float64") -> list[str]:
     demand(off.max() <= 8 * slack, f"faces on edge {off.argmax()}: off by {off.max():.3g}")
     # Faces run from vertex to vertex, in loops, the cell on their left.
     off = np.abs(np.hypot(*(b - a).T) - d.face_measures)
-    demand(
-        (off <= 2 * loose).all(),
-        f"face measures are not the distance of their ends: {off.max():.3g}",
-    )
+    demand((off <= 2 * loose).all(), f"face measures are not the distance of their ends: {off.max():.3g}")
     off = np.abs((a + b) / 2 - d.face_centroids).max(axis=1)
     demand((off <= loose).all(), f"face centroids: {off.max():.3g}")
     x = d.points[owner]
@@ -271,20 +262,11 @@ def faults(diagram, real: str = "float64") -> list[str]:
     perimeter = np.bincount(owner, d.face_measures, minlength=n)
     # A part that was cut off may lie far from the generator: here products of such distances round.
     apart = 8 * 2.3e-16 * reach**2
-    demand(
-        (np.abs(off) <= slack * perimeter + slack**2 + apart).all(),
-        f"volumes: {np.abs(off).max():.3g}",
-    )
-    moment = np.stack(
-        [np.bincount(owner, cross * (a + b - 2 * x)[:, c], minlength=n) for c in (0, 1)]
-    )
+    demand((np.abs(off) <= slack * perimeter + slack**2 + apart).all(), f"volumes: {np.abs(off).max():.3g}")
+    moment = np.stack([np.bincount(owner, cross * (a + b - 2 * x)[:, c], minlength=n) for c in (0, 1)])
     with np.errstate(all="ignore"):
         center = (moment / (6 * d.volumes)).T + d.points
-        off = (
-            np.hypot(*(center - d.centroids).T)
-            - (4 * slack * perimeter + apart) * reach / d.volumes
-            - slack
-        )
+        off = np.hypot(*(center - d.centroids).T) - (4 * slack * perimeter + apart) * reach / d.volumes - slack
     demand((off <= 0).all(), f"centroids: {off.max():.3g}")
     _check_loops(d, demand)
     return found

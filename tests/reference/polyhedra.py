@@ -23,10 +23,7 @@ class Mesh:
     def of(cls, mesh):
         """The mesh of a `SolverMesh` without seams."""
         loops = np.split(mesh.corners, mesh.starts[1:-1])
-        faces = [
-            (int(i), int(j), loop.tolist())
-            for i, j, loop in zip(mesh.owner, mesh.neighbor, loops, strict=True)
-        ]
+        faces = [(int(i), int(j), loop.tolist()) for i, j, loop in zip(mesh.owner, mesh.neighbor, loops, strict=True)]
         return cls(dict(enumerate(mesh.points)), faces)
 
     def cells(self):
@@ -65,9 +62,7 @@ class Mesh:
             if len({a for a, _ in sides}) - len(sides) // 2 + len(faces) != 2:
                 return False
         whole = len(self.points) - len(everything) + len(self.faces) - len(self.cells())
-        return whole == 1 and all(
-            meet_on_a_path(f[2], g[2]) for f, g in combinations(self.faces, 2)
-        )
+        return whole == 1 and all(meet_on_a_path(f[2], g[2]) for f, g in combinations(self.faces, 2))
 
 
 def sides_of(loop):
@@ -150,9 +145,7 @@ def quality(mesh, at):
             if cell < 0:
                 continue
             y, tip = x[k] - centers[cell], center - centers[cell]
-            about = [
-                sign * np.linalg.det([a, b, tip]) for a, b in zip(y, np.roll(y, -1, 0), strict=True)
-            ]
+            about = [sign * np.linalg.det([a, b, tip]) for a, b in zip(y, np.roll(y, -1, 0), strict=True)]
             positive &= min(about) > 0 and sign * (area @ tip) > 0
             for b in range(len(y)):
                 fan = [

@@ -42,9 +42,7 @@ def power_cells(box, points, weights):
         share = np.abs(np.linalg.det(simplices))
         share /= share.sum()
         volumes[i] = cell.volume
-        centroids[i] = (
-            origin + apex + (share[:, None] * simplices.sum(axis=1)).sum(axis=0) / (d + 1)
-        )
+        centroids[i] = origin + apex + (share[:, None] * simplices.sum(axis=1)).sum(axis=0) / (d + 1)
     return volumes, centroids
 
 
@@ -61,12 +59,7 @@ def polygon_power_cells(domain, points, weights):
             way = d / np.linalg.norm(d)
             across = far * np.array([-way[1], way[0]])
             foot = x + (d @ d - (weights[j] - weights[i])) / (2 * d @ d) * d
-            behind = (
-                foot + across,
-                foot - across,
-                foot - across - far * way,
-                foot + across - far * way,
-            )
+            behind = (foot + across, foot - across, foot - across - far * way, foot + across - far * way)
             cell = shapely.intersection(cell, shapely.Polygon(behind))
         cells.append(cell)
     return cells

@@ -28,24 +28,12 @@ def comb(teeth: int, depth: float = 0.8, gap: float = 0.5) -> np.ndarray:
 
 def slit(width: float, depth: float = 0.7) -> np.ndarray:
     """The unit square with a wedge cut into it from above."""
-    return np.array(
-        [
-            (0, 0),
-            (1, 0),
-            (1, 1),
-            (0.5 + width / 2, 1),
-            (0.5, 1 - depth),
-            (0.5 - width / 2, 1),
-            (0, 1),
-        ]
-    )
+    return np.array([(0, 0), (1, 0), (1, 1), (0.5 + width / 2, 1), (0.5, 1 - depth), (0.5 - width / 2, 1), (0, 1)])
 
 
 def spit(width: float) -> np.ndarray:
     """The unit square with a needle on its right."""
-    return np.array(
-        [(0, 0), (1, 0), (1, 0.5), (2, 0.5 + width), (1, 0.5 + 2 * width), (1, 1), (0, 1)]
-    )
+    return np.array([(0, 0), (1, 0), (1, 0.5), (2, 0.5 + width), (1, 0.5 + 2 * width), (1, 1), (0, 1)])
 
 
 def koch(level: int) -> np.ndarray:
@@ -76,10 +64,7 @@ def blocks(rng: np.random.Generator, side: int) -> object:
     """Some squares of a lattice, united: a shapely geometry."""
     taken = rng.random((side, side)) < 0.6
     taken[0, 0] = True
-    boxes = [
-        shapely.box(i / side, j / side, (i + 1) / side, (j + 1) / side)
-        for i, j in np.argwhere(taken).tolist()
-    ]
+    boxes = [shapely.box(i / side, j / side, (i + 1) / side, (j + 1) / side) for i, j in np.argwhere(taken).tolist()]
     return shapely.union_all(boxes)
 
 
@@ -92,15 +77,12 @@ POLYGONS = {
     "burr": lambda: clvoro.Polygon(star(300)),
     "hole": lambda: clvoro.Polygon(UNIT, [star(7, 3, (0.5, 0.5), 0.3)]),
     "holes": lambda: clvoro.Polygon(
-        UNIT,
-        [star(7, 3, (0.3, 0.5), 0.2), star(9, 4, (0.75, 0.6), 0.15), star(9, 4, (0.6, 0.2), 1e-3)],
+        UNIT, [star(7, 3, (0.3, 0.5), 0.2), star(9, 4, (0.75, 0.6), 0.15), star(9, 4, (0.6, 0.2), 1e-3)]
     ),
     "islands": lambda: clvoro.Polygon.from_pieces(
         [[UNIT, UNIT * 0.8 + 0.1], [UNIT * 0.6 + 0.2, UNIT * 0.4 + 0.3], [UNIT * 0.2 + 0.4]]
     ),
-    "pieces": lambda: clvoro.Polygon.from_pieces(
-        [[star(9, 1)], [star(30, 2, (2.2, 0))], [star(5, 3, (0, 2.5), 0.01)]]
-    ),
+    "pieces": lambda: clvoro.Polygon.from_pieces([[star(9, 1)], [star(30, 2, (2.2, 0))], [star(5, 3, (0, 2.5), 0.01)]]),
     "comb": lambda: clvoro.Polygon(comb(5)),
     "fine comb": lambda: clvoro.Polygon(comb(60, 0.9, 0.7)),
     "slit": lambda: clvoro.Polygon(slit(1e-3)),
@@ -112,29 +94,15 @@ POLYGONS = {
     "diamond": lambda: clvoro.Polygon(DIAMOND),
     "diamond hole": lambda: clvoro.Polygon(UNIT, [DIAMOND * 0.5 + 0.25]),
     "corner": lambda: clvoro.Polygon([(0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)]),
-    "stairs": lambda: clvoro.Polygon(
-        [(0, 0), (1, 0), *((1 - k / 8, (k + s) / 8) for k in range(8) for s in (0, 1))]
-    ),
+    "stairs": lambda: clvoro.Polygon([(0, 0), (1, 0), *((1 - k / 8, (k + s) / 8) for k in range(8) for s in (0, 1))]),
     "straight": lambda: clvoro.Polygon(
-        [
-            (0, 0),
-            (0.25, 0),
-            (0.5, 0),
-            (0.75, 0),
-            (1, 0),
-            (1, 0.5),
-            (1, 1),
-            (0.5, 1),
-            (0, 1),
-            (0, 0.125),
-        ]
+        [(0, 0), (0.25, 0), (0.5, 0), (0.75, 0), (1, 0), (1, 0.5), (1, 1), (0.5, 1), (0, 1), (0, 0.125)]
     ),
 }
 """What makes each of them."""
 TOUCHING = {
     "holes": lambda: clvoro.Polygon(
-        UNIT,
-        [[(0.25, 0.25), (0.5, 0.5), (0.25, 0.75)], [(0.5, 0.5), (0.75, 0.25), (0.75, 0.75)]],
+        UNIT, [[(0.25, 0.25), (0.5, 0.5), (0.25, 0.75)], [(0.5, 0.5), (0.75, 0.25), (0.75, 0.75)]]
     ),
     "pieces": lambda: clvoro.Polygon.from_pieces([[UNIT * 0.5], [UNIT * 0.5 + 0.5]]),
     "blocks": lambda: clvoro.Polygon.from_shapely(blocks(np.random.default_rng(5), 6)),

@@ -63,8 +63,7 @@ def solid_diagram(lower, upper, points, shortest=1e-9):
     pyramids = np.einsum("ij,ij->i", areas, middles - points[owners]) / 3
     volumes = np.bincount(owners, pyramids, minlength=n)
     centroids = [
-        np.bincount(owners, pyramids * (0.75 * middles + 0.25 * points[owners])[:, a], minlength=n)
-        for a in range(3)
+        np.bincount(owners, pyramids * (0.75 * middles + 0.25 * points[owners])[:, a], minlength=n) for a in range(3)
     ]
     return Diagram(
         box,
@@ -77,9 +76,7 @@ def solid_diagram(lower, upper, points, shortest=1e-9):
             "face_measures": measures,
             "face_centroids": middles,
             "vertices": lambda: vertices[used],  # read when first used, as from a device
-            "face_vertex_starts": np.cumsum([0] + [len(loop) for _, loop in faces]).astype(
-                np.int32
-            ),
+            "face_vertex_starts": np.cumsum([0] + [len(loop) for _, loop in faces]).astype(np.int32),
             "face_vertices": numbers.ravel().astype(np.int32),
         },
     )

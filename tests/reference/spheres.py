@@ -25,9 +25,7 @@ def clustered_points(n, seed):
 def grid_of_rings():
     """Return points on meridians and parallels, with both poles: four cells meet at each vertex."""
     lon, lat = np.meshgrid(np.arange(0, 360, 10.0), np.arange(-80, 81, 10.0))
-    return UNIT.positions(
-        np.concatenate([np.column_stack([lon.ravel(), lat.ravel()]), [(0, 90), (0, -90)]])
-    )
+    return UNIT.positions(np.concatenate([np.column_stack([lon.ravel(), lat.ravel()]), [(0, 90), (0, -90)]]))
 
 
 class SphericalDiagram:
@@ -58,11 +56,7 @@ class SphericalDiagram:
             for i, j, k in ((a, b, c), (b, c, a), (c, a, b)):
                 follows[i][j] = k, v
         self.neighbors, self.arcs, self.middles = [], [], []
-        self.areas, self.offsets, self.moments = (
-            np.zeros(len(x)),
-            np.zeros((len(x), 3)),
-            np.zeros((len(x), 3, 3)),
-        )
+        self.areas, self.offsets, self.moments = (np.zeros(len(x)), np.zeros((len(x), 3)), np.zeros((len(x), 3, 3)))
         for i, around in enumerate(follows):
             j, row, corners = next(iter(around)), [], []
             for _ in around:
@@ -95,6 +89,4 @@ class SphericalDiagram:
         middle = ((p + q) / 3 * weight[:, None]).sum(axis=0) / weight.sum()
         outer = np.einsum("ki,kj->kij", p, p) + np.einsum("ki,kj->kij", q, q)
         outer += np.einsum("ki,kj->kij", p + q, p + q)
-        self.moments[i] = np.einsum("k,kij->ij", weight / 12, outer) / weight.sum() - np.outer(
-            middle, middle
-        )
+        self.moments[i] = np.einsum("k,kij->ij", weight / 12, outer) / weight.sum() - np.outer(middle, middle)

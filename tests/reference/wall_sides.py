@@ -68,9 +68,7 @@ def outlines(diagram) -> list[Outline]:
             goes_on = last is not None and owner[last[0]] == i
             passed = []
             if goes_on:
-                passed = [
-                    (last[1] + k) % len(ring) for k in range(1, (e - last[1]) % len(ring) + 1)
-                ]
+                passed = [(last[1] + k) % len(ring) for k in range(1, (e - last[1]) % len(ring) + 1)]
                 turned += sum(turns[passed])
             found[i].missing += sum(turns[passed]) / (math.pi / 3) + (0 if goes_on else 2)
             if not goes_on or abs(turned) > math.radians(30.01):

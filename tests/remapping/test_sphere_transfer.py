@@ -83,9 +83,7 @@ def integrals(flat, axes):
     """
     area, moment = 0.0, np.zeros(3)
     s, t = np.meshgrid(NODES, NODES, indexing="ij")
-    weight = np.outer(
-        WEIGHTS * NODES, WEIGHTS
-    ).ravel()  # a square, of which one side becomes a point
+    weight = np.outer(WEIGHTS * NODES, WEIGHTS).ravel()  # a square, of which one side becomes a point
     s, t = s.ravel()[:, None], t.ravel()[:, None]
     for b, c in pairwise(flat[1:]):
         a = flat[0]
@@ -156,10 +154,7 @@ def test_matches_intersections_by_shapely(mesh, adapter, way):
 def test_cells_as_wide_as_the_sphere(adapter, counts):
     """Cells of 70 degrees from generator to corner: shares of random points, within five standard deviations."""
     corners = UNIT.icosahedral_points(0)
-    made = {
-        5: np.array([(1, 0, 0.1), (-0.5, 0.8, 0), (-0.5, -0.9, 0), (0, 0, 1), (0.1, 0, -1)]),
-        12: corners,
-    }
+    made = {5: np.array([(1, 0, 0.1), (-0.5, 0.8, 0), (-0.5, -0.9, 0), (0, 0, 1), (0.1, 0, -1)]), 12: corners}
     old = adapter.diagram(UNIT, made.get(counts[0], random_points(40, 3)))
     new = adapter.diagram(UNIT, made.get(counts[1], random_points(40, 4)) @ TURN)
     q = np.random.default_rng(8).normal(size=len(old))
@@ -175,15 +170,11 @@ def test_cells_as_wide_as_the_sphere(adapter, counts):
 @pytest.mark.sparse(8)
 @ORDERS
 @pytest.mark.parametrize("radius", [1.0, 6371229.0])
-@pytest.mark.parametrize(
-    "counts", [(900, 700), (40, 2000), (2000, 40), (8, 3000), (3000, 8), (9, 8)]
-)
+@pytest.mark.parametrize("counts", [(900, 700), (40, 2000), (2000, 40), (8, 3000), (3000, 8), (9, 8)])
 def test_mass_bounds_and_constants(mesh, adapter, order, radius, counts):
     old, new = mesh(counts[0], 991, radius), mesh(counts[1], 4673, radius)
     rng = np.random.default_rng(88)
-    q = np.column_stack(
-        [rng.normal(size=counts[0]), np.full(counts[0], -2.7), rng.random(counts[0]) > 0.7]
-    )
+    q = np.column_stack([rng.normal(size=counts[0]), np.full(counts[0], -2.7), rng.random(counts[0]) > 0.7])
     got = old.transfer(q, new, order, adapter=adapter)
     assert got.shape == (counts[1], 3)
     # The round-off of a sum of a thousand products is about 1e-14.
@@ -238,9 +229,11 @@ def test_order_of_convergence(adapter, order, limited):
 
 @pytest.mark.sparse(4)
 @ORDERS
-@pytest.mark.parametrize("points", [
-    random_points(700, 1327), grid_of_rings(), UNIT.icosahedral_points(3), clustered_points(800, 9),
-], ids=["random", "rings", "icosahedral", "clustered"])  # fmt: skip
+@pytest.mark.parametrize(
+    "points",
+    [random_points(700, 1327), grid_of_rings(), UNIT.icosahedral_points(3), clustered_points(800, 9)],
+    ids=["random", "rings", "icosahedral", "clustered"],
+)
 def test_same_mesh_is_the_identity(adapter, points, order):
     old = adapter.diagram(UNIT, points)
     q = np.random.default_rng(7).normal(size=len(old))
@@ -334,17 +327,11 @@ def test_results_in_single_precision(ctx):
 
 def test_other_domains_are_rejected(mesh, adapter):
     old, plane = mesh(9, 1), adapter.diagram(clvoro.Box((0, 0), (1, 1)), [[0.5, 0.5]])
-    with pytest.raises(
-        InputError, match=r"Sphere\(radius=2.0\), .* Sphere\(radius=1.0\); expected the same"
-    ):
+    with pytest.raises(InputError, match=r"Sphere\(radius=2.0\), .* Sphere\(radius=1.0\); expected the same"):
         old.transfer(np.ones(9), mesh(8, 2, 2.0))
-    with pytest.raises(
-        InputError, match=r"onto is a mesh of Box.* are on Sphere.*expected the same"
-    ):
+    with pytest.raises(InputError, match=r"onto is a mesh of Box.* are on Sphere.*expected the same"):
         old.transfer(np.ones(9), plane)
-    with pytest.raises(
-        InputError, match=r"onto is a mesh of Sphere.* are on Box.*expected the same"
-    ):
+    with pytest.raises(InputError, match=r"onto is a mesh of Sphere.* are on Box.*expected the same"):
         plane.transfer(np.ones(1), old)
 
 
@@ -361,10 +348,7 @@ def test_bad_values_are_rejected(mesh):
     assert old.transfer(np.ones((9, 0)), new).shape == (8, 0)
 
 
-NAMES = (
-    "volumes", "centroids", "neighbor_starts", "neighbors", "vertices", "cell_vertex_starts",
-    "cell_vertices",
-)  # fmt: skip
+NAMES = ("volumes", "centroids", "neighbor_starts", "neighbors", "vertices", "cell_vertex_starts", "cell_vertices")
 
 
 def with_points(diagram, points):

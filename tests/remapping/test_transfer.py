@@ -42,10 +42,7 @@ def mesh(adapter):
 def lattice(adapter, dim, side):
     """Return a diagram whose cells are equal boxes."""
     box = BOXES[dim]
-    axes = [
-        low + (high - low) * (np.arange(side) + 0.5) / side
-        for low, high in zip(box.lower, box.upper, strict=True)
-    ]
+    axes = [low + (high - low) * (np.arange(side) + 0.5) / side for low, high in zip(box.lower, box.upper, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
     return adapter.diagram(box, grid)
 
@@ -63,9 +60,7 @@ def half_spaces(diagram, i):
     normals = others - x[i]
     planes = np.column_stack([normals, -((others**2).sum(axis=1) - (x[i] ** 2).sum()) / 2])
     eye = np.eye(box.dim)
-    walls = np.vstack(
-        [np.column_stack([eye, -np.array(box.upper)]), np.column_stack([-eye, box.lower])]
-    )
+    walls = np.vstack([np.column_stack([eye, -np.array(box.upper)]), np.column_stack([-eye, box.lower])])
     planes = np.vstack([planes, walls])
     return planes / np.linalg.norm(planes[:, :-1], axis=1, keepdims=True)
 
@@ -100,9 +95,8 @@ def solid_part(planes):
 
     ones = np.ones(len(planes))
     ball = linprog(
-        [0, 0, 0, -1], np.column_stack([planes[:, :3], ones]), -planes[:, 3],
-        bounds=[(None, None)] * 3 + [(0, None)],
-    )  # fmt: skip
+        [0, 0, 0, -1], np.column_stack([planes[:, :3], ones]), -planes[:, 3], bounds=[(None, None)] * 3 + [(0, None)]
+    )
     if not ball.success or ball.x[3] < 1e-7:
         return 0.0, np.zeros(3)
     corners = HalfspaceIntersection(planes, ball.x[:3]).intersections
@@ -189,9 +183,7 @@ def test_matches_plain_clipping(mesh, adapter, dim, way):
 def test_mass_bounds_and_constants(mesh, adapter, dim, order, counts):
     old, new = mesh(dim, counts[0], 991), mesh(dim, counts[1], 4673)
     rng = np.random.default_rng(88)
-    q = np.column_stack(
-        [rng.normal(size=counts[0]), np.full(counts[0], -2.7), rng.random(counts[0]) > 0.7]
-    )
+    q = np.column_stack([rng.normal(size=counts[0]), np.full(counts[0], -2.7), rng.random(counts[0]) > 0.7])
     got = old.transfer(q, new, order, adapter=adapter)
     assert got.shape == (counts[1], 3)
     # The round-off of a sum of a thousand products is about 1e-14.
@@ -211,11 +203,14 @@ def test_linear_functions_are_exact_without_limiter(mesh, adapter, dim):
     np.testing.assert_allclose(got, 2 + new.centroids @ slope, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("points", [
-    [(0.1, 0.13), (0.5, 0.8), (0.9, 0.2), (0.7, 0.5), (0.05, 0.04)],
-    [(0.2, 0.3), (0.7, 0.6)],
-    [(0.1, 0.2, 0.3), (0.5, 0.9, 0.4), (0.8, 0.3, 0.9)],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "points",
+    [
+        [(0.1, 0.13), (0.5, 0.8), (0.9, 0.2), (0.7, 0.5), (0.05, 0.04)],
+        [(0.2, 0.3), (0.7, 0.6)],
+        [(0.1, 0.2, 0.3), (0.5, 0.9, 0.4), (0.8, 0.3, 0.9)],
+    ],
+)
 def test_too_few_neighbors_give_slopes_of_least_norm(adapter, points):
     """A corner cell with one neighbor, or cells in a row, do not determine all slopes."""
     dim = len(points[0])
@@ -230,9 +225,7 @@ def test_too_few_neighbors_give_slopes_of_least_norm(adapter, points):
     whole = [
         i
         for i in range(len(new))
-        if (
-            ((corners(new, i)[:, None] - old.points) ** 2).sum(axis=2).argmin(axis=1) == owner[i]
-        ).all()
+        if (((corners(new, i)[:, None] - old.points) ** 2).sum(axis=2).argmin(axis=1) == owner[i]).all()
     ]
     assert len(whole) > 50
     expected = q[owner] + ((new.centroids - old.centroids[owner]) * g[owner]).sum(axis=1)
@@ -265,9 +258,7 @@ def test_same_mesh_is_the_identity(mesh, adapter, dim, order):
 
 @pytest.mark.sparse(4)
 @DIMS
-@pytest.mark.parametrize(
-    "sides", [(6, 6, 0.0), (6, 12, 0.0), (12, 6, 0.0), (6, 9, 0.0), (6, 6, 0.5)]
-)
+@pytest.mark.parametrize("sides", [(6, 6, 0.0), (6, 12, 0.0), (12, 6, 0.0), (6, 9, 0.0), (6, 6, 0.5)])
 def test_lattices(adapter, dim, sides):
     """Faces coincide with faces, corners with corners, generators with corners."""
     coarse, fine, shift = sides
@@ -358,9 +349,7 @@ def test_cells_of_many_faces(adapter, dim):
     got = old.transfer(old.centroids[:, 1], new, 2, limited=False, adapter=adapter)
     np.testing.assert_allclose(got, new.centroids[:, 1], rtol=0, atol=1e-11)
     # The new cell lies within one old cell. Their intersection needs room for 90 faces.
-    wide = adapter.diagram(
-        box, np.array([0.5] * dim) + np.array([[-0.49], [-0.41]]) * np.eye(dim)[0]
-    )
+    wide = adapter.diagram(box, np.array([0.5] * dim) + np.array([[-0.49], [-0.41]]) * np.eye(dim)[0])
     again = clvoro.Adapter(adapter.ctx)
     got = wide.transfer(wide.centroids[:, 0], new, 2, limited=False, adapter=again)
     # Singular systems are solved to sqrt(eps).
@@ -442,9 +431,7 @@ def test_large_and_small_numbers(mesh, adapter):
     q = np.random.default_rng(13).normal(size=90)
     plain = old.transfer(q, new, 2, adapter=adapter)
     for factor in (2.0**1000, 2.0**-900):
-        np.testing.assert_array_equal(
-            old.transfer(q * factor, new, 2, adapter=adapter), plain * factor
-        )
+        np.testing.assert_array_equal(old.transfer(q * factor, new, 2, adapter=adapter), plain * factor)
     np.testing.assert_array_equal(old.transfer(np.zeros(90), new, adapter=adapter), 0)
 
 
@@ -455,9 +442,7 @@ def test_any_mesh(adapter, data, dim, order):
     box = Box((0,) * dim, (1,) * dim)
     place = st.tuples(*[st.integers(0, 8)] * dim)
     meshes = [
-        adapter.diagram(
-            box, np.array(data.draw(st.lists(place, min_size=1, max_size=25, unique=True))) / 8
-        )
+        adapter.diagram(box, np.array(data.draw(st.lists(place, min_size=1, max_size=25, unique=True))) / 8)
         for _ in range(2)
     ]
     old, new = meshes
@@ -506,9 +491,7 @@ def test_coincident_generators_are_rejected(mesh, adapter, dim):
     names = ("volumes", "centroids", "neighbor_starts", "neighbors")
     arrays = {name: getattr(new, name) for name in names}
     with pytest.raises(InputError, match=r"diagram\.check\(\)"):
-        old.transfer(
-            np.ones(60), Diagram(new.domain, {**arrays, "points": points}), adapter=adapter
-        )
+        old.transfer(np.ones(60), Diagram(new.domain, {**arrays, "points": points}), adapter=adapter)
 
 
 def test_graphs_of_no_voronoi_diagram_are_rejected(mesh, adapter):

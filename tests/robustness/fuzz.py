@@ -99,21 +99,13 @@ def table(ends: dict[str, collections.Counter], errors: dict[str, collections.Co
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.robustness.fuzz", description=__doc__.split("\n")[0]
-    )
+    parser = argparse.ArgumentParser(prog="python -m tests.robustness.fuzz", description=__doc__.split("\n")[0])
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--seed", type=int, help="of the first input (default: from the clock)")
-    parser.add_argument(
-        "--repeat", type=int, metavar="SEED", help="try this one input, and show how it ends"
-    )
+    parser.add_argument("--repeat", type=int, metavar="SEED", help="try this one input, and show how it ends")
     parser.add_argument("--only", choices=list(WORK), help="inputs of one kind")
-    parser.add_argument(
-        "--without", choices=list(WORK), nargs="+", default=[], help="no inputs of these kinds"
-    )
-    parser.add_argument(
-        "--out", type=Path, default=Path("fuzz-failures"), help="folder for what fails"
-    )
+    parser.add_argument("--without", choices=list(WORK), nargs="+", default=[], help="no inputs of these kinds")
+    parser.add_argument("--out", type=Path, default=Path("fuzz-failures"), help="folder for what fails")
     arguments = parser.parse_args()
     if arguments.repeat is not None:
         kind = arguments.only or kind_of(arguments.repeat)
@@ -132,9 +124,7 @@ def main() -> int:
             continue
         tried += 1
         faulthandler.dump_traceback_later(SLOWEST, exit=True)
-        now.write_text(
-            f"python -m tests.robustness.fuzz --repeat {seed} --only {kind}\n"
-        )  # should it crash or hang
+        now.write_text(f"python -m tests.robustness.fuzz --repeat {seed} --only {kind}\n")  # should it crash or hang
         try:
             end, error = attempt(kind, seed)
             ends[kind][end] += 1
@@ -148,9 +138,7 @@ def main() -> int:
             ends[kind]["failed"] += 1
             text = f"python -m tests.robustness.fuzz --repeat {seed} --only {kind}\n\n{traceback.format_exc()}"
             (arguments.out / f"{seed}.txt").write_text(text)
-            print(
-                f"--repeat {seed} --only {kind}: {type(error).__name__}: {error!s:.600}", flush=True
-            )
+            print(f"--repeat {seed} --only {kind}: {type(error).__name__}: {error!s:.600}", flush=True)
     faulthandler.cancel_dump_traceback_later()
     now.unlink(missing_ok=True)
     print(table(ends, errors))

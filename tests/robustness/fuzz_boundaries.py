@@ -53,9 +53,7 @@ def try_hard(rng: np.random.Generator) -> str:
     if method in ("adaptive", "exact"):
         options["effort"] = "fast"
     cells = 10 ** rng.uniform(0.5, 2.7)
-    if (
-        len(points) > 20 * cells
-    ):  # of very many on lines few are deleted at a time, which takes minutes
+    if len(points) > 20 * cells:  # of very many on lines few are deleted at a time, which takes minutes
         return diagram(domain, points, real)
     size = float(np.sqrt(domain.measure / cells))
     steps = int(rng.integers(0, 6))

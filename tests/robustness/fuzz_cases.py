@@ -9,9 +9,7 @@ import numpy as np
 
 from tests.robustness import fuzz_files as files
 
-STRANGE = [
-    None, -1, 0, "", "nonsense", [], {}, True, [1], 1e300, [[1, 2]], float("nan"), "../a.npy",
-]  # fmt: skip
+STRANGE = [None, -1, 0, "", "nonsense", [], {}, True, [1], 1e300, [[1, 2]], float("nan"), "../a.npy"]
 DOMAINS: list[dict[str, Any]] = [
     {"lower": [0, 0], "upper": [2, 1]},
     {"lower": [0, 0], "upper": [2, 2], "periodic": True},
@@ -21,7 +19,7 @@ DOMAINS: list[dict[str, Any]] = [
     {"polygon": "g.geojson"},
     {"polygon": "w.wkt"},
     {"lower": [0, 0, 0], "upper": [1, 1, 0.7]},
-]  # fmt: skip
+]
 
 
 def some_shape(rng: np.random.Generator, d: int) -> dict[str, Any]:
@@ -47,9 +45,7 @@ def some_field(rng: np.random.Generator, domain: dict[str, Any], depth: int = 0)
     d = len(domain.get("lower", (0, 0)))
     growth = {"growth": 1.3} if rng.random() < 0.5 else {"slope": 0.4}
     shapes = [some_shape(rng, d) for _ in range(rng.integers(1, 3))]
-    covers = (
-        {} if "lower" in domain and rng.random() < 0.5 else {"lower": [-1] * d, "upper": [7] * d}
-    )
+    covers = {} if "lower" in domain and rng.random() < 0.5 else {"lower": [-1] * d, "upper": [7] * d}
     bounds = {"h_min": 0.1, "h_max": 0.4}
     fields: list[Any] = [
         0.2,
@@ -58,7 +54,7 @@ def some_field(rng: np.random.Generator, domain: dict[str, Any], depth: int = 0)
         {"kind": "distance", "shapes": shapes, "h_min": 0.1, "h_max": 0.3, **growth},
         {"kind": "raster", "file": "a.npy", "outside": "nearest", **covers},
         {"kind": str(rng.choice(["hessian", "gradient"])), "file": "u.npy", "eps": 0.1, **bounds, **covers},
-    ]  # fmt: skip
+    ]
     if "lower" not in domain:
         fields.append({"kind": "feature", "cells_across": 2, "growth": 1.4, **bounds})
     if depth > 1 or rng.random() < 0.5:
@@ -89,9 +85,15 @@ def some_run(rng: np.random.Generator, d: int, real: str) -> dict[str, Any]:
     else:
         run["method"] = str(rng.choice(methods))
     optional = {
-        "levels": ["auto", 0, 1][rng.integers(3)], "error_target": 0.05, "start": "uniform", "tol": 0.7, "k": 0.3,
-        "alpha": 2.0, "points": "points.npy", "n_cells": 150,
-    }  # fmt: skip
+        "levels": ["auto", 0, 1][rng.integers(3)],
+        "error_target": 0.05,
+        "start": "uniform",
+        "tol": 0.7,
+        "k": 0.3,
+        "alpha": 2.0,
+        "points": "points.npy",
+        "n_cells": 150,
+    }
     return run | {key: value for key, value in optional.items() if rng.random() < 0.12}
 
 

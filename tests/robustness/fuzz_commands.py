@@ -53,12 +53,19 @@ def try_command(rng: np.random.Generator) -> str:
         several = isinstance(settings, dict) and "methods" in settings
         run = ["run", str(folder / "c.toml"), "--out", str(folder / "out")]
         options = [
-            ["--profile"], ["--quiet"], ["--json"], ["--steps", "3"], ["--tol", "0.6"], ["--seed", "8"],
-            ["--dtype", "float32"], ["--levels", "two" if wild else str(rng.choice(["auto", "0", "1"]))],
+            ["--profile"],
+            ["--quiet"],
+            ["--json"],
+            ["--steps", "3"],
+            ["--tol", "0.6"],
+            ["--seed", "8"],
+            ["--dtype", "float32"],
+            ["--levels", "two" if wild else str(rng.choice(["auto", "0", "1"]))],
             ["--cells", "90"],
-            ["--method", "magic" if wild else str(rng.choice(["exact", "lloyd"]))], ["--k", "0.4"],
+            ["--method", "magic" if wild else str(rng.choice(["exact", "lloyd"]))],
+            ["--k", "0.4"],
             ["--checkpoint-every", "-1" if wild else "0"],
-        ]  # fmt: skip
+        ]
         if not wild and (case.get("layers") or several):  # of many rows, and without a state
             options = [o for o in options if o[0] not in ("--cells", "--checkpoint-every")]
         run += [word for option in options if rng.random() < 0.15 for word in option]

@@ -49,13 +49,7 @@ def surfaces() -> dict[str, bytes]:
     corners = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
     sides = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
     mesh = trimesh.Trimesh(corners, sides, process=False)
-    kinds = {
-        "s.stl": "stl",
-        "ascii.stl": "stl_ascii",
-        "s.obj": "obj",
-        "s.off": "off",
-        "s.ply": "ply",
-    }
+    kinds = {"s.stl": "stl", "ascii.stl": "stl_ascii", "s.obj": "obj", "s.off": "off", "s.ply": "ply"}
     made = {name: mesh.export(file_type=kind) for name, kind in kinds.items()}
     return {k: v.encode() if isinstance(v, str) else bytes(v) for k, v in made.items()}
 
@@ -69,12 +63,7 @@ def valid_files(adapter: clvoro.Adapter) -> dict[str, bytes]:
         result.save(folder / "m.npz")
         result.save(folder / "m.vtu")
         np.save(folder / "a.npy", result.points)
-        for file, text in {
-            "c.toml": CASE,
-            "g.geojson": GEOJSON,
-            "w.wkt": WKT,
-            **surfaces(),
-        }.items():
+        for file, text in {"c.toml": CASE, "g.geojson": GEOJSON, "w.wkt": WKT, **surfaces()}.items():
             (folder / file).write_bytes(text)
         return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
@@ -130,9 +119,7 @@ def read(path: Path) -> object:
 
 def same(a: Saved, b: Saved) -> bool:
     """Return whether two checkpoints have the same content."""
-    return set(a.arrays) == set(b.arrays) and all(
-        _bytes(a.arrays[name]) == _bytes(b.arrays[name]) for name in a.arrays
-    )
+    return set(a.arrays) == set(b.arrays) and all(_bytes(a.arrays[name]) == _bytes(b.arrays[name]) for name in a.arrays)
 
 
 def _bytes(array: np.ndarray) -> bytes:

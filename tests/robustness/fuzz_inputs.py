@@ -26,10 +26,7 @@ def some_box(rng: np.random.Generator, dim: int = 2, wild: bool = True) -> clvor
         return clvoro.Box(tuple(lower), tuple(lower + extent))
 
 
-SHAPES = {
-    2: [(1, 1), (1, 0.75), (0.625, 1), (1, 0.3125)],
-    3: [(1, 1, 1), (1, 0.75, 0.75), (0.6875, 1, 0.5625)],
-}
+SHAPES = {2: [(1, 1), (1, 0.75), (0.625, 1), (1, 0.3125)], 3: [(1, 1, 1), (1, 0.75, 0.75), (0.6875, 1, 0.5625)]}
 """Extents of most periodic boxes: kernels are built for each shape, and exact in binary whatever the unit."""
 
 
@@ -40,9 +37,7 @@ def some_periodic_box(rng: np.random.Generator, dim: int, wild: bool = True) -> 
         box = some_box(rng, dim, wild)
         lower, upper = box.lower, box.upper
     else:
-        extent = np.array(SHAPES[dim][rng.integers(len(SHAPES[dim]))]) * 2.0 ** rng.integers(
-            -30, 30
-        )
+        extent = np.array(SHAPES[dim][rng.integers(len(SHAPES[dim]))]) * 2.0 ** rng.integers(-30, 30)
         lower = float(rng.choice([0, -0.5, 3])) * extent
         upper = lower + extent
     return clvoro.Box(tuple(lower), tuple(upper), periodic=tuple(periodic.tolist()))
@@ -50,9 +45,7 @@ def some_periodic_box(rng: np.random.Generator, dim: int, wild: bool = True) -> 
 
 def some_points(rng: np.random.Generator, dim: int = 2) -> np.ndarray:
     """Generators in the unit box."""
-    n = int(
-        rng.choice([1, 2, 3, rng.integers(4, 13), rng.integers(13, 300), rng.integers(300, 2500)])
-    )
+    n = int(rng.choice([1, 2, 3, rng.integers(4, 13), rng.integers(13, 300), rng.integers(300, 2500)]))
     if dim == 3:
         n = min(n, 200)
     return KINDS[rng.choice(list(KINDS))](rng, n, dim)
@@ -84,9 +77,7 @@ def ulps(rng, n, dim):
 def lattice(rng, n, dim):
     """A lattice, also up to the walls, sheared, or disturbed by round-off."""
     side = max(1, round(n ** (1 / dim)))
-    line = (
-        np.arange(side) / max(side - 1, 1) if rng.random() < 0.4 else (np.arange(side) + 0.5) / side
-    )
+    line = np.arange(side) / max(side - 1, 1) if rng.random() < 0.4 else (np.arange(side) + 0.5) / side
     x = np.stack(np.meshgrid(*[line] * dim), axis=-1).reshape(-1, dim)
     if rng.random() < 0.3:
         x[:, 0] = (x[:, 0] + rng.choice([0.25, 0.5]) * x[:, 1]) % 1
@@ -118,9 +109,7 @@ def walls(rng, n, dim):
     """Generators on walls, in corners, and one ulp beside them."""
     x = rng.random((n, dim))
     put = rng.random((n, dim)) < 0.6
-    x[put] = rng.choice(
-        [0.0, 1.0, np.finfo(float).eps, 1 - np.finfo(float).eps / 2, 1e-300], put.sum()
-    )
+    x[put] = rng.choice([0.0, 1.0, np.finfo(float).eps, 1 - np.finfo(float).eps / 2, 1e-300], put.sum())
     return x
 
 
@@ -130,9 +119,7 @@ def repeated(rng, n, dim):
     return x
 
 
-KINDS = {
-    f.__name__: f for f in (uniform, graded, clusters, ulps, lattice, circle, line, walls, repeated)
-}
+KINDS = {f.__name__: f for f in (uniform, graded, clusters, ulps, lattice, circle, line, walls, repeated)}
 
 
 def around(rng: np.random.Generator, dim: int) -> np.ndarray:
@@ -161,9 +148,7 @@ def around(rng: np.random.Generator, dim: int) -> np.ndarray:
     return x
 
 
-def placed(
-    rng: np.random.Generator, box: clvoro.Box, real: str = "float64", wild: bool = True
-) -> np.ndarray:
+def placed(rng: np.random.Generator, box: clvoro.Box, real: str = "float64", wild: bool = True) -> np.ndarray:
     """Return points in `box` that are distinct in the precision `real`; `wild`: also coincident ones."""
     if wild and rng.random() < 0.1:
         return NONSENSE[rng.integers(len(NONSENSE))]
@@ -171,13 +156,7 @@ def placed(
     if any(box.periodic) and rng.random() < 0.2:
         x = x + rng.integers(-3, 4, x.shape) * np.where(box.periodic, box.extent, 0.0)
     elif not wild or rng.random() < 0.95:
-        x = np.clip(
-            x,
-            *(
-                np.where(box.periodic, (-np.inf, np.inf)[k], c)
-                for k, c in enumerate((box.lower, box.upper))
-            ),
-        )
+        x = np.clip(x, *(np.where(box.periodic, (-np.inf, np.inf)[k], c) for k, c in enumerate((box.lower, box.upper))))
     x = x.astype(np.float32) if wild and rng.random() < 0.1 else x
     if wild and rng.random() < 0.6:
         return x
@@ -186,10 +165,20 @@ def placed(
 
 
 NONSENSE = [
-    None, "points", np.zeros((0, 2)), np.zeros((3, 4)), [[1, 2], [3]], np.array([["a", "b"]]), 3.0,
-    np.full((2, 2), np.nan), np.array([[np.inf, 0.0]]), np.zeros((2, 2), complex), np.zeros((4, 2), object),
-    np.zeros((2, 2, 2)), {"x": 1},
-]  # fmt: skip
+    None,
+    "points",
+    np.zeros((0, 2)),
+    np.zeros((3, 4)),
+    [[1, 2], [3]],
+    np.array([["a", "b"]]),
+    3.0,
+    np.full((2, 2), np.nan),
+    np.array([[np.inf, 0.0]]),
+    np.zeros((2, 2), complex),
+    np.zeros((4, 2), object),
+    np.zeros((2, 2, 2)),
+    {"x": 1},
+]
 
 
 def some_polygon(rng: np.random.Generator) -> clvoro.Polygon:
@@ -215,17 +204,13 @@ def some_polygon(rng: np.random.Generator) -> clvoro.Polygon:
     extent = np.array(shape.bounds[2:]) - low
     for _ in range(rng.integers(0, 4) if rng.random() < 0.4 else 0):
         center, radius = low + rng.uniform(0.1, 0.9, 2) * extent, 10 ** rng.uniform(-6, -0.5)
-        shape = shape.difference(
-            shapely.Polygon(shores.star(int(rng.integers(3, 9)), seed, center, radius))
-        )
+        shape = shape.difference(shapely.Polygon(shores.star(int(rng.integers(3, 9)), seed, center, radius)))
     if rng.random() < 0.3:
         a = rng.choice([np.pi / 4, np.pi / 6, rng.uniform(0, 6)])
         turn = np.array([(np.cos(a), np.sin(a)), (-np.sin(a), np.cos(a))])
         shape = shapely.transform(shape, lambda x: x @ turn)
     if rng.random() < 0.3:
-        scale = (
-            10.0 ** rng.uniform(-2, 2, 2) if rng.random() < 0.5 else 10.0 ** rng.uniform(-30, 30)
-        )
+        scale = 10.0 ** rng.uniform(-2, 2, 2) if rng.random() < 0.5 else 10.0 ** rng.uniform(-30, 30)
         shift = rng.choice([0, 1, 1e4]) * rng.uniform(-1, 1, 2)
         shape = shapely.transform(shape, lambda x: (x + shift) * scale)
     return clvoro.Polygon.from_shapely(shape)
@@ -267,9 +252,11 @@ def some_layers(
         width = min(edges / 10 ** rng.uniform(1, 3), np.inf if wild else 0.3 * room)
         count, growth = int(rng.integers(1, 6)), float(rng.choice([1.0, 1.1, 1.2, 1.5, 3.0]))
         options = {
-            "height": min(width, 0.5 * room) * 10 ** rng.uniform(-2, 0), "count": count, "growth": growth,
+            "height": min(width, 0.5 * room) * 10 ** rng.uniform(-2, 0),
+            "count": count,
+            "growth": growth,
             "spacing": width if rng.random() < 0.7 else None,
-        }  # fmt: skip
+        }
         if not wild:
             thickness = min(width, 0.2 * room) * 10 ** rng.uniform(-1, 0)
             options["height"] = thickness / (growth ** np.arange(count)).sum()

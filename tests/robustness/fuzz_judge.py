@@ -84,9 +84,7 @@ def demand_truth(error: InputError, domain: Any, real: str, points: Any, levels:
     if points is not None:
         placed = domain.place(np.asarray(points, float), np.dtype(float))
         apart = KDTree(placed).query(placed, k=2)[0][:, 1] if len(placed) > 1 else np.array([1.0])
-        least = (
-            CLOSE * np.finfo(real).eps if domain.dim == 2 else 3**levels * LEAST_SEPARATION[real]
-        )
+        least = CLOSE * np.finfo(real).eps if domain.dim == 2 else 3**levels * LEAST_SEPARATION[real]
         if apart.min() <= least:
             return
     raise Wrong(f"this is not so: {error}") from error

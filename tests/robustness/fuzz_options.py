@@ -12,9 +12,14 @@ from tests.robustness.fuzz_inputs import placed, placed_in_polygon
 from tests.robustness.fuzz_sizes import fail, fine_size
 
 CALLBACKS: list[Any] = [
-    lambda row: fail(), lambda row: "yes", lambda row: np.ones(2), lambda row: np.bool_(row["step"] > 2),
-    lambda: None, 3, lambda row: 0.0,
-]  # fmt: skip
+    lambda row: fail(),
+    lambda row: "yes",
+    lambda row: np.ones(2),
+    lambda row: np.bool_(row["step"] > 2),
+    lambda: None,
+    3,
+    lambda row: 0.0,
+]
 
 
 def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -> dict[str, Any]:
@@ -24,8 +29,9 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
     options: dict[str, Any] = {
         "method": str(rng.choice(methods, p=[0.35, 0.2, 0.13, 0.08, 0.08, 0.1, 0.06])),
         "effort": str(rng.choice(["fast", "default", "best"], p=[0.6, 0.3, 0.1])),
-        "seed": int(rng.integers(0, 2**31)), "start": str(rng.choice(["density", "uniform"])),
-    }  # fmt: skip
+        "seed": int(rng.integers(0, 2**31)),
+        "start": str(rng.choice(["density", "uniform"])),
+    }
     # Without a draw: the inputs of earlier seeds stay.
     others, chance = ("mmpde", "monge-ampere", "transport"), options["seed"] % 24
     # Most runs in boxes are complete.

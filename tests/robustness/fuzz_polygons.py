@@ -33,9 +33,7 @@ def fjords(rng: np.random.Generator) -> Any:
         way = 2 * np.array([np.cos(a), np.sin(a)]) * (1 - t) + rng.normal(0, 0.2, 2) * t
         way += rng.normal(0, 0.1, (n, 2))
         width = 10 ** rng.uniform(-6, -1.5)
-        cut = shapely.LineString(way).buffer(
-            width, cap_style="flat", join_style="mitre", quad_segs=1
-        )
+        cut = shapely.LineString(way).buffer(width, cap_style="flat", join_style="mitre", quad_segs=1)
         shape = shape.difference(cut)
     return shape
 
@@ -79,11 +77,7 @@ def many_pieces(rng: np.random.Generator) -> Any:
     n = int(rng.integers(5, 20))
     return shapely.union_all(
         [
-            shapely.Polygon(
-                shores.star(
-                    int(rng.integers(3, 8)), some_seed(rng), (i, j), rng.uniform(0.05, 0.48)
-                )
-            )
+            shapely.Polygon(shores.star(int(rng.integers(3, 8)), some_seed(rng), (i, j), rng.uniform(0.05, 0.48)))
             for i in range(n)
             for j in range(n)
             if rng.random() < 0.6
@@ -170,9 +164,20 @@ def spoilt(rng: np.random.Generator, ring: np.ndarray) -> Any:
     if rng.random() >= 0.06:
         return r
     strange = [
-        None, "x", 3.0, {}, [], [[1, 2], [3]], r.astype(object), r.astype(complex), r.tolist(), r[:, :1], r[None],
-        np.ma.array(r), r > 0,
-    ]  # fmt: skip
+        None,
+        "x",
+        3.0,
+        {},
+        [],
+        [[1, 2], [3]],
+        r.astype(object),
+        r.astype(complex),
+        r.tolist(),
+        r[:, :1],
+        r[None],
+        np.ma.array(r),
+        r > 0,
+    ]
     return strange[rng.integers(len(strange))]
 
 

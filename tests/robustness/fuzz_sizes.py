@@ -19,11 +19,27 @@ def fail():
 
 
 ABSURD = [
-    0, -1.0, np.nan, np.inf, 1e-300, 1e300, "0.1", None, [1, 2], lambda x: x, lambda x: None,
-    lambda x: np.full(len(x), np.nan), lambda x: -np.ones(len(x)), lambda x: "abc", lambda x: fail(),
-    lambda x: np.ones(len(x) + 1), lambda x: np.where(x[:, 0] > x[:, 0].mean(), 1.0, 0.0),
-    sizing.Expression("x"), sizing.Expression("log(x - y)"), sizing.Expression("1e300*exp(x)*exp(y)"),
-]  # fmt: skip
+    0,
+    -1.0,
+    np.nan,
+    np.inf,
+    1e-300,
+    1e300,
+    "0.1",
+    None,
+    [1, 2],
+    lambda x: x,
+    lambda x: None,
+    lambda x: np.full(len(x), np.nan),
+    lambda x: -np.ones(len(x)),
+    lambda x: "abc",
+    lambda x: fail(),
+    lambda x: np.ones(len(x) + 1),
+    lambda x: np.where(x[:, 0] > x[:, 0].mean(), 1.0, 0.0),
+    sizing.Expression("x"),
+    sizing.Expression("log(x - y)"),
+    sizing.Expression("1e300*exp(x)*exp(y)"),
+]
 
 
 def some_size(rng: np.random.Generator, domain: Domain, wild: bool):
@@ -73,9 +89,7 @@ def constant(rng, domain, h, depth):
 
 def distance(rng, domain, h, depth):
     shapes = [some_shape(rng, domain) for _ in range(rng.integers(1, 4))]
-    growth = (
-        {"growth": rng.uniform(1.05, 2)} if rng.random() < 0.5 else {"slope": rng.uniform(0.02, 1)}
-    )
+    growth = {"growth": rng.uniform(1.05, 2)} if rng.random() < 0.5 else {"slope": rng.uniform(0.02, 1)}
     return sizing.Distance(shapes, h / ratio(rng, domain), h_max=h, **growth)
 
 
@@ -86,9 +100,7 @@ def some_shape(rng: np.random.Generator, domain: Domain):
     corners = middle + rng.uniform(-reach, reach, (int(rng.integers(3, 9)), d)) * (high - low)
     kind = rng.integers(0, 7)
     if kind == 0:
-        return sizing.Circle(
-            corners[0], float(rng.choice([0, 0.1, 0.3])) * float((high - low).min())
-        )
+        return sizing.Circle(corners[0], float(rng.choice([0, 0.1, 0.3])) * float((high - low).min()))
     if kind == 1:
         return sizing.Segment(corners[0], corners[1])
     if kind == 2:
@@ -96,9 +108,7 @@ def some_shape(rng: np.random.Generator, domain: Domain):
     if kind == 3:
         return sizing.ClosedPolyline(corners)
     if kind == 4 and d == 3:
-        return (
-            sizing.Surface(corners[:3], [[0, 1, 2]]) if len(corners) < 5 else tetrahedron(corners)
-        )
+        return sizing.Surface(corners[:3], [[0, 1, 2]]) if len(corners) < 5 else tetrahedron(corners)
     if kind == 5:
         return clvoro.Box(tuple(middle - 0.2 * (high - low)), tuple(middle + 0.3 * (high - low)))
     return domain
@@ -130,13 +140,8 @@ def scattered(rng, domain, h, depth):
 def expression(rng, domain, h, depth):
     """A wave, continuous across seams or not."""
     low, extent, share = domain.lower, domain.extent, 1 - 1 / ratio(rng, domain)
-    waves = [
-        2 * np.pi * (int(rng.integers(0, 3)) if rng.random() < 0.7 else rng.uniform(0, 3)) / e
-        for e in extent
-    ]
-    phase = " + ".join(
-        f"{w!r}*({a} - {c!r})" for w, a, c in zip(map(float, waves), "xyz", low, strict=False)
-    )
+    waves = [2 * np.pi * (int(rng.integers(0, 3)) if rng.random() < 0.7 else rng.uniform(0, 3)) / e for e in extent]
+    phase = " + ".join(f"{w!r}*({a} - {c!r})" for w, a, c in zip(map(float, waves), "xyz", low, strict=False))
     return sizing.Expression(f"{h!r} * (1 - {share / 2!r}*(1 + sin({phase})))")
 
 
@@ -149,9 +154,7 @@ def jump(rng, domain, h, depth):
     if depth:  # combined with others it may be as fine everywhere, with a million cells: too long for a test
         fine = max(fine, h / 5)
     place = float(rng.choice([middle, domain.lower[0], domain.upper[0]]))
-    return sizing.Expression(
-        f"fabs(x - {place!r}) < {fine * rng.uniform(0.2, 4)!r} ? {float(fine)!r} : {h!r}"
-    )
+    return sizing.Expression(f"fabs(x - {place!r}) < {fine * rng.uniform(0.2, 4)!r} ? {float(fine)!r} : {h!r}")
 
 
 def function(rng, domain, h, depth):
@@ -195,26 +198,18 @@ def solution(rng, domain, h, depth):
 
 def feature(rng, domain, h, depth):
     return sizing.FeatureSize(
-        domain, rng.uniform(0.5, 4), rng.uniform(1.1, 2), h_min=h / ratio(rng, domain), h_max=h,
+        domain,
+        rng.uniform(0.5, 4),
+        rng.uniform(1.1, 2),
+        h_min=h / ratio(rng, domain),
+        h_max=h,
         curvature=float(rng.choice([0, 1, 3])),
-    )  # fmt: skip
+    )
 
 
 FIELDS = {
     f.__name__: f
-    for f in (
-        constant,
-        distance,
-        raster,
-        scattered,
-        expression,
-        jump,
-        function,
-        graded,
-        combined,
-        solution,
-        feature,
-    )
+    for f in (constant, distance, raster, scattered, expression, jump, function, graded, combined, solution, feature)
 }
 
 
@@ -228,9 +223,7 @@ def some_graded(rng: np.random.Generator, domain: Domain, field, wild: bool) -> 
         strange = [1e9, 1e300, -1.0, np.nan] if wild else []
         options["slope"] = rng.choice([0.0, 1e-9, 0.1, 0.5, 3.0, *strange])
     if rng.random() < 0.5:
-        options["resolution"] = [2, 3, 17, 90, tuple(rng.integers(2, 9, domain.dim).tolist())][
-            rng.integers(5)
-        ]
+        options["resolution"] = [2, 3, 17, 90, tuple(rng.integers(2, 9, domain.dim).tolist())][rng.integers(5)]
     if wild and rng.random() < 0.4:
         # More nodes than any grid may have. Numbers between take too long for a test.
         options["resolution"] = [10**7, 2.5, 1, (10**7,) * domain.dim][rng.integers(4)]

@@ -15,14 +15,7 @@ import clvoro
 from clvoro.errors import InputError
 from clvoro.geometry.boundary_layers import count_rows, free_domain, place_layers
 from clvoro.io.vtu_read import load_vtu
-from tests.robustness.fuzz_inputs import (
-    around,
-    placed,
-    some_box,
-    some_layers,
-    some_periodic_box,
-    some_polygon,
-)
+from tests.robustness.fuzz_inputs import around, placed, some_box, some_layers, some_periodic_box, some_polygon
 from tests.robustness.fuzz_judge import Wrong, adapter, demand, diagram_by, run_by, some_real
 from tests.robustness.fuzz_options import some_options
 from tests.robustness.fuzz_sizes import fine_size, some_size
@@ -158,11 +151,7 @@ def some_domain(rng: np.random.Generator) -> clvoro.Box | clvoro.Polygon:
     kind = rng.integers(0, 5)
     if kind < 2:
         return some_box(rng, int(rng.choice([2, 2, 3])), wild=False)
-    return (
-        some_polygon(rng)
-        if kind == 2
-        else some_periodic_box(rng, int(rng.choice([2, 2, 3])), wild=False)
-    )
+    return some_polygon(rng) if kind == 2 else some_periodic_box(rng, int(rng.choice([2, 2, 3])), wild=False)
 
 
 def try_resumed(rng: np.random.Generator) -> str:
@@ -170,12 +159,7 @@ def try_resumed(rng: np.random.Generator) -> str:
     domain, real = some_domain(rng), some_real(rng)
     arguments = (domain, some_size(rng, domain, wild=False))
     options = some_options(rng, domain, real, wild=False)
-    if (
-        not isinstance(domain, clvoro.Polygon)
-        and domain.dim == 2
-        and rng.random() < 0.2
-        and not any(domain.periodic)
-    ):
+    if not isinstance(domain, clvoro.Polygon) and domain.dim == 2 and rng.random() < 0.2 and not any(domain.periodic):
         options["layers"] = few_layers(rng, domain, wild=False)
         options.pop("n_cells", None)
     whole = run_by(clvoro.Adapter(adapter(real).ctx, real), *arguments, **options)
@@ -193,9 +177,7 @@ def try_resumed(rng: np.random.Generator) -> str:
         if not state.exists():
             return "mesh"  # it had ended
         try:
-            resumed = adapter(real).run(
-                *arguments, checkpoint=clvoro.Checkpoint(resume=state), **options
-            )
+            resumed = adapter(real).run(*arguments, checkpoint=clvoro.Checkpoint(resume=state), **options)
         except InputError as error:
             raise Wrong(f"not resumed after row {left}: {error}") from error
     for name in ("points", "size_error", "quality", "target_size"):
@@ -207,21 +189,13 @@ def try_resumed(rng: np.random.Generator) -> str:
 def try_moved(rng: np.random.Generator) -> str:
     """A mesh adapted to another field, and values carried over to it."""
     domain, real = some_domain(rng), some_real(rng)
-    options = {
-        "effort": "fast",
-        "method": str(rng.choice(["adaptive", "exact"])),
-        "seed": int(rng.integers(99)),
-    }
+    options = {"effort": "fast", "method": str(rng.choice(["adaptive", "exact"])), "seed": int(rng.integers(99))}
     first = run_by(adapter(real), domain, some_size(rng, domain, wild=False), **options)
-    second = adapter(real).run(
-        domain, some_size(rng, domain, wild=False), points=first.points, **options
-    )
+    second = adapter(real).run(domain, some_size(rng, domain, wild=False), points=first.points, **options)
     demand(second, real)
     if domain.dim == 3 and any(domain.periodic):  # where transfer is not implemented
         return "mesh"
-    values = rng.choice([1.0, 1e-200, 1e200]) * rng.standard_normal(
-        (len(first.points), 2)
-    ) + rng.choice([0, 1])
+    values = rng.choice([1.0, 1e-200, 1e200]) * rng.standard_normal((len(first.points), 2)) + rng.choice([0, 1])
     got = first.transfer(values, onto=second, order=int(rng.choice([1, 2])))
     before, after = first.diagram.volumes @ values, second.diagram.volumes @ got
     # In single precision the sums of volumes differ, and bounds have priority over conservation.
@@ -260,17 +234,17 @@ def try_turns(rng: np.random.Generator) -> str:
             if not np.array_equal(getattr(resumed, name), getattr(whole, name)):
                 raise Wrong(f"in an adapter that has done more a resumed run has other {name}")
         changed: dict[str, Any] = {
-            "seed": options["seed"] + 1, "options": clvoro.PaperOptions(k=0.7, tol=0.3),
-            "points": whole.points[:3], "n_cells": 7, "method": "lloyd",
-            "max_steps": 1, "effort": "default",
-        }  # fmt: skip
+            "seed": options["seed"] + 1,
+            "options": clvoro.PaperOptions(k=0.7, tol=0.3),
+            "points": whole.points[:3],
+            "n_cells": 7,
+            "method": "lloyd",
+            "max_steps": 1,
+            "effort": "default",
+        }
         name = str(rng.choice(list(changed)))
         with contextlib.suppress(InputError):  # the state is of another run
-            other = kept.run(
-                *arguments,
-                **{**options, name: changed[name]},
-                checkpoint=clvoro.Checkpoint(resume=state),
-            )
+            other = kept.run(*arguments, **{**options, name: changed[name]}, checkpoint=clvoro.Checkpoint(resume=state))
             demand(other, real)
     return "mesh"
 

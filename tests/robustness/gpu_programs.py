@@ -32,18 +32,9 @@ TARGETS = {
     "NVIDIA": ["-target", "nvptx64-nvidia-nvcl"],
     "AMD": ["-target", "amdgcn-amd-amdhsa", "-mcpu=gfx90a", "-nogpulib"],
     "SPIR": ["-target", "spir64", "-emit-llvm"],
-    "generic": [
-        "-target",
-        "spir64",
-        "-cl-std=CL2.0",
-        "-emit-llvm",
-        "-Wno-constant-logical-operand",
-    ],
+    "generic": ["-target", "spir64", "-cl-std=CL2.0", "-emit-llvm", "-Wno-constant-logical-operand"],
 }
-CLANG = [
-    "-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header", "-Xclang",
-    "-fdeclare-opencl-builtins",
-]  # fmt: skip
+CLANG = ["-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header", "-Xclang", "-fdeclare-opencl-builtins"]
 LIBRARIES = ("/usr/lib/clc", "/usr/lib/llvm-*/share/clc", "/usr/share/clc")
 """Folders of the built-in functions in LLVM's bitcode (Debian's packages libclc-*)."""
 FIRST_CAPACITIES = {
@@ -82,9 +73,7 @@ def noting_programs() -> Iterator[list[Source]]:
     sources: list[Source] = []
     build = _program.build_program
 
-    def noted(
-        context: cl.Context, name: str, defines: Mapping[str, object], prelude: str
-    ) -> cl.Program:
+    def noted(context: cl.Context, name: str, defines: Mapping[str, object], prelude: str) -> cl.Program:
         text, options = _program.program_text(name, defines, prelude)
         source = Source(name, options, text)
         if source not in found:
@@ -149,31 +138,23 @@ def programs_of_a_first_run(ctx: cl.Context, dim: int, dtype: str) -> list[Sourc
         if f"{stage}.cl" in CPU_ONLY:
             continue
         scalar = {"IN_LANES": "0"} if "IN_LANES" in defines else {}
-        real = {name: dtype.replace("float64", "double").replace("float32", "float")
-                for name, value in defines.items() if value == "double"}  # fmt: skip
+        real = {
+            name: dtype.replace("float64", "double").replace("float32", "float")
+            for name, value in defines.items()
+            if value == "double"
+        }
         full = engine.all_defines(stage, defines | scalar | real | FIRST_CAPACITIES.get(stage, {}))
         text, options = _program.program_text(f"{stage}.cl", full, "")
         sources.append(Source(f"{stage}.cl", options, text))
     return sources
 
 
-def compile_for(
-    target: str, source: Source, folder: Path, *more: str, optimize: str = "-O1"
-) -> tuple[str, str]:
+def compile_for(target: str, source: Source, folder: Path, *more: str, optimize: str = "-O1") -> tuple[str, str]:
     """Return the text that clang makes of `source`, and its messages."""
     stem = f"{abs(hash((target, source, more, optimize))):x}"
     given, made = folder / f"{stem}.cl", folder / f"{stem}.s"
     given.write_text(source.text)
-    flags = [
-        clang() or "clang",
-        *CLANG,
-        optimize,
-        "-Wall",
-        "-Wno-unused",
-        *TARGETS[target],
-        *source.options,
-        *more,
-    ]
+    flags = [clang() or "clang", *CLANG, optimize, "-Wall", "-Wno-unused", *TARGETS[target], *source.options, *more]
     done = subprocess.run([*flags, "-S", "-o", made, given], capture_output=True, text=True)
     assert done.returncode == 0 or done.stderr
     text = made.read_text() if made.exists() else ""
@@ -195,17 +176,19 @@ def undefined_functions(target: str, source: Source, folder: Path) -> list[str]:
 @cache
 def clang() -> str | None:
     """Return the compiler: `CLANG` of the environment, else clang, else the newest version such as PoCL installs."""
-    versions = [
-        p for p in Path("/usr/bin").glob("clang-*") if p.name.removeprefix("clang-").isdigit()
-    ]
+    versions = [p for p in Path("/usr/bin").glob("clang-*") if p.name.removeprefix("clang-").isdigit()]
     newest = max(versions, key=lambda p: int(p.name.removeprefix("clang-")), default=None)
     return shutil.which(os.environ.get("CLANG", "clang")) or (str(newest) if newest else None)
 
 
 def library(name: str) -> Path | None:
     """Return the built-in functions of OpenCL for a target, or None if they are not installed."""
-    found = (path / name for pattern in (os.environ.get("LIBCLC", ""), *LIBRARIES) if pattern
-             for path in sorted(Path("/").glob(pattern.lstrip("/"))))  # fmt: skip
+    found = (
+        path / name
+        for pattern in (os.environ.get("LIBCLC", ""), *LIBRARIES)
+        if pattern
+        for path in sorted(Path("/").glob(pattern.lstrip("/")))
+    )
     return next((path for path in found if path.exists()), None)
 
 
@@ -229,30 +212,38 @@ _LIBRARY = {"NVIDIA": "nvptx64--nvidiacl.bc", "AMD": "amdgcn--amdhsa.bc"}
 
 def nvidia_figures(source: Source, folder: Path, arch: str = "sm_90") -> dict[str, Figures]:
     """Return the figures of each kernel by ``ptxas -v``, from PTX of clang with libclc's functions."""
-    triple = ["-target", "nvptx64--nvidiacl", "-Xclang", "-target-cpu", "-Xclang", "sm_80",
-              "-Xclang", "-target-feature", "-Xclang", "+ptx70"]  # fmt: skip
+    triple = [
+        "-target",
+        "nvptx64--nvidiacl",
+        "-Xclang",
+        "-target-cpu",
+        "-Xclang",
+        "sm_80",
+        "-Xclang",
+        "-target-feature",
+        "-Xclang",
+        "+ptx70",
+    ]
     bitcode = library(_LIBRARY["NVIDIA"])
     assert bitcode is not None
-    ptx, said = compile_for(
-        "NVIDIA", static(source), folder, *triple, *linking(bitcode), optimize="-O3"
-    )
+    ptx, said = compile_for("NVIDIA", static(source), folder, *triple, *linking(bitcode), optimize="-O3")
     assert ptx, f"{source.name}: {said[:1000]}"
     stem = folder / f"{abs(hash(ptx)):x}.ptx"
     stem.write_text(ptx)
     done = subprocess.run(
-        ["ptxas", "-v", f"-arch={arch}", "-o", stem.with_suffix(".cubin"), stem],
-        capture_output=True, text=True,
-    )  # fmt: skip
+        ["ptxas", "-v", f"-arch={arch}", "-o", stem.with_suffix(".cubin"), stem], capture_output=True, text=True
+    )
     for path in (stem, stem.with_suffix(".cubin")):
         path.unlink(missing_ok=True)
     assert done.returncode == 0, f"{source.name}: {done.stderr[:1000]}"
     found = {}
-    for name, block in re.findall(
-        r"Compiling entry function '(\w+)'(.*?)(?=Compiling entry|\Z)", done.stderr, re.S
-    ):
-        frame, stores, loads = map(int, re.findall(
-            rf"Function properties for {name}\n\s*(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+)", block
-        )[0])  # fmt: skip
+    for name, block in re.findall(r"Compiling entry function '(\w+)'(.*?)(?=Compiling entry|\Z)", done.stderr, re.S):
+        frame, stores, loads = map(
+            int,
+            re.findall(
+                rf"Function properties for {name}\n\s*(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+)", block
+            )[0],
+        )
         found[name] = Figures(
             _number(r"Used (\d+) registers", block),
             stores + loads,
@@ -280,15 +271,10 @@ def amd_figures(source: Source, folder: Path) -> dict[str, Figures]:
     return found
 
 
-FIGURES: dict[str, Callable[[Source, Path], dict[str, Figures]]] = {
-    "NVIDIA": nvidia_figures,
-    "AMD": amd_figures,
-}
+FIGURES: dict[str, Callable[[Source, Path], dict[str, Figures]]] = {"NVIDIA": nvidia_figures, "AMD": amd_figures}
 
 
-def for_each(
-    function: Callable[[Source], Answer], sources: Iterable[Source]
-) -> list[tuple[Source, Answer]]:
+def for_each(function: Callable[[Source], Answer], sources: Iterable[Source]) -> list[tuple[Source, Answer]]:
     """Return each source with what `function` says of it; as many at a time as there are cores."""
     sources = list(sources)
     with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -42,9 +42,12 @@ def work(folder: Path) -> None:
         mesh.save(folder / "mesh.vtu")
 
     result = adapter.run(
-        BOX, clvoro.sizing.Expression(SIZE), callback=callback,
-        checkpoint=clvoro.Checkpoint(state, every=0, resume=True), **OPTIONS,
-    )  # fmt: skip
+        BOX,
+        clvoro.sizing.Expression(SIZE),
+        callback=callback,
+        checkpoint=clvoro.Checkpoint(state, every=0, resume=True),
+        **OPTIONS,
+    )
     result.save(folder / "result.npz")
 
 
@@ -107,13 +110,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="python -m tests.robustness.killing")
     parser.add_argument("--times", type=int, default=50)
     parser.add_argument("--seed", type=int, default=time.time_ns() % 10**6)
-    parser.add_argument(
-        "--patience", type=float, default=2.0, help="seconds up to which a child is let run"
-    )
+    parser.add_argument("--patience", type=float, default=2.0, help="seconds up to which a child is let run")
     parser.add_argument("--work", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    sys.exit(
-        work(arguments.work)
-        if arguments.work
-        else main(arguments.times, arguments.seed, arguments.patience)
-    )
+    sys.exit(work(arguments.work) if arguments.work else main(arguments.times, arguments.seed, arguments.patience))

@@ -34,10 +34,34 @@ _TOKEN = re.compile(
 )
 _IGNORED = re.compile(r"/\*.*?\*/|//[^\n]*|^[ \t]*#(?:\\\n|[^\n])*|\"[^\"\n]*\"", re.S | re.M)
 _SWAPPED = {
-    "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "&&": "||", "||": "&&", "+": "-", "-": "+",
-    "*": "/", "/": "*", "+=": "-=", "-=": "+=", "*=": "/=", "&": "|", "|": "&", "&=": "|=", "|=": "&=", "<<": ">>",
-    ">>": "<<", "min": "max", "max": "min", "fmin": "fmax", "fmax": "fmin", "any": "all", "all": "any",
-}  # fmt: skip
+    "<": "<=",
+    "<=": "<",
+    ">": ">=",
+    ">=": ">",
+    "==": "!=",
+    "!=": "==",
+    "&&": "||",
+    "||": "&&",
+    "+": "-",
+    "-": "+",
+    "*": "/",
+    "/": "*",
+    "+=": "-=",
+    "-=": "+=",
+    "*=": "/=",
+    "&": "|",
+    "|": "&",
+    "&=": "|=",
+    "|=": "&=",
+    "<<": ">>",
+    ">>": "<<",
+    "min": "max",
+    "max": "min",
+    "fmin": "fmax",
+    "fmax": "fmin",
+    "any": "all",
+    "all": "any",
+}
 _STATEMENT = re.compile(
     r"(?<=[;{})])\s*((?:return|continue|break"
     r"|(?:\+\+|\*)?\w[\w.\[\]>\-+* ]*(?:[+\-*/|&]?= [^;{}]*|\([^;{}]*\)|\+\+|--));)"
@@ -65,9 +89,7 @@ class Mutant:
     def __str__(self) -> str:
         begin = self.text.rfind("\n", 0, self.start) + 1
         end = self.text.find("\n", self.end)
-        mutated = (
-            f"{self.text[begin : self.start]}[{self.text[self.start : self.end]} -> {self.new}]"
-        )
+        mutated = f"{self.text[begin : self.start]}[{self.text[self.start : self.end]} -> {self.new}]"
         return f"{self.place}\n    {(mutated + self.text[self.end : end]).strip()}"
 
 
@@ -161,7 +183,7 @@ def main() -> int:
     parser.add_argument("files", nargs="*", metavar="FILE")
     parser.add_argument(
         "--tests", nargs="+", required=True, help='as pytest takes them; options in one word: "-k one or other"'
-    )  # fmt: skip
+    )
     parser.add_argument("--count", type=int, default=50, help="mutants in all, drawn by chance")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=[], metavar="PLACE")

@@ -25,7 +25,7 @@ from clvoro.adaptation.plan.actions import (
     ResetMomentum,
     Step,
 )
-from clvoro.geometry.box import Domain
+from clvoro.geometry.domain import Domain
 from clvoro.sizing import Expression
 from clvoro.tessellation import incremental as repair
 
@@ -61,9 +61,7 @@ def large(work: Work) -> Work:
 def polishing(domain: Domain) -> list[Action]:
     """Return the steps that end a run: descent with a penalty, then sizes alone."""
     descent = "quality" if domain.cell_dim == 2 else "surface"
-    exact = ProjectedMethod(
-        descent, penalty=1e-3, k=0.3, gradient_from_field=True, correct_mean=True
-    )
+    exact = ProjectedMethod(descent, penalty=1e-3, k=0.3, gradient_from_field=True, correct_mean=True)
     return [
         Step(ProjectedMethod(descent, quality_scale=0.02, log_ratio_scale=0.03, k=0.3)),
         Step(exact, openings=2 if isinstance(domain, clvoro.Sphere) else 0),
@@ -95,13 +93,7 @@ def every_action(domain: Domain, levels: int) -> list[Action]:
     return [*plan, ResetMomentum(), *polishing(domain)]
 
 
-def every_step(
-    domain: Domain,
-    size: str,
-    n_cells: int,
-    levels: int = 1,
-    **options: object,
-) -> Work:
+def every_step(domain: Domain, size: str, n_cells: int, levels: int = 1, **options: object) -> Work:
     """Return work that carries out the plan in `domain`, and its last steps once more as for a large mesh."""
 
     def work(adapter: clvoro.Adapter) -> None:
@@ -134,9 +126,7 @@ def every_step(
     return work
 
 
-def transport(
-    adapter: clvoro.Adapter, domain: Domain, x: np.ndarray, max_steps: int | None = None
-) -> None:
+def transport(adapter: clvoro.Adapter, domain: Domain, x: np.ndarray, max_steps: int | None = None) -> None:
     """Give the cells of `x` (n, d) equal volumes; after `max_steps`, others."""
     options = {} if max_steps is None else {"max_steps": max_steps}
     found = adapter.transport(domain, x, np.full(len(x), domain.measure / len(x)), **options)
@@ -184,9 +174,7 @@ SQUARE = clvoro.Box((0, 0), (1, 1), periodic=True)
 ROD = clvoro.Box((0, 0, 0), (1, 0.2, 0.2), periodic=(True, False, False))
 SLIT = [(0.499, 0), (0.499, 0.7), (0.501, 0.7), (0.501, 0)]
 NOTCHED = clvoro.Polygon([(0, 0), *SLIT, (2, 0), (2, 1.5), (1.2, 0.9), (1, 1.5), (0, 1.5)])
-TEETH = [
-    (k + side, 1 - 0.8 * (side in (0.4, 0.6))) for k in range(4) for side in (0.1, 0.4, 0.6, 0.9)
-]
+TEETH = [(k + side, 1 - 0.8 * (side in (0.4, 0.6))) for k in range(4) for side in (0.1, 0.4, 0.6, 0.9)]
 COMB = clvoro.Polygon([(-1, 0), (4.5, 0), *TEETH[::-1]])
 LAYERS = clvoro.Layers(0.05, count=2, spacing=0.2, edges=[2])
 RUNS: dict[str, Work] = {

@@ -27,18 +27,7 @@ from clvoro.opencl import program as _program
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.kernels import Kernels
 from clvoro.opencl.primitives import Scan
-from clvoro.sizing import (
-    Ball,
-    Circle,
-    ClosedPolyline,
-    Distance,
-    Expression,
-    Graded,
-    Raster,
-    Sizing,
-    Surface,
-    minimum,
-)
+from clvoro.sizing import Ball, Circle, ClosedPolyline, Distance, Expression, Graded, Raster, Sizing, Surface, minimum
 from clvoro.tessellation import teams
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT
@@ -66,14 +55,7 @@ def diagrams(adapter: clvoro.Adapter) -> None:
     cluster = np.concatenate([points(15), 0.3 + 1e-4 * points(60)])
     angle = np.linspace(0, 2 * np.pi, 29)[:-1]
     ring = 0.5 + 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    for each in (
-        points(1),
-        points(2),
-        to_the_walls,
-        lattice(4, 2),
-        cluster,
-        np.vstack([ring, [[0.5, 0.5]]]),
-    ):
+    for each in (points(1), points(2), to_the_walls, lattice(4, 2), cluster, np.vstack([ring, [[0.5, 0.5]]])):
         diagram = adapter.diagram(square, each)
         assert abs(diagram.volumes.sum() - 1) < 1e-4
         assert len(diagram.vertices) > 3
@@ -130,9 +112,7 @@ def solid(adapter: clvoro.Adapter) -> None:
         assert len(diagram.vertices) > 3
 
 
-def method(
-    name: str, box: clvoro.Box = BOX, size: str = GRADED, **options: object
-) -> Callable[[clvoro.Adapter], None]:
+def method(name: str, box: clvoro.Box = BOX, size: str = GRADED, **options: object) -> Callable[[clvoro.Adapter], None]:
     def work(adapter: clvoro.Adapter) -> None:
         result = adapter.run(box, Expression(size), method=name, seed=911, **options)
         assert np.isfinite(result.size_error).all()
@@ -171,17 +151,25 @@ def drop_faces(adapter: clvoro.Adapter) -> None:
         m = int(t.starts.get()[-1])
         kept = np.ones(m, np.uint8)
         kept[::7] = 0
-        starts = np.concatenate(
-            [[0], np.cumsum(np.add.reduceat(kept.astype(int), t.starts.get()[:-1]))]
-        )
+        starts = np.concatenate([[0], np.cumsum(np.add.reduceat(kept.astype(int), t.starts.get()[:-1]))])
         left = int(starts[-1])
         ints = [engine.empty(left, np.int32) for _ in range(3)]
         engine.run_each(
-            stages.ghost_images._kernels.close_rows, n, t.starts, engine.upload(kept, np.uint8),
-            engine.upload(starts, np.int32), t.neighbors, periodic.latest.folded.codes, t.face_measures,
-            t.face_centroids, ints[0], ints[1], engine.empty(left, engine.face),
-            engine.empty((left, dim), engine.face), ints[2],
-        )  # fmt: skip
+            stages.ghost_images._kernels.close_rows,
+            n,
+            t.starts,
+            engine.upload(kept, np.uint8),
+            engine.upload(starts, np.int32),
+            t.neighbors,
+            periodic.latest.folded.codes,
+            t.face_measures,
+            t.face_centroids,
+            ints[0],
+            ints[1],
+            engine.empty(left, engine.face),
+            engine.empty((left, dim), engine.face),
+            ints[2],
+        )
         assert (ints[2].get() == np.flatnonzero(kept)).all()
 
 
@@ -204,13 +192,7 @@ def drop_loops(adapter: clvoro.Adapter) -> None:
         for cell, other, before in ((i, j, before_i), (j, i, before_j)):
             rows[cell].insert(rows[cell].index(before) + 1, other)
 
-    for column, row, crossed in (
-        (1, 1, True),
-        (5, 2, True),
-        (3, 5, False),
-        (6, 6, True),
-        (1, 6, False),
-    ):
+    for column, row, crossed in ((1, 1, True), (5, 2, True), (3, 5, False), (6, 6, True), (1, 6, False)):
         i = column + across * row  # lower left of the four
         right, above, opposite = i + 1, i + across, i + across + 1
         join(i, opposite, right, above)
@@ -313,14 +295,7 @@ def periodic(adapter: clvoro.Adapter) -> None:
         assert abs(diagram.volumes.sum() - 1) < 1e-4
         assert len(diagram.vertices) > 3
     square = clvoro.Box((0, 0), (1, 1), periodic=True)
-    adapter.run(
-        square,
-        0.13,
-        effort="fast",
-        options=clvoro.MultilevelOptions(levels=0),
-        max_steps=4,
-        seed=911,
-    )
+    adapter.run(square, 0.13, effort="fast", options=clvoro.MultilevelOptions(levels=0), max_steps=4, seed=911)
     # The second diagram of a run in 3D begins with the rows of the first, unfolded.
     rod = clvoro.Box((0, 0, 0), (1, 0.4, 0.4), periodic=(True, False, False))
     adapter.run(rod, 0.17, method="coupled", max_steps=2)
@@ -362,10 +337,7 @@ def fields(adapter: clvoro.Adapter) -> None:
     body = Surface(corners, ConvexHull(corners).simplices)
     cube = Raster(0.2 + 0.1 * points(12).reshape(2, 4, 3), CUBE.lower, CUBE.upper)
     flat = minimum(few, raster), Distance([many], 0.2, slope=0.3), Expression(GRADED)
-    solid = (
-        Distance(body, 0.1, slope=0.3),
-        Distance(Ball((0.5, 0.5, 0.4), 0.2), 0.1, slope=0.3) + cube,
-    )
+    solid = (Distance(body, 0.1, slope=0.3), Distance(Ball((0.5, 0.5, 0.4), 0.2), 0.1, slope=0.3) + cube)
     for box, size in (*((BOX, size) for size in flat), *((CUBE, size) for size in solid)):
         n, d = 40, box.dim
         engine = Engine(adapter.ctx, adapter.queue, d, np.dtype(adapter.dtype))
@@ -396,17 +368,13 @@ def multigrid(adapter: clvoro.Adapter) -> None:
     rhs = engine.upload(points(n)[:, 0])
     for preconditioner in ("multigrid", "jacobi"):
         potential = engine.zeros(n)
-        solution = stage.solve(
-            laplacian, rhs, potential, tolerance=1e-3, preconditioner=preconditioner
-        )
+        solution = stage.solve(laplacian, rhs, potential, tolerance=1e-3, preconditioner=preconditioner)
         assert solution.converged
         stage.apply(laplacian, potential, rhs)
     # The levels below the finest by one work-group each.
     with mock.patch.object(cycle, "one_group_limit", return_value=n):
         potential, kind = engine.zeros(n), "multigrid"
-        alone = Poisson(engine).solve(
-            laplacian, rhs, potential, tolerance=1e-3, preconditioner=kind
-        )
+        alone = Poisson(engine).solve(laplacian, rhs, potential, tolerance=1e-3, preconditioner=kind)
         assert alone.converged
     # Steps of smoothing merged, or apart: what this device does not do by itself.
     other = Poisson(engine)
@@ -415,12 +383,8 @@ def multigrid(adapter: clvoro.Adapter) -> None:
     potential.fill(0)
     assert other.solve(laplacian, rhs, potential, tolerance=1e-3, preconditioner=kind).converged
     # A solve whose initial guess is not zero.
-    rough = stage.assemble(
-        t.starts, t.neighbors, t.face_measures, t.points, tolerance=SINGLE_PRECISION_TOLERANCE
-    )
-    assert stage.solve(
-        rough, rhs, engine.upload(points(n)[:, 1]), tolerance=SINGLE_PRECISION_TOLERANCE
-    ).converged
+    rough = stage.assemble(t.starts, t.neighbors, t.face_measures, t.points, tolerance=SINGLE_PRECISION_TOLERANCE)
+    assert stage.solve(rough, rhs, engine.upload(points(n)[:, 1]), tolerance=SINGLE_PRECISION_TOLERANCE).converged
 
 
 def nuclei(adapter: clvoro.Adapter) -> None:
@@ -430,14 +394,15 @@ def nuclei(adapter: clvoro.Adapter) -> None:
     t = tessellate(engine, x := x[PATCH.contains(x)])
     n, h = len(x), 0.08 * (3**0.5 / 2) ** 0.5
     rows = Generators(
-        t.points, engine.upload(np.arange(n), np.int32), engine.zeros((n, 2)), engine.zeros(n, np.uint64),
+        t.points,
+        engine.upload(np.arange(n), np.int32),
+        engine.zeros((n, 2)),
+        engine.zeros(n, np.uint64),
         engine.zeros(n),
-    )  # fmt: skip
+    )
     sizes, log_ratio = engine.upload(np.full(n, h)), engine.zeros(n)
     control = InsertionDeletion(engine)
-    found = control.insert_delete(
-        PATCH, t, CellSizes(sizes, sizes, log_ratio), rows, n, Change(0.0, nuclei=2)
-    )
+    found = control.insert_delete(PATCH, t, CellSizes(sizes, sizes, log_ratio), rows, n, Change(0.0, nuclei=2))
     assert found is not None
     assert found.inserted + found.deleted >= 2
     quality = engine.upload(np.linspace(0.8, 1, n))
@@ -477,9 +442,7 @@ def broken(kernel: str) -> Callable[[clvoro.Adapter], None]:
         ones = np.zeros(16, np.int32)
         buffer = cl.Buffer(adapter.ctx, cl.mem_flags.COPY_HOST_PTR, hostbuf=ones)
         program = cl.Program(adapter.ctx, text).build()
-        cl.enqueue_nd_range_kernel(
-            adapter.queue, _bound(program.all_kernels()[0], buffer), (16,), (16,)
-        )
+        cl.enqueue_nd_range_kernel(adapter.queue, _bound(program.all_kernels()[0], buffer), (16,), (16,))
         adapter.queue.finish()
 
     return work
@@ -519,32 +482,15 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "coupled": large(method("coupled", max_steps=2)),
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
-    "adaptive": method(
-        "adaptive",
-        options=clvoro.MultilevelOptions(levels=1),
-        n_cells=90,
-        effort="fast",
-        max_steps=60,
-    ),
-    "best": method(
-        "adaptive",
-        options=clvoro.MultilevelOptions(levels=0),
-        n_cells=150,
-        effort="best",
-        max_steps=20,
-    ),
-    "exact": large(
-        method("exact", options=clvoro.MultilevelOptions(levels=0), effort="fast", max_steps=75)
-    ),
+    "adaptive": method("adaptive", options=clvoro.MultilevelOptions(levels=1), n_cells=90, effort="fast", max_steps=60),
+    "best": method("adaptive", options=clvoro.MultilevelOptions(levels=0), n_cells=150, effort="best", max_steps=20),
+    "exact": large(method("exact", options=clvoro.MultilevelOptions(levels=0), effort="fast", max_steps=75)),
     "mmpde": method("mmpde", n_cells=80, max_steps=2),
     "solid-mmpde": method("mmpde", CUBE, SOLID, n_cells=130, max_steps=2),
     "solid-adaptive": method("adaptive", CUBE, SOLID, effort="fast"),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
     **RUNS,
-    **{
-        f"broken-{k}": broken(k)
-        for k in ("bounds", "race", "same", "local_race", "barrier_", "private")
-    },
+    **{f"broken-{k}": broken(k) for k in ("bounds", "race", "same", "local_race", "barrier_", "private")},
 }
 
 
@@ -600,9 +546,7 @@ def build_for_simulator() -> None:
     """
     build = _program.compile_text
 
-    def built(
-        ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True
-    ) -> cl.Program:
+    def built(ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True) -> cl.Program:
         if "shape_gradients" not in text and "clip_polyhedra_by_teams" not in text:
             program = build(ctx, text, options, short)
             if b"noalias.scope.decl" not in program.binaries[0]:

@@ -41,9 +41,7 @@ SANITIZERS = {
     ],
 }
 COMMON = ["-O0", "-g1", "-w", "-ffp-contract=off", "-fno-omit-frame-pointer"]
-KERNEL = [
-    "-x", "cl", "-cl-std=CL1.2", "-Xclang", "-cl-ext=+all", "-fgnu89-inline", "-include", "opencl-c-base.h",
-]  # fmt: skip
+KERNEL = ["-x", "cl", "-cl-std=CL1.2", "-Xclang", "-cl-ext=+all", "-fgnu89-inline", "-include", "opencl-c-base.h"]
 
 
 @functools.cache
@@ -98,9 +96,7 @@ class Recorder:
             program = self._build(ctx, name, defines, prelude)
             if program.int_ptr not in self.programs:
                 text = prelude + "\n" + _program.source_text(name)
-                self.programs[program.int_ptr] = Program(
-                    text, dict(defines), signatures(ctx, text, defines)
-                )
+                self.programs[program.int_ptr] = Program(text, dict(defines), signatures(ctx, text, defines))
             return program
 
         _kernels.set_changed, cl.Kernel.set_args = noted_changed, noted_args
@@ -127,25 +123,13 @@ class Recorder:
         if taken >= self.most or count < 2**taken:
             return self._plain[1](queue, kernel, size, group, *rest, **more)
         self.taken[which] += 1
-        buffers = list(
-            {a.int_ptr: a for a in kernel.noted if isinstance(a, cl.MemoryObject)}.values()
-        )
+        buffers = list({a.int_ptr: a for a in kernel.noted if isinstance(a, cl.MemoryObject)}.values())
         before = [fetch(queue, each) for each in buffers]
         event = self._plain[1](queue, kernel, size, group, *rest, **more)
         after = [fetch(queue, each) for each in buffers]
         path = self.folder / f"{kernel.stage}.{name}.{which[0]:x}.{count}"
         at_once = group[0] > 1 and "barrier(" in program.text
-        write_job(
-            path,
-            kernel,
-            program.signatures[name],
-            at_once,
-            size[0],
-            group[0],
-            buffers,
-            before,
-            after,
-        )
+        write_job(path, kernel, program.signatures[name], at_once, size[0], group[0], buffers, before, after)
         program.jobs.append(path)
         return event
 
@@ -162,18 +146,10 @@ def signatures(ctx: cl.Context, text: str, defines) -> dict[str, list[tuple[str,
     # A program from PyOpenCL's cache is a binary, in which some runtimes do not know of arguments.
     program = cl.Program(ctx, text).build([*options, "-cl-kernel-arg-info"], cache_dir=False)
     info, spaces = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
-    names = {
-        spaces.GLOBAL: "global",
-        spaces.CONSTANT: "constant",
-        spaces.LOCAL: "local",
-        spaces.PRIVATE: "private",
-    }
+    names = {spaces.GLOBAL: "global", spaces.CONSTANT: "constant", spaces.LOCAL: "local", spaces.PRIVATE: "private"}
     return {
         kernel.function_name: [
-            (
-                names[kernel.get_arg_info(k, info.ADDRESS_QUALIFIER)],
-                kernel.get_arg_info(k, info.TYPE_NAME),
-            )
+            (names[kernel.get_arg_info(k, info.ADDRESS_QUALIFIER)], kernel.get_arg_info(k, info.TYPE_NAME))
             for k in range(kernel.num_args)
         ]
         for kernel in program.all_kernels()
@@ -217,17 +193,12 @@ def translation(program: Program) -> tuple[str, str]:
     parts = [f'#include "{HERE / "host_opencl.h"}"', program.text, '#line 1 "launch"']
     for name, args in program.signatures.items():
         taken = [
-            f"*(private {type_} *)args[{k}]"
-            if space == "private"
-            else f"({space} {type_})args[{k}]"
+            f"*(private {type_} *)args[{k}]" if space == "private" else f"({space} {type_})args[{k}]"
             for k, (space, type_) in enumerate(args)
         ]
         parts.append(f"void launch_{name}(private ulong *args) {{ {name}({', '.join(taken)}); }}")
     names = list(program.signatures)
-    table = [
-        "#include <stdint.h>",
-        "typedef struct { const char *name; void (*launch)(uint64_t *); } kernel_t;",
-    ]
+    table = ["#include <stdint.h>", "typedef struct { const char *name; void (*launch)(uint64_t *); } kernel_t;"]
     table += [f"void launch_{name}(uint64_t *);" for name in names]
     rows = "".join(f'{{"{name}", launch_{name}}}, ' for name in names)
     table.append(f"const kernel_t kernels[] = {{{rows}{{0, 0}}}};")
@@ -281,14 +252,12 @@ def repeat(program: Program, sanitizer: str, folder: Path) -> tuple[list[Outcome
         return [], ""
     done = subprocess.run(
         [build(program, sanitizer, folder), *program.jobs], capture_output=True, text=True, errors="replace"
-    )  # fmt: skip
+    )
     outcomes = []
     for line in done.stdout.splitlines():
         path, differing, difference, absolute, unwritten = line.rsplit(" ", 4)
         kernel = ".".join(Path(path).name.split(".")[:2])
-        outcomes.append(
-            Outcome(kernel, int(differing), float(difference), float(absolute), int(unwritten))
-        )
+        outcomes.append(Outcome(kernel, int(differing), float(difference), float(absolute), int(unwritten)))
     said = done.stderr.strip()
     if done.returncode and not said:
         said = f"ended with {done.returncode}"

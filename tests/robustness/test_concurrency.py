@@ -29,22 +29,14 @@ WORK = [
     {"method": "adaptive", "effort": "fast", "max_steps": 25, "seed": 2},
     {"method": "exact", "effort": "fast", "n_cells": 120, "max_steps": 20, "seed": 3},
     {"method": "weighted", "max_steps": 5, "seed": 4},
-]  # fmt: skip
+]
 
 
 def digest(result):
     """A hash of every bit of the outcome but the times."""
     hashed = hashlib.sha256()
     d = result.diagram
-    parts = [
-        result.points,
-        result.target_size,
-        result.size_error,
-        result.quality,
-        d.volumes,
-        d.neighbors,
-        d.vertices,
-    ]
+    parts = [result.points, result.target_size, result.size_error, result.quality, d.volumes, d.neighbors, d.vertices]
     parts += [result.history[name] for name in result.history.dtype.names if name != "seconds"]
     for part in parts:
         hashed.update(np.ascontiguousarray(part).tobytes())
@@ -94,9 +86,13 @@ def test_processes_find_the_same_bits(ctx, alone):
     program += "for k in (0, 3, 1): print(t.run(a, t.WORK[k]))"
     # Another seed of Python's hashes, because no order of a set may matter, and another number of cores for PoCL.
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=Path(__file__).parents[2], text=True, check=True,
-        capture_output=True, env={**os.environ, "PYTHONHASHSEED": "12345", "POCL_MAX_PTHREAD_COUNT": "1"},
-    )  # fmt: skip
+        [sys.executable, "-c", program],
+        cwd=Path(__file__).parents[2],
+        text=True,
+        check=True,
+        capture_output=True,
+        env={**os.environ, "PYTHONHASHSEED": "12345", "POCL_MAX_PTHREAD_COUNT": "1"},
+    )
     units, *found = done.stdout.split()
     assert units == "1" or ctx.devices[0].platform.name != "Portable Computing Language"
     assert found == [alone[0], alone[3], alone[1]]
@@ -114,7 +110,7 @@ LARGE = {
     "periodic": (TORUS, "0.011 + 0.004*sin(6.283185307179586*x)", FAST, "float64"),
     "space": (CUBE, "0.045 + 0.02*x", FAST, "float64"),
     "periodic space": (clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), "0.053", FAST, "float64"),
-}  # fmt: skip
+}
 """Runs of 5,000 to 15,000 cells need many work-groups, unlike small ones."""
 
 
@@ -167,9 +163,13 @@ def test_one_core_finds_the_bits_of_two(ctx, name):
     found = []
     for cores in (1, 2):
         done = subprocess.run(
-            [sys.executable, "-c", program, name], cwd=Path(__file__).parents[2], text=True, check=True,
-            capture_output=True, env={**os.environ, "POCL_MAX_PTHREAD_COUNT": str(cores)},
-        )  # fmt: skip
+            [sys.executable, "-c", program, name],
+            cwd=Path(__file__).parents[2],
+            text=True,
+            check=True,
+            capture_output=True,
+            env={**os.environ, "POCL_MAX_PTHREAD_COUNT": str(cores)},
+        )
         found.append(done.stdout.split())
     (one, cells, bits), (two, *others) = found
     if two != "2":
@@ -189,16 +189,14 @@ FEW = {"method": "coupled", "max_steps": 2}
 PLANNED = {"effort": "fast", "max_steps": 12}
 GROWS = {
     "box": (BOX, 0.06, FEW),
-    "polygon": (
-        clvoro.Polygon(SHORE, [ISLAND]), 0.12, FEW,
-    ),
+    "polygon": (clvoro.Polygon(SHORE, [ISLAND]), 0.12, FEW),
     "periodic": (TORUS, 0.05, FEW),
     "space": (CUBE, 0.2, FEW),
     "adaptive": (BOX, 0.06, {**PLANNED, "options": clvoro.MultilevelOptions(levels=1)}),
     "layers": (BOX, 0.1, {**FEW, "layers": clvoro.Layers(0.02, count=2, growth=1.2)}),
     "adaptive in space": (CUBE, 0.2, {"effort": "fast", "max_steps": 3}),
     "resumed": (BOX, 0.06, {"method": "weighted", "max_steps": 3}),
-}  # fmt: skip
+}
 """Domain, a mean size for some hundred cells, and options of the run."""
 
 

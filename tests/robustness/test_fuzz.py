@@ -32,9 +32,7 @@ def test_the_table_counts_what_there_was():
 
 def test_refusals_have_to_be_true():
     """The judge checks an error that edges or generators are too close to each other: some must be."""
-    error = InputError(
-        "edges of it are too close to each other, or generators are, for the precision"
-    )
+    error = InputError("edges of it are too close to each other, or generators are, for the precision")
     apart, near = np.array([(0.2, 0.2), (0.8, 0.2)]), np.array([(0.2, 0.2), (0.2 + 1e-7, 0.2)])
     eps = float(np.finfo(np.float32).eps)
     for wide, points in ((100 * eps, None), (0.1, apart), (np.inf, None), (np.inf, apart)):
@@ -90,11 +88,7 @@ def test_polygons_that_failed_once(kind, seed):
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("kind", "seed"),
-    [
-        ("around", 822841374),
-        pytest.param("around", 220865677, marks=pytest.mark.slow),
-        ("hard-polygon", 95364499),
-    ],
+    [("around", 822841374), pytest.param("around", 220865677, marks=pytest.mark.slow), ("hard-polygon", 95364499)],
 )
 def test_vertices_that_were_elsewhere_once(kind, seed):
     """Near a corner of the box; where very many cells meet in space; at the tip of a needle that sticks out of the

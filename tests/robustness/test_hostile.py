@@ -80,10 +80,7 @@ def test_every_cut_is_refused(result, tmp_path, suffix):
 def test_pickles_are_not_opened(result, tmp_path):
     trap = np.array([Bomb(tmp_path / "exploded")], dtype=object)
     result.save(tmp_path / "m.npz")
-    with (
-        zipfile.ZipFile(tmp_path / "m.npz") as old,
-        zipfile.ZipFile(tmp_path / "t.npz", "w") as new,
-    ):
+    with zipfile.ZipFile(tmp_path / "m.npz") as old, zipfile.ZipFile(tmp_path / "t.npz", "w") as new:
         for info in old.infolist():
             trapped = info.filename == "quality.npy"
             new.writestr(info.filename, member(trap, True) if trapped else old.read(info))
@@ -110,9 +107,14 @@ def test_headers_that_ask_for_terabytes_are_refused(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    ["{'descr': '<f8', 'shape': ", "[" * 500, "__import__('os').mkdir('x')", "{'descr': '|V0', "
-     "'fortran_order': False, 'shape': (9,), }", "{'descr': '<f8', 'fortran_order': 0, 'shape': (-1,), }"],
-)  # fmt: skip
+    [
+        "{'descr': '<f8', 'shape': ",
+        "[" * 500,
+        "__import__('os').mkdir('x')",
+        "{'descr': '|V0', 'fortran_order': False, 'shape': (9,), }",
+        "{'descr': '<f8', 'fortran_order': 0, 'shape': (-1,), }",
+    ],
+)
 def test_headers_that_are_none_are_refused(tmp_path, text):
     (tmp_path / "a.npy").write_bytes(header(text) + b"\0" * 64)
     with pytest.raises(InputError, match=r"size\.file"):
@@ -143,9 +145,7 @@ COMPRESSOR = ' compressor="vtkZLibDataCompressor"'
 TAIL = b"\n</AppendedData>\n</VTKFile>\n"
 LAUGHS = (
     '<!DOCTYPE lolz [<!ENTITY lol "lol">'
-    + "".join(
-        f'<!ENTITY lol{k} "{f"&lol{k - 1 if k > 1 else str()};" * 10}">' for k in range(1, 10)
-    )
+    + "".join(f'<!ENTITY lol{k} "{f"&lol{k - 1 if k > 1 else str()};" * 10}">' for k in range(1, 10))
     + "]>"
 )
 SPY = '<!DOCTYPE x [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
@@ -167,9 +167,7 @@ def test_vtu_bombs_and_lies_are_refused(tmp_path):
 
     def write(count, block_size, partial, sizes, blocks, points=1):
         table = struct.pack(f"<{3 + len(sizes)}Q", count, block_size, partial, *sizes)
-        path.write_bytes(
-            (VTU % ("", points)).encode() + table + blocks + b"\n</AppendedData>\n</VTKFile>\n"
-        )
+        path.write_bytes((VTU % ("", points)).encode() + table + blocks + b"\n</AppendedData>\n</VTKFile>\n")
 
     lies = {
         "expands to more": (300, 1 << 20, 0, [len(block)] * 300, block * 300),
@@ -209,14 +207,9 @@ def test_many_arrays_in_the_same_bytes_are_refused(tmp_path, compress):
 
     def write(names):
         text = VTU % ("", 1) if compress else (VTU % ("", 1)).replace(COMPRESSOR, "")
-        arrays = "".join(
-            f'<DataArray type="Float64" Name="{name}" format="appended" offset="0"/>'
-            for name in names
-        )
+        arrays = "".join(f'<DataArray type="Float64" Name="{name}" format="appended" offset="0"/>' for name in names)
         text = text.replace("</Piece>", f"<Cells></Cells></Piece><FieldData>{arrays}</FieldData>")
-        path.write_bytes(
-            text.replace('offset="0"/></Points>', 'offset="8"/></Points>').encode() + data + TAIL
-        )
+        path.write_bytes(text.replace('offset="0"/></Points>', 'offset="8"/></Points>').encode() + data + TAIL)
 
     write([f"a{k}" for k in range(200)])
     head = 1 << 22  # bytes that are read for it
@@ -258,12 +251,51 @@ def test_results_that_expand_more_than_honest_ones_are_refused(tmp_path):
 
 
 INJECTIONS = [
-    "__import__('os').system('true')", "x.__class__", "(lambda: 1)()", "exec('1')", "x; y", "x\ny; }",
-    "1 /* */ + x", "x // y", "#include <x>", "get_global_id(0)", "data[0]", "x[0]", "*data", "&x", "printf(x)",
-    "as_double(x)", "x = 1", "x++", "1e999", "0x10", "1f", "'a'", '"a"', "x ? y", "s1", "size_at(x, data)",
-    "asm(1)", "x\\\n", "\0", "x\u2028y", "\uff58 + 1", "x" * 5000, "(" * 3000 + "x" + ")" * 3000, "-" * 4000, "",
-    "1 ? " * 60 + "x", "M_E", "true", "x if y else z", "x**2", "{x}", "x@y", "`x`", "$x",
-]  # fmt: skip
+    "__import__('os').system('true')",
+    "x.__class__",
+    "(lambda: 1)()",
+    "exec('1')",
+    "x; y",
+    "x\ny; }",
+    "1 /* */ + x",
+    "x // y",
+    "#include <x>",
+    "get_global_id(0)",
+    "data[0]",
+    "x[0]",
+    "*data",
+    "&x",
+    "printf(x)",
+    "as_double(x)",
+    "x = 1",
+    "x++",
+    "1e999",
+    "0x10",
+    "1f",
+    "'a'",
+    '"a"',
+    "x ? y",
+    "s1",
+    "size_at(x, data)",
+    "asm(1)",
+    "x\\\n",
+    "\0",
+    "x\u2028y",
+    "\uff58 + 1",
+    "x" * 5000,
+    "(" * 3000 + "x" + ")" * 3000,
+    "-" * 4000,
+    "",
+    "1 ? " * 60 + "x",
+    "M_E",
+    "true",
+    "x if y else z",
+    "x**2",
+    "{x}",
+    "x@y",
+    "`x`",
+    "$x",
+]
 
 
 @pytest.mark.parametrize("text", INJECTIONS, ids=range(len(INJECTIONS)))
@@ -287,12 +319,14 @@ CASES = {
     "cut off": b"[domain]\nlower = [0, ",
     "deep": b"x = " + b"[" * 100_000,
     "nested sizes": b"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\nkind='scale'\nfactor=2.0\nfield="
-    + b"{kind='scale',factor=2.0,field=" * 3000 + b"1.0" + b"}" * 3000,
+    + b"{kind='scale',factor=2.0,field=" * 3000
+    + b"1.0"
+    + b"}" * 3000,
     "path": b"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\nkind='raster'\nfile='/dev/zero'\n",
     "huge number": b"[domain]\nlower=[0,0]\nupper=[1e400,1]\n[size]\nkind='constant'\nvalue=1\n",
     "huge integer": b"[domain]\nlower=[0,0]\nupper=[" + b"9" * 400 + b",1]\n[size]\nkind='constant'\nvalue=1\n",
     "null": b"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\nkind='raster'\nfile='a\\u0000b'\n",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", list(CASES))
@@ -317,22 +351,7 @@ def test_keys_of_very_many_parts_are_refused(tmp_path, part, line):
 
 def test_the_search_for_long_keys_goes_over_the_text_once():
     """A search from each of so many characters back to the first would take minutes."""
-    for piece in (
-        "a",
-        "a.",
-        "a ",
-        '"',
-        "'",
-        "\"'",
-        ". ",
-        '"\\',
-        "a.'",
-        "\\",
-        '"""\\"',
-        "'''a",
-        '"a"',
-        "a#",
-    ):
+    for piece in ("a", "a.", "a ", '"', "'", "\"'", ". ", '"\\', "a.'", "\\", '"""\\"', "'''a", '"a"', "a#"):
         text = piece * ((1 << 18) // len(piece))
         began = time.process_time()
         with pytest.raises(ValueError, match=r"\(at "):
@@ -352,12 +371,7 @@ def test_keys_of_many_parts_and_numbers_are_read():
         f"b='''\n{dots}'''",
     ):
         assert toml.read(text)["b"]
-    for ends in (
-        '"""c""""',
-        '"""c"""""',
-        "'''c''''",
-        "'''c'''''",
-    ):  # with quotes before the last ones
+    for ends in ('"""c""""', '"""c"""""', "'''c''''", "'''c'''''"):  # with quotes before the last ones
         with pytest.raises(ValueError, match="parts"):
             toml.read(f"x=[{{b={ends}, {dots}=1}}]")
     with pytest.raises(ValueError, match="parts"):  # whatever stands before it
@@ -367,9 +381,8 @@ def test_keys_of_many_parts_and_numbers_are_read():
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["/tmp/x", "../x", "..", ".", "a/b", "a\\b", "a/", "C:x", "a\0b", "a\nb", "\x1b[31m", "\u00e4" * 101, ""],
-)  # fmt: skip
+    "name", ["/tmp/x", "../x", "..", ".", "a/b", "a\\b", "a/", "C:x", "a\0b", "a\nb", "\x1b[31m", "\u00e4" * 101, ""]
+)
 def test_names_of_cases_that_lead_elsewhere_are_refused(tmp_path, name):
     path = tmp_path / "c.toml"
     path.write_bytes(f"name = {json.dumps(name)}\n".encode() + PLAIN)
@@ -423,13 +436,11 @@ def test_geojson_with_positions_that_are_no_numbers_is_refused(bad):
 @pytest.mark.parametrize(
     "other",
     [[(1, 1), (2, 1), (2, 2)], [(2, 1), (2, 2), (1, 1), (2, 1)], [(2, 2), (2, 1), (1, 1)], [(2, 1), (1, 1), (2, 2)]],
-)  # fmt: skip
+)
 def test_equal_rings_are_refused_before_all_are_looked_at(monkeypatch, other):
     square, hole = [(0, 0), (9, 0), (9, 9), (0, 9)], [(1, 1), (2, 1), (2, 2)]
     looked = []
-    monkeypatch.setattr(
-        rings, "_cleaned", lambda *a, clean=rings._cleaned: looked.append(a) or clean(*a)
-    )
+    monkeypatch.setattr(rings, "_cleaned", lambda *a, clean=rings._cleaned: looked.append(a) or clean(*a))
     with pytest.raises(InputError, match="Polygon's hole-2 repeats hole-1; leave"):
         clvoro.Polygon(square, [hole, *[other] * 10_000])
     assert len(looked) == 3
@@ -451,8 +462,19 @@ def test_well_known_text_may_have_many_parentheses_beside_each_other():
 
 
 FORMATS = [
-    "m.npz", "m.vtu", "a.npy", "state", "c.toml", "g.geojson", "w.wkt", "s.stl", "ascii.stl", "s.obj", "s.off", "s.ply",
-]  # fmt: skip
+    "m.npz",
+    "m.vtu",
+    "a.npy",
+    "state",
+    "c.toml",
+    "g.geojson",
+    "w.wkt",
+    "s.stl",
+    "ascii.stl",
+    "s.obj",
+    "s.off",
+    "s.ply",
+]
 
 
 @pytest.fixture(scope="module")
@@ -564,9 +586,7 @@ def test_a_thousand_damaged_files_are_refused_or_read(valid, tmp_path, name):
 
 
 @pytest.mark.sparse(1)
-@pytest.mark.parametrize(
-    "count", [60, pytest.param(2000, marks=pytest.mark.slow)], ids=["some", "many"]
-)
+@pytest.mark.parametrize("count", [60, pytest.param(2000, marks=pytest.mark.slow)], ids=["some", "many"])
 @pytest.mark.parametrize("name", ["state", "m.npz"])
 def test_a_changed_bit_is_found_or_harmless(valid, tmp_path, name, count):
     """Checksums cover every bit of the data: a file that can be read after a change has the same data."""

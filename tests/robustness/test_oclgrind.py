@@ -34,73 +34,97 @@ TRAPS = {
 USEFUL = [name for name in WORK if not name.startswith("broken")]
 VARIANTS = {"float64": (), "float32": ("float32",), "work-groups": ("groups",)}
 LANES = {
-    "hulls.wrap_all_hulls", "incremental.wrap_marked", "walks.count_cubes", "walks.order_places",
+    "hulls.wrap_all_hulls",
+    "incremental.wrap_marked",
+    "walks.count_cubes",
+    "walks.order_places",
     "walks.walk_all_cells",
-}  # fmt: skip
+}
 """Kernels that find eight cells at a time in vector lanes of a CPU, in float64, or choose these cells."""
 NEW = "polyhedra_by_teams.clip_polyhedra_by_teams"
 UPDATED = "polyhedra_update_by_teams.update_cells_by_teams"
 TEAMS = {NEW, UPDATED}
 """Kernels of devices with warps, and of work with the option `teams`. test_polyhedra_teams.py compares their bits."""
 WITH_TEAMS = {"teams": ("groups", "teams"), "teams, float32": ("groups", "teams", "float32")}
-OF_TEAMS = [
-    *((name, variant) for name in ("solid", "solid-coupled") for variant in WITH_TEAMS),
-    ("rod-run", "teams"),
-]
+OF_TEAMS = [*((name, variant) for name in ("solid", "solid-coupled") for variant in WITH_TEAMS), ("rod-run", "teams")]
 """Work in 3D: sets of all kinds, updates with walls, and with periods, in which some cells change their vertices."""
 NOT_IN = {
     # Work-groups take it in place of two kernels.
     "float64": {"conjugate_gradient.apply_to_direction"},
     # Most of these are between float32 and the precision of the mesh.
-    "float32": LANES | {
+    "float32": LANES
+    | {
         "conjugate_gradient.apply_to_direction",
-        "cells.clip_by_rings", "cells.measure_faces", "aggregation.scale_weights", "multigrid.smooth_into",
-        "multigrid.smooth_from_zero_rounded", "multigrid.smooth_pairs_into", "multigrid.smooth_pairs_from_zero_rounded",
+        "cells.clip_by_rings",
+        "cells.measure_faces",
+        "aggregation.scale_weights",
+        "multigrid.smooth_into",
+        "multigrid.smooth_from_zero_rounded",
+        "multigrid.smooth_pairs_into",
+        "multigrid.smooth_pairs_from_zero_rounded",
         "poisson.apply_laplacian_full",
     },
     "work-groups": LANES | {"conjugate_gradient.update_direction"},
-}  # fmt: skip
+}
 """Kernels that do not exist in a variant. All others run in it."""
 ALIKE = {
-    "aggregation", "conjugate_gradient", "copy", "gradation", "multigrid", "primitives", "transfer",
-    "bins.count_in_child_bins", "bins.make_grids", "cells.drop_loops", "poisson.apply_laplacian",
-    "poisson.apply_laplacian_full", "volume_projection.project_by_group",
-}  # fmt: skip
+    "aggregation",
+    "conjugate_gradient",
+    "copy",
+    "gradation",
+    "multigrid",
+    "primitives",
+    "transfer",
+    "bins.count_in_child_bins",
+    "bins.make_grids",
+    "cells.drop_loops",
+    "poisson.apply_laplacian",
+    "poisson.apply_laplacian_full",
+    "volume_projection.project_by_group",
+}
 """Files, and kernels of other files, that do not depend on the kind of domain. A run in one kind is enough."""
 IN_PLANE = {
-    "cells", "hulls", "incremental", "quality_descent", "vertices", "insertion_deletion.average_strain",
-    "insertion_deletion.flag_sites", "insertion_deletion.mark_bad_cells", "insertion_deletion.mark_nuclei",
-    "insertion_deletion.mark_pairs", "insertion_deletion.measure_strain", "insertion_deletion.score_bad_cells",
-    "insertion_deletion.score_pairs", "insertion_deletion.score_strain", "insertion_deletion.count_pair_changes",
-}  # fmt: skip
-IN_SPACE = {
-    "consistency",
-    "half_faces",
-    "polyhedra",
-    "polyhedra_update",
-    "walks",
-    "surface_descent",
+    "cells",
+    "hulls",
+    "incremental",
+    "quality_descent",
+    "vertices",
+    "insertion_deletion.average_strain",
+    "insertion_deletion.flag_sites",
+    "insertion_deletion.mark_bad_cells",
+    "insertion_deletion.mark_nuclei",
+    "insertion_deletion.mark_pairs",
+    "insertion_deletion.measure_strain",
+    "insertion_deletion.score_bad_cells",
+    "insertion_deletion.score_pairs",
+    "insertion_deletion.score_strain",
+    "insertion_deletion.count_pair_changes",
 }
+IN_SPACE = {"consistency", "half_faces", "polyhedra", "polyhedra_update", "walks", "surface_descent"}
 AT_POLYGONS = {"boundary_crossings", "corners", "local_counts", "thin_walls", "trim"}
-AT_LAYERS = {
-    "metric.set_fixed_sizes",
-    "motion.zero_fixed_displacements",
-    "insertion_deletion.drop_fixed_sites",
-}
+AT_LAYERS = {"metric.set_fixed_sizes", "motion.zero_fixed_displacements", "insertion_deletion.drop_fixed_sites"}
 WITH_WEIGHTS = {"power", "weight_bounds", "cells.clip_by_rings", "trim.find_outside"}
 MOVING_MESH, VOLUMES, OBTUSE = {"mmpde"}, {"transport"}, {"quality_descent.open_obtuse_triangles"}
 NOT_FOR = {
     "plane": IN_SPACE | AT_POLYGONS | WITH_WEIGHTS | OBTUSE | {"ghost_images"},
     "polygon": IN_SPACE | WITH_WEIGHTS | MOVING_MESH | OBTUSE | {"ghost_images", "cells.measure_faces"},
     # Only in space do diagrams begin with the one before.
-    "torus": IN_SPACE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | MOVING_MESH | OBTUSE
+    "torus": IN_SPACE
+    | AT_POLYGONS
+    | AT_LAYERS
+    | WITH_WEIGHTS
+    | MOVING_MESH
+    | OBTUSE
     | {"ghost_images.unfold_rows", "ghost_images.fold_clipped_cells", "ghost_images.scale_far_measures"},
     "sphere": IN_SPACE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | MOVING_MESH | VOLUMES | {"ghost_images"},
     "space": IN_PLANE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | {"ghost_images"},
-    "periodic space": IN_PLANE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | MOVING_MESH
-    | {"ghost_images.measure_required_depths", "ghost_images.scale_far_measures",
-       "transport.prescribe_sizes"},
-}  # fmt: skip
+    "periodic space": IN_PLANE
+    | AT_POLYGONS
+    | AT_LAYERS
+    | WITH_WEIGHTS
+    | MOVING_MESH
+    | {"ghost_images.measure_required_depths", "ghost_images.scale_far_measures", "transport.prescribe_sizes"},
+}
 """Files and kernels that a kind of domain does not need. All others except `ALIKE` run in it, in every variant."""
 WEIGHTED = {"bins", "power", "weight_bounds"}
 ONLY_FOR = {
@@ -113,11 +137,15 @@ NOT_WEIGHTED = {
     # Generators are not sorted, polygons have precise faces, and every part of a cell belongs to it.
     "weighted plane": {"bins.number_items", "power.detach_weights"},
     "weighted polygon": {
-        "bins.number_items", "power.detach_weights", "cells.measure_faces", "trim.adopt_pieces", "trim.settle_pieces",
+        "bins.number_items",
+        "power.detach_weights",
+        "cells.measure_faces",
+        "trim.adopt_pieces",
+        "trim.settle_pieces",
         "trim.list_orphans",
     },
     "weighted space": {"bins.number_items", "power.detach_weights"},
-}  # fmt: skip
+}
 """Kernels of these files that they do not need."""
 PATIENCE = 20
 """Seconds without a word."""
@@ -199,14 +227,7 @@ def simulate(name, *options):
     # Now and then the simulator ends by a signal, with nothing in its log, and not when it is started again.
     for _ in range(3):
         try:
-            done = subprocess.run(
-                [*command, *options],
-                cwd=ROOT,
-                env=env,
-                capture_output=True,
-                text=True,
-                timeout=1800,
-            )
+            done = subprocess.run([*command, *options], cwd=ROOT, env=env, capture_output=True, text=True, timeout=1800)
             text = log.read_text(errors="replace") if log.exists() else ""
         finally:
             log.unlink(missing_ok=True)
@@ -287,9 +308,7 @@ def all_kernels():
 @pytest.mark.parametrize("variant", list(VARIANTS))
 def test_every_kernel_has_run(trusted, variant):
     assert len(all_kernels()) > 100
-    seen = {
-        kernel for runs in runs_of(trusted, variant) for some in runs.values() for kernel in some
-    }
+    seen = {kernel for runs in runs_of(trusted, variant) for some in runs.values() for kernel in some}
     assert all_kernels() - seen == NOT_IN[variant]
 
 

@@ -17,14 +17,19 @@ BOX = clvoro.Box((0, 0), (2.5, 1.5))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 MAIN = {
     2: [
-        "tessellation/cells", "tessellation/incremental", "solvers/volume_projection", "solvers/poisson",
+        "tessellation/cells",
+        "tessellation/incremental",
+        "solvers/volume_projection",
+        "solvers/poisson",
         "adaptation/descent/quality_descent",
     ],
     3: [
-        "tessellation/polyhedra", "tessellation/polyhedra_update", "solvers/volume_projection",
+        "tessellation/polyhedra",
+        "tessellation/polyhedra_update",
+        "solvers/volume_projection",
         "adaptation/descent/surface_descent",
     ],
-}  # fmt: skip
+}
 """Programs whose kernels take most of the time of a step."""
 COMMON_LIMITS = 128, 512
 """Registers, and bytes of private memory, that a work-item of a kernel may take, by NVIDIA's and AMD's compilers."""
@@ -68,9 +73,7 @@ def test_groups_change_nothing_but_rounding(ctx, dtype, domain, size):
 
     def run():
         adapter = clvoro.Adapter(ctx, dtype)
-        return adapter.run(
-            domain, size, seed=5, method="coupled", max_steps=3, options=clvoro.PaperOptions(tol=0)
-        )
+        return adapter.run(domain, size, seed=5, method="coupled", max_steps=3, options=clvoro.PaperOptions(tol=0))
 
     plain = run()
     with groups(32):
@@ -102,9 +105,7 @@ def test_kernels_compile_for_gpus(ctx, dtype, tmp_path):
     for target in gpu_programs.TARGETS:
         for source, (_, said) in each(partial(compile_for, target, folder=tmp_path), sources):
             assert not said, f"{source.name} for {target}: {said[:2000]}"
-        for source, missing in each(
-            partial(undefined_functions, target, folder=tmp_path), map(static, sources)
-        ):
+        for source, missing in each(partial(undefined_functions, target, folder=tmp_path), map(static, sources)):
             assert not missing, f"{source.name} for {target} calls {missing} without a body"
 
 
@@ -121,9 +122,7 @@ def test_kernels_of_first_runs_compile_with_generic_pointers(ctx, tmp_path):
 def test_functions_are_static_on_gpus(ctx, monkeypatch):
     """PoCL inlines all functions only if they are not static."""
     texts, plain = [], cl.Program
-    monkeypatch.setattr(
-        _program.cl, "Program", lambda ctx, text: texts.append(text) or plain(ctx, text)
-    )
+    monkeypatch.setattr(_program.cl, "Program", lambda ctx, text: texts.append(text) or plain(ctx, text))
     for gpu in (False, True):
         monkeypatch.setattr(_program, "needs_static_functions", lambda _, gpu=gpu: gpu)
         text = "inline int two(int i) { return 2 * i; } kernel void k(global int *a) { a[0] = two(a[1]); }"
@@ -131,9 +130,7 @@ def test_functions_are_static_on_gpus(ctx, monkeypatch):
         assert texts.pop().startswith(_program.STATIC_FUNCTIONS) == gpu
 
 
-@pytest.mark.parametrize(
-    ("kind", "expected"), [("CPU", False), ("GPU", True), ("ACCELERATOR", True)]
-)
+@pytest.mark.parametrize(("kind", "expected"), [("CPU", False), ("GPU", True), ("ACCELERATOR", True)])
 def test_kinds_of_devices_with_static_functions(kind, expected):
     class Device:
         type = getattr(cl.device_type, kind)
@@ -142,9 +139,7 @@ def test_kinds_of_devices_with_static_functions(kind, expected):
 
 
 def test_a_function_without_a_body_is_found(tmp_path):
-    text = (
-        "inline int two(int i) { return 2 * i; } kernel void k(global int *a) { a[0] = two(a[1]); }"
-    )
+    text = "inline int two(int i) { return 2 * i; } kernel void k(global int *a) { a[0] = two(a[1]); }"
     source = gpu_programs.Source("k.cl", (), text)
     assert undefined_functions("NVIDIA", source, tmp_path) == ["two"]
     assert undefined_functions("NVIDIA", source._replace(text=f"static {text}"), tmp_path) == []

@@ -91,11 +91,18 @@ def test_other_results_are_found(harmless, built):
 
 FUNCTIONS = {
     "mmpde.descend_functional",
-    "bins.sort_bins", "density.evaluate_density", "metric.evaluate_metric", "insertion_deletion.mark_split_delete",
-    "insertion_deletion.mark_bad_cells", "volume_projection.assemble_projection",
-    "quality_descent.compute_cell_forces", "surface_descent.compute_surface_forces", "corners.share_corners",
-    "size_field.evaluate_size", "size_field.evaluate_size_gradient",
-}  # fmt: skip
+    "bins.sort_bins",
+    "density.evaluate_density",
+    "metric.evaluate_metric",
+    "insertion_deletion.mark_split_delete",
+    "insertion_deletion.mark_bad_cells",
+    "volume_projection.assemble_projection",
+    "quality_descent.compute_cell_forces",
+    "surface_descent.compute_surface_forces",
+    "corners.share_corners",
+    "size_field.evaluate_size",
+    "size_field.evaluate_size_gradient",
+}
 """Kernels with functions that OpenCL does not ask to be rounded correctly (as log, cbrt, cos): libraries differ."""
 ROUNDINGS = 128
 """Over the largest number of an array: small size errors, and slopes, are differences of nearly equal numbers."""
@@ -106,9 +113,13 @@ ROUNDINGS_OF_ROOTS = 4
 IN_SINGLE = {"volume_projection.assemble_projection"}
 """Of these kernels, those that compute in single precision for generators of any precision."""
 ORDERED = {
-    "bins.count_root", "bins.count_in_child_bins", "boundary_crossings.count_chords", "polyhedra.clip_polyhedra",
-    "polyhedra_update.update_cells", "walks.walk_all_cells",
-}  # fmt: skip
+    "bins.count_root",
+    "bins.count_in_child_bins",
+    "boundary_crossings.count_chords",
+    "polyhedra.clip_polyhedra",
+    "polyhedra_update.update_cells",
+    "walks.walk_all_cells",
+}
 """Kernels whose work-items take places in the order of their execution. A later kernel sorts."""
 
 
@@ -142,9 +153,6 @@ def test_nothing_is_found(ctx, request, tmp_path, built, name, variant):
                 assert outcome.differing == 0, outcome
                 real = np.float32 if single or outcome.kernel in IN_SINGLE else np.float64
                 allowed = ROUNDINGS * np.finfo(real).eps if outcome.kernel in FUNCTIONS else 0
-                if (
-                    outcome.kernel in OF_ROOTS
-                    and outcome.absolute <= ROUNDINGS_OF_ROOTS * np.finfo(real).eps
-                ):
+                if outcome.kernel in OF_ROOTS and outcome.absolute <= ROUNDINGS_OF_ROOTS * np.finfo(real).eps:
                     continue
                 assert outcome.difference <= allowed, outcome

@@ -41,9 +41,7 @@ def agreement(monkeypatch):
 def test_diagrams_and_steps(both, dtype):
     """To the tolerances that the script states."""
     rows = records("two_devices.py", "--cells", "2e3", "--no-runs", "--dtype", dtype)
-    assert [(r["dim"], r["what"]) for r in rows] == [
-        (2, "diagram"), (2, "3 steps"), (3, "diagram"), (3, "3 steps"),
-    ]  # fmt: skip
+    assert [(r["dim"], r["what"]) for r in rows] == [(2, "diagram"), (2, "3 steps"), (3, "diagram"), (3, "3 steps")]
     assert all(r["graph"] for r in rows if r["what"] == "diagram")
 
 
@@ -57,9 +55,13 @@ def test_whole_runs(both, dtype):
 DIAGRAM = {"what": "diagram", "dtype": "float64", "graph": True, "off": 1e-13}
 STEPS = {"what": "3 steps", "dtype": "float64", "graph": True, "off": 1e-8}
 RUN = {
-    "what": "fast", "dtype": "float64", "cells": 2000, "cells_off": 1,
-    "mean_error": [0.0025, 0.0026], "mean_quality": [0.97, 0.971],
-}  # fmt: skip
+    "what": "fast",
+    "dtype": "float64",
+    "cells": 2000,
+    "cells_off": 1,
+    "mean_error": [0.0025, 0.0026],
+    "mean_quality": [0.97, 0.971],
+}
 
 
 @pytest.mark.parametrize("record", [DIAGRAM, STEPS, RUN], ids=lambda r: r["what"])

@@ -127,9 +127,13 @@ def test_the_process_ends_by_its_exit_code_and_a_message():
     """Nor by Python's own, when it fails again to write the rest."""
     with open("/dev/full", "w") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "clvoro", "cases"], stdout=full, stderr=subprocess.PIPE, text=True,
-            cwd=ROOT, env={k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"},
-        )  # fmt: skip
+            [sys.executable, "-m", "clvoro", "cases"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            env={k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"},
+        )
     assert done.returncode == cli.FAILED
     assert done.stderr.count("\n") == 1
     assert "standard output: No space left" in done.stderr
@@ -210,9 +214,7 @@ def test_all_files_that_fail_are_named(capsys):
         raise OutputError(name)
 
     with pytest.raises(OutputError, match="third"):
-        outputs.do_all(
-            [lambda: fail("first"), lambda: done.append(1), lambda: fail("third"), lambda: done.append(2)]
-        )  # fmt: skip
+        outputs.do_all([lambda: fail("first"), lambda: done.append(1), lambda: fail("third"), lambda: done.append(2)])
     assert done == [1, 2]
     assert capsys.readouterr().err == "clvoro: first\n"
 
@@ -225,17 +227,13 @@ def test_folders_in_the_place_of_files_are_found_before_the_run(here, capsys, na
     assert os.listdir("out/small") == [name]
 
 
-def test_a_checkpoint_that_does_not_fit_costs_neither_the_run_nor_the_one_before(
-    adapter, tmp_path, monkeypatch
-):
+def test_a_checkpoint_that_does_not_fit_costs_neither_the_run_nor_the_one_before(adapter, tmp_path, monkeypatch):
     path = tmp_path / "state"
     options = {**FEW, "checkpoint": clvoro.Checkpoint(path, every=0)}
     both = clvoro.Checkpoint(path, every=0, resume=True)
     whole = adapter.run(BOX, 0.15, callback=lambda row: row["step"] == 1, **options)
     before = path.read_bytes()
-    monkeypatch.setattr(
-        checkpoint.Checkpointer, "write", in_little_room(checkpoint.Checkpointer.write, 1000)
-    )
+    monkeypatch.setattr(checkpoint.Checkpointer, "write", in_little_room(checkpoint.Checkpointer.write, 1000))
     with pytest.warns(CheckpointWarning, match="File too large.* The run continues"):
         result = adapter.run(BOX, 0.15, **{**options, "checkpoint": both})
     whole = adapter.run(BOX, 0.15, **FEW)
@@ -259,9 +257,7 @@ def test_checkpoints_replace_nothing_else(adapter, tmp_path, content):
     path.write_bytes(b"")  # as mktemp makes it
     adapter.run(BOX, 0.15, checkpoint=clvoro.Checkpoint(path, every=0), **FEW)
     assert Saved(path).state["steps"] == FEW["max_steps"]
-    adapter.run(
-        BOX, 0.2, checkpoint=clvoro.Checkpoint(path, every=0), **FEW
-    )  # another run's checkpoint
+    adapter.run(BOX, 0.2, checkpoint=clvoro.Checkpoint(path, every=0), **FEW)  # another run's checkpoint
 
 
 def test_results_replace_neither_checkpoints_nor_what_a_run_begins_with(here, capsys):
@@ -287,9 +283,7 @@ def test_results_replace_neither_checkpoints_nor_what_a_run_begins_with(here, ca
 
 def test_frames_before_one_that_fails_are_kept(here, capsys):
     text = CASE.replace("size = 0.15\n", "") + '[size]\nkind = "expression"\n'
-    (here / "small.toml").write_text(
-        text + 'expression = "0.2 - 0.3*{t}"\n[sequence]\nframes = 4\n'
-    )
+    (here / "small.toml").write_text(text + 'expression = "0.2 - 0.3*{t}"\n[sequence]\nframes = 4\n')
     assert call("--quiet") == cli.BAD_INPUT
     assert "the size field" in capsys.readouterr().err
     rows = (here / "out/small/frames.csv").read_text().splitlines()
@@ -400,9 +394,7 @@ def test_the_hosts_memory_ends(here, monkeypatch, capsys):
         ("no such line", {}, None),
     ],
 )
-def test_limits_of_containers_and_batch_systems_hold(
-    adapter, tmp_path, monkeypatch, own, limits, least
-):
+def test_limits_of_containers_and_batch_systems_hold(adapter, tmp_path, monkeypatch, own, limits, least):
     """Work beyond the limit is refused, because the system would kill the process without a message."""
     whole = _host_memory.host_memory()
     for name, text in limits.items():

@@ -27,9 +27,7 @@ def filled(monkeypatch):
             def filled(self, shape, dtype=None, plain=plain):
                 array = plain(self, shape, dtype)
                 if array.nbytes:
-                    array.set(
-                        np.full(array.nbytes, byte, np.uint8).view(array.dtype).reshape(array.shape)
-                    )
+                    array.set(np.full(array.nbytes, byte, np.uint8).view(array.dtype).reshape(array.shape))
                 return array
 
             monkeypatch.setattr(Engine, name, filled)
@@ -57,9 +55,7 @@ def test_diagrams(ctx, filled):
         for byte in PATTERNS:
             filled(byte)
             d = clvoro.Adapter(ctx).diagram(BOX, points)
-            found.add(
-                b"".join(a.tobytes() for a in (d.volumes, d.neighbors, d.vertices, d.centroids))
-            )
+            found.add(b"".join(a.tobytes() for a in (d.volumes, d.neighbors, d.vertices, d.centroids)))
         assert len(found) == 1
 
 

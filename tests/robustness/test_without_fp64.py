@@ -18,10 +18,23 @@ def complaints(text, options, fp64):
     """Return what clang reports on a program for a device with or without double precision."""
     extension = [] if fp64 else ["-Xclang", "-cl-ext=-cl_khr_fp64,-__opencl_c_fp64"]
     done = subprocess.run(
-        [gpu_programs.clang(), *gpu_programs.CLANG, *extension, "-fsyntax-only", "-target", "spir64",
-         "-Wall", "-Wdouble-promotion", "-Wno-unused", *options, "-"],
-        input=text, text=True, capture_output=True,
-    )  # fmt: skip
+        [
+            gpu_programs.clang(),
+            *gpu_programs.CLANG,
+            *extension,
+            "-fsyntax-only",
+            "-target",
+            "spir64",
+            "-Wall",
+            "-Wdouble-promotion",
+            "-Wno-unused",
+            *options,
+            "-",
+        ],
+        input=text,
+        text=True,
+        capture_output=True,
+    )
     found = [line for line in done.stderr.splitlines() if "warning:" in line or "error:" in line]
     return [line for line in found if HARMLESS not in line]
 

@@ -35,10 +35,7 @@ def test_distance_to_the_boundary_of_the_domain() -> None:
     rings = [np.roll(ring, -1, axis=0) for ring in domain.rings]
     for edges in (chosen, mask):
         a, b = domain.vertices[mask], np.concatenate(rings)[mask]
-        wanted = [
-            sizing.Distance(sizing.Segment(p, q), 0.1, slope=0.5)(x)
-            for p, q in zip(a, b, strict=True)
-        ]
+        wanted = [sizing.Distance(sizing.Segment(p, q), 0.1, slope=0.5)(x) for p, q in zip(a, b, strict=True)]
         found = sizing.Distance(domain.boundary(edges), 0.1, slope=0.5)(x)
         assert np.abs(found - np.min(wanted, axis=0)).max() < 1e-15
     with pytest.raises(InputError, match="has edge 80, expected numbers from 0 to 79"):
@@ -90,9 +87,7 @@ def test_gaps_outside_of_the_domain_are_ignored() -> None:
     assert sizing.FeatureSize(apart)(inner(apart)).min() > 0.3
 
 
-def reference(
-    domain: clvoro.Polygon, x: np.ndarray, across: float, slope: float, facing: float
-) -> np.ndarray:
+def reference(domain: clvoro.Polygon, x: np.ndarray, across: float, slope: float, facing: float) -> np.ndarray:
     """The same size from the empty circumcircles of the Delaunay triangles of a dense sample of the boundary."""
     start, end = domain.oriented.vertices, domain.oriented.vertices[domain.oriented.next_vertex]
     t = (np.arange(120) + 0.5)[:, None, None] / 120
@@ -104,10 +99,7 @@ def reference(
     twice = 2 * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     uu, vv = (u**2).sum(1), (v**2).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        to_center = (
-            np.column_stack([v[:, 1] * uu - u[:, 1] * vv, u[:, 0] * vv - v[:, 0] * uu])
-            / twice[:, None]
-        )
+        to_center = np.column_stack([v[:, 1] * uu - u[:, 1] * vv, u[:, 0] * vv - v[:, 0] * uu]) / twice[:, None]
     center = a + to_center
     fine = np.isfinite(center).all(axis=1)
     fine[fine] = domain.contains(center[fine])
@@ -117,9 +109,7 @@ def reference(
         radius2 = (one**2).sum(1)
         faces = (one * two).sum(1) <= math.cos(facing) * radius2
         found = corners[fine][faces][:, [i, j]]
-        sources.append(
-            found[np.hypot(*(found[:, 0] - found[:, 1]).T) > 8 * apart]
-        )  # shorter ones are not resolved
+        sources.append(found[np.hypot(*(found[:, 0] - found[:, 1]).T) > 8 * apart])  # shorter ones are not resolved
     chords = np.concatenate(sources)
     begin, along = chords[:, 0], chords[:, 1] - chords[:, 0]
     length2 = (along**2).sum(1)
@@ -137,12 +127,7 @@ def test_gaps_of_random_polygons(seed: int) -> None:
     h = size(x)
     # The sample is 1/120 of an edge apart, so are the ends of its chords off; edges that just face each other,
     # or just do not, may be classified otherwise: ten degrees either way.
-    step = (
-        np.hypot(
-            *(domain.oriented.vertices[domain.oriented.next_vertex] - domain.oriented.vertices).T
-        ).max()
-        / 120
-    )
+    step = np.hypot(*(domain.oriented.vertices[domain.oriented.next_vertex] - domain.oriented.vertices).T).max() / 120
     turn = math.radians(10)
     more, fewer = (reference(domain, x, 4, 0.3, FACING + s * turn).clip(0.02, 0.5) for s in (-1, 1))
     assert (h >= more - (0.25 + 0.3) * step).all()
@@ -203,12 +188,15 @@ def test_device_and_host_agree(ctx, dtype: str) -> None:
     ("options", "says"),
     [
         ({"domain": clvoro.Box((0, 0), (1, 1))}, "domain is a Box, expected a clvoro.Polygon"),
-        ({"cells_across": 0}, "cells_across is 0"), ({"growth": 0.9}, "growth is 0.9"), ({"growth": 1}, "no growth"),
-        ({"growth": 1.2, "slope": 0.1}, "exactly one"), ({"h_min": -1}, "h_min is -1"),
+        ({"cells_across": 0}, "cells_across is 0"),
+        ({"growth": 0.9}, "growth is 0.9"),
+        ({"growth": 1}, "no growth"),
+        ({"growth": 1.2, "slope": 0.1}, "exactly one"),
+        ({"h_min": -1}, "h_min is -1"),
         ({"h_min": 0.1, "h_max": 0.05}, "h_max is 0.05, expected at least h_min"),
         ({"curvature": -1}, "curvature is -1"),
     ],
-)  # fmt: skip
+)
 def test_bad_input(options: dict, says: str) -> None:
     with pytest.raises((InputError, InputTypeError), match=says):
         sizing.FeatureSize(**{"domain": clvoro.Polygon(SQUARE), **options})
@@ -271,12 +259,8 @@ def test_graded_fields_resolve_narrow_straits() -> None:
         (0, 1),
     ]
     domain = clvoro.Polygon(canal)
-    graded = sizing.Graded(
-        sizing.Expression("x > 1 && x < 2 ? 0.01 : 0.3"), slope=0.2, resolution=151
-    )
+    graded = sizing.Graded(sizing.Expression("x > 1 && x < 2 ? 0.01 : 0.3"), slope=0.2, resolution=151)
     graded.raster(domain)
     h = graded(np.array([(1.5, 0.5035), (0.5, 0.5035), (0.5, 0.9)]))
     # The error is the growth over a spacing of 0.02, and over some distance across the corner.
-    assert h == pytest.approx(
-        [0.01, 0.01 + 0.2 * 0.5, 0.01 + 0.2 * math.hypot(0.5, 0.3965)], abs=2 * 0.2 * 0.02
-    )
+    assert h == pytest.approx([0.01, 0.01 + 0.2 * 0.5, 0.01 + 0.2 * math.hypot(0.5, 0.3965)], abs=2 * 0.2 * 0.02)

@@ -31,8 +31,7 @@ def test_balls(most: float) -> None:
     normals = np.column_stack([-edge[:, 1], edge[:, 0]]) / np.hypot(*edge.T)[:, None]
     begin, end, radius = _balls(domain, points, normals, most)
     wanted = [
-        largest_radius(domain, x, n, most / (2 * math.sin(FACING / 2)))
-        for x, n in zip(points, normals, strict=True)
+        largest_radius(domain, x, n, most / (2 * math.sin(FACING / 2))) for x, n in zip(points, normals, strict=True)
     ]
     np.testing.assert_array_equal(begin, points)
     found = np.isfinite(radius)

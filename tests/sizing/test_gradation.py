@@ -35,9 +35,7 @@ def jacobi(values, spacing, slope):
         high = np.min([a + slope * s for a, s in zip(lesser, d, strict=True)], axis=0)
         for _ in range(60):
             middle = 0.5 * (low + high)
-            steep = sum(
-                (np.maximum(middle - a, 0) / s) ** 2 for a, s in zip(lesser, d, strict=True)
-            )
+            steep = sum((np.maximum(middle - a, 0) / s) ** 2 for a, s in zip(lesser, d, strict=True))
             low = np.where(steep < slope**2, middle, low)
             high = np.where(steep < slope**2, high, middle)
         fresh = np.minimum(u, high)
@@ -94,7 +92,7 @@ def test_minima_of_tiles(make_engine, shape):
     lowest = engine.empty(expected.size)
     engine.run_each(
         stage._kernels.tile_minima, expected.size, *map(np.int32, counts), engine.upload(values.ravel()), lowest
-    )  # fmt: skip
+    )
     assert np.array_equal(lowest.get(), expected.ravel())
 
 
@@ -201,8 +199,11 @@ def test_slopes_are_bounded(make_engine):
     """Along the axes strictly; of the gradient to first order."""
     engine = make_engine(2)
     field = sizing.Graded(
-        sizing.Distance([sizing.Circle((0.2, 3.4), 0.2), sizing.Segment((-1, 3), (0, 4))], 0.01,
-                        slope=3), slope=0.2, box=PLANE, resolution=(401, 201))  # fmt: skip
+        sizing.Distance([sizing.Circle((0.2, 3.4), 0.2), sizing.Segment((-1, 3), (0, 4))], 0.01, slope=3),
+        slope=0.2,
+        box=PLANE,
+        resolution=(401, 201),
+    )
     values = field.raster(engine=engine).values
     d = 2 / 400
     dx, dy = np.diff(values, axis=1) / d, np.diff(values, axis=0) / d
@@ -218,9 +219,8 @@ def test_minima_between_nodes_are_included(make_engine):
     engine = make_engine(2)
     source = np.array([0.3071, 3.4567])
     field = sizing.Graded(
-        sizing.Distance(sizing.Circle(source, 0), 0.001, slope=50, h_max=1), slope=0.1, box=PLANE,
-        resolution=41,
-    )  # fmt: skip
+        sizing.Distance(sizing.Circle(source, 0), 0.001, slope=50, h_max=1), slope=0.1, box=PLANE, resolution=41
+    )
     raster = field.raster(engine=engine)
     x = np.random.default_rng(3).uniform(PLANE.lower, PLANE.upper, (500, 2))
     exact = 0.001 + 0.1 * np.linalg.norm(x - source, axis=1)
@@ -245,9 +245,7 @@ def test_result_is_below_the_field_and_idempotent(ctx, nx, ny, slope, seed):
     # The least values are landmarks, whose cones are exact to the corners of their pixels, where
     # the scheme is of first order: 1 + 1 / sqrt(2) of a spacing where sqrt(2) is exact.
     spacing = 1 / (nx - 1) + 2 / (ny - 1)
-    assert again.raster(engine=engine).values == pytest.approx(
-        once.values, rel=1e-12, abs=0.3 * slope * spacing
-    )
+    assert again.raster(engine=engine).values == pytest.approx(once.values, rel=1e-12, abs=0.3 * slope * spacing)
 
 
 @pytest.mark.sparse(1)
@@ -261,9 +259,7 @@ def test_3d_and_combined_fields(make_engine):
     expected = 2 * np.minimum(plain(x), 0.2)
     # First order in the spacing of 0.02, twice for the factor.
     assert np.abs(stage(x) - expected).max() < 2 * 0.3 * 0.02
-    hosted = sizing.Sizing(
-        engine, domain, sizing.minimum(sizing.Graded(ball, slope=0.3), lambda p: 0.2 + 0 * p[:, 0])
-    )
+    hosted = sizing.Sizing(engine, domain, sizing.minimum(sizing.Graded(ball, slope=0.3), lambda p: 0.2 + 0 * p[:, 0]))
     assert 2 * hosted(x) == pytest.approx(stage(x), rel=1e-5)
 
 
@@ -322,21 +318,9 @@ def test_resolution_is_chosen_and_capped(queue, monkeypatch):
         (lambda: sizing.Graded(1.0, 1.2, resolution=1), InputError, "at least 2"),
         (lambda: sizing.Graded(1.0, 1.2, resolution=(5, 5, 5), box=PLANE), InputError, "per axis"),
         (lambda: sizing.Graded(1.0, 1.2, resolution=2.5), InputTypeError, "integers"),
-        (
-            lambda: sizing.Graded(1.0, 1.2)([(0, 0)]),
-            InputError,
-            "no domain to be computed on.*box=",
-        ),
-        (
-            lambda: sizing.Graded(sizing.Expression("z + 1"), 1.2, box=PLANE),
-            InputError,
-            "3 dimensions",
-        ),
-        (
-            lambda: sizing.Graded(sizing.Expression("x"), 1.2, box=PLANE).raster(),
-            SizeFieldError,
-            "positive",
-        ),
+        (lambda: sizing.Graded(1.0, 1.2)([(0, 0)]), InputError, "no domain to be computed on.*box="),
+        (lambda: sizing.Graded(sizing.Expression("z + 1"), 1.2, box=PLANE), InputError, "3 dimensions"),
+        (lambda: sizing.Graded(sizing.Expression("x"), 1.2, box=PLANE).raster(), SizeFieldError, "positive"),
     ],
 )
 def test_bad_input(make, error, message):
@@ -351,9 +335,7 @@ def test_too_many_nodes_are_rejected_before_allocation(make_engine, monkeypatch)
     engine = make_engine(2)
     monkeypatch.setattr("clvoro.sizing.graded.host_memory", lambda: 48 * n - 1)
     monkeypatch.setattr(sizing.Graded, "_at_nodes", None)  # is not reached
-    with pytest.raises(
-        MemoryLimitError, match=r"resolution is 200, .* 2.02e\+04 nodes .* the host has"
-    ):
+    with pytest.raises(MemoryLimitError, match=r"resolution is 200, .* 2.02e\+04 nodes .* the host has"):
         field.raster(box, engine)
     monkeypatch.undo()
     monkeypatch.setattr("clvoro.sizing.graded.host_memory", lambda: 48 * n)
@@ -386,12 +368,7 @@ def globe_cones(sphere, values, slope):
 
 
 # One node, by longitude and latitude: on the equator, at the date line, beside the poles; and many.
-SOURCES = {
-    "equator": [(91, 1)],
-    "date-line": [(180.1, 40)],
-    "north": [(11, 89.9)],
-    "south": [(-100, -87)],
-}
+SOURCES = {"equator": [(91, 1)], "date-line": [(180.1, 40)], "north": [(11, 89.9)], "south": [(-100, -87)]}
 
 
 @pytest.mark.sparse(1)
@@ -406,9 +383,7 @@ def test_growth_on_a_sphere_is_along_great_circles(make_engine, where):
     for lon, lat in SOURCES.get(where, []):
         values[int((lat + 90) / 180 * ny), int(lon % 360 / 360 * nx)] = 0.05
     on_device = engine.upload(values.ravel())
-    Gradation(engine, globe=True).sweep_tiles(
-        on_device, (nx, ny), (2 * np.pi / nx, np.pi / ny), slope
-    )
+    Gradation(engine, globe=True).sweep_tiles(on_device, (nx, ny), (2 * np.pi / nx, np.pi / ny), slope)
     found, exact = on_device.get().reshape(ny, nx), globe_cones(unit, values, slope)
     spacing = np.pi / ny
     # As in the plane. Fronts meet at the far side, where values are too low by less than half a step.
@@ -434,23 +409,15 @@ def test_graded_on_a_sphere():
     step = 2 * np.pi * earth.radius / globe_columns(300)
     assert field(x) == pytest.approx(expected, abs=1.5 * slope * step)
     # Over the pole and across the date line there is no step.
-    for ways in (
-        [(a, b) for a in (0, 90, 180, 270) for b in (89.9,)],
-        [(179.99, 30), (-179.99, 30)],
-    ):
+    for ways in ([(a, b) for a in (0, 90, 180, 270) for b in (89.9,)], [(179.99, 30), (-179.99, 30)]):
         assert np.ptp(field(earth.positions(ways))) < 1.5 * slope * step
     assert (2 * given).map_parts(lambda f: on_domain(f, earth))(x) == pytest.approx(2 * field(x))
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [
-        ({"box": clvoro.Box((0, 0), (1, 1))}, "leave out box"),
-        ({"resolution": (64, 32)}, "nodes along the equator"),
-    ],
+    [({"box": clvoro.Box((0, 0), (1, 1))}, "leave out box"), ({"resolution": (64, 32)}, "nodes along the equator")],
 )
 def test_mistakes_on_a_sphere(options, message):
     with pytest.raises(InputError, match=message):
-        clvoro.adapt(
-            clvoro.Sphere(), sizing.Graded(sizing.Expression("1e6 + 0*lat"), 1.1, **options)
-        )
+        clvoro.adapt(clvoro.Sphere(), sizing.Graded(sizing.Expression("1e6 + 0*lat"), 1.1, **options))

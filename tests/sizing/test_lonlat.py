@@ -13,10 +13,12 @@ from clvoro.opencl.engine import Engine
 from clvoro.sizing.on_domain import on_domain
 
 EARTH = clvoro.Sphere()
-POINTS = np.concatenate([
-    EARTH.wrap(np.random.default_rng(0).normal(size=(3000, 3))),
-    EARTH.positions([(0, 90), (0, -90), (180, 0), (-180, 0), (0, 0), (-45, 45), (135, -45)]),
-])  # fmt: skip
+POINTS = np.concatenate(
+    [
+        EARTH.wrap(np.random.default_rng(0).normal(size=(3000, 3))),
+        EARTH.positions([(0, 90), (0, -90), (180, 0), (-180, 0), (0, 0), (-45, 45), (135, -45)]),
+    ]
+)
 LON, LAT = EARTH.lonlat(POINTS).T
 NORTH = np.linspace(-90, 90, 19)
 WAVES = 3e5 + 1e5 * np.cos(np.radians(NORTH))[:, None] * np.sin(np.radians(np.arange(0, 360, 10.0)))
@@ -46,12 +48,8 @@ FIELDS = {
     "expression": (sizing.Expression("2e5 + 1e3*abs(lat) + 200*abs(lon)"), 2e5 + 1e3 * abs(LAT) + 200 * abs(LON)),
     "function": (sizing.LonLat(lambda p: 2e5 + 1e3 * abs(p[:, 1])), 2e5 + 1e3 * abs(LAT)),
     "raster": (sizing.Raster(WAVES, (0, -90), (350, 90)), bilinear(WAVES, 0, 10)),
-    "repeated": (
-        sizing.Raster(np.c_[WAVES, WAVES[:, :1]], (0, -90), (360, 90)), bilinear(WAVES, 0, 10),
-    ),
-    "from-the-west": (
-        sizing.Raster(np.roll(WAVES, 18, axis=1), (-180, -90), (170, 90)), bilinear(WAVES, 0, 10),
-    ),
+    "repeated": (sizing.Raster(np.c_[WAVES, WAVES[:, :1]], (0, -90), (360, 90)), bilinear(WAVES, 0, 10)),
+    "from-the-west": (sizing.Raster(np.roll(WAVES, 18, axis=1), (-180, -90), (170, 90)), bilinear(WAVES, 0, 10)),
     "point": (
         sizing.Distance(sizing.Circle((-45, 45), 0), h_min=5e4, growth=1.2, h_max=5e5),
         np.minimum(5e4 + np.log(1.2) * arc((-45, 45)), 5e5),
@@ -66,11 +64,13 @@ FIELDS = {
     ),
     "caps": (
         sizing.Caps([((-45, 45), 3e6, 2e5), ((-45, 45), 1e6, 1e5)], h_max=4e5, growth=1.1),
-        np.minimum.reduce([
-            np.full(len(POINTS), 4e5),
-            2e5 + np.log(1.1) * np.maximum(arc((-45, 45)) - 3e6, 0),
-            1e5 + np.log(1.1) * np.maximum(arc((-45, 45)) - 1e6, 0),
-        ]),
+        np.minimum.reduce(
+            [
+                np.full(len(POINTS), 4e5),
+                2e5 + np.log(1.1) * np.maximum(arc((-45, 45)) - 3e6, 0),
+                1e5 + np.log(1.1) * np.maximum(arc((-45, 45)) - 1e6, 0),
+            ]
+        ),
     ),
     "combined": (
         2 * sizing.minimum(sizing.Expression("2e5 + 1e3*abs(lat)"), sizing.Raster(WAVES, (0, -90), (350, 90)), 25e4),
@@ -85,7 +85,7 @@ FIELDS = {
         ),
     ),
     "cartesian": (sizing.Expression("3e5 + 0.01*z"), 3e5 + 0.01 * POINTS[:, 2]),
-}  # fmt: skip
+}
 COARSE = {"circle": 5e-4}
 """Relative error of curves that stand for others; that of chords is a thousandth of h_min at most."""
 
@@ -107,17 +107,13 @@ def test_on_the_device(ctx, name, real):
     engine = Engine(ctx, cl.CommandQueue(ctx), 3, kind, EARTH.kind(kind))
     found = sizing.Sizing(engine, EARTH, field)(POINTS)
     # A longitude near 180 degrees may be rounded to the other side, where a raster has the same value.
-    assert found == pytest.approx(
-        on_domain(field, EARTH)(POINTS), rel=500 * float(np.finfo(kind).eps)
-    )
+    assert found == pytest.approx(on_domain(field, EARTH)(POINTS), rel=500 * float(np.finfo(kind).eps))
 
 
 def test_landmarks_are_on_the_sphere():
     for name in ("raster", "circle", "caps"):
         marks = on_domain(FIELDS[name][0], EARTH).landmarks(EARTH)
-        assert np.linalg.norm(marks, axis=1) == pytest.approx(
-            np.full(len(marks), EARTH.radius), rel=1e-3
-        )
+        assert np.linalg.norm(marks, axis=1) == pytest.approx(np.full(len(marks), EARTH.radius), rel=1e-3)
 
 
 def test_fields_of_the_plane_stay():
@@ -143,7 +139,7 @@ def test_fields_of_the_plane_stay():
         (lambda: clvoro.adapt(EARTH, sizing.Distance(sizing.Circle((3, 100), 5), 1e5, 1.1)), r"position \(3, 100\)"),
         (lambda: clvoro.adapt(EARTH, sizing.Expression("5e6 + 3e4*lat")), r"longitude -?\d+, latitude 8\d, larger"),
     ],
-)  # fmt: skip
+)
 def test_mistakes(call, message):
     with pytest.raises(ClvoroError, match=message):
         call()

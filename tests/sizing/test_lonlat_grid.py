@@ -58,7 +58,7 @@ LAYOUTS = {
     "far": (GLOBAL + 300, POLES),
     "varying": (np.sort(np.r_[GLOBAL, 1.0, 2.5, 3.7]), np.degrees(np.arcsin(np.linspace(-1, 1, 121)))),
     "open seam": (np.arange(0, 358, 3.5), POLES),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", list(LAYOUTS))
@@ -148,7 +148,7 @@ def radians(lon, lat, **attrs):
         (np.ones((37, 72)), "expected an xarray.DataArray"),
         (SimpleNamespace(data_vars={"h": 0}), r"Dataset of h.*dataset\['NAME'\]"),
     ],
-)  # fmt: skip
+)
 def test_mistakes(given, message):
     with pytest.raises(ClvoroError, match=message):
         sizing.Raster.from_xarray(given)
@@ -158,9 +158,7 @@ def test_small_regions_in_degrees_are_no_radians():
     raster = sizing.Raster.from_xarray(array(np.linspace(0, 1, 11), np.linspace(0, 1, 11)))
     assert error(raster, np.array([(0.5, 0.5)])) < 1
     units = ({"units": "degrees_east"}, {"units": "degrees_north"})
-    raster = sizing.Raster.from_xarray(
-        array(np.arange(0, 6.2, 0.1), np.linspace(0, 1, 11), attrs=units)
-    )
+    raster = sizing.Raster.from_xarray(array(np.arange(0, 6.2, 0.1), np.linspace(0, 1, 11), attrs=units))
     assert error(raster, np.array([(3.0, 0.5)])) < 1
 
 
@@ -172,8 +170,6 @@ def test_xarray_itself():
         ("latitude", "longitude"),
     )
     assert error(sizing.Raster.from_xarray(data)) < LINEAR
-    assert np.array_equal(
-        sizing.Raster.from_xarray(data.T).values, sizing.Raster.from_xarray(data).values
-    )
+    assert np.array_equal(sizing.Raster.from_xarray(data.T).values, sizing.Raster.from_xarray(data).values)
     with pytest.raises(ClvoroError, match="Dataset of h"):
         sizing.Raster.from_xarray(data.to_dataset(name="h"))

@@ -33,9 +33,7 @@ def _within(box, n, margin=0.0):
 _CIRCLE = sizing.Distance(sizing.Circle((0.2, 100.9), 0.3), 0.02, growth=1.3)
 _ENDS = _within(PLANE, 60, 0.3).reshape(30, 2, 2)
 _SEGMENTS = [sizing.Segment(a, a + 0.1 * (b - a)) for a, b in _ENDS]
-_CIRCLES = [
-    sizing.Circle(c, r) for c, r in zip(_within(PLANE, 40), _rng.uniform(0, 0.4, 40), strict=True)
-]
+_CIRCLES = [sizing.Circle(c, r) for c, r in zip(_within(PLANE, 40), _rng.uniform(0, 0.4, 40), strict=True)]
 _HELIX = np.column_stack(
     [
         1 + 0.3 * np.cos(np.linspace(0, 20, 300)),
@@ -51,21 +49,15 @@ PLANE_FIELDS = {
     "point": sizing.Distance(sizing.Circle((0.2, 100.9), 0), 0.02, slope=0.2),
     "capped": sizing.Distance(sizing.Segment((0, 100.5), (1, 101)), 0.01, slope=0.5, h_max=0.1),
     "flat": sizing.Distance(sizing.Segment((0, 100.5), (1, 101)), 0.01, growth=1),
-    "polygon": sizing.Distance(
-        sizing.ClosedPolyline(_wavy(700, (0.5, 101), 0.4)), 0.001, growth=1.1
-    ),
+    "polygon": sizing.Distance(sizing.ClosedPolyline(_wavy(700, (0.5, 101), 0.4)), 0.001, growth=1.1),
     "polygon capped": sizing.Distance(
         sizing.ClosedPolyline(_wavy(700, (0.5, 101), 0.4)), 0.001, growth=1.1, h_max=0.004
     ),
     "polyline": sizing.Distance(sizing.Polyline(_wavy(9, (0.5, 101), 0.4)), 0.01, growth=1.1),
-    "polygon 9": sizing.Distance(
-        sizing.ClosedPolyline(_wavy(9, (0.5, 101), 0.4)), 0.01, growth=1.1
-    ),
+    "polygon 9": sizing.Distance(sizing.ClosedPolyline(_wavy(9, (0.5, 101), 0.4)), 0.01, growth=1.1),
     "mixed": sizing.Distance([*_SEGMENTS, *_CIRCLES], 0.01, growth=1.5),
     "zero segments": sizing.Distance(
-        [sizing.Polyline([(0, 101), (0, 101), (1, 101)]), sizing.Segment((1, 101), (1, 101))],
-        0.01,
-        slope=1,
+        [sizing.Polyline([(0, 101), (0, 101), (1, 101)]), sizing.Segment((1, 101), (1, 101))], 0.01, slope=1
     ),
     "raster": sizing.Raster(_IMAGE, (-0.5, 100.4), (1.5, 101.5)),
     "raster centers": sizing.Raster(_IMAGE, (-0.7, 100.2), (1.8, 101.7), at="centers"),
@@ -90,8 +82,7 @@ SPACE_FIELDS = {
     "expression": sizing.Expression("0.1 + 0.01*(x*y*z > 0 ? x : z)"),
     "minimum": sizing.minimum(sizing.Expression("0.1*z"), 0.35) * 2,
     "segment": sizing.Distance(sizing.Segment((0.6, -2, 3), (1.4, -1.3, 4)), 0.02, slope=0.3),
-    "product": sizing.Expression("1 + 0.1*x*z")
-    * sizing.Distance(sizing.Ball((1, -1.6, 3.5), 0.25), 0.04, slope=0.3),
+    "product": sizing.Expression("1 + 0.1*x*z") * sizing.Distance(sizing.Ball((1, -1.6, 3.5), 0.25), 0.04, slope=0.3),
     "quotient": 0.3 / (sizing.Expression("2 + sin(5*y)") / 2 + 1),
     "box": sizing.Distance(Box((0.7, -1.9, 3.2), (1.4, -1.4, 4.1)), 0.01, growth=1.2),
 }
@@ -233,9 +224,7 @@ def test_callable_is_evaluated_on_the_host(make_engine):
         results.append((h.get(), gradient.get()))
     tolerance = _tolerance(engine, PLANE, twin)
     assert np.abs(results[0][0] - results[1][0]).max() < tolerance
-    smooth = (
-        np.abs(results[0][0] * PLANE.frame[1] - 0.3) > 0.03
-    )  # the kink is seen over other steps
+    smooth = np.abs(results[0][0] * PLANE.frame[1] - 0.3) > 0.03  # the kink is seen over other steps
     smooth &= results[0][0] * PLANE.frame[1] > 0.1  # and so is the tip
     step = 1e-3 if engine.real == np.float64 else 5e-2
     off = np.abs(results[0][1] - results[1][1])[smooth]
@@ -251,8 +240,7 @@ def test_parts_of_a_mixed_field_run_on_the_device(make_engine, monkeypatch):
     engine = make_engine(2)
     polygon = PLANE_FIELDS["polygon"]
     field = 0.5 * sizing.maximum(
-        sizing.minimum(lambda x: 0.05 + 0.1 * np.abs(x[:, 0]), polygon),
-        sizing.Expression("0.02*(x - 0.5)"),
+        sizing.minimum(lambda x: 0.05 + 0.1 * np.abs(x[:, 0]), polygon), sizing.Expression("0.02*(x - 0.5)")
     )
     points = _within(PLANE, 500)
     expected = field(points)
@@ -297,17 +285,11 @@ def test_operators_are_those_of_numbers(double):
 
 def test_gradient_of_a_product(double):
     engine, domain = double(2), Box((0, 0), (3, 1))
-    field = (
-        sizing.Expression("1 + x*x")
-        * sizing.Expression("0.01*(2 + y)")
-        / (sizing.Expression("1 + x*y"))
-    )
+    field = sizing.Expression("1 + x*x") * sizing.Expression("0.01*(2 + y)") / (sizing.Expression("1 + x*y"))
     x = np.random.default_rng(87).uniform((0.1, 0.1), (2.9, 0.9), (60, 2))
     scale = domain.frame[1]
     h, slope = engine.empty(60), engine.empty((60, 2))
-    sizing.Sizing(engine, domain, field).evaluate_with_gradient(
-        _device_points(engine, domain, x), 60, h, slope
-    )
+    sizing.Sizing(engine, domain, field).evaluate_with_gradient(_device_points(engine, domain, x), 60, h, slope)
     a, b = x.T
     expected = [2 * a / (1 + a * a) - b / (1 + a * b), 1 / (2 + b) - a / (1 + a * b)]
     # Differences over 1e-3 of h, of the order of 1e-4: second order in that.
@@ -497,9 +479,7 @@ def test_accepted_expressions_agree_on_the_device(double):
     for text in (short, *(t for t in texts if len(t) >= 50)):
         field = sizing.Expression(f"1000 + ({text})")  # positive
         # 1e-12 of 1000: a few ulp of each function.
-        assert sizing.Sizing(engine, domain, field)(points) == pytest.approx(
-            field(points), rel=1e-12
-        )
+        assert sizing.Sizing(engine, domain, field)(points) == pytest.approx(field(points), rel=1e-12)
 
 
 def test_z_needs_three_dimensions(double):
@@ -585,13 +565,7 @@ def test_sizes_beyond_the_domain_and_the_precision(make_engine):
         with pytest.raises(SizeFieldError):
             tiny(points)
     # Sizes that float64 holds, but not (L - h) / L or h^-2. Numbers beyond float32 are not clipped.
-    for huge in (
-        3e9,
-        1e39,
-        1e300,
-        sizing.Expression("x > 0.2 ? 1e100 : 1"),
-        lambda x: 1e200 + x[:, 0],
-    ):
+    for huge in (3e9, 1e39, 1e300, sizing.Expression("x > 0.2 ? 1e100 : 1"), lambda x: 1e200 + x[:, 0]):
         with pytest.raises(SizeFieldError, match="at most 2e"):
             sizing.Sizing(engine, domain, huge)(points)
         with pytest.raises(SizeFieldError, match="at most 2e"):
@@ -625,9 +599,7 @@ def test_sizes_beyond_the_domain_and_the_precision(make_engine):
         (lambda: sizing.Distance(_CIRCLES, 0, slope=1), InputError, "h_min"),
         (lambda: sizing.Distance(_CIRCLES, 1, slope=1, h_max=0.5), InputError, "h_max"),
         (
-            lambda: sizing.Distance(
-                [sizing.Circle((0, 0), 1), sizing.Circle((0, 0, 0), 1)], 1, 1.1
-            ),
+            lambda: sizing.Distance([sizing.Circle((0, 0), 1), sizing.Circle((0, 0, 0), 1)], 1, 1.1),
             InputError,
             "2 and of 3",
         ),
@@ -660,11 +632,7 @@ def test_sizes_beyond_the_domain_and_the_precision(make_engine):
         (lambda: _CIRCLE(np.zeros((5, 3))), InputError, "2 dimensions"),
         (lambda: sizing.Function(lambda p: p)(np.zeros((5, 2))), InputError, r"shape \(5, 2\)"),
         (lambda: sizing.Function(lambda p: 1.0)(np.zeros((5, 2))), InputError, "vectorized"),
-        (
-            lambda: sizing.Function(lambda p: p[:, 0] * 1j)(np.zeros((5, 2))),
-            InputTypeError,
-            "complex",
-        ),
+        (lambda: sizing.Function(lambda p: p[:, 0] * 1j)(np.zeros((5, 2))), InputTypeError, "complex"),
     ],
 )
 def test_bad_input(make, error, message):

@@ -145,9 +145,7 @@ def test_units_do_not_matter(scale):
     x, y = grid((0, 0), (1, 1), (31, 31))
     u = np.sin(5 * x) * y
     plain = sizing.hessian_size(u, (0, 0), (1, 1), n_cells=500).values
-    assert sizing.hessian_size(u * scale, (0, 0), (1, 1), n_cells=500).values == pytest.approx(
-        plain
-    )
+    assert sizing.hessian_size(u * scale, (0, 0), (1, 1), n_cells=500).values == pytest.approx(plain)
 
 
 def test_on_the_device(ctx):
@@ -181,9 +179,7 @@ def test_gaps_are_filled_with_the_nearest_value(shape):
         away = np.linalg.norm(places[known] - place, axis=1)
         assert value in values.ravel()[known][away <= near * (1 + 1e-12)]
     masked = np.ma.masked_array(values, gaps)
-    assert np.array_equal(
-        sizing.Raster(masked, (0,) * len(shape), upper, missing="nearest").values, found
-    )
+    assert np.array_equal(sizing.Raster(masked, (0,) * len(shape), upper, missing="nearest").values, found)
     u = sizing.hessian_size(holed, (0,) * len(shape), upper, eps=0.1, missing="nearest")
     v = sizing.hessian_size(found, (0,) * len(shape), upper, eps=0.1)
     assert np.array_equal(u.values, v.values)
@@ -203,9 +199,7 @@ def test_linear_data_are_interpolated_exactly():
 def test_nearest_value_outside_of_the_hull():
     rng = np.random.default_rng(65)
     points, values = rng.random((50, 2)), rng.uniform(1, 2, 50)
-    field = sizing.Scattered(
-        points, values, (-1, -1), (2, 3), resolution=(25, 41), method="nearest"
-    )
+    field = sizing.Scattered(points, values, (-1, -1), (2, 3), resolution=(25, 41), method="nearest")
     nodes = np.stack(grid((-1, -1), (2, 3), (25, 41)), axis=-1).reshape(-1, 2)
     away = np.linalg.norm(nodes[:, None] - points, axis=2)
     assert np.array_equal(field.values.ravel(), values[away.argmin(axis=1)])
@@ -229,78 +223,34 @@ def test_default_resolution_follows_the_points():
             InputError,
             r"\[0, 1\] is nan.*2 of 4 are missing.*missing='nearest'",
         ),
-        (
-            lambda: sizing.Raster([[np.nan]], (0, 0), (1, 1), missing="nearest"),
-            InputError,
-            "all missing",
-        ),
-        (
-            lambda: sizing.Raster([[1, np.inf]], (0, 0), (1, 1), missing="nearest"),
-            InputError,
-            r"\[0, 1\] is inf",
-        ),
+        (lambda: sizing.Raster([[np.nan]], (0, 0), (1, 1), missing="nearest"), InputError, "all missing"),
+        (lambda: sizing.Raster([[1, np.inf]], (0, 0), (1, 1), missing="nearest"), InputError, r"\[0, 1\] is inf"),
         (lambda: sizing.Raster([[1]], (0, 0), (1, 1), missing="zero"), InputError, "'nearest'"),
         (lambda: sizing.hessian_size(np.ones((3, 3)), (0, 0), (1, 1)), InputError, "exactly one"),
-        (
-            lambda: sizing.hessian_size(np.ones((2, 3)), (0, 0), (1, 1), eps=1),
-            InputError,
-            "at least 3",
-        ),
-        (
-            lambda: sizing.hessian_size(np.ones((3, 3)), (0, 0), (1, 1), eps=1, p=0.5),
-            InputError,
-            "at least 1",
-        ),
-        (
-            lambda: sizing.hessian_size(np.ones((3, 3)), (0, 0), (1, 1), eps=0),
-            InputError,
-            "hessian_size eps",
-        ),
+        (lambda: sizing.hessian_size(np.ones((2, 3)), (0, 0), (1, 1), eps=1), InputError, "at least 3"),
+        (lambda: sizing.hessian_size(np.ones((3, 3)), (0, 0), (1, 1), eps=1, p=0.5), InputError, "at least 1"),
+        (lambda: sizing.hessian_size(np.ones((3, 3)), (0, 0), (1, 1), eps=0), InputError, "hessian_size eps"),
         (
             lambda: sizing.gradient_size(np.ones((3, 3)), (0, 0), (1, 1), eps=1, h_min=2, h_max=1),
             InputError,
             "h_min <= h_max",
         ),
-        (
-            lambda: sizing.gradient_size(np.ones((3, 3)), (0, 0), (1, 0), eps=1),
-            InputError,
-            "gradient_size got lower",
-        ),
+        (lambda: sizing.gradient_size(np.ones((3, 3)), (0, 0), (1, 0), eps=1), InputError, "gradient_size got lower"),
         (lambda: sizing.gradient_size("ab", (0, 0), (1, 1), eps=1), InputError, "shape"),
         (lambda: sizing.Scattered([(0, 0)], [1]), InputError, "pass lower and upper"),
         (lambda: sizing.Scattered(np.zeros((0, 2)), []), InputError, "no points"),
-        (
-            lambda: sizing.Scattered([(0, 0), (1, 1)], [1, 2], (0, 0), (1, 1)),
-            InputError,
-            "method='nearest'",
-        ),
-        (
-            lambda: sizing.Scattered([(0, 0), (1, 1), (2, 2), (3, 3)], [1, 2, 3, 4]),
-            InputError,
-            "on a line",
-        ),
+        (lambda: sizing.Scattered([(0, 0), (1, 1)], [1, 2], (0, 0), (1, 1)), InputError, "method='nearest'"),
+        (lambda: sizing.Scattered([(0, 0), (1, 1), (2, 2), (3, 3)], [1, 2, 3, 4]), InputError, "on a line"),
         (lambda: sizing.Scattered([(0, 0), (1, 1)], [1]), InputError, r"shape \(1,\) for 2"),
-        (
-            lambda: sizing.Scattered([(0, 0), (1, 1)], [1, np.nan]),
-            InputError,
-            r"values\[1\] is nan",
-        ),
+        (lambda: sizing.Scattered([(0, 0), (1, 1)], [1, np.nan]), InputError, r"values\[1\] is nan"),
         (lambda: sizing.Scattered([(0, 0), (1, 1)], ["a", "b"]), InputTypeError, "real numbers"),
         (
             lambda: sizing.Scattered([(0, 0), (1, 0), (0, 1), (1, 0)], [1, 2, 3, 4]),
             InputError,
             r"points\[1\] and points\[3\] are at the same place",
         ),
-        (
-            lambda: sizing.Scattered([(0, 0), (1, 1)], [1, 2], method="cubic"),
-            InputError,
-            "'linear' or 'nearest'",
-        ),
-        (
-            lambda: sizing.Scattered([(0, 0), (1, 1)], [1, 2], resolution=1),
-            InputError,
-            "at least 2",
-        ),
+        (lambda: sizing.Scattered([(0, 0), (1, 1)], [1, 2], method="cubic"), InputError, "'linear' or 'nearest'"),
+        (lambda: sizing.Scattered([(0, 0), (1, 1)], [1, 2], resolution=1), InputError, "at least 2"),
     ],
 )
 def test_bad_input(make, error, message):

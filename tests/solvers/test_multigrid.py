@@ -38,11 +38,7 @@ def weights_of(graph, density=None):
 def upload(engine, W):
     W = sp.csr_matrix(W)
     W.sort_indices()
-    return (
-        engine.upload(W.indptr, np.int32),
-        engine.upload(W.indices, np.int32),
-        engine.upload(W.data),
-    )
+    return (engine.upload(W.indptr, np.int32), engine.upload(W.indices, np.int32), engine.upload(W.data))
 
 
 def matrix_of(graph):
@@ -155,9 +151,7 @@ def reference_cycle(multigrid, depth, b):
     S = sp.csr_matrix((both.astype(float), (cells, partner)), (n, n)) + sp.diags(
         own + np.where(partner == cells, 0, both.astype(float))
     )
-    P = sp.csr_matrix(
-        (np.ones(n), (cells, level.aggregates.aggregate.get())), (n, len(level.aggregates))
-    )
+    P = sp.csr_matrix((np.ones(n), (cells, level.aggregates.aggregate.get())), (n, len(level.aggregates)))
     low, high = 0.35, 2.0
     roots = (low + high) / 2 + (high - low) / 2 * np.cos(np.pi * np.array([1, 3]) / 4)
     x = np.zeros(b.shape)
@@ -203,9 +197,10 @@ def test_merged_steps_and_levels_give_the_same_bits(make, monkeypatch, name, gro
         launched = []
         with monkeypatch.context() as patched:
             patched.setattr(
-                cl, "enqueue_nd_range_kernel",
+                cl,
+                "enqueue_nd_range_kernel",
                 lambda *args, into=launched: into.append(args[1].function_name) or plain(*args),
-            )  # fmt: skip
+            )
             multigrid.apply(r, u)
         deep = len(multigrid.sizes) > 2
         assert ("smooth_from_zero" in launched) == (most == 0 and not merged and deep)
@@ -384,9 +379,7 @@ def solve(engine, W, seed=17, tolerance=1e-8):
         # are below round-off.
         b = (sp.diags(D) - W) @ b
     phi = engine.zeros(n)
-    solution = poisson.solve(
-        laplacian, engine.upload(b), phi, preconditioner="multigrid", tolerance=tolerance
-    )
+    solution = poisson.solve(laplacian, engine.upload(b), phi, preconditioner="multigrid", tolerance=tolerance)
     A = sp.diags(D) - W
     b = b - b.mean()
     true = np.linalg.norm(b - A @ phi.get().astype(float)) / np.linalg.norm(b)
@@ -443,9 +436,7 @@ def test_weights_of_any_unit(make, real, scale):
 
 
 @pytest.mark.sparse(1)
-@pytest.mark.parametrize(
-    ("name", "most"), [("lattice", 20), ("random 3D", 20), ("chain", 40), ("star", 20)]
-)
+@pytest.mark.parametrize(("name", "most"), [("lattice", 20), ("random 3D", 20), ("chain", 40), ("star", 20)])
 def test_iterations_of_other_graphs(make, name, most):
     solution, true = solve(make(3 if "3D" in name else 2), GRAPHS[name]())
     assert solution.converged
@@ -608,9 +599,7 @@ def test_coarse_levels_are_reused_while_they_converge(make):
         diagonal = np.asarray(W.sum(axis=1)).ravel()
         laplacian = Laplacian(*upload(engine, W))
         phi = engine.zeros(n)
-        solution = poisson.solve(
-            laplacian, engine.upload(b), phi, preconditioner="multigrid", ordering=ordering
-        )
+        solution = poisson.solve(laplacian, engine.upload(b), phi, preconditioner="multigrid", ordering=ordering)
         assert solution.reason == "converged"
         A = sp.diags(diagonal) - W
         left = np.linalg.norm(b - b.mean() - A @ phi.get()) / np.linalg.norm(b - b.mean())

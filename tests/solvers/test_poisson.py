@@ -46,10 +46,7 @@ def assembled(engine, graph, density=None, tolerance=0.0):
 def as_matrix(laplacian):
     """The device's operator as a SciPy matrix."""
     n, starts = len(laplacian), laplacian.starts.get()
-    weights, columns = (
-        laplacian.weights.get()[: starts[-1]],
-        laplacian.neighbors.get()[: starts[-1]],
-    )
+    weights, columns = (laplacian.weights.get()[: starts[-1]], laplacian.neighbors.get()[: starts[-1]])
     assert not weights[columns < 0].any()
     rows = np.repeat(np.arange(n), np.diff(starts))
     off = sp.csr_matrix((weights, np.where(columns < 0, rows, columns), starts), (n, n))
@@ -128,9 +125,13 @@ def test_large_tolerances_use_single_precision(make, preconditioner, start):
     b -= b.mean()
     phi = engine.upload(0.999 * direct(full, b)) if start == "near" else engine.zeros(n)
     solution = poisson.solve(
-        laplacian, engine.upload(b), phi, tolerance=1e-3 if start == "zero" else 2e-4,
-        preconditioner=preconditioner, from_zero=start == "zero",
-    )  # fmt: skip
+        laplacian,
+        engine.upload(b),
+        phi,
+        tolerance=1e-3 if start == "zero" else 2e-4,
+        preconditioner=preconditioner,
+        from_zero=start == "zero",
+    )
     assert solution.reason == "converged"
     assert solution.iterations > 2
     left = np.linalg.norm(b - full @ phi.get()) / np.linalg.norm(b)
@@ -154,9 +155,7 @@ def test_cells_with_several_faces():
     """Around a periodic box, or a hole, two cells may have more than one: all count, on both sides alike."""
     ctx = create_context()
     domain = Box((0, 0), (1, 1), periodic=(True, False))
-    engine = Engine(
-        ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64), domain.kind(np.dtype(np.float64))
-    )
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64), domain.kind(np.dtype(np.float64)))
     points = np.array([[0.2, 0.5], [0.6, 0.5], [0.5, 0.9]])
     starts, neighbors = np.array([0, 4, 8, 10]), np.array([1, -3, 1, 2, 0, 2, 0, -3, 0, 1])
     measures = np.array([1.0, 1, 0.5, 0.1, 0.51, 0.2, 1.01, 1, 0.1, 0.2])
@@ -169,13 +168,7 @@ def test_cells_with_several_faces():
 
 def test_measures_of_a_face_are_averaged(make):
     points = np.array([[0.25, 0.5], [0.75, 0.5]])
-    graph = (
-        points,
-        np.array([0, 2, 4]),
-        np.array([1, -1, 0, -2]),
-        np.array([1.0, 1, 1.5, 1]),
-        None,
-    )
+    graph = (points, np.array([0, 2, 4]), np.array([1, -1, 0, -2]), np.array([1.0, 1, 1.5, 1]), None)
     A = as_matrix(assembled(make(), graph)[1]).toarray()
     assert np.array_equal(A, [[2.5, -2.5], [-2.5, 2.5]])
 
@@ -330,9 +323,7 @@ def test_start_far_from_the_solution(make):
     b, start = (rng.standard_normal(900) for _ in range(2))
     start *= 1e3 * np.linalg.norm(b) / np.linalg.norm(A @ start)
     x = engine.upload(start)
-    solution = poisson.solve(
-        laplacian, engine.upload(b), x, tolerance=1e-8, preconditioner="jacobi"
-    )
+    solution = poisson.solve(laplacian, engine.upload(b), x, tolerance=1e-8, preconditioner="jacobi")
     assert solution.converged
     expected = direct(A, b - b.mean())
     # Condition number about 1e4.
@@ -363,10 +354,7 @@ def test_buffers_of_earlier_solves_do_not_matter(make, preconditioner, left):
     b = engine.upload(np.random.default_rng(60).standard_normal(900))
     for soiled in (False, True):
         poisson, laplacian = assembled(engine, graphs.random_graph(900, seed=59))
-        solver, options = (
-            poisson._conjugate_gradient,
-            {"tolerance": 1e-6, "preconditioner": preconditioner},
-        )
+        solver, options = (poisson._conjugate_gradient, {"tolerance": 1e-6, "preconditioner": preconditioner})
         poisson.solve(laplacian, b, engine.zeros(900), max_iterations=300, **options)
         for array in (solver.partial, solver.state, solver.record, solver._group_state) * soiled:
             array.fill(left)
@@ -389,7 +377,7 @@ def test_result_does_not_depend_on_the_lookahead(make):
         x = engine.zeros(800)
         solution = ConjugateGradient(engine).solve(
             singular(poisson, laplacian), b, x, poisson.inverse_diagonal(laplacian), Limits(1e-6, 500, lookahead)
-        )  # fmt: skip
+        )
         results.append((solution.iterations, x.get()))
     assert len({iterations for iterations, _ in results}) == 1
     assert all(np.array_equal(x, results[0][1]) for _, x in results)
@@ -411,17 +399,14 @@ def test_preconditioner_is_applied_once_per_iteration(make):
     b = engine.upload(np.random.default_rng(58).standard_normal(800))
     solution = ConjugateGradient(engine).solve(
         singular(poisson, laplacian), b, engine.zeros(800), precondition, Limits(1e-2, 500, 1, verify=False)
-    )  # fmt: skip
+    )
     assert solution.converged
     assert applied == solution.iterations > 10
 
 
 @pytest.mark.parametrize(
     ("n", "group_size"),
-    [
-        (1500, None),
-        pytest.param(15, 4, marks=pytest.mark.slow),
-    ],  # barriers in loops take long to compile
+    [(1500, None), pytest.param(15, 4, marks=pytest.mark.slow)],  # barriers in loops take long to compile
     ids=["cpu", "gpu"],
 )
 def test_one_work_group_solves_alike(n, group_size, monkeypatch):
@@ -455,9 +440,7 @@ def test_callable_preconditioner(make):
         u[:] = poisson.inverse_diagonal(laplacian) * r
 
     x, y = engine.zeros(800), engine.zeros(800)
-    solution = ConjugateGradient(engine).solve(
-        singular(poisson, laplacian), b, x, jacobi, Limits(1e-8, 500)
-    )  # fmt: skip
+    solution = ConjugateGradient(engine).solve(singular(poisson, laplacian), b, x, jacobi, Limits(1e-8, 500))
     expected = poisson.solve(laplacian, b, y)
     assert abs(solution.iterations - expected.iterations) <= 2
     assert np.abs(x.get() - y.get()).max() <= 1e-5 * np.abs(y.get()).max()
@@ -477,9 +460,12 @@ def test_breakdown_is_reported(make):
 
     with pytest.raises(SolverError, match="positive definite"):
         solver.solve(
-            Operator(apply, singular=True), engine.upload(b), negative, poisson.inverse_diagonal(laplacian),
+            Operator(apply, singular=True),
+            engine.upload(b),
+            negative,
+            poisson.inverse_diagonal(laplacian),
             Limits(1e-8, 50),
-        )  # fmt: skip
+        )
     b[7] = np.nan
     with pytest.raises(SolverError, match="not finite"):
         poisson.solve(laplacian, engine.upload(b), engine.zeros(100))
@@ -532,9 +518,7 @@ def test_from_zero_and_unverified(make):
 def crossover(dim, tolerance, factors):
     """The number of cells from which on multigrid is chosen."""
     sizes = np.unique(np.geomspace(100, 1e7, 2000).astype(int))
-    better = [
-        b < a for a, b in (expected_costs(int(n), dim, tolerance, False, factors) for n in sizes)
-    ]
+    better = [b < a for a, b in (expected_costs(int(n), dim, tolerance, False, factors) for n in sizes)]
     first = better.index(True)
     assert all(better[first:])
     return sizes[first]

@@ -41,10 +41,16 @@ class Given:
         reserve = stage._reserve
         stage._reserve = lambda *args: taken.append(reserve(*args)) or taken[-1]
         solution = stage.project(
-            self.t, Targets(*targets), displacement, u, Penalty(EPS, QUALITY_SCALE, LOG_RATIO_SCALE),
-            Limits(tolerance, max_iterations), labels=self.engine.upload(self.labels, np.int32),
-            fixed=self.fixed, start=start,
-        )  # fmt: skip
+            self.t,
+            Targets(*targets),
+            displacement,
+            u,
+            Penalty(EPS, QUALITY_SCALE, LOG_RATIO_SCALE),
+            Limits(tolerance, max_iterations),
+            labels=self.engine.upload(self.labels, np.int32),
+            fixed=self.fixed,
+            start=start,
+        )
         return solution, u.get(), start.get(), taken[0]
 
     def operator(self):
@@ -70,12 +76,18 @@ class Given:
 @pytest.fixture(
     scope="module",
     params=[
-        ("plane", "float64", None), ("plane", "float32", None), ("plane", "float64", 16), ("space", "float64", None),
-        ("space", "float32", 16), ("torus", "float64", None), ("slab", "float64", None),
-        ("sphere", "float64", None), ("sphere", "float32", 16),
+        ("plane", "float64", None),
+        ("plane", "float32", None),
+        ("plane", "float64", 16),
+        ("space", "float64", None),
+        ("space", "float32", 16),
+        ("torus", "float64", None),
+        ("slab", "float64", None),
+        ("sphere", "float64", None),
+        ("sphere", "float32", 16),
     ],
     ids=lambda p: f"{p[0]}, {p[1]}" + (", groups" if p[2] else ""),
-)  # fmt: skip
+)
 def kind(ctx, request):
     name, real, group_size = request.param
     box = Sphere(1) if name == "sphere" else patch.BOXES[name]

@@ -61,9 +61,8 @@ class Assembled:
             sums=None if sums is None else engine.upload(sums),
         )
         projection.project(
-            t, targets, engine.upload(given["displacement"]), engine.empty((n, 2)), Penalty(**options),
-            Limits(1e-12, 0),
-        )  # fmt: skip
+            t, targets, engine.upload(given["displacement"]), engine.empty((n, 2)), Penalty(**options), Limits(1e-12, 0)
+        )
         host, (v,) = patch.fetch(t), taken
         self.eps, self.inverse, self.rhs = v.eps.get(), v.inverse.get(), v.r.get()
         inner = host.neighbors >= 0
@@ -138,16 +137,7 @@ def test_diagonal(assembled):
 def test_right_side(engine, points):
     """r + J Ld."""
     r, lloyd = log_ratios(points), np.random.default_rng(17).normal(0, 0.01, (N, 2))
-    made = Assembled(
-        engine,
-        points,
-        sizes(points),
-        np.tile(SLOPE, (N, 1)),
-        r,
-        lloyd,
-        eps=0.3,
-        log_ratio_scale=0.4,
-    )
+    made = Assembled(engine, points, sizes(points), np.tile(SLOPE, (N, 1)), r, lloyd, eps=0.3, log_ratio_scale=0.4)
     expected = r + np.einsum("ija,ja->i", made.derivative(), lloyd)
     assert made.rhs == pytest.approx(expected, abs=1e-6 * np.abs(expected).max())
 
@@ -169,11 +159,16 @@ def project(engine, points, h, gradient, r, displacement, tolerance=1e-6, **opti
     targets = Targets(*map(engine.upload, (h, gradient, r, np.ones(len(points)))))
     penalty = Penalty(
         options.pop("eps"), log_ratio_scale=options.pop("log_ratio_scale", 0.0), power=options.pop("power", 2)
-    )  # fmt: skip
+    )
     solution = VolumeProjection(engine).project(
-        patch.tessellate(engine, points), targets, engine.upload(displacement), out, penalty,
-        Limits(tolerance, options.pop("max_iterations")), **options,
-    )  # fmt: skip
+        patch.tessellate(engine, points),
+        targets,
+        engine.upload(displacement),
+        out,
+        penalty,
+        Limits(tolerance, options.pop("max_iterations")),
+        **options,
+    )
     return out.get(), solution
 
 
@@ -188,13 +183,7 @@ def test_projection(engine, points, log_ratio_scale, power):
     assert made.eps == pytest.approx(eps, rel=1e-6)  # of single precision
     expected = made.correction(made.rhs)
     correction, solution = project(
-        engine,
-        *given,
-        eps=0.02,
-        log_ratio_scale=log_ratio_scale,
-        power=power,
-        max_iterations=1000,
-        tolerance=1e-12,
+        engine, *given, eps=0.02, log_ratio_scale=log_ratio_scale, power=power, max_iterations=1000, tolerance=1e-12
     )
     assert solution.converged
     assert solution.reason == "converged"
@@ -211,7 +200,7 @@ def test_tolerance(engine, points, tolerance):
     made = Assembled(engine, points, h, gradient, r, eps=0.05)
     u, solution = project(
         engine, points, h, gradient, r, np.zeros((N, 2)), eps=0.05, max_iterations=60, tolerance=tolerance
-    )  # fmt: skip
+    )
     assert solution.converged
     assert solution.residual <= tolerance < solution.residuals[-2]
     # u = -W J^T y for some y. The residual of the best y for this u is nearly the reported one.
@@ -255,9 +244,13 @@ def test_result_does_not_depend_on_the_lookahead(engine, points):
         projection._ahead = ahead
         h, gradient, r = (engine.upload(a) for a in given[1:])
         solution = projection.project(
-            t, Targets(h, gradient, r, engine.upload(np.ones(N))), engine.zeros((N, 2)), out, Penalty(0.1),
+            t,
+            Targets(h, gradient, r, engine.upload(np.ones(N))),
+            engine.zeros((N, 2)),
+            out,
+            Penalty(0.1),
             Limits(1e-3, 40),
-        )  # fmt: skip
+        )
         results.append((out.get(), solution.residuals))
     for u, residuals in results[1:]:
         assert np.array_equal(u, results[0][0])
@@ -273,9 +266,12 @@ def test_start(engine, points, of):
     B = made.B.reshape(N, -1)
     y = np.linalg.solve(B @ B.T + np.diag(made.eps), made.rhs)
     start = {
-        "solution": y, "scaled": 1e6 * y, "turned": -y, "zero": 0 * y,
+        "solution": y,
+        "scaled": 1e6 * y,
+        "turned": -y,
+        "zero": 0 * y,
         "other": np.random.default_rng(31).normal(size=N),
-    }[of]  # fmt: skip
+    }[of]
     options = {"eps": 0.05, "max_iterations": 1000, "tolerance": 1e-12}
     _, cold = project(engine, *given, **options)
     on_device = engine.upload(start, np.float32)
@@ -289,11 +285,7 @@ def test_start(engine, points, of):
     # A start in single precision leaves the residual at some 1e-7 of the right side.
     good = of in ("solution", "scaled", "turned")
     assert (solution.residuals[1] < 1e-5) == good
-    assert (
-        solution.iterations < cold.iterations
-        if good
-        else solution.iterations <= cold.iterations + 5
-    )
+    assert solution.iterations < cold.iterations if good else solution.iterations <= cold.iterations + 5
     # A projection from a start that is at its target needs no more.
     rough = {**options, "tolerance": 1e-5}
     _, again = project(engine, *given, **rough, start=on_device, warm=True)
@@ -304,9 +296,7 @@ def test_not_finite(engine, points):
     r = log_ratios(points)
     r[7] = np.nan
     with pytest.raises(SolverError, match="not finite"):
-        project(
-            engine, points, sizes(points), np.tile(SLOPE, (N, 1)), r, np.zeros((N, 2)), eps=0.1, max_iterations=9
-        )  # fmt: skip
+        project(engine, points, sizes(points), np.tile(SLOPE, (N, 1)), r, np.zeros((N, 2)), eps=0.1, max_iterations=9)
 
 
 def test_penalty_of_bad_cells(engine, points, assembled):
@@ -327,9 +317,16 @@ def test_penalty_of_bad_cells(engine, points, assembled):
     assert 5 < (eps == 3).sum() < N - 5
     for at_walls, most in ((1.0, math.inf), (2.0, math.inf), (1.0, 0.05)):
         made = Assembled(
-            engine, points, sizes(points), np.tile(SLOPE, (N, 1)), eps=0.2, quality_scale=0.3, at_walls=at_walls,
-            most_at_walls=most, quality=quality,
-        )  # fmt: skip
+            engine,
+            points,
+            sizes(points),
+            np.tile(SLOPE, (N, 1)),
+            eps=0.2,
+            quality_scale=0.3,
+            at_walls=at_walls,
+            most_at_walls=most,
+            quality=quality,
+        )
         expected = np.where(on_wall, penalties(0.3 * at_walls, min(most, 0.2)), eps)
         assert made.eps == pytest.approx(expected, rel=1e-5)  # of single precision
 
@@ -348,7 +345,7 @@ def test_perturbed_mesh_converges_quadratically(engine):
         r -= np.average(r, weights=weight)
         u, _ = project(
             engine, moved, h, np.zeros((N, 2)), r, np.zeros((N, 2)), eps=1e-6, max_iterations=3000, tolerance=1e-8
-        )  # fmt: skip
+        )
         after = log_ratios(moved + u, h)
         left.append(np.abs(after - after.mean()).max())
         assert left[-1] < 0.1 * np.abs(r).max()
@@ -363,9 +360,7 @@ def test_single_precision(ctx, points):
     gradient, nothing = np.tile(SLOPE, (N, 1)), np.zeros((N, 2))
     options = {"eps": 0.05, "max_iterations": 60}
     u, solution = project(engine, points, sizes(points), gradient, r, nothing, **options)
-    exact, _ = project(
-        patch.make_engine(ctx), points, sizes(points), gradient, r, nothing, **options
-    )
+    exact, _ = project(patch.make_engine(ctx), points, sizes(points), gradient, r, nothing, **options)
     assert solution.residual < 1e-5
     assert np.abs(u - exact).max() < 1e-4 * np.abs(exact).max()
 
@@ -377,5 +372,5 @@ def test_one_cell(engine):
     w = Density(engine).lloyd_weights(t, engine.upload([0.2]))
     u, _ = project(
         engine, one, np.array([0.2]), w.gradient.get(), w.log_ratio.get(), np.zeros((1, 2)), eps=0.1, max_iterations=40
-    )  # fmt: skip
+    )
     assert not u.any()

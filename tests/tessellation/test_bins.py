@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 
 from clvoro.geometry.box import Box
-from clvoro.tessellation.bins import (
-    MAX_CHILD_SIDE,
-    MAX_LEVELS,
-    OCCUPANCY,
-    SPACING_COUNT,
-    SPLIT_COUNT,
-    Bins,
-)
+from clvoro.tessellation.bins import MAX_CHILD_SIDE, MAX_LEVELS, OCCUPANCY, SPACING_COUNT, SPLIT_COUNT, Bins
 from clvoro.tessellation.periodic.ghost_images import ExtendedBox
 from tests.reference import patch
 
@@ -48,9 +41,7 @@ def walk(binned, n, dim, eps):
             if grid == next_grid:
                 # The spacing at an empty leaf is not used.
                 for width in range(1, max(sides) + 1 if count else 1):
-                    block = counts[
-                        tuple(slice(max(i - width, 0), i + width + 1) for i in index[::-1])
-                    ]
+                    block = counts[tuple(slice(max(i - width, 0), i + width + 1) for i in index[::-1])]
                     if block.sum() >= SPACING_COUNT:
                         break
                 spacing = edge * (OCCUPANCY * block.size / block.sum()) ** (1 / dim) if count else 0
@@ -108,9 +99,7 @@ def sets(dim, box):
         "random": square,
         "graded": lower + rng.random((900, dim)) ** 5 * extent,
         "corners": np.concatenate([corners, square[:50]]),
-        "clusters": np.concatenate(
-            [tight * (1 + s * rng.random((120, dim))) for s in (1e-2, 1e-5, 1e-6, 1e-8, 1e-12)]
-        ),
+        "clusters": np.concatenate([tight * (1 + s * rng.random((120, dim))) for s in (1e-2, 1e-5, 1e-6, 1e-8, 1e-12)]),
         "one place": np.repeat(square[:1], 400, axis=0),
         "few places": np.repeat(square[:5], [1, 90, 11, 3000, 10], axis=0)[rng.permutation(3112)],
         "line": lower + np.linspace(0, 1, 501)[:, None] * extent,
@@ -239,7 +228,14 @@ def test_leaves_are_sorted_for_any_order_of_atomics(ctx):
     assert (mixed != expected).sum() > 2000
     items = engine.upload(mixed, np.int32)
     engine.run_each(
-        bins._kernels.sort_bins, len(bins._bins) // 2 - 1, bins._bins, bins._grid_of, bins._frames,
-        bins._shapes, items, binned.reach, binned.spacing,
-    )  # fmt: skip
+        bins._kernels.sort_bins,
+        len(bins._bins) // 2 - 1,
+        bins._bins,
+        bins._grid_of,
+        bins._frames,
+        bins._shapes,
+        items,
+        binned.reach,
+        binned.spacing,
+    )
     assert np.array_equal(items.get(), expected)

@@ -97,10 +97,7 @@ def check_invariants(diagram, eps):
     following[starts[1:] - 1] = starts[:-1]
     edge = corners[following] - corners
     assert np.abs(np.hypot(*edge.T) - diagram.face_measures).max() <= 64 * eps * scale
-    assert (
-        np.abs((corners[following] + corners) / 2 - diagram.face_centroids).max()
-        <= 64 * eps * scale
-    )
+    assert np.abs((corners[following] + corners) / 2 - diagram.face_centroids).max() <= 64 * eps * scale
     a = corners - diagram.points[i]
     b = corners[following] - diagram.points[i]
     turn = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
@@ -114,9 +111,7 @@ def check_invariants(diagram, eps):
         for side, wall in enumerate((box.lower[axis], box.upper[axis])):
             on = j == -1 - (2 * axis + side)
             assert np.abs(diagram.face_centroids[on, axis] - wall).max() <= 4 * eps * scale
-            assert diagram.face_measures[on].sum() == pytest.approx(
-                box.extent[1 - axis], rel=64 * eps
-            )
+            assert diagram.face_measures[on].sum() == pytest.approx(box.extent[1 - axis], rel=64 * eps)
 
 
 @pytest.mark.sparse(10)
@@ -228,14 +223,7 @@ def test_bad_points(adapter64, points, message):
 def test_same_bits_twice(adapter):
     points = POINTS["graded"]
     a, b = adapter.diagram(BOX, points), adapter.diagram(BOX, points)
-    for name in (
-        "volumes",
-        "centroids",
-        "neighbors",
-        "face_measures",
-        "vertices",
-        "cell_vertices",
-    ):
+    for name in ("volumes", "centroids", "neighbors", "face_measures", "vertices", "cell_vertices"):
         assert (getattr(a, name) == getattr(b, name)).all(), name
 
 
@@ -295,9 +283,11 @@ def test_later_meshes_do_not_keep_an_enlarged_capacity(adapter64):
 @given(
     st.lists(
         st.tuples(st.integers(0, 12), st.integers(0, 8), st.integers(-1, 1), st.integers(-1, 1)),
-        min_size=1, max_size=40, unique_by=lambda p: p[:2],
+        min_size=1,
+        max_size=40,
+        unique_by=lambda p: p[:2],
     )
-)  # fmt: skip
+)
 def test_degenerate_sets(adapter64, places):
     """Subsets of a lattice that covers the box and its walls; some points are off by one ulp."""
     a = np.array(places, float)
@@ -314,9 +304,7 @@ def test_a_repeated_search_widens(ctx, seed):
     around = rng.uniform(0, 1, (40, 2))
     cluster = 0.3 + rng.normal(size=(300, 2)) * 10.0 ** -rng.uniform(6, 8)
     with pytest.raises(clvoro.ClvoroError, match=r"coincide|too close"):
-        clvoro.Adapter(ctx, "float32").diagram(
-            clvoro.Box((0, 0), (1, 1)), np.concatenate([around, cluster])
-        )
+        clvoro.Adapter(ctx, "float32").diagram(clvoro.Box((0, 0), (1, 1)), np.concatenate([around, cluster]))
 
 
 @pytest.mark.parametrize("doubtful", [False, True])
@@ -342,9 +330,7 @@ def test_cells_with_two_faces_are_rejected(ctx, doubtful):
         assert flags == (COLLAPSED if two else 0) | (DOUBT if doubtful else 0)
 
 
-@pytest.mark.parametrize(
-    "labels", [[], [0], [3], [2, 0, 1], [7, 1, 4], [10**9, 5, 0], [0, 4, 2, 9]]
-)
+@pytest.mark.parametrize("labels", [[], [0], [3], [2, 0, 1], [7, 1, 4], [10**9, 5, 0], [0, 4, 2, 9]])
 def test_order_of_labels(labels):
     given = np.array(labels, np.int32)
     assert np.array_equal(order_of(given), np.argsort(given))

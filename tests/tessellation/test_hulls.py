@@ -50,9 +50,7 @@ def point_sets():
         "near walls": np.concatenate([random[:300] * [1, 1e-5], random[300:900]]),
         # Two of three generators may be collinear with a corner of a hull up to round-off, while the third is not.
         **{
-            f"trios, {gap}": np.concatenate(
-                [(p + gap * trio) for p in random[:60]] + [random[60:900]]
-            )
+            f"trios, {gap}": np.concatenate([(p + gap * trio) for p in random[:60]] + [random[60:900]])
             for gap in (1e-6, 1e-8, 1e-9, 1e-10)
         },
         # The nearest of three generators in a row has a face as short as their distance.
@@ -78,11 +76,24 @@ def wrapped_rows(engine, points, first_reach=FIRST_REACH):
     cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
     rows = cells.take_rows(n)
     engine.run_each(
-        cells._hulls.wrap_all_hulls, -(-n // (LANES * EIGHTS)), np.int32(n), np.int32(n), binned.points,
-        binned.items, binned.spacing,
-        binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes, *BOX.device_corners(engine.real),
-        engine.real.type(first_reach), rows.slots, rows.counts, rows.places, group=1,
-    )  # fmt: skip
+        cells._hulls.wrap_all_hulls,
+        -(-n // (LANES * EIGHTS)),
+        np.int32(n),
+        np.int32(n),
+        binned.points,
+        binned.items,
+        binned.spacing,
+        binned.reach,
+        binned.bins,
+        binned.grid_frames,
+        binned.grid_shapes,
+        *BOX.device_corners(engine.real),
+        engine.real.type(first_reach),
+        rows.slots,
+        rows.counts,
+        rows.places,
+        group=1,
+    )
     assert (rows.places.get() == np.arange(n)).all()
     return rows.counts.get(), rows.slots.get().reshape(n, -1)
 
@@ -96,9 +107,7 @@ def test_rows_are_those_of_clipping(engine, name):
     for wrap in (True, False):
         cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
         taken, take = [], cells.take_rows
-        cells.take_rows = lambda n, taken=taken, take=take, **options: (
-            taken.append(take(n, **options)) or taken[-1]
-        )
+        cells.take_rows = lambda n, taken=taken, take=take, **options: taken.append(take(n, **options)) or taken[-1]
         if not wrap:
             cells._hulls = None
         t = patch.fetch(cells.tessellate(BOX, x, n, binned, exact=False))
@@ -113,8 +122,7 @@ def test_rows_are_those_of_clipping(engine, name):
 
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize(
-    "name",
-    ["1 random", "9 random", "random", "clusters", "ring and center", "lattice to the walls"],
+    "name", ["1 random", "9 random", "random", "clusters", "ring and center", "lattice to the walls"]
 )
 def test_measures_in_lanes_are_those_of_single_cells(engine, name):
     points = np.clip(POINTS[name], 0, [1, 0.75])
@@ -133,21 +141,11 @@ def test_measures_in_lanes_are_those_of_single_cells(engine, name):
         cells._build(cells.cell_capacity, cells.row_capacity)
         found.append(patch.fetch(cells.tessellate(BOX, x, n, binned, exact=False)))
     a, b = found
-    for field in (
-        "starts",
-        "neighbors",
-        "face_measures",
-        "face_centroids",
-        "volumes",
-        "offsets",
-        "covariances",
-    ):
+    for field in ("starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances"):
         assert np.array_equal(getattr(a, field), getattr(b, field)), field
 
 
-@pytest.mark.parametrize(
-    ("name", "share"), [("random", 0.99), ("hexagons", 0.99), ("cubed", 0.95), ("radial", 0.9)]
-)
+@pytest.mark.parametrize(("name", "share"), [("random", 0.99), ("hexagons", 0.99), ("cubed", 0.95), ("radial", 0.9)])
 def test_most_cells_are_wrapped(engine, name, share):
     """Otherwise the kernel would be useless. Lattices, where every decision is near round-off, are left to clipping."""
     counts, _ = wrapped_rows(engine, np.clip(POINTS[name], 0, [1, 0.75]))
@@ -170,9 +168,7 @@ def test_cells_have_up_to_sixteen_faces(engine, count, is_wrapped):
 def test_rows_do_not_depend_on_the_first_search_radius(engine, name, first_reach):
     """With a small radius no hull contains the generator and searches repeat; with a large one lists are cut."""
     points = np.clip(POINTS[name], 0, [1, 0.75])
-    (counts, rows), (others, other_rows) = (
-        wrapped_rows(engine, points, reach) for reach in (FIRST_REACH, first_reach)
-    )
+    (counts, rows), (others, other_rows) = (wrapped_rows(engine, points, reach) for reach in (FIRST_REACH, first_reach))
     both = (counts > 0) & (others > 0)
     assert np.count_nonzero(both) > 0.8 * len(points)
     assert np.array_equal(counts[both], others[both])
@@ -187,8 +183,12 @@ def test_against_scipy(engine):
     lower, upper = np.zeros(2), np.array([1, 0.75])
     for i in np.flatnonzero(counts):
         x = points[i]
-        walls = [[2 * (lower[0] - x[0]), 0], [2 * (upper[0] - x[0]), 0],
-                 [0, 2 * (lower[1] - x[1])], [0, 2 * (upper[1] - x[1])]]  # fmt: skip
+        walls = [
+            [2 * (lower[0] - x[0]), 0],
+            [2 * (upper[0] - x[0]), 0],
+            [0, 2 * (lower[1] - x[1])],
+            [0, 2 * (upper[1] - x[1])],
+        ]
         d = np.concatenate([np.delete(points, i, axis=0) - x, walls])
         labels = np.append(np.delete(np.arange(300), i), [-1, -2, -3, -4])
         hull = labels[ConvexHull(d / (d**2).sum(axis=1)[:, None]).vertices]

@@ -59,18 +59,12 @@ class Carried:
 
     def __init__(self, engine, points):
         self.engine, self.n = engine, len(points)
-        self.cells, self.bins, self.incremental = (
-            Cells(engine),
-            Bins(engine),
-            IncrementalUpdate(engine),
-        )
+        self.cells, self.bins, self.incremental = (Cells(engine), Bins(engine), IncrementalUpdate(engine))
         self.t = self.anew(self.cells, points)
 
     def anew(self, cells, points):
         x = self.engine.upload(points)
-        return cells.tessellate(
-            patch.BOX, x, self.n, self.bins.build(patch.BOX, x, self.n), exact=False
-        )
+        return cells.tessellate(patch.BOX, x, self.n, self.bins.build(patch.BOX, x, self.n), exact=False)
 
     def move(self, points):
         """Update the diagram to `points`; return it as NumPy arrays, and whether the update succeeded."""
@@ -113,9 +107,7 @@ def check(t, eps):
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
 def test_update_gives_the_diagram_made_anew(engine, name, share, monkeypatch):
     """Ten small motions give the same bits as a diagram made anew, apart from degenerate vertices."""
-    monkeypatch.setattr(
-        repair, "FEW", 1
-    )  # however small the set, cells are found in lanes where there are any
+    monkeypatch.setattr(repair, "FEW", 1)  # however small the set, cells are found in lanes where there are any
     rng = np.random.default_rng(40963)
     eps = float(np.finfo(engine.real).eps)
     points = POINTS[name].astype(engine.real)
@@ -153,10 +145,9 @@ def fitting(t):
         at = np.flatnonzero(row == j)
         return None if len(at) != 1 else (row[at[0] - 1], row[(at[0] + 1) % len(row)])
 
-    return np.array([
-        all(turned(row, j) == (turned(rows[j], i) or ())[::-1] for j in row if j >= 0)
-        for i, row in enumerate(rows)
-    ])  # fmt: skip
+    return np.array(
+        [all(turned(row, j) == (turned(rows[j], i) or ())[::-1] for j in row if j >= 0) for i, row in enumerate(rows)]
+    )
 
 
 @pytest.mark.sparse(2)
@@ -230,8 +221,7 @@ def test_most_cells_are_made_in_lanes(ctx, monkeypatch):
     # Cells with a single change are correct at once.
     rows = np.split(t.neighbors, t.starts[1:-1])
     right = [
-        np.array_equal(rows[i], slots[w * SLOT :][:n])
-        for w, (i, n) in enumerate(zip(listed, counts, strict=True))
+        np.array_equal(rows[i], slots[w * SLOT :][:n]) for w, (i, n) in enumerate(zip(listed, counts, strict=True))
     ]
     assert np.mean(np.array(right)[counts > 0]) > 0.97
 
@@ -288,9 +278,7 @@ def test_mostly_changed_cells_are_clipped(ctx, group_size, monkeypatch):
         rounds.clear()
         after, was = carried.move(points)
         assert was
-        pairs = [
-            set(zip(t.owners.tolist(), t.neighbors.tolist(), strict=True)) for t in (before, after)
-        ]
+        pairs = [set(zip(t.owners.tolist(), t.neighbors.tolist(), strict=True)) for t in (before, after)]
         changed = {i for i, _ in pairs[0] ^ pairs[1]}
         first, *others = [*rounds, np.zeros(0, int)]
         assert first.tolist() == no_longer_convex(before, points)

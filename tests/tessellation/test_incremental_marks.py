@@ -43,9 +43,20 @@ def test_a_former_neighbor_of_a_clipped_cell_loses_its_mark(ctx, again):
     # In the second round, after one clipped cell.
     flags = engine.upload([0, 0, 0, 2, 2, 0, 0, 1, 0, 1, 2], np.int32)
     engine.run_each(
-        kernels.clip_marked, 1, engine.upload([i], np.int32), np.int32(1), np.int32(n),
-        engine.upload(places, np.int32), slots, counts, *old, x, *patch.BOX.device_corners(engine.real), fits, flags,
-    )  # fmt: skip
+        kernels.clip_marked,
+        1,
+        engine.upload([i], np.int32),
+        np.int32(1),
+        np.int32(n),
+        engine.upload(places, np.int32),
+        slots,
+        counts,
+        *old,
+        x,
+        *patch.BOX.device_corners(engine.real),
+        fits,
+        flags,
+    )
     assert np.array_equal(slots.get()[SLOT:][: len(rows[i])], rows[i])
     assert counts.get()[1] == len(rows[i])
     expected = np.ones(n)

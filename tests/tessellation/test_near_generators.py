@@ -24,8 +24,7 @@ def pairs(diagram):
     first = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
     places = [tuple(x) for x in diagram.points.tolist()]
     return {
-        (places[i], places[j] if j >= 0 else j)
-        for i, j in zip(first.tolist(), diagram.neighbors.tolist(), strict=True)
+        (places[i], places[j] if j >= 0 else j) for i, j in zip(first.tolist(), diagram.neighbors.tolist(), strict=True)
     }
 
 
@@ -223,9 +222,7 @@ def test_the_side_of_a_corner(ctx, kind, real):
     kernel(engine.queue, (n,), None, np.int32(n), places.data, numbers.data, found.data)
     zeros = 0
     for (i, a, b, j), side in zip(four.tolist(), found.get().tolist(), strict=True):
-        truth, is_corner = exactly_beyond(
-            x[i], *(label if label < 0 else x[label] for label in (a, b)), x[j]
-        )
+        truth, is_corner = exactly_beyond(x[i], *(label if label < 0 else x[label] for label in (a, b)), x[j])
         zeros += truth == 0
         assert np.sign(side) == np.sign(float(truth)) or (not is_corner and side == 0)
         # Twice the digits, minus those that cancel.
@@ -297,9 +294,7 @@ def test_the_face_that_a_line_leaves_by(ctx, kind, real):
     signs = []
     for places, later in zip(x, found.get().tolist(), strict=True):
         truth, terms = exactly_later(*places)
-        if (
-            later == 0
-        ):  # the value is below the limit for round-off, including the error of that limit
+        if later == 0:  # the value is below the limit for round-off, including the error of that limit
             assert abs(truth) <= 80 * eps2 * terms
         else:  # a few eps^2 for each of eight operations, and one rounding of the sum
             assert abs(Fraction(later) - truth) <= 16 * eps2 * terms + abs(truth) / 2**20

@@ -90,10 +90,10 @@ def point_sets():
         ),
         "lattice on walls": np.array(list(np.ndindex(4, 4, 4))) / 3 * extent,
         "clusters": np.concatenate(
-            [np.array(c) + s * rng.random((30, 3)) for c, s in
-             [((0.4, 0.4, 0.4), 1e-2), ((1.8, 1.0, 0.7), 1e-3)]] + [spread]
+            [np.array(c) + s * rng.random((30, 3)) for c, s in [((0.4, 0.4, 0.4), 1e-2), ((1.8, 1.0, 0.7), 1e-3)]]
+            + [spread]
         ),
-    }  # fmt: skip
+    }
 
 
 POINTS = point_sets()
@@ -103,9 +103,7 @@ FINE = [name for name in POINTS if name not in ("walls, edges and corners", "lat
 def rows(diagram):
     """Return the cell i of each face, and a dictionary of faces by (i, neighbor)."""
     i = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
-    return i, {
-        pair: k for k, pair in enumerate(zip(i.tolist(), diagram.neighbors.tolist(), strict=True))
-    }
+    return i, {pair: k for k, pair in enumerate(zip(i.tolist(), diagram.neighbors.tolist(), strict=True))}
 
 
 def normals(diagram, i):
@@ -131,9 +129,7 @@ def check_invariants(diagram, eps, crowding=1.0):
     i, faces = rows(diagram)
     assert len(faces) == len(i), "a neighbor is listed twice"
     inner = np.flatnonzero(diagram.neighbors >= 0)
-    twin = np.array(
-        [faces.get((diagram.neighbors[k], i[k]), -1) for k in inner.tolist()], dtype=int
-    )
+    twin = np.array([faces.get((diagram.neighbors[k], i[k]), -1) for k in inner.tolist()], dtype=int)
     assert (twin >= 0).all(), "the graph is not symmetric"
     tolerance = 64 * eps * scale**2 * crowding
     assert np.abs(area[inner] - area[twin]).max(initial=0) <= tolerance
@@ -204,9 +200,7 @@ def test_lattices_off_by_round_off(adapter, kind, roundings):
     straight = lattice(kind, 5 if kind == "cubic" else 3) / BOX.extent
     turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
     for points in (straight, 0.5 + 0.55 * (straight - 0.5) @ turn):
-        diagram = adapter.diagram(
-            cube, points + roundings * eps * rng.standard_normal(points.shape)
-        )
+        diagram = adapter.diagram(cube, points + roundings * eps * rng.standard_normal(points.shape))
         # Faces that are left out, as they are no polygons, are up to some ten roundings wide.
         check_invariants(diagram, eps, 2)
         check_loops(diagram, eps, 2)
@@ -354,9 +348,16 @@ def test_duplicates_are_named(adapter):
 def test_same_bits_twice(adapter, name):
     a, b = adapter.diagram(BOX, POINTS[name]), adapter.diagram(BOX, POINTS[name])
     for array in (
-        "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures",
-        "face_centroids", "vertices", "face_vertex_starts", "face_vertices",
-    ):  # fmt: skip
+        "volumes",
+        "centroids",
+        "neighbor_starts",
+        "neighbors",
+        "face_measures",
+        "face_centroids",
+        "vertices",
+        "face_vertex_starts",
+        "face_vertices",
+    ):
         assert np.array_equal(getattr(a, array), getattr(b, array)), array
 
 

@@ -23,15 +23,7 @@ from tests.robustness.gpu_like import by_teams, groups
 from tests.tessellation import test_polyhedra_update as updates
 from tests.tessellation.test_polyhedra import BOX, POINTS, directions
 
-ARRAYS = (
-    "starts",
-    "neighbors",
-    "face_measures",
-    "face_centroids",
-    "volumes",
-    "offsets",
-    "covariances",
-)
+ARRAYS = ("starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances")
 
 
 def more_sets():
@@ -50,7 +42,7 @@ def more_sets():
 SETS = {
     name: POINTS[name]
     for name in ("one", "two", "random", "graded", "bcc", "prism", "walls, edges and corners", "lattice on walls")
-} | more_sets()  # fmt: skip
+} | more_sets()
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +55,7 @@ def ctx():
             continue
         if teams.has_warps(found.devices[0]) or not program.on_nvidia(found.devices[0]):
             return found
-    pytest.skip(
-        "needs an NVIDIA GPU of compute capability 8, or Intel's runtime: pip install '.[cpu]'"
-    )
+    pytest.skip("needs an NVIDIA GPU of compute capability 8, or Intel's runtime: pip install '.[cpu]'")
 
 
 def diagrams(ctx, dtype, points, wanted):
@@ -133,9 +123,7 @@ def test_same_bits_in_ranges(ctx, monkeypatch):
 @pytest.fixture
 def as_written(monkeypatch):
     """Build without optimization. Intel's compiler else adds products to the sums of single work-items by fma."""
-    monkeypatch.setattr(
-        program, "compile_text", partial(without_optimization, program.compile_text)
-    )
+    monkeypatch.setattr(program, "compile_text", partial(without_optimization, program.compile_text))
 
 
 def without_optimization(plain, ctx, text, options, short=True):
@@ -221,9 +209,7 @@ def test_items_work_alone_if_the_kernels_are_not_built(monkeypatch):
         return build(context, name, defines, prelude)
 
     def mesh(adapter):
-        return adapter.run(
-            BOX, 0.5, points=POINTS["random"][:60], method="lloyd", max_steps=3
-        ).points
+        return adapter.run(BOX, 0.5, points=POINTS["random"][:60], method="lloyd", max_steps=3).points
 
     expected = mesh(adapter)
     monkeypatch.setattr(program, "build_program", fails)
@@ -235,12 +221,7 @@ def test_items_work_alone_if_the_kernels_are_not_built(monkeypatch):
 
 @pytest.mark.parametrize(
     ("platform", "capability", "expected"),
-    [
-        ("NVIDIA CUDA", 9, True),
-        ("NVIDIA CUDA", 8, True),
-        ("NVIDIA CUDA", 7, False),
-        ("Intel(R) OpenCL", 9, False),
-    ],
+    [("NVIDIA CUDA", 9, True), ("NVIDIA CUDA", 8, True), ("NVIDIA CUDA", 7, False), ("Intel(R) OpenCL", 9, False)],
 )
 def test_devices_with_teams(platform, capability, expected):
     class Device:

@@ -82,9 +82,7 @@ class Carried:
         return self.bins.build(BOX, x, self.n)
 
     def clip_of(self, x):
-        return lambda cut, report, _: self.cells.clip_rest(
-            cut, report, BOX, x, self.binned(x), self.t
-        )
+        return lambda cut, report, _: self.cells.clip_rest(cut, report, BOX, x, self.binned(x), self.t)
 
     def move(self, points):
         """Update the diagram to `points`; return whether that succeeded."""
@@ -102,9 +100,7 @@ class Carried:
         t, m = self.t, self.t.starts.get()[-1]
         names = "neighbors", "face_measures", "face_centroids"
         saved = {name: getattr(t, name).get()[:m] for name in names}
-        saved |= {
-            name: getattr(t, name).get() for name in ("starts", "volumes", "offsets", "covariances")
-        }
+        saved |= {name: getattr(t, name).get() for name in ("starts", "volumes", "offsets", "covariances")}
         vertices = t.vertices[0].get()[: 2 * m], t.vertices[1].get()[:m]
         self.cells, self.update = Polyhedra(self.engine), PolyhedraUpdate(self.engine)
         self.t = self.cells.restore(t.points, saved, len(t.neighbors) - m, vertices)
@@ -122,9 +118,7 @@ class Carried:
             assert np.abs(ours.areas - theirs.areas).max() <= share * mean ** (2 / 3)
         else:
             # Round-off may decide about small faces.
-            assert (
-                abs(len(ours.neighbors) - len(theirs.neighbors)) <= 0.002 * len(ours.neighbors) + 4
-            )
+            assert abs(len(ours.neighbors) - len(theirs.neighbors)) <= 0.002 * len(ours.neighbors) + 4
         assert abs(ours.cells[0].sum(dtype=float) - 0.75) <= 0.75 * share / 100
         for power, a, b in zip((1, 1 / 3, 2 / 3), ours.cells, theirs.cells, strict=True):
             largest = np.abs(b).max()
@@ -192,9 +186,7 @@ def test_kept_vertices_have_no_nearer_generator(engine):
     vertices = 0
     for i, labels in carried.kept_vertices():
         rows = [
-            (x[j] - x[i], (x[j] @ x[j] - x[i] @ x[i]) / 2)
-            if j >= 0
-            else (walls[0][-1 - j], walls[1][-1 - j])
+            (x[j] - x[i], (x[j] @ x[j] - x[i] @ x[i]) / 2) if j >= 0 else (walls[0][-1 - j], walls[1][-1 - j])
             for j in labels
         ]
         y = np.linalg.solve(np.array([row[0] for row in rows]), np.array([row[1] for row in rows]))
@@ -261,11 +253,12 @@ def test_same_bits_with_four_and_eight_lanes(ctx, monkeypatch):
     kernels, found = Engine.kernels, []
     for eight in (0, 1):
         monkeypatch.setattr(
-            Engine, "kernels",
+            Engine,
+            "kernels",
             lambda self, stage, defines=None, prelude="", eight=eight: kernels(
                 self, stage, {**(defines or {}), "EIGHT_DOUBLES": eight}, prelude
             ),
-        )  # fmt: skip
+        )
         engine = patch.make_engine(ctx, "float64", dim=3)
         carried = Carried(engine, POINTS["random"])
         relaxed(carried, POINTS["random"], 4)
@@ -276,8 +269,12 @@ def test_same_bits_with_four_and_eight_lanes(ctx, monkeypatch):
         assert np.abs(way.get()).max() > 1e-4
         arrays = t.volumes, t.offsets, t.covariances, t.face_measures, t.face_centroids, way
         m = t.starts.get()[-1]
-        found.append([a.get()[: m if "face" in name else N].tobytes() for name, a in zip(
-            ("", "", "", "face", "face", ""), arrays, strict=True)])  # fmt: skip
+        found.append(
+            [
+                a.get()[: m if "face" in name else N].tobytes()
+                for name, a in zip(("", "", "", "face", "face", ""), arrays, strict=True)
+            ]
+        )
     assert found[0] == found[1]
 
 

@@ -126,10 +126,7 @@ def test_weights_of_a_moved_periodic_diagram(ctx):
 def test_equal_weights_give_the_voronoi_diagram(ctx, dim):
     box, points, _ = random_case(dim, 300, 0.0)
     adapter = clvoro.Adapter(ctx)
-    power, voronoi = (
-        adapter.power_diagram(box, points, np.full(300, -3.0)),
-        adapter.diagram(box, points),
-    )
+    power, voronoi = (adapter.power_diagram(box, points, np.full(300, -3.0)), adapter.diagram(box, points))
     rows = np.diff(voronoi.neighbor_starts)
     assert np.diff(power.neighbor_starts).tolist() == rows.tolist()
     for i in range(0, 300, 7):
@@ -154,10 +151,7 @@ def test_many_cells_in_a_point(ctx, dim):
     """In a lattice with two weights in turn all corners are shared by more cells than faces determine."""
     line = (np.arange(6) + 0.5) / 6
     points = np.stack(np.meshgrid(*[line] * dim, indexing="ij"), -1).reshape(-1, dim)
-    turn = (
-        np.stack(np.meshgrid(*[np.arange(6)] * dim, indexing="ij"), -1).reshape(-1, dim).sum(axis=1)
-        % 2
-    )
+    turn = np.stack(np.meshgrid(*[np.arange(6)] * dim, indexing="ij"), -1).reshape(-1, dim).sum(axis=1) % 2
     box = clvoro.Box((0,) * dim, (1,) * dim)
     for step in (0.0, 0.01, 0.03):
         with pytest.warns(EmptyCellsWarning) if step == 0.03 else nullcontext():
@@ -229,9 +223,11 @@ def test_files_pictures_and_other_libraries(ctx, tmp_path):
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
     assert (ux * vy - uy * vx > 0).all()
     for refused in (
-        lambda: full.transfer(np.ones(len(full)), full), full.to_disv,
-        lambda: full.save(tmp_path / "d.nc", convention="mpas"), lambda: full.check("mpas"),
-    ):  # fmt: skip
+        lambda: full.transfer(np.ones(len(full)), full),
+        full.to_disv,
+        lambda: full.save(tmp_path / "d.nc", convention="mpas"),
+        lambda: full.check("mpas"),
+    ):
         with pytest.raises(InputError, match="Voronoi"):
             refused()
 

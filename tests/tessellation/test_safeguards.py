@@ -81,13 +81,18 @@ def test_former_neighbors_are_clipped_again(ctx, group_size, generous):
 @pytest.mark.sparse(1)
 def test_two_cells_that_do_not_fit_are_clipped_again(ctx, group_size, generous):
     points = np.array(
-        [[0.7414, 0.2586], [0.6, 0.6], [0.6, 0.2], [0.7414, 0.5414], [0.4, 0.4], [0.4586, 0.2586], [0.8, 0.4],
-         [0.4586, 0.5414]]
-    )  # fmt: skip
-    moved = (
-        points
-        + np.array([[0, 2], [0, -3], [0, 3], [0, -2], [0, 0], [0, 2], [0, 0], [0, -2]]) * 1e-4
+        [
+            [0.7414, 0.2586],
+            [0.6, 0.6],
+            [0.6, 0.2],
+            [0.7414, 0.5414],
+            [0.4, 0.4],
+            [0.4586, 0.2586],
+            [0.8, 0.4],
+            [0.4586, 0.5414],
+        ]
     )
+    moved = points + np.array([[0, 2], [0, -3], [0, 3], [0, -2], [0, 0], [0, 2], [0, 0], [0, -2]]) * 1e-4
     t, expected = carry(ctx, "float64", group_size, points, moved)
     assert_same(t, expected)
 
@@ -105,19 +110,42 @@ def test_rows_that_drop_different_faces_of_zero_length_stay(ctx, group_size):
     ("real", "points", "moved"),
     [
         # A face becomes as short as round-off.
-        ("float64", [[0.2811, 0.2812], [0.3126, 0.2812], [0.2813, 0.3438], [0.3126, 0.3438]],
-         [[0.28, 0.28], [0.31, 0.28], [0.28, 0.34], [0.31, 0.34]]),
+        (
+            "float64",
+            [[0.2811, 0.2812], [0.3126, 0.2812], [0.2813, 0.3438], [0.3126, 0.3438]],
+            [[0.28, 0.28], [0.31, 0.28], [0.28, 0.34], [0.31, 0.34]],
+        ),
         # Four generators on a circle that is far smaller than their cells.
-        ("float32", [[0.6991, 0.22476], [0.70043, 0.22476], [0.70043, 0.22576], [0.6991, 0.22576]],
-         [[0.6991, 0.22476], [0.70043, 0.22476], [0.70043, 0.22576], [0.6991, 0.22575]]),
+        (
+            "float32",
+            [[0.6991, 0.22476], [0.70043, 0.22476], [0.70043, 0.22576], [0.6991, 0.22576]],
+            [[0.6991, 0.22476], [0.70043, 0.22476], [0.70043, 0.22576], [0.6991, 0.22575]],
+        ),
         # A cluster whose corners differ by little more than the round-off of positions.
-        ("float32", [[0.40047, 0.40051], [0.40058, 0.40043], [0.40075, 0.40016], [0.40034, 0.40043], [0.40042, 0.40038],
-                     [0.40053, 0.40041], [0.40055, 0.40058]],
-         [[0.45948, 0.40124], [0.45953, 0.40117], [0.4596, 0.40089], [0.45943, 0.40116], [0.45947, 0.40111],
-          [0.45951, 0.40114], [0.45952, 0.40132]]),
+        (
+            "float32",
+            [
+                [0.40047, 0.40051],
+                [0.40058, 0.40043],
+                [0.40075, 0.40016],
+                [0.40034, 0.40043],
+                [0.40042, 0.40038],
+                [0.40053, 0.40041],
+                [0.40055, 0.40058],
+            ],
+            [
+                [0.45948, 0.40124],
+                [0.45953, 0.40117],
+                [0.4596, 0.40089],
+                [0.45943, 0.40116],
+                [0.45947, 0.40111],
+                [0.45951, 0.40114],
+                [0.45952, 0.40132],
+            ],
+        ),
     ],
     ids=["short faces", "near generators", "small distances"],
-)  # fmt: skip
+)
 def test_bits_where_round_off_decides(ctx, real, points, moved, group_size, generous):
     """The updated diagram has the faces of the one made anew, including those of zero length."""
     t, expected = carry(ctx, real, group_size, points, moved)

@@ -12,13 +12,7 @@ from clvoro.errors import InputError
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.tessellator import Tessellator
-from tests.reference.spheres import (
-    UNIT,
-    SphericalDiagram,
-    clustered_points,
-    grid_of_rings,
-    random_points,
-)
+from tests.reference.spheres import UNIT, SphericalDiagram, clustered_points, grid_of_rings, random_points
 
 SETS = {
     "random": random_points(2000, 1),
@@ -72,10 +66,12 @@ def test_measures(ctx, name, real):
     reference = SphericalDiagram(points[order])
     eps, spacing = float(np.finfo(real).eps), np.sqrt(reference.areas)
     starts, rows = t.starts.get(), t.neighbors.get()
-    same = np.array([
-        as_cycle(rows[a:b].tolist()) == as_cycle(row)
-        for (a, b), row in zip(pairwise(starts.tolist()), reference.neighbors, strict=True)
-    ])  # fmt: skip
+    same = np.array(
+        [
+            as_cycle(rows[a:b].tolist()) == as_cycle(row)
+            for (a, b), row in zip(pairwise(starts.tolist()), reference.neighbors, strict=True)
+        ]
+    )
     assert same.mean() > 0.99
     # Positions have an error of eps, and so have corners over the sine of the angle between their faces, which is small
     # in a few cells of random sets.
@@ -83,28 +79,19 @@ def test_measures(ctx, name, real):
 
     def agree(found, expected, tolerance):
         away = np.abs(found - expected).reshape(len(same), -1).max(axis=1)[same]
-        return (
-            np.quantile(away, 0.98) < tolerance and (away < largest * np.abs(expected).max()).all()
-        )
+        return np.quantile(away, 0.98) < tolerance and (away < largest * np.abs(expected).max()).all()
 
     assert agree(t.volumes.get(), reference.areas, close)
     assert agree(t.offsets.get().reshape(-1, 3), reference.offsets, close / spacing.min())
     tangents = UNIT.tangents(points[order])
     packed = np.column_stack(
-        [
-            np.einsum("ki,kij,kj->k", tangents[a], reference.moments, tangents[b])
-            for a, b in ((0, 0), (0, 1), (1, 1))
-        ]
+        [np.einsum("ki,kij,kj->k", tangents[a], reference.moments, tangents[b]) for a, b in ((0, 0), (0, 1), (1, 1))]
     )
-    assert agree(
-        t.covariances.get().reshape(-1, 3), packed, 4 * close * spacing.max() / spacing.min()
-    )
+    assert agree(t.covariances.get().reshape(-1, 3), packed, 4 * close * spacing.max() / spacing.min())
     lengths, middles = t.face_measures.get(), t.face_centroids.get().reshape(-1, 3)
     for i in np.flatnonzero(same)[::7]:
         row, first = rows[starts[i] : starts[i + 1]].tolist(), starts[i]
-        for j, arc, middle in zip(
-            reference.neighbors[i], reference.arcs[i], reference.middles[i], strict=True
-        ):
+        for j, arc, middle in zip(reference.neighbors[i], reference.arcs[i], reference.middles[i], strict=True):
             k = first + row.index(j)
             assert abs(lengths[k] - arc) < close / spacing.min()
             assert np.abs(middles[k] + points[order[i]] - middle).max() < close / spacing.min()
@@ -180,18 +167,14 @@ def test_update(ctx, step, real):
     points = SETS["random"]
     tessellator, t, order = tessellate(ctx, points, real)
     engine, n = tessellator.stages.engine, len(points)
-    moved = UNIT.wrap(
-        points[order] + step / np.sqrt(n) * np.random.default_rng(5).normal(size=(n, 3))
-    )
+    moved = UNIT.wrap(points[order] + step / np.sqrt(n) * np.random.default_rng(5).normal(size=(n, 3)))
     new = tessellator.tessellate(engine.upload(UNIT.place(moved, engine.real)), n, t)
     starts, rows = new.starts.get(), new.neighbors.get()
     found = [as_cycle(rows[a:b].tolist()) for a, b in pairwise(starts.tolist())]
     expected = [as_cycle(row) for row in SphericalDiagram(moved).neighbors]
     wrong = sum(a != b for a, b in zip(found, expected, strict=True))
     assert wrong <= (0 if real == "float64" else 0.01 * n)
-    assert new.volumes.get().astype(float).sum() == pytest.approx(
-        4 * np.pi, rel=64 * float(np.finfo(real).eps)
-    )
+    assert new.volumes.get().astype(float).sum() == pytest.approx(4 * np.pi, rel=64 * float(np.finfo(real).eps))
 
 
 def test_lanes_and_single_cells(ctx, monkeypatch):

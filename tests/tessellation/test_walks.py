@@ -51,9 +51,7 @@ def point_sets():
             [spot + s * (rng.random((300, 3)) - 0.5) for s in (1e-2, 1e-4, 1e-6)] + [random[:50]]
         ),
         # Cells as long as the box with neighbors at a thousandth of that: edges lie on bisectors up to a few eps.
-        "spots": np.clip(
-            random[:150].repeat(20, axis=0) + 1e-3 * rng.standard_normal((3000, 3)), 1e-6, 1
-        ),
+        "spots": np.clip(random[:150].repeat(20, axis=0) + 1e-3 * rng.standard_normal((3000, 3)), 1e-6, 1),
         "a dense and an empty half": np.concatenate([random[:2000] * [0.3, 1, 1], [[0.99, 0.7, 0.2]]]),
         "cubic": lattice([[0, 0, 0]], 8),
         "bcc": bcc,
@@ -67,12 +65,10 @@ def point_sets():
         "plane": np.column_stack([random[:500, :2], np.full(500, 0.3)]),
         "near walls": np.concatenate([random[:300] * [1, 1, 1e-5], random[300:900]]),
         "pairs": np.concatenate([random[:500], random[:500] + 1e-6 * (random[500:1000] - 0.5)]),
-        "few and a cluster": np.concatenate(
-            [random[:20], 0.5 + 0.05 * directions(rng, 3000) * rng.random((3000, 1))]
-        ),
+        "few and a cluster": np.concatenate([random[:20], 0.5 + 0.05 * directions(rng, 3000) * rng.random((3000, 1))]),
         # Of some there walls were the nearest at first, and what a cell was walked from once more lay outside of it.
         **{f"clump {seed}": clump(seed) for seed in (165, 2459, 7147)},
-    }  # fmt: skip
+    }
 
 
 def clump(seed):
@@ -93,11 +89,29 @@ def walked(engine, points, rows=None):
     sizes = [(40 * n,), (40 * n, 3), (rows,), (rows, 3), (rows, 6)]
     report = engine.zeros(2, np.int32)
     engine.run_each(
-        cells._wrap, -(-rows // STRETCH), np.int32(rows), cells._ordered(b, rows), b.points, b.items,
-        b.spacing, b.reach, b.bins, b.grid_frames, b.grid_shapes, *CUBE.device_corners(engine.real),
-        engine.real.type(FIRST_REACH), np.int32(40 * n), places, counts, labels,
-        *(engine.empty(size) for size in sizes), report, np.int32(0), report, group=1,
-    )  # fmt: skip
+        cells._wrap,
+        -(-rows // STRETCH),
+        np.int32(rows),
+        cells._ordered(b, rows),
+        b.points,
+        b.items,
+        b.spacing,
+        b.reach,
+        b.bins,
+        b.grid_frames,
+        b.grid_shapes,
+        *CUBE.device_corners(engine.real),
+        engine.real.type(FIRST_REACH),
+        np.int32(40 * n),
+        places,
+        counts,
+        labels,
+        *(engine.empty(size) for size in sizes),
+        report,
+        np.int32(0),
+        report,
+        group=1,
+    )
     counts = counts.get()
     counts[counts > 0] -= CERTAIN
     assert ((counts >= 4) | (counts == UNFINISHED)).all()
@@ -163,11 +177,17 @@ def test_cells_are_those_of_clipping(engine, name):
 @pytest.mark.parametrize(
     ("name", "share"),
     [
-        ("random", 0.99), ("bcc, jittered", 0.99), ("cubed", 0.9), ("radial", 0.95), ("hollow", 0.98),
+        ("random", 0.99),
+        ("bcc, jittered", 0.99),
+        ("cubed", 0.9),
+        ("radial", 0.95),
+        ("hollow", 0.98),
         # Cells that near generators do not close, and cells that many generators may cut.
-        ("a dense and an empty half", 0.99), ("few and a cluster", 0.99), ("clusters", 0.8),
+        ("a dense and an empty half", 0.99),
+        ("few and a cluster", 0.99),
+        ("clusters", 0.8),
     ],
-)  # fmt: skip
+)
 def test_most_cells_are_walked(engine, name, share):
     """Otherwise the kernel would be useless. Lattices, where every decision is near round-off, are left to clipping."""
     counts = walked(engine, POINTS[name])
@@ -179,9 +199,7 @@ def morton(side):
     if side == 1:
         return np.zeros((1, 3), int)
     half = morton(side // 2)
-    return np.concatenate(
-        [half + side // 2 * np.array([x, y, z]) for z, y, x in np.ndindex(2, 2, 2)]
-    )
+    return np.concatenate([half + side // 2 * np.array([x, y, z]) for z, y, x in np.ndindex(2, 2, 2)])
 
 
 @pytest.mark.sparse(5)

@@ -257,8 +257,7 @@ kernel void descend_quality(const int size, global const int *starts, global con
 inline REAL missing_height(const REAL *u, const REAL *v, REAL *up, REAL *across)
 {
     REAL up2 = 0, across2 = 0;
-    EACH_AXIS(a)
-    {
+    EACH_AXIS (a) {
         up[a] = u[a] + v[a];
         across[a] = u[a] - v[a];
         up2 += up[a] * up[a];
@@ -267,8 +266,7 @@ inline REAL missing_height(const REAL *u, const REAL *v, REAL *up, REAL *across)
     if (up2 >= across2)
         return 0;
     const REAL height = sqrt(up2), width = sqrt(across2);
-    EACH_AXIS(a)
-    {
+    EACH_AXIS (a) {
         up[a] = height > 0 ? up[a] / height : 0;
         across[a] /= width;
     }
@@ -293,8 +291,7 @@ kernel void open_obtuse_triangles(const int size, global const int *starts, glob
         if (j < 0 || l < 0)
             continue;
         REAL u[DIM], v[DIM], w[DIM], from_j[DIM], from_l[DIM], back[DIM], up[DIM], across[DIM], gap2 = 0;
-        EACH_AXIS(a)
-        {
+        EACH_AXIS (a) {
             u[a] = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
             v[a] = DIFFERENCE(a, points[DIM * i + a], points[DIM * l + a]);
             w[a] = v[a] - u[a];
@@ -305,20 +302,20 @@ kernel void open_obtuse_triangles(const int size, global const int *starts, glob
         }
         nearest2 = fmin(nearest2, gap2);
         const REAL own = missing_height(u, v, up, across);
-        EACH_AXIS(a)
-        way[a] -= own / 2 * up[a];
+        EACH_AXIS (a)
+            way[a] -= own / 2 * up[a];
         count += own > 0;
         const REAL at_j = missing_height(from_j, w, up, across);
-        EACH_AXIS(a)
-        way[a] += at_j / 4 * (up[a] - across[a]);
+        EACH_AXIS (a)
+            way[a] += at_j / 4 * (up[a] - across[a]);
         const REAL at_l = missing_height(from_l, back, up, across);
-        EACH_AXIS(a)
-        way[a] += at_l / 4 * (up[a] - across[a]);
+        EACH_AXIS (a)
+            way[a] += at_l / 4 * (up[a] - across[a]);
     }
-    EACH_AXIS(a)
-    way2 += way[a] * way[a];
+    EACH_AXIS (a)
+        way2 += way[a] * way[a];
     const REAL most2 = LARGEST_OPENING * LARGEST_OPENING * nearest2, scale = way2 > most2 ? sqrt(most2 / way2) : 1;
-    EACH_AXIS(a)
-    displacement[DIM * i + a] = scale * way[a];
+    EACH_AXIS (a)
+        displacement[DIM * i + a] = scale * way[a];
     counts[i] = count;
 }

@@ -31,8 +31,8 @@ inline REAL shape_gradients(const REAL e[DIM][DIM], REAL a[DIM][DIM])
     }
     const REAL det = e[0][0] * a[0][0] + e[0][1] * a[0][1] + e[0][2] * a[0][2];
     for (int k = 0; k < DIM; ++k)
-        EACH_AXIS(c)
-    a[k][c] /= det;
+        EACH_AXIS (c)
+            a[k][c] /= det;
 #endif
     return det;
 }
@@ -42,8 +42,7 @@ inline void place_vertex(global const REAL *points, const int n, const int j, gl
                          global const int *codes, const REAL *lower, const REAL *upper, REAL *x)
 {
     const int image = j >= n, owner = image ? owners[j - n] : j, code = image ? codes[j - n] : 0;
-    EACH_AXIS(c)
-    {
+    EACH_AXIS (c) {
         const int wall = code >> 2 * c & 3;
         x[c] = points[DIM * owner + c];
         if (wall)
@@ -66,8 +65,8 @@ kernel void descend_functional(const int size, global const int *starts, global 
     BOX_CORNERS(lower, upper);
     const REAL p = R(1.5), theta = R(1) / 3;
     REAL force[DIM], steepest = 0, stiffness = 0, share = 0, folded = 0;
-    EACH_AXIS(c)
-    force[c] = 0;
+    EACH_AXIS (c)
+        force[c] = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         REAL e[DIM][DIM], e0[DIM][DIM], a[DIM][DIM], sizes = h[i];
         for (int v = 0; v < DIM; ++v) {
@@ -75,8 +74,7 @@ kernel void descend_functional(const int size, global const int *starts, global 
             REAL x[DIM], x0[DIM];
             place_vertex(points, size, j, owners, codes, lower, upper, x);
             place_vertex(reference, size, j, owners, codes, lower, upper, x0);
-            EACH_AXIS(c)
-            {
+            EACH_AXIS (c) {
                 e[v][c] = x[c] - points[DIM * i + c];
                 e0[v][c] = x0[c] - reference[DIM * i + c];
             }
@@ -89,39 +87,34 @@ kernel void descend_functional(const int size, global const int *starts, global 
         }
         /* a0 = the gradient at this generator, J = sum_v e0_v a_v^T, and J^T J a0. */
         REAL a0[DIM], jacobian[DIM][DIM], image[DIM], mapped[DIM], length2 = 0, norm2 = 0;
-        EACH_AXIS(c)
-        {
+        EACH_AXIS (c) {
             a0[c] = 0;
-            EACH_AXIS(b)
-            jacobian[c][b] = 0;
+            EACH_AXIS (b)
+                jacobian[c][b] = 0;
         }
         for (int v = 0; v < DIM; ++v) {
             REAL own2 = 0;
-            EACH_AXIS(c)
-            {
+            EACH_AXIS (c) {
                 a0[c] -= a[v][c];
                 own2 += a[v][c] * a[v][c];
-                EACH_AXIS(b)
-                jacobian[c][b] += e0[v][c] * a[v][b];
+                EACH_AXIS (b)
+                    jacobian[c][b] += e0[v][c] * a[v][b];
             }
             steepest = fmax(steepest, own2);
         }
-        EACH_AXIS(c)
-        {
+        EACH_AXIS (c) {
             image[c] = 0;
             length2 += a0[c] * a0[c];
-            EACH_AXIS(b)
-            {
+            EACH_AXIS (b) {
                 image[c] += jacobian[c][b] * a0[b];
                 norm2 += jacobian[c][b] * jacobian[c][b];
             }
         }
         steepest = fmax(steepest, length2);
-        EACH_AXIS(b)
-        {
+        EACH_AXIS (b) {
             mapped[b] = 0;
-            EACH_AXIS(c)
-            mapped[b] += jacobian[c][b] * image[c];
+            EACH_AXIS (c)
+                mapped[b] += jacobian[c][b] * image[c];
         }
         const REAL ratio = det0 / det;
 #if DIM == 2
@@ -132,15 +125,14 @@ kernel void descend_functional(const int size, global const int *starts, global 
 #endif
         const REAL g2 = (1 - 2 * theta) * scale * ratio * sqrt(ratio);
         const REAL weight = fabs(det) / (DIM == 2 ? 2 : 6) * size_factor;
-        EACH_AXIS(c)
-        force[c] += weight * ((g1 + g2 - p * g2) * a0[c] - p * DIM * g1 / norm2 * mapped[c] +
-                              (g1 + g2) * DIM * (p - 1) / (DIM + 1) * gradient[DIM * i + c]);
+        EACH_AXIS (c)
+            force[c] += weight * ((g1 + g2 - p * g2) * a0[c] - p * DIM * g1 / norm2 * mapped[c] +
+                                  (g1 + g2) * DIM * (p - 1) / (DIM + 1) * gradient[DIM * i + c]);
         share += weight * (g1 + g2) / (DIM + 1);
         stiffness += weight * p * (g1 + p * g2) * length2;
     }
     REAL work = 0;
-    EACH_AXIS(c)
-    {
+    EACH_AXIS (c) {
         descent[DIM * i + c] = stiffness > 0 ? -rate * force[c] / stiffness : 0;
         work += force[c] * velocity[DIM * i + c];
     }
@@ -157,13 +149,12 @@ kernel void bound_displacement(const int size, global const REAL *velocity, cons
 {
     WORK_ITEM(i);
     REAL d[DIM], length2 = 0;
-    EACH_AXIS(c)
-    {
+    EACH_AXIS (c) {
         d[c] = displacement[DIM * i + c] + share * velocity[DIM * i + c];
         length2 += d[c] * d[c];
     }
     const REAL longest = fmin(k * local_length[i], part * room[i]);
     const REAL scale = length2 > longest * longest ? longest / sqrt(length2) : 1;
-    EACH_AXIS(c)
-    displacement[DIM * i + c] = scale * d[c];
+    EACH_AXIS (c)
+        displacement[DIM * i + c] = scale * d[c];
 }

@@ -42,8 +42,7 @@ inline int step_of(int code, int a)
 inline int codes_near(const REAL *x, global const int *extremes PERIOD_ARGS)
 {
     int codes = (1 << CODES) - 1;
-    EACH_AXIS(a)
-    {
+    EACH_AXIS (a) {
         const REAL period = PERIOD(a), wide = as_float(extremes[a]);
         const bool back = period > 0 && period - x[a] <= wide, ahead = period > 0 && x[a] <= wide;
         codes &= (back ? BACK(a) : 0) | BACK(a) << PLACE_VALUE(a) | (ahead ? BACK(a) << 2 * PLACE_VALUE(a) : 0);
@@ -62,10 +61,9 @@ inline int take_code(int *codes)
 /* Compute the image y of x with this code. Returns whether it lies in the halo. */
 inline bool make_image(const REAL *x, int code, global const float *depths, const blocks_t *blocks, REAL *y PERIOD_ARGS)
 {
-    EACH_AXIS(a)
-    y[a] = x[a] + step_of(code, a) * PERIOD(a);
-    EACH_AXIS(a)
-    {
+    EACH_AXIS (a)
+        y[a] = x[a] + step_of(code, a) * PERIOD(a);
+    EACH_AXIS (a) {
         const int step = step_of(code, a);
         if (step == 0)
             continue;
@@ -136,8 +134,8 @@ kernel void count_images(const int size, global const REAL *points, global const
     WORK_ITEM(i);
     MAKE_BLOCKS;
     REAL x[DIM], y[DIM];
-    EACH_AXIS(a)
-    x[a] = points[STRIDE * i + a];
+    EACH_AXIS (a)
+        x[a] = points[STRIDE * i + a];
     int count = 0;
     for (int codes = codes_near(x, extremes PERIODS); codes != 0;)
         count += make_image(x, take_code(&codes), depths, &blocks, y PERIODS);
@@ -146,8 +144,8 @@ kernel void count_images(const int size, global const REAL *points, global const
 
 inline void put_site(global REAL *points, int i, const REAL *x, REAL weight)
 {
-    EACH_AXIS(a)
-    points[STRIDE * i + a] = x[a];
+    EACH_AXIS (a)
+        points[STRIDE * i + a] = x[a];
 #ifdef WEIGHTED
     WEIGHT(points, i) = weight;
 #endif
@@ -162,8 +160,8 @@ kernel void place_images(const int size, global const REAL *points, global const
     WORK_ITEM(i);
     MAKE_BLOCKS;
     REAL x[DIM], y[DIM];
-    EACH_AXIS(a)
-    x[a] = points[STRIDE * i + a];
+    EACH_AXIS (a)
+        x[a] = points[STRIDE * i + a];
     put_site(extended, i, x, WEIGHT(points, i));
     int g = firsts[i];
     for (int near = codes_near(x, extremes PERIODS); near != 0;) {
@@ -197,8 +195,7 @@ kernel void measure_required_depths(const int size, global const int *items, glo
     const REAL far = (REAL)reach[p] / 2, sideways = halo.sideways, outwards = halo.outwards;
     const REAL radius = (far + ball_radius(far * far, SITE_WEIGHT(x), &halo)) * (1 + BALL_NOISE);
     bool near = false;
-    EACH_AXIS(a)
-    {
+    EACH_AXIS (a) {
         near = near || (PERIOD(a) > 0 && fmin(x[a], PERIOD(a) - x[a]) < (1 + sideways + outwards) * radius);
     }
     /* One ball that contains all others and their room for motion. */
@@ -272,8 +269,7 @@ kernel void fold_rows(const int size, global const int *starts, global const int
         if (label >= 0 && (!mutual || nearest)) {
             REAL d2 = 0;
             bool far = false;
-            EACH_AXIS(a)
-            {
+            EACH_AXIS (a) {
                 const REAL d = points[STRIDE * label + a] - points[STRIDE * i + a];
                 far = far || DIFFERENCE(a, points[STRIDE * i + a], points[STRIDE * j + a]) != d;
                 d2 += d * d;
@@ -316,8 +312,8 @@ kernel void close_rows(const int size, global const int *starts, global const uc
         new_folded[to] = folded[k];
         new_codes[to] = face_codes[k];
         new_measures[to] = face_measures[k];
-        EACH_AXIS(a)
-        new_centroids[DIM * to + a] = face_centroids[DIM * k + a];
+        EACH_AXIS (a)
+            new_centroids[DIM * to + a] = face_centroids[DIM * k + a];
         places[to++] = k;
     }
 }
@@ -351,8 +347,8 @@ kernel void unfold_rows(const int size, global const int *starts, global const i
 {
     WORK_ITEM(i);
     REAL x[DIM];
-    EACH_AXIS(a)
-    x[a] = points[STRIDE * i + a];
+    EACH_AXIS (a)
+        x[a] = points[STRIDE * i + a];
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbors[k];
         int label = j < 0 ? -1 : j, wanted = CENTER, weight = 1;
@@ -381,9 +377,9 @@ kernel void fold_clipped_cells(const int size, const int used, const int room, g
     const int begin = row_places[i], end = begin + COUNT_OF(row_counts[i]);
     for (int k = begin; k < end; ++k) {
         const int label = labels[k];
-        EACH_AXIS(a)
-        if (label >= 0 && PERIOD(a) > 0 && fabs(points[3 * label + a] - points[3 * i + a]) >= PERIOD(a) / 4)
-            atomic_or(report + REPORT_FLAGS, FLAG_FULL);
+        EACH_AXIS (a)
+            if (label >= 0 && PERIOD(a) > 0 && fabs(points[3 * label + a] - points[3 * i + a]) >= PERIOD(a) / 4)
+                atomic_or(report + REPORT_FLAGS, FLAG_FULL);
         if (label >= size)
             labels[k] = owners[label - size];
     }

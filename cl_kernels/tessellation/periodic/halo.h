@@ -187,8 +187,8 @@ inline bool reaches_beyond(const REAL *y, REAL wide, const halo_t *in)
 {
     const REAL periods[3] = {in->period.s0, in->period.s1, in->period.s2};
     bool beyond = false;
-    EACH_AXIS(a)
-    beyond = beyond || !(wide - y[a] <= in->limits[2 * a] && wide + y[a] - periods[a] <= in->limits[2 * a + 1]);
+    EACH_AXIS (a)
+        beyond = beyond || !(wide - y[a] <= in->limits[2 * a] && wide + y[a] - periods[a] <= in->limits[2 * a + 1]);
     return beyond;
 }
 

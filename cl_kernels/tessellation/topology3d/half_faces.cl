@@ -38,8 +38,7 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
                           global int *corner_counts, global int *half_face_counts, global int *full CELL_ARGS)
 {
     TAKE_CELL(cell);
-    EACH_CELL(i)
-    {
+    EACH_CELL (i) {
         if (capacities[i] != 0)
             continue;
 #ifdef WEIGHTED
@@ -116,8 +115,7 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
                          global int *half_face_labels, global int *loop_starts, global int *loops CELL_ARGS)
 {
     TAKE_CELL(cell);
-    EACH_CELL(i)
-    {
+    EACH_CELL (i) {
         if (capacities[i] != FACE_CAPACITY)
             continue;
         const int base = corner_starts[i];

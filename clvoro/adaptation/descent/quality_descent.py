@@ -100,15 +100,38 @@ class QualityDescent:
         with engine.workspace.frame():
             forces = engine.scratch((t.n, 4))
             engine.run(
-                k.compute_cell_forces, -(-t.n // 4), np.int32(t.n), t.starts, t.face_measures, t.volumes,
-                quality, h, real(quality_weight), real(bad_cell_weight), forces,
-            )  # fmt: skip
+                k.compute_cell_forces,
+                -(-t.n // 4),
+                np.int32(t.n),
+                t.starts,
+                t.face_measures,
+                t.volumes,
+                quality,
+                h,
+                real(quality_weight),
+                real(bad_cell_weight),
+                forces,
+            )
             engine.run_each(
-                k.descend_quality, t.n, t.starts, t.neighbors, t.face_measures, t.face_centroids,
-                t.points, forces, real(rate), real(max_displacement), real(edges.length),
-                real(edges.stiffness), real(pairs.length), real(pairs.stiffness), real(full_rate), lloyd,
-                *t.outlines, *engine.period_args,
-            )  # fmt: skip
+                k.descend_quality,
+                t.n,
+                t.starts,
+                t.neighbors,
+                t.face_measures,
+                t.face_centroids,
+                t.points,
+                forces,
+                real(rate),
+                real(max_displacement),
+                real(edges.length),
+                real(edges.stiffness),
+                real(pairs.length),
+                real(pairs.stiffness),
+                real(full_rate),
+                lloyd,
+                *t.outlines,
+                *engine.period_args,
+            )
 
     def open_triangles(self, t: Tessellation, displacement: cla.Array) -> int:
         """Write the displacement (n, d) that opens obtuse Delaunay triangles; return their number.
@@ -119,8 +142,14 @@ class QualityDescent:
         with engine.workspace.frame():
             counts, sums = (engine.scratch(n + 1, np.int32) for _ in range(2))
             engine.run_each(
-                self._kernels.open_obtuse_triangles, n, t.starts, t.neighbors, t.points, displacement, counts,
+                self._kernels.open_obtuse_triangles,
+                n,
+                t.starts,
+                t.neighbors,
+                t.points,
+                displacement,
+                counts,
                 *engine.period_args,
-            )  # fmt: skip
+            )
             self._scan.exclusive(counts, sums, n)
             return read_number(sums, n)

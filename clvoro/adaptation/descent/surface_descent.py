@@ -44,11 +44,28 @@ class SurfaceDescent:
         with engine.workspace.frame():
             forces = engine.scratch((t.n, 2))
             engine.run_each(
-                k.compute_surface_forces, t.n, t.starts, t.face_measures, t.volumes, quality,
-                real(bad_cell_weight), forces,
-            )  # fmt: skip
+                k.compute_surface_forces,
+                t.n,
+                t.starts,
+                t.face_measures,
+                t.volumes,
+                quality,
+                real(bad_cell_weight),
+                forces,
+            )
             engine.run_each(
-                k.descend_surface, t.n, t.starts, t.neighbors, t.face_measures, t.face_centroids,
-                t.vertices[0], t.points, h, forces, real(rate), real(max_displacement), lloyd,
+                k.descend_surface,
+                t.n,
+                t.starts,
+                t.neighbors,
+                t.face_measures,
+                t.face_centroids,
+                t.vertices[0],
+                t.points,
+                h,
+                forces,
+                real(rate),
+                real(max_displacement),
+                lloyd,
                 *engine.period_args,
-            )  # fmt: skip
+            )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.box import Domain
+from ...geometry.domain import Domain
 
 FEWEST_ROWS = 4
 """Fewest cells across the box in each direction."""
@@ -32,9 +32,7 @@ def lattice_points(domain: Domain, n: int) -> np.ndarray:
             f"least {FEWEST_ROWS} for a moving mesh; use smaller sizes, or another method"
         )
     if domain.dim == 2:
-        points = _rows(
-            domain.extent, n, round(domain.extent[1] / spacing * math.sqrt(2 / math.sqrt(3)))
-        )
+        points = _rows(domain.extent, n, round(domain.extent[1] / spacing * math.sqrt(2 / math.sqrt(3))))
         return np.array(domain.lower) + points
     edge = 2 ** (1 / 3) * spacing
     layers, z = [], 0.0
@@ -61,9 +59,7 @@ def _rows(extent: np.ndarray, n: int, count: int, shift: int | None = None) -> n
         height = extent[1] * m / n
         offset = 0.25 + 0.5 * (k % 2 if shift is None else shift)
         x = (np.arange(m) + offset) / m * extent[0]
-        rows.append(
-            np.column_stack([x, np.full(m, y + height * (0.5 if shift is None else offset))])
-        )
+        rows.append(np.column_stack([x, np.full(m, y + height * (0.5 if shift is None else offset))]))
         y += height
     return np.concatenate(rows)
 

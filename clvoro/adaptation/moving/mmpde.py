@@ -15,7 +15,7 @@ from scipy.spatial import Delaunay
 
 from ...arguments import warn
 from ...errors import TangledMeshWarning
-from ...geometry.box import Domain
+from ...geometry.domain import Domain
 from ...opencl.engine import Engine
 from ...opencl.primitives import Summaries
 from ...solvers.linear_system import Solution
@@ -72,19 +72,12 @@ def connect(engine: Engine, domain: Domain, points: np.ndarray) -> Connections:
     n, d = points.shape
     spacing = (domain.measure / n) ** (1 / d)
     images = mirrored(points, np.array(domain.lower), np.array(domain.upper), IMAGE_DEPTH * spacing)
-    shaken = (
-        images.points
-        + np.random.default_rng(7).uniform(-1, 1, images.points.shape) * JITTER * spacing
-    )
+    shaken = images.points + np.random.default_rng(7).uniform(-1, 1, images.points.shape) * JITTER * spacing
     simplices = Delaunay(shaken).simplices
     simplices = simplices[(simplices < n).any(axis=1)]
     corners = images.points[simplices]
     longest = np.max(
-        [
-            np.linalg.norm(corners[:, a] - corners[:, b], axis=1)
-            for a, b in combinations(range(d + 1), 2)
-        ],
-        0,
+        [np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in combinations(range(d + 1), 2)], 0
     )
     volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
     simplices = simplices[volume > FLAT * longest**d]
@@ -94,10 +87,12 @@ def connect(engine: Engine, domain: Domain, points: np.ndarray) -> Connections:
     entries = entries[np.argsort(entries[:, 0], kind="stable")]
     starts = np.concatenate([[0], np.cumsum(np.bincount(entries[:, 0], minlength=n))])
     return Connections(
-        engine.upload(starts, np.int32), engine.upload(entries[:, 1:], np.int32),
-        engine.upload(images.owners[n:], np.int32), engine.upload(images.codes[n:], np.int32),
+        engine.upload(starts, np.int32),
+        engine.upload(entries[:, 1:], np.int32),
+        engine.upload(images.owners[n:], np.int32),
+        engine.upload(images.codes[n:], np.int32),
         engine.upload(domain.place(points, engine.real)),
-    )  # fmt: skip
+    )
 
 
 class Mmpde:
@@ -109,12 +104,7 @@ class Mmpde:
         self._summaries = Summaries(engine, ("energy", "power", "flat"))
 
     def descend_functional(
-        self,
-        mesh: MeshState,
-        connections: Connections,
-        gradient: cla.Array,
-        descent: cla.Array,
-        room: cla.Array,
+        self, mesh: MeshState, connections: Connections, gradient: cla.Array, descent: cla.Array, room: cla.Array
     ) -> tuple[float, float, int]:
         """Write the step of the steepest descent to `descent` (n, d), and the least height of simplices to `room` (n,).
 
@@ -124,10 +114,25 @@ class Mmpde:
         c, real = connections, self.engine.real.type
         energy, power, flat = (self.engine.scratch(mesh.n) for _ in range(3))
         self.engine.run_each(
-            self._kernels.descend_functional, mesh.n, c.starts, c.vertices, c.owners, c.codes, c.reference,
-            mesh.points, mesh.h, gradient, mesh.velocity, real(RATE), *mesh.domain.device_args(self.engine), descent,
-            energy, power, flat, room,
-        )  # fmt: skip
+            self._kernels.descend_functional,
+            mesh.n,
+            c.starts,
+            c.vertices,
+            c.owners,
+            c.codes,
+            c.reference,
+            mesh.points,
+            mesh.h,
+            gradient,
+            mesh.velocity,
+            real(RATE),
+            *mesh.domain.device_args(self.engine),
+            descent,
+            energy,
+            power,
+            flat,
+            room,
+        )
         self._summaries.collect_all({"energy": energy, "power": power, "flat": flat}, mesh.n)
         found = self._summaries.read()
         return found["energy"].sum, found["power"].sum, round(found["flat"].sum)
@@ -136,9 +141,16 @@ class Mmpde:
         """Add `share` of the last displacement to `mesh.lloyd`, and bound its length."""
         real = self.engine.real.type
         self.engine.run_each(
-            self._kernels.bound_displacement, mesh.n, mesh.velocity, real(share), real(LONGEST), real(ROOM),
-            mesh.local_length, room, mesh.lloyd,
-        )  # fmt: skip
+            self._kernels.bound_displacement,
+            mesh.n,
+            mesh.velocity,
+            real(share),
+            real(LONGEST),
+            real(ROOM),
+            mesh.local_length,
+            room,
+            mesh.lloyd,
+        )
 
 
 @dataclass
@@ -190,9 +202,7 @@ class MmpdeMethod:
         with engine.workspace.frame():
             gradient, sizes = engine.scratch(mesh.points.shape), engine.scratch(mesh.n)
             mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
-            energy, power, folded = stage.descend_functional(
-                mesh, self.connections, gradient, mesh.lloyd, room
-            )
+            energy, power, folded = stage.descend_functional(mesh, self.connections, gradient, mesh.lloyd, room)
         self._warn(folded, mesh.n)
         self._compare(energy)
         # Uphill: forget the last displacement.

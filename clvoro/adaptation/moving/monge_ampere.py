@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 
 from ...arguments import warn
 from ...errors import TangledMeshWarning
-from ...geometry.box import Domain
+from ...geometry.domain import Domain
 from ...solvers.linear_system import Solution
 from .lattice import mirrored
 
@@ -96,9 +96,7 @@ class LatticeMap:
             found[:, a, b] = found[:, b, a] = operator @ phi
         return found + np.eye(d)
 
-    def newton(
-        self, jacobian: np.ndarray, slope: np.ndarray, residual: np.ndarray
-    ) -> tuple[np.ndarray, int]:
+    def newton(self, jacobian: np.ndarray, slope: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, int]:
         """Return the change of phi that cancels `residual` (n,) up to a constant, and the iterations of the solver.
 
         The derivative of log(rho det(I + H)) is (I + H)^-1 : H' + grad log rho . grad phi'. `slope` (n, d) is

@@ -75,13 +75,4 @@ class Prescribe:
     moves: int = 0
 
 
-Action = (
-    Step
-    | InsertDelete
-    | RepairCells
-    | Refine
-    | CorrectCount
-    | BalanceCounts
-    | ResetMomentum
-    | Prescribe
-)
+Action = Step | InsertDelete | RepairCells | Refine | CorrectCount | BalanceCounts | ResetMomentum | Prescribe

@@ -145,39 +145,118 @@ class Effort:
 
 EFFORTS = {
     "fast": Effort(
-        8, 2, 3, (0, 1, 4, 8), alone=8, glide=6, first=4, polish=5, error_target=0.0035, steep_error_target=0.007,
-        relaxation=3.0, calm_relaxation=1.0, loose_bad_cells=1.0, largest_log_ratio_scale=0.25, deficit=0.022,
-        separate=1, loose=LoosePolish(0.01, 15, 0.8),
+        8,
+        2,
+        3,
+        (0, 1, 4, 8),
+        alone=8,
+        glide=6,
+        first=4,
+        polish=5,
+        error_target=0.0035,
+        steep_error_target=0.007,
+        relaxation=3.0,
+        calm_relaxation=1.0,
+        loose_bad_cells=1.0,
+        largest_log_ratio_scale=0.25,
+        deficit=0.022,
+        separate=1,
+        loose=LoosePolish(0.01, 15, 0.8),
     ),
     "default": Effort(
-        30, 5, 3, (4, 20, 6, 3), alone=20, glide=7, polish=21, error_target=0.0025, steep_error_target=0.0155,
-        relaxation=3.2, momentum=0.8, bad_cell_weight=40.0, quality_scale=0.02, log_ratio_scale=11.0,
+        30,
+        5,
+        3,
+        (4, 20, 6, 3),
+        alone=20,
+        glide=7,
+        polish=21,
+        error_target=0.0025,
+        steep_error_target=0.0155,
+        relaxation=3.2,
+        momentum=0.8,
+        bad_cell_weight=40.0,
+        quality_scale=0.02,
+        log_ratio_scale=11.0,
         repairs=((5, RepairCells(0.06)), (9, RepairCells(0.06)), (13, RepairCells(0.07))),
         loose=LoosePolish(0.02, 40, 0.9),
     ),
     "best": Effort(
-        60, 5, 10, (26, 16, 16, 16), alone=26, glide=6, polish=60, error_target=0.0039, steep_error_target=0.01,
-        relaxation=3.2, momentum=0.85, polish_momentum=0.8, penalty=0.7, nuclei=0.0015,
-        bad_cell_weight=120.0, quality_scale=0.02, log_ratio_scale=24.0,
+        60,
+        5,
+        10,
+        (26, 16, 16, 16),
+        alone=26,
+        glide=6,
+        polish=60,
+        error_target=0.0039,
+        steep_error_target=0.01,
+        relaxation=3.2,
+        momentum=0.85,
+        polish_momentum=0.8,
+        penalty=0.7,
+        nuclei=0.0015,
+        bad_cell_weight=120.0,
+        quality_scale=0.02,
+        log_ratio_scale=24.0,
         repairs=((12, RepairCells(0.035)), (24, RepairCells(0.035, split=True)), (36, RepairCells(0.035))),
         deficit=0.006,
     ),
-}  # fmt: skip
+}
 
 EFFORTS_3D = {
     "fast": Effort(
-        12, 2, 3, (), glide=0, polish=4, error_target=0.004, relaxation=1.5, momentum=0.8, penalty=0.15,
-        log_ratio_scale=8.0, alone=5, coarse_glide=5, coarse_polish=10, recouple=1,
+        12,
+        2,
+        3,
+        (),
+        glide=0,
+        polish=4,
+        error_target=0.004,
+        relaxation=1.5,
+        momentum=0.8,
+        penalty=0.15,
+        log_ratio_scale=8.0,
+        alone=5,
+        coarse_glide=5,
+        coarse_polish=10,
+        recouple=1,
     ),
     "default": Effort(
-        16, 3, 2, (), glide=0, polish=8, error_target=0.0025, relaxation=2.5, momentum=0.9, penalty=0.15,
-        log_ratio_scale=8.0, alone=16, coarse_glide=12, coarse_polish=8, recouple=1,
+        16,
+        3,
+        2,
+        (),
+        glide=0,
+        polish=8,
+        error_target=0.0025,
+        relaxation=2.5,
+        momentum=0.9,
+        penalty=0.15,
+        log_ratio_scale=8.0,
+        alone=16,
+        coarse_glide=12,
+        coarse_polish=8,
+        recouple=1,
     ),
     "best": Effort(
-        80, 8, 3, (), glide=85, polish=10, error_target=0.003, relaxation=1.5, momentum=0.9, penalty=0.3,
-        log_ratio_scale=8.0, alone=100, coarse_glide=100, coarse_polish=40, recouple=4,
+        80,
+        8,
+        3,
+        (),
+        glide=85,
+        polish=10,
+        error_target=0.003,
+        relaxation=1.5,
+        momentum=0.9,
+        penalty=0.3,
+        log_ratio_scale=8.0,
+        alone=100,
+        coarse_glide=100,
+        coarse_polish=40,
+        recouple=4,
     ),
-}  # fmt: skip
+}
 """The same in 3D. On a coarser level `couple` steps come before the first correction of the number of cells, and
 `recouple` after each of two. On the finest level there are `couple_finest`, and as many again after a correction.
 
@@ -187,9 +266,7 @@ and S1 0.001 less. 12 or 16 coupled steps at the start, in place of 30 or 40, ch
 least quality; they cost "fast" 0.0015 of mean Q on S2, nothing elsewhere."""
 
 
-def is_near(
-    dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float
-) -> bool:
+def is_near(dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float) -> bool:
     """Return whether a given mesh of `n` cells only needs a correction to reach the quality of `effort`.
 
     Parameters
@@ -202,9 +279,7 @@ def is_near(
         Mean of Q.
     """
     deficit = EFFORTS[effort].deficit + WALL_DEFICIT / math.sqrt(n) if dim == 2 else DEFICIT_3D
-    return (
-        mean_error <= NEAR_ERROR and abs(missing) <= NEAR_COUNT * n and 1 - mean_quality <= deficit
-    )
+    return mean_error <= NEAR_ERROR and abs(missing) <= NEAR_COUNT * n and 1 - mean_quality <= deficit
 
 
 def steep_share(slopes: np.ndarray, cells: np.ndarray) -> float:
@@ -219,9 +294,7 @@ def steep_share(slopes: np.ndarray, cells: np.ndarray) -> float:
     return float(steepness @ cells / cells.sum())
 
 
-def choose_error_target(
-    dim: int, effort: str, levels: int, near: bool = False, steep: float = 0.0
-) -> float:
+def choose_error_target(dim: int, effort: str, levels: int, near: bool = False, steep: float = 0.0) -> float:
     """Return the error target of a run for which the caller has given none.
 
     Parameters

@@ -39,16 +39,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from ..methods import Method, ProjectedMethod, WeightedMethod
-from .actions import (
-    Action,
-    BalanceCounts,
-    CorrectCount,
-    InsertDelete,
-    Refine,
-    RepairCells,
-    ResetMomentum,
-    Step,
-)
+from .actions import Action, BalanceCounts, CorrectCount, InsertDelete, Refine, RepairCells, ResetMomentum, Step
 from .efforts import EFFORTS, EFFORTS_3D, Effort, choose_error_target
 
 COARSEST = {2: 1400, 3: 1500}
@@ -232,13 +223,7 @@ def _opened(schedule: list[Action], exact: int, openings: int) -> list[Action]:
 
 
 def _several_kinds(
-    dim: int,
-    effort: str,
-    levels: int,
-    exact: bool,
-    error_target: float | None,
-    warm: bool,
-    near: bool,
+    dim: int, effort: str, levels: int, exact: bool, error_target: float | None, warm: bool, near: bool
 ) -> list[Action]:
     settings = (EFFORTS if dim == 2 else EFFORTS_3D)[effort]
     if error_target is None:
@@ -250,13 +235,15 @@ def _several_kinds(
     return list(_adaptive_2d(settings, levels, exact, error_target, warm))
 
 
-def _adaptive_2d(
-    effort: Effort, levels: int, exact: bool, error_target: float, warm: bool
-) -> Iterator[Action]:
+def _adaptive_2d(effort: Effort, levels: int, exact: bool, error_target: float, warm: bool) -> Iterator[Action]:
     glide = ProjectedMethod(
-        "lloyd", effort.relaxation, effort.momentum, penalty=0.1, calm_relaxation=effort.calm_relaxation,
+        "lloyd",
+        effort.relaxation,
+        effort.momentum,
+        penalty=0.1,
+        calm_relaxation=effort.calm_relaxation,
         tolerance=GLIDE_TOLERANCE if levels else POLISH_TOLERANCE,
-    )  # fmt: skip
+    )
     tolerance = START_TOLERANCE if levels else WeightedMethod.tolerance
     start = WeightedMethod(cautious=True, tolerance=tolerance)
     if warm:
@@ -285,9 +272,7 @@ def _adaptive_2d(
     yield CorrectCount()
     yield ResetMomentum()
     if levels == 0:
-        effort = replace(
-            effort, quality_scale=max(effort.quality_scale, SINGLE_LEVEL_QUALITY_SCALE)
-        )
+        effort = replace(effort, quality_scale=max(effort.quality_scale, SINGLE_LEVEL_QUALITY_SCALE))
     yield from _finish_2d(effort, exact, error_target, effort.penalty)
 
 
@@ -297,14 +282,7 @@ def _correction(dim: int, effort: Effort, exact: bool, error_target: float) -> I
     yield CorrectCount(COUNT_LEAST)
     yield stride
     correct = ProjectedMethod(
-        "lloyd",
-        0.0,
-        0.0,
-        penalty=1e-2,
-        k=1.0,
-        iterations=60,
-        tolerance=1e-3,
-        gradient_from_field=True,
+        "lloyd", 0.0, 0.0, penalty=1e-2, k=1.0, iterations=60, tolerance=1e-3, gradient_from_field=True
     )
     yield Step(correct)
     yield CorrectCount()
@@ -314,9 +292,7 @@ def _correction(dim: int, effort: Effort, exact: bool, error_target: float) -> I
     yield from (_finish_2d if dim == 2 else _finish_3d)(effort, exact, error_target, NEAR_PENALTY)
 
 
-def _finish_2d(
-    effort: Effort, exact: bool, error_target: float, penalty: float
-) -> Iterator[Action]:
+def _finish_2d(effort: Effort, exact: bool, error_target: float, penalty: float) -> Iterator[Action]:
     """Polish, and project."""
     looser = error_target / effort.error_target
     tight = looser < TIGHT
@@ -329,11 +305,18 @@ def _finish_2d(
     if effort.loose and error_target > effort.loose.above:
         effort = replace(effort, polish=effort.loose.steps, polish_momentum=effort.loose.momentum)
     polish = ProjectedMethod(
-        "quality", momentum=effort.polish_momentum, penalty=penalty, quality_scale=effort.quality_scale,
-        log_ratio_scale=scale, k=0.3, error_target=error_target,
-        bad_cell_weight=bad_cell_weight, tolerance=POLISH_TOLERANCE, power=power,
+        "quality",
+        momentum=effort.polish_momentum,
+        penalty=penalty,
+        quality_scale=effort.quality_scale,
+        log_ratio_scale=scale,
+        k=0.3,
+        error_target=error_target,
+        bad_cell_weight=bad_cell_weight,
+        tolerance=POLISH_TOLERANCE,
+        power=power,
         gradient_from_field=tight,
-    )  # fmt: skip
+    )
     repairs = dict(effort.repairs)
     for step in range(effort.polish):
         if step == 3:
@@ -345,12 +328,15 @@ def _finish_2d(
         yield Step(polish)
     if exact:
         project = ProjectedMethod(
-            "quality", penalty=EXACT_PENALTY, iterations=EXACT_ITERATIONS, tolerance=EXACT_TOLERANCE, k=0.3,
-            gradient_from_field=True, correct_mean=True,
-        )  # fmt: skip
-        newton = replace(
-            project, descent="lloyd", relaxation=0.0, momentum=0.0, penalty=NEWTON_PENALTY
+            "quality",
+            penalty=EXACT_PENALTY,
+            iterations=EXACT_ITERATIONS,
+            tolerance=EXACT_TOLERANCE,
+            k=0.3,
+            gradient_from_field=True,
+            correct_mean=True,
         )
+        newton = replace(project, descent="lloyd", relaxation=0.0, momentum=0.0, penalty=NEWTON_PENALTY)
         yield from [Step(project)] * PROJECT_STEPS
         yield Step(replace(COUPLE, cautious=False, lloyd=False))
         yield Step(replace(newton, descent="edges", relaxation=1.0))
@@ -358,13 +344,11 @@ def _finish_2d(
     else:
         separate = replace(
             polish, descent="edges", momentum=0.0, penalty=SEPARATE_PENALTY, quality_scale=0.0, error_target=0.0
-        )  # fmt: skip
+        )
         yield from [Step(separate)] * effort.separate
 
 
-def _adaptive_3d(
-    effort: Effort, levels: int, exact: bool, error_target: float, warm: bool
-) -> Iterator[Action]:
+def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, warm: bool) -> Iterator[Action]:
     couple = [Step(COUPLE)]
     coarse_glide = _glide_3d(effort, COARSE_PENALTY, COARSE_TOLERANCE)
     coarse_polish = _polish_3d(effort, COARSE_PENALTY, COARSE_TOLERANCE)
@@ -394,34 +378,31 @@ def _adaptive_3d(
     yield from _finish_3d(effort, exact, error_target, effort.penalty)
 
 
-def _glide_3d(
-    effort: Effort, penalty: float, tolerance: float, error_target: float = 0.0
-) -> ProjectedMethod:
+def _glide_3d(effort: Effort, penalty: float, tolerance: float, error_target: float = 0.0) -> ProjectedMethod:
     return ProjectedMethod(
         "lloyd", effort.relaxation, effort.momentum, penalty=penalty, tolerance=tolerance, error_target=error_target
-    )  # fmt: skip
+    )
 
 
-def _polish_3d(
-    effort: Effort, penalty: float, tolerance: float, error_target: float = 0.0
-) -> ProjectedMethod:
+def _polish_3d(effort: Effort, penalty: float, tolerance: float, error_target: float = 0.0) -> ProjectedMethod:
     return ProjectedMethod(
-        "surface", momentum=POLISH_MOMENTUM_3D, penalty=penalty, tolerance=tolerance, rate=POLISH_RATE_3D,
-        bad_cell_weight=effort.bad_cell_weight, error_target=LOOSE_POLISH_3D * error_target,
+        "surface",
+        momentum=POLISH_MOMENTUM_3D,
+        penalty=penalty,
+        tolerance=tolerance,
+        rate=POLISH_RATE_3D,
+        bad_cell_weight=effort.bad_cell_weight,
+        error_target=LOOSE_POLISH_3D * error_target,
         log_ratio_scale=effort.log_ratio_scale * error_target,
-    )  # fmt: skip
+    )
 
 
-def _finish_3d(
-    effort: Effort, exact: bool, error_target: float, penalty: float
-) -> Iterator[Action]:
+def _finish_3d(effort: Effort, exact: bool, error_target: float, penalty: float) -> Iterator[Action]:
     """Glide, polish, and project."""
     glide = _glide_3d(effort, penalty, POLISH_TOLERANCE, error_target)
     yield from [Step(glide)] * effort.glide
     polish = _polish_3d(effort, penalty, POLISH_TOLERANCE, error_target)
-    settle = replace(
-        polish, descent="lloyd", relaxation=0.0, momentum=0.0, penalty=SETTLE_PENALTY_3D, error_target=0.0
-    )  # fmt: skip
+    settle = replace(polish, descent="lloyd", relaxation=0.0, momentum=0.0, penalty=SETTLE_PENALTY_3D, error_target=0.0)
     yield from [Step(polish)] * (effort.polish // 2)
     # Where h is steep, cells of other shapes have their generators at other places, with other sizes.
     yield CorrectCount(POLISH_COUNT_3D)
@@ -429,9 +410,13 @@ def _finish_3d(
     yield Step(settle)
     if exact:
         newton = replace(
-            settle, penalty=NEWTON_PENALTY, log_ratio_scale=0.0, iterations=NEWTON_ITERATIONS_3D,
-            gradient_from_field=True, correct_mean=True,
-        )  # fmt: skip
+            settle,
+            penalty=NEWTON_PENALTY,
+            log_ratio_scale=0.0,
+            iterations=NEWTON_ITERATIONS_3D,
+            gradient_from_field=True,
+            correct_mean=True,
+        )
         for tolerance in NEWTON_TOLERANCES_3D:
             yield Step(replace(newton, tolerance=tolerance))
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from ...geometry.box import Domain
+    from ...geometry.domain import Domain
 
 _HALVED = 0.5 ** np.arange(64)
 _ALL = slice(None)
@@ -188,11 +188,21 @@ def _snake(shape: np.ndarray) -> np.ndarray:
 def _spread(bits: np.ndarray, dim: int) -> np.ndarray:
     """Put dim - 1 zeros between the bits of `bits` (uint64, up to 31 bits in 2D, 21 in 3D)."""
     steps = {
-        2: ((16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F),
-            (2, 0x3333333333333333), (1, 0x5555555555555555)),
-        3: ((32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F),
-            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)),
-    }  # fmt: skip
+        2: (
+            (16, 0x0000FFFF0000FFFF),
+            (8, 0x00FF00FF00FF00FF),
+            (4, 0x0F0F0F0F0F0F0F0F),
+            (2, 0x3333333333333333),
+            (1, 0x5555555555555555),
+        ),
+        3: (
+            (32, 0x001F00000000FFFF),
+            (16, 0x001F0000FF0000FF),
+            (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3),
+            (2, 0x1249249249249249),
+        ),
+    }
     for shift, mask in steps[dim]:
         bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
     return bits

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.box import Box, Domain
+from ...geometry.box import Box
+from ...geometry.domain import Domain
 from ...geometry.sphere import Sphere
 
 
@@ -65,6 +66,4 @@ def from_chart(sphere: Sphere, points: np.ndarray) -> np.ndarray:
 def into_chart(sphere: Sphere, points: np.ndarray) -> np.ndarray:
     """Return the points (n, 2) of the chart at positions (n, 3)."""
     x, y, z = (np.asarray(points, float).reshape(-1, 3) / sphere.radius).T
-    return sphere.radius * np.column_stack(
-        [np.arctan2(y, x), np.clip(z / np.hypot(np.hypot(x, y), z), -1, 1)]
-    )
+    return sphere.radius * np.column_stack([np.arctan2(y, x), np.clip(z / np.hypot(np.hypot(x, y), z), -1, 1)])

@@ -10,7 +10,7 @@ import shapely
 from ...geometry.polygon import Polygon
 
 if TYPE_CHECKING:
-    from ...geometry.box import Domain
+    from ...geometry.domain import Domain
     from .box_tree import BoxTree
 
 _LEAST = 1e-12  # share of a box below which it counts as outside
@@ -93,9 +93,7 @@ class PolygonCoverage(FullCoverage):
     def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Split the boxes where `chosen` (m,) is true; see `BoxTree.split`."""
         parent, child = self.boxes.split(chosen)
-        self.share, self.inner, self._parts = (
-            a[parent] for a in (self.share, self.inner, self._parts)
-        )
+        self.share, self.inner, self._parts = (a[parent] for a in (self.share, self.inner, self._parts))
         rows = np.flatnonzero((child >= 0) & (self.share > 0) & (self.share < 1))
         self._cut(self._parts[rows], rows)
         return parent, child

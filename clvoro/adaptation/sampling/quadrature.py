@@ -17,7 +17,7 @@ from .box_tree import BoxTree, hilbert_tables
 from .coverage import coverage_of
 
 if TYPE_CHECKING:
-    from ...geometry.box import Domain
+    from ...geometry.domain import Domain
 
 _BASE = {2: 1024, 3: 4096}  # initial boxes inside the domain, at least
 _MAX_BASE = {2: 16384, 3: 65536}  # initial boxes in total, at most
@@ -54,9 +54,7 @@ def _slopes(points: np.ndarray, values: np.ndarray) -> np.ndarray:
         step = np.diff(points.reshape(*rows, dim), axis=axis).reshape(m, -1, dim)
         rise = np.diff(values.reshape(rows), axis=axis).reshape(m, -1)
         length2 = (step**2).sum(axis=2)
-        squares += np.divide(rise**2, length2, out=np.zeros_like(rise), where=length2 > 0).mean(
-            axis=1
-        )
+        squares += np.divide(rise**2, length2, out=np.zeros_like(rise), where=length2 > 0).mean(axis=1)
     return np.sqrt(squares)
 
 
@@ -110,20 +108,13 @@ class DensityTree:
         If h is not positive and finite, or h^-d is not finite, at a sampled point.
     """
 
-    def __init__(
-        self, field: Callable[[np.ndarray], np.ndarray], domain: Domain, tolerance: float = 1e-4
-    ):
+    def __init__(self, field: Callable[[np.ndarray], np.ndarray], domain: Domain, tolerance: float = 1e-4):
         if not callable(field):
-            raise InputTypeError(
-                f"field is {type(field).__name__}, expected a field of clvoro.sizing"
-            )
+            raise InputTypeError(f"field is {type(field).__name__}, expected a field of clvoro.sizing")
         self.field, self._domain, self.boxes = field, domain, BoxTree(domain)
         self.coverage = coverage_of(self.boxes, domain)
         dim = domain.dim
-        while (
-            np.count_nonzero(self.coverage.occupied) << dim < _BASE[dim]
-            and len(self.boxes) << dim < _MAX_BASE[dim]
-        ):
+        while np.count_nonzero(self.coverage.occupied) << dim < _BASE[dim] and len(self.boxes) << dim < _MAX_BASE[dim]:
             self.coverage.split(self.coverage.occupied)
         m = len(self.boxes)
         self.cells, self._differences, self._low, self._high = np.zeros((4, m))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from ...errors import InputError, InputTypeError
-from ...geometry.box import Domain
+from ...geometry.domain import Domain
 from ...geometry.polygon import Polygon
 from ...geometry.sphere import Sphere
 from ...sizing import as_field
@@ -26,9 +26,7 @@ _MAX_EXPECTED = 1.0  # points per box
 _TOLERANCE = 1e-3  # relative error of the integral in the tree for sampling
 
 
-def count_cells(
-    field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain, tolerance: float = 1e-4
-) -> float:
+def count_cells(field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain, tolerance: float = 1e-4) -> float:
     """Return the number of cells that `field` requires: the integral of h^-d over the domain.
 
     Parameters
@@ -211,9 +209,7 @@ def _halve(
     densest = log_density.max(axis=1, keepdims=True)
     # Siblings without a part inside the domain, because slivers were dropped.
     densest[densest == -np.inf] = 0
-    weight = coverage.scale_by_share(np.exp(log_density - densest).ravel(), new).reshape(
-        log_density.shape
-    )
+    weight = coverage.scale_by_share(np.exp(log_density - densest).ravel(), new).reshape(log_density.shape)
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), np.finfo(float).tiny)
     # No slope towards the outside of the domain.
     log_density = np.where(log_density == -np.inf, densest, log_density)
@@ -234,9 +230,7 @@ def _log_linear(u: np.ndarray, slope: np.ndarray) -> np.ndarray:
     return np.where(flat, u, np.log1p(u * np.expm1(safe)) / safe)
 
 
-def _distinct(
-    draw: Callable[[np.ndarray, int], np.ndarray], domain: Domain, n: int, real: np.dtype
-) -> np.ndarray:
+def _distinct(draw: Callable[[np.ndarray, int], np.ndarray], domain: Domain, n: int, real: np.dtype) -> np.ndarray:
     """Draw points. Repeat those that coincide or are on a wall in precision `real`."""
     origin, scale = domain.frame
     points = np.empty((n, domain.dim))
@@ -264,9 +258,7 @@ def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) ->
     if isinstance(domain, Polygon):
         margin = _ULPS * float(np.finfo(working.dtype).eps) * scale
         return domain.contains_well(points, margin)
-    lower, upper = (
-        ((np.array(c) - origin) / scale).astype(working.dtype) for c in (domain.lower, domain.upper)
-    )
+    lower, upper = (((np.array(c) - origin) / scale).astype(working.dtype) for c in (domain.lower, domain.upper))
     bad = ((working <= lower) | (working >= upper)).any(axis=1)
     bad |= ((points <= domain.lower) | (points >= domain.upper)).any(axis=1)
     return np.asarray(~bad)
@@ -277,9 +269,7 @@ def _in_all_pieces(domain: Domain, points: np.ndarray) -> np.ndarray:
     if not isinstance(domain, Polygon) or domain.n_pieces == 1:
         return points
     if len(points) < domain.n_pieces:
-        raise InputError(
-            f"n is {len(points)}, expected at least {domain.n_pieces}, one per piece of the domain"
-        )
+        raise InputError(f"n is {len(points)}, expected at least {domain.n_pieces}, one per piece of the domain")
     piece = domain.piece_of(points)
     counts = np.bincount(piece, minlength=domain.n_pieces)
     for missing in np.flatnonzero(counts == 0).tolist():

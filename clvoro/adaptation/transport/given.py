@@ -8,7 +8,7 @@ import shapely
 
 from ...arguments import Naming, check_integer, check_number, check_points, warn
 from ...errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWarning
-from ...geometry.box import Domain
+from ...geometry.domain import Domain
 from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
 from ...mesh.transported import Transported
@@ -58,12 +58,7 @@ def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: ob
 
 
 def transport_to(
-    stages: Stages,
-    domain: Domain,
-    points: object,
-    volumes: object,
-    tolerance: float | None,
-    max_steps: int,
+    stages: Stages, domain: Domain, points: object, volumes: object, tolerance: float | None, max_steps: int
 ) -> Transported:
     """Return the power diagram of `points` whose cells have `volumes`; see `clvoro.transport`."""
     engine = stages.engine
@@ -87,9 +82,7 @@ def transport_to(
         )
         t, extended = power.final(t)
     diagram = fetch_diagram(power.stages.engine, domain, t, labels, extended=extended)
-    result = Transported(
-        diagram, np.array(newton.errors), np.array(newton.shares), newton.converged
-    )
+    result = Transported(diagram, np.array(newton.errors), np.array(newton.shares), newton.converged)
     if not newton.converged:
         warn(
             f"the volumes of {newton.far} of {n} cells differ from the prescribed ones by more than {tolerance:.3g}, "
@@ -109,9 +102,7 @@ def _remedy(real: np.dtype, used_up: bool) -> str:
 def _sorted(stages: Stages, domain: Domain, host: np.ndarray) -> tuple[cla.Array, cla.Array]:
     """Return the rows of the generators in the order of the bins, and their positions on the device."""
     n = len(host)
-    binned = stages.bins.build(
-        domain, stages.engine.upload(domain.place(host, stages.engine.real)), n
-    )
+    binned = stages.bins.build(domain, stages.engine.upload(domain.place(host, stages.engine.real)), n)
     return binned.items[:n].copy(), binned.points[:n].copy()
 
 
@@ -120,9 +111,7 @@ def _check_numbers(name: str, value: object, n: int) -> np.ndarray:
     try:
         array = np.asarray(value)
     except Exception as error:  # arrays of other libraries raise anything
-        raise InputTypeError(
-            f"{name} is not an array ({error}), expected one real number per point"
-        ) from error
+        raise InputTypeError(f"{name} is not an array ({error}), expected one real number per point") from error
     if np.ma.is_masked(value):
         raise InputTypeError(
             f"{name} is a masked array with {np.ma.count_masked(value)} masked numbers, expected one number per point; "
@@ -135,9 +124,7 @@ def _check_numbers(name: str, value: object, n: int) -> np.ndarray:
     array = array.astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(array))
     if bad.size:
-        raise InputError(
-            f"{name}[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of {n} are not)"
-        )
+        raise InputError(f"{name}[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of {n} are not)")
     return array
 
 

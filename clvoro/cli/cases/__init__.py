@@ -14,7 +14,7 @@ from ...adaptation.options import uses
 from ...errors import InputError
 from ...files import open_plain, read_text
 from ...geometry.boundary_layers import Layers
-from ...geometry.box import Domain
+from ...geometry.domain import Domain
 from ...geometry.sphere import Sphere
 from ...io.atomic import atomic_file
 from . import schema, toml
@@ -26,10 +26,22 @@ from .files import FOLDER, WRITTEN, locate
 __all__ = ["WRITTEN", "Case", "builtin_cases", "load_case"]
 
 _RUN_ORDER = (
-    "method", "methods", "effort", "levels", "error_target", "start", "points", "fixed", "n_cells",
-    "max_steps", "tol", "alpha", "k",
-    "seed", "dtype",
-)  # fmt: skip
+    "method",
+    "methods",
+    "effort",
+    "levels",
+    "error_target",
+    "start",
+    "points",
+    "fixed",
+    "n_cells",
+    "max_steps",
+    "tol",
+    "alpha",
+    "k",
+    "seed",
+    "dtype",
+)
 
 
 @dataclass(frozen=True)
@@ -83,9 +95,7 @@ class Case:
         try:
             checked = schema.case(content, place)
         except (OverflowError, RecursionError) as error:
-            raise InputError(
-                f"{place} not a case: a number is too large or the nesting too deep ({error})"
-            ) from error
+            raise InputError(f"{place} not a case: a number is too large or the nesting too deep ({error})") from error
         run = checked.get("run", {})
         if "method" in run and "methods" in run:
             raise InputError(f"{place} run has both method and methods; keep one of them")
@@ -161,9 +171,7 @@ class Case:
 
     def _moved(self) -> tuple[Case, dict[str, Path]]:
         """Return the case with all its files in one folder, and their present paths: {name: source}."""
-        moved = replace(
-            self, size=copy.deepcopy(self.size), run=dict(self.run), place=dict(self.place)
-        )
+        moved = replace(self, size=copy.deepcopy(self.size), run=dict(self.run), place=dict(self.place))
         taken: dict[str, Path] = {}
         for (node, key), source in zip(moved._entries(), self.sources(), strict=True):
             target = source.name

@@ -43,9 +43,7 @@ def text(value: object, place: str) -> str:
 def file_name(value: object, place: str) -> str:
     """Check for a name that is valid for a file or folder, without a path, on any system."""
     name = text(value, place)
-    alone = (
-        PureWindowsPath(name).name == name != ".."
-    )  # Windows paths know all separators and drives
+    alone = PureWindowsPath(name).name == name != ".."  # Windows paths know all separators and drives
     spelt = name.encode("utf-8", "replace")  # with a ? for invalid characters
     if not alone or len(spelt) > _LONGEST_NAME or _CONTROL.search(name) or spelt.decode() != name:
         raise refuse(
@@ -113,9 +111,7 @@ def one_of(*names: str) -> Check:
 
     def check(value: object, place: str) -> str:
         if value not in names:
-            raise InputError(
-                f"{place} is {value!r}{_nearest(value, names)}; expected one of {_join(names)}"
-            )
+            raise InputError(f"{place} is {value!r}{_nearest(value, names)}; expected one of {_join(names)}")
         return str(value)
 
     return check

@@ -16,9 +16,7 @@ import shapely
 _DIGITS = 4  # of coordinates in the file: a tenth of a meter, if the unit is a kilometer
 
 
-def fractal_ring(
-    corners: np.ndarray, levels: int, roughness: float, rng: np.random.Generator
-) -> np.ndarray:
+def fractal_ring(corners: np.ndarray, levels: int, roughness: float, rng: np.random.Generator) -> np.ndarray:
     """Return the ring `corners` (k, 2) with each edge's midpoint displaced sideways, `levels` times.
 
     Displacements are normal, with a standard deviation of `roughness` edge lengths, at most 0.45. They are
@@ -61,19 +59,20 @@ def _ellipse(center: tuple[float, float], a: float, b: float, turn: float, k: in
 
 # Center, half axes and turn of each island; the two in the north-east leave a strait.
 _ISLANDS = (
-    ((2.6, 2.3), 0.75, 0.4, 0.4), ((5.2, 3.3), 0.5, 0.35, -0.6), ((6.35, 3.15), 0.4, 0.28, 0.9),
-    ((4.4, 1.5), 0.18, 0.12, 0.0), ((7.9, 2.3), 0.25, 0.12, 1.2), ((1.2, 3.1), 0.16, 0.1, 2.0),
-)  # fmt: skip
+    ((2.6, 2.3), 0.75, 0.4, 0.4),
+    ((5.2, 3.3), 0.5, 0.35, -0.6),
+    ((6.35, 3.15), 0.4, 0.28, 0.9),
+    ((4.4, 1.5), 0.18, 0.12, 0.0),
+    ((7.9, 2.3), 0.25, 0.12, 1.2),
+    ((1.2, 3.1), 0.16, 0.1, 2.0),
+)
 
 
 def lake(seed: int = 20269) -> dict:
     """Return a lake of 9 x 5 with six islands as a GeoJSON Feature."""
     rng = np.random.Generator(np.random.PCG64(seed))
     shore = fractal_ring(_ellipse((4.5, 2.5), 4.3, 2.0, 0.0, 12), 7, 0.14, rng)
-    islands = [
-        fractal_ring(_ellipse(*island, 6), 4 if island[1] < 0.3 else 5, 0.13, rng)
-        for island in _ISLANDS
-    ]
+    islands = [fractal_ring(_ellipse(*island, 6), 4 if island[1] < 0.3 else 5, 0.13, rng) for island in _ISLANDS]
     rings = [np.vstack([r, r[:1]]).round(_DIGITS).tolist() for r in (shore, *islands)]
     return {
         "type": "Feature",

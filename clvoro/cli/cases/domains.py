@@ -8,8 +8,9 @@ from typing import Any
 
 from ...errors import InputError
 from ...files import LONGEST_GEOMETRY, read_text
-from ...geometry.box import Box, Domain
+from ...geometry.box import Box
 from ...geometry.curves import Curve
+from ...geometry.domain import Domain
 from ...geometry.polygon import Polygon
 from ...geometry.sphere import Sphere
 from .files import locate

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.box import Box, Domain
+from ...geometry.box import Box
 from ...geometry.curves import Curve
+from ...geometry.domain import Domain
 from ...geometry.polygon import Polygon
 from ...geometry.sphere import Sphere
 from ...io.arrays import read_array
@@ -63,9 +64,7 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
         return sizing.Distance(shapes, node["h_min"], **options)
     if kind == "feature":
         if not isinstance(domain, Polygon):
-            raise InputError(
-                f"size.kind is 'feature', which needs a polygon as domain, not {domain}"
-            )
+            raise InputError(f"size.kind is 'feature', which needs a polygon as domain, not {domain}")
         options = _given(node, "cells_across", "growth", "h_min", "h_max", "curvature")
         return sizing.FeatureSize(domain, **options)
     if kind == "graded":
@@ -95,9 +94,7 @@ def _caps(node: Mapping[str, Any], domain: Domain) -> Any:
             "in [domain]"
         )
     regions = [(r["center"], r["radius"], r["size"]) for r in node["regions"]]
-    return sizing.Caps(
-        regions, h_max=node["h_max"], sphere=domain, **_given(node, "growth", "slope")
-    )
+    return sizing.Caps(regions, h_max=node["h_max"], sphere=domain, **_given(node, "growth", "slope"))
 
 
 def _raster(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
@@ -110,9 +107,7 @@ def _raster(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
     if grid is not None:
         for key in ("lower", "upper", "at"):
             if key in node:
-                raise InputError(
-                    f"size.{key} is given, and {path} has longitudes and latitudes; leave it out"
-                )
+                raise InputError(f"size.{key} is given, and {path} has longitudes and latitudes; leave it out")
         return sizing.Raster.from_xarray(grid, **_given(node, "missing", "outside"))
     if "variable" in node:
         raise InputError(
@@ -145,9 +140,7 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
         return domain if "edges" not in node else domain.boundary(node["edges"])
     if kind == "box":
         if isinstance(domain, Sphere) and not {"lower", "upper"} <= node.keys():
-            raise InputError(
-                "size.shapes has a box without corners, expected lower and upper in degrees on a sphere"
-            )
+            raise InputError("size.shapes has a box without corners, expected lower and upper in degrees on a sphere")
         return Box(node.get("lower", domain.lower), node.get("upper", domain.upper))
     if kind in ("circle", "sphere"):
         return sizing.Circle(node["center"], node["radius"])

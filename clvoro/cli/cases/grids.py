@@ -51,9 +51,7 @@ def read_grid(path: Path, variable: str | None) -> Any:
     return None
 
 
-def _choose(
-    variable: str | None, found: Mapping[str, Any], shape: Callable[[Any], Iterable[int]]
-) -> str:
+def _choose(variable: str | None, found: Mapping[str, Any], shape: Callable[[Any], Iterable[int]]) -> str:
     """Return the name of the variable: the given one, or the only one with two dimensions.
 
     `shape` returns the lengths of the dimensions that have coordinates.
@@ -65,23 +63,17 @@ def _choose(
         return str(variable)
     names = ", ".join(found) or "none"
     said = f"names {variable!r}" if variable else f"names none of the {len(plane)} on grids"
-    raise FileError(
-        f"it has the variables {names:.300}, and the case {said}; expected variable = one of them"
-    )
+    raise FileError(f"it has the variables {names:.300}, and the case {said}; expected variable = one of them")
 
 
 def _from_npz(path: Path, variable: str | None) -> Labeled | None:
     with explained(path, "a .npz file"), open_plain(path) as file, zipfile.ZipFile(file) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist()]
-    lon, lat = (
-        next((n for n in names if n.lower() in known), None) for known in (_LONGITUDES, _LATITUDES)
-    )
+    lon, lat = (next((n for n in names if n.lower() in known), None) for known in (_LONGITUDES, _LATITUDES))
     if lon is None or lat is None:
         if variable is None:
             return None
-        raise InputError(
-            f"{path} has the arrays {', '.join(names):.300}, expected lon and lat, too"
-        )
+        raise InputError(f"{path} has the arrays {', '.join(names):.300}, expected lon and lat, too")
     arrays = {n: read_array(path, n) for n in names if n not in (lon, lat)}
     with explained(path, "a .npz file"):
         name = _choose(variable, arrays, np.shape)
@@ -89,9 +81,7 @@ def _from_npz(path: Path, variable: str | None) -> Labeled | None:
     coords = {key: Labeled(key, values, (key,)) for key, values in along.items()}
     shape, counts = arrays[name].shape, tuple(len(np.atleast_1d(along[key])) for key in (lat, lon))
     if shape != counts:
-        raise InputError(
-            f"{path}: {name} has shape {shape}, expected (latitudes, longitudes) = {counts}"
-        )
+        raise InputError(f"{path}: {name} has shape {shape}, expected (latitudes, longitudes) = {counts}")
     return Labeled(name, arrays[name], (lat, lon), coords=coords)
 
 
@@ -116,9 +106,7 @@ def _from_classic(file: Any, path: Path, variable: str | None) -> Labeled:
             known = held.variables
 
             def lengths(item: Any) -> list[int]:
-                return [
-                    n for n, dim in zip(item.shape, item.dimensions, strict=True) if dim in known
-                ]
+                return [n for n, dim in zip(item.shape, item.dimensions, strict=True) if dim in known]
 
             name = _choose(variable, _data_variables(held), lengths)
             own = held.variables[name]
@@ -146,9 +134,7 @@ def _labeled(name: str, found: Any) -> Labeled:
 
 def _by_xarray(path: Path, variable: str | None) -> Any:
     """Read netCDF-4, which is HDF5."""
-    remedy = (
-        "pip install xarray netCDF4, or convert the file to netCDF-3, as by nccopy -k nc6 IN OUT"
-    )
+    remedy = "pip install xarray netCDF4, or convert the file to netCDF-3, as by nccopy -k nc6 IN OUT"
     try:
         import xarray
     except ModuleNotFoundError as error:

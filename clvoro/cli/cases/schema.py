@@ -47,12 +47,9 @@ def names(value: object, place: str) -> dict[str, Any]:
 
 _OF_CURVE: dict[str, Check] = {"name": text, "tolerance": positive}
 _CURVES = {
-    "arc": Table(
-        {"center": vector(2), "radius": positive, "start": number, "end": number}, {**_OF_CURVE}
-    ),
+    "arc": Table({"center": vector(2), "radius": positive, "start": number, "end": number}, {**_OF_CURVE}),
     "ellipse": Table(
-        {"center": vector(2), "semi_axes": vector(2)},
-        {"angle": number, "start": number, "end": number, **_OF_CURVE},
+        {"center": vector(2), "semi_axes": vector(2)}, {"angle": number, "start": number, "end": number, **_OF_CURVE}
     ),
     "naca": Table(
         {"code": text},
@@ -65,8 +62,7 @@ _CURVES = {
         },
     ),
     "spline": Table(
-        {"points": list_of(vector(2), 2)},
-        {"closed": true_or_false, "corners": list_of(whole(0), 0), **_OF_CURVE},
+        {"points": list_of(vector(2), 2)}, {"closed": true_or_false, "corners": list_of(whole(0), 0), **_OF_CURVE}
     ),
 }
 """The curves of `clvoro.curves`, except circles."""
@@ -107,9 +103,7 @@ _SIZE = Kinds(
         "constant": Table({"value": positive}, {}),
         "caps": Table(
             {
-                "regions": list_of(
-                    Table({"center": vector(2), "radius": not_negative, "size": positive}, {})
-                ),
+                "regions": list_of(Table({"center": vector(2), "radius": not_negative, "size": positive}, {})),
                 "h_max": positive,
             },
             {"growth": positive, "slope": positive},
@@ -121,31 +115,15 @@ _SIZE = Kinds(
             choice=("growth", "slope"),
         ),
         "expression": Table({"expression": text}, {}),
-        "raster": Table(
-            {"file": text},
-            {**_COVERED, "variable": text, "outside": one_of("nearest", "error")},
-        ),
+        "raster": Table({"file": text}, {**_COVERED, "variable": text, "outside": one_of("nearest", "error")}),
         "hessian": Table(
             {"file": text},
-            {
-                **_COVERED,
-                "n_cells": positive,
-                "eps": positive,
-                "p": positive,
-                "h_min": not_negative,
-                "h_max": positive,
-            },
+            {**_COVERED, "n_cells": positive, "eps": positive, "p": positive, "h_min": not_negative, "h_max": positive},
             choice=("n_cells", "eps"),
         ),
         "gradient": Table(
             {"file": text},
-            {
-                **_COVERED,
-                "n_cells": positive,
-                "eps": positive,
-                "h_min": not_negative,
-                "h_max": positive,
-            },
+            {**_COVERED, "n_cells": positive, "eps": positive, "h_min": not_negative, "h_max": positive},
             choice=("n_cells", "eps"),
         ),
         "feature": Table(
@@ -159,9 +137,7 @@ _SIZE = Kinds(
             },
         ),
         "graded": Table(
-            {"field": size},
-            {"growth": positive, "slope": positive, "resolution": whole(2)},
-            choice=("growth", "slope"),
+            {"field": size}, {"growth": positive, "slope": positive, "resolution": whole(2)}, choice=("growth", "slope")
         ),
         "min": Table({"fields": list_of(size)}, {}),
         "max": Table({"fields": list_of(size)}, {}),
@@ -172,9 +148,7 @@ _SIZE = Kinds(
     }
 )
 
-_CURVE = Kinds(
-    {"circle": Table({"center": vector(2), "radius": positive}, {**_OF_CURVE}), **_CURVES}
-)
+_CURVE = Kinds({"circle": Table({"center": vector(2), "radius": positive}, {**_OF_CURVE}), **_CURVES})
 
 
 def ring(value: object, place: str) -> Any:
@@ -184,10 +158,7 @@ def ring(value: object, place: str) -> Any:
     items = value if isinstance(value, (list, tuple)) else []
     if len(items) < 3 and not any(isinstance(item, Mapping) for item in items):
         raise refuse(place, value, "a list of 3 or more points, [x, y] each, or a curve")
-    return [
-        (_CURVE if isinstance(item, Mapping) else vector(2))(item, f"{place}[{i}]")
-        for i, item in enumerate(items)
-    ]
+    return [(_CURVE if isinstance(item, Mapping) else vector(2))(item, f"{place}[{i}]") for i, item in enumerate(items)]
 
 
 def directions(value: object, place: str) -> bool | list[bool]:
@@ -201,18 +172,10 @@ def directions(value: object, place: str) -> bool | list[bool]:
 
 _DOMAINS = Kinds(
     {
-        "box": Table(
-            {"lower": vector(2, 3), "upper": vector(2, 3)}, {"periodic": directions, "names": names}
-        ),
+        "box": Table({"lower": vector(2, 3), "upper": vector(2, 3)}, {"periodic": directions, "names": names}),
         "polygon": Table(
             {},
-            {
-                "file": text,
-                "outer": ring,
-                "holes": list_of(ring),
-                "names": names,
-                "simplified": positive,
-            },
+            {"file": text, "outer": ring, "holes": list_of(ring), "names": names, "simplified": positive},
             choice=("file", "outer"),
         ),
         "sphere": Table({}, {"radius": positive}),
@@ -274,26 +237,12 @@ _RUN = Table(
 
 SEQUENCE = Table({"frames": whole(1)}, {})
 
-LAYERS = Table(
-    {"height": positive},
-    {
-        "count": whole(1),
-        "growth": positive,
-        "spacing": positive,
-        "edges": walls,
-    },
-)
+LAYERS = Table({"height": positive}, {"count": whole(1), "growth": positive, "spacing": positive, "edges": walls})
 """Layers of cells along edges or sides."""
 
 _CASE = Table(
     {"domain": domain, "size": size},
-    {
-        "name": file_name,
-        "title": text,
-        "run": _RUN,
-        "layers": list_of(LAYERS),
-        "sequence": SEQUENCE,
-    },
+    {"name": file_name, "title": text, "run": _RUN, "layers": list_of(LAYERS), "sequence": SEQUENCE},
 )
 
 _HOMES = {

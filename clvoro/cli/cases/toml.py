@@ -77,10 +77,7 @@ def _write_table(lines: list[str], path: tuple[str, ...], table: Mapping[str, ob
 
 
 def _is_table_list(value: object) -> bool:
-    return (
-        isinstance(value, (list, tuple)) and len(value) > 0
-        and all(isinstance(item, Mapping) for item in value)
-    )  # fmt: skip
+    return isinstance(value, (list, tuple)) and len(value) > 0 and all(isinstance(item, Mapping) for item in value)
 
 
 def _key(key: str) -> str:

@@ -29,9 +29,7 @@ TURN_GOAL = 0.02
 """Turns in the corners of cells are to be at least this large, in radians."""
 DETERMINANT_GOAL = 0.02
 """Determinant of a cell that is aimed at."""
-SKEW_WEIGHT, LENGTH_WEIGHT, AREA_WEIGHT, TURN_WEIGHT, DETERMINANT_WEIGHT = (
-    0.3, 5.0, 0.5, 5.0, 1.5,
-)  # fmt: skip
+SKEW_WEIGHT, LENGTH_WEIGHT, AREA_WEIGHT, TURN_WEIGHT, DETERMINANT_WEIGHT = (0.3, 5.0, 0.5, 5.0, 1.5)
 
 
 class Figures(NamedTuple):
@@ -82,10 +80,7 @@ class Figures(NamedTuple):
 
 
 def face_figures(
-    ends: tuple[np.ndarray, ...],
-    here: tuple[np.ndarray, ...],
-    there: tuple[np.ndarray, ...],
-    wall: np.ndarray,
+    ends: tuple[np.ndarray, ...], here: tuple[np.ndarray, ...], there: tuple[np.ndarray, ...], wall: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return non-orthogonality in radians, skewness and length of faces, (..., f) each.
 
@@ -167,10 +162,21 @@ class Cells:
         place = np.full(len(self.area), -1)
         place[cells] = np.arange(len(cells))
         return Cells(
-            starts, self.loop[at], place[self.row[at]], self.between[at], self.bound[at],
-            self.faces[faces], self.ends[faces], place[self.owner[faces]], place[self.neighbor[faces]],
-            self.wall[faces], self.aim[faces], self.area[cells], self.size[cells], self.origin[cells],
-        )  # fmt: skip
+            starts,
+            self.loop[at],
+            place[self.row[at]],
+            self.between[at],
+            self.bound[at],
+            self.faces[faces],
+            self.ends[faces],
+            place[self.owner[faces]],
+            place[self.neighbor[faces]],
+            self.wall[faces],
+            self.aim[faces],
+            self.area[cells],
+            self.size[cells],
+            self.origin[cells],
+        )
 
     @classmethod
     def joined(cls, parts: list[Cells], begins: list[int]) -> Cells:
@@ -186,10 +192,21 @@ class Cells:
 
         starts = [p.starts[:-1] + i for p, i in zip(parts, corners, strict=False)]
         return cls(
-            np.concatenate([*starts, corners[-1:]]), all_of("loop", begins), all_of("row", cells), all_of("between"),
-            all_of("bound"), all_of("faces"), all_of("ends", begins), all_of("owner", cells), all_of("neighbor", cells),
-            all_of("wall"), all_of("aim"), all_of("area"), all_of("size"), all_of("origin"),
-        )  # fmt: skip
+            np.concatenate([*starts, corners[-1:]]),
+            all_of("loop", begins),
+            all_of("row", cells),
+            all_of("between"),
+            all_of("bound"),
+            all_of("faces"),
+            all_of("ends", begins),
+            all_of("owner", cells),
+            all_of("neighbor", cells),
+            all_of("wall"),
+            all_of("aim"),
+            all_of("area"),
+            all_of("size"),
+            all_of("origin"),
+        )
 
     def figures(self, x: np.ndarray, y: np.ndarray) -> Figures:
         """Return the figures for points with these coordinates, (v,) each."""
@@ -221,9 +238,25 @@ class Cells:
         mean = np.add.reduceat(np.sqrt(ux * ux + uy * uy), first) / self.sides
         determinant = (xx * yy - xy * xy) / (8 * np.maximum(mean, 1e-75) ** 4)
         return Figures(
-            angle, skewness, length / self.smaller, double / 2, determinant, turn, x, y, px, py, qx, qy,
-            twice, positive, centers, length, ux, uy,
-        )  # fmt: skip
+            angle,
+            skewness,
+            length / self.smaller,
+            double / 2,
+            determinant,
+            turn,
+            x,
+            y,
+            px,
+            py,
+            qx,
+            qy,
+            twice,
+            positive,
+            centers,
+            length,
+            ux,
+            uy,
+        )
 
     def terms(self, now: Figures) -> np.ndarray:
         """Return the terms of the sum of squares but those of the moves, (3 f + 2 n + k,)."""
@@ -233,8 +266,7 @@ class Cells:
             LENGTH_WEIGHT * np.maximum(self.aim - now.length, 0),
             AREA_WEIGHT * (now.area / self.area - 1),
             # The root has a slope where the faces of a cell are parallel.
-            DETERMINANT_WEIGHT
-            * np.maximum(DETERMINANT_GOAL**0.5 - np.sqrt(np.maximum(now.determinant, 0)), 0),
+            DETERMINANT_WEIGHT * np.maximum(DETERMINANT_GOAL**0.5 - np.sqrt(np.maximum(now.determinant, 0)), 0),
             TURN_WEIGHT * np.where(self.bound, 0, np.maximum(TURN_GOAL - now.turn, 0)),
         )
         return np.concatenate(terms)

@@ -96,9 +96,7 @@ class Problem:
         return found
 
 
-def minimize(
-    problems: Sequence[Problem], steps: Sequence[int], ring: RingCoordinate | None
-) -> list[np.ndarray]:
+def minimize(problems: Sequence[Problem], steps: Sequence[int], ring: RingCoordinate | None) -> list[np.ndarray]:
     """Lower the sum of squares of each problem by some steps of Levenberg and Marquardt; return its moves, (m, 2).
 
     Parameters
@@ -121,9 +119,7 @@ def minimize(
         tried = [search.moves - search.step() for search in going]
         costs = joint.evaluate(tried)
         better = [s.judge(x, cost) for s, x, cost in zip(going, tried, costs, strict=True)]
-        joint.set_equations(
-            np.array([b and s.left > 0 for b, s in zip(better, going, strict=True)])
-        )
+        joint.set_equations(np.array([b and s.left > 0 for b, s in zip(better, going, strict=True)]))
     return [search.moves for search in searches]
 
 
@@ -150,9 +146,7 @@ class _Search:
         self.cost, self.damping = np.inf, _DAMPING
         self.matrix: np.ndarray | scipy.sparse.csc_array
 
-    def set_equations(
-        self, jacobian: np.ndarray | scipy.sparse.csr_array, gradient: np.ndarray
-    ) -> None:
+    def set_equations(self, jacobian: np.ndarray | scipy.sparse.csr_array, gradient: np.ndarray) -> None:
         """Take the derivatives of the terms at `moves`, (t, 2 m), and half of those of the sum of squares, (2 m,)."""
         k, weight = len(gradient), _MOVE_WEIGHT**2
         self.gradient = gradient + weight * self.moves.ravel()
@@ -207,8 +201,7 @@ class _Joint:
         self.counts = np.array([len(p.active) for p in problems])
         blocks = np.arange(len(searches))
         of_face, of_cell, of_corner = (
-            np.repeat(blocks, [len(getattr(p.cells, name)) for p in problems])
-            for name in ("faces", "area", "loop")
+            np.repeat(blocks, [len(getattr(p.cells, name)) for p in problems]) for name in ("faces", "area", "loop")
         )
         self.of_term = np.concatenate([of_face] * 3 + [of_cell] * 2 + [of_corner])
 
@@ -226,10 +219,7 @@ class _Joint:
         if not wanted.any():
             return
         problem, n = self.problem, len(self.searches)
-        number, of_unknown = (
-            np.full(len(problem.positions), -1),
-            np.repeat(np.arange(n), self.counts),
-        )
+        number, of_unknown = (np.full(len(problem.positions), -1), np.repeat(np.arange(n), self.counts))
         chosen = wanted[of_unknown]
         number[problem.active[chosen]] = np.flatnonzero(chosen)
         found = slopes(problem.cells, self.at)
@@ -258,9 +248,7 @@ class _Joint:
         for i in np.flatnonzero(wanted).tolist():
             at, k, height = order[ends[i] : ends[i + 1]], int(widths[i]), int(heights[i])
             entries = values[at], rows[at], columns[at]
-            self.searches[i].set_equations(
-                _matrix(*entries, (height, k)), gradient[begins[i] : begins[i] + k]
-            )
+            self.searches[i].set_equations(_matrix(*entries, (height, k)), gradient[begins[i] : begins[i] + k])
 
 
 def _matrix(

@@ -81,10 +81,18 @@ def take_patch(mesh: SolverMesh, chosen: np.ndarray) -> Patch:
     neighbor = np.where(mesh.twin >= 0, BORDER, mesh.neighbor.astype(np.int64))
     v = len(mesh.points)
     whole = Patch(
-        np.arange(len(mesh)), mesh.points, np.arange(v), mesh.corners.reshape(-1, 2), mesh.owner,
-        neighbor, mesh.half_face, np.full(len(neighbor), np.nan), np.zeros(v, bool),
-        np.zeros(v, bool), np.full(v, np.nan),
-    )  # fmt: skip
+        np.arange(len(mesh)),
+        mesh.points,
+        np.arange(v),
+        mesh.corners.reshape(-1, 2),
+        mesh.owner,
+        neighbor,
+        mesh.half_face,
+        np.full(len(neighbor), np.nan),
+        np.zeros(v, bool),
+        np.zeros(v, bool),
+        np.full(v, np.nan),
+    )
     made = part_of(whole, chosen)
     made.fixed |= made.on_walls
     return made
@@ -113,9 +121,19 @@ def part_of(patch: Patch, chosen: np.ndarray) -> Patch:
     held = np.zeros(len(ids), bool)
     held[local[at_border[owner] | beyond]] = True
     return Patch(
-        cells, patch.points[ids], ids, local, owner, neighbor, patch.half_face[rows],
-        patch.aim[rows], held, held | patch.fixed[ids], patch.positions[ids], patch.limits,
-    )  # fmt: skip
+        cells,
+        patch.points[ids],
+        ids,
+        local,
+        owner,
+        neighbor,
+        patch.half_face[rows],
+        patch.aim[rows],
+        held,
+        held | patch.fixed[ids],
+        patch.positions[ids],
+        patch.limits,
+    )
 
 
 def restored(patch: Patch, part: Patch) -> Patch:
@@ -127,10 +145,7 @@ def restored(patch: Patch, part: Patch) -> Patch:
     kept, rows = ~whole | (patch.neighbor == BORDER), part.neighbor != BORDER
     other = np.where(part.neighbor >= 0, part.cells[np.maximum(part.neighbor, 0)], part.neighbor)
     ids, more = _numbered(part.ids, len(patch.points))
-    points, positions = (
-        np.pad(patch.points, ((0, more), (0, 0))),
-        np.pad(patch.positions, (0, more)),
-    )
+    points, positions = (np.pad(patch.points, ((0, more), (0, 0))), np.pad(patch.positions, (0, more)))
     points[ids], positions[ids] = part.points, part.positions
     return replace(
         patch,
@@ -173,9 +188,7 @@ def put_back(mesh: SolverMesh, patches: list[Patch]) -> SolverMesh:
     for p, numbers in zip(patches, ids, strict=True):
         rows = p.neighbor != BORDER
         other = np.where(p.neighbor >= 0, p.cells[np.maximum(p.neighbor, 0)], p.neighbor)
-        columns.append(
-            (numbers[p.ends[rows]], p.cells[p.owner[rows]], other[rows], p.half_face[rows])
-        )
+        columns.append((numbers[p.ends[rows]], p.cells[p.owner[rows]], other[rows], p.half_face[rows]))
     ends, owner, neighbor, half = (np.concatenate(x) for x in zip(*columns, strict=True))
     wall = neighbor < 0
     first, second = np.where(wall, -neighbor, owner), np.where(wall, owner, neighbor)

@@ -72,9 +72,21 @@ class PricedPatch:
         self.goals = goals
         owner = patch.owner[faces]
         self.cells = Cells(
-            starts, loop, row, ~on_wall, bound, faces, patch.ends[faces], owner,
-            np.where(wall, owner, patch.neighbor[faces]), wall, patch.aim[faces], goals[:, 0], goals[:, 1], origin,
-        )  # fmt: skip
+            starts,
+            loop,
+            row,
+            ~on_wall,
+            bound,
+            faces,
+            patch.ends[faces],
+            owner,
+            np.where(wall, owner, patch.neighbor[faces]),
+            wall,
+            patch.aim[faces],
+            goals[:, 0],
+            goals[:, 1],
+            origin,
+        )
         self._set_prices()
         fresh = np.isnan(self.cells.aim)
         if fresh.any():
@@ -152,9 +164,7 @@ class PricedPatch:
             scale=self._widths()[active],
         )
 
-    def moved(
-        self, problem: Problem, moves: np.ndarray, ring: RingCoordinate | None
-    ) -> PricedPatch:
+    def moved(self, problem: Problem, moves: np.ndarray, ring: RingCoordinate | None) -> PricedPatch:
         """Return the patch after the `moves` (m, 2) of the points of `problem`. Those on walls slide along `ring`."""
         points, positions = self.patch.points.copy(), self.patch.positions.copy()
         points[problem.active] = problem.placed(moves, ring)[:, problem.active].T

@@ -41,9 +41,7 @@ _MOST = 100
 """Most places that are regarded in a patch, the same ones again included."""
 
 
-def repaired(
-    given: PricedPatch, ring: RingCoordinate | None, walls: Walls | None = None
-) -> Task[PricedPatch]:
+def repaired(given: PricedPatch, ring: RingCoordinate | None, walls: Walls | None = None) -> Task[PricedPatch]:
     """Find a patch of lower price: place by place points move, also along walls, and faces change.
 
     With the `walls` of the mesh only cells are regarded that OpenFOAM refuses, and corners of walls can be cut off.
@@ -110,9 +108,7 @@ def _best_changes(
     if walls is not None:
         changes.append(WallCorners(given, walls).changes(given.near(focus, 1)))
     made = [PricedPatch.of(patch, given.goals) for patch in chain.from_iterable(changes)]
-    found = yield from in_step(
-        [_settled(patch, focus, (1,), _FIRST_STEPS) for patch in made if patch is not None]
-    )
+    found = yield from in_step([_settled(patch, focus, (1,), _FIRST_STEPS) for patch in made if patch is not None])
     good = yield from _each_settled(sorted(found, key=_price)[:_GOOD], focus, (1,), _SECOND_STEPS)
     return (yield from _each_settled(good[:_BEST], focus, (2, 3), _STEPS))
 
@@ -129,9 +125,7 @@ def _each_settled(
     return sorted(found, key=_price)
 
 
-def _settled(
-    made: PricedPatch, focus: np.ndarray, rings: tuple[int, ...], steps: int
-) -> Task[PricedPatch]:
+def _settled(made: PricedPatch, focus: np.ndarray, rings: tuple[int, ...], steps: int) -> Task[PricedPatch]:
     """Return the patch after moves of points at and around the cells near `focus` (n,) bool that have a price."""
     for k in rings:
         priced = (made.prices > 0) & made.near(focus, 2)
@@ -182,16 +176,20 @@ class _Connections:
         ends[ends == b] = a
         kept = np.arange(len(ends)) != face
         yield replace(
-            p, points=points, positions=positions, ends=ends[kept], owner=p.owner[kept],
-            neighbor=p.neighbor[kept], half_face=p.half_face[kept], aim=p.aim[kept],
-        )  # fmt: skip
+            p,
+            points=points,
+            positions=positions,
+            ends=ends[kept],
+            owner=p.owner[kept],
+            neighbor=p.neighbor[kept],
+            half_face=p.half_face[kept],
+            aim=p.aim[kept],
+        )
 
     def _beside(self, face: int, end: int, cell: int) -> int:
         """Return the other face of a cell at an end of one of its faces."""
         p = self.patch
-        return next(
-            f for f in self.faces_at[end] if f != face and cell in (p.owner[f], p.neighbor[f])
-        )
+        return next(f for f in self.faces_at[end] if f != face and cell in (p.owner[f], p.neighbor[f]))
 
     def _beyond(self, face: int, cell: int) -> int:
         """Return the cell across a face; a negative number if there is none."""
@@ -202,9 +200,13 @@ class _Connections:
         """Return the patch with the `changed` arrays and `face` between two cells, or a cell and a wall."""
         p = self.patch
         made = replace(
-            p, owner=p.owner.copy(), neighbor=p.neighbor.copy(), half_face=p.half_face.copy(), aim=p.aim.copy(),
+            p,
+            owner=p.owner.copy(),
+            neighbor=p.neighbor.copy(),
+            half_face=p.half_face.copy(),
+            aim=p.aim.copy(),
             **changed,
-        )  # fmt: skip
+        )
         made.owner[face], made.neighbor[face] = owner, neighbor
         made.half_face[face], made.aim[face] = -1, LENGTH_GOAL
         return made
@@ -244,7 +246,7 @@ class _Connections:
 
     def _opened(
         self, face: int, ends_of_face: tuple[int, int], cell: int, inner: tuple[int, int], walls: tuple[int, int]
-    ) -> Iterator[Patch]:  # fmt: skip
+    ) -> Iterator[Patch]:
         """Yield the patch in which the cell at the inner end of a face has a wall face at the other end.
 
         Parameters
@@ -294,15 +296,11 @@ class _Connections:
                 continue
             points, positions, ends = p.points.copy(), p.positions.copy(), p.ends.copy()
             into = points[far].mean(axis=0) - points[stays]
-            points[goes] = points[stays] + into * min(
-                1.0, _OPENED * self.sizes[cell] / max(np.hypot(*into), 1e-300)
-            )
+            points[goes] = points[stays] + into * min(1.0, _OPENED * self.sizes[cell] / max(np.hypot(*into), 1e-300))
             positions[goes] = np.nan
             ends[ends == goes] = stays
             for f in inner:
                 ends[f][ends[f] == stays] = goes
             # On the way from the wall into the domain, the first cell along the wall is on the left.
             ends[face] = (stays, goes) if first < last else (goes, stays)
-            yield self._between(
-                face, min(first, last), max(first, last), points=points, positions=positions, ends=ends
-            )  # fmt: skip
+            yield self._between(face, min(first, last), max(first, last), points=points, positions=positions, ends=ends)

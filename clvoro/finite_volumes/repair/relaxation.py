@@ -101,11 +101,7 @@ def _report(cuts: list[Cut]) -> None:
     far = max(cuts, key=lambda cut: cut.far / cut.size, default=None)
     if far is None or far.far <= FILLED * far.size:
         return
-    what = (
-        "1 corner of the boundary is"
-        if len(cuts) == 1
-        else f"{len(cuts)} corners of the boundary are"
-    )
+    what = "1 corner of the boundary is" if len(cuts) == 1 else f"{len(cuts)} corners of the boundary are"
     warn(
         f"{what} cut off, because no convex cells fit there, as the one at {format_point(np.array(far[:2]))}, which is "
         f"{far.far:.3g} from the wall, where cells are {far.size:.3g} wide; use smaller cells there",
@@ -152,9 +148,7 @@ def _limited(mesh: SolverMesh) -> tuple[tuple[float, float], np.ndarray] | None:
     return _LIMITS[k], beyond[k]
 
 
-def _bad_cells(
-    mesh: SolverMesh, loops: tuple[np.ndarray, ...], faces: np.ndarray, all_kinds: bool
-) -> np.ndarray:
+def _bad_cells(mesh: SolverMesh, loops: tuple[np.ndarray, ...], faces: np.ndarray, all_kinds: bool) -> np.ndarray:
     """Return which cells have one of the `faces`, (n,) bool.
 
     With `all_kinds`, also cells that are not convex or have a low determinant.
@@ -175,9 +169,7 @@ def _determinants(mesh: SolverMesh) -> np.ndarray:
     """Return the determinant of each cell in 2D, (n,), as `SolverMeasures.determinant`."""
     k, n = mesh.inner, len(mesh)
     between = np.concatenate([np.arange(k), np.arange(mesh.outer, len(mesh.owner))])
-    a, b = mesh.points[
-        mesh.corners.reshape(-1, 2)[np.concatenate([between, np.arange(k)])]
-    ].swapaxes(0, 1)
+    a, b = mesh.points[mesh.corners.reshape(-1, 2)[np.concatenate([between, np.arange(k)])]].swapaxes(0, 1)
     cell = np.concatenate([mesh.owner[between], mesh.neighbor[:k]])
     x, y = (b - a).T
     mean = np.bincount(cell, np.hypot(x, y), n) / np.maximum(np.bincount(cell, minlength=n), 1)

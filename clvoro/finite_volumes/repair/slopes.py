@@ -45,12 +45,7 @@ def slopes(cells: Cells, now: Figures) -> Slopes:
     """Return the derivatives of ``cells.terms(now)`` other than 0."""
     f, n = len(cells.faces), len(cells.area)
     made = _Slopes(cells, now)
-    parts = [
-        made.of_faces(),
-        made.of_areas(3 * f),
-        made.of_determinants(3 * f + n),
-        made.of_turns(3 * f + 2 * n),
-    ]
+    parts = [made.of_faces(), made.of_areas(3 * f), made.of_determinants(3 * f + n), made.of_turns(3 * f + 2 * n)]
     return Slopes(*(np.concatenate(z) for z in zip(*parts, strict=True)))
 
 
@@ -72,16 +67,12 @@ class _Slopes:
         """Return the derivatives of the terms for areas; `term` is the number of the first one."""
         c = self.cells
         weight = AREA_WEIGHT / 2 / c.area[c.row]
-        return Slopes(
-            term + c.row, c.loop, weight * (self.now.qy - self.oy), weight * (self.ox - self.now.qx)
-        )
+        return Slopes(term + c.row, c.loop, weight * (self.now.qy - self.oy), weight * (self.ox - self.now.qx))
 
     def of_faces(self) -> Slopes:
         """Return the derivatives of the terms of faces."""
         c, f, now = self.cells, len(self.cells.faces), self.now
-        beyond = np.stack(
-            [now.angle > ANGLE_GOAL, now.skewness > SKEWNESS_GOAL, now.length < c.aim]
-        )
+        beyond = np.stack([now.angle > ANGLE_GOAL, now.skewness > SKEWNESS_GOAL, now.length < c.aim])
         rows = np.flatnonzero(beyond.any(axis=0))
         (a, b), owner, neighbor = c.ends[rows].T, c.owner[rows], c.neighbor[rows]
         centers = now.centers + c.origin.T
@@ -105,14 +96,10 @@ class _Slopes:
                 cells += [owner[used], neighbor[used]]
                 by += [slope[4:6], slope[6:8]]
         by_centroids = np.concatenate(by, axis=1)
-        parts.append(
-            self._of_centroids(np.concatenate(terms), np.concatenate(cells), *by_centroids)
-        )
+        parts.append(self._of_centroids(np.concatenate(terms), np.concatenate(cells), *by_centroids))
         return Slopes(*(np.concatenate(z) for z in zip(*parts, strict=True)))
 
-    def _of_centroids(
-        self, terms: np.ndarray, cells: np.ndarray, by_x: np.ndarray, by_y: np.ndarray
-    ) -> Slopes:
+    def _of_centroids(self, terms: np.ndarray, cells: np.ndarray, by_x: np.ndarray, by_y: np.ndarray) -> Slopes:
         """Return the derivatives of terms whose derivatives by the centroids of `cells` are known, (m,) each."""
         c = self.cells
         now, counts = self.now, c.counts[cells]

@@ -64,9 +64,7 @@ class Walls:
     def beside(self, cells: np.ndarray, points: np.ndarray) -> Walls:
         """Return the walls of other cells than `cells` (n,) that are near `points` (v, 2)."""
         low, high = points.min(axis=0), points.max(axis=0)
-        near = (self.ends.max(axis=1) >= low).all(axis=1) & (self.ends.min(axis=1) <= high).all(
-            axis=1
-        )
+        near = (self.ends.max(axis=1) >= low).all(axis=1) & (self.ends.min(axis=1) <= high).all(axis=1)
         near &= ~np.isin(self.owner, cells)
         return replace(self, ends=self.ends[near], owner=self.owner[near])
 
@@ -137,13 +135,7 @@ class WallCorners:
     def _with_walls(self, faces: list[int], cell: int) -> Patch:
         """Return a copy of the patch in which the wall faces `faces` belong to `cell`."""
         p = self.patch
-        made = replace(
-            p,
-            ends=p.ends.copy(),
-            owner=p.owner.copy(),
-            half_face=p.half_face.copy(),
-            aim=p.aim.copy(),
-        )
+        made = replace(p, ends=p.ends.copy(), owner=p.owner.copy(), half_face=p.half_face.copy(), aim=p.aim.copy())
         made.owner[faces], made.half_face[faces], made.aim[faces] = cell, -1, LENGTH_GOAL
         return made
 
@@ -217,9 +209,7 @@ class WallCorners:
         size = float(self.sizes[p.owner[faces[0]]])
         if far > _FARTHEST * size or self._obstructed((a, point, b), x):
             return
-        yield replace(
-            _without(p, point), cuts=(*p.cuts, Cut(float(x[1, 0]), float(x[1, 1]), far, size))
-        )
+        yield replace(_without(p, point), cuts=(*p.cuts, Cut(float(x[1, 0]), float(x[1, 1]), far, size)))
 
     def _obstructed(self, corners: tuple[int, int, int], x: np.ndarray) -> bool:
         """Return whether another wall meets the triangle `x` (3, 2) of the points `corners`."""
@@ -229,9 +219,7 @@ class WallCorners:
         apart = ~own.any(axis=1)
         beside = ends[~apart & ~own.all(axis=1)]
         tips = p.points[beside[~np.isin(beside, corners)]]
-        others = np.concatenate(
-            [self.walls.ends, p.points[ends[apart]], np.stack([tips, tips], axis=1)]
-        )
+        others = np.concatenate([self.walls.ends, p.points[ends[apart]], np.stack([tips, tips], axis=1)])
         return bool(_meet(x, others).any())
 
 
@@ -248,12 +236,7 @@ def _without(patch: Patch, point: int) -> Patch:
     neighbor[first], half[first], aim[first] = neighbor[longer], half[longer], LENGTH_GOAL
     kept = np.arange(len(ends)) != last
     return replace(
-        p,
-        ends=ends[kept],
-        owner=p.owner[kept],
-        neighbor=neighbor[kept],
-        half_face=half[kept],
-        aim=aim[kept],
+        p, ends=ends[kept], owner=p.owner[kept], neighbor=neighbor[kept], half_face=half[kept], aim=aim[kept]
     )
 
 

@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 
 @makes_curves
-def circle(
-    center: ArrayLike, radius: float, *, name: str | None = None, tolerance: float | None = None
-) -> Curve:
+def circle(center: ArrayLike, radius: float, *, name: str | None = None, tolerance: float | None = None) -> Curve:
     """Return a circle.
 
     Parameters
@@ -157,9 +155,7 @@ def ellipse(
     return Curve("ellipse", arguments, spans, closed=abs(b - a) == 360)
 
 
-def _arcs(
-    center: list[float], axes: tuple[float, float], angle: float, start: float, end: float
-) -> list[Span]:
+def _arcs(center: list[float], axes: tuple[float, float], angle: float, start: float, end: float) -> list[Span]:
     """Return the parts of an ellipse between multiples of 90 degrees, so that extreme points are vertices."""
     sign, (c, s) = (1.0 if end > start else -1.0), cos_sin(np.array(angle))
     rotation = np.array([[c, -s], [s, c]])

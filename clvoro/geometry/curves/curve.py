@@ -54,9 +54,7 @@ class Curve:
     (('outer', 'cylinder'), 0.0)
     """
 
-    def __init__(
-        self, kind: str, arguments: Mapping[str, Any], spans: Iterable[Span], closed: bool
-    ):
+    def __init__(self, kind: str, arguments: Mapping[str, Any], spans: Iterable[Span], closed: bool):
         self.kind, self.spans, self.closed = kind, tuple(spans), closed
         self.arguments = {key: value for key, value in arguments.items() if value is not None}
         name = self.name = arguments.get("name")
@@ -65,9 +63,7 @@ class Curve:
                 f"{kind} name is {name!r:.60}, expected a word of ASCII letters, digits, _, . and - that begins with a "
                 "letter or _"
             )
-        points = np.concatenate(
-            [s.at(np.linspace(s.begin, s.end, s.samples + 1))[0] for s in self.spans]
-        )
+        points = np.concatenate([s.at(np.linspace(s.begin, s.end, s.samples + 1))[0] for s in self.spans])
         self.extent = float(np.ptp(points, axis=0).max())
         far = float(np.abs(points).max())
         if not np.isfinite(points).all() or self.extent < _DIGITS * far:
@@ -97,8 +93,7 @@ class Curve:
         """Vertices of the polyline, (k, 2); those of a closed curve without a closing vertex."""
         ends, span = self.nodes
         points = np.concatenate(
-            [s.at(ends[span == i, 0])[0] for i, s in enumerate(self.spans)]
-            + [self.spans[-1].at(ends[-1:, 1])[0]]
+            [s.at(ends[span == i, 0])[0] for i, s in enumerate(self.spans)] + [self.spans[-1].at(ends[-1:, 1])[0]]
         )
         if self.closed and np.hypot(*(points[-1] - points[0])) <= CLOSE * self.extent:
             points = points[:-1]
@@ -128,9 +123,7 @@ class Curve:
         rest = {key: value for key, value in values.items() if key != "kind"}
         kind = values.get("kind")
         if not isinstance(kind, str) or kind not in MAKERS:
-            raise InputError(
-                f"curve has the kind {kind!r:.60}, expected one of {', '.join(MAKERS)}"
-            )
+            raise InputError(f"curve has the kind {kind!r:.60}, expected one of {', '.join(MAKERS)}")
         try:
             made = MAKERS[kind](**rest)
         except TypeError as error:
@@ -145,8 +138,7 @@ class Curve:
 
     def __repr__(self) -> str:
         shown = {
-            key: f"<{len(value)} points>" if key == "points" else repr(value)
-            for key, value in self.arguments.items()
+            key: f"<{len(value)} points>" if key == "points" else repr(value) for key, value in self.arguments.items()
         }
         return f"{self.kind}({', '.join(f'{key}={value}' for key, value in shown.items())})"
 

@@ -81,10 +81,7 @@ def naca(
             '"0012" or "2412" for example'
         )
     length = check_number("naca chord", chord, above=0)
-    place, turn = (
-        check_point("naca leading_edge", leading_edge),
-        check_number("naca angle", angle_of_attack),
-    )
+    place, turn = (check_point("naca leading_edge", leading_edge), check_number("naca angle", angle_of_attack))
     check_choice("naca trailing_edge", trailing_edge, ("closed", "blunt"))
     m, p, thickness = int(code[0]) / 100, int(code[1]) / 10, int(code[2:]) / 100
     c, s = cos_sin(np.array(-turn))
@@ -98,11 +95,7 @@ def naca(
         root = np.abs(t)
         x, dx = t**2, 2 * t
         y = side * np.polynomial.polynomial.polyval(root, half)
-        dy = (
-            np.sign(t)
-            * side
-            * np.polynomial.polynomial.polyval(root, np.polynomial.polynomial.polyder(half))
-        )
+        dy = np.sign(t) * side * np.polynomial.polynomial.polyval(root, np.polynomial.polynomial.polyder(half))
         dy[t == 0] = -half[1]
         q, dq, camber = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
         if m > 0:
@@ -123,7 +116,12 @@ def naca(
             fore, side = abs(begin + end) / 2 < crest, 1 if end <= 0 else -1
             spans.append(Span(begin, end, lambda t, f=fore, s=side: at(t, f, s)))
     arguments = {
-        "code": code, "chord": length, "leading_edge": place, "angle_of_attack": turn, "trailing_edge": trailing_edge,
-        "name": name, "tolerance": tolerance,
-    }  # fmt: skip
+        "code": code,
+        "chord": length,
+        "leading_edge": place,
+        "angle_of_attack": turn,
+        "trailing_edge": trailing_edge,
+        "name": name,
+        "tolerance": tolerance,
+    }
     return Curve("naca", arguments, spans, closed=True)

@@ -62,15 +62,11 @@ def spline(
     array = check_rows("spline points", points, 2)
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
-        raise InputError(
-            f"spline points[{bad[0]}] is {array[bad[0]].tolist()}, expected finite numbers"
-        )
+        raise InputError(f"spline points[{bad[0]}] is {array[bad[0]].tolist()}, expected finite numbers")
     if closed and len(array) > 1 and (array[0] == array[-1]).all():
         array = array[:-1]
     if len(array) < 2 + bool(closed):
-        raise InputError(
-            f"spline got {len(array)} distinct points, expected at least {2 + bool(closed)}"
-        )
+        raise InputError(f"spline got {len(array)} distinct points, expected at least {2 + bool(closed)}")
     n, given = len(array), array.tolist()
     chosen = sorted({check_integer("spline corners", k, 0) for k in corners})
     if chosen and chosen[-1] >= n:
@@ -107,8 +103,5 @@ def _spline_span(lengths: np.ndarray, points: np.ndarray, ends: str) -> Span:
     curve = CubicSpline(lengths, points, bc_type=ends)
     slope = curve.derivative()
     return Span(
-        float(lengths[0]),
-        float(lengths[-1]),
-        lambda t: (curve(t), slope(t)),
-        max(SAMPLES, 8 * (len(points) - 1)),
+        float(lengths[0]), float(lengths[-1]), lambda t: (curve(t), slope(t)), max(SAMPLES, 8 * (len(points) - 1))
     )

@@ -114,9 +114,7 @@ def small_land(triangles: Triangles, scale: float) -> np.ndarray:
     # A cape has one root: the sides to other land are one polyline.
     t, k = np.nonzero(parts.rim)
     part, corners = parts.part[t], triangles.corners[parts.row[t]]
-    ends = [
-        keys_of(np.column_stack([part, corners[np.arange(len(t)), (k + i) % 3]])) for i in (1, 2)
-    ]
+    ends = [keys_of(np.column_stack([part, corners[np.arange(len(t)), (k + i) % 3]])) for i in (1, 2)]
     nodes, index = np.unique(ends, return_inverse=True)
     begin, end = index.reshape(2, -1)
     graph = scipy.sparse.coo_array((np.ones(len(t)), (begin, end)), (len(nodes), len(nodes)))

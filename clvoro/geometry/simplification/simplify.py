@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 Sizes = Callable[[np.ndarray], np.ndarray]
 
 
-def simplify(
-    domain: Polygon, size: object, tolerance: float
-) -> tuple[list[list[np.ndarray]], dict[str, list[int]]]:
+def simplify(domain: Polygon, size: object, tolerance: float) -> tuple[list[list[np.ndarray]], dict[str, list[int]]]:
     """Return the rings of the simplified domain, piece by piece, and the names of edges; see `Polygon.simplified`."""
     tolerance = check_number("tolerance", tolerance, least=0)
     if tolerance > 0.5:
@@ -32,8 +30,11 @@ def simplify(
     triangles = Triangles(*boundary, lambda x: shapely.contains_xy(domain.geometry, *x.T))
     turned = np.zeros(0, bool)
     for find, scales in (
-        (narrow_water, SCALES[:1]), (small_land, SCALES[:1]), (narrow_water, SCALES[1:]), (small_land, SCALES[1:]),
-    ):  # fmt: skip
+        (narrow_water, SCALES[:1]),
+        (small_land, SCALES[:1]),
+        (narrow_water, SCALES[1:]),
+        (small_land, SCALES[1:]),
+    ):
         triangles = triangles.rebuilt() if turned.any() else triangles
         turned = np.any([find(triangles, scale) for scale in scales], axis=0)
         triangles.water ^= turned
@@ -60,9 +61,7 @@ def as_sizes(domain: Polygon, size: object) -> Sizes:
             )
         if not ((found > 0) & (found < math.inf)).all():
             row = int(np.argmin((found > 0) & (found < math.inf)))
-            raise InputError(
-                f"size is {found[row]:g} at {format_point(points[row])}, expected a positive length"
-            )
+            raise InputError(f"size is {found[row]:g} at {format_point(points[row])}, expected a positive length")
         return found
 
     return sizes

@@ -74,9 +74,7 @@ def divided_boundary(
     return x, np.concatenate([h, sizes(x[len(h) :])]), edges, n
 
 
-def _split(
-    x: np.ndarray, edges: np.ndarray, n: int, share: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def _split(x: np.ndarray, edges: np.ndarray, n: int, share: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the parts of edges, (2 k, 2), and all points. Edges are divided at shares of their lengths, (k,).
 
     Without shares these are halves, but beside one of the first `n` points an edge is divided at a distance that is a

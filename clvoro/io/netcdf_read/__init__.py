@@ -38,9 +38,7 @@ def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
         with open_plain(path) as file:
             head = file.read(4)
             if head == _HDF5:
-                raise FileError(
-                    "it is netCDF-4, expected netCDF-3; convert it by `nccopy -k nc6 FILE NEW`"
-                )
+                raise FileError("it is netCDF-4, expected netCDF-3; convert it by `nccopy -k nc6 FILE NEW`")
             file.seek(0)
             with netcdf_file(file, mmap=False) as found:
                 cells = _read(Variables(found))
@@ -55,9 +53,15 @@ def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
         return diagram
     size, error, quality = cells.of_run
     return Result(
-        points=diagram.points, diagram=diagram, target_size=size, size_error=error, quality=quality,
-        history=np.zeros(0, HISTORY_DTYPE), converged=False, stop_reason="read from a .nc file",
-    )  # fmt: skip
+        points=diagram.points,
+        diagram=diagram,
+        target_size=size,
+        size_error=error,
+        quality=quality,
+        history=np.zeros(0, HISTORY_DTYPE),
+        converged=False,
+        stop_reason="read from a .nc file",
+    )
 
 
 def _read(file: Variables) -> Cells:

@@ -93,10 +93,14 @@ def make_diagram(cells: Cells) -> Diagram:
         within = cells.points[np.unique(owner[alone])]
         sphere = SphereRegion(radius, within=within, beyond=beyond, area=area)
     known = {
-        "points": cells.points, "volumes": volumes, "neighbor_starts": starts.astype(np.int32),
-        "neighbors": neighbors.astype(np.int32), "vertices": cells.vertices,
-        "cell_vertex_starts": starts.astype(np.int32), "cell_vertices": cells.corners.astype(np.int32),
-    }  # fmt: skip
+        "points": cells.points,
+        "volumes": volumes,
+        "neighbor_starts": starts.astype(np.int32),
+        "neighbors": neighbors.astype(np.int32),
+        "vertices": cells.vertices,
+        "cell_vertex_starts": starts.astype(np.int32),
+        "cell_vertices": cells.corners.astype(np.int32),
+    }
     return Diagram(sphere, {**known, **rebuild_on_sphere(Diagram(sphere, known))})
 
 
@@ -113,9 +117,7 @@ def _neighbors(owner: np.ndarray, ends: np.ndarray, v: int) -> np.ndarray:
     return np.where(ranked[place] == there, owner[order[place]], -1)
 
 
-def _removed(
-    cells: Cells, owner: np.ndarray, ends: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _removed(cells: Cells, owner: np.ndarray, ends: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the generators of removed cells (b, 3), and which of them is behind each boundary face (k,).
 
     A face is on the bisector of both generators. So the other one is the reflection of that of the cell, through the

@@ -62,9 +62,7 @@ def read_mpas(file: Variables) -> Cells | None:
     if str(file.attribute("on_a_sphere")).strip().upper() != "YES":
         raise FileError(_PLANE)
     radius = float(np.ravel(file.attribute("sphere_radius"))[0])
-    points, vertices, edges = (
-        file.real(*(f"{axis}{what}" for axis in "xyz")) for what in ("Cell", "Vertex", "Edge")
-    )
+    points, vertices, edges = (file.real(*(f"{axis}{what}" for axis in "xyz")) for what in ("Cell", "Vertex", "Edge"))
     counts, table = file.integer("nEdgesOnCell"), file.integer("verticesOnCell")
     ends = _ragged(table, counts, len(vertices), 1, "verticesOnCell")
     of_faces = _ragged(file.integer("edgesOnCell"), counts, len(edges), 1, "edgesOnCell")
@@ -83,9 +81,7 @@ def read_ugrid(file: Variables) -> Cells | None:
     if not meshes:
         return None
     mesh = meshes[0]
-    nodes, faces = (
-        _lonlat_names(file, file.about(mesh, f"{what}_coordinates")) for what in ("node", "face")
-    )
+    nodes, faces = (_lonlat_names(file, file.about(mesh, f"{what}_coordinates")) for what in ("node", "face"))
     if nodes is None:
         raise FileError(_PLANE)
     if faces is None:

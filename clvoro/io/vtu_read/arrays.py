@@ -25,16 +25,38 @@ END = b"\n</AppendedData>\n</VTKFile>\n"
 _TYPES = {"Float64": "f8", "Float32": "f4", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}
 _BLOCK = 1 << 20
 _USED = {
-    "Points.", "Cells.types", "Cells.connectivity", "Cells.offsets", "Cells.faces", "Cells.faceoffsets",
-    "CellData.size", "CellData.error", "CellData.quality", "CellData.volume", "CellData.generator",
+    "Points.",
+    "Cells.types",
+    "Cells.connectivity",
+    "Cells.offsets",
+    "Cells.faces",
+    "Cells.faceoffsets",
+    "CellData.size",
+    "CellData.error",
+    "CellData.quality",
+    "CellData.volume",
+    "CellData.generator",
     "CellData.weight",
-    "CellData.label", "CellData.sides", "CellData.faces_of_cell",
-    "FieldData.box_corners", "FieldData.box_periodic",
-    "FieldData.seam_faces", "FieldData.seam_neighbors", "FieldData.seam_shifts",
-    "FieldData.domain_vertices", "FieldData.domain_ring_starts", "FieldData.domain_piece_of_ring",
-    "FieldData.domain_edge_numbers", "FieldData.bridges", "FieldData.wall_faces", "FieldData.wall_edges",
-    "FieldData.sphere_radius", "FieldData.region_within", "FieldData.region_beyond", "FieldData.region_area",
-}  # fmt: skip
+    "CellData.label",
+    "CellData.sides",
+    "CellData.faces_of_cell",
+    "FieldData.box_corners",
+    "FieldData.box_periodic",
+    "FieldData.seam_faces",
+    "FieldData.seam_neighbors",
+    "FieldData.seam_shifts",
+    "FieldData.domain_vertices",
+    "FieldData.domain_ring_starts",
+    "FieldData.domain_piece_of_ring",
+    "FieldData.domain_edge_numbers",
+    "FieldData.bridges",
+    "FieldData.wall_faces",
+    "FieldData.wall_edges",
+    "FieldData.sphere_radius",
+    "FieldData.region_within",
+    "FieldData.region_beyond",
+    "FieldData.region_area",
+}
 
 
 class FileError(Exception):

@@ -15,7 +15,8 @@ from scipy.spatial import KDTree
 
 from ...errors import InputError
 from ...files import open_plain
-from ...geometry.box import Box, Domain
+from ...geometry.box import Box
+from ...geometry.domain import Domain
 from ...geometry.polygon import Polygon
 from ...geometry.sphere import Sphere
 from ...geometry.sphere_region import SphereRegion
@@ -70,9 +71,7 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
         RecursionError,
         expat.ExpatError,
     ) as error:
-        raise InputError(
-            f"cannot read {name}: it is damaged or not from clvoro ({error})"
-        ) from error
+        raise InputError(f"cannot read {name}: it is damaged or not from clvoro ({error})") from error
     except OSError as error:
         raise InputError(f"cannot read {name}: {error.strerror or error}") from error
 
@@ -109,9 +108,15 @@ def _assemble(arrays: dict[str, np.ndarray], reader: FileReader) -> Result | Dia
         return diagram
     size, error, quality = (arrays[name].astype(float) for name in of_run)
     return Result(
-        points=points, diagram=diagram, target_size=size, size_error=error, quality=quality,
-        history=np.zeros(0, HISTORY_DTYPE), converged=False, stop_reason="read from a .vtu file",
-    )  # fmt: skip
+        points=points,
+        diagram=diagram,
+        target_size=size,
+        size_error=error,
+        quality=quality,
+        history=np.zeros(0, HISTORY_DTYPE),
+        converged=False,
+        stop_reason="read from a .vtu file",
+    )
 
 
 def _domain(arrays: dict[str, np.ndarray], x: np.ndarray, reader: FileReader) -> Domain:
@@ -141,9 +146,7 @@ def _sphere(arrays: dict[str, np.ndarray], x: np.ndarray, reader: FileReader) ->
     within, beyond, area = (arrays[f"FieldData.region_{k}"] for k in ("within", "beyond", "area"))
     if area.shape != (1,):
         raise FileError(f"region_area has shape {area.shape}")
-    return SphereRegion(
-        sphere.radius, within=within, beyond=beyond, area=float(area[0]), names=reader.names
-    )
+    return SphereRegion(sphere.radius, within=within, beyond=beyond, area=float(area[0]), names=reader.names)
 
 
 def _cell_polygons(arrays: dict[str, np.ndarray], v: int, domain: Domain) -> dict[str, np.ndarray]:
@@ -169,14 +172,15 @@ def _cell_polyhedra(arrays: dict[str, np.ndarray], v: int) -> dict[str, np.ndarr
     """Return the diagram's arrays of faces in 3D, and again `starts` and `corners` of the faces."""
     cell_starts, starts, corners = _polyhedra(arrays, v)
     return {
-        "neighbor_starts": cell_starts, "face_vertex_starts": starts, "face_vertices": corners, "starts": starts,
+        "neighbor_starts": cell_starts,
+        "face_vertex_starts": starts,
+        "face_vertices": corners,
+        "starts": starts,
         "corners": corners,
-    }  # fmt: skip
+    }
 
 
-def _periodic_box(
-    arrays: dict[str, np.ndarray], dim: int, names: dict[str, list[int]] | None
-) -> Box:
+def _periodic_box(arrays: dict[str, np.ndarray], dim: int, names: dict[str, list[int]] | None) -> Box:
     """Return the periodic box in the file."""
     corners = arrays["FieldData.box_corners"].reshape(2, 3)[:, :dim].astype(float)
     axes = arrays["FieldData.box_periodic"]
@@ -185,9 +189,7 @@ def _periodic_box(
     return Box(*corners.tolist(), periodic=tuple(bool(a) for a in axes), names=names)
 
 
-def _seam(
-    arrays: dict[str, np.ndarray], neighbors: np.ndarray, dim: int, n: int
-) -> dict[str, np.ndarray]:
+def _seam(arrays: dict[str, np.ndarray], neighbors: np.ndarray, dim: int, n: int) -> dict[str, np.ndarray]:
     """Set the neighbors across the seams, where faces share no corners, and return the shifts."""
     faces = _indices(arrays["FieldData.seam_faces"], len(neighbors), "seam_faces")
     others = _indices(arrays["FieldData.seam_neighbors"], n, "seam_neighbors")
@@ -279,9 +281,7 @@ def _polyhedra(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.nd
     return np.array(cells, np.int64), faces, _indices(corners, v, "corners of faces")
 
 
-def _neighbors(
-    owner: np.ndarray, starts: np.ndarray, corners: np.ndarray, x: np.ndarray, domain: Domain
-) -> np.ndarray:
+def _neighbors(owner: np.ndarray, starts: np.ndarray, corners: np.ndarray, x: np.ndarray, domain: Domain) -> np.ndarray:
     """Return the neighbor across each face: the cell with a face of the same corners, or else the nearest wall."""
     sides = np.diff(starts)
     face = np.repeat(np.arange(len(sides)), sides)

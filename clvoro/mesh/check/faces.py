@@ -46,19 +46,23 @@ def check_corners(check: Check) -> None:
         wrong[row[off]] = True
     owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
     check.note(
-        "vertices once", wrong,
+        "vertices once",
+        wrong,
         lambda k: f"the face of cells {owner[here[k]]} and {owner[there[k]]} has other vertices from either side",
-    )  # fmt: skip
+    )
     if d.domain.cell_dim == 2 and not any(d.domain.periodic):
         # Across seams a vertex has several numbers.
         expected = _euler_characteristic(d)
         v, e = len(d.vertices), len(d.neighbors) - len(inner) // 2
         c = int(np.count_nonzero(np.diff(d.neighbor_starts)))
         check.note(
-            "Euler's formula", np.array([expected is not None and v - e + c != expected]),
-            lambda _: f"{v} vertices - {e} faces + {c} cells is {v - e + c}, expected {expected}: faces "
-            "cross, or two vertices have one number",
-        )  # fmt: skip
+            "Euler's formula",
+            np.array([expected is not None and v - e + c != expected]),
+            lambda _: (
+                f"{v} vertices - {e} faces + {c} cells is {v - e + c}, expected {expected}: faces "
+                "cross, or two vertices have one number"
+            ),
+        )
 
 
 def _euler_characteristic(d: Diagram) -> int | None:
@@ -109,9 +113,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
         # their places. Such a part lies at the boundary, and so does the cell that it belongs to.
         there = g.areas / np.maximum(g.measures, 1e-300)[:, None]
         at_boundary = np.bincount(g.owner[walls], minlength=n) > 0
-        at_wall = (
-            at_boundary[g.owner] | at_boundary[np.where(d.neighbors < 0, g.owner, d.neighbors)]
-        )
+        at_wall = at_boundary[g.owner] | at_boundary[np.where(d.neighbors < 0, g.owner, d.neighbors)]
         off = np.linalg.norm(there - normals, axis=1) * g.measures
         adopted = off > np.where(at_wall, doubts.measures, positions.measures)
         adopted &= (d.neighbors >= 0) & (g.measures > 0)
@@ -123,14 +125,13 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     across = np.where(d.shifts.any(axis=1), g.period_off, 0.0) * d.face_measures
     turned = across / g.spacings
     width = np.bincount(g.owner, doubts.measures + rounding + turned, n)
-    gap = np.stack(
-        [np.bincount(g.owner, d.face_measures * normals[:, k], n) for k in range(dim)], axis=1
-    )
+    gap = np.stack([np.bincount(g.owner, d.face_measures * normals[:, k], n) for k in range(dim)], axis=1)
     gap = np.linalg.norm(gap, axis=1)
     check.note(
-        "measures close", np.maximum(gap - width, 0),
+        "measures close",
+        np.maximum(gap - width, 0),
         lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
-    )  # fmt: skip
+    )
     if isinstance(d.domain, Polygon):  # corners alone give the places of cut faces
         return
     if d.is_power and dim == 2:
@@ -145,6 +146,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     width = doubts.volumes + np.bincount(g.owner, d.face_measures, n) * own
     width += np.bincount(g.owner, across, n) / (2 * dim)
     check.note(
-        "volumes", np.maximum(gap - width, 0),
+        "volumes",
+        np.maximum(gap - width, 0),
         lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, the measures of its faces give {volumes[i]:.17g}",
-    )  # fmt: skip
+    )

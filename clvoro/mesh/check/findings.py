@@ -97,8 +97,12 @@ class Report(Verdict):
         head = f"{self.cells} cells, {self.faces} faces, {self.precision}"
         if self.ok:
             return f"{head}: {len(self.checked)} properties hold"
-        return "\n".join([f"{head}: {len(self.findings)} of {len(self.checked)} properties do not hold",
-                          *(f"  {finding}" for finding in self.findings)])  # fmt: skip
+        return "\n".join(
+            [
+                f"{head}: {len(self.findings)} of {len(self.checked)} properties do not hold",
+                *(f"  {finding}" for finding in self.findings),
+            ]
+        )
 
 
 class CheckError(ClvoroError):
@@ -117,9 +121,7 @@ class Check:
         self.findings: list[Finding] = []
         self.checked: list[str] = []
 
-    def note(
-        self, name: str, wrong: ArrayLike, say: Callable[[int], str], stop: bool = False
-    ) -> None:
+    def note(self, name: str, wrong: ArrayLike, say: Callable[[int], str], stop: bool = False) -> None:
         """Record whether the property `name` holds: `wrong` (k,) is true, or a positive deviation, where it does not.
 
         `say` returns the message for a place. With `stop` a property that does not hold ends the check.
@@ -137,9 +139,11 @@ class Check:
         """Record whether an array has the expected shape and finite numbers."""
         fits = array.shape == shape and array.dtype.kind in kinds
         self.note(
-            "shapes", np.array([not fits]),
-            lambda _: f"{name} is {array.dtype} {array.shape}, expected {shape}", stop=True,
-        )  # fmt: skip
+            "shapes",
+            np.array([not fits]),
+            lambda _: f"{name} is {array.dtype} {array.shape}, expected {shape}",
+            stop=True,
+        )
         if array.dtype.kind == "f":
             bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
             self.note("finite", bad, lambda i: f"{name}[{i}] is {array[i]}", stop=True)

@@ -23,49 +23,53 @@ def check_history(check: Check, result: Result, rounding: float) -> None:
         values = rows[name]
         least = int(name == "cells")  # all others are at least 0
         check.note(
-            "history", ~(np.isfinite(values) & (values >= least)),
+            "history",
+            ~(np.isfinite(values) & (values >= least)),
             lambda r, name=name, values=values: f"{name} in row {r} of the history is {values[r]}",
-        )  # fmt: skip
+        )
     # A second row may follow the last step.
     steps = rows["step"].astype(np.int64)
     rises = np.diff(steps)
     wrong = rises != 1
     wrong[-1:] &= rises[-1:] != 0
-    check.note(
-        "history", wrong,
-        lambda r: f"row {r + 1} of the history is step {steps[r + 1]}, after {steps[r]}",
-    )  # fmt: skip
+    check.note("history", wrong, lambda r: f"row {r + 1} of the history is step {steps[r + 1]}, after {steps[r]}")
     for name, sign in (("level", -1), ("progress", 1), ("seconds", 1)):
         values = rows[name].astype(float)
         check.note(
-            "history", np.diff(values) * sign < 0,
-            lambda r, name=name, values=values: f"{name} in row {r + 1} of the history is {values[r + 1]}, "
-            f"after {values[r]}",
-        )  # fmt: skip
-    cells, inserted, deleted = (
-        rows[name].astype(np.int64) for name in ("cells", "inserted", "deleted")
+            "history",
+            np.diff(values) * sign < 0,
+            lambda r, name=name, values=values: (
+                f"{name} in row {r + 1} of the history is {values[r + 1]}, after {values[r]}"
+            ),
+        )
+    cells, inserted, deleted = (rows[name].astype(np.int64) for name in ("cells", "inserted", "deleted"))
+    check.note(
+        "history",
+        np.diff(cells) != (inserted - deleted)[1:],
+        lambda r: (
+            f"row {r + 1} of the history has {cells[r + 1]} cells, after {cells[r]}, of {inserted[r + 1]} "
+            f"inserted and {deleted[r + 1]} deleted"
+        ),
     )
     check.note(
-        "history", np.diff(cells) != (inserted - deleted)[1:],
-        lambda r: f"row {r + 1} of the history has {cells[r + 1]} cells, after {cells[r]}, of {inserted[r + 1]} "
-        f"inserted and {deleted[r + 1]} deleted",
-    )  # fmt: skip
-    check.note(
-        "history", [rows["cells"][-1] != len(result.points)],
+        "history",
+        [rows["cells"][-1] != len(result.points)],
         lambda _: f"the history ends with {rows['cells'][-1]} cells, the mesh has {len(result.points)}",
-    )  # fmt: skip
+    )
     check.note(
-        "history", [rows["level"][-1] != 0],
-        lambda _: f"the history ends on level {rows['level'][-1]}, expected 0",
-    )  # fmt: skip
+        "history", [rows["level"][-1] != 0], lambda _: f"the history ends on level {rows['level'][-1]}, expected 0"
+    )
     error = np.abs(result.size_error)
     expected = {
-        "mean_error": error.mean(), "max_error": error.max(),
-        "mean_quality": result.quality.mean(), "min_quality": result.quality.min(),
-    }  # fmt: skip
+        "mean_error": error.mean(),
+        "max_error": error.max(),
+        "mean_quality": result.quality.mean(),
+        "min_quality": result.quality.min(),
+    }
     for name, value in expected.items():
         last = rows[name][-1]
         check.note(
-            "history", [not abs(last - value) <= LOOSE * abs(value) + rounding],
+            "history",
+            [not abs(last - value) <= LOOSE * abs(value) + rounding],
             lambda _, name=name, last=last, value=value: f"{name} ends with {last:.6g}, the mesh has {value:.6g}",
-        )  # fmt: skip
+        )

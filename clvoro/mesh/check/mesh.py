@@ -37,14 +37,10 @@ def check_diagram(diagram: Diagram) -> Report:
 def check_result(result: Result) -> Report:
     """Check a result: its diagram, sizes, error (the paper's 3.1), quality (4.1) and history; see `Result.check`."""
     check = Check(result.diagram)
-    return _finish(
-        check, result.settings.get("dtype"), lambda geometry: check_values(check, result, geometry)
-    )
+    return _finish(check, result.settings.get("dtype"), lambda geometry: check_values(check, result, geometry))
 
 
-def _finish(
-    check: Check, dtype: object = None, more: Callable[[Rebuilt], None] | None = None
-) -> Report:
+def _finish(check: Check, dtype: object = None, more: Callable[[Rebuilt], None] | None = None) -> Report:
     diagram, geometry = check.diagram, None
     try:
         # Wrong numbers may cause divisions by 0; they become findings.
@@ -86,30 +82,39 @@ def _check_structure(check: Check) -> None:
             check.shape("face_vertex_starts", d.face_vertex_starts, (m + 1,), "iu")
             check.shape("face_vertices", d.face_vertices, (2 * m,), "iu")
             check.note(
-                "shapes", d.face_vertex_starts != 2 * np.arange(m + 1),
-                lambda k: f"face_vertex_starts[{k}] is {d.face_vertex_starts[k]}, expected {2 * k}", stop=True,
-            )  # fmt: skip
+                "shapes",
+                d.face_vertex_starts != 2 * np.arange(m + 1),
+                lambda k: f"face_vertex_starts[{k}] is {d.face_vertex_starts[k]}, expected {2 * k}",
+                stop=True,
+            )
             corners = np.concatenate([corners, d.face_vertices])
         else:
             check.note(
-                "shapes", d.cell_vertex_starts != d.neighbor_starts,
-                lambda i: f"cell_vertex_starts[{i}] is {d.cell_vertex_starts[i]}, expected as many corners "
-                f"as faces, {d.neighbor_starts[i]}", stop=True,
-            )  # fmt: skip
+                "shapes",
+                d.cell_vertex_starts != d.neighbor_starts,
+                lambda i: (
+                    f"cell_vertex_starts[{i}] is {d.cell_vertex_starts[i]}, expected as many corners "
+                    f"as faces, {d.neighbor_starts[i]}"
+                ),
+                stop=True,
+            )
     else:
         check.shape("face_vertex_starts", d.face_vertex_starts, (m + 1,), "iu")
         _check_starts(check, "face_vertex_starts", d.face_vertex_starts, len(d.face_vertices))
         corners = d.face_vertices
     check.note(
-        "corners exist", (corners < 0) | (corners >= len(d.vertices)),
-        lambda k: f"corner {k} is vertex {corners[k]} of {len(d.vertices)}", stop=True,
-    )  # fmt: skip
+        "corners exist",
+        (corners < 0) | (corners >= len(d.vertices)),
+        lambda k: f"corner {k} is vertex {corners[k]} of {len(d.vertices)}",
+        stop=True,
+    )
     j, walls = d.neighbors, len(d.domain.boundary_index)
     check.note(
-        "neighbors exist", (j >= n) | (j < -walls),
+        "neighbors exist",
+        (j >= n) | (j < -walls),
         lambda f: f"face {f} leads to {j[f]}, expected a cell below {n} or a wall from {-walls} to -1",
         stop=True,
-    )  # fmt: skip
+    )
     used = np.bincount(corners, minlength=len(d.vertices))
     check.note("vertices used", used == 0, lambda v: f"vertex {v} is no cell's corner")
     _check_shifts(check)
@@ -124,10 +129,7 @@ def _check_graph(check: Check) -> None:
     d = check.diagram
     n, j = len(d), d.neighbors
     i = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
-    check.note(
-        "neighbors", (i == j) & ~d.shifts.any(axis=1),
-        lambda f: f"cell {j[f]} is its own neighbor",
-    )  # fmt: skip
+    check.note("neighbors", (i == j) & ~d.shifts.any(axis=1), lambda f: f"cell {j[f]} is its own neighbor")
     inner = np.flatnonzero(j >= 0)
     there, back = face_keys(d, inner)
     order = np.argsort(there)
@@ -140,14 +142,17 @@ def _check_graph(check: Check) -> None:
 
     twice = np.flatnonzero(sorted_[1:] == sorted_[:-1])
     check.note(
-        "neighbors", np.isin(np.arange(len(there)), twice),
+        "neighbors",
+        np.isin(np.arange(len(there)), twice),
         lambda k: "cell {} lists cell {} twice".format(*pair(sorted_[k])),
-    )  # fmt: skip
+    )
     lone = np.setdiff1d(there, back)
     check.note(
-        "graph symmetric", np.ones(len(lone)),
-        lambda k: "cell {} lists cell {}, which does not list it".format(*pair(lone[k])), stop=True,
-    )  # fmt: skip
+        "graph symmetric",
+        np.ones(len(lone)),
+        lambda k: "cell {} lists cell {}, which does not list it".format(*pair(lone[k])),
+        stop=True,
+    )
 
 
 def _check_shifts(check: Check) -> None:
@@ -157,17 +162,19 @@ def _check_shifts(check: Check) -> None:
     shifts, j = d.shifts, d.neighbors
     allowed = np.where(periodic & (j >= 0)[:, None], 1, 0)
     check.note(
-        "shifts", (np.abs(shifts) > allowed).any(axis=1),
+        "shifts",
+        (np.abs(shifts) > allowed).any(axis=1),
         lambda f: f"shifts[{f}] of the face to {j[f]} is {shifts[f]}, expected -1 to 1 along periodic axes, else 0",
         stop=True,
-    )  # fmt: skip
+    )
     if periodic.any():
         walls = np.flatnonzero(j < 0)
         check.note(
-            "walls", periodic[(-1 - j[walls]) // 2],
+            "walls",
+            periodic[(-1 - j[walls]) // 2],
             lambda k: f"face {walls[k]} leads to wall {-1 - j[walls[k]]}, across a periodic axis",
             stop=True,
-        )  # fmt: skip
+        )
 
 
 def _check_starts(check: Check, name: str, starts: np.ndarray, total: int) -> None:
@@ -175,9 +182,11 @@ def _check_starts(check: Check, name: str, starts: np.ndarray, total: int) -> No
     good = len(starts) > 0 and starts[0] == 0 and starts[-1] == total
     rises = np.diff(starts.astype(np.int64)) if len(starts) else np.zeros(0)
     check.note(
-        "shapes", np.array([not good or bool((rises < 0).any())]),
-        lambda _: f"{name} does not cut {total} entries into rows", stop=True,
-    )  # fmt: skip
+        "shapes",
+        np.array([not good or bool((rises < 0).any())]),
+        lambda _: f"{name} does not cut {total} entries into rows",
+        stop=True,
+    )
 
 
 def _check_geometry(check: Check, g: Rebuilt) -> None:
@@ -194,25 +203,29 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
     # Cells of a power diagram may be empty.
     filled = np.diff(d.neighbor_starts) > 0 if d.is_power else np.ones(n, bool)
     check.note(
-        "volumes", ~(d.volumes > 0) & (filled | (d.volumes != 0)),
+        "volumes",
+        ~(d.volumes > 0) & (filled | (d.volumes != 0)),
         lambda i: f"volumes[{i}] is {d.volumes[i]}, expected > 0",
-    )  # fmt: skip
+    )
     check.note(
-        "orientation", ~(g.volumes >= -slack * (g.perimeters + slack)),
+        "orientation",
+        ~(g.volumes >= -slack * (g.perimeters + slack)),
         lambda i: f"the corners of cell {i} go around clockwise (volume {g.volumes[i]:.4g})",
-    )  # fmt: skip
+    )
     excess = np.abs(d.volumes - g.volumes) - doubts.volumes - slack**domain.cell_dim
     check.note(
-        "volumes", np.maximum(excess, 0),
+        "volumes",
+        np.maximum(excess, 0),
         lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, its corners give {g.volumes[i]:.17g}",
-    )  # fmt: skip
+    )
     total = float(d.volumes.sum())
     border = 0.0 if spherical else boundary_measure(domain)
     allowed = slack * (g.perimeters.sum() / np.sqrt(n) + border)
     check.note(
-        "volumes sum", np.array([abs(total - domain.measure) > allowed]),
+        "volumes sum",
+        np.array([abs(total - domain.measure) > allowed]),
         lambda _: f"the volumes' sum is {total:.17g}, expected the domain's {domain.measure:.17g}",
-    )  # fmt: skip
+    )
     _check_faces(check, g, slack, doubts)
     if spherical:
         check_generators(check, g)
@@ -222,10 +235,10 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
     # The error of a centroid is relative to the volume.
     doubt = slack + doubts.volumes * g.reach / np.maximum(g.volumes, 1e-300)
     check.note(
-        "centroids", np.maximum(off - doubt, 0),
-        lambda i: f"centroids[{i}] is {d.centroids[i]}, its corners give "
-        f"{d.points[i] + g.centroids[i]}",
-    )  # fmt: skip
+        "centroids",
+        np.maximum(off - doubt, 0),
+        lambda i: f"centroids[{i}] is {d.centroids[i]}, its corners give {d.points[i] + g.centroids[i]}",
+    )
     if isinstance(domain, Polygon):
         check_edges(check, domain, g, slack)
         check_cells(check, domain, g, slack)
@@ -236,16 +249,18 @@ def _check_inside(check: Check, slack: float) -> None:
     """Check that generators and vertices lie in the domain."""
     d, domain = check.diagram, check.diagram.domain
     check.note(
-        "generators inside", ~domain.contains(d.points) | (domain.wrap(d.points) != d.points).any(axis=1),
+        "generators inside",
+        ~domain.contains(d.points) | (domain.wrap(d.points) != d.points).any(axis=1),
         lambda i: f"generator {i} at {d.points[i]} lies outside {domain}",
-    )  # fmt: skip
+    )
     outside = np.flatnonzero(~domain.contains(d.vertices))
     if isinstance(domain, Polygon):  # vertices on oblique edges have round-off
         outside = outside[domain.boundary_distance(d.vertices[outside]) > slack]
     check.note(
-        "vertices inside", np.ones(len(outside)),
+        "vertices inside",
+        np.ones(len(outside)),
         lambda k: f"vertex {outside[k]} at {d.vertices[outside[k]]} lies outside {domain}",
-    )  # fmt: skip
+    )
 
 
 def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None:
@@ -255,20 +270,26 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
         _check_closed(check, g, slack)
     wrong = np.abs(d.face_measures - g.measures) - width
     check.note(
-        "face measures", np.maximum(wrong, 0),
-        lambda f: f"face_measures[{f}] of cell {g.owner[f]} is {d.face_measures[f]:.17g}, its corners give "
-        f"{g.measures[f]:.17g}",
-    )  # fmt: skip
+        "face measures",
+        np.maximum(wrong, 0),
+        lambda f: (
+            f"face_measures[{f}] of cell {g.owner[f]} is {d.face_measures[f]:.17g}, its corners give "
+            f"{g.measures[f]:.17g}"
+        ),
+    )
     middle = d.face_centroids - d.points[g.owner]
     off = np.linalg.norm(middle - g.middles, axis=1)
     if d.domain.cell_dim == 3:
         # The centroid of a needle is uncertain along it: compare first moments.
         off = np.minimum(off, off * g.measures / np.maximum(g.reach[g.owner], 1e-150) ** 2)
     check.note(
-        "face centroids", np.maximum(off - 4 * doubts.middles, 0),
-        lambda f: f"face_centroids[{f}] of cell {g.owner[f]} is {d.face_centroids[f]}, its corners give "
-        f"{d.points[g.owner[f]] + g.middles[f]}",
-    )  # fmt: skip
+        "face centroids",
+        np.maximum(off - 4 * doubts.middles, 0),
+        lambda f: (
+            f"face_centroids[{f}] of cell {g.owner[f]} is {d.face_centroids[f]}, its corners give "
+            f"{d.points[g.owner[f]] + g.middles[f]}"
+        ),
+    )
     _check_sides(check, g, slack, width)
 
 
@@ -287,10 +308,13 @@ def _check_closed(check: Check, g: Rebuilt, slack: float) -> None:
         odd = np.flatnonzero(turns)
         turns[odd[g.are_slits(where[odd], slack)]] = 0
         check.note(
-            "faces closed", turns != 0,
-            lambda k: f"cell {g.owner[face[where[k]]]} is open, or its faces turn different ways, at the edge "
-            f"from vertex {a[where[k]]} to {b[where[k]]}",
-        )  # fmt: skip
+            "faces closed",
+            turns != 0,
+            lambda k: (
+                f"cell {g.owner[face[where[k]]]} is open, or its faces turn different ways, at the edge "
+                f"from vertex {a[where[k]]} to {b[where[k]]}"
+            ),
+        )
     gap = np.stack([np.bincount(g.owner, g.areas[:, k], minlength=n) for k in range(dim)], axis=1)
     gap = np.linalg.norm(gap, axis=1)
     bound = np.full(n, slack)
@@ -299,9 +323,7 @@ def _check_closed(check: Check, g: Rebuilt, slack: float) -> None:
         near = np.full(n, np.inf)
         np.minimum.at(near, g.owner, g.spacings)
         bound *= 2 * g.reach * (1 + g.reach / near)
-    check.note(
-        "faces closed", np.maximum(gap - bound, 0), lambda i: f"the faces of cell {i} do not close"
-    )
+    check.note("faces closed", np.maximum(gap - bound, 0), lambda i: f"the faces of cell {i} do not close")
 
 
 def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> None:
@@ -312,32 +334,35 @@ def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> N
     if isinstance(d.domain, Polygon):
         # A part that the boundary cuts off from its generator belongs to an adjacent cell. Its faces are not on the
         # bisector, and single ones between the same two cells may point inward.
-        pair = np.unique(
-            g.owner * (len(d) + 1) + np.maximum(d.neighbors, -1) + 1, return_inverse=True
-        )[1]
+        pair = np.unique(g.owner * (len(d) + 1) + np.maximum(d.neighbors, -1) + 1, return_inverse=True)[1]
         together = np.bincount(pair, inward)[pair]
         inward = np.where(d.neighbors >= 0, np.minimum(inward, together), inward)
     check.note(
-        "faces outward", np.maximum(inward - width, 0),
+        "faces outward",
+        np.maximum(inward - width, 0),
         lambda f: f"face {f} of cell {g.owner[f]} does not look towards {d.neighbors[f]}",
-    )  # fmt: skip
+    )
     if len(walls) and not isinstance(d.domain, Sphere):
         # Faces towards removed cells are on bisectors; see `check_generators`.
         middles = g.middles[walls] + d.points[g.owner[walls]]
         height = wall_distance(d.domain, -1 - d.neighbors[walls], middles)
         height[g.measures[walls] == 0] = 0  # a face without measure has no place
         check.note(
-            "walls", np.maximum(height - slack, 0),
+            "walls",
+            np.maximum(height - slack, 0),
             lambda k: f"face {walls[k]} of cell {g.owner[walls[k]]} is off its wall by {height[k]:.3g}",
-        )  # fmt: skip
+        )
     here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
     off = np.abs(d.face_measures[here] - d.face_measures[there])
     wide = np.maximum(width[here], width[there])
     check.note(
-        "faces the same from both sides", np.maximum(off - 2 * wide, 0),
-        lambda k: f"the face of cells {g.owner[here[k]]} and {d.neighbors[here[k]]} measures "
-        f"{d.face_measures[here[k]]:.17g} and {d.face_measures[there[k]]:.17g}",
-    )  # fmt: skip
+        "faces the same from both sides",
+        np.maximum(off - 2 * wide, 0),
+        lambda k: (
+            f"the face of cells {g.owner[here[k]]} and {d.neighbors[here[k]]} measures "
+            f"{d.face_measures[here[k]]:.17g} and {d.face_measures[there[k]]:.17g}"
+        ),
+    )
 
 
 def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
@@ -361,7 +386,9 @@ def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
     if isinstance(d.domain, Polygon) and not d.is_power:
         excess[hidden(d, d.domain, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0
     check.note(
-        "nearest generators", excess,
-        lambda k: f"vertex {g.corners[k]} of cell {g.cells[k]} is nearer to another generator, by "
-        f"{own[k] - nearest[k]:.3g}",
-    )  # fmt: skip
+        "nearest generators",
+        excess,
+        lambda k: (
+            f"vertex {g.corners[k]} of cell {g.cells[k]} is nearer to another generator, by {own[k] - nearest[k]:.3g}"
+        ),
+    )

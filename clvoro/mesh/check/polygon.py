@@ -28,9 +28,10 @@ def check_outlines(check: Check) -> None:
     n, ends, following = len(d), face_ends(d), next_faces(d)
     owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
     check.note(
-        "faces closed", ends[:, 1] != ends[following, 0],
+        "faces closed",
+        ends[:, 1] != ends[following, 0],
         lambda f: f"face {f} of cell {owner[f]} ends in vertex {ends[f, 1]}, where no face of it begins",
-    )  # fmt: skip
+    )
     corners, starts = d.cell_vertices, d.cell_vertex_starts
     places = np.arange(1, len(corners) + 1)
     filled = starts[1:] > starts[:-1]
@@ -48,10 +49,13 @@ def check_outlines(check: Check) -> None:
     left = np.bincount(np.cumsum(new) - 1, times[order])
     where = order[new]
     check.note(
-        "outlines", left != 0,
-        lambda k: f"the corners of cell {of[where[k]]} do not go along its faces between vertices "
-        f"{a[where[k]]} and {b[where[k]]}",
-    )  # fmt: skip
+        "outlines",
+        left != 0,
+        lambda k: (
+            f"the corners of cell {of[where[k]]} do not go along its faces between vertices "
+            f"{a[where[k]]} and {b[where[k]]}"
+        ),
+    )
 
 
 def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None:
@@ -63,27 +67,30 @@ def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     begin, end = oriented.vertices, oriented.vertices[oriented.next_vertex]
     length = np.hypot(*(end - begin).T)
     along = (end - begin) / length[:, None]
-    first, last = (
-        ((d.vertices[v] - begin[edge]) * along[edge]).sum(axis=1) for v in face_ends(d)[rows].T
-    )
+    first, last = (((d.vertices[v] - begin[edge]) * along[edge]).sum(axis=1) for v in face_ends(d)[rows].T)
     order = np.lexsort((first + last, edge))
     edge, first, last = edge[order], first[order], last[order]
     # Each face begins where the previous one ends, the first at 0; the last one ends with the edge.
     new = np.diff(edge, prepend=-1) != 0
     gap = np.abs(first - np.where(new, 0.0, np.roll(last, 1)))
     check.note(
-        "edges covered", np.maximum(gap - 2 * slack, 0),
-        lambda k: f"on edge {oriented.edge_numbers[edge[k]]} there is a gap or an overlap of {gap[k]:.3g} before the "
-        f"face of cell {g.owner[rows[order[k]]]}",
-    )  # fmt: skip
+        "edges covered",
+        np.maximum(gap - 2 * slack, 0),
+        lambda k: (
+            f"on edge {oriented.edge_numbers[edge[k]]} there is a gap or an overlap of {gap[k]:.3g} before the "
+            f"face of cell {g.owner[rows[order[k]]]}"
+        ),
+    )
     reached = np.zeros(len(length))
     reached[edge] = last  # the last one written is the last on the edge
     rest = np.abs(length - reached)
     check.note(
-        "edges covered", np.maximum(rest - 2 * slack, 0),
-        lambda e: f"the faces on edge {oriented.edge_numbers[e]} of length {length[e]:.6g} end {rest[e]:.3g} from its "
-        "end",
-    )  # fmt: skip
+        "edges covered",
+        np.maximum(rest - 2 * slack, 0),
+        lambda e: (
+            f"the faces on edge {oriented.edge_numbers[e]} of length {length[e]:.6g} end {rest[e]:.3g} from its end"
+        ),
+    )
 
 
 def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None:
@@ -106,19 +113,14 @@ def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
         beside = KDTree(d.points).query(d.points[wrong], k=2)[0][:, 1]
         wrong = wrong[(beside > slack) | (domain.boundary_distance(d.points[wrong]) > slack)]
     check.note(
-        "generators in their cells", np.isin(np.arange(len(d)), wrong),
+        "generators in their cells",
+        np.isin(np.arange(len(d)), wrong),
         lambda i: f"the faces of cell {i} go {turns[i]:.3g} times around its generator, expected once",
-    )  # fmt: skip
+    )
 
 
 def hidden(
-    d: Diagram,
-    domain: Polygon,
-    tree: KDTree,
-    places: np.ndarray,
-    corners: np.ndarray,
-    slack: float,
-    unit: float,
+    d: Diagram, domain: Polygon, tree: KDTree, places: np.ndarray, corners: np.ndarray, slack: float, unit: float
 ) -> np.ndarray:
     """Return those of `places` in the cells' `corners` from which one of the nearest generators is not visible.
 

@@ -85,9 +85,7 @@ class Rebuilt:
         cones = np.einsum("ij,ij->i", self.areas, self.middles) / dim
         self.volumes = np.bincount(self.owner, cones, minlength=n)
         share = dim / (dim + 1)
-        moments = [
-            np.bincount(self.owner, cones * share * self.middles[:, k], n) for k in range(dim)
-        ]
+        moments = [np.bincount(self.owner, cones * share * self.middles[:, k], n) for k in range(dim)]
         safe = np.where(self.volumes > 0, self.volumes, 1)
         self.centroids = np.stack(moments, axis=1) / safe[:, None]
         self.perimeters = np.bincount(self.owner, self.measures, minlength=n)
@@ -102,9 +100,7 @@ class Rebuilt:
 
     def _set_polygons(self, d: Diagram) -> None:
         """Set areas and middles of faces, and the corners of cells, in 2D."""
-        at = d.points[
-            self.owner
-        ]  # relative to it, small cells far from the origin keep their digits
+        at = d.points[self.owner]  # relative to it, small cells far from the origin keep their digits
         first, last = face_ends(d).T
         a, b = d.vertices[first] - at, d.vertices[last] - at
         edge = b - a
@@ -133,9 +129,7 @@ class Rebuilt:
         weight = np.einsum("ij,ij->i", triangle, normal[face])
         moment = weight[:, None] * (a + b + o) / 3
         sums = np.stack([np.bincount(face, moment[:, k], m) for k in range(3)], axis=1)
-        self.middles = np.where(
-            (total > 0)[:, None], sums / np.where(total > 0, total, 1)[:, None], 0.0
-        )
+        self.middles = np.where((total > 0)[:, None], sums / np.where(total > 0, total, 1)[:, None], 0.0)
         self.cells, self.corners = self.owner[face], d.face_vertices
         self.edges = (face, d.face_vertices, d.face_vertices[following])
         self._tails, self._edge, self._before = a, b - a, np.argsort(following)
@@ -150,9 +144,7 @@ class Rebuilt:
         # Both ends decide: the middle of an adopted face may lie on the bisector by chance.
         half = np.stack([-self.areas[:, 1], self.areas[:, 0]], axis=1) / 2
         ends = [self.middles - half, self.middles + half]
-        off = np.max(
-            [np.abs((end * self.directions).sum(axis=1) - across / 2) for end in ends], axis=0
-        )
+        off = np.max([np.abs((end * self.directions).sum(axis=1) - across / 2) for end in ends], axis=0)
         far = np.max([np.linalg.norm(end, axis=1) for end in ends], axis=0)
         # At smaller distances the quotient would overflow.
         least = np.maximum(1e-200 * far, np.finfo(float).tiny)
@@ -160,9 +152,7 @@ class Rebuilt:
         self.adopted = inner & (off > noise) & (self.measures > 0)
         # An adopted face can lie on the bisector, too, if each cell has adopted a part of the other's region. Then
         # another generator is nearer there, or neither of the two sees the face.
-        inward = np.flatnonzero(
-            inner & ~self.adopted & ((self.areas * self.directions).sum(axis=1) < 0)
-        )
+        inward = np.flatnonzero(inner & ~self.adopted & ((self.areas * self.directions).sum(axis=1) < 0))
         if inward.size:
             own = d.points[self.owner[inward]]
             places = own + self.middles[inward]
@@ -297,8 +287,7 @@ def find_precision(d: Diagram, dtype: object = None) -> np.dtype:
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(points - points.astype(np.float32))
         single, short = (
-            bool((np.abs(x - x.astype(np.float32)) <= rounded * np.abs(x)).all())
-            for x in (volumes, lengths)
+            bool((np.abs(x - x.astype(np.float32)) <= rounded * np.abs(x)).all()) for x in (volumes, lengths)
         )
     single &= (short or bool((off <= noise).mean() >= 0.25)) and dtype != "float64"
     return np.dtype(np.float32 if single else np.float64)

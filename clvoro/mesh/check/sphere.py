@@ -75,9 +75,7 @@ class SphereCells(Rebuilt):
         # The bisectors of two neighbors are the lines n.p = |d|^2 / 2 in the tangent plane.
         corners, _ = bisector_corners(d.neighbor_starts, normal, level)
         with np.errstate(all="ignore"):
-            corner = unit[self.owner] + sum(
-                p[:, None] * t for p, t in zip(corners.T, self._tangents, strict=True)
-            )
+            corner = unit[self.owner] + sum(p[:, None] * t for p, t in zip(corners.T, self._tangents, strict=True))
             self.expected_corners = sphere.wrap(corner)
 
     def _along_tangents(self, vectors: np.ndarray) -> np.ndarray:
@@ -110,10 +108,12 @@ def check_places(check: Check, g: Rebuilt) -> None:
     for name in ("points", "vertices", "centroids", "face_centroids"):
         off = np.abs(np.linalg.norm(getattr(d, name), axis=1) / radius - 1)
         check.note(
-            "on the sphere", np.maximum(off - allowed, 0),
-            lambda k, name=name, off=off: f"{name}[{k}] is {getattr(d, name)[k]}, off the sphere of radius "
-            f"{radius:g} by {off[k]:.3g} of it",
-        )  # fmt: skip
+            "on the sphere",
+            np.maximum(off - allowed, 0),
+            lambda k, name=name, off=off: (
+                f"{name}[{k}] is {getattr(d, name)[k]}, off the sphere of radius {radius:g} by {off[k]:.3g} of it"
+            ),
+        )
 
 
 def check_generators(check: Check, g: Rebuilt) -> None:
@@ -133,7 +133,9 @@ def check_generators(check: Check, g: Rebuilt) -> None:
     )
     for name, given, found, width in pairs:
         check.note(
-            f"{name} of the generators", np.maximum(np.abs(given - found) - width, 0),
-            lambda k, name=name, given=given, found=found: f"{name.replace(' ', '_')}[{k}] is {given[k]:.17g}, "
-            f"generators and neighbors give {found[k]:.17g}",
-        )  # fmt: skip
+            f"{name} of the generators",
+            np.maximum(np.abs(given - found) - width, 0),
+            lambda k, name=name, given=given, found=found: (
+                f"{name.replace(' ', '_')}[{k}] is {given[k]:.17g}, generators and neighbors give {found[k]:.17g}"
+            ),
+        )

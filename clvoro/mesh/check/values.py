@@ -28,12 +28,11 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
     check.shape("points", result.points, (n, d.domain.dim))
     h, e, q = result.target_size, result.size_error, result.quality
     check.note(
-        "points", (result.points != d.points).any(axis=1),
+        "points",
+        (result.points != d.points).any(axis=1),
         lambda i: f"points[{i}] is {result.points[i]}, the diagram's {d.points[i]}",
-    )  # fmt: skip
-    check.note(
-        "target_size", ~(h > 0), lambda i: f"target_size[{i}] is {h[i]}, expected > 0", stop=True
     )
+    check.note("target_size", ~(h > 0), lambda i: f"target_size[{i}] is {h[i]}, expected > 0", stop=True)
     eps = float(np.finfo(g.real).eps)
     length = np.maximum(d.volumes, 0) ** (1 / dim)
     with np.errstate(all="ignore"):
@@ -47,9 +46,10 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         else:
             quality = 36 * np.pi * d.volumes**2 / perimeter**3
     check.note(
-        "size_error", np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
+        "size_error",
+        np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
         lambda i: f"size_error[{i}] is {e[i]:.10g}, volume and size give {error[i]:.10g} (the paper's 3.1)",
-    )  # fmt: skip
+    )
     # Measures from the corners in a file, and straightened boundaries, have the round-off of positions.
     rounding = ROUNDINGS * g.unit * counts * (1 if dim == 2 else g.reach) / perimeter
     off = np.abs(q - quality) - 64 * eps * (1 + quality)
@@ -65,9 +65,10 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
             loose[doubtful[borders_on_lost_faces(d, g, doubtful)]] = True
         rounding *= loose
     check.note(
-        "quality", np.maximum(off - 3 * rounding, 0),
+        "quality",
+        np.maximum(off - 3 * rounding, 0),
         lambda i: f"quality[{i}] is {q[i]:.10g}, the cell gives {quality[i]:.10g}",
-    )  # fmt: skip
+    )
     # A run computes its last errors before faces are measured in full precision, which moves corners by a few units.
     check_history(check, result, 64 * eps + 8 * g.unit / float(length.min(initial=np.inf)))
     _check_factor(check, result)
@@ -95,11 +96,7 @@ def borders_on_lost_faces(d: Diagram, g: Rebuilt, cells: np.ndarray) -> np.ndarr
     step = np.where((along >= 0)[:, None], shifts[pair[1]] - shifts[pair[0]], 0)
 
     def names(cell: np.ndarray, label: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        return (cell.astype(np.int64) * (n + walls) + label + walls) * 125 + (shift + 2) @ (
-            1,
-            5,
-            25,
-        )
+        return (cell.astype(np.int64) * (n + walls) + label + walls) * 125 + (shift + 2) @ (1, 5, 25)
 
     beside = np.flatnonzero(np.isin(g.owner, across))
     known = names(g.owner[beside], d.neighbors[beside], shifts[beside])
@@ -115,11 +112,13 @@ def _check_factor(check: Check, result: Result) -> None:
     known = "n_cells" in result.settings and not scaled
     number = isinstance(factor, int | float) and np.isfinite(factor) and factor > 0
     check.note(
-        "size factor", [not number or (known and factor != 1)],
+        "size factor",
+        [not number or (known and factor != 1)],
         lambda _: f"size_factor is {factor!r:.40}, expected " + ("1, as there is no n_cells" if known else "> 0"),
-    )  # fmt: skip
+    )
     recorded = result.settings.get("size_factor", factor)
     check.note(
-        "size factor", [recorded != factor],
+        "size factor",
+        [recorded != factor],
         lambda _: f"size_factor is {factor!r:.40}, {recorded!r:.40} in the settings",
-    )  # fmt: skip
+    )

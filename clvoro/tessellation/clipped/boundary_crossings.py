@@ -77,9 +77,7 @@ def inward_vectors(domain: Polygon, real: np.dtype) -> np.ndarray:
     turn = before[:, 0] * ahead[:, 1] - before[:, 1] * ahead[:, 0]
     sharp = np.hypot(*across.T) < np.hypot(*along.T)
     way = np.where(
-        sharp[:, None],
-        np.where(turn > 0, 1, -1)[:, None] * along,
-        np.column_stack([-across[:, 1], across[:, 0]]),
+        sharp[:, None], np.where(turn > 0, 1, -1)[:, None] * along, np.column_stack([-across[:, 1], across[:, 0]])
     )
     return _ROUNDINGS * float(np.finfo(real).eps) * way / np.hypot(*way.T)[:, None]
 
@@ -121,9 +119,7 @@ class Boundary:
         self._known = 0  # number of cells when `owners` was computed
         self._flags = engine.empty(1, np.int32)
 
-    def cut(
-        self, t: Tessellation, generators: int, shift: tuple[float, float] = (0, 0)
-    ) -> Chords | np.ndarray:
+    def cut(self, t: Tessellation, generators: int, shift: tuple[float, float] = (0, 0)) -> Chords | np.ndarray:
         """Trace all edges, shifted by `shift` (normalized coordinates), through the cells of `t`.
 
         The first `generators` generators of `t` lie in the domain, the others are ghost generators. If the boundary
@@ -159,26 +155,11 @@ class Boundary:
             raise BoundaryError
         cells, of_edges = (room(name, size=count, dtype=np.int32) for name in ("cells", "of_edges"))
         ends = room("ends", size=count)
-        engine.run_each(
-            k.walk_edges,
-            edges,
-            *walk,
-            np.int32(1),
-            firsts,
-            cells,
-            of_edges,
-            ends,
-            intruders,
-            self._flags,
-        )
-        arrays = (
-            vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends, self.shells, self.owner_sites,
-        )  # fmt: skip
+        engine.run_each(k.walk_edges, edges, *walk, np.int32(1), firsts, cells, of_edges, ends, intruders, self._flags)
+        arrays = (vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends, self.shells, self.owner_sites)
         return self._sort(count, arrays, cells, t.n, np.array(shift, float))
 
-    def _sort(
-        self, count: int, arrays: tuple[cla.Array, ...], cells: cla.Array, n: int, shift: np.ndarray
-    ) -> Chords:
+    def _sort(self, count: int, arrays: tuple[cla.Array, ...], cells: cla.Array, n: int, shift: np.ndarray) -> Chords:
         """List the crossed cells, and the chords of each."""
         engine, k, room = self.engine, self._kernels, self._room
         slots = room("slots", size=n, dtype=np.int32).fill(UNTOUCHED)
@@ -196,7 +177,4 @@ class Boundary:
         self._scan.exclusive(starts, starts, touched_count)
         engine.run_each(k.place_chords, count, cells, slots, ranks, starts, listed)
         engine.run_each(k.sort_chords, touched_count, starts, listed)
-        return Chords(
-            count, touched_count, arrays, slots, touched, starts, listed, self.tangents, self.turns,
-            shift,
-        )  # fmt: skip
+        return Chords(count, touched_count, arrays, slots, touched, starts, listed, self.tangents, self.turns, shift)

@@ -21,9 +21,7 @@ MOST_BOXES = 1 << 20
 _JITTER = 0.2  # of a spacing, so that no four lie on a circle
 
 
-def place_ghost_generators(
-    domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
+def place_ghost_generators(domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Return ghost generators (s, 2) outside `domain`, inside the box that clips its cells.
 
     Parameters
@@ -53,9 +51,7 @@ def place_ghost_generators(
         found.append(centers[taken] + shift)
         # Divide the others while a point at the least distance fits into them.
         reach = distance + edge * np.sqrt(0.5)
-        divided = (
-            ~good & ~(~outside & whole) & (np.where(outside, reach, reach - distance) > clearance)
-        )
+        divided = ~good & ~(~outside & whole) & (np.where(outside, reach, reach - distance) > clearance)
         edge /= 2
         centers = (centers[divided][:, None] + 2 * edge * children).reshape(-1, 2)
     points = np.concatenate(found)

@@ -32,10 +32,7 @@ class PolygonTessellator:
     """
 
     def __init__(
-        self,
-        stages: TessellationStages,
-        domain: Polygon,
-        spacing: Callable[[np.ndarray], np.ndarray] | None,
+        self, stages: TessellationStages, domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray] | None
     ) -> None:
         self.stages, self.domain = stages, domain
         self.engine = stages.engine
@@ -47,12 +44,7 @@ class PolygonTessellator:
         self._all: cla.Array | None = None
 
     def tessellate(
-        self,
-        points: cla.Array,
-        n: int,
-        previous: Tessellation | None,
-        exact: bool,
-        binned: BinnedPoints | None = None,
+        self, points: cla.Array, n: int, previous: Tessellation | None, exact: bool, binned: BinnedPoints | None = None
     ) -> Tessellation:
         """Tessellate; see `Tessellator.tessellate`."""
         stages, domain = self.stages, self.domain
@@ -65,10 +57,7 @@ class PolygonTessellator:
                     self._all[n:].set(self._ghosts)
                 convex = None
             cl.enqueue_copy(
-                self.engine.queue,
-                buffer_of(self._all),
-                buffer_of(points),
-                byte_count=2 * n * self.engine.real.itemsize,
+                self.engine.queue, buffer_of(self._all), buffer_of(points), byte_count=2 * n * self.engine.real.itemsize
             )
             if total > n:
                 binned = None  # without the ghost generators

@@ -74,9 +74,7 @@ class Trim:
         self._kernels = engine.kernels("tessellation/clipped/trim")
         self._flags = engine.empty(1, np.int32)
 
-    def trim(
-        self, domain: Polygon, points: cla.Array, convex: Tessellation, chords: Chords, n: int
-    ) -> Tessellation:
+    def trim(self, domain: Polygon, points: cla.Array, convex: Tessellation, chords: Chords, n: int) -> Tessellation:
         """Return the diagram of `domain` for `points` (n, 2), the first `n` generators of `convex`.
 
         A cell is the piece of its convex cell within the domain that contains the generator. Any other piece goes to
@@ -91,23 +89,44 @@ class Trim:
         engine, k, room = self.engine, self._kernels, self._room
         u, places = chords.touched_count, chords.count + chords.touched_count
         cells = (
-            convex.starts, convex.neighbors, convex.sites, *domain.device_corners(engine.real),
-            chords.touched, chords.list_starts, chords.listed, *chords.arrays,
-        )  # fmt: skip
+            convex.starts,
+            convex.neighbors,
+            convex.sites,
+            *domain.device_corners(engine.real),
+            chords.touched,
+            chords.list_starts,
+            chords.listed,
+            *chords.arrays,
+        )
         self._flags.fill(0)
         if convex.weighted is not None:
             engine.run_each(
-                k.find_outside, n, convex.starts, convex.neighbors, convex.sites, *chords.arrays[:2],
-                np.int32(len(chords.tangents)), chords.slots, convex.volumes, convex.offsets,
-            )  # fmt: skip
+                k.find_outside,
+                n,
+                convex.starts,
+                convex.neighbors,
+                convex.sites,
+                *chords.arrays[:2],
+                np.int32(len(chords.tangents)),
+                chords.slots,
+                convex.volumes,
+                convex.offsets,
+            )
         loops = room("loops", size=places, dtype=np.int32)
         pieces = room("pieces", size=places, dtype=np.int32)
         roots = room("roots", size=places, dtype=np.int32)
         starts = room("segment_starts", size=u + 1, dtype=np.int32)
         engine.run_each(
-            k.find_loops, u, *cells, room("chord_loops", size=chords.count, dtype=np.int32), loops,
-            pieces, roots, starts, self._flags,
-        )  # fmt: skip
+            k.find_loops,
+            u,
+            *cells,
+            room("chord_loops", size=chords.count, dtype=np.int32),
+            loops,
+            pieces,
+            roots,
+            starts,
+            self._flags,
+        )
         self._scan.exclusive(starts, starts, u)
         count = int(starts[u].get())
         flags = self._demand(int(self._flags.get()[0]))
@@ -117,15 +136,21 @@ class Trim:
         engine.run_each(k.write_segments, u, *cells, loops, pieces, starts, *parts)
         segments = (starts, *parts)
         engine.run_each(
-            k.check_segments, u, np.int32(n), *segments, chords.touched, chords.slots, roots,
-            convex.starts, convex.neighbors, self._flags,
-        )  # fmt: skip
+            k.check_segments,
+            u,
+            np.int32(n),
+            *segments,
+            chords.touched,
+            chords.slots,
+            roots,
+            convex.starts,
+            convex.neighbors,
+            self._flags,
+        )
         self._demand(int(self._flags.get()[0]))
         marks = room.zeros("marks", size=n, dtype=np.int32)
         found = _Pieces(segments, count, pieces, roots)
-        orphans, orphan_count = (
-            self._adopt(chords, found, marks) if flags & ORPHANS else (pieces, 0)
-        )
+        orphans, orphan_count = self._adopt(chords, found, marks) if flags & ORPHANS else (pieces, 0)
         return self._write(points, convex, chords, found, (orphans, orphan_count), marks)
 
     @staticmethod
@@ -176,22 +201,50 @@ class Trim:
         face_segments = room("face_segments", size=m, dtype=np.int32)
         outlines = room("outlines", size=2 * n)
         engine.run_each(
-            k.copy_whole, n, convex.starts, convex.neighbors, convex.face_measures,
-            convex.face_centroids, *segments, chords.slots, roots, marks, starts, neighbors, measures,
-            centroids, convex.volumes, outlines,
-        )  # fmt: skip
+            k.copy_whole,
+            n,
+            convex.starts,
+            convex.neighbors,
+            convex.face_measures,
+            convex.face_centroids,
+            *segments,
+            chords.slots,
+            roots,
+            marks,
+            starts,
+            neighbors,
+            measures,
+            centroids,
+            convex.volumes,
+            outlines,
+        )
         place_cells = room("place_cells", size=chords.count + u, dtype=np.int32)
         chord_owners = room("chord_owners", size=chords.count, dtype=np.int32)
         engine.run_each(
-            k.name_owners, u, *segments, chords.list_starts, chords.listed, roots, place_cells,
-            chord_owners,
-        )  # fmt: skip
+            k.name_owners, u, *segments, chords.list_starts, chords.listed, roots, place_cells, chord_owners
+        )
         engine.run_each(
-            k.write_trimmed, u, *segments, *chords.arrays, chord_owners, *chords.turns,
-            points, *owners, orphans[0], np.int32(orphans[1]), place_cells, starts, neighbors,
-            measures, centroids, face_segments, convex.volumes, convex.offsets, convex.covariances,
+            k.write_trimmed,
+            u,
+            *segments,
+            *chords.arrays,
+            chord_owners,
+            *chords.turns,
+            points,
+            *owners,
+            orphans[0],
+            np.int32(orphans[1]),
+            place_cells,
+            starts,
+            neighbors,
+            measures,
+            centroids,
+            face_segments,
+            convex.volumes,
+            convex.offsets,
+            convex.covariances,
             outlines,
-        )  # fmt: skip
+        )
         return Tessellation(
             n=n,
             points=points,

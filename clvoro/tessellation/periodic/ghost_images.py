@@ -112,9 +112,7 @@ class GhostImages:
         self._report = engine.empty(3, np.int32)
         self._turn = 0
 
-    def extend(
-        self, domain: Box, points: cla.Array, n: int, halo: Halo, factor: float, grow: bool
-    ) -> ExtendedPoints:
+    def extend(self, domain: Box, points: cla.Array, n: int, halo: Halo, factor: float, grow: bool) -> ExtendedPoints:
         """Return the first `n` of `points` (n, d) with their images in the halo.
 
         In a power diagram rows of `points` end with weights.
@@ -137,16 +135,22 @@ class GhostImages:
         kept = np.float32((KEPT_ESTIMATE if others or halo.estimated else KEPT)[d])
         halo.extremes.fill(0)
         engine.run_each(
-            k.predict_halo_depths, block_count(d), halo.required, was, np.float32(factor),
-            np.int32(others), np.int32(grow), *blocks, halo.depths, halo.extremes, halo.requests,
+            k.predict_halo_depths,
+            block_count(d),
+            halo.required,
+            was,
+            np.float32(factor),
+            np.int32(others),
+            np.int32(grow),
+            *blocks,
+            halo.depths,
+            halo.extremes,
+            halo.requests,
             *engine.period_args,
-        )  # fmt: skip
+        )
         self._report.set(np.array([0, 0, 2**31 - 1], np.int32))
         firsts = self._room("firsts", size=n + 1, dtype=np.int32)
-        engine.run_each(
-            k.count_images, n, points, halo.depths, halo.extremes, *blocks, firsts,
-            *engine.period_args,
-        )  # fmt: skip
+        engine.run_each(k.count_images, n, points, halo.depths, halo.extremes, *blocks, firsts, *engine.period_args)
         self._scan.exclusive(firsts, firsts, n)
         ghosts = int(firsts[n].get())
         count = n + ghosts
@@ -154,19 +158,36 @@ class GhostImages:
         owners = self._room("owners", size=ghosts, dtype=np.int32)
         codes = self._room("image codes", size=ghosts, dtype=np.int32)
         engine.run_each(
-            k.place_images, n, points, halo.depths, halo.extremes, *blocks, firsts, extended,
-            owners, codes, *engine.period_args,
-        )  # fmt: skip
+            k.place_images,
+            n,
+            points,
+            halo.depths,
+            halo.extremes,
+            *blocks,
+            firsts,
+            extended,
+            owners,
+            codes,
+            *engine.period_args,
+        )
         lower, upper = (corner[:d].astype(np.float64) for corner in corners)
         # Round up to a coarse grid, so that the corners of the extended box are exact.
         widest = np.ceil(halo.extremes.get().view(np.float32)[:d] * 2.0**20) / 2.0**20
         wide = np.minimum(periods, widest).astype(engine.real)
         box = ExtendedBox(lower - wide, upper + wide)
         halo_args = (
-            np.int32(n), np.append(periods, np.zeros(4 - d)).astype(engine.real), *blocks,
-            engine.real.type(SIDEWAYS), engine.real.type(OUTWARDS), kept,
-            halo.depths, halo.extremes, halo.requests, self._report, halo.most,
-        )  # fmt: skip
+            np.int32(n),
+            np.append(periods, np.zeros(4 - d)).astype(engine.real),
+            *blocks,
+            engine.real.type(SIDEWAYS),
+            engine.real.type(OUTWARDS),
+            kept,
+            halo.depths,
+            halo.extremes,
+            halo.requests,
+            self._report,
+            halo.most,
+        )
         return ExtendedPoints(n, count, box, halo, kept, halo_args, extended, firsts, owners, codes)
 
     def scale_far_measures(self, t: Tessellation, codes: cla.Array) -> cla.Array:
@@ -177,9 +198,16 @@ class GhostImages:
         """
         engine, scaled = self.engine, self.engine.scratch(len(t.neighbors), self.engine.face)
         engine.run_each(
-            self._kernels.scale_far_measures, t.n, t.starts, t.neighbors, codes, t.face_measures, t.sites, scaled,
+            self._kernels.scale_far_measures,
+            t.n,
+            t.starts,
+            t.neighbors,
+            codes,
+            t.face_measures,
+            t.sites,
+            scaled,
             *engine.period_args,
-        )  # fmt: skip
+        )
         return scaled
 
     def unfold(self, images: ExtendedPoints, previous: Tessellation | NeighborRows) -> NeighborRows:
@@ -187,19 +215,34 @@ class GhostImages:
         m = int(previous.starts[images.n].get())
         neighbors = self._room("unfolded", size=m, dtype=np.int32)
         self.engine.run_each(
-            self._kernels.unfold_rows, images.n, previous.starts, previous.neighbors,
-            images.points, images.firsts, images.codes, neighbors, *self.engine.period_args,
-        )  # fmt: skip
+            self._kernels.unfold_rows,
+            images.n,
+            previous.starts,
+            previous.neighbors,
+            images.points,
+            images.firsts,
+            images.codes,
+            neighbors,
+            *self.engine.period_args,
+        )
         return NeighborRows(images.n, previous.starts, neighbors)
 
-    def fold_clipped(
-        self, images: ExtendedPoints, cut: CutCells, report: cla.Array, used: int
-    ) -> None:
+    def fold_clipped(self, images: ExtendedPoints, cut: CutCells, report: cla.Array, used: int) -> None:
         """Replace images by their owners in cells that were clipped in an update, in 3D: those behind `used` faces."""
         self.engine.run_each(
-            self._kernels.fold_clipped_cells, images.n, np.int32(used), np.int32(cut.m), cut.places, cut.counts,
-            images.points, images.owners, self._report, cut.labels, report, *self.engine.period_args,
-        )  # fmt: skip
+            self._kernels.fold_clipped_cells,
+            images.n,
+            np.int32(used),
+            np.int32(cut.m),
+            cut.places,
+            cut.counts,
+            images.points,
+            images.owners,
+            self._report,
+            cut.labels,
+            report,
+            *self.engine.period_args,
+        )
 
     def fold(
         self,
@@ -236,26 +279,50 @@ class GhostImages:
         halo = images.halo
         if engine.dim == 2:  # in 3D the kernels that clip cells do this
             engine.run_each(
-                k.measure_required_depths, images.count, binned.items, binned.reach, images.points, t.starts,
-                t.neighbors, *images.box.device_corners(engine.real), *images.halo_args,
-            )  # fmt: skip
+                k.measure_required_depths,
+                images.count,
+                binned.items,
+                binned.reach,
+                images.points,
+                t.starts,
+                t.neighbors,
+                *images.box.device_corners(engine.real),
+                *images.halo_args,
+            )
         engine.run_each(
-            k.store_required_depths, block_count(engine.dim), halo.depths, images.kept, halo.requests,
-            halo.required, *engine.period_args,
-        )  # fmt: skip
+            k.store_required_depths,
+            block_count(engine.dim),
+            halo.depths,
+            images.kept,
+            halo.requests,
+            halo.required,
+            *engine.period_args,
+        )
         halo.cells, halo.estimated = n, False
         m = int(t.starts[n].get())
         self._turn = 1 - self._turn
-        graph = [
-            self._room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbors", "codes")
-        ]
+        graph = [self._room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbors", "codes")]
         kept = self._room("kept", size=m, dtype=np.uint8)
         starts = self._room("starts", self._turn, size=n + 1, dtype=np.int32)
         engine.run_each(
-            k.fold_rows, n, t.starts, t.neighbors, t.face_measures, t.volumes, t.points,
-            images.firsts, images.owners, images.codes, engine.real.type(share), np.int32(nearest),
-            *graph, kept, starts, self._report, *engine.period_args,
-        )  # fmt: skip
+            k.fold_rows,
+            n,
+            t.starts,
+            t.neighbors,
+            t.face_measures,
+            t.volumes,
+            t.points,
+            images.firsts,
+            images.owners,
+            images.codes,
+            engine.real.type(share),
+            np.int32(nearest),
+            *graph,
+            kept,
+            starts,
+            self._report,
+            *engine.period_args,
+        )
         words = self._report.get()
         flags, places = int(words[1]), None
         measures = t.face_measures[:m], t.face_centroids[:m]
@@ -265,16 +332,16 @@ class GhostImages:
             left = int(starts[n].get())
             places = engine.empty(left, np.int32)
             closed = (
-                engine.empty(left, np.int32), engine.empty(left, np.int32),
-                engine.empty(left, engine.face), engine.empty((left, engine.dim), engine.face),
-            )  # fmt: skip
-            engine.run_each(
-                k.close_rows, n, t.starts, kept, starts, *graph, *measures, *closed, places
+                engine.empty(left, np.int32),
+                engine.empty(left, np.int32),
+                engine.empty(left, engine.face),
+                engine.empty((left, engine.dim), engine.face),
             )
+            engine.run_each(k.close_rows, n, t.starts, kept, starts, *graph, *measures, *closed, places)
             graph, measures, vertices = list(closed[:2]), closed[2:], ()
         folded = Tessellation(
             n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n], vertices=vertices
-        )  # fmt: skip
+        )
         enough = not words[0]
         if not enough:
             # The next attempt writes to the same buffers, since it starts from the previous graph as well.

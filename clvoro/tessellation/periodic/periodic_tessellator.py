@@ -15,14 +15,7 @@ from ...geometry.box import Box
 from ...opencl.primitives import Summaries
 from ..bins import BinnedPoints
 from ..cut_cells import CutCells
-from ..device_diagram import (
-    EXACT_SHARE,
-    ROUGH_SHARE,
-    CloseError,
-    NeighborRows,
-    Tessellation,
-    domain_position,
-)
+from ..device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, NeighborRows, Tessellation, domain_position
 from ..polyhedra import Polyhedra
 from .ghost_images import COLLAPSED, FAR, ExtendedBox, ExtendedPoints, FoldedDiagram
 from .halo import Halo
@@ -72,10 +65,7 @@ class PeriodicTessellator:
     def __init__(self, stages: TessellationStages, domain: Box, halo: Halo | None = None) -> None:
         self.stages, self.domain = stages, domain
         self.periods = domain.periods(stages.engine.real)
-        lower, upper = (
-            corner[: domain.dim].astype(np.float64)
-            for corner in domain.device_corners(stages.engine.real)
-        )
+        lower, upper = (corner[: domain.dim].astype(np.float64) for corner in domain.device_corners(stages.engine.real))
         self._edges = upper - lower
         self.wide = ExtendedBox(lower - self.periods, upper + self.periods)
         self._sums = Summaries(stages.engine, ("volumes",))
@@ -135,15 +125,11 @@ class PeriodicTessellator:
             args = images.box, images.points, images.count, binned
             if isinstance(cells, Polyhedra):
                 first = None if rows is None else ghost_images.unfold(images, rows)
-                t = cells.tessellate(
-                    *args, first, exact, None if keep_extended else n, images.halo_args
-                )
+                t = cells.tessellate(*args, first, exact, None if keep_extended else n, images.halo_args)
             else:
                 t = cells.tessellate(*args, exact, None if keep_extended else n)
             share = EXACT_SHARE if exact else ROUGH_SHARE
-            folded, enough, flags, generator = ghost_images.fold(
-                images, binned, t, points, share, nearest
-            )
+            folded, enough, flags, generator = ghost_images.fold(images, binned, t, points, share, nearest)
             if enough:
                 break
             factor, grow = 1.0, True
@@ -192,26 +178,20 @@ class PeriodicTessellator:
         total, measure = self._sums.read_one("volumes").sum, float(np.prod(self._edges))
         return t if abs(total - measure) < measure / 2 else None
 
-    def _clip_of(
-        self, points: cla.Array, n: int, previous: Tessellation
-    ) -> Callable[[CutCells, cla.Array, int], None]:
+    def _clip_of(self, points: cla.Array, n: int, previous: Tessellation) -> Callable[[CutCells, cla.Array, int], None]:
         """Return a function that clips the unfinished cells of an update of `previous` to `points`, in 3D."""
         stages, halo, cells = self.stages, self.halo, self.stages.cells
         assert isinstance(cells, Polyhedra)
 
         @cache
         def images_in_bins() -> tuple[ExtendedPoints, BinnedPoints, NeighborRows]:
-            images = stages.ghost_images.extend(
-                self.domain, points, n, halo, (halo.cells / n) ** (1 / 3), False
-            )
+            images = stages.ghost_images.extend(self.domain, points, n, halo, (halo.cells / n) ** (1 / 3), False)
             binned = stages.bins.build(images.box, images.points, images.count)
             return images, binned, stages.ghost_images.unfold(images, previous)
 
         def clip(cut: CutCells, report: cla.Array, used: int) -> None:
             images, binned, rows = images_in_bins()
-            cells.clip_rest(
-                cut, report, images.box, images.points, binned, rows, images.count, images.halo_args
-            )
+            cells.clip_rest(cut, report, images.box, images.points, binned, rows, images.count, images.halo_args)
             stages.ghost_images.fold_clipped(images, cut, report, used)
 
         return clip

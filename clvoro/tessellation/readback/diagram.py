@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 import pyopencl.array as cla
 
-from ...geometry.box import Box, ClipBox, Domain
+from ...geometry.box import Box
+from ...geometry.domain import ClipBox, Domain
 from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
@@ -118,9 +119,7 @@ class _DiagramReader:
     With `copy` the reader owns its arrays, since the stages reuse theirs.
     """
 
-    def __init__(
-        self, engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool
-    ) -> None:
+    def __init__(self, engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool) -> None:
         self.engine, self.domain, self.n = engine, domain, t.n
         self.box: ClipBox = domain
         self.origin, self.scale = domain.frame
@@ -141,9 +140,7 @@ class _DiagramReader:
 
     def diagram(self) -> Diagram:
         """Return the result, with the arrays that `names` lists."""
-        return Diagram(
-            self.domain, {name: (lambda name=name: getattr(self, name)()) for name in self.names}
-        )
+        return Diagram(self.domain, {name: (lambda name=name: getattr(self, name)()) for name in self.names})
 
     @cached_property
     def faces(self) -> SharedFaces:
@@ -219,9 +216,7 @@ class _DiagramReader:
         if self.kept is not None:
             return None
         upload = self.engine.upload
-        return Lists(
-            upload(self.order, np.int32), self.t.starts, upload(self.neighbor_starts(), np.int32)
-        )
+        return Lists(upload(self.order, np.int32), self.t.starts, upload(self.neighbor_starts(), np.int32))
 
     @cached_property
     def ranks(self) -> np.ndarray:

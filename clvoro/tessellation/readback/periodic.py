@@ -24,13 +24,7 @@ class _PeriodicReader(_DiagramReader):
     """
 
     def __init__(
-        self,
-        engine: Engine,
-        domain: Box,
-        t: Tessellation,
-        labels: cla.Array,
-        copy: bool,
-        extended: ExtendedDiagram,
+        self, engine: Engine, domain: Box, t: Tessellation, labels: cla.Array, copy: bool, extended: ExtendedDiagram
     ) -> None:
         super().__init__(engine, domain, t, labels, copy)
         m = len(self.t.neighbors)

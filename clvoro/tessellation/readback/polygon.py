@@ -22,9 +22,7 @@ class _PolygonReader(_DiagramReader):
     of each face are stored, as several loops may bound a cell.
     """
 
-    def __init__(
-        self, engine: Engine, domain: Polygon, t: Tessellation, labels: cla.Array, copy: bool
-    ) -> None:
+    def __init__(self, engine: Engine, domain: Polygon, t: Tessellation, labels: cla.Array, copy: bool) -> None:
         super().__init__(engine, domain, t, labels, copy)
         made = t.trimmed
         assert made is not None

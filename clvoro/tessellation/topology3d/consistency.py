@@ -16,7 +16,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ...geometry.box import ClipBox
+from ...geometry.domain import ClipBox
 from ...opencl.device_array import buffer_of
 from ...opencl.engine import Engine
 from ...opencl.primitives import Scan
@@ -116,9 +116,7 @@ class FaceSharing:
         while True:
             changed.fill(0)
             cl.enqueue_copy(engine.queue, buffer_of(self.labels), buffer_of(labels))
-            engine.run_each(
-                k.spread_labels, self.c, f.same, f.twin_corners, self.labels, labels, changed
-            )
+            engine.run_each(k.spread_labels, self.c, f.same, f.twin_corners, self.labels, labels, changed)
             if not int(changed[0].get()):
                 break
         best = engine.zeros(self.c, np.uint32)
@@ -129,21 +127,17 @@ class FaceSharing:
     def compare(self) -> bool:
         """Reduce all loops; return whether any half-face differs from its twin."""
         f, k, any_ = self.half_faces, self._kernels, self.engine.zeros(1, np.int32)
-        self.engine.run_each(
-            k.reduce_loops, self.h, f.loop_starts, f.loops, self.labels, self.reduced, self.counts
-        )
+        self.engine.run_each(k.reduce_loops, self.h, f.loop_starts, f.loops, self.labels, self.reduced, self.counts)
         self.engine.run_each(
             k.compare_half_faces, self.h, self.twins, f.loop_starts, self.reduced, self.counts, self.differs, any_
-        )  # fmt: skip
+        )
         return bool(any_[0].get())
 
     @property
     def _vertices(self) -> tuple[object, ...]:
         """What kernels take as VERTEX_ARGS."""
         f = self.half_faces
-        return (
-            self.t.sites, f.corners, f.owners, f.corner_faces, self.labels, self.best_corners, *self._corners
-        )  # fmt: skip
+        return (self.t.sites, f.corners, f.owners, f.corner_faces, self.labels, self.best_corners, *self._corners)
 
     def merge(self, doublings: int) -> bool:
         """Merge vertices of half-faces that differ, within a tolerance; return whether there were any to merge."""
@@ -152,13 +146,21 @@ class FaceSharing:
         targets = engine.empty(c, np.int32).fill(_LARGEST)
         for second_pass in (0, 1):
             engine.run_each(
-                k.find_targets, self.h, *self._vertices, f.sharpness, f.loop_starts, f.loops, self.twins,
-                self.differs, np.int32(doublings), np.int32(second_pass), distances, targets,
-            )  # fmt: skip
+                k.find_targets,
+                self.h,
+                *self._vertices,
+                f.sharpness,
+                f.loop_starts,
+                f.loops,
+                self.twins,
+                self.differs,
+                np.int32(doublings),
+                np.int32(second_pass),
+                distances,
+                targets,
+            )
         rejected, any_ = engine.zeros(c, np.int32), engine.zeros(1, np.int32)
-        engine.run_each(
-            k.reject_targets, c, *self._vertices, targets, np.int32(doublings), rejected
-        )
+        engine.run_each(k.reject_targets, c, *self._vertices, targets, np.int32(doublings), rejected)
         labels = self.labels.copy()
         engine.run_each(k.merge_vertices, c, self.labels, targets, rejected, labels, any_)
         if not int(any_[0].get()):
@@ -171,15 +173,11 @@ class FaceSharing:
         engine, t, f, k, c = self.engine, self.t, self.half_faces, self._kernels, self.c
         n, m, scan = t.n, int(t.starts[t.n].get()), Scan(engine)
         starts, ids = engine.empty(m + 1, np.int32), engine.zeros(c + 1, np.int32)
-        engine.run_each(
-            k.measure_loops, n, t.starts, f.starts, f.loop_starts, self.reduced, self.counts, starts, ids
-        )  # fmt: skip
+        engine.run_each(k.measure_loops, n, t.starts, f.starts, f.loop_starts, self.reduced, self.counts, starts, ids)
         scan.exclusive(starts, starts, m)
         scan.exclusive(ids, ids, c)
         vertices = engine.empty(int(starts[m].get()), np.int32)
         positions = engine.empty((int(ids[c].get()), 3))
-        engine.run_each(
-            k.write_loops, n, t.starts, f.starts, f.loop_starts, self.reduced, ids, starts, vertices
-        )  # fmt: skip
+        engine.run_each(k.write_loops, n, t.starts, f.starts, f.loop_starts, self.reduced, ids, starts, vertices)
         engine.run_each(k.write_positions, c, *self._vertices, ids, positions)
         return SharedFaces(positions, starts, vertices, self.merged, doublings > SAFE_DOUBLINGS)

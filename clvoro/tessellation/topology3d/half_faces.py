@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ...errors import MemoryLimitError
-from ...geometry.box import ClipBox
+from ...geometry.domain import ClipBox
 from ...opencl.engine import Engine
 from ...opencl.kernels import Kernels
 from ...opencl.primitives import Scan
@@ -81,20 +81,26 @@ def list_half_faces(engine: Engine, box: ClipBox, t: Tessellation) -> HalfFaces:
     scan.exclusive(starts, starts, n)
     c, h = int(corner_starts[n].get()), int(starts[n].get())
     if not 0 < c <= MOST_LOOP_ENTRIES // 3:
-        raise MemoryLimitError(
-            f"{n} cells have more vertices than 32-bit indices can tell apart; use fewer cells"
-        )
+        raise MemoryLimitError(f"{n} cells have more vertices than 32-bit indices can tell apart; use fewer cells")
     owners, same, twin_corners = (engine.empty(c, np.int32) for _ in range(3))
     corners, sharpness = engine.empty((c, 3)), engine.empty(c, np.float32)
     corner_faces, loops = engine.empty((c, 3), np.int32), engine.empty(3 * c, np.int32)
     labels, loop_starts = engine.empty(h, np.int32), engine.empty(h + 1, np.int32)
     lists = (
-        capacities, corner_starts, starts, corners, sharpness, corner_faces, owners, same, labels, loop_starts, loops,
-    )  # fmt: skip
+        capacities,
+        corner_starts,
+        starts,
+        corners,
+        sharpness,
+        corner_faces,
+        owners,
+        same,
+        labels,
+        loop_starts,
+        loops,
+    )
     for capacity in used:
         kernel = _kernels(engine, capacity).list_corners
         clip_each(engine, kernel, capacity, n, (*cell, *lists))
     engine.run_each(k.match_corners, c, owners, corner_starts, corner_faces, twin_corners)
-    return HalfFaces(
-        corners, owners, sharpness, corner_faces, same, twin_corners, starts, labels, loop_starts, loops
-    )  # fmt: skip
+    return HalfFaces(corners, owners, sharpness, corner_faces, same, twin_corners, starts, labels, loop_starts, loops)

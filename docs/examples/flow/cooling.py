@@ -18,9 +18,7 @@ from clvoro import sizing
 
 pipe = clvoro.curves.circle((0.7, 0.5), 0.2, name="pipe")
 block = clvoro.Polygon(
-    [(0, 0), (2, 0), (2, 1.6), (1.2, 1.6), (1.2, 1), (0, 1)],
-    [pipe],
-    names={"hot": 1, "sides": [0, 2, 3, 4, 5]},
+    [(0, 0), (2, 0), (2, 1.6), (1.2, 1.6), (1.2, 1), (0, 1)], [pipe], names={"hot": 1, "sides": [0, 2, 3, 4, 5]}
 )
 size = sizing.Distance(block.boundary("pipe"), h_min=0.015, growth=1.12, h_max=0.06)
 mesh = clvoro.adapt(block, size)

@@ -14,9 +14,7 @@ from clvoro import sizing
 
 cylinder = clvoro.curves.circle((0.2, 0.2), 0.05, name="cylinder")
 domain = clvoro.Polygon(
-    [(0, 0), (2.2, 0), (2.2, 0.41), (0, 0.41)],
-    [cylinder],
-    names={"walls": [0, 2], "outlet": 1, "inlet": 3},
+    [(0, 0), (2.2, 0), (2.2, 0.41), (0, 0.41)], [cylinder], names={"walls": [0, 2], "outlet": 1, "inlet": 3}
 )
 
 # %%

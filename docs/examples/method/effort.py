@@ -16,9 +16,7 @@ circle = sizing.Circle((0.6, 0.5), radius=0.25)
 size = sizing.Distance(circle, h_min=0.01, growth=1.15, h_max=0.06)
 
 # %%
-meshes = {
-    effort: clvoro.adapt(domain, size, effort=effort) for effort in ("fast", "default", "best")
-}
+meshes = {effort: clvoro.adapt(domain, size, effort=effort) for effort in ("fast", "default", "best")}
 figure, axes = plt.subplots(3, 1, figsize=(6.4, 11.6), layout="constrained")
 for ax, (effort, mesh) in zip(axes, meshes.items(), strict=True):
     mesh.plot("sides", ax=ax, title=effort)

@@ -49,9 +49,7 @@ for x in places[1:]:
     mesh, values = after, temperature(after.points, x)
     frames.append((mesh, values))
 
-print(
-    f"{np.median(steps):.0f} steps per mesh, the first one took {frames[0][0].history['step'][-1]}"
-)
+print(f"{np.median(steps):.0f} steps per mesh, the first one took {frames[0][0].history['step'][-1]}")
 print(f"total after a transfer off by {np.abs(lost).max():.0e} at most")
 
 # %%

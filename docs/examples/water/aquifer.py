@@ -50,13 +50,9 @@ matrix = scipy.sparse.diags_array((upper + upper.T).sum(axis=1)) - upper - upper
 water = 6e-9 * cells.volumes  # m3/s of recharge
 water[: len(wells)] -= pumping
 
-leak = np.where(
-    sizing.Distance(sizing.Polyline(river), h_min=1, slope=1)(cells.points) < 21, 1e-2, 0
-)
+leak = np.where(sizing.Distance(sizing.Polyline(river), h_min=1, slope=1)(cells.points) < 21, 1e-2, 0)
 stage = 100 - 0.004 * cells.points[:, 0]
-head = scipy.sparse.linalg.spsolve(
-    (matrix + scipy.sparse.diags_array(leak)).tocsc(), water + leak * stage
-)
+head = scipy.sparse.linalg.spsolve((matrix + scipy.sparse.diags_array(leak)).tocsc(), water + leak * stage)
 print(f"recharge {6e-9 * domain.measure:.4f}, wells {pumping.sum():.4f} m3/s")
 print(f"from the river {(leak * (stage - head)).sum():.4f} m3/s")
 

@@ -109,9 +109,7 @@ figure.axes[0].plot(*wells.T, "o", color="white", ms=5, mec="black")
 # size, a quarter of the error. Of two numbers of time steps the error in time is extrapolated.
 
 transmissivity, storage, rate, end = 5e-3, 2e-4, 0.02, 7200.0
-aquifer = clvoro.Polygon(
-    [(0, 0), (3000, -200), (4200, 1500), (3500, 3600), (1200, 3900), (-500, 2000)]
-)
+aquifer = clvoro.Polygon([(0, 0), (3000, -200), (4200, 1500), (3500, 3600), (1200, 3900), (-500, 2000)])
 place = (1700, 1700)
 coarse = sizing.Distance(sizing.Circle(place, radius=1), h_min=20, slope=0.1, h_max=150)
 
@@ -122,9 +120,7 @@ def drawdown(diagram, steps):
     s, source = np.zeros(len(diagram)), rate * (np.arange(len(diagram)) == 0)
     for dt in np.diff(end * np.linspace(0, 1, steps + 1) ** 3):
         capacity = storage * diagram.volumes / dt
-        s = scipy.sparse.linalg.spsolve(
-            (flow + scipy.sparse.diags_array(capacity)).tocsc(), source + capacity * s
-        )
+        s = scipy.sparse.linalg.spsolve((flow + scipy.sparse.diags_array(capacity)).tocsc(), source + capacity * s)
     return s
 
 

@@ -36,9 +36,7 @@ def energy(points, omega):
     return float((omega * (2 * np.log(perimeter) - np.log(area))).sum())
 
 
-def descend_from(
-    engine, t, h, bad_cell_weight, rate, max_displacement, quality, stiffness=0.0, full_rate=1e30
-):
+def descend_from(engine, t, h, bad_cell_weight, rate, max_displacement, quality, stiffness=0.0, full_rate=1e30):
     """Displacements from the diagram `t`."""
     out = engine.empty((t.n, 2))
     QualityDescent(engine).descend(
@@ -56,9 +54,7 @@ def descend_from(
     return out.get()
 
 
-def descend(
-    engine, points, h, bad_cell_weight, rate=0.1, max_displacement=0.2, quality=None, stiffness=0.0
-):
+def descend(engine, points, h, bad_cell_weight, rate=0.1, max_displacement=0.2, quality=None, stiffness=0.0):
     """Displacements from points, with the quality of their cells by default."""
     quality = qualities(points)[:, 0] if quality is None else quality
     t = patch.tessellate(engine, points)
@@ -166,7 +162,7 @@ DOMAINS = {
     "polygon": clvoro.Polygon(
         [(0, 0.05), (0.45, 0), (1, 0.02), (1.05, 0.4), (1, 0.7), (0.6, 0.8), (0.45, 0.7), (0.25, 0.85), (0, 0.8)]
     ),
-}  # fmt: skip
+}
 
 
 def edges_of(d):
@@ -175,9 +171,7 @@ def edges_of(d):
     ends, polygon = face_ends(d), isinstance(d.domain, clvoro.Polygon)
     turns = {}
     if polygon:
-        turns = dict(
-            zip(map(tuple, d.domain.oriented.vertices), d.domain.oriented.turns, strict=True)
-        )
+        turns = dict(zip(map(tuple, d.domain.oriented.vertices), d.domain.oriented.turns, strict=True))
     walls = {}
     for k, (i, j) in enumerate(zip(owner.tolist(), d.neighbors.tolist(), strict=True)):
         if j >= 0:
@@ -229,13 +223,18 @@ def test_gradient_of_short_edges(ctx, name):
     t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
     out = engine.empty((n, 2))
     QualityDescent(engine).descend(
-        t, engine.upload(h / unit), engine.upload(np.full(n, 0.5)), out, quality_weight=0, rate=0.3,
-        max_displacement=1e9, edges=Repulsion(short, 2), pairs=NONE,
-    )  # fmt: skip
-    some = rng.permutation(n)[:16]
-    gradient = gradient_of(
-        lambda x: 2 * edge_energy(adapter.diagram(domain, x), h, short), points, some
+        t,
+        engine.upload(h / unit),
+        engine.upload(np.full(n, 0.5)),
+        out,
+        quality_weight=0,
+        rate=0.3,
+        max_displacement=1e9,
+        edges=Repulsion(short, 2),
+        pairs=NONE,
     )
+    some = rng.permutation(n)[:16]
+    gradient = gradient_of(lambda x: 2 * edge_energy(adapter.diagram(domain, x), h, short), points, some)
     expected = -0.3 * h[:, None] ** 2 * gradient / unit
     scale = np.abs(expected).max()
     assert (np.abs(expected[some]) > 1e-3 * scale).all(axis=1).sum() > 8
@@ -249,9 +248,16 @@ def test_gradient_of_close_generators(ctx):
     engine = patch.make_engine(ctx)
     out = engine.empty((N, 2))
     QualityDescent(engine).descend(
-        patch.tessellate(engine, points), engine.upload(h), engine.upload(np.full(N, 0.5)), out, quality_weight=0,
-        rate=0.3, max_displacement=1e9, edges=NONE, pairs=Repulsion(limit, 2),
-    )  # fmt: skip
+        patch.tessellate(engine, points),
+        engine.upload(h),
+        engine.upload(np.full(N, 0.5)),
+        out,
+        quality_weight=0,
+        rate=0.3,
+        max_displacement=1e9,
+        edges=NONE,
+        pairs=Repulsion(limit, 2),
+    )
     expected, pairs = np.zeros((N, 2)), 0
     for i, cell in enumerate(reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)):
         for j in cell.neighbors:
@@ -282,9 +288,7 @@ def test_short_edges_grow(ctx, real):
 
 
 @pytest.mark.sparse(1)
-@pytest.mark.parametrize(
-    ("settings", "seed"), [({"effort": "fast"}, 5), ({}, 16), ({"method": "exact"}, 14)]
-)
+@pytest.mark.parametrize(("settings", "seed"), [({"effort": "fast"}, 5), ({}, 16), ({"method": "exact"}, 14)])
 def test_runs_have_no_short_edges(ctx, settings, seed):
     """A steep field, and starts from which runs without the energy end with an edge of 0.02 h or less."""
     field = clvoro.sizing.Distance(clvoro.sizing.Circle((0.5, 0.4), 0.2), h_min=0.012, slope=0.3)
@@ -356,8 +360,6 @@ def test_a_regular_mesh_stays(ctx):
 def test_degenerate(ctx, real, points):
     n = len(points)
     some = np.full(n, 0.5)
-    u = descend(
-        patch.make_engine(ctx, real), np.array(points, float), np.full(n, 0.3), 5.0, quality=some
-    )
+    u = descend(patch.make_engine(ctx, real), np.array(points, float), np.full(n, 0.3), 5.0, quality=some)
     assert np.isfinite(u).all()
     assert np.linalg.norm(u, axis=1).max() <= 0.2 * 0.3 * 1.001

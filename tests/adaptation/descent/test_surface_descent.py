@@ -58,29 +58,26 @@ def test_descent_follows_the_gradient(ctx, dtype):
     engine = patch.make_engine(ctx, dtype, dim=3)
     points, quality, expected = expected_descent()
     placed = engine.upload(points)
-    t = Polyhedra(engine).tessellate(
-        BOX, placed, N, Bins(engine).build(BOX, placed, N), exact=False
-    )
+    t = Polyhedra(engine).tessellate(BOX, placed, N, Bins(engine).build(BOX, placed, N), exact=False)
 
     def descend(most):
         out = engine.empty((N, 3)).fill(KEPT)
         SurfaceDescent(engine).descend(
-            t, engine.upload(np.full(N, H)), engine.upload(quality), out, bad_cell_weight=WEIGHT, rate=RATE,
+            t,
+            engine.upload(np.full(N, H)),
+            engine.upload(quality),
+            out,
+            bad_cell_weight=WEIGHT,
+            rate=RATE,
             max_displacement=most,
-        )  # fmt: skip
+        )
         return out.get()
 
-    tolerance = (
-        1e-6 if dtype == "float64" else 1e-3
-    )  # of the finite differences; of single precision
+    tolerance = 1e-6 if dtype == "float64" else 1e-3  # of the finite differences; of single precision
     found = descend(1e9)
     known = (found != KEPT).all(axis=1)
     assert known.sum() >= N - 5
     some = known[:MOVED]
-    np.testing.assert_allclose(
-        found[:MOVED][some], expected[some], atol=tolerance * np.abs(expected).max()
-    )
+    np.testing.assert_allclose(found[:MOVED][some], expected[some], atol=tolerance * np.abs(expected).max())
     bounded = np.linalg.norm(descend(1e-3)[known], axis=1)
-    np.testing.assert_allclose(
-        bounded, np.minimum(np.linalg.norm(found[known], axis=1), 1e-3 * H), rtol=1e-4
-    )
+    np.testing.assert_allclose(bounded, np.minimum(np.linalg.norm(found[known], axis=1), 1e-3 * H), rtol=1e-4)

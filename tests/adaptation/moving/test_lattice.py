@@ -9,8 +9,7 @@ from clvoro.errors import InputError
 
 
 @pytest.mark.parametrize(
-    ("box", "n"),
-    [(clvoro.Box((-1, 2), (1.5, 3.5)), 601), (clvoro.Box((0, 0, 1), (1, 1.3, 2)), 517)],
+    ("box", "n"), [(clvoro.Box((-1, 2), (1.5, 3.5)), 601), (clvoro.Box((0, 0, 1), (1, 1.3, 2)), 517)]
 )
 def test_cells_have_the_same_volume(adapter, box, n):
     """A dislocation changes a few; the rows are as wide as their numbers say."""

@@ -47,9 +47,7 @@ def test_descent_is_that_of_the_functional(ctx, dim):
     h = field(points)[np.concatenate([np.arange(n), images[0]])]
     rows = np.repeat(np.arange(n), np.diff(c.starts.get()))
     simplices = np.column_stack([rows, c.vertices.get()])
-    volumes = np.abs(np.linalg.det(xi[simplices][:, 1:] - xi[simplices][:, :1])) / (
-        2 if dim == 2 else 6
-    )
+    volumes = np.abs(np.linalg.det(xi[simplices][:, 1:] - xi[simplices][:, :1])) / (2 if dim == 2 else 6)
     # The diagonals of cospherical points at walls are not those of their images.
     assert volumes.sum() / (dim + 1) == pytest.approx(mesh.domain.measure, rel=0.03)
     terms = moving.functional(x, xi, h, simplices)
@@ -63,9 +61,7 @@ def test_descent_is_that_of_the_functional(ctx, dim):
                 moved, changed = x.copy(), h.copy()
                 moved[i, axis] += sign * step
                 changed[i] = field(moved[i : i + 1])[0]
-                force[axis] += (
-                    sign * moving.functional(moved, xi, changed, around).sum() / (2 * step)
-                )
+                force[axis] += sign * moving.functional(moved, xi, changed, around).sum() / (2 * step)
         # The shape functions of each simplex: 1 and x are their sums with the vertices' values.
         shapes = np.linalg.inv(np.concatenate([np.ones((*around.shape, 1)), x[around]], axis=2))
         slopes = np.linalg.norm(shapes[:, 1:, :], axis=1)
@@ -80,11 +76,7 @@ def test_displacements_are_bounded(ctx):
     """By the size of the cell, and by the room in which simplices do not turn over."""
     mesh, _, points = make_mesh(ctx, 2, shift=0.15)
     rng, engine = np.random.default_rng(8), mesh.engine
-    step, velocity, room = (
-        rng.normal(size=points.shape),
-        rng.normal(size=points.shape),
-        rng.random(len(points)),
-    )
+    step, velocity, room = (rng.normal(size=points.shape), rng.normal(size=points.shape), rng.random(len(points)))
     mesh.velocity.set(velocity)
     mesh.lloyd = engine.upload(step * 0.02)
     mesh.stages.mmpde.bound_displacement(mesh, 0.01, engine.upload(room * 0.2))

@@ -24,9 +24,7 @@ def test_derivatives_of_quadratics(dim, n):
     spacing = (box.measure / n) ** (1 / dim)
     inner = ((x > 1.6 * spacing) & (x < box.extent - 1.6 * spacing)).all(axis=1)
     assert inner.sum() > 5
-    assert lattice.jacobian(phi)[inner] - np.eye(dim) == pytest.approx(
-        np.tile(h, (inner.sum(), 1, 1))
-    )
+    assert lattice.jacobian(phi)[inner] - np.eye(dim) == pytest.approx(np.tile(h, (inner.sum(), 1, 1)))
     even = np.cos(np.pi * x / box.extent).sum(axis=1) * spacing**2
     slope = -np.pi / box.extent * np.sin(np.pi * x / box.extent) * spacing**2
     assert np.abs(lattice.place(even) - x - slope).mean() < 0.05 * np.abs(slope).mean()

@@ -27,10 +27,7 @@ SMOOTH = sizing.Expression("0.03 + 0.004 * x")
 
 def share_on_grid(field, box, step):
     """Return the share of steep cells, each point of a grid weighted by h^-2, with differences of NumPy."""
-    axes = [
-        np.arange(low + step / 2, high, step)
-        for low, high in zip(box.lower, box.upper, strict=True)
-    ]
+    axes = [np.arange(low + step / 2, high, step) for low, high in zip(box.lower, box.upper, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     h = field(points.reshape(-1, 2)).reshape(points.shape[:2])
     slope = np.hypot(*np.gradient(h, step))
@@ -104,9 +101,7 @@ def test_a_kinked_and_steep_field_gets_cells_of_a_good_shape(adapter):
     target = result.settings["error_target"]
     assert 0.01 < target < 0.0155
     assert "in place of 0.0025" in result.summary()["trade"]
-    inner = ~np.logical_or.reduceat(
-        result.diagram.neighbors < 0, result.diagram.neighbor_starts[:-1]
-    )
+    inner = ~np.logical_or.reduceat(result.diagram.neighbors < 0, result.diagram.neighbor_starts[:-1])
     assert result.quality[inner].mean() > 0.985
     assert result.quality[inner].min() > 0.92
     # The last step, against short edges, lowers the error by less than a tenth.

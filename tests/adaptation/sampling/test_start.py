@@ -38,21 +38,13 @@ INTEGRALS = {
     "F2": (BOX, F2, 22972.2421613),
     "F3": (BOX, F3, 11454.1213852),
     "exponential": (BOX, sizing.Expression("0.05*exp(-2*x)"), 1.5 / 0.0025 * math.expm1(10) / 4),
-    "exponential 3D": (
-        CUBE,
-        sizing.Expression("0.2*exp(-(x+y+z-3))"),
-        (math.expm1(3) / 3) ** 3 / 0.008,
-    ),
+    "exponential 3D": (CUBE, sizing.Expression("0.2*exp(-(x+y+z-3))"), (math.expm1(3) / 3) ** 3 / 0.008),
     "jump of 100 along a line": (
         BOX,
         sizing.Expression("x + 0.3*y < 1.50033 ? 0.005 : 0.5"),
         (1.5 * 1.50033 - 0.15 * 1.5**2) * (1 / 0.005**2 - 4) + 3.75 * 4,
     ),
-    "jump along the boxes": (
-        BOX,
-        sizing.Expression("x < 1.00001 ? 0.005 : 0.5"),
-        1.500015 * 40000 + 2.249985 * 4,
-    ),
+    "jump along the boxes": (BOX, sizing.Expression("x < 1.00001 ? 0.005 : 0.5"), 1.500015 * 40000 + 2.249985 * 4),
     # The width of the dip is 1/170 of the domain: only the landmarks on the line find it.
     "thin dip at a line": (
         BOX,
@@ -263,10 +255,7 @@ def test_position_inside_a_box_follows_the_slope():
 
 
 def test_starts_repeat_bit_by_bit():
-    for sample in (
-        lambda s: sample_density(F1, BOX, 588, s),
-        lambda s: sample_uniform(BOX, 588, s),
-    ):
+    for sample in (lambda s: sample_density(F1, BOX, 588, s), lambda s: sample_uniform(BOX, 588, s)):
         first = sample(2718)
         assert np.array_equal(first, sample(2718))
         assert not np.array_equal(first, sample(2719))

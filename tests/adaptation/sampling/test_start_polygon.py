@@ -15,12 +15,7 @@ from tests.reference.polygons import HOLE, SQUARE, crossings, ragged
 ANNULUS = clvoro.Polygon(ragged(400), [ragged(90, 5, (0.05, 0.0), 0.2)])
 NEEDLE = clvoro.Polygon([(0, 0), (1e-3, 0), (3, 2), (3, 2 + 1e-3)])  # along a diagonal
 PIECES = clvoro.Polygon.from_pieces(
-    [
-        [SQUARE, HOLE],
-        [SQUARE * 1e-3 + 7],
-        [HOLE * 0.5 + (0.75, 0.75)],
-        [SQUARE[::-1] + np.array([4, 3])],
-    ]
+    [[SQUARE, HOLE], [SQUARE * 1e-3 + 7], [HOLE * 0.5 + (0.75, 0.75)], [SQUARE[::-1] + np.array([4, 3])]]
 )
 DOMAINS = {"annulus": ANNULUS, "needle": NEEDLE, "pieces": PIECES}
 GROWING = sizing.Expression("0.01 + 0.1 * hypot(x - 0.6, y)")
@@ -173,9 +168,7 @@ def test_two_common_faces_bring_two_generators(ctx) -> None:
     t = Tessellator(stages, domain).tessellate(points, 2, exact=True)
     origin, scale = domain.frame
     finer = stages.refinement.refine(domain, t, upload([0.5, 0.5])).get() * scale + origin
-    assert (
-        len(finer) == len(np.unique(finer, axis=0)) == 6
-    )  # the parents, two middles, one before each's longest wall
+    assert len(finer) == len(np.unique(finer, axis=0)) == 6  # the parents, two middles, one before each's longest wall
     assert domain.contains(finer).all()
     for middle in ((0.0, 0), (2.1, 0)):
         assert np.hypot(*(finer - middle).T).min() < 1e-12
@@ -200,8 +193,6 @@ def test_coarse_levels_reach_every_piece(ctx) -> None:
     corner = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
     pieces = [[corner + np.array([2 * i, 3 * (i % 2)])] for i in range(9)]
     domain = clvoro.Polygon.from_pieces(pieces)
-    result = clvoro.Adapter(ctx).run(
-        domain, 0.3, effort="fast", options=clvoro.MultilevelOptions(levels=2), seed=1
-    )
+    result = clvoro.Adapter(ctx).run(domain, 0.3, effort="fast", options=clvoro.MultilevelOptions(levels=2), seed=1)
     assert len(set(domain.piece_of(result.points))) == 9
     assert result.check().ok

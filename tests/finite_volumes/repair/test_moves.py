@@ -31,9 +31,7 @@ def patches(ctx):
 
 
 def requests(given):
-    return [
-        Move(p, p.near(p.bad, 2), True, steps) for p, steps in zip(given, (3, 15, 8), strict=True)
-    ]
+    return [Move(p, p.near(p.bad, 2), True, steps) for p, steps in zip(given, (3, 15, 8), strict=True)]
 
 
 def test_patches_move_alike_alone_and_together(patches):

@@ -7,14 +7,7 @@ import pytest
 
 import clvoro
 from clvoro.finite_volumes.prisms import simple_loops
-from clvoro.finite_volumes.repair.patch import (
-    BORDER,
-    cell_sides,
-    part_of,
-    put_back,
-    restored,
-    take_patch,
-)
+from clvoro.finite_volumes.repair.patch import BORDER, cell_sides, part_of, put_back, restored, take_patch
 from clvoro.finite_volumes.repair.pricing import PricedPatch
 from clvoro.finite_volumes.repair.relaxation import _with_positions
 from clvoro.finite_volumes.repair.tasks import Move, moved
@@ -25,9 +18,7 @@ from tests.finite_volumes.test_straight_walls import ELL, circle
 DOMAINS = {
     "ell": clvoro.Polygon(ELL, names={"low": [0, 1], "rest": [2, 3, 4, 5]}),
     "ring": clvoro.Polygon(circle(40, 0.45), [circle(15, 0.15)]),
-    "curve": clvoro.Polygon(
-        clvoro.curves.circle((0.5, 0.5), 0.5), [clvoro.curves.circle((0.5, 0.4), 0.2)]
-    ),
+    "curve": clvoro.Polygon(clvoro.curves.circle((0.5, 0.5), 0.5), [clvoro.curves.circle((0.5, 0.4), 0.2)]),
     "periodic": clvoro.Box((0, 0), (1, 1), periodic=(True, False)),
 }
 
@@ -62,16 +53,9 @@ def with_positions(mesh, patch):
 
 def faces_of(patch) -> set:
     """Faces in terms of the mesh, without borders."""
-    there = np.where(
-        patch.neighbor >= 0, patch.cells[np.maximum(patch.neighbor, 0)], patch.neighbor
-    )
+    there = np.where(patch.neighbor >= 0, patch.cells[np.maximum(patch.neighbor, 0)], patch.neighbor)
     rows = patch.neighbor != BORDER
-    columns = (
-        patch.ids[patch.ends[:, 0]],
-        patch.ids[patch.ends[:, 1]],
-        patch.cells[patch.owner],
-        there,
-    )
+    columns = (patch.ids[patch.ends[:, 0]], patch.ids[patch.ends[:, 1]], patch.cells[patch.owner], there)
     return set(zip(*(c[rows].tolist() for c in columns), strict=True))
 
 
@@ -125,11 +109,7 @@ def test_sides_go_around_each_cell(mesh):
 def test_cells_that_are_no_rings_have_no_sides(mesh):
     patch = take_patch(mesh, np.ones(len(mesh), bool))
     kept = np.arange(len(patch.owner)) != 3
-    patch.ends, patch.owner, patch.neighbor = (
-        patch.ends[kept],
-        patch.owner[kept],
-        patch.neighbor[kept],
-    )
+    patch.ends, patch.owner, patch.neighbor = (patch.ends[kept], patch.owner[kept], patch.neighbor[kept])
     assert cell_sides(patch) is None
 
 
@@ -147,9 +127,7 @@ def test_figures_are_those_of_the_solver_mesh(mesh):
     np.testing.assert_allclose(now.skewness[rows], measures.skewness[rows], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(now.determinant, measures.determinant, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(now.area, measures.sizes**2, rtol=1e-9)
-    assert np.array_equal(
-        np.isclose(np.bincount(given.cells.row, now.turn), 2 * np.pi), np.ones(len(mesh), bool)
-    )
+    assert np.array_equal(np.isclose(np.bincount(given.cells.row, now.turn), 2 * np.pi), np.ones(len(mesh), bool))
 
 
 @pytest.mark.parametrize("domain", [d for d in DOMAINS.values() if isinstance(d, clvoro.Polygon)])
@@ -161,8 +139,7 @@ def test_positions_run_along_the_rings(domain):
     points = ring.points(s)
     on_edges = (
         ring.vertices[ring.edges(s)]
-        + (s - ring.begins[ring.edges(s)])[:, None]
-        * (ring.along / ring.lengths[:, None])[ring.edges(s)]
+        + (s - ring.begins[ring.edges(s)])[:, None] * (ring.along / ring.lengths[:, None])[ring.edges(s)]
     )
     np.testing.assert_allclose(points, domain.on_curve(on_edges, edges), atol=1e-14)
     np.testing.assert_allclose(ring.find(on_edges, edges, np.full(40, 0.1)), s, atol=1e-9)

@@ -17,9 +17,26 @@ from tests.finite_volumes.repair.test_patch import with_positions
 from tests.finite_volumes.test_straight_walls import concave_by, polygons
 
 # A coast with spits, bays and an island, about as fine as the cells.
-COAST = [(0, 0), (0.31, 0.02), (0.4, 0.12), (0.46, 0.01), (1, 0), (1, 0.4), (0.82, 0.45), (1, 0.5),
-         (1, 1), (0.6, 1), (0.55, 0.83), (0.52, 1), (0.2, 1), (0.1, 0.9), (0, 1), (0, 0.55), (0.14, 0.5),
-         (0, 0.46)]  # fmt: skip
+COAST = [
+    (0, 0),
+    (0.31, 0.02),
+    (0.4, 0.12),
+    (0.46, 0.01),
+    (1, 0),
+    (1, 0.4),
+    (0.82, 0.45),
+    (1, 0.5),
+    (1, 1),
+    (0.6, 1),
+    (0.55, 0.83),
+    (0.52, 1),
+    (0.2, 1),
+    (0.1, 0.9),
+    (0, 1),
+    (0, 0.55),
+    (0.14, 0.5),
+    (0, 0.46),
+]
 ISLAND = [(0.4, 0.45), (0.62, 0.5), (0.41, 0.53)]
 DOMAIN = clvoro.Polygon(COAST, [ISLAND], names={"island": [18, 19, 20], "south": range(5)})
 
@@ -68,11 +85,7 @@ def test_repaired_meshes_are_accepted_and_whole(ctx, seed):
     assert total == pytest.approx(sum(p.area for p in cells), rel=1e-9)
     assert total == pytest.approx(DOMAIN.measure * (1 + after.area_change), rel=1e-12)
     # Faces are in order, each pair of cells has one, and named parts keep their places.
-    pairs = list(
-        zip(
-            after.owner[: after.inner].tolist(), after.neighbor[: after.inner].tolist(), strict=True
-        )
-    )
+    pairs = list(zip(after.owner[: after.inner].tolist(), after.neighbor[: after.inner].tolist(), strict=True))
     assert pairs == sorted(set(pairs))
     assert (after.owner[: after.inner] < after.neighbor[: after.inner]).all()
     assert (np.diff(-1 - after.neighbor[after.inner : after.outer]) >= 0).all()
@@ -91,9 +104,7 @@ def test_points_alone_do_not_suffice(ctx, monkeypatch):
 
     monkeypatch.setattr(relaxation, "repaired", not_repaired)
     measures = [coast(ctx, seed).solver_mesh().measures for seed in (0, 2)]
-    assert any(
-        m.concave.any() or m.non_orthogonality.max() > 20 or m.skewness.max() > 2 for m in measures
-    )
+    assert any(m.concave.any() or m.non_orthogonality.max() > 20 or m.skewness.max() > 2 for m in measures)
 
 
 def test_all_changes_of_faces_keep_the_mesh_consistent(ctx):

@@ -124,9 +124,7 @@ def test_faces_remain_where_too_many_cells_are_bad(mesh, monkeypatch):
         assert [bool(WARNED.search(str(w.message))) for w in seen] == ([] if few else [True])
 
 
-WARNED = re.compile(
-    r"^\d+ cells of the mesh .* at \(0\.[23].*, 0\.[23].*\), .*simplified\(1\.5 \* h\)"
-)
+WARNED = re.compile(r"^\d+ cells of the mesh .* at \(0\.[23].*, 0\.[23].*\), .*simplified\(1\.5 \* h\)")
 
 
 def test_a_mesh_that_was_not_adapted_is_left_alone(ctx):

@@ -54,9 +54,7 @@ def test_chords(ctx, name, real):
         assert np.array_equal(owners, [edge[0][0] for edge in expected])
         assert np.array_equal(np.diff(firsts[: len(expected) + 1]), list(map(len, expected)))
         assert np.array_equal(of_chords[:count], cells)
-        assert np.array_equal(
-            edges[:count], np.repeat(np.arange(len(expected)), list(map(len, expected)))
-        )
+        assert np.array_equal(edges[:count], np.repeat(np.arange(len(expected)), list(map(len, expected))))
         # Crossings round by the rounding of positions over the distance of the generators, as seen along the edge.
         across = points[cells[1:]] - points[cells[:-1]]
         slopes = np.abs((across * ways[edges[: count - 1]]).sum(axis=1))
@@ -78,9 +76,7 @@ def test_cells_of_outside_generators_that_the_boundary_crosses_are_reported(ctx)
     domain = POLYGONS["star"]()
     engine = patch.make_engine(ctx, box=domain)
     inside = domain.place(scattered(domain, N, 5703), engine.real)
-    around = np.random.default_rng(5704).random((200, 2)) * domain.place(
-        np.array(domain.upper)[None], engine.real
-    )
+    around = np.random.default_rng(5704).random((200, 2)) * domain.place(np.array(domain.upper)[None], engine.real)
     away = around[~domain.contains(around * domain.frame[1] + domain.frame[0])]
     points = np.concatenate([inside, away])
     t = tessellate_box(Stages(engine), domain, engine.upload(points), len(points), None, False)

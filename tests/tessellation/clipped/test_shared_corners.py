@@ -35,9 +35,7 @@ def test_runs_from_shared_corners(ctx, name, method):
         points = np.concatenate([corners, scattered(domain, others, 1)]) if others else corners
         counts = method in ("exact", "adaptive")
         options = {"effort": "fast"} if counts else {"max_steps": 30}
-        result = clvoro.Adapter(ctx, real).run(
-            domain, 0.1, points=points, method=method, seed=1, **options
-        )
+        result = clvoro.Adapter(ctx, real).run(domain, 0.1, points=points, method=method, seed=1, **options)
         report = result.check()
         assert report, report
         assert len(result.points) >= len(points)
@@ -60,10 +58,7 @@ def test_generators_from_a_split_are_distinct(ctx, name):
     for m, label in zip(centers, host.neighbors, strict=True):
         inwards = np.array([-along[-1 - label, 1], along[-1 - label, 0]])
         line = shapely.LineString([m + 1e-12 * inwards, m + way * inwards])
-        inside = min(
-            shapely.get_parts(shapely.intersection(line, domain.geometry)),
-            key=shapely.Point(m).distance,
-        )
+        inside = min(shapely.get_parts(shapely.intersection(line, domain.geometry)), key=shapely.Point(m).distance)
         free = inside.length > way * (1 - 1e-9)
         expected.append(m + (way if free else inside.length / 2) * inwards)
     expected = np.array(expected)
@@ -80,13 +75,14 @@ def reorganized(engine, domain, t, total):
     """Return the generators after the count has changed by `total`, where cells have their target size."""
     one = engine.upload(np.ones(t.n))
     rows = Generators(
-        t.points, engine.upload(np.arange(t.n), np.int32), engine.zeros((t.n, 2)),
-        engine.zeros(t.n, np.uint64), engine.zeros(t.n),
-    )  # fmt: skip
-    sizes = CellSizes(one, one, engine.zeros(t.n))
-    return InsertionDeletion(engine).insert_delete(
-        domain, t, sizes, rows, t.n, Change(total, climb=False)
+        t.points,
+        engine.upload(np.arange(t.n), np.int32),
+        engine.zeros((t.n, 2)),
+        engine.zeros(t.n, np.uint64),
+        engine.zeros(t.n),
     )
+    sizes = CellSizes(one, one, engine.zeros(t.n))
+    return InsertionDeletion(engine).insert_delete(domain, t, sizes, rows, t.n, Change(total, climb=False))
 
 
 def test_components_follow_from_the_graph_not_from_positions(ctx):

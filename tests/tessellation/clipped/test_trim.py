@@ -11,19 +11,7 @@ from clvoro.opencl.engine import Engine
 from clvoro.tessellation.readback.diagram import fetch_diagram
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.polygon_diagrams import euler_excess, faults, polygon_voronoi
-from tests.reference.shores import (
-    DIAMOND,
-    POLYGONS,
-    TOUCHING,
-    UNIT,
-    coast,
-    comb,
-    koch,
-    lattice,
-    scattered,
-    slit,
-    spit,
-)
+from tests.reference.shores import DIAMOND, POLYGONS, TOUCHING, UNIT, coast, comb, koch, lattice, scattered, slit, spit
 
 REALS = ("float64", "float32")
 
@@ -109,7 +97,7 @@ def test_pieces_change_cells(adapters):
 @pytest.mark.parametrize(
     "name",
     ["square", "triangle", "frame", "diamond", "diamond hole", "corner", "stairs", "straight", "comb", "islands"],
-)  # fmt: skip
+)
 def test_edges_on_faces_and_vertices_on_vertices(adapters, name, kind):
     domain = POLYGONS[name]()
     for side in (2, 4, 8, 10):
@@ -156,11 +144,7 @@ def test_points_on_a_circle_around_a_vertex(adapters):
 @pytest.mark.parametrize("name", TOUCHING)
 def test_rings_that_touch(adapters, name):
     domain = TOUCHING[name]()
-    sets = [
-        scattered(domain, 60, 1),
-        domain.oriented.vertices,
-        *(lattice(k) for k in (2, 4, 6, 8, 10)),
-    ]
+    sets = [scattered(domain, 60, 1), domain.oriented.vertices, *(lattice(k) for k in (2, 4, 6, 8, 10))]
     for points in sets:
         inside = np.unique(points[domain.contains(points)], axis=0)
         for real, adapter in adapters.items():
@@ -232,7 +216,7 @@ NOTCHED = np.array([(-1, -1), (0.5, -1), (0.5, 0.5), (0.75, 0), (0.75, -0.5), (1
 
 @pytest.mark.parametrize(
     ("generator", "island"), [((2.5, 4), DIAMOND * 2 - 1), ((4, 4), DIAMOND * 2 - 1), ((4, 4), NOTCHED)]
-)  # fmt: skip
+)
 def test_corners_of_an_island_level_with_the_generator(adapters, generator, island):
     """A ray from the generator meets them; the island, in a lake, and the land around that are both in its region."""
     lake = np.array([(2.75, 2.75), (5.25, 2.75), (5.25, 5.25), (2.75, 5.25)])
@@ -261,9 +245,14 @@ def test_parts_thinner_than_round_off_are_rejected_or_correct(adapters):
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize(
     ("make", "n"),
-    [(lambda: koch(5), 2), (lambda: koch(5), 1000), (lambda: coast(4096), 3), (lambda: coast(4096), 1000),
-     (lambda: comb(1000, 0.95, 0.6), 1000)],
-)  # fmt: skip
+    [
+        (lambda: koch(5), 2),
+        (lambda: koch(5), 1000),
+        (lambda: coast(4096), 3),
+        (lambda: coast(4096), 1000),
+        (lambda: comb(1000, 0.95, 0.6), 1000),
+    ],
+)
 def test_many_edges(adapters, make, n):
     domain = clvoro.Polygon(make())
     points = scattered(domain, n, 3)
@@ -286,16 +275,8 @@ def test_a_rectangle_is_a_box(adapters, real):
 def read(stages, domain, t):
     labels = stages.engine.upload(np.arange(t.n), np.int32)
     diagram = fetch_diagram(stages.engine, domain, t, labels)
-    names = (
-        "volumes",
-        "centroids",
-        "neighbor_starts",
-        "neighbors",
-        "face_measures",
-        "face_vertices",
-        "vertices",
-    )
-    return [getattr(diagram, name) for name in names]  # fmt: skip
+    names = ("volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_vertices", "vertices")
+    return [getattr(diagram, name) for name in names]
 
 
 @pytest.fixture(scope="module", params=REALS)
@@ -342,10 +323,7 @@ def test_updated_diagrams_are_those_made_anew(stages, name):
         assert all(np.array_equal(a, b) for a, b in zip(anew, again, strict=True))
         eps = np.finfo(stages.engine.real).eps * domain.extent.max()
         owner = [np.repeat(np.arange(n), np.diff(x[2])) for x in (mine, anew)]
-        pairs = [
-            sorted(zip(o.tolist(), x[3].tolist(), strict=True))
-            for o, x in zip(owner, (mine, anew), strict=True)
-        ]
+        pairs = [sorted(zip(o.tolist(), x[3].tolist(), strict=True)) for o, x in zip(owner, (mine, anew), strict=True)]
         assert pairs[0] == pairs[1]
         assert np.abs(mine[0] - anew[0]).max() < 64 * eps * domain.extent.max()
         moved = points + 0.02 * rng.standard_normal(points.shape) * domain.extent.max() / np.sqrt(n)

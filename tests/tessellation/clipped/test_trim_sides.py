@@ -44,12 +44,8 @@ def compare(adapter, domain, points):
     far = max(map(abs, (*domain.lower, *domain.upper)))
     # Sums over some hundred faces, each rounded twice.
     rounding = 1024 * (2.2e-16 * (size + far))
-    assert np.abs(straight.areas[some] - areas).max() < rounding * size + 64 * size**2 * (
-        np.finfo(real).eps
-    )
-    assert np.abs(straight.perimeters[some] - perimeters).max() < rounding + 64 * size * (
-        np.finfo(real).eps
-    )
+    assert np.abs(straight.areas[some] - areas).max() < rounding * size + 64 * size**2 * (np.finfo(real).eps)
+    assert np.abs(straight.perimeters[some] - perimeters).max() < rounding + 64 * size * (np.finfo(real).eps)
     report = result.check()
     assert report, report
     return found, result
@@ -75,13 +71,9 @@ def test_parts_of_a_cell_on_both_sides_of_a_face_are_one(adapters, real):
     for holes in ([], [hole], [hole + 0.01, DIAMOND * 0.1 + (0.1, 0.1)]):
         found, result = compare(adapters[real], clvoro.Polygon(outer, holes), points)
         bisector = result.diagram.neighbors >= 0
-        assert (
-            found[0].sides == 4 + 2
-        )  # left, bottom, the spit's near side, its tip's far side, top; the bisector
+        assert found[0].sides == 4 + 2  # left, bottom, the spit's near side, its tip's far side, top; the bisector
         assert bisector.sum() == 2
-        assert (
-            result.diagram.neighbors == -1
-        ).sum() == 2  # the bottom is cut, and none the less one side
+        assert (result.diagram.neighbors == -1).sum() == 2  # the bottom is cut, and none the less one side
 
 
 @pytest.mark.sparse(4)
@@ -114,9 +106,7 @@ def test_sides_along_edges_without_a_length(adapters, real):
     """Edges below round-off have no faces, but still turn the boundary."""
     tiny = 3e-11
     corner = np.array([(1 - tiny, 0), (1, tiny)])  # by 45 degrees twice
-    bend = np.array(
-        [(0.5 - tiny, 1), (0.5 - 2 * tiny, 1 - 0.1 * tiny)]
-    )  # by some degrees, in sum by none
+    bend = np.array([(0.5 - tiny, 1), (0.5 - 2 * tiny, 1 - 0.1 * tiny)])  # by some degrees, in sum by none
     domain = clvoro.Polygon(np.concatenate([[(0, 0)], corner, [(1, 1)], bend, [(0, 1)]]))
     found, result = compare(adapters[real], domain, np.array([(0.4, 0.3)]))
     assert len(result.diagram.neighbors) == (7 if real == "float64" else 5)
@@ -133,9 +123,7 @@ def test_missing_neighbors(ctx, real):
         engine = Engine(ctx, cl.CommandQueue(ctx), 2, dtype, domain.kind(dtype))
         points = scattered(domain, 90, 4)
         stages = Stages(engine)
-        t = Tessellator(stages, domain).tessellate(
-            engine.upload(domain.place(points, dtype)), len(points)
-        )
+        t = Tessellator(stages, domain).tessellate(engine.upload(domain.place(points, dtype)), len(points))
         missing = 6 - t.outlines[0].get().reshape(-1, 2)[: len(points), 1]
         diagram = clvoro.Adapter(ctx, real).diagram(domain, points)
         expected = [o.missing for o in outlines(diagram)]

@@ -27,10 +27,7 @@ class Carried:
 
     def __init__(self, stages, box, points):
         self.stages, self.box, self.n = stages, box, len(points)
-        self.periodic, self.fresh = (
-            PeriodicTessellator(stages, box),
-            PeriodicTessellator(stages, box),
-        )
+        self.periodic, self.fresh = (PeriodicTessellator(stages, box), PeriodicTessellator(stages, box))
         self.t = self.periodic.tessellate(self.place(points), self.n)
 
     def place(self, points):
@@ -60,9 +57,7 @@ def moved(points, box, by, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "box", [pytest.param(UNIT, id="unit"), pytest.param(CHANNEL, id="channel")]
-)
+@pytest.mark.parametrize("box", [pytest.param(UNIT, id="unit"), pytest.param(CHANNEL, id="channel")])
 def test_lanes_have_the_bits_of_single_cells(ctx, box, monkeypatch):
     """On CPUs, vector lanes check, clip and measure eight rows at a time."""
     monkeypatch.setattr(repair, "FEW", 1)
@@ -98,9 +93,7 @@ def test_cells_that_cover_the_box_twice(ctx, real):
     run = Carried(stages, UNIT, points + 0.001)
     twice = points * [2, 1] + np.column_stack([apart.imag, apart.real])
     stages.folded_cells.reserve(run.n)
-    covered = stages.incremental.update(
-        stages.folded_cells, run.periodic.wide, run.place(twice), run.t
-    )
+    covered = stages.incremental.update(stages.folded_cells, run.periodic.wide, run.place(twice), run.t)
     assert patch.fetch(covered).volumes.sum() == pytest.approx(2, rel=1e-5)
     run = Carried(stages, UNIT, points + 0.001)
     assert run.move(twice) is None

@@ -7,12 +7,7 @@ import pytest
 
 import clvoro
 from clvoro.tessellation.periodic.ghost_images import COLLAPSED, FAR
-from clvoro.tessellation.periodic.halo import (
-    BLOCKS,
-    Halo,
-    block_count,
-    block_counts,
-)
+from clvoro.tessellation.periodic.halo import BLOCKS, Halo, block_count, block_counts
 from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
 BOXES = {
@@ -114,9 +109,7 @@ def test_images_are_those_in_the_halo(adapter, name):
     images, expected = given.images, given.expected()
     owners, codes = images.owners.get(), images.codes.get()
     assert images.count == 60 + len(expected)
-    assert [(i, c) for i, c, _ in expected] == list(zip(owners, codes, strict=True))[
-        : len(expected)
-    ]
+    assert [(i, c) for i, c, _ in expected] == list(zip(owners, codes, strict=True))[: len(expected)]
     points = images.points.get()[: images.count]
     assert np.array_equal(points, np.concatenate([given.points, [p for *_, p in expected]]))
     # Extremes cover the blocks that exist.
@@ -124,13 +117,8 @@ def test_images_are_those_in_the_halo(adapter, name):
     used = [given.wide_of(a, end) for a in range(given.dim) for end in (0, 1)]
     walls = np.repeat(given.periods == 0, 2)
     widest = [0 if wall else wide.max() for wall, wide in zip(walls, used, strict=True)]
-    assert np.array_equal(
-        extremes[: given.dim].view(np.float32), np.maximum(widest[::2], widest[1::2])
-    )
-    least = [
-        0 if wall else bits(WHOLE) - bits(wide.min())
-        for wall, wide in zip(walls, used, strict=True)
-    ]
+    assert np.array_equal(extremes[: given.dim].view(np.float32), np.maximum(widest[::2], widest[1::2]))
+    least = [0 if wall else bits(WHOLE) - bits(wide.min()) for wall, wide in zip(walls, used, strict=True)]
     assert np.array_equal(extremes[4 : 4 + 2 * given.dim], least)
     firsts = np.searchsorted([i for i, *_ in expected], np.arange(61))
     assert np.array_equal(images.firsts.get(), firsts)
@@ -184,9 +172,7 @@ class Folding:
         self.x = images.points.get()
         self.owners, self.codes = images.owners.get(), images.codes.get()
         self.rows = {
-            (j, c): n + g
-            for g, (j, c) in enumerate(zip(self.owners, self.codes, strict=True))
-            if g < images.count - n
+            (j, c): n + g for g, (j, c) in enumerate(zip(self.owners, self.codes, strict=True)) if g < images.count - n
         }
 
     def face(self, k):
@@ -211,11 +197,9 @@ class Folding:
         upload, t, face = self.given.engine.upload, self.t, self.given.engine.face
         changed = replace(
             t, neighbors=upload(neighbors, np.int32), face_measures=upload(measures, face), volumes=upload(volumes)
-        )  # fmt: skip
+        )
         ghost_images = self.given.ghost_images
-        ghost_images._report.set(
-            np.array([0, 0, 2**31 - 1], np.int32)
-        )  # of the images, of which there is one diagram
+        ghost_images._report.set(np.array([0, 0, 2**31 - 1], np.int32))  # of the images, of which there is one diagram
         return ghost_images.fold(self.images, self.binned, changed, self.given.x, share, nearest)
 
     def far(self, neighbors):
@@ -249,9 +233,7 @@ def test_faces_that_are_missing_on_one_side(adapter, name):
         cone = measures[k] * length / (2 * dim)
         volumes = folding.volumes.copy()
         volumes[i], volumes[j] = rng.permutation([1.0, 2.0])
-        share = (
-            cone * (1.2, 0.7, 0.4)[trial % 3]
-        )  # of the lesser or of both, no more; or more than of either
+        share = cone * (1.2, 0.7, 0.4)[trial % 3]  # of the lesser or of both, no more; or more than of either
         lesser = min(volumes[i], volumes[j])
         tiny = measures[k] < most and cone <= share * lesser
         nearest = trial % 2 == 0

@@ -8,19 +8,10 @@ from scipy.spatial import Delaunay
 
 import clvoro
 from clvoro.tessellation.periodic.ghost_images import KEPT, OUTWARDS, SIDEWAYS, GhostImages
-from clvoro.tessellation.periodic.halo import (
-    BLOCKS,
-    FEWEST_BLOCKS,
-    FINENESS,
-    Halo,
-    block_counts,
-)
+from clvoro.tessellation.periodic.halo import BLOCKS, FEWEST_BLOCKS, FINENESS, Halo, block_counts
 from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
-BOXES = {
-    2: clvoro.Box((0, 0), (1, 0.7), periodic=True),
-    3: clvoro.Box((0, 0, 0), (1, 0.7, 0.8), periodic=True),
-}
+BOXES = {2: clvoro.Box((0, 0), (1, 0.7), periodic=True), 3: clvoro.Box((0, 0, 0), (1, 0.7, 0.8), periodic=True)}
 WALLED = {
     2: clvoro.Box((0, 0), (1, 0.7), periodic=(False, True)),
     3: clvoro.Box((0, 0, 0), (1, 0.7, 0.8), periodic=(False, True, True)),
@@ -93,11 +84,7 @@ def needs(points, edges, periods, counts, sideways, outwards, noise):
         for a in (a for a in range(len(periods)) if a != axis):
             ends = np.arange(counts[a] + 1) * edges[a] / counts[a]
             away = outside(centers[:, a], ends[:-1], ends[1:])
-            aside2 = (
-                aside2 + away**2
-                if np.ndim(aside2) == 0
-                else aside2[..., None] + away[:, None, :] ** 2
-            )
+            aside2 = aside2 + away**2 if np.ndim(aside2) == 0 else aside2[..., None] + away[:, None, :] ** 2
         shape = (-1,) + (1,) * (aside2.ndim - 1)
         radius, side = radii.reshape(shape), (sideways * ways).reshape(shape)
         out = outwards * ways + np.clip(radii + to_boundary, 0, sideways * ways)
@@ -244,9 +231,7 @@ def test_nearly_a_period_counts_as_the_whole_period(adapter):
         halo.cells = n
         stages.ghost_images.extend(box, x, n, halo, 1.0, False)
         for (axis, _), found in blocks_of(halo.depths, 2, counts).items():
-            wide = (
-                share * periods[axis] if share < 0.99 else 4.0
-            )  # WHOLE_PERIOD of tessellation/periodic/halo.h
+            wide = share * periods[axis] if share < 0.99 else 4.0  # WHOLE_PERIOD of tessellation/periodic/halo.h
             assert found == pytest.approx(np.full(found.shape, wide), rel=1e-6)
 
 
@@ -262,8 +247,7 @@ def test_there_are_up_to_two_blocks_per_cell():
 
 @pytest.mark.sparse(4)
 @pytest.mark.parametrize(
-    ("dim", "before", "after"),
-    [(2, 600, 900), (3, 600, 5000), (3, 5000, 600), (3, 5000, 40_000), (3, 40_000, 5000)],
+    ("dim", "before", "after"), [(2, 600, 900), (3, 600, 5000), (3, 5000, 600), (3, 5000, 40_000), (3, 40_000, 5000)]
 )
 def test_depths_after_a_change_of_blocks(adapter, dim, before, after):
     """Each new block takes the largest depth among old blocks no farther away than their depth."""

@@ -78,17 +78,14 @@ def torus_voronoi(box, points):
 
 def faces_of(diagram):
     keys = zip(
-        face_owners(diagram).tolist(), diagram.neighbors.tolist(),
-        map(tuple, diagram.shifts.tolist()), strict=True,
-    )  # fmt: skip
+        face_owners(diagram).tolist(), diagram.neighbors.tolist(), map(tuple, diagram.shifts.tolist()), strict=True
+    )
     return dict(zip(keys, diagram.face_measures.tolist(), strict=True))
 
 
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 60, 500])
-@pytest.mark.parametrize(
-    "box", [UNIT, CHANNEL, CUBE, SLAB], ids=["unit", "channel", "cube", "slab"]
-)
+@pytest.mark.parametrize("box", [UNIT, CHANNEL, CUBE, SLAB], ids=["unit", "channel", "cube", "slab"])
 def test_against_qhull(adapter, box, n):
     points = some_points(box, n)
     diagram = adapter.diagram(box, points)
@@ -189,10 +186,7 @@ def test_lattices(adapter, lattice, n, offset):
     box = clvoro.Box((0,) * len(edges), edges, periodic=True)
     d = adapter.diagram(box, points + offset * np.array(edges))
     assert (np.diff(d.neighbor_starts) == sides).all()
-    assert (
-        np.abs(d.volumes * len(points) / box.measure - 1).max()
-        < 40 * np.finfo(adapter.dtype).eps * n
-    )
+    assert np.abs(d.volumes * len(points) / box.measure - 1).max() < 40 * np.finfo(adapter.dtype).eps * n
     assert d.check()
 
 
@@ -235,11 +229,7 @@ def test_images_include_all_that_cells_need(adapter, box):
     corners = (corners - np.array(box.frame[0])) / scale
     steps = [(-1, 0, 1) if p else (0,) for p in box.periodic]
     all_images = np.concatenate(
-        [
-            x.get() + np.array(step) * box.periods(adapter.dtype)
-            for step in itertools.product(*steps)
-            if any(step)
-        ]
+        [x.get() + np.array(step) * box.periods(adapter.dtype) for step in itertools.product(*steps) if any(step)]
     )
     # Centers of large balls have a round-off of radius / distance of the generators.
     noise = 1e-5 if adapter.dtype == np.float64 else 1e-3
@@ -306,9 +296,7 @@ def test_arguments(adapter):
 
 # Runs.
 
-SPOT = sizing.Expression(
-    "0.05 + 0.3 * fmax(hypot(x - 0.05 - floor(x + 0.45), y - 0.9 - floor(y - 0.4)) - 0.1, 0)"
-)
+SPOT = sizing.Expression("0.05 + 0.3 * fmax(hypot(x - 0.05 - floor(x + 0.45), y - 0.9 - floor(y - 0.4)) - 0.1, 0)")
 """A refined spot around (0.05, 0.9), across two periodic boundaries."""
 
 
@@ -329,9 +317,7 @@ def test_runs(adapter, options):
     result = adapter.run(UNIT, SPOT, seed=3, **options)
     assert result.check()
     assert (np.abs(result.diagram.shifts).max(axis=0) == 1).all()
-    assert abs(result.diagram.volumes.sum() - 1) < 4 * np.finfo(adapter.dtype).eps * len(
-        result.points
-    )
+    assert abs(result.diagram.volumes.sum() - 1) < 4 * np.finfo(adapter.dtype).eps * len(result.points)
     if not options:
         # The count is correct to two cells, and less than a third of a cell changes nothing: pairs of defects have
         # priority. Each surplus cell makes all smaller by 1 / 2n, which is most of the error of so few cells.
@@ -455,12 +441,7 @@ def test_resume(double, tmp_path):
         resumed = double.run(box, size, checkpoint=clvoro.Checkpoint(resume=file), **options)
         assert resumed.points.tobytes() == whole.points.tobytes()
         with pytest.raises(InputError, match="domain"):
-            double.run(
-                clvoro.Box(box.lower, box.upper),
-                size,
-                checkpoint=clvoro.Checkpoint(resume=file),
-                **options,
-            )
+            double.run(clvoro.Box(box.lower, box.upper), size, checkpoint=clvoro.Checkpoint(resume=file), **options)
 
 
 @pytest.mark.sparse(1)
@@ -482,9 +463,7 @@ def test_a_lattice_stays(double, lattice, n):
     box = clvoro.Box((0,) * len(edges), edges, periodic=True)
     size = (box.measure / len(points)) ** (1 / box.dim)
     for method in ("coupled", "weighted"):
-        result = double.run(
-            box, size, points, method=method, max_steps=5, options=clvoro.PaperOptions(tol=0)
-        )
+        result = double.run(box, size, points, method=method, max_steps=5, options=clvoro.PaperOptions(tol=0))
         moved = result.points - box.wrap(points)
         assert np.abs(moved - np.rint(moved / box.extent) * box.extent).max() < 1e-12
 
@@ -612,9 +591,7 @@ def test_transfer_across_periodic_boundaries(adapter, periodic, order):
     rng = np.random.default_rng(2211)
 
     def mean_error(n: int) -> float:
-        old, new = (
-            adapter.diagram(box, rng.uniform(box.lower, box.upper, (n, 2))) for _ in range(2)
-        )
+        old, new = (adapter.diagram(box, rng.uniform(box.lower, box.upper, (n, 2))) for _ in range(2))
 
         def field(x: np.ndarray) -> np.ndarray:
             return np.sin(np.pi * (x[:, 0] - 0.5)) + np.cos(np.pi * x[:, 1]) ** 2
@@ -648,24 +625,18 @@ def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, resto
     if restored:
         saved = {name: getattr(previous, name).get() for name in DIAGRAM}
         m = saved["starts"][-1]
-        saved |= {
-            name: saved[name][:m] for name in ("neighbors", "face_measures", "face_centroids")
-        }
+        saved |= {name: saved[name][:m] for name in ("neighbors", "face_measures", "face_centroids")}
         previous = tessellator.restore(x, saved, 0, ())
     rows = previous.starts.get(), previous.neighbors.get()[: previous.starts.get()[-1]]
     extend, unfold = GhostImages.extend, GhostImages.unfold
 
     def narrow(ghost_images, domain, points, n, halo, factor, grow):
         short = len(begun) < 3
-        return extend(
-            ghost_images, domain, points, n, halo, 0.4 if short else factor, grow and not short
-        )
+        return extend(ghost_images, domain, points, n, halo, 0.4 if short else factor, grow and not short)
 
     def seen(ghost_images, images, graph):
         begun.append((graph.starts.get(), graph.neighbors.get()[: len(rows[1])]))
-        assert all(
-            map(np.array_equal, begun[-1], rows)
-        )  # before they are read: there would be other labels
+        assert all(map(np.array_equal, begun[-1], rows))  # before they are read: there would be other labels
         return unfold(ghost_images, images, graph)
 
     monkeypatch.setattr(PeriodicTessellator, "_updated", lambda *_: None)

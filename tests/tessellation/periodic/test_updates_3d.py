@@ -21,13 +21,9 @@ class Carried:
 
     def __init__(self, ctx, box, points, real="float64"):
         made = patch.make_engine(ctx, real)
-        self.stages, self.anew = (
-            Stages(Engine(ctx, made.queue, 3, made.real, box.kind(made.real))) for _ in range(2)
-        )
+        self.stages, self.anew = (Stages(Engine(ctx, made.queue, 3, made.real, box.kind(made.real))) for _ in range(2))
         self.box, self.n = box, len(points)
-        self.periodic, self.fresh = (
-            PeriodicTessellator(stages, box) for stages in (self.stages, self.anew)
-        )
+        self.periodic, self.fresh = (PeriodicTessellator(stages, box) for stages in (self.stages, self.anew))
         self.t = self.periodic.tessellate(self.place(points), self.n)
 
     def place(self, points):
@@ -65,9 +61,11 @@ def rows_of(t):
     order = np.argsort(faces)
     cells = {name: getattr(t, name).get()[: t.n] for name in ("volumes", "offsets", "covariances")}
     return {
-        "faces": faces[order], "areas": t.face_measures.get()[:m][order],
-        "centroids": t.face_centroids.get()[:m][order], **cells,
-    }  # fmt: skip
+        "faces": faces[order],
+        "areas": t.face_measures.get()[:m][order],
+        "centroids": t.face_centroids.get()[:m][order],
+        **cells,
+    }
 
 
 def some_points(box, n, seed=50103):
@@ -92,9 +90,7 @@ def moved(points, box, by, rng):
 
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", ["float64", "float32"])
-@pytest.mark.parametrize(
-    "box", [pytest.param(UNIT, id="unit"), pytest.param(CHANNEL, id="channel")]
-)
+@pytest.mark.parametrize("box", [pytest.param(UNIT, id="unit"), pytest.param(CHANNEL, id="channel")])
 def test_updated_diagrams_equal_new_ones(ctx, box, real):
     points, rng = some_points(box, N), np.random.default_rng(50104)
     carried = Carried(ctx, box, points, real)
@@ -122,9 +118,7 @@ def test_generators_that_cross_the_seam_keep_their_cells(ctx):
 
 def test_few_cells_are_made_anew(ctx):
     """Vertices farther than a quarter of a period from their generators."""
-    points = (
-        np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5
-    ) / 4
+    points = (np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / 4
     points += 0.02 * np.random.default_rng(5).standard_normal(points.shape)
     carried = Carried(ctx, UNIT, points)
     assert carried.update(points + 1e-3)
@@ -144,9 +138,11 @@ def test_cells_that_cover_the_box_twice(ctx):
     names = [t.neighbors.get()[: t.starts.get()[half]] for t in rows]
     upload = carried.stages.engine.upload
     twice = replace(
-        carried.t, starts=upload(np.append(0, np.cumsum(counts)), np.int32),
-        neighbors=upload(np.concatenate([names[0], names[1] + half]), np.int32), vertices=(),
-    )  # fmt: skip
+        carried.t,
+        starts=upload(np.append(0, np.cumsum(counts)), np.int32),
+        neighbors=upload(np.concatenate([names[0], names[1] + half]), np.int32),
+        vertices=(),
+    )
     update, x = carried.stages.polyhedra_update, carried.t.points
     clip = carried.periodic._clip_of(x, N, twice)
     covered = update.update(carried.stages.cells, carried.periodic.wide, x, twice, clip)

@@ -79,9 +79,14 @@ def test_loops_without_repetitions_and_spurs(engine, kernels, labels):
     turns = engine.upload(names[flat], np.int32)
     reduced, counts = engine.empty(len(flat), np.int32), engine.empty(len(given), np.int32)
     engine.run_each(
-        kernels.reduce_loops, len(given), engine.upload(starts, np.int32), turns,
-        engine.upload(of, np.int32), reduced, counts,
-    )  # fmt: skip
+        kernels.reduce_loops,
+        len(given),
+        engine.upload(starts, np.int32),
+        turns,
+        engine.upload(of, np.int32),
+        reduced,
+        counts,
+    )
     reduced, counts = reduced.get(), counts.get()
     for k, loop in enumerate(given):
         found = reduced[starts[k] : starts[k] + counts[k]].tolist()
@@ -96,7 +101,7 @@ def test_half_faces_that_differ(engine, kernels):
 
     def add(one, other, differs):
         k = len(loops)
-        turn = [np.roll(loop, rng.integers(len(loop))).tolist() if loop else [] for loop in (one, other)]  # fmt: skip
+        turn = [np.roll(loop, rng.integers(len(loop))).tolist() if loop else [] for loop in (one, other)]
         loops.extend(turn)
         twins.extend([k + 1, k])
         expected.extend([differs, differs])
@@ -120,9 +125,13 @@ def test_half_faces_that_differ(engine, kernels):
     add([], [], False)
     # Walls, and half-faces that the graph lacks.
     for loop, twin, differs in (
-        ([1, 2, 3, 4], "own", False), ([1, 2, 1, 4], "own", True), ([1, 2, 3, 4, 2], "own", True),
-        ([], "own", False), ([], -1, False), ([1, 2, 3], -1, True),
-    ):  # fmt: skip
+        ([1, 2, 3, 4], "own", False),
+        ([1, 2, 1, 4], "own", True),
+        ([1, 2, 3, 4, 2], "own", True),
+        ([], "own", False),
+        ([], -1, False),
+        ([1, 2, 3], -1, True),
+    ):
         twins.append(len(loops) if twin == "own" else twin)
         loops.append(loop)
         expected.append(differs)
@@ -135,9 +144,7 @@ def test_half_faces_that_differ(engine, kernels):
     counts = engine.upload([len(loop) for loop in loops], np.int32)
     v, any_ = len(loops), engine.zeros(1, np.int32)
     differs = engine.zeros(v, np.uint8)
-    engine.run_each(
-        kernels.compare_half_faces, v, engine.upload(twins, np.int32), starts, turns, counts, differs, any_
-    )  # fmt: skip
+    engine.run_each(kernels.compare_half_faces, v, engine.upload(twins, np.int32), starts, turns, counts, differs, any_)
     assert differs.get().tolist() == expected
     assert int(any_[0].get()) == 1
     same = [k for k in range(v) if not expected[k]]
@@ -145,9 +152,15 @@ def test_half_faces_that_differ(engine, kernels):
     starts, turns = rows(engine, [loops[k] for k in same])
     any_.fill(0)
     engine.run_each(
-        kernels.compare_half_faces, len(same), engine.upload([place.get(twins[k], -1) for k in same], np.int32),
-        starts, turns, engine.upload([len(loops[k]) for k in same], np.int32), differs, any_,
-    )  # fmt: skip
+        kernels.compare_half_faces,
+        len(same),
+        engine.upload([place.get(twins[k], -1) for k in same], np.int32),
+        starts,
+        turns,
+        engine.upload([len(loops[k]) for k in same], np.int32),
+        differs,
+        any_,
+    )
     assert int(any_[0].get()) == 0
 
 
@@ -206,9 +219,7 @@ def test_vertices_are_merged_into_better_ones_on_their_planes(engine):
         if not sharing.merge(0):
             break
     ends = {i for i, label in enumerate(f.corner_faces.get().tolist()) if min(label) < 0}
-    on_axis = [
-        u for u in ends if abs(np.ptp(np.linalg.norm(at[u] - t.points.get(), axis=1))) < 1e-14
-    ]
+    on_axis = [u for u in ends if abs(np.ptp(np.linalg.norm(at[u] - t.points.get(), axis=1))) < 1e-14]
     labels = sharing.labels.get()
     assert len({labels[u] for u in on_axis}) == 2
 
@@ -216,7 +227,5 @@ def test_vertices_are_merged_into_better_ones_on_their_planes(engine):
 def test_a_face_that_cannot_be_shared_is_an_error(engine, monkeypatch):
     monkeypatch.setattr(FaceSharing, "merge", lambda self, doublings: False)
     t = tessellation(engine, Bins(engine), Polyhedra(engine), ring(40))
-    with pytest.raises(
-        clvoro.errors.InputError, match="perturb generators that lie on a common sphere"
-    ):
+    with pytest.raises(clvoro.errors.InputError, match="perturb generators that lie on a common sphere"):
         share_faces(engine, BOX, t)

@@ -75,9 +75,7 @@ def test_corners_lie_on_their_faces(seen):
 
 @pytest.mark.sparse(2)
 def test_corners_of_one_vertex(seen):
-    by_faces = {
-        (i, faces): u for u, (i, faces) in enumerate(zip(seen.owners, seen.faces, strict=True))
-    }
+    by_faces = {(i, faces): u for u, (i, faces) in enumerate(zip(seen.owners, seen.faces, strict=True))}
     for u in seen.u:
         i, found = seen.owners[u], u
         for j in sorted(seen.faces[u]):
@@ -130,6 +128,4 @@ def check_half_faces(seen):
                 # The edge that leaves a corner counter-clockwise is shared with the face before.
                 assert faces[faces.index(label) - 1] in seen.faces[v]
     assert seen.loop_starts[-1] == 3 * len(seen.owners)
-    assert np.array_equal(
-        np.unique(seen.loops, return_counts=True)[1], np.full(len(seen.owners), 3)
-    )
+    assert np.array_equal(np.unique(seen.loops, return_counts=True)[1], np.full(len(seen.owners), 3))

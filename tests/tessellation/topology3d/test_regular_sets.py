@@ -34,9 +34,7 @@ def pipe(radii, n, layers):
     turn = 2 * np.pi * np.arange(n) / n + 0.1
     ring = np.column_stack([np.cos(turn), np.sin(turn)])
     rings = 0.5 + np.concatenate([r * ring for r in radii])
-    return np.vstack(
-        [np.pad(rings, ((0, 0), (0, 1)), constant_values=(k + 0.5) / layers) for k in range(layers)]
-    )
+    return np.vstack([np.pad(rings, ((0, 0), (0, 1)), constant_values=(k + 0.5) / layers) for k in range(layers)])
 
 
 def ring(n, radius, seed):
@@ -56,13 +54,9 @@ def spiral(n):
 
 def globe(rows, columns):
     """Generators on circles of latitude."""
-    down, round_ = np.meshgrid(
-        (np.arange(rows) + 0.5) / rows * np.pi, 2 * np.pi * np.arange(columns) / columns
-    )
+    down, round_ = np.meshgrid((np.arange(rows) + 0.5) / rows * np.pi, 2 * np.pi * np.arange(columns) / columns)
     across = np.sin(down)
-    return 0.5 + 0.4 * np.stack(
-        [across * np.cos(round_), across * np.sin(round_), np.cos(down)], -1
-    ).reshape(-1, 3)
+    return 0.5 + 0.4 * np.stack([across * np.cos(round_), across * np.sin(round_), np.cos(down)], -1).reshape(-1, 3)
 
 
 def torus(n, m):
@@ -94,18 +88,8 @@ SETS = {
     "torus": turned(torus(60, 24)),
     "layers": np.vstack([np.pad(PLANE, ((0, 0), (0, 1)), constant_values=z) for z in (0.003, 0.01, 0.03, 0.1, 0.3)]),
     "line among others": np.vstack([np.linspace(0.2, 0.8, 150)[:, None] * (1, 1, 1), RNG.random((60, 3))]),
-}  # fmt: skip
-IN_TORUS = (
-    "cubic",
-    "hexagonal, turned",
-    "ring",
-    "pipe",
-    "sphere",
-    "even sphere",
-    "shells",
-    "globe",
-    "layers",
-)
+}
+IN_TORUS = ("cubic", "hexagonal, turned", "ring", "pipe", "sphere", "even sphere", "shells", "globe", "layers")
 
 
 def check(adapter, box, points):
@@ -151,7 +135,7 @@ def near_each_other(gap, seed=0):
         "line": np.vstack([base, 0.3 + gap * np.arange(60)[:, None] * directions(1, rng)]),
         "circle": np.vstack([base, 0.5 + gap * circle / 0.51]),
         "layers": np.column_stack([np.tile(base[:80, :2], (4, 1)), np.repeat(gap * np.arange(1, 5), 80)]),
-    }  # fmt: skip
+    }
 
 
 KINDS = list(near_each_other(1))

@@ -1,0 +1,176 @@
+"""The protocol of domains: what the rest of the package asks of the region to mesh."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ..arguments import check_rows
+from ..opencl.engine import DomainKind
+from .boundary_names import BoundaryNames, Walls
+
+if TYPE_CHECKING:
+    from ..opencl.engine import Engine
+    from .shapes import Edges
+    from .surface import Surface
+
+LARGEST_EDGE = 1e50
+"""Longest edge of a domain, and the inverse of the shortest: fifth powers of lengths must not overflow float64."""
+
+
+class ClipBox(Protocol):
+    """The box that clips cells: a `Domain`, or a box that a stage makes. Stages use nothing else of a domain."""
+
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Corners in the device's coordinates, padded to four numbers as kernels take them."""
+        ...
+
+
+class Domain(ABC):
+    """The region to mesh.
+
+    Attributes
+    ----------
+    lower, upper : tuples of d floats
+        Opposite corners of the bounding box.
+    periodic : tuple of d bool
+        Directions in which the domain is periodic.
+    names : mapping or None
+        The caller's names of boundaries.
+    """
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    names: Mapping[str, Walls] | None
+
+    @property
+    def periodic(self) -> tuple[bool, ...]:
+        """Directions in which the domain is periodic. By default none."""
+        return (False,) * self.dim
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates, 2 or 3."""
+        return len(self.lower)
+
+    @property
+    def cell_dim(self) -> int:
+        """Dimension of the cells: 2 on a sphere in 3D."""
+        return self.dim
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Edge lengths of the bounding box, (d,)."""
+        return np.subtract(self.upper, self.lower)
+
+    @property
+    def n_pieces(self) -> int:
+        """Number of separate pieces. Each one needs a generator."""
+        return 1
+
+    @property
+    @abstractmethod
+    def measure(self) -> float:
+        """Area or volume."""
+
+    # The boundary: walls are the sides of a box or the edges of a polygon.
+
+    @abstractmethod
+    def _default_names(self) -> BoundaryNames:
+        """Return the parts of the boundary with their default names."""
+
+    @cached_property
+    def boundaries(self) -> BoundaryNames:
+        """The parts of the boundary, with the caller's names."""
+        default = self._default_names()
+        return default.renamed(f"{type(self).__name__} names", self.names) if self.names else default
+
+    @property
+    def boundary_names(self) -> tuple[str, ...]:
+        """Names of the parts of the boundary: the caller's first, then the default names of all other walls."""
+        return self.boundaries.names
+
+    @property
+    def boundary_index(self) -> np.ndarray:
+        """Index in `boundary_names` for each wall, (k,) int32; -1 for the periodic sides of a box.
+
+        A face with the neighbor -1 - k belongs to ``boundary_names[boundary_index[k]]``.
+        """
+        return self.boundaries.index
+
+    @abstractmethod
+    def boundary(self, walls: Walls | None = None) -> Edges | Surface:
+        """Return walls as a shape for `clvoro.sizing.Distance`: numbers, names, or by default all."""
+
+    def _checked_names(self) -> dict[str, list[int]] | None:
+        """Check the caller's names, and return them with the numbers of their walls; None without names."""
+        parts = self.boundaries
+        return {n: parts.select(n, n).tolist() for n in self.names} if self.names else None
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return the domain as a dictionary of numbers, strings and lists, for files."""
+
+    @abstractmethod
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) whether it lies in the domain, boundary included; (n,) bool.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If `points` is not an array of numbers of that shape.
+        """
+
+    def check_rows(self, name: str, points: object) -> np.ndarray:
+        """Return `points`, an array_like of real numbers, as a float64 array (n, d); see `arguments.check_rows`."""
+        return check_rows(name, points, self.dim)
+
+    def wrap(self, points: np.ndarray) -> np.ndarray:
+        """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
+        return np.asarray(points, float)
+
+    # The device's view.
+
+    @property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1].
+
+        The scale is a power of two, so scaling is exact.
+        """
+        return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
+
+    def place(self, points: np.ndarray, real: np.dtype) -> np.ndarray:
+        """Return positions (n, d) in the device's coordinates and precision."""
+        origin, scale = self.frame
+        return ((points - origin) / scale).astype(real)
+
+    @property
+    def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the box that clips cells."""
+        return np.array(self.lower), np.array(self.upper)
+
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of `clip_box` in the device's coordinates, padded to four numbers as kernels take them."""
+        # Cached, because every stage needs them in every step.
+        known: dict[np.dtype, tuple[np.ndarray, np.ndarray]] = vars(self).setdefault("_corners", {})
+        if real not in known:
+            origin, scale = self.frame
+            corners = np.zeros((2, 4), real)
+            corners[:, : self.dim] = (np.array(self.clip_box) - origin) / scale
+            corners.setflags(write=False)
+            known[real] = corners[0], corners[1]
+        return known[real]
+
+    def kind(self, real: np.dtype) -> DomainKind:
+        """Return the kind of domain, for which kernels are built; `real` is the precision of periods."""
+        del real
+        return DomainKind()
+
+    def device_args(self, engine: Engine) -> tuple[object, ...]:
+        """Return the arguments of kernels with DOMAIN_ARGS; see geometry/domain.h."""
+        return *self.device_corners(engine.real), *engine.period_args
