@@ -24,11 +24,11 @@ def insert_delete_smooth(
     adapter: clvoro.Adapter, domain: clvoro.Box, size: sizing.Field, seed: int
 ) -> tuple[np.ndarray, int, float]:
     """Return generators (n, d), the number of Lloyd steps, and the changes of neighbors per cell."""
-    mesh = adapter.run(domain, size, "density", method="lloyd", seed=seed, max_steps=SMOOTHING)
+    mesh = adapter.run(domain, size, points="density", method="lloyd", seed=seed, max_steps=SMOOTHING)
     best, steps, changes = mesh, SMOOTHING, 0.0
     for _ in range(SWEEPS):
         points = _divide_and_delete(mesh.diagram, np.asarray(mesh.target_size))
-        mesh = adapter.run(domain, size, points, method="lloyd", max_steps=SMOOTHING)
+        mesh = adapter.run(domain, size, points=points, method="lloyd", max_steps=SMOOTHING)
         steps += SMOOTHING
         changes += float(mesh.history["changed"].sum()) / len(points)
         if np.abs(mesh.size_error).mean() < np.abs(best.size_error).mean():

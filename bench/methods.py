@@ -165,7 +165,7 @@ def measure(
         if name == "paper" and way.source == "the paper":
             arguments["options"], start = clvoro.PaperOptions(tol=0, k=1.0), "uniform"
         begun = time.process_time()
-        mesh = adapter.run(domain, size, start, seed=FIRST_SEED, **arguments)
+        mesh = adapter.run(domain, size, points=start, seed=FIRST_SEED, **arguments)
         record |= {"seconds": time.process_time() - begun, "steps": int(mesh.history["step"][-1])}
         record["changes"] = float((mesh.history["changed"] / mesh.history["cells"]).sum())
         return {**record, **judge(mesh.diagram, mesh.target_size)}, mesh

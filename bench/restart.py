@@ -101,7 +101,11 @@ def main(arguments: list[str] | None = None) -> int:
             by = min(k, options.moves) * options.by * 0.002 * factor
             start = time.perf_counter()
             new = adapter.run(
-                BOX, moved_field(by, factor), result.points if warm else None, effort=options.effort, seed=FIRST_SEED
+                BOX,
+                moved_field(by, factor),
+                points=result.points if warm else None,
+                effort=options.effort,
+                seed=FIRST_SEED,
             )
             seconds = time.perf_counter() - start
             if warm:

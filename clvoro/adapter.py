@@ -204,7 +204,7 @@ class Adapter:
 
         Parameters
         ----------
-        domain : Box or Polygon
+        domain : Box, Polygon or Sphere
         points : (n, d) array of float
             Distinct generators inside the domain, walls included.
 
@@ -244,7 +244,7 @@ class Adapter:
         return fetch_diagram(engine, domain, t, labels, extended=extended)
 
     def power_diagram(self, domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
-        """Return the power diagram of `points` with `weights`; see `clvoro.power_diagram`."""
+        """Return the power diagram of `points` with `weights` in a box or a polygon; see `clvoro.power_diagram`."""
         with self._alone():
             return power_diagram_of(self._stages_for(domain), domain, points, weights)
 
@@ -257,7 +257,10 @@ class Adapter:
         tolerance: float | None = None,
         max_steps: int = 100,
     ) -> Transported:
-        """Return the power diagram of `points` whose cells have `volumes`; see `clvoro.transport`."""
+        """Return the power diagram of `points` whose cells have `volumes`, in a box or a polygon.
+
+        See `clvoro.transport`.
+        """
         with self._alone():
             return transport_to(self._stages_for(domain), domain, points, volumes, tolerance, max_steps)
 
@@ -265,11 +268,11 @@ class Adapter:
         self,
         domain: Domain,
         size: object,
+        effort: EffortName = "default",
+        *,
         points: ArrayLike | Start = "density",
         method: MethodName = "adaptive",
         n_cells: int | None = None,
-        *,
-        effort: EffortName = "default",
         layers: Layers | Sequence[Layers] = (),
         fixed: ArrayLike | None = None,
         seed: int = 0,
@@ -283,11 +286,14 @@ class Adapter:
 
         Parameters
         ----------
-        domain : Box or Polygon
+        domain : Box, Polygon or Sphere
+            "transport" needs a box or a polygon, a moving mesh a box without periodic sides.
         size : number, callable or clvoro.sizing field
             Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d. A callable
             takes points (n, d), returns (n,), and is evaluated on the host: each step then moves all points there and
             back.
+        effort : "fast", "default" or "best"
+            Amount of work of "adaptive", "exact" and "transport".
         points : (n, d) array of float, "density" or "uniform"
             Generators to start from: those of the array, random ones with density h^-d, or uniform random ones as in
             the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
@@ -303,11 +309,10 @@ class Adapter:
             Number of generators; by default the integral of h^-d over the domain. "adaptive", "exact" and "transport"
             end with exactly that many. They scale the size field by a common factor so that the mean of log(L / h)
             vanishes, and report it as ``Result.size_factor``; "transport" always does.
-        effort : "fast", "default" or "best"
-            Amount of work of "adaptive", "exact" and "transport".
         layers : Layers or sequence of Layers
-            Rows of generators along walls, in 2D, that do not move: the first rows of the result. Beyond them the
-            sizes grow gradually from the size of the layers; see `Layers`. Their cells count as having the right size.
+            Rows of generators along walls of a box in 2D or a polygon. They do not move and are the first rows of the
+            result. Beyond them the sizes grow gradually from the size of the layers; see `Layers`. Their cells count as
+            having the right size.
         fixed : (k, d) array of float, optional
             Generators that do not move, such as wells: rows 0 to k - 1 of the result, exactly at these positions. Their
             neighbors move until all have their sizes. Not for "transport" and moving meshes, which move all of them.
@@ -398,10 +403,10 @@ class Adapter:
         self,
         domain: Domain,
         size: object,
+        *,
         points: ArrayLike | Start = "density",
         method: MethodName = "adaptive",
         n_cells: int | None = None,
-        *,
         layers: Layers | Sequence[Layers] = (),
         options: MultilevelOptions | PaperOptions | None = None,
     ) -> float:

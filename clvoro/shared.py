@@ -64,7 +64,8 @@ def adapt(
 
     Parameters
     ----------
-    domain : Box or Polygon
+    domain : Box, Polygon or Sphere
+        "transport" needs a box or a polygon, a moving mesh a box without periodic sides.
     size : number, callable or clvoro.sizing field
         Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d.
     effort : "fast", "default" or "best"
@@ -77,7 +78,7 @@ def adapt(
     n_cells : int, optional
         Number of cells; by default the number that the size field requires.
     layers : Layers or sequence of Layers
-        Boundary layers, in 2D.
+        Boundary layers, in boxes in 2D and polygons.
     fixed : (k, d) array of float, optional
         Generators that do not move, such as wells: rows 0 to k - 1 of the result.
     seed : int
@@ -105,7 +106,16 @@ def adapt(
     (True, True)
     """
     return shared_adapter().run(
-        domain, size, points, method, n_cells, effort=effort, layers=layers, fixed=fixed, seed=seed, callback=callback
+        domain,
+        size,
+        effort,
+        points=points,
+        method=method,
+        n_cells=n_cells,
+        layers=layers,
+        fixed=fixed,
+        seed=seed,
+        callback=callback,
     )
 
 
@@ -208,7 +218,7 @@ def voronoi(domain: Domain, points: ArrayLike) -> Diagram:
 
     Parameters
     ----------
-    domain : Box or Polygon
+    domain : Box, Polygon or Sphere
     points : (n, d) array of float
         Distinct generators inside the domain, walls included, in the domain's unit of length.
 

@@ -69,7 +69,7 @@ def test_generators_stay_and_their_cells_have_the_sizes(ctx, monkeypatch, dtype,
 @pytest.mark.parametrize("method", ["lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"])
 def test_published_methods_keep_them_and_the_number_of_cells(adapter, method):
     start = np.random.default_rng(1).random((90, 2)) * (2, 1)
-    mesh = adapter.run(BOX, 0.15, start, method, fixed=WELLS, max_steps=8)
+    mesh = adapter.run(BOX, 0.15, points=start, method=method, fixed=WELLS, max_steps=8)
     assert np.array_equal(mesh.points[: len(WELLS)], WELLS)
     assert len(mesh.points) == 90
     # They have taken the places of the nearest points.
@@ -81,7 +81,7 @@ def test_published_methods_keep_them_and_the_number_of_cells(adapter, method):
 def test_they_are_the_same_bits_from_run_to_run_and_in_a_warm_start(adapter):
     first, second = (adapter.run(BOX, 0.06, fixed=WELLS, effort="fast", options=DEEP) for _ in range(2))
     assert np.array_equal(first.points, second.points)
-    after = adapter.run(BOX, 0.0601, first.points, fixed=WELLS, effort="fast")
+    after = adapter.run(BOX, 0.0601, points=first.points, fixed=WELLS, effort="fast")
     assert np.array_equal(after.points[: len(WELLS)], WELLS)
     assert after.origin[: len(WELLS)].tolist() == list(range(len(WELLS)))
     assert after.history["step"][-1] < first.history["step"][-1]

@@ -37,7 +37,7 @@ def test_diagram_is_computed_again_at_the_end(ctx, dtype):
         result = adapter.run(
             clvoro.Box((0, 0), (1, 1), periodic=True),
             1 / 12,
-            points,
+            points=points,
             method="lloyd",
             max_steps=3,
             options=clvoro.PaperOptions(tol=0),

@@ -49,7 +49,7 @@ def steps_to_tolerance(history):
 def test_moved_by_two_cells(adapter, first, dim):
     before = first[dim]
     smallest = {2: 0.006, 3: 0.05}[dim]
-    after = adapter.run(BOXES[dim], field(dim, 2 * smallest), before.points)
+    after = adapter.run(BOXES[dim], field(dim, 2 * smallest), points=before.points)
     assert after.history["mean_error"][0] > 0.02
     assert steps_to_tolerance(after.history) <= 5
     assert after.history["step"][-1] < SHORT[dim]
@@ -64,7 +64,7 @@ def test_moved_by_two_cells(adapter, first, dim):
 def test_moved_again_and_again(adapter, first, method):
     points = first[2].points
     for k in range(1, 5):
-        result = adapter.run(BOXES[2], field(2, 0.012 * k), points, method=method)
+        result = adapter.run(BOXES[2], field(2, 0.012 * k), points=points, method=method)
         points = result.points
         assert steps_to_tolerance(result.history) <= 5
     # The exact projection alone costs about 0.002 (compare default and exact in bench/convergence.py).
@@ -75,7 +75,7 @@ def test_moved_again_and_again(adapter, first, method):
 
 
 def test_same_field_again_keeps_the_mesh(adapter, first):
-    result = adapter.run(BOXES[2], field(2), first[2].points)
+    result = adapter.run(BOXES[2], field(2), points=first[2].points)
     moved = np.linalg.norm(result.points - first[2].points, axis=1) / first[2].target_size
     assert np.median(moved) < 0.1
     assert (result.origin >= 0).all()
@@ -88,13 +88,13 @@ def test_other_points_take_the_full_schedule(adapter, first):
     box = BOXES[2]
     random = box.lower + box.extent * np.random.default_rng(553).random((n, 2))
     for points, size in ((random, field(2)), (first[2].points, field(2, factor=0.9))):
-        result = adapter.run(box, size, points, max_steps=SHORT[2] + 5)
+        result = adapter.run(box, size, points=points, max_steps=SHORT[2] + 5)
         assert result.history["step"][-1] == SHORT[2] + 5
 
 
 def test_held_count(adapter, first):
     n = len(first[2].points) + 6
-    result = adapter.run(BOXES[2], field(2, 0.012), first[2].points, n_cells=n)
+    result = adapter.run(BOXES[2], field(2, 0.012), points=first[2].points, n_cells=n)
     assert len(result.points) == n
     assert result.history["step"][-1] < SHORT[2]
     assert steps_to_tolerance(result.history) <= 6
@@ -102,15 +102,15 @@ def test_held_count(adapter, first):
 
 def test_resumes_bit_for_bit(adapter, first, tmp_path):
     path, size = tmp_path / "state", field(2, 0.012)
-    whole = adapter.run(BOXES[2], size, first[2].points)
+    whole = adapter.run(BOXES[2], size, points=first[2].points)
     adapter.run(
         BOXES[2],
         size,
-        first[2].points,
+        points=first[2].points,
         checkpoint=clvoro.Checkpoint(path, every=0),
         callback=lambda row: row["step"] == 6,
     )
-    rest = adapter.run(BOXES[2], size, first[2].points, checkpoint=clvoro.Checkpoint(resume=path))
+    rest = adapter.run(BOXES[2], size, points=first[2].points, checkpoint=clvoro.Checkpoint(resume=path))
     np.testing.assert_array_equal(rest.points, whole.points)
     np.testing.assert_array_equal(rest.history["mean_error"], whole.history["mean_error"])
 

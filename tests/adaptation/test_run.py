@@ -32,7 +32,7 @@ def check(result, field, box=BOX, real="float64"):
 def test_row_i_is_the_callers_generator(adapter):
     """One step of Lloyd's takes every generator to the centroid of its own cell."""
     points = random_points(400, 5)
-    result = adapter.run(BOX, 0.1, points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0))
+    result = adapter.run(BOX, 0.1, points=points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0))
     cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
     assert result.points == pytest.approx(np.array([c.centroid for c in cells]), abs=1e-12)
     assert np.array_equal(result.initial.points, points)
@@ -43,7 +43,7 @@ def test_row_i_is_the_callers_generator(adapter):
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_no_steps(adapter, method):
     points = random_points(300, 6)
-    result = adapter.run(BOX, F1, points, method=method, max_steps=0, options=clvoro.MultilevelOptions(levels=0))
+    result = adapter.run(BOX, F1, points=points, method=method, max_steps=0, options=clvoro.MultilevelOptions(levels=0))
     assert np.array_equal(result.points, points)
     assert len(result.history) == 1
     assert (result.converged, result.stop_reason) == (False, "max_steps reached")
@@ -56,9 +56,9 @@ def test_warm_start(adapter, method):
     """Five steps, and five more from their result, are the same as ten."""
     options = {"method": method, "options": clvoro.PaperOptions(tol=0)}
     points = random_points(500, 7)
-    ten = adapter.run(BOX, F1, points, max_steps=10, **options)
-    five = adapter.run(BOX, F1, points, max_steps=5, **options)
-    again = adapter.run(BOX, F1, five.points, max_steps=5, **options)
+    ten = adapter.run(BOX, F1, points=points, max_steps=10, **options)
+    five = adapter.run(BOX, F1, points=points, max_steps=5, **options)
+    again = adapter.run(BOX, F1, points=five.points, max_steps=5, **options)
     assert again.points == pytest.approx(ten.points, abs=1e-10)
     assert again.history["mean_error"][0] == pytest.approx(five.history["mean_error"][-1], rel=1e-10)
     assert ten.settings["start"] == "points"
@@ -67,7 +67,7 @@ def test_warm_start(adapter, method):
 def test_origin_names_the_callers_generators(adapter):
     """Kept generators come first, in their order and near their positions; inserted ones have -1."""
     first = adapter.run(BOX, F1, seed=31, effort="fast")
-    result = adapter.run(BOX, F1, first.points, effort="fast", n_cells=len(first.points) + 9)
+    result = adapter.run(BOX, F1, points=first.points, effort="fast", n_cells=len(first.points) + 9)
     origin = result.origin
     kept = origin >= 0
     inserted, deleted = (result.history[name].sum() for name in ("inserted", "deleted"))
@@ -84,7 +84,7 @@ def test_origin_names_the_callers_generators(adapter):
 
 
 def test_origin_of_methods_that_keep_all(adapter):
-    result = adapter.run(BOX, F1, random_points(200, 3), method="coupled", max_steps=4)
+    result = adapter.run(BOX, F1, points=random_points(200, 3), method="coupled", max_steps=4)
     assert np.array_equal(result.origin, np.arange(200))
 
 
@@ -147,8 +147,8 @@ def test_units_do_not_matter(adapter, method, steps, off):
     box = clvoro.Box((40, -7), (40 + 2.5e-3, -7 + 1.5e-3))
     small = sizing.Distance(sizing.Circle((40 + 0.9e-3, -7 + 0.75e-3), 0.3e-3), 0.02e-3, slope=0.3)
     options = {"method": method, "max_steps": steps, "options": clvoro.PaperOptions(tol=0)}
-    a = adapter.run(BOX, F1, points, **options)
-    b = adapter.run(box, small, points * 1e-3 + box.lower, **options)
+    a = adapter.run(BOX, F1, points=points, **options)
+    b = adapter.run(box, small, points=points * 1e-3 + box.lower, **options)
     # 40 rounds to 7e-15, 1e-10 of a cell, faces and rough solves to 6e-8; steps let differences grow, until one of the
     # solves takes an iteration more than the other.
     assert (b.points - box.lower) * 1e3 == pytest.approx(a.points, abs=off)
@@ -369,7 +369,7 @@ def test_levels(adapter, levels):
 def test_levels_from_the_callers_points(adapter):
     """A coarse mesh is refined as often as necessary, one with the right number of cells is not."""
     for n, level in ((40, 2), (150, 1), (590, 0)):
-        result = adapter.run(BOX, F1, random_points(n, 17), effort="fast")
+        result = adapter.run(BOX, F1, points=random_points(n, 17), effort="fast")
         assert result.history["level"][0] == level
         assert len(result.points) == pytest.approx(600, rel=0.1)
         check(result, F1)
@@ -378,7 +378,7 @@ def test_levels_from_the_callers_points(adapter):
 @pytest.mark.slow
 def test_far_too_many_points(adapter):
     """They are reduced to the number that the size field requires."""
-    result = adapter.run(BOX, F1, random_points(3000, 17), effort="fast")
+    result = adapter.run(BOX, F1, points=random_points(3000, 17), effort="fast")
     assert len(result.points) == pytest.approx(600, rel=0.1)
 
 
@@ -419,7 +419,7 @@ def test_published_ordering(adapter):
     """Lloyd's alone never meets the sizes, Poisson's alone meets them with poor cells, coupled does both."""
     start = random_points(588, 18)
     lloyd, poisson, coupled = (
-        figures(adapter.run(BOX, F1, start, method=method, max_steps=100, options=clvoro.PaperOptions(tol=0)))
+        figures(adapter.run(BOX, F1, points=start, method=method, max_steps=100, options=clvoro.PaperOptions(tol=0)))
         for method in ("lloyd", "poisson", "coupled")
     )
     assert lloyd[0] > 1
@@ -618,5 +618,7 @@ def test_errors_of_the_field_during_a_run(adapter):
         return np.where(len(seen) > 40, -1.0, 0.1) * np.ones(len(points))
 
     with pytest.raises(SizeFieldError, match=r"-1 at \("):
-        adapter.run(BOX, size, random_points(300, 3), method="lloyd", max_steps=100, options=clvoro.PaperOptions(tol=0))
+        adapter.run(
+            BOX, size, points=random_points(300, 3), method="lloyd", max_steps=100, options=clvoro.PaperOptions(tol=0)
+        )
     check(adapter.run(BOX, F1, method="lloyd", max_steps=1), F1)

@@ -70,7 +70,7 @@ def test_figures_of_repeated_steps(adapter):
     start = random_points(500, 18)
     field = S1 * 1.55
     lloyd, poisson, coupled, weighted = (
-        figures(adapter.run(BOX, field, start, method=method, max_steps=60, options=clvoro.PaperOptions(tol=0)))
+        figures(adapter.run(BOX, field, points=start, method=method, max_steps=60, options=clvoro.PaperOptions(tol=0)))
         for method in ("lloyd", "poisson", "coupled", "weighted")
     )
     assert lloyd[0] > 3 * coupled[0]
@@ -106,7 +106,7 @@ def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, larg
 def test_row_i_is_the_callers_generator(adapter):
     """One step of Lloyd's takes every generator to the centroid of its own cell."""
     points = random_points(250, 5)
-    result = adapter.run(BOX, 0.2, points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0))
+    result = adapter.run(BOX, 0.2, points=points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0))
     cells = reference3d.box_voronoi(BOX.lower, BOX.upper, points)
     assert result.points == pytest.approx(np.array([c.centroid for c in cells]), abs=1e-12)
     assert np.array_equal(result.initial.points, points)
@@ -117,7 +117,9 @@ def test_row_i_is_the_callers_generator(adapter):
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_no_steps(adapter, method):
     points = random_points(200, 6)
-    result = adapter.run(BOX, SMALL, points, method=method, max_steps=0, options=clvoro.MultilevelOptions(levels=0))
+    result = adapter.run(
+        BOX, SMALL, points=points, method=method, max_steps=0, options=clvoro.MultilevelOptions(levels=0)
+    )
     assert np.array_equal(result.points, points)
     assert len(result.history) == 1
     check(result, SMALL)
@@ -129,9 +131,9 @@ def test_warm_start(adapter, method):
     """Four steps, and four more from their result, are the same as eight."""
     options = {"method": method, "options": clvoro.PaperOptions(tol=0)}
     points = random_points(300, 7)
-    eight = adapter.run(BOX, SMALL, points, max_steps=8, **options)
-    four = adapter.run(BOX, SMALL, points, max_steps=4, **options)
-    again = adapter.run(BOX, SMALL, four.points, max_steps=4, **options)
+    eight = adapter.run(BOX, SMALL, points=points, max_steps=8, **options)
+    four = adapter.run(BOX, SMALL, points=points, max_steps=4, **options)
+    again = adapter.run(BOX, SMALL, points=four.points, max_steps=4, **options)
     assert again.points == pytest.approx(eight.points, abs=1e-10)
     assert again.settings["start"] == "points"
 
@@ -139,7 +141,7 @@ def test_warm_start(adapter, method):
 def test_origin_names_the_callers_generators(adapter):
     """Kept generators come first, in their order and near their positions; inserted ones have -1."""
     first = adapter.run(BOX, SMALL, seed=31, effort="fast")
-    result = adapter.run(BOX, SMALL, first.points, effort="fast", n_cells=len(first.points) + 9)
+    result = adapter.run(BOX, SMALL, points=first.points, effort="fast", n_cells=len(first.points) + 9)
     origin = result.origin
     kept = origin >= 0
     assert 0 < (~kept).sum() <= result.history["inserted"].sum()
@@ -179,8 +181,8 @@ def test_units_do_not_matter(adapter):
     box = clvoro.Box((40, -7, 3), (40 + 1e-3, -7 + 1e-3, 3 + 1e-3))
     small = sizing.Distance(sizing.Circle((40 + 0.5e-3, -7 + 0.5e-3, 3 + 0.4e-3), 0.25e-3), 0.08e-3, slope=0.6)
     options = {"method": "weighted", "max_steps": 5, "options": clvoro.PaperOptions(tol=0)}
-    a = adapter.run(BOX, SMALL, points, **options)
-    b = adapter.run(box, small, points * 1e-3 + box.lower, **options)
+    a = adapter.run(BOX, SMALL, points=points, **options)
+    b = adapter.run(box, small, points=points * 1e-3 + box.lower, **options)
     # 40 rounds to 7e-15, 1e-10 of a cell; five steps let differences grow.
     assert (b.points - box.lower) * 1e3 == pytest.approx(a.points, abs=1e-6)
     assert b.history["mean_error"] == pytest.approx(a.history["mean_error"], rel=1e-5)
@@ -256,7 +258,7 @@ def test_levels(adapter, levels):
 @pytest.mark.slow
 def test_levels_from_the_callers_points(adapter):
     for n, level in ((250, 1), (1900, 0)):
-        result = adapter.run(BOX, S1, random_points(n, 17), effort="fast")
+        result = adapter.run(BOX, S1, points=random_points(n, 17), effort="fast")
         assert result.history["level"][0] == level
         assert len(result.points) == pytest.approx(1900, rel=0.1)
         check(result, S1)
@@ -340,7 +342,7 @@ def test_fields(adapter, name):
 def test_callable_and_device_field_agree(adapter):
     options = {"method": "coupled", "max_steps": 5, "seed": 3, "options": clvoro.PaperOptions(tol=0)}
     device = adapter.run(BOX, SMALL, **options)
-    host = adapter.run(BOX, lambda points: SMALL(points), device.initial.points, **options)
+    host = adapter.run(BOX, lambda points: SMALL(points), points=device.initial.points, **options)
     assert host.points == pytest.approx(device.points, abs=1e-6)
 
 
@@ -369,7 +371,7 @@ def test_points_on_walls_edges_and_corners(adapter):
     weights = np.where((points == 0) | (points == 1), 0.5, 1).prod(axis=1)
     assert diagram.volumes == pytest.approx(weights / 27, rel=1e-12)
     for method in runs.FROM_POINTS:
-        result = adapter.run(BOX, 0.25, points, method=method, effort="fast", max_steps=6)
+        result = adapter.run(BOX, 0.25, points=points, method=method, effort="fast", max_steps=6)
         check(result, sizing.Constant(0.25))
 
 
@@ -378,7 +380,7 @@ def test_lattices_are_left_alone(adapter):
     line = (np.arange(5) + 0.5) / 5
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
     for method in ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"):
-        result = adapter.run(BOX, 0.2, points, method=method, max_steps=3, options=clvoro.PaperOptions(tol=0))
+        result = adapter.run(BOX, 0.2, points=points, method=method, max_steps=3, options=clvoro.PaperOptions(tol=0))
         assert result.points == pytest.approx(points, abs=1e-12), method
         assert np.abs(result.size_error).max() < 1e-12
 
@@ -394,7 +396,7 @@ def test_a_lattice_keeps_its_quality(adapter):
     """The quotient of the truncated octahedron is 0.753, far above that of random starts."""
     start = bcc(5)
     size = float((1 / len(start)) ** (1 / 3))
-    lattice = adapter.run(BOX, size, start)
+    lattice = adapter.run(BOX, size, points=start)
     random = adapter.run(BOX, size, n_cells=len(start), seed=5)
     for result in (lattice, random):
         check(result, sizing.Constant(size))

@@ -254,7 +254,7 @@ def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):
     for m, spread in ((5, 30), (7, 30), (10, 200 if dtype == "float64" else 60)):
         middles = np.stack(np.meshgrid(*[np.arange(m)] * 3), -1).reshape(-1, 3) + 0.5
         noise = spread * eps * np.random.default_rng(3).standard_normal(middles.shape)
-        result = adapter.run(box, 1 / m, (middles / m + noise) * box.extent, method="lloyd", max_steps=0)
+        result = adapter.run(box, 1 / m, points=(middles / m + noise) * box.extent, method="lloyd", max_steps=0)
         result.check().demand()
         quality = result.quality.copy()
         quality[17] *= 1 + 2e4 * eps * m
@@ -275,7 +275,7 @@ def test_periods_round_on_the_device(ctx, dtype):
 def test_only_where_faces_may_have_been_left_out_quality_may_be_off(ctx):
     box = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(True, False, False))
     points = np.random.default_rng(5).random((300, 3))
-    result = clvoro.Adapter(ctx).run(box, 0.15, points, method="lloyd", max_steps=1)
+    result = clvoro.Adapter(ctx).run(box, 0.15, points=points, method="lloyd", max_steps=1)
     g = Rebuilt(result.diagram)
     assert not borders_on_lost_faces(result.diagram, g, np.arange(300)).any()
     cubes = (np.stack(np.meshgrid(*[np.arange(6)] * 3), -1).reshape(-1, 3) + 0.5) / 6

@@ -107,7 +107,7 @@ def every_step(domain: Domain, size: str, n_cells: int, levels: int = 1, **optio
                 result = adapter.run(
                     domain,
                     Expression(size),
-                    points,
+                    points=points,
                     options=clvoro.MultilevelOptions(levels=levels),
                     n_cells=n_cells,
                     seed=911,
@@ -144,7 +144,7 @@ def power(domain: clvoro.Box | clvoro.Polygon, n: int) -> Work:
         transport(adapter, domain, x)
         plan: list[Action] = [Step(WeightedMethod()), Prescribe(moves=1)]
         with mock.patch.object(preparation, "adaptive_schedule", return_value=plan):
-            result = adapter.run(domain, Expression("1 + x"), x, n_cells=n)
+            result = adapter.run(domain, Expression("1 + x"), points=x, n_cells=n)
         assert abs(result.diagram.volumes.sum() - domain.measure) < 1e-3 * domain.measure
 
     return work

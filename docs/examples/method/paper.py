@@ -20,7 +20,7 @@ size = sizing.Distance(sizing.Circle((0.9, 0.75), radius=0.3), h_min=0.02, slope
 adapter = clvoro.Adapter()
 options = clvoro.PaperOptions(tol=0, k=1)
 runs = {
-    method: adapter.run(domain, size, "uniform", method, seed=20251, max_steps=100, options=options)
+    method: adapter.run(domain, size, points="uniform", method=method, seed=20251, max_steps=100, options=options)
     for method in ("lloyd", "poisson", "coupled")
 }
 

@@ -463,7 +463,7 @@ def test_a_lattice_stays(double, lattice, n):
     box = clvoro.Box((0,) * len(edges), edges, periodic=True)
     size = (box.measure / len(points)) ** (1 / box.dim)
     for method in ("coupled", "weighted"):
-        result = double.run(box, size, points, method=method, max_steps=5, options=clvoro.PaperOptions(tol=0))
+        result = double.run(box, size, points=points, method=method, max_steps=5, options=clvoro.PaperOptions(tol=0))
         moved = result.points - box.wrap(points)
         assert np.abs(moved - np.rint(moved / box.extent) * box.extent).max() < 1e-12
 
@@ -473,7 +473,7 @@ def test_refinement_across_periodic_boundaries(double):
     points, edges, _ = hexagonal(6)
     box = clvoro.Box((0, 0), edges, periodic=True)
     size = (box.measure / 144) ** 0.5
-    result = double.run(box, size, points, options=clvoro.MultilevelOptions(levels=1), max_steps=0)
+    result = double.run(box, size, points=points, options=clvoro.MultilevelOptions(levels=1), max_steps=0)
     assert len(result.points) == 144
     assert (np.diff(result.diagram.neighbor_starts) == 6).all()
     assert np.abs(result.diagram.volumes * 144 / box.measure - 1).max() < 1e-12
@@ -491,7 +491,7 @@ def test_too_few_cells_for_a_run(double):
 @pytest.mark.parametrize("kind", ["npz", "vtu"])
 def test_files(double, tmp_path, box, kind):
     points = some_points(box, 500 if box.dim == 3 else 60)
-    result = double.run(box, 0.3, points, method="lloyd", max_steps=0)
+    result = double.run(box, 0.3, points=points, method="lloyd", max_steps=0)
     path = tmp_path / f"mesh.{kind}"
     result.save(path)
     read = clvoro.load(path) if kind == "npz" else load_vtu(path)
