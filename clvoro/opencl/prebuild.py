@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pyopencl as cl
 
-from .program import build_in_threads, has_short_declarations, on_pocl, program_text, shorten
+from .program import build_in_threads, on_pocl, program_text, text_for_driver
 from .runtimes import cache_home
 
 if TYPE_CHECKING:
@@ -90,8 +90,9 @@ def build_ahead(engine: Engine) -> int:
         return len(work.launches) if is_new else 0
     if not _waiting:
         _start(device)
+    texts = [text_for_driver(engine.ctx, *program) for program in work.programs]
     for index, worker in enumerate(_waiting):
-        mine = Work(work.programs, _share(work.launches, index, len(_waiting)))
+        mine = Work(texts, _share(work.launches, index, len(_waiting)))
         # A worker reads once it has loaded the compiler, and a pipe holds less than the work.
         threading.Thread(target=_send, args=(worker, mine), daemon=True).start()
     _waiting.clear()
@@ -123,11 +124,7 @@ def _work(engine: Engine, recorded: dict) -> Work:
             defines = {k: reals.get(v, v) for k, v in defines.items()}
             defines |= {"IN_LANES": "0"} if "IN_LANES" in defines else {}
         places[index] = len(programs)
-        text, options = program_text(f"{stage}.cl", engine.all_defines(stage, defines), "")
-        if on_pocl(engine.queue.device) and has_short_declarations(engine.ctx):
-            text, more = shorten(text)
-            options = (*options, *more)
-        programs.append((text, options))
+        programs.append(program_text(f"{stage}.cl", engine.all_defines(stage, defines), ""))
     launches = [Launch(places[index], *rest) for index, *rest in recorded["launches"] if index in places]
     return Work(programs, launches)
 

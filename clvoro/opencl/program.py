@@ -162,19 +162,31 @@ def program_text(name: str, defines: Mapping[str, object], prelude: str) -> tupl
 
 
 def compile_text(ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True) -> cl.Program:
-    """Build `text`; if `short`, with the declarations of `shorten`."""
+    """Build `text`; if `short`, with our declarations of built-in functions where the driver can do without its own."""
+    with _silenced():
+        if short and has_short_declarations(ctx):
+            with contextlib.suppress(cl.Error):  # a function that they lack
+                return _build(ctx, *text_for_driver(ctx, text, options))
+        return _build(ctx, *text_for_driver(ctx, text, options, short=False))
+
+
+def _build(ctx: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
+    return cl.Program(ctx, text).build(options=list(options))
+
+
+def text_for_driver(
+    ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True
+) -> tuple[str, tuple[str, ...]]:
+    """Return the text and the options that the driver gets, which are also the key of its cache."""
     device = ctx.devices[0]
     options = (*options, *device_options(device))
     if on_pocl(device):
         text = NO_ABI_WARNINGS + text
     if needs_static_functions(device):
         text = STATIC_FUNCTIONS + text
-    with _silenced():
-        if short and has_short_declarations(ctx):
-            with contextlib.suppress(cl.Error):  # a function that they lack
-                short_text, more = shorten(text)
-                return cl.Program(ctx, short_text).build(options=[*options, *more])
-        return cl.Program(ctx, text).build(options=list(options))
+    if short and has_short_declarations(ctx):
+        text, options = f"{source_text('opencl/pocl_builtins.h')}\n{text}", (*options, "-D_OPENCL_H_")
+    return text, options
 
 
 def device_options(device: cl.Device) -> tuple[str, ...]:
@@ -206,14 +218,9 @@ def on_nvidia(device: cl.Device) -> bool:
 
 
 def has_short_declarations(ctx: cl.Context) -> bool:
-    """Return whether the driver is a version of PoCL for which `shorten` has been tested."""
+    """Return whether the driver is a version of PoCL for which opencl/pocl_builtins.h has been tested."""
     device = ctx.devices[0]
     return on_pocl(device) and "PoCL 3." in device.platform.version
-
-
-def shorten(text: str) -> tuple[str, tuple[str, ...]]:
-    """Return `text` with our declarations of built-in functions, and the options for PoCL to leave out its own."""
-    return f"{source_text('opencl/pocl_builtins.h')}\n{text}", ("-D_OPENCL_H_",)
 
 
 def build_seconds() -> float:

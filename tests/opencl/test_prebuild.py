@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import queue
 import subprocess
 import sys
 import threading
@@ -77,6 +78,21 @@ def test_workers_build_recorded_kernels_once(engine, tmp_path):
     assert len(codes) == workers
     built = {path.stem for path in tmp_path.rglob("*.so")}
     assert built >= ({"gather_rows", "scan_blocks"} if workers else set())
+
+
+def test_workers_build_what_this_process_will_need(engine, monkeypatch):
+    """The text is the key of PoCL's cache. With another, all kernels would be built twice."""
+    sent, texts, plain = queue.Queue(), [], cl.Program
+    monkeypatch.setattr(prebuild, "_is_new", lambda *_: True)
+    monkeypatch.setattr(prebuild, "_known", set())
+    monkeypatch.setattr(prebuild, "_waiting", ["a worker"])
+    monkeypatch.setattr(prebuild, "_send", lambda _, work: sent.put(work))
+    assert prebuild.build_ahead(engine) > 20
+    work = sent.get(timeout=30)
+    monkeypatch.setattr(program, "_programs", {})
+    monkeypatch.setattr(program.cl, "Program", lambda ctx, text: texts.append(text) or plain(ctx, text))
+    assert engine.kernels("opencl/primitives").gather_rows
+    assert texts[0] in [text for text, _ in work.programs]
 
 
 def test_workers_share_whole_programs_last_ones_first():
