@@ -153,7 +153,7 @@ def edges(d: clvoro.Diagram) -> tuple[np.ndarray, np.ndarray]:
     once = np.flatnonzero(owner < neighbor)
     keys = owner[once] * len(d) + neighbor[once]
     order = np.argsort(keys)
-    lengths = EARTH.arcs(np.linalg.norm(end - begin, axis=1)[once])
+    lengths = EARTH.lengths(np.linalg.norm(end - begin, axis=1)[once])
     return keys[order], lengths[order]
 
 

@@ -130,6 +130,42 @@ class Box(Domain):
         return Edges(x[order], x[(order + 1) % 4])
 
     @property
+    def boundary_measure(self) -> float:
+        """Length or area of all sides, periodic ones included."""
+        return float(2 * sum(np.prod(np.delete(self.extent, a)) for a in range(self.dim)))
+
+    def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return outward unit normals of sides (k,) int, and a point on each, (k, d) each."""
+        axis, upper = walls // 2, walls % 2
+        normals = np.zeros((len(walls), self.dim))
+        normals[np.arange(len(walls)), axis] = 2.0 * upper - 1
+        return normals, np.array([self.lower, self.upper])[upper]
+
+    def _gaps(self, points: np.ndarray) -> np.ndarray:
+        """Return the signed distances (n, 2 d) of `points` to the planes of all sides, inf for periodic ones."""
+        gaps = np.stack([np.subtract(points, self.lower), np.subtract(self.upper, points)], axis=2)
+        gaps[:, np.array(self.periodic)] = np.inf
+        return gaps.reshape(len(points), -1)
+
+    def closest_walls(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) the side whose plane is the closest one, (n,) int."""
+        return self._gaps(points).argmin(axis=1)
+
+    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (n, d) to the walls, inside and outside; (n,), inf without walls."""
+        gaps = self._gaps(points)
+        outside = np.linalg.norm(np.minimum(gaps, 0), axis=1)
+        return np.where(outside > 0, outside, gaps.min(axis=1))
+
+    def inner_points(self) -> np.ndarray:
+        """Return the center, (1, d)."""
+        return (np.array([self.lower]) + self.upper) / 2
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return the nearest point of the box to each of `points` (n, d)."""
+        return np.where(self.periodic, points, np.clip(points, self.lower, self.upper))
+
+    @property
     def measure(self) -> float:
         """Area or volume."""
         return float(np.prod(self.extent))

@@ -6,17 +6,19 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
-from ..arguments import check_rows
+from ..arguments import check_rows, format_point
 from ..opencl.engine import DomainKind
 from .boundary_names import BoundaryNames, Walls
 
 if TYPE_CHECKING:
     from ..opencl.engine import Engine
+    from .polygon import Polygon
     from .shapes import Edges
+    from .sphere import Sphere
     from .surface import Surface
 
 LARGEST_EDGE = 1e50
@@ -64,6 +66,25 @@ class Domain(ABC):
         return self.dim
 
     @property
+    def curved(self) -> bool:
+        """Whether cells are pieces of a curved surface."""
+        return self.cell_dim < self.dim
+
+    cuts_cells: ClassVar[bool] = False
+    """Whether the boundary cuts cells anywhere. Cells at walls then need not be convex, they may have several loops,
+    and each face stores both of its ends."""
+
+    @property
+    def globe(self) -> Sphere | None:
+        """The sphere whose longitudes and latitudes positions have, or None."""
+        return None
+
+    @property
+    def outline(self) -> Polygon | None:
+        """The polygon whose edges are the boundary and cut the cells, or None."""
+        return None
+
+    @property
     def extent(self) -> np.ndarray:
         """Edge lengths of the bounding box, (d,)."""
         return np.subtract(self.upper, self.lower)
@@ -103,6 +124,28 @@ class Domain(ABC):
         """
         return self.boundaries.index
 
+    @property
+    @abstractmethod
+    def boundary_measure(self) -> float:
+        """Length or area of the walls; at least that of all walls' faces."""
+
+    @abstractmethod
+    def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return outward unit normals of `walls` (k,) int, and a point on each, (k, d) each."""
+
+    def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (k, d) to its wall of `walls` (k,); by default to the plane."""
+        normals, anchors = self.wall_planes(walls)
+        return np.abs(((points - anchors) * normals).sum(axis=1))
+
+    @abstractmethod
+    def closest_walls(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) the number of the closest wall, (n,) int; -1 without walls."""
+
+    @abstractmethod
+    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (n, d) to the boundary, inside and outside; (n,), inf without one."""
+
     @abstractmethod
     def boundary(self, walls: Walls | None = None) -> Edges | Surface:
         """Return walls as a shape for `clvoro.sizing.Distance`: numbers, names, or by default all."""
@@ -133,6 +176,30 @@ class Domain(ABC):
     def wrap(self, points: np.ndarray) -> np.ndarray:
         """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
         return np.asarray(points, float)
+
+    def lengths(self, chords: np.ndarray) -> np.ndarray:
+        """Return the lengths in the domain of straight segments of the lengths `chords`; arcs on a sphere."""
+        return np.asarray(chords)
+
+    def tangents(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return `cell_dim` orthogonal unit vectors tangential to the domain at `points` (n, d), each (n, d)."""
+        return tuple(np.broadcast_to(axis, np.shape(points)) for axis in np.eye(self.dim))
+
+    def place_name(self, x: np.ndarray) -> str:
+        """Return a position (d,) in words, for messages."""
+        return format_point(x)
+
+    def piece_of(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) in the domain the piece that holds it, (n,) int; -1 elsewhere."""
+        return np.where(self.contains(points), 0, -1)
+
+    @abstractmethod
+    def inner_points(self) -> np.ndarray:
+        """Return a point inside of each piece, (n_pieces, d), not on its boundary."""
+
+    @abstractmethod
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return the nearest point of the domain to each of `points` (n, d): the point itself if it is inside."""
 
     # The device's view.
 

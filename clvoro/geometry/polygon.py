@@ -19,7 +19,7 @@ from .curved_edges import CurvedEdges
 from .curves import Curve
 from .device_polygon import DevicePolygon
 from .geojson import pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt
-from .rings import OrientedRings, make_rings, signed_area
+from .rings import OrientedRings, make_rings, project, signed_area
 from .shapes import Edges
 from .simplification import pieces_of, simplify
 
@@ -170,10 +170,10 @@ class Polygon(DevicePolygon):
         self.piece_of_ring = np.repeat(np.arange(len(made), dtype=np.int32), [len(piece) for piece in made])
         for array in self._arrays():
             array.setflags(write=False)
-        self.curved = CurvedEdges.join([ring.curved for ring in rings])
+        self.curved_edges = CurvedEdges.join([ring.curved for ring in rings])
         if curves:
             ends = self.vertices[self._next_given]
-            self.curved = CurvedEdges.described(curves, self.vertices, ends)
+            self.curved_edges = CurvedEdges.described(curves, self.vertices, ends)
         self.oriented = OrientedRings.of(rings)
         self.lower = tuple(self.vertices.min(axis=0).tolist())
         self.upper = tuple(self.vertices.max(axis=0).tolist())
@@ -184,10 +184,17 @@ class Polygon(DevicePolygon):
     def _arrays(self) -> tuple[np.ndarray, ...]:
         return self.vertices, self.ring_starts, self.piece_of_ring
 
+    cuts_cells = True
+
+    @property
+    def outline(self) -> Polygon:
+        """The polygon itself."""
+        return self
+
     @property
     def curves(self) -> tuple[Curve, ...]:
         """The curves of the boundary."""
-        return self.curved.curves
+        return self.curved_edges.curves
 
     def on_curve(self, points: np.ndarray, edges: np.ndarray) -> np.ndarray:
         """Return the nearest points on the boundary's curves, exact to round-off.
@@ -225,7 +232,7 @@ class Polygon(DevicePolygon):
         if edges.size and not (edges.min() >= 0 and edges.max() < len(self.vertices)):
             raise InputError(f"edges has {edges.min()} to {edges.max()}, expected 0 to {len(self.vertices) - 1}")
         after = self._next_given[edges]
-        return self.curved.nearest(points, edges, self.vertices[edges], self.vertices[after])
+        return self.curved_edges.nearest(points, edges, self.vertices[edges], self.vertices[after])
 
     def simplified(self, size: object, tolerance: float = 0.1) -> Polygon:
         """Return the domain without what is smaller than a cell.
@@ -299,7 +306,7 @@ class Polygon(DevicePolygon):
         """SHA-256 of vertices, rings, pieces and curves: the same for equal domains."""
         content = b"".join(array.tobytes() for array in self._arrays())
         if self.curves:
-            content += json.dumps(self.curved.describe(), sort_keys=True).encode()
+            content += json.dumps(self.curved_edges.describe(), sort_keys=True).encode()
         return hashlib.sha256(content).hexdigest()
 
     def __repr__(self) -> str:
@@ -323,7 +330,7 @@ class Polygon(DevicePolygon):
             "vertices": self.vertices.tolist(),
             "ring_starts": self.ring_starts.tolist(),
             "piece_of_ring": self.piece_of_ring.tolist(),
-            **({"curves": self.curved.describe()} if self.curves else {}),
+            **({"curves": self.curved_edges.describe()} if self.curves else {}),
             **({"names": dict(self.names)} if self.names else {}),
         }
 
@@ -356,9 +363,9 @@ class Polygon(DevicePolygon):
         for c, curve in enumerate(self.curves):
             if curve.name is not None:
                 names += [] if curve.name in names else [curve.name]
-                index[self.curved.curve == c] = names.index(curve.name)
+                index[self.curved_edges.curve == c] = names.index(curve.name)
         for c, curve in enumerate(self.curves):
-            edges = self.curved.curve == c
+            edges = self.curved_edges.curve == c
             part = index[edges][0]
             clash = (ring == part) & (index == part)
             if clash.any() and ring[edges][0] != part:
@@ -396,6 +403,22 @@ class Polygon(DevicePolygon):
         """Return the begins and ends, (m, 2) each, of edges by their `numbers` (m,), the domain on their left."""
         oriented, places = self.oriented, self.oriented.places[numbers]
         return oriented.vertices[places], oriented.vertices[oriented.next_vertex[places]]
+
+    @property
+    def boundary_measure(self) -> float:
+        """Length of all edges."""
+        along = self.oriented.vertices[self.oriented.next_vertex] - self.oriented.vertices
+        return float(np.hypot(*along.T).sum())
+
+    def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return outward unit normals of edges (k,) int, and the begin of each, (k, 2) each."""
+        begin, end = self.edge_ends(walls)
+        along = (end - begin) / np.hypot(*(end - begin).T)[:, None]
+        return np.stack([along[:, 1], -along[:, 0]], axis=1), begin
+
+    def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (k, 2) to its edge of `walls` (k,)."""
+        return np.hypot(*(project(points, *self.edge_ends(walls)) - points).T)
 
     def boundary(self, walls: Walls | None = None) -> Edges:
         """Return edges as a shape for `clvoro.sizing.Distance`.

@@ -106,9 +106,13 @@ class Region(Domain):
             found[rest] = self.piece_of_ring[ring]
         return found
 
-    def inner_point(self, piece: int) -> np.ndarray:
-        """Return a point (2,) inside of a piece, not on its boundary."""
-        return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces[piece]))[0])
+    def inner_points(self) -> np.ndarray:
+        """Return a point inside of each piece, (n_pieces, 2), not on its boundary."""
+        return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces)))
+
+    def closest_walls(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) the number of the closest edge, (n,) int."""
+        return self.nearest_edge(points)[0]
 
     def nearest_edge(self, points: np.ndarray, within: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the number of the nearest edge to each of `points` (n, 2), and the nearest point on it.

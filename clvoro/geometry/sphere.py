@@ -100,6 +100,28 @@ class Sphere(Domain):
         """Area."""
         return 4 * np.pi * self.radius**2
 
+    @property
+    def globe(self) -> Sphere:
+        """The sphere itself."""
+        return self
+
+    @property
+    def boundary_measure(self) -> float:
+        """0: a sphere has no boundary."""
+        return 0.0
+
+    def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return no planes: a sphere has no walls."""
+        return np.empty((len(walls), 3)), np.empty((len(walls), 3))
+
+    def closest_walls(self, points: np.ndarray) -> np.ndarray:
+        """Return -1 for each of `points` (n, 3): a sphere has no walls."""
+        return np.full(len(points), -1)
+
+    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return an infinite distance for each of `points` (n, 3): (n,)."""
+        return np.full(len(points), np.inf)
+
     @cached_property
     def boundaries(self) -> BoundaryNames:  # type: ignore[override]
         """No parts."""
@@ -179,7 +201,7 @@ class Sphere(Domain):
         """Return longitudes in [-180, 180] and latitudes of positions (n, 3), in degrees, (n, 2)."""
         return directions(np.asarray(points, float))
 
-    def arcs(self, chords: ArrayLike) -> np.ndarray:
+    def lengths(self, chords: ArrayLike) -> np.ndarray:
         """Return the lengths of the arcs of great circles over chords, (n,)."""
         return 2 * self.radius * np.arcsin(np.minimum(np.asarray(chords) / (2 * self.radius), 1))
 
@@ -220,6 +242,19 @@ class Sphere(Domain):
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return True for each of `points`, (n, 3) or longitudes and latitudes (n, 2): (n,) bool."""
         return np.ones(len(self.check_rows("points", points)), bool)
+
+    def inner_points(self) -> np.ndarray:
+        """Return the place at longitude 0 on the equator, (1, 3)."""
+        return np.array([(self.radius, 0.0, 0.0)])
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return the nearest position on the sphere to each of `points` (n, 3)."""
+        return self.wrap(points)
+
+    def place_name(self, x: np.ndarray) -> str:
+        """Return the longitude and latitude of a position (3,) in words."""
+        lon, lat = self.lonlat(np.asarray(x)[None])[0]
+        return f"longitude {lon:.6g}, latitude {lat:.6g}"
 
     def wrap(self, points: np.ndarray) -> np.ndarray:
         """Return the positions on the sphere, (n, 3), in the direction of `points`."""

@@ -130,6 +130,10 @@ class SphereRegion(Sphere):
         nearest = np.asarray(self._tree.query(self.check_rows("points", points))[1])
         return nearest < len(np.asarray(self.within))
 
+    def closest_walls(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 3) on the boundary the wall towards the closest removed cell, (n,) int."""
+        return np.asarray(KDTree(self.beyond).query(points)[1])
+
     @cached_property
     def _tree(self) -> KDTree:
         return KDTree(np.concatenate([self.within, self.beyond]))

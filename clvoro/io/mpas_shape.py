@@ -111,8 +111,8 @@ def _on_sphere(diagram: Diagram, sphere: Sphere, halves: HalfEdges) -> Shape:
         r * middles,
         kites,
         np.bincount(halves.cell, kites, len(diagram)),
-        sphere.arcs(r * lengths),
-        sphere.arcs(r * np.linalg.norm(line, axis=1)),
+        sphere.lengths(r * lengths),
+        sphere.lengths(r * np.linalg.norm(line, axis=1)),
         np.arctan2((line * north).sum(axis=1), (line * east).sum(axis=1)),
         r * np.maximum(np.abs(line).max(axis=0), np.abs(begin - own).max(axis=0)),
     )

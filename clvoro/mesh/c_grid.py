@@ -135,9 +135,9 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
     angles = _angles(begin[corners], middle[corners], normal[corners], distance[corners])
     if isinstance(domain, Sphere):
         middle = domain.wrap(middle)
-        offset = domain.arcs(np.linalg.norm(d.face_centroids - middle, axis=1))
-        distance = domain.arcs(distance)
-        away = domain.arcs(np.linalg.norm(d.centroids - d.points, axis=1))
+        offset = domain.lengths(np.linalg.norm(d.face_centroids - middle, axis=1))
+        distance = domain.lengths(distance)
+        away = domain.lengths(np.linalg.norm(d.centroids - d.points, axis=1))
     else:
         offset = np.linalg.norm(d.face_centroids - middle, axis=1)
         away = np.linalg.norm(d.centroids - d.points, axis=1)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry.boundary import wall_planes
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
 from ..geometry.sphere_region import SphereRegion
@@ -108,11 +107,11 @@ def make_faces(diagram: Diagram) -> Faces:
         distance[~inner] = np.linalg.norm(outward, axis=1)
         normal[~inner] = outward / distance[~inner, None]
     else:
-        normal[~inner], anchors = wall_planes(domain, walls)
+        normal[~inner], anchors = domain.wall_planes(walls)
         apart = anchors - diagram.points[t.owner[~inner]]
         distance[~inner] = (apart * normal[~inner]).sum(axis=1)
     if isinstance(domain, Sphere):
-        distance = domain.arcs(distance)
+        distance = domain.lengths(distance)
         distance[~inner] /= 2  # the face is halfway to the removed cell
     if isinstance(domain, Polygon):
         _correct_cut_faces(diagram, t, normal, distance, center)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry.boundary import wall_planes
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
 from .connectivity import face_owners, neighbor_points, plane_shares
@@ -160,7 +159,7 @@ def measure_mesh(diagram: Diagram) -> Measures:
     else:
         line = points[other] + diagram.shifts * domain.extent - points[owner]
         walls = np.flatnonzero(~inner)
-        normals, anchors = wall_planes(domain, -1 - neighbor[walls])
+        normals, anchors = domain.wall_planes(-1 - neighbor[walls])
         gaps = ((anchors - points[owner[walls]]) * normals).sum(axis=1)
         line[walls] = 2 * gaps[:, None] * normals
         distance = np.linalg.norm(line, axis=1)
@@ -172,7 +171,7 @@ def measure_mesh(diagram: Diagram) -> Measures:
         crossing = domain.wrap(crossing)
     offset = np.linalg.norm(middles - crossing, axis=1)
     if isinstance(domain, Sphere):
-        offset, distance = domain.arcs(offset), domain.arcs(distance)
+        offset, distance = domain.lengths(offset), domain.lengths(distance)
     skewness = np.where(offset > 0, np.inf, 0.0)  # remains where the distance is 0
     np.divide(offset, distance, out=skewness, where=distance > 0)
 

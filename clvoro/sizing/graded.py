@@ -218,7 +218,7 @@ class Graded(Field):
         grid = _axes(box, counts)
         probes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, box.dim)
         if isinstance(box, Polygon):
-            inner = np.array([box.inner_point(piece) for piece in range(box.n_pieces)])
+            inner = box.inner_points()
             probes = np.concatenate([probes[box.contains(probes)], inner])
         least = min(evaluate(probes).min(), at_marks.min(initial=math.inf))
         finest = (box.measure / MOST_NODES) ** (1 / box.dim)

@@ -138,7 +138,7 @@ class ArcGraded(Field):
             for row in (below, below + 1):
                 i, j = column % nx, np.clip(row, 0, ny - 1)
                 away = np.linalg.norm(_nodes(sphere, nx, i, j) - marks, axis=1)
-                np.minimum.at(values, i + nx * j, at_marks + self.given.slope * sphere.arcs(away))
+                np.minimum.at(values, i + nx * j, at_marks + self.given.slope * sphere.lengths(away))
 
     def __repr__(self) -> str:
         return repr(self.given)

@@ -176,7 +176,7 @@ class ArcDistance(Distance):
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of `points` (n, 3) to the nearest shape along a great circle, (n,) float64."""
-        return self.sphere.arcs(super().distance(points))
+        return self.sphere.lengths(super().distance(points))
 
     def _finish(self, writer: CodeWriter, best2: str, law: int) -> str:
         arc = writer.variable(f"2 * asin(fmin(sqrt({best2}) / 2, (REAL)1))")

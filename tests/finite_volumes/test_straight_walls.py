@@ -164,7 +164,7 @@ def test_points_on_curved_walls_lie_on_the_curves(ctx):
     result = adapt(ctx, domain, size)
     found = {0: [], 1: [], 2: [], -1: []}
     for _, edge, a, b in wall_faces(result.solver_mesh()):
-        found[int(domain.curved.curve[edge])] += [a, b]
+        found[int(domain.curved_edges.curve[edge])] += [a, b]
     x, y = np.array(found[0]).T
     assert np.abs(np.hypot(x - 1.5, y - 1) - 0.5).max() < 1e-12
     x, y = np.array(found[2]).T

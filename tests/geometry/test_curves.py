@@ -194,7 +194,7 @@ def test_ends_of_curves_are_merged_with_points():
     two = clvoro.Polygon([arc((0, 0), 1, 10, 200), arc((0, 0), 1, 200, 370)])
     assert two.measure == pytest.approx(math.pi, rel=1e-5)
     assert len(two.curves) == 2
-    assert (two.curved.span >= 0).all()
+    assert (two.curved_edges.span >= 0).all()
 
 
 def test_names_of_curves():
@@ -228,13 +228,13 @@ def test_points_on_curves(curve):
     begin, end = domain.vertices[edges], domain.vertices[domain._next_given[edges]]
     points = begin + rng.random((len(edges), 1)) * (end - begin)
     found = domain.on_curve(points, edges)
-    curved = domain.curved.span[edges] >= 0
+    curved = domain.curved_edges.span[edges] >= 0
     assert (found[~curved] == points[~curved]).all()
     assert np.hypot(*(found - points).T).max() <= 1.05 * curve.tolerance
     # Reference: the parameter by bisection of (points - curve) . tangent.
     for s, span in enumerate(curve.spans):
-        rows = np.flatnonzero(domain.curved.span[edges] == s)
-        low, high = domain.curved.ends[edges[rows]].T
+        rows = np.flatnonzero(domain.curved_edges.span[edges] == s)
+        low, high = domain.curved_edges.ends[edges[rows]].T
         for _ in range(70):
             middle = (low + high) / 2
             at, ahead = span.at(middle)

@@ -27,7 +27,7 @@ def test_vectors_of_any_length_are_positions():
 
 def test_arcs():
     chord = np.linalg.norm(np.subtract(*EARTH.positions([(0, 0), (60, 0)])))
-    assert EARTH.arcs([chord]) == pytest.approx([EARTH.radius * np.pi / 3])
+    assert EARTH.lengths([chord]) == pytest.approx([EARTH.radius * np.pi / 3])
 
 
 def test_tangents():

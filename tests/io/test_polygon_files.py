@@ -10,7 +10,6 @@ import shapely
 import clvoro
 from clvoro.cli import command as cli
 from clvoro.errors import InputError, InputTypeError
-from clvoro.geometry.boundary import boundary_measure, wall_planes
 from clvoro.geometry.polygon import Polygon
 from clvoro.io import vtu
 from clvoro.io.vtu_read import load_vtu
@@ -60,7 +59,7 @@ DOMAINS = {"bay": bay, "ring": ring, "comb": comb, "three": three}
 def scattered(domain: Polygon, n: int, seed: int = 1) -> np.ndarray:
     """Return `n` points well inside, some in every piece."""
     rng = np.random.default_rng(seed)
-    inner = np.array([domain.inner_point(p) for p in range(domain.n_pieces)])
+    inner = domain.inner_points()
     x = rng.uniform(domain.lower, domain.upper, (20 * n, 2))
     x = x[domain.contains(x) & (domain.boundary_distance(x) > 1e-3)]
     return np.concatenate([inner, x])[:n]
@@ -216,14 +215,14 @@ def test_numbers_of_a_result_are_recomputed(result, name: str) -> None:
 def test_walls_of_polygons() -> None:
     domain = bay()
     walls = np.arange(len(domain.vertices))
-    normals, anchors = wall_planes(domain, walls)
+    normals, anchors = domain.wall_planes(walls)
     rings = [(ring + np.roll(ring, -1, axis=0)) / 2 for ring in domain.rings]
     middle = np.concatenate(rings)
     assert np.abs(((middle - anchors) * normals).sum(axis=1)).max() < 1e-15
     assert not domain.contains(middle + 1e-3 * normals).any()
     assert domain.contains(middle - 1e-3 * normals).all()
-    assert boundary_measure(domain) == pytest.approx(domain.geometry.length, rel=1e-15)
-    assert boundary_measure(clvoro.Box((0, 0, 0), (1, 2, 3))) == 22
+    assert domain.boundary_measure == pytest.approx(domain.geometry.length, rel=1e-15)
+    assert clvoro.Box((0, 0, 0), (1, 2, 3)).boundary_measure == 22
 
 
 def cells_of(diagram) -> list:
@@ -618,7 +617,7 @@ def test_size_is_evaluated_inside_only(result) -> None:
     assert all(max(pixel(figure, place)) < 250 for place in INSIDE)
     # Up to the boundary: a raster would end in steps there.
     beside = np.add(*domain.edge_ends(np.arange(len(domain.vertices)))) / 2
-    inward = beside - 0.02 * wall_planes(domain, np.arange(len(beside)))[0]
+    inward = beside - 0.02 * domain.wall_planes(np.arange(len(beside)))[0]
     kept = inward[:9][domain.contains(inward[:9])]
     assert len(kept) == 9
     assert all(pixel(figure, place) != [255, 255, 255] for place in kept)

@@ -85,7 +85,7 @@ def test_pieces_of_one_cell_each_have_no_potential(adapters, method):
     """The source of an isolated cell minus its mean is 0 up to round-off."""
     corner, rng = np.array([(0, 0), (1, 0), (0.3, 0.7)]), np.random.default_rng(5)
     domain = clvoro.Polygon.from_pieces([[corner * rng.uniform(0.1, 0.9) + (k % 4, k // 4)] for k in range(12)])
-    points = np.array([domain.inner_point(piece) for piece in range(12)])
+    points = domain.inner_points()
     for adapter in adapters.values():
         result = adapter.run(domain, 0.3, points=points, method=method, max_steps=2)
         report = result.check()

@@ -40,9 +40,9 @@ def try_hard(rng: np.random.Generator) -> str:
     if kind < 0.3:  # cells larger than most edges
         points = domain.lower + rng.random((int(rng.integers(1, 6)), 2)) * domain.extent
         points = points[domain.contains(points)]
-        points = points if len(points) else domain.inner_point(0)[None]
+        points = points if len(points) else domain.inner_points()[:1]
     elif kind < 0.45:
-        points = np.array([domain.inner_point(p) for p in range(domain.n_pieces)])
+        points = domain.inner_points()
     else:
         points = placed_in_polygon(rng, domain)
     if kind < 0.8 and rng.random() < 0.6:
@@ -71,4 +71,4 @@ def try_rings(rng: np.random.Generator) -> str:
     n = int(rng.choice([1, 3, 20]))
     points = domain.lower + rng.random((8 * n, 2)) * domain.extent
     points = points[domain.contains(points)][:n]
-    return diagram(domain, points if len(points) else domain.inner_point(0)[None], real)
+    return diagram(domain, points if len(points) else domain.inner_points()[:1], real)

@@ -233,7 +233,7 @@ def placed_in_polygon(rng: np.random.Generator, domain: clvoro.Polygon) -> np.nd
         x = x + 10.0 ** rng.uniform(-17, -5) * rng.standard_normal(x.shape)
     x = low + x * extent
     inside = x[domain.contains(x)] if rng.random() < 0.98 else x
-    return np.unique(inside, axis=0) if len(inside) else domain.inner_point(0)[None]
+    return np.unique(inside, axis=0) if len(inside) else domain.inner_points()[:1]
 
 
 def some_layers(

@@ -275,7 +275,7 @@ def _in_all_pieces(domain: Domain, points: np.ndarray) -> np.ndarray:
     for missing in np.flatnonzero(counts == 0).tolist():
         most = int(np.argmax(counts))
         row = np.flatnonzero(piece == most)[-1]
-        points[row] = domain.inner_point(missing)
+        points[row] = domain.inner_points()[missing]
         piece[row] = missing
         counts[[most, missing]] += [-1, 1]
     return points

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ...geometry.boundary import wall_planes
 from ...geometry.polygon import Polygon
 from ...geometry.sphere import Sphere
 from ..connectivity import face_ends, face_keys, plane_shares, take_rows
@@ -105,7 +104,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     inner = np.flatnonzero(d.neighbors >= 0)
     height[inner] = plane_shares(d, inner) * g.spacings[inner]
     walls = np.flatnonzero(d.neighbors < 0)
-    planes, anchors = wall_planes(d.domain, -1 - d.neighbors[walls])
+    planes, anchors = d.domain.wall_planes(-1 - d.neighbors[walls])
     height[walls] = ((anchors - d.points[g.owner[walls]]) * planes).sum(axis=1)
     loose = np.zeros(len(g.owner), bool)
     if isinstance(d.domain, Polygon):

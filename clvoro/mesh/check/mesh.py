@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...geometry.boundary import boundary_measure, wall_distance
 from ...geometry.polygon import Polygon
 from ...geometry.sphere import Sphere
 from ..connectivity import face_keys
@@ -219,7 +218,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, its corners give {g.volumes[i]:.17g}",
     )
     total = float(d.volumes.sum())
-    border = 0.0 if spherical else boundary_measure(domain)
+    border = domain.boundary_measure
     allowed = slack * (g.perimeters.sum() / np.sqrt(n) + border)
     check.note(
         "volumes sum",
@@ -345,7 +344,7 @@ def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> N
     if len(walls) and not isinstance(d.domain, Sphere):
         # Faces towards removed cells are on bisectors; see `check_generators`.
         middles = g.middles[walls] + d.points[g.owner[walls]]
-        height = wall_distance(d.domain, -1 - d.neighbors[walls], middles)
+        height = d.domain.wall_distance(-1 - d.neighbors[walls], middles)
         height[g.measures[walls] == 0] = 0  # a face without measure has no place
         check.note(
             "walls",
@@ -377,7 +376,7 @@ def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
     last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
     # The tree takes a period of 0 for an axis that is not periodic.
     tree = power_tree(d, np.minimum(d.points - lower, last), periods)
-    lengths = d.domain.arcs if isinstance(d.domain, Sphere) else np.asarray
+    lengths = d.domain.lengths
     own = lengths(np.linalg.norm(corners - d.points[g.cells], axis=1))
     if d.is_power:
         own = np.hypot(own, tree.data[g.cells, -1])

@@ -9,7 +9,6 @@ import numpy as np
 import shapely
 from scipy.spatial import KDTree
 
-from ...geometry.boundary import wall_planes
 from ...geometry.polygon import Polygon
 from ..connectivity import face_ends, neighbor_points, next_faces
 
@@ -261,7 +260,7 @@ def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     inner, walls = np.flatnonzero(d.neighbors >= 0), np.flatnonzero(d.neighbors < 0)
     across = np.zeros((len(owner), d.domain.dim))
     across[inner] = neighbor_points(d, inner) - d.points[owner[inner]]
-    across[walls] = wall_planes(d.domain, -1 - d.neighbors[walls])[0]
+    across[walls] = d.domain.wall_planes(-1 - d.neighbors[walls])[0]
     distance = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
     spacing = distance.copy()
     spacing[walls] = np.inf
