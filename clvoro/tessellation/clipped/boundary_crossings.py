@@ -9,6 +9,7 @@ import pyopencl.array as cla
 
 from ...errors import InputError
 from ...geometry.polygon import Polygon
+from ...geometry.rings import OrientedRings
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
 from ..device_diagram import Tessellation
@@ -50,6 +51,8 @@ class Chords:
         The edge before each edge, and the turning angle between them; see tessellation/clipped/wall_sides.h.
     shift : (2,) float
         Shift of the boundary in normalized coordinates.
+    rings : OrientedRings
+        The boundary, in the domain's unit of length.
     """
 
     count: int
@@ -62,6 +65,7 @@ class Chords:
     tangents: cla.Array
     turns: tuple[cla.Array, ...]
     shift: np.ndarray
+    rings: OrientedRings
 
 
 def inward_vectors(domain: Polygon, real: np.dtype) -> np.ndarray:
@@ -98,7 +102,7 @@ class Boundary:
         self._scan, self._room = Scan(engine), NamedArrays(engine, spare=1 / 16)
         self._kernels = engine.kernels("tessellation/clipped/boundary_crossings")
         origin, scale = domain.frame
-        oriented = domain.oriented
+        self._rings = oriented = domain.oriented
         self.edges = len(oriented.vertices)
         vertices = (oriented.vertices - origin) / scale
         inner = vertices + inward_vectors(domain, engine.real)
@@ -177,4 +181,6 @@ class Boundary:
         self._scan.exclusive(starts, starts, touched_count)
         engine.run_each(k.place_chords, count, cells, slots, ranks, starts, listed)
         engine.run_each(k.sort_chords, touched_count, starts, listed)
-        return Chords(count, touched_count, arrays, slots, touched, starts, listed, self.tangents, self.turns, shift)
+        return Chords(
+            count, touched_count, arrays, slots, touched, starts, listed, self.tangents, self.turns, shift, self._rings
+        )

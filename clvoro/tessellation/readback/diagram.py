@@ -8,9 +8,7 @@ from functools import cached_property
 import numpy as np
 import pyopencl.array as cla
 
-from ...geometry.box import Box
 from ...geometry.domain import ClipBox, Domain
-from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ...opencl.primitives import Gather, Lists
@@ -18,6 +16,7 @@ from ..device_diagram import UNEVEN, CloseError, Tessellation
 from ..periodic.periodic_tessellator import ExtendedDiagram
 from ..topology3d.consistency import SharedFaces, share_faces
 from ..vertices import VertexNumbering, Vertices
+from .cut_faces import CutFaces, chain_faces, join_loops
 
 SMALL_FACE = 1e-3
 """Share of the mean face: areas of smaller ones are compared with those of their vertices, where these were merged."""
@@ -47,22 +46,7 @@ def fetch_diagram(
     InputError
         If round-off has made cells wrong.
     """
-    from .periodic import _PeriodicReader
-    from .polygon import _PolygonReader
-
-    others = ["face_vert" if engine.cell_dim == 2 else "cell_vert"]
-    if extended is None:
-        others.append("shifts")
-    if t.weighted is None:
-        others.append("weights")
-    if isinstance(domain, Polygon):
-        reader: _DiagramReader = _PolygonReader(engine, domain, t, labels, copy)
-        others.remove("face_vert")
-    elif extended is not None and isinstance(domain, Box):
-        reader = _PeriodicReader(engine, domain, t, labels, copy, extended)
-    else:
-        reader = _DiagramReader(engine, domain, t, labels, copy)
-    reader.names = [name for name in Diagram._NAMES if not name.startswith(tuple(others))]
+    reader = _DiagramReader(engine, domain, t, labels, copy, extended)
     if reader.whole.round_off & UNEVEN:
         assert reader.faces
     return reader.diagram()
@@ -113,34 +97,170 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
     )
 
 
+def merge_ends(corners: np.ndarray, starts: np.ndarray, dropped: np.ndarray) -> np.ndarray:
+    """Return `corners` of cells in 2D, (m,), where both ends of a dropped face are the same vertex.
+
+    Parameters
+    ----------
+    corners : (m or more,) int
+        First vertex of each face.
+    starts : (n + 1,) int32
+        Rows of the faces.
+    dropped : (k,) int
+        Faces that are left out.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = int(corners.max(initial=-1)) + 1
+    ends = np.arange(1, starts[-1] + 1)
+    filled = np.diff(starts) > 0  # cells of power diagrams may be empty
+    ends[starts[1:][filled] - 1] = starts[:-1][filled]
+    pairs = corners[dropped], corners[ends[dropped]]
+    graph = coo_array((np.ones(len(dropped), np.int8), pairs), (count, count))
+    parts = connected_components(graph, directed=False)[1]
+    return np.unique(parts, return_index=True)[1][parts][corners]
+
+
 class _DiagramReader:
     """Read the arrays of a `Diagram` from a tessellation, each when first used.
 
+    Vertices are those of one diagram of convex cells, `whole`: of the tessellation itself, of the extended diagram of a
+    periodic box, where cells beyond the periodic boundaries are ordinary cells, or of the diagram that a boundary cuts.
+    In a periodic box the corners of a cell therefore surround its generator, and a vertex near a periodic boundary
+    appears once for each of its images that is a corner of a cell in the box. A boundary adds vertices, `cut`. Then
+    both ends of each face are stored, as several loops may bound a cell.
+
     With `copy` the reader owns its arrays, since the stages reuse theirs.
+
+    Attributes
+    ----------
+    whole : Tessellation
+    box : ClipBox
+        The box that clips its cells.
+    places : (m,) int, or None
+        Index in `whole` of each face on the device; None if it is the same.
+    codes : (m,) int32, or None
+        Codes of the images across the faces, in a periodic box.
+    cut : CutFaces, or None
     """
 
-    def __init__(self, engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        domain: Domain,
+        t: Tessellation,
+        labels: cla.Array,
+        copy: bool,
+        extended: ExtendedDiagram | None,
+    ) -> None:
         self.engine, self.domain, self.n = engine, domain, t.n
-        self.box: ClipBox = domain
         self.origin, self.scale = domain.frame
         self.labels = labels.get()[: t.n]
-        self.names: list[str] = []
-        m = int(t.starts[t.n].get())
-        self.t = self.whole = kept_faces(t, m, copy)
+        self.m = int(t.starts[t.n].get())
+        self.t = self.whole = kept_faces(t, self.m, copy)
+        self.box: ClipBox = domain
+        self.places: np.ndarray | None = None
+        self.codes: np.ndarray | None = None
+        self.cut: CutFaces | None = None
+        whole = None
+        if extended is not None:
+            whole, places = extended.tessellation, extended.folded.places
+            self.box = extended.images.box
+            self.codes = extended.folded.codes[: self.m].get()
+            self.places = None if places is None else places.get()
+        elif t.trimmed is not None:
+            whole = t.trimmed.convex
+            self.cut = CutFaces(t.trimmed, self.n, self.m, self.scale)
+        if whole is not None:
+            self.whole = kept_faces(whole, int(whole.starts[whole.n].get()), copy)
 
-    @cached_property
-    def places(self) -> np.ndarray:
-        """Index in `whole` of each face on the device, (m,)."""
-        return np.arange(len(self.t.neighbors))
+    def diagram(self) -> Diagram:
+        """Return the result, with the arrays that such a diagram has."""
+        missing = ["cell_vert"] if self.engine.cell_dim == 3 else ["face_vert"] if self.cut is None else []
+        if self.codes is None:
+            missing.append("shifts")
+        if self.t.weighted is None:
+            missing.append("weights")
+        names = [name for name in Diagram._NAMES if not name.startswith(tuple(missing))]
+        return Diagram(self.domain, {name: (lambda name=name: getattr(self, name)()) for name in names})
+
+    # The order of rows and faces.
 
     @cached_property
     def order(self) -> np.ndarray:
         """Row on the device of each row of the result, (n,)."""
         return order_of(self.labels)
 
-    def diagram(self) -> Diagram:
-        """Return the result, with the arrays that `names` lists."""
-        return Diagram(self.domain, {name: (lambda name=name: getattr(self, name)()) for name in self.names})
+    @cached_property
+    def ranks(self) -> np.ndarray:
+        """Row of the result of each row on the device, (n,)."""
+        inverse = np.empty(self.n, np.int32)
+        inverse[self.order] = np.arange(self.n, dtype=np.int32)
+        return inverse
+
+    @cached_property
+    def kept(self) -> np.ndarray | None:
+        """Mask (m,) of the faces on the device that are in the result; None if all are.
+
+        In 3D faces no wider than round-off are left out: those without a loop of vertices.
+        """
+        if not self.whole.round_off:
+            return None
+        seen = np.diff(self.loop_starts) > 0
+        if self.places is not None:
+            seen = seen[self.places]
+        if self.codes is not None:
+            # The two half-faces at a periodic boundary have separate loops.
+            seen = seen[: self.m]
+            i, j = np.repeat(np.arange(self.n), np.diff(self.t.starts.get())), self.t.neighbors.get()
+            inner, last = np.flatnonzero(j >= 0), 3**self.engine.dim - 1
+            i, j, code = i[inner].astype(np.int64), j[inner].astype(np.int64), self.codes[inner]
+            here = inner[np.lexsort((code, j, i))]
+            there = inner[np.lexsort((last - code, i, j))]
+            seen[here] &= seen[there].copy()
+        return seen
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """`starts` on the device (n + 1,), counting kept faces only."""
+        starts = self.t.starts.get()
+        if self.kept is None:
+            return starts
+        return np.concatenate([[0], np.cumsum(self.kept)])[starts]
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """Number of faces of each row of the result, (n,)."""
+        return np.diff(self.starts)[self.order]
+
+    @cached_property
+    def slots(self) -> np.ndarray:
+        """Index on the device of each face of the result, (m,); ordered along the loops of cells with several."""
+        return self.row_slots if self.cut is None else self.chained[0]
+
+    @cached_property
+    def row_slots(self) -> np.ndarray:
+        """Index on the device of each face of the result, (m,), in the order of the device within rows."""
+        shift = self.starts[self.order] - self.neighbor_starts()[:-1]
+        places = np.repeat(shift, self.counts)
+        places += np.arange(len(places), dtype=places.dtype)
+        return places if self.kept is None else np.flatnonzero(self.kept)[places]
+
+    @cached_property
+    def lists(self) -> Lists | None:
+        """How the device brings the faces into the order of the result; None if faces within rows differ."""
+        if self.kept is not None or self.cut is not None:
+            return None
+        upload = self.engine.upload
+        return Lists(upload(self.order, np.int32), self.t.starts, upload(self.neighbor_starts(), np.int32))
+
+    # Vertices.
+
+    @cached_property
+    def shared(self) -> Vertices:
+        """Vertices of `whole` in 2D."""
+        return VertexNumbering(self.engine).number(self.box, self.whole)
 
     @cached_property
     def faces(self) -> SharedFaces:
@@ -161,6 +281,11 @@ class _DiagramReader:
             raise error.within(self.domain) from None
         return faces
 
+    @cached_property
+    def loop_starts(self) -> np.ndarray:
+        """`starts` of the vertex loops of faces of `whole`, (m + 1,)."""
+        return self.faces.starts.get()
+
     def needs_check(self) -> bool:
         """Return whether round-off may have spoiled the result."""
         if self.faces.needs_check or self.whole.round_off & UNEVEN:
@@ -168,72 +293,65 @@ class _DiagramReader:
         lost = 0 if self.kept is None else self._gaps(self.kept)
         return bool((lost > LEFT_OUT * self.whole.volumes.get()).any())
 
-    @cached_property
-    def kept(self) -> np.ndarray | None:
-        """Mask (m,) of the faces on the device that are in the result; None if all are.
-
-        In 3D faces no wider than round-off are left out.
-        """
-        return self.polygons() if self.whole.round_off else None
-
-    def polygons(self) -> np.ndarray:
-        """Return the mask (m,) of the faces on the device that have a loop of vertices."""
-        return np.diff(self.loop_starts) > 0
-
     def _gaps(self, kept: np.ndarray) -> np.ndarray:
         """Return, for each cell of `whole`, the volume of the cones over faces that are not `kept`."""
-        t, faces = self.whole, self.places[~kept]
+        t, faces = self.whole, self._in_whole(np.flatnonzero(~kept))
         cell = np.searchsorted(t.starts.get(), faces, side="right") - 1
         other, points = t.neighbors.get()[faces], t.points.get().astype(float)
         inner = other >= 0  # faces on walls are never below round-off
         way = np.linalg.norm(points[other] - points[cell], axis=1) * inner
         return np.bincount(cell, t.face_measures.get()[faces] * way / 6, t.n)
 
-    @cached_property
-    def starts(self) -> np.ndarray:
-        """`starts` on the device (n + 1,), counting kept faces only."""
-        starts = self.t.starts.get()
-        if self.kept is None:
-            return starts
-        return np.concatenate([[0], np.cumsum(self.kept)])[starts]
+    def _in_whole(self, faces: np.ndarray) -> np.ndarray:
+        """Return the indices in `whole` of faces on the device."""
+        return faces if self.places is None else self.places[faces]
 
     @cached_property
-    def counts(self) -> np.ndarray:
-        """Number of faces of each row of the result, (n,)."""
-        return np.diff(self.starts)[self.order]
+    def ends(self) -> np.ndarray:
+        """First and last vertex of each face on the device, (m, 2), where a boundary cuts cells."""
+        assert self.cut is not None
+        return self.cut.ends(self.whole.starts.get(), self.shared, self.starts)
 
     @cached_property
-    def slots(self) -> np.ndarray:
-        """Index on the device of each face of the result, (m,)."""
-        shift = self.starts[self.order] - self.neighbor_starts()[:-1]
-        places = np.repeat(shift, self.counts)
-        places += np.arange(len(places), dtype=places.dtype)
-        return places if self.kept is None else np.flatnonzero(self.kept)[places]
+    def chained(self) -> tuple[np.ndarray, dict[int, list[int]]]:
+        """`slots` along the loops of cells, and the lengths of the loops of those rows that have several."""
+        return chain_faces(self.row_slots, self.ends, self.neighbor_starts())
 
     @cached_property
-    def lists(self) -> Lists | None:
-        """How the device brings the faces into the order of the result; None if the result leaves faces out."""
-        if self.kept is not None:
-            return None
-        upload = self.engine.upload
-        return Lists(upload(self.order, np.int32), self.t.starts, upload(self.neighbor_starts(), np.int32))
+    def corners(self) -> tuple[np.ndarray | None, np.ndarray]:
+        """The vertices that are corners of the result, None for all, and the place among them of each corner."""
+        if self.cut is not None:
+            return used_indices(self.ends[self.slots].ravel(), self.shared.count + len(self.cut.positions))
+        found = self._corners_in_2d() if self.engine.cell_dim == 2 else self._corners_in_3d()
+        return (None, found) if self.whole is self.t else used_indices(found, len(self._positions))
 
-    @cached_property
-    def ranks(self) -> np.ndarray:
-        """Row of the result of each row on the device, (n,)."""
-        inverse = np.empty(self.n, np.int32)
-        inverse[self.order] = np.arange(self.n, dtype=np.int32)
-        return inverse
+    @property
+    def _positions(self) -> cla.Array:
+        return (self.shared if self.engine.cell_dim == 2 else self.faces).positions
 
-    @cached_property
-    def shared(self) -> Vertices:
-        """Shared vertices in 2D."""
-        return VertexNumbering(self.engine).number(self.domain, self.t)
+    def _corners_in_2d(self) -> np.ndarray:
+        if self.whole is self.t:
+            return self._read_faces(self.shared.cell_vertices)
+        corners = self.shared.cell_vertices.get()
+        if self.places is not None:
+            starts = self.whole.starts.get()[: self.n + 1]
+            corners = merge_ends(corners, starts, np.setdiff1d(np.arange(starts[-1]), self.places))
+        return corners[self._in_whole(self.slots)]
 
-    @cached_property
-    def loop_starts(self) -> np.ndarray:
-        """`starts` of the vertex loops of faces on the device, (m + 1,)."""
-        return self.faces.starts.get()
+    def _corners_in_3d(self) -> np.ndarray:
+        starts = self.face_vertex_starts()
+        if self.lists is not None and self.whole is self.t:
+            # The loops of a cell's faces follow one another on the device, too.
+            begins = self.loop_starts[self.starts]
+            to = starts_of(np.diff(begins)[self.order])
+            upload = self.engine.upload
+            loops = Lists(self.lists.order, upload(begins, np.int32), upload(to, np.int32))
+            return Gather(self.engine).lists(loops, self.faces.vertices[: int(to[-1])]).get()
+        shift = self.loop_starts[self._in_whole(self.slots)] - starts[:-1]
+        places = np.arange(starts[-1]) + np.repeat(shift, np.diff(starts))
+        return self.faces.vertices.get()[places]
+
+    # Units.
 
     def _read(self, array: cla.Array, power: int) -> np.ndarray:
         """Return an array of cells in physical units."""
@@ -252,19 +370,32 @@ class _DiagramReader:
         numbers *= self.scale**power
         return numbers
 
-    def _placed(self, numbers: np.ndarray) -> np.ndarray:
-        """Return positions in physical units, within the domain. The array may be used for that."""
-        x = self._physical(numbers)
+    def _placed(self, numbers: np.ndarray, within_seams: bool) -> np.ndarray:
+        """Return positions in physical units, within the walls. The array may be used for that.
+
+        With `within_seams` they are also in [lower, upper) along periodic directions.
+        """
+        x, periodic = self._physical(numbers), self.domain.periodic
         # Round-off must not move a point on a wall out of the domain. Axis by axis is faster.
         for a in range(x.shape[1]):
             x[:, a] += self.origin[a]
-            np.clip(x[:, a], self.domain.lower[a], self.domain.upper[a], out=x[:, a])
+            lower, upper = self.domain.lower[a], self.domain.upper[a]
+            if periodic[a]:
+                if not within_seams:
+                    continue
+                upper = np.nextafter(upper, lower)
+            np.clip(x[:, a], lower, upper, out=x[:, a])
         return x
 
     # One method per array of `Diagram`.
 
     def points(self) -> np.ndarray:
-        return self._placed(np.take(self.t.points.get(), self.order, axis=0))
+        x = self._placed(np.take(self.t.points.get(), self.order, axis=0), within_seams=True)
+        if self.cut is not None:
+            # Round-off must not move a generator on the boundary out of the domain.
+            near = slice(None) if self.cut.shifted else self.ranks[self.cut.touched]
+            x[near] = self.domain.nearest(x[near])
+        return x
 
     def weights(self) -> np.ndarray:
         assert self.t.weighted is not None
@@ -283,11 +414,20 @@ class _DiagramReader:
         return starts_of(self.counts)
 
     def neighbors(self) -> np.ndarray:
-        if self.lists is None:
-            j = self._read_faces(self.t.neighbors)
-            return np.where(j >= 0, self.ranks[np.maximum(j, 0)], j)
-        ranks = self.engine.upload(self.ranks, np.int32)
-        return Gather(self.engine).lists(self.lists, self.t.neighbors, ranks).get()
+        if self.lists is not None:
+            ranks = self.engine.upload(self.ranks, np.int32)
+            return Gather(self.engine).lists(self.lists, self.t.neighbors, ranks).get()
+        j = self._read_faces(self.t.neighbors)
+        walls = np.minimum(j, -1)
+        if self.cut is not None:
+            walls = -1 - self.cut.edge_numbers[-1 - walls]
+        return np.where(j >= 0, self.ranks[np.maximum(j, 0)], walls)
+
+    def shifts(self) -> np.ndarray:
+        assert self.codes is not None
+        codes = self.codes[self.slots]
+        steps = [codes // 3**a % 3 - 1 for a in range(self.engine.dim)]
+        return np.stack(steps, axis=1).astype(np.int8)
 
     def face_measures(self) -> np.ndarray:
         measures = self._physical(self._read_faces(self.t.face_measures), self.engine.cell_dim - 1)
@@ -315,27 +455,26 @@ class _DiagramReader:
         return found
 
     def vertices(self) -> np.ndarray:
-        shared = self.shared if self.engine.cell_dim == 2 else self.faces
-        return self._placed(shared.positions.get())
+        used, x = self.corners[0], self._positions.get()
+        if self.cut is not None:
+            x = np.concatenate([self._physical(x) + self.origin, self.cut.positions])
+            return x[used]
+        return self._placed(x if used is None else x[used], within_seams=False)
 
     def cell_vertex_starts(self) -> np.ndarray:
-        return self.neighbor_starts()
+        return self.neighbor_starts() if self.cut is None else self._outlines[0]
 
     def cell_vertices(self) -> np.ndarray:
-        return self._read_faces(self.shared.cell_vertices)
+        return self.corners[1] if self.cut is None else self._outlines[1]
+
+    @cached_property
+    def _outlines(self) -> tuple[np.ndarray, np.ndarray]:
+        return join_loops(self.corners[1][::2], self.neighbor_starts(), self.chained[1])
 
     def face_vertex_starts(self) -> np.ndarray:
-        return starts_of(np.take(np.diff(self.loop_starts), self.slots))
+        if self.cut is not None:
+            return (2 * np.arange(self.m + 1)).astype(np.int32)
+        return starts_of(np.take(np.diff(self.loop_starts), self._in_whole(self.slots)))
 
     def face_vertices(self) -> np.ndarray:
-        if self.lists is not None:
-            # The loops of a cell's faces follow one another on the device, too.
-            begins = self.loop_starts[self.starts]
-            to = starts_of(np.diff(begins)[self.order])
-            upload = self.engine.upload
-            loops = Lists(self.lists.order, upload(begins, np.int32), upload(to, np.int32))
-            return Gather(self.engine).lists(loops, self.faces.vertices[: int(to[-1])]).get()
-        starts = self.face_vertex_starts()
-        shift = self.loop_starts[self.slots] - starts[:-1]
-        places = np.arange(starts[-1]) + np.repeat(shift, np.diff(starts))
-        return self.faces.vertices.get()[places]
+        return self.corners[1]
