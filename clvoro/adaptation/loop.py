@@ -195,7 +195,7 @@ class Loop:
     def prescribe(self, action: Prescribe, progress: float) -> bool:
         """Give the cells their target volumes, and move generators to the centroids; return whether to stop."""
         mesh, phase = self.mesh, PowerPhase(self.mesh)
-        mesh.stages.clear("poisson")
+        mesh.stages.clear_poisson()
         for move in range(action.moves + 1):
             self.begun = self.steps + 1
             with mesh.engine.workspace.frame():
@@ -216,14 +216,14 @@ class Loop:
         if action.least and abs(self.missing()) <= action.least * self.mesh.n:
             return
         # The solver cannot reuse its large buffers for other generators.
-        self.mesh.stages.clear("poisson")
+        self.mesh.stages.clear_poisson()
         nuclei = round(action.nuclei * self.mesh.n)
         max_cells = math.inf if self.fixed_count is not None else self.max_cells()
         self.mesh.insert_delete(nuclei, self.fixed_count, climb_strain=action.climb_strain, most=max_cells)
 
     def repair_cells(self, action: RepairCells) -> None:
         """Delete or split the worst cells."""
-        self.mesh.stages.clear("poisson")
+        self.mesh.stages.clear_poisson()
         self.mesh.repair_cells(action.deficit, action.split)
 
     def count_changed(self, steps: int) -> bool:
@@ -304,7 +304,7 @@ class Loop:
     def refine(self) -> None:
         """Refine to the next finer level."""
         # The finer level needs another solver and more memory.
-        self.mesh.stages.clear("poisson")
+        self.mesh.stages.clear_poisson()
         self.mesh.engine.workspace.clear()
         finer = self.mesh.refine(finest=self.level == 1)
         # One assignment, because an interruption between two would leave a mesh that does not belong to its level.

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from ..solvers.poisson import Poisson
 from ..solvers.transport import Transport
 from ..solvers.volume_projection import VolumeProjection
-from ..tessellation.stages import TessellationStages
+from ..tessellation.stages import TessellationStages, made_by
 from .corners import Corners
 from .density import Density
 from .descent.quality_descent import QualityDescent
@@ -24,35 +22,22 @@ from .thin_walls import ThinWalls
 class Stages(TessellationStages):
     """The stages of one engine, each compiled when first used. Meshes share their buffers."""
 
-    metric: Metric
-    density: Density
-    poisson: Poisson
-    transport: Transport
-    volume_projection: VolumeProjection
-    quality_descent: QualityDescent
-    motion: Motion
-    mmpde: Mmpde
-    corners: Corners
-    thin_walls: ThinWalls
-    refinement: Refinement
-    surface_descent: SurfaceDescent
-    insertion_deletion: InsertionDeletion
-    local_counts: LocalCounts
+    metric = made_by(Metric)
+    density = made_by(Density)
+    poisson = made_by(Poisson)
+    transport = made_by(Transport)
+    volume_projection = made_by(VolumeProjection)
+    quality_descent = made_by(QualityDescent)
+    motion = made_by(Motion)
+    mmpde = made_by(Mmpde)
+    corners = made_by(Corners)
+    thin_walls = made_by(ThinWalls)
+    refinement = made_by(Refinement)
+    surface_descent = made_by(SurfaceDescent)
+    insertion_deletion = made_by(InsertionDeletion)
+    local_counts = made_by(LocalCounts)
 
-    CLASSES: ClassVar[dict[str, type]] = {
-        **TessellationStages.CLASSES,
-        "metric": Metric,
-        "density": Density,
-        "poisson": Poisson,
-        "transport": Transport,
-        "volume_projection": VolumeProjection,
-        "quality_descent": QualityDescent,
-        "motion": Motion,
-        "mmpde": Mmpde,
-        "corners": Corners,
-        "thin_walls": ThinWalls,
-        "refinement": Refinement,
-        "insertion_deletion": InsertionDeletion,
-        "surface_descent": SurfaceDescent,
-        "local_counts": LocalCounts,
-    }
+    def clear_poisson(self) -> None:
+        """Free the buffers of `poisson`, if it exists; its kernels stay."""
+        if "poisson" in vars(self):
+            self.poisson.clear()

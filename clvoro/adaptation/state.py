@@ -288,7 +288,7 @@ class MeshState(MeshArrays):
         See `LocalCounts`.
         """
         stages, engine, new = self.stages, self.engine, None
-        stages.clear("poisson")
+        stages.clear_poisson()
         engine.workspace.clear()
         with engine.workspace.frame():
             w = stages.density.cell_weights(self.t, self.h)
@@ -298,7 +298,7 @@ class MeshState(MeshArrays):
                 new = stages.insertion_deletion.split_delete(
                     self.free, self.t, self._data.generators, self.next_label, sites, self.fixed
                 )
-        stages.clear("poisson")
+        stages.clear_poisson()
         rows, counts = _take_apart(new)
         del new
         return self._replace(rows, counts)
@@ -375,7 +375,7 @@ class MeshState(MeshArrays):
 
         Return whether the diagram has been computed again for that.
         """
-        self.stages.clear("poisson")
+        self.stages.clear_poisson()
         self.engine.workspace.clear()
         if self.t.weighted is not None and self.power is not None:
             self.tessellation, self._extended = self.power.final(self.t)
@@ -385,7 +385,7 @@ class MeshState(MeshArrays):
         if not whole:
             # Free the present diagram before the new one is computed.
             self.tessellation = None
-            self.stages.clear("folded_cells")
+            self.stages.clear_folded_cells()
             self.tessellation = self.tessellator.extend(self.points, self.n)
         self.tessellation, self._extended = self.tessellator.final(self.t)
         self.evaluate_metric()

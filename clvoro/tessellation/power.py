@@ -187,7 +187,7 @@ class PowerTessellator:
         self, periodic: PeriodicTessellator, t: Tessellation
     ) -> tuple[Tessellation, ExtendedDiagram]:
         if t is not self._complete:
-            self.stages.clear("folded_cells")
+            self.stages.clear_folded_cells()
             assert t.weighted is not None
             self._from_nothing(t.weighted, t.n, exact=True, complete=True)
         t = replace(periodic.measure_faces(), points=t.points, weighted=t.weighted)

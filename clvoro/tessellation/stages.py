@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from functools import cache
-from typing import ClassVar
+from collections.abc import Callable
+from functools import cache, cached_property
+from typing import TypeVar
 
 import pyopencl.array as cla
 
@@ -21,64 +22,53 @@ from .polyhedra import Polyhedra
 from .polyhedra_update import PolyhedraUpdate
 from .power_cells import PowerCells
 
+Stage = TypeVar("Stage")
+
+
+def made_by(kind: Callable[[Engine], Stage]) -> cached_property[Stage]:
+    """Return an attribute that ``kind(engine)`` makes when it is first used."""
+    return cached_property(lambda stages: kind(stages.engine))
+
 
 class TessellationStages:
     """The stages of one engine that make diagrams, each compiled when first used; meshes share their buffers."""
 
-    bins: Bins
-    cells: Cells | Polyhedra
-    incremental: IncrementalUpdate
-    polyhedra_update: PolyhedraUpdate
-    ghost_images: GhostImages
-    folded_cells: FoldedCells
-    trim: Trim
-    gather: Gather
-
-    CLASSES: ClassVar[dict[str, type]] = {
-        "bins": Bins,
-        "cells": Cells,
-        "incremental": IncrementalUpdate,
-        "polyhedra_update": PolyhedraUpdate,
-        "ghost_images": GhostImages,
-        "folded_cells": FoldedCells,
-        "trim": Trim,
-        "gather": Gather,
-    }
+    bins = made_by(Bins)
+    incremental = made_by(IncrementalUpdate)
+    polyhedra_update = made_by(PolyhedraUpdate)
+    ghost_images = made_by(GhostImages)
+    trim = made_by(Trim)
+    gather = made_by(Gather)
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
 
-    def __getattr__(self, name: str) -> object:
-        if name not in self.CLASSES:
-            raise AttributeError(name)
-        kind = self.CLASSES[name]
-        if name == "cells" and self.engine.cell_dim == 3:
-            kind = Polyhedra
-        elif name == "cells" and self.engine.domain_kind.weighted:
-            kind = PowerCells
-        elif name == "folded_cells" and self.engine.domain_kind.weighted:
-            kind = FoldedPowerCells
-        stage = kind(self.engine)
-        setattr(self, name, stage)
-        return stage
+    @cached_property
+    def cells(self) -> Cells | Polyhedra:
+        """What builds cells of this dimension, with weights if the engine has them."""
+        if self.engine.cell_dim == 3:
+            return Polyhedra(self.engine)
+        return (PowerCells if self.engine.domain_kind.weighted else Cells)(self.engine)
 
-    @property
+    @cached_property
+    def folded_cells(self) -> FoldedCells:
+        """What builds the cells of a periodic box in 2D without its images."""
+        return (FoldedPowerCells if self.engine.domain_kind.weighted else FoldedCells)(self.engine)
+
+    @cached_property
     def weighted(self) -> TessellationStages:
         """The stages for power diagrams; they share workspace and kernels with these."""
-        if "_weighted" not in self.__dict__:
-            self._weighted = TessellationStages(self.engine.weighted())
-        return self._weighted
+        return TessellationStages(self.engine.weighted())
 
-    def clear(self, *names: str) -> None:
-        """Free the buffers of these stages, where they exist; their kernels stay."""
-        for name in names:
-            if name in self.__dict__:
-                getattr(self, name).clear()
+    def clear_folded_cells(self) -> None:
+        """Free the buffers of `folded_cells`, if it exists; its kernels stay."""
+        if "folded_cells" in vars(self):
+            self.folded_cells.clear()
 
     def release(self) -> None:
         """Free all stages and their buffers; a stage that is used again is created anew."""
-        for name in (*self.CLASSES, "_weighted"):
-            self.__dict__.pop(name, None)
+        for name in set(vars(self)) - {"engine"}:
+            delattr(self, name)
         self.engine.workspace.clear()
         self.engine.pool.release()
 
