@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import clvoro
-from clvoro import sizing
+from clvoro import earth, sizing
 from clvoro.adaptation.sampling.start import count_cells
 
 Kind = tuple[clvoro.Box | clvoro.Polygon | clvoro.Sphere, Any, dict[str, Any]]
@@ -76,7 +76,7 @@ def graded(domain: Any, formula: str) -> Callable[[int], Kind]:
 RANDOM = np.random.default_rng(1)
 CURVE = np.column_stack([np.linspace(0.1, 0.9, 500), 0.5 + 0.2 * np.sin(np.linspace(0, 9, 500))])
 GLOBE = clvoro.Sphere(1.0)
-CAPS = sizing.Caps([((-45, 45), 0.3, 0.1)], h_max=0.8, growth=1.2, sphere=GLOBE)
+CAPS = earth.Caps([((-45, 45), 0.3, 0.1)], h_max=0.8, growth=1.2, sphere=GLOBE)
 SPHERE = sizing.Distance(sizing.Ball((0.5, 0.5, 0.4), 0.25), h_min=0.045, slope=0.2)
 SHORE = sizing.Distance(COAST.boundary(), h_min=0.002, slope=0.5)
 JUMP = "x < 0.5 ? 1.0 : 10.0"

@@ -29,7 +29,7 @@ import numpy as np
 from _common import FIRST_SEED, Report, counts, heading, make_adapter, names, parser
 
 import clvoro
-from clvoro import sizing
+from clvoro import earth, sizing
 from clvoro.adaptation import preparation
 from clvoro.mesh.connectivity import face_ends, face_owners
 
@@ -41,12 +41,12 @@ SEEDS = 12
 
 def nested(growth: float) -> sizing.Field:
     """Return 27, 9 and 3 km, times 9, in nested caps."""
-    return sizing.Caps([(ATLANTIC, 3e6, 81e3), (ATLANTIC, 1e6, 27e3)], h_max=243e3, growth=growth)
+    return earth.Caps([(ATLANTIC, 3e6, 81e3), (ATLANTIC, 1e6, 27e3)], h_max=243e3, growth=growth)
 
 
 def steep(growth: float) -> sizing.Field:
     """Return sizes of 1 : 64."""
-    return sizing.Caps([(ATLANTIC, 5e5, 8e3)], h_max=512e3, growth=growth)
+    return earth.Caps([(ATLANTIC, 5e5, 8e3)], h_max=512e3, growth=growth)
 
 
 GRADED = {
@@ -99,7 +99,7 @@ def coarse(growth: float) -> sizing.Field:
     """Return two caps of fine cells, for about 4,000 cells."""
     fine = 6e4 if growth < 1.15 else 5e4
     caps = [(ATLANTIC, 1e6, fine), ((100, -20), 5e5, 1.7 * fine)]
-    return sizing.Caps(caps, h_max=12 * fine, growth=growth)
+    return earth.Caps(caps, h_max=12 * fine, growth=growth)
 
 
 def compare_openings(options: Any) -> None:

@@ -12,8 +12,9 @@ diagram are moved, inserted and deleted until its cells have that size and are n
 True
 
 Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shapely), with `Layers` along walls, and
-`Sphere`, for global models; `regions` finds the cells of oceans and limited areas. `curves` has circles, ellipses, wing
-sections and splines for their boundaries. Sizes: numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`.
+`Sphere`, for global models; `earth` has sizes by longitude and latitude, and finds the cells of oceans and limited
+areas. `curves` has circles, ellipses, wing sections and splines for boundaries. Sizes: numbers, functions of NumPy
+arrays, and the fields of `clvoro.sizing`.
 `adapt` returns a `Result`, `voronoi` a `Diagram` of given generators; both have arrays, `save`, `plot`, `check` and
 `transfer`, and `load` reads a saved result. `power_diagram` takes generators with weights; `transport` finds those with
 which cells have given volumes (`Transported`). `Adapter` is the full interface, on a device of your choice, with
@@ -22,7 +23,7 @@ and warnings are in `clvoro.errors`, pictures in `clvoro.plotting`, times of ker
 ``clvoro``; begin with ``clvoro --help``.
 """
 
-from . import curves, regions, sizing
+from . import curves, earth, sizing
 from .adaptation.options import Checkpoint, MultilevelOptions, PaperOptions
 from .adapter import Adapter
 from .errors import ClvoroError, Interrupted
@@ -58,11 +59,11 @@ __all__ = [
     "adapt",
     "create_context",
     "curves",
+    "earth",
     "list_devices",
     "load",
     "power_diagram",
     "profile",
-    "regions",
     "sizing",
     "transport",
     "voronoi",

@@ -28,7 +28,6 @@ ORDER = (
     "geometry",
     "curves",
     "mesh",
-    "regions",
     "finite_volumes",
     "io",
     "sizing",
@@ -37,6 +36,7 @@ ORDER = (
     "adaptation",
     "remapping",
     "plotting",
+    "earth",
     "adapter",
     "shared",
     "__init__",
@@ -45,13 +45,14 @@ ORDER = (
 )
 """Packages and root modules: each imports only from those before it."""
 UPWARD = {
+    ("mesh.quality", "earth"),
     ("mesh.diagram", "finite_volumes"),
     ("mesh.output", "finite_volumes"),
     ("mesh.output", "io"),
     ("mesh.output", "plotting"),
     ("mesh.diagram", "remapping"),
 }
-"""Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, check, transfer."""
+"""Imports against the order, all inside methods of `Result`, `Diagram` and `Measures`: save, plot, check, transfer."""
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
 """Files directly in `clvoro/`, and in each of its folders."""
 OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")

@@ -130,7 +130,7 @@ class Preparation:
         if options.method in MOVING:
             _check_moving(domain, points, options)
         self.rows, self.free = np.empty((0, domain.dim)), domain
-        field = given_field = on_domain(as_field(size), domain)
+        field = given_field = on_domain(domain, as_field(size))
         if options.layers:
             field = self._place_layers(given_field)
         self.sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -9,8 +10,6 @@ import numpy as np
 from ..arguments import check_choice
 from ..errors import InputError
 from ..geometry.sphere import Sphere
-from ..mesh.c_grid import RIGHT_ANGLE, measure_c_grid
-from ..mesh.connectivity import face_ends, face_keys, face_owners
 from ..mesh.diagram import Diagram
 from .criteria import Criterion, Rows, SolverReport
 from .measures import SolverMeasures
@@ -19,18 +18,8 @@ from .solver_mesh import SolverMesh, WallShape, make_solver_mesh
 
 Solver = Literal["openfoam", "mpas"]
 """Solvers whose criteria are known."""
-_LEAST = 1e-300
+LEAST_MEASURE = 1e-300
 """OpenFOAM's VSMALL: least area of a face and volume of a cell."""
-_SHORTEST_EDGE = 1e-6
-"""Least ratio of the length of an edge to the distance of its generators: C-grid schemes divide by the length."""
-_LEAST_ANGLE = 30.0
-"""Angle of a triangle, in degrees, below which the mesh is warned of."""
-_LEAST_EDGE_RATIO = 0.1
-"""Ratio of the shortest to the longest edge of a cell below which the mesh is warned of."""
-_MOST_CENTROID_OFFSET = 0.1
-"""Distance from generator to centroid over the size of the cell above which the mesh is warned of.
-
-C grids take the value at the generator for the mean over the cell, which is of second order at the centroid only."""
 
 
 def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallShape | None = None) -> SolverReport:
@@ -42,14 +31,11 @@ def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallS
         If the solver is not known or has no meshes of such a domain, or `walls` is neither "straight" nor "exact", or
         given for "mpas".
     """
-    check_choice("solver", solver, ("openfoam", "mpas"))
-    if solver == "mpas":
-        if walls is not None:
-            raise InputError(f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out")
-        faces, domain, made = int(diagram.faces.owner.size), diagram.domain, _mpas(diagram)
-        if isinstance(domain, Sphere):
-            made = [criterion.on_sphere(domain) for criterion in made]
-        return SolverReport(solver, tuple(made), len(diagram), faces, 0.0)
+    check_choice("solver", solver, tuple(SOLVERS))
+    return SOLVERS[solver](diagram, walls)
+
+
+def _check_for_openfoam(diagram: Diagram, walls: WallShape | None) -> SolverReport:
     if isinstance(diagram.domain, Sphere):
         raise InputError(
             f"solver is 'openfoam', whose meshes are polyhedra, and the mesh is on {diagram.domain}; use "
@@ -57,7 +43,11 @@ def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallS
         )
     walls = "straight" if walls is None else walls
     mesh = make_solver_mesh(diagram, walls, walls == "straight")
-    return SolverReport(solver, tuple(_openfoam(mesh)), len(mesh), len(mesh.owner), mesh.area_change)
+    return SolverReport("openfoam", tuple(_openfoam(mesh)), len(mesh), len(mesh.owner), mesh.area_change)
+
+
+SOLVERS: dict[str, Callable[[Diagram, WallShape | None], SolverReport]] = {"openfoam": _check_for_openfoam}
+"""The check of a diagram for each solver; `earth` adds models on C grids."""
 
 
 def _openfoam(mesh: SolverMesh) -> list[Criterion]:
@@ -81,15 +71,15 @@ def _openfoam(mesh: SolverMesh) -> list[Criterion]:
     ends = m.cells.points[edges].mean(axis=1)
     sides = np.bincount(m.face_cells[0], minlength=len(mesh))
     walls = np.concatenate([g.areas[mesh.inner : mesh.outer], g.areas[len(mesh.owner) :]])
-    openness = np.abs(walls.sum(axis=0)).max() / (np.linalg.norm(walls, axis=1).sum() + _LEAST)
+    openness = np.abs(walls.sum(axis=0)).max() / (np.linalg.norm(walls, axis=1).sum() + LEAST_MEASURE)
     concave = np.where(m.concave, np.maximum(m.concavity, 0), 0)
     made = [
         Criterion("boundary openness", float(openness), 1e-6, True, True, int(openness > 1e-6)),
         cells("faces of a cell", sides, 4, above=False),
         cells("cell openness", m.openness, 1e-6),
         cells("aspect ratio", m.aspect_ratio, 1000),
-        faces("face area", np.linalg.norm(g.areas, axis=1), _LEAST, above=False),
-        cells("cell volume", g.volumes, _LEAST, above=False),
+        faces("face area", np.linalg.norm(g.areas, axis=1), LEAST_MEASURE, above=False),
+        cells("cell volume", g.volumes, LEAST_MEASURE, above=False),
         faces("non-orthogonality", angle, 90 - np.degrees(1e-15), strict=False),
         faces("non-orthogonality, severe", angle, 70, demanded=False),
         faces("face pyramids", m.pyramids, -1e-15, above=False),
@@ -123,33 +113,3 @@ def _regions(mesh: SolverMesh) -> int:
     pair = (mesh.owner[joined], mesh.neighbor[joined])
     graph = scipy.sparse.coo_array((np.ones(len(joined)), pair), (len(mesh), len(mesh)))
     return int(scipy.sparse.csgraph.connected_components(graph, directed=False)[0])
-
-
-def _mpas(diagram: Diagram) -> list[Criterion]:
-    """Return the criteria for meshes of MPAS.
-
-    Raises
-    ------
-    InputError
-        In 3D and in polygonal domains.
-    """
-    d, m = diagram, measure_c_grid(diagram)
-    dim, owner = d.domain.dim, face_owners(diagram)
-    inner = np.flatnonzero(m.inner)
-    inner = inner[np.less(*face_keys(d, inner))]  # each edge once
-    cells = Rows(d.points, None, dim)
-    edges = Rows(d.face_centroids[inner], owner[inner], dim)
-    places, cell = d.vertices[face_ends(d)[m.corners, 0]], owner[m.corners]
-    corners, vertices = Rows(places, cell, dim), Rows(places[m.first], cell[m.first], dim)
-    return [
-        cells("edges of a cell", np.diff(d.neighbor_starts), 3, above=False),
-        cells("cell area", d.volumes, _LEAST, above=False),
-        edges("edge length over distance", m.length_ratio[inner], _SHORTEST_EDGE, above=False),
-        corners("largest angle of triangle", m.angles, RIGHT_ANGLE),
-        corners("smallest angle of triangle", m.angles, _LEAST_ANGLE, above=False, demanded=False),
-        corners("kite area over cell area", m.kites, 0, above=False),
-        vertices("cells at a vertex", m.vertex_cells[m.first], 3, demanded=False),
-        edges("edge offset", m.edge_offset[inner], 0.5, demanded=False),
-        cells("centroid offset", m.centroid_offset, _MOST_CENTROID_OFFSET, demanded=False),
-        cells("edge ratio", m.edge_ratio, _LEAST_EDGE_RATIO, above=False, demanded=False),
-    ]

@@ -24,11 +24,8 @@ from .foam import write_foam
 from .formats import check_polygons, write_foreign
 from .history import write_history
 from .metis import write_metis
-from .mpas import write_mpas
-from .netcdf_read import load_netcdf
 from .npz import load as load_npz
 from .npz import write_npz
-from .scrip import write_scrip
 from .ugrid import write_ugrid
 from .vtu import write_vtu
 from .vtu_read import load_vtu
@@ -55,7 +52,10 @@ __all__ = [
 ]
 
 _WRITERS = {".npz": write_npz, ".info": write_metis, ".graph": write_metis}
-_CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas, "scrip": write_scrip}
+CONVENTIONS: dict[str, Callable[[Contents, Path, str], None]] = {"ugrid": write_ugrid}
+"""Writers of ``.nc`` files; `earth` adds those of its models."""
+READERS: dict[str, Callable[[str | PathLike[str]], Result | Diagram]] = {".vtu": load_vtu}
+"""Readers by suffix, besides that of ``.npz``; `earth` adds ``.nc``."""
 
 
 def load(path: str | PathLike[str]) -> Result | Diagram:
@@ -88,8 +88,7 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
         fault.
     """
     path = check_path("path", path)
-    readers = {".vtu": load_vtu, ".nc": load_netcdf}
-    return readers.get(Path(path).suffix.lower(), load_npz)(path)
+    return READERS.get(Path(path).suffix.lower(), load_npz)(path)
 
 
 def save(mesh: Result | Diagram, path: str | PathLike[str], **options: Any) -> None:
@@ -201,6 +200,6 @@ def to_pyvista(mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None
 
 def _chosen(convention: object) -> Callable[[Contents, Path, str], None]:
     name = "ugrid" if convention is None else convention
-    if not isinstance(name, str) or name not in _CONVENTIONS:
-        raise InputError(f"convention is {name!r:.60}, expected 'ugrid', 'mpas' or 'scrip'")
-    return _CONVENTIONS[name]
+    if not isinstance(name, str) or name not in CONVENTIONS:
+        raise InputError(f"convention is {name!r:.60}, expected one of {', '.join(map(repr, CONVENTIONS))}")
+    return CONVENTIONS[name]

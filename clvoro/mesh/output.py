@@ -40,7 +40,7 @@ class MeshOutput:
         """Return the mesh without some of its cells, on a sphere.
 
         The cells that are left do not change. Their faces towards removed cells become faces on a boundary. The domain
-        of the new mesh is a `clvoro.geometry.sphere_region.SphereRegion`. `clvoro.regions` finds the cells of oceans
+        of the new mesh is a `clvoro.geometry.sphere_region.SphereRegion`. `clvoro.earth` finds the cells of oceans
         and of limited areas.
 
         Parameters

@@ -15,8 +15,8 @@ from .diagram import Diagram
 from .straightening import straighten
 
 if TYPE_CHECKING:
+    from ..earth.c_grid import CGridMeasures
     from ..finite_volumes.measures import SolverMeasures
-    from .c_grid import CGridMeasures
 
 
 @dataclass(frozen=True, repr=False)
@@ -85,7 +85,7 @@ class Measures:
 
         On spheres, and in boxes in 2D; `InputError` in other domains.
         """
-        from .c_grid import measure_c_grid
+        from ..earth.c_grid import measure_c_grid
 
         assert self.diagram is not None
         return measure_c_grid(self.diagram)

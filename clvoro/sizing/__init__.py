@@ -19,13 +19,11 @@ from .feature import FeatureSize
 from .field import Constant, Field, as_field, maximum, minimum
 from .function import Function
 from .graded import Graded
-from .lonlat import Caps, LonLat
 from .raster import Raster, Scattered
 from .solution import gradient_size, hessian_size
 
 __all__ = [
     "Ball",
-    "Caps",
     "Circle",
     "ClosedPolyline",
     "Constant",
@@ -36,7 +34,6 @@ __all__ = [
     "Field",
     "Function",
     "Graded",
-    "LonLat",
     "Polyline",
     "Raster",
     "Scattered",

@@ -65,7 +65,7 @@ class Sizing:
     """
 
     def __init__(self, engine: Engine, domain: Domain, field: object, gradient_step: float | None = None):
-        self.engine, self.domain, self.field = engine, domain, on_domain(as_field(field), domain)
+        self.engine, self.domain, self.field = engine, domain, on_domain(domain, as_field(field))
         self.field.check_dim(domain.dim)
         self._origin, self._scale = domain.frame
         self._walls = (np.array([domain.lower, domain.upper]) - self._origin) / self._scale

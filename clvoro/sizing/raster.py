@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ..geometry.polygon import Polygon
 from .advice import coverage_warnings
 from .field import Field
 from .gridding import fill_missing, grid_scattered
-from .lonlat_grid import lonlat_grid
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -86,40 +85,6 @@ class Raster(Field):
         self.values = fill_missing("Raster values", values, missing, spacing)
         self.lower, self.upper, self.at = low, high, at
         self.dim = self.values.ndim
-
-    @classmethod
-    def from_xarray(cls, array: Any, *, missing: str = "error", outside: str | None = None) -> Raster:
-        """Return the raster of an xarray.DataArray of longitude and latitude in degrees.
-
-        On a `clvoro.Sphere` a raster that goes around it is periodic. xarray itself is not needed: any object with
-        ``dims``, ``coords`` and ``values`` like those of a DataArray will do.
-
-        Parameters
-        ----------
-        array : xarray.DataArray
-            Sizes, in the sphere's unit of length. Its coordinates have the standard names or units of CF, or are named
-            lon and lat or longitude and latitude. Latitudes run upwards or downwards, longitudes from 0 to 360 or from
-            -180 to 180 or over any part of them. Where a spacing varies, values are interpolated linearly to the
-            finest one.
-        missing, outside
-            As for `Raster`.
-
-        Raises
-        ------
-        InputError, InputTypeError
-            If there are no such coordinates, if they are in radians, two-dimensional, out of range or not in order, if
-            there is a further dimension, or if the finest spacing gives more than 16 million values.
-
-        Examples
-        --------
-        Cells of a tenth of the Rossby radius, from a file::
-
-            radius = xarray.open_dataset("rossby.nc")["radius"]
-            size = Raster.from_xarray(0.1 * radius, missing="nearest")
-            mesh = clvoro.adapt(clvoro.Sphere(), sizing.maximum(size, 20e3), n_cells=100_000)
-        """
-        grid = lonlat_grid(array, missing)
-        return Raster(grid.values, grid.lower, grid.upper, grid.at, outside=outside)
 
     @property
     def _counts(self) -> np.ndarray:

@@ -5,6 +5,7 @@ from pathlib import Path
 WIDTH, ROW, GAP = 760, 62, 14
 ROWS = [
     [("cli", "the command, cases"), ("adapter.py", "the entry: adapt, voronoi, Adapter")],
+    [("earth", "longitudes and latitudes, oceans, C grids")],
     [
         ("plotting", "pictures, report"),
         ("remapping", "transfer between meshes"),
@@ -17,7 +18,7 @@ ROWS = [
     [("geometry", "domains, shapes, layers")],
     [("opencl", "devices, kernels, arrays")],
 ]
-FILLS = ["#f2f6fb", "#e8eef7", "#dbe7f5", "#cfe0f2", "#c3d9ef", "#b7d2ec", "#abcbe9", "#9fc4e6"]
+FILLS = ["#f8fafd", "#f2f6fb", "#e8eef7", "#dbe7f5", "#cfe0f2", "#c3d9ef", "#b7d2ec", "#abcbe9", "#9fc4e6"]
 
 
 def main() -> None:

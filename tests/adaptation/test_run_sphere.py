@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial import KDTree
 
 import clvoro
-from clvoro import sizing
+from clvoro import earth, sizing
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
 from tests.reference.spheres import SphericalDiagram
 
 EARTH = clvoro.Sphere()
-SIZE = sizing.Caps([((-45, 45), 3e6, 3e5)], h_max=8e5, growth=1.2)
+SIZE = earth.Caps([((-45, 45), 3e6, 3e5)], h_max=8e5, growth=1.2)
 
 
 def angles_of_triangles(diagram):
@@ -161,9 +161,9 @@ def test_warning_of_obtuse_triangles(ctx):
     adapter = clvoro.Adapter(ctx)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        result = adapter.run(EARTH, sizing.LonLat(jump), effort="fast")
-        adapter.run(EARTH, sizing.LonLat(jump), method="weighted", max_steps=2)  # promises nothing
-        graded = adapter.run(EARTH, sizing.Graded(sizing.LonLat(jump), growth=1.2), effort="fast")
+        result = adapter.run(EARTH, earth.LonLat(jump), effort="fast")
+        adapter.run(EARTH, earth.LonLat(jump), method="weighted", max_steps=2)  # promises nothing
+        graded = adapter.run(EARTH, sizing.Graded(earth.LonLat(jump), growth=1.2), effort="fast")
     (said,) = (w for w in caught if w.category is clvoro.errors.ObtuseTrianglesWarning)
     assert said.filename == __file__
     text = str(said.message)

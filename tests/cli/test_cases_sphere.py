@@ -7,7 +7,7 @@ import pytest
 from scipy.io import netcdf_file
 
 import clvoro
-from clvoro import sizing
+from clvoro import earth, sizing
 from clvoro.cli import command as cli
 from clvoro.cli.cases import Case, load_case, toml
 from clvoro.errors import InputError
@@ -25,7 +25,7 @@ SMALL = HEAD + "[size]\nkind = 'constant'\nvalue = 300\n[run]\neffort = 'fast'\n
 
 def sizes(text, folder=None):
     case = Case.from_toml(HEAD + text, "my.toml", *([folder] if folder else []))
-    return on_domain(case.size_field(), case.domain)(X)
+    return on_domain(case.domain, case.size_field())(X)
 
 
 def call(*arguments):
@@ -83,11 +83,11 @@ fields = [
 """
     shapes = [sizing.Circle((-120, 10), 0), sizing.Polyline([(170, 0), (190, 40)]), clvoro.Box((40, -30), (50, -20))]
     size = sizing.minimum(
-        sizing.Caps([((10, 20), 300, 50)], 200, slope=0.2, sphere=SPHERE),
+        earth.Caps([((10, 20), 300, 50)], 200, slope=0.2, sphere=SPHERE),
         sizing.Distance(shapes, 20, growth=1.2),
         sizing.Expression("100 + abs(lat) + 0.1 * abs(lon)"),
     )
-    assert sizes(text) == pytest.approx(on_domain(size, SPHERE)(X))
+    assert sizes(text) == pytest.approx(on_domain(SPHERE, size)(X))
 
 
 def test_a_ball_in_space_is_a_source_of_sizes():
@@ -99,7 +99,7 @@ def test_a_ball_in_space_is_a_source_of_sizes():
 
 def test_grids_in_files(tmp_path):
     upward = sizing.Raster(WAVES[::-1], (0, -90), (350, 90))
-    wanted = on_domain(upward, SPHERE)(X)
+    wanted = on_domain(SPHERE, upward)(X)
     write_netcdf(tmp_path / "h.nc")
     assert sizes(RASTER.format("h.nc"), tmp_path) == pytest.approx(wanted)
     assert sizes(RASTER.format("h.nc") + "variable = 'h'", tmp_path) == pytest.approx(wanted)
@@ -118,7 +118,7 @@ def test_packed_values_with_gaps(tmp_path):
     with pytest.raises(InputError, match="1 of 684 are missing"):
         sizes(RASTER.format("h.nc"), tmp_path)
     found = sizes(RASTER.format("h.nc") + "missing = 'nearest'", tmp_path)
-    wanted = on_domain(sizing.Raster(WAVES[::-1], (0, -90), (350, 90)), SPHERE)(X)
+    wanted = on_domain(SPHERE, sizing.Raster(WAVES[::-1], (0, -90), (350, 90)))(X)
     # Rounded to 0.01; beside the gap the value of a neighbor, 10 degrees away.
     assert np.abs(found - wanted).max() < 20 * np.radians(10)
     assert np.median(np.abs(found - wanted)) < 0.005
@@ -130,7 +130,7 @@ def test_grids_go_with_the_case(tmp_path):
     out.mkdir()
     Case.from_toml(HEAD + RASTER.format("h.nc"), "my.toml", tmp_path).write(out)
     (tmp_path / "h.nc").unlink()
-    assert on_domain(load_case(out / "case.toml").size_field(), SPHERE)(X).min() > 70
+    assert on_domain(SPHERE, load_case(out / "case.toml").size_field())(X).min() > 70
 
 
 @pytest.mark.parametrize(

@@ -261,7 +261,7 @@ def test_ugrid_is_the_default(room, tmp_path):
 
 @pytest.mark.parametrize("convention", ["MPAS", "", 3, ["mpas"]])
 def test_other_conventions_are_refused(room, tmp_path, convention):
-    with pytest.raises(InputError, match=r"convention is .*expected 'ugrid', 'mpas' or 'scrip'"):
+    with pytest.raises(InputError, match=r"convention is .*expected one of 'ugrid', 'mpas', 'scrip'"):
         room.save(tmp_path / "mesh.nc", convention=convention)
     assert not list(tmp_path.iterdir())
 

@@ -9,8 +9,8 @@ from scipy.spatial import KDTree
 import clvoro
 from clvoro.errors import InputError
 from clvoro.mesh.connectivity import face_ends
-from tests.io.test_netcdf_mpas import check_energy
-from tests.io.test_sphere_mpas import Globe
+from tests.earth.test_netcdf_mpas import check_energy
+from tests.earth.test_sphere_mpas import Globe
 from tests.reference.netcdf_files import read, result_of
 from tests.reference.spheres import grid_of_rings, random_points
 
@@ -165,7 +165,7 @@ def test_mpas_weights_are_those_of_the_kept_cells(files, maps):
 
 def test_mpas_zones_of_a_limited_area(globe, tmp_path):
     lat = globe.diagram.domain.lonlat(globe.points)[:, 1]
-    ring = clvoro.regions.rings(globe, lat > 40, 2)
+    ring = clvoro.earth.rings(globe, lat > 40, 2)
     area = globe.subset(ring >= 0, "open")
     zones = ring[ring >= 0]
     area.save(tmp_path / "area.nc", convention="mpas", cell_data={"bdyMaskCell": zones})

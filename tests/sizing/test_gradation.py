@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import clvoro
-from clvoro import Box, sizing
+from clvoro import Box, earth, sizing
 from clvoro.errors import InputError, InputTypeError, MemoryLimitError, SizeFieldError
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.host_memory import host_memory
@@ -394,24 +394,24 @@ def test_growth_on_a_sphere_is_along_great_circles(make_engine, where):
 
 def test_graded_on_a_sphere():
     """Small cells beside a pole and across the date line, in a function of longitude and latitude."""
-    earth, slope = clvoro.Sphere(), math.log(1.2)
-    marks = earth.positions([(50, 89), (180, -20)])
+    globe, slope = clvoro.Sphere(), math.log(1.2)
+    marks = globe.positions([(50, 89), (180, -20)])
 
     def jump(lonlat):
-        away = np.linalg.norm(earth.positions(lonlat)[:, None] - marks, axis=2).min(axis=1)
+        away = np.linalg.norm(globe.positions(lonlat)[:, None] - marks, axis=2).min(axis=1)
         return np.where(away < 5e5, 1e5, 1e6)
 
-    given = sizing.Graded(sizing.LonLat(jump), growth=1.2, resolution=300)
-    field = on_domain(given, earth)
-    x = earth.wrap(np.random.default_rng(72).normal(size=(2000, 3)))
-    away = earth.lengths(np.linalg.norm(x[:, None] - marks, axis=2)).min(axis=1)
+    given = sizing.Graded(earth.LonLat(jump), growth=1.2, resolution=300)
+    field = on_domain(globe, given)
+    x = globe.wrap(np.random.default_rng(72).normal(size=(2000, 3)))
+    away = globe.lengths(np.linalg.norm(x[:, None] - marks, axis=2)).min(axis=1)
     expected = np.minimum(1e5 + slope * np.maximum(away - 5e5, 0), 1e6)
-    step = 2 * np.pi * earth.radius / globe_columns(300)
+    step = 2 * np.pi * globe.radius / globe_columns(300)
     assert field(x) == pytest.approx(expected, abs=1.5 * slope * step)
     # Over the pole and across the date line there is no step.
     for ways in ([(a, b) for a in (0, 90, 180, 270) for b in (89.9,)], [(179.99, 30), (-179.99, 30)]):
-        assert np.ptp(field(earth.positions(ways))) < 1.5 * slope * step
-    assert (2 * given).map_parts(lambda f: on_domain(f, earth))(x) == pytest.approx(2 * field(x))
+        assert np.ptp(field(globe.positions(ways))) < 1.5 * slope * step
+    assert (2 * given).map_parts(lambda f: on_domain(globe, f))(x) == pytest.approx(2 * field(x))
 
 
 @pytest.mark.parametrize(

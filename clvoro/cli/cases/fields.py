@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ... import earth, sizing
+from ...earth.sizes import DEGREES
 from ...errors import InputError
 from ...geometry.box import Box
 from ...geometry.curves import Curve
@@ -33,7 +35,6 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
     domain : Domain
         Default extent of a raster.
     """
-    from ... import sizing
 
     def inner(child: Mapping[str, Any]) -> Any:
         return build_size(child, folder, domain)
@@ -86,29 +87,24 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
 
 
 def _caps(node: Mapping[str, Any], domain: Domain) -> Any:
-    from ... import sizing
-
     if not isinstance(domain, Sphere):
         raise InputError(
             f"size.kind is 'caps', which is for a sphere, not for {domain}; expected distance, or kind = \"sphere\" "
             "in [domain]"
         )
     regions = [(r["center"], r["radius"], r["size"]) for r in node["regions"]]
-    return sizing.Caps(regions, h_max=node["h_max"], sphere=domain, **_given(node, "growth", "slope"))
+    return earth.Caps(regions, h_max=node["h_max"], sphere=domain, **_given(node, "growth", "slope"))
 
 
 def _raster(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
     """Return a raster of an array with given corners, or of a grid with longitudes and latitudes."""
-    from ... import sizing
-    from ...sizing.lonlat import DEGREES
-
     path = folder / node["file"]
     grid = read_grid(path, node.get("variable"))
     if grid is not None:
         for key in ("lower", "upper", "at"):
             if key in node:
                 raise InputError(f"size.{key} is given, and {path} has longitudes and latitudes; leave it out")
-        return sizing.Raster.from_xarray(grid, **_given(node, "missing", "outside"))
+        return earth.from_xarray(grid, **_given(node, "missing", "outside"))
     if "variable" in node:
         raise InputError(
             f"size.variable is {node['variable']!r}, and {path} is neither a netCDF nor a .npz file; leave it out"
@@ -124,7 +120,6 @@ def _given(node: Mapping[str, Any], *keys: str) -> dict[str, Any]:
 
 
 def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
-    from ... import sizing
 
     kind = node["kind"]
     if kind == "surface":

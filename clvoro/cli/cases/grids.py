@@ -32,7 +32,7 @@ class Labeled:
 
 
 def read_grid(path: Path, variable: str | None) -> Any:
-    """Return a variable of a file with its coordinates, for `Raster.from_xarray`; None for an array without them.
+    """Return a variable of a file with its coordinates, for `earth.from_xarray`; None for an array without them.
 
     Parameters
     ----------

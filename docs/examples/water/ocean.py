@@ -70,7 +70,7 @@ old_world = [
 sea = [(0, 38), (10, 42), (30, 35), (32, 31), (15, 32)]
 land = shapely.MultiPolygon([shapely.Polygon(america), shapely.Polygon(old_world, [sea])])
 
-keep = clvoro.regions.ocean(globe, land, passages=[(-12, 36), (3, 37.5)])
+keep = clvoro.earth.ocean(globe, land, passages=[(-12, 36), (3, 37.5)])
 ocean = globe.subset(keep)
 print(ocean)
 print(ocean.diagram.check())
@@ -93,7 +93,7 @@ ocean.save("ocean.nc", convention="mpas")
 # A limited area for the atmosphere has seven rings of neighbors around it, in which values are relaxed or given.
 
 area = clvoro.Polygon([(-30, 20), (20, 20), (35, 60), (-40, 60)])
-ring = clvoro.regions.rings(globe, clvoro.regions.inside(globe, area))
+ring = clvoro.earth.rings(globe, clvoro.earth.inside(globe, area))
 limited = globe.subset(ring >= 0, "open")
 limited.save("limited_area.nc", convention="mpas", cell_data={"bdyMaskCell": ring[ring >= 0]})
 limited.plot(ring[ring >= 0].astype(float), label="ring", center=(0, 40))

@@ -17,8 +17,8 @@ import shapely
 
 from ..arguments import check_rows, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
-from .geojson import pieces_of_geojson, pieces_of_shape, read_geojson
-from .polygon import Polygon
+from ..geometry.geojson import pieces_of_geojson, pieces_of_shape, read_geojson
+from ..geometry.polygon import Polygon
 
 _Predicate = Literal["intersects", "contains"]
 _FARTHEST = 720.0  # longitude

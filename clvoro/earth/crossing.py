@@ -7,8 +7,8 @@ from scipy.spatial import KDTree
 
 from ..geometry.sphere import Sphere
 from ..geometry.sphere_region import SphereRegion
-from .connectivity import face_owners
-from .diagram import Diagram
+from ..mesh.connectivity import face_owners
+from ..mesh.diagram import Diagram
 
 _STEP = 0.1
 """Length in degrees of the arcs by which lines in longitude and latitude are approximated."""

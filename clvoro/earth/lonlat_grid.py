@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..errors import InputError, InputTypeError
-from .gridding import fill_missing
+from ..sizing.gridding import fill_missing
+from ..sizing.raster import Raster
 
 MOST_VALUES = 1 << 24
 """Most values of a uniform grid that stands for one of varying spacing."""
@@ -23,30 +24,35 @@ _TURN = 360.0
 _ROUND_OFF = 1e-4  # degrees: 360 degrees in float32, and additions of such
 
 
-class Grid(NamedTuple):
-    """The arguments of a `Raster`: values (ny, nx), corners in degrees, and where the values are."""
+def from_xarray(array: Any, *, missing: str = "error", outside: str | None = None) -> Raster:
+    """Return the raster of an xarray.DataArray of longitude and latitude in degrees.
 
-    values: np.ndarray
-    lower: tuple[float, float]
-    upper: tuple[float, float]
-    at: str
-
-
-def lonlat_grid(array: Any, missing: str = "error") -> Grid:
-    """Return the values of a DataArray of longitude and latitude on a uniform grid.
+    On a `clvoro.Sphere` a raster that goes around it is periodic. xarray itself is not needed: any object with
+    ``dims``, ``coords`` and ``values`` like those of a DataArray will do.
 
     Parameters
     ----------
     array : xarray.DataArray
-        Or any object with `dims`, `coords` and `values` like that.
-    missing : "error" or "nearest"
+        Sizes, in the sphere's unit of length. Its coordinates have the standard names or units of CF, or are named
+        lon and lat or longitude and latitude. Latitudes run upwards or downwards, longitudes from 0 to 360 or from
+        -180 to 180 or over any part of them. Where a spacing varies, values are interpolated linearly to the
+        finest one.
+    missing, outside
         As for `Raster`; the nearest value may be on the other side of the seam of a grid that goes around the sphere.
 
     Raises
     ------
     InputError, InputTypeError
-        If it has no such coordinates, they are in radians, two-dimensional, out of range or not in order, or the
-        uniform grid would have more than `MOST_VALUES` values.
+        If there are no such coordinates, if they are in radians, two-dimensional, out of range or not in order, if
+        there is a further dimension, or if the finest spacing gives more than 16 million values.
+
+    Examples
+    --------
+    Cells of a tenth of the Rossby radius, from a file::
+
+        radius = xarray.open_dataset("rossby.nc")["radius"]
+        size = earth.from_xarray(0.1 * radius, missing="nearest")
+        mesh = clvoro.adapt(clvoro.Sphere(), sizing.maximum(size, 20e3), n_cells=100_000)
     """
     what = _describe(array)
     lon_name, lat_name = (_coordinate(array, axis, what) for axis in _NAMES)
@@ -68,10 +74,11 @@ def lonlat_grid(array: Any, missing: str = "error") -> Grid:
         lon, lat, values = _resampled(lon, lat, values, what)
     half = (lat[-1] - lat[0]) / (len(lat) - 1) / 2
     if lat[0] - half < -90 - _ROUND_OFF or lat[-1] + half > 90 + _ROUND_OFF:
-        return Grid(values, (lon[0], lat[0]), (lon[-1], lat[-1]), "nodes")
+        return Raster(values, (lon[0], lat[0]), (lon[-1], lat[-1]), "nodes", outside=outside)
     # Pixels, so that a grid that ends half a row before the poles covers them.
     wide = (lon[-1] - lon[0]) / (len(lon) - 1) / 2
-    return Grid(values, (lon[0] - wide, lat[0] - half), (lon[-1] + wide, lat[-1] + half), "centers")
+    lower, upper = (lon[0] - wide, lat[0] - half), (lon[-1] + wide, lat[-1] + half)
+    return Raster(values, lower, upper, "centers", outside=outside)
 
 
 def _describe(array: Any) -> str:

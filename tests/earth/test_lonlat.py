@@ -7,7 +7,7 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro import sizing
+from clvoro import earth, sizing
 from clvoro.errors import ClvoroError, MismatchWarning
 from clvoro.opencl.engine import Engine
 from clvoro.sizing.on_domain import on_domain
@@ -46,7 +46,7 @@ def bilinear(values, west, step):
 
 FIELDS = {
     "expression": (sizing.Expression("2e5 + 1e3*abs(lat) + 200*abs(lon)"), 2e5 + 1e3 * abs(LAT) + 200 * abs(LON)),
-    "function": (sizing.LonLat(lambda p: 2e5 + 1e3 * abs(p[:, 1])), 2e5 + 1e3 * abs(LAT)),
+    "function": (earth.LonLat(lambda p: 2e5 + 1e3 * abs(p[:, 1])), 2e5 + 1e3 * abs(LAT)),
     "raster": (sizing.Raster(WAVES, (0, -90), (350, 90)), bilinear(WAVES, 0, 10)),
     "repeated": (sizing.Raster(np.c_[WAVES, WAVES[:, :1]], (0, -90), (360, 90)), bilinear(WAVES, 0, 10)),
     "from-the-west": (sizing.Raster(np.roll(WAVES, 18, axis=1), (-180, -90), (170, 90)), bilinear(WAVES, 0, 10)),
@@ -63,7 +63,7 @@ FIELDS = {
         np.minimum(5e4 + 0.2 * EARTH.radius * np.radians(abs(LAT)), 5e5),
     ),
     "caps": (
-        sizing.Caps([((-45, 45), 3e6, 2e5), ((-45, 45), 1e6, 1e5)], h_max=4e5, growth=1.1),
+        earth.Caps([((-45, 45), 3e6, 2e5), ((-45, 45), 1e6, 1e5)], h_max=4e5, growth=1.1),
         np.minimum.reduce(
             [
                 np.full(len(POINTS), 4e5),
@@ -78,7 +78,7 @@ FIELDS = {
     ),
     "mixed": (
         sizing.minimum(
-            sizing.Caps([((-45, 45), 1e6, 1e5)], h_max=4e5, growth=1.1), 2 * sizing.Raster(WAVES, (0, -90), (350, 90))
+            earth.Caps([((-45, 45), 1e6, 1e5)], h_max=4e5, growth=1.1), 2 * sizing.Raster(WAVES, (0, -90), (350, 90))
         ),
         np.minimum(
             np.minimum(1e5 + np.log(1.1) * np.maximum(arc((-45, 45)) - 1e6, 0), 4e5), 2 * bilinear(WAVES, 0, 10)
@@ -94,7 +94,7 @@ COARSE = {"circle": 5e-4}
 @pytest.mark.parametrize("name", list(FIELDS))
 def test_values(name):
     field, expected = FIELDS[name]
-    assert on_domain(field, EARTH)(POINTS) == pytest.approx(
+    assert on_domain(EARTH, field)(POINTS) == pytest.approx(
         expected, rel=COARSE.get(name, 1e-4 if name == "equator" else 1e-9)
     )
 
@@ -107,18 +107,18 @@ def test_on_the_device(ctx, name, real):
     engine = Engine(ctx, cl.CommandQueue(ctx), 3, kind, EARTH.kind(kind))
     found = sizing.Sizing(engine, EARTH, field)(POINTS)
     # A longitude near 180 degrees may be rounded to the other side, where a raster has the same value.
-    assert found == pytest.approx(on_domain(field, EARTH)(POINTS), rel=500 * float(np.finfo(kind).eps))
+    assert found == pytest.approx(on_domain(EARTH, field)(POINTS), rel=500 * float(np.finfo(kind).eps))
 
 
 def test_landmarks_are_on_the_sphere():
     for name in ("raster", "circle", "caps"):
-        marks = on_domain(FIELDS[name][0], EARTH).landmarks(EARTH)
+        marks = on_domain(EARTH, FIELDS[name][0]).landmarks(EARTH)
         assert np.linalg.norm(marks, axis=1) == pytest.approx(np.full(len(marks), EARTH.radius), rel=1e-3)
 
 
 def test_fields_of_the_plane_stay():
     box, field = clvoro.Box((0, 0), (1, 1)), sizing.Expression("0.1 + 0.1*lon")
-    assert on_domain(field, box) is field
+    assert on_domain(box, field) is field
     assert field(np.array([(0.5, 0.0)])) == pytest.approx([0.15])
 
 
@@ -126,12 +126,12 @@ def test_fields_of_the_plane_stay():
     ("call", "message"),
     [
         (lambda: sizing.Expression("x + lon"), "lon and lat, or x, y and z"),
-        (lambda: sizing.LonLat(sizing.Expression("z")), "3 dimensions"),
-        (lambda: sizing.Caps([], 1e5, 1.1), "no regions"),
-        (lambda: sizing.Caps([((0, 95), 1e5, 1e5)], 1e5, 1.1), "latitude"),
-        (lambda: sizing.Caps([((0, 5), -1, 1e5)], 1e5, 1.1), "radius"),
-        (lambda: sizing.Caps([((0, 5), 1e5)], 1e5, 1.1), r"regions\[0\]"),
-        (lambda: sizing.Caps([((0, 5), 1e5, 1e5)], 1e5, 1.1, sphere=3), "expected a clvoro.Sphere"),
+        (lambda: earth.LonLat(sizing.Expression("z")), "3 dimensions"),
+        (lambda: earth.Caps([], 1e5, 1.1), "no regions"),
+        (lambda: earth.Caps([((0, 95), 1e5, 1e5)], 1e5, 1.1), "latitude"),
+        (lambda: earth.Caps([((0, 5), -1, 1e5)], 1e5, 1.1), "radius"),
+        (lambda: earth.Caps([((0, 5), 1e5)], 1e5, 1.1), r"regions\[0\]"),
+        (lambda: earth.Caps([((0, 5), 1e5, 1e5)], 1e5, 1.1, sphere=3), "expected a clvoro.Sphere"),
         (lambda: clvoro.adapt(EARTH, sizing.Expression("lat")), "positive"),
         (lambda: clvoro.adapt(EARTH, sizing.Raster(WAVES, (-180, -95), (180, 95))), "-95 to 95 along its rows"),
         (lambda: clvoro.adapt(EARTH, sizing.Raster(WAVES.T, (-90, -180), (90, 180))), "longitude and latitude swapped"),
@@ -150,15 +150,15 @@ def test_mistakes(call, message):
     [
         lambda: sizing.Distance(sizing.Polyline([(-0.5, 0.7), (1.2, 0.2)]), h_min=1e5, growth=1.1),
         lambda: sizing.Distance(sizing.Circle((-0.5, 0.7), 0.1), h_min=1e5, growth=1.1),
-        lambda: sizing.Caps([((-0.785, 0.785), 3e6, 9e4)], 27e4, 1.1),
+        lambda: earth.Caps([((-0.785, 0.785), 3e6, 9e4)], 27e4, 1.1),
     ],
 )
 def test_radians_are_warned_of(make):
     with pytest.warns(MismatchWarning, match="look like radians"):
-        on_domain(make(), EARTH)
+        on_domain(EARTH, make())
 
 
 def test_whole_degrees_are_not_taken_for_radians():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        sizing.Caps([((0, 0), 3e6, 9e4)], 27e4, 1.1)
+        earth.Caps([((0, 0), 3e6, 9e4)], 27e4, 1.1)

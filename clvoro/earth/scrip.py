@@ -13,9 +13,9 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.sphere import Sphere
+from ..io.contents import Contents
+from ..io.netcdf import NetCDF
 from ..mesh.connectivity import cell_corners
-from .contents import Contents
-from .netcdf import NetCDF
 
 
 def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:

@@ -14,14 +14,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError
-from .contents import Contents
-from .half_edges import HalfEdges, half_edges
+from ..io.contents import Contents
+from ..io.half_edges import HalfEdges, half_edges
+from ..io.netcdf import NetCDF, squared
 from .mpas_shape import Shape, coordinates, describe, measure
-from .netcdf import NetCDF, squared
 from .trisk import find_weights
 
 ZONES = "bdyMaskCell"
-"""Cell data from which those of edges and vertices follow; see `clvoro.regions.rings`."""
+"""Cell data from which those of edges and vertices follow; see `clvoro.earth.rings`."""
 
 
 def write_mpas(contents: Contents, path: Path, unit: str = "m") -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .half_edges import HalfEdges
+from ..io.half_edges import HalfEdges
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import shapely
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 import clvoro
-from clvoro import regions
+from clvoro import earth
+from clvoro.earth.straits import narrow_cells, widen_straits
 from clvoro.errors import InputError, InputTypeError, MismatchWarning
-from clvoro.mesh.straits import narrow_cells, widen_straits
 from tests.reference.spheres import grid_of_rings, random_points
 
 EARTH = clvoro.Sphere()
@@ -63,17 +63,17 @@ def test_rings_cross_the_date_line(globe, lonlat, by, order):
     expected = by_rays(BLOB, turned(lonlat, -by))
     assert 200 < expected.sum() < 600
     ring = turned(BLOB, by)[::order]
-    found = regions.inside(globe, shapely.Polygon(ring))
+    found = earth.inside(globe, shapely.Polygon(ring))
     assert np.array_equal(found, expected)
     continuous = moved(BLOB[::order], by)
-    assert np.array_equal(regions.inside(globe, clvoro.Polygon(continuous)), expected)
+    assert np.array_equal(earth.inside(globe, clvoro.Polygon(continuous)), expected)
 
 
 def test_positions_may_be_on_both_sides_of_the_date_line(globe, lonlat):
     ring = [(170, -30), (180, -30), (-180, -30), (-160, -30), (-160, 20), (-180, 25), (180, 25)]
     expected = by_rays(np.array([(170, -30), (200, -30), (200, 20), (180, 25)]), moved(turned(lonlat, 180), 180))
     assert expected.sum() > 50
-    assert np.array_equal(regions.inside(globe, shapely.Polygon(ring)), expected)
+    assert np.array_equal(earth.inside(globe, shapely.Polygon(ring)), expected)
 
 
 @pytest.mark.sparse(2)
@@ -86,21 +86,21 @@ def test_rings_around_a_pole(globe, lonlat, pole, order):
         lonlat[:, 0], [*(lon - 360), *lon, *(lon + 360)], np.tile(60 + 10 * np.sin(np.radians(3 * lon)), 3)
     )
     expected = pole * lonlat[:, 1] > edge
-    assert np.array_equal(regions.inside(globe, shapely.Polygon(ring)), expected)
+    assert np.array_equal(earth.inside(globe, shapely.Polygon(ring)), expected)
     # Closed along the pole, as in most files, and then also across the equator.
     lon = lon[::order]
     for height in (60, -20):
         wavy = pole * (height + 10 * np.sin(np.radians(3 * np.arange(-180, 181, 10))))
         closed = [*np.column_stack([np.arange(-180.0, 181, 10), wavy]), (180, 90 * pole), (-180, 90 * pole)]
         inside = pole * lonlat[:, 1] > pole * np.interp(lonlat[:, 0], np.arange(-180, 181, 10), wavy)
-        assert np.array_equal(regions.inside(globe, shapely.Polygon(closed[::order])), inside)
+        assert np.array_equal(earth.inside(globe, shapely.Polygon(closed[::order])), inside)
 
 
 def test_boxes_of_whole_parallels(globe, lonlat):
-    found = regions.inside(globe, shapely.box(-180, -30, 180, 90))
+    found = earth.inside(globe, shapely.box(-180, -30, 180, 90))
     assert np.array_equal(found, lonlat[:, 1] >= -30)
-    assert regions.inside(globe, shapely.box(-180, -90, 180, 90)).all()
-    assert regions.inside(globe, shapely.box(0, -90, 360, 90)).all()
+    assert earth.inside(globe, shapely.box(-180, -90, 180, 90)).all()
+    assert earth.inside(globe, shapely.box(0, -90, 360, 90)).all()
 
 
 def test_poles_are_inside_or_in_holes(ctx):
@@ -108,11 +108,11 @@ def test_poles_are_inside_or_in_holes(ctx):
     lat = EARTH.lonlat(globe.points)[:, 1]
     lon = np.arange(0.0, 360, 30)
     cap, hole = (np.column_stack([lon, np.full(12, y)]) for y in (45.0, 75.0))
-    assert np.array_equal(regions.inside(globe, shapely.Polygon(cap)), lat > 45)
+    assert np.array_equal(earth.inside(globe, shapely.Polygon(cap)), lat > 45)
     # Holes may begin at another longitude.
     ring = shapely.Polygon(cap, [np.roll(hole[::-1], 5, axis=0)])
-    assert np.array_equal(regions.inside(globe, ring), (lat > 45) & (lat < 75))
-    assert np.array_equal(regions.inside(globe, shapely.Polygon(-cap)), lat < -45)
+    assert np.array_equal(earth.inside(globe, ring), (lat > 45) & (lat < 75))
+    assert np.array_equal(earth.inside(globe, shapely.Polygon(-cap)), lat < -45)
 
 
 def test_all_kinds_of_land_are_the_same(globe, lonlat, tmp_path):
@@ -144,7 +144,7 @@ def test_all_kinds_of_land_are_the_same(globe, lonlat, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for land in lands:
-            assert np.array_equal(regions.inside(globe, land), expected)
+            assert np.array_equal(earth.inside(globe, land), expected)
 
 
 # --- lines ---
@@ -159,14 +159,14 @@ def test_lines_cross_the_cells_of_their_points(globe, line):
     shares = np.linspace(0, 1, 400_001 // (len(x) - 1))
     places = np.concatenate([a + shares[:, None] * (b - a) for a, b in pairwise(x)])
     expected = np.unique(globe.locate(EARTH.positions(places)))
-    found = np.flatnonzero(regions.crossed(globe, line))
+    found = np.flatnonzero(earth.crossed(globe, line))
     assert np.array_equal(found, expected)
     assert connected_components(globe.adjacency[found][:, found])[0] == 1
 
 
 def test_all_kinds_of_lines_are_the_same(globe, tmp_path):
     one, two = [(-30, -20), (50, 40)], [(100, 0), (140, 0), (140, 20)]
-    expected = regions.crossed(globe, one) | regions.crossed(globe, np.array(two))
+    expected = earth.crossed(globe, one) | earth.crossed(globe, np.array(two))
     shape = shapely.MultiLineString([one, two])
     path = tmp_path / "lines.geojson"
     path.write_text(json.dumps(shapely.geometry.mapping(shape)))
@@ -176,23 +176,23 @@ def test_all_kinds_of_lines_are_the_same(globe, tmp_path):
         "features": [{"type": "Feature", "geometry": shapely.geometry.mapping(line)} for line in lines],
     }
     for given in (shape, path, [one, two], [np.array(one), two], lines, collection):
-        assert np.array_equal(regions.crossed(globe, given), expected)
+        assert np.array_equal(earth.crossed(globe, given), expected)
 
 
 def test_lines_through_vertices_are_a_cell_wide(ctx):
     """Cells of longitudes and latitudes: on a diagonal they touch in vertices only."""
     globe = clvoro.Adapter(ctx).diagram(EARTH, grid_of_rings())
     for line in ([(-40, -20), (0, 20)], [(-35, -25), (35, 45)], [(-45, 5), (45, 5)], [(5, -80), (5, 80)]):
-        found = np.flatnonzero(regions.crossed(globe, line))
+        found = np.flatnonzero(earth.crossed(globe, line))
         assert len(found) > 5
         assert connected_components(globe.adjacency[found][:, found])[0] == 1
 
 
 def test_short_and_polar_lines(globe):
     place = EARTH.lonlat(globe.points[7:8])[0]
-    assert np.flatnonzero(regions.crossed(globe, [place, place + 1e-9])).tolist() == [7]
-    assert np.flatnonzero(regions.crossed(globe, [place, place])).tolist() == [7]
-    over = regions.crossed(globe, [(20, 80), (20, 90), (200, 90), (200, 80)])
+    assert np.flatnonzero(earth.crossed(globe, [place, place + 1e-9])).tolist() == [7]
+    assert np.flatnonzero(earth.crossed(globe, [place, place])).tolist() == [7]
+    over = earth.crossed(globe, [(20, 80), (20, 90), (200, 90), (200, 80)])
     assert connected_components(globe.adjacency[over][:, over])[0] == 1
 
 
@@ -209,9 +209,9 @@ RING = shapely.Polygon(box(-60, -40, 60, 40), [box(-30, -20, 30, 20)])
 
 def test_lakes_are_removed(globe, lonlat):
     outside, lake = ~by_rays(box(-60, -40, 60, 40), lonlat), by_rays(box(-30, -20, 30, 20), lonlat)
-    assert np.array_equal(regions.ocean(globe, RING), outside)
-    assert np.array_equal(regions.ocean(globe, RING, least_cells=5), outside | lake)
-    assert np.array_equal(regions.ocean(globe, RING, least_cells=int(lake.sum()) + 1), outside)
+    assert np.array_equal(earth.ocean(globe, RING), outside)
+    assert np.array_equal(earth.ocean(globe, RING, least_cells=5), outside | lake)
+    assert np.array_equal(earth.ocean(globe, RING, least_cells=int(lake.sum()) + 1), outside)
     assert parts_of(globe, outside | lake) == 2
 
 
@@ -221,26 +221,26 @@ def test_the_largest_part_is_that_with_the_largest_area(ctx):
     fine = EARTH.positions(np.column_stack([rng.uniform(-35, 35, 2000), rng.uniform(-25, 25, 2000)]))
     points = np.concatenate([fine, random_points(600, 4) * EARTH.radius])
     globe = clvoro.Adapter(ctx).diagram(EARTH, points)
-    kept = regions.ocean(globe, RING)
+    kept = earth.ocean(globe, RING)
     assert kept.sum() < 700
     assert EARTH.lonlat(globe.points[kept])[:, 0].min() < -150
 
 
 def test_passages_stay_open_and_blockages_close_them(globe):
     strait, wall = [(0, 0), (0, 60)], [(-50, 30), (50, 30)]
-    kept = regions.ocean(globe, RING, passages=strait)
-    crossed = regions.crossed(globe, strait)
-    assert np.array_equal(kept, regions.ocean(globe, RING, least_cells=5) | crossed)
+    kept = earth.ocean(globe, RING, passages=strait)
+    crossed = earth.crossed(globe, strait)
+    assert np.array_equal(kept, earth.ocean(globe, RING, least_cells=5) | crossed)
     assert parts_of(globe, kept) == 1
     globe.subset(kept).check().demand()
     # A channel that is open is closed by a line; a passage has precedence.
     channel = RING.difference(shapely.box(-8, 0, 8, 50))
-    lake = np.flatnonzero(regions.crossed(globe, [(0, 0), (10, 0)]))
-    assert regions.ocean(globe, channel)[lake].all()
-    closed = regions.ocean(globe, channel, blockages=wall)
+    lake = np.flatnonzero(earth.crossed(globe, [(0, 0), (10, 0)]))
+    assert earth.ocean(globe, channel)[lake].all()
+    closed = earth.ocean(globe, channel, blockages=wall)
     assert not closed[lake].any()
-    assert not closed[regions.crossed(globe, wall)].any()
-    assert regions.ocean(globe, channel, blockages=wall, passages=strait)[lake].all()
+    assert not closed[earth.crossed(globe, wall)].any()
+    assert earth.ocean(globe, channel, blockages=wall, passages=strait)[lake].all()
 
 
 def slow_narrow(globe, water):
@@ -266,10 +266,10 @@ STRAITS = [[(0, 0), (0, 60)], [(0, 0), (90, 5)]]
 
 
 def test_straits_are_widened(globe):
-    kept = regions.ocean(globe, RING, passages=STRAITS)
+    kept = earth.ocean(globe, RING, passages=STRAITS)
     assert np.array_equal(narrow_cells(globe, kept), slow_narrow(globe, kept))
     assert slow_narrow(globe, kept).sum() > 10
-    wide = regions.ocean(globe, RING, passages=STRAITS, straits="widen")
+    wide = earth.ocean(globe, RING, passages=STRAITS, straits="widen")
     assert not slow_narrow(globe, wide).any()
     assert wide[kept].all()
     # Not more than a row of cells beside each strait.
@@ -297,40 +297,38 @@ def test_straits_between_blockages_stay(globe):
     """Land on both sides of a passage has to stay."""
     beside = [[(-6, 12), (-6, 45)], [(6, 12), (6, 45)], [(-1, 50), (-14, 50)]]
     with pytest.warns(MismatchWarning, match=r"remain one cell wide.*first one is at longitude [-\d]"):
-        kept = regions.ocean(
-            globe, RING, passages=STRAITS[:1], blockages=[*beside, [(0, 12), (0, 45)]], straits="widen"
-        )
-    blocked = regions.crossed(globe, beside) & ~regions.crossed(globe, STRAITS[:1])
+        kept = earth.ocean(globe, RING, passages=STRAITS[:1], blockages=[*beside, [(0, 12), (0, 45)]], straits="widen")
+    blocked = earth.crossed(globe, beside) & ~earth.crossed(globe, STRAITS[:1])
     assert not kept[blocked].any()
     with pytest.raises(InputError, match="straits is 'wide', expected"):
-        regions.ocean(globe, RING, straits="wide")
+        earth.ocean(globe, RING, straits="wide")
 
 
 def test_a_passage_into_a_lake_is_warned_of(globe):
     with pytest.warns(MismatchWarning, match=r"passages\[0\] leads to water that is not connected"):
-        kept = regions.ocean(globe, RING, passages=[(0, 0), (0, 30)])
-    assert np.array_equal(kept, regions.ocean(globe, RING))
+        kept = earth.ocean(globe, RING, passages=[(0, 0), (0, 30)])
+    assert np.array_equal(kept, earth.ocean(globe, RING))
 
 
 def test_rings_of_neighbors(globe):
-    keep = regions.inside(globe, shapely.Polygon(BLOB))
-    ring = regions.rings(globe, keep, 4)
+    keep = earth.inside(globe, shapely.Polygon(BLOB))
+    ring = earth.rings(globe, keep, 4)
     steps = shortest_path(globe.adjacency, unweighted=True, indices=np.flatnonzero(keep)).min(axis=0)
     assert np.array_equal(ring, np.where(steps <= 4, steps, -1))
-    assert regions.rings(globe, keep).max() == 7
+    assert earth.rings(globe, keep).max() == 7
     # In a part of the mesh there are no rings beyond its boundary.
     part = globe.subset(ring >= 0, "open")
-    assert np.array_equal(regions.rings(part, keep[ring >= 0], 9), ring[ring >= 0])
+    assert np.array_equal(earth.rings(part, keep[ring >= 0], 9), ring[ring >= 0])
 
 
 def test_parts_have_parts(globe):
-    ocean = globe.subset(regions.ocean(globe, RING))
-    kept = regions.ocean(ocean, shapely.Polygon(moved(BLOB, 150)))
-    both = regions.ocean(globe, shapely.union_all([RING, shapely.Polygon(moved(BLOB, 150))]))
+    ocean = globe.subset(earth.ocean(globe, RING))
+    kept = earth.ocean(ocean, shapely.Polygon(moved(BLOB, 150)))
+    both = earth.ocean(globe, shapely.union_all([RING, shapely.Polygon(moved(BLOB, 150))]))
     assert np.array_equal(ocean.subset(kept).points[:, 0], globe.points[both, 0])
     with pytest.raises(InputError, match=r"lines\[0\] crosses no cell of the mesh: it is outside"):
-        regions.crossed(ocean, [(0, -30), (0, 30)])
-    assert regions.crossed(ocean, [(0, 30), (0, 60)]).any()
+        earth.crossed(ocean, [(0, -30), (0, 30)])
+    assert earth.crossed(ocean, [(0, 30), (0, 60)]).any()
 
 
 # --- errors ---
@@ -360,7 +358,7 @@ def test_parts_have_parts(globe):
 )
 def test_wrong_land_is_refused(globe, land, kind, message):
     with pytest.raises(kind, match=message):
-        regions.ocean(globe, land)
+        earth.ocean(globe, land)
 
 
 @pytest.mark.parametrize(
@@ -377,27 +375,27 @@ def test_wrong_land_is_refused(globe, land, kind, message):
 )
 def test_wrong_lines_are_refused(globe, lines, kind, message):
     with pytest.raises(kind, match=message):
-        regions.ocean(globe, RING, passages=lines)
+        earth.ocean(globe, RING, passages=lines)
 
 
 def test_radians_are_warned_of(globe):
     with pytest.warns(MismatchWarning, match="area has .* look like radians"):
-        regions.inside(globe, shapely.Polygon(np.radians(BLOB)))
+        earth.inside(globe, shapely.Polygon(np.radians(BLOB)))
     with pytest.warns(MismatchWarning, match="lines has .* look like radians"):
-        regions.crossed(globe, np.radians([(0, 0), (100, 30)]))
+        earth.crossed(globe, np.radians([(0, 0), (100, 30)]))
 
 
 def test_other_wrong_arguments_are_refused(ctx, globe):
     with pytest.raises(InputError, match="least_cells is 4000, and the largest part"):
-        regions.ocean(globe, RING, least_cells=4000)
+        earth.ocean(globe, RING, least_cells=4000)
     with pytest.raises(InputTypeError, match="least_cells"):
-        regions.ocean(globe, RING, least_cells=2.5)
+        earth.ocean(globe, RING, least_cells=2.5)
     with pytest.raises(InputTypeError, match="mesh is a Sphere"):
-        regions.inside(EARTH, RING)
+        earth.inside(EARTH, RING)
     plane = clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0), (1, 1)), [(0.5, 0.5)])
     with pytest.raises(InputError, match="expected a mesh on a clvoro"):
-        regions.inside(plane, RING)
+        earth.inside(plane, RING)
     with pytest.raises(InputError, match="keep selects no cell"):
-        regions.rings(globe, np.zeros(3000, bool))
+        earth.rings(globe, np.zeros(3000, bool))
     with pytest.raises(InputError, match="count is -1"):
-        regions.rings(globe, np.ones(3000, bool), -1)
+        earth.rings(globe, np.ones(3000, bool), -1)

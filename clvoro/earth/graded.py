@@ -11,15 +11,16 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.sphere import Sphere
 from ..opencl.engine import Engine
-from .field import Field
-from .gradation import Gradation, globe_columns
-from .graded import BATCH, MOST_NODES, Graded, default_engine
-from .lonlat import LonLat
-from .raster import Raster
+from ..sizing.evaluation import Sizing
+from ..sizing.field import Field
+from ..sizing.gradation import Gradation, globe_columns
+from ..sizing.graded import BATCH, MOST_NODES, Graded, default_engine
+from ..sizing.raster import Raster
+from .sizes import LonLat
 
 if TYPE_CHECKING:
     from ..geometry.domain import Domain
-    from .codegen import CodeWriter
+    from ..sizing.codegen import CodeWriter
 
 _PROBES = 1 << 13
 """Positions that sample the smallest size."""
@@ -93,8 +94,6 @@ class ArcGraded(Field):
         return field._emit(writer)
 
     def _compute(self, sphere: Sphere, engine: Engine) -> Raster:
-        from .evaluation import Sizing
-
         evaluate = Sizing(engine, sphere, self.field)
         marks = self.field.landmarks(sphere)
         at_marks = evaluate(marks) if len(marks) else np.zeros(0)

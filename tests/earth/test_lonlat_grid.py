@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro import sizing
+from clvoro import earth, sizing
 from clvoro.errors import ClvoroError
 from clvoro.sizing.on_domain import on_domain
 
@@ -34,7 +34,7 @@ def array(lon, lat, values=None, dims=("lat", "lon"), names=("lon", "lat"), attr
 
 
 def at(raster, places=PLACES):
-    return on_domain(raster, EARTH)(EARTH.positions(places))
+    return on_domain(EARTH, raster)(EARTH.positions(places))
 
 
 def error(raster, places=PLACES):
@@ -64,7 +64,7 @@ LAYOUTS = {
 @pytest.mark.parametrize("name", list(LAYOUTS))
 def test_layouts(name):
     lon, lat = LAYOUTS[name]
-    raster = sizing.Raster.from_xarray(array(lon, lat))
+    raster = earth.from_xarray(array(lon, lat))
     # Rows at equal steps of the sine are up to 7.4 degrees apart at the poles.
     bound = {"centers": SIDES, "varying": 2.5 * LINEAR}.get(name, LINEAR)
     assert error(raster) < bound
@@ -75,7 +75,7 @@ def test_layouts(name):
 
 
 def test_dimensions_may_have_other_orders_and_names():
-    wanted = at(sizing.Raster.from_xarray(array(GLOBAL, POLES)))
+    wanted = at(earth.from_xarray(array(GLOBAL, POLES)))
     values = smooth(*np.meshgrid(GLOBAL, POLES))
     along = {
         "XC": SimpleNamespace(values=GLOBAL, dims=("i",), attrs={"standard_name": "longitude"}),
@@ -83,11 +83,11 @@ def test_dimensions_may_have_other_orders_and_names():
         "time": SimpleNamespace(values=np.zeros(1), dims=("time",), attrs={}),
     }
     turned = SimpleNamespace(values=values.T[:, None], dims=("i", "time", "j"), coords=along)
-    assert np.array_equal(at(sizing.Raster.from_xarray(turned)), wanted)
+    assert np.array_equal(at(earth.from_xarray(turned)), wanted)
 
 
 def test_values_of_a_part_are_those_of_its_nearer_side():
-    raster = sizing.Raster.from_xarray(array(np.arange(170, 191, 5.0), np.arange(-10, 11, 5.0)))
+    raster = earth.from_xarray(array(np.arange(170, 191, 5.0), np.arange(-10, 11, 5.0)))
     west, east = smooth(170, 0), smooth(190, 0)
     found = at(raster, [(165, 0), (170, 0), (-170, 0), (-165, 0), (100, 0), (-100, 0)])
     assert found == pytest.approx([west, west, east, east, west, east])
@@ -97,24 +97,24 @@ def test_missing_values_come_from_across_the_seam():
     values = smooth(*np.meshgrid(GLOBAL, POLES))
     values[:, :6] = np.nan  # 0 to 25 degrees; 355 is nearest to 0, and 30 to 25
     with pytest.raises(ClvoroError, match="missing"):
-        sizing.Raster.from_xarray(array(GLOBAL, POLES, values))
-    raster = sizing.Raster.from_xarray(array(GLOBAL, POLES, values), missing="nearest")
+        earth.from_xarray(array(GLOBAL, POLES, values))
+    raster = earth.from_xarray(array(GLOBAL, POLES, values), missing="nearest")
     assert at(raster, [(0, 0), (25, 0)]) == pytest.approx([smooth(355, 0), smooth(30, 0)])
     masked = np.ma.masked_array(np.nan_to_num(values), np.isnan(values))
-    again = sizing.Raster.from_xarray(array(GLOBAL, POLES, masked), missing="nearest")
+    again = earth.from_xarray(array(GLOBAL, POLES, masked), missing="nearest")
     assert np.array_equal(again.values, raster.values)
 
 
 def test_grids_that_reach_the_poles_with_their_pixels_cover_the_sphere():
     for lon, lat in ((GLOBAL + 2.5, CENTERED), (GLOBAL, POLES)):
-        raster = sizing.Raster.from_xarray(array(lon, lat), outside="error")
-        assert sizing.generate_code(on_domain(raster, EARTH), EARTH).data.size
+        raster = earth.from_xarray(array(lon, lat), outside="error")
+        assert sizing.generate_code(on_domain(EARTH, raster), EARTH).data.size
         assert at(raster, [(0, 90), (0, -90)]).min() > 0
 
 
 def test_a_mesh_of_it(ctx):
     del ctx  # OpenCL is there
-    size = 4 * sizing.Raster.from_xarray(array(GLOBAL, POLES[::-1]))
+    size = 4 * earth.from_xarray(array(GLOBAL, POLES[::-1]))
     mesh = clvoro.adapt(EARTH, size, effort="fast")
     mesh.check().demand()
     expected = np.mean(4 * smooth(*EARTH.lonlat(mesh.points).T) / mesh.target_size)
@@ -151,14 +151,14 @@ def radians(lon, lat, **attrs):
 )
 def test_mistakes(given, message):
     with pytest.raises(ClvoroError, match=message):
-        sizing.Raster.from_xarray(given)
+        earth.from_xarray(given)
 
 
 def test_small_regions_in_degrees_are_no_radians():
-    raster = sizing.Raster.from_xarray(array(np.linspace(0, 1, 11), np.linspace(0, 1, 11)))
+    raster = earth.from_xarray(array(np.linspace(0, 1, 11), np.linspace(0, 1, 11)))
     assert error(raster, np.array([(0.5, 0.5)])) < 1
     units = ({"units": "degrees_east"}, {"units": "degrees_north"})
-    raster = sizing.Raster.from_xarray(array(np.arange(0, 6.2, 0.1), np.linspace(0, 1, 11), attrs=units))
+    raster = earth.from_xarray(array(np.arange(0, 6.2, 0.1), np.linspace(0, 1, 11), attrs=units))
     assert error(raster, np.array([(3.0, 0.5)])) < 1
 
 
@@ -169,7 +169,7 @@ def test_xarray_itself():
         {"latitude": POLES[::-1], "longitude": GLOBAL},
         ("latitude", "longitude"),
     )
-    assert error(sizing.Raster.from_xarray(data)) < LINEAR
-    assert np.array_equal(sizing.Raster.from_xarray(data.T).values, sizing.Raster.from_xarray(data).values)
+    assert error(earth.from_xarray(data)) < LINEAR
+    assert np.array_equal(earth.from_xarray(data.T).values, earth.from_xarray(data).values)
     with pytest.raises(ClvoroError, match="Dataset of h"):
-        sizing.Raster.from_xarray(data.to_dataset(name="h"))
+        earth.from_xarray(data.to_dataset(name="h"))

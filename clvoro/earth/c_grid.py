@@ -17,8 +17,8 @@ from ..errors import InputError
 from ..geometry.box import Box
 from ..geometry.sphere import Sphere
 from ..geometry.spherical_triangles import triangle_areas
-from .connectivity import face_ends, face_keys, face_owners, neighbor_points, next_faces
-from .diagram import Diagram
+from ..mesh.connectivity import face_ends, face_keys, face_owners, neighbor_points, next_faces
+from ..mesh.diagram import Diagram
 
 RIGHT_ANGLE = 90 + 1e-4
 """Angle in degrees above which a triangle counts as obtuse. Those of a square lattice have 90 up to round-off."""

@@ -12,17 +12,17 @@ from ..arguments import check_number
 from ..errors import InputError, InputTypeError
 from ..geometry.box import Box
 from ..geometry.domain import Domain
-from ..geometry.lonlat_shapes import check_lonlat, warn_of_radians
 from ..geometry.sphere import Sphere, directions
-from .arguments import check_positive, check_slope
-from .distance import Distance
-from .field import Field, as_field
-from .raster import Raster
+from ..sizing.arguments import check_positive, check_slope
+from ..sizing.distance import Distance
+from ..sizing.field import Field, as_field
+from ..sizing.raster import Raster
+from .shapes import check_lonlat, warn_of_radians
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from .codegen import CodeWriter
+    from ..sizing.codegen import CodeWriter
 
 DEGREES = Box((-180, -90), (180, 90))
 """The whole sphere in longitude and latitude."""
@@ -53,7 +53,7 @@ class LonLat(Field):
 
     Examples
     --------
-    >>> size = sizing.LonLat(lambda p: 200e3 + 2e3 * abs(p[:, 1]))
+    >>> size = earth.LonLat(lambda p: 200e3 + 2e3 * abs(p[:, 1]))
     >>> size(clvoro.Sphere().positions([(0, 0), (0, 90)])).tolist()
     [200000.0, 380000.0]
     """
@@ -235,7 +235,7 @@ class Caps(Field):
     --------
     27 km everywhere, 9 km and 3 km in the North Atlantic:
 
-    >>> size = sizing.Caps([((-45, 45), 3e6, 9e3), ((-45, 45), 1e6, 3e3)], h_max=27e3, growth=1.1)
+    >>> size = earth.Caps([((-45, 45), 3e6, 9e3), ((-45, 45), 1e6, 3e3)], h_max=27e3, growth=1.1)
     >>> size(clvoro.Sphere().positions([(-45, 45), (-45, 30), (135, -45)])).round().tolist()
     [3000.0, 9000.0, 27000.0]
     """

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial import ConvexHull, Delaunay
 
 import clvoro
+from clvoro.earth.c_grid import measure_c_grid
 from clvoro.errors import InputError
-from clvoro.mesh.c_grid import measure_c_grid
 from clvoro.mesh.connectivity import face_ends, face_owners
 from tests.mesh.test_sphere_check import icosahedron, scattered
 from tests.reference.solids import solid_diagram

@@ -21,7 +21,7 @@ def result(ctx, request):
 def ocean(ctx):
     """A mesh with a coast and, at longitudes from 100 on, an open boundary."""
     globe = clvoro.Adapter(ctx).diagram(clvoro.Sphere(2), scattered(250))
-    water = globe.subset(~clvoro.regions.inside(globe, clvoro.Polygon([(-40, -40), (30, -20), (0, 50)])))
+    water = globe.subset(~clvoro.earth.inside(globe, clvoro.Polygon([(-40, -40), (30, -20), (0, 50)])))
     return result_of(water.subset(globe.domain.lonlat(water.points)[:, 0] < 100, "open"))
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .connectivity import face_owners, following
-from .diagram import Diagram
+from ..mesh.connectivity import face_owners, following
+from ..mesh.diagram import Diagram
 
 
 def narrow_cells(diagram: Diagram, water: np.ndarray) -> np.ndarray:

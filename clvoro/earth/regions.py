@@ -4,7 +4,7 @@
 >>> import shapely
 >>> globe = clvoro.voronoi(clvoro.Sphere(), clvoro.Sphere().icosahedral_points(3))
 >>> continent = shapely.box(-60, -40, 20, 50)
->>> ocean = globe.subset(clvoro.regions.ocean(globe, continent))
+>>> ocean = globe.subset(clvoro.earth.ocean(globe, continent))
 >>> len(globe), len(ocean), ocean.domain.boundary_names
 (642, 543, ('coast',))
 """
@@ -19,22 +19,22 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from .arguments import check_choice, check_integer, warn
-from .errors import InputError, InputTypeError, MismatchWarning
-from .geometry.lonlat_shapes import area_of, lines_of
-from .geometry.sphere import Sphere
-from .mesh.connectivity import face_owners
-from .mesh.crossing import cells_across, rings_around
-from .mesh.diagram import Diagram
-from .mesh.results import Result
-from .mesh.straits import widen_straits
-from .mesh.subset import check_mask
+from ..arguments import check_choice, check_integer, warn
+from ..errors import InputError, InputTypeError, MismatchWarning
+from ..geometry.sphere import Sphere
+from ..mesh.connectivity import face_owners
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
+from ..mesh.subset import check_mask
+from .crossing import cells_across, rings_around
+from .shapes import area_of, lines_of
+from .straits import widen_straits
 
 if TYPE_CHECKING:
     import shapely
     from numpy.typing import ArrayLike
 
-    from .geometry.polygon import Polygon
+    from ..geometry.polygon import Polygon
 
     Area = (
         Polygon
@@ -86,9 +86,9 @@ def inside(mesh: Result | Diagram, area: Area) -> np.ndarray:
     >>> import shapely
     >>> globe = clvoro.voronoi(clvoro.Sphere(), clvoro.Sphere().icosahedral_points(2))
     >>> pacific = [(160, -50), (-110, -50), (-120, 40), (160, 40)]
-    >>> int(clvoro.regions.inside(globe, shapely.Polygon(pacific)).sum())
+    >>> int(clvoro.earth.inside(globe, shapely.Polygon(pacific)).sum())
     27
-    >>> int(clvoro.regions.inside(globe, lambda lonlat: lonlat[:, 1] > 66.5).sum())
+    >>> int(clvoro.earth.inside(globe, lambda lonlat: lonlat[:, 1] > 66.5).sum())
     7
     """
     diagram, sphere = _diagram_of(mesh)
@@ -120,7 +120,7 @@ def crossed(mesh: Result | Diagram, lines: Lines) -> np.ndarray:
     Examples
     --------
     >>> globe = clvoro.voronoi(clvoro.Sphere(), clvoro.Sphere().icosahedral_points(3))
-    >>> int(clvoro.regions.crossed(globe, [(-10, 36), (10, 36)]).sum())
+    >>> int(clvoro.earth.crossed(globe, [(-10, 36), (10, 36)]).sum())
     3
     """
     diagram, sphere = _diagram_of(mesh)
@@ -180,11 +180,11 @@ def ocean(
     >>> import shapely
     >>> globe = clvoro.voronoi(clvoro.Sphere(), clvoro.Sphere().icosahedral_points(4))
     >>> land = shapely.box(-60, -40, 20, 50).difference(shapely.box(-40, -20, 0, 20))
-    >>> int(clvoro.regions.ocean(globe, land).sum())
+    >>> int(clvoro.earth.ocean(globe, land).sum())
     2161
-    >>> int(clvoro.regions.ocean(globe, land, passages=[(-20, 0), (40, 0)]).sum())
+    >>> int(clvoro.earth.ocean(globe, land, passages=[(-20, 0), (40, 0)]).sum())
     2260
-    >>> int(clvoro.regions.ocean(globe, land, passages=[(-20, 0), (40, 0)], straits="widen").sum())
+    >>> int(clvoro.earth.ocean(globe, land, passages=[(-20, 0), (40, 0)], straits="widen").sum())
     2266
     """
     diagram, sphere = _diagram_of(mesh)
@@ -241,7 +241,7 @@ def rings(mesh: Result | Diagram, keep: ArrayLike, count: int = 7) -> np.ndarray
     Examples
     --------
     >>> globe = clvoro.voronoi(clvoro.Sphere(), clvoro.Sphere().icosahedral_points(4))
-    >>> ring = clvoro.regions.rings(globe, clvoro.regions.inside(globe, clvoro.Polygon([(0, 0), (40, 0), (20, 30)])))
+    >>> ring = clvoro.earth.rings(globe, clvoro.earth.inside(globe, clvoro.Polygon([(0, 0), (40, 0), (20, 30)])))
     >>> area = globe.subset(ring >= 0, "open")
     >>> area.save("area.nc", convention="mpas", cell_data={"bdyMaskCell": ring[ring >= 0]})
     """

@@ -1,0 +1,65 @@
+"""Whether models on C grids accept a mesh: the criteria of the solver "mpas"."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import InputError
+from ..finite_volumes.criteria import Criterion, Rows, SolverReport
+from ..finite_volumes.gate import LEAST_MEASURE
+from ..finite_volumes.solver_mesh import WallShape
+from ..geometry.sphere import Sphere
+from ..mesh.connectivity import face_ends, face_keys, face_owners
+from ..mesh.diagram import Diagram
+from .c_grid import RIGHT_ANGLE, measure_c_grid
+
+_SHORTEST_EDGE = 1e-6
+"""Least ratio of the length of an edge to the distance of its generators: C-grid schemes divide by the length."""
+_LEAST_ANGLE = 30.0
+"""Angle of a triangle, in degrees, below which the mesh is warned of."""
+_LEAST_EDGE_RATIO = 0.1
+"""Ratio of the shortest to the longest edge of a cell below which the mesh is warned of."""
+_MOST_CENTROID_OFFSET = 0.1
+"""Distance from generator to centroid over the size of the cell above which the mesh is warned of.
+
+C grids take the value at the generator for the mean over the cell, which is of second order at the centroid only."""
+
+
+def check_for_mpas(diagram: Diagram, walls: WallShape | None) -> SolverReport:
+    """Check `diagram` by the criteria of models on C grids.
+
+    Raises
+    ------
+    InputError
+        In 3D and in polygonal domains, or if `walls` is given.
+    """
+    if walls is not None:
+        raise InputError(f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out")
+    faces, domain, made = int(diagram.faces.owner.size), diagram.domain, _criteria(diagram)
+    if isinstance(domain, Sphere):
+        made = [criterion.on_sphere(domain) for criterion in made]
+    return SolverReport("mpas", tuple(made), len(diagram), faces, 0.0)
+
+
+def _criteria(diagram: Diagram) -> list[Criterion]:
+    """Return the criteria for meshes of MPAS."""
+    d, m = diagram, measure_c_grid(diagram)
+    dim, owner = d.domain.dim, face_owners(diagram)
+    inner = np.flatnonzero(m.inner)
+    inner = inner[np.less(*face_keys(d, inner))]  # each edge once
+    cells = Rows(d.points, None, dim)
+    edges = Rows(d.face_centroids[inner], owner[inner], dim)
+    places, cell = d.vertices[face_ends(d)[m.corners, 0]], owner[m.corners]
+    corners, vertices = Rows(places, cell, dim), Rows(places[m.first], cell[m.first], dim)
+    return [
+        cells("edges of a cell", np.diff(d.neighbor_starts), 3, above=False),
+        cells("cell area", d.volumes, LEAST_MEASURE, above=False),
+        edges("edge length over distance", m.length_ratio[inner], _SHORTEST_EDGE, above=False),
+        corners("largest angle of triangle", m.angles, RIGHT_ANGLE),
+        corners("smallest angle of triangle", m.angles, _LEAST_ANGLE, above=False, demanded=False),
+        corners("kite area over cell area", m.kites, 0, above=False),
+        vertices("cells at a vertex", m.vertex_cells[m.first], 3, demanded=False),
+        edges("edge offset", m.edge_offset[inner], 0.5, demanded=False),
+        cells("centroid offset", m.centroid_offset, _MOST_CENTROID_OFFSET, demanded=False),
+        cells("edge ratio", m.edge_ratio, _LEAST_EDGE_RATIO, above=False, demanded=False),
+    ]
