@@ -86,7 +86,7 @@ class Sets:
     """Generators of one domain, in the order of their bins, and their tessellator."""
 
     def __init__(self, adapter: clvoro.Adapter, domain: Any, n: int) -> None:
-        engine = Engine(adapter.ctx, adapter.queue, 2, adapter.dtype, domain.kind(adapter.dtype))
+        engine = Engine(adapter.ctx, adapter.queue, 2, adapter.dtype, domain.traits(adapter.dtype))
         stages = Stages(engine)
         unsorted = engine.upload(domain.place(random_points(domain, n), adapter.dtype))
         items = stages.bins.build(domain, unsorted, n).items[:n].copy()

@@ -108,7 +108,7 @@ class Adapter:
         if real == np.float64:
             device.require_fp64(self.ctx)
         self.queue = cl.CommandQueue(self.ctx)
-        self._stages: dict[tuple[int, bool, bool, bool], Stages] = {}
+        self._stages: dict[tuple[int, tuple[str, ...]], Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None
         self._watch: Callable[[np.void], None] | None = None
@@ -187,12 +187,12 @@ class Adapter:
             raise InputTypeError(
                 f"domain is a {type(domain).__name__}, expected a clvoro.Box, a clvoro.Polygon or a clvoro.Sphere{hint}"
             )
-        kind = domain.kind(self.dtype)
-        key = domain.dim, kind.periodic, kind.polygonal, kind.spherical
+        traits = domain.traits(self.dtype)
+        key = domain.dim, traits.macros
         stages = self._stages.get(key)
-        if stages is None or stages.engine.domain_kind != kind:
+        if stages is None or stages.engine.traits != traits:
             # Stages of other periods are dropped. The programs are cached elsewhere and serve these, too.
-            engine = Engine(self.ctx, self.queue, domain.dim, self.dtype, kind)
+            engine = Engine(self.ctx, self.queue, domain.dim, self.dtype, traits)
             stages = self._stages[key] = Stages(engine)
         return stages
 

@@ -85,7 +85,7 @@ class Extras:
 
 def _kind_of(engine: Engine) -> int | str:
     """Return the key of the figures for `engine`."""
-    return SPHERE if engine.domain_kind.spherical else engine.dim
+    return SPHERE if engine.traits.curved else engine.dim
 
 
 def fixed_bytes(engine: Engine, n: float) -> float:
@@ -98,8 +98,7 @@ def fixed_bytes(engine: Engine, n: float) -> float:
 def workspace_bytes(engine: Engine, n: float) -> float:
     """Return the part of these bytes that one diagram needs, too."""
     unit = max(64, engine.queue.device.mem_base_addr_align // 8)
-    periodic = engine.domain_kind.periodic
-    halo = 3 * 4 * block_count(engine.dim) if periodic else 0
+    halo = 3 * 4 * block_count(engine.dim) if engine.traits.periods else 0
     space = clipping_space(n) if engine.cell_dim == 3 else 0
     return ARRAYS * unit + SCANS * 4 * engine.groups + halo + space
 

@@ -69,7 +69,7 @@ class ArcGraded(Field):
         found = [raster for (box, _), raster in known.items() if box == whole]
         if engine is None and found:
             return LonLat(found[0])
-        engine = engine or default_engine(3, whole.kind(np.dtype(np.float64)))
+        engine = engine or default_engine(3, whole.traits(np.dtype(np.float64)))
         key = (whole, engine.real)
         if key not in known:
             known[key] = self._compute(whole, engine)

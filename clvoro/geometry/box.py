@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
-from ..opencl.engine import DomainKind
+from ..opencl.engine import PLAIN, Traits
 from .boundary_names import BoundaryNames, Walls
 from .domain import LARGEST_EDGE, Domain
 from .shapes import Edges
@@ -234,12 +234,12 @@ class Box(Domain):
             known[real] = lower, upper
         return known[real]
 
-    def kind(self, real: np.dtype) -> DomainKind:
-        """Return the kind of domain and its periods, in the device's coordinates."""
+    def traits(self, real: np.dtype) -> Traits:
+        """Return for what kernels are built, with the periods in the device's coordinates."""
         if not any(self.periodic):
-            return DomainKind()
+            return PLAIN
         x, y, z = [float(period) for period in self.periods(real)] + [0.0] * (3 - self.dim)
-        return DomainKind(periodic=True, periods=(x, y, z))
+        return Traits(("PERIODIC",), (x, y, z))
 
 
 def _directions(periodic: object, dim: int) -> tuple[bool, ...]:

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ..opencl.engine import DomainKind
+from ..opencl.engine import Traits
 from .edge_grid import bin_edges
 from .region import Region
 
@@ -43,10 +43,10 @@ class DevicePolygon(Region):
         lower, upper = self.clip_box
         return lower, 2.0 ** math.ceil(math.log2((upper - lower).max()))
 
-    def kind(self, real: np.dtype) -> DomainKind:
-        """Return the kind of domain, for which kernels are built."""
+    def traits(self, real: np.dtype) -> Traits:
+        """Return for what kernels are built."""
         del real
-        return DomainKind(polygonal=True)
+        return Traits(("POLYGON",), cut=True)
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the corners of the clip box and the edges in bins; see geometry/edges.h."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 
 from ..arguments import check_rows, format_point
-from ..opencl.engine import DomainKind
+from ..opencl.engine import PLAIN, Traits
 from .boundary_names import BoundaryNames, Walls
 
 if TYPE_CHECKING:
@@ -233,10 +233,10 @@ class Domain(ABC):
             known[real] = corners[0], corners[1]
         return known[real]
 
-    def kind(self, real: np.dtype) -> DomainKind:
-        """Return the kind of domain, for which kernels are built; `real` is the precision of periods."""
+    def traits(self, real: np.dtype) -> Traits:
+        """Return for what kernels are built; `real` is the precision of periods."""
         del real
-        return DomainKind()
+        return PLAIN
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the arguments of kernels with DOMAIN_ARGS; see geometry/domain.h."""

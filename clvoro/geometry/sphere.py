@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, KDTree
 
 from ..arguments import check_integer, check_number, check_rows
 from ..errors import InputError
-from ..opencl.engine import DomainKind
+from ..opencl.engine import Traits
 from .boundary_names import BoundaryNames, Walls
 from .domain import LARGEST_EDGE, Domain
 
@@ -266,7 +266,7 @@ class Sphere(Domain):
         """Origin and scale of the device's coordinates: unit vectors."""
         return np.zeros(3), self.radius
 
-    def kind(self, real: np.dtype) -> DomainKind:
-        """Return the kind of domain, for which kernels are built."""
+    def traits(self, real: np.dtype) -> Traits:
+        """Return for what kernels are built."""
         del real
-        return DomainKind(spherical=True)
+        return Traits(("SPHERE",), curved=True)

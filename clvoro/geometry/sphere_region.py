@@ -18,7 +18,7 @@ from .sphere import Sphere
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from ..opencl.engine import DomainKind
+    from ..opencl.engine import Traits
 
 COAST = "coast"
 """Name of the boundary unless the caller gives another one."""
@@ -138,7 +138,7 @@ class SphereRegion(Sphere):
     def _tree(self) -> KDTree:
         return KDTree(np.concatenate([self.within, self.beyond]))
 
-    def kind(self, real: np.dtype) -> DomainKind:
+    def traits(self, real: np.dtype) -> Traits:
         """Raise an error, because a mesh is made on the whole sphere before cells are removed."""
         del real
         raise InputError(

@@ -22,38 +22,32 @@ ITEM_GROUP = 64
 """Work-items per group of a kernel in which each work-item does one item."""
 
 
-class DomainKind(NamedTuple):
-    """The kind of a domain, for which kernels are built; they take the periods as an argument.
+class Traits(NamedTuple):
+    """What kernels are built for, and take as arguments, besides dimension and precision.
 
     Attributes
     ----------
-    periodic, polygonal, spherical : bool
-        Whether it is a periodic box, a polygon, or a sphere.
-    periods : tuple of 3 floats
-        In the device's coordinates; 0 where there are walls.
-    weighted : bool
-        Whether generators have weights, for power diagrams; see geometry/weights.h.
+    macros : tuple of str
+        Macros that are set.
+    periods : tuple of 3 floats, or empty
+        PERIOD_ARGS of kernels, in the device's coordinates; 0 where there are walls.
+    curved : bool
+        Whether cells have one dimension less than positions.
+    cut : bool
+        Whether cells in 2D are cut after they were clipped: then faces are measured in full precision.
+    site_values : int
+        Numbers per generator besides its coordinates.
     """
 
-    periodic: bool = False
-    polygonal: bool = False
-    periods: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    spherical: bool = False
-    weighted: bool = False
-
-    @property
-    def defines(self) -> dict[str, object]:
-        """Macros for kernels; see geometry/domain.h."""
-        macros = {
-            "PERIODIC": self.periodic,
-            "POLYGON": self.polygonal,
-            "SPHERE": self.spherical,
-            "WEIGHTED": self.weighted,
-        }
-        return {name: 1 for name, is_set in macros.items() if is_set}
+    macros: tuple[str, ...] = ()
+    periods: tuple[float, ...] = ()
+    curved: bool = False
+    cut: bool = False
+    site_values: int = 0
 
 
-WALLED_BOX = DomainKind()
+PLAIN = Traits()
+"""Those of boxes with walls on all sides."""
 
 
 class GroupSizes(NamedTuple):
@@ -93,8 +87,8 @@ class Engine:
     dim : 2 or 3
     real : numpy.dtype
         float64 or float32.
-    domain_kind : DomainKind
-        The kind of domain for which kernels are built.
+    traits : Traits
+        For what kernels are built.
     workspace : Workspace, optional
         Memory that stages use in turn; see `scratch`.
     pool : KernelPool, optional
@@ -114,66 +108,54 @@ class Engine:
         queue: cl.CommandQueue,
         dim: int,
         real: np.dtype,
-        domain_kind: DomainKind = WALLED_BOX,
+        traits: Traits = PLAIN,
         *,
         workspace: Workspace | None = None,
         pool: KernelPool | None = None,
     ) -> None:
         self.ctx, self.queue = ctx, queue
-        self.dim, self.real, self.domain_kind = dim, real, domain_kind
+        self.dim, self.real, self.traits = dim, real, traits
         self.groups, self.group_size = group_sizes(queue.device)
         self._divides = ranges.may_be_interrupted(queue.device)
         self.period_args: tuple[np.ndarray, ...] = ()
-        if domain_kind.periodic:
-            vector = np.array([*domain_kind.periods, 0], real)
+        if traits.periods:
+            vector = np.array([*traits.periods, 0], real)
             vector.setflags(write=False)
             self.period_args = (vector,)
         self.workspace = Workspace(queue) if workspace is None else workspace
         self.pool = KernelPool() if pool is None else pool
 
-    def single(self) -> Engine:
-        """Return an engine in float32 that shares workspace and kernels with this one."""
+    def replaced(self, *, real: np.dtype | None = None, traits: Traits | None = None) -> Engine:
+        """Return an engine of another precision or other traits that shares workspace and kernels with this one."""
         return Engine(
             self.ctx,
             self.queue,
             self.dim,
-            np.dtype(np.float32),
-            self.domain_kind,
-            workspace=self.workspace,
-            pool=self.pool,
-        )
-
-    def weighted(self) -> Engine:
-        """Return an engine for power diagrams that shares workspace and kernels with this one."""
-        return Engine(
-            self.ctx,
-            self.queue,
-            self.dim,
-            self.real,
-            self.domain_kind._replace(weighted=True),
+            self.real if real is None else real,
+            self.traits if traits is None else traits,
             workspace=self.workspace,
             pool=self.pool,
         )
 
     @property
     def site_size(self) -> int:
-        """Numbers per generator: its coordinates, and its weight in a power diagram."""
-        return self.dim + self.domain_kind.weighted
+        """Numbers per generator: its coordinates, and those of the traits."""
+        return self.dim + self.traits.site_values
 
     @property
     def cell_dim(self) -> int:
-        """Dimension of the cells: 2 on a sphere in 3D."""
-        return 2 if self.domain_kind.spherical else self.dim
+        """Dimension of the cells."""
+        return self.dim - self.traits.curved
 
     @property
     def face(self) -> np.dtype:
         """Precision of the measures and centroids of faces during a run.
 
         They are relative to the generator. So single precision is enough to move generators, and halves most of the
-        memory of a diagram in 2D. Cells in polygons and in 3D are measured only while they are clipped: there the
-        precision is `real`.
+        memory of a diagram in 2D. Cells in 3D are measured only while they are clipped, and others only while they are
+        cut: there the precision is `real`.
         """
-        full = self.cell_dim == 3 or self.domain_kind.polygonal
+        full = self.cell_dim == 3 or self.traits.cut
         return self.real if full else np.dtype(np.float32)
 
     @staticmethod
@@ -209,7 +191,7 @@ class Engine:
         """Return `defines` and those macros of the engine that `cl_kernels/<stage>.cl` names."""
         # A macro that the text does not use changes nothing but the cache key: the same program would be built again.
         text = program.source_text(f"{stage}.cl")
-        optional = {"FACE": self.name_of(self.face), **self.domain_kind.defines}
+        optional = {"FACE": self.name_of(self.face), **dict.fromkeys(self.traits.macros, 1)}
         named = {name: value for name, value in optional.items() if name in text}
         return {"DIM": self.dim, "REAL": self.name_of(self.real), "GROUP_SIZE": self.group_size, **named, **defines}
 

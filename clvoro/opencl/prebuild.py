@@ -101,7 +101,7 @@ def build_ahead(engine: Engine) -> int:
 
 def kind_of(engine: Engine) -> str:
     """Return the kind of a run: dimension, precision and kind of domain."""
-    return " ".join([f"{engine.dim}D", engine.real.name, *engine.domain_kind.defines])
+    return " ".join([f"{engine.dim}D", engine.real.name, *engine.traits.macros])
 
 
 @cache

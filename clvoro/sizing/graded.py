@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import InputError, InputTypeError, MemoryLimitError
 from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
-from ..opencl.engine import WALLED_BOX, DomainKind, Engine
+from ..opencl.engine import PLAIN, Engine, Traits
 from ..opencl.host_memory import host_memory
 from .advice import coverage_warnings
 from .arguments import check_slope
@@ -283,11 +283,11 @@ def _check_resolution(resolution: int | Sequence[int], dim: int | None) -> int |
     return tuple(given.tolist()) if given.ndim else int(given)
 
 
-def default_engine(dim: int, kind: DomainKind = WALLED_BOX) -> Engine:
+def default_engine(dim: int, traits: Traits = PLAIN) -> Engine:
     """Return an engine in float64 on the default device."""
     import pyopencl as cl
 
     from ..opencl.devices import create_context
 
     ctx = create_context()
-    return Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64), kind)
+    return Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64), traits)

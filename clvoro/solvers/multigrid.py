@@ -107,7 +107,7 @@ class Multigrid:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._single = engine.single()
+        self._single = engine.replaced(real=np.dtype(np.float32))
         self._kernels = self._single.kernels("solvers/multigrid", {"SOURCE": "float"})
         self._aggregation = Aggregation(self._single)
         self._cycle = Cycle(self._single)

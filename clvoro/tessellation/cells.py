@@ -454,7 +454,7 @@ class Cells:
 
     def _enlarge(self, n: int) -> None:
         """Double the capacities, for a mesh of `n` cells."""
-        many = self.engine.group_size == 1 and not self.engine.domain_kind.polygonal
+        many = self.engine.group_size == 1 and not self.engine.traits.cut
         if self.row_capacity >= (LARGEST_ROW if many else LARGEST_ELSEWHERE):
             raise ClvoroError(
                 f"a cell has more than {self.row_capacity} faces, expected fewer; remove or perturb cocircular "

@@ -65,7 +65,7 @@ class Polyhedra:
             )
             self._team = TeamKernel(engine.queue.device, by_teams, "clip_polyhedra_by_teams")
         self._wrap = None
-        self._bounds = WeightBounds(engine) if engine.domain_kind.weighted else None
+        self._bounds = WeightBounds(engine) if engine.traits.site_values else None
         if self._bounds is None and engine.group_size == 1 and engine.real == np.float64:
             defines = {"STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine)}
             self._walks = engine.kernels("simd/walks", defines)

@@ -48,17 +48,19 @@ class TessellationStages:
         """What builds cells of this dimension, with weights if the engine has them."""
         if self.engine.cell_dim == 3:
             return Polyhedra(self.engine)
-        return (PowerCells if self.engine.domain_kind.weighted else Cells)(self.engine)
+        return (PowerCells if self.engine.traits.site_values else Cells)(self.engine)
 
     @cached_property
     def folded_cells(self) -> FoldedCells:
         """What builds the cells of a periodic box in 2D without its images."""
-        return (FoldedPowerCells if self.engine.domain_kind.weighted else FoldedCells)(self.engine)
+        return (FoldedPowerCells if self.engine.traits.site_values else FoldedCells)(self.engine)
 
     @cached_property
     def weighted(self) -> TessellationStages:
         """The stages for power diagrams; they share workspace and kernels with these."""
-        return TessellationStages(self.engine.weighted())
+        traits = self.engine.traits
+        traits = traits._replace(macros=(*traits.macros, "WEIGHTED"), site_values=1)
+        return TessellationStages(self.engine.replaced(traits=traits))
 
     def clear_folded_cells(self) -> None:
         """Free the buffers of `folded_cells`, if it exists; its kernels stay."""

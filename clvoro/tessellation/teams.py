@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyopencl as cl
 
 from ..errors import BuildError
-from ..opencl.engine import WALLED_BOX, Engine
+from ..opencl.engine import PLAIN, Engine
 from ..opencl.kernels import Kernels
 from ..opencl.program import on_nvidia
 from .bins import MAX_LEVELS
@@ -31,12 +31,12 @@ def has_warps(device: cl.Device) -> bool:
 
 def are_for(engine: Engine) -> bool:
     """Return whether teams update cells in 3D: without weights, on devices where they are faster."""
-    return not engine.domain_kind.weighted and are_faster(engine.queue.device)
+    return not engine.traits.site_values and are_faster(engine.queue.device)
 
 
 def are_for_new_cells(engine: Engine) -> bool:
     """Return whether teams also build cells from scratch: then the box must have walls on all sides."""
-    return engine.domain_kind == WALLED_BOX and FACE_CAPACITY == TEAM and are_for(engine)
+    return engine.traits == PLAIN and FACE_CAPACITY == TEAM and are_for(engine)
 
 
 def team_defines(warps: bool) -> dict[str, object]:

@@ -191,7 +191,7 @@ def shared(domain, points, h):
 
 
 def make_mesh(ctx, domain, points, real, fixed=0, h=H, free=None):
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.kind(np.dtype(real)))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.traits(np.dtype(real)))
     sizing = Sizing(engine, domain, as_field(h))
     on_device = engine.upload(domain.place(points, engine.real))
     return MeshState.create(Stages(engine), domain, sizing, on_device, free=free, fixed=fixed)

@@ -39,7 +39,7 @@ def unbalanced(left, right, pieces=False):
 
 
 def make_mesh(ctx, domain, points, fixed=0, real=np.float64):
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.kind(np.dtype(real)))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.traits(np.dtype(real)))
     on_device = engine.upload(domain.place(points, engine.real))
     sizing = Sizing(engine, domain, as_field(H))
     return MeshState.create(Stages(engine), domain, sizing, on_device, fixed=fixed)

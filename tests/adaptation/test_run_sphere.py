@@ -125,7 +125,7 @@ def test_checkpoint(ctx, quick, tmp_path):
 def test_obtuse_triangles_are_opened(ctx, real):
     """Random cells have many. The shortest move of the corners gives each its missing height, to first order."""
     points = EARTH.wrap(np.random.default_rng(8).normal(size=(500, 3)))
-    engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(real), EARTH.kind(np.dtype(real)))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(real), EARTH.traits(np.dtype(real)))
     on_device = engine.upload(EARTH.place(points, engine.real))
     field = sizing.Sizing(engine, EARTH, sizing.as_field(1e6))
     mesh = MeshState.create(Stages(engine), EARTH, field, on_device)

@@ -69,7 +69,7 @@ def test_pairs(ctx, real, half):
     domain = slit(half)
     rng = np.random.default_rng(7)
     x = (np.indices((10, 10)).reshape(2, -1).T + 0.5) / 10 + rng.uniform(-0.03, 0.03, (100, 2))
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.kind(np.dtype(real)))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.traits(np.dtype(real)))
     mesh = MeshState.create(
         Stages(engine), domain, Sizing(engine, domain, as_field(H)), engine.upload(domain.place(x, engine.real))
     )
@@ -104,7 +104,7 @@ def test_sides_of_unlike_size_have_no_pairs(ctx):
     """A row of cells has no image in a row with fewer cells."""
     x = (np.indices((10, 10)).reshape(2, -1).T + 0.5) / 10
     x[:, 1] += np.where(x[:, 0] < 0.5, 0.01, -0.01)
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(float), SLIT.kind(np.dtype(float)))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(float), SLIT.traits(np.dtype(float)))
     moved = []
     for ratio in (1.1, 1.2):
         size = as_field(clvoro.sizing.Expression(f"x < 0.5 ? {H} : {H * ratio}"))

@@ -104,7 +104,7 @@ def test_values(name):
 @pytest.mark.parametrize("name", list(FIELDS))
 def test_on_the_device(ctx, name, real):
     field, kind = FIELDS[name][0], np.dtype(real)
-    engine = Engine(ctx, cl.CommandQueue(ctx), 3, kind, EARTH.kind(kind))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 3, kind, EARTH.traits(kind))
     found = sizing.Sizing(engine, EARTH, field)(POINTS)
     # A longitude near 180 degrees may be rounded to the other side, where a raster has the same value.
     assert found == pytest.approx(on_domain(EARTH, field)(POINTS), rel=500 * float(np.finfo(kind).eps))

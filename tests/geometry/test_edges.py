@@ -21,7 +21,7 @@ def move(ctx, request):
     """Positions (n, 2) after a displacement, both in the device's coordinates."""
     queue = cl.CommandQueue(ctx)
     real = np.dtype(request.param)
-    engine = Engine(ctx, queue, 2, real, POLYGONS["square"]().kind(real))
+    engine = Engine(ctx, queue, 2, real, POLYGONS["square"]().traits(real))
     motion = Motion(engine)
 
     def moved(domain, points, way):

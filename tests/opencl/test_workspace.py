@@ -246,7 +246,10 @@ def test_kernels_are_not_shared_until_released(engine):
     assert first.scan_blocks is first.scan_blocks
     assert len(held) == 2
     engine.pool.release()
-    third, fourth = (engine.kernels("opencl/primitives"), engine.single().kernels("opencl/primitives"))
+    third, fourth = (
+        engine.kernels("opencl/primitives"),
+        engine.replaced(real=np.dtype(np.float32)).kernels("opencl/primitives"),
+    )
     assert third.scan_blocks.int_ptr in held
     assert fourth.scan_blocks.int_ptr not in held  # another program
     with pytest.raises(AttributeError, match="has no kernel nothing"):

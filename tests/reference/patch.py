@@ -29,7 +29,7 @@ BOXES = {
 def make_engine(ctx, real="float64", dim=2, group_size=None, box=BOX):
     """Return an engine for `box`; with `group_size` as on a GPU also where the device is a CPU."""
     real = np.dtype(real)
-    engine = Engine(ctx, cl.CommandQueue(ctx), dim, real, box.kind(real))
+    engine = Engine(ctx, cl.CommandQueue(ctx), dim, real, box.traits(real))
     if group_size is not None:
         object.__setattr__(engine, "group_size", group_size)
     return engine

@@ -19,7 +19,7 @@ import pyopencl as cl
 import clvoro
 from clvoro.opencl import prebuild
 from clvoro.opencl import program as _program
-from clvoro.opencl.engine import DomainKind, Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.cells import CELL_CAPACITY
 from clvoro.tessellation.cut_cells import FACE_CAPACITY
 from clvoro.tessellation.teams import TEAM, team_defines
@@ -131,7 +131,7 @@ def team_program(ctx: cl.Context, stage: str, dtype: str, warps: bool) -> Source
 def programs_of_a_first_run(ctx: cl.Context, dim: int, dtype: str) -> list[Source]:
     """Return the programs of a first run in a box on a GPU, as they are recorded for a CPU. Nothing is built."""
     with groups(128):
-        engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(dtype), DomainKind())
+        engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(dtype))
     recorded = prebuild._record()[f"{dim}D float64"]["programs"]
     sources = []
     for stage, defines in recorded:

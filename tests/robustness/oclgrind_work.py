@@ -509,14 +509,14 @@ def domain_of(engine: Engine) -> str:
 
     Engines for power diagrams have "weighted" before it.
     """
-    kind = engine.domain_kind
-    if kind.spherical:
+    macros = engine.traits.macros
+    if "SPHERE" in macros:
         name = "sphere"
     elif engine.dim == 3:
-        name = "periodic space" if kind.periodic else "space"
+        name = "periodic space" if "PERIODIC" in macros else "space"
     else:
-        name = "torus" if kind.periodic else "polygon" if kind.polygonal else "plane"
-    return f"weighted {name}" if kind.weighted else name
+        name = "torus" if "PERIODIC" in macros else "polygon" if "POLYGON" in macros else "plane"
+    return f"weighted {name}" if "WEIGHTED" in macros else name
 
 
 def name_domains() -> None:

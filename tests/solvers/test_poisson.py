@@ -155,7 +155,7 @@ def test_cells_with_several_faces():
     """Around a periodic box, or a hole, two cells may have more than one: all count, on both sides alike."""
     ctx = create_context()
     domain = Box((0, 0), (1, 1), periodic=(True, False))
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64), domain.kind(np.dtype(np.float64)))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64), domain.traits(np.dtype(np.float64)))
     points = np.array([[0.2, 0.5], [0.6, 0.5], [0.5, 0.9]])
     starts, neighbors = np.array([0, 4, 8, 10]), np.array([1, -3, 1, 2, 0, 2, 0, -3, 0, 1])
     measures = np.array([1.0, 1, 0.5, 0.1, 0.51, 0.2, 1.01, 1, 0.1, 0.2])

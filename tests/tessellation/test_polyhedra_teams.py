@@ -236,9 +236,9 @@ def test_devices_with_teams(platform, capability, expected):
 
 def test_domains_with_teams():
     """In boxes without weights they update cells, and with walls they also build them."""
-    context, kind_of = clvoro.create_context(), engine_module.DomainKind
+    context, traits_of = clvoro.create_context(), engine_module.Traits
     with by_teams(True):
-        for kind in (kind_of(), kind_of(periodic=True), kind_of(weighted=True)):
-            made = Engine(context, cl.CommandQueue(context), 3, np.dtype(np.float32), kind)
-            assert teams.are_for(made) == (not kind.weighted)
-            assert teams.are_for_new_cells(made) == (kind == engine_module.WALLED_BOX)
+        for traits in (traits_of(), traits_of(("PERIODIC",), (1.0, 1.0, 1.0)), traits_of(("WEIGHTED",), site_values=1)):
+            made = Engine(context, cl.CommandQueue(context), 3, np.dtype(np.float32), traits)
+            assert teams.are_for(made) == (not traits.site_values)
+            assert teams.are_for_new_cells(made) == (traits == engine_module.PLAIN)

@@ -25,7 +25,7 @@ PRECISIONS = ["float64", "float32"]
 
 def tessellate(ctx, points, real="float64"):
     """Return the tessellation on the device, and the order of its rows."""
-    engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(real), UNIT.kind(np.dtype(real)))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(real), UNIT.traits(np.dtype(real)))
     stages, n = Stages(engine), len(points)
     on_device = engine.upload(UNIT.place(points, engine.real))
     binned = stages.bins.build(UNIT, on_device, n)

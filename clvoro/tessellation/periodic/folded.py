@@ -16,7 +16,7 @@ class FoldedCells(Cells):
     searches = False
 
     def __init__(self, engine: Engine) -> None:
-        self._folds = {f"FOLD_{a}": engine.domain_kind.periods[a].hex() for a in range(2)}
+        self._folds = {f"FOLD_{a}": engine.traits.periods[a].hex() for a in range(2)}
         super().__init__(engine)
 
     @property

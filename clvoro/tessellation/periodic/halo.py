@@ -16,7 +16,7 @@ FINENESS = 2.0
 
 def halo_defines(engine: Engine) -> dict[str, object]:
     """Return the defines of kernels that take HALO_ARGS (see halo.h); empty for domains that are not periodic."""
-    if not engine.domain_kind.periodic:
+    if not engine.traits.periods:
         return {}
     return {"HALO": 1, "BLOCKS": BLOCKS[engine.dim]}
 

@@ -105,7 +105,7 @@ def test_gradient_in_a_polygon(ctx):
     # A piece that goes to another cell would make the energy not differentiable.
     assert all(piece.root == piece.home for piece in cells.pieces)
     real = np.dtype("float64")
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.kind(real))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.traits(real))
     placed = domain.place(points, real)
     t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
     q, h = rng.uniform(0.5, 1, n), rng.uniform(0.05, 0.2, n)
@@ -217,7 +217,7 @@ def test_gradient_of_short_edges(ctx, name):
     n, short = len(points), 1.1
     h = rng.uniform(0.1, 0.14, n)
     real = np.dtype("float64")
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.kind(real))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.traits(real))
     placed = domain.place(points, real)
     unit = domain.frame[1]
     t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)

@@ -283,7 +283,7 @@ def read(stages, domain, t):
 def stages(ctx, request):
     domain = POLYGONS["star"]()
     real = np.dtype(request.param)
-    return Stages(Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.kind(real)))
+    return Stages(Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.traits(real)))
 
 
 @pytest.mark.sparse(3)

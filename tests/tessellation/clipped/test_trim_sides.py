@@ -120,7 +120,7 @@ def test_missing_neighbors(ctx, real):
     """A cell at a straight wall lacks 2 neighbors, in a corner of 90 degrees 3.5, of 270 degrees 0.5."""
     for domain in (clvoro.Polygon(comb(2, 0.5, 0.3)), blunt_holes(), POLYGONS["islands"]()):
         dtype = np.dtype(real)
-        engine = Engine(ctx, cl.CommandQueue(ctx), 2, dtype, domain.kind(dtype))
+        engine = Engine(ctx, cl.CommandQueue(ctx), 2, dtype, domain.traits(dtype))
         points = scattered(domain, 90, 4)
         stages = Stages(engine)
         t = Tessellator(stages, domain).tessellate(engine.upload(domain.place(points, dtype)), len(points))

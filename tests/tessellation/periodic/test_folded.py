@@ -16,7 +16,7 @@ CHANNEL = clvoro.Box((3, -2), (5.5, -0.5), periodic=(True, False))
 
 def make_stages(ctx, box, real="float64", one_by_one=False):
     made = patch.make_engine(ctx, real)
-    engine = Engine(ctx, made.queue, 2, made.real, box.kind(made.real))
+    engine = Engine(ctx, made.queue, 2, made.real, box.traits(made.real))
     if one_by_one:
         object.__setattr__(engine, "group_size", 128)  # as on a GPU
     return Stages(engine)

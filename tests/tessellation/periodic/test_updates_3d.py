@@ -21,7 +21,9 @@ class Carried:
 
     def __init__(self, ctx, box, points, real="float64"):
         made = patch.make_engine(ctx, real)
-        self.stages, self.anew = (Stages(Engine(ctx, made.queue, 3, made.real, box.kind(made.real))) for _ in range(2))
+        self.stages, self.anew = (
+            Stages(Engine(ctx, made.queue, 3, made.real, box.traits(made.real))) for _ in range(2)
+        )
         self.box, self.n = box, len(points)
         self.periodic, self.fresh = (PeriodicTessellator(stages, box) for stages in (self.stages, self.anew))
         self.t = self.periodic.tessellate(self.place(points), self.n)
