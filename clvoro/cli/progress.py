@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, TextIO, TypeVar
+from typing import TextIO, TypeVar
 
 import numpy as np
 
@@ -56,21 +56,16 @@ class Progress:
         # For each step of the latter half of the time: seconds, completed share, and number of cells moved so far.
         self._past: deque[tuple[float, float, int]] = deque()
         self._shown, self._began = 0.0, time.monotonic()
-        self._status = _rich_status(self.stream)
-        self.live = self._status is not None or self.stream.isatty()
+        self.live = self.stream.isatty()
 
     def __enter__(self) -> Progress:
-        if self._status is not None:
-            self._status.start()
         self._change(f"{self.title}: preparing")
         if self.live:
             self._shown = time.monotonic() - REFRESH
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._status is not None:
-            self._status.stop()
-        elif self.live and self._shown:
+        if self.live and self._shown:
             self.stream.write("\r\x1b[K")
             self.stream.flush()
 
@@ -100,23 +95,15 @@ class Progress:
 
     def tell(self, text: str) -> None:
         """Write a permanent line above the changing one."""
-        if self._status is not None:
-            self._status.tell(text)
-            return
         self.stream.write(f"\r{text}\x1b[K\n" if self.live else f"{text}\n")
         self.stream.flush()
 
     def _change(self, text: str) -> None:
         """Replace the text of the changing line, if there is one."""
-        if self._status is not None:
-            self._status.update(text)
-        elif self.live:
-            self._replace(text)
-
-    def _replace(self, text: str) -> None:
-        columns = shutil.get_terminal_size().columns
-        self.stream.write(f"\r{text[: columns - 1]}\x1b[K")
-        self.stream.flush()
+        if self.live:
+            columns = shutil.get_terminal_size().columns
+            self.stream.write(f"\r{text[: columns - 1]}\x1b[K")
+            self.stream.flush()
 
     def line(self, row: np.void) -> str:
         """Return the text for `row`: step, errors, quality, cells per second, time left."""
@@ -141,42 +128,6 @@ class Progress:
     def _done(self, row: np.void) -> float:
         """Lower bound of the completed share of the work."""
         return max(float(row["progress"]), self.steps / self.max_steps if self.max_steps else 0.0)
-
-
-class _Status:
-    """A line drawn by rich, which fits the width of the terminal and tolerates other output."""
-
-    def __init__(self, stream: TextIO) -> None:
-        from rich.console import Console
-        from rich.live import Live
-        from rich.text import Text
-
-        self._text: Any = Text
-        console = Console(file=stream)
-        self._live = Live("", console=console, transient=True, auto_refresh=False)
-
-    def start(self) -> None:
-        self._live.start()
-
-    def stop(self) -> None:
-        self._live.stop()
-
-    def tell(self, text: str) -> None:
-        self._live.console.print(self._text(text))
-
-    def update(self, text: str) -> None:
-        line = self._text(text, no_wrap=True, overflow="ellipsis")
-        self._live.update(line, refresh=True)
-
-
-def _rich_status(stream: TextIO) -> _Status | None:
-    """Return a line of rich, on a terminal and with rich installed."""
-    if not stream.isatty():
-        return None
-    try:
-        return _Status(stream)
-    except ModuleNotFoundError:
-        return None
 
 
 def _short(number: float) -> str:

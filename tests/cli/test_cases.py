@@ -52,8 +52,8 @@ def test_airfoil_case_leaves_the_section_out_and_resolves_its_wake():
 def test_every_built_in_case_survives_being_written():
     for name in builtin_cases():
         read = load_case(name)
-        again = Case.from_toml(toml.write(read.table()), "case.toml")
-        assert again.table() == read.table()
+        again = Case.from_toml(toml.write(read.table), "case.toml")
+        assert again.table == read.table
 
 
 def test_kinds_of_size_fields(tmp_path):
@@ -151,8 +151,8 @@ def test_sizes_from_a_solution(tmp_path):
         ("size = 0.1\n[run]\nseed = 1.5", ["run.seed", "1.5", "whole"]),
         ("size = 0.1\n[run]\nstart = 'densty'", ["run.start", "did you mean 'density'"]),
         ("size = 0.1\n[run]\nmethod = 'lloyd'\nmethods = ['lloyd']", ["method and methods"]),
-        ("size = 0.1\n[run]\nmethods = ['lloyd', 'lloyd']", ["run.methods[1]", "'lloyd'", "each name once"]),
-        ("size = -0.1", ["size", "-0.1", "above 0"]),
+        ("size = 0.1\n[run]\nmethods = ['lloyd', 'lloyd']", ["run", "'lloyd'", "each name once"]),
+        ("size = -0.1", ["size", "-0.1", "a number > 0"]),
         ("size = nan", ["size", "finite"]),
         ("sise = 0.1", ["'sise'", "did you mean 'size'"]),
         ("seed = 3\nsize = 0.1", ["'seed'", "it belongs to [run]"]),
@@ -176,15 +176,15 @@ def test_sizes_from_a_solution(tmp_path):
         ),
         (
             "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='segment',a=[0],b=[1,1]}]",
-            ["size.shapes[0].a", "2 or 3 numbers"],
+            ["size.shapes[0].a", "a list of length >= 2"],
         ),
         ("[size]\nkind='graded'\nfield=1", ["size", "none of growth, slope"]),
-        ("[size]\nkind='graded'\nslope=1\nfield=-1", ["size.field", "above 0"]),
+        ("[size]\nkind='graded'\nslope=1\nfield=-1", ["size.field", "a number > 0"]),
         ("[size]\nkind='hessian'\nfile='u.npy'\neps=1\nn_cells=5", ["n_cells, eps"]),
-        ("[size]\nkind='quotient'\nfields=[1]", ["size.fields", "2 or more"]),
+        ("[size]\nkind='quotient'\nfields=[1]", ["size.fields", "length >= 2"]),
         (
             "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='sphere',center=[0,0],radius=1}]",
-            ["size.shapes[0].center", "3 numbers"],
+            ["size.shapes[0].center", "a list of length 3"],
         ),
         ("[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='surface'}]", ["lacks file"]),
         ("a b", ["not a TOML file", "line"]),
@@ -231,7 +231,7 @@ def test_written_case_carries_its_files(tmp_path):
     assert again.size_field()(start) == pytest.approx(0.125)
     assert np.array_equal(again.run_arguments()["points"], start)
     again.write(target)  # over itself
-    assert load_case(path).table() == again.table()
+    assert load_case(path).table == again.table
 
 
 def test_files_of_one_name_are_kept_apart(tmp_path):
@@ -277,11 +277,10 @@ def test_toml_is_read_as_it_was_written(table):
     assert toml.read(toml.write(table)) == table
 
 
-def test_toml_writes_numpy_and_leaves_out_none():
-    text = toml.write({"a": np.float64(0.1), "b": np.arange(3), "c": None}, ["note"])
-    assert toml.read(text) == {"a": 0.1, "b": [0, 1, 2]}
-    with pytest.raises(TypeError, match="no form"):
-        toml.write({"a": object()})
+def test_toml_is_written_with_lists_of_numbers_on_one_line():
+    text = toml.write({"a": [0.5, 1], "b": [[1, 2], [3, 4]], "c": [{"d": "x, y"}]}, ["note", "", "more"])
+    lists = "a = [0.5, 1]\nb = [\n    [1, 2],\n    [3, 4],\n]\n"
+    assert text == f'# note\n#\n# more\n\n{lists}c = [\n    {{ d = "x, y" }},\n]\n'
 
 
 def test_fixed_generators_are_positions_or_a_file(tmp_path):
@@ -293,5 +292,5 @@ def test_fixed_generators_are_positions_or_a_file(tmp_path):
     out.mkdir()
     for read in (inline, named, load_case(named.write(out))):
         assert np.array_equal(read.run_arguments()["fixed"], at)
-    with pytest.raises(InputError, match=r"run\.fixed.*a list of 1 or more points"):
+    with pytest.raises(InputError, match=r"run\.fixed.*a text in quotes or a list"):
         case(f"{size}fixed = 0.5")

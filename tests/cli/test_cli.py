@@ -435,8 +435,7 @@ def test_the_time_left_is_told_by_the_pace_of_the_latter_half():
     assert "1k cells/s" in lines[-1]
 
 
-def test_terminal_without_rich_gets_one_changing_line(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rich.console", None)
+def test_terminal_gets_one_changing_line(monkeypatch):
     monkeypatch.setattr(progress, "REFRESH", 0.0)
     stream = Terminal()
     with progress.Progress("x", 5, stream) as shown:
@@ -449,8 +448,7 @@ def test_terminal_without_rich_gets_one_changing_line(monkeypatch):
     assert text.count("\r") == 5
 
 
-def test_terminal_shows_how_many_kernels_are_built(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rich", None)
+def test_terminal_shows_how_many_kernels_are_built():
     stream = Terminal()
     with progress.Progress("x", 5, stream) as shown:
         shown.show_builds(3, 50)
@@ -460,22 +458,8 @@ def test_terminal_shows_how_many_kernels_are_built(monkeypatch):
     assert silent.getvalue() == ""
 
 
-def test_terminal_with_rich(monkeypatch):
-    pytest.importorskip("rich")
-    monkeypatch.setattr(progress, "REFRESH", 0.0)
-    stream = Terminal()
-    with progress.Progress("[x]", 5, stream) as shown:
-        shown(row(0, 0))
-        shown(row(1, 1))
-    assert "[x] 1/5" in stream.getvalue()
-
-
-@pytest.mark.parametrize("kind", ["log", "terminal", "rich"])
-def test_a_line_that_stays(monkeypatch, kind):
-    if kind == "rich":
-        pytest.importorskip("rich")
-    else:
-        monkeypatch.setitem(sys.modules, "rich.console", None)
+@pytest.mark.parametrize("kind", ["log", "terminal"])
+def test_a_line_that_stays(kind):
     stream = io.StringIO() if kind == "log" else Terminal()
     with progress.Progress("x", 5, stream) as shown:
         shown.tell("takes [1] MiB")

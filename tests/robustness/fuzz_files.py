@@ -11,8 +11,7 @@ import numpy as np
 import clvoro
 from clvoro.adaptation.resume import Saved
 from clvoro.cli.cases import load_case
-from clvoro.cli.cases.domains import build_domain
-from clvoro.cli.cases.fields import load_array
+from clvoro.cli.cases.schema import PolygonTable, load_array
 from clvoro.io.vtu_read import load_vtu
 from clvoro.sizing import Surface
 
@@ -108,7 +107,7 @@ def read(path: Path) -> object:
     if path.suffix == ".geojson":
         return clvoro.Polygon.from_geojson(path)
     if path.suffix == ".wkt":
-        return build_domain({"kind": "polygon", "file": path.name}, path.parent)
+        return PolygonTable(file=path.name).build(path.parent)
     if path.suffix in (".stl", ".obj", ".off", ".ply"):
         surface = Surface.read(path)
         with np.errstate(all="ignore"):

@@ -19,7 +19,7 @@ import pytest
 import clvoro
 from clvoro.adaptation.resume import Saved
 from clvoro.cli.cases import load_case, toml
-from clvoro.cli.cases.fields import load_array
+from clvoro.cli.cases.schema import load_array
 from clvoro.errors import InputError
 from clvoro.files import read_text
 from clvoro.geometry import rings

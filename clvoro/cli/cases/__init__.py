@@ -5,43 +5,24 @@ from __future__ import annotations
 import copy
 import difflib
 import shutil
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from ...adaptation.options import uses
 from ...errors import InputError
 from ...files import open_plain, read_text
 from ...geometry.boundary_layers import Layers
 from ...geometry.domain import Domain
-from ...geometry.sphere import Sphere
 from ...io.atomic import atomic_file
 from . import schema, toml
 from .checks import file_name
-from .domains import build_domain
-from .fields import build_size, load_array, named_files
 from .files import FOLDER, WRITTEN, locate
 
 __all__ = ["WRITTEN", "Case", "builtin_cases", "load_case"]
-
-_RUN_ORDER = (
-    "method",
-    "methods",
-    "effort",
-    "levels",
-    "error_target",
-    "start",
-    "points",
-    "fixed",
-    "n_cells",
-    "max_steps",
-    "tol",
-    "alpha",
-    "k",
-    "seed",
-    "dtype",
-)
 
 
 @dataclass(frozen=True)
@@ -50,31 +31,16 @@ class Case:
 
     Attributes
     ----------
-    name, title : str
+    table : dict
+        What the file holds, by the tables and keys of `schema.CaseTable`, with a name and a title.
     domain : Domain
-    size : dict
-        The size field's tree of tables; `size_field` builds it.
-    run : dict
-        The keys of the file's `[run]` table.
     folder : Path
         Folder of the files that the case names; those of the built-in cases are found, too.
-    place : dict
-        The keys of the file's `[domain]` table; empty for a box or a sphere made in Python.
-    layers : tuple of dict
-        The tables of the file's `[[layers]]`.
-    frames : int
-        Number of meshes that follow a moving size field, the first included; see `clvoro.cli.sequence`.
     """
 
-    name: str
-    title: str
+    table: dict[str, Any]
     domain: Domain
-    size: dict[str, Any]
-    run: dict[str, Any] = field(default_factory=dict)
     folder: Path = Path()
-    place: dict[str, Any] = field(default_factory=dict)
-    frames: int = 1
-    layers: tuple[dict[str, Any], ...] = ()
 
     @classmethod
     def from_toml(cls, text: str, name: str, folder: Path = Path()) -> Case:
@@ -87,30 +53,36 @@ class Case:
         """
         place = f"{name}:"
         try:
-            content = toml.read(text)
+            checked = schema.check_case(toml.read(text), place)
+        except InputError:
+            raise
         except ValueError as error:
             raise InputError(f"{place} not a TOML file: {error}") from error
         except RecursionError as error:
             raise InputError(f"{place} not a case: it is nested too deep") from error
-        try:
-            checked = schema.case(content, place)
-        except (OverflowError, RecursionError) as error:
-            raise InputError(f"{place} not a case: a number is too large or the nesting too deep ({error})") from error
-        run = checked.get("run", {})
-        if "method" in run and "methods" in run:
-            raise InputError(f"{place} run has both method and methods; keep one of them")
-        stem = file_name(checked.get("name", Path(name).stem), f"{place} name")
-        return cls(
-            name=stem,
-            title=str(checked.get("title", stem)),
-            domain=build_domain(checked["domain"], folder),
-            size=checked["size"],
-            run=run,
-            folder=folder,
-            place=checked["domain"],
-            frames=checked.get("sequence", {}).get("frames", 1),
-            layers=tuple(checked.get("layers", ())),
-        )
+        checked.name = file_name(Path(name).stem if checked.name is None else checked.name, f"{place} name")
+        checked.title = checked.title or checked.name
+        return cls(msgspec.to_builtins(checked), checked.domain.build(folder), folder)
+
+    @property
+    def name(self) -> str:
+        """Name of the case, and of its output folder."""
+        return self.table["name"]
+
+    @property
+    def title(self) -> str:
+        """Title of reports."""
+        return self.table["title"]
+
+    @property
+    def run(self) -> dict[str, Any]:
+        """The keys of the file's `[run]` table."""
+        return self.table.get("run", {})
+
+    @property
+    def frames(self) -> int:
+        """Number of meshes that follow a moving size field, the first included; see `clvoro.cli.sequence`."""
+        return self.table.get("sequence", {}).get("frames", 1)
 
     @property
     def methods(self) -> tuple[str | None, ...]:
@@ -129,11 +101,13 @@ class Case:
             unused = {key for key in self.run if not any(uses(method, key) for method in methods)}
             dropped = {"method", "methods", *unused}
         run = {key: value for key, value in self.run.items() if key not in dropped}
-        return replace(self, run=schema.run({**run, **changes}, f"{self.name}: run"))
+        checked = schema.check_run({**run, **changes}, f"{self.name}: run")
+        return replace(self, table={**self.table, "run": msgspec.to_builtins(checked)})
 
     def size_field(self, time: float = 0.0) -> Any:
         """Build the size field (an object of `clvoro.sizing`), with `time` for {t} in expressions."""
-        return build_size(_at(self.size, time), self.folder, self.domain)
+        size = msgspec.convert(_at(self.table["size"], time), schema.Size)
+        return schema.build_size(size, self.folder, self.domain)
 
     def run_arguments(self) -> dict[str, Any]:
         """Return the arguments of `Adapter.run` that the case sets, except method and dtype."""
@@ -141,39 +115,20 @@ class Case:
         arguments = {key: value for key, value in self.run.items() if key not in apart}
         for key in ("points", "fixed"):
             if isinstance(arguments.get(key), str):
-                arguments[key] = load_array(self.folder / arguments[key], f"run.{key}")
-        if self.layers:
-            arguments["layers"] = [Layers(**table) for table in self.layers]
+                arguments[key] = schema.load_array(self.folder / arguments[key], f"run.{key}")
+        if "layers" in self.table:
+            arguments["layers"] = [Layers(**layers) for layers in self.table["layers"]]
         return arguments
-
-    def table(self) -> dict[str, Any]:
-        """Return the case as the table that its TOML file holds."""
-        return {
-            "name": self.name,
-            "title": self.title,
-            "domain": self.place or _place(self.domain),
-            "size": self.size,
-            "run": {key: self.run[key] for key in _RUN_ORDER if key in self.run},
-            **({"layers": list(self.layers)} if self.layers else {}),
-            **({"sequence": {"frames": self.frames}} if self.frames > 1 else {}),
-        }
 
     def sources(self) -> list[Path]:
         """Return the paths of the files that the case names."""
-        return [locate(self.folder, node[key]).resolve() for node, key in self._entries()]
+        return [locate(self.folder, node[key]).resolve() for node, key in _files(self.table)]
 
-    def _entries(self) -> list[tuple[dict[str, Any], str]]:
-        """Return the tables of the case that name files, and the keys with the names."""
-        entries = [(node, "file") for node in named_files(self.size)]
-        entries += [(self.place, "file")] * ("file" in self.place)
-        entries += [(self.run, k) for k in ("points", "fixed") if isinstance(self.run.get(k), str)]
-        return entries
-
-    def _moved(self) -> tuple[Case, dict[str, Path]]:
-        """Return the case with all its files in one folder, and their present paths: {name: source}."""
-        moved = replace(self, size=copy.deepcopy(self.size), run=dict(self.run), place=dict(self.place))
+    def _moved(self) -> tuple[dict[str, Any], dict[str, Path]]:
+        """Return the case's table with all its files in one folder, and their present paths: {name: source}."""
+        moved = copy.deepcopy(self.table)
         taken: dict[str, Path] = {}
-        for (node, key), source in zip(moved._entries(), self.sources(), strict=True):
+        for (node, key), source in zip(_files(moved), self.sources(), strict=True):
             target = source.name
             while WRITTEN.fullmatch(target) or taken.setdefault(target, source) != source:
                 target = f"other-{target}"
@@ -182,7 +137,7 @@ class Case:
 
     def text(self, header: tuple[str, ...] = ()) -> str:
         """Return the text of `case.toml`."""
-        return toml.write(self._moved()[0].table(), header)
+        return toml.write(self._moved()[0], header)
 
     def write(self, folder: Path, header: tuple[str, ...] = ()) -> Path:
         """Write `case.toml` into `folder`, with copies of the files that it names; return its path.
@@ -199,12 +154,13 @@ class Case:
         return path
 
 
-def _place(domain: Domain) -> dict[str, Any]:
-    """Return the table of a box or a sphere."""
-    if isinstance(domain, Sphere):
-        return {"kind": "sphere", "radius": domain.radius}
-    table: dict[str, Any] = {"lower": list(domain.lower), "upper": list(domain.upper)}
-    return {**table, "periodic": list(domain.periodic)} if any(domain.periodic) else table
+def _files(node: Any) -> Iterator[tuple[dict[str, Any], str]]:
+    """Iterate over the tables of a case that name files, and the keys with the names."""
+    for item in node.values() if isinstance(node, dict) else node:
+        if isinstance(item, (dict, list)):
+            yield from _files(item)
+    if isinstance(node, dict):
+        yield from ((node, key) for key in ("file", "points", "fixed") if isinstance(node.get(key), str))
 
 
 def _at(node: Any, time: float) -> Any:

@@ -1,221 +1,163 @@
-"""Checks of values and tables of a case file; errors name the key, and the nearest known one."""
+"""Check the tables of a case file against their types; errors name the key, the value, and the nearest known name."""
 
 from __future__ import annotations
 
 import difflib
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PureWindowsPath
-from typing import Any
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import inspect
 
 from ...errors import InputError
 
-Check = Callable[[object, str], Any]
-"""Takes a value and its place in the file; returns it in its final type or raises InputError."""
+T = TypeVar("T")
 
 _LONGEST_NAME = 200  # bytes: file systems allow 255, and some files get a further suffix
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+_MESSAGE = re.compile(r"(?P<text>.*?)(?: - at `\$(?P<path>.*)`)?", re.DOTALL)
+_WORDS = {
+    "object": "a table",
+    "array": "a list",
+    "int": "a whole number",
+    "float": "a number",
+    "str": "a text in quotes",
+    "bool": "true or false",
+}
+"""The types of values, as the author of a case file calls them."""
 
 
-class UnknownKeyError(InputError):
-    """A table has a key that it does not take; `place` names the table, `known` are the keys that it takes."""
+def check(kind: type[T], content: object, place: str, homes: Mapping[str, Iterable[str]]) -> T:
+    """Return `content` as an instance of `kind`.
 
-    def __init__(self, place: str, key: object, known: Iterable[str], hint: str = "") -> None:
-        self.place, self.key, self.known = place, key, list(known)
-        hint = hint or _nearest(key, self.known)
-        super().__init__(f"{place} has the unknown key {key!r}{hint}; it takes {_join(self.known)}")
+    Parameters
+    ----------
+    kind : type
+        A `msgspec.Struct` of `schema`.
+    content : object
+        Tables, lists and values as TOML has them.
+    place : str
+        Name of `content` in errors: ``"case.toml:"`` or ``"name: run"``.
+    homes : mapping
+        Keys by the names of the tables that take them, for hints.
 
-
-def refuse(place: str, got: object, expected: str) -> InputError:
-    """Return the error for one value."""
-    return InputError(f"{place} is {got!r}, expected {expected}")
-
-
-def text(value: object, place: str) -> str:
-    """Check for a string that is not empty."""
-    if not isinstance(value, str) or not value.strip():
-        raise refuse(place, value, "a text in quotes")
-    return value
-
-
-def file_name(value: object, place: str) -> str:
-    """Check for a name that is valid for a file or folder, without a path, on any system."""
-    name = text(value, place)
-    alone = PureWindowsPath(name).name == name != ".."  # Windows paths know all separators and drives
-    spelt = name.encode("utf-8", "replace")  # with a ? for invalid characters
-    if not alone or len(spelt) > _LONGEST_NAME or _CONTROL.search(name) or spelt.decode() != name:
-        raise refuse(
-            place,
-            name[: _LONGEST_NAME + 1],
-            "a name in UTF-8 without slashes, no '.' or '..' (results go to out/NAME; "
-            "--out chooses another folder); the case may give one: name = ...",
-        )
-    return name
-
-
-def number(value: object, place: str) -> float:
-    """Check for a finite number."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise refuse(place, value, "a finite number")
-    return float(value)
-
-
-def positive(value: object, place: str) -> float:
-    """Check for a number above zero."""
-    checked = number(value, place)
-    if checked <= 0:
-        raise refuse(place, value, "a number above 0")
-    return checked
-
-
-def not_negative(value: object, place: str) -> float:
-    """Check for a number that is zero or more."""
-    checked = number(value, place)
-    if checked < 0:
-        raise refuse(place, value, "a number >= 0")
-    return checked
-
-
-def true_or_false(value: object, place: str) -> bool:
-    """Check for a truth value."""
-    if not isinstance(value, bool):
-        raise refuse(place, value, "true or false")
-    return value
-
-
-def whole(least: int) -> Check:
-    """Return the check for a whole number of at least `least`."""
-
-    def check(value: object, place: str) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise refuse(place, value, f"a whole number, {least} or more")
-        return value
-
-    return check
-
-
-def auto_or_whole(value: object, place: str) -> str | int:
-    """Check that a value is "auto" or a whole number."""
-    if value == "auto":
-        return "auto"
+    Raises
+    ------
+    InputError
+        With the first key that is wrong, its value and what was expected.
+    """
+    _require_finite(content, place)
     try:
-        return whole(0)(value, place)
-    except InputError:
-        raise refuse(place, value, "a whole number, 0 or more, or 'auto'") from None
+        return msgspec.convert(content, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(_explain(str(error), kind, content, place, homes)) from None
 
 
-def one_of(*names: str) -> Check:
-    """Return the check for one of a few words."""
-
-    def check(value: object, place: str) -> str:
-        if value not in names:
-            raise InputError(f"{place} is {value!r}{_nearest(value, names)}; expected one of {_join(names)}")
-        return str(value)
-
-    return check
-
-
-def vector(*lengths: int) -> Check:
-    """Return the check for a list of numbers of one of these lengths."""
-
-    def check(value: object, place: str) -> list[float]:
-        if not isinstance(value, (list, tuple)) or len(value) not in lengths:
-            raise refuse(place, value, f"a list of {' or '.join(map(str, lengths))} numbers")
-        return [number(v, f"{place}[{i}]") for i, v in enumerate(value)]
-
-    return check
+def file_name(value: str, place: str) -> str:
+    """Check for a name that is valid for a file or folder, without a path, on any system."""
+    alone = PureWindowsPath(value).name == value != ".."  # Windows paths know all separators and drives
+    spelt = value.encode("utf-8", "replace")  # with a ? for invalid characters
+    if (
+        not value.strip()
+        or not alone
+        or len(spelt) > _LONGEST_NAME
+        or _CONTROL.search(value)
+        or spelt.decode() != value
+    ):
+        raise InputError(
+            f"{place} is {value[: _LONGEST_NAME + 1]!r}, expected a name in UTF-8 without slashes, no '.' or '..' "
+            "(results go to out/NAME; --out chooses another folder); the case may give one: name = ..."
+        )
+    return value
 
 
-def vectors(least: int) -> Check:
-    """Return the check for a list of at least `least` points."""
-
-    def check(value: object, place: str) -> list[list[float]]:
-        if not isinstance(value, (list, tuple)) or len(value) < least:
-            raise refuse(place, value, f"a list of {least} or more points, [x, y] each")
-        return [vector(2, 3)(v, f"{place}[{i}]") for i, v in enumerate(value)]
-
-    return check
-
-
-def list_of(check_item: Check, least: int = 1) -> Check:
-    """Return the check for a list, every item of which passes `check_item`."""
-
-    def check(value: object, place: str) -> list[object]:
-        if not isinstance(value, (list, tuple)) or len(value) < least:
-            single = isinstance(value, Mapping) and least == 1
-            hint = "; put it in [ ], or under a heading in double brackets" if single else ""
-            raise refuse(place, value, f"a list with {least} or more entries{hint}")
-        return [check_item(v, f"{place}[{i}]") for i, v in enumerate(value)]
-
-    return check
+def _require_finite(node: object, place: str) -> None:
+    """Reject numbers that are not finite. They would pass bounds, and integers may be beyond any float."""
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            _require_finite(value, _below(place, str(key)))
+    elif isinstance(node, (list, tuple)):
+        for i, value in enumerate(node):
+            _require_finite(value, f"{place}[{i}]")
+    elif isinstance(node, (int, float)) and not (abs(node) < 2**63 if isinstance(node, int) else math.isfinite(node)):
+        raise InputError(f"{place} is {node!r:.60}, expected a finite number")
 
 
-def names_of(*allowed: str) -> Check:
-    """Return the check for a list of some of the names `allowed`, each of them once."""
-    listed = list_of(one_of(*allowed))
+def _explain(message: str, kind: Any, content: object, place: str, homes: Mapping[str, Iterable[str]]) -> str:
+    """Return the message of an error: the place in the file, what is there, what was expected, and what may help."""
+    found = _MESSAGE.fullmatch(message)
+    assert found is not None
+    text, path = found["text"], found["path"] or ""
+    where, got, keys = place, content, []
+    for key, index in re.findall(r"\.([^.\[]+)|\[(\d+)\]", path.split("[...]")[0]):
+        keys.append(int(index) if index else key)
+        got = got[keys[-1]] if index or key in got else None  # type: ignore[index, operator]
+        where = f"{where}[{index}]" if index else _below(where, key)
+    name = "".join(re.findall(r"`(.*)`", text)[:1])
+    tables, others = _types_at(inspect.type_info(kind), content, keys)
+    if text.startswith("Object"):
+        known = [f.encode_name for table in _chosen(tables, got) for f in table.fields]
+        takes = f"it takes {', '.join(known or ['kind'])}"
+        if "missing" in text:
+            return f"{where} lacks {name}; {takes}"
+        kinds = [repr(t.tag) for t in tables if any(name == f.encode_name for f in t.fields)]
+        hint = next(
+            (f" (it belongs to {home})" for home, taken in homes.items() if name in taken), _nearest(name, known)
+        )
+        hint = f" (it is for kind = {' or '.join(kinds)})" if kinds else hint
+        return f"{where} has the unknown key {name!r}{hint}; {takes}"
+    if text.startswith("Invalid"):  # a word that is none of several
+        if tables and keys[-1] == "kind":
+            known = [str(table.tag) for table in tables]
+        else:
+            known = [str(word) for k in others if isinstance(k, inspect.LiteralType) for word in k.values]
+            names = [type(k).__name__.removesuffix("Type").lower() for k in others]
+            known += [_WORDS[name] for name in names if name in _WORDS]
+        return f"{where} is {got!r:.60}{_nearest(got, known)}; expected one of {', '.join(known)}"
+    if not text.startswith("Expected"):  # an error of a table as a whole
+        return f"{where} {text}"
+    expected = text.partition(", got")[0].removeprefix("Expected ").replace(" | null", "").replace(" | ", "` or `")
+    expected = re.sub("`([a-z]+)`", lambda word: _WORDS.get(word[1], word[0]), expected)
+    if "[...]" in path:  # it does not say which
+        got_type = re.sub("`([a-z]+)`.*", lambda word: _WORDS.get(word[1], word[0]), text.partition(", got ")[2])
+        return f"{where} has a value that is {got_type}, expected {expected}"
+    hint = ""
+    if "a table" not in expected and isinstance(got, Mapping):
+        hint = "; put it in [ ], or under a heading in double brackets"
+    return f"{where} is {got!r:.200}, expected {expected}{hint}"
 
-    def check(value: object, place: str) -> list[object]:
-        names = listed(value, place)
-        for i, name in enumerate(names):
-            if name in names[:i]:
-                raise refuse(f"{place}[{i}]", name, "each name once")
-        return names
 
-    return check
+def _types_at(
+    kind: inspect.Type, node: Any, keys: Sequence[str | int]
+) -> tuple[list[inspect.StructType], list[inspect.Type]]:
+    """Return the tables and the other types that the value at `keys` below `node` may be.
 
-
-@dataclass(frozen=True)
-class Table:
-    """The keys of a table: required ones, optional ones, and a group of which exactly one is required."""
-
-    required: Mapping[str, Check]
-    optional: Mapping[str, Check]
-    choice: tuple[str, ...] = ()
-
-    def __call__(self, value: object, place: str) -> dict[str, Any]:
-        """Return the checked table, its keys in the file's order."""
-        if not isinstance(value, Mapping):
-            raise refuse(place, value, "a table")
-        checks = {**self.required, **self.optional}
-        for key in value:
-            if key not in checks:
-                raise UnknownKeyError(place, key, checks)
-        missing = [key for key in self.required if key not in value]
-        if missing:
-            raise InputError(f"{place} lacks {_join(missing)}; it takes {_join(checks)}")
-        if self.choice and sum(key in value for key in self.choice) != 1:
-            raise InputError(
-                f"{place} has {_join([k for k in self.choice if k in value]) or 'none'} of "
-                f"{_join(self.choice)}, expected exactly one of them"
-            )
-        return {key: checks[key](item, _below(place, key)) for key, item in value.items()}
+    A key `kind` that chooses the type of its table has the types of that table.
+    """
+    kinds = [k.type if isinstance(k, inspect.Metadata) else k for k in getattr(kind, "types", (kind,))]
+    tables = [k for k in kinds if isinstance(k, inspect.StructType)]
+    if keys and isinstance(keys[0], str):
+        inner = [f.type for table in _chosen(tables, node) for f in table.fields if f.encode_name == keys[0]]
+    elif keys:
+        inner = [k.item_type for k in kinds if isinstance(k, inspect.ListType)]
+    else:
+        inner = []
+    if not inner:
+        return tables, [k for k in kinds if k not in tables]
+    return _types_at(inner[0], node[keys[0]], keys[1:])
 
 
-@dataclass(frozen=True)
-class Kinds:
-    """A table whose key `kind` says which other keys it has."""
-
-    tables: Mapping[str, Table]
-    default: str | None = None
-
-    def __call__(self, value: object, place: str) -> dict[str, Any]:
-        """Return the checked table with its kind first."""
-        if not isinstance(value, Mapping):
-            raise refuse(place, value, "a table")
-        kind = one_of(*self.tables)(value.get("kind", self.default), _below(place, "kind"))
-        rest = {key: item for key, item in value.items() if key != "kind"}
-        return {"kind": kind, **self.tables[str(kind)](rest, place)}
+def _chosen(tables: list[inspect.StructType], node: Any) -> list[inspect.StructType]:
+    """Return the table that the key `kind` of `node` names, or the only one."""
+    return tables if len(tables) < 2 else [table for table in tables if table.tag == node.get("kind")]
 
 
 def _below(place: str, key: str) -> str:
     """Name a key of the table at `place`; the file itself is the place "case.toml:"."""
     return f"{place} {key}" if place.endswith(":") else f"{place}.{key}"
-
-
-def _join(names: Iterable[object]) -> str:
-    return ", ".join(map(str, names))
 
 
 def _nearest(name: object, known: Iterable[str]) -> str:

@@ -1,284 +1,566 @@
-"""The tables and keys of a case file."""
+"""The tables of a case file: their keys, the values that these take, and what a run makes of them.
+
+Each table is a `msgspec.Struct`. A table of several kinds is a union of classes with the key `kind` as their tag.
+`build` returns the object that a table describes: a shape, a size field or a domain. `folder` is that of the files that
+the table names; `domain` is what sizes are for, and the default extent of rasters.
+"""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
-from typing import Any
+import functools
+import operator
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from ...adaptation.options import METHODS
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from ... import earth, sizing
+from ...adaptation.options import EffortName, MethodName, Start
+from ...earth.sizes import DEGREES
 from ...errors import InputError
-from .checks import (
-    Check,
-    Kinds,
-    Table,
-    UnknownKeyError,
-    auto_or_whole,
-    file_name,
-    list_of,
-    names_of,
-    not_negative,
-    number,
-    one_of,
-    positive,
-    refuse,
-    text,
-    true_or_false,
-    vector,
-    vectors,
-    whole,
-)
+from ...files import LONGEST_GEOMETRY, read_text
+from ...geometry.box import Box
+from ...geometry.curves import Curve
+from ...geometry.domain import Domain
+from ...geometry.polygon import Polygon
+from ...geometry.sphere import Sphere
+from ...io.arrays import read_array
+from . import checks
+from .files import locate
+from .grids import read_grid
+
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=1)]
+Natural = Annotated[int, Meta(ge=0)]
+Text = Annotated[str, Meta(min_length=1)]
+Plane = tuple[float, float]
+Space = tuple[float, float, float]
+Point = Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
+Walls = int | str | Annotated[list[int | str], Meta(min_length=1)]
+"""Edges or sides: a number, a name, or a list of them."""
 
 
-def walls(value: object, place: str) -> Any:
-    """Check a selection of edges or sides: a number, a name, or a list of them."""
-    items = value if isinstance(value, list) else [value]
-    if not items or not all(isinstance(v, str | int) and not isinstance(v, bool) for v in items):
-        raise refuse(place, value, "the number or name of an edge or side, or a list of them")
-    return value
+class Table(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """A table. Keys with the value None are not given."""
 
+    CHOICE: ClassVar[tuple[str, ...]] = ()
+    """Keys of which exactly one is required."""
 
-def names(value: object, place: str) -> dict[str, Any]:
-    """Check names of boundaries with their edges or sides."""
-    if not isinstance(value, Mapping):
-        raise refuse(place, value, "a table of names, such as {inlet = 0, island = [4, 5, 6]}")
-    return {name: walls(chosen, f"{place}.{name}") for name, chosen in value.items()}
-
-
-_OF_CURVE: dict[str, Check] = {"name": text, "tolerance": positive}
-_CURVES = {
-    "arc": Table({"center": vector(2), "radius": positive, "start": number, "end": number}, {**_OF_CURVE}),
-    "ellipse": Table(
-        {"center": vector(2), "semi_axes": vector(2)}, {"angle": number, "start": number, "end": number, **_OF_CURVE}
-    ),
-    "naca": Table(
-        {"code": text},
-        {
-            "chord": positive,
-            "leading_edge": vector(2),
-            "angle_of_attack": number,
-            "trailing_edge": one_of("closed", "blunt"),
-            **_OF_CURVE,
-        },
-    ),
-    "spline": Table(
-        {"points": list_of(vector(2), 2)}, {"closed": true_or_false, "corners": list_of(whole(0), 0), **_OF_CURVE}
-    ),
-}
-"""The curves of `clvoro.curves`, except circles."""
-
-SHAPE = Kinds(
-    {
-        "circle": Table({"center": vector(2, 3), "radius": not_negative}, {}),
-        "sphere": Table({"center": vector(3), "radius": not_negative}, {}),
-        "box": Table({}, {"lower": vector(2, 3), "upper": vector(2, 3)}),
-        "boundary": Table({}, {"edges": walls}),
-        "surface": Table({"file": text}, {"closed": true_or_false, "join": positive}),
-        "segment": Table({"a": vector(2, 3), "b": vector(2, 3)}, {}),
-        "polyline": Table({"points": vectors(2)}, {}),
-        "closed_polyline": Table({"points": vectors(3)}, {}),
-        **_CURVES,
-    }
-)
-"""A shape that sizes are measured from."""
-
-
-def size(value: object, place: str) -> dict[str, Any]:
-    """Check a size field: a number, or a tree of tables."""
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return {"kind": "constant", "value": positive(value, place)}
-    return _SIZE(value, place)
-
-
-# Extent and layout of an array in a file.
-_COVERED: dict[str, Check] = {
-    "lower": vector(2, 3),
-    "upper": vector(2, 3),
-    "at": one_of("nodes", "centers"),
-    "missing": one_of("error", "nearest"),
-}
-
-_SIZE = Kinds(
-    {
-        "constant": Table({"value": positive}, {}),
-        "caps": Table(
-            {
-                "regions": list_of(Table({"center": vector(2), "radius": not_negative, "size": positive}, {})),
-                "h_max": positive,
-            },
-            {"growth": positive, "slope": positive},
-            choice=("growth", "slope"),
-        ),
-        "distance": Table(
-            {"shapes": list_of(SHAPE), "h_min": positive},
-            {"growth": positive, "slope": positive, "h_max": positive},
-            choice=("growth", "slope"),
-        ),
-        "expression": Table({"expression": text}, {}),
-        "raster": Table({"file": text}, {**_COVERED, "variable": text, "outside": one_of("nearest", "error")}),
-        "hessian": Table(
-            {"file": text},
-            {**_COVERED, "n_cells": positive, "eps": positive, "p": positive, "h_min": not_negative, "h_max": positive},
-            choice=("n_cells", "eps"),
-        ),
-        "gradient": Table(
-            {"file": text},
-            {**_COVERED, "n_cells": positive, "eps": positive, "h_min": not_negative, "h_max": positive},
-            choice=("n_cells", "eps"),
-        ),
-        "feature": Table(
-            {},
-            {
-                "cells_across": positive,
-                "growth": positive,
-                "h_min": positive,
-                "h_max": positive,
-                "curvature": not_negative,
-            },
-        ),
-        "graded": Table(
-            {"field": size}, {"growth": positive, "slope": positive, "resolution": whole(2)}, choice=("growth", "slope")
-        ),
-        "min": Table({"fields": list_of(size)}, {}),
-        "max": Table({"fields": list_of(size)}, {}),
-        "sum": Table({"fields": list_of(size)}, {}),
-        "product": Table({"fields": list_of(size)}, {}),
-        "quotient": Table({"fields": list_of(size, 2)}, {}),
-        "scale": Table({"factor": positive, "field": size}, {}),
-    }
-)
-
-_CURVE = Kinds({"circle": Table({"center": vector(2), "radius": positive}, {**_OF_CURVE}), **_CURVES})
-
-
-def ring(value: object, place: str) -> Any:
-    """Check and return a ring: a closed curve, or a list of points and curves."""
-    if isinstance(value, Mapping):
-        return _CURVE(value, place)
-    items = value if isinstance(value, (list, tuple)) else []
-    if len(items) < 3 and not any(isinstance(item, Mapping) for item in items):
-        raise refuse(place, value, "a list of 3 or more points, [x, y] each, or a curve")
-    return [(_CURVE if isinstance(item, Mapping) else vector(2))(item, f"{place}[{i}]") for i, item in enumerate(items)]
-
-
-def directions(value: object, place: str) -> bool | list[bool]:
-    """Check a truth value, or one for each direction."""
-    if isinstance(value, bool):
-        return value
-    if not isinstance(value, list) or not all(isinstance(v, bool) for v in value):
-        raise refuse(place, value, "true, false or one of them for each direction")
-    return value
-
-
-_DOMAINS = Kinds(
-    {
-        "box": Table({"lower": vector(2, 3), "upper": vector(2, 3)}, {"periodic": directions, "names": names}),
-        "polygon": Table(
-            {},
-            {"file": text, "outer": ring, "holes": list_of(ring), "names": names, "simplified": positive},
-            choice=("file", "outer"),
-        ),
-        "sphere": Table({}, {"radius": positive}),
-    },
-    default="box",
-)
-
-
-def domain(value: object, place: str) -> dict[str, Any]:
-    """Check a domain: a box by its corners, a polygon by a file or its rings, a sphere by its kind."""
-    if isinstance(value, Mapping) and "kind" not in value:
-        corners = [key for key in ("lower", "upper", "periodic") if key in value]
-        rings = [key for key in ("polygon", "outer", "holes") if key in value]
-        if corners and rings:
-            raise InputError(
-                f"{place} has both {corners[0]}, of a box, and {rings[0]}, of a polygon; leave one of them out"
+    def __post_init__(self) -> None:
+        found = [key for key in self.CHOICE if getattr(self, key) is not None]
+        if self.CHOICE and len(found) != 1:
+            raise ValueError(
+                f"has {', '.join(found) or 'none'} of {', '.join(self.CHOICE)}, expected exactly one of them"
             )
-        if not corners and not rings:
+
+    def given(self, *without: str) -> dict[str, Any]:
+        """Return the values of the keys that are given, except `without`."""
+        values = {key: getattr(self, key) for key in self.__struct_fields__ if key not in without}
+        return {key: value for key, value in values.items() if value is not None}
+
+
+class Kind(Table, tag_field="kind"):
+    """A table of a kind, which its key `kind` names. By default it holds arguments of `MAKE`."""
+
+    MAKE: ClassVar[Callable[..., Any]]
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        return type(self).MAKE(**self.given())
+
+
+# Curves, which are rings of domains and shapes of sizes.
+
+
+class CurveTable(Kind):
+    """A curve of `clvoro.curves`."""
+
+    name: Text | None = None
+    tolerance: Positive | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Curve:
+        return Curve.described(msgspec.to_builtins(self))
+
+
+class CircleCurve(CurveTable, tag="circle", kw_only=True):
+    center: Plane
+    radius: Positive
+
+
+class Arc(CurveTable, tag="arc", kw_only=True):
+    center: Plane
+    radius: Positive
+    start: float
+    end: float
+
+
+class Ellipse(CurveTable, tag="ellipse", kw_only=True):
+    center: Plane
+    semi_axes: Plane
+    angle: float | None = None
+    start: float | None = None
+    end: float | None = None
+
+
+class Naca(CurveTable, tag="naca", kw_only=True):
+    code: Text
+    chord: Positive | None = None
+    leading_edge: Plane | None = None
+    angle_of_attack: float | None = None
+    trailing_edge: Literal["closed", "blunt"] | None = None
+
+
+class Spline(CurveTable, tag="spline", kw_only=True):
+    points: Annotated[list[Plane], Meta(min_length=2)]
+    closed: bool | None = None
+    corners: list[Natural] | None = None
+
+
+# Shapes that sizes are measured from.
+
+
+class Circle(Kind, tag="circle"):
+    MAKE = sizing.Circle
+    center: Point
+    radius: NotNegative
+
+
+class Ball(Kind, tag="sphere"):
+    MAKE = sizing.Circle
+    center: Space
+    radius: NotNegative
+
+
+class BoxShape(Kind, tag="box"):
+    lower: Point | None = None
+    upper: Point | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        if domain.curved and None in (self.lower, self.upper):
+            raise InputError(f"size.shapes has a box without corners, expected lower and upper in degrees on {domain}")
+        return Box(self.lower or domain.lower, self.upper or domain.upper)
+
+
+class BoundaryShape(Kind, tag="boundary"):
+    edges: Walls | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        shape = domain.boundary(self.edges)  # an error where there is none
+        return domain if self.edges is None else shape
+
+
+class SurfaceShape(Kind, tag="surface"):
+    file: Text
+    closed: bool = False
+    join: Positive | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        surface = sizing.Surface.read(locate(folder, self.file), **self.given("file", "closed"))
+        if self.closed:
+            surface.require_closed()
+            if self.join is None:  # nearly coincident corners would make triangles intersect
+                surface.check()
+        return surface
+
+
+class SegmentShape(Kind, tag="segment"):
+    MAKE = sizing.Segment
+    a: Point
+    b: Point
+
+
+class PolylineShape(Kind, tag="polyline"):
+    MAKE = sizing.Polyline
+    points: Annotated[list[Point], Meta(min_length=2)]
+
+
+class ClosedPolylineShape(Kind, tag="closed_polyline"):
+    MAKE = sizing.ClosedPolyline
+    points: Annotated[list[Point], Meta(min_length=3)]
+
+
+Shape = (
+    Circle
+    | Ball
+    | BoxShape
+    | BoundaryShape
+    | SurfaceShape
+    | SegmentShape
+    | PolylineShape
+    | ClosedPolylineShape
+    | Arc
+    | Ellipse
+    | Naca
+    | Spline
+)
+
+# Size fields.
+
+_ON_SPHERE = "caps, distance, expression, raster or a combination of them"
+
+
+class Constant(Kind, tag="constant"):
+    MAKE = sizing.Constant
+    value: Positive
+
+
+class Region(Table):
+    center: Plane
+    radius: NotNegative
+    size: Positive
+
+
+class Caps(Kind, tag="caps"):
+    CHOICE = ("growth", "slope")
+    regions: Annotated[list[Region], Meta(min_length=1)]
+    h_max: Positive
+    growth: Positive | None = None
+    slope: Positive | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        remedy = 'distance, or kind = "sphere" in [domain]'
+        _require(domain.globe is not None, self, remedy, domain)
+        regions = [(r.center, r.radius, r.size) for r in self.regions]
+        return earth.Caps(regions, sphere=domain.globe, **self.given("regions"))
+
+
+class Distance(Kind, tag="distance"):
+    CHOICE = ("growth", "slope")
+    shapes: Annotated[list[Shape], Meta(min_length=1)]
+    h_min: Positive
+    growth: Positive | None = None
+    slope: Positive | None = None
+    h_max: Positive | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        return sizing.Distance([shape.build(folder, domain) for shape in self.shapes], **self.given("shapes"))
+
+
+class Expression(Kind, tag="expression"):
+    expression: Text
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        return sizing.Expression(self.expression)
+
+
+class ArrayTable(Kind):
+    """A size field from an array in a file, over the box from `lower` to `upper`, by default over the domain."""
+
+    file: Text
+    lower: Point | None = None
+    upper: Point | None = None
+    at: Literal["nodes", "centers"] | None = None
+    missing: Literal["error", "nearest"] | None = None
+
+    def over(self, domain: Domain, values: np.ndarray) -> Any:
+        """Return the size field of an array over `domain`, unless the table has other corners."""
+        corners = self.lower or domain.lower, self.upper or domain.upper
+        return type(self).MAKE(values, *corners, **self.given("file", "lower", "upper"))
+
+
+class Raster(ArrayTable, tag="raster"):
+    MAKE = sizing.Raster
+    variable: Text | None = None
+    outside: Literal["nearest", "error"] | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        path = folder / self.file
+        grid = read_grid(path, self.variable)
+        if grid is not None:
+            for key in self.given("file", "variable", "missing", "outside"):
+                raise InputError(f"size.{key} is given, and {path} has longitudes and latitudes; leave it out")
+            return earth.from_xarray(grid, **self.given("file", "variable"))
+        if self.variable is not None:
             raise InputError(
-                f"{place} is neither a box nor a polygon nor a sphere, expected lower and upper, or outer, or "
-                'polygon = FILE, or kind = "sphere"'
+                f"size.variable is {self.variable!r}, and {path} is neither a netCDF nor a .npz file; leave it out"
             )
-        if "polygon" in value:
-            rest = {key: item for key, item in value.items() if key != "polygon"}
-            value = {"kind": "polygon", "file": text(value["polygon"], f"{place}.polygon"), **rest}
-        elif "outer" in value:
-            value = {"kind": "polygon", **value}
-    checked = _DOMAINS(value, place)
-    if "file" in checked and "holes" in checked:
-        raise InputError(f"{place} has both a file and holes, expected holes beside outer only")
-    return checked
+        return self.over(DEGREES if domain.curved else domain, load_array(path, "size.file"))
 
 
-def fixed(value: object, place: str) -> object:
-    """Check fixed generators: the name of a file, or a list of positions."""
-    return text(value, place) if isinstance(value, str) else vectors(1)(value, place)
+class Gradient(ArrayTable, tag="gradient"):
+    MAKE = staticmethod(sizing.gradient_size)
+    CHOICE = ("n_cells", "eps")
+    n_cells: Positive | None = None
+    eps: Positive | None = None
+    h_min: NotNegative | None = None
+    h_max: Positive | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        _require(not domain.curved, self, _ON_SPHERE, domain)
+        return self.over(domain, load_array(folder / self.file, "size.file"))
 
 
-_RUN = Table(
-    {},
-    {
-        "method": one_of(*METHODS),
-        "methods": names_of(*METHODS),
-        "start": one_of("density", "uniform"),
-        "points": text,
-        "fixed": fixed,
-        "n_cells": whole(1),
-        "max_steps": whole(0),
-        "tol": not_negative,
-        "alpha": positive,
-        "k": positive,
-        "seed": whole(0),
-        "dtype": one_of("float64", "float32"),
-        "effort": one_of("fast", "default", "best"),
-        "levels": auto_or_whole,
-        "error_target": positive,
-    },
+class Hessian(Gradient, tag="hessian"):
+    MAKE = staticmethod(sizing.hessian_size)
+    p: Positive | None = None
+
+
+class Feature(Kind, tag="feature"):
+    cells_across: Positive | None = None
+    growth: Positive | None = None
+    h_min: Positive | None = None
+    h_max: Positive | None = None
+    curvature: NotNegative | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        _require(domain.outline is not None, self, "distance, or a polygon in [domain]", domain)
+        return sizing.FeatureSize(domain.outline, **self.given())
+
+
+class Graded(Kind, tag="graded"):
+    CHOICE = ("growth", "slope")
+    field: Size
+    growth: Positive | None = None
+    slope: Positive | None = None
+    resolution: Annotated[int, Meta(ge=2)] | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        _require(not domain.curved, self, _ON_SPHERE, domain)
+        return sizing.Graded(build_size(self.field, folder, domain), box=domain, **self.given("field"))
+
+
+class Scale(Kind, tag="scale"):
+    factor: Positive
+    field: Size
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        return self.factor * build_size(self.field, folder, domain)
+
+
+class Min(Kind, tag="min"):
+    MAKE = staticmethod(sizing.minimum)
+    fields: Annotated[list[Size], Meta(min_length=1)]
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        return type(self).MAKE(*(build_size(field, folder, domain) for field in self.fields))
+
+
+class Max(Min, tag="max"):
+    MAKE = staticmethod(sizing.maximum)
+
+
+def _joined(operation: Callable[[Any, Any], Any]) -> Any:
+    return staticmethod(lambda *fields: functools.reduce(operation, fields))
+
+
+class Sum(Min, tag="sum"):
+    MAKE = _joined(operator.add)
+
+
+class Product(Min, tag="product"):
+    MAKE = _joined(operator.mul)
+
+
+class Quotient(Min, tag="quotient"):
+    MAKE = _joined(operator.truediv)
+    fields: Annotated[list[Size], Meta(min_length=2)]
+
+
+Size = (
+    Positive
+    | Constant
+    | Caps
+    | Distance
+    | Expression
+    | Raster
+    | Hessian
+    | Gradient
+    | Feature
+    | Graded
+    | Scale
+    | Min
+    | Max
+    | Sum
+    | Product
+    | Quotient
 )
 
-SEQUENCE = Table({"frames": whole(1)}, {})
 
-LAYERS = Table({"height": positive}, {"count": whole(1), "growth": positive, "spacing": positive, "edges": walls})
-"""Layers of cells along edges or sides."""
+def build_size(size: Any, folder: Path, domain: Domain) -> Any:
+    """Return the size field that `size` describes, an instance of `Size`.
 
-_CASE = Table(
-    {"domain": domain, "size": size},
-    {"name": file_name, "title": text, "run": _RUN, "layers": list_of(LAYERS), "sequence": SEQUENCE},
-)
+    `folder` is that of the files that it names; `domain` is the default extent of a raster.
+    """
+    return sizing.Constant(size) if isinstance(size, float) else size.build(folder, domain)
 
-_HOMES = {
-    "the case itself, above all tables": {*_CASE.required, *_CASE.optional},
-    "[domain]": {key for t in _DOMAINS.tables.values() for key in (*t.required, *t.optional)},
-    "[size]": {key for t in _SIZE.tables.values() for key in (*t.required, *t.optional)},
-    "[run]": {*_RUN.optional},
-    "[[layers]]": {*LAYERS.required, *LAYERS.optional},
-    "[sequence]": {*SEQUENCE.optional},
+
+def _require(fits: bool, size: Kind, remedy: str, domain: Domain) -> None:
+    if not fits:
+        kind = size.__struct_config__.tag
+        raise InputError(f"size.kind is {kind!r}, which is not for {domain}; expected {remedy}")
+
+
+def load_array(path: Path, place: str) -> np.ndarray:
+    """Read an array from a `.npy` file, or the array `points` from a `.npz` file; `place` is the key that names it.
+
+    Raises
+    ------
+    InputError
+        If there is no such file or it holds no such array.
+    """
+    try:
+        return read_array(path, "points")
+    except InputError as error:
+        raise InputError(
+            f"{place} names {str(path)!r}, which cannot be read as an array ({error}); "
+            "give a .npy file beside the case file"
+        ) from error
+
+
+# Domains.
+
+Names = dict[str, Walls]
+RingCurve = CircleCurve | Arc | Ellipse | Naca | Spline
+Ring = RingCurve | list[Plane | RingCurve]
+
+
+def _ring(ring: Any) -> Any:
+    if isinstance(ring, CurveTable):
+        return ring.build(Path())
+    return [item.build(Path()) if isinstance(item, CurveTable) else item for item in ring]
+
+
+class BoxTable(Kind, tag="box"):
+    MAKE = Box
+    lower: Point
+    upper: Point
+    periodic: bool | list[bool] | None = None
+    names: Names | None = None
+
+
+class PolygonTable(Kind, tag="polygon"):
+    CHOICE = ("file", "outer")
+    file: Text | None = None
+    outer: Ring | None = None
+    holes: list[Ring] | None = None
+    names: Names | None = None
+    simplified: Positive | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.file and self.holes:
+            raise ValueError("has both a file and holes, expected holes beside outer only")
+
+    def build(self, folder: Path, domain: Any = None) -> Polygon:
+        domain = self._whole(folder)
+        return domain if self.simplified is None else domain.simplified(self.simplified)
+
+    def _whole(self, folder: Path) -> Polygon:
+        if self.file is None:
+            return Polygon(_ring(self.outer), [_ring(hole) for hole in self.holes or []], self.names)
+        path = locate(folder, self.file)
+        if path.suffix.lower() not in (".wkt", ".txt"):
+            return Polygon.from_geojson(path, self.names)
+        try:
+            text = read_text(path, LONGEST_GEOMETRY)
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"cannot read {path} ({error}), expected well-known text") from error
+        return Polygon.from_wkt(text, self.names)
+
+
+class SphereTable(Kind, tag="sphere"):
+    MAKE = Sphere
+    radius: Positive | None = None
+
+
+DomainTable = BoxTable | PolygonTable | SphereTable
+
+
+def with_kind(domain: object, place: str) -> object:
+    """Return the table `domain` with its key `kind`, which boxes and polygons may leave out."""
+    if not isinstance(domain, Mapping) or "kind" in domain:
+        return domain
+    corners = [key for key in ("lower", "upper", "periodic") if key in domain]
+    rings = [key for key in ("polygon", "outer", "holes") if key in domain]
+    if corners and rings:
+        raise InputError(
+            f"{place} has both {corners[0]}, of a box, and {rings[0]}, of a polygon; leave one of them out"
+        )
+    if not corners and not rings:
+        raise InputError(
+            f"{place} is neither a box nor a polygon nor a sphere, expected lower and upper, or outer, or "
+            'polygon = FILE, or kind = "sphere"'
+        )
+    named = {"file" if key == "polygon" else key: value for key, value in domain.items()}
+    return {"kind": "polygon" if rings else "box", **named}
+
+
+# The case.
+
+
+class Run(Table):
+    method: MethodName | None = None
+    methods: Annotated[list[MethodName], Meta(min_length=1)] | None = None
+    effort: EffortName | None = None
+    levels: Literal["auto"] | Natural | None = None
+    error_target: Positive | None = None
+    start: Start | None = None
+    points: Text | None = None
+    fixed: Text | Annotated[list[Point], Meta(min_length=1)] | None = None
+    n_cells: Count | None = None
+    max_steps: Natural | None = None
+    tol: NotNegative | None = None
+    alpha: Positive | None = None
+    k: Positive | None = None
+    seed: Natural | None = None
+    dtype: Literal["float64", "float32"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.method and self.methods:
+            raise ValueError("has both method and methods; keep one of them")
+        if len(set(self.methods or ())) < len(self.methods or ()):
+            raise ValueError(f"has methods = {self.methods}, expected each name once")
+
+
+class LayersTable(Table):
+    """Layers of cells along edges or sides."""
+
+    height: Positive
+    count: Count | None = None
+    growth: Positive | None = None
+    spacing: Positive | None = None
+    edges: Walls | None = None
+
+
+class Sequence(Table):
+    frames: Count | None = None
+
+
+class CaseTable(Table, kw_only=True):
+    name: str | None = None
+    title: Text | None = None
+    domain: DomainTable
+    size: Size
+    run: Run | None = None
+    layers: Annotated[list[LayersTable], Meta(min_length=1)] | None = None
+    sequence: Sequence | None = None
+
+
+def _keys(*tables: type[Table]) -> set[str]:
+    return {key for table in tables for key in table.__struct_fields__}
+
+
+HOMES = {
+    "the case itself, above all tables": _keys(CaseTable),
+    "[domain]": _keys(*get_args(DomainTable)),
+    "[size]": _keys(*get_args(Size)[1:]),
+    "[run]": _keys(Run),
+    "[[layers]]": _keys(LayersTable),
+    "[sequence]": _keys(Sequence),
 }
 """The keys of each table."""
 
 
-def _home(name: object, place: str) -> str:
-    """Return a hint for an unknown key at `place`: the table or the kinds that have this key."""
-    kinds = [kind for kind, t in _SIZE.tables.items() if name in (*t.required, *t.optional)]
-    if kinds and re.search(r" size\b", place):
-        return f" (it is for kind = {' or '.join(map(repr, kinds))})"
-    homes = [home for home, keys in _HOMES.items() if name in keys]
-    return f" (it belongs to {homes[0]})" if len(homes) == 1 else ""
+def check_case(content: object, place: str) -> CaseTable:
+    """Check a whole case; see `checks.check`."""
+    if isinstance(content, Mapping) and "domain" in content:
+        content = {**content, "domain": with_kind(content["domain"], f"{place} domain")}
+    return checks.check(CaseTable, content, place, HOMES)
 
 
-def case(value: object, place: str) -> dict[str, Any]:
-    """Check a whole case."""
-    return _check_table(_CASE, value, place)
-
-
-def run(value: object, place: str) -> dict[str, Any]:
-    """Check the settings of a run."""
-    return _check_table(_RUN, value, place)
-
-
-def _check_table(table: Table, value: object, place: str) -> dict[str, Any]:
-    """Check `value`; errors about a key in the wrong table name the right one."""
-    try:
-        return table(value, place)
-    except UnknownKeyError as error:
-        hint = _home(error.key, error.place)
-        raise UnknownKeyError(error.place, error.key, error.known, hint) from None
+def check_run(content: Mapping[str, object], place: str) -> Run:
+    """Check the settings of a run; see `checks.check`."""
+    return checks.check(Run, content, place, HOMES)

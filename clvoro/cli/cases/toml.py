@@ -1,12 +1,12 @@
-"""Write plain settings as TOML text; reading is `tomllib`'s."""
+"""Read and write TOML text with `tomllib` and `tomli_w`."""
 
 from __future__ import annotations
 
-import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import tomli_w
 
 try:
     import tomllib
@@ -25,7 +25,8 @@ _TOKENS = re.compile(
     r"""#[^\n]*|\"{3}(?:[^"\\]+|\\[\s\S]|"(?!""))*(?:"{3,5})?|'{3}(?:[^']+|'(?!''))*(?:'{3,5})?"""
     rf"|{_PART}(?:{_DOT}){{0,{_DEEPEST - 1}}}(?P<deep>{_DOT})?"
 )
-_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+_FLAT = re.compile(r"\[\n((?: +[^\[\]{}\"\n]+,\n)+) *\]")
+"""A list of numbers, one a line."""
 
 
 def read(text: str) -> dict:
@@ -39,15 +40,10 @@ def read(text: str) -> dict:
     return tomllib.loads(text)
 
 
-def write(table: Mapping[str, object], header: Sequence[str] = ()) -> str:
+def write(table: Mapping[str, Any], header: Sequence[str] = ()) -> str:
     """Return `table` as TOML text, with the lines of `header` as comments above it.
 
-    Parameters
-    ----------
-    table : mapping
-        Strings, booleans, integers, floats, lists of these, tables, and lists of tables; keys whose
-        value is None are left out. Floats are written with all their digits: reading them gives
-        the same number.
+    Reading it gives the same table, floats with all their digits. A list of numbers stands on one line.
 
     Raises
     ------
@@ -55,53 +51,5 @@ def write(table: Mapping[str, object], header: Sequence[str] = ()) -> str:
         For a value that TOML cannot represent.
     """
     lines = [f"# {line}".rstrip() for line in header]
-    lines += [""] * bool(lines)
-    _write_table(lines, (), table)
-    return "\n".join(lines).strip("\n") + "\n"
-
-
-def _write_table(lines: list[str], path: tuple[str, ...], table: Mapping[str, object]) -> None:
-    """Append the plain keys of `table` first, then its sub-tables, as TOML demands."""
-    nested = []
-    for key, value in table.items():
-        if isinstance(value, Mapping) or _is_table_list(value):
-            nested.append((key, value))
-        elif value is not None:
-            lines.append(f"{_key(key)} = {_value(value)}")
-    for key, value in nested:
-        below = (*path, key)
-        name = ".".join(map(_key, below))
-        for item in [value] if isinstance(value, Mapping) else value:
-            lines += ["", f"[{name}]" if isinstance(value, Mapping) else f"[[{name}]]"]
-            _write_table(lines, below, item)
-
-
-def _is_table_list(value: object) -> bool:
-    return isinstance(value, (list, tuple)) and len(value) > 0 and all(isinstance(item, Mapping) for item in value)
-
-
-def _key(key: str) -> str:
-    return key if _BARE_KEY.fullmatch(key) else _string(key)
-
-
-def _string(text: str) -> str:
-    # JSON's escapes are TOML's, except that TOML also wants DEL escaped.
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _value(value: Any) -> str:
-    if hasattr(value, "tolist"):  # NumPy scalars and arrays
-        value = value.tolist()
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return _string(value)
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, float):
-        return repr(value) if math.isfinite(value) else str(value)
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    if isinstance(value, Mapping):  # inside a list that also holds plain values
-        return "{" + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + "}"
-    raise TypeError(f"TOML has no form for {value!r} ({type(value).__name__})")
+    text = _FLAT.sub(lambda found: f"[{' '.join(found[1].split())[:-1]}]", tomli_w.dumps(table))
+    return "\n".join([*lines, *[""] * bool(lines), text])
