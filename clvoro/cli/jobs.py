@@ -21,8 +21,6 @@ from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, wa
 from ..errors import Aborted, ClvoroError, InputError, SolverWarning
 from ..finite_volumes.gate import Solver
 from ..finite_volumes.solver_mesh import WallShape
-from ..geometry.polygon import Polygon
-from ..geometry.sphere import Sphere
 from ..io import save, write_history
 from ..io.check_mesh import run_check_mesh
 from ..mesh.results import Result
@@ -223,13 +221,13 @@ class Job:
             raise InputError(
                 f"walls is {self.walls!r}, and no mesh is written for OpenFOAM; add --format foam, or leave it out"
             )
-        if isinstance(self.case.domain, Sphere) and (self.solver is not None or "foam" in self.mesh_formats):
+        if self.case.domain.curved and (self.solver is not None or "foam" in self.mesh_formats):
             what = "format foam" if self.solver is None else f"check-solver {self.solver}"
             raise InputError(
                 f"{self.case.name}: {what} is for meshes in boxes and polygons, and the domain is a sphere; expected "
                 "--format mpas or nc, and clvoro check --for mpas"
             )
-        if "scrip" in self.mesh_formats and not isinstance(self.case.domain, Sphere):
+        if "scrip" in self.mesh_formats and not self.case.domain.curved:
             raise InputError(
                 f"{self.case.name}: format scrip is for meshes on a sphere; expected nc, mpas or another format"
             )
@@ -405,7 +403,7 @@ class Job:
                 print(f"{name}: {result.settings['trade']}")
             if result.diagram.domain.cell_dim == 3:
                 print(f"{name}: {result.measures.line()}")
-            if isinstance(result.diagram.domain, Polygon):
+            if result.diagram.domain.cuts_cells:
                 print(f"{name}: {boundary_line(result)}")
         first = "report.html" if self.report else "mesh.vtu"
         print(f"written: {self.out / first} and the files beside it")

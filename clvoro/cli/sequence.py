@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..adaptation.options import Options, arguments_of_run, uses
-from ..geometry.sphere import Sphere
 from ..io import save
 from ..io.atomic import atomic_file, writing
 from ..mesh.results import Result
@@ -115,7 +114,7 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
     limits = shared_limits(results, "size")
     lower, upper = domain.lower[:2], domain.upper[:2]
     plot: Callable[..., Any] = plot_cells
-    if isinstance(domain, Sphere):
+    if domain.curved:
         plot = partial(plot_globe, center=default_center(results[0]))
     with styled():
         figure = new_figure(WIDTH, grid_height(lower, upper, lines, columns, 0.65, 0.3))

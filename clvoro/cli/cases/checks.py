@@ -109,7 +109,7 @@ def _explain(message: str, kind: Any, content: object, place: str, homes: Mappin
         )
         hint = f" (it is for kind = {' or '.join(kinds)})" if kinds else hint
         return f"{where} has the unknown key {name!r}{hint}; {takes}"
-    if text.startswith("Invalid"):  # a word that is none of several
+    if text.startswith("Invalid"):  # a word, where others are expected
         if tables and keys[-1] == "kind":
             known = [str(table.tag) for table in tables]
         else:
