@@ -27,7 +27,7 @@ from _common import Report, heading, make_adapter, names, parser
 
 import clvoro
 from clvoro import sizing
-from clvoro.finite_volumes.two_point import TwoPointFaces, two_point_faces
+from clvoro.mesh.faces import Faces
 
 WAVE = np.array([2.0, 1.3, 1.7])
 """Frequencies w of u = prod_k sin(w_k x_k + k / 2) + exp(x_0 / 2)."""
@@ -114,7 +114,7 @@ def source(x: np.ndarray) -> np.ndarray:
     return (WAVE[:d] ** 2).sum() * waves - np.exp(x[:, 0] / 2) / 4
 
 
-def solve(mesh: clvoro.Diagram, faces: TwoPointFaces, f: np.ndarray, mixed: bool, place: str) -> np.ndarray:
+def solve(mesh: clvoro.Diagram, faces: Faces, f: np.ndarray, mixed: bool, place: str) -> np.ndarray:
     """Return the unknowns at the generators, (n,)."""
     n = len(mesh)
     inner = faces.neighbor >= 0
@@ -142,7 +142,7 @@ def solve(mesh: clvoro.Diagram, faces: TwoPointFaces, f: np.ndarray, mixed: bool
 def measure(result: clvoro.Result, walls: str, conditions: str, where: str, place: str) -> dict[str, Any]:
     """Solve on one mesh; return the errors."""
     mesh = result.diagram
-    faces = two_point_faces(mesh.solver_mesh(walls, collapse=False), mesh.points)
+    faces = mesh.solver_mesh(walls, collapse=False)
     f = source(mesh.centroids if where == "mean" else mesh.points)
     error = np.abs(solve(mesh, faces, f, conditions == "mixed", place) - exact(mesh.points))
     on_wall = np.unique(faces.owner[faces.neighbor < 0])

@@ -28,8 +28,8 @@ from _common import CUBE, FIRST_SEED, Report, heading, make_adapter, names, pars
 import clvoro
 from clvoro import sizing
 from clvoro.finite_volumes.collapse import SHORT_EDGE, SMALL_FACE, collapse_short
-from clvoro.finite_volumes.geometry import smaller_size
-from clvoro.finite_volumes.solver_mesh import SolverMesh
+from clvoro.mesh.faces import Faces
+from clvoro.mesh.geometry import smaller_size
 
 ROWS: dict[str, dict[str, Any]] = {
     "fast": {"effort": "fast"},
@@ -56,7 +56,7 @@ def setup(name: str) -> tuple[clvoro.Box, Any]:
 FIELDS = ("S1", "S2", "S3", "spheres", "ridge", "periodic")
 
 
-def count_short(mesh: SolverMesh, sizes: np.ndarray) -> tuple[int, int]:
+def count_short(mesh: Faces, sizes: np.ndarray) -> tuple[int, int]:
     """Return the numbers of short edges and of small faces; at seams each image counts."""
     h = smaller_size(mesh.owner, mesh.neighbor, sizes)
     m = mesh.measures

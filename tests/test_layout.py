@@ -47,6 +47,7 @@ ORDER = (
 UPWARD = {
     ("mesh.quality", "earth"),
     ("mesh.diagram", "finite_volumes"),
+    ("mesh.faces", "finite_volumes"),
     ("mesh.output", "finite_volumes"),
     ("mesh.output", "io"),
     ("mesh.output", "plotting"),

@@ -8,11 +8,11 @@ import scipy.sparse.csgraph
 
 from ..mesh.connectivity import distinct, following, slices, take_ranges, take_rows
 from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
+from ..mesh.geometry import cross_columns, dots, lengths, smaller_size, sum_columns
 from .defects import Limits
-from .geometry import cross_columns, dots, lengths, smaller_size, sum_columns
 from .merging import Cells, Merges
 from .seams import pack
-from .solver_mesh import SolverMesh, compact
 
 SHORT_EDGE = 0.02
 """Edges shorter than this share of h, the cube root of a cell's volume, are collapsed."""
@@ -34,7 +34,7 @@ _SURE = 1.05
 """Margin of the suspects: areas of the diagram differ a little from those of the mesh."""
 
 
-def collapse_short(mesh: SolverMesh, diagram: Diagram) -> SolverMesh:
+def collapse_short(mesh: Faces, diagram: Diagram) -> Faces:
     """Return `mesh` without edges shorter than 0.02 h and faces smaller than 0.001 h^2, where its cells stay valid.
 
     Faces smaller than 0.02 h^2 whose skewness exceeds 1.8 are collapsed, too.
@@ -46,13 +46,13 @@ def collapse_short(mesh: SolverMesh, diagram: Diagram) -> SolverMesh:
 
     Parameters
     ----------
-    mesh : SolverMesh
+    mesh : Faces
         Of the diagram, in 3D.
     diagram : Diagram
     """
     suspects = _suspects(mesh, diagram)
     if not suspects.any():
-        return compact(mesh)
+        return mesh.compact()
     cells, faces = _fold(mesh, diagram)
     scan = _Scan(cells, np.flatnonzero(suspects[faces]))
     cells.prepare(scan.vertices)
@@ -71,10 +71,10 @@ def collapse_short(mesh: SolverMesh, diagram: Diagram) -> SolverMesh:
             pending = distinct(np.concatenate([pending, active]))
         scan = _Scan(cells, pending)
     unchanged = (cells.now == np.arange(len(cells.now))).all()
-    return compact(mesh) if unchanged else _unfold(mesh, cells, faces)
+    return mesh.compact() if unchanged else _unfold(mesh, cells, faces)
 
 
-def _suspects(mesh: SolverMesh, diagram: Diagram) -> np.ndarray:
+def _suspects(mesh: Faces, diagram: Diagram) -> np.ndarray:
     """Return a mask (f,) of the faces that may be small or skew, or have a short side: all of them, and a few others.
 
     All faces are read here, and never again. Their areas are those of the diagram.
@@ -103,7 +103,7 @@ def _suspects(mesh: SolverMesh, diagram: Diagram) -> np.ndarray:
     return found
 
 
-def _fold(mesh: SolverMesh, diagram: Diagram) -> tuple[Cells, np.ndarray]:
+def _fold(mesh: Faces, diagram: Diagram) -> tuple[Cells, np.ndarray]:
     """Return the cells of `mesh` with faces at seams and images of points once; the faces of `mesh` that they have."""
     upper = np.flatnonzero((mesh.twin < 0) | (mesh.twin > np.arange(len(mesh.twin))))
     points, extent = mesh.points, np.asarray(mesh.domain.extent, float)
@@ -135,7 +135,7 @@ def _fold(mesh: SolverMesh, diagram: Diagram) -> tuple[Cells, np.ndarray]:
     return cells, upper
 
 
-def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
+def _unfold(mesh: Faces, cells: Cells, upper: np.ndarray) -> Faces:
     """Return `mesh` as `cells` have become."""
     alive = cells.count > 0
     kept = np.zeros(len(mesh.owner), bool)
@@ -160,7 +160,7 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
         points = cells.positions(vertices[order][new], codes[order][new]).T
     else:
         starts, corners = take_ranges(cells.begin[left], cells.count[left], cells.corners)
-    return mesh.take_faces(left, points=points, starts=starts, corners=corners)
+    return mesh.take_faces(left, points=points, starts=starts, corners=corners).compact()
 
 
 class _Scan:

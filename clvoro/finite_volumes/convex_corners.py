@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..mesh.connectivity import following
-from .geometry import turns
+from ..mesh.faces import Faces
+from ..mesh.geometry import turns
 from .prisms import simple_loops
-from .solver_mesh import SolverMesh
 
 _STRAIGHT = 1e-4
 """Least turn in a corner of a convex cell."""
@@ -24,14 +24,14 @@ _NO_LENGTH = 1e-12
 """Length of an edge, over the extent of its cell, below which it has no direction."""
 
 
-def join_faces(mesh: SolverMesh) -> SolverMesh:
+def join_faces(mesh: Faces) -> Faces:
     """Return `mesh` with a straight face for two that follow each other between the same cells, where convexity gains.
 
     The sum of both cells' angles beyond 180 degrees must become less, and their areas stay positive.
     """
     while True:
         ends = mesh.corners.reshape(-1, 2)
-        k, v = mesh.inner, len(mesh.points)
+        k, v = mesh.n_inner, len(mesh.points)
         once = np.bincount(mesh.corners, minlength=v) == 2
         before, behind = np.full(v, -1), np.full(v, -1)
         behind[ends[:k, 0]] = np.arange(k)
@@ -41,7 +41,7 @@ def join_faces(mesh: SolverMesh) -> SolverMesh:
             return mesh
         starts, loops, broken = simple_loops(mesh)
         # Only cells that are not convex become less concave.
-        cell, bent = np.repeat(np.arange(len(mesh)), np.diff(starts)), np.zeros(len(mesh), bool)
+        cell, bent = np.repeat(np.arange(mesh.n_cells), np.diff(starts)), np.zeros(mesh.n_cells, bool)
         bent[cell[turns(mesh.points[loops], following(starts)) < _STRAIGHT]] = True
         sides = before[middles]
         middles = middles[bent[mesh.owner[sides]] | bent[mesh.neighbor[sides]]]
@@ -63,10 +63,10 @@ def join_faces(mesh: SolverMesh) -> SolverMesh:
             return mesh
         kept = np.ones(len(ends), bool)
         kept[drop] = False
-        mesh = replace(mesh, corners=ends.ravel()).take_faces(kept)
+        mesh = replace(mesh, corners=ends.ravel()).take_faces(kept).compact()
 
 
-def move_concave_points(mesh: SolverMesh) -> SolverMesh:
+def move_concave_points(mesh: Faces) -> Faces:
     """Return `mesh` with points away from walls and seams moved so that cells with a concave corner become convex.
 
     The point in that corner moves onto the line between the corners before and after it. If it is on a wall, one of
@@ -75,10 +75,10 @@ def move_concave_points(mesh: SolverMesh) -> SolverMesh:
     """
     points = mesh.points.copy()
     held = np.zeros(len(points), bool)
-    held[mesh.corners[mesh.starts[mesh.inner] :]] = True
+    held[mesh.corners[mesh.starts[mesh.n_inner] :]] = True
     starts, loops, broken = simple_loops(mesh)
     after = following(starts)
-    cell = np.repeat(np.arange(len(mesh)), np.diff(starts))
+    cell = np.repeat(np.arange(mesh.n_cells), np.diff(starts))
     in_broken = np.isin(cell, broken)
     held[loops[in_broken]] = True
     by_point = np.argsort(loops, kind="stable")
@@ -87,7 +87,7 @@ def move_concave_points(mesh: SolverMesh) -> SolverMesh:
     def around(p: int) -> np.ndarray:
         return cell[by_point[first[p] : first[p + 1]]]
 
-    changes, changed, tried = 0, np.zeros(len(mesh), np.int64), np.full(len(loops), -1)
+    changes, changed, tried = 0, np.zeros(mesh.n_cells, np.int64), np.full(len(loops), -1)
 
     def moves(p: int, target: np.ndarray) -> bool:
         """Move point p if that makes the cells around it less concave; return whether it does."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mesh.connectivity import distinct, following, take_rows
-from .geometry import cross_columns, dots, lengths, loop_geometry, pyramid_sums, smaller_size
+from ..mesh.geometry import cross_columns, dots, lengths, loop_geometry, pyramid_sums, smaller_size
 
 if TYPE_CHECKING:
     from .merging import Cells

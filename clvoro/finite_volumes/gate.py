@@ -11,10 +11,11 @@ from ..arguments import check_choice
 from ..errors import InputError
 from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
 from .criteria import Criterion, Rows, SolverReport
 from .measures import SolverMeasures
 from .prisms import simple_loops
-from .solver_mesh import SolverMesh, WallShape, make_solver_mesh
+from .solver_mesh import WallShape, make_solver_mesh
 
 Solver = Literal["openfoam", "mpas"]
 """Solvers whose criteria are known."""
@@ -43,14 +44,14 @@ def _check_for_openfoam(diagram: Diagram, walls: WallShape | None) -> SolverRepo
         )
     walls = "straight" if walls is None else walls
     mesh = make_solver_mesh(diagram, walls, walls == "straight")
-    return SolverReport("openfoam", tuple(_openfoam(mesh)), len(mesh), len(mesh.owner), mesh.area_change)
+    return SolverReport("openfoam", tuple(_openfoam(mesh)), mesh.n_cells, len(mesh), mesh.area_change)
 
 
 SOLVERS: dict[str, Callable[[Diagram, WallShape | None], SolverReport]] = {"openfoam": _check_for_openfoam}
 """The check of a diagram for each solver; `earth` adds models on C grids."""
 
 
-def _openfoam(mesh: SolverMesh) -> list[Criterion]:
+def _openfoam(mesh: Faces) -> list[Criterion]:
     """Return the criteria of `checkMesh -allGeometry -allTopology` of OpenFOAM v1912."""
     if mesh.dim == 2:
         broken = simple_loops(mesh)[2]
@@ -69,8 +70,8 @@ def _openfoam(mesh: SolverMesh) -> list[Criterion]:
     span = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     edges = m.edges
     ends = m.cells.points[edges].mean(axis=1)
-    sides = np.bincount(m.face_cells[0], minlength=len(mesh))
-    walls = np.concatenate([g.areas[mesh.inner : mesh.outer], g.areas[len(mesh.owner) :]])
+    sides = np.bincount(m.face_cells[0], minlength=mesh.n_cells)
+    walls = np.concatenate([g.areas[mesh.n_inner : mesh.n_outer], g.areas[len(mesh.owner) :]])
     openness = np.abs(walls.sum(axis=0)).max() / (np.linalg.norm(walls, axis=1).sum() + LEAST_MEASURE)
     concave = np.where(m.concave, np.maximum(m.concavity, 0), 0)
     made = [
@@ -105,11 +106,11 @@ def _cells_of_edges(m: SolverMeasures) -> np.ndarray:
     return found
 
 
-def _regions(mesh: SolverMesh) -> int:
+def _regions(mesh: Faces) -> int:
     """Return the number of connected parts of the mesh."""
     import scipy.sparse
 
     joined = np.flatnonzero(mesh.neighbor >= 0)
     pair = (mesh.owner[joined], mesh.neighbor[joined])
-    graph = scipy.sparse.coo_array((np.ones(len(joined)), pair), (len(mesh), len(mesh)))
+    graph = scipy.sparse.coo_array((np.ones(len(joined)), pair), (mesh.n_cells, mesh.n_cells))
     return int(scipy.sparse.csgraph.connected_components(graph, directed=False)[0])

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mesh.connectivity import following, take_rows
-from .geometry import Geometry, cell_geometry, face_geometry, polygon_areas, smaller_size, sum_rows
-from .prisms import Polyhedra, polyhedra
+from ..mesh.geometry import Geometry, cell_geometry, face_geometry, polygon_areas, smaller_size, sum_rows
+from .prisms import polyhedra
 
 if TYPE_CHECKING:
-    from .solver_mesh import SolverMesh
+    from ..mesh.faces import Faces
 
 PLANAR_COSINE = 1e-6
 """Two faces of a cell are concave if a center is nearer to the other's plane than this, over the distance of both."""
@@ -29,11 +29,11 @@ class SolverMeasures:
     `polyMeshTools`. Unknowns are at the centroids.
     """
 
-    def __init__(self, mesh: SolverMesh, thickness: float | None = None) -> None:
+    def __init__(self, mesh: Faces, thickness: float | None = None) -> None:
         self.mesh, self.thickness = mesh, thickness
 
     @cached_property
-    def cells(self) -> Polyhedra:
+    def cells(self) -> Faces:
         """The cells as polyhedra: in 2D prisms.
 
         Raises
@@ -46,20 +46,17 @@ class SolverMeasures:
     @cached_property
     def geometry(self) -> Geometry:
         """Centers, areas, centroids and volumes of the polyhedra."""
-        p, k = self.cells, self.mesh.inner
+        p, k = self.cells, self.mesh.n_inner
         centers, areas = face_geometry(p.points, p.starts, p.corners)
-        made = cell_geometry(centers, areas, p.owner, self.mesh.neighbor[:k], len(self.mesh))
+        made = cell_geometry(centers, areas, p.owner, self.mesh.neighbor[:k], self.mesh.n_cells)
         return Geometry(centers, areas, *made)
 
     @cached_property
     def face_cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The cell, the face and the sign of the normal for each side of each face, three arrays (s,)."""
-        f, k = len(self.cells.owner), self.mesh.inner
-        return (
-            np.concatenate([self.cells.owner, self.mesh.neighbor[:k]]).astype(np.int64),
-            np.concatenate([np.arange(f), np.arange(k)]),
-            np.concatenate([np.ones(f), -np.ones(k)]),
-        )
+        cell, face = self.cells.sides()
+        sign = np.where(np.arange(len(face)) < len(self.cells), 1.0, -1.0)
+        return cell, face, sign
 
     @cached_property
     def coupled(self) -> np.ndarray:
@@ -140,7 +137,7 @@ class SolverMeasures:
     @cached_property
     def pyramids(self) -> np.ndarray:
         """Smaller volume of the two pyramids of each face, with the centroids of its cells as tips."""
-        g, k = self.geometry, self.mesh.inner
+        g, k = self.geometry, self.mesh.n_inner
         arm = g.centers - g.centroids[self.cells.owner]
         volumes = np.einsum("ij,ij->i", g.areas, arm) / 3
         beyond = g.centroids[self.mesh.neighbor[:k]] - g.centers[:k]
@@ -152,13 +149,13 @@ class SolverMeasures:
         """Largest component of the sum of each cell's area vectors over the sum of its absolute values, (n,)."""
         cell, face, sign = self.face_cells
         areas = self.geometry.areas[face] * sign[:, None]
-        return (np.abs(sum_rows(cell, areas, len(self.mesh))) / (self._spread + _TINY)).max(axis=1)
+        return (np.abs(sum_rows(cell, areas, self.mesh.n_cells)) / (self._spread + _TINY)).max(axis=1)
 
     @cached_property
     def _spread(self) -> np.ndarray:
         """Sum of the absolute components of each cell's area vectors, (n, 3)."""
         cell, face, _ = self.face_cells
-        return sum_rows(cell, np.abs(self.geometry.areas[face]), len(self.mesh))
+        return sum_rows(cell, np.abs(self.geometry.areas[face]), self.mesh.n_cells)
 
     @cached_property
     def aspect_ratio(self) -> np.ndarray:
@@ -177,7 +174,7 @@ class SolverMeasures:
         between = np.zeros(len(self.cells.owner), bool)
         between[self.coupled] = True
         kept = between[face]
-        cell, areas, n = cell[kept], self.geometry.areas[face[kept]], len(self.mesh)
+        cell, areas, n = cell[kept], self.geometry.areas[face[kept]], self.mesh.n_cells
         mean = np.bincount(cell, np.linalg.norm(areas, axis=1), n)
         counts = np.bincount(cell, minlength=n)
         scaled = areas / (mean / np.maximum(counts, 1))[cell][:, None]
@@ -190,14 +187,13 @@ class SolverMeasures:
     @cached_property
     def concave(self) -> np.ndarray:
         """Whether OpenFOAM counts the cell as concave: a face's center is beyond the plane of another one, (n,)."""
-        cell, face, sign = self.face_cells
-        order = np.argsort(cell, kind="stable")
-        counts = np.bincount(cell, minlength=len(self.mesh))
-        starts = np.concatenate([[0], np.cumsum(counts)])
+        _, face, sign = self.face_cells
+        starts, order = self.cells.cell_faces()
+        counts = np.diff(starts)
         areas = self.geometry.areas[face[order]] * sign[order][:, None]
         normals = areas / np.maximum(np.linalg.norm(areas, axis=1), _TINY)[:, None]
         centers = self.geometry.centers[face[order]]
-        concave = np.zeros(len(self.mesh), bool)
+        concave = np.zeros(self.mesh.n_cells, bool)
         ends = np.cumsum(counts.astype(np.int64) ** 2)
         first = 0
         while first < len(counts):
@@ -234,7 +230,7 @@ class SolverMeasures:
         concave = np.einsum("ij,ij->i", across, along) * sign[a] < 0
         size = np.linalg.norm(across, axis=1)
         angle = np.degrees(np.arctan2(size, np.einsum("ij,ij->i", one, two)))
-        worst = np.zeros(len(self.mesh))
+        worst = np.zeros(self.mesh.n_cells)
         np.maximum.at(worst, cell[a], np.where(concave, angle, 0.0))
         return worst
 
@@ -270,7 +266,7 @@ class SolverMeasures:
         One for each cell in which a triangle about the face's center has no positive volume. One more if no corner of
         the face is the base of a fan of triangles with positive volumes on both sides.
         """
-        g, p, k = self.geometry, self.cells, self.mesh.inner
+        g, p, k = self.geometry, self.cells, self.mesh.n_inner
         counts = np.diff(p.starts)
         face = np.repeat(np.arange(len(counts)), counts)
         after = p.corners[following(p.starts)]
@@ -320,8 +316,8 @@ class SolverMeasures:
 
     def _least(self, values: np.ndarray) -> np.ndarray:
         """Return the least of `values` (f,) among the faces of each cell, (n,)."""
-        k = self.mesh.inner
-        least = np.full(len(self.mesh), np.inf)
+        k = self.mesh.n_inner
+        least = np.full(self.mesh.n_cells, np.inf)
         np.minimum.at(least, self.mesh.owner, values)
         np.minimum.at(least, self.mesh.neighbor[:k], values[:k])
         return least

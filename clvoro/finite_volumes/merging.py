@@ -13,8 +13,8 @@ import numpy as np
 
 from ..mesh.connectivity import distinct, take_ranges, take_rows
 from ..mesh.diagram import Diagram
+from ..mesh.geometry import lengths, loop_geometry, sum_columns
 from .defects import Defects, Limits, find_defects
-from .geometry import lengths, loop_geometry, sum_columns
 from .independent import independent
 from .neighborhood import Neighborhood
 from .seams import unpack

@@ -2,46 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 
 from ..arguments import check_number, format_point
 from ..errors import InputError
 from ..mesh.connectivity import take_rows
-from ..mesh.read_only import Sealed
-
-if TYPE_CHECKING:
-    from .solver_mesh import SolverMesh
+from ..mesh.faces import Faces
 
 
-@dataclass(frozen=True, eq=False)
-class Polyhedra(Sealed):
-    """Polyhedral cells: the faces of a solver mesh, then in 2D the bottoms of the prisms, then the tops.
+def polyhedra(mesh: Faces, thickness: float | None = None) -> Faces:
+    """Return the cells of `mesh` as polyhedra: in 2D one layer of prisms.
 
-    Attributes
-    ----------
-    points : (v, 3) float64
-    starts : (f + 1,) int64
-    corners : (k,) int64
-        Corners of each face, counter-clockwise as seen from outside of the owner.
-    owner : (f,) int32
-        Of bottom and top of cell i, i.
-    """
-
-    points: np.ndarray
-    starts: np.ndarray
-    corners: np.ndarray
-    owner: np.ndarray
-
-
-def polyhedra(mesh: SolverMesh, thickness: float | None = None) -> Polyhedra:
-    """Return the cells of `mesh` as polyhedra.
+    The bottoms of the prisms follow the faces of `mesh`, then the tops. Bottom and top of cell i have the neighbors
+    -1 - w and -2 - w, with w the number of walls of the domain.
 
     Parameters
     ----------
-    mesh : SolverMesh
+    mesh : Faces
     thickness : float, optional
         In 2D: height of the prisms, whose bottoms are at z = 0. By default the mean width of a cell.
 
@@ -53,13 +32,11 @@ def polyhedra(mesh: SolverMesh, thickness: float | None = None) -> Polyhedra:
     if mesh.dim == 3:
         if thickness is not None:
             raise InputError("thickness is for meshes in 2D, and the mesh has 3 dimensions; leave it out")
-        return Polyhedra(mesh.points, mesh.starts, mesh.corners, mesh.owner)
+        return mesh
+    n, v = mesh.n_cells, len(mesh.points)
     height = (
-        float(np.sqrt(mesh.domain.measure / len(mesh)))
-        if thickness is None
-        else check_number("thickness", thickness, above=0)
+        float(np.sqrt(mesh.domain.measure / n)) if thickness is None else check_number("thickness", thickness, above=0)
     )
-    v = len(mesh.points)
     points = np.pad(np.concatenate([mesh.points, mesh.points]), ((0, 0), (0, 1)))
     points[v:, 2] = height
     a, b = mesh.corners.reshape(-1, 2).T
@@ -67,18 +44,25 @@ def polyhedra(mesh: SolverMesh, thickness: float | None = None) -> Polyhedra:
     lower = (mesh.twin >= 0) & (mesh.twin < np.arange(len(mesh.twin)))
     sides[lower] = np.roll(sides[lower], -1, axis=1)  # begins with the image of the twin's first
     starts, loops = cell_loops(mesh)
-    cells = np.arange(len(mesh), dtype=mesh.owner.dtype)
-    _, bottoms = take_rows(starts, loops, cells, np.ones(len(cells), bool))
+    cells = np.arange(n, dtype=mesh.owner.dtype)
+    _, bottoms = take_rows(starts, loops, cells, np.ones(n, bool))
     lengths = np.concatenate([np.full(len(sides), 4), np.diff(starts), np.diff(starts)])
-    return Polyhedra(
-        points,
-        np.concatenate([[0], np.cumsum(lengths)]),
-        np.concatenate([sides.ravel(), bottoms, loops + v]),
-        np.concatenate([mesh.owner, cells, cells]),
+    walls = len(mesh.domain.boundary_index)
+    return replace(
+        mesh,
+        generators=np.pad(mesh.generators, ((0, 0), (0, 1))),
+        points=points,
+        starts=np.concatenate([[0], np.cumsum(lengths)]),
+        corners=np.concatenate([sides.ravel(), bottoms, loops + v]),
+        owner=np.concatenate([mesh.owner, cells, cells]),
+        neighbor=np.concatenate([mesh.neighbor, np.repeat(np.array([-1 - walls, -2 - walls], np.int32), n)]),
+        twin=np.pad(mesh.twin, (0, 2 * n), constant_values=-1),
+        shift=np.pad(mesh.shift, ((0, 2 * n), (0, 1))),
+        half_face=np.pad(mesh.half_face, (0, 2 * n), constant_values=-1),
     )
 
 
-def cell_loops(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
+def cell_loops(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of each cell in 2D as ragged rows, counter-clockwise: starts (n + 1,) and points.
 
     Raises
@@ -98,16 +82,13 @@ def cell_loops(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
     return starts, loop
 
 
-def simple_loops(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simple_loops(mesh: Faces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return starts and points as `cell_loops`, and the cells that are no simple polygons, whose rows mean nothing."""
-    a, b = mesh.corners.reshape(-1, 2).T
-    k, v = mesh.inner, len(mesh.points)
-    cell = np.concatenate([mesh.owner, mesh.neighbor[:k]]).astype(np.int64)
-    begin, end = np.concatenate([a, b[:k]]), np.concatenate([b, a[:k]])
+    v, cell, (begin, end) = len(mesh.points), mesh.sides()[0], mesh.side_ends()
     key = cell * v + begin
     order = np.argsort(key, kind="stable")
     key, cell, begin, end = key[order], cell[order], begin[order], end[order]
-    counts = np.bincount(cell, minlength=len(mesh))
+    counts = np.bincount(cell, minlength=mesh.n_cells)
     starts = np.concatenate([[0], np.cumsum(counts)])
     after = np.minimum(np.searchsorted(key, cell * v + end), len(key) - 1)
     loop = begin.copy()

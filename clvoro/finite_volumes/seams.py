@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..errors import ClvoroError
-from ..mesh.connectivity import FaceTopology, face_corners, face_keys, face_owners, face_topology, take_rows
+from ..mesh.connectivity import face_corners, face_keys, face_owners, take_rows
 from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
 
 _BASE = 64
 """Offsets of images, three numbers between -32 and 31, are digits of one integer: offsets add as integers."""
 
 
-def faces_with_seams(diagram: Diagram) -> tuple[FaceTopology, np.ndarray, np.ndarray]:
-    """Return the faces of `diagram`, those at seams twice and at the end; their twins (f,); their shifts (f, d) int8.
+def faces_with_seams(diagram: Diagram) -> Faces:
+    """Return the faces of `diagram`, those at the seams of a periodic box twice and at the end.
 
     For each periodic direction the faces on the upper side come first. A face that is shifted in several directions
     belongs to the first of them.
@@ -23,10 +26,9 @@ def faces_with_seams(diagram: Diagram) -> tuple[FaceTopology, np.ndarray, np.nda
     ClvoroError
         If a face exists on one side of a seam only.
     """
-    faces = face_topology(diagram)
-    count = len(faces.owner)
-    if not any(diagram.domain.periodic):
-        return faces, np.full(count, -1), np.zeros((count, diagram.domain.dim), np.int8)
+    faces, domain = diagram.faces, diagram.domain
+    if not any(domain.periodic):
+        return faces
     shifts = diagram.shifts.astype(np.int64)
     starts, corners = face_corners(diagram)
     rows = np.flatnonzero(shifts.any(axis=1) & (np.diff(starts) > 0))
@@ -40,10 +42,10 @@ def faces_with_seams(diagram: Diagram) -> tuple[FaceTopology, np.ndarray, np.nda
         raise ClvoroError(
             "the two sides of a seam have different faces, because some are as short as round-off; use dtype='float64'"
         )
-    kept = np.flatnonzero(~shifts[faces.rows].any(axis=1))
+    kept = np.flatnonzero(~faces.shift.any(axis=1))
     first = len(kept)
     order, twin = [], [np.full(first, -1)]
-    for a in range(diagram.domain.dim):
+    for a in range(domain.dim):
         these = axis[upper] == a
         k = int(np.count_nonzero(these))
         order += [upper[these], lower[these]]
@@ -52,37 +54,23 @@ def faces_with_seams(diagram: Diagram) -> tuple[FaceTopology, np.ndarray, np.nda
     rows = rows[np.concatenate(order)]
     kept_starts, kept_corners = take_rows(faces.starts, faces.corners, kept)
     seam_starts, seam_corners = take_rows(starts, corners, rows)
-    seams = FaceTopology(
-        np.concatenate([faces.owner[kept], face_owners(diagram)[rows]]),
-        np.concatenate([faces.neighbor[kept], diagram.neighbors[rows]]),
-        np.concatenate([faces.rows[kept], rows]),
-        np.concatenate([kept_starts, kept_starts[-1] + seam_starts[1:]]),
-        np.concatenate([kept_corners, seam_corners]),
-        np.concatenate([faces.flipped[kept], np.zeros(len(rows), bool)]),
+    made = replace(
+        faces,
+        starts=np.concatenate([kept_starts, kept_starts[-1] + seam_starts[1:]]),
+        corners=np.concatenate([kept_corners, seam_corners]),
+        owner=np.concatenate([faces.owner[kept], face_owners(diagram)[rows]]),
+        neighbor=np.concatenate([faces.neighbor[kept], diagram.neighbors[rows]]),
+        twin=np.concatenate(twin),
+        shift=np.concatenate([faces.shift[kept], diagram.shifts[rows]]),
+        half_face=np.concatenate([faces.half_face[kept], rows]),
     )
-    twins = np.concatenate(twin)
-    shift = np.concatenate([np.zeros((len(kept), diagram.domain.dim), np.int64), shifts[rows]])
-    if diagram.domain.dim == 3:
-        period = shift * np.array(diagram.domain.extent)
-        aligned = align_seams(diagram.vertices, seams.starts, seams.corners, twins, period)
-        seams = FaceTopology(seams.owner, seams.neighbor, seams.rows, seams.starts, aligned, seams.flipped)
-    return seams, twins, shift.astype(np.int8)
+    return replace(made, corners=_aligned(made)) if domain.dim == 3 else made
 
 
-def align_seams(
-    points: np.ndarray, starts: np.ndarray, corners: np.ndarray, twin: np.ndarray, period: np.ndarray
-) -> np.ndarray:
-    """Return the corners of all faces; at seams the first corner of a lower face is the image of that of its twin.
-
-    Parameters
-    ----------
-    points : (v, d) float
-    starts, corners : int
-        Corners of each face as ragged rows.
-    twin : (f,) int
-    period : (f, d) float
-        Shift of each face times the extent of the box.
-    """
+def _aligned(faces: Faces) -> np.ndarray:
+    """Return the corners of all faces; at seams the first corner of a lower face is the image of that of its twin."""
+    points, starts, corners, twin = faces.points, faces.starts, faces.corners, faces.twin
+    period = faces.shift * np.array(faces.domain.extent)
     lower = np.flatnonzero((twin >= 0) & (twin < np.arange(len(twin))))
     if not len(lower):
         return corners

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from ..mesh.connectivity import following, take_rows
+from ..mesh.faces import Faces
+from ..mesh.geometry import polygon_areas, smaller_size, turns
 from ..mesh.straightening import WALL_CORNER, cross
-from .geometry import polygon_areas, smaller_size, turns
 from .independent import independent
 from .prisms import simple_loops
-from .solver_mesh import SolverMesh
 
 SHORT, THIN = 0.055, 0.2
 """A face is short if it is shorter than both, over the smaller size of its cells and over the width of the thinner one.
@@ -24,7 +24,7 @@ _FREE, _WALL, CORNER = range(3)
 """Kinds of points: of two with different kinds, the one of the larger kind stays."""
 
 
-def collapse_short_edges(mesh: SolverMesh, parts: np.ndarray) -> SolverMesh:
+def collapse_short_edges(mesh: Faces, parts: np.ndarray) -> Faces:
     """Return a mesh in 2D without short faces, as far as its cells remain convex.
 
     A corner of the domain and a point where the name of the boundary changes stay where they are. Of two points on a
@@ -33,7 +33,7 @@ def collapse_short_edges(mesh: SolverMesh, parts: np.ndarray) -> SolverMesh:
 
     Parameters
     ----------
-    mesh : SolverMesh
+    mesh : Faces
     parts : (k,) int
         Index of the named part of the boundary for each wall.
     """
@@ -55,7 +55,7 @@ class _Round:
 
     Attributes
     ----------
-    mesh : SolverMesh
+    mesh : Faces
     starts, loop, cell : int
         Points around each cell as ragged rows, and the cell of each item.
     images : (v,) int
@@ -74,11 +74,11 @@ class _Round:
         The point that takes its place: where two ends of a face merge, one of them.
     """
 
-    def __init__(self, mesh: SolverMesh, parts: np.ndarray, failed: np.ndarray) -> None:
+    def __init__(self, mesh: Faces, parts: np.ndarray, failed: np.ndarray) -> None:
         """Choose among the short faces of `mesh` without those of `failed`."""
         self.mesh, v = mesh, len(mesh.points)
         self.starts, self.loop, broken = simple_loops(mesh)
-        self.cell = np.repeat(np.arange(len(mesh)), np.diff(self.starts))
+        self.cell = np.repeat(np.arange(mesh.n_cells), np.diff(self.starts))
         self.images = mesh.images if any(mesh.domain.periodic) else np.arange(v)
         self.kind = point_kinds(mesh, parts, self.images)
         ratio = _lengths_over_limits(mesh, broken)
@@ -100,7 +100,7 @@ class _Round:
         """Return those of `faces`, the first ones preferred, whose points and their images touch no common cell."""
         if not faces.size:
             return faces
-        n, classes = len(self.mesh), self.images.max() + 1
+        n, classes = self.mesh.n_cells, self.images.max() + 1
         ends = self.images[self.mesh.corners.reshape(-1, 2)[faces]].T.ravel()
         moving = np.zeros(classes, bool)
         moving[ends] = True
@@ -165,36 +165,36 @@ class _Round:
         points[moving] = target[face] + self.shift[moving] * np.array(self.mesh.domain.extent)
         return points
 
-    def collapsed(self, target: np.ndarray, done: np.ndarray) -> SolverMesh:
+    def collapsed(self, target: np.ndarray, done: np.ndarray) -> Faces:
         """Return the mesh in which both ends of the faces `done` (e,) are at `target` (e, 2)."""
         into = np.where((self.face_of >= 0) & done[self.face_of], self.into, np.arange(len(self.into)))
         ends = into[self.mesh.corners].reshape(-1, 2)
         made = replace(self.mesh, points=self._moved(target, done), corners=ends.ravel())
-        return made.take_faces(ends[:, 0] != ends[:, 1])
+        return made.take_faces(ends[:, 0] != ends[:, 1]).compact()
 
 
-def _lengths_over_limits(mesh: SolverMesh, broken: np.ndarray) -> np.ndarray:
+def _lengths_over_limits(mesh: Faces, broken: np.ndarray) -> np.ndarray:
     """Return the length of each face over that below which it is short, (f,).
 
     The width of a cell is 4 times its area over its perimeter; `broken` are cells that are no simple polygons.
     """
     a, b = mesh.points[mesh.corners.reshape(-1, 2)].swapaxes(0, 1)
     lengths = np.linalg.norm(b - a, axis=1)
-    both = np.concatenate([mesh.owner, mesh.neighbor[: mesh.inner]])
-    perimeter = np.bincount(both, np.concatenate([lengths, lengths[: mesh.inner]]), len(mesh))
+    both = np.concatenate([mesh.owner, mesh.neighbor[: mesh.n_inner]])
+    perimeter = np.bincount(both, np.concatenate([lengths, lengths[: mesh.n_inner]]), mesh.n_cells)
     area = np.maximum(polygon_areas(mesh), 0)
     limit = np.minimum(SHORT * np.sqrt(area), THIN * 4 * area / np.maximum(perimeter, 1e-300))
     limit[broken] = 0
     return lengths / np.maximum(smaller_size(mesh.owner, mesh.neighbor, limit), 1e-300)
 
 
-def point_kinds(mesh: SolverMesh, parts: np.ndarray, images: np.ndarray | None = None) -> np.ndarray:
+def point_kinds(mesh: Faces, parts: np.ndarray, images: np.ndarray | None = None) -> np.ndarray:
     """Return whether each point is free, on a wall, or fixed in a corner, (v,) int.
 
     `images` (v,) int is the class of each point, if points are periodic images of one another.
     """
     images = np.arange(len(mesh.points)) if images is None else images
-    walls = slice(mesh.inner, mesh.outer)
+    walls = slice(mesh.n_inner, mesh.n_outer)
     a, b = mesh.corners.reshape(-1, 2)[walls].T
     part = parts[-1 - mesh.neighbor[walls]]
     classes = int(images.max()) + 1

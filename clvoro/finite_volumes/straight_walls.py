@@ -20,11 +20,11 @@ from ..errors import MismatchWarning
 from ..geometry.polygon import Polygon
 from ..geometry.simplification import DEFAULT_NAME
 from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
+from ..mesh.geometry import polygon_centroids, polygon_sides
 from ..mesh.straightening import along_rings, cross
 from .chords import chords, kept_points, least_of_rows
-from .geometry import polygon_centroids, polygon_sides
 from .independent import independent
-from .solver_mesh import SolverMesh
 from .wall_runs import WallRuns
 
 REACH = 0.4
@@ -35,12 +35,12 @@ _CHEAP = 1e-4
 """Runs that cost less than this remain as they are, in squares of the size of the cell."""
 
 
-def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> SolverMesh:
+def straight_walls(mesh: Faces, diagram: Diagram, parts: np.ndarray) -> Faces:
     """Return `mesh`, which has exact walls, with straight walls.
 
     Parameters
     ----------
-    mesh : SolverMesh
+    mesh : Faces
         Of `diagram`, in 2D.
     diagram : Diagram
     parts : (k,) int
@@ -51,7 +51,7 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
     mesh = _on_curves(_without_islands(mesh, domain, parts), domain)
     runs = WallRuns(mesh, along_rings(diagram, domain), parts)
     # 1: the ends of the cell do not move; 2: its walls remain as they are.
-    spared, most = np.zeros(len(mesh), int), np.where(_starlike(mesh), 2, 1)
+    spared, most = np.zeros(mesh.n_cells, int), np.where(_starlike(mesh), 2, 1)
     while True:
         made = _straightened(runs, spared)
         worse = ~_starlike(made) & (spared < most)
@@ -60,7 +60,7 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
         spared[worse] += 1
 
 
-def _without_islands(mesh: SolverMesh, domain: Polygon, parts: np.ndarray) -> SolverMesh:
+def _without_islands(mesh: Faces, domain: Polygon, parts: np.ndarray) -> Faces:
     """Return `mesh` without the holes of the domain that lie within one cell each.
 
     Those stay with which a named part of the boundary would vanish, but for rings that nobody gave a name.
@@ -70,10 +70,10 @@ def _without_islands(mesh: SolverMesh, domain: Polygon, parts: np.ndarray) -> So
     MismatchWarning
         If there are such holes.
     """
-    walls = np.arange(mesh.inner, mesh.outer)
+    walls = np.arange(mesh.n_inner, mesh.n_outer)
     edge, owner = -1 - mesh.neighbor[walls], mesh.owner[walls].astype(np.int64)
     ring, rings = (np.searchsorted(domain.ring_starts, edge, "right") - 1, len(domain.ring_starts) - 1)
-    least, most = np.full(rings, len(mesh)), np.full(rings, -1)
+    least, most = np.full(rings, mesh.n_cells), np.full(rings, -1)
     np.minimum.at(least, ring, owner)
     np.maximum.at(most, ring, owner)
     within = (least == most) & (np.diff(domain.piece_of_ring, prepend=-1) == 0)
@@ -97,14 +97,14 @@ def _without_islands(mesh: SolverMesh, domain: Polygon, parts: np.ndarray) -> So
     )
     kept = np.ones(len(mesh.owner), bool)
     kept[walls[within[ring]]] = False
-    return mesh.take_faces(kept)
+    return mesh.take_faces(kept).compact()
 
 
-def _on_curves(mesh: SolverMesh, domain: Polygon) -> SolverMesh:
+def _on_curves(mesh: Faces, domain: Polygon) -> Faces:
     """Return `mesh` with the points on walls moved from the domain's edges to its curves."""
     if not domain.curves:
         return mesh
-    walls = slice(mesh.inner, mesh.outer)
+    walls = slice(mesh.n_inner, mesh.n_outer)
     ends, edges = mesh.corners.reshape(-1, 2)[walls], -1 - mesh.neighbor[walls]
     rows, first = np.unique(ends, return_index=True)
     points = mesh.points.copy()
@@ -113,7 +113,7 @@ def _on_curves(mesh: SolverMesh, domain: Polygon) -> SolverMesh:
     return replace(mesh, points=points)
 
 
-def _straightened(runs: WallRuns, spared: np.ndarray) -> SolverMesh:
+def _straightened(runs: WallRuns, spared: np.ndarray) -> Faces:
     """Return the mesh with straight walls, where `spared` (n,) is not 2; face ends move where it is 0."""
     mesh, ends = runs.mesh, _Ends(runs, spared == 0)
     while ends.move():
@@ -134,7 +134,7 @@ def _straightened(runs: WallRuns, spared: np.ndarray) -> SolverMesh:
     owner = mesh.owner[source].copy()
     owner[: len(firsts)] = runs.cell[left[lines.row[steps[firsts]]]]
     order = np.lexsort((owner, -mesh.neighbor[source]))
-    k = mesh.inner
+    k = mesh.n_inner
     taken = np.concatenate([np.arange(k), source[order]])
     pairs = np.concatenate([corners[:k], np.stack([a, b], axis=1)[order]])
     return replace(
@@ -310,11 +310,11 @@ class _Ends:
         return True
 
 
-def _starlike(mesh: SolverMesh) -> np.ndarray:
+def _starlike(mesh: Faces) -> np.ndarray:
     """Return whether each cell's centroid sees all of its faces from inside, (n,); short faces do not count."""
     cell, p, q, origins = polygon_sides(mesh)
     areas, centroids = polygon_centroids(mesh)
     middle = (centroids - origins)[cell]
     seen = cross(p - middle, q - middle) > 0
     seen |= ((q - p) ** 2).sum(axis=1) < 2 * _SHORT**2 * areas[cell]
-    return (areas > 0) & (np.bincount(cell, ~seen, len(mesh)) == 0)
+    return (areas > 0) & (np.bincount(cell, ~seen, mesh.n_cells) == 0)

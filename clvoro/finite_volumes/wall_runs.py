@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mesh.faces import Faces
+from ..mesh.geometry import polygon_centroids
 from .chords import Lines, chord_costs, complex_of, concave_prices, kept_points
-from .geometry import polygon_centroids
 from .prisms import simple_loops
-from .solver_mesh import SolverMesh
 
 _WAY_PRICE, _TILT_PRICE = 0.02, 0.6
 """Prices of moving the end of a face, in squares of the size of the cell: for the distance over the size, and for the
@@ -41,8 +41,8 @@ class WallRuns:
         Sizes of cells.
     """
 
-    def __init__(self, mesh: SolverMesh, onward: np.ndarray, parts: np.ndarray) -> None:
-        self.mesh, self.walls = mesh, np.arange(mesh.inner, mesh.outer)
+    def __init__(self, mesh: Faces, onward: np.ndarray, parts: np.ndarray) -> None:
+        self.mesh, self.walls = mesh, np.arange(mesh.n_inner, mesh.n_outer)
         self.first, self.last = mesh.corners.reshape(-1, 2)[self.walls].T
         areas, centroids = polygon_centroids(mesh)
         self.points, self.centroids = complex_of(mesh.points), complex_of(centroids)
@@ -114,7 +114,7 @@ class WallRuns:
     def _beside(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the two points before and after each run in the loop around its cell, and whether they are known."""
         starts, loops, broken = simple_loops(self.mesh)
-        v, row = len(self.mesh.points), np.repeat(np.arange(len(self.mesh)), np.diff(starts))
+        v, row = len(self.mesh.points), np.repeat(np.arange(self.mesh.n_cells), np.diff(starts))
         keys = row * v + loops
         order = np.argsort(keys, kind="stable")
         keys = keys[order]
@@ -139,7 +139,7 @@ class WallRuns:
 
     def _links(self) -> tuple[np.ndarray, ...]:
         """Return the runs on both sides of face ends that can move, the inner faces, and which of their ends."""
-        k, v = self.mesh.inner, len(self.mesh.points)
+        k, v = self.mesh.n_inner, len(self.mesh.points)
         inner = self.mesh.corners[: 2 * k]
         wall_ends = np.concatenate([self.first, self.last])
         single = np.bincount(inner, minlength=v) == 1

@@ -133,6 +133,19 @@ class Domain(ABC):
     def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return outward unit normals of `walls` (k,) int, and a point on each, (k, d) each."""
 
+    def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the normals (k, d) of `walls` (k,) int, and the signed distances (k,) of `points` (k, d) from them.
+
+        On a part of a sphere the normal leads to the removed generator, and the distance is half of that way.
+        """
+        normals, anchors = self.wall_planes(walls)
+        return normals, ((anchors - points) * normals).sum(axis=1)
+
+    def mirrored(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the mirror images (k, d) of `points` (k, d) behind `walls` (k,) int; there the removed generators."""
+        normals, gaps = self.toward_walls(walls, points)
+        return points + 2 * gaps[:, None] * normals
+
     def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return the distance of each of `points` (k, d) to its wall of `walls` (k,); by default to the plane."""
         normals, anchors = self.wall_planes(walls)

@@ -134,6 +134,17 @@ class SphereRegion(Sphere):
         """Return for each of `points` (n, 3) on the boundary the wall towards the closest removed cell, (n,) int."""
         return np.asarray(KDTree(self.beyond).query(points)[1])
 
+    def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return unit vectors (k, 3) from `points` to the removed generators behind `walls`, and half the ways (k,)."""
+        ways = self.mirrored(walls, points) - points
+        length = np.linalg.norm(ways, axis=1)
+        return ways / length[:, None], length / 2
+
+    def mirrored(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the removed generators behind `walls` (k,) int, (k, 3)."""
+        del points
+        return np.asarray(self.beyond)[walls]
+
     @cached_property
     def _tree(self) -> KDTree:
         return KDTree(np.concatenate([self.within, self.beyond]))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..finite_volumes.solver_mesh import SolverMesh
+from ..mesh.faces import Faces
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class Patch:
     separation: tuple[float, ...] = ()
 
 
-def cyclic_patches(mesh: SolverMesh) -> list[Patch]:
+def cyclic_patches(mesh: Faces) -> list[Patch]:
     """Return the pairs of patches of the faces at seams, in the order of the faces: upper, lower, upper, ..."""
     made: list[Patch] = []
-    shifts = mesh.shift[mesh.outer :].astype(np.int64)
+    shifts = mesh.shift[mesh.n_outer :].astype(np.int64)
     axes = np.argmax(shifts != 0, axis=1)
     for axis in np.unique(axes).tolist():
         both = shifts[axes == axis]

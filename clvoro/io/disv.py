@@ -11,9 +11,9 @@ from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
-from ..finite_volumes.solver_mesh import SolverMesh, check_not_sphere
-from ..finite_volumes.two_point import two_point_faces
+from ..finite_volumes.solver_mesh import check_not_sphere
 from ..mesh.connectivity import take_rows
+from ..mesh.faces import Faces
 from ..mesh.read_only import Sealed
 
 if TYPE_CHECKING:
@@ -106,12 +106,12 @@ class Disv(Sealed):
         return f"Disv({len(self.centers)} cells, {len(self.vertices)} vertices; {', '.join(self.boundaries)})"
 
 
-def _without_empty_faces(mesh: SolverMesh) -> SolverMesh:
+def _without_empty_faces(mesh: Faces) -> Faces:
     """Return `mesh` without faces between cells that are as short as round-off: MODFLOW divides by their length."""
     ends = mesh.corners.reshape(-1, 2)
     a, b = mesh.points[ends].swapaxes(0, 1)
     short = np.hypot(*(b - a).T) <= _EMPTY * float(np.max(mesh.domain.extent))
-    short[mesh.inner :] = False
+    short[mesh.n_inner :] = False
     if not short.any():
         return mesh
     # Several such faces may be in a row. All their ends become the first one.
@@ -119,7 +119,7 @@ def _without_empty_faces(mesh: SolverMesh) -> SolverMesh:
     graph = coo_array((short[short], ends[short].T), shape=(size, size))
     label = connected_components(graph, directed=False)[1]
     into = np.unique(label, return_index=True)[1][label]
-    return replace(mesh, corners=into[mesh.corners]).take_faces(~short)
+    return replace(mesh, corners=into[mesh.corners]).take_faces(~short).compact()
 
 
 def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
@@ -139,12 +139,11 @@ def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
         raise InputError("DISV grids have no periodic sides, and this box has; use a box without periodic directions")
     mesh = _without_empty_faces(diagram.solver_mesh(walls, collapse=False))
     starts, loops = cell_loops(mesh)
-    cells = np.arange(len(mesh))
-    faces = two_point_faces(mesh, diagram.points)
+    cells = np.arange(mesh.n_cells)
     found = DisvBoundaries()
     for k, name in enumerate(domain.boundary_names):
-        rows = np.flatnonzero(faces.boundary == k)
-        rows = rows[np.argsort(faces.owner[rows], kind="stable")]
-        found[name] = DisvBoundary(faces.owner[rows], faces.area[rows], faces.near[rows], faces.foot[rows])
+        rows = np.flatnonzero(mesh.boundary == k)
+        rows = rows[np.argsort(mesh.owner[rows], kind="stable")]
+        found[name] = DisvBoundary(mesh.owner[rows], mesh.area[rows], mesh.near[rows], mesh.foot[rows])
     starts, corners = take_rows(starts, loops, cells, np.ones(len(cells), bool))
     return Disv(mesh.points, starts, corners, diagram.points.astype(float), found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,12 +11,12 @@ from fipy.variables.faceVariable import FaceVariable
 
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
-from ..finite_volumes.two_point import TwoPointFaces, two_point_faces
 from ..mesh.connectivity import take_rows
 
 if TYPE_CHECKING:
-    from ..finite_volumes.solver_mesh import SolverMesh, WallShape
+    from ..finite_volumes.solver_mesh import WallShape
     from ..mesh.diagram import Diagram
+    from ..mesh.faces import Faces
 
 
 class _AtGenerators:
@@ -30,11 +29,12 @@ class _AtGenerators:
 
     physicalFaces: dict[str, FaceVariable]  # noqa: N815  (as FiPy's meshes from Gmsh)
 
-    def __init__(
-        self, generators: np.ndarray, volumes: np.ndarray, faces: TwoPointFaces, shift: np.ndarray, **arrays: Any
-    ) -> None:
-        self._generators, self._volumes, self._faces = generators, volumes, faces
-        self._shift = shift  # (f, d), of the neighbor to its image beside the owner
+    def __init__(self, mesh: Faces, kept: np.ndarray, **arrays: Any) -> None:
+        """`kept` are the faces of `mesh` that FiPy gets."""
+        self._generators, self._volumes = mesh.generators.astype(float), _volumes(mesh)
+        names = ("owner", "neighbor", "area", "normal", "foot")
+        self._owner, self._neighbor, self._area, self._normal, self._foot = (getattr(mesh, n)[kept] for n in names)
+        self._shift = mesh.shift[kept] * np.array(mesh.domain.extent)  # of the neighbor to its image beside the owner
         super().__init__(**arrays)
 
     def _calcCellCenters(self) -> np.ndarray:  # noqa: N802
@@ -44,25 +44,24 @@ class _AtGenerators:
         return self._volumes
 
     def _calcFaceCenters(self) -> np.ndarray:  # noqa: N802
-        return self._faces.foot.T.copy()
+        return self._foot.T.copy()
 
     def _calcFaceAreas(self) -> np.ndarray:  # noqa: N802
-        return self._faces.area.copy()
+        return self._area.copy()
 
     def _calcFaceNormals(self) -> np.ndarray:  # noqa: N802
         # FiPy's own come from the first three corners, which may be nearly in line.
-        return np.where(self._owner_first(), 1.0, -1.0) * self._faces.normal.T
+        return np.where(self._owner_first(), 1.0, -1.0) * self._normal.T
 
     # FiPy's own vectors from cell to cell do not know of periodic images.
 
     def _calcFaceToCellDistAndVec(self) -> tuple[Any, Any]:  # noqa: N802
-        f = self._faces
-        here = f.foot - self._generators[f.owner]
-        beyond = f.foot - self._generators[np.maximum(f.neighbor, 0)] - self._shift
+        here = self._foot - self._generators[self._owner]
+        beyond = self._foot - self._generators[np.maximum(self._neighbor, 0)] - self._shift
         first = self._owner_first()[:, None]
         arms = np.stack([np.where(first, here, beyond), np.where(first, beyond, here)])
         mask = np.zeros(arms.shape, bool)
-        mask[1, f.neighbor < 0] = True
+        mask[1, self._neighbor < 0] = True
         vectors = np.ma.array(arms, mask=mask).transpose(2, 0, 1)
         return np.ma.sqrt((vectors**2).sum(axis=0)), vectors
 
@@ -77,7 +76,7 @@ class _AtGenerators:
 
     def _owner_first(self) -> np.ndarray:
         """Whether the first cell of ``faceCellIDs`` is the owner, (f,)."""
-        return np.ma.filled(self.faceCellIDs[0], -1) == self._faces.owner  # type: ignore[attr-defined]
+        return np.ma.filled(self.faceCellIDs[0], -1) == self._owner  # type: ignore[attr-defined]
 
 
 class VoronoiMesh2D(_AtGenerators, Mesh2D):
@@ -106,47 +105,39 @@ def make_fipy_mesh(diagram: Diagram, walls: WallShape) -> VoronoiMesh2D | Vorono
     seam = kept[mesh.twin[kept] >= 0]
     place[mesh.twin[seam]] = place[seam]
     starts, items = _cell_faces(mesh)
-    faces = two_point_faces(mesh, diagram.points)
     kind = VoronoiMesh2D if domain.dim == 2 else VoronoiMesh3D
     made = kind(
-        diagram.points.astype(float),
-        _volumes(mesh, faces, diagram.points),
-        TwoPointFaces(*(getattr(faces, f.name)[kept] for f in fields(faces))),
-        mesh.shift[kept] * np.array(domain.extent),
+        mesh,
+        kept,
         vertexCoords=mesh.points.T.copy(),
         faceVertexIDs=_padded(*take_rows(mesh.starts, mesh.corners, kept)),
         cellFaceIDs=_padded(starts, place[items]),
     )
-    part = faces.boundary[kept]
+    part = mesh.boundary[kept]
     made.physicalFaces = {
         name: FaceVariable(mesh=made, value=part == k) for k, name in enumerate(domain.boundary_names)
     }
     return made
 
 
-def _volumes(mesh: SolverMesh, faces: TwoPointFaces, points: np.ndarray) -> np.ndarray:
+def _volumes(mesh: Faces) -> np.ndarray:
     """Return the volumes of the cells, (n,): the sums of the pyramids from the generators to the faces."""
-    k, n = mesh.inner, len(mesh)
-    cell = np.concatenate([mesh.owner, mesh.neighbor[:k]])
-    face = np.concatenate([np.arange(len(mesh.owner)), np.arange(k)])
-    sign = np.where(np.arange(len(face)) < len(mesh.owner), 1.0, -1.0)
-    heights = sign * ((faces.center[face] - points[cell]) * faces.normal[face]).sum(axis=1)
-    return np.bincount(cell, faces.area[face] * heights / mesh.dim, n)
+    cell, face = mesh.sides()
+    sign = np.where(np.arange(len(face)) < len(mesh), 1.0, -1.0)
+    heights = sign * ((mesh.center[face] - mesh.generators[cell]) * mesh.normal[face]).sum(axis=1)
+    return np.bincount(cell, mesh.area[face] * heights / mesh.dim, mesh.n_cells)
 
 
-def _cell_faces(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
+def _cell_faces(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
     """Return the faces of each cell as ragged rows: starts (n + 1,) and faces; in 2D counter-clockwise."""
-    f, k, n = len(mesh.owner), mesh.inner, len(mesh)
-    cell = np.concatenate([mesh.owner, mesh.neighbor[:k]]).astype(np.int64)
-    face = np.concatenate([np.arange(f), np.arange(k)])
+    cell, face = mesh.sides()
     if mesh.dim == 3:
-        starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=n))])
-        return starts, face[np.argsort(cell, kind="stable")]
-    a, b = mesh.corners.reshape(-1, 2).T
-    key = cell * len(mesh.points) + np.concatenate([a, b[:k]])
+        starts, sides = mesh.cell_faces()
+        return starts, face[sides]
+    key = cell * len(mesh.points) + mesh.side_ends()[0]
     order = np.argsort(key)
     starts, loops = cell_loops(mesh)
-    wanted = np.repeat(np.arange(n), np.diff(starts)) * len(mesh.points) + loops
+    wanted = np.repeat(np.arange(mesh.n_cells), np.diff(starts)) * len(mesh.points) + loops
     return starts, face[order[np.searchsorted(key[order], wanted)]]
 
 

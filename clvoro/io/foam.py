@@ -15,7 +15,8 @@ from ..geometry.boundary_names import Walls
 from ..mesh.connectivity import slices
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import Contents
-from .polymesh import PatchType, PolyMesh, poly_mesh
+from .cyclic import Patch
+from .polymesh import PatchType, poly_mesh
 
 _FILES = {
     "points": "vectorField",
@@ -49,7 +50,8 @@ def write_foam(
     binary : bool, optional
         Write numbers as bytes: labels of 32 bits and scalars of 64.
     """
-    mesh = poly_mesh(contents.diagram, patches, types, thickness, walls or "straight")
+    mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls or "straight")
+    inner = mesh.n_inner
     marker = path if path.suffix.lower() == ".foam" else None
     folder = path if marker is None else path.parent / "constant" / "polyMesh"
     if marker is not None:
@@ -57,27 +59,24 @@ def write_foam(
         with atomic_file(marker):  # first, because it fails if the folder is not writable
             pass
     make_folder(folder)
-    note = (
-        f"nPoints:{len(mesh.points)} nCells:{len(contents.diagram)} nFaces:{len(mesh.owner)} "
-        f"nInternalFaces:{len(mesh.neighbor)}"
-    )
-    changed = f"straight walls change the area by {100 * mesh.area_change:+.3g} %" if mesh.area_change else ""
+    note = f"nPoints:{len(mesh.points)} nCells:{mesh.n_cells} nFaces:{len(mesh)} nInternalFaces:{inner}"
+    changed = f"straight walls change the area by {100 * change:+.3g} %" if change else ""
     notes = {"owner": note, "neighbour": note, "points": changed}
     if binary:
         lists = {
             "points": _bytes(mesh.points, np.float64),
             "faces": chain(_bytes(mesh.starts, np.int32), _bytes(mesh.corners, np.int32)),
             "owner": _bytes(mesh.owner, np.int32),
-            "neighbour": _bytes(mesh.neighbor, np.int32),
+            "neighbour": _bytes(mesh.neighbor[:inner], np.int32),
         }
     else:
         lists = {
             "points": _text(len(mesh.points), _vectors(mesh.points)),
             "faces": _text(len(mesh.owner), _faces(mesh.starts, mesh.corners)),
             "owner": _text(len(mesh.owner), _labels(mesh.owner)),
-            "neighbour": _text(len(mesh.neighbor), _labels(mesh.neighbor)),
+            "neighbour": _text(inner, _labels(mesh.neighbor[:inner])),
         }
-    lists["boundary"] = _text(len(mesh.patches), [_boundary(mesh).encode("ascii")])
+    lists["boundary"] = _text(len(made), [_boundary(made, inner).encode("ascii")])
     # `faces` is moved last: a case without it is recognized as incomplete.
     with atomic_folder(folder / "faces") as target:
         for name in _FILES:
@@ -145,9 +144,9 @@ def _numbers(values: np.ndarray) -> bytes:
     return orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)[1:-1]
 
 
-def _boundary(mesh: PolyMesh) -> str:
-    body, start = "", len(mesh.neighbor)
-    for patch in mesh.patches:
+def _boundary(patches: list[Patch], start: int) -> str:
+    body = ""
+    for patch in patches:
         body += f"    {patch.name}\n    {{\n        type            {patch.kind};\n"
         if patch.across:
             body += f"        neighbourPatch  {patch.across};\n"

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..mesh.connectivity import face_topology
 from .atomic import atomic_file
 from .contents import Contents
 
@@ -28,8 +27,8 @@ def write_metis(contents: Contents, path: Path) -> None:
     """
     if contents.extra:
         raise InputError(f"cannot write cell_data to {path}: a graph for METIS holds none; save as .nc or leave it out")
-    topology, n = face_topology(contents.diagram), len(contents.diagram)
-    i, j = (ends[: topology.inner].astype(np.int64) for ends in (topology.owner, topology.neighbor))
+    faces, n = contents.diagram.faces, len(contents.diagram)
+    i, j = (ends[: faces.n_inner].astype(np.int64) for ends in (faces.owner, faces.neighbor))
     pairs = np.unique(np.concatenate([i * n + j, j * n + i]))
     pairs = pairs[pairs // n != pairs % n]
     starts = np.concatenate([[0], np.cumsum(np.bincount(pairs // n, minlength=n))])

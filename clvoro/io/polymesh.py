@@ -7,7 +7,6 @@ patches of type `cyclic`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -16,41 +15,12 @@ from ..errors import InputError, InputTypeError
 from ..finite_volumes.prisms import polyhedra
 from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.boundary_names import Walls
-from ..mesh.connectivity import take_rows
 from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
 from .cyclic import Patch, cyclic_patches
 
 PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
 """Types of patches for `poly_mesh`."""
-
-
-@dataclass(frozen=True)
-class PolyMesh:
-    """A mesh in the arrays of OpenFOAM's polyMesh.
-
-    Attributes
-    ----------
-    points : (v, 3) float
-    starts : (f + 1,) int, corners : int
-        Corners of each face, counter-clockwise as seen from its neighbor or from outside.
-    owner : (f,) int
-        Owner of each face.
-    neighbor : (inner,) int
-        Neighbor of each inner face; owner < neighbor. Inner faces come first, in upper-triangular order: by owner, then
-        by neighbor.
-    patches : list of Patch
-        The faces of the patches follow the inner faces, patch by patch.
-    area_change : float
-        As in `SolverMesh`.
-    """
-
-    points: np.ndarray
-    starts: np.ndarray
-    corners: np.ndarray
-    owner: np.ndarray
-    neighbor: np.ndarray
-    patches: list[Patch]
-    area_change: float = 0.0
 
 
 def poly_mesh(
@@ -59,7 +29,7 @@ def poly_mesh(
     types: Mapping[str, PatchType] | None = None,
     thickness: float | None = None,
     walls: WallShape = "straight",
-) -> PolyMesh:
+) -> tuple[Faces, list[Patch], float]:
     """Describe `diagram` for OpenFOAM; faces without measure and points without a face are left out.
 
     The patches are the boundaries of the domain by their names, then one pair of cyclic patches for each periodic
@@ -77,6 +47,14 @@ def poly_mesh(
     walls : {"straight", "exact"}, optional
         See `Diagram.solver_mesh`.
 
+    Returns
+    -------
+    Faces
+        The cells as polyhedra. The faces of the patches follow those between two cells, patch by patch.
+    list of Patch
+    float
+        `Faces.area_change` of the mesh, in 2D of its polygons.
+
     Raises
     ------
     InputError, InputTypeError
@@ -89,24 +67,21 @@ def poly_mesh(
     kinds = _kinds(parts.names, types)
     mesh = make_solver_mesh(diagram, walls, walls == "straight", parts.index)
     cells = polyhedra(mesh, thickness)
-    groups = parts.index[-1 - mesh.neighbor[mesh.inner : mesh.outer]]
+    groups = parts.index[-1 - mesh.neighbor[mesh.n_inner : mesh.n_outer]]
     counts = np.bincount(groups, minlength=len(parts.names)).tolist()
     made = [Patch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]
     made += cyclic_patches(mesh)
     if domain.dim == 2:
-        made += [Patch("back", "empty", len(mesh)), Patch("front", "empty", len(mesh))]
+        made += [Patch("back", "empty", mesh.n_cells), Patch("front", "empty", mesh.n_cells)]
     own = {patch.name for patch in made[len(parts.names) :]}
     clash = [name for name in parts.names if name in own]
     if clash:
         raise InputError(
             f"the boundary {clash[0]!r} has the name of a patch that OpenFOAM needs here; choose another name"
         )
-    order = np.arange(len(cells.owner))
-    order[mesh.inner : mesh.outer] = mesh.inner + np.argsort(groups, kind="stable")
-    starts, corners = take_rows(cells.starts, cells.corners, order)
-    return PolyMesh(
-        cells.points, starts, corners, cells.owner[order], mesh.neighbor[: mesh.inner], made, mesh.area_change
-    )
+    order = np.arange(len(cells))
+    order[mesh.n_inner : mesh.n_outer] = mesh.n_inner + np.argsort(groups, kind="stable")
+    return cells.take_faces(order), made, mesh.area_change
 
 
 def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> list[str]:

@@ -15,15 +15,16 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..finite_volumes.geometry import polygon_areas
 from ..finite_volumes.prisms import cell_loops
-from ..finite_volumes.solver_mesh import SolverMesh, WallShape, make_solver_mesh
+from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.sphere import Sphere
 from ..geometry.sphere_region import SphereRegion
 from ..mesh.connectivity import face_corners, face_owners, next_faces, take_rows
 from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
+from ..mesh.geometry import polygon_areas
 from ..mesh.straightening import count_sides
 from .atomic import atomic_file
 from .contents import Contents
@@ -153,45 +154,42 @@ def _polygon_graph(diagram: Diagram) -> dict[str, np.ndarray]:
     }
 
 
-def _polygons(mesh: Diagram | SolverMesh) -> dict[str, np.ndarray]:
+def _polygons(mesh: Diagram | Faces) -> dict[str, np.ndarray]:
     """Return the corners of cells, counter-clockwise, and the end of each cell's part."""
-    if isinstance(mesh, SolverMesh):
+    if isinstance(mesh, Faces):
         starts, corners = cell_loops(mesh)
         return {"connectivity": corners.astype(np.int32), "offsets": starts[1:].astype(np.int32)}
     return {"connectivity": mesh.cell_vertices, "offsets": mesh.cell_vertex_starts[1:]}
 
 
-def _half_faces(mesh: Diagram | SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _half_faces(mesh: Diagram | Faces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return cell, starts and corners of each half-face in 3D, cell by cell."""
-    if not isinstance(mesh, SolverMesh):
+    if not isinstance(mesh, Faces):
         return face_owners(mesh), *face_corners(mesh)
-    k = mesh.inner
-    cell = np.concatenate([mesh.owner, mesh.neighbor[:k]])
-    order = np.argsort(cell, kind="stable")
-    face = np.concatenate([np.arange(len(mesh.owner)), np.arange(k)])[order]
-    turned = order >= len(mesh.owner)
-    return cell[order], *take_rows(mesh.starts, mesh.corners, face, turned)
+    starts, sides = mesh.cell_faces()
+    face = mesh.sides()[1][sides]
+    cell = np.repeat(np.arange(mesh.n_cells), np.diff(starts))
+    return cell, *take_rows(mesh.starts, mesh.corners, face, sides >= len(mesh))
 
 
-def _solver_data(mesh: SolverMesh) -> dict[str, np.ndarray]:
+def _solver_data(mesh: Faces) -> dict[str, np.ndarray]:
     """Return the cell data that differ from those of the diagram."""
-    counts = np.bincount(mesh.owner, minlength=len(mesh))
-    counts += np.bincount(mesh.neighbor[: mesh.inner], minlength=len(mesh))
+    counts = np.bincount(mesh.sides()[0], minlength=mesh.n_cells)
     flat = mesh.dim == 2
     return {
         "volume": polygon_areas(mesh) if flat else mesh.measures.geometry.volumes,
         "sides" if flat else "faces_of_cell": counts.astype(np.int32),
-        **_on_boundaries(mesh.domain, mesh.owner, mesh.neighbor, len(mesh)),
+        **_on_boundaries(mesh.domain, mesh.owner, mesh.neighbor, mesh.n_cells),
     }
 
 
-def polyhedra(mesh: Diagram | SolverMesh) -> dict[str, np.ndarray]:
+def polyhedra(mesh: Diagram | Faces) -> dict[str, np.ndarray]:
     """Return the corners and faces of cells in VTK's arrays.
 
     `faces` has for each cell the number of its faces, and then for each face the number of its corners and the corners,
     counter-clockwise as seen from outside. `faceoffsets` has the end of each cell's part.
     """
-    n, v = len(mesh), len(mesh.points if isinstance(mesh, SolverMesh) else mesh.vertices)
+    n, v = (mesh.n_cells, len(mesh.points)) if isinstance(mesh, Faces) else (len(mesh), len(mesh.vertices))
     owner, starts, corners = _half_faces(mesh)
     sides = np.diff(starts)
     owner, sides = owner[sides > 0], sides[sides > 0]

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..geometry.polygon import Polygon
-from ..geometry.sphere_region import SphereRegion
 from .diagram import Diagram
 
 if TYPE_CHECKING:
@@ -31,14 +29,15 @@ def boundary_cells(diagram: Diagram, walls: Walls | None) -> np.ndarray:
 def neighbor_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
     """Return the generators, or their images, behind the half-faces `faces` (k,): (k, d).
 
-    The half-faces are between two cells, or on the boundary of a `SphereRegion`, behind which a cell was removed.
+    Behind a wall it is the mirror image of the cell's own, on a part of a sphere the generator of the removed cell.
     """
     domain, neighbors = diagram.domain, diagram.neighbors[faces]
-    if isinstance(domain, SphereRegion):
-        beyond = np.asarray(domain.beyond)[np.maximum(-1 - neighbors, 0)]
-        inner = diagram.points[np.maximum(neighbors, 0)]
-        return np.where((neighbors < 0)[:, None], beyond, inner)
-    return diagram.points[neighbors] + diagram.shifts[faces] * domain.extent
+    found = diagram.points[np.maximum(neighbors, 0)] + diagram.shifts[faces] * domain.extent
+    walls = np.flatnonzero(neighbors < 0)
+    if walls.size:
+        own = diagram.points[face_owners(diagram)[faces[walls]]]
+        found[walls] = domain.mirrored(-1 - neighbors[walls], own)
+    return found
 
 
 def plane_shares(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
@@ -197,70 +196,3 @@ def cell_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
     kept = corners != corners[following(starts)]
     counts = np.bincount(cell[kept], minlength=len(diagram))
     return np.concatenate([[0], np.cumsum(counts)]), corners[kept]
-
-
-@dataclass(frozen=True)
-class FaceTopology:
-    """Every face once: those between two cells first, in the order of (owner, neighbor), then the walls'.
-
-    Attributes
-    ----------
-    owner, neighbor : (f,) int32
-        Cells on both sides, owner < neighbor (or equal, in a periodic box); on wall k the neighbor is -1 - k. One wall
-        follows the other, each in the order of the owners.
-    rows : (f,) int
-        A half-face of each face.
-    starts : (f + 1,) int, corners : int
-        Vertices of each face: in 2D the owner is on the left of the way from the first to the second, in 3D the
-        order is counter-clockwise as seen from the neighbor.
-    flipped : (f,) bool
-        Whether only the neighbor's half-face is there, so that `rows` leads to that one.
-    """
-
-    owner: np.ndarray
-    neighbor: np.ndarray
-    rows: np.ndarray
-    starts: np.ndarray
-    corners: np.ndarray
-    flipped: np.ndarray
-
-    @property
-    def inner(self) -> int:
-        """Number of faces between two cells."""
-        return int(np.count_nonzero(self.neighbor >= 0))
-
-
-def face_topology(diagram: Diagram) -> FaceTopology:
-    """Return every face of `diagram` that has a measure, once."""
-    owner, neighbor = face_owners(diagram), diagram.neighbors
-    starts, corners = face_corners(diagram)
-    filled = np.diff(starts) > 0
-    inner = np.flatnonzero(filled & (neighbor >= 0))
-    # Of two half-faces that of the lower cell is taken, or that which is there.
-    here, there = face_keys(diagram, inner)
-    first, second = np.flatnonzero(here < there), np.flatnonzero(here > there)
-    key, other = here[first], there[second]
-    order = np.argsort(key, kind="stable")
-    # Keys in the order of the cells are nearly sorted, which is fast to complete.
-    by_cell = inverse(np.arange(len(second) + 1), neighbor[inner[second]], len(diagram))[1]
-    nearly = other[by_cell]
-    if not np.array_equal(key[order], np.sort(nearly, kind="stable")):
-        second = second[~np.isin(other, key)]
-        first, key = np.concatenate([first, second]), np.concatenate([key, there[second]])
-        order = np.argsort(key, kind="stable")
-    chosen = first[order]
-    inner, flipped = inner[chosen], here[chosen] > there[chosen]
-    outer = np.flatnonzero(filled & (neighbor < 0))
-    outer = outer[np.lexsort((owner[outer], -neighbor[outer]))]
-    rows = np.concatenate([inner, outer])
-    one, other = owner[inner], neighbor[inner]
-    backwards = np.concatenate([flipped, np.zeros(len(outer), bool)])
-    taken, vertices = take_rows(starts, corners, rows, backwards)
-    return FaceTopology(
-        np.concatenate([np.minimum(one, other), owner[outer]]).astype(np.int32),
-        np.concatenate([np.maximum(one, other), neighbor[outer]]).astype(np.int32),
-        rows,
-        taken,
-        vertices,
-        backwards,
-    )

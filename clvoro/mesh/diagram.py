@@ -162,7 +162,7 @@ class Diagram(LazyArrays, MeshOutput):
     def faces(self) -> Faces:
         """Every face once, seams and walls included: owner, neighbor, boundary, area, normal, center, distance.
 
-        See `clvoro.mesh.faces.Faces` for the arrays. They are computed when first used.
+        See `clvoro.mesh.faces.Faces` for the arrays, which are computed when first used.
 
         Examples
         --------

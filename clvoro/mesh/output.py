@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import pyvista
     from numpy.typing import ArrayLike
 
-    from ..finite_volumes.solver_mesh import SolverMesh, WallShape
+    from ..finite_volumes.solver_mesh import WallShape
     from ..geometry.boundary_names import Walls
     from ..io.disv import Disv
     from ..io.fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..plotting.globe import Projection
     from ..plotting.solids import View
     from .diagram import Diagram
+    from .faces import Faces
     from .results import Result
 
 
@@ -191,7 +192,7 @@ class MeshOutput:
             for_netcdf={"convention": convention, "units": units},
         )
 
-    def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> SolverMesh:
+    def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> Faces:
         """Return the mesh as a finite-volume solver sees it: points, and each face with corners, owner and neighbor.
 
         Solvers reject or mistrust cells that are not convex, and faces that are much smaller than their cells. The
@@ -218,8 +219,8 @@ class MeshOutput:
 
         Returns
         -------
-        SolverMesh
-            See `clvoro.finite_volumes.solver_mesh.SolverMesh`. Its `measures` are those of OpenFOAM's `checkMesh`.
+        Faces
+            See `clvoro.mesh.faces.Faces`. Its `measures` are those of OpenFOAM's `checkMesh`.
 
         Raises
         ------
@@ -236,7 +237,7 @@ class MeshOutput:
         >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8), (0.3, 0.7)]
         >>> mesh = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), points).solver_mesh()
         >>> mesh, mesh.measures.non_orthogonality.max().round(1)
-        (SolverMesh(4 cells, 13 faces), np.float64(9.6))
+        (Faces(4 cells, 13 faces), np.float64(9.6))
         """
         from ..finite_volumes.solver_mesh import make_solver_mesh
 

@@ -94,7 +94,7 @@ def test_cells_fill_the_domain(meshes):
     assert volumes.sum() == pytest.approx(diagram.domain.measure, rel=1e-13)
     assert volumes == pytest.approx(diagram.volumes, rel=0.08)
     assert after.measures.openness.max() < 1e-13
-    assert len(after) == len(diagram)
+    assert after.n_cells == len(diagram)
 
 
 @pytest.mark.sparse(2)
@@ -123,7 +123,7 @@ def test_cells_are_polyhedra(meshes):
     """Euler's formula, two faces at each edge, and faces that meet on one path."""
     _, _, after = meshes
     loops = np.split(after.corners, after.starts[1:-1])
-    cells = [[] for _ in range(len(after))]
+    cells = [[] for _ in range(after.n_cells)]
     for f, loop in enumerate(loops):
         assert len(set(loop.tolist())) == len(loop) >= 3
         cells[after.owner[f]].append(loop.tolist())
@@ -154,7 +154,7 @@ def test_faces_are_flat_and_cells_convex(meshes):
 @pytest.mark.sparse(2)
 def test_faces_are_in_order_and_seams_are_images(meshes):
     _, _, after = meshes
-    inner = list(zip(after.owner[: after.inner], after.neighbor[: after.inner], strict=True))
+    inner = list(zip(after.owner[: after.n_inner], after.neighbor[: after.n_inner], strict=True))
     assert inner == sorted(inner)
     extent = np.array(after.domain.extent)
     for f in np.flatnonzero(after.twin >= 0):

@@ -6,13 +6,13 @@ import shapely
 
 import clvoro
 from clvoro.finite_volumes.convex_corners import join_faces, move_concave_points
-from clvoro.finite_volumes.solver_mesh import SolverMesh
+from clvoro.mesh.faces import Faces
 from tests.finite_volumes.test_straight_walls import concave_by, polygons
 
 SLIT = [(0, 0), (1, 0), (1, 1), (0.5005, 1), (0.5, 0.3), (0.4995, 1), (0, 1)]
 
 
-def square_in_four(middle: tuple[float, float]) -> SolverMesh:
+def square_in_four(middle: tuple[float, float]) -> Faces:
     """The unit square in quarters that meet in `middle`."""
     points = [(0, 0), (0.5, 0), (1, 0), (1, 0.5), (1, 1), (0.5, 1), (0, 1), (0, 0.5), middle]
     inner = [(1, 8, 0, 1), (8, 7, 0, 3), (3, 8, 1, 2), (8, 5, 3, 2)]
@@ -31,13 +31,13 @@ def square_in_four(middle: tuple[float, float]) -> SolverMesh:
     return mesh_of(points, inner, walls, 4)
 
 
-def mesh_of(points, inner, walls, cells) -> SolverMesh:
+def mesh_of(points, inner, walls, cells) -> Faces:
     inner = sorted(inner, key=lambda face: face[2:])
     a, b, owner, neighbor = np.array([*inner, *walls]).T
     count = len(a)
-    return SolverMesh(
+    return Faces(
         domain=clvoro.Box((0, 0), (1, 1)),
-        cells=cells,
+        generators=np.zeros((cells, 2)),
         points=np.array(points, float),
         starts=2 * np.arange(count + 1),
         corners=np.stack([a, b], axis=1).ravel(),

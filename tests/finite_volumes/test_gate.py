@@ -30,7 +30,7 @@ def test_a_good_mesh_is_accepted(good):
     assert good.diagram.check("openfoam") == report
     report.demand()
     mesh = good.solver_mesh()
-    assert (report.cells, report.faces) == (len(mesh), len(mesh.owner))
+    assert (report.cells, report.faces) == (mesh.n_cells, len(mesh.owner))
     assert report.area_change == mesh.area_change
     text = str(report)
     assert "openfoam: accepted" in text.splitlines()[0]
@@ -76,7 +76,7 @@ def test_a_cell_around_an_island_is_the_only_finding(ctx):
     diagram = clvoro.Adapter(ctx).diagram(domain, points)
     with pytest.warns(MismatchWarning, match=r"1 island lies within one cell .* at \(0\.5, 0\.5\)"):
         mesh = diagram.solver_mesh()
-    assert set(-1 - mesh.neighbor[mesh.inner :]) == set(range(4))
+    assert set(-1 - mesh.neighbor[mesh.n_inner :]) == set(range(4))
     assert mesh.area_change == pytest.approx(1 / domain.measure - 1, rel=1e-12)
     with warnings.catch_warnings():  # the mesh is kept, and warned of once
         warnings.simplefilter("error")

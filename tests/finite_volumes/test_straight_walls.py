@@ -24,17 +24,17 @@ def adapt(ctx, domain, size=0.08, **options) -> clvoro.Result:
 
 def wall_faces(mesh) -> list:
     """The faces on walls: (owner, edge of the domain, first point, second point)."""
-    walls = range(mesh.inner, mesh.outer)
+    walls = range(mesh.n_inner, mesh.n_outer)
     ends = mesh.points[mesh.corners.reshape(-1, 2)]
     return [(int(mesh.owner[f]), -1 - int(mesh.neighbor[f]), *ends[f]) for f in walls]
 
 
 def polygons(mesh) -> list:
     """The cells, one after the other, from the points and faces alone."""
-    sides = {i: {} for i in range(len(mesh))}
+    sides = {i: {} for i in range(mesh.n_cells)}
     for f, (a, b) in enumerate(mesh.corners.reshape(-1, 2).tolist()):
         sides[mesh.owner[f]][a] = b
-        if f < mesh.inner:
+        if f < mesh.n_inner:
             sides[mesh.neighbor[f]][b] = a
     found = []
     for cell in sides.values():

@@ -7,7 +7,6 @@ import scipy.sparse.linalg
 
 import clvoro
 from clvoro import sizing
-from clvoro.finite_volumes.two_point import two_point_faces
 
 PENTAGON = [(0, 0), (2, 0.1), (2.2, 1.2), (1, 1.6), (-0.1, 1)]
 ISLAND = [(0.7, 0.5), (1.4, 0.6), (0.9, 1.0)]
@@ -24,7 +23,7 @@ def minus_laplacian(x):
 def errors(mesh, walls):
     """Return the largest and the mean square error for u on all walls."""
     d = mesh.diagram
-    n, f = len(d), two_point_faces(d.solver_mesh(walls, collapse=False), d.points)
+    n, f = len(d), d.solver_mesh(walls, collapse=False)
     matrix, right = scipy.sparse.lil_array((n, n)), d.volumes * minus_laplacian(d.centroids)
     for i, j, a, value in zip(f.owner, f.neighbor, f.conductance, u(f.foot), strict=True):
         matrix[i, i] += a
@@ -55,7 +54,7 @@ def test_faces_are_those_of_the_diagram(dim):
     """In a box, where nothing is straightened: areas, distances, names; u = x is solved exactly."""
     box = clvoro.Box((0,) * dim, (1,) * dim, names={"inlet": "xMin"})
     d = clvoro.voronoi(box, np.random.default_rng(dim).random((60, dim)))
-    f = two_point_faces(d.solver_mesh(collapse=False), d.points)
+    f = d.solver_mesh(collapse=False)
     there = {(i, j): k for k, (i, j) in enumerate(zip(d.faces.owner, d.faces.neighbor, strict=True))}
     rows = [there[i, j] for i, j in zip(f.owner, f.neighbor, strict=True)]
     assert len(rows) == len(there)
@@ -73,7 +72,7 @@ def test_faces_are_those_of_the_diagram(dim):
 def test_seams_have_the_distance_to_the_image():
     box = clvoro.Box((0, 0), (1, 1), periodic=(True, False))
     d = clvoro.voronoi(box, [(0.1, 0.5), (0.5, 0.5), (0.9, 0.5)])
-    f = two_point_faces(d.solver_mesh(), d.points)
+    f = d.solver_mesh()
     between = f.neighbor >= 0
     seam = between & (np.abs(f.owner - f.neighbor) == 2)
     assert seam.sum() == 2
@@ -85,7 +84,7 @@ def test_a_generator_behind_the_plane_of_a_wall_uses_the_center():
     """At a corner of 315 degrees one cell has walls whose planes pass behind its generator."""
     ring = [(0, 0), (2, 0), (2, 1), (1, 1), (2, 1.9), (2, 2), (0, 2)]
     d = clvoro.voronoi(clvoro.Polygon(ring), [(0.9, 1.02), (0.3, 0.3), (1.7, 0.3), (0.4, 1.7)])
-    f = two_point_faces(d.solver_mesh("exact"), d.points)
+    f = d.solver_mesh("exact")
     behind = f.near * 0 + ((f.center - d.points[f.owner]) * f.normal).sum(axis=1) <= 0
     assert behind.any()
     assert (f.near > 0).all()

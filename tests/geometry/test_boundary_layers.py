@@ -234,7 +234,7 @@ def test_faces_end_in_the_corners_of_bodies_with_layers(adapter, angle, spacing)
     mesh = adapter.run(domain, 0.08, layers=layers, effort="fast").solver_mesh()
     faces = mesh.points[mesh.corners.reshape(-1, 2)]
     for corner in body:
-        assert (faces[: mesh.inner] == corner).all(axis=-1).any()
+        assert (faces[: mesh.n_inner] == corner).all(axis=-1).any()
     starts, loops = cell_loops(mesh)
     for first, last in pairwise(starts.tolist()):
         x = mesh.points[loops[first:last]]

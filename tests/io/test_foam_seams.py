@@ -135,9 +135,9 @@ def test_as_openfoam_checks_it(result, tmp_path):
 def test_one_cell_is_its_own_neighbor(ctx, tmp_path):
     box = clvoro.Box((0, 0), (1, 2), periodic=True)
     diagram = clvoro.Adapter(ctx).diagram(box, np.array([[0.3, 0.4]]))
-    mesh = io.polymesh.poly_mesh(diagram)
-    assert len(mesh.neighbor) == 0
-    assert {p.name for p in mesh.patches} == {"xMin", "xMax", "yMin", "yMax", "back", "front"}
+    mesh, patches, _ = io.polymesh.poly_mesh(diagram)
+    assert mesh.n_inner == 0
+    assert {p.name for p in patches} == {"xMin", "xMax", "yMin", "yMax", "back", "front"}
 
 
 @pytest.mark.sparse(2)

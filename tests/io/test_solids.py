@@ -13,7 +13,7 @@ from clvoro import io
 from clvoro.errors import InputError
 from clvoro.io.contents import Contents
 from clvoro.io.vtu import largest_boundary, polyhedra, write_vtu
-from clvoro.mesh.connectivity import face_corners, face_owners, face_topology, take_rows
+from clvoro.mesh.connectivity import face_corners, face_owners, take_rows
 from clvoro.mesh.diagram import Diagram
 from tests.io.test_io import assert_equal_results, assert_same_array, rewrite
 from tests.reference import solids
@@ -97,7 +97,7 @@ def test_faces_without_measure_are_left_out(lattice):
     for name, array in polyhedra(lattice).items():
         assert_same_array(polyhedra(d)[name], array)
     assert [len(loop) for loop in loops_of(d)[5:9]] == [4, 0, 0, 4]
-    assert len(face_topology(d).owner) == len(face_topology(lattice).owner)
+    assert len(d.faces.owner) == len(lattice.faces.owner)
 
 
 def test_take_rows_forwards_and_backwards():
@@ -108,7 +108,7 @@ def test_take_rows_forwards_and_backwards():
 
 
 def test_faces_once_has_each_face_once(diagram):
-    faces, owner = face_topology(diagram), face_owners(diagram)
+    faces, owner = diagram.faces, face_owners(diagram)
     pairs = {
         (min(i, j), max(i, j)) if j >= 0 else (i, j)
         for i, j in zip(owner.tolist(), diagram.neighbors.tolist(), strict=True)
@@ -116,8 +116,8 @@ def test_faces_once_has_each_face_once(diagram):
     found = list(zip(faces.owner.tolist(), faces.neighbor.tolist(), strict=True))
     assert len(found) == len(pairs)
     assert set(found) == pairs
-    assert found[: faces.inner] == sorted(p for p in pairs if p[1] >= 0)
-    assert found[faces.inner :] == sorted((p for p in pairs if p[1] < 0), key=lambda p: (-p[1], p[0]))
+    assert found[: faces.n_inner] == sorted(p for p in pairs if p[1] >= 0)
+    assert found[faces.n_inner :] == sorted((p for p in pairs if p[1] < 0), key=lambda p: (-p[1], p[0]))
 
 
 def test_a_face_of_one_cell_only_is_reversed(diagram):
@@ -133,7 +133,7 @@ def test_a_face_of_one_cell_only_is_reversed(diagram):
         face_vertex_starts=np.cumsum([0] + [len(loop) for loop in loops]).astype(np.int32),
         face_vertices=np.concatenate(loops).astype(np.int32),
     )
-    whole, partial = face_topology(diagram), face_topology(d)
+    whole, partial = diagram.faces, d.faces
     assert_same_array(whole.owner, partial.owner)
     assert_same_array(whole.neighbor, partial.neighbor)
     (k,) = np.flatnonzero((whole.owner == 20) & (whole.neighbor == neighbor[lost]))

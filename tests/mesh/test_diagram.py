@@ -125,7 +125,7 @@ def test_corners_of_faces_go_around_the_normal(case):
     diagram, noise = case
     f = diagram.faces
     for k in np.flatnonzero(f.area > 1e3 * noise):
-        corners = diagram.vertices[f.vertices[f.vertex_starts[k] : f.vertex_starts[k + 1]]]
+        corners = f.points[f.corners[f.starts[k] : f.starts[k + 1]]]
         if f.neighbor[k] < f.owner[k] and f.neighbor[k] >= 0:
             continue
         if corners.shape[1] == 2:

@@ -21,7 +21,7 @@ class Mesh:
 
     @classmethod
     def of(cls, mesh):
-        """The mesh of a `SolverMesh` without seams."""
+        """The mesh of a `Faces` without seams."""
         loops = np.split(mesh.corners, mesh.starts[1:-1])
         faces = [(int(i), int(j), loop.tolist()) for i, j, loop in zip(mesh.owner, mesh.neighbor, loops, strict=True)]
         return cls(dict(enumerate(mesh.points)), faces)

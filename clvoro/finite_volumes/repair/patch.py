@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..solver_mesh import SolverMesh, compact
+from ...mesh.faces import Faces
 
 if TYPE_CHECKING:
     from .wall_corners import Cut
@@ -76,12 +76,12 @@ class Patch:
         return found
 
 
-def take_patch(mesh: SolverMesh, chosen: np.ndarray) -> Patch:
+def take_patch(mesh: Faces, chosen: np.ndarray) -> Patch:
     """Return the cells `chosen` (n,) bool of `mesh`, all points on walls fixed; faces at seams are borders."""
     neighbor = np.where(mesh.twin >= 0, BORDER, mesh.neighbor.astype(np.int64))
     v = len(mesh.points)
     whole = Patch(
-        np.arange(len(mesh)),
+        np.arange(mesh.n_cells),
         mesh.points,
         np.arange(v),
         mesh.corners.reshape(-1, 2),
@@ -171,15 +171,15 @@ def _numbered(ids: np.ndarray, count: int) -> tuple[np.ndarray, int]:
     return made, len(new)
 
 
-def put_back(mesh: SolverMesh, patches: list[Patch]) -> SolverMesh:
+def put_back(mesh: Faces, patches: list[Patch]) -> Faces:
     """Return `mesh` with the faces and points of `patches`, which have no cell in common."""
     new = [int((patch.ids < 0).sum()) for patch in patches]
-    points, of, ids = np.pad(mesh.points, ((0, sum(new)), (0, 0))), np.full(len(mesh), -1), []
+    points, of, ids = np.pad(mesh.points, ((0, sum(new)), (0, 0))), np.full(mesh.n_cells, -1), []
     for i, patch in enumerate(patches):
         ids.append(_numbered(patch.ids, len(mesh.points) + sum(new[:i]))[0])
         points[ids[-1]] = patch.points
         of[patch.cells] = i
-    n = mesh.outer
+    n = mesh.n_outer
     here, there = mesh.owner[:n], mesh.neighbor[:n]
     within = (there < 0) | (of[np.maximum(there, 0)] == of[here])
     kept = np.flatnonzero(~within | (of[here] < 0))
@@ -211,7 +211,7 @@ def put_back(mesh: SolverMesh, patches: list[Patch]) -> SolverMesh:
         shift=shift,
         half_face=np.concatenate([half[order], mesh.half_face[seams]]),
     )
-    return compact(made)
+    return made.compact()
 
 
 def cell_sides(patch: Patch) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

@@ -17,11 +17,11 @@ from ...errors import MismatchWarning
 from ...geometry.polygon import Polygon
 from ...geometry.ring_coordinate import RingCoordinate
 from ...mesh.connectivity import following
+from ...mesh.faces import Faces
+from ...mesh.geometry import polygon_centroids, turns
 from ..chords import FILLED
-from ..geometry import polygon_centroids, turns
 from ..prisms import simple_loops
 from ..short_edges import CORNER, point_kinds
-from ..solver_mesh import SolverMesh
 from .figures import face_figures
 from .patch import LIMITS, Patch, part_of, put_back, take_patch
 from .pricing import LEAST_DETERMINANT, STRAIGHT, PricedPatch
@@ -52,12 +52,12 @@ _BLAS = threading.Lock()
 """Held while BLAS has one thread, which is a setting of the process."""
 
 
-def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> SolverMesh:
+def relax_points(mesh: Faces, parts: np.ndarray, straight: bool = True) -> Faces:
     """Return `mesh` with fewer faces that are skew or far from orthogonal, and fewer cells that are not convex.
 
     Parameters
     ----------
-    mesh : SolverMesh
+    mesh : Faces
     parts : (k,) int
         Index of the named part of the boundary for each wall.
     straight : bool
@@ -79,14 +79,14 @@ def relax_points(mesh: SolverMesh, parts: np.ndarray, straight: bool = True) -> 
     region = _grown(loops, bad)
     around, groups = take_patch(mesh, region), _connected_parts(mesh, region, bad)
     around.limits = limits
-    on_walls = slice(mesh.inner, mesh.outer)
+    on_walls = slice(mesh.n_inner, mesh.n_outer)
     walls = Walls(mesh.points[mesh.corners.reshape(-1, 2)[on_walls]], mesh.owner[on_walls], parts)
     patches = [_with_positions(_patch_of(around, cells), ring, kinds) for cells in groups]
     given = [made for made in map(PricedPatch.of, patches) if made is not None and made.bad.any()]
     # The last bits of sums in BLAS depend on its number of threads.
     with _BLAS, threadpool_limits(1, user_api="blas"):
         better = carried_out(in_step([_moved(patch) for patch in given]), ring)
-        if straight and _are_few(better, max(_MOST_PLACES, int(_PLACES_SHARE * len(mesh)))):
+        if straight and _are_few(better, max(_MOST_PLACES, int(_PLACES_SHARE * mesh.n_cells))):
             better = carried_out(in_step([repaired(patch, ring) for patch in better]), ring)
         refused = sum(int(patch.refused.sum()) for patch in better)
         if straight and 0 < refused <= _MOST_REFUSED:
@@ -137,7 +137,7 @@ def _are_few(patches: list[PricedPatch], most: int) -> bool:
     return False
 
 
-def _limited(mesh: SolverMesh) -> tuple[tuple[float, float], np.ndarray] | None:
+def _limited(mesh: Faces) -> tuple[tuple[float, float], np.ndarray] | None:
     """Return the limits that hold for `mesh`, and the faces beyond one of them; None if it was not adapted."""
     angle, skewness = face_measures(mesh)
     beyond = [np.flatnonzero((angle > a) | (skewness > s)) for a, s in _LIMITS]
@@ -148,27 +148,27 @@ def _limited(mesh: SolverMesh) -> tuple[tuple[float, float], np.ndarray] | None:
     return _LIMITS[k], beyond[k]
 
 
-def _bad_cells(mesh: SolverMesh, loops: tuple[np.ndarray, ...], faces: np.ndarray, all_kinds: bool) -> np.ndarray:
+def _bad_cells(mesh: Faces, loops: tuple[np.ndarray, ...], faces: np.ndarray, all_kinds: bool) -> np.ndarray:
     """Return which cells have one of the `faces`, (n,) bool.
 
     With `all_kinds`, also cells that are not convex or have a low determinant.
     """
     starts, points, broken = loops
-    found = np.zeros(len(mesh), bool)
+    found = np.zeros(mesh.n_cells, bool)
     found[mesh.owner[faces]] = True
     found[mesh.neighbor[faces[mesh.neighbor[faces] >= 0]]] = True
     if all_kinds:
         bent = turns(mesh.points[points], following(starts)) < STRAIGHT
-        found[np.repeat(np.arange(len(mesh)), np.diff(starts))[bent]] = True
+        found[np.repeat(np.arange(mesh.n_cells), np.diff(starts))[bent]] = True
         found |= _determinants(mesh) < LEAST_DETERMINANT
     found[broken] = False
     return found
 
 
-def _determinants(mesh: SolverMesh) -> np.ndarray:
+def _determinants(mesh: Faces) -> np.ndarray:
     """Return the determinant of each cell in 2D, (n,), as `SolverMeasures.determinant`."""
-    k, n = mesh.inner, len(mesh)
-    between = np.concatenate([np.arange(k), np.arange(mesh.outer, len(mesh.owner))])
+    k, n = mesh.n_inner, mesh.n_cells
+    between = np.concatenate([np.arange(k), np.arange(mesh.n_outer, len(mesh.owner))])
     a, b = mesh.points[mesh.corners.reshape(-1, 2)[np.concatenate([between, np.arange(k)])]].swapaxes(0, 1)
     cell = np.concatenate([mesh.owner[between], mesh.neighbor[:k]])
     x, y = (b - a).T
@@ -190,9 +190,9 @@ def _grown(loops: tuple[np.ndarray, ...], chosen: np.ndarray) -> np.ndarray:
     return found
 
 
-def _connected_parts(mesh: SolverMesh, region: np.ndarray, bad: np.ndarray) -> list[np.ndarray]:
+def _connected_parts(mesh: Faces, region: np.ndarray, bad: np.ndarray) -> list[np.ndarray]:
     """Return the parts of a `region` (n,) bool that are connected by faces and have bad cells, each (n,) bool."""
-    n, here, there = len(mesh), mesh.owner[: mesh.inner], mesh.neighbor[: mesh.inner]
+    n, here, there = mesh.n_cells, mesh.owner[: mesh.n_inner], mesh.neighbor[: mesh.n_inner]
     within = region[here] & region[there]
     pairs = (here[within], there[within])
     graph = scipy.sparse.coo_array((np.ones(len(pairs[0])), pairs), (n, n))
@@ -231,10 +231,10 @@ def _with_positions(patch: Patch, ring: RingCoordinate | None, kinds: np.ndarray
     return patch
 
 
-def face_measures(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
+def face_measures(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
     """Return non-orthogonality in radians and skewness of each face in 2D, (f,) each; 0 at seams."""
     _, centroids = polygon_centroids(mesh)
-    k = mesh.outer
+    k = mesh.n_outer
     ends = mesh.points[mesh.corners.reshape(-1, 2)[:k]].reshape(k, 4)
     there = mesh.neighbor[:k]
     found = np.zeros((2, len(mesh.owner)))

@@ -20,7 +20,7 @@ def patches(ctx):
     points = np.random.default_rng(2).random((300, 2))
     mesh = clvoro.Adapter(ctx).diagram(domain, points[domain.contains(points)])
     mesh = mesh.solver_mesh(collapse=False)
-    whole, ring = with_positions(mesh, take_patch(mesh, np.ones(len(mesh), bool)))
+    whole, ring = with_positions(mesh, take_patch(mesh, np.ones(mesh.n_cells, bool)))
     middles = PricedPatch.of(whole).cells.origin
     found = []
     for center in ([0.1, 0.1], [0.8, 0.2], [0.3, 0.8]):

@@ -39,7 +39,7 @@ def mesh(request, ctx):
 def some_cells(mesh, seed: int) -> np.ndarray:
     starts, loops, _ = simple_loops(mesh)
     corner = mesh.points[loops[starts[:-1]]]
-    center = corner[np.random.default_rng(seed).integers(len(mesh))]
+    center = corner[np.random.default_rng(seed).integers(mesh.n_cells)]
     return np.hypot(*(corner - center).T) < 0.3
 
 
@@ -70,7 +70,7 @@ def test_patches_go_back_as_they_came(mesh, seed):
         assert np.array_equal(getattr(made, name), getattr(mesh, name)), name
         assert getattr(made, name).dtype == getattr(mesh, name).dtype, name
     p = patches[0]
-    k = mesh.inner
+    k = mesh.n_inner
     held = set(p.ids[p.held].tolist())
     # Points at cells with a face to cells that are not in the patch, and at seams, stay.
     outside = ~chosen
@@ -81,7 +81,7 @@ def test_patches_go_back_as_they_came(mesh, seed):
 
 
 def test_parts_of_patches_go_back_as_they_came(mesh):
-    patch, _ = with_positions(mesh, take_patch(mesh, np.ones(len(mesh), bool)))
+    patch, _ = with_positions(mesh, take_patch(mesh, np.ones(mesh.n_cells, bool)))
     chosen = some_cells(mesh, 3)
     part = part_of(patch, chosen)
     assert faces_of(restored(patch, part)) == faces_of(patch)
@@ -93,7 +93,7 @@ def test_parts_of_patches_go_back_as_they_came(mesh):
 
 
 def test_sides_go_around_each_cell(mesh):
-    patch = take_patch(mesh, np.ones(len(mesh), bool))
+    patch = take_patch(mesh, np.ones(mesh.n_cells, bool))
     starts, begins, faces = cell_sides(patch)
     known_starts, known, broken = simple_loops(mesh)
     assert not broken.size
@@ -107,27 +107,27 @@ def test_sides_go_around_each_cell(mesh):
 
 
 def test_cells_that_are_no_rings_have_no_sides(mesh):
-    patch = take_patch(mesh, np.ones(len(mesh), bool))
+    patch = take_patch(mesh, np.ones(mesh.n_cells, bool))
     kept = np.arange(len(patch.owner)) != 3
     patch.ends, patch.owner, patch.neighbor = (patch.ends[kept], patch.owner[kept], patch.neighbor[kept])
     assert cell_sides(patch) is None
 
 
 def test_figures_are_those_of_the_solver_mesh(mesh):
-    given = PricedPatch.of(take_patch(mesh, np.ones(len(mesh), bool)))
+    given = PricedPatch.of(take_patch(mesh, np.ones(mesh.n_cells, bool)))
     now, measures = given.cells.figures(*given.patch.points.T), mesh.measures
-    assert np.array_equal(given.cells.faces, np.arange(mesh.outer))
+    assert np.array_equal(given.cells.faces, np.arange(mesh.n_outer))
     # OpenFOAM's centroids of concave cells are not exact.
-    bent = np.zeros(len(mesh), bool)
+    bent = np.zeros(mesh.n_cells, bool)
     bent[given.cells.row[given.bent]] = True
     rows = np.flatnonzero(~bent[given.cells.owner] & ~bent[given.cells.neighbor])
-    assert len(rows) > 0.9 * mesh.outer
+    assert len(rows) > 0.9 * mesh.n_outer
     angle = np.degrees(now.angle[rows])
     np.testing.assert_allclose(angle, measures.non_orthogonality[rows], atol=1e-6)
     np.testing.assert_allclose(now.skewness[rows], measures.skewness[rows], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(now.determinant, measures.determinant, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(now.area, measures.sizes**2, rtol=1e-9)
-    assert np.array_equal(np.isclose(np.bincount(given.cells.row, now.turn), 2 * np.pi), np.ones(len(mesh), bool))
+    assert np.array_equal(np.isclose(np.bincount(given.cells.row, now.turn), 2 * np.pi), np.ones(mesh.n_cells, bool))
 
 
 @pytest.mark.parametrize("domain", [d for d in DOMAINS.values() if isinstance(d, clvoro.Polygon)])
@@ -153,7 +153,7 @@ def test_positions_run_along_the_rings(domain):
 
 @pytest.mark.sparse(2)
 def test_points_slide_along_the_boundary_and_fixed_ones_stay(mesh):
-    patch, ring = with_positions(mesh, take_patch(mesh, np.ones(len(mesh), bool)))
+    patch, ring = with_positions(mesh, take_patch(mesh, np.ones(mesh.n_cells, bool)))
     given = PricedPatch.of(patch)
     assert given.bad.any()
     (made,) = moved([Move(given, given.near(given.bad, 3), True, 12)], ring)

@@ -12,7 +12,7 @@ from clvoro.finite_volumes.repair.patch import take_patch
 from clvoro.finite_volumes.repair.pricing import PricedPatch
 from clvoro.finite_volumes.repair.reconnection import _Connections
 from clvoro.finite_volumes.repair.relaxation import relax_points
-from clvoro.finite_volumes.solver_mesh import SolverMesh
+from clvoro.mesh.faces import Faces
 from tests.finite_volumes.repair.test_patch import with_positions
 from tests.finite_volumes.test_straight_walls import concave_by, polygons
 
@@ -53,14 +53,14 @@ def coast(ctx, seed: int) -> clvoro.Diagram:
     return diagram
 
 
-def unrepaired(diagram) -> SolverMesh:
+def unrepaired(diagram) -> Faces:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(relaxation, "relax_points", lambda mesh, *_: mesh)
         return copy.copy(diagram).solver_mesh()
 
 
 def lengths_of_parts(mesh) -> np.ndarray:
-    walls = slice(mesh.inner, mesh.outer)
+    walls = slice(mesh.n_inner, mesh.n_outer)
     a, b = mesh.points[mesh.corners.reshape(-1, 2)[walls]].swapaxes(0, 1)
     part = DOMAIN.boundaries.index[-1 - mesh.neighbor[walls]]
     return np.bincount(part, np.hypot(*(b - a).T))
@@ -85,10 +85,10 @@ def test_repaired_meshes_are_accepted_and_whole(ctx, seed):
     assert total == pytest.approx(sum(p.area for p in cells), rel=1e-9)
     assert total == pytest.approx(DOMAIN.measure * (1 + after.area_change), rel=1e-12)
     # Faces are in order, each pair of cells has one, and named parts keep their places.
-    pairs = list(zip(after.owner[: after.inner].tolist(), after.neighbor[: after.inner].tolist(), strict=True))
+    pairs = list(zip(after.owner[: after.n_inner].tolist(), after.neighbor[: after.n_inner].tolist(), strict=True))
     assert pairs == sorted(set(pairs))
-    assert (after.owner[: after.inner] < after.neighbor[: after.inner]).all()
-    assert (np.diff(-1 - after.neighbor[after.inner : after.outer]) >= 0).all()
+    assert (after.owner[: after.n_inner] < after.neighbor[: after.n_inner]).all()
+    assert (np.diff(-1 - after.neighbor[after.n_inner : after.n_outer]) >= 0).all()
     assert lengths_of_parts(after) == pytest.approx(lengths_of_parts(before), rel=0.03)
     areas = np.array([p.area for p in cells])
     assert np.median(np.abs(areas / diagram.volumes - 1)) < 0.02
@@ -110,7 +110,7 @@ def test_points_alone_do_not_suffice(ctx, monkeypatch):
 def test_all_changes_of_faces_keep_the_mesh_consistent(ctx):
     """Each change gives cells that are simple rings, with the same sum of areas as their outline."""
     mesh = unrepaired(coast(ctx, 1))
-    patch, ring = with_positions(mesh, take_patch(mesh, np.ones(len(mesh), bool)))
+    patch, ring = with_positions(mesh, take_patch(mesh, np.ones(mesh.n_cells, bool)))
     given = PricedPatch.of(patch)
     connections, count = _Connections(given, ring), {-1: 0, 0: 0}
     for face in given.cells.faces.tolist():

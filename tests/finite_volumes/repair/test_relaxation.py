@@ -10,15 +10,15 @@ import scipy.linalg.lapack
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import clvoro
-from clvoro.finite_volumes.geometry import polygon_areas
 from clvoro.finite_volumes.repair import relaxation
 from clvoro.finite_volumes.repair.patch import LIMITS
 from clvoro.finite_volumes.repair.relaxation import face_measures, relax_points
-from clvoro.finite_volumes.solver_mesh import SolverMesh
+from clvoro.mesh.faces import Faces
+from clvoro.mesh.geometry import polygon_areas
 from tests.finite_volumes.test_straight_walls import concave_by, polygons
 
 
-def ell(ctx, steps: int) -> SolverMesh:
+def ell(ctx, steps: int) -> Faces:
     """Return an L of 121 cells after some of Lloyd's steps."""
     domain = clvoro.Polygon([(0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
     adapter = clvoro.Adapter(ctx)
@@ -30,7 +30,7 @@ def ell(ctx, steps: int) -> SolverMesh:
 
 
 @pytest.fixture(scope="module")
-def mesh(ctx) -> SolverMesh:
+def mesh(ctx) -> Faces:
     """Some faces are bad."""
     return ell(ctx, 1)
 
@@ -49,7 +49,7 @@ def test_bad_faces_become_fewer_and_nothing_else_suffers(mesh):
     assert after[0].max() < np.radians(19)
     assert after[1].max() < 1.9
     assert relaxed.area_change == pytest.approx(mesh.area_change, abs=1e-12)
-    held = np.unique(mesh.corners[mesh.starts[mesh.inner] :])
+    held = np.unique(mesh.corners[mesh.starts[mesh.n_inner] :])
     np.testing.assert_array_equal(relaxed.points[held], mesh.points[held])
     assert max(map(concave_by, polygons(relaxed))) < 1e-4
     np.testing.assert_allclose(polygon_areas(relaxed), polygon_areas(mesh), rtol=0.3)

@@ -21,7 +21,7 @@ def patch(ctx):
     points = np.concatenate([rng.random((50, 2)), passage])
     diagram = clvoro.Adapter(ctx).diagram(domain, points[domain.contains(points)])
     mesh = diagram.solver_mesh(collapse=False)
-    given = PricedPatch.of(take_patch(mesh, np.ones(len(mesh), bool)))
+    given = PricedPatch.of(take_patch(mesh, np.ones(mesh.n_cells, bool)))
     x, y = given.patch.points.T + rng.normal(0, 0.002, given.patch.points.T.shape)
     given.cells.aim = np.full(len(given.cells.faces), LENGTH_GOAL)
     return given.cells, x, y

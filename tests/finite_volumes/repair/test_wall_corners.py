@@ -157,7 +157,7 @@ PLACES = {
 }
 
 
-def made(diagram) -> tuple[clvoro.finite_volumes.solver_mesh.SolverMesh, list[str]]:
+def made(diagram) -> tuple[clvoro.mesh.faces.Faces, list[str]]:
     """The solver mesh, and warnings of corners that are cut off."""
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always", MismatchWarning)
@@ -188,7 +188,7 @@ def test_refused_cells_become_accepted(ctx, name, monkeypatch):
     total = shapely.union_all(cells).area
     assert total == pytest.approx(sum(p.area for p in cells), rel=1e-9)
     assert total == pytest.approx(diagram.domain.measure * (1 + mesh.area_change), rel=1e-12)
-    assert (np.diff(-1 - mesh.neighbor[mesh.inner : mesh.outer]) >= 0).all()
+    assert (np.diff(-1 - mesh.neighbor[mesh.n_inner : mesh.n_outer]) >= 0).all()
     assert len(warned) == (place.cut is not None)
     if place.cut is not None:
         assert f"({place.cut[0]:g}, {place.cut[1]:g})" in warned[0]
@@ -208,7 +208,7 @@ def test_refused_cells_become_accepted(ctx, name, monkeypatch):
 def test_all_changes_of_walls_keep_the_mesh_consistent(ctx):
     """Cells are simple rings, and have the area of their outline; what is taken back to the mesh is the same."""
     mesh = unrepaired(coast(ctx, 1))
-    every = np.ones(len(mesh), bool)
+    every = np.ones(mesh.n_cells, bool)
     patch, _ = with_positions(mesh, take_patch(mesh, every))
     given = PricedPatch.of(patch)
     # Also corners that are convex.
@@ -250,7 +250,7 @@ def test_corners_are_not_cut_off_through_another_wall(ctx):
     place = PLACES["blunt tip"]
     diagram = clvoro.Adapter(ctx).diagram(clvoro.Polygon(place.vertices), np.array(place.points))
     mesh = unrepaired(diagram)
-    every = np.ones(len(mesh), bool)
+    every = np.ones(mesh.n_cells, bool)
     patch, _ = with_positions(mesh, take_patch(mesh, every))
     given = PricedPatch.of(patch)
     pond = np.array([[(-0.4, -0.06), (-0.36, 0.02)]])

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mesh.connectivity import following
-from ..mesh.read_only import Sealed
-from ..mesh.straightening import cross
+from .connectivity import following
+from .read_only import Sealed
+from .straightening import cross
 
 if TYPE_CHECKING:
-    from .solver_mesh import SolverMesh
+    from .faces import Faces
 
 _TINY = 1e-150
 """OpenFOAM's ROOTVSMALL, which keeps quotients finite."""
@@ -117,33 +117,30 @@ def pyramid_sums(centers: np.ndarray, areas: np.ndarray, cell: np.ndarray, cells
     return means + 0.75 * moments / safe, volumes / 3
 
 
-def polygon_sides(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def polygon_sides(mesh: Faces) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the sides of all cells in 2D: their cells (s,), two ends relative to a corner of the cell, (s, 2) each.
 
     The last array is that corner for each cell, (n, 2). A cell lies on the left of the way from the first end to the
     second.
     """
-    k = mesh.inner
-    a, b = mesh.corners.reshape(-1, 2).T
-    cell = np.concatenate([mesh.owner, mesh.neighbor[:k]]).astype(np.int64)
-    begin, end = np.concatenate([a, b[:k]]), np.concatenate([b, a[:k]])
-    base = np.zeros(len(mesh), np.int64)
+    cell, (begin, end) = mesh.sides()[0], mesh.side_ends()
+    base = np.zeros(mesh.n_cells, np.int64)
     base[cell] = begin
     origins = mesh.points.take(base, axis=0)
     near = origins.take(cell, axis=0)
     return (cell, mesh.points.take(begin, axis=0) - near, mesh.points.take(end, axis=0) - near, origins)
 
 
-def polygon_areas(mesh: SolverMesh) -> np.ndarray:
+def polygon_areas(mesh: Faces) -> np.ndarray:
     """Return the area of each cell in 2D, (n,)."""
     cell, p, q, _ = polygon_sides(mesh)
-    return np.bincount(cell, cross(p, q), len(mesh)) / 2
+    return np.bincount(cell, cross(p, q), mesh.n_cells) / 2
 
 
-def polygon_centroids(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
+def polygon_centroids(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
     """Return area and centroid of each cell in 2D, (n,) and (n, 2)."""
     cell, p, q, origins = polygon_sides(mesh)
-    n, twice = len(mesh), cross(p, q)
+    n, twice = mesh.n_cells, cross(p, q)
     area = np.bincount(cell, twice, n)
     safe = np.where(area > 0, area, np.inf)
     middle = sum_rows(cell, twice[:, None] * (p + q), n) / (3 * safe)[:, None]
