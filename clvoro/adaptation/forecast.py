@@ -179,8 +179,7 @@ def expected_boundary_cells(domain: Polygon, size: Callable[[np.ndarray], np.nda
         h(points (k, 2)) -> (k,).
     """
     begins = domain.oriented.vertices
-    along = begins[domain.oriented.next_vertex] - begins
-    lengths = np.hypot(*along.T)
+    along, lengths = domain.oriented.along, domain.oriented.lengths
     parts = np.maximum(1, np.ceil(lengths / (lengths.sum() / BOUNDARY_SAMPLE))).astype(int)
     edge = np.repeat(np.arange(len(parts)), parts)
     part = np.arange(len(edge)) - np.repeat(np.cumsum(parts) - parts, parts)

@@ -22,8 +22,7 @@ def has_thin_walls(domain: Polygon, h: np.ndarray) -> bool:
     Samples along the edges are half a cell apart, at most `MOST_SAMPLES` on an edge.
     """
     oriented = domain.oriented
-    begin, edge = oriented.vertices, oriented.vertices[oriented.next_vertex] - oriented.vertices
-    length = np.hypot(*edge.T)
+    begin, edge, length = oriented.vertices, oriented.along, oriented.lengths
     least = np.minimum(h, h[oriented.next_vertex])
     counts = np.ceil(length / (0.5 * least)).clip(1, MOST_SAMPLES).astype(int)
     rows = np.repeat(np.arange(len(begin)), counts)

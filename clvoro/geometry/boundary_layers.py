@@ -204,8 +204,7 @@ def chosen_segments(domain: Domain, layer: Layers) -> np.ndarray:
     """Return the edges that have `layer`, (k, 2, 2): both ends of each."""
     polygon, _ = as_polygon(domain)
     oriented = polygon.oriented
-    ends = np.stack([oriented.vertices, oriented.vertices[oriented.next_vertex]], axis=1)
-    return ends[_chosen(domain, layer)]
+    return np.stack([oriented.vertices, oriented.ends], axis=1)[_chosen(domain, layer)]
 
 
 def _chosen(domain: Domain, layer: Layers) -> np.ndarray:

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
-from ..opencl.engine import PLAIN, Traits
 from .boundary_names import BoundaryNames, Walls
 from .domain import LARGEST_EDGE, Domain
 from .shapes import Edges
@@ -183,63 +182,6 @@ class Box(Domain):
         points = check_rows("points", points, self.dim)
         inside = (points >= self.lower) & (points <= self.upper)
         return np.all(inside | (np.array(self.periodic) & np.isfinite(points)), axis=1)
-
-    def wrap(self, points: np.ndarray) -> np.ndarray:
-        """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
-        points, lower, extent = np.asarray(points, float), np.array(self.lower), self.extent
-        inside = (points >= lower) & (points < self.upper)
-        with np.errstate(invalid="ignore"):  # callers refuse infinite coordinates
-            moved = lower + np.mod(points - lower, extent)
-        last = np.nextafter(np.array(self.upper), lower)  # for positions that are rounded up to the seam
-        moved = np.clip(moved, lower, last)
-        return np.where(inside | ~np.array(self.periodic), points, moved)
-
-    def periods(self, real: np.dtype) -> np.ndarray:
-        """Return the lengths of periods in the device's coordinates, (d,) float64; 0 across walls.
-
-        Raises
-        ------
-        InputError
-            If a period is shorter than 1000 units of round-off.
-        """
-        step = float(np.finfo(real).eps)
-        lengths = np.rint(self.extent / self.frame[1] / step) * step
-        short = np.flatnonzero(np.array(self.periodic) & (lengths < 1000 * step))
-        if short.size:
-            raise InputError(
-                f"{self} is too thin along its periodic axis {short[0]} for {np.dtype(real).name}, expected at least "
-                f"{1000 * step:.1g} of the longest edge; use dtype='float64' or a thicker box"
-            )
-        return np.where(self.periodic, lengths, 0.0)
-
-    def place(self, points: np.ndarray, real: np.dtype) -> np.ndarray:
-        """Return positions (n, d) in the device's coordinates and precision, in [0, period) along periods."""
-        if not any(self.periodic):
-            return super().place(points, real)
-        origin, scale = self.frame
-        x, periods = (self.wrap(points) - origin) / scale, self.periods(real)
-        along, step = np.array(self.periodic), float(np.finfo(real).eps)
-        x = np.where(along, np.rint(x / step) * step, x)
-        return np.where(along & (x >= periods), x - periods, x).astype(real)
-
-    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
-        """Corners in the device's coordinates, padded to four numbers as kernels take them."""
-        known: dict[np.dtype, tuple[np.ndarray, np.ndarray]] = vars(self).setdefault("_box_corners", {})
-        if real not in known:
-            lower, upper = super().device_corners(real)
-            if any(self.periodic):
-                upper = upper.copy()
-                upper[: self.dim] = np.where(self.periodic, self.periods(real), upper[: self.dim])
-                upper.setflags(write=False)
-            known[real] = lower, upper
-        return known[real]
-
-    def traits(self, real: np.dtype) -> Traits:
-        """Return for what kernels are built, with the periods in the device's coordinates."""
-        if not any(self.periodic):
-            return PLAIN
-        x, y, z = [float(period) for period in self.periods(real)] + [0.0] * (3 - self.dim)
-        return Traits(("PERIODIC",), (x, y, z))
 
 
 def _directions(periodic: object, dim: int) -> tuple[bool, ...]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 
 from ..arguments import check_rows, format_point
+from ..errors import InputError
 from ..opencl.engine import PLAIN, Traits
 from .boundary_names import BoundaryNames, Walls
 
@@ -188,7 +189,15 @@ class Domain(ABC):
 
     def wrap(self, points: np.ndarray) -> np.ndarray:
         """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
-        return np.asarray(points, float)
+        points, lower, extent = np.asarray(points, float), np.array(self.lower), self.extent
+        if not any(self.periodic):
+            return points
+        inside = (points >= lower) & (points < self.upper)
+        with np.errstate(invalid="ignore"):  # callers refuse infinite coordinates
+            moved = lower + np.mod(points - lower, extent)
+        last = np.nextafter(np.array(self.upper), lower)  # for positions that are rounded up to the seam
+        moved = np.clip(moved, lower, last)
+        return np.where(inside | ~np.array(self.periodic), points, moved)
 
     def lengths(self, chords: np.ndarray) -> np.ndarray:
         """Return the lengths in the domain of straight segments of the lengths `chords`; arcs on a sphere."""
@@ -224,10 +233,33 @@ class Domain(ABC):
         """
         return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
 
+    def periods(self, real: np.dtype) -> np.ndarray:
+        """Return the lengths of periods in the device's coordinates, (d,) float64; 0 across walls.
+
+        Raises
+        ------
+        InputError
+            If a period is shorter than 1000 units of round-off.
+        """
+        step = float(np.finfo(real).eps)
+        lengths = np.rint(self.extent / self.frame[1] / step) * step
+        short = np.flatnonzero(np.array(self.periodic) & (lengths < 1000 * step))
+        if short.size:
+            raise InputError(
+                f"{self} is too thin along its periodic axis {short[0]} for {np.dtype(real).name}, expected at least "
+                f"{1000 * step:.1g} of the longest edge; use dtype='float64' or a thicker box"
+            )
+        return np.where(self.periodic, lengths, 0.0)
+
     def place(self, points: np.ndarray, real: np.dtype) -> np.ndarray:
-        """Return positions (n, d) in the device's coordinates and precision."""
+        """Return positions (n, d) in the device's coordinates and precision, in [0, period) along periods."""
         origin, scale = self.frame
-        return ((points - origin) / scale).astype(real)
+        if not any(self.periodic):
+            return ((points - origin) / scale).astype(real)
+        x, periods = (self.wrap(points) - origin) / scale, self.periods(real)
+        along, step = np.array(self.periodic), float(np.finfo(real).eps)
+        x = np.where(along, np.rint(x / step) * step, x)
+        return np.where(along & (x >= periods), x - periods, x).astype(real)
 
     @property
     def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
@@ -242,14 +274,18 @@ class Domain(ABC):
             origin, scale = self.frame
             corners = np.zeros((2, 4), real)
             corners[:, : self.dim] = (np.array(self.clip_box) - origin) / scale
+            if any(self.periodic):
+                corners[1, : self.dim] = np.where(self.periodic, self.periods(real), corners[1, : self.dim])
             corners.setflags(write=False)
             known[real] = corners[0], corners[1]
         return known[real]
 
     def traits(self, real: np.dtype) -> Traits:
-        """Return for what kernels are built; `real` is the precision of periods."""
-        del real
-        return PLAIN
+        """Return for what kernels are built, with the periods in the device's coordinates."""
+        if not any(self.periodic):
+            return PLAIN
+        x, y, z = [float(period) for period in self.periods(real)] + [0.0] * (3 - self.dim)
+        return Traits(("PERIODIC",), (x, y, z))
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the arguments of kernels with DOMAIN_ARGS; see geometry/domain.h."""

@@ -7,28 +7,40 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import pairwise
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
 
 from ..arguments import check_rows, format_point
 from ..errors import InputError, InputTypeError
+from ..opencl.engine import Traits
 from .boundary_names import BoundaryNames, Walls
 from .curved_edges import CurvedEdges
 from .curves import Curve
-from .device_polygon import DevicePolygon
+from .domain import Domain
+from .edge_bins import EdgeBins
 from .geojson import pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt
 from .rings import OrientedRings, make_rings, project, signed_area
 from .shapes import Edges
 from .simplification import pieces_of, simplify
+
+if TYPE_CHECKING:
+    from ..opencl.engine import Engine
+
+_MARGIN = 1 / 64
+"""Distance from the domain to the box that clips cells, as a share of the bounding box's longest edge."""
+_ROUNDINGS = 8
+"""Tolerance for points on the boundary, in units of round-off of the largest coordinate."""
 
 BOUNDARY_SHIFTS = (8, 16, 32, 64, 64, 64, 64, 64)
 """Shifts of the boundary in units of round-off, each in another direction. They are tried one after the other if the
 boundary cannot be traced through the diagram. They are within the tolerance of vertices."""
 
 
-class Polygon(DevicePolygon):
+class Polygon(Domain):
     """Polygonal domain in 2D.
 
     Parameters
@@ -185,6 +197,8 @@ class Polygon(DevicePolygon):
         return self.vertices, self.ring_starts, self.piece_of_ring
 
     cuts_cells = True
+    framed_by: Polygon | None = None
+    """The polygon that this one is a part of; its frame is used on the device."""
 
     @property
     def outline(self) -> Polygon:
@@ -401,14 +415,13 @@ class Polygon(DevicePolygon):
 
     def edge_ends(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the begins and ends, (m, 2) each, of edges by their `numbers` (m,), the domain on their left."""
-        oriented, places = self.oriented, self.oriented.places[numbers]
-        return oriented.vertices[places], oriented.vertices[oriented.next_vertex[places]]
+        places = self.oriented.places[numbers]
+        return self.oriented.vertices[places], self.oriented.ends[places]
 
     @property
     def boundary_measure(self) -> float:
         """Length of all edges."""
-        along = self.oriented.vertices[self.oriented.next_vertex] - self.oriented.vertices
-        return float(np.hypot(*along.T).sum())
+        return float(self.oriented.lengths.sum())
 
     def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return outward unit normals of edges (k,) int, and the begin of each, (k, 2) each."""
@@ -439,8 +452,160 @@ class Polygon(DevicePolygon):
         >>> square.boundary("inlet").begin.tolist(), square.boundary("inlet").end.tolist()
         ([[0.0, 1.0]], [[0.0, 0.0]])
         """
-        rows, vertices = self.find_edges("boundary", walls), self.oriented.vertices
-        return Edges(vertices[rows], vertices[self.oriented.next_vertex[rows]])
+        rows = self.find_edges("boundary", walls)
+        return Edges(self.oriented.vertices[rows], self.oriented.ends[rows])
+
+    # Points.
+
+    @property
+    def n_pieces(self) -> int:
+        """Number of pieces, each with one outer ring."""
+        return int(self.piece_of_ring[-1]) + 1
+
+    @property
+    def rings(self) -> list[np.ndarray]:
+        """Vertices (k, 2) of each ring, as the caller gave them."""
+        return [self.vertices[a:b] for a, b in pairwise(self.ring_starts)]
+
+    @cached_property
+    def pieces(self) -> list[Any]:
+        """Each piece as a shapely Polygon."""
+        found = []
+        for p in range(self.n_pieces):
+            mine = [r for r, piece in zip(self.oriented.rings, self.piece_of_ring, strict=True) if piece == p]
+            found.append(shapely.Polygon(mine[0], mine[1:]))
+        return found
+
+    @cached_property
+    def geometry(self) -> Any:
+        """The domain as a shapely Polygon or MultiPolygon, prepared."""
+        whole = self.pieces[0] if self.n_pieces == 1 else shapely.MultiPolygon(self.pieces)
+        shapely.prepare(whole)
+        return whole
+
+    @property
+    def _rounding(self) -> float:
+        far = max(map(abs, (*self.lower, *self.upper)))
+        return _ROUNDINGS * float(np.finfo(float).eps) * far
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) whether it lies in the domain; (n,) bool.
+
+        The boundary is included, with a tolerance of eight units of round-off of the largest coordinate: points on
+        slanted edges cannot be represented exactly.
+        """
+        points = check_rows("points", points, 2)
+        inside = self.covers(points)
+        near = self.lower - np.full(2, self._rounding), self.upper + np.full(2, self._rounding)
+        rest = np.flatnonzero(~inside & ((points >= near[0]) & (points <= near[1])).all(axis=1))
+        if rest.size:
+            rows, _ = self.oriented.tree.query(
+                shapely.points(points[rest]), predicate="dwithin", distance=self._rounding
+            )
+            inside[rest[rows]] = True
+        return inside
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) whether it lies in the domain, without tolerance; (n,) bool."""
+        return np.array(shapely.intersects_xy(self.geometry, points[:, 0], points[:, 1]))
+
+    def contains_well(self, points: np.ndarray, margin: float) -> np.ndarray:
+        """Return for each of `points` (n, 2) whether it is inside and over `margin` from the boundary; (n,) bool."""
+        inside = self.covers(points)
+        rows = np.flatnonzero(inside)
+        near, _ = self.oriented.tree.query(shapely.points(points[rows]), predicate="dwithin", distance=margin)
+        inside[rows[near]] = False
+        return inside
+
+    def piece_of(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) in the domain the piece that holds it, (n,) int; -1 elsewhere."""
+        found = np.full(len(points), -1)
+        rows, pieces = shapely.STRtree(self.pieces).query(shapely.points(points), predicate="intersects")
+        found[rows] = pieces
+        return found
+
+    def inner_points(self) -> np.ndarray:
+        """Return a point inside of each piece, (n_pieces, 2), not on its boundary."""
+        return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces)))
+
+    def closest_walls(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) the number of the closest edge, (n,) int."""
+        return self.nearest_edge(points)[0]
+
+    def nearest_edge(self, points: np.ndarray, within: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the number of the nearest edge to each of `points` (n, 2), and the nearest point on it.
+
+        A search radius `within` makes it faster; the number is -1 for points without an edge in that radius.
+
+        Returns
+        -------
+        edges : (n,) int
+        nearest : (n, 2) float64
+        """
+        oriented = self.oriented
+        points = np.asarray(points, dtype=float)
+        edge = np.full(len(points), -1)
+        rows, edges = self.oriented.tree.query_nearest(shapely.points(points), max_distance=within, all_matches=False)
+        edge[rows] = edges
+        nearest = project(points, oriented.vertices[edge], oriented.ends[edge])
+        return np.where(edge >= 0, oriented.edge_numbers[edge], -1), nearest
+
+    def edges_within(self, points: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return pairs of rows of `points` (n, 2) and of oriented edges that are nearer than `distance` (n,)."""
+        found = self.oriented.tree.query(shapely.points(points), predicate="dwithin", distance=distance)
+        return found[0], found[1]
+
+    def is_slit(self, points: np.ndarray, within: float) -> np.ndarray:
+        """Return for each of `points` (n, 2) whether separate parts of the boundary are within `within`; (n,) bool."""
+        rows, edges = self.oriented.tree.query(shapely.points(points), predicate="dwithin", distance=within)
+        following = self.oriented.next_vertex
+        after, count = following[edges], len(following)
+        on = np.hypot(*(self.oriented.vertices[after] - points[rows]).T) <= within
+        on &= np.isin(rows * count + after, rows * count + edges)
+        return np.bincount(rows, minlength=len(points)) > 1 + np.bincount(rows[on], minlength=len(points))
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return the nearest point of the domain to each of `points` (n, 2): the point itself if it is inside."""
+        found = np.array(points, dtype=float)
+        outside = np.flatnonzero(~self.contains(found))
+        if outside.size:
+            found[outside] = self.nearest_edge(found[outside])[1]
+        return found
+
+    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (n, 2) to the boundary, inside and outside; (n,)."""
+        return np.hypot(*(self.nearest_edge(points)[1] - points).T)
+
+    # The device's view. The polygon does not touch the box that clips cells.
+
+    @property
+    def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the bounding box enlarged by 1/64 of its longest edge on every side."""
+        if self.framed_by is not None:
+            return self.framed_by.clip_box
+        margin = _MARGIN * self.extent.max()
+        return self.lower - np.full(2, margin), self.upper + np.full(2, margin)
+
+    @property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1]."""
+        lower, upper = self.clip_box
+        return lower, 2.0 ** math.ceil(math.log2((upper - lower).max()))
+
+    def traits(self, real: np.dtype) -> Traits:
+        """Return for what kernels are built."""
+        del real
+        return Traits(("POLYGON",), cut=True)
+
+    @cached_property
+    def _bins(self) -> EdgeBins:
+        origin, scale = self.frame
+        begins, ends = ((x - origin) / scale for x in (self.oriented.vertices, self.oriented.ends))
+        return EdgeBins(begins, ends, self._rounding / scale)
+
+    def device_args(self, engine: Engine) -> tuple[object, ...]:
+        """Return the corners of the clip box and the edges in bins; see geometry/edges.h."""
+        return *self.device_corners(engine.real), *self._bins.arguments(engine)
 
 
 def _described(values: dict[str, Any]) -> Polygon:

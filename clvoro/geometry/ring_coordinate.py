@@ -13,8 +13,7 @@ class RingCoordinate:
     def __init__(self, domain: Polygon) -> None:
         self.domain, o = domain, domain.oriented
         self.vertices = o.vertices
-        self.along = o.vertices[o.next_vertex] - o.vertices
-        self.lengths = np.hypot(*self.along.T)
+        self.along, self.lengths = o.along, o.lengths
         self.begins = np.concatenate([[0.0], np.cumsum(self.lengths)])
         self.ring_starts = o.ring_starts.astype(np.int64)
         self.first_positions = self.begins[self.ring_starts[1:-1]]

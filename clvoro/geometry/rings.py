@@ -104,10 +104,36 @@ class OrientedRings:
         return [self.vertices[a:b] for a, b in pairwise(self.ring_starts)]
 
     @cached_property
+    def ends(self) -> np.ndarray:
+        """The end of each edge, (k, 2)."""
+        return self.vertices[self.next_vertex]
+
+    @cached_property
+    def along(self) -> np.ndarray:
+        """The vector from the begin to the end of each edge, (k, 2)."""
+        return self.ends - self.vertices
+
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """The length of each edge, (k,)."""
+        return np.hypot(*self.along.T)
+
+    @cached_property
+    def before(self) -> np.ndarray:
+        """The edge that ends in each vertex, (k,) int."""
+        found = np.empty(len(self.next_vertex), int)
+        found[self.next_vertex] = np.arange(len(found))
+        return found
+
+    @cached_property
+    def tree(self) -> Any:
+        """Tree of the edges."""
+        return shapely.STRtree(np.asarray(shapely.linestrings(np.stack([self.vertices, self.ends], axis=1))))
+
+    @cached_property
     def turns(self) -> np.ndarray:
         """Angle by which the boundary turns to the left in each vertex, -pi to pi, (k,)."""
-        ahead = self.vertices[self.next_vertex] - self.vertices
-        ahead /= np.hypot(*ahead.T)[:, None]
+        ahead = self.along / self.lengths[:, None]
         after = ahead[self.next_vertex]
         found = np.empty(len(ahead))
         found[self.next_vertex] = angles(ahead, after)

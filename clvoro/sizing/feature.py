@@ -123,7 +123,7 @@ class FeatureSize(Field):
             curved = np.flatnonzero(radius < self.curvature * self.h_max)
             oriented = domain.oriented
             begin = np.concatenate([begin, oriented.vertices[curved]])
-            end = np.concatenate([end, oriented.vertices[oriented.next_vertex[curved]]])
+            end = np.concatenate([end, oriented.ends[curved]])
             size = np.concatenate([size, radius[curved] / self.curvature])
         size = np.maximum(size, self.h_min)
         kept = size < self.h_max

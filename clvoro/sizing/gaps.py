@@ -50,9 +50,7 @@ def find_gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, n
     begin, end : (m, 2) float64
         The points where the balls touch the boundary.
     """
-    start = domain.oriented.vertices
-    edge = start[domain.oriented.next_vertex] - start
-    length = np.hypot(*edge.T)
+    start, edge, length = domain.oriented.vertices, domain.oriented.along, domain.oriented.lengths
     normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / length[:, None]
     found = [_from_corners(domain, normal, most)]
     # Edges are sampled more finely at narrower gaps.
@@ -134,8 +132,7 @@ def find_narrow_parts(
 def _ring_lengths(domain: Polygon) -> tuple[np.ndarray, np.ndarray]:
     """Return the length of each ring, (r,), and of the boundary before each oriented edge, all rings in turn, (k,)."""
     oriented = domain.oriented
-    edge = oriented.vertices[oriented.next_vertex] - oriented.vertices
-    total = np.concatenate([[0.0], np.cumsum(np.hypot(*edge.T))])
+    total = np.concatenate([[0.0], np.cumsum(oriented.lengths)])
     return np.diff(total[oriented.ring_starts]), total[:-1]
 
 
@@ -143,9 +140,7 @@ def _wall_samples(
     domain: Polygon, size: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return points on the boundary (n, 2), about half a size apart, their normals, places along it, and sizes (n,)."""
-    start = domain.oriented.vertices
-    edge = start[domain.oriented.next_vertex] - start
-    length = np.hypot(*edge.T)
+    start, edge, length = domain.oriented.vertices, domain.oriented.along, domain.oriented.lengths
     # Long edges in parts, along which the size changes.
     parts = np.ceil(length / (domain.extent.max() / _PARTS)).astype(np.int64)
     row = np.repeat(np.arange(len(edge)), parts)
@@ -165,9 +160,7 @@ def _wall_samples(
 
 def _from_corners(domain: Polygon, normal: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:
     """Return chords from reentrant corners (more than 180 degrees inside the domain)."""
-    before = np.empty(len(normal), np.int64)
-    before[domain.oriented.next_vertex] = np.arange(len(normal))
-    first = normal[before]
+    first = normal[domain.oriented.before]
     turn = np.arctan2(first[:, 0] * normal[:, 1] - first[:, 1] * normal[:, 0], (first * normal).sum(axis=1))
     rows = np.flatnonzero(turn < -_FAN)
     counts = np.ceil(-turn[rows] / _FAN).astype(np.int64) - 1
@@ -226,7 +219,7 @@ def _touched(
     A ball of radius r touches a line at the distance d, with the unit normal m towards the point, if d + r m.n = r.
     """
     begin = domain.oriented.vertices[edge]
-    way = domain.oriented.vertices[domain.oriented.next_vertex[edge]] - begin
+    way = domain.oriented.along[edge]
     length = np.hypot(*way.T)
     facing = np.column_stack([-way[:, 1], way[:, 0]]) / length[:, None]
     off = points - begin

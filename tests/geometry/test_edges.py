@@ -9,7 +9,7 @@ import shapely
 
 import clvoro
 from clvoro.adaptation.motion import Motion
-from clvoro.geometry.edge_grid import bin_edges
+from clvoro.geometry.edge_bins import bin_edges
 from clvoro.opencl.engine import Engine
 from tests.reference.shores import POLYGONS, coast, scattered
 

@@ -64,9 +64,8 @@ def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     rows = np.flatnonzero(d.neighbors < 0)
     oriented = domain.oriented
     edge = oriented.places[-1 - d.neighbors[rows]]
-    begin, end = oriented.vertices, oriented.vertices[oriented.next_vertex]
-    length = np.hypot(*(end - begin).T)
-    along = (end - begin) / length[:, None]
+    begin, length = oriented.vertices, oriented.lengths
+    along = oriented.along / length[:, None]
     first, last = (((d.vertices[v] - begin[edge]) * along[edge]).sum(axis=1) for v in face_ends(d)[rows].T)
     order = np.lexsort((first + last, edge))
     edge, first, last = edge[order], first[order], last[order]

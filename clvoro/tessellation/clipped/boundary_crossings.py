@@ -112,10 +112,8 @@ class Boundary:
         self.vertices, self.inner = (engine.upload(places) for places in self._places)
         self.next_vertex = engine.upload(oriented.next_vertex, np.int32)
         self.shells = engine.upload(outer_ring_edges(domain), np.int32)
-        along = oriented.vertices[oriented.next_vertex] - oriented.vertices
-        self.tangents = engine.upload(along / np.hypot(*along.T)[:, None])
-        before = np.empty_like(oriented.next_vertex)
-        before[oriented.next_vertex] = np.arange(self.edges)
+        self.tangents = engine.upload(oriented.along / oriented.lengths[:, None])
+        before = oriented.before.copy()
         before[oriented.sharpest] = -1 - before[oriented.sharpest]
         self.turns = engine.upload(before, np.int32), engine.upload(oriented.turns)
         self.owners = engine.zeros(self.edges, np.int32)

@@ -1,12 +1,53 @@
-"""Sort the edges of a polygon into uniform bins, for the device; see geometry/edges.h."""
+"""The edges of a polygon in uniform bins on the device; see geometry/edges.h."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from ..opencl.engine import Engine
+    from ..opencl.workspace import Workspace
 
 BINS_PER_EDGE = 4
 LEAST_SIDE, LARGEST_SIDE = 32, 1024
 """Bins along the longer side. Small bins are fast to search; empty ones cost only memory."""
+
+_BEHIND = 16
+"""Tolerance for generators on an edge, in units of round-off on the device."""
+
+
+class EdgeBins:
+    """Edges as arguments of kernels: EDGE_ARGS. They are freed with the workspace of the engine.
+
+    Parameters
+    ----------
+    begins, ends : (k, 2) float64
+        In the device's coordinates.
+    rounding : float
+        Round-off of a generator on an edge.
+    """
+
+    def __init__(self, begins: np.ndarray, ends: np.ndarray, rounding: float) -> None:
+        self._edges, self._rounding = (begins, ends), rounding
+        self._known: WeakKeyDictionary[Workspace, dict[np.dtype, tuple[object, ...]]] = WeakKeyDictionary()
+
+    def arguments(self, engine: Engine) -> tuple[object, ...]:
+        """Return the frame and shape of the bins, their starts, and the edges in them; see geometry/edges.h."""
+        there = self._known.setdefault(engine.workspace, {})
+        if engine.real not in there:
+            frame, shape, starts, listed = bin_edges(*self._edges)
+            # The round-off of a generator on an edge: that of the device and that of the domain.
+            frame[3] = _BEHIND * float(np.finfo(engine.real).eps) + self._rounding
+            there[engine.real] = (
+                frame.astype(engine.real),
+                shape,
+                engine.upload(starts, np.int32),
+                engine.upload(np.concatenate(self._edges, axis=1)[listed].ravel()),
+            )
+        return there[engine.real]
 
 
 def bin_edges(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
