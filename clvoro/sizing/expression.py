@@ -1,7 +1,9 @@
-"""A size field from a formula in a small language, which is parsed here."""
+"""A size field from a formula in a small language, which Python's `ast` parses."""
 
 from __future__ import annotations
 
+import ast
+import bisect
 import math
 import re
 from collections.abc import Callable
@@ -25,13 +27,16 @@ _TOKEN = re.compile(
     r"|(?P<operator><=|>=|==|!=|&&|\|\||[-+*/()<>?:,!]))",
     re.ASCII,
 )
+_PYTHON = {"&&": "and", "||": "or", "!": "~", "?": "if (", ":": ") else"}
+"""Python's words for those of C, of the same precedence. ``a ? b : c`` becomes ``a if (b) else c``, which Python parses
+as a choice with the parts `body`, `test` and `orelse`, here condition, first and second value."""
 
 _CONSTANTS = {"pi": math.pi, "M_PI": math.pi}
 _AXES = {"x": 0, "y": 1, "z": 2, "lon": 0, "lat": 1}
 _DEGREES = {"lon", "lat"}
 
 
-class _Function(NamedTuple):
+class _Operation(NamedTuple):
     arguments: int
     opencl: str
     numpy: Callable[..., np.ndarray]
@@ -42,71 +47,57 @@ def _smoothstep(low: np.ndarray, high: np.ndarray, value: np.ndarray) -> np.ndar
     return t * t * (3 - 2 * t)
 
 
+def _call(arguments: int, name: str, numpy: Callable[..., np.ndarray]) -> _Operation:
+    return _Operation(arguments, f"{name}({', '.join(['{}'] * arguments)})", numpy)
+
+
+def _truth(opencl: str, numpy: Callable[..., Any]) -> _Operation:
+    return _Operation(opencl.count("{}"), f"(REAL)({opencl})", lambda *a: numpy(*a).astype(float))
+
+
+_SAME_NAME = "fabs sqrt cbrt exp exp2 log log2 log10 sin cos tan sinh cosh tanh floor ceil"
 _FUNCTIONS = {
-    **{
-        name: _Function(1, name, getattr(np, name))
-        for name in (
-            "fabs",
-            "sqrt",
-            "cbrt",
-            "exp",
-            "exp2",
-            "log",
-            "log2",
-            "log10",
-            "sin",
-            "cos",
-            "tan",
-            "sinh",
-            "cosh",
-            "tanh",
-            "floor",
-            "ceil",
-        )
-    },
-    "abs": _Function(1, "fabs", np.abs),
-    "asin": _Function(1, "asin", np.arcsin),
-    "acos": _Function(1, "acos", np.arccos),
-    "atan": _Function(1, "atan", np.arctan),
-    "atan2": _Function(2, "atan2", np.arctan2),
-    "pow": _Function(2, "pow", np.power),
-    "hypot": _Function(2, "hypot", np.hypot),
-    "fmod": _Function(2, "fmod", np.fmod),
-    "min": _Function(2, "size_min", np.minimum),
-    "fmin": _Function(2, "size_min", np.minimum),
-    "max": _Function(2, "size_max", np.maximum),
-    "fmax": _Function(2, "size_max", np.maximum),
-    "clamp": _Function(3, "clamp", lambda v, low, high: np.minimum(np.maximum(v, low), high)),
-    "mix": _Function(3, "mix", lambda a, b, t: a + (b - a) * t),
-    "step": _Function(2, "step", lambda edge, v: np.where(v < edge, 0.0, 1.0)),
-    "smoothstep": _Function(3, "smoothstep", _smoothstep),
+    **{name: _call(1, name, getattr(np, name)) for name in _SAME_NAME.split()},
+    "abs": _call(1, "fabs", np.abs),
+    "asin": _call(1, "asin", np.arcsin),
+    "acos": _call(1, "acos", np.arccos),
+    "atan": _call(1, "atan", np.arctan),
+    "atan2": _call(2, "atan2", np.arctan2),
+    "pow": _call(2, "pow", np.power),
+    "hypot": _call(2, "hypot", np.hypot),
+    "fmod": _call(2, "fmod", np.fmod),
+    "min": _call(2, "size_min", np.minimum),
+    "fmin": _call(2, "size_min", np.minimum),
+    "max": _call(2, "size_max", np.maximum),
+    "fmax": _call(2, "size_max", np.maximum),
+    "clamp": _call(3, "clamp", lambda v, low, high: np.minimum(np.maximum(v, low), high)),
+    "mix": _call(3, "mix", lambda a, b, t: a + (b - a) * t),
+    "step": _call(2, "step", lambda edge, v: np.where(v < edge, 0.0, 1.0)),
+    "smoothstep": _call(3, "smoothstep", _smoothstep),
 }
-
-# Precedence of the binary operators, as in C.
-_PRECEDENCE = {"||": 1, "&&": 2, "==": 3, "!=": 3, "<": 4, ">": 4, "<=": 4, ">=": 4, "+": 5, "-": 5, "*": 6, "/": 6}
-_TRUTH = frozenset(("||", "&&", "==", "!=", "<", ">", "<=", ">="))
-
-_NUMPY = {
-    "+": np.add,
-    "-": np.subtract,
-    "*": np.multiply,
-    "/": np.divide,
-    "<": np.less,
-    ">": np.greater,
-    "<=": np.less_equal,
-    ">=": np.greater_equal,
-    "==": np.equal,
-    "!=": np.not_equal,
-    "&&": np.logical_and,
-    "||": np.logical_or,
+_OPERATORS: dict[type[ast.AST], _Operation] = {
+    ast.Add: _Operation(2, "{} + {}", np.add),
+    ast.Sub: _Operation(2, "{} - {}", np.subtract),
+    ast.Mult: _Operation(2, "{} * {}", np.multiply),
+    ast.Div: _Operation(2, "{} / {}", np.divide),
+    ast.USub: _Operation(1, "-{}", np.negative),
+    ast.Invert: _truth("{} == 0", np.logical_not),
+    ast.Lt: _truth("{} < {}", np.less),
+    ast.Gt: _truth("{} > {}", np.greater),
+    ast.LtE: _truth("{} <= {}", np.less_equal),
+    ast.GtE: _truth("{} >= {}", np.greater_equal),
+    ast.Eq: _truth("{} == {}", np.equal),
+    ast.NotEq: _truth("{} != {}", np.not_equal),
+    ast.And: _truth("{} && {}", np.logical_and),
+    ast.Or: _truth("{} || {}", np.logical_or),
+    ast.IfExp: _Operation(3, "{} != 0 ? {} : {}", lambda a, b, c: np.where(a != 0, b, c)),
 }
 
 
 class _Node(NamedTuple):
-    """One operation. `arguments` are indices of earlier nodes, so that a list is evaluated in order."""
+    """A number, the index of a coordinate, or an operation on earlier nodes, so that a list is evaluated in order."""
 
-    kind: str  # "number", "axis", "negate", "not", "choose", "binary", "call"
-    value: Any
+    value: float | int | _Operation
     arguments: tuple[int, ...] = ()
 
 
@@ -131,7 +122,8 @@ class Expression(Field):
     degrees on a `clvoro.Sphere`, and otherwise other names of x and y. In float32 they have 7 digits, so the origin
     should be near the domain.
 
-    The text is parsed into a list of operations, and the OpenCL code is generated from that list, never from the text.
+    Python parses the text, after its words have been checked. The result is a list of known operations, and the OpenCL
+    code is generated from that list, never from the text.
 
     Raises
     ------
@@ -143,10 +135,14 @@ class Expression(Field):
         if not isinstance(text, str):
             raise InputTypeError(f"Expression got {type(text).__name__}, expected a string")
         self.text = text
+        if len(text) > _MAX_LENGTH:
+            raise InputError(
+                f"Expression has {len(text)} characters, expected at most {_MAX_LENGTH}; use a Raster instead"
+            )
         parser = _Parser(text)
-        self._nodes = parser.parse()
-        self._axes = 1 + max((n.value for n in self._nodes if n.kind == "axis"), default=-1)
-        used = {word for kind, word, _ in parser.tokens if kind == "name" and word in _AXES}
+        self._nodes = parser.nodes
+        self._axes = 1 + max((n.value for n in self._nodes if isinstance(n.value, int)), default=-1)
+        used = {word for word, _ in parser.tokens if word in _AXES}
         if used & _DEGREES and used - _DEGREES:
             raise InputError(f"Expression {text!r} has {', '.join(sorted(used))}, expected lon and lat, or x, y and z")
         self.dim = 2 if used & _DEGREES else 3 if self._axes == 3 else None
@@ -155,58 +151,33 @@ class Expression(Field):
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         values: list[Any] = []
         with np.errstate(all="ignore"):
-            for kind, value, arguments in self._nodes:
-                a = [values[i] for i in arguments]
-                if kind == "number":
-                    result = np.float64(value)
-                elif kind == "axis":
-                    result = points[:, value]
-                elif kind == "negate":
-                    result = -a[0]
-                elif kind == "not":
-                    result = np.equal(a[0], 0).astype(float)
-                elif kind == "choose":
-                    result = np.where(a[0] != 0, a[1], a[2])
-                elif kind == "call":
-                    result = _FUNCTIONS[value].numpy(*a)
+            for value, arguments in self._nodes:
+                if isinstance(value, _Operation):
+                    values.append(value.numpy(*(values[i] for i in arguments)))
                 else:
-                    result = _NUMPY[value](*a)
-                    if value in _TRUTH:
-                        result = result.astype(float)
-                values.append(result)
+                    values.append(points[:, value] if isinstance(value, int) else np.float64(value))
         return np.array(np.broadcast_to(values[-1], (len(points),)), dtype=float)
 
     def _emit(self, writer: CodeWriter) -> str:
         frame = writer.store(writer.scale, 1.0 / writer.scale, writer.origin)
         exponents = self._exponents()
         names: list[str] = []
-        for node, (kind, value, arguments) in enumerate(self._nodes):
-            a = [names[i] for i in arguments]
-            if kind == "number":
+        for node, (value, arguments) in enumerate(self._nodes):
+            if isinstance(value, _Operation):
+                code = value.opencl.format(*(names[i] for i in arguments))
+            elif isinstance(value, int):
+                code = f"x[{value}] * data[{frame}] + data[{frame + 2 + value}]"
+            else:
                 # Formulas that differ in numbers share a kernel. The compiler knows powers of given exponents.
                 code = f"(REAL)({value!r})" if node in exponents else f"data[{writer.store(value)}]"
-            elif kind == "axis":
-                code = f"x[{value}] * data[{frame}] + data[{frame + 2 + value}]"
-            elif kind == "negate":
-                code = f"-{a[0]}"
-            elif kind == "not":
-                code = f"(REAL)({a[0]} == 0)"
-            elif kind == "choose":
-                code = f"{a[0]} != 0 ? {a[1]} : {a[2]}"
-            elif kind == "call":
-                code = f"{_FUNCTIONS[value].opencl}({', '.join(a)})"
-            elif value in _TRUTH:
-                code = f"(REAL)({a[0]} {value} {a[1]})"
-            else:
-                code = f"{a[0]} {value} {a[1]}"
             names.append(writer.variable(code))
         return writer.variable(f"{names[-1]} * data[{frame + 1}]")
 
     def _exponents(self) -> set[int]:
         """Return the nodes that are second arguments of `pow`, and the numbers that such nodes negate."""
-        found = {arguments[1] for _, value, arguments in self._nodes if value == "pow"}
+        found = {arguments[1] for value, arguments in self._nodes if value is _FUNCTIONS["pow"]}
         for node in range(len(self._nodes) - 1, -1, -1):
-            if node in found and self._nodes[node].kind == "negate":
+            if node in found and self._nodes[node].value is _OPERATORS[ast.USub]:
                 found.update(self._nodes[node].arguments)
         return found
 
@@ -216,38 +187,34 @@ class Expression(Field):
 
 
 class _Parser:
-    """Recursive descent with precedence climbing. The last node of the result is the value."""
+    """Checks the words of a formula, lets Python parse them, and lists the operations. The last node is the value."""
 
     def __init__(self, text: str):
         self.text = text
-        if len(text) > _MAX_LENGTH:
-            raise InputError(
-                f"Expression has {len(text)} characters, expected at most {_MAX_LENGTH}; use a Raster instead"
-            )
         self.tokens = self._tokens()
-        self.at = 0
-        self.depth = 0
+        """The words, and where they begin."""
+        self.starts: list[int] = []
+        """Where they begin in Python's text."""
         self.nodes: list[_Node] = []
+        self._list(self._parse())
 
-    def parse(self) -> list[_Node]:
-        self._formula()
-        if self._kind() != "end":
-            self._fail(f"unexpected {self._word()!r}, expected an operator or the end")
-        return self.nodes
-
-    def _tokens(self) -> list[tuple[str, str, int]]:
-        found, position = [], 0
-        end = len(self.text.rstrip())
+    def _tokens(self) -> list[tuple[str, int]]:
+        found: list[tuple[str, int]] = []
+        position, end = 0, len(self.text.rstrip())
         while position < end:
             match = _TOKEN.match(self.text, position)
             if match is None:
                 rest = self.text[position:]
-                column = position + len(rest) - len(rest.lstrip())
-                self._reject(column)
-            kind = match.lastgroup or ""
-            found.append((kind, match[kind], match.start(kind)))
-            position = match.end()
-        found.append(("end", "", end))
+                self._reject(position + len(rest) - len(rest.lstrip()))
+            kind, position = str(match.lastgroup), match.end()
+            word, column = match[kind], match.start(kind)
+            if kind == "number" and not math.isfinite(float(word)):
+                self._fail(f"{word} is too large for a number", column)
+            if kind == "name" and not any(word in known for known in (_AXES, _CONSTANTS, _FUNCTIONS)):
+                self._fail(f"unknown name {word!r}", column)
+            if word == "*" and found and found[-1][0] == "*":
+                self._fail("there is no operator **; write pow(a, b)", column)
+            found.append((word, column))
         return found
 
     def _reject(self, column: int) -> NoReturn:
@@ -258,14 +225,7 @@ class _Parser:
         others = {"^": "; write pow(a, b) for a power", "%": "; write fmod(a, b) for a remainder"}
         self._fail(f"unexpected character {rest[0]!r}{others.get(rest[0], '')}", column)
 
-    def _kind(self) -> str:
-        return self.tokens[self.at][0]
-
-    def _word(self) -> str:
-        return self.tokens[self.at][1]
-
-    def _fail(self, what: str, column: int | None = None) -> NoReturn:
-        column = self.tokens[self.at][2] if column is None else column
+    def _fail(self, what: str, column: int) -> NoReturn:
         begin = max(0, column - 20)
         near = self.text[begin : column + 20]
         raise InputError(
@@ -274,96 +234,95 @@ class _Parser:
             "listed in clvoro.sizing.Expression"
         )
 
-    def _take(self, word: str) -> bool:
-        if self._kind() == "operator" and self._word() == word:
-            self.at += 1
-            return True
-        return False
+    def _parse(self) -> ast.AST:
+        """Return Python's tree of the formula."""
+        python, depths = "", [1]
+        for word, column in self.tokens:
+            if word == ")":
+                depths = depths[:-1] or [0]
+            elif word in ("(", "?"):
+                deeper = depths[-1] + 1
+                if deeper > _MAX_DEPTH:
+                    self._fail(f"nested more than {_MAX_DEPTH} deep; simplify it, or use a Raster", column)
+                depths = [*depths, deeper] if word == "(" else [*depths[:-1], deeper]
+            self.starts.append(len(python))
+            python += (repr(float(word)) if word[0] in ".0123456789" else _PYTHON.get(word, word)) + " "
+        if not self.tokens:
+            self._fail("it is empty", 0)
+        try:
+            return ast.parse(python.rstrip(), mode="eval").body
+        except SyntaxError as error:
+            self._explain(error, python)
+        except (MemoryError, RecursionError):
+            self._fail("nested too deep; simplify it, or use a Raster", 0)
 
-    def _need(self, word: str) -> None:
-        if not self._take(word):
-            got = repr(self._word()) if self._kind() != "end" else "the end"
-            self._fail(f"expected {word!r}, got {got}")
+    def _explain(self, error: SyntaxError, python: str) -> NoReturn:
+        """Say in the words of the formula what Python's parser found."""
+        two_values = "forgot" in error.msg  # a comma between them, it supposes, and names both
+        place = ((error.end_offset if two_values else error.offset) or 0) - 1 - two_values
+        if not 0 <= place < len(python) - 1:
+            self._fail("it ends where a value is expected", len(self.text.rstrip()))
+        word, column = self._token_at(place)
+        if "closed" in error.msg:
+            self._fail(f"expected {':' if word == '?' else ')'!r} after {word!r}, got the end", column)
+        expected = "an operator or the end" if word[0].isalnum() or word in ("(", ")") else "a value"
+        self._fail(f"unexpected {word!r}, expected {expected}", column)
 
-    def _add(self, kind: str, value: object, *arguments: int) -> int:
-        self.nodes.append(_Node(kind, value, arguments))
-        return len(self.nodes) - 1
+    def _token_at(self, place: int) -> tuple[str, int]:
+        """Return the word at an offset in Python's text, and where it begins in the formula."""
+        return self.tokens[max(0, bisect.bisect_right(self.starts, place) - 1)]
 
-    def _formula(self) -> int:
-        self.depth += 1
-        if self.depth > _MAX_DEPTH:
-            self._fail(f"nested more than {_MAX_DEPTH} deep; simplify it, or use a Raster")
-        result = self._binary(1)
-        if self._take("?"):
-            yes = self._formula()
-            self._need(":")
-            no = self._formula()
-            result = self._add("choose", None, result, yes, no)
-        self.depth -= 1
-        return result
+    def _list(self, tree: ast.AST) -> None:
+        """Append the nodes of a tree, operands first."""
+        todo: list[ast.AST | tuple[_Operation, int]] = [tree]
+        done: list[int] = []
+        while todo:
+            item = todo.pop()
+            if isinstance(item, tuple):
+                operation, count = item
+                node = _Node(operation, tuple(done[-count:]))
+                del done[-count:]
+            else:
+                value, operands = self._read(item)
+                if isinstance(value, _Operation):
+                    todo += [(value, len(operands)), *reversed(operands)]
+                    continue
+                node = _Node(value)
+            done.append(len(self.nodes))
+            self.nodes.append(node)
 
-    def _binary(self, least: int) -> int:
-        left = self._unary()
-        compared = False
-        while self._kind() == "operator" and _PRECEDENCE.get(self._word(), 0) >= least:
-            word = self._word()
-            comparison = _PRECEDENCE[word] in (3, 4)
-            if comparison and compared:
-                self._fail("comparisons cannot be chained; write a < b && b < c")
-            self.at += 1
-            if word == "*" and self._kind() == "operator" and self._word() == "*":
-                self._fail("there is no operator **; write pow(a, b)")
-            right = self._binary(_PRECEDENCE[word] + 1)
-            left = self._add("binary", word, left, right)
-            compared = comparison
-        return left
-
-    def _unary(self) -> int:
-        signs = []
-        while self._kind() == "operator" and self._word() in "+-!":
-            signs.append(self._word())
-            self.at += 1
-        result = self._primary()
-        for sign in reversed(signs):
-            if sign != "+":
-                result = self._add("negate" if sign == "-" else "not", None, result)
-        return result
-
-    def _primary(self) -> int:
-        kind, word, _ = self.tokens[self.at]
-        if kind == "number":
-            value = float(word)
-            if not math.isfinite(value):
-                self._fail(f"{word} is too large for a number")
-            self.at += 1
-            return self._add("number", value)
-        if kind == "name":
-            return self._name(word)
-        if self._take("("):
-            result = self._formula()
-            self._need(")")
-            return result
-        if kind == "end":
-            self._fail("it ends where a value is expected" if self.tokens[:-1] else "it is empty")
-        self._fail(f"unexpected {word!r}, expected a value")
-        raise AssertionError
-
-    def _name(self, word: str) -> int:
-        if word in _AXES or word in _CONSTANTS:
-            self.at += 1
-            if word in _AXES:
-                return self._add("axis", _AXES[word])
-            return self._add("number", _CONSTANTS[word])
-        if word not in _FUNCTIONS:
-            self._fail(f"unknown name {word!r}")
-        begin = self.at
-        self.at += 1
-        self._need("(")
-        arguments = [self._formula()]
-        while self._take(","):
-            arguments.append(self._formula())
-        self._need(")")
-        expected = _FUNCTIONS[word].arguments
-        if len(arguments) != expected:
-            self._fail(f"{word} got {len(arguments)} arguments, expected {expected}", self.tokens[begin][2])
-        return self._add("call", word, *arguments)
+    def _read(self, tree: Any) -> tuple[float | int | _Operation, list[Any]]:
+        """Return what a tree stands for, and the trees of its operands."""
+        while isinstance(tree, ast.UnaryOp) and isinstance(tree.op, ast.UAdd):
+            tree = tree.operand
+        word, column = self._token_at(tree.col_offset)
+        match tree:
+            case ast.Constant(float(value)):
+                return value, []
+            case ast.Name(name):
+                if name in _FUNCTIONS:
+                    self._fail(f"expected '(' after {name!r}", column)
+                return _AXES.get(name, _CONSTANTS.get(name, 0)), []
+            case ast.Call(ast.Name(name), operands) if name in _FUNCTIONS:
+                expected = _FUNCTIONS[name].arguments
+                if len(operands) != expected:
+                    self._fail(f"{name} got {len(operands)} arguments, expected {expected}", column)
+                return _FUNCTIONS[name], operands
+            case ast.Call():
+                self._fail(f"{word!r} is not a function; write * for a product", column)
+            case ast.UnaryOp(operator, operand):
+                return _OPERATORS[type(operator)], [operand]
+            case ast.BinOp(left, operator, right) | ast.Compare(left, [operator], [right]):
+                return _OPERATORS[type(operator)], [left, right]
+            case ast.BoolOp(operator, [left, right]):
+                return _OPERATORS[type(operator)], [left, right]
+            case ast.BoolOp(operator, [*others, last]):
+                first = ast.copy_location(ast.BoolOp(operator, others), tree)
+                return _OPERATORS[type(operator)], [first, last]
+            case ast.IfExp(second, condition, third):
+                return _OPERATORS[ast.IfExp], [condition, second, third]
+            case ast.Compare():
+                self._fail("comparisons cannot be chained; write a < b && b < c", column)
+            case ast.Tuple([_, second, *_]):
+                self._fail("unexpected ',', expected an operator or the end", self._token_at(second.col_offset)[1])
+        self._fail(f"unexpected {word!r}, expected a value", column)

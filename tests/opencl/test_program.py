@@ -75,7 +75,7 @@ def test_short_declarations_have_the_functions_of_formulas(ctx, monkeypatch, rea
     if not program.has_short_declarations(ctx):
         pytest.skip("for some versions of PoCL only")
     names = ("x[0]", "x[1]", "x[2]")
-    calls = [f"{f.opencl}({', '.join(names[: f.arguments])})" for f in _FUNCTIONS.values()]
+    calls = [f.opencl.format(*names[: f.arguments]) for f in _FUNCTIONS.values()]
     puts = "\n".join(f"h[{row}] = {call};" for row, call in enumerate(calls))
     text = (
         f"{source_text('sizing/size_fields.h')}\n"
