@@ -16,7 +16,7 @@ from unittest.mock import patch
 import pyopencl as cl
 
 from clvoro.adaptation import loop, preparation, run
-from clvoro.mesh import lazy_arrays
+from clvoro.mesh import diagram
 from clvoro.opencl import device_array, engine, kernels, launch, workspace
 
 REST = "other"
@@ -36,7 +36,7 @@ PLACES: dict[str, list[tuple[Any, str]]] = {
     "history": [(loop.Loop, "add_row")],
     "insertion, deletion, refinement": [(loop.Loop, name) for name in ("insert_delete", "correct_count", "refine")],
     "result": [(loop.Loop, "result")],
-    "reading the diagram": [(lazy_arrays.LazyArrays, "__getattr__")],
+    "reading the diagram": [(diagram.Diagram, "__getattr__")],
 }
 """Functions by part. A function's time does not include that of other parts that it calls."""
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from ..arguments import check_integer
 from ..errors import InputError
-from ..geometry.polygon import Polygon
 from .read_only import Sealed
 
 if TYPE_CHECKING:
@@ -61,7 +60,8 @@ def make_cell(diagram: Diagram, i: int) -> Cell:
         raise InputError(f"i is {i}, expected at most {n - 1}: the diagram has {n} cells")
     i %= n
     first, last = (int(k) for k in diagram.neighbor_starts[i : i + 2])
-    starts, corners = _face_corners(diagram, i, first, last)
+    starts = diagram.face_vertex_starts[first : last + 1]
+    corners = diagram.face_vertices[starts[0] : starts[-1]]
     _, place, inverse = np.unique(corners, return_index=True, return_inverse=True)
     order = np.argsort(place)  # corners in the order in which faces have them
     rank = np.empty_like(order)
@@ -74,15 +74,5 @@ def make_cell(diagram: Diagram, i: int) -> Cell:
         neighbors=diagram.neighbors[first:last],
         areas=diagram.face_measures[first:last],
         vertices=diagram.vertices[corners[place[order]]],
-        faces=tuple(np.split(rank[inverse.ravel()], starts[1:-1])),
+        faces=tuple(np.split(rank[inverse.ravel()], (starts - starts[0])[1:-1])),
     )
-
-
-def _face_corners(diagram: Diagram, i: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the faces of cell `i` as ragged rows: starts (k + 1,) and vertices."""
-    if diagram.domain.cell_dim == 2 and not isinstance(diagram.domain, Polygon):
-        begin = diagram.cell_vertices[slice(*diagram.cell_vertex_starts[i : i + 2])]
-        ends = np.stack([begin, np.roll(begin, -1)], axis=1)
-        return 2 * np.arange(len(begin) + 1), ends.ravel()
-    starts = diagram.face_vertex_starts[first : last + 1]
-    return starts - starts[0], diagram.face_vertices[starts[0] : starts[-1]]

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry.polygon import Polygon
 from .diagram import Diagram
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
         codes = (diagram.shifts[faces] + 1) @ 3 ** np.arange(dim)
         here = here * 3**dim + codes
         there = there * 3**dim + (3**dim - 1 - codes)
-    if not isinstance(diagram.domain, Polygon):
+    if not diagram.domain.cuts_cells:
         return here, there
     begin, end = face_ends(diagram)[faces].T
     columns = [np.concatenate(c) for c in ((end, begin), (begin, end), (here, there))]
@@ -78,10 +77,7 @@ def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def face_ends(diagram: Diagram) -> np.ndarray:
     """Return the first and last vertex of each half-face in 2D, (m, 2); its cell is on the left."""
-    if isinstance(diagram.domain, Polygon):
-        return diagram.face_vertices.reshape(-1, 2)
-    starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
-    return np.stack([corners, corners[following(starts)]], axis=1)
+    return diagram.face_vertices.reshape(-1, 2)
 
 
 def next_faces(diagram: Diagram) -> np.ndarray:
@@ -167,11 +163,7 @@ def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
     as seen from outside of the cell. A repeated corner is given once. A face that then has no measure (fewer than 2
     corners in 2D, 3 in 3D) has an empty row.
     """
-    if diagram.domain.cell_dim == 2:
-        ends = face_ends(diagram)
-        least, starts, corners = 2, 2 * np.arange(len(ends) + 1), ends.ravel()
-    else:
-        least, starts, corners = 3, diagram.face_vertex_starts, diagram.face_vertices
+    least, starts, corners = diagram.domain.cell_dim, diagram.face_vertex_starts, diagram.face_vertices
     kept = np.empty(len(corners), bool)
     np.not_equal(corners[1:], corners[:-1], out=kept[:-1])
     filled = np.flatnonzero(starts[1:] > starts[:-1])

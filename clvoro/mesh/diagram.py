@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from ..errors import InputError
-from .lazy_arrays import LazyArrays
+from ..opencl.probe import check_process
 from .output import MeshOutput
-from .read_only import seal
+from .read_only import read_only, seal
 
 if TYPE_CHECKING:
     import scipy.sparse
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from .results import Result
 
 
-class Diagram(LazyArrays, MeshOutput):
+class Diagram(MeshOutput):
     """A Voronoi diagram clipped to its domain, as `clvoro.voronoi` and `Adapter.diagram` return it.
 
     Row i belongs to the i-th generator of the caller. Arrays are read from the device when they are first used. They
@@ -45,7 +46,7 @@ class Diagram(LazyArrays, MeshOutput):
 
     Attributes
     ----------
-    domain : Box or Polygon
+    domain : Box, Polygon, Sphere or SphereRegion
     points : (n, d) float64
         Generators, in the domain's unit of length.
     volumes : (n,) float64
@@ -76,13 +77,12 @@ class Diagram(LazyArrays, MeshOutput):
         Corners of cell i, ``cell_vertices[cell_vertex_starts[i]:cell_vertex_starts[i + 1]]``, counter-clockwise. In a
         box face k of a cell runs from its corner k to its corner k + 1. In a polygonal domain several loops of a cell
         are joined by bridges there and back, so that it has more corners than faces.
-    face_vertex_starts : (m + 1,) int32, in 3D and in polygonal domains
-    face_vertices : (k,) int32, in 3D and in polygonal domains
-        Corners of half-face f, ``face_vertices[face_vertex_starts[f]:face_vertex_starts[f + 1]]``. In 3D the order is
-        counter-clockwise as seen from outside of the cell; the opposite half-face has the opposite order. Empty where a
-        face is as narrow as round-off. In a polygonal domain the two ends, with the cell on the left of the way from
-        the first to the second.
-
+    face_vertex_starts : (m + 1,) int32
+    face_vertices : (k,) int32
+        Corners of half-face f, ``face_vertices[face_vertex_starts[f]:face_vertex_starts[f + 1]]``. In 2D the two ends,
+        with the cell on the left of the way from the first to the second. In 3D the order is counter-clockwise as seen
+        from outside of the cell; the opposite half-face has the opposite order. Empty where a face is as narrow as
+        round-off.
     weights : (n,) float64
         Weights w of the generators in a power diagram, in the square of the domain's unit of length. Zeros in a Voronoi
         diagram.
@@ -114,6 +114,79 @@ class Diagram(LazyArrays, MeshOutput):
     >>> bool(abs(out).max() < 1e-15)
     True
     """
+
+    _NAMES = (
+        "points",
+        "volumes",
+        "centroids",
+        "neighbor_starts",
+        "neighbors",
+        "shifts",
+        "face_measures",
+        "face_centroids",
+        "vertices",
+        "cell_vertex_starts",
+        "cell_vertices",
+        "face_vertex_starts",
+        "face_vertices",
+        "weights",
+    )
+
+    def __init__(self, domain: Domain, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]) -> None:
+        """`arrays` has arrays by name, or functions that return them, called when they are first used.
+
+        Arrays that are missing follow from the others, or diagrams of such a domain do not have them.
+        """
+        self.domain = domain
+        self._arrays = {n: a if callable(a) else read_only(a) for n, a in arrays.items()}
+        self._derived: dict[str, np.ndarray] = {}
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        if name not in self._NAMES:
+            # A copy under construction has no arrays yet; `copy` looks for private names.
+            there = "" if name.startswith("_") else f"; it has {', '.join(self._there())}"
+            raise AttributeError(f"a Diagram has no {name!r}{there}", name=name, obj=self)
+        value = self._arrays.get(name)
+        if value is None:
+            if name not in self._there():
+                raise AttributeError(
+                    f"a diagram in {self.domain.dim}D has no {name}; it has {', '.join(self._there())}"
+                )
+            if name not in self._derived:
+                self._derived[name] = read_only(self._derive(name))
+            return self._derived[name]
+        if callable(value):
+            check_process()  # it may still be on a device
+            value = self._arrays[name] = read_only(value())
+        return value
+
+    def _derive(self, name: str) -> np.ndarray:
+        """Return an array that follows from others."""
+        if name == "shifts":
+            return np.zeros((len(self.neighbors), self.domain.dim), np.int8)
+        if name == "weights":
+            return np.zeros(len(self.points))
+        if name == "face_vertex_starts":
+            return 2 * np.arange(len(self.neighbors) + 1, dtype=np.int32)
+        from .connectivity import following
+
+        corners = self.cell_vertices
+        return np.stack([corners, corners[following(self.cell_vertex_starts)]], axis=1).ravel()
+
+    def _there(self) -> list[str]:
+        """Return the names of the arrays."""
+        derived = ["shifts", "weights"]
+        if "cell_vertices" in self._arrays:
+            derived += ["face_vertex_starts", "face_vertices"]
+        return [n for n in self._NAMES if n in derived or n in self._arrays]
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self._there()]
+
+    @property
+    def is_power(self) -> bool:
+        """Whether it is a power diagram. Its cells need not contain their generators, and may be empty."""
+        return "weights" in self._arrays
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays that may still be on a device are read.

@@ -371,5 +371,7 @@ def test_cases_name_boundaries(tmp_path, back) -> None:
     case = Case.from_toml(CASE.format(domain="lower = [0, 0]\nupper = [2, 1]", shore="'yMin'"), "c")
     assert case.domain.boundary_names == ("shore", "inlet", "xMin", "xMax")
     assert case.size_field()(np.array([(0.5, 0.25)])) == pytest.approx(0.225)
-    with pytest.raises(InputError, match=r"domain\.names has a value that is a number, expected a whole number or a text"):
+    with pytest.raises(
+        InputError, match=r"domain\.names has a value that is a number, expected a whole number or a text"
+    ):
         Case.from_toml(CASE.format(domain="outer = [[0, 0], [1, 0], [1, 1]]", shore="0.5"), "d")
