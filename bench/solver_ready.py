@@ -33,7 +33,7 @@ from short_edges import setup
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.io.check_mesh import Verdict, check_case
+from clvoro.io.check_mesh import CheckMeshResult, check_case
 
 NUMBER = r"([-+.\deE]*\d)"
 FIGURES = {
@@ -49,7 +49,7 @@ DOMAINS: dict[str, Callable[[], tuple[Any, Any, dict[str, Any]]]] = {
 }
 
 
-def figures_of(verdict: Verdict) -> dict[str, Any]:
+def figures_of(verdict: CheckMeshResult) -> dict[str, Any]:
     """Return the figures in the output of checkMesh, and what it says of the mesh."""
     matches = {name: re.search(pattern, verdict.text) for name, pattern in FIGURES.items()}
     found: dict[str, Any] = {k: float(m.group(1)) if m else 0.0 for k, m in matches.items()}
@@ -67,7 +67,7 @@ def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
         verdict = check_case(case)
         (case / "checkMesh.log").write_text(verdict.text)
     except InputError as error:  # a cell that goes around an island is no polygon
-        verdict = Verdict(False, (str(error),), "")
+        verdict = CheckMeshResult(False, (str(error),), "")
     d = result.diagram
     inner = off_walls(d)
     wall, e = ~inner, np.abs(result.size_error)

@@ -30,7 +30,7 @@ from .adaptation.preparation import Preparation
 from .adaptation.run import check_run, run_adaptation
 from .adaptation.stages import Stages
 from .adaptation.transport.given import power_diagram_of, transport_to
-from .arguments import Naming, check_choice, check_points
+from .arguments import check_choice, check_points, coincident_named
 from .errors import InputError, InputTypeError, Interrupted, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.domain import Domain
@@ -38,7 +38,7 @@ from .mesh.diagram import Diagram
 from .mesh.results import Result
 from .mesh.transported import Transported
 from .opencl import devices as device
-from .opencl.build_notice import BuildNotice, noticed_builds
+from .opencl.build_notice import BuildNotice, report_builds
 from .opencl.engine import Engine
 from .opencl.probe import check_process
 from .tessellation.readback.diagram import fetch_diagram
@@ -236,7 +236,7 @@ class Adapter:
         check_memory(engine, n, domain, run=False)
         binned = stages.bins.build(domain, engine.upload(domain.place(host, self.dtype)), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
-        with Naming(host, domain, self.dtype):
+        with coincident_named(host, domain, self.dtype):
             tessellator = Tessellator(stages, domain)
             stages.bins.renumber(binned, n)
             t = tessellator.tessellate(sorted_points, n, exact=True, binned=binned)
@@ -389,7 +389,7 @@ class Adapter:
             stages = self._stages_for(domain)
             host = None if given is None else check_points(given, domain)
             wells = check_fixed(fixed, domain, self.dtype)
-            with noticed_builds(stages.engine, self.on_build) as notice:
+            with report_builds(stages.engine, self.on_build) as notice:
                 result = run_adaptation(
                     stages, domain, size, host, wells, merged, files, self._shown(callback, notice), self.on_memory
                 )

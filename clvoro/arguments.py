@@ -5,7 +5,8 @@ from __future__ import annotations
 import inspect
 import sys
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from os import fsdecode, fsencode, fspath
 from typing import TYPE_CHECKING
 
@@ -192,22 +193,17 @@ def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
         raise InputError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
-class Naming:
-    """A context that names the caller's coincident points, after the device has found that some coincide."""
-
-    def __init__(self, points: np.ndarray, domain: Domain, real: np.dtype) -> None:
-        self.points, self.domain, self.real = points, domain, real
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if not isinstance(error, InputError):
-            return
-        pair = coincident_pair(self.domain.place(self.points, self.real))
-        if pair is not None:
-            other = "" if self.real == np.float64 else " or use dtype='float64'"
-            raise InputError(
-                f"points[{pair[0]}] and points[{pair[1]}] coincide in {self.real}, expected distinct "
-                f"generators; remove duplicates (numpy.unique(points, axis=0)){other}"
-            ) from error
+@contextmanager
+def coincident_named(points: np.ndarray, domain: Domain, real: np.dtype) -> Iterator[None]:
+    """Name the caller's coincident points in an error by which the device has found that some coincide."""
+    try:
+        yield
+    except InputError as error:
+        pair = coincident_pair(domain.place(points, real))
+        if pair is None:
+            raise
+        other = "" if real == np.float64 else " or use dtype='float64'"
+        raise InputError(
+            f"points[{pair[0]}] and points[{pair[1]}] coincide in {real}, expected distinct "
+            f"generators; remove duplicates (numpy.unique(points, axis=0)){other}"
+        ) from error

@@ -50,7 +50,7 @@ def offset_of(missing: np.ndarray | float, cells: np.ndarray | float) -> np.ndar
     return np.clip(each * missing, -LARGEST_OFFSET, LARGEST_OFFSET)
 
 
-class Pieces:
+class PieceCounts:
     """The pieces of a domain, and how many cells each of them requires.
 
     The potential of each piece has a free constant, which is set here. The work is done on the host.
@@ -92,7 +92,7 @@ class LocalCounts:
         for array in (potential, changes, chosen, blocked):
             array.fill(0)
         missing, total = mesh.missing_cells(w), 0
-        pieces = Pieces(mesh, w) if has_pieces(mesh.domain) else None
+        pieces = PieceCounts(mesh, w) if has_pieces(mesh.domain) else None
         laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=TOLERANCE)
         for turn in count():
             offset = real(offset_of(missing, math.inf) if pieces is None else 0)

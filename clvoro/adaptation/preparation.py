@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..arguments import Naming, warn
+from ..arguments import coincident_named, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
 from ..geometry.boundary_layers import apart_from, count_rows, free_domain, place_layers
 from ..geometry.box import Box
@@ -328,7 +328,7 @@ class Preparation:
         taken = np.full(len(self.fixed), -1, np.int32)
         if len(taken) and self.levels == 0:
             placed, labels, taken = take_places(placed, labels, self.fixed, self.domain, setup.fixed)
-        with Naming(host, self.domain, real):
+        with coincident_named(host, self.domain, real):
             start = {"points": upload(placed), "labels": upload(labels, np.int32)}
             mesh = MeshState(setup, self.factor * 2.0**self.levels, start)
         mesh.next_label, mesh.taken = setup.first_row + len(host), taken

@@ -30,7 +30,7 @@ from ..opencl.profile import Profile
 from .cases import Case
 from .formats import MESH_FILES, PLANE
 from .outputs import check_folder, do_all, refuse_own_files, require_plots
-from .progress import Progress, during
+from .progress import ProgressDisplay, during
 from .sequence import frames_line, run_frames
 
 _REPEATED = ("effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k", "seed", "dtype")
@@ -162,7 +162,7 @@ class Job:
             arguments["method"] = method
         most = arguments.get("max_steps")
         title = f"{self.case.name} {method or ''}".strip()
-        progress: Any = nullcontext() if self.quiet else Progress(title, most)
+        progress: Any = nullcontext() if self.quiet else ProgressDisplay(title, most)
         with progress as shown:
 
             def callback(row: np.void) -> bool:

@@ -36,7 +36,7 @@ def during(text: str, quiet: bool, task: Callable[[], T]) -> T:
         timer.cancel()
 
 
-class Progress:
+class ProgressDisplay:
     """Shows the rows of the history of a run; call it with each row.
 
     Parameters
@@ -58,7 +58,7 @@ class Progress:
         self._shown, self._began = 0.0, time.monotonic()
         self.live = self.stream.isatty()
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> ProgressDisplay:
         self._change(f"{self.title}: preparing")
         if self.live:
             self._shown = time.monotonic() - REFRESH

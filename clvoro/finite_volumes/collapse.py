@@ -10,8 +10,8 @@ from ..mesh.connectivity import distinct, following, slices, take_ranges, take_r
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import cross_columns, dots, lengths, smaller_size, sum_columns
-from .defects import Limits
-from .merging import Cells, Merges
+from .defects import DefectLimits
+from .merging import Merges, MergingCells
 from .seams import pack
 
 SHORT_EDGE = 0.02
@@ -26,7 +26,7 @@ _WIDEST = 0.15
 """Most extent of vertices that become one, as a share of h."""
 _LONGEST = 0.25
 """Longest edge that is collapsed, if it is the shortest of a small face."""
-LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, skewness=3))
+LIMITS = (DefectLimits(), DefectLimits(non_orthogonality=20), DefectLimits(non_orthogonality=40, skewness=3))
 """Tried in turn, the later ones where short edges or small faces are left."""
 _CHUNK = 1 << 12
 """Faces that are read at a time: their arrays fit the caches."""
@@ -42,7 +42,7 @@ def collapse_short(mesh: Faces, diagram: Diagram) -> Faces:
     The ends of an edge, or the corners of a face, become one point: their mean, or one of them. Points on walls, edges
     and corners of the box stay on them, and images of a point move together. The cells therefore still fill the domain.
     Faces that lose their area vanish, and their cells are no longer neighbors. An edge or face is left as it is if
-    otherwise a face would be warped or a cell concave; see `Limits`.
+    otherwise a face would be warped or a cell concave; see `DefectLimits`.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _suspects(mesh: Faces, diagram: Diagram) -> np.ndarray:
     return found
 
 
-def _fold(mesh: Faces, diagram: Diagram) -> tuple[Cells, np.ndarray]:
+def _fold(mesh: Faces, diagram: Diagram) -> tuple[MergingCells, np.ndarray]:
     """Return the cells of `mesh` with faces at seams and images of points once; the faces of `mesh` that they have."""
     upper = np.flatnonzero((mesh.twin < 0) | (mesh.twin > np.arange(len(mesh.twin))))
     points, extent = mesh.points, np.asarray(mesh.domain.extent, float)
@@ -116,7 +116,7 @@ def _fold(mesh: Faces, diagram: Diagram) -> tuple[Cells, np.ndarray]:
     else:
         starts, corners = mesh.starts, mesh.corners
         codes, face_codes = (np.broadcast_to(0, len(of)) for of in (corners, upper))
-    cells = Cells(
+    cells = MergingCells(
         points,
         starts,
         corners,
@@ -135,7 +135,7 @@ def _fold(mesh: Faces, diagram: Diagram) -> tuple[Cells, np.ndarray]:
     return cells, upper
 
 
-def _unfold(mesh: Faces, cells: Cells, upper: np.ndarray) -> Faces:
+def _unfold(mesh: Faces, cells: MergingCells, upper: np.ndarray) -> Faces:
     """Return `mesh` as `cells` have become."""
     alive = cells.count > 0
     kept = np.zeros(len(mesh.owner), bool)
@@ -180,7 +180,7 @@ class _Scan:
         Skewed faces count as small.
     """
 
-    def __init__(self, cells: Cells, faces: np.ndarray) -> None:
+    def __init__(self, cells: MergingCells, faces: np.ndarray) -> None:
         self.cells, self.faces = cells, faces[cells.count[faces] > 0]
         self.starts, places = cells.face_corners(self.faces)
         face = np.repeat(np.arange(len(self.faces)), np.diff(self.starts))

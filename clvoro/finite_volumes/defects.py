@@ -11,7 +11,7 @@ from ..mesh.connectivity import distinct, following, take_rows
 from ..mesh.geometry import cross_columns, dots, lengths, loop_geometry, pyramid_sums, smaller_size
 
 if TYPE_CHECKING:
-    from .merging import Cells
+    from .merging import MergingCells
     from .neighborhood import Neighborhood
 
 _WORSE = 0.02
@@ -21,7 +21,7 @@ _THIN = 1e-6
 
 
 @dataclass(frozen=True)
-class Limits:
+class DefectLimits:
     """What cells must satisfy after a merge.
 
     Attributes
@@ -59,7 +59,7 @@ class Defects:
     skewness: np.ndarray
 
     @classmethod
-    def allowed(cls, k: int, limits: Limits) -> Defects:
+    def allowed(cls, k: int, limits: DefectLimits) -> Defects:
         """Return what is allowed anywhere."""
         none = np.zeros(k, np.int64)
         return cls(none, none, np.full(k, limits.non_orthogonality), np.full(k, limits.skewness))
@@ -95,7 +95,7 @@ class _Shapes:
     volumes: np.ndarray
 
 
-def find_defects(around: Neighborhood, limits: Limits, targets: np.ndarray | None = None) -> Defects:
+def find_defects(around: Neighborhood, limits: DefectLimits, targets: np.ndarray | None = None) -> Defects:
     """Return what is wrong with the cells if the vertices of each group meet in `targets` (g, 3)."""
     w = around.whole
     x = w.positions(around.corners, around.codes)
@@ -124,7 +124,7 @@ def find_defects(around: Neighborhood, limits: Limits, targets: np.ndarray | Non
     return Defects(count, serious, angle, skewness)
 
 
-def _large(whole: Cells, faces: np.ndarray, areas: np.ndarray) -> np.ndarray:
+def _large(whole: MergingCells, faces: np.ndarray, areas: np.ndarray) -> np.ndarray:
     """Return which of `faces` are at least as large as the limit. `areas` (3, ...) are their area vectors."""
     h = smaller_size(whole.owner[faces], whole.neighbor[faces], whole.sizes)
     return np.sqrt((areas**2).sum(axis=0)) >= whole.small * h**2

@@ -1,7 +1,7 @@
 """Merge vertices of a polyhedral mesh in 3D where the cells stay valid; many merges at once.
 
 Each set of merges is tried on its own `Neighborhood`. It is made if the topology stays valid and `find_defects` finds
-nothing beyond the `Limits`. Sets that share no cell are tried together.
+nothing beyond the `DefectLimits`. Sets that share no cell are tried together.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from ..mesh.connectivity import distinct, take_ranges, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.geometry import lengths, loop_geometry, sum_columns
-from .defects import Defects, Limits, find_defects
+from .defects import DefectLimits, Defects, find_defects
 from .independent import independent
 from .neighborhood import Neighborhood
 from .seams import unpack
@@ -111,7 +111,7 @@ class _Finder:
         return take_ranges(self.begin[wanted], self.count[wanted], self.rows)
 
 
-class Cells:
+class MergingCells:
     """Polyhedral cells in 3D whose vertices can be merged.
 
     In periodic directions images of a vertex are one vertex, and a corner of a face is a vertex with an offset.
@@ -158,7 +158,7 @@ class Cells:
         self.owner, self.neighbor = owner.astype(np.int64), neighbor.astype(np.int64)
         self.face_codes, self.n = face_codes, len(diagram)
         self.sizes, self.centroids, self.small = np.cbrt(diagram.volumes), diagram.centroids, small
-        self.limits = Limits()
+        self.limits = DefectLimits()
         v = len(points)
         self.walls = np.zeros(v, np.int64)
         outer = np.flatnonzero(self.neighbor < 0)

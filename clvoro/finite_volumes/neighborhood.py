@@ -10,10 +10,10 @@ import numpy as np
 from ..mesh.connectivity import distinct, following, take_rows
 
 if TYPE_CHECKING:
-    from .merging import Cells, Merges
+    from .merging import Merges, MergingCells
 
 VERTICES, CELLS, FACES = range(3)
-"""Kinds of items of a mesh; see `Cells.find`."""
+"""Kinds of items of a mesh; see `MergingCells.find`."""
 
 
 class Neighborhood:
@@ -47,7 +47,9 @@ class Neighborhood:
         Packed offset of the face as seen from that cell.
     """
 
-    def __init__(self, whole: Cells, merges: Merges, sets: np.ndarray, faces: np.ndarray, merged: bool = True) -> None:
+    def __init__(
+        self, whole: MergingCells, merges: Merges, sets: np.ndarray, faces: np.ndarray, merged: bool = True
+    ) -> None:
         self.whole, self.faces, self.set_of_face = whole, faces, sets
         self.k, self.set_of_group = len(merges.priority), merges.sets
         old_starts, places = whole.face_corners(faces)

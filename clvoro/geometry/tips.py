@@ -48,7 +48,7 @@ def find_tips(
     direction, angle = np.zeros(len(x)), np.full(len(x), np.inf)
     in_bay = np.zeros(len(x), bool)
     for a, b in pairwise(starts.tolist()):
-        ring = Ring(x[a:b])
+        ring = RingPositions(x[a:b])
         own = corners[(corners >= a) & (corners < b)] - a
         in_bay[a:b] = ring.is_between(own, _MOUTH * h[a:b])
         for reach in REACHES:
@@ -70,7 +70,7 @@ def find_tips(
     return tips, direction[tips], angle[tips], np.maximum(_CELLS * length, h[tips])
 
 
-class Ring:
+class RingPositions:
     """Positions along one ring (k, 2)."""
 
     def __init__(self, x: np.ndarray) -> None:

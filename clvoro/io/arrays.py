@@ -26,7 +26,7 @@ _PIECE = 1 << 22  # bytes per read
 
 
 class FileError(Exception):
-    """The fault of a file. `explained` adds the file's name."""
+    """The fault of a file. `explained` and the readers of formats add the file's name."""
 
 
 @contextmanager

@@ -27,7 +27,7 @@ _SYSTEM = {
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CheckMeshResult:
     """What `checkMesh -allGeometry -allTopology` says.
 
     Attributes
@@ -45,7 +45,7 @@ class Verdict:
     text: str
 
 
-def run_check_mesh(mesh: Result | Diagram, walls: WallShape = "straight") -> Verdict | None:
+def run_check_mesh(mesh: Result | Diagram, walls: WallShape = "straight") -> CheckMeshResult | None:
     """Return the verdict of OpenFOAM's `checkMesh` on a mesh, or None if it is not installed.
 
     The mesh is written into a temporary case.
@@ -63,7 +63,7 @@ def run_check_mesh(mesh: Result | Diagram, walls: WallShape = "straight") -> Ver
         return check_case(case)
 
 
-def check_case(case: Path) -> Verdict:
+def check_case(case: Path) -> CheckMeshResult:
     """Return the verdict of `checkMesh`, which is installed, on the mesh of a case; its folder `system` is written."""
     (case / "system").mkdir(exist_ok=True)
     for file, text in _SYSTEM.items():
@@ -74,4 +74,4 @@ def check_case(case: Path) -> Verdict:
     done = subprocess.run(command, env={**settings, **os.environ}, capture_output=True, text=True, check=False)
     text = done.stdout + done.stderr
     stars = re.findall(r"^ *\*\*\*(.*)$", text, re.MULTILINE)
-    return Verdict("Mesh OK." in text, tuple(line.strip() for line in stars), text)
+    return CheckMeshResult("Mesh OK." in text, tuple(line.strip() for line in stars), text)

@@ -17,7 +17,7 @@ from ..mesh.faces import Faces
 
 
 @dataclass(frozen=True)
-class Patch:
+class FoamPatch:
     """A part of the boundary.
 
     Attributes
@@ -39,9 +39,9 @@ class Patch:
     separation: tuple[float, ...] = ()
 
 
-def cyclic_patches(mesh: Faces) -> list[Patch]:
+def cyclic_patches(mesh: Faces) -> list[FoamPatch]:
     """Return the pairs of patches of the faces at seams, in the order of the faces: upper, lower, upper, ..."""
-    made: list[Patch] = []
+    made: list[FoamPatch] = []
     shifts = mesh.shift[mesh.n_outer :].astype(np.int64)
     axes = np.argmax(shifts != 0, axis=1)
     for axis in np.unique(axes).tolist():
@@ -52,6 +52,6 @@ def cyclic_patches(mesh: Faces) -> list[Patch]:
         if (steps == steps[0]).all():
             period = np.pad(steps[0] * np.array(mesh.domain.extent), (0, 3 - mesh.dim))
             there, back = tuple((0 - period).tolist()), tuple(period.tolist())
-        made.append(Patch(upper, "cyclic", len(steps), lower, there))
-        made.append(Patch(lower, "cyclic", len(steps), upper, back))
+        made.append(FoamPatch(upper, "cyclic", len(steps), lower, there))
+        made.append(FoamPatch(lower, "cyclic", len(steps), upper, back))
     return made

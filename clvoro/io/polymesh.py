@@ -17,7 +17,7 @@ from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.boundary_names import Walls
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
-from .cyclic import Patch, cyclic_patches
+from .cyclic import FoamPatch, cyclic_patches
 
 PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
 """Types of patches for `poly_mesh`."""
@@ -29,7 +29,7 @@ def poly_mesh(
     types: Mapping[str, PatchType] | None = None,
     thickness: float | None = None,
     walls: WallShape = "straight",
-) -> tuple[Faces, list[Patch], float]:
+) -> tuple[Faces, list[FoamPatch], float]:
     """Describe `diagram` for OpenFOAM; faces without measure and points without a face are left out.
 
     The patches are the boundaries of the domain by their names, then one pair of cyclic patches for each periodic
@@ -69,10 +69,10 @@ def poly_mesh(
     cells = polyhedra(mesh, thickness)
     groups = parts.index[-1 - mesh.neighbor[mesh.n_inner : mesh.n_outer]]
     counts = np.bincount(groups, minlength=len(parts.names)).tolist()
-    made = [Patch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]
+    made = [FoamPatch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]
     made += cyclic_patches(mesh)
     if domain.dim == 2:
-        made += [Patch("back", "empty", mesh.n_cells), Patch("front", "empty", mesh.n_cells)]
+        made += [FoamPatch("back", "empty", mesh.n_cells), FoamPatch("front", "empty", mesh.n_cells)]
     own = {patch.name for patch in made[len(parts.names) :]}
     clash = [name for name in parts.names if name in own]
     if clash:

@@ -55,7 +55,7 @@ class BuildNotice:
 
 
 @contextmanager
-def noticed_builds(engine: Engine, on_build: Callable[[int, int], object] | None) -> Iterator[BuildNotice | None]:
+def report_builds(engine: Engine, on_build: Callable[[int, int], object] | None) -> Iterator[BuildNotice | None]:
     """Let workers build kernels of a first run, and report the progress inside the ``with`` block.
 
     Parameters

@@ -51,7 +51,7 @@ class Cost:
 
 
 @dataclass
-class Span:
+class TimeSpan:
     """The time between two rows of a run's history.
 
     Attributes
@@ -88,7 +88,7 @@ def tabulate(profile: Profile) -> str:
     if len(levels) > 1:
         columns |= groups
 
-    def per_step(seconds: Callable[[Span], float]) -> list[str]:
+    def per_step(seconds: Callable[[TimeSpan], float]) -> list[str]:
         return [f"{1e3 * sum(map(seconds, s)) / len(s):.2f}" for s in columns.values()]
 
     def time_of(seconds: float) -> list[str]:

@@ -45,7 +45,7 @@ _known: set[tuple[str, int]] = set()
 """Kinds of runs, and devices, of this process."""
 
 
-class Launch(NamedTuple):
+class FirstLaunch(NamedTuple):
     """The first launch of a kernel: index of its program, size of its group, bytes of its arguments (0: a buffer)."""
 
     program: int
@@ -58,7 +58,7 @@ class Work(NamedTuple):
     """What a worker builds: text and options of programs, and launches in the order of building."""
 
     programs: list[tuple[str, tuple[str, ...]]]
-    launches: list[Launch]
+    launches: list[FirstLaunch]
 
 
 def start_workers(device: cl.Device) -> None:
@@ -125,11 +125,11 @@ def _work(engine: Engine, recorded: dict) -> Work:
             defines |= {"IN_LANES": "0"} if "IN_LANES" in defines else {}
         places[index] = len(programs)
         programs.append(program_text(f"{stage}.cl", engine.all_defines(stage, defines), ""))
-    launches = [Launch(places[index], *rest) for index, *rest in recorded["launches"] if index in places]
+    launches = [FirstLaunch(places[index], *rest) for index, *rest in recorded["launches"] if index in places]
     return Work(programs, launches)
 
 
-def _share(launches: list[Launch], index: int, count: int) -> list[Launch]:
+def _share(launches: list[FirstLaunch], index: int, count: int) -> list[FirstLaunch]:
     """Return the launches for worker `index` of `count`: those of whole programs, in reverse order."""
     order = list(dict.fromkeys(launch.program for launch in reversed(launches)))
     mine = order[index::count]

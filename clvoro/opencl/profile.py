@@ -14,7 +14,7 @@ import pyopencl as cl
 
 from ..errors import InputError
 from . import hooks as _hooks
-from .costs import Cost, Span, tabulate
+from .costs import Cost, TimeSpan, tabulate
 from .program import build_program, build_seconds
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Profile:
     ----------
     costs : dict of (str, str) to Cost
         Per stage and kernel; a stage is a file of kernels. Complete after the profile is closed.
-    spans : list of Span
+    spans : list of TimeSpan
         The time before each row of the history, and that after the last row.
     wall, building : float
         Wall time in seconds between opening and closing, and the part of it that built programs.
@@ -74,9 +74,9 @@ class Profile:
             self._adapter = target
             self.queue = own if own.properties & enabled else profiled_queue(target.ctx)
         self.costs: dict[tuple[str, str], Cost] = {}
-        self.spans: list[Span] = []
+        self.spans: list[TimeSpan] = []
         self.wall = self.building = 0.0
-        self._pending: list[tuple[cl.Event, tuple[str, str], int | None, Span]] = []
+        self._pending: list[tuple[cl.Event, tuple[str, str], int | None, TimeSpan]] = []
         self._closing = ExitStack()
 
     def __enter__(self) -> Profile:
@@ -85,7 +85,7 @@ class Profile:
         self._closing.enter_context(_hooks.watching(self.queue, self._add))
         self.building -= build_seconds()
         self._began = time.perf_counter()
-        self._span = Span(self._began)
+        self._span = TimeSpan(self._began)
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -120,7 +120,7 @@ class Profile:
         span.step, span.level, span.cells = (int(row[name]) for name in ("step", "level", "cells"))
         span.wall = now - span.began
         self.spans.append(span)
-        self._span = Span(now)
+        self._span = TimeSpan(now)
 
     def _collect(self, count: int) -> None:
         """Wait for the oldest `count` events, read their times and release them."""
@@ -130,7 +130,7 @@ class Profile:
             self._count(*entry)
         del self._pending[:count]
 
-    def _count(self, event: cl.Event, key: tuple[str, str], moved: int | None, span: Span) -> None:
+    def _count(self, event: cl.Event, key: tuple[str, str], moved: int | None, span: TimeSpan) -> None:
         event.wait()
         times = event.profile
         seconds = 1e-9 * (times.end - times.start)
@@ -164,7 +164,7 @@ class Profile:
         return self.wall - self.device
 
     @property
-    def steps(self) -> list[Span]:
+    def steps(self) -> list[TimeSpan]:
         """The spans of steps."""
         return [span for span in self.spans if span.step]
 

@@ -102,7 +102,7 @@ class ConjugateGradient:
         if operator.rows is not None and isinstance(precondition, cla.Array):
             if len(rhs) <= self._one_group_limit:
                 return self._solve_by_group(operator, rhs, x, precondition, limits, from_zero, store)
-        system = _System(self, operator, rhs, x, precondition, limits.tolerance, store)
+        system = _Iteration(self, operator, rhs, x, precondition, limits.tolerance, store)
         iterations, history, reason = 0, [], "max_iterations"
         # From zero the relative residual is 1; the host reads the norm of b with the first iterations.
         begun = from_zero and 0 < limits.max_iterations and limits.tolerance < 1
@@ -209,7 +209,7 @@ class ConjugateGradient:
         return math.sqrt(norm_r / norm_b)
 
     def _iterate(
-        self, system: _System, begun: int, limits: Limits, residual: float, history: list[float], unknown: bool
+        self, system: _Iteration, begun: int, limits: Limits, residual: float, history: list[float], unknown: bool
     ) -> int | None:
         """Iterate from the present residual until a stop, or up to `max_iterations`; return the number of iterations.
 
@@ -267,7 +267,7 @@ class ConjugateGradient:
         )
 
 
-class _System:
+class _Iteration:
     """One linear system with the vectors and launches of its iteration."""
 
     def __init__(

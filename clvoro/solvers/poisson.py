@@ -85,7 +85,7 @@ class Laplacian:
 
 
 @dataclass(frozen=True)
-class _System:
+class _Equation:
     """One system A phi = b and how accurately it is solved."""
 
     laplacian: Laplacian
@@ -327,7 +327,7 @@ class Poisson:
         if not tolerance > 0:
             raise InputError(f"tolerance got {tolerance!r}, expected a number > 0, such as 1e-8")
         operator = Operator(self._apply_of(laplacian), writes_curvature=True, singular=True, rows=laplacian.rows)
-        system = _System(laplacian, operator, rhs, potential, tolerance)
+        system = _Equation(laplacian, operator, rhs, potential, tolerance)
         if preconditioner == "auto":
             one_group = n <= one_group_limit(self.engine)
             factors = cost_factors(self.engine.queue.device)
@@ -339,13 +339,13 @@ class Poisson:
         most = max_iterations if max_cycles is None else max_cycles
         return self._solve_multigrid(system, most, ordering, from_zero)
 
-    def _solve_jacobi(self, system: _System, max_iterations: int, from_zero: bool) -> Solution:
+    def _solve_jacobi(self, system: _Equation, max_iterations: int, from_zero: bool) -> Solution:
         with self.engine.workspace.frame():
             inverse = self.inverse_diagonal(system.laplacian)
             return self._run(system, inverse, max_iterations, 64, from_zero)
 
     def _solve_multigrid(
-        self, system: _System, max_iterations: int | None, ordering: object, from_zero: bool
+        self, system: _Equation, max_iterations: int | None, ordering: object, from_zero: bool
     ) -> Solution:
         """Solve with multigrid, and with Jacobi's preconditioner from there if that fails."""
         most = _MAX_CYCLES if max_iterations is None else max_iterations
@@ -386,7 +386,7 @@ class Poisson:
 
     def _run(
         self,
-        system: _System,
+        system: _Equation,
         precondition: cla.Array | Precondition,
         max_iterations: int,
         lookahead: int,

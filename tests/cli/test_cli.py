@@ -209,14 +209,14 @@ def test_start_from_points(here):
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("last_step", [0, 2])
 def test_interrupt_keeps_what_there_is(here, monkeypatch, capsys, last_step):
-    plain = progress.Progress.__call__
+    plain = progress.ProgressDisplay.__call__
 
     def pressing(self, row):
         plain(self, row)
         if row["step"] == last_step:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(progress.Progress, "__call__", pressing)
+    monkeypatch.setattr(progress.ProgressDisplay, "__call__", pressing)
     handler = signal.getsignal(signal.SIGINT)
     report = last_step > 0  # once, because pictures take time
     assert call("run", "small.toml", *([] if report else ["--no-report"])) == cli.INTERRUPTED
@@ -398,7 +398,7 @@ def row(step, seconds, cells=1000, progress=0.1):
 
 
 def test_line_holds_the_numbers():
-    shown = progress.Progress("paper lloyd", 10, io.StringIO())
+    shown = progress.ProgressDisplay("paper lloyd", 10, io.StringIO())
     for step in range(6):
         shown(row(step, 0.5 * step))
     line = shown.line(row(5, 2.5))
@@ -408,7 +408,7 @@ def test_line_holds_the_numbers():
 
 
 def test_line_of_a_run_of_unknown_length():
-    shown = progress.Progress("paper", None, io.StringIO())
+    shown = progress.ProgressDisplay("paper", None, io.StringIO())
     for step, cells in enumerate([10, 10, 10, 40, 40, 40]):
         shown(row(step, float(step), cells, progress=step / 8))
     line = shown.line(row(5, 5.0, 40, progress=0.625))
@@ -419,7 +419,7 @@ def test_line_of_a_run_of_unknown_length():
 
 def test_the_time_left_is_told_by_the_pace_of_the_latter_half():
     """Kernels are built before and in the first two steps, so the first four steps are not representative."""
-    shown = progress.Progress("paper", None, io.StringIO())
+    shown = progress.ProgressDisplay("paper", None, io.StringIO())
     seconds = [90, 100, 110, 111, 112, 113, 114, 115, *range(116, 300)]
     lines = []
     for step, at in enumerate(seconds):
@@ -438,7 +438,7 @@ def test_the_time_left_is_told_by_the_pace_of_the_latter_half():
 def test_terminal_gets_one_changing_line(monkeypatch):
     monkeypatch.setattr(progress, "REFRESH", 0.0)
     stream = Terminal()
-    with progress.Progress("x", 5, stream) as shown:
+    with progress.ProgressDisplay("x", 5, stream) as shown:
         for step in range(3):
             shown(row(step, step))
     text = stream.getvalue()
@@ -450,18 +450,18 @@ def test_terminal_gets_one_changing_line(monkeypatch):
 
 def test_terminal_shows_how_many_kernels_are_built():
     stream = Terminal()
-    with progress.Progress("x", 5, stream) as shown:
+    with progress.ProgressDisplay("x", 5, stream) as shown:
         shown.show_builds(3, 50)
     assert "\rx: building kernels, once for this device: 3 of 50" in stream.getvalue()
     silent = io.StringIO()
-    progress.Progress("x", 5, silent).show_builds(3, 50)
+    progress.ProgressDisplay("x", 5, silent).show_builds(3, 50)
     assert silent.getvalue() == ""
 
 
 @pytest.mark.parametrize("kind", ["log", "terminal"])
 def test_a_line_that_stays(kind):
     stream = io.StringIO() if kind == "log" else Terminal()
-    with progress.Progress("x", 5, stream) as shown:
+    with progress.ProgressDisplay("x", 5, stream) as shown:
         shown.tell("takes [1] MiB")
     text = stream.getvalue()
     assert re.search(r"takes \[1\] MiB\S*\s*\n", text)
@@ -482,7 +482,7 @@ def test_log_gets_a_line_now_and_then(monkeypatch):
     stream = io.StringIO()
     clock = iter(range(0, 1000, 2))
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
-    with progress.Progress("x", 20, stream) as shown:
+    with progress.ProgressDisplay("x", 20, stream) as shown:
         for step in range(10):  # two seconds each
             shown(row(step, 2.0 * step))
     lines = stream.getvalue().splitlines()

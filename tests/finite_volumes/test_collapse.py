@@ -8,7 +8,7 @@ import pytest
 import clvoro
 from clvoro.finite_volumes import collapse
 from clvoro.finite_volumes.collapse import collapse_short
-from clvoro.finite_volumes.defects import Limits
+from clvoro.finite_volumes.defects import DefectLimits
 from clvoro.finite_volumes.merging import Merges
 from clvoro.finite_volumes.seams import pack, unpack
 from clvoro.mesh.connectivity import following
@@ -204,7 +204,7 @@ def test_merges_are_those_of_a_slow_reference():
         rng.choice(mesh.corners[mesh.starts[f] : mesh.starts[f + 1]], 2, replace=False)
         for f in rng.integers(len(mesh.owner), size=6)
     ]
-    limits, verdicts = Limits(non_orthogonality=60, skewness=4), []
+    limits, verdicts = DefectLimits(non_orthogonality=60, skewness=4), []
     for a, b in [*ends.tolist(), *np.array(apart).tolist()]:
         cells, _ = collapse._fold(mesh, diagram)
         cells.limits = limits

@@ -17,7 +17,7 @@ import pytest
 import clvoro
 from clvoro.opencl import build_notice, prebuild, program
 from clvoro.opencl import engine as engines
-from clvoro.opencl.build_notice import BuildNotice, noticed_builds
+from clvoro.opencl.build_notice import BuildNotice, report_builds
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.program import POCL
 
@@ -96,7 +96,7 @@ def test_workers_build_what_this_process_will_need(engine, monkeypatch):
 
 
 def test_workers_share_whole_programs_last_ones_first():
-    launches = [prebuild.Launch(p, name, 1, []) for p, name in [(0, "a"), (1, "b"), (0, "c"), (2, "d")]]
+    launches = [prebuild.FirstLaunch(p, name, 1, []) for p, name in [(0, "a"), (1, "b"), (0, "c"), (2, "d")]]
     names = [[launch.kernel for launch in prebuild._share(launches, i, 2)] for i in range(2)]
     assert names == [["d", "b"], ["c", "a"]]
     assert [launch.kernel for launch in prebuild._share(launches, 0, 1)] == ["d", "c", "b", "a"]
@@ -128,7 +128,7 @@ def test_only_first_runs_on_terminals_show_a_line(engine, monkeypatch, new, term
     monkeypatch.setattr(build_notice, "build_ahead", lambda _: new)
     monkeypatch.setattr(build_notice, "PATIENCE", 0)
     monkeypatch.setattr(sys, "stderr", Terminal() if terminal else io.StringIO())
-    with noticed_builds(engine, None):
+    with report_builds(engine, None):
         assert engine.kernels("opencl/primitives").gather_rows
     assert sys.stderr.getvalue().count("1 of 5") == lines
     assert not sys.stderr.getvalue() or sys.stderr.getvalue().endswith("\r\x1b[K")
@@ -138,7 +138,7 @@ def test_callback_replaces_the_line(engine, monkeypatch):
     monkeypatch.setattr(build_notice, "build_ahead", lambda _: 2)
     monkeypatch.setattr(sys, "stderr", Terminal())
     told = []
-    with noticed_builds(engine, lambda built, total: told.append((built, total))):
+    with report_builds(engine, lambda built, total: told.append((built, total))):
         kernels = engine.kernels("opencl/primitives")
         _ = kernels.gather_rows, kernels.gather_rows, kernels.scan_blocks, kernels.combine_blocks
     _ = kernels.summarize_blocks

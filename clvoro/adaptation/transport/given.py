@@ -6,7 +6,7 @@ import numpy as np
 import pyopencl.array as cla
 import shapely
 
-from ...arguments import Naming, check_integer, check_number, check_points, warn
+from ...arguments import check_integer, check_number, check_points, coincident_named, warn
 from ...errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWarning
 from ...geometry.domain import Domain
 from ...geometry.polygon import Polygon
@@ -39,7 +39,7 @@ def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: ob
     # Only differences count. Around 0 weights have the least round-off.
     near = np.maximum(given - given.max(), -WITHIN_REACH * float((domain.extent**2).sum()))
     scaled = (near - near.mean()) / domain.frame[1] ** 2
-    with Naming(host, domain, stages.engine.real):
+    with coincident_named(host, domain, stages.engine.real):
         labels, sorted_points = _sorted(stages, domain, host)
         device_weights = stages.engine.upload(scaled[labels.get()])
         t = power.tessellate(sorted_points, device_weights, n, exact=True, complete=True)
@@ -74,7 +74,7 @@ def transport_to(
     _check_volumes(given, domain, rounding)
     _check_pieces(host, given, domain, rounding)
     check_memory(engine, n, domain, run=False, power=True)
-    with Naming(host, domain, engine.real):
+    with coincident_named(host, domain, engine.real):
         labels, sorted_points = _sorted(stages, domain, host)
         prescribed = given[labels.get()] / domain.frame[1] ** domain.cell_dim
         t, _, newton = stages.transport.solve(

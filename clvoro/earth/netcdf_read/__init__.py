@@ -13,9 +13,10 @@ from scipy.io import netcdf_file
 
 from ...errors import InputError
 from ...files import open_plain
+from ...io.arrays import FileError
 from ...mesh.diagram import Diagram
 from ...mesh.results import HISTORY_DTYPE, Result
-from .cells import Cells, FileError, make_diagram
+from .cells import MeshInFile, make_diagram
 from .conventions import READERS, Variables
 
 _HDF5 = b"\x89HDF"
@@ -64,7 +65,7 @@ def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
     )
 
 
-def _read(file: Variables) -> Cells:
+def _read(file: Variables) -> MeshInFile:
     for reader in READERS:
         cells = reader(file)
         if cells is not None:

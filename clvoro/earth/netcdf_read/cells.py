@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from ...geometry.sphere import Sphere
 from ...geometry.sphere_region import SphereRegion
 from ...geometry.spherical_triangles import triangle_areas
+from ...io.arrays import FileError
 from ...mesh.connectivity import following
 from ...mesh.diagram import Diagram
 from ...mesh.spherical import rebuild_on_sphere
@@ -23,12 +24,8 @@ _SAME = 0.05
 from their cells."""
 
 
-class FileError(Exception):
-    """The fault of a file. `load_netcdf` adds the file's name."""
-
-
 @dataclass
-class Cells:
+class MeshInFile:
     """The cells of a mesh on a sphere, as a file has them.
 
     Attributes
@@ -55,7 +52,7 @@ class Cells:
     of_run: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
-def make_diagram(cells: Cells) -> Diagram:
+def make_diagram(cells: MeshInFile) -> Diagram:
     """Return the diagram of `cells`; without the whole sphere it is that of a `SphereRegion`.
 
     Raises
@@ -117,7 +114,9 @@ def _neighbors(owner: np.ndarray, ends: np.ndarray, v: int) -> np.ndarray:
     return np.where(ranked[place] == there, owner[order[place]], -1)
 
 
-def _removed(cells: Cells, owner: np.ndarray, ends: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _removed(
+    cells: MeshInFile, owner: np.ndarray, ends: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the generators of removed cells (b, 3), and which of them is behind each boundary face (k,).
 
     A face is on the bisector of both generators. So the other one is the reflection of that of the cell, through the

@@ -1,4 +1,4 @@
-"""The variables of netCDF files by MPAS, UGRID and SCRIP, as `Cells`."""
+"""The variables of netCDF files by MPAS, UGRID and SCRIP, as `MeshInFile`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 from scipy.io import netcdf_file
 
 from ...geometry.sphere import EARTH_RADIUS, Sphere
+from ...io.arrays import FileError
 from ...mesh.connectivity import following
-from .cells import Cells, FileError
+from .cells import MeshInFile
 
 _PLANE = "it is a mesh in the plane, expected one on a sphere; load a .npz or .vtu file instead"
 
@@ -55,7 +56,7 @@ class Variables:
         return found
 
 
-def read_mpas(file: Variables) -> Cells | None:
+def read_mpas(file: Variables) -> MeshInFile | None:
     """Return the cells of a file by the MPAS mesh specification; None for other files."""
     if "verticesOnCell" not in file:
         return None
@@ -69,10 +70,10 @@ def read_mpas(file: Variables) -> Cells | None:
     # Vertex k of a cell lies between its edges k and k + 1, so that it ends edge k.
     corners = np.empty_like(ends)
     corners[following(np.concatenate([[0], np.cumsum(counts)]))] = ends
-    return Cells(radius, points, vertices, counts, corners, edges[of_faces])
+    return MeshInFile(radius, points, vertices, counts, corners, edges[of_faces])
 
 
-def read_ugrid(file: Variables) -> Cells | None:
+def read_ugrid(file: Variables) -> MeshInFile | None:
     """Return the cells of a file by UGRID with longitudes and latitudes; None for other files.
 
     The coordinates of faces are taken as the generators.
@@ -101,10 +102,10 @@ def read_ugrid(file: Variables) -> Cells | None:
     of_run = [f for f in ("size", "error", "quality") if f in file]
     of_cells = tuple(file.real(f)[:, 0] for f in of_run) if len(of_run) == 3 else None
     points = sphere.positions(file.real(*faces))
-    return Cells(radius, points, vertices, counts, corners, of_run=of_cells)  # type: ignore[arg-type]
+    return MeshInFile(radius, points, vertices, counts, corners, of_run=of_cells)  # type: ignore[arg-type]
 
 
-def read_scrip(file: Variables) -> Cells | None:
+def read_scrip(file: Variables) -> MeshInFile | None:
     """Return the cells of a file by SCRIP of clvoro; None for other files.
 
     SCRIP has the corners of each cell on their own. Those at the same place are one.
@@ -128,10 +129,10 @@ def read_scrip(file: Variables) -> Cells | None:
     counts = 1 + (table != table[:, -1:]).sum(axis=1)
     corners = table[np.arange(most) < counts[:, None]]
     points = sphere.positions(file.real("generator_lon", "generator_lat"))
-    return Cells(radius, points, sphere.positions(lonlat), counts, corners)
+    return MeshInFile(radius, points, sphere.positions(lonlat), counts, corners)
 
 
-READERS: tuple[Callable[[Variables], Cells | None], ...] = (read_mpas, read_ugrid, read_scrip)
+READERS: tuple[Callable[[Variables], MeshInFile | None], ...] = (read_mpas, read_ugrid, read_scrip)
 
 
 def _ragged(table: np.ndarray, counts: np.ndarray, bound: int, first: int, name: str) -> np.ndarray:

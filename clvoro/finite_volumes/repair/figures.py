@@ -108,7 +108,7 @@ def face_figures(
 
 
 @dataclass(eq=False)
-class Cells:
+class CellGroup:
     """Some cells of a patch, and the faces whose figures depend on these cells only.
 
     Attributes
@@ -156,12 +156,12 @@ class Cells:
         sides = np.add.reduceat(self.between.astype(np.int64), self.starts[:-1])
         self.sides = np.maximum(sides, 1)
 
-    def part(self, cells: np.ndarray, faces: np.ndarray) -> Cells:
+    def part(self, cells: np.ndarray, faces: np.ndarray) -> CellGroup:
         """Return the part with these cells, (m,) int in ascending order, and these faces, (e,) int."""
         starts, at = take_rows(self.starts, np.arange(len(self.loop)), cells)
         place = np.full(len(self.area), -1)
         place[cells] = np.arange(len(cells))
-        return Cells(
+        return CellGroup(
             starts,
             self.loop[at],
             place[self.row[at]],
@@ -179,7 +179,7 @@ class Cells:
         )
 
     @classmethod
-    def joined(cls, parts: list[Cells], begins: list[int]) -> Cells:
+    def joined(cls, parts: list[CellGroup], begins: list[int]) -> CellGroup:
         """Return the cells of all `parts`; points of a part are counted from its number in `begins` on."""
         cells = np.cumsum([0] + [len(p.area) for p in parts]).tolist()
         corners = np.cumsum([0] + [len(p.loop) for p in parts]).tolist()

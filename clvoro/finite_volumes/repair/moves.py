@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse
 
 from ...geometry.ring_coordinate import RingCoordinate
-from .figures import Cells
+from .figures import CellGroup
 from .slopes import slopes
 
 _MOVE_WEIGHT = 0.1
@@ -36,7 +36,7 @@ class Problem:
 
     Attributes
     ----------
-    cells : Cells
+    cells : CellGroup
     points : (2, v) float
         Coordinates of all points before they move.
     positions : (v,) float
@@ -48,7 +48,7 @@ class Problem:
     scale : (m,) float
     """
 
-    cells: Cells
+    cells: CellGroup
     points: np.ndarray
     positions: np.ndarray
     active: np.ndarray
@@ -63,7 +63,7 @@ class Problem:
         v = _begins([len(p.positions) for p in problems])
         m = _begins([len(p.active) for p in problems])
         return cls(
-            cells=Cells.joined([p.cells for p in problems], v),
+            cells=CellGroup.joined([p.cells for p in problems], v),
             points=np.concatenate([p.points for p in problems], axis=1),
             positions=np.concatenate([p.positions for p in problems]),
             active=np.concatenate([p.active + i for p, i in zip(problems, v, strict=False)]),

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...geometry.ring_coordinate import RingCoordinate
 from ...mesh.connectivity import following
-from .figures import LENGTH_GOAL, Cells
+from .figures import LENGTH_GOAL, CellGroup
 from .moves import Problem
 from .patch import BORDER, Patch, cell_sides
 
@@ -33,7 +33,7 @@ class PricedPatch:
     Attributes
     ----------
     patch : Patch
-    cells : Cells
+    cells : CellGroup
         All of them, and all faces but those at borders.
     goals : (n, 2) float
         Area and size of each cell at first.
@@ -71,7 +71,7 @@ class PricedPatch:
             goals = np.column_stack([area, np.sqrt(area)])
         self.goals = goals
         owner = patch.owner[faces]
-        self.cells = Cells(
+        self.cells = CellGroup(
             starts,
             loop,
             row,

@@ -18,7 +18,7 @@ from .figures import LENGTH_GOAL
 from .patch import BORDER, Patch, part_of, restored
 from .pricing import PricedPatch
 from .tasks import Move, Task, in_step
-from .wall_corners import WallCorners, Walls
+from .wall_corners import WallCorners, WallEdges
 
 _OPENED = 0.25
 """Length of a new face over the size of its smallest cell."""
@@ -41,7 +41,7 @@ _MOST = 100
 """Most places that are regarded in a patch, the same ones again included."""
 
 
-def repaired(given: PricedPatch, ring: RingCoordinate | None, walls: Walls | None = None) -> Task[PricedPatch]:
+def repaired(given: PricedPatch, ring: RingCoordinate | None, walls: WallEdges | None = None) -> Task[PricedPatch]:
     """Find a patch of lower price: place by place points move, also along walls, and faces change.
 
     With the `walls` of the mesh only cells are regarded that OpenFOAM refuses, and corners of walls can be cut off.
@@ -74,7 +74,7 @@ def repaired(given: PricedPatch, ring: RingCoordinate | None, walls: Walls | Non
 
 
 def _changed(
-    given: PricedPatch, focus: np.ndarray, ring: RingCoordinate | None, walls: Walls | None
+    given: PricedPatch, focus: np.ndarray, ring: RingCoordinate | None, walls: WallEdges | None
 ) -> Task[PricedPatch]:
     """Find the best of a patch and those with one change for the cells `focus` (n,) bool; if none helps, with two."""
     first = yield from _best_changes(given, focus, ring, walls)
@@ -90,7 +90,7 @@ def _price(given: PricedPatch) -> float:
 
 
 def _best_changes(
-    given: PricedPatch, focus: np.ndarray, ring: RingCoordinate | None, walls: Walls | None
+    given: PricedPatch, focus: np.ndarray, ring: RingCoordinate | None, walls: WallEdges | None
 ) -> Task[list[PricedPatch]]:
     """Find the best of the patches with one change for the cells `focus` (n,) bool, the best one first."""
     c = given.cells

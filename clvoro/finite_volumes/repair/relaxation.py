@@ -26,8 +26,8 @@ from .figures import face_figures
 from .patch import LIMITS, Patch, part_of, put_back, take_patch
 from .pricing import LEAST_DETERMINANT, STRAIGHT, PricedPatch
 from .reconnection import repaired
-from .tasks import Move, Task, carried_out, in_step
-from .wall_corners import Cut, Walls
+from .tasks import Move, Task, in_step, run_task
+from .wall_corners import Cut, WallEdges
 
 _RINGS = 5
 """Rings of cells around those beyond a limit that make a patch."""
@@ -80,17 +80,17 @@ def relax_points(mesh: Faces, parts: np.ndarray, straight: bool = True) -> Faces
     around, groups = take_patch(mesh, region), _connected_parts(mesh, region, bad)
     around.limits = limits
     on_walls = slice(mesh.n_inner, mesh.n_outer)
-    walls = Walls(mesh.points[mesh.corners.reshape(-1, 2)[on_walls]], mesh.owner[on_walls], parts)
+    walls = WallEdges(mesh.points[mesh.corners.reshape(-1, 2)[on_walls]], mesh.owner[on_walls], parts)
     patches = [_with_positions(_patch_of(around, cells), ring, kinds) for cells in groups]
     given = [made for made in map(PricedPatch.of, patches) if made is not None and made.bad.any()]
     # The last bits of sums in BLAS depend on its number of threads.
     with _BLAS, threadpool_limits(1, user_api="blas"):
-        better = carried_out(in_step([_moved(patch) for patch in given]), ring)
+        better = run_task(in_step([_moved(patch) for patch in given]), ring)
         if straight and _are_few(better, max(_MOST_PLACES, int(_PLACES_SHARE * mesh.n_cells))):
-            better = carried_out(in_step([repaired(patch, ring) for patch in better]), ring)
+            better = run_task(in_step([repaired(patch, ring) for patch in better]), ring)
         refused = sum(int(patch.refused.sum()) for patch in better)
         if straight and 0 < refused <= _MOST_REFUSED:
-            better = carried_out(in_step([repaired(patch, ring, walls) for patch in better]), ring)
+            better = run_task(in_step([repaired(patch, ring, walls) for patch in better]), ring)
     made = [b.patch for a, b in zip(given, better, strict=True) if b.price < a.price]
     _report([cut for patch in made for cut in patch.cuts])
     return put_back(mesh, made) if made else mesh

@@ -1,4 +1,4 @@
-"""Derivatives of the terms of `Cells.terms` with respect to the coordinates of points."""
+"""Derivatives of the terms of `CellGroup.terms` with respect to the coordinates of points."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .figures import (
     SKEWNESS_GOAL,
     TURN_GOAL,
     TURN_WEIGHT,
-    Cells,
+    CellGroup,
     Figures,
     face_figures,
 )
@@ -41,7 +41,7 @@ class Slopes(NamedTuple):
     y: np.ndarray
 
 
-def slopes(cells: Cells, now: Figures) -> Slopes:
+def slopes(cells: CellGroup, now: Figures) -> Slopes:
     """Return the derivatives of ``cells.terms(now)`` other than 0."""
     f, n = len(cells.faces), len(cells.area)
     made = _Slopes(cells, now)
@@ -59,7 +59,7 @@ class _Slopes:
         The previous corner of each one, relative to the origin of the cell.
     """
 
-    def __init__(self, cells: Cells, now: Figures) -> None:
+    def __init__(self, cells: CellGroup, now: Figures) -> None:
         self.cells, self.now = cells, now
         self.ox, self.oy = now.px[cells.before], now.py[cells.before]
 

@@ -73,7 +73,7 @@ def in_step(tasks: Sequence[Task[_T]]) -> Task[list[_T]]:
     return [results[i] for i in range(len(tasks))]
 
 
-def carried_out(task: Task[_T], ring: RingCoordinate | None) -> _T:
+def run_task(task: Task[_T], ring: RingCoordinate | None) -> _T:
     """Run a task, and return its result; points on walls slide along `ring`."""
     try:
         moves = next(task)

@@ -46,7 +46,7 @@ class Cut(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Walls:
+class WallEdges:
     """The walls of a mesh.
 
     Attributes
@@ -61,7 +61,7 @@ class Walls:
     owner: np.ndarray
     parts: np.ndarray
 
-    def beside(self, cells: np.ndarray, points: np.ndarray) -> Walls:
+    def beside(self, cells: np.ndarray, points: np.ndarray) -> WallEdges:
         """Return the walls of other cells than `cells` (n,) that are near `points` (v, 2)."""
         low, high = points.min(axis=0), points.max(axis=0)
         near = (self.ends.max(axis=1) >= low).all(axis=1) & (self.ends.min(axis=1) <= high).all(axis=1)
@@ -76,11 +76,11 @@ class WallCorners:
     ----------
     given : PricedPatch
     patch : Patch
-    walls : Walls
+    walls : WallEdges
         Those of other cells.
     """
 
-    def __init__(self, given: PricedPatch, walls: Walls) -> None:
+    def __init__(self, given: PricedPatch, walls: WallEdges) -> None:
         self.given, self.patch, self.walls = given, given.patch, walls
         self.sizes, self.is_wall = given.goals[:, 1], given.patch.walls
         self.faces_at: list[list[int]] = [[] for _ in self.patch.points]

@@ -16,7 +16,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from ..arrays import EXPANSION, LEAST
+from ..arrays import EXPANSION, LEAST, FileError
 from ..vtu import CURVES, NAMES, SOLVER_MESH
 
 LONGEST_HEAD = 1 << 22
@@ -57,10 +57,6 @@ _USED = {
     "FieldData.region_beyond",
     "FieldData.region_area",
 }
-
-
-class FileError(Exception):
-    """The fault of a file. `load_vtu` adds the file's name."""
 
 
 class FileReader:

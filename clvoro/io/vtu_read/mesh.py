@@ -25,8 +25,9 @@ from ...mesh.connectivity import following
 from ...mesh.diagram import Diagram
 from ...mesh.results import HISTORY_DTYPE, Result
 from ...mesh.spherical import rebuild_on_sphere
+from ..arrays import FileError
 from ..vtu_checks import check_repeated
-from .arrays import END, LONGEST_HEAD, MARK, FileError, FileReader
+from .arrays import END, LONGEST_HEAD, MARK, FileReader
 
 _OFF_SPHERE = 1e-5
 """Largest distance of a vertex from its sphere in units of the radius: round-off of float32, and more."""

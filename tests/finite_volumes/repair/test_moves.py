@@ -8,7 +8,7 @@ import clvoro
 from clvoro.finite_volumes.repair import moves
 from clvoro.finite_volumes.repair.patch import part_of, take_patch
 from clvoro.finite_volumes.repair.pricing import PricedPatch
-from clvoro.finite_volumes.repair.tasks import Move, carried_out, in_step, moved
+from clvoro.finite_volumes.repair.tasks import Move, in_step, moved, run_task
 from tests.finite_volumes.repair.test_patch import with_positions
 from tests.finite_volumes.test_straight_walls import ELL
 
@@ -85,9 +85,9 @@ def test_tasks_in_step_give_the_results_of_each(patches):
         return patch
 
     counts = (2, 0, 1)
-    alone = [carried_out(some_moves(p, n), ring) for p, n in zip(given, counts, strict=True)]
+    alone = [run_task(some_moves(p, n), ring) for p, n in zip(given, counts, strict=True)]
     tasks = [some_moves(p, n) for p, n in zip(given, counts, strict=True)]
-    together = carried_out(in_step(tasks), ring)
+    together = run_task(in_step(tasks), ring)
     assert together[1] is given[1]
     for one, other in zip(together, alone, strict=True):
         np.testing.assert_allclose(one.patch.points, other.patch.points, rtol=0, atol=1e-9)

@@ -13,7 +13,7 @@ from clvoro.errors import MismatchWarning
 from clvoro.finite_volumes.repair import relaxation
 from clvoro.finite_volumes.repair.patch import put_back, restored, take_patch
 from clvoro.finite_volumes.repair.pricing import PricedPatch
-from clvoro.finite_volumes.repair.wall_corners import WallCorners, Walls, _meet
+from clvoro.finite_volumes.repair.wall_corners import WallCorners, WallEdges, _meet
 from tests.finite_volumes.repair.test_patch import with_positions
 from tests.finite_volumes.repair.test_reconnection import coast, unrepaired
 from tests.finite_volumes.test_straight_walls import concave_by, polygons
@@ -213,7 +213,7 @@ def test_all_changes_of_walls_keep_the_mesh_consistent(ctx):
     given = PricedPatch.of(patch)
     # Also corners that are convex.
     given.bent = np.ones(len(given.bent), bool)
-    walls = Walls(np.empty((0, 2, 2)), np.empty(0, int), mesh.domain.boundaries.index)
+    walls = WallEdges(np.empty((0, 2, 2)), np.empty(0, int), mesh.domain.boundaries.index)
     parts = mesh.domain.boundaries.index
     count = {-1: 0, 0: 0, 1: 0}
     for made in WallCorners(given, walls).changes(every):
@@ -257,7 +257,7 @@ def test_corners_are_not_cut_off_through_another_wall(ctx):
     beside = pond - 0.6
     cuts = []
     for ends in (pond, beside):
-        walls = Walls(ends, np.array([-1]), mesh.domain.boundaries.index)
+        walls = WallEdges(ends, np.array([-1]), mesh.domain.boundaries.index)
         found = WallCorners(given, walls).changes(every)
         cuts.append({(cut.x, cut.y) for made in found for cut in made.cuts})
     assert cuts[1] - cuts[0] == {place.cut}
@@ -265,7 +265,7 @@ def test_corners_are_not_cut_off_through_another_wall(ctx):
 
 def test_walls_beside_a_patch_are_those_of_other_cells_nearby():
     ends = np.array([[(0, 0), (1, 0)], [(1, 0), (1, 1)], [(5, 5), (6, 5)], [(-9, -9), (9, 9)]], float)
-    walls = Walls(ends, np.array([0, 1, 2, 3]), np.zeros(4, int))
+    walls = WallEdges(ends, np.array([0, 1, 2, 3]), np.zeros(4, int))
     beside = walls.beside(np.array([1, 8]), np.array([(0.2, -0.5), (0.6, 0.5)]))
     assert beside.owner.tolist() == [0, 3]
     np.testing.assert_array_equal(beside.ends, ends[[0, 3]])
