@@ -15,7 +15,7 @@ from ..geometry.boundary_names import Walls
 from ..mesh.connectivity import slices
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import Contents
-from .cyclic import Patch
+from .cyclic import FoamPatch
 from .polymesh import PatchType, poly_mesh
 
 _FILES = {
@@ -144,7 +144,7 @@ def _numbers(values: np.ndarray) -> bytes:
     return orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)[1:-1]
 
 
-def _boundary(patches: list[Patch], start: int) -> str:
+def _boundary(patches: list[FoamPatch], start: int) -> str:
     body = ""
     for patch in patches:
         body += f"    {patch.name}\n    {{\n        type            {patch.kind};\n"
