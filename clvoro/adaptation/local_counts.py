@@ -17,7 +17,7 @@ import pyopencl.array as cla
 from ..opencl.device_array import read_numbers
 from ..opencl.engine import Engine
 from ..opencl.workspace import framed
-from ..solvers.components import balance_components, connected_components, has_pieces
+from ..solvers.components import balance_components, connected_components
 
 if TYPE_CHECKING:
     from .density import CellWeights
@@ -92,7 +92,7 @@ class LocalCounts:
         for array in (potential, changes, chosen, blocked):
             array.fill(0)
         missing, total = mesh.missing_cells(w), 0
-        pieces = PieceCounts(mesh, w) if has_pieces(mesh.domain) else None
+        pieces = PieceCounts(mesh, w) if mesh.domain.n_pieces > 1 else None
         laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=TOLERANCE)
         for turn in count():
             offset = real(offset_of(missing, math.inf) if pieces is None else 0)

@@ -211,6 +211,10 @@ class Domain(ABC):
         """Return a position (d,) in words, for messages."""
         return format_point(x)
 
+    def share_within(self, lower: np.ndarray, upper: np.ndarray) -> float:
+        """Return the share of the domain in a part of its bounding box with the corners `lower` and `upper`, (d,)."""
+        return float(np.prod((upper - lower) / self.extent))
+
     def piece_of(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, d) in the domain the piece that holds it, (n,) int; -1 elsewhere."""
         return np.where(self.contains(points), 0, -1)

@@ -524,6 +524,10 @@ class Polygon(Domain):
         found[rows] = pieces
         return found
 
+    def share_within(self, lower: np.ndarray, upper: np.ndarray) -> float:
+        """Return the share of the area in the box with the corners `lower` and `upper`, (2,)."""
+        return float(shapely.intersection(self.geometry, shapely.box(*lower, *upper)).area / self.measure)
+
     def inner_points(self) -> np.ndarray:
         """Return a point inside of each piece, (n_pieces, 2), not on its boundary."""
         return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces)))

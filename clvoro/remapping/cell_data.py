@@ -10,8 +10,6 @@ import numpy as np
 import pyopencl as cl
 
 from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
-from ..geometry.polygon import Polygon
-from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..opencl import probe
@@ -44,7 +42,7 @@ def transfer_values(
             f"onto is a mesh of {target.domain}, the values are on {source.domain}; expected the same domain: make "
             "both meshes with one domain"
         )
-    on_host = isinstance(source.domain, Polygon | Sphere) or any(source.domain.periodic)
+    on_host = source.domain.cuts_cells or source.domain.curved or any(source.domain.periodic)
     if on_host and source.domain.cell_dim == 3:
         raise InputError(
             f"the meshes are of {source.domain}; expected a domain with walls, since transfer in 3D periodic boxes is "
@@ -150,7 +148,7 @@ def _transfer_on_host(
     source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Do what `_transfer_on_device` does, for polygons, 2D periodic boxes and spheres."""
-    work = transfer_on_sphere if isinstance(source.domain, Sphere) else transfer_on_host
+    work = transfer_on_sphere if source.domain.curved else transfer_on_host
     means, low, high, covered = work(source, target, columns, order, limited)
     unit = source.domain.frame[1] ** 2
     _require_cover(covered / unit, target.volumes / unit, 2)

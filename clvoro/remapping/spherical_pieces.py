@@ -11,7 +11,6 @@ from functools import cached_property
 
 import numpy as np
 
-from ..geometry.sphere import Sphere
 from ..geometry.spherical_triangles import arc_excess
 from ..mesh.connectivity import face_owners, following, take_rows
 from ..mesh.diagram import Diagram
@@ -151,8 +150,8 @@ class TangentCells:
     """
 
     def __init__(self, diagram: Diagram) -> None:
-        sphere, owner = diagram.domain, face_owners(diagram)
-        assert isinstance(sphere, Sphere)
+        sphere, owner = diagram.domain.globe, face_owners(diagram)
+        assert sphere is not None
         radius, on_sphere = sphere.frame[1], sphere.wrap(diagram.points)
         self.x, self.tangents = on_sphere / radius, sphere.tangents(on_sphere)
         self.starts = np.asarray(diagram.neighbor_starts, np.int64)

@@ -7,9 +7,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import shapely
-
-from ..geometry.polygon import Polygon
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -65,10 +62,7 @@ def covered_share(domain: Domain, lower: ArrayLike, upper: ArrayLike) -> float:
     if ((high < begin) | (low > end)).any():
         return 0.0
     low, high = (np.where(flat, begin, np.maximum(low, begin)), np.where(flat, end, np.minimum(high, end)))
-    if isinstance(domain, Polygon):
-        inside = shapely.intersection(domain.geometry, shapely.box(*low, *high))
-        return float(inside.area / domain.measure)
-    return float(np.prod((high - low) / domain.extent))
+    return domain.share_within(low, high)
 
 
 def coverage_warnings(

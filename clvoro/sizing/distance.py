@@ -12,12 +12,10 @@ import shapely
 
 from ..errors import InputError, InputTypeError
 from ..geometry import curves
-from ..geometry.box import Box
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
-from ..geometry.shapes import Circle, ClosedPolyline, Edges, Polyline, Segment, shapes_of
-from ..geometry.surface import Surface, box_surface
+from ..geometry.shapes import Circle, Edges, Polyline, Segment, shapes_of
+from ..geometry.surface import Surface
 from ..geometry.triangles import segment_distance2
 from .arguments import check_positive, check_slope
 from .field import Field
@@ -32,7 +30,7 @@ _FAR = 100  # diagonals of the domain beyond which a shape is probably in anothe
 _STRAIGHT, _ROUND, _TRIANGLE = 0, 1, 2
 
 Curve = Circle | Segment | Polyline | Edges | curves.Curve
-Shape = Curve | Surface | Box | Polygon
+Shape = Curve | Surface | Domain
 
 
 class Distance(Field):
@@ -42,7 +40,7 @@ class Distance(Field):
     ----------
     shapes : shape or iterable of shapes
         `Circle`, `Segment`, `Polyline`, `ClosedPolyline`; in 3D `Ball`, `Segment`, `Polyline`, `ClosedPolyline`,
-        `Surface`; in both a `clvoro.Box`, which stands for its sides, and a `clvoro.Polygon`, which stands for its
+        `Surface`; in both a `clvoro.Box`, which stands for its walls, and a `clvoro.Polygon`, which stands for its
         edges (``domain.boundary("island")`` for some of them); in 2D a curve of `clvoro.curves`, or a geometry of
         shapely, which stands for its points, lines and rings. The distance is to the curve or surface, from both sides.
     h_min : float
@@ -103,7 +101,7 @@ class Distance(Field):
             raise InputError(f"Distance h_max is {h_max!r}, expected at least h_min = {self.h_min}")
         self.h_max = float(h_max)
 
-        plain = [_plain(shape) for shape in self.shapes]
+        plain = [shape.boundary() if isinstance(shape, Domain) else shape for shape in self.shapes]
         self.surfaces = tuple(s for s in plain if isinstance(s, Surface))
         parts = [s.items() for s in plain if not isinstance(s, Surface)]
         dims = {begin.shape[1] for begin, _, _ in parts} | ({3} if self.surfaces else set())
@@ -246,18 +244,6 @@ class Distance(Field):
 
     def __repr__(self) -> str:
         return f"Distance({len(self.shapes)} shapes, h_min={self.h_min:g}, slope={self.slope:g}, h_max={self.h_max:g})"
-
-
-def _plain(shape: Shape) -> Curve | Surface:
-    """Return the sides of a domain, and any other shape as it is."""
-    if isinstance(shape, Polygon):
-        return shape.boundary()
-    if not isinstance(shape, Box):
-        return shape
-    if shape.dim == 3:
-        return box_surface(np.array(shape.lower), np.array(shape.upper))
-    (x0, y0), (x1, y1) = shape.lower, shape.upper
-    return ClosedPolyline(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]))
 
 
 def _item_boxes(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

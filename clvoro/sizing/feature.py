@@ -93,7 +93,7 @@ class FeatureSize(Field):
         curvature: float = 3,
         slope: float | None = None,
     ):
-        if not isinstance(domain, Polygon):
+        if getattr(domain, "outline", None) is None:
             raise InputTypeError(f"FeatureSize domain is a {type(domain).__name__}, expected a clvoro.Polygon")
         self.domain, longest = domain, float(domain.extent.max())
         self.cells_across = check_positive("FeatureSize cells_across", cells_across)

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..errors import InputError, InputTypeError, MemoryLimitError
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
 from ..opencl.engine import PLAIN, Engine, Traits
 from ..opencl.host_memory import host_memory
 from .advice import coverage_warnings
@@ -184,13 +183,14 @@ class Graded(Field):
         A node at most one spacing outside gets the value that the nearest point inside allows, so that no narrow strait
         is lost between the nodes.
         """
-        if not isinstance(box, Polygon):
+        polygon = box.outline
+        if polygon is None:
             return evaluate(nodes)
         values = np.full(len(nodes), math.inf)
         inside = box.contains(nodes)
         out = np.flatnonzero(~inside)
         spacing = float(np.hypot(*(axis[1] - axis[0] for axis in axes)))
-        edge, nearest = box.nearest_edge(nodes[out], within=spacing)
+        edge, nearest = polygon.nearest_edge(nodes[out], within=spacing)
         near = edge >= 0
         places = np.concatenate([nodes[inside], nearest[near]])
         if len(places):
@@ -217,9 +217,8 @@ class Graded(Field):
         counts = _along(box, coarse)
         grid = _axes(box, counts)
         probes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, box.dim)
-        if isinstance(box, Polygon):
-            inner = box.inner_points()
-            probes = np.concatenate([probes[box.contains(probes)], inner])
+        if box.cuts_cells:
+            probes = np.concatenate([probes[box.contains(probes)], box.inner_points()])
         least = min(evaluate(probes).min(), at_marks.min(initial=math.inf))
         finest = (box.measure / MOST_NODES) ** (1 / box.dim)
         spacing = min(max(least, finest), coarse)

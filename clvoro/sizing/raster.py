@@ -10,7 +10,6 @@ import numpy as np
 
 from ..arguments import format_point
 from ..errors import InputError
-from ..geometry.polygon import Polygon
 from .advice import coverage_warnings
 from .field import Field
 from .gridding import fill_missing, grid_scattered
@@ -163,8 +162,7 @@ class Raster(Field):
     def _emit(self, writer: CodeWriter) -> str:
         # A box contains a domain if it contains its corners.
         domain = writer.domain
-        corners = domain.vertices if isinstance(domain, Polygon) else [domain.lower, domain.upper]
-        self._check_outside(np.array(corners))
+        self._check_outside(np.array([domain.lower, domain.upper]))
         if (self.upper < domain.lower).any() or (self.lower > domain.upper).any():
             raise InputError(
                 f"{self!r} lies beside the domain, from {list(domain.lower)} to {list(domain.upper)}, expected an "

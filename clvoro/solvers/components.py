@@ -6,18 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry.polygon import Polygon
-
 if TYPE_CHECKING:
     import pyopencl.array as cla
 
     from ..geometry.domain import Domain
     from ..tessellation.device_diagram import Tessellation
-
-
-def has_pieces(domain: Domain) -> bool:
-    """Return whether a domain has several pieces."""
-    return isinstance(domain, Polygon) and domain.n_pieces > 1
 
 
 def balance_components(domain: Domain, t: Tessellation, source: cla.Array, weights: cla.Array) -> None:
@@ -32,7 +25,7 @@ def balance_components(domain: Domain, t: Tessellation, source: cla.Array, weigh
         Right side, changed in place. It may be longer than n.
     weights : (n,) real, device
     """
-    if not has_pieces(domain):
+    if domain.n_pieces == 1:
         return
     component = connected_components(t)
     values, weight = source[: t.n].get(), weights[: t.n].get().astype(float)
@@ -49,7 +42,7 @@ def fit_components(domain: Domain, t: Tessellation, prescribed: cla.Array) -> bo
 
     Return False, and do nothing, if the domain has one piece.
     """
-    if not has_pieces(domain):
+    if domain.n_pieces == 1:
         return False
     component = connected_components(t)
     volumes, wanted = t.volumes.get().astype(float), prescribed.get().astype(float)
