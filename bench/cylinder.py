@@ -116,7 +116,7 @@ def mesh_clvoro(layers: bool, effort: str, mirrored: bool = False) -> Callable[.
         else:
             made = adapter.run(domain, field, n_cells=n_cells, effort=effort, layers=rows, seed=seed)
         types = {name: "patch" for name, kind in PATCHES.items() if kind == "patch"}
-        made.save(case.folder / "constant" / "polyMesh", types=types, thickness=THICKNESS)
+        made.to_openfoam(case.folder / "constant" / "polyMesh", types=types, thickness=THICKNESS)
 
     return mesh
 

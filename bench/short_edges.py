@@ -71,7 +71,7 @@ def _seconds_to_file(diagram: clvoro.Diagram, binary: bool) -> float:
     diagram = copy.copy(diagram)  # which has not made the mesh yet
     with tempfile.TemporaryDirectory() as folder:
         begin = time.process_time()
-        diagram.save(Path(folder) / "polyMesh", binary=binary)
+        diagram.to_openfoam(Path(folder) / "polyMesh", binary=binary)
         return time.process_time() - begin
 
 

@@ -317,12 +317,12 @@ def _readable(name: str) -> str:
 
 
 def _convert(arguments: argparse.Namespace) -> int:
-    from ..io import load, save
+    from ..io import load, write
     from .progress import during
 
     mesh = load(_readable(arguments.mesh))
-    write = partial(save, mesh, convention=arguments.convention, walls=arguments.walls)
-    during(f"writing {arguments.out}", False, lambda: write(arguments.out))
+    options = {"convention": arguments.convention, "walls": arguments.walls}
+    during(f"writing {arguments.out}", False, lambda: write(mesh, arguments.out, **options))
     print(f"written: {arguments.out}")
     return OK
 

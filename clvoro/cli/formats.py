@@ -12,6 +12,6 @@ MESH_FILES = {
     "obj": ("mesh.obj", None),
     "metis": ("graph.info", None),
 }
-"""By the name of the format: the file, and the convention that `save` takes."""
+"""By the name of the format: the file, and its convention, which `clvoro.io.write` takes."""
 PLANE = ("nc", "mpas", "vtk", "ply", "obj")
 """Formats that hold polygons only."""

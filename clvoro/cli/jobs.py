@@ -21,7 +21,7 @@ from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, wa
 from ..errors import Aborted, ClvoroError, InputError, SolverWarning
 from ..finite_volumes.gate import Solver
 from ..finite_volumes.solver_mesh import WallShape
-from ..io import save, write_history
+from ..io import save, write, write_history
 from ..io.check_mesh import run_check_mesh
 from ..mesh.results import Result
 from ..mesh.summary import boundary_line, summary
@@ -290,9 +290,9 @@ class Job:
         for kind in self.mesh_formats:
             name, convention = MESH_FILES[kind]
             walls = self.walls if kind == "foam" else None
-            write = partial(save, main, self.out / name, convention=convention, walls=walls)
+            task = partial(write, main, self.out / name, convention=convention, walls=walls)
             work = "solver mesh" if kind == "foam" else name
-            tasks.append(partial(self._during, f"writing the {work}", write))
+            tasks.append(partial(self._during, f"writing the {work}", task))
         for other, result in others:
             tasks.append(partial(save, result, self.out / f"mesh-{other}.npz"))
             tasks.append(partial(write_history, result, self.out / f"history-{other}.csv"))

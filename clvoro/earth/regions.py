@@ -243,7 +243,7 @@ def rings(mesh: Result | Diagram, keep: ArrayLike, count: int = 7) -> np.ndarray
     >>> globe = clvoro.voronoi(clvoro.Sphere(), clvoro.Sphere().icosahedral_points(4))
     >>> ring = clvoro.earth.rings(globe, clvoro.earth.inside(globe, clvoro.Polygon([(0, 0), (40, 0), (20, 30)])))
     >>> area = globe.subset(ring >= 0, "open")
-    >>> area.save("area.nc", convention="mpas", cell_data={"bdyMaskCell": ring[ring >= 0]})
+    >>> area.to_netcdf("area.nc", convention="mpas", cell_data={"bdyMaskCell": ring[ring >= 0]})
     """
     diagram, _ = _diagram_of(mesh)
     kept = check_mask("keep", keep, len(diagram))

@@ -10,12 +10,10 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..arguments import check_choice, check_path
+from ..arguments import check_path
 from ..errors import InputError, InputTypeError
 from ..finite_volumes.solver_mesh import WallShape, check_not_sphere
-from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
-from ..mesh.output import MeshOutput
 from ..mesh.results import Result
 from .atomic import check_writable, make_folder
 from .contents import Contents
@@ -48,10 +46,10 @@ __all__ = [
     "to_fipy",
     "to_meshio",
     "to_pyvista",
+    "write",
     "write_history",
 ]
 
-_WRITERS = {".npz": write_npz, ".info": write_metis, ".graph": write_metis}
 CONVENTIONS: dict[str, Callable[[Contents, Path, str], None]] = {"ugrid": write_ugrid}
 """Writers of ``.nc`` files; `earth` adds those of its models."""
 READERS: dict[str, Callable[[str | PathLike[str]], Result | Diagram]] = {".vtu": load_vtu}
@@ -91,68 +89,87 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
     return READERS.get(Path(path).suffix.lower(), load_npz)(path)
 
 
-def save(mesh: Result | Diagram, path: str | PathLike[str], **options: Any) -> None:
-    """Write a mesh to `path`; the suffix selects the format. The options are those of `Diagram.save`."""
-    MeshOutput.save(mesh, path, **options)
+def save(
+    mesh: Result | Diagram, path: str | PathLike[str], *, cell_data: Mapping[str, ArrayLike] | None = None
+) -> None:
+    """Write a mesh in a box, a polygon or on a sphere to `path`; the suffix selects the format; see `Diagram.save`."""
+    write(mesh, path, cell_data)
 
 
-def write_mesh(
+def write(
     mesh: Result | Diagram,
     path: str | PathLike[str],
-    cell_data: Mapping[str, ArrayLike] | None,
-    walls: WallShape | None,
-    for_foam: dict[str, Any],
-    for_netcdf: dict[str, Any],
+    cell_data: Mapping[str, ArrayLike] | None = None,
+    kind: str | None = None,
+    **options: Any,
 ) -> None:
-    """Write a mesh to `path`; the arguments are those of `Diagram.save`, in groups for each format."""
+    """Write a mesh to `path` with `options` of its format; see `Diagram.save`, `to_openfoam`, `to_netcdf`, `to_vtu`.
+
+    Parameters
+    ----------
+    mesh : Result or Diagram
+        In a box, a polygon or on a sphere.
+    path : str or path
+    cell_data : mapping, optional
+    kind : {".foam", ".nc", ".vtu"}, optional
+        The format that is meant. By default that of `path`.
+    **options
+        Those that are None are left out.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If the format is unknown, another than `kind`, or cannot hold the cells, an option is wrong or for another
+        format, or the file cannot be written. An existing file is then unchanged.
+    """
     contents = Contents.of(mesh, cell_data)
     path = Path(check_path("path", path))
-    suffix = path.suffix.lower()
+    suffix = ".foam" if path.name == "polyMesh" else path.suffix.lower()
+    if kind not in (None, suffix):
+        raise InputError(f"cannot write {path} as {_KINDS[kind]}, expected a name that ends in {kind}; or use save")
+    given = {name: value for name, value in options.items() if value is not None}
+    for name in given:
+        if name not in _OPTIONS.get(suffix, ()):
+            fits = [of for of, names in _OPTIONS.items() if name in names]
+            raise InputError(
+                f"cannot write {path} with {name}, which is for {' and '.join(_KINDS[of] for of in fits)}; save as "
+                f"{' or '.join(fits)} or leave it out"
+            )
     if suffix != ".npz":
-        contents.diagram.demand_cells(f"a {suffix or 'polyMesh'} file")
-    is_foam = path.name == "polyMesh" or suffix == ".foam"
-    for options, fits, format_, name in (
-        (for_foam, is_foam, "OpenFOAM", ".foam"),
-        (for_netcdf, suffix == ".nc", "netCDF", ".nc"),
-    ):
-        given = [key for key, value in options.items() if value is not None]
-        if given and not fits:
-            raise InputError(
-                f"cannot write {path} with {given[0]}, which is for {format_}; save as {name} or leave it out"
-            )
-    if walls is not None:
-        check_choice("walls", walls, ("straight", "exact"))
-        if not is_foam and suffix != ".vtu":
-            raise InputError(
-                f"cannot write {path} with walls, which is for OpenFOAM and .vtu; save as .foam or leave it out"
-            )
-    if is_foam:
-        check_not_sphere(
-            contents.diagram,
-            f"cannot write {path}: OpenFOAM's cells are polyhedra",
-            "save as .nc with convention='mpas', or as .vtu",
+        contents.diagram.demand_cells(f"a {suffix} file")
+    _WRITERS.get(suffix, write_foreign)(contents, path, **given)
+
+
+def _write_netcdf(contents: Contents, path: Path, convention: str = "ugrid", units: str = "m") -> None:
+    """Write a netCDF file; see `Diagram.to_netcdf`."""
+    check_polygons(contents, path)
+    if not isinstance(units, str) or not units.isascii() or not units.strip():
+        raise InputTypeError(f"units is {units!r:.60}, expected a unit of length, such as 'm' or 'km'")
+    if units.startswith("degree") and contents.diagram.domain.curved:
+        raise InputError(
+            f"units is {units!r:.60}, expected on a sphere the unit of its radius, such as 'm' or 'km'; UGRID has "
+            "degrees there anyway"
         )
-        if contents.extra:
-            raise InputError(
-                f"cannot write cell_data to {path}: OpenFOAM's polyMesh holds none; save as .vtu or leave it out"
-            )
-        write_foam(contents, path, **for_foam, walls=walls)
-    elif suffix == ".nc":
-        check_polygons(contents, path)
-        convention, units = for_netcdf["convention"], for_netcdf["units"]
-        unit = "m" if units is None else units
-        if not isinstance(unit, str) or not unit.isascii() or not unit.strip():
-            raise InputTypeError(f"units is {unit!r:.60}, expected a unit of length, such as 'm' or 'km'")
-        if unit.startswith("degree") and isinstance(contents.diagram.domain, Sphere):
-            raise InputError(
-                f"units is {unit!r:.60}, expected on a sphere the unit of its radius, such as 'm' or 'km'; UGRID has "
-                "degrees there anyway"
-            )
-        _chosen(convention)(contents, path, unit)
-    elif suffix == ".vtu":
-        write_vtu(contents, path, walls=walls)
-    else:
-        _WRITERS.get(suffix, write_foreign)(contents, path)
+    if not isinstance(convention, str) or convention not in CONVENTIONS:
+        raise InputError(f"convention is {convention!r:.60}, expected one of {', '.join(map(repr, CONVENTIONS))}")
+    CONVENTIONS[convention](contents, path, units)
+
+
+_WRITERS: dict[str, Callable[..., None]] = {
+    ".npz": write_npz,
+    ".vtu": write_vtu,
+    ".foam": write_foam,
+    ".nc": _write_netcdf,
+    ".info": write_metis,
+    ".graph": write_metis,
+}
+_KINDS = {".foam": "OpenFOAM", ".nc": "netCDF", ".vtu": ".vtu"}
+_OPTIONS = {
+    ".foam": ("patches", "types", "thickness", "binary", "walls"),
+    ".nc": ("convention", "units"),
+    ".vtu": ("walls",),
+}
+"""Options of the writers that have some."""
 
 
 def to_disv(mesh: Result | Diagram, walls: WallShape = "straight") -> Disv:
@@ -196,10 +213,3 @@ def to_pyvista(mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None
     contents = Contents.of(mesh, cell_data)
     contents.diagram.demand_cells("to_pyvista")
     return to_pyvista(contents)
-
-
-def _chosen(convention: object) -> Callable[[Contents, Path, str], None]:
-    name = "ugrid" if convention is None else convention
-    if not isinstance(name, str) or name not in CONVENTIONS:
-        raise InputError(f"convention is {name!r:.60}, expected one of {', '.join(map(repr, CONVENTIONS))}")
-    return CONVENTIONS[name]

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import orjson
 
-from ..finite_volumes.solver_mesh import WallShape
+from ..errors import InputError
+from ..finite_volumes.solver_mesh import WallShape, check_not_sphere
 from ..geometry.boundary_names import Walls
 from ..mesh.connectivity import slices
 from .atomic import atomic_file, atomic_folder, make_folder
@@ -35,8 +36,8 @@ def write_foam(
     patches: Mapping[str, Walls] | None = None,
     types: Mapping[str, PatchType] | None = None,
     thickness: float | None = None,
-    binary: bool | None = None,
-    walls: WallShape | None = None,
+    binary: bool = False,
+    walls: WallShape = "straight",
 ) -> None:
     """Write a polyMesh.
 
@@ -50,7 +51,16 @@ def write_foam(
     binary : bool, optional
         Write numbers as bytes: labels of 32 bits and scalars of 64.
     """
-    mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls or "straight")
+    check_not_sphere(
+        contents.diagram,
+        f"cannot write {path}: OpenFOAM's cells are polyhedra",
+        "save as .nc with convention='mpas', or as .vtu",
+    )
+    if contents.extra:
+        raise InputError(
+            f"cannot write cell_data to {path}: OpenFOAM's polyMesh holds none; save as .vtu or leave it out"
+        )
+    mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls)
     inner = mesh.n_inner
     marker = path if path.suffix.lower() == ".foam" else None
     folder = path if marker is None else path.parent / "constant" / "polyMesh"
@@ -80,7 +90,7 @@ def write_foam(
     # `faces` is moved last: a case without it is recognized as incomplete.
     with atomic_folder(folder / "faces") as target:
         for name in _FILES:
-            head = _header(name, notes.get(name, ""), bool(binary) and name != "boundary")
+            head = _header(name, notes.get(name, ""), binary and name != "boundary")
             with open(target.with_name(name), "wb") as file:
                 file.write(head.encode("ascii"))
                 file.writelines(lists[name])

@@ -15,6 +15,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from ..arguments import check_choice
 from ..finite_volumes.prisms import cell_loops
 from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.domain import Domain
@@ -37,7 +38,7 @@ _BLOCK = 1 << 20
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 
 
-def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: WallShape | None = None) -> None:
+def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: WallShape = "exact") -> None:
     """Write the cells as polygons or polyhedra with cell data.
 
     Cell data: `size` (h), `error` (signed) and `quality` of a result; `volume` (area in 2D); `sides` (in 3D
@@ -50,6 +51,7 @@ def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: Wall
     With `walls` "straight" the cells are those of the solver mesh, with their volumes, and without the domain, as the
     file is no diagram to `load`.
     """
+    check_choice("walls", walls, ("straight", "exact"))
     diagram = contents.diagram
     n = len(diagram)
     appended = _Appended(compress)

@@ -99,39 +99,20 @@ class MeshOutput:
         diagram: Any = getattr(self._self, "diagram", self._self)
         return boundary_cells(diagram, boundary)
 
-    def save(
-        self,
-        path: str | PathLike[str],
-        *,
-        cell_data: Mapping[str, ArrayLike] | None = None,
-        patches: Mapping[str, Walls] | None = None,
-        types: Mapping[str, PatchType] | None = None,
-        thickness: float | None = None,
-        binary: bool | None = None,
-        walls: WallShape | None = None,
-        convention: Literal["ugrid", "mpas", "scrip"] | None = None,
-        units: str | None = None,
-    ) -> None:
+    def save(self, path: str | PathLike[str], *, cell_data: Mapping[str, ArrayLike] | None = None) -> None:
         """Write the mesh to `path`; the suffix selects the format.
 
-        The file of a diagram has no sizes, errors and history. Meshes on spheres are written in all formats but that
-        of OpenFOAM.
+        The file of a diagram has no sizes, errors and history. Meshes in boxes, polygons and on spheres are written in
+        all formats, except that OpenFOAM has no meshes on spheres.
 
         ``.npz``
             Everything; `clvoro.load` reads it.
         ``.vtu``
-            For ParaView and other VTK programs, and for `clvoro.load`: polygons or polyhedra with size, error, quality,
-            boundary and more as cell data; row i is cell i of the mesh. VTK's `vtkCellSizeFilter` (PyVista's
-            `compute_cell_sizes`) is wrong for cells that are not convex, as there are along the boundary of a polygon:
-            use the cell data `volume`. meshio 5.3 reads a mesh in 2D as one block of cells for each run of cells with
-            equally many corners; a ``.vtk`` file has one block for each number of corners. In 3D it refuses most files,
-            as its reader assigns cell data to the wrong blocks of polyhedra.
+            For ParaView and other VTK programs, and for `clvoro.load`; `to_vtu` has options.
         ``.../constant/polyMesh`` or ``CASE/name.foam``
-            A folder for OpenFOAM, alone or within a case that ParaView opens, too. In 2D one layer of prisms between
-            patches of type `empty`. Each periodic direction is one pair of cyclic patches;
-            with several of them, these are for OpenFOAM of openfoam.com.
+            A folder for OpenFOAM, alone or within a case that ParaView opens, too; `to_openfoam` has options.
         ``.nc``
-            Meshes in 2D and on spheres as netCDF, for models of oceans and atmospheres, QGIS, ParaView and xarray.
+            Meshes in 2D and on spheres as netCDF by UGRID; `to_netcdf` has other conventions.
         ``.info``, ``.graph``
             The neighbors of each cell as a graph for METIS, which divides it among the ranks of a parallel run; MPAS
             reads the parts of ``graph.info``.
@@ -147,50 +128,129 @@ class MeshOutput:
             Data of your own by name, (n,) or (n, k) arrays of real numbers: cell data in ``.vtu`` and ``.vtk``,
             variables in ``.nc``, members ``cell_data.<name>`` in ``.npz``, which `clvoro.load` leaves out. Other
             formats hold none.
-        patches : mapping, optional
-            For OpenFOAM: names of patches, each with its walls: numbers, names of the domain, or a sequence of them.
-            Walls that are not mentioned keep the name that the domain gives them.
-        types : mapping, optional
-            For OpenFOAM: type of each patch by name, "wall" (the default), "patch", "symmetry" or "symmetryPlane".
-            Inlets, outlets and far fields need "patch": ``types={"inlet": "patch"}``.
-        thickness : float, optional
-            For OpenFOAM and a mesh in 2D: height of the layer of prisms. By default the mean width of a cell.
-        binary : bool, optional
-            For OpenFOAM: write numbers as bytes (labels of 32 bits, scalars of 64), which is faster and takes less
-            space. By default numbers are text.
-        walls : {"straight", "exact"}, optional
-            For OpenFOAM and ``.vtu``. With "straight", the default for OpenFOAM, the file has the cells of
-            `Diagram.solver_mesh`: the faces of a cell on the boundary become one straight face where they turn by at
-            most 30 degrees in sum, face ends near a corner of the domain move into it, and short edges are collapsed.
-            Solvers reject cells that are not convex. `clvoro.load` does not read such a ``.vtu`` file. With "exact",
-            the default for ``.vtu``, all faces are those of the diagram, as in all other formats.
-        convention : {"ugrid", "mpas", "scrip"}, optional
-            For netCDF. With "ugrid", the default: cells as polygons with size, error, quality and area, and for each
-            edge the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas": cells, edges and
-            vertices with all variables of the MPAS mesh specification for C grids; cells at seams are connected. On a
-            sphere UGRID has longitudes and latitudes in degrees; MPAS has positions, and both in radians. With "scrip",
-            on spheres only: centers, corners and areas, for tools that remap data between grids.
-        units : str, optional
-            For netCDF: unit of the coordinates, as UDUNITS writes it. By default "m". In UGRID, "degrees" stands for
-            longitudes and latitudes. On a sphere: unit of the radius.
 
         Raises
         ------
         InputError, InputTypeError
-            If the format is unknown or cannot hold the cells, an argument is wrong or for another format, or the file
-            cannot be written. An existing file is then unchanged.
+            If the format is unknown or cannot hold the cells, or the file cannot be written. An existing file is then
+            unchanged.
         """
-        from ..io import write_mesh
+        from ..io import save
 
-        # Not `_self`: `clvoro.io.save` may get an object that is no mesh, which `write_mesh` refuses.
-        write_mesh(
-            cast("Result | Diagram", self),
-            path,
-            cell_data,
-            walls,
-            for_foam={"patches": patches, "types": types, "thickness": thickness, "binary": binary},
-            for_netcdf={"convention": convention, "units": units},
-        )
+        # Not `_self`: `clvoro.io.save` may get an object that is no mesh, which it refuses.
+        save(cast("Result | Diagram", self), path, cell_data=cell_data)
+
+    def to_openfoam(
+        self,
+        path: str | PathLike[str],
+        *,
+        patches: Mapping[str, Walls] | None = None,
+        types: Mapping[str, PatchType] | None = None,
+        thickness: float | None = None,
+        binary: bool = False,
+        walls: WallShape = "straight",
+    ) -> None:
+        """Write the mesh in a box or a polygon for OpenFOAM.
+
+        In 2D it is one layer of prisms between patches of type `empty`. Each periodic direction is one pair of cyclic
+        patches; with several of them, these are for OpenFOAM of openfoam.com.
+
+        Parameters
+        ----------
+        path : str or path
+            The folder ``.../constant/polyMesh``, or a file ``CASE/name.foam``, which ParaView opens.
+        patches : mapping, optional
+            Names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls that are
+            not mentioned keep the name that the domain gives them.
+        types : mapping, optional
+            Type of each patch by name, "wall" (the default), "patch", "symmetry" or "symmetryPlane". Inlets, outlets
+            and far fields need "patch": ``types={"inlet": "patch"}``.
+        thickness : float, optional
+            For a mesh in 2D: height of the layer of prisms. By default the mean width of a cell.
+        binary : bool
+            Write numbers as bytes (labels of 32 bits, scalars of 64), which is faster and takes less space.
+        walls : {"straight", "exact"}
+            With "straight" the cells are those of `solver_mesh`: the faces of a cell on the boundary become one
+            straight face where they turn by at most 30 degrees in sum, face ends near a corner of the domain move into
+            it, and short edges are collapsed. Solvers reject cells that are not convex. With "exact" all faces are
+            those of the diagram.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            On a sphere, for a cell around an island, if an argument is wrong or the files cannot be written.
+        """
+        from ..io import write
+
+        options = {"patches": patches, "types": types, "thickness": thickness, "binary": binary, "walls": walls}
+        write(self._self, path, kind=".foam", **options)
+
+    def to_netcdf(
+        self,
+        path: str | PathLike[str],
+        *,
+        convention: Literal["ugrid", "mpas", "scrip"] = "ugrid",
+        units: str = "m",
+        cell_data: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        """Write the mesh in 2D, in a box or a polygon, or on a sphere as netCDF.
+
+        It is for models of oceans and atmospheres, QGIS, ParaView and xarray.
+
+        Parameters
+        ----------
+        path : str or path
+            A file ``.nc``.
+        convention : {"ugrid", "mpas", "scrip"}
+            With "ugrid": cells as polygons with size, error, quality and area, and for each edge the number of its wall
+            and its boundary; at seams as in ``.vtu``. With "mpas": cells, edges and vertices with all variables of the
+            MPAS mesh specification for C grids; cells at seams are connected. On a sphere UGRID has longitudes and
+            latitudes in degrees; MPAS has positions, and both in radians. With "scrip", on spheres only: centers,
+            corners and areas, for tools that remap data between grids.
+        units : str
+            Unit of the coordinates, as UDUNITS writes it. In UGRID, "degrees" stands for longitudes and latitudes. On a
+            sphere: unit of the radius.
+        cell_data : mapping, optional
+            As for `save`.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            In 3D, if an argument is wrong or the file cannot be written. An existing file is then unchanged.
+        """
+        from ..io import write
+
+        write(self._self, path, cell_data, ".nc", convention=convention, units=units)
+
+    def to_vtu(
+        self, path: str | PathLike[str], *, walls: WallShape = "exact", cell_data: Mapping[str, ArrayLike] | None = None
+    ) -> None:
+        """Write the mesh in a box, a polygon or on a sphere for ParaView and other VTK programs.
+
+        Cells are polygons or polyhedra with size, error, quality, boundary and more as cell data; row i is cell i of
+        the mesh. VTK's `vtkCellSizeFilter` (PyVista's `compute_cell_sizes`) is wrong for cells that are not convex, as
+        there are along the boundary of a polygon: use the cell data `volume`. meshio 5.3 reads a mesh in 2D as one
+        block of cells for each run of cells with equally many corners; a ``.vtk`` file has one block for each number of
+        corners. In 3D it refuses most files, as its reader assigns cell data to the wrong blocks of polyhedra.
+
+        Parameters
+        ----------
+        path : str or path
+            A file ``.vtu``.
+        walls : {"straight", "exact"}
+            With "straight" the cells are those of `solver_mesh`, which `clvoro.load` does not read. With "exact" all
+            faces are those of the diagram.
+        cell_data : mapping, optional
+            As for `save`.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If an argument is wrong or the file cannot be written. An existing file is then unchanged.
+        """
+        from ..io import write
+
+        write(self._self, path, cell_data, ".vtu", walls=walls)
 
     def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> Faces:
         """Return the mesh as a finite-volume solver sees it: points, and each face with corners, owner and neighbor.

@@ -105,7 +105,7 @@ def result(ctx, name):
 @pytest.fixture(scope="module")
 def mesh(result, name, tmp_path_factory):
     path = tmp_path_factory.mktemp("mpas") / "mesh.nc"
-    result.save(path, convention="mpas")
+    result.to_netcdf(path, convention="mpas")
     return Mesh(path, name)
 
 
@@ -295,7 +295,7 @@ def test_an_adopted_part_close_to_a_bisector_is_recognized(ctx, tmp_path):
     """The middle of its edge is off the bisector by 0.0006 of the distance; found in one of a hundred meshes."""
     domain = clvoro.Polygon.from_shapely(blocks(np.random.default_rng(85), 4))
     diagram = clvoro.Adapter(ctx).diagram(domain, scattered(domain, 60, 85))
-    result_of(diagram).save(tmp_path / "mesh.nc", convention="mpas")
+    result_of(diagram).to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     areas = read(tmp_path / "mesh.nc")["areaCell"]
     np.testing.assert_allclose(areas, diagram.volumes, rtol=1e-11)
 
@@ -382,7 +382,7 @@ def test_divergence_of_the_rotated_flow_is_the_mean_of_the_cells(mesh):
 @pytest.mark.parametrize("name", ["room", "torus"])
 def test_balances_hold_in_single_precision(ctx, tmp_path, name):
     result = made(ctx, name, "float32")
-    result.save(tmp_path / "mesh.nc", convention="mpas")
+    result.to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     mesh = Mesh(tmp_path / "mesh.nc", name)
     # Round-off of corners is 2^-24 of the frame; cells are 0.1 wide.
     np.testing.assert_allclose(mesh["areaCell"], result.diagram.volumes, rtol=1e-4)
@@ -397,7 +397,7 @@ def test_each_side_of_a_slit_without_width_has_its_own_vertices(ctx, tmp_path):
     diagram = clvoro.Adapter(ctx, "float32").diagram(domain, scattered(domain, 20))
     walls = face_ends(diagram)[diagram.neighbors < 0]
     assert len(np.unique(np.sort(walls), axis=0)) < len(walls)  # shared by both sides
-    result_of(diagram).save(tmp_path / "mesh.nc", convention="mpas")
+    result_of(diagram).to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     mesh = Mesh(tmp_path / "mesh.nc", "needle")
     assert mesh.v - mesh.e + mesh.n == 1
     for v, edges in enumerate(mesh.edgesOnVertex):
@@ -412,7 +412,7 @@ def test_faces_without_length_are_no_edges(tmp_path):
     diagram = make_diagram(points)
     ends = face_ends(diagram)
     assert (ends[:, 0] == ends[:, 1]).sum() > 10
-    result_of(diagram).save(tmp_path / "mesh.nc", convention="mpas")
+    result_of(diagram).to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     mesh = Mesh(tmp_path / "mesh.nc", "squares")
     assert {len(row) for row in mesh.cellsOnCell} == {4}
     assert mesh.file.dimensions["vertexDegree"] == 4
@@ -424,7 +424,7 @@ def test_faces_without_length_are_no_edges(tmp_path):
 
 def test_weights_of_regular_hexagons(ctx, tmp_path):
     """Thuburn et al.: 1/3, 1/6, 0, 1/6, 1/3 over the square root of 3, exact for constant flows."""
-    made(ctx, "hexagons").save(tmp_path / "mesh.nc", convention="mpas")
+    made(ctx, "hexagons").to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     mesh = Mesh(tmp_path / "mesh.nc", "hexagons")
     assert {len(row) for row in mesh.edgesOnEdge} == {10}
     expected = np.array([2, 1, 0, 1, 2] * 2) / 6 / 3**0.5
@@ -449,7 +449,7 @@ def test_a_cell_around_an_island_is_refused(ctx, tmp_path):
     domain, points = netcdf_files.around_an_island()
     result = result_of(clvoro.Adapter(ctx).diagram(domain, points))
     with pytest.raises(InputError, match=r"mesh\.nc: cell 0 \(1 in all\) goes around"):
-        result.save(tmp_path / "mesh.nc", convention="mpas")
+        result.to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     assert not list(tmp_path.iterdir())
     result.save(tmp_path / "mesh.nc")
 
@@ -469,10 +469,10 @@ def test_places_half_a_period_away_are_refused(ctx, tmp_path, periodic, nx, ny, 
     box = clvoro.Box((0, 0), (2, 2), periodic=periodic)
     result = result_of(clvoro.Adapter(ctx).diagram(box, netcdf_files.grid(box, nx, ny)))
     if fits:
-        result.save(tmp_path / "mesh.nc", convention="mpas")
+        result.to_netcdf(tmp_path / "mesh.nc", convention="mpas")
         mesh = Mesh(tmp_path / "mesh.nc", "few")
         assert (mesh.n, mesh["areaCell"].sum()) == (nx * ny, pytest.approx(4))
         return
     with pytest.raises(InputError, match=r"across a period of 2, .*use more cells"):
-        result.save(tmp_path / "mesh.nc", convention="mpas")
+        result.to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     result.save(tmp_path / "mesh.nc")

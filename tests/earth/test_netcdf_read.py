@@ -26,7 +26,7 @@ def ocean(ctx):
 
 
 def folder_of(mesh, path, convention):
-    mesh.save(path / "mesh.nc", convention=convention)
+    mesh.to_netcdf(path / "mesh.nc", convention=convention)
     return clvoro.load(path / "mesh.nc")
 
 
@@ -81,7 +81,7 @@ def test_saved_again_it_is_the_same(ocean, tmp_path):
 
 def changed(path, convention, change):
     """Write a mesh, change the variables of its file, and return the path."""
-    clvoro.voronoi(EARTH, scattered(150)).save(path / "good.nc", convention=convention)
+    clvoro.voronoi(EARTH, scattered(150)).to_netcdf(path / "good.nc", convention=convention)
     with netcdf_file(path / "good.nc", mmap=False) as good, netcdf_file(path / "bad.nc", "w") as bad:
         for name, length in good.dimensions.items():
             bad.createDimension(name, length)
@@ -136,7 +136,7 @@ def test_other_files_are_refused(tmp_path):
             clvoro.load(path)
     plane = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.8), (0.6, 0.1)])
     for convention in ("mpas", "ugrid"):
-        plane.save(path, convention=convention)
+        plane.to_netcdf(path, convention=convention)
         with pytest.raises(InputError, match="a mesh in the plane, expected one on a sphere"):
             clvoro.load(path)
     with pytest.raises(InputError, match="No such file"):

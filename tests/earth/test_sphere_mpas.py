@@ -33,7 +33,7 @@ class Globe(Mesh):
 @pytest.fixture(scope="module")
 def mesh(result, tmp_path_factory):
     path = tmp_path_factory.mktemp("mpas") / "mesh.nc"
-    result.save(path, convention="mpas")
+    result.to_netcdf(path, convention="mpas")
     return Globe(path)
 
 
@@ -240,7 +240,7 @@ def test_tangential_velocities_of_a_turning_sphere(ctx, tmp_path):
     They are inconsistent on other cells than regular hexagons (Peixoto, J. Comput. Phys. 310 (2016) 127).
     """
     run = clvoro.Adapter(ctx).run(clvoro.Sphere(1), 1.0, n_cells=300, effort="fast")
-    run.save(tmp_path / "mesh.nc", convention="mpas")
+    run.to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     mesh = Globe(tmp_path / "mesh.nc")
     angle, lat = mesh["angleEdge"], mesh["latEdge"]
     across, along = np.cos(lat) * np.cos(angle), -np.cos(lat) * np.sin(angle)
@@ -254,7 +254,7 @@ def test_more_than_three_cells_may_share_a_vertex(ctx, tmp_path):
     places = np.column_stack([lon.ravel(), lat.ravel()])
     poles = [(0.0, 90.0), (0.0, -90.0)]
     diagram = clvoro.Adapter(ctx).diagram(clvoro.Sphere(1), np.concatenate([places, poles]))
-    diagram.save(tmp_path / "mesh.nc", convention="mpas")
+    diagram.to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     mesh = Globe(tmp_path / "mesh.nc")
     assert (mesh.n, mesh.e, mesh.v) == (86, 7 * 24 + 12, 8 * 12)
     assert mesh.file.dimensions["vertexDegree"] == 4

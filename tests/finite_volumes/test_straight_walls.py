@@ -206,10 +206,10 @@ def test_vtu_files_hold_solver_meshes(request, ctx, tmp_path, name):
         result = request.getfixturevalue("ring")
     else:
         result = clvoro.Adapter(ctx).run(clvoro.Box((0, 0, 0), (1, 1, 1)), 0.2, effort="fast")
-    result.save(tmp_path / "exact.vtu", walls="exact")
+    result.to_vtu(tmp_path / "exact.vtu", walls="exact")
     result.save(tmp_path / "mesh.vtu")
     assert (tmp_path / "mesh.vtu").read_bytes() == (tmp_path / "exact.vtu").read_bytes()
-    result.save(tmp_path / "mesh.vtu", walls="straight", cell_data={"mine": result.quality})
+    result.to_vtu(tmp_path / "mesh.vtu", walls="straight", cell_data={"mine": result.quality})
     reader = vtk.vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(tmp_path / "mesh.vtu"))
     sizes = vtk.vtkCellSizeFilter()
@@ -233,10 +233,10 @@ def test_vtu_files_hold_solver_meshes(request, ctx, tmp_path, name):
 
 def test_other_formats_have_exact_walls(ring, tmp_path):
     for name, walls in (("mesh.npz", "exact"), ("mesh.nc", "straight"), ("mesh.vtk", "exact")):
-        with pytest.raises(InputError, match="with walls, which is for OpenFOAM and"):
-            ring.save(tmp_path / name, walls=walls)
+        with pytest.raises(InputError, match=r"with walls, which is for OpenFOAM and \.vtu; save as \.foam or"):
+            clvoro.io.write(ring, tmp_path / name, walls=walls)
     with pytest.raises(InputError, match="walls is 'round', expected one of straight, exact"):
-        ring.save(tmp_path / "mesh.vtu", walls="round")
+        ring.to_vtu(tmp_path / "mesh.vtu", walls="round")
     assert not list(tmp_path.iterdir())
 
 

@@ -132,7 +132,7 @@ def test_openfoam_has_the_names(meshed, tmp_path, walls) -> None:
             {"top": [2, 3], "in--let": [4], "island": [5, 6, 7], "part": [9], "outer": [0, 1], "hole-2": [8, 10, 11]},
         ),
     ):
-        result.save(tmp_path / "polyMesh", patches=patches, walls=walls)
+        result.to_openfoam(tmp_path / "polyMesh", patches=patches, walls=walls)
         points, faces, *_, written = test_foam.read(tmp_path / "polyMesh")
         assert list(written)[:-2] == list(parts)
         for name, numbers in parts.items():
@@ -222,7 +222,7 @@ def test_names_of_boxes(adapter_of_module, tmp_path) -> None:
     ends = chosen_segments(box, clvoro.Layers(0.1, edges="walls"))
     assert sorted(ends[:, :, 1].mean(axis=1).tolist()) == [0, 1]
     result = adapter_of_module.run(box, 0.2, method="lloyd", max_steps=1)
-    result.save(tmp_path / "polyMesh", patches={"outlet": "xMax"})
+    result.to_openfoam(tmp_path / "polyMesh", patches={"outlet": "xMax"})
     assert list(test_foam.read(tmp_path / "polyMesh")[-1]) == ["outlet", "inlet", "walls", "back", "front"]
 
 

@@ -89,12 +89,12 @@ def test_own_data_in_other_formats(diagram, result, tmp_path):
     for convention in ("ugrid", "mpas"):
         if convention == "mpas" and isinstance(diagram.domain, clvoro.Polygon):
             continue
-        diagram.save(tmp_path / "a.nc", cell_data=data, convention=convention)
+        diagram.to_netcdf(tmp_path / "a.nc", cell_data=data, convention=convention)
         with netcdf_file(tmp_path / "a.nc", mmap=False) as file:
             for name, values in data.items():
                 np.testing.assert_array_equal(file.variables[name][:], values)
             assert ("size" in file.variables) is False
-        diagram.save(tmp_path / "b.nc", convention=convention)
+        diagram.to_netcdf(tmp_path / "b.nc", convention=convention)
     with pytest.raises(InputError, match="is that of another variable"):
         result.save(tmp_path / "c.nc", cell_data={"mesh_node_x": result.quality})
 

@@ -73,7 +73,7 @@ def read(folder):
 @pytest.fixture
 def mesh(result, tmp_path):
     folder = tmp_path / "constant" / "polyMesh"
-    io.save(result, folder, walls="exact")
+    result.to_openfoam(folder, walls="exact")
     assert {p.name for p in folder.iterdir()} == {"points", "faces", "owner", "neighbour", "boundary"}
     return read(folder)
 
@@ -179,7 +179,7 @@ def read_binary(folder, name):
 
 def test_binary_files_hold_the_same(result, tmp_path):
     io.save(result, tmp_path / "text" / "polyMesh")
-    io.save(result, tmp_path / "bytes" / "polyMesh", binary=True)
+    result.to_openfoam(tmp_path / "bytes" / "polyMesh", binary=True)
     points, faces, owner, neighbor, _ = read(tmp_path / "text" / "polyMesh")
     folder = tmp_path / "bytes" / "polyMesh"
     for name, values in (("points", points), ("owner", owner), ("neighbour", neighbor)):
@@ -208,7 +208,7 @@ def test_as_vtk_reads_it(result, binary, tmp_path):
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy
 
-    io.save(result, tmp_path / "case.foam", walls="exact", binary=binary)
+    result.to_openfoam(tmp_path / "case.foam", walls="exact", binary=binary)
     (tmp_path / "system").mkdir()
     (tmp_path / "system" / "controlDict").write_text(
         "FoamFile { version 2.0; format ascii; class dictionary; object controlDict; }\n"
@@ -220,7 +220,7 @@ def test_as_vtk_reads_it(result, binary, tmp_path):
     sizes.SetInputConnection(reader.GetOutputPort())
     sizes.Update()
     found = vtk_to_numpy(sizes.GetOutput().GetBlock(0).GetCellData().GetArray("Volume"))
-    io.save(result, tmp_path / "polyMesh", walls="exact")
+    result.to_openfoam(tmp_path / "polyMesh", walls="exact")
     volumes = prism_volumes(result, read(tmp_path / "polyMesh")[0])
     # VTK stores these points in single precision, and orients wedges in two ways.
     np.testing.assert_allclose(np.abs(found), volumes, rtol=0, atol=1e-4 * volumes.mean())
@@ -228,7 +228,7 @@ def test_as_vtk_reads_it(result, binary, tmp_path):
 
 def check_mesh(result, folder, **settings):
     """What checkMesh prints for a result saved in `folder` with some settings."""
-    io.save(result, folder / "case.foam", **settings)
+    result.to_openfoam(folder / "case.foam", **settings)
     return check_case(folder).text
 
 
@@ -248,7 +248,7 @@ def test_as_openfoam_checks_it(result, binary, tmp_path):
 
 def test_types_of_patches_are_the_callers(plane, tmp_path):
     types = {"xMin": "patch", "zone": "symmetryPlane"}
-    io.save(plane, tmp_path / "polyMesh", patches={"zone": ["yMin"]}, types=types)
+    plane.to_openfoam(tmp_path / "polyMesh", patches={"zone": ["yMin"]}, types=types)
     patches = read(tmp_path / "polyMesh")[-1]
     kinds = {name: patch[0] for name, patch in patches.items()}
     assert kinds == {
@@ -262,7 +262,7 @@ def test_types_of_patches_are_the_callers(plane, tmp_path):
 
 
 def test_thickness_is_the_callers(plane, tmp_path):
-    io.save(plane, tmp_path / "polyMesh", thickness=0.25)
+    plane.to_openfoam(tmp_path / "polyMesh", thickness=0.25)
     assert set(read(tmp_path / "polyMesh")[0][:, 2].tolist()) == {0, 0.25}
     io.save(plane, tmp_path / "polyMesh")
     width = np.sqrt(plane.diagram.domain.measure / len(plane.points))
@@ -282,19 +282,19 @@ def test_thickness_is_the_callers(plane, tmp_path):
 )
 def test_wrong_options_are_refused(plane, tmp_path, options, says):
     with pytest.raises((InputError, InputTypeError), match=says):
-        io.save(plane, tmp_path / "polyMesh", **options)
+        plane.to_openfoam(tmp_path / "polyMesh", **options)
     assert not list(tmp_path.iterdir())
 
 
 def test_options_of_other_meshes_and_formats_are_refused(solid, plane, tmp_path):
     with pytest.raises(InputError, match="thickness is for meshes in 2D"):
-        io.save(solid, tmp_path / "polyMesh", thickness=1.0)
+        solid.to_openfoam(tmp_path / "polyMesh", thickness=1.0)
     for option in ({"types": {}}, {"thickness": 1}, {"patches": {}}, {"binary": True}):
         with pytest.raises(InputError, match=f"with {next(iter(option))}, which is for OpenFOAM"):
-            io.save(plane, tmp_path / "mesh.vtu", **option)
+            io.write(plane, tmp_path / "mesh.vtu", **option)
     for option in ({"units": "m"}, {"convention": "mpas"}):
         with pytest.raises(InputError, match=f"with {next(iter(option))}, which is for netCDF"):
-            io.save(plane, tmp_path / "mesh.vtu", **option)
+            io.write(plane, tmp_path / "mesh.vtu", **option)
 
 
 def test_failure_leaves_the_old_mesh(solid, tmp_path, monkeypatch):

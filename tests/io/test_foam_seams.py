@@ -31,7 +31,7 @@ def result(request, ctx):
 
 @pytest.fixture
 def mesh(result, tmp_path):
-    io.save(result, tmp_path / "polyMesh", walls="exact")
+    result.to_openfoam(tmp_path / "polyMesh", walls="exact")
     return read(tmp_path / "polyMesh")
 
 

@@ -191,7 +191,7 @@ def test_units_are_the_callers(room, tmp_path):
         "degrees": ("degrees_east", "degrees", "degrees2", "longitude"),
     }
     for unit, (x, size, area, name) in wanted.items():
-        room.save(tmp_path / "mesh.nc", units=unit)
+        room.to_netcdf(tmp_path / "mesh.nc", units=unit)
         about = read(tmp_path / "mesh.nc").about
         for place in ("node", "edge", "face"):
             assert about[f"mesh_{place}_x"]["units"].decode() == x
@@ -199,19 +199,19 @@ def test_units_are_the_callers(room, tmp_path):
         assert about["size"]["units"].decode() == size
         assert about["area"]["units"].decode() == area
         assert about["quality"]["units"] == b"1"
-    room.save(tmp_path / "mesh.nc", units="km", convention="mpas")
+    room.to_netcdf(tmp_path / "mesh.nc", units="km", convention="mpas")
     about = read(tmp_path / "mesh.nc").about
     found = {name: about[name]["units"].decode() for name in ("xCell", "zVertex", "dcEdge", "areaCell", "latEdge")}
     assert found == {"xCell": "km", "zVertex": "km", "dcEdge": "km", "areaCell": "km2", "latEdge": "rad"}
     for unit in (3, "", "µm"):
         with pytest.raises(InputTypeError, match="units is"):
-            room.save(tmp_path / "mesh.nc", units=unit)
+            room.to_netcdf(tmp_path / "mesh.nc", units=unit)
 
 
 def test_as_xarray_reads_it(room, tmp_path):
     xarray = pytest.importorskip("xarray")
     for convention in BOTH:
-        room.save(tmp_path / "mesh.nc", convention=convention)
+        room.to_netcdf(tmp_path / "mesh.nc", convention=convention)
         expected = read(tmp_path / "mesh.nc")
         for engine in ("scipy", "netcdf4"):
             if engine == "netcdf4":
@@ -245,7 +245,7 @@ def test_as_uxarray_reads_it(result, tmp_path):
 @pytest.mark.parametrize("convention", BOTH)
 def test_the_same_mesh_gives_the_same_bytes(room, tmp_path, convention):
     for name in ("a.nc", "b.NC"):
-        room.save(tmp_path / name, convention=convention)
+        room.to_netcdf(tmp_path / name, convention=convention)
     data = (tmp_path / "a.nc").read_bytes()
     assert data == (tmp_path / "b.NC").read_bytes()
     assert data[:4] == b"CDF\2"
@@ -255,45 +255,47 @@ def test_the_same_mesh_gives_the_same_bytes(room, tmp_path, convention):
 
 def test_ugrid_is_the_default(room, tmp_path):
     room.save(tmp_path / "a.nc")
-    room.save(tmp_path / "b.nc", convention="ugrid")
+    room.to_netcdf(tmp_path / "b.nc", convention="ugrid")
     assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
 
 
 @pytest.mark.parametrize("convention", ["MPAS", "", 3, ["mpas"]])
 def test_other_conventions_are_refused(room, tmp_path, convention):
     with pytest.raises(InputError, match=r"convention is .*expected one of 'ugrid', 'mpas', 'scrip'"):
-        room.save(tmp_path / "mesh.nc", convention=convention)
+        room.to_netcdf(tmp_path / "mesh.nc", convention=convention)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["mesh.vtu", "mesh.npz", "mesh.vtk", "case.foam", "polyMesh"])
 def test_conventions_are_for_netcdf_alone(room, tmp_path, name):
-    with pytest.raises(InputError, match=rf"{name}.*netCDF; save as \.nc"):
-        room.save(tmp_path / name, convention="mpas")
-    with pytest.raises(InputError, match="patches"):
-        room.save(tmp_path / "mesh.nc", patches={"a": [0]})
+    with pytest.raises(InputError, match=rf"{name} with convention.*netCDF; save as \.nc"):
+        clvoro.io.write(room, tmp_path / name, convention="mpas")
+    with pytest.raises(InputError, match=rf"{name} as netCDF, expected a name that ends in \.nc"):
+        room.to_netcdf(tmp_path / name, convention="mpas")
+    with pytest.raises(InputError, match="with patches, which is for OpenFOAM"):
+        clvoro.io.write(room, tmp_path / "mesh.nc", patches={"a": [0]})
     assert not list(tmp_path.iterdir())
 
 
 def test_meshes_in_3d_are_refused(tmp_path):
     points = np.random.default_rng(1).random((20, 3))
     solid = solids.solid_result(solids.solid_diagram((0, 0, 0), (1, 1, 1), points))
-    for convention in (None, *BOTH):
+    for convention in BOTH:
         with pytest.raises(InputError, match=r"3 dimensions.*\.vtu, \.foam or \.npz"):
-            solid.save(tmp_path / "mesh.nc", convention=convention)
+            solid.to_netcdf(tmp_path / "mesh.nc", convention=convention)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("convention", BOTH)
 def test_variables_too_large_for_the_format_are_refused(room, tmp_path, monkeypatch, convention):
     largest = {"ugrid": "mesh_face_nodes", "mpas": "edgesOnEdge"}[convention]
-    room.save(tmp_path / "mesh.nc", convention=convention)
+    room.to_netcdf(tmp_path / "mesh.nc", convention=convention)
     size = read(tmp_path / "mesh.nc")[largest].nbytes
     (tmp_path / "mesh.nc").unlink()
     monkeypatch.setattr(netcdf, "_MOST", size - 1)
     named = rf"mesh\.nc: {largest} \(\d+ x \d+\) has {size} bytes"
     with pytest.raises(InputError, match=named):
-        room.save(tmp_path / "mesh.nc", convention=convention)
+        room.to_netcdf(tmp_path / "mesh.nc", convention=convention)
     assert not list(tmp_path.iterdir())
 
 
@@ -312,10 +314,10 @@ def test_a_full_disk_leaves_the_old_file(room, tmp_path, monkeypatch, convention
         else:
             patched.setattr(netcdf_file, "_write_var_data", full)
         with pytest.raises(InputError, match=r"mesh\.nc: No space left"):
-            room.save(path, convention=convention)
+            room.to_netcdf(path, convention=convention)
     assert path.read_text() == "the old one"
     assert [p.name for p in tmp_path.iterdir()] == ["mesh.nc"]
     with pytest.raises(InputError, match="create it first"):
-        room.save(tmp_path / "absent" / "mesh.nc", convention=convention)
-    room.save(path, convention=convention)
+        room.to_netcdf(tmp_path / "absent" / "mesh.nc", convention=convention)
+    room.to_netcdf(path, convention=convention)
     assert len(read(path).values) > 10

@@ -478,7 +478,7 @@ def pond(ctx) -> clvoro.Result:
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("walls", ["exact", "straight"])
 def test_openfoam_cells_are_closed(pond, tmp_path, walls) -> None:
-    pond.save(tmp_path / "constant" / "polyMesh", walls=walls)
+    pond.to_openfoam(tmp_path / "constant" / "polyMesh", walls=walls)
     points, faces, owner, neighbor, _ = test_foam.read(tmp_path / "constant" / "polyMesh")
     inner, n = len(neighbor), len(pond.points)
     pairs = list(zip(owner[:inner].tolist(), neighbor.tolist(), strict=True))
@@ -522,14 +522,14 @@ def lengths_of(patches: dict, points: np.ndarray, faces: list) -> dict:
 
 def test_openfoam_patches(pond, tmp_path) -> None:
     domain, folder = pond.diagram.domain, tmp_path / "polyMesh"
-    pond.save(folder, walls="exact")
+    pond.to_openfoam(folder, walls="exact")
     points, faces, *_, patches = test_foam.read(folder)
     assert list(patches) == ["outer", "hole-1", "hole-2", "back", "front"]
     rings = [shapely.LinearRing(ring).length for ring in domain.oriented.rings]
     assert list(lengths_of(patches, points, faces).values()) == pytest.approx(rings, rel=1e-12)
     given = domain.vertices
     edges = {"in": [0], "walls": [3, 7, 1]}
-    pond.save(folder, patches=edges, walls="exact")
+    pond.to_openfoam(folder, patches=edges, walls="exact")
     points, faces, *_, patches = test_foam.read(folder)
     assert list(patches) == ["in", "walls", "outer", "hole-1", "hole-2", "back", "front"]
 
@@ -541,7 +541,7 @@ def test_openfoam_patches(pond, tmp_path) -> None:
     assert found["in"] == pytest.approx(length(0), rel=1e-12)
     assert found["walls"] == pytest.approx(length(3) + length(7) + length(1), rel=1e-12)
     assert sum(found.values()) == pytest.approx(sum(rings), rel=1e-12)
-    pond.save(folder, patches={"all": range(6)})
+    pond.to_openfoam(folder, patches={"all": range(6)})
     assert list(test_foam.read(folder)[-1]) == ["all", "hole-1", "hole-2", "back", "front"]
 
 
@@ -560,15 +560,15 @@ def test_openfoam_patches(pond, tmp_path) -> None:
 )
 def test_wrong_patches_are_refused(pond, tmp_path, patches: object, says: str) -> None:
     with pytest.raises((InputError, InputTypeError), match=says):
-        pond.save(tmp_path / "case.foam", patches=patches)
+        pond.to_openfoam(tmp_path / "case.foam", patches=patches)
     assert not list(tmp_path.iterdir())
 
 
 def test_cells_around_islands_are_refused_for_openfoam(result, pond, tmp_path) -> None:
     with pytest.raises(InputError, match=r"cell \d+ \(1 in all\) goes around a part of the boundary"):
-        result.save(tmp_path / "case.foam", walls="exact")
-    with pytest.raises(InputError, match="which is for OpenFOAM"):
-        pond.save(tmp_path / "mesh.vtu", patches={"a": [1]})
+        result.to_openfoam(tmp_path / "case.foam", walls="exact")
+    with pytest.raises(InputError, match="as OpenFOAM, expected a name"):
+        pond.to_openfoam(tmp_path / "mesh.vtu", patches={"a": [1]})
     assert not list(tmp_path.iterdir())
 
 

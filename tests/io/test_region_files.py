@@ -38,8 +38,8 @@ def part(globe):
 @pytest.fixture(scope="module")
 def files(globe, part, tmp_path_factory):
     folder = tmp_path_factory.mktemp("mpas")
-    globe.save(folder / "globe.nc", convention="mpas")
-    part.save(folder / "part.nc", convention="mpas")
+    globe.to_netcdf(folder / "globe.nc", convention="mpas")
+    part.to_netcdf(folder / "part.nc", convention="mpas")
     return Globe(folder / "globe.nc"), Globe(folder / "part.nc")
 
 
@@ -168,7 +168,7 @@ def test_mpas_zones_of_a_limited_area(globe, tmp_path):
     ring = clvoro.earth.rings(globe, lat > 40, 2)
     area = globe.subset(ring >= 0, "open")
     zones = ring[ring >= 0]
-    area.save(tmp_path / "area.nc", convention="mpas", cell_data={"bdyMaskCell": zones})
+    area.to_netcdf(tmp_path / "area.nc", convention="mpas", cell_data={"bdyMaskCell": zones})
     mesh = Globe(tmp_path / "area.nc")
     assert np.array_equal(mesh["bdyMaskCell"], zones)
     for name, table in (("bdyMaskEdge", mesh.cellsOnEdge), ("bdyMaskVertex", mesh.cellsOnVertex)):

@@ -23,7 +23,7 @@ def result(ctx, request):
 
 @pytest.mark.sparse(2)
 def test_scrip(result, tmp_path):
-    result.save(tmp_path / "mesh.nc", convention="scrip")
+    result.to_netcdf(tmp_path / "mesh.nc", convention="scrip")
     file, d = read(tmp_path / "mesh.nc"), result.diagram
     n, sides = len(d), np.diff(d.neighbor_starts)
     eps = 2e-15 if is_double(result) else 2e-7
@@ -45,7 +45,7 @@ def test_scrip(result, tmp_path):
 def test_scrip_is_for_spheres(tmp_path):
     plane = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.8)])
     with pytest.raises(InputError, match="SCRIP files are for meshes on a Sphere"):
-        plane.save(tmp_path / "mesh.nc", convention="scrip")
+        plane.to_netcdf(tmp_path / "mesh.nc", convention="scrip")
     assert not list(tmp_path.iterdir())
 
 
@@ -53,7 +53,7 @@ def test_scrip_is_for_spheres(tmp_path):
 
 
 def test_ugrid_has_degrees(result, tmp_path):
-    result.save(tmp_path / "mesh.nc", units="km")
+    result.to_netcdf(tmp_path / "mesh.nc", units="km")
     file, d = read(tmp_path / "mesh.nc"), result.diagram
     for place in ("node", "edge", "face"):
         for axis, name, units in (("x", "longitude", "degrees_east"), ("y", "latitude", "degrees_north")):
@@ -80,7 +80,7 @@ def test_degrees_are_no_unit_of_a_radius(ctx, tmp_path):
     diagram = clvoro.Adapter(ctx).diagram(EARTH, scattered(150))
     for convention in ("ugrid", "mpas"):
         with pytest.raises(InputError, match="units is 'degrees', expected on a sphere"):
-            diagram.save(tmp_path / "mesh.nc", convention=convention, units="degrees")
+            diagram.to_netcdf(tmp_path / "mesh.nc", convention=convention, units="degrees")
 
 
 def lonlat(file, place):
@@ -284,7 +284,7 @@ def test_graph_for_metis_in_parts(ctx, tmp_path, monkeypatch):
     [
         (lambda d, to: d.save(to / "mesh.foam"), r"cannot write .*mesh\.foam: OpenFOAM.*Sphere.*\.nc"),
         (lambda d, to: d.save(to / "constant" / "polyMesh"), "OpenFOAM.*Sphere"),
-        (lambda d, to: d.save(to / "mesh.vtu", walls="straight"), "solvers .*Sphere.*walls='exact'"),
+        (lambda d, to: d.to_vtu(to / "mesh.vtu", walls="straight"), "solvers .*Sphere.*walls='exact'"),
         (lambda d, _: d.solver_mesh(), "solvers .*Sphere"),
         (lambda d, _: d.check(solver="openfoam"), "polyhedra, and the mesh is on Sphere"),
         (lambda d, _: d.to_disv(), "DISV .*Sphere.*Polygon"),

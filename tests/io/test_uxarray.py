@@ -13,7 +13,7 @@ ux = pytest.importorskip("uxarray")
 def test_areas_and_zonal_means(ctx, tmp_path, convention):
     earth = clvoro.Sphere()
     d = clvoro.Adapter(ctx).run(earth, 1.0, n_cells=642, effort="fast").diagram
-    d.save(tmp_path / "mesh.nc", convention=convention)
+    d.to_netcdf(tmp_path / "mesh.nc", convention=convention)
     grid = ux.open_grid(tmp_path / "mesh.nc")
     assert grid.n_face == len(d)
     found = grid.compute_face_areas()

@@ -109,7 +109,7 @@ def use(rng: np.random.Generator, result: clvoro.Result, folder: Path) -> None:
     if isinstance(diagram.domain, clvoro.Polygon) and rng.random() < 0.5:
         patches = {"inlet": [0], "wall": [1, 2]}
     with contextlib.suppress(InputError):  # which cannot hold cells around holes
-        result.save(folder / "case" / "a.foam", patches=patches)
+        result.to_openfoam(folder / "case" / "a.foam", patches=patches)
     if diagram.domain.dim == 2 and not any(diagram.domain.periodic):
         corners = diagram.triangles()
         if corners.shape[1] != 3 or corners.max(initial=0) >= len(result.points):

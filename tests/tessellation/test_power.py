@@ -225,7 +225,7 @@ def test_files_pictures_and_other_libraries(ctx, tmp_path):
     for refused in (
         lambda: full.transfer(np.ones(len(full)), full),
         full.to_disv,
-        lambda: full.save(tmp_path / "d.nc", convention="mpas"),
+        lambda: full.to_netcdf(tmp_path / "d.nc", convention="mpas"),
         lambda: full.check("mpas"),
     ):
         with pytest.raises(InputError, match="Voronoi"):

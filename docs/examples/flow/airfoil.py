@@ -38,4 +38,4 @@ mesh.plot("size", window=((0.78, -0.12), (1.16, 0.1)))
 # %%
 # OpenFOAM reads this folder. Patches have the names of the domain, and are walls unless `types` says otherwise.
 
-mesh.save("airfoil/airfoil.foam", types={"outer": "patch"})
+mesh.to_openfoam("airfoil/airfoil.foam", types={"outer": "patch"})

@@ -37,4 +37,4 @@ mesh.plot("quality", window=((0.1, 0.1), (0.4, 0.3)))
 # %%
 # OpenFOAM reads this folder.
 
-mesh.save("cylinder/cylinder.foam", types={"inlet": "patch", "outlet": "patch"})
+mesh.to_openfoam("cylinder/cylinder.foam", types={"inlet": "patch", "outlet": "patch"})

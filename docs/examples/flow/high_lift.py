@@ -67,4 +67,4 @@ mesh.plot("size", window=((0.6, -0.06), (0.9, 0.09)))
 
 print(mesh.solver_mesh().measures)
 assert mesh.check(solver="openfoam")
-mesh.save("high_lift/high_lift.foam", types={"far-field": "patch"})
+mesh.to_openfoam("high_lift/high_lift.foam", types={"far-field": "patch"})

@@ -87,7 +87,7 @@ ocean.plot("size", projection="plate")
 # %%
 # In the file for MPAS, 0 stands for missing cells beyond the coast.
 
-ocean.save("ocean.nc", convention="mpas")
+ocean.to_netcdf("ocean.nc", convention="mpas")
 
 # %%
 # A limited area for the atmosphere has seven rings of neighbors around it, in which values are relaxed or given.
@@ -95,6 +95,6 @@ ocean.save("ocean.nc", convention="mpas")
 area = clvoro.Polygon([(-30, 20), (20, 20), (35, 60), (-40, 60)])
 ring = clvoro.earth.rings(globe, clvoro.earth.inside(globe, area))
 limited = globe.subset(ring >= 0, "open")
-limited.save("limited_area.nc", convention="mpas", cell_data={"bdyMaskCell": ring[ring >= 0]})
+limited.to_netcdf("limited_area.nc", convention="mpas", cell_data={"bdyMaskCell": ring[ring >= 0]})
 limited.plot(ring[ring >= 0].astype(float), label="ring", center=(0, 40))
 plt.show()
