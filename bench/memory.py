@@ -12,7 +12,7 @@ larger of the two over it. In the fields of the second line sizes change several
 The third line has all kinds of runs (`_kinds.py`, or some of them by their first word), one that is
 resumed and a transfer: shares of the estimate that are in use while the run is prepared, in the run,
 and while its diagram is read.
-`clvoro.adaptation.estimates.PEAK` holds the estimates, in reals and 32-bit integers.
+`clvoro.adaptation.estimates.SIZES` holds the estimates, in reals and 32-bit integers.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ import numpy as np
 from _common import Report, counts, heading, make_adapter, parser
 
 import clvoro
-from clvoro.adaptation.forecast import expected_images
+from clvoro.adaptation.estimates import expected_images
 from clvoro.adaptation.sampling.start import density_tree
 from clvoro.sizing import Expression
 from clvoro.tessellation.tessellator import Tessellator

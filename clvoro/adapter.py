@@ -412,9 +412,9 @@ class Adapter:
     ) -> float:
         """Estimate the bytes that `run` needs on the device with these arguments.
 
-        A run needs at most a tenth more. Where sizes change several-fold from one cell to the next it may need a fifth
-        less, at seams of periodic boxes up to three fifths less. The estimate includes reading all arrays of the
-        diagram afterwards: in 3D that needs more than the run.
+        A run of some thousand cells needs at most a quarter more, and no less than three quarters of it. Where sizes
+        change several-fold from one cell to the next it may need half of it. The estimate includes reading all arrays
+        of the diagram afterwards: in 3D that needs more than the run.
 
         Parameters
         ----------

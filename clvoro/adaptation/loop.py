@@ -15,8 +15,8 @@ from ..opencl.primitives import Summary
 from ..solvers.linear_system import Solution
 from .checkpoint import Checkpointer, Progress
 from .diagnostics import warn_of_obtuse_triangles
+from .estimates import MOST_SURPLUS
 from .fixed_points import origins, put_back
-from .forecast import MOST_SURPLUS
 from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod
 from .plan.actions import (

@@ -23,9 +23,8 @@ from ..tessellation.power import require_power_domain
 from .arrays import Setup
 from .descent.quality_descent import OPENINGS
 from .diagnostics import check_precision, narrow_parts, warn_of_mismatches, warn_of_narrow_parts
-from .estimates import Extras, check_memory
+from .estimates import Extras, check_memory, expected_boundary_cells, expected_images, expected_surplus
 from .fixed_points import check_room, take_places
-from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
 from .options import Options
