@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -32,6 +32,14 @@ class ClipBox(Protocol):
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners in the device's coordinates, padded to four numbers as kernels take them."""
         ...
+
+
+class Chart(NamedTuple):
+    """A plane domain of the same measure as a domain, and maps of points (n, d') -> (n, d) from it and (n, d) to it."""
+
+    domain: Domain
+    position: Callable[[np.ndarray], np.ndarray]
+    place: Callable[[np.ndarray], np.ndarray]
 
 
 class Domain(ABC):
@@ -226,6 +234,10 @@ class Domain(ABC):
     @abstractmethod
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Return the nearest point of the domain to each of `points` (n, d): the point itself if it is inside."""
+
+    def chart(self) -> Chart:
+        """Return the domain in which generators are drawn and sizes are integrated: itself, unless it is curved."""
+        return Chart(self, np.asarray, np.asarray)
 
     # The device's view.
 

@@ -14,7 +14,8 @@ from ..arguments import check_integer, check_number, check_rows
 from ..errors import InputError
 from ..opencl.engine import Traits
 from .boundary_names import BoundaryNames, Walls
-from .domain import LARGEST_EDGE, Domain
+from .box import Box
+from .domain import LARGEST_EDGE, Chart, Domain
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -190,6 +191,21 @@ class Sphere(Domain):
             middle = x[edges].sum(axis=1)
             x = np.concatenate([x, middle / np.linalg.norm(middle, axis=1)[:, None]])
         return self.radius * x
+
+    def chart(self) -> Chart:
+        """Return the box of r longitude and r sin(latitude): Lambert's cylindrical equal-area projection."""
+        r = self.radius
+
+        def position(points: np.ndarray) -> np.ndarray:
+            lon, sine = np.asarray(points, float).reshape(-1, 2).T / r
+            cosine = np.sqrt(np.maximum((1 - sine) * (1 + sine), 0))
+            return r * np.column_stack([cosine * np.cos(lon), cosine * np.sin(lon), sine])
+
+        def place(points: np.ndarray) -> np.ndarray:
+            x, y, z = (np.asarray(points, float).reshape(-1, 3) / r).T
+            return r * np.column_stack([np.arctan2(y, x), np.clip(z / np.hypot(np.hypot(x, y), z), -1, 1)])
+
+        return Chart(Box((-np.pi * r, -r), (np.pi * r, r)), position, place)
 
     def spiral_points(self, n: int) -> np.ndarray:
         """Return `n` evenly spread positions (n, 3), on a spiral in golden angles (Fibonacci lattice)."""

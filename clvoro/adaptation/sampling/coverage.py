@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
-from ...geometry.polygon import Polygon
-
 if TYPE_CHECKING:
     from ...geometry.domain import Domain
+    from ...geometry.polygon import Polygon
     from .box_tree import BoxTree
 
 _LEAST = 1e-12  # share of a box below which it counts as outside
@@ -168,4 +167,4 @@ class PolygonCoverage(FullCoverage):
 
 def coverage_of(boxes: BoxTree, domain: Domain) -> FullCoverage:
     """Return the coverage of `domain` by `boxes`."""
-    return PolygonCoverage(boxes, domain) if isinstance(domain, Polygon) else FullCoverage(boxes)
+    return FullCoverage(boxes) if domain.outline is None else PolygonCoverage(boxes, domain.outline)

@@ -11,11 +11,9 @@ from numpy.typing import DTypeLike
 
 from ...errors import InputError, InputTypeError
 from ...geometry.domain import Domain
-from ...geometry.polygon import Polygon
-from ...geometry.sphere import Sphere
 from ...sizing import as_field
 from .box_tree import BoxTree
-from .charts import charted, from_chart
+from .charts import charted
 from .coverage import PolygonCoverage, coverage_of
 from .quadrature import DensityTree
 
@@ -108,9 +106,10 @@ def sample_density(
     n, seed = _check_arguments(n, seed)
     field = _evaluator(field)
     tree = density_tree(field, domain) if tree is None else tree
-    if isinstance(domain, Sphere):
-        chart, field = charted(domain, field)
-        return from_chart(domain, sample_density(field, chart, n, seed, real, tree))
+    chart = domain.chart()
+    if domain.curved:
+        _, field = charted(domain, field)
+        return chart.position(sample_density(field, chart.domain, n, seed, real, tree))
     boxes, coverage, slopes = tree.boxes, tree.coverage, tree.slopes
     share = tree.cells * (n / tree.integral)
     while (chosen := (share > _MAX_EXPECTED) & (boxes.level < 45)).any():
@@ -153,9 +152,9 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
         If the precision has not `n` distinct points.
     """
     n, seed = _check_arguments(n, seed)
-    if isinstance(domain, Sphere):
-        chart, _ = charted(domain, as_field(1.0))
-        return from_chart(domain, sample_uniform(chart, n, seed, real))
+    if domain.curved:
+        chart = domain.chart()
+        return chart.position(sample_uniform(chart.domain, n, seed, real))
     rng = np.random.Generator(np.random.PCG64(seed))
     place = _uniform_in(domain, rng)
 
@@ -255,9 +254,9 @@ def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) ->
     `working` are the points in the domain's frame.
     """
     origin, scale = domain.frame
-    if isinstance(domain, Polygon):
+    if domain.outline is not None:
         margin = _ULPS * float(np.finfo(working.dtype).eps) * scale
-        return domain.contains_well(points, margin)
+        return domain.outline.contains_well(points, margin)
     lower, upper = (((np.array(c) - origin) / scale).astype(working.dtype) for c in (domain.lower, domain.upper))
     bad = ((working <= lower) | (working >= upper)).any(axis=1)
     bad |= ((points <= domain.lower) | (points >= domain.upper)).any(axis=1)
@@ -266,7 +265,7 @@ def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) ->
 
 def _in_all_pieces(domain: Domain, points: np.ndarray) -> np.ndarray:
     """Move points from the piece with most of them, so that each piece of the domain has one."""
-    if not isinstance(domain, Polygon) or domain.n_pieces == 1:
+    if domain.n_pieces == 1:
         return points
     if len(points) < domain.n_pieces:
         raise InputError(f"n is {len(points)}, expected at least {domain.n_pieces}, one per piece of the domain")
