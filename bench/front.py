@@ -9,7 +9,7 @@ sides) into `bench/pictures` or `--out`. Fields: F3; `circles` and `ridge`, whic
 (see `test_field` in `_common.py`). The runs of effort
 "best" take most of the time; `--no-best` leaves them out.
 
-Gmsh is measured if it is installed (see `peers.py`). The points of JIGSAW and MMG are not measured here. They are
+Gmsh is measured if it is installed (`pip install gmsh`). The points of JIGSAW and MMG are not measured here. They are
 constants of this script, for the same field, with e after one global factor on h. The picture says so.
 
 `--goals` compares with goals instead, on several fields: runs without any argument; and runs with at most half the
@@ -32,9 +32,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import BOX, FIRST_SEED, PICTURES, Report, figures, heading, make_adapter, parser, shown, test_field, work
-from _remeshers import MissingPeerError, vertices_gmsh
-from peers import judge, mesh_peer
+from _common import (
+    BOX,
+    FIRST_SEED,
+    PICTURES,
+    Report,
+    cell_quality,
+    figures,
+    heading,
+    make_adapter,
+    off_walls,
+    parser,
+    shown,
+    test_field,
+    work,
+)
+from _remeshers import EDGE, MissingPeerError, vertices_gmsh
 
 import clvoro
 
@@ -122,11 +135,14 @@ def measure(
 
 
 def measure_gmsh(adapter: clvoro.Adapter) -> dict[str, Any] | None:
+    size = test_field("F3")
     try:
-        points, seconds = mesh_peer(vertices_gmsh)(adapter, 1.0)
+        points, seconds = vertices_gmsh(BOX, size, EDGE[2])
     except MissingPeerError:
         return None
-    found = judge(adapter, points, 1.0)
+    diagram, h = adapter.diagram(BOX, points), np.asarray(size(points))
+    common = float(np.exp(np.log(np.sqrt(diagram.volumes) / h)[off_walls(diagram)].mean()))
+    found = figures(diagram, h * common, cell_quality(diagram))
     # Its vertices on the walls have cut cells: those are no part of the comparison.
     found["mean_error"], found["max_error"] = found["mean_error_inner"], found["max_error_inner"]
     return {"group": "Gmsh", "name": "Gmsh", **found, "seconds": seconds}

@@ -1,14 +1,12 @@
 """What bounds the quality of cells in 3D: lattices, their strain, grains, the growth of h, and walls.
 
-    python bench/shape_3d.py [--parts lattices,strain,grains,growth,fields,filled] [--cells 16000]
+    python bench/shape_3d.py [--parts lattices,strain,grains,growth] [--cells 16000]
                              [--efforts default,best] [--device NAME] [--dtype float32] [--json]
 
 *lattices*  cells of perfect lattices: mean Q, and the spread of their sizes about their mean
 *strain*    cells of the body-centered lattice stretched along one axis, at constant volume
 *grains*    a constant size: from the lattice, from grains of the lattice with random orientations, and at random
 *growth*    h = h0 + slope (x - 1/2): from the lattice, mapped along x to the density h^-3, and at random
-*fields*    S1, S2 and S3 with the default start, without the cells at walls and with them
-*filled*    S3 from grains of the lattice that are mapped conformally, so that h and its gradient fit at their centers
 
 The quality is 36 pi V^2 / S^3.
 """
@@ -20,22 +18,20 @@ import time
 from typing import Any
 
 import numpy as np
-from _common import CUBE, FIRST_SEED, Report, domain_of, figures, heading, make_adapter, names, parser, test_field
-from lattice import body_centered
+from _common import CUBE, FIRST_SEED, Report, figures, heading, make_adapter, names, parser
 from scipy.spatial import ConvexHull, KDTree, Voronoi
 from scipy.spatial.transform import Rotation
 
 import clvoro
 from clvoro import sizing
 
-PARTS = ("lattices", "strain", "grains", "growth", "fields", "filled")
+PARTS = ("lattices", "strain", "grains", "growth")
 BCC = np.array([[0, 0, 0], [2, 2, 2]]) / 4
 FCC = np.array([[0, 0, 0], [2, 2, 0], [2, 0, 2], [0, 2, 2]]) / 4
 A15 = np.array([[0, 0, 0], [2, 2, 2], [1, 2, 0], [3, 2, 0], [0, 1, 2], [0, 3, 2], [2, 0, 1], [2, 0, 3]]) / 4
 STRAINS = (0.02, 0.05, 0.1, 0.2)
 GRAINS = (8, 32, 128)
 SLOPES = (0.01, 0.02, 0.05)
-FILLED = (60, 250)
 MARGIN, NEAREST = 0.3, 0.65
 """Least distances over h of generators of grains from walls, and from those of another grain."""
 LEVELS = clvoro.MultilevelOptions(levels=0)
@@ -77,50 +73,30 @@ def relaxed_seeds(count: int, seed: int) -> np.ndarray:
     return seeds
 
 
-def conformal(lattice: np.ndarray, center: np.ndarray, h: float, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Map `lattice` (k, 3) to places around `center`; return them and the size there.
-
-    x = center + h (y - b |y|^2) / D, D = 1 - 2 b.y + |b|^2 |y|^2, b = slope / 2 is conformal, with the factor h / D:
-    its value at the center is h, its gradient `slope`.
-    """
-    b, square = slope / 2, (lattice**2).sum(axis=1)
-    factor = 1 - 2 * lattice @ b + b @ b * square
-    return center + h * (lattice - b * square[:, None]) / factor[:, None], h / factor
-
-
-def fill(seeds: np.ndarray, field: Any, seed: int, reach: float) -> np.ndarray:
-    """Return generators in grains around `seeds`: conformal images of the lattice up to `reach` cells away."""
-    random, tree = np.random.default_rng(seed), KDTree(seeds)
-    line = np.arange(-int(reach / 1.25) - 1, int(reach / 1.25) + 2)
+def fill(seeds: np.ndarray, size: float, seed: int) -> np.ndarray:
+    """Return the generators of grains around `seeds`: the lattice with cells of volume size^3, turned at random."""
+    random, tree, most = np.random.default_rng(seed), KDTree(seeds), int(1.8 / size / 1.25) + 1
+    line = np.arange(-most, most + 1)
     cubes = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
-    lattice = np.concatenate([cubes, cubes + 0.5]) * 2 ** (1 / 3)  # cells of volume 1
-    lattice = lattice[(lattice**2).sum(axis=1) < reach**2]
+    lattice = size * np.concatenate([cubes, cubes + 0.5]) * 2 ** (1 / 3)
     parts = []
     for k, center in enumerate(seeds):
-        turned = lattice @ Rotation.from_quat(random.normal(size=4)).as_matrix()
-        h = float(field(center[None])[0])
-        around = np.clip(center + 2 * h * np.concatenate([np.eye(3), -np.eye(3)]), 0, 1)
-        sizes = np.asarray(field(around))
-        slope = (sizes[:3] - sizes[3:]) / np.diag(around[:3] - around[3:])
-        turned = turned[turned @ slope < 1.1]  # far from where the map folds
-        for last in (False, False, True):
-            x, size = conformal(turned, center, h, slope)
-            margin = (MARGIN * size if last else 0 * size)[:, None]
-            own = ((x > margin) & (x < 1 - margin)).all(axis=1)
-            own = np.flatnonzero(own)
-            own = own[tree.query(x[own])[1] == k]
-            h *= float(np.exp(np.mean(np.log(np.asarray(field(x[own])) / size[own])))) if not last else 1
-        parts.append(x[own])
-    points = np.concatenate(parts)
-    grain = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
-    sizes, kept = np.asarray(field(points)), np.ones(len(points), bool)
-    found = KDTree(points).query(points, k=8)
-    distance, near = np.asarray(found[0]), np.asarray(found[1])
-    for i, j in zip(*np.nonzero(distance < NEAREST * sizes[:, None]), strict=True):
-        other = near[i, j]
-        if grain[other] != grain[i] and kept[i] and kept[other]:
-            kept[other] = False
+        x = center + lattice @ Rotation.from_quat(random.normal(size=4)).as_matrix()
+        x = x[((x > MARGIN * size) & (x < 1 - MARGIN * size)).all(axis=1)]
+        parts.append(x[tree.query(x)[1] == k])
+    points, grain = np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(p) for p in parts])
+    kept = np.ones(len(points), bool)
+    for i, j in KDTree(points).query_pairs(NEAREST * size):
+        if grain[i] != grain[j] and kept[i] and kept[j]:
+            kept[j] = False
     return points[kept]
+
+
+def body_centered(m: int) -> np.ndarray:
+    """Return the lattice of `m` cubes along each side of the unit cube, (2 m^3, 3)."""
+    line = np.arange(m)
+    corners = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
+    return np.concatenate([corners + 0.25, corners + 0.75]) / m
 
 
 def mapped_along_x(points: np.ndarray, size: float, slope: float) -> np.ndarray:
@@ -140,24 +116,15 @@ def starts(part: str, n: int) -> list[tuple[str, str, Any, dict[str, Any]]]:
         field = sizing.Constant(size)
         runs = [("constant", "lattice", field, {"points": lattice, "options": LEVELS})]
         for count in GRAINS:
-            points = fill(relaxed_seeds(count, FIRST_SEED), field, FIRST_SEED, 1.8 / size)
+            points = fill(relaxed_seeds(count, FIRST_SEED), size, FIRST_SEED)
             runs.append(("constant", f"{count} grains", field, {"points": points, "options": LEVELS}))
         return [*runs, ("constant", "random", field, {**at_random, "options": LEVELS})]
-    if part == "growth":
-        runs = []
-        for slope in SLOPES:
-            field, name = sizing.Expression(f"{size} + {slope} * (x - 0.5)"), f"slope {slope}"
-            points = mapped_along_x(lattice, size, slope)
-            runs.append((name, "lattice", field, {"points": points, "options": LEVELS}))
-            runs.append((name, "random", field, {**at_random, "options": LEVELS}))
-        return runs
-    if part == "fields":
-        return [(name, "random", test_field(name), at_random) for name in ("S1", "S2", "S3")]
-    field = test_field("S3")
     runs = []
-    for count in FILLED:
-        points = fill(relaxed_seeds(count, FIRST_SEED), field, FIRST_SEED, 17)
-        runs.append(("S3", f"{count} grains", field, {"points": points, "options": LEVELS}))
+    for slope in SLOPES:
+        field, name = sizing.Expression(f"{size} + {slope} * (x - 0.5)"), f"slope {slope}"
+        points = mapped_along_x(lattice, size, slope)
+        runs.append((name, "lattice", field, {"points": points, "options": LEVELS}))
+        runs.append((name, "random", field, {**at_random, "options": LEVELS}))
     return runs
 
 
@@ -201,8 +168,7 @@ def main() -> int:
         for case, start, field, given in starts(part, options.cells):
             for effort in options.efforts:
                 began = time.process_time()
-                domain = domain_of("S1") if part in ("fields", "filled") else CUBE
-                result = adapter.run(domain, field, effort=effort, **given)
+                result = adapter.run(CUBE, field, effort=effort, **given)
                 made = figures(result.diagram, result.target_size, result.quality)
                 made["seconds"] = time.process_time() - began
                 report.add(

@@ -1,7 +1,7 @@
 """The update of a diagram in 3D against a new one: small moves of relaxed generators, and whole runs.
 
     python bench/update_3d.py [--sizes 1e5,1e6] [--moves 0,0.003,0.01,0.03] [--relax 6] [--repeat 4] [--runs 0.25]
-                              [--processor-time] [--shares 1e4,1e5] [--device NAME] [--dtype float32] [--json]
+                              [--processor-time] [--device NAME] [--dtype float32] [--json]
 
 Random generators in the unit cube move to their centroids `--relax` times. Then all move at random by `--moves`
 spacings, `--repeat` times. Each time the diagram is updated and, with other buffers, made anew, from binning on.
@@ -11,34 +11,21 @@ Seconds are means over the moves. "cells changed" have other neighbors than befo
 updates: seconds of the run and of all its diagrams, mean |log(L / h)| and Q.
 
 With `--processor-time`, seconds are the processor time of this process over the device's compute units.
-
-`--shares` instead makes meshes of S1 with so many cells, in a box with walls and in a periodic one, and prints what
-happens to the cells on the finest level by kind of step (see `launches.py`): shares of the cells that keep their
-vertices; that keep their neighbors; that are updated again, in all rounds; that are clipped by all generators near
-them; and of the steps with new diagrams. Early and late steps are the first and the second half of each kind.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable
 from typing import Any
-from unittest import mock
 
 import numpy as np
-from _common import CUBE, Report, clock_of, counts, heading, make_adapter, markdown, names, parser, test_field
-from launches import name_of
+from _common import CUBE, Report, clock_of, counts, heading, make_adapter, names, parser, test_field
 
 import clvoro
-from clvoro.adaptation.loop import Loop
-from clvoro.adaptation.sampling.start import count_cells
 from clvoro.opencl.engine import Engine
-from clvoro.tessellation import polyhedra_update
-from clvoro.tessellation.cut_cells import REPORT_LISTED
 from clvoro.tessellation.device_diagram import Tessellation
-from clvoro.tessellation.polyhedra_update import ALL_CELLS, MAX_ROUNDS, PolyhedraUpdate
+from clvoro.tessellation.polyhedra_update import PolyhedraUpdate
 from clvoro.tessellation.stages import TessellationStages, tessellate_box
 from clvoro.tessellation.tessellator import Tessellator
 
@@ -139,105 +126,6 @@ def run(adapter: clvoro.Adapter, factor: float, updated: bool, clock: Callable[[
     }
 
 
-class Shares:
-    """What happens to cells in updates: for each, the kind of step and shares of the cells."""
-
-    NAMES = "vertices", "neighbors", "again", "clipped", "anew"
-
-    def __init__(self) -> None:
-        self.steps: list[dict[str, Any]] = []
-        self.kind = ""
-
-    def mean(self, steps: list[dict[str, Any]]) -> dict[str, float]:
-        """Return the mean shares of `steps`; those of cells over the steps with updates."""
-        updated = [step for step in steps if not step["anew"]]
-        return {name: float(np.mean([step[name] for step in updated])) for name in self.NAMES[:-1]} | {
-            "anew": 1 - len(updated) / len(steps)
-        }
-
-    @contextmanager
-    def counting(self) -> Iterator[None]:
-        """Count the updates while the context is open and `kind` is set."""
-        update, update_round = PolyhedraUpdate.update, polyhedra_update._Rounds.update
-
-        def updated(
-            own: PolyhedraUpdate, cells: Any, box: Any, points: Any, previous: Tessellation, clip: Any, *follow: Any
-        ) -> Tessellation | None:
-            if not self.kind:
-                return update(own, cells, box, points, previous, clip, *follow)
-            n = previous.n
-            found: dict[str, Any] = {"kind": self.kind, "cells": n} | dict.fromkeys(self.NAMES, 0.0)
-            self.steps.append(found)
-            # The graph is overwritten by the next one.
-            before = replace(previous, starts=previous.starts.copy(), neighbors=previous.neighbors.copy())
-
-            def clipped(cut: Any, report: Any, used: int) -> None:
-                found["clipped"] += np.count_nonzero(cut.counts.get() < 0) / n
-                clip(cut, report, used)
-
-            t = update(own, cells, box, points, previous, clipped, *follow)
-            found["anew"] = t is None
-            if t is not None:
-                report = own._report.get()
-                found["again"] = int(report[REPORT_LISTED : REPORT_LISTED + MAX_ROUNDS].sum()) / n
-                other = np.setxor1d(rows_of(before), rows_of(t), assume_unique=True)
-                found["neighbors"] = 1 - len(np.unique(other // (n + 8))) / n
-            return t
-
-        def updated_round(rounds: Any, size: int, which: int) -> None:
-            if not self.kind or which != ALL_CELLS:
-                return update_round(rounds, size, which)
-            starts, triples = (a.get() for a in (rounds._fixed[0], rounds._fixed[3]))
-            update_round(rounds, size, which)
-            new = rounds.cut.corners.get()
-            kept = (rounds.cut.counts.get() > 0) & (rounds.cut.places.get() == starts[:-1])
-            # A row has two entries per face, four of them unused. The fourth byte of the first is a state.
-            entries = 2 * starts[-1]
-            differ = triples[:entries] != new[:entries]
-            differ[2 * starts[:-1]] = (triples[2 * starts[:-1]] ^ new[2 * starts[:-1]]) & 0xFFFFFF
-            for k in range(1, 5):
-                differ[2 * starts[1:] - k] = False
-            kept &= ~np.logical_or.reduceat(differ, 2 * starts[:-1])
-            self.steps[-1]["vertices"] = kept.mean()
-
-        with (
-            mock.patch.object(PolyhedraUpdate, "update", updated),
-            mock.patch.object(polyhedra_update._Rounds, "update", updated_round),
-        ):
-            yield
-
-
-def shares_of(adapter: clvoro.Adapter, n: int, periodic: bool) -> list[list[str]]:
-    """Return the rows of the table of shares: those of a run, on its finest level."""
-    shares, box, step = (Shares(), clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(periodic,) * 3), Loop.step)
-    field = test_field("S1")
-
-    def stepped(loop: Loop, action: Any) -> None:
-        shares.kind = name_of(action.method) if loop.level == 0 else ""
-        step(loop, action)
-        shares.kind = ""
-
-    with shares.counting(), mock.patch.object(Loop, "step", stepped):
-        adapter.run(box, field * (count_cells(field, box) / n) ** (1 / 3), seed=1)
-    rows = []
-    for kind in dict.fromkeys(step["kind"] for step in shares.steps):
-        steps = [step for step in shares.steps if step["kind"] == kind]
-        half = len(steps) // 2
-        for when, part in (("early", steps[:half]), ("late", steps[half:])):
-            if part:
-                means = shares.mean(part)
-                rows.append(
-                    [
-                        f"{kind}, {when}",
-                        f"{part[-1]['cells']:,}",
-                        "yes" if periodic else "no",
-                        str(len(part)),
-                        *(f"{means[name]:.1%}" for name in shares.NAMES),
-                    ]
-                )
-    return rows
-
-
 def shown(name: str, form: str) -> Callable[[dict[str, Any]], str]:
     return lambda r: format(r[name], form) if name in r else ""
 
@@ -250,15 +138,8 @@ def main() -> None:
     options_of.add_argument("--repeat", type=int, default=4)
     options_of.add_argument("--runs", type=names, default=["0.25"])
     options_of.add_argument("--processor-time", action="store_true")
-    options_of.add_argument("--shares", type=counts)
     options = options_of.parse_args()
     adapter = make_adapter(options)
-    if options.shares:
-        rows = [r for n in options.shares for p in (False, True) for r in shares_of(adapter, n, p)]
-        header = ["step", "cells", "periodic", "steps", *Shares.NAMES]
-        print(heading(adapter, "Cells in updates of 3D runs") + "\n")
-        print(markdown(header, rows))
-        return
     clock = clock_of(options, adapter)
     report = Report(
         options.json,

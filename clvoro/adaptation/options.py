@@ -89,8 +89,7 @@ class MultilevelOptions:
         on, from about 2,800 cells on; "best" ends at .00014 to .0002, "fast" with a target of .001 at .004, and runs
         with one level at .0007 to .0009. The shape is as good as it gets at a mean error of about .05 on steep fields,
         of .03 on smooth ones ("fast": .06 to .07, and .04). With a larger target the mesh stays there,
-        ``settings["trade"]`` says so, and the largest error stays bounded to about .25 ("fast": .28;
-        `bench/front_ends.py` has the default and "best").
+        ``settings["trade"]`` says so, and the largest error stays bounded to about .25 ("fast": .28).
 
     Raises
     ------

@@ -107,7 +107,7 @@ class Effort:
     recouple : int
         In 3D, coupled steps after each correction of the number of cells on a coarser level.
     loose : LoosePolish, optional
-        In 2D. With the default and target 0.2 mean |e| on F3 ends at 0.0356, mean Q at 0.9984 (bench/front_ends.py).
+        In 2D. With the default and target 0.2 mean |e| on F3 ends at 0.0356, mean Q at 0.9984.
     separate : int
         Steps of separating, in 2D. Measured on eleven fields, four starts each: after one no edge is shorter than
         0.07 h, after two 0.09 h.
