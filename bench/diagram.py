@@ -4,7 +4,7 @@
                             [--scipy] [--repeat 5] [--processor-time] [--device NAME]
                             [--dtype float32] [--json]
 
-With `--dim 3` the unit cube: "uniform", "cubed", "radial" with sizes 1 : 1000 around an empty
+With `--dim 3` the unit cube: "uniform", "radial" with sizes 1 : 1000 around an empty
 ball, "core", the same with the ball filled, and "bcc", the body-centered cubic lattice, jittered
 likewise. Cells at the empty ball are cones to its center, each near hundreds of others; "core" has the
 cost of grading alone. Areas and moments are then part of "clip". A warm row bins the moved generators and clips by the
@@ -26,8 +26,7 @@ there is no binning. Rates are millions of cells per second: of clipping alone; 
 graph; and from "order" to graph, which is a diagram of points in any order: these need no further
 binning. With `--scipy`
 SciPy's Voronoi of the same points runs too (vertices and regions, no areas), up to
-`--scipy-up-to` cells; "x SciPy" compares it with the last of the rates. The table ends with the
-rates of graded sets over the uniform one and with the slope of time against count.
+`--scipy-up-to` cells; "x SciPy" compares it with the last of the rates.
 
 With `--processor-time`, seconds are the processor time of this process over the device's compute units (SciPy: over
 one): the time of an idle CPU.
@@ -43,7 +42,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import Report, best, clock_of, counts, heading, make_adapter, markdown, names, parser
+from _common import Report, best, clock_of, counts, heading, make_adapter, names, parser
 
 import clvoro
 from clvoro.opencl.engine import Engine
@@ -96,10 +95,6 @@ def uniform_3d(n: int, rng: np.random.Generator) -> np.ndarray:
     return rng.random((n, 3))
 
 
-def cubed_3d(n: int, rng: np.random.Generator) -> np.ndarray:
-    return rng.random((n, 3)) ** 3
-
-
 def radial_3d(n: int, rng: np.random.Generator) -> np.ndarray:
     """Points of density 1 / r^3 between r = R / 1000 and the corners, R = sqrt(3/4)."""
     kept: list[np.ndarray] = []
@@ -132,7 +127,7 @@ def bcc_3d(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
-SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, cubed_3d, radial_3d, core_3d, bcc_3d)}
+SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, radial_3d, core_3d, bcc_3d)}
 
 
 KERNELS = {"clip": ("walk", "wrap", "clip", "check", "list", "place"), "match": ("match",), "measure": ("measure",)}
@@ -332,32 +327,6 @@ COLUMNS = {
 }
 
 
-def comparisons(records: list[dict[str, Any]]) -> list[list[str]]:
-    """Return cost per cell over the uniform set's at the largest count, and slopes in log-log."""
-    rows = []
-    for name in dict.fromkeys(r["set"] for r in records):
-        for start in ("cold", "warm"):
-            mine = [r for r in records if r["set"] == name and r["start"] == start]
-            last = mine[-1]
-            base = next(
-                (
-                    r
-                    for r in records
-                    if r["set"] == "uniform" and r["start"] == start and abs(r["cells"] / last["cells"] - 1) < 0.05
-                ),
-                None,
-            )
-            clip = f"{base['clip_rate'] / last['clip_rate']:.2f}" if base else ""
-            graph = f"{base['graph_rate'] / last['graph_rate']:.2f}" if base else ""
-            slope = ""
-            if len(mine) > 1:
-                n = np.log([r["cells"] for r in mine])
-                seconds = np.log([r["cells"] / r["graph_rate"] for r in mine])
-                slope = f"{np.polyfit(n, seconds, 1)[0]:.3f}"
-            rows.append([name, start, f"{last['cells']:,}", clip, graph, slope])
-    return rows
-
-
 def main() -> None:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[10**4, 10**5, 10**6, 4 * 10**6])
@@ -383,16 +352,6 @@ def main() -> None:
             except clvoro.ClvoroError as error:
                 print(f"{name} {n:,}: {error}", file=sys.stderr)
     report.finish(heading(adapter, f"Diagram alone, medians of {options.repeat}"))
-    if not options.json:
-        header = [
-            "points",
-            "start",
-            "cells",
-            "clip: cost per cell / uniform's",
-            "bins to graph: the same",
-            "slope of time against cells",
-        ]
-        print(markdown(header, comparisons(report.records)))
 
 
 if __name__ == "__main__":
