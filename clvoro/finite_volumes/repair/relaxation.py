@@ -43,8 +43,7 @@ _MOST_REFUSED = 50
 _MOST_PLACES, _PLACES_SHARE = 200, 0.005
 """Faces are connected in another way if at most this many cells, or this share of all, are bad after points have moved.
 
-On coasts with more features than cells 3 to 10 % are bad. In Chesapeake Bay as given the repair of 1,272 took minutes,
-and 799 remained."""
+More are bad where the boundary has more features than the mesh has cells; their repair takes minutes, and fails."""
 _NOT_ADAPTED = 0.12
 """Nothing changes if more faces than this share are bad by the first limits: the generators were not adapted."""
 
