@@ -93,8 +93,8 @@ def channel(adapter: clvoro.Adapter, dim: int, n: int) -> dict:
     x = stages.engine.upload(box.place(points, adapter.dtype))
     tessellator = Tessellator(stages, box)
     for _ in range(2):  # the second uses the margins that the first one required
-        tessellator.tessellate(x, n, exact=True)
-    images = tessellator.extended.images  # type: ignore[union-attr]
+        t = tessellator.tessellate(x, n, exact=True)
+    images = t.folded.part
     wide = (images.box.upper - images.box.lower - 1) / 2
     one = 0
     for step in itertools.product((-1, 0, 1), repeat=dim):
@@ -130,11 +130,11 @@ def measure(
     tessellator = Tessellator(stages, box)
     times = {
         "cold": clock(adapter, repeat, lambda: tessellator.tessellate(x, n)),
-        "whole": clock(adapter, repeat, lambda: tessellator.tessellate(x, n, exact=True)),
+        "whole": clock(adapter, repeat, lambda: tessellator.tessellate(x, n, exact=True, complete=True)),
     }
-    latest, images = tessellator.extended, 0.0
-    if latest is not None:
-        images = latest.images.count / n - 1
+    folded, images = tessellator.tessellate(x, n).folded, 0.0
+    if folded is not None:
+        images = folded.part.count / n - 1
     state = [tessellator.tessellate(moves[0], n), 0]
 
     def warm() -> None:

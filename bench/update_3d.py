@@ -26,7 +26,7 @@ import clvoro
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.device_diagram import Tessellation
 from clvoro.tessellation.polyhedra_update import PolyhedraUpdate
-from clvoro.tessellation.stages import TessellationStages, tessellate_box
+from clvoro.tessellation.stages import TessellationStages
 from clvoro.tessellation.tessellator import Tessellator
 
 SEED = 7919
@@ -41,7 +41,7 @@ class Diagrams:
     def make(self, points: np.ndarray, previous: Tessellation | None = None) -> Tessellation:
         """Return the diagram of the points, and wait for it."""
         x = self.stages.engine.upload(points)
-        t = tessellate_box(self.stages, CUBE, x, len(points), previous, exact=False)
+        t = Tessellator(self.stages, CUBE).tessellate(x, len(points), previous)
         self.stages.engine.queue.finish()
         return t
 

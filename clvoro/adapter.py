@@ -239,9 +239,8 @@ class Adapter:
         with coincident_named(host, domain, self.dtype):
             tessellator = Tessellator(stages, domain)
             stages.bins.renumber(binned, n)
-            t = tessellator.tessellate(sorted_points, n, exact=True, binned=binned)
-            t, extended = tessellator.final(t)
-        return fetch_diagram(engine, domain, t, labels, extended=extended)
+            t = tessellator.final(tessellator.tessellate(sorted_points, n, exact=True, binned=binned, complete=True))
+        return fetch_diagram(engine, domain, t, labels)
 
     def power_diagram(self, domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
         """Return the power diagram of `points` with `weights` in a box or a polygon; see `clvoro.power_diagram`."""

@@ -61,10 +61,10 @@ OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[
 PARTS = {
     "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
     "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
-    "tessellation.power": {"tessellation.polyhedra", "tessellation.power_cells"},
-    "solvers.transport": {"solvers.poisson", "tessellation.power"},
+    "solvers.transport": {"solvers.poisson"},
     "tessellation.power_cells": {"tessellation.cells", "tessellation.weight_bounds"},
     "tessellation.polyhedra": {"tessellation.weight_bounds"},
+    "tessellation.periodic.ghost_images": {"tessellation.part"},
     "tessellation.incremental": {"tessellation.cells"},
     "tessellation.polyhedra_update": {"tessellation.polyhedra"},
 }

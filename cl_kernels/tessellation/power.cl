@@ -10,11 +10,3 @@ kernel void attach_weights(const int size, global const REAL *points, global con
     weighted[(DIM + 1) * i + DIM] = weights[i];
     atomic_max(most, key_of_weight(weights[i]));
 }
-
-/* Per row i: its position without the weight. */
-kernel void detach_weights(const int size, global const REAL *weighted, global REAL *points)
-{
-    WORK_ITEM(i);
-    for (int a = 0; a < DIM; ++a)
-        points[DIM * i + a] = weighted[(DIM + 1) * i + a];
-}

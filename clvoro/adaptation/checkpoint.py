@@ -143,10 +143,10 @@ class Checkpointer:
             arrays[f"vertices.{name}"] = array[: per_face * m].get()
         for name, array in mesh.stages.poisson.save(mesh.labels).items():
             arrays[f"multigrid.{name}"] = array
-        periodic = mesh.tessellator.periodic
-        if periodic is not None:
+        halo = mesh.tessellator.steps.halo
+        if halo is not None:
             # The depth of the halo: in 3D the last bits of a cell depend on it.
-            arrays["seam.needed"] = periodic.halo.required.get()
+            arrays["seam.needed"] = halo.required.get()
         for part in ("initial", "final"):
             if getattr(loop, part) is not None:
                 for field in dataclasses.fields(Displacements):
@@ -165,7 +165,7 @@ class Checkpointer:
             "methods": [state_of(method) for method in methods_of(loop.schedule)],
             "capacities": capacities_of(mesh.stages),
             "levels": loop.levels,
-            "seam_cells": 0 if periodic is None else periodic.halo.cells,
+            "seam_cells": 0 if halo is None else halo.cells,
         }
         about = {"fingerprint": self.fingerprint, "schedule": self.schedule, "state": state}
         arrays["about"] = np.array(json.dumps(about))

@@ -191,10 +191,10 @@ class Saved:
         vertices = [a[f"vertices.{name}"] for name in VERTICES if f"vertices.{name}" in a]
         mesh.tessellation = mesh.tessellator.restore(points, diagram, state["spare"], vertices)
         mesh.next_label, mesh.taken = state["next_label"], a["taken"]
-        periodic = mesh.tessellator.periodic
-        if periodic is not None:
-            periodic.halo.required.set(a["seam.needed"])
-            periodic.halo.cells = state["seam_cells"]
+        halo = mesh.tessellator.steps.halo
+        if halo is not None:
+            halo.required.set(a["seam.needed"])
+            halo.cells = state["seam_cells"]
         mesh.evaluate_metric()
         mesh.summaries.values.set(a["summaries"])
         levels = {k.removeprefix("multigrid."): v for k, v in a.items() if k.startswith("multigrid.")}

@@ -11,7 +11,7 @@ from ..arguments import check_callable
 from ..errors import InputTypeError
 from ..geometry.domain import Domain
 from ..mesh.results import Result
-from ..tessellation.periodic.periodic_tessellator import FewCellsError
+from ..tessellation.periodic.images import FewCellsError
 from .checkpoint import Checkpointer
 from .fingerprint import run_fingerprint
 from .loop import Loop

@@ -16,7 +16,6 @@ from ..opencl.device_array import buffer_of
 from ..sizing import Sizing
 from ..tessellation.bins import BinnedPoints
 from ..tessellation.device_diagram import Tessellation
-from ..tessellation.power import PowerTessellator
 from ..tessellation.readback.diagram import fetch_diagram
 from ..tessellation.tessellator import Tessellator
 from .arrays import Arrays, CellArrays, MeshArrays, Setup
@@ -49,7 +48,7 @@ class MeshState(MeshArrays):
         Summarize log(L / h) with error and quality, so that `mean_log_ratio_error` needs no transfer of its own.
     taken : (k,) int32
         Labels of those whose places fixed generators have taken; -1 for none.
-    power : PowerTessellator or None
+    power : Tessellator or None
         What made the present diagram, if it is a power diagram.
     """
 
@@ -58,7 +57,7 @@ class MeshState(MeshArrays):
     ) -> None:
         super().__init__(setup, size_factor)
         self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser)
-        self.power: PowerTessellator | None = None
+        self.power: Tessellator | None = None
         self.follows_log_ratio = False
         self.taken = np.full(setup.first_row, -1, np.int32)
         self._knows_log_ratio = False
@@ -163,7 +162,7 @@ class MeshState(MeshArrays):
         if data.cells is None:
             data.cells = CellArrays.empty(self.engine, self.n)
         previous = data.tessellation
-        if previous is not None and previous.weighted is not None:
+        if previous is not None and previous.is_power:
             previous = None
 
         def evaluate(t: Tessellation, report: cla.Array | None) -> list[int]:
@@ -377,27 +376,26 @@ class MeshState(MeshArrays):
         """
         self.stages.clear_poisson()
         self.engine.workspace.clear()
-        if self.t.weighted is not None and self.power is not None:
-            self.tessellation, self._extended = self.power.final(self.t)
-            self.evaluate_metric()
-            return self._extended is not None
-        whole = self.tessellator.has_extended(self.t)
-        if not whole:
+        tessellator, sites = self._latest_tessellator, self.t.sites
+        again = not tessellator.is_complete(self.t)
+        if again:
             # Free the present diagram before the new one is computed.
             self.tessellation = None
-            self.stages.clear_folded_cells()
-            self.tessellation = self.tessellator.extend(self.points, self.n)
-        self.tessellation, self._extended = self.tessellator.final(self.t)
+            self.tessellation = tessellator.complete(self.points, sites, self.n)
+        self.tessellation = tessellator.final(self.t)
         self.evaluate_metric()
-        return not whole
+        return again
+
+    @property
+    def _latest_tessellator(self) -> Tessellator:
+        """The tessellator that made the present diagram."""
+        return self.tessellator if self.power is None or not self.t.is_power else self.power
 
     def fetch_diagram(self) -> Diagram:
         """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards."""
-        engine = self.engine
-        if self.t.weighted is not None and self.power is not None:
-            engine = self.power.stages.engine
+        engine = self._latest_tessellator.stages.engine
         self.stages.release()
-        return fetch_diagram(engine, self.domain, self.t, self.labels, copy=False, extended=self._extended)
+        return fetch_diagram(engine, self.domain, self.t, self.labels, copy=False)
 
 
 def _take_apart(new: Outcome | None) -> tuple[dict[str, cla.Array], tuple[int, int]]:

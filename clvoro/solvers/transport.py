@@ -15,7 +15,7 @@ import pyopencl.array as cla
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..tessellation.device_diagram import NeighborRows, Tessellation
-from ..tessellation.power import PowerTessellator
+from ..tessellation.tessellator import Tessellator
 from .components import balance_components, fit_components
 from .linear_system import Solution
 from .poisson import Poisson
@@ -90,7 +90,7 @@ class Transport:
 
     def solve(
         self,
-        power: PowerTessellator,
+        power: Tessellator,
         points: cla.Array,
         prescribed: cla.Array,
         start: cla.Array | None = None,
@@ -111,7 +111,7 @@ class Transport:
             Largest |V - m| / m; by default that of `TOLERANCE`.
         max_steps : int
         exact : bool
-            As for `PowerTessellator.tessellate`.
+            As for `Tessellator.tessellate`.
         """
         engine, n = self.engine, len(prescribed)
         tolerance = TOLERANCE[engine.real.name] if tolerance is None else tolerance
@@ -134,7 +134,7 @@ class Transport:
         ordering = object()
         while now.error > tolerance and len(newton.shares) < max_steps:
             # Trial steps overwrite the diagram.
-            self._rows = power.rows(now.t)
+            self._rows = NeighborRows.copy_of(now.t)
             balance_components(power.domain, now.t, now.rhs, prescribed)
             step, newton.solution = self._newton_step(power, now, points, ordering)
             new, share = None, 2.0
@@ -158,17 +158,18 @@ class Transport:
             newton.far = int((np.abs(now.relative.get()) > tolerance).sum())
         return now.t, now.weights, newton
 
-    def _fit(self, power: PowerTessellator, prescribed: cla.Array) -> float:
+    def _fit(self, power: Tessellator, prescribed: cla.Array) -> float:
         """Scale volumes so that their sum is that of the domain; return the factor."""
         engine = self.engine
         self._summaries.collect("volume", prescribed, len(prescribed))
-        factor = power.volume / self._summaries.read_one("volume").sum
+        assert power.rings is not None
+        factor = power.rings.volume / self._summaries.read_one("volume").sum
         engine.run_each(self._kernels.scale_volumes, len(prescribed), engine.real.type(factor), prescribed)
         return factor
 
     def _evaluate(
         self,
-        power: PowerTessellator,
+        power: Tessellator,
         points: cla.Array,
         prescribed: cla.Array,
         weights: cla.Array,
@@ -177,7 +178,7 @@ class Transport:
     ) -> _State | None:
         """Return the state with these weights; None if a cell is known to be smaller than `least`."""
         engine, n = self.engine, len(prescribed)
-        t = power.tessellate(points, weights, n, exact, self._rows, least)
+        t = power.tessellate_weighted(points, weights, n, exact, self._rows, least)
         if t is None:
             return None
         rhs, square, relative = (engine.empty(n) for _ in range(3))
@@ -187,7 +188,7 @@ class Transport:
         return _State(weights, t, rhs, relative, s["square"].sum ** 0.5, s["relative"].peak, s["volume"].least)
 
     def _newton_step(
-        self, power: PowerTessellator, now: _State, points: cla.Array, ordering: object
+        self, power: Tessellator, now: _State, points: cla.Array, ordering: object
     ) -> tuple[cla.Array, Solution]:
         engine, t = self.engine, now.t
         tolerance = max(min(ROUGHEST, FORCING * now.error), FINEST[engine.real.name])

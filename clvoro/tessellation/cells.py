@@ -26,6 +26,7 @@ from .device_diagram import (
     OPEN,
     ROUGH_SHARE,
     CloseError,
+    NeighborRows,
     OpenCellError,
     Tessellation,
     restored,
@@ -58,6 +59,8 @@ class Cells:
     """Cells that one work-item measures or checks."""
     hulls_from = 1000
     """Number of generators from which CPUs use `hulls.cl`. For fewer, its build takes longer than it saves."""
+    from_previous = False
+    """Whether new cells may start from the neighbors in an earlier diagram, and updates need bins."""
     searches = True
     """Whether neighbors are searched in bins."""
 
@@ -117,7 +120,13 @@ class Cells:
             }
             self._room = most
 
-    def restore(self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int) -> Tessellation:
+    def reserve(self, n: int) -> None:
+        """Make room for `n` cells."""
+        self._reserve(n)
+
+    def restore(
+        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int, vertices: Sequence[np.ndarray] = ()
+    ) -> Tessellation:
         """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces."""
         n, m = len(points), len(saved["neighbors"])
         self._reserve(n)
@@ -133,7 +142,9 @@ class Cells:
         n: int,
         binned: BinnedPoints,
         exact: bool = True,
-        wanted: int | None = None,
+        previous: Tessellation | NeighborRows | None = None,
+        n_own: int | None = None,
+        halo_args: tuple[object, ...] = (),
     ) -> Tessellation:
         """Tessellate `box` by the first `n` of `points` (n, d), which lie in `binned`.
 
@@ -142,7 +153,9 @@ class Cells:
         exact : bool
             Reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
             otherwise more than `ROUGH_SHARE`.
-        wanted : int, optional
+        previous, halo_args : optional
+            As in 3D (`Polyhedra.tessellate`). In 2D they are not needed.
+        n_own : int, optional
             Number of cells to build, those of the first generators. Their faces with other cells are not matched.
 
         Raises
@@ -154,7 +167,7 @@ class Cells:
         ClvoroError
             If a cell has more than `LARGEST_ROW` faces, or `LARGEST_ELSEWHERE`, or a little more.
         """
-        engine, total, n = self.engine, n, n if wanted is None else wanted
+        engine, total, n = self.engine, n, n if n_own is None else n_own
         if self.row_capacity > ROW_CAPACITY and n > self._enlarged_for:
             # The capacities were enlarged for a smaller mesh: start again with the default ones.
             self._build(CELL_CAPACITY, ROW_CAPACITY)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from ..geometry.domain import Domain
     from .clipped.trim import Trimmed
+    from .periodic.ghost_images import Folded
 
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Largest share of a cell that round-off may make uncertain: in a final diagram, and in the steps of a run."""
@@ -127,17 +128,19 @@ class Tessellation:
     covariances : (n, 3) or (n, 6) real
         Second moments about the centroid per unit volume: xx, xy, yy in 2D, on a sphere along the tangents at the
         generator (geometry/site.h); xx, xy, xz, yy, yz, zz in 3D.
+    sites : (n, d) or (n, d + 1) real
+        The generators as kernels of the tessellation take them: in a power diagram each row ends with the weight.
     outlines : tuple of arrays
-        The OUTLINE_ARGS of a diagram trimmed by a boundary (tessellation/clipped/outline.h); else empty.
+        The OUTLINE_ARGS of kernels (tessellation/clipped/outline.h): empty where no boundary cuts cells.
     vertices : tuple of arrays
         In 3D, while generators move: the vertices as triples of faces, (2 m,) uint32, and the keys of the faces, (m,)
         uint32 (tessellation/polyhedra_update.cl); else empty.
-    weighted : array, optional
-        In a power diagram: the points with their weights, (n, d + 1) real.
+    folded : Folded, optional
+        How the diagram was made from that of generators and images. None after an update, and without images.
     trimmed : Trimmed, optional
-        How the boundary cut such a diagram.
+        How a boundary cut it out of convex cells. None where no boundary cuts cells.
     round_off : int
-        In 3D, what round-off may have spoiled, for `topology3d.consistency`: bits `NARROW`, faces may be no wider than
+        What round-off may have spoiled, for `topology3d.consistency`: bits `NARROW`, faces may be no wider than
         round-off, and `UNEVEN`, cells may differ about their common faces by more than a thousandth of a cell.
     """
 
@@ -152,14 +155,19 @@ class Tessellation:
     covariances: cla.Array
     outlines: tuple[cla.Array, ...] = ()
     vertices: tuple[cla.Array, ...] = ()
+    folded: Folded | None = None
     trimmed: Trimmed | None = None
     round_off: int = 0
-    weighted: cla.Array | None = None
+    sites: cla.Array = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.sites is None:
+            object.__setattr__(self, "sites", self.points)
 
     @property
-    def sites(self) -> cla.Array:
-        """The generators as kernels of the tessellation take them: with weights in a power diagram."""
-        return self.points if self.weighted is None else self.weighted
+    def is_power(self) -> bool:
+        """Whether it is a power diagram."""
+        return self.sites.shape[1] > self.points.shape[1]
 
 
 Follow: TypeAlias = Callable[[Tessellation, cla.Array | None], list[int]]
@@ -186,6 +194,12 @@ class NeighborRows:
     n: int
     starts: cla.Array
     neighbors: cla.Array
+
+    @classmethod
+    def copy_of(cls, t: Tessellation) -> NeighborRows:
+        """Return a copy of the graph of `t`, or of the convex cells that it was cut from."""
+        whole = t if t.trimmed is None else t.trimmed.convex
+        return cls(whole.n, whole.starts.copy(), whole.neighbors.copy())
 
 
 def restored(points: cla.Array, arrays: Mapping[str, cla.Array], saved: Mapping[str, np.ndarray]) -> Tessellation:

@@ -48,17 +48,27 @@ class IncrementalUpdate:
         self._last: ReferenceType[Tessellation] | None = None
 
     def update(
-        self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation, follow: Follow = read_report
+        self,
+        cells: Cells,
+        box: ClipBox,
+        points: cla.Array,
+        previous: Tessellation,
+        clip: object = None,
+        follow: Follow = read_report,
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, d), the new positions of the generators of `previous`.
 
         The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the flags. See
-        `Follow` for what is called with the diagram.
+        `Follow` for what is called with the diagram. `clip` is not used: in 2D the update finishes all cells.
 
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
         """
+        cells.reserve(previous.n)
         with self.engine.workspace.frame():
             t = self._update(cells, box, points, previous, follow)
+        if t is None:
+            # Free the work arrays of the steps, because the bins need memory.
+            self.engine.workspace.clear()
         self._last = None if t is None else ref(t)
         return t
 

@@ -53,6 +53,9 @@ class Polyhedra:
     one is complete.
     """
 
+    from_previous = True
+    """Whether new cells may start from the neighbors in an earlier diagram, and updates need bins."""
+
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
@@ -155,7 +158,7 @@ class Polyhedra:
         binned: BinnedPoints,
         previous: Tessellation | NeighborRows | None = None,
         exact: bool = True,
-        rows: int | None = None,
+        n_own: int | None = None,
         halo_args: tuple[object, ...] = (),
     ) -> Tessellation:
         """Tessellate `box` by the first `n` of `points` (n, 3), which lie in `binned`.
@@ -167,7 +170,7 @@ class Polyhedra:
         exact : bool
             Reject generators so close together that two cells differ about their common face by more than `EXACT_SHARE`
             of a cell; otherwise by more than `ROUGH_SHARE`.
-        rows : int, optional
+        n_own : int, optional
             Number of cells to build, those of the first generators. Their faces with other cells are not matched.
         halo_args : tuple, optional
             In a periodic box the HALO_ARGS of kernels, which test the balls around vertices
@@ -182,7 +185,7 @@ class Polyhedra:
         ClvoroError
             If a cell has more than `MOST_FACES` faces.
         """
-        engine, rows = self.engine, n if rows is None else rows
+        engine, rows = self.engine, n if n_own is None else n_own
         self._reserve_cells(rows)
         share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         first = engine.scratch(n, np.float32)
@@ -199,6 +202,10 @@ class Polyhedra:
                 if not flags & ~HARMLESS:
                     return matching.tessellation(flags)
         raise CloseError(points, n)
+
+    def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
+        """Return `t`: faces in 3D have full precision already."""
+        return t
 
     def _begin_anew(self, binned: BinnedPoints, first: cla.Array, n: int) -> None:
         """Restore the search radii, so that the last bits of the result do not depend on earlier attempts."""

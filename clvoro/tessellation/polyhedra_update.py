@@ -69,7 +69,7 @@ class PolyhedraUpdate:
         box: ClipBox,
         points: cla.Array,
         previous: Tessellation,
-        clip: Callable[[CutCells, cla.Array, int], None],
+        clip: Callable[[Polyhedra, CutCells, cla.Array, int], None],
         follow: Follow = read_report,
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, 3), the new positions of the generators of `previous`.
@@ -79,8 +79,8 @@ class PolyhedraUpdate:
         The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the report.
 
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
-        `clip` clips unfinished cells; it gets the report and the number of faces so far. See `Follow` for what is
-        called with the diagram.
+        `clip` clips unfinished cells; it gets `cells`, the unfinished ones, the report and the number of faces so far.
+        See `Follow` for what is called with the diagram.
         """
         n, before = previous.n, len(previous.neighbors)
         most = int(MAX_SHARE * n)
@@ -112,7 +112,7 @@ class PolyhedraUpdate:
                 if not marked:
                     rounds.list_marked(done, 0)
                     done, clipped, final = done + 1, True, True
-                    clip(rounds.cut, self._report, used)
+                    clip(cells, rounds.cut, self._report, used)
                     rounds.check()
                 continue
             self._clips = clipped

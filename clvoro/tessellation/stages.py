@@ -1,17 +1,18 @@
-"""The stages that make a diagram, and their order in a box with walls."""
+"""The stages that make a diagram."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, cached_property
-from typing import TypeVar
+from functools import cached_property
+from typing import Any, Protocol, TypeVar
 
+import numpy as np
 import pyopencl.array as cla
 
-from ..geometry.domain import Domain
+from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Gather
-from .bins import BinnedPoints, Bins
+from .bins import Bins
 from .cells import Cells
 from .clipped.trim import Trim
 from .device_diagram import Follow, Tessellation, read_report
@@ -30,12 +31,26 @@ def made_by(kind: Callable[[Engine], Stage]) -> cached_property[Stage]:
     return cached_property(lambda stages: kind(stages.engine))
 
 
+class Update(Protocol):
+    """What updates a diagram incrementally."""
+
+    def update(
+        self,
+        cells: Any,
+        box: ClipBox,
+        points: cla.Array,
+        previous: Tessellation,
+        clip: Any,
+        follow: Follow = read_report,
+    ) -> Tessellation | None:
+        """Tessellate `box` by `points`, the new positions of the generators of `previous`; None if made anew."""
+        ...
+
+
 class TessellationStages:
     """The stages of one engine that make diagrams, each compiled when first used; meshes share their buffers."""
 
     bins = made_by(Bins)
-    incremental = made_by(IncrementalUpdate)
-    polyhedra_update = made_by(PolyhedraUpdate)
     ghost_images = made_by(GhostImages)
     trim = made_by(Trim)
     gather = made_by(Gather)
@@ -51,9 +66,22 @@ class TessellationStages:
         return (PowerCells if self.engine.traits.site_values else Cells)(self.engine)
 
     @cached_property
-    def folded_cells(self) -> FoldedCells:
-        """What builds the cells of a periodic box in 2D without its images."""
+    def folded_cells(self) -> Cells | Polyhedra:
+        """What builds the cells of a periodic box without its images; in 3D `cells` does this as well."""
+        if self.engine.cell_dim == 3:
+            return self.cells
         return (FoldedPowerCells if self.engine.traits.site_values else FoldedCells)(self.engine)
+
+    @property
+    def ring_cells(self) -> PowerCells | None:
+        """What builds cells with weights from the neighbors in an earlier diagram: in 2D and float64."""
+        cells = self.folded_cells if self.engine.traits.periods else self.cells
+        return cells if isinstance(cells, PowerCells) and self.engine.real == np.float64 else None
+
+    @cached_property
+    def update(self) -> Update:
+        """What updates diagrams of such cells."""
+        return (PolyhedraUpdate if self.engine.cell_dim == 3 else IncrementalUpdate)(self.engine)
 
     @cached_property
     def weighted(self) -> TessellationStages:
@@ -64,8 +92,9 @@ class TessellationStages:
 
     def clear_folded_cells(self) -> None:
         """Free the buffers of `folded_cells`, if it exists; its kernels stay."""
-        if "folded_cells" in vars(self):
-            self.folded_cells.clear()
+        cells = vars(self).get("folded_cells")
+        if isinstance(cells, FoldedCells):
+            cells.clear()
 
     def release(self) -> None:
         """Free all stages and their buffers; a stage that is used again is created anew."""
@@ -73,45 +102,3 @@ class TessellationStages:
             delattr(self, name)
         self.engine.workspace.clear()
         self.engine.pool.release()
-
-
-def tessellate_box(
-    stages: TessellationStages,
-    domain: Domain,
-    points: cla.Array,
-    n: int,
-    previous: Tessellation | None,
-    exact: bool,
-    binned: BinnedPoints | None = None,
-    follow: Follow = read_report,
-) -> Tessellation:
-    """Tessellate the clip box of `domain`; see `Tessellator.tessellate`."""
-    cells = stages.cells
-    if isinstance(cells, Polyhedra):
-        bins = cache(lambda: stages.bins.build(domain, points, n) if binned is None else binned)
-        if previous is not None and not exact:
-            t = stages.polyhedra_update.update(
-                cells,
-                domain,
-                points,
-                previous,
-                lambda cut, report, _: cells.clip_rest(cut, report, domain, points, bins(), previous),
-                follow,
-            )
-            if t is not None:
-                return t
-        t = cells.tessellate(domain, points, n, bins(), previous, exact)
-        follow(t, None)
-        return t
-    if previous is not None and not exact:
-        t = stages.incremental.update(cells, domain, points, previous, follow)
-        if t is not None:
-            return t
-        # Free the work arrays of the steps, because the bins need memory.
-        stages.engine.workspace.clear()
-    if binned is None:
-        binned = stages.bins.build(domain, points, n)
-        stages.bins.clear_work()
-    t = cells.tessellate(domain, points, n, binned, exact)
-    follow(t, None)
-    return t

@@ -1,36 +1,51 @@
-"""From generators to the diagram of a domain: the stages and their order."""
+"""From generators to the diagram of a domain: ``extend -> bins -> build or update -> finish``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pyopencl.array as cla
 
-from ..geometry.box import Box
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
 from .bins import BinnedPoints
-from .clipped.polygonal import PolygonTessellator
-from .device_diagram import CloseError, Follow, Tessellation, read_report
-from .periodic.periodic_tessellator import ExtendedDiagram, PeriodicTessellator
-from .polyhedra import Polyhedra
-from .stages import TessellationStages, tessellate_box
+from .clipped.cut import Cut
+from .device_diagram import CloseError, Follow, NeighborRows, Tessellation, read_report
+from .part import Part
+from .periodic.images import Images
+from .power import Rings, require_power_domain
+from .stages import TessellationStages
+from .steps import DomainSteps, Sort
 
 
 class Tessellator:
-    """Tessellate one domain repeatedly.
+    """Tessellate one domain repeatedly, by generators without or with weights.
 
     Each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new one is complete.
 
     Parameters
     ----------
     spacing : callable, optional
-        For a polygon: distance of generators near points (k, 2) of its boundary, (k,); places the ghost generators.
+        Where a boundary cuts cells: distance of generators near points (k, 2) of it, (k,); places ghost generators.
     coarser : Tessellator, optional
         The tessellator of a coarser level of the same domain. Its halo is the first guess in a periodic box.
+    weighted : bool
+        Make power diagrams.
+
+    Attributes
+    ----------
+    steps : DomainSteps
+        What the domain adds to the steps.
+    rings : Rings or None
+        For power diagrams.
+
+    Raises
+    ------
+    InputError
+        If there are no power diagrams in such a domain.
     """
 
     def __init__(
@@ -39,66 +54,20 @@ class Tessellator:
         domain: Domain,
         spacing: Callable[[np.ndarray], np.ndarray] | None = None,
         coarser: Tessellator | None = None,
+        weighted: bool = False,
     ) -> None:
-        self.stages, self.domain = stages, domain
-        self.periodic: PeriodicTessellator | None = None
-        if isinstance(domain, Box) and any(domain.periodic):
-            known = None if coarser is None or coarser.periodic is None else coarser.periodic.halo
-            self.periodic = PeriodicTessellator(stages, domain, known)
-        self._polygon = PolygonTessellator(stages, domain, spacing) if isinstance(domain, Polygon) else None
-
-    @property
-    def extended(self) -> ExtendedDiagram | None:
-        """The extended diagram that the latest one was folded from, in a periodic box."""
-        return None if self.periodic is None else self.periodic.latest
-
-    def has_extended(self, t: Tessellation) -> bool:
-        """Return whether the complete extended diagram of `t`, the latest diagram, is known."""
-        latest = self.extended
-        return self.periodic is None or (latest is not None and latest.folded.tessellation is t)
-
-    def extend(self, points: cla.Array, n: int) -> Tessellation:
-        """Tessellate a periodic box from scratch, with a complete extended diagram."""
-        assert self.periodic is not None
-        with self._in_units():
-            return self.periodic.tessellate(points, n, keep_extended=True)
-
-    def final(self, t: Tessellation) -> tuple[Tessellation, ExtendedDiagram | None]:
-        """Return `t`, the latest diagram, with faces in full precision, and its extended diagram in a periodic box.
-
-        The extended diagram of `t` must be known (`has_extended`).
-        """
-        if self.periodic is not None:
-            return self.periodic.measure_faces(), self.extended
-        if self._polygon is None and not isinstance(self.stages.cells, Polyhedra):
-            t = self.stages.cells.measure_faces(self.domain, t)
-        return t, None
-
-    def restore(
-        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int, vertices: Sequence[np.ndarray] = ()
-    ) -> Tessellation:
-        """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces.
-
-        It uses the arrays of the stage that makes the next diagram, to save memory. `vertices` are those of
-        the diagram, if it had any.
-        """
-        stages = self.stages
-        if self._polygon is not None:
-            # The convex diagram is not saved. A new diagram has the same bits.
-            t = self.tessellate(points, len(points))
-            stages.bins.clear()
-            return t
-        if self.periodic is not None and stages.engine.dim == 2:
-            return stages.folded_cells.restore(points, saved, spare)
-        t = (
-            stages.cells.restore(points, saved, spare, vertices)
-            if isinstance(stages.cells, Polyhedra)
-            else stages.cells.restore(points, saved, spare)
-        )
-        if self.periodic is not None:
-            # The next diagram may take several attempts that all start from this graph.
-            t = replace(t, starts=t.starts.copy(), neighbors=t.neighbors.copy())
-        return t
+        if weighted:
+            require_power_domain(domain)
+        self.domain, self.weighted = domain, weighted
+        self.stages = stages.weighted if weighted else stages
+        if any(domain.periodic):
+            halo = None if coarser is None else coarser.steps.halo
+            self.steps: DomainSteps = Images(self.stages, domain, halo)
+        elif domain.outline is not None:
+            self.steps = Cut(self.stages, domain.outline, spacing)
+        else:
+            self.steps = DomainSteps(self.stages, domain)
+        self.rings = Rings(self.stages, domain) if weighted else None
 
     def tessellate(
         self,
@@ -108,6 +77,7 @@ class Tessellator:
         exact: bool = False,
         binned: BinnedPoints | None = None,
         follow: Follow = read_report,
+        complete: bool = False,
     ) -> Tessellation:
         """Tessellate by the first `n` of `points` (n, d), in normalized coordinates.
 
@@ -121,26 +91,170 @@ class Tessellator:
             The generators in bins, if they are known.
         follow : callable, optional
             See `Follow`.
+        complete : bool
+            Make all that `final` needs: in a periodic box the cells of images as well.
 
         Raises
         ------
         InputError
             If generators are too close to each other to be distinguished.
         """
-        with self._in_units():
-            if self.periodic is not None:
-                t = self.periodic.tessellate(points, n, previous, exact, not exact, keep_extended=exact)
-            elif self._polygon is not None:
-                t = self._polygon.tessellate(points, n, previous, exact, binned)
-            else:
-                return tessellate_box(self.stages, self.domain, points, n, previous, exact, binned, follow)
+
+        @cache
+        def sort() -> BinnedPoints:
+            return self._sorted(Part(n, n, points, self.domain)) if binned is None else binned
+
+        with self._in_units(points, n):
+            if previous is not None and not exact:
+                t = self.steps.update(points, n, previous, sort, follow)
+                if t is not None:
+                    return t
+            t = self._build(points, points, n, sort, previous, exact, complete)
         follow(t, None)
         return t
 
+    def tessellate_weighted(
+        self,
+        points: cla.Array,
+        weights: cla.Array,
+        n: int,
+        exact: bool = False,
+        previous: NeighborRows | None = None,
+        least: float = 0.0,
+        complete: bool = False,
+    ) -> Tessellation | None:
+        """Return the power diagram of `points` (n, d) with `weights` (n,), in normalized coordinates.
+
+        Parameters
+        ----------
+        previous : NeighborRows, optional
+            The graph of a diagram of similar weights, without empty cells: in 2D and float64 cells start from its
+            neighbors. Far from its generator a cell is found much sooner than by a search around the generator.
+        least : float
+            With `previous`: None is returned as soon as a cell is known to be smaller.
+        exact, complete : bool
+            As for `tessellate`.
+
+        Raises
+        ------
+        InputError
+            If generators are too close to each other to be distinguished.
+        """
+        assert self.rings is not None
+        with self._in_units(points, n):
+            sites = self.rings.attach(points, weights, n, self.steps.most)
+            if previous is not None:
+                t, too_small = self.rings.search(self.steps.box, sites, previous, exact, least)
+                if too_small:
+                    return None
+                t = None if t is None else self.steps.finish_updated(t, points, n)
+                if t is not None:
+                    return replace(t, points=points, sites=sites)
+            return self.build(points, sites, n, exact, complete)
+
+    def build(
+        self, points: cla.Array, sites: cla.Array, n: int, exact: bool = False, complete: bool = False
+    ) -> Tessellation:
+        """Tessellate from nothing by the first `n` of `sites`: `points`, with their weights in a power diagram."""
+        with self._in_units(points, n):
+            whole = Part(n, n, sites, self.domain)
+            return self._build(points, sites, n, cache(lambda: self._sorted(whole)), None, exact, complete)
+
+    def _build(
+        self,
+        points: cla.Array,
+        sites: cla.Array,
+        n: int,
+        sort: Sort,
+        previous: Tessellation | None,
+        exact: bool,
+        complete: bool,
+    ) -> Tessellation:
+        steps, cells = self.steps, self.stages.cells
+        rows = None if previous is None or not cells.from_previous else steps.rows(previous)
+        nearest = not (exact or self.weighted)
+        steps.begin(n)
+        while True:
+            part = steps.extend(sites, n)
+            binned = sort() if part.points is sites else self._sorted(part)
+            try:
+                t = cells.tessellate(
+                    part.box,
+                    part.points,
+                    part.count,
+                    binned,
+                    exact=exact,
+                    previous=None if rows is None else steps.unfold(part, rows),
+                    # Ghosts without values need cells, since something cuts these.
+                    n_own=n if part.home is not None and not complete else part.count,
+                    halo_args=part.halo_args,
+                )
+            except CloseError:
+                if not steps.drop_ghosts():
+                    raise
+                continue
+            found = steps.finish(part, binned, t, points, exact, nearest)
+            if found is not None:
+                return replace(found, points=points, sites=sites)
+            # Memory for the new diagram.
+            del part, binned, t
+
+    def _sorted(self, part: Part) -> BinnedPoints:
+        bins = self.stages.bins
+        binned = bins.build(part.box, part.points, part.count)
+        if not self.stages.cells.from_previous:
+            bins.clear_work()
+        return binned
+
+    def is_complete(self, t: Tessellation) -> bool:
+        """Return whether `final` can take `t`, the latest diagram, as it is."""
+        return self.steps.is_complete(t)
+
+    def complete(self, points: cla.Array, sites: cla.Array, n: int) -> Tessellation:
+        """Return the diagram of the first `n` of `points`, with weights in `sites`, made anew for `final`."""
+        self.stages.clear_folded_cells()
+        return self.build(points, sites, n, exact=self.weighted, complete=True)
+
+    def final(self, t: Tessellation) -> Tessellation:
+        """Return `t`, the latest diagram, with faces in full precision and all that its vertices need."""
+        if not self.is_complete(t):
+            t = self.complete(t.points, t.sites, t.n)
+        stages, folded = self.stages, t.folded
+        if t.face_measures.dtype == stages.engine.real:
+            return t
+        if folded is None or folded.whole is None:
+            return stages.cells.measure_faces(self.domain, t)
+        whole = stages.cells.measure_faces(folded.part.box, folded.whole)
+        faces = whole.face_measures, whole.face_centroids
+        if folded.places is not None:
+            faces = tuple(stages.gather.rows(folded.places, array) for array in faces)
+        return replace(t, face_measures=faces[0], face_centroids=faces[1])
+
+    def laplacian_measures(self, t: Tessellation) -> cla.Array:
+        """Return the face measures of `t` for a Poisson matrix (see `GhostImages.scale_far_measures`)."""
+        return t.face_measures if t.folded is None else self.stages.ghost_images.scale_far_measures(t, t.folded.codes)
+
+    def restore(
+        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int, vertices: Sequence[np.ndarray] = ()
+    ) -> Tessellation:
+        """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces.
+
+        It uses the arrays of the stage that makes the next diagram, to save memory. `vertices` are those of
+        the diagram, if it had any.
+        """
+        if self.domain.cuts_cells:
+            # The convex diagram is not saved. A new diagram has the same bits.
+            t = self.tessellate(points, len(points))
+            self.stages.bins.clear()
+            return t
+        cells = self.stages.cells if self.steps.halo is None else self.stages.folded_cells
+        return cells.restore(points, saved, spare, vertices)
+
     @contextmanager
-    def _in_units(self) -> Iterator[None]:
+    def _in_units(self, points: cla.Array, n: int) -> Iterator[None]:
         """Give errors about close generators the positions in the domain."""
         try:
             yield
         except CloseError as error:
-            raise error.within(self.domain) from None
+            given = CloseError(points, n) if self.weighted else error
+            raise given.within(self.domain) from None

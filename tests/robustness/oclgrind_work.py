@@ -130,7 +130,7 @@ def repaired(adapter: clvoro.Adapter) -> None:
     for seed in range(2):
         where = np.clip(where + 0.008 * (points(n, seed=seed) - 0.5), 0, 1)
         x = stages.engine.upload(where)
-        again = stages.incremental.update(stages.cells, square, x, t)
+        again = stages.update.update(stages.cells, square, x, t)
         assert again is not None
         t = again
         assert abs(t.volumes.get().sum() - 1) < 1e-4
@@ -138,16 +138,17 @@ def repaired(adapter: clvoro.Adapter) -> None:
 
 def drop_faces(adapter: clvoro.Adapter) -> None:
     """Close rows that have lost faces, which round-off hardly ever causes."""
-    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
-
     for dim in (2, 3):
         which, n = (True, *(dim == 2,) * (dim - 1)), 30 if dim == 2 else 12
         box = clvoro.Box((0,) * dim, (1,) * dim, periodic=which)
         stages = adapter._stages_for(box)
         engine = stages.engine
-        periodic = PeriodicTessellator(stages, box)
         x = engine.upload(box.place(points(n, dim), adapter.dtype))
-        t = periodic.tessellate(x, n, nearest=False, keep_extended=True)
+        t = Tessellator(stages, box).tessellate(x, n, exact=True, complete=True)
+        home = t.folded.part.home
+        values = engine.upload(np.append(np.arange(n), np.zeros(t.folded.part.count - n)), np.int32)
+        t.folded.part.forward(engine, values)
+        assert (values.get()[n:] == home.rows.get()[: len(values) - n]).all()
         m = int(t.starts.get()[-1])
         kept = np.ones(m, np.uint8)
         kept[::7] = 0
@@ -161,7 +162,7 @@ def drop_faces(adapter: clvoro.Adapter) -> None:
             engine.upload(kept, np.uint8),
             engine.upload(starts, np.int32),
             t.neighbors,
-            periodic.latest.folded.codes,
+            t.folded.codes,
             t.face_measures,
             t.face_centroids,
             ints[0],
@@ -305,12 +306,10 @@ def periodic(adapter: clvoro.Adapter) -> None:
 
 def move_some_far(adapter: clvoro.Adapter) -> None:
     """Move generators a little and some far, in a periodic box in 3D: some cells are clipped anew."""
-    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
-
     box, n = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(True, True, False)), 216
     x = lattice(6, 3) + 0.03 * (points(n, 3) - 0.5)
     stages = adapter._stages_for(box)
-    periodic = PeriodicTessellator(stages, box)
+    periodic = Tessellator(stages, box)
     t = periodic.tessellate(stages.engine.upload(box.place(x, adapter.dtype)), n)
     x = x + 0.002 * (points(n, 3, seed=1) - 0.5)
     x[::31] = (x[::31] + 0.25) % 1

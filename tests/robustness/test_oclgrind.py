@@ -73,6 +73,7 @@ ALIKE = {
     "copy",
     "gradation",
     "multigrid",
+    "part",
     "primitives",
     "transfer",
     "bins.count_in_child_bins",
@@ -135,16 +136,15 @@ ONLY_FOR = {
 """Files that power diagrams need."""
 NOT_WEIGHTED = {
     # Generators are not sorted, polygons have precise faces, and every part of a cell belongs to it.
-    "weighted plane": {"bins.number_items", "power.detach_weights"},
+    "weighted plane": {"bins.number_items"},
     "weighted polygon": {
         "bins.number_items",
-        "power.detach_weights",
         "cells.measure_faces",
         "trim.adopt_pieces",
         "trim.settle_pieces",
         "trim.list_orphans",
     },
-    "weighted space": {"bins.number_items", "power.detach_weights"},
+    "weighted space": {"bins.number_items"},
 }
 """Kernels of these files that they do not need."""
 PATIENCE = 20

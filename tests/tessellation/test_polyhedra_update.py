@@ -82,7 +82,7 @@ class Carried:
         return self.bins.build(BOX, x, self.n)
 
     def clip_of(self, x):
-        return lambda cut, report, _: self.cells.clip_rest(cut, report, BOX, x, self.binned(x), self.t)
+        return lambda cells, cut, report, _: cells.clip_rest(cut, report, BOX, x, self.binned(x), self.t)
 
     def move(self, points):
         """Update the diagram to `points`; return whether that succeeded."""

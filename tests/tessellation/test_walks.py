@@ -143,7 +143,7 @@ def tessellations(engine, points, rows=None):
         cells, binned = Polyhedra(engine), Bins(engine).build(CUBE, x, n)
         if not walk:
             cells._wrap = None
-        t = cells.tessellate(CUBE, x, n, binned, exact=False, rows=rows)
+        t = cells.tessellate(CUBE, x, n, binned, exact=False, n_own=rows)
         radii = np.zeros(n)
         radii[binned.items.get()[:n]] = binned.reach.get()[:n]
         found.append((Rows(t), radii[: t.n]))

@@ -13,8 +13,8 @@ from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
 from ...mesh.transported import Transported
 from ...solvers.transport import TOLERANCE
-from ...tessellation.power import PowerTessellator
 from ...tessellation.readback.diagram import fetch_diagram
+from ...tessellation.tessellator import Tessellator
 from ..estimates import check_memory
 from ..stages import Stages
 
@@ -28,7 +28,7 @@ weights are raised to this multiple of it, so that nothing overflows."""
 
 def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: object) -> Diagram:
     """Return the power diagram of `points` with `weights`; see `clvoro.power_diagram`."""
-    power = PowerTessellator(stages, domain)
+    power = Tessellator(stages, domain, weighted=True)
     host = check_points(points, domain)
     n, given = len(host), _check_numbers("weights", weights, len(host))
     if not np.isfinite(float(given.max()) - float(given.min())):
@@ -42,10 +42,10 @@ def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: ob
     with coincident_named(host, domain, stages.engine.real):
         labels, sorted_points = _sorted(stages, domain, host)
         device_weights = stages.engine.upload(scaled[labels.get()])
-        t = power.tessellate(sorted_points, device_weights, n, exact=True, complete=True)
+        t = power.tessellate_weighted(sorted_points, device_weights, n, exact=True, complete=True)
         assert t is not None
-        t, extended = power.final(t)
-    diagram = fetch_diagram(power.stages.engine, domain, t, labels, extended=extended)
+        t = power.final(t)
+    diagram = fetch_diagram(power.stages.engine, domain, t, labels)
     diagram = diagram.with_weights(given)
     empty = diagram.empty_cells
     if len(empty):
@@ -62,7 +62,7 @@ def transport_to(
 ) -> Transported:
     """Return the power diagram of `points` whose cells have `volumes`; see `clvoro.transport`."""
     engine = stages.engine
-    power = PowerTessellator(stages, domain)
+    power = Tessellator(stages, domain, weighted=True)
     host = check_points(points, domain)
     n, given = len(host), _check_numbers("volumes", volumes, len(host))
     most = check_integer("max_steps", max_steps, 0, 10**6)
@@ -80,8 +80,8 @@ def transport_to(
         t, _, newton = stages.transport.solve(
             power, sorted_points, engine.upload(prescribed), None, tolerance, most, exact=True
         )
-        t, extended = power.final(t)
-    diagram = fetch_diagram(power.stages.engine, domain, t, labels, extended=extended)
+        t = power.final(t)
+    diagram = fetch_diagram(power.stages.engine, domain, t, labels)
     result = Transported(diagram, np.array(newton.errors), np.array(newton.shares), newton.converged)
     if not newton.converged:
         warn(

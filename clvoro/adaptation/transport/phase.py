@@ -10,7 +10,7 @@ from __future__ import annotations
 import pyopencl.array as cla
 
 from ...solvers.conjugate_gradient import Solution
-from ...tessellation.power import PowerTessellator
+from ...tessellation.tessellator import Tessellator
 from ..state import MeshState
 
 
@@ -19,7 +19,7 @@ class PowerPhase:
 
     def __init__(self, mesh: MeshState) -> None:
         self.mesh = mesh
-        mesh.power = PowerTessellator(mesh.stages, mesh.domain)
+        mesh.power = Tessellator(mesh.stages, mesh.domain, weighted=True)
         self._weights: cla.Array | None = None
 
     def prescribe(self) -> Solution:

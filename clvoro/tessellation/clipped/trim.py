@@ -99,7 +99,7 @@ class Trim:
             *chords.arrays,
         )
         self._flags.fill(0)
-        if convex.weighted is not None:
+        if engine.traits.site_values:
             engine.run_each(
                 k.find_outside,
                 n,
@@ -257,5 +257,4 @@ class Trim:
             covariances=convex.covariances[:n],
             outlines=(outlines, chords.tangents),
             trimmed=Trimmed(convex, chords, segments, face_segments, found.segment_count),
-            weighted=convex.weighted,
         )

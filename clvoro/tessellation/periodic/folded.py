@@ -24,10 +24,6 @@ class FoldedCells(Cells):
         """The capacities and the periods: defines of all kernels that read the rows."""
         return {**super().defines, **self._folds}
 
-    def reserve(self, n: int) -> None:
-        """Make room for `n` cells."""
-        self._reserve(n)
-
     def clear(self) -> None:
         """Free all buffers of cells and faces."""
         self._of_cells, self._of_faces, self._views = {}, {}, {}

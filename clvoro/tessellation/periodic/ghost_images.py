@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
-from ...geometry.box import Box
+from ...geometry.domain import Domain
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
 from ..bins import BinnedPoints
 from ..cut_cells import CutCells
 from ..device_diagram import NeighborRows, Tessellation
+from ..part import Home, Part
 from .halo import Halo, block_count, block_counts, halo_defines
 
 DROPPED, FAR, COLLAPSED = 1, 2, 4
@@ -48,57 +49,27 @@ class ExtendedBox:
 
 
 @dataclass(frozen=True)
-class ExtendedPoints:
-    """Generators of a periodic box and their ghost images, on the device.
+class Folded:
+    """How a diagram was folded: the rows of the generators of a part, with images replaced by their owners.
+
+    The neighbor across a face is a generator or an image of it.
 
     Attributes
     ----------
-    n, count : int
-        Number of generators; number of generators and images.
-    box : ExtendedBox
-    halo : Halo
-    kept : float32
-        Least share of its depth that the halo keeps.
-    halo_args : tuple
-        HALO_ARGS of kernels that test the balls around vertices (tessellation/periodic/halo.h).
-    points : (>= count, d) real
-        Generators first, then images, ordered by owner and code.
-    firsts : (n + 1,) int32
-        The images of generator i begin at ``firsts[i]``.
-    owners, codes : (>= count - n,) int32
-        Generator of each image, and its code: the sum over the axes a of (c + 1) 3^a, where the image is shifted by c
-        periods, c = -1, 0 or 1.
-    """
-
-    n: int
-    count: int
-    box: ExtendedBox
-    halo: Halo
-    kept: np.float32
-    halo_args: tuple[object, ...]
-    points: cla.Array
-    firsts: cla.Array
-    owners: cla.Array
-    codes: cla.Array
-
-
-@dataclass(frozen=True)
-class FoldedDiagram:
-    """The rows of the generators in an extended diagram, with images replaced by their owners.
-
-    Attributes
-    ----------
-    tessellation : Tessellation
-        Of the n generators. The neighbor across a face is a generator or an image of it.
+    part : Part
+        Generators and images.
     codes : (>= m,) int32
-        Code of the image across each face, as in `ExtendedPoints`.
+        Code of the image across each face, as in `Home`.
     places : (m,) int32 or None
-        Index of each face in the extended diagram; None if it is the same.
+        Index of each face in the diagram of the part; None if it is the same.
+    whole : Tessellation or None
+        The diagram of the part, if it has the cells of images as well.
     """
 
-    tessellation: Tessellation
+    part: Part
     codes: cla.Array
     places: cla.Array | None
+    whole: Tessellation | None
 
 
 class GhostImages:
@@ -112,7 +83,7 @@ class GhostImages:
         self._report = engine.empty(3, np.int32)
         self._turn = 0
 
-    def extend(self, domain: Box, points: cla.Array, n: int, halo: Halo, factor: float, grow: bool) -> ExtendedPoints:
+    def extend(self, domain: Domain, points: cla.Array, n: int, halo: Halo, factor: float, grow: bool) -> Part:
         """Return the first `n` of `points` (n, d) with their images in the halo.
 
         In a power diagram rows of `points` end with weights.
@@ -132,7 +103,7 @@ class GhostImages:
         lengths = np.maximum((corners[1] - corners[0]) / counts, 1e-30).astype(engine.real)
         blocks = corners[0], lengths, counts
         others = abs(factor - 1) > OTHER_CELLS or bool((was != counts).any())
-        kept = np.float32((KEPT_ESTIMATE if others or halo.estimated else KEPT)[d])
+        halo.kept = np.float32((KEPT_ESTIMATE if others or halo.estimated else KEPT)[d])
         halo.extremes.fill(0)
         engine.run_each(
             k.predict_halo_depths,
@@ -181,20 +152,20 @@ class GhostImages:
             *blocks,
             engine.real.type(SIDEWAYS),
             engine.real.type(OUTWARDS),
-            kept,
+            halo.kept,
             halo.depths,
             halo.extremes,
             halo.requests,
             self._report,
             halo.most,
         )
-        return ExtendedPoints(n, count, box, halo, kept, halo_args, extended, firsts, owners, codes)
+        return Part(n, count, extended, box, Home(owners, codes=codes, firsts=firsts), halo_args)
 
     def scale_far_measures(self, t: Tessellation, codes: cla.Array) -> cla.Array:
         """Return the face measures of the folded diagram `t`, scaled for a Poisson matrix.
 
         The matrix divides them by the distance to the nearest image of the neighbor; the face may be that of another
-        image. `codes` are those of its faces (see `FoldedDiagram`). The array is in the workspace.
+        image. `codes` are those of its faces (see `Folded`). The array is in the workspace.
         """
         engine, scaled = self.engine, self.engine.scratch(len(t.neighbors), self.engine.face)
         engine.run_each(
@@ -210,34 +181,35 @@ class GhostImages:
         )
         return scaled
 
-    def unfold(self, images: ExtendedPoints, previous: Tessellation | NeighborRows) -> NeighborRows:
+    def unfold(self, part: Part, previous: Tessellation | NeighborRows) -> NeighborRows:
         """Return rows of the extended graph from `previous`, the diagram of the generators at earlier positions."""
-        m = int(previous.starts[images.n].get())
+        n, home = part.n_own, _home(part)
+        m = int(previous.starts[n].get())
         neighbors = self._room("unfolded", size=m, dtype=np.int32)
         self.engine.run_each(
             self._kernels.unfold_rows,
-            images.n,
+            n,
             previous.starts,
             previous.neighbors,
-            images.points,
-            images.firsts,
-            images.codes,
+            part.points,
+            home.firsts,
+            home.codes,
             neighbors,
             *self.engine.period_args,
         )
-        return NeighborRows(images.n, previous.starts, neighbors)
+        return NeighborRows(n, previous.starts, neighbors)
 
-    def fold_clipped(self, images: ExtendedPoints, cut: CutCells, report: cla.Array, used: int) -> None:
+    def fold_clipped(self, part: Part, cut: CutCells, report: cla.Array, used: int) -> None:
         """Replace images by their owners in cells that were clipped in an update, in 3D: those behind `used` faces."""
         self.engine.run_each(
             self._kernels.fold_clipped_cells,
-            images.n,
+            part.n_own,
             np.int32(used),
             np.int32(cut.m),
             cut.places,
             cut.counts,
-            images.points,
-            images.owners,
+            part.points,
+            _home(part).rows,
             self._report,
             cut.labels,
             report,
@@ -246,14 +218,15 @@ class GhostImages:
 
     def fold(
         self,
-        images: ExtendedPoints,
+        part: Part,
+        halo: Halo,
         binned: BinnedPoints,
         t: Tessellation,
         points: cla.Array,
         share: float,
         nearest: bool,
-    ) -> tuple[FoldedDiagram, bool, int, int]:
-        """Fold `t`, the diagram of `images`.
+    ) -> tuple[Tessellation, bool, int, int]:
+        """Fold `t`, the diagram of `part`, whose ghosts are images in `halo`.
 
         Parameters
         ----------
@@ -268,32 +241,31 @@ class GhostImages:
 
         Returns
         -------
-        folded : FoldedDiagram
+        folded : Tessellation
         enough : bool
             Whether the halo was deep enough for all cells. If not, the diagram is wrong, and the halo's required
             depths are up to date.
         flags, generator : int
             `FAR`, `COLLAPSED` or both, and the first generator with such a face.
         """
-        engine, k, n = self.engine, self._kernels, images.n
-        halo = images.halo
+        engine, k, n, home = self.engine, self._kernels, part.n_own, _home(part)
         if engine.dim == 2:  # in 3D the kernels that clip cells do this
             engine.run_each(
                 k.measure_required_depths,
-                images.count,
+                part.count,
                 binned.items,
                 binned.reach,
-                images.points,
+                part.points,
                 t.starts,
                 t.neighbors,
-                *images.box.device_corners(engine.real),
-                *images.halo_args,
+                *part.box.device_corners(engine.real),
+                *part.halo_args,
             )
         engine.run_each(
             k.store_required_depths,
             block_count(engine.dim),
             halo.depths,
-            images.kept,
+            halo.kept,
             halo.requests,
             halo.required,
             *engine.period_args,
@@ -312,9 +284,9 @@ class GhostImages:
             t.face_measures,
             t.volumes,
             t.points,
-            images.firsts,
-            images.owners,
-            images.codes,
+            home.firsts,
+            home.rows,
+            home.codes,
             engine.real.type(share),
             np.int32(nearest),
             *graph,
@@ -340,10 +312,24 @@ class GhostImages:
             engine.run_each(k.close_rows, n, t.starts, kept, starts, *graph, *measures, *closed, places)
             graph, measures, vertices = list(closed[:2]), closed[2:], ()
         folded = Tessellation(
-            n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n], vertices=vertices
+            n,
+            points,
+            starts,
+            graph[0],
+            *measures,
+            t.volumes[:n],
+            t.offsets[:n],
+            t.covariances[:n],
+            vertices=vertices,
+            folded=Folded(part, graph[1], places, t if t.n == part.count else None),
         )
         enough = not words[0]
         if not enough:
             # The next attempt writes to the same buffers, since it starts from the previous graph as well.
             self._turn = 1 - self._turn
-        return FoldedDiagram(folded, graph[1], places), enough, flags & ~DROPPED, int(words[2])
+        return folded, enough, flags & ~DROPPED, int(words[2])
+
+
+def _home(part: Part) -> Home:
+    assert part.home is not None
+    return part.home

@@ -57,6 +57,8 @@ class Halo:
         Depths that the cells of a diagram require, while it is made: bits of floats.
     extremes : (10,) int32, device
         Largest and least of `depths`; see tessellation/periodic/halo.h.
+    kept : float32
+        Least share of its depth that the halo keeps.
     most : (1,) int32, device
         Key of the largest weight, in a power diagram; see geometry/weights.h.
     """
@@ -64,7 +66,7 @@ class Halo:
     def __init__(self, engine: Engine) -> None:
         count = block_count(engine.dim)
         self.required = engine.zeros(count, np.float32)
-        self.cells, self.estimated = 0, False
+        self.cells, self.estimated, self.kept = 0, False, np.float32(0)
         self.depths = engine.zeros(count, np.float32)
         self.requests = engine.zeros(count, np.int32)
         self.extremes = engine.empty(10, np.int32)

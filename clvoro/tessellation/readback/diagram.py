@@ -13,7 +13,6 @@ from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ...opencl.primitives import Gather, Lists
 from ..device_diagram import UNEVEN, CloseError, Tessellation
-from ..periodic.periodic_tessellator import ExtendedDiagram
 from ..topology3d.consistency import SharedFaces, share_faces
 from ..vertices import VertexNumbering, Vertices
 from .cut_faces import CutFaces, chain_faces, join_loops
@@ -24,29 +23,20 @@ LEFT_OUT = 1e-5
 """Largest share of a cell behind faces below round-off that may be left out without a check of the diagram."""
 
 
-def fetch_diagram(
-    engine: Engine,
-    domain: Domain,
-    t: Tessellation,
-    labels: cla.Array,
-    copy: bool = True,
-    extended: ExtendedDiagram | None = None,
-) -> Diagram:
+def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool = True) -> Diagram:
     """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are read when first used.
 
     Parameters
     ----------
     copy : bool
         Copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
-    extended : ExtendedDiagram, optional
-        In a periodic box, the diagram that `t` was folded from.
 
     Raises
     ------
     InputError
         If round-off has made cells wrong.
     """
-    reader = _DiagramReader(engine, domain, t, labels, copy, extended)
+    reader = _DiagramReader(engine, domain, t, labels, copy)
     if reader.whole.round_off & UNEVEN:
         assert reader.faces
     return reader.diagram()
@@ -82,9 +72,11 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
     def kept(array: cla.Array) -> cla.Array:
         return array.copy() if copy else array
 
+    points = kept(t.points[: t.n])
     return Tessellation(
         n=t.n,
-        points=kept(t.points[: t.n]),
+        points=points,
+        sites=kept(t.sites[: t.n]) if t.is_power else points,
         starts=kept(t.starts),
         neighbors=kept(t.neighbors[:m]),
         face_measures=kept(t.face_measures[:m]),
@@ -93,7 +85,6 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
         offsets=kept(t.offsets),
         covariances=t.covariances,
         round_off=t.round_off,
-        weighted=None if t.weighted is None else kept(t.weighted[: t.n]),
     )
 
 
@@ -145,15 +136,7 @@ class _DiagramReader:
     cut : CutFaces, or None
     """
 
-    def __init__(
-        self,
-        engine: Engine,
-        domain: Domain,
-        t: Tessellation,
-        labels: cla.Array,
-        copy: bool,
-        extended: ExtendedDiagram | None,
-    ) -> None:
+    def __init__(self, engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool) -> None:
         self.engine, self.domain, self.n = engine, domain, t.n
         self.origin, self.scale = domain.frame
         self.labels = labels.get()[: t.n]
@@ -164,10 +147,10 @@ class _DiagramReader:
         self.codes: np.ndarray | None = None
         self.cut: CutFaces | None = None
         whole = None
-        if extended is not None:
-            whole, places = extended.tessellation, extended.folded.places
-            self.box = extended.images.box
-            self.codes = extended.folded.codes[: self.m].get()
+        if t.folded is not None:
+            whole, places = t.folded.whole, t.folded.places
+            self.box = t.folded.part.box
+            self.codes = t.folded.codes[: self.m].get()
             self.places = None if places is None else places.get()
         elif t.trimmed is not None:
             whole = t.trimmed.convex
@@ -180,7 +163,7 @@ class _DiagramReader:
         missing = ["cell_vert"] if self.engine.cell_dim == 3 else ["face_vert"] if self.cut is None else []
         if self.codes is None:
             missing.append("shifts")
-        if self.t.weighted is None:
+        if not self.t.is_power:
             missing.append("weights")
         names = [name for name in Diagram._NAMES if not name.startswith(tuple(missing))]
         return Diagram(self.domain, {name: (lambda name=name: getattr(self, name)()) for name in names})
@@ -297,7 +280,7 @@ class _DiagramReader:
         """Return, for each cell of `whole`, the volume of the cones over faces that are not `kept`."""
         t, faces = self.whole, self._in_whole(np.flatnonzero(~kept))
         cell = np.searchsorted(t.starts.get(), faces, side="right") - 1
-        other, points = t.neighbors.get()[faces], t.points.get().astype(float)
+        other, points = t.neighbors.get()[faces], t.points.get()[:, : self.engine.dim].astype(float)
         inner = other >= 0  # faces on walls are never below round-off
         way = np.linalg.norm(points[other] - points[cell], axis=1) * inner
         return np.bincount(cell, t.face_measures.get()[faces] * way / 6, t.n)
@@ -398,8 +381,7 @@ class _DiagramReader:
         return x
 
     def weights(self) -> np.ndarray:
-        assert self.t.weighted is not None
-        rows = self.t.weighted.get()[self.order, self.engine.dim]
+        rows = self.t.sites.get()[self.order, self.engine.dim]
         return rows.astype(np.float64) * self.scale**2
 
     def volumes(self) -> np.ndarray:

@@ -7,7 +7,6 @@ import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.tessellation.clipped.boundary_crossings import UNTOUCHED, Boundary
 from clvoro.tessellation.device_diagram import CloseError
-from clvoro.tessellation.stages import tessellate_box
 from tests.reference import patch
 from tests.reference.shores import POLYGONS, UNIT, scattered
 
@@ -29,6 +28,11 @@ def envelope(a, e, points):
         assert t > 0
 
 
+def convex(stages, domain, points, n):
+    """Return the convex cells in the clip box of a domain."""
+    return stages.cells.tessellate(domain, points, n, stages.bins.build(domain, points, n), exact=False)
+
+
 @pytest.mark.sparse(4)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", ["star", "holes", "pieces", "comb", "slit"])
@@ -37,7 +41,7 @@ def test_chords(ctx, name, real):
     engine = patch.make_engine(ctx, real, box=domain)
     points = domain.place(scattered(domain, N, 5701), engine.real)
     on_device, boundary = engine.upload(points), Boundary(engine, domain)
-    t = tessellate_box(Stages(engine), domain, on_device, N, None, False)
+    t = convex(Stages(engine), domain, on_device, N)
     vertices = boundary.vertices.get().reshape(-1, 2).astype(float)
     ways = vertices[domain.oriented.next_vertex] - vertices
     expected = [envelope(a, e, points.astype(float)) for a, e in zip(vertices, ways, strict=True)]
@@ -79,7 +83,7 @@ def test_cells_of_outside_generators_that_the_boundary_crosses_are_reported(ctx)
     around = np.random.default_rng(5704).random((200, 2)) * domain.place(np.array(domain.upper)[None], engine.real)
     away = around[~domain.contains(around * domain.frame[1] + domain.frame[0])]
     points = np.concatenate([inside, away])
-    t = tessellate_box(Stages(engine), domain, engine.upload(points), len(points), None, False)
+    t = convex(Stages(engine), domain, engine.upload(points), len(points))
     boundary = Boundary(engine, domain)
     vertices = boundary.vertices.get().reshape(-1, 2)
     met = {
@@ -106,7 +110,7 @@ def test_vertices_belong_to_the_nearer_of_two_close_generators(ctx, real):
         points = np.stack([x, x + rng.integers(1, 4, 2) * (1, -1) * np.spacing(x)])
         on_device, n = engine.upload(points.astype(engine.real)), len(points)
         try:
-            t = tessellate_box(stages, domain, on_device, n, None, False)
+            t = convex(stages, domain, on_device, n)
         except CloseError:
             continue
         made += 1

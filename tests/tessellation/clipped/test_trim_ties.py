@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 import clvoro
-from clvoro.tessellation.clipped import polygonal
+from clvoro.tessellation.clipped import cut as cut_module
 from clvoro.tessellation.clipped.boundary_crossings import Boundary, BoundaryError
 from tests.reference.polygon_diagrams import faults
 from tests.reference.shores import blocks, slit, spit
@@ -136,7 +136,7 @@ def test_crowds_around_a_corner(adapters, real, n):
 
 def test_edges_without_a_path_shift_the_boundary_or_raise(adapters, monkeypatch):
     """The boundary is shifted slightly; an error is raised if that does not help."""
-    monkeypatch.setattr(polygonal, "BOUNDARY_SHIFTS", ())
+    monkeypatch.setattr(cut_module, "BOUNDARY_SHIFTS", ())
     with pytest.raises(BoundaryError, match="cannot be traced"):
         adapters[0].diagram(PAIR, crowd(0, 200))
     # Nothing of it is left.
@@ -171,5 +171,5 @@ def test_a_shifted_boundary(adapters, monkeypatch, real):
     assert report, report
     # Measures are those of the shifted boundary, some eps away.
     off = domain.boundary_distance(diagram.vertices[~domain.contains(diagram.vertices)])
-    assert 0 < off.max() <= (polygonal.BOUNDARY_SHIFTS[0] + 4) * eps * domain.frame[1]
+    assert 0 < off.max() <= (cut_module.BOUNDARY_SHIFTS[0] + 4) * eps * domain.frame[1]
     assert shifts == [False, True]

@@ -7,7 +7,8 @@ import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation import incremental as repair
-from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
+from clvoro.tessellation.device_diagram import read_report
+from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
 
 UNIT = clvoro.Box((0, 0), (1, 1), periodic=True)
@@ -27,7 +28,7 @@ class Carried:
 
     def __init__(self, stages, box, points):
         self.stages, self.box, self.n = stages, box, len(points)
-        self.periodic, self.fresh = (PeriodicTessellator(stages, box), PeriodicTessellator(stages, box))
+        self.periodic, self.fresh = (Tessellator(stages, box), Tessellator(stages, box))
         self.t = self.periodic.tessellate(self.place(points), self.n)
 
     def place(self, points):
@@ -36,7 +37,7 @@ class Carried:
     def move(self, points):
         """Update the diagram to `points`; return it as NumPy arrays, or None if it was made anew."""
         x = self.place(points)
-        t = self.periodic._updated(x, self.n, self.t)
+        t = self.periodic.steps.update(x, self.n, self.t, None, read_report)
         self.t = self.periodic.tessellate(x, self.n) if t is None else t
         return None if t is None else patch.fetch(t)
 
@@ -92,8 +93,7 @@ def test_cells_that_cover_the_box_twice(ctx, real):
     apart = 0.25 / m * np.exp(2j * np.pi * points[:, 0])
     run = Carried(stages, UNIT, points + 0.001)
     twice = points * [2, 1] + np.column_stack([apart.imag, apart.real])
-    stages.folded_cells.reserve(run.n)
-    covered = stages.incremental.update(stages.folded_cells, run.periodic.wide, run.place(twice), run.t)
+    covered = stages.update.update(stages.folded_cells, run.periodic.steps.box, run.place(twice), run.t)
     assert patch.fetch(covered).volumes.sum() == pytest.approx(2, rel=1e-5)
     run = Carried(stages, UNIT, points + 0.001)
     assert run.move(twice) is None

@@ -8,7 +8,7 @@ import pytest
 import clvoro
 from clvoro.tessellation.periodic.ghost_images import COLLAPSED, FAR
 from clvoro.tessellation.periodic.halo import BLOCKS, Halo, block_count, block_counts
-from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
+from clvoro.tessellation.tessellator import Tessellator
 
 BOXES = {
     "torus": clvoro.Box((0, 0), (1, 0.7), periodic=True),
@@ -107,7 +107,7 @@ class Given:
 def test_images_are_those_in_the_halo(adapter, name):
     given = Given(adapter, name, 60, stepped=True)
     images, expected = given.images, given.expected()
-    owners, codes = images.owners.get(), images.codes.get()
+    owners, codes = images.home.rows.get(), images.home.codes.get()
     assert images.count == 60 + len(expected)
     assert [(i, c) for i, c, _ in expected] == list(zip(owners, codes, strict=True))[: len(expected)]
     points = images.points.get()[: images.count]
@@ -121,7 +121,7 @@ def test_images_are_those_in_the_halo(adapter, name):
     least = [0 if wall else bits(WHOLE) - bits(wide.min()) for wall, wide in zip(walls, used, strict=True)]
     assert np.array_equal(extremes[4 : 4 + 2 * given.dim], least)
     firsts = np.searchsorted([i for i, *_ in expected], np.arange(61))
-    assert np.array_equal(images.firsts.get(), firsts)
+    assert np.array_equal(images.home.firsts.get(), firsts)
 
 
 @pytest.mark.sparse(2)
@@ -129,7 +129,7 @@ def test_images_are_those_in_the_halo(adapter, name):
 def test_unfolded_rows_name_the_nearest_images(adapter, name):
     """A neighbor without an image becomes -1; the former code of an image does not matter."""
     given = Given(adapter, name, 60)
-    t = PeriodicTessellator(given.stages, given.box).tessellate(given.x, 60, nearest=False)
+    t = Tessellator(given.stages, given.box).tessellate(given.x, 60, exact=True)
     given.extend()
     rows = given.ghost_images.unfold(given.images, t)
     places = {key[:2]: 60 + g for g, key in enumerate(given.expected())}
@@ -160,17 +160,14 @@ class Folding:
         self.images = images = given.images
         self.binned = given.stages.bins.build(images.box, images.points, images.count)
         args = images.box, images.points, images.count, self.binned
-        if given.dim == 3:
-            self.t = given.stages.cells.tessellate(*args, None, False, n, images.halo_args)
-        else:
-            self.t = given.stages.cells.tessellate(*args, False, n)
+        self.t = given.stages.cells.tessellate(*args, exact=False, n_own=n, halo_args=images.halo_args)
         self.n, self.starts = n, self.t.starts.get()
         self.m = int(self.starts[n])
         self.neighbors, self.measures = self.t.neighbors.get(), self.t.face_measures.get()
         self.volumes = self.t.volumes.get()
         self.centroids = self.t.face_centroids.get()
         self.x = images.points.get()
-        self.owners, self.codes = images.owners.get(), images.codes.get()
+        self.owners, self.codes = images.home.rows.get(), images.home.codes.get()
         self.rows = {
             (j, c): n + g for g, (j, c) in enumerate(zip(self.owners, self.codes, strict=True)) if g < images.count - n
         }
@@ -200,7 +197,7 @@ class Folding:
         )
         ghost_images = self.given.ghost_images
         ghost_images._report.set(np.array([0, 0, 2**31 - 1], np.int32))  # of the images, of which there is one diagram
-        return ghost_images.fold(self.images, self.binned, changed, self.given.x, share, nearest)
+        return ghost_images.fold(self.images, self.given.halo, self.binned, changed, self.given.x, share, nearest)
 
     def far(self, neighbors):
         """Return the generators with a neighbor that is not the nearest image."""
@@ -243,17 +240,17 @@ def test_faces_that_are_missing_on_one_side(adapter, name):
         assert flags == (0 if tiny else COLLAPSED) + (FAR if far else 0)
         assert generator == min(far | {i})
         if not tiny:
-            assert folded.places is None
+            assert folded.folded.places is None
             continue
         kept = np.delete(np.arange(m), k)
-        t = folded.tessellation
-        assert np.array_equal(folded.places.get(), kept)
+        t, made = folded, folded.folded
+        assert np.array_equal(made.places.get(), kept)
         expected = [folding.face(q)[1:] for q in kept]
         lost = neighbors[kept] == -1
         labels = np.where(lost, -1, [j for j, _ in expected])
         codes = np.where(lost, 3**dim // 2, [c for _, c in expected])
         assert np.array_equal(t.neighbors.get(), labels)
-        assert np.array_equal(folded.codes.get(), codes)
+        assert np.array_equal(made.codes.get(), codes)
         assert np.array_equal(t.face_measures.get(), measures[kept])
         assert np.array_equal(t.face_centroids.get(), folding.centroids[kept])
         assert np.array_equal(t.starts.get(), np.searchsorted(kept, folding.starts[: n + 1]))
@@ -269,12 +266,12 @@ def test_neighbors_that_are_not_the_nearest_images(adapter, name, n):
     far = folding.far(folding.neighbors)
     assert bool(far) == (n < 90)
     for nearest in (False, True):
-        folded, enough, flags, generator = folding.fold(*given, nearest)
+        t, enough, flags, generator = folding.fold(*given, nearest)
         assert enough
         assert flags == (FAR if nearest and far else 0)
         assert generator == (min(far) if nearest and far else 2**31 - 1)
-        assert folded.places is None
-        m, t = folding.m, folded.tessellation
+        assert t.folded.places is None
+        m = folding.m
         expected = [folding.face(k)[1:] for k in range(m)]
-        assert list(zip(t.neighbors.get()[:m], folded.codes.get()[:m], strict=True)) == expected
+        assert list(zip(t.neighbors.get()[:m], t.folded.codes.get()[:m], strict=True)) == expected
         assert np.array_equal(t.starts.get(), folding.starts[: n + 1])

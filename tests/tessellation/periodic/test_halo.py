@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay
 import clvoro
 from clvoro.tessellation.periodic.ghost_images import KEPT, OUTWARDS, SIDEWAYS, GhostImages
 from clvoro.tessellation.periodic.halo import BLOCKS, FEWEST_BLOCKS, FINENESS, Halo, block_counts
-from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
+from clvoro.tessellation.tessellator import Tessellator
 
 BOXES = {2: clvoro.Box((0, 0), (1, 0.7), periodic=True), 3: clvoro.Box((0, 0, 0), (1, 0.7, 0.8), periodic=True)}
 WALLED = {
@@ -127,7 +127,7 @@ def check_depths(adapter, box, points, walks):
             pytest.skip("cells are made in one way only")
         stages.cells._wrap = None
     x = stages.engine.upload(box.place(points, real))
-    periodic = PeriodicTessellator(stages, box)
+    periodic = Tessellator(stages, box)
     for _ in range(5):  # depths converge to those required
         periodic.tessellate(x, n)
     stages.release()
@@ -135,8 +135,8 @@ def check_depths(adapter, box, points, walks):
     edges = box.device_corners(real)[1][:dim].astype(float)
     counts = block_counts(edges, n)[:dim]
     noise = NOISE[real.name]
-    needed = blocks_of(periodic.halo.required, dim, counts)
-    widths = blocks_of(periodic.halo.depths, dim, counts)
+    needed = blocks_of(periodic.steps.halo.required, dim, counts)
+    widths = blocks_of(periodic.steps.halo.depths, dim, counts)
     expected = needs(place, edges, periods, counts, SIDEWAYS, OUTWARDS, noise)
     least = needs(place, edges, periods, counts, 0, 0, 0)
     spacing, requests = (np.prod(edges) / n) ** (1 / dim), 0
@@ -183,11 +183,8 @@ def is_enough(stages, ghost_images: GhostImages, box, x, n, halo):
     images = ghost_images.extend(box, x, n, halo, 1.0, False)
     binned = stages.bins.build(images.box, images.points, images.count)
     args = images.box, images.points, images.count, binned
-    if box.dim == 3:
-        t = stages.cells.tessellate(*args, None, False, n, images.halo_args)
-    else:
-        t = stages.cells.tessellate(*args, False, n)
-    return ghost_images.fold(images, binned, t, x, 0.5, True)[1]
+    t = stages.cells.tessellate(*args, exact=False, n_own=n, halo_args=images.halo_args)
+    return ghost_images.fold(images, halo, binned, t, x, 0.5, True)[1]
 
 
 @pytest.mark.sparse(2)

@@ -13,8 +13,10 @@ from clvoro.io.vtu_read import load_vtu
 from clvoro.mesh.connectivity import face_owners
 from clvoro.mesh.quality import measure_mesh
 from clvoro.opencl import program as _program
+from clvoro.tessellation.device_diagram import read_report
 from clvoro.tessellation.periodic.ghost_images import GhostImages
-from clvoro.tessellation.periodic.periodic_tessellator import FewCellsError
+from clvoro.tessellation.periodic.images import FewCellsError, Images
+from clvoro.tessellation.tessellator import Tessellator
 
 UNIT = clvoro.Box((0, 0), (1, 1), periodic=True)
 CHANNEL = clvoro.Box((3, -2), (5.5, -0.5), periodic=(True, False))
@@ -206,18 +208,15 @@ def test_clusters_need_a_deep_halo(adapter):
 @pytest.mark.parametrize("box", [CHANNEL, SLAB], ids=["channel", "slab"])
 def test_images_include_all_that_cells_need(adapter, box):
     """All generators on the balls around vertices have images, none lies inside; small cells need few."""
-    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
-
     rng = np.random.default_rng(11)
     n = {2: 600, 3: 1200}[box.dim]
     unit = rng.random((n, box.dim)) ** 3
     points = np.array(box.lower) + box.extent * unit
     stages = adapter._stages_for(box)
     x = stages.engine.upload(box.place(points, adapter.dtype))
-    periodic = PeriodicTessellator(stages, box)
-    periodic.tessellate(x, n, keep_extended=True)
-    latest = periodic.latest
-    taken = latest.images.points.get()[: latest.images.count].astype(float)
+    periodic = Tessellator(stages, box)
+    part = periodic.tessellate(x, n, complete=True).folded.part
+    taken = part.points.get()[: part.count].astype(float)
     diagram, scale = adapter.diagram(box, points), box.frame[1]
     owner = face_owners(diagram)
     if box.dim == 2:
@@ -337,19 +336,17 @@ def test_the_same_bits_from_run_to_run(adapter):
 @pytest.mark.sparse(1)
 def test_incremental_update_across_periodic_boundaries(adapter):
     """Diagrams updated from step to step equal those made anew."""
-    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
-
     stages = adapter._stages_for(UNIT)
     engine, n = stages.engine, 800
     rng = np.random.default_rng(11)
     points = rng.random((n, 2))
-    periodic, fresh = PeriodicTessellator(stages, UNIT), PeriodicTessellator(stages, UNIT)
+    periodic, fresh = Tessellator(stages, UNIT), Tessellator(stages, UNIT)
     x = engine.upload(UNIT.place(points, adapter.dtype))
     t = periodic.tessellate(x, n)
     for _ in range(4):
         points = points + 0.0003 * rng.standard_normal((n, 2))
         x = engine.upload(UNIT.place(points, adapter.dtype))
-        t = periodic._updated(x, n, t)
+        t = periodic.steps.update(x, n, t, None, read_report)
         assert t is not None
         rows = [set(row) for row in np.split(*rows_of(t))]
         volumes = t.volumes.get()
@@ -366,8 +363,6 @@ def rows_of(t):
 @pytest.mark.sparse(1)
 def test_rows_do_not_depend_on_cells_of_images(adapter):
     """Rows of generators are the same whether or not images get cells, even in lattices off by one ulp."""
-    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
-
     eps = np.finfo(adapter.dtype).eps
     for box, lattice in ((UNIT, square(12)[0]), (CUBE, bcc(4)[0])):
         stages, n = adapter._stages_for(box), len(lattice)
@@ -376,7 +371,7 @@ def test_rows_do_not_depend_on_cells_of_images(adapter):
             x = stages.engine.upload(box.place(moved, adapter.dtype))
             found = []
             for whole in (True, False):
-                t = PeriodicTessellator(stages, box).tessellate(x, n, keep_extended=whole)
+                t = Tessellator(stages, box).tessellate(x, n, complete=whole)
                 starts = t.starts.get()
                 i = np.repeat(np.arange(n), np.diff(starts))
                 j = t.neighbors.get()[: starts[-1]]
@@ -399,7 +394,7 @@ def test_ends_of_a_dropped_face_become_one_vertex(adapter, box, monkeypatch):
 
     def folded(self, *arguments):
         found = fold(self, *arguments)
-        dropped.append(found[0].places is not None)
+        dropped.append(found[0].folded.places is not None)
         return found
 
     monkeypatch.setattr(GhostImages, "fold", folded)
@@ -614,8 +609,6 @@ def test_transfer_across_periodic_boundaries(adapter, periodic, order):
 def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, restored):
     """A second attempt, after a halo that is too shallow, must not start from the graph of the first."""
     from clvoro.adaptation.checkpoint import DIAGRAM
-    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
-    from clvoro.tessellation.tessellator import Tessellator
 
     n, stages = 300, adapter._stages_for(SLAB)
     points, begun = some_points(SLAB, n), []
@@ -639,7 +632,7 @@ def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, resto
         assert all(map(np.array_equal, begun[-1], rows))  # before they are read: there would be other labels
         return unfold(ghost_images, images, graph)
 
-    monkeypatch.setattr(PeriodicTessellator, "_updated", lambda *_: None)
+    monkeypatch.setattr(Images, "update", lambda *_: None)
     monkeypatch.setattr(GhostImages, "extend", narrow)
     monkeypatch.setattr(GhostImages, "unfold", seen)
     again = tessellator.tessellate(x, n, previous)

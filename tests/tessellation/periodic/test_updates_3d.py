@@ -8,7 +8,8 @@ import pytest
 import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl.engine import Engine
-from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
+from clvoro.tessellation.device_diagram import read_report
+from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
 
 UNIT = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
@@ -25,7 +26,7 @@ class Carried:
             Stages(Engine(ctx, made.queue, 3, made.real, box.traits(made.real))) for _ in range(2)
         )
         self.box, self.n = box, len(points)
-        self.periodic, self.fresh = (PeriodicTessellator(stages, box) for stages in (self.stages, self.anew))
+        self.periodic, self.fresh = (Tessellator(stages, box) for stages in (self.stages, self.anew))
         self.t = self.periodic.tessellate(self.place(points), self.n)
 
     def place(self, points):
@@ -34,7 +35,7 @@ class Carried:
     def update(self, points):
         """Update the diagram to `points`; return whether that succeeded."""
         x = self.place(points)
-        t = self.periodic._updated(x, self.n, self.t)
+        t = self.periodic.steps.update(x, self.n, self.t, None, read_report)
         self.t = self.periodic.tessellate(x, self.n, self.t) if t is None else t
         return t is not None
 
@@ -130,7 +131,7 @@ def test_few_cells_are_made_anew(ctx):
     carried.compare(jumped)
 
 
-def test_cells_that_cover_the_box_twice(ctx):
+def test_cells_that_cover_the_box_twice(ctx, monkeypatch):
     """Rows of two sheets that do not know each other are consistent."""
     half = N // 2
     sheets = [some_points(UNIT, half, seed) for seed in (1, 2)]
@@ -145,8 +146,14 @@ def test_cells_that_cover_the_box_twice(ctx):
         neighbors=upload(np.concatenate([names[0], names[1] + half]), np.int32),
         vertices=(),
     )
-    update, x = carried.stages.polyhedra_update, carried.t.points
-    clip = carried.periodic._clip_of(x, N, twice)
-    covered = update.update(carried.stages.cells, carried.periodic.wide, x, twice, clip)
-    assert covered.volumes.get()[:N].sum() == pytest.approx(2, rel=1e-9)
-    assert carried.periodic._updated(x, N, twice) is None
+    updates, x, volumes = carried.stages.update, carried.t.points, []
+    update = updates.update
+
+    def updated(*args, **options):
+        t = update(*args, **options)
+        volumes.append(t.volumes.get()[:N].sum())
+        return t
+
+    monkeypatch.setattr(updates, "update", updated)
+    assert carried.periodic.steps.update(x, N, twice, None, read_report) is None
+    assert volumes == [pytest.approx(2, rel=1e-9)]

@@ -1,0 +1,106 @@
+"""The steps of a domain whose boundary cuts cells: ghost generators outside of it; convex cells, which are trimmed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+from ...geometry.polygon import BOUNDARY_SHIFTS, Polygon
+from ...opencl.device_array import buffer_of
+from ..device_diagram import Follow, Tessellation, read_report
+from ..part import Part
+from ..stages import TessellationStages
+from ..steps import DomainSteps, Sort
+from .boundary_crossings import Boundary, BoundaryError, Chords
+from .ghost_generators import place_ghost_generators
+
+PATIENCE = 3
+"""Attempts that remove single ghost generators, before all are removed."""
+
+
+class Cut(DomainSteps):
+    """The steps of one polygon.
+
+    Ghost generators have cells, because the boundary is traced through them, but no values.
+
+    Parameters
+    ----------
+    spacing : callable or None
+        Distance of generators near points (k, 2) of the boundary, (k,); see `place_ghost_generators`. None: no ghost
+        generators. The diagram is the same, but slow to make where many generators surround a wide hole.
+    """
+
+    def __init__(
+        self, stages: TessellationStages, domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray] | None
+    ) -> None:
+        super().__init__(stages, domain)
+        engine = stages.engine
+        self._boundary, self._polygon = Boundary(engine, domain), domain
+        origin, scale = domain.frame
+        self._spacing = spacing
+        found = np.empty((0, 2)) if spacing is None else place_ghost_generators(domain, spacing)
+        self._ghosts = ((found - origin) / scale).astype(engine.real)
+        self._removals = 0
+        self._all: cla.Array | None = None
+
+    def extend(self, sites: cla.Array, n: int) -> Part:
+        """Return the first `n` of `sites` with the ghost generators."""
+        if self._spacing is None:
+            return super().extend(sites, n)
+        engine, total = self.stages.engine, n + len(self._ghosts)
+        if self._all is None or len(self._all) != total:
+            self._all = engine.empty((total, self.domain.dim))
+            if total > n:
+                self._all[n:].set(self._ghosts)
+        size = n * self.domain.dim * engine.real.itemsize
+        cl.enqueue_copy(engine.queue, buffer_of(self._all), buffer_of(sites), byte_count=size)
+        return Part(n, total, self._all, self.domain)
+
+    def drop_ghosts(self) -> bool:
+        """Remove all ghost generators: round-off at distant ones may make generators appear too close."""
+        there = len(self._ghosts) > 0
+        self._ghosts = self._ghosts[:0]
+        return there
+
+    def finish_updated(self, t: Tessellation, points: cla.Array, n: int) -> Tessellation | None:
+        """Clip the convex diagram `t` by the boundary; None if ghost generators had to be removed.
+
+        Where many cells share a vertex that lies on a vertex of the boundary, their faces there are as short as
+        round-off, and the tracing may fail. A boundary shifted by a few ulps crosses only one or two of these cells.
+        """
+        eps = float(np.finfo(self.stages.engine.real).eps)
+        lost = BoundaryError()
+        for attempt, far in enumerate((0, *BOUNDARY_SHIFTS)):
+            angle, length = 2 * attempt, far * eps
+            shift = (length * math.cos(angle), length * math.sin(angle))
+            try:
+                # The search for the vertices starts from the cells of the previous call.
+                chords = self._boundary.cut(t, n, shift)
+                if isinstance(chords, Chords):
+                    return self.stages.trim.trim(self._polygon, points, t, chords, n)
+            except BoundaryError as error:
+                lost = error
+                continue
+            self._removals += 1
+            keep = np.ones(len(self._ghosts), bool)
+            keep[chords] = False
+            self._ghosts = self._ghosts[keep & (self._removals < PATIENCE)]
+            return None
+        raise lost
+
+    def update(
+        self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
+    ) -> Tessellation | None:
+        """Update the convex diagram of `previous`, and clip it."""
+        if previous.trimmed is None or previous.trimmed.convex.n != n + len(self._ghosts):
+            return None
+        part = self.extend(sites, n)
+        t = super().update(part.points, part.count, previous.trimmed.convex, sort, read_report)
+        t = None if t is None else self.finish_updated(t, sites, n)
+        if t is not None:
+            follow(t, None)
+        return t

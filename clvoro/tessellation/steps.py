@@ -1,0 +1,99 @@
+"""What a domain adds to the steps of a tessellator, ``extend -> bins -> build or update -> finish``.
+
+`DomainSteps` is what boxes with walls and spheres need: nothing. `Images` in `periodic/images.py` makes ghost images
+and folds diagrams, `Cut` in `clipped/cut.py` lets a boundary cut them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+import pyopencl.array as cla
+
+from ..geometry.domain import ClipBox, Domain
+from .bins import BinnedPoints
+from .cut_cells import CutCells
+from .device_diagram import Follow, NeighborRows, Tessellation
+from .part import Part
+from .periodic.halo import Halo
+from .polyhedra import Polyhedra
+from .stages import TessellationStages
+
+Sort: TypeAlias = Callable[[], BinnedPoints]
+"""Returns the generators in bins, and sorts them when it is first called."""
+
+
+class DomainSteps:
+    """The steps before and after cells are built, for one domain.
+
+    Attributes
+    ----------
+    box : ClipBox
+        Clips the cells of a finished diagram.
+    most : (1,) int32, device
+        Key of the largest weight, in a power diagram; see geometry/weights.h.
+    halo : Halo or None
+        In a periodic box.
+    """
+
+    box: ClipBox
+    halo: Halo | None = None
+
+    def __init__(self, stages: TessellationStages, domain: Domain) -> None:
+        self.stages, self.domain, self.box = stages, domain, domain
+        self.most = stages.engine.empty(1, np.int32)
+
+    def begin(self, n: int) -> None:
+        """Prepare for a new diagram of `n` generators."""
+
+    def extend(self, sites: cla.Array, n: int) -> Part:
+        """Return the part of the first `n` of `sites` and the ghosts that their cells need, as far as known."""
+        return Part(n, n, sites, self.domain)
+
+    def drop_ghosts(self) -> bool:
+        """Make ghosts fewer, because generators appear too close; return whether that is possible."""
+        return False
+
+    def rows(self, previous: Tessellation) -> Tessellation | NeighborRows:
+        """Return the graph from which new cells may start, as long as they are built."""
+        return previous
+
+    def unfold(self, part: Part, rows: Tessellation | NeighborRows) -> Tessellation | NeighborRows:
+        """Return `rows` with neighbors that are rows of `part`."""
+        return rows
+
+    def finish(
+        self, part: Part, binned: BinnedPoints, t: Tessellation, points: cla.Array, exact: bool, nearest: bool
+    ) -> Tessellation | None:
+        """Return the diagram of the domain from `t`, that of `part`; None if other ghosts are needed.
+
+        Parameters
+        ----------
+        points : (n, d) real
+            Positions of the generators.
+        exact : bool
+            As for `Cells.tessellate`.
+        nearest : bool
+            In a periodic box, reject neighbors that are not the nearest image of their generator.
+        """
+        return self.finish_updated(t, points, part.n_own)
+
+    def finish_updated(self, t: Tessellation, points: cla.Array, n: int) -> Tessellation | None:
+        """Do the same for a diagram whose neighbors are generators already."""
+        return t
+
+    def is_complete(self, t: Tessellation) -> bool:
+        """Return whether the latest diagram `t` has all that its vertices need."""
+        return True
+
+    def update(
+        self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
+    ) -> Tessellation | None:
+        """Update `previous` incrementally to the first `n` of `sites`; None if too much has changed."""
+
+        def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
+            cells.clip_rest(cut, report, self.box, sites, sort(), previous)
+
+        return self.stages.update.update(self.stages.cells, self.box, sites, previous, follow=follow, clip=clip)
