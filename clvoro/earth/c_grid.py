@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.box import Box
-from ..geometry.sphere import Sphere
 from ..geometry.spherical_triangles import triangle_areas
 from ..mesh.connectivity import face_ends, face_keys, face_owners, neighbor_points, next_faces
 from ..mesh.diagram import Diagram
@@ -118,7 +116,7 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
     """
     d, domain = diagram, diagram.domain
     diagram.demand_voronoi("c_grid")
-    if not isinstance(domain, Sphere) and not (isinstance(domain, Box) and domain.dim == 2):
+    if domain.cell_dim != 2 or domain.cuts_cells:
         raise InputError(
             f"measures for C grids are for meshes on a Sphere and in a Box in 2D, not for {domain}; use the other "
             "entries of measures"
@@ -133,7 +131,7 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
     distance = np.maximum(np.linalg.norm(line, axis=1), 1e-300)
     normal, middle = line / distance[:, None], own + line / 2
     angles = _angles(begin[corners], middle[corners], normal[corners], distance[corners])
-    if isinstance(domain, Sphere):
+    if domain.globe:
         middle = domain.wrap(middle)
         offset = domain.lengths(np.linalg.norm(d.face_centroids - middle, axis=1))
         distance = domain.lengths(distance)
@@ -197,8 +195,8 @@ def _cells_around(d: Diagram, corners: np.ndarray, after: np.ndarray) -> tuple[n
 
 def _kites(d: Diagram, own: np.ndarray, before: np.ndarray, vertex: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the signed areas of quadrilaterals own, before, vertex, after, counter-clockwise, (k,)."""
-    if isinstance(d.domain, Sphere):
-        a, p, v, q = (d.domain.wrap(x) / d.domain.radius for x in (own, before, vertex, after))
-        return d.domain.radius**2 * (triangle_areas(a, p, v) + triangle_areas(a, v, q))
+    if globe := d.domain.globe:
+        a, p, v, q = (globe.wrap(x) / globe.radius for x in (own, before, vertex, after))
+        return globe.radius**2 * (triangle_areas(a, p, v) + triangle_areas(a, v, q))
     p, v, q = (x - own for x in (before, vertex, after))
     return (p[:, 0] * v[:, 1] - p[:, 1] * v[:, 0] + v[:, 0] * q[:, 1] - v[:, 1] * q[:, 0]) / 2

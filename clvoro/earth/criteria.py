@@ -8,7 +8,6 @@ from ..errors import InputError
 from ..finite_volumes.criteria import Criterion, Rows, SolverReport
 from ..finite_volumes.gate import LEAST_MEASURE
 from ..finite_volumes.solver_mesh import WallShape
-from ..geometry.sphere import Sphere
 from ..mesh.connectivity import face_ends, face_keys, face_owners
 from ..mesh.diagram import Diagram
 from .c_grid import RIGHT_ANGLE, measure_c_grid
@@ -36,8 +35,8 @@ def check_for_mpas(diagram: Diagram, walls: WallShape | None) -> SolverReport:
     if walls is not None:
         raise InputError(f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out")
     faces, domain, made = int(diagram.faces.owner.size), diagram.domain, _criteria(diagram)
-    if isinstance(domain, Sphere):
-        made = [criterion.on_sphere(domain) for criterion in made]
+    if domain.globe:
+        made = [criterion.on_sphere(domain.globe) for criterion in made]
     return SolverReport("mpas", tuple(made), len(diagram), faces, 0.0)
 
 

@@ -48,17 +48,17 @@ class Shape:
 
 def measure(diagram: Diagram, halves: HalfEdges) -> Shape:
     """Return the geometry of `diagram` in the plane or on a sphere."""
-    if isinstance(diagram.domain, Sphere):
-        return _on_sphere(diagram, diagram.domain, halves)
+    if globe := diagram.domain.globe:
+        return _on_sphere(diagram, globe, halves)
     return _in_plane(diagram, halves)
 
 
 def describe(domain: Domain) -> dict[str, str | np.generic]:
     """Return the attributes of the file that describe the domain."""
-    if isinstance(domain, Sphere):
+    if globe := domain.globe:
         return {
             "on_a_sphere": "YES",
-            "sphere_radius": np.float64(domain.radius),
+            "sphere_radius": np.float64(globe.radius),
             "is_periodic": "NO",
             "x_period": np.float64(0),
             "y_period": np.float64(0),
@@ -78,12 +78,13 @@ def coordinates(domain: Domain, points: np.ndarray) -> dict[str, np.ndarray]:
 
     Longitudes are in [0, 2 pi), as in the meshes of MPAS.
     """
-    if not isinstance(domain, Sphere):
+    globe = domain.globe
+    if globe is None:
         nothing = np.zeros(len(points))
         x, y = points.T
         return {"x": x, "y": y, "z": nothing, "lat": nothing, "lon": nothing}
     x, y, z = points.T
-    lon, lat = np.radians(domain.lonlat(points)).T
+    lon, lat = np.radians(globe.lonlat(points)).T
     lon = np.where(lon < 0, lon + 2 * np.pi, lon)
     return {"x": x, "y": y, "z": z, "lat": lat, "lon": np.where(lon < 2 * np.pi, lon, 0.0)}
 

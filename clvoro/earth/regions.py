@@ -256,9 +256,10 @@ def _diagram_of(mesh: object) -> tuple[Diagram, Sphere]:
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     if not isinstance(diagram, Diagram):
         raise InputTypeError(f"mesh is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram")
-    if not isinstance(diagram.domain, Sphere):
+    globe = diagram.domain.globe
+    if globe is None:
         raise InputError(f"mesh is in {diagram.domain}, expected a mesh on a clvoro.Sphere")
-    return diagram, diagram.domain
+    return diagram, globe
 
 
 def _inside(diagram: Diagram, sphere: Sphere, name: str, area: Any) -> np.ndarray:

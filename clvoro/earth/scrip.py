@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.sphere import Sphere
 from ..io.contents import Contents
 from ..io.netcdf import NetCDF
 from ..mesh.connectivity import cell_corners
@@ -28,7 +27,8 @@ def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
     """
     del unit
     diagram, domain = contents.diagram, contents.diagram.domain
-    if not isinstance(domain, Sphere):
+    globe = domain.globe
+    if globe is None:
         raise InputError(
             f"cannot write {path}: SCRIP files are for meshes on a Sphere, not for {domain}; leave out "
             "convention='scrip'"
@@ -41,19 +41,19 @@ def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
         path,
         contents,
         {"grid_size": n, "grid_corners": most, "grid_rank": 1},
-        {"title": "Voronoi cells", "Conventions": "SCRIP", "sphere_radius": np.float64(domain.radius)},
+        {"title": "Voronoi cells", "Conventions": "SCRIP", "sphere_radius": np.float64(globe.radius)},
     )
     file.add("grid_dims", ("grid_rank",), np.array([n], np.int32))
     file.add("grid_imask", ("grid_size",), np.ones(n, np.int32), units="unitless")
-    centers, around = domain.lonlat(diagram.centroids), domain.lonlat(diagram.vertices)
+    centers, around = globe.lonlat(diagram.centroids), globe.lonlat(diagram.vertices)
     for column, name in enumerate(("lon", "lat")):
         file.add(f"grid_center_{name}", ("grid_size",), centers[:, column], units="degrees")
         shape = ("grid_size", "grid_corners")
         file.add(f"grid_corner_{name}", shape, around[table, column], units="degrees")
-    generators = domain.lonlat(diagram.points)
+    generators = globe.lonlat(diagram.points)
     for column, name in enumerate(("lon", "lat")):
         file.add(f"generator_{name}", ("grid_size",), generators[:, column], units="degrees")
-    areas = diagram.volumes / domain.radius**2
+    areas = diagram.volumes / globe.radius**2
     file.add("grid_area", ("grid_size",), areas, units="radians^2", long_name="area of a cell")
     file.add_extra("grid_size")
     file.write()

@@ -80,9 +80,9 @@ class LonLat(Field):
 
     def landmarks(self, domain: Domain) -> np.ndarray:
         """Return the landmarks of the field as positions on the sphere."""
-        assert isinstance(domain, Sphere)
+        assert domain.globe
         found = self.field.landmarks(DEGREES)
-        return domain.positions(np.clip(found, (-720, -90), (720, 90)))
+        return domain.globe.positions(np.clip(found, (-720, -90), (720, 90)))
 
     def warnings(self, domain: Domain) -> list[str]:
         """Return the warnings of the field."""
