@@ -122,7 +122,7 @@ class Spline(CurveTable, tag="spline", kw_only=True):
 # Shapes that sizes are measured from.
 
 
-class Circle(Kind, tag="circle"):
+class CircleShape(Kind, tag="circle"):
     MAKE = sizing.Circle
     center: Point
     radius: NotNegative
@@ -183,7 +183,7 @@ class ClosedPolylineShape(Kind, tag="closed_polyline"):
 
 
 Shape = (
-    Circle
+    CircleShape
     | Ball
     | BoxShape
     | BoundaryShape
@@ -202,7 +202,7 @@ Shape = (
 _ON_SPHERE = "caps, distance, expression, raster or a combination of them"
 
 
-class Constant(Kind, tag="constant"):
+class ConstantTable(Kind, tag="constant"):
     MAKE = sizing.Constant
     value: Positive
 
@@ -213,7 +213,7 @@ class Region(Table):
     size: Positive
 
 
-class Caps(Kind, tag="caps"):
+class CapsTable(Kind, tag="caps"):
     CHOICE = ("growth", "slope")
     regions: Annotated[list[Region], Meta(min_length=1)]
     h_max: Positive
@@ -227,7 +227,7 @@ class Caps(Kind, tag="caps"):
         return earth.Caps(regions, sphere=domain.globe, **self.given("regions"))
 
 
-class Distance(Kind, tag="distance"):
+class DistanceTable(Kind, tag="distance"):
     CHOICE = ("growth", "slope")
     shapes: Annotated[list[Shape], Meta(min_length=1)]
     h_min: Positive
@@ -239,7 +239,7 @@ class Distance(Kind, tag="distance"):
         return sizing.Distance([shape.build(folder, domain) for shape in self.shapes], **self.given("shapes"))
 
 
-class Expression(Kind, tag="expression"):
+class ExpressionTable(Kind, tag="expression"):
     expression: Text
 
     def build(self, folder: Path, domain: Any = None) -> Any:
@@ -261,7 +261,7 @@ class ArrayTable(Kind):
         return type(self).MAKE(values, *corners, **self.given("file", "lower", "upper"))
 
 
-class Raster(ArrayTable, tag="raster"):
+class RasterTable(ArrayTable, tag="raster"):
     MAKE = sizing.Raster
     variable: Text | None = None
     outside: Literal["nearest", "error"] | None = None
@@ -310,7 +310,7 @@ class Feature(Kind, tag="feature"):
         return sizing.FeatureSize(domain.outline, **self.given())
 
 
-class Graded(Kind, tag="graded"):
+class GradedTable(Kind, tag="graded"):
     CHOICE = ("growth", "slope")
     field: Size
     growth: Positive | None = None
@@ -361,15 +361,15 @@ class Quotient(Min, tag="quotient"):
 
 Size = (
     Positive
-    | Constant
-    | Caps
-    | Distance
-    | Expression
-    | Raster
+    | ConstantTable
+    | CapsTable
+    | DistanceTable
+    | ExpressionTable
+    | RasterTable
     | Hessian
     | Gradient
     | Feature
-    | Graded
+    | GradedTable
     | Scale
     | Min
     | Max

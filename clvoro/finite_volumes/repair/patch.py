@@ -10,7 +10,7 @@ import numpy as np
 from ...mesh.faces import Faces
 
 if TYPE_CHECKING:
-    from .wall_corners import Cut
+    from .wall_corners import CornerCut
 
 BORDER = np.iinfo(np.int32).min
 """In place of the neighbor of a face that stays: the cell behind it is not in the patch."""
@@ -61,7 +61,7 @@ class Patch:
     fixed: np.ndarray
     positions: np.ndarray
     limits: tuple[float, float] = LIMITS
-    cuts: tuple[Cut, ...] = ()
+    cuts: tuple[CornerCut, ...] = ()
 
     @property
     def walls(self) -> np.ndarray:

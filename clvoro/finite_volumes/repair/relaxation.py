@@ -27,7 +27,7 @@ from .patch import LIMITS, Patch, part_of, put_back, take_patch
 from .pricing import LEAST_DETERMINANT, STRAIGHT, PricedPatch
 from .reconnection import repaired
 from .tasks import Move, Task, in_step, run_task
-from .wall_corners import Cut, WallEdges
+from .wall_corners import CornerCut, WallEdges
 
 _RINGS = 5
 """Rings of cells around those beyond a limit that make a patch."""
@@ -95,7 +95,7 @@ def relax_points(mesh: Faces, parts: np.ndarray, straight: bool = True) -> Faces
     return put_back(mesh, made) if made else mesh
 
 
-def _report(cuts: list[Cut]) -> None:
+def _report(cuts: list[CornerCut]) -> None:
     """Warn if a corner of a wall that was cut off is far from the new wall face."""
     far = max(cuts, key=lambda cut: cut.far / cut.size, default=None)
     if far is None or far.far <= FILLED * far.size:

@@ -27,7 +27,7 @@ _FARTHEST = 1.0
 """Farthest corner that is cut off, as its distance from the chord over the size of the cell."""
 
 
-class Cut(NamedTuple):
+class CornerCut(NamedTuple):
     """A corner of a wall that has been cut off.
 
     Attributes
@@ -209,7 +209,7 @@ class WallCorners:
         size = float(self.sizes[p.owner[faces[0]]])
         if far > _FARTHEST * size or self._obstructed((a, point, b), x):
             return
-        yield replace(_without(p, point), cuts=(*p.cuts, Cut(float(x[1, 0]), float(x[1, 1]), far, size)))
+        yield replace(_without(p, point), cuts=(*p.cuts, CornerCut(float(x[1, 0]), float(x[1, 1]), far, size)))
 
     def _obstructed(self, corners: tuple[int, int, int], x: np.ndarray) -> bool:
         """Return whether another wall meets the triangle `x` (3, 2) of the points `corners`."""
