@@ -9,7 +9,6 @@ import numpy as np
 
 from ..arguments import check_choice
 from ..errors import InputError
-from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .criteria import Criterion, Rows, SolverReport
@@ -37,7 +36,7 @@ def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallS
 
 
 def _check_for_openfoam(diagram: Diagram, walls: WallShape | None) -> SolverReport:
-    if isinstance(diagram.domain, Sphere):
+    if diagram.domain.curved:
         raise InputError(
             f"solver is 'openfoam', whose meshes are polyhedra, and the mesh is on {diagram.domain}; use "
             "solver='mpas' for meshes on a sphere"

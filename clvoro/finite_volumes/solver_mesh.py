@@ -9,8 +9,6 @@ import numpy as np
 
 from ..arguments import check_choice, warn
 from ..errors import InputError, MismatchWarning
-from ..geometry.polygon import Polygon
-from ..geometry.sphere import Sphere
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .seams import faces_with_seams
@@ -64,7 +62,7 @@ def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray)
     )
     if mesh.dim == 3:
         return collapse_short(mesh, diagram) if collapse else mesh.compact()
-    straight = walls == "straight" and isinstance(diagram.domain, Polygon)
+    straight = walls == "straight" and diagram.domain.outline is not None
     if straight:
         mesh = straight_walls(join_faces(mesh), diagram, parts)
     if collapse:
@@ -91,5 +89,5 @@ def check_not_sphere(diagram: Diagram, why: str, instead: str) -> None:
     InputError
         Says `why`, and what to do `instead`.
     """
-    if isinstance(diagram.domain, Sphere):
+    if diagram.domain.curved:
         raise InputError(f"{why}, and the cells on {diagram.domain} are pieces of a curved surface; {instead}")

@@ -46,8 +46,8 @@ def straight_walls(mesh: Faces, diagram: Diagram, parts: np.ndarray) -> Faces:
     parts : (k,) int
         Index of the named part of the boundary for each wall. A straight face has walls of one part.
     """
-    domain = diagram.domain
-    assert isinstance(domain, Polygon)
+    domain = diagram.domain.outline
+    assert domain is not None
     mesh = _on_curves(_without_islands(mesh, domain, parts), domain)
     runs = WallRuns(mesh, along_rings(diagram, domain), parts)
     # 1: the ends of the cell do not move; 2: its walls remain as they are.

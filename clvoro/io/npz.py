@@ -219,7 +219,7 @@ def _not_in(domain: Domain) -> tuple[str, ...]:
     others = ["weights"] if any(domain.periodic) else ["weights", "shifts"]
     if domain.cell_dim == 3:
         others.append("cell_vert")
-    elif not isinstance(domain, Polygon):
+    elif not domain.cuts_cells:
         others.append("face_vert")
     return tuple(others)
 
@@ -232,7 +232,7 @@ def _check_domain(arrays: Mapping[str, np.ndarray], domain: Domain) -> None:
     shifts = arrays.get("diagram.shifts")
     if shifts is not None and shifts.size and not (shifts.min() >= -1 and shifts.max() <= 1):
         raise FileError("diagram.shifts has values other than -1, 0 and 1")
-    if isinstance(domain, Polygon):
+    if domain.cuts_cells:
         starts = arrays["diagram.face_vertex_starts"]
         if not np.array_equal(starts, 2 * np.arange(len(neighbors) + 1)):
             raise FileError("diagram.face_vertices does not have two ends for each face")

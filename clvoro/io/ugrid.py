@@ -71,8 +71,8 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     _add_coordinates(file, diagram, ends, unit)
     _add_connectivity(file, halves, ends, np.diff(starts), corners)
     of_faces = {"mesh": "mesh", "location": "face", "coordinates": "mesh_face_x mesh_face_y"}
-    if isinstance(diagram.domain, Sphere):
-        _add_globe(file, diagram.domain, unit)
+    if diagram.domain.globe is not None:
+        _add_globe(file, diagram.domain.globe, unit)
         of_faces["grid_mapping"] = "globe"
     units = {"size": unit, "area": squared(unit)}
     for name, values in {**contents.of_run, "area": diagram.volumes}.items():
@@ -89,10 +89,10 @@ def _add_coordinates(file: NetCDF, diagram: Diagram, ends: np.ndarray, unit: str
         "edge": ("middles of the edges", diagram.vertices[ends].mean(axis=1)),
         "face": ("generators of the cells", diagram.points),
     }
-    domain = diagram.domain
-    if isinstance(domain, Sphere):
+    globe = diagram.domain.globe
+    if globe is not None:
         unit = "degrees"
-        places = {place: (what, domain.lonlat(x)) for place, (what, x) in places.items()}
+        places = {place: (what, globe.lonlat(x)) for place, (what, x) in places.items()}
     for place, (what, points) in places.items():
         for axis, values in zip("xy", points.T, strict=True):
             file.add(

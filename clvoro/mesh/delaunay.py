@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.sphere import Sphere
 from .diagram import Diagram
 
 
@@ -28,9 +27,8 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
         sums = [np.bincount(vertices, diagram.points[cells, a], len(centers)) for a in range(2)]
         centers = np.column_stack(sums) / number[:, None]
     arms = diagram.points[cells] - centers[vertices]
-    if isinstance(diagram.domain, Sphere):
-        axes = diagram.domain.tangents(diagram.vertices)
-        arms = np.column_stack([(arms * axis[vertices]).sum(axis=1) for axis in axes])
+    axes = diagram.domain.tangents(diagram.vertices)
+    arms = np.column_stack([(arms * axis[vertices]).sum(axis=1) for axis in axes])
     # Around each vertex counter-clockwise.
     order = np.lexsort((np.arctan2(arms[:, 1], arms[:, 0]), vertices))
     cells = cells[order]

@@ -8,8 +8,6 @@ import numpy as np
 import shapely
 from scipy.spatial import KDTree
 
-from ..geometry.polygon import Polygon
-
 if TYPE_CHECKING:
     from .diagram import Diagram
 
@@ -59,7 +57,7 @@ class Locator:
         if not len(x):
             return found
         found[inside] = self.tree.query(lifted(self.diagram, self._place(x)))[1]
-        if isinstance(self.domain, Polygon):
+        if self.domain.cuts_cells:
             found[inside] = self._corrected(x, found[inside])
         return found
 

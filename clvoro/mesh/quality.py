@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry.polygon import Polygon
-from ..geometry.sphere import Sphere
-from .connectivity import face_owners, neighbor_points, plane_shares
+from .connectivity import face_owners, plane_shares
 from .diagram import Diagram
-from .straightening import straighten
+from .straightening import cell_quality
 
 if TYPE_CHECKING:
     from ..earth.c_grid import CGridMeasures
@@ -49,8 +47,6 @@ class Measures:
         Number of faces of the cell.
     inner : (m,) bool
         Whether the face is between two cells.
-    polygonal : bool
-        Whether the domain is a polygon.
     diagram : Diagram or None
     """
 
@@ -61,7 +57,6 @@ class Measures:
     volume_ratio: np.ndarray
     faces: np.ndarray
     inner: np.ndarray
-    polygonal: bool = False
     diagram: Diagram | None = field(default=None, compare=False)
 
     @cached_property
@@ -118,12 +113,13 @@ class Measures:
         `skewness` in a polygonal domain, whose walls may have generators behind them. On a sphere those of `c_grid`
         follow.
         """
-        spherical = self.diagram is not None and isinstance(self.diagram.domain, Sphere)
-        of_c_grid = self.c_grid.summary() if spherical else {}
+        domain = None if self.diagram is None else self.diagram.domain
+        of_c_grid = self.c_grid.summary() if domain is not None and domain.curved else {}
         angle, ratio = (
             values[self.inner] if self.inner.any() else values for values in (self.centroid_angle, self.volume_ratio)
         )
-        skewness = self.skewness[self.inner] if self.polygonal and self.inner.any() else self.skewness
+        cut = domain is not None and domain.cuts_cells and self.inner.any()
+        skewness = self.skewness[self.inner] if cut else self.skewness
         return {
             "mean_faces": float(self.faces.mean()),
             "mean_quality": float(self.quality.mean()),
@@ -153,33 +149,26 @@ def measure_mesh(diagram: Diagram) -> Measures:
     inner = neighbor >= 0
     other = np.where(inner, neighbor, 0)
     domain = diagram.domain
-    if isinstance(domain, Sphere):
-        line = neighbor_points(diagram, np.arange(len(neighbor))) - points[owner]
-        distance = np.linalg.norm(line, axis=1)
-    else:
-        line = points[other] + diagram.shifts * domain.extent - points[owner]
-        walls = np.flatnonzero(~inner)
-        normals, anchors = domain.wall_planes(-1 - neighbor[walls])
-        gaps = ((anchors - points[owner[walls]]) * normals).sum(axis=1)
-        line[walls] = 2 * gaps[:, None] * normals
-        distance = np.linalg.norm(line, axis=1)
-        distance[walls[gaps <= 0]] = 0
+    line = points[other] + diagram.shifts * domain.extent - points[owner]
+    walls = np.flatnonzero(~inner)
+    normals, gaps = domain.toward_walls(-1 - neighbor[walls], points[owner[walls]])
+    line[walls] = 2 * gaps[:, None] * normals
+    distance = np.linalg.norm(line, axis=1)
+    distance[walls[gaps <= 0]] = 0
     share = np.full(len(line), 0.5)
     share[inner] = plane_shares(diagram, np.flatnonzero(inner))
     crossing = points[owner] + share[:, None] * line
-    if isinstance(domain, Sphere):
+    if domain.curved:
         crossing = domain.wrap(crossing)
-    offset = np.linalg.norm(middles - crossing, axis=1)
-    if isinstance(domain, Sphere):
-        offset, distance = domain.lengths(offset), domain.lengths(distance)
+    offset, distance = domain.lengths(np.linalg.norm(middles - crossing, axis=1)), domain.lengths(distance)
     skewness = np.where(offset > 0, np.inf, 0.0)  # remains where the distance is 0
     np.divide(offset, distance, out=skewness, where=distance > 0)
 
     angle = np.zeros(len(line))
     between = centroids[other] + diagram.shifts * diagram.domain.extent - centroids[owner]
-    if isinstance(domain, Sphere):
+    if domain.curved:
         # The part in the plane that touches the sphere where the arcs cross.
-        up = crossing / domain.radius
+        up = crossing / domain.frame[1]
         between -= (between * up).sum(axis=1)[:, None] * up
     angle[inner] = _angles(line[inner], between[inner])
 
@@ -188,18 +177,12 @@ def measure_mesh(diagram: Diagram) -> Measures:
     surface, largest, smallest = (np.ones(len(counts)) for _ in range(3))
     for values, function in ((surface, np.add), (largest, np.maximum), (smallest, np.minimum)):
         values[some] = function.reduceat(areas, starts[:-1][some])
-    if isinstance(domain, Sphere):
-        quality = 4 * counts * np.tan(np.pi / counts) * volumes / surface**2
-    elif diagram.domain.dim == 2:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            quality = straighten(diagram).quality()
-    else:
-        quality = 36 * np.pi * volumes**2 / surface**3
+    with np.errstate(divide="ignore", invalid="ignore"):
+        quality = cell_quality(diagram, surface)
     quality[~some] = 0
     here, there = volumes[owner], np.where(inner, volumes[other], volumes[owner])
     ratio = np.maximum(here, there) / np.minimum(here, there)
-    polygonal = isinstance(diagram.domain, Polygon)
-    return Measures(quality, skewness, angle, smallest / largest, ratio, counts, inner, polygonal, diagram)
+    return Measures(quality, skewness, angle, smallest / largest, ratio, counts, inner, diagram)
 
 
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:

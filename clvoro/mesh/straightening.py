@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry.polygon import Polygon
 from .connectivity import face_ends
 
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike
 
+    from ..geometry.polygon import Polygon
     from .diagram import Diagram
 
 WALL_CORNER = np.pi / 6
@@ -69,9 +69,10 @@ def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
     counts, n = np.diff(starts), len(diagram)
     owner, measures = np.repeat(np.arange(n), counts), diagram.face_measures
     perimeters = np.bincount(owner, measures, minlength=n)
-    if not isinstance(diagram.domain, Polygon):
+    domain = diagram.domain.outline
+    if domain is None:
         return Straightened(counts, diagram.volumes, perimeters)
-    of, first, final = _stretches(diagram, diagram.domain, owner, np.dtype(real))
+    of, first, final = _stretches(diagram, domain, owner, np.dtype(real))
     rows, cells, last = np.flatnonzero(of >= 0), owner[first], len(first)
     # Positions are relative to the generator. A side of a single face changes nothing.
     ends = face_ends(diagram)
@@ -91,14 +92,24 @@ def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
     )
 
 
+def cell_quality(diagram: Diagram, surfaces: np.ndarray, real: DTypeLike = np.float64) -> np.ndarray:
+    """Return the quality of each cell, (n,): the paper's (4.1) in 2D and on a sphere, the isoperimetric quotient in 3D.
+
+    `surfaces` (n,) are the sums of the measures of the cells' faces; `real` as for `straighten`.
+    """
+    if diagram.domain.cell_dim == 2:
+        return straighten(diagram, real).quality()
+    return 36 * np.pi * diagram.volumes**2 / surfaces**3
+
+
 def have_corners(diagram: Diagram) -> np.ndarray:
     """Return which cells in a polygonal domain have a corner of the boundary, (n,) bool.
 
     That is a turn by more than 30 degrees (`SIDE_TURN`): at the end of a wall face of the cell, or in sum within it, so
     that the cell has several sides on one stretch of the boundary.
     """
-    domain = diagram.domain
-    assert isinstance(domain, Polygon)
+    domain = diagram.domain.outline
+    assert domain is not None
     owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
     of, _, _ = _stretches(diagram, domain, owner, np.dtype(np.float64))
     following, edges = along_rings(diagram, domain), _places(diagram, domain)

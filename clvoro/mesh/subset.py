@@ -20,7 +20,7 @@ Mesh = TypeVar("Mesh", Result, Diagram)
 def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     """Return `mesh` without the cells where `keep` is False; see `MeshOutput.subset`."""
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
-    if not isinstance(diagram.domain, Sphere):
+    if diagram.domain.globe is None:
         raise InputError(
             f"subset() is for meshes on a sphere, and this one is in {diagram.domain}; for another domain make a new "
             "mesh in a clvoro.Polygon with holes"
@@ -32,7 +32,7 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
         )
     if kept.all():
         return mesh
-    part = _subset_diagram(diagram, diagram.domain, kept, boundary)
+    part = _subset_diagram(diagram, diagram.domain.globe, kept, boundary)
     if not isinstance(mesh, Result):
         return cast("Mesh", part)
     taken = {name: getattr(mesh, name)[kept] for name in ("target_size", "size_error", "quality")}
@@ -86,8 +86,8 @@ def _subset_diagram(d: Diagram, sphere: Sphere, kept: np.ndarray, boundary: str)
     labels = [sphere.boundary_names[k] for k in sphere.boundary_index[former]]
     labels += [boundary] * len(removed)
     beyond = [d.points[removed]]
-    if isinstance(sphere, SphereRegion):
-        beyond.insert(0, np.asarray(sphere.beyond)[former])
+    if len(former):
+        beyond.insert(0, sphere.mirrored(former, d.points[:0]))
     region = SphereRegion(
         sphere.radius,
         within=d.points[np.unique(owner[faces[neighbors < 0]])],

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.polygon import Polygon
 from .results import Result
 from .straightening import have_corners
 
@@ -14,7 +13,7 @@ from .straightening import have_corners
 def summary(result: Result) -> dict[str, Any]:
     """Return the figures of a run; see `Result.summary`."""
     error, history = np.abs(result.size_error), result.history
-    parts = beside_boundary(result) if isinstance(result.diagram.domain, Polygon) else {}
+    parts = beside_boundary(result) if result.diagram.domain.outline is not None else {}
     apart = {f"{part}_{name}": value for part, some in parts.items() for name, value in some.items()}
     return {
         "cells": len(result.points),

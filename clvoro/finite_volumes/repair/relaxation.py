@@ -14,7 +14,6 @@ import scipy.sparse
 
 from ...arguments import format_point, warn
 from ...errors import MismatchWarning
-from ...geometry.polygon import Polygon
 from ...geometry.ring_coordinate import RingCoordinate
 from ...mesh.connectivity import following
 from ...mesh.faces import Faces
@@ -72,8 +71,8 @@ def relax_points(mesh: Faces, parts: np.ndarray, straight: bool = True) -> Faces
     bad = _bad_cells(mesh, loops, faces, straight)
     if not bad.any():
         return mesh
-    domain = mesh.domain
-    ring = RingCoordinate(domain) if straight and isinstance(domain, Polygon) else None
+    outline = mesh.domain.outline if straight else None
+    ring = None if outline is None else RingCoordinate(outline)
     kinds = point_kinds(mesh, parts)
     region = _grown(loops, bad)
     around, groups = take_patch(mesh, region), _connected_parts(mesh, region, bad)

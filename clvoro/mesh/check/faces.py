@@ -8,8 +8,6 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ...geometry.polygon import Polygon
-from ...geometry.sphere import Sphere
 from ..connectivity import face_ends, face_keys, plane_shares, take_rows
 from .findings import ROUNDINGS
 
@@ -26,7 +24,7 @@ def check_corners(check: Check) -> None:
     different vertices.
     """
     d = check.diagram
-    if isinstance(d.domain, Polygon):
+    if d.domain.cuts_cells:
         return
     inner = np.flatnonzero((d.neighbors >= 0) & ~d.shifts.any(axis=1))
     here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
@@ -69,7 +67,7 @@ def _euler_characteristic(d: Diagram) -> int | None:
 
     It is 2 for each connected part of a sphere, less one for each of its boundaries, as that of a rectangle.
     """
-    if not isinstance(d.domain, Sphere):
+    if not d.domain.curved:
         return 1
     owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
     walls = d.neighbors < 0
@@ -107,7 +105,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     planes, anchors = d.domain.wall_planes(-1 - d.neighbors[walls])
     height[walls] = ((anchors - d.points[g.owner[walls]]) * planes).sum(axis=1)
     loose = np.zeros(len(g.owner), bool)
-    if isinstance(d.domain, Polygon):
+    if d.domain.cuts_cells:
         # Faces of parts that the boundary has cut off from their generators are not on bisectors: their corners give
         # their places. Such a part lies at the boundary, and so does the cell that it belongs to.
         there = g.areas / np.maximum(g.measures, 1e-300)[:, None]
@@ -131,7 +129,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
         np.maximum(gap - width, 0),
         lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
     )
-    if isinstance(d.domain, Polygon):  # corners alone give the places of cut faces
+    if d.domain.cuts_cells:  # corners alone give the places of cut faces
         return
     if d.is_power and dim == 2:
         # A small cell may be far from its generator: one of its corners is the better origin. In 3D the device, too,

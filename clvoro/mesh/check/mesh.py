@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...geometry.polygon import Polygon
-from ...geometry.sphere import Sphere
 from ..connectivity import face_keys
 from ..locate import lifted, power_tree
 from .faces import check_corners, check_measures
@@ -77,7 +75,7 @@ def _check_structure(check: Check) -> None:
         check.shape("cell_vertex_starts", d.cell_vertex_starts, (n + 1,), "iu")
         _check_starts(check, "cell_vertex_starts", d.cell_vertex_starts, len(d.cell_vertices))
         corners = d.cell_vertices
-        if isinstance(d.domain, Polygon):
+        if d.domain.cuts_cells:
             check.shape("face_vertex_starts", d.face_vertex_starts, (m + 1,), "iu")
             check.shape("face_vertices", d.face_vertices, (2 * m,), "iu")
             check.note(
@@ -119,7 +117,7 @@ def _check_structure(check: Check) -> None:
     _check_shifts(check)
     _check_graph(check)
     check_corners(check)
-    if isinstance(d.domain, Polygon):
+    if d.domain.cuts_cells:
         check_outlines(check)
 
 
@@ -192,10 +190,9 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
     """Check positions, volumes and faces against the rebuilt cells `g`."""
     d = check.diagram
     n, domain = len(d), d.domain
-    spherical = isinstance(domain, Sphere)
     slack = ROUNDINGS * g.unit
     doubts = g.doubts(slack)
-    if spherical:
+    if domain.curved:
         check_places(check, g)
     else:
         _check_inside(check, slack)
@@ -226,7 +223,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         lambda _: f"the volumes' sum is {total:.17g}, expected the domain's {domain.measure:.17g}",
     )
     _check_faces(check, g, slack, doubts)
-    if spherical:
+    if domain.curved:
         check_generators(check, g)
     else:
         check_measures(check, g, doubts)
@@ -238,9 +235,9 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         np.maximum(off - doubt, 0),
         lambda i: f"centroids[{i}] is {d.centroids[i]}, its corners give {d.points[i] + g.centroids[i]}",
     )
-    if isinstance(domain, Polygon):
-        check_edges(check, domain, g, slack)
-        check_cells(check, domain, g, slack)
+    if domain.outline is not None:
+        check_edges(check, domain.outline, g, slack)
+        check_cells(check, domain.outline, g, slack)
     _check_nearest(check, g, slack)
 
 
@@ -253,7 +250,7 @@ def _check_inside(check: Check, slack: float) -> None:
         lambda i: f"generator {i} at {d.points[i]} lies outside {domain}",
     )
     outside = np.flatnonzero(~domain.contains(d.vertices))
-    if isinstance(domain, Polygon):  # vertices on oblique edges have round-off
+    if domain.cuts_cells:  # vertices on oblique edges have round-off
         outside = outside[domain.boundary_distance(d.vertices[outside]) > slack]
     check.note(
         "vertices inside",
@@ -265,7 +262,7 @@ def _check_inside(check: Check, slack: float) -> None:
 def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None:
     """Check faces: closed around each cell, right measures, outward, on their walls, equal on both sides."""
     d, width = check.diagram, doubts.measures
-    if not isinstance(d.domain, Sphere):
+    if not d.domain.curved:
         _check_closed(check, g, slack)
     wrong = np.abs(d.face_measures - g.measures) - width
     check.note(
@@ -330,7 +327,7 @@ def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> N
     d = check.diagram
     inner, walls = np.flatnonzero(d.neighbors >= 0), np.flatnonzero(d.neighbors < 0)
     inward = -np.einsum("ij,ij->i", g.areas, g.directions)
-    if isinstance(d.domain, Polygon):
+    if d.domain.cuts_cells:
         # A part that the boundary cuts off from its generator belongs to an adjacent cell. Its faces are not on the
         # bisector, and single ones between the same two cells may point inward.
         pair = np.unique(g.owner * (len(d) + 1) + np.maximum(d.neighbors, -1) + 1, return_inverse=True)[1]
@@ -341,7 +338,7 @@ def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> N
         np.maximum(inward - width, 0),
         lambda f: f"face {f} of cell {g.owner[f]} does not look towards {d.neighbors[f]}",
     )
-    if len(walls) and not isinstance(d.domain, Sphere):
+    if len(walls) and not d.domain.curved:
         # Faces towards removed cells are on bisectors; see `check_generators`.
         middles = g.middles[walls] + d.points[g.owner[walls]]
         height = d.domain.wall_distance(-1 - d.neighbors[walls], middles)
@@ -382,8 +379,8 @@ def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
         own = np.hypot(own, tree.data[g.cells, -1])
     nearest = lengths(tree.query(lifted(d, d.vertices - lower))[0][g.corners])
     excess = np.maximum(own - nearest - slack, 0)
-    if isinstance(d.domain, Polygon) and not d.is_power:
-        excess[hidden(d, d.domain, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0
+    if d.domain.outline is not None and not d.is_power:
+        excess[hidden(d, d.domain.outline, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0
     check.note(
         "nearest generators",
         excess,

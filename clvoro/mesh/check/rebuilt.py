@@ -9,7 +9,6 @@ import numpy as np
 import shapely
 from scipy.spatial import KDTree
 
-from ...geometry.polygon import Polygon
 from ..connectivity import face_ends, neighbor_points, next_faces
 
 if TYPE_CHECKING:
@@ -136,7 +135,7 @@ class Rebuilt:
     def _find_adopted(self, d: Diagram) -> None:
         """Set `adopted`, and the directions of adopted faces."""
         self.adopted = np.zeros(len(self.owner), bool)
-        if not isinstance(d.domain, Polygon):
+        if d.domain.outline is None:
             return
         inner = d.neighbors >= 0
         across = np.where(inner, self.spacings, 0.0)
@@ -158,7 +157,7 @@ class Rebuilt:
             away = np.linalg.norm(self.middles[inward], axis=1)
             nearest = KDTree(d.points).query(places)[0]
             ways = shapely.linestrings(np.stack([own, places], axis=1))
-            hidden = ~shapely.covers(d.domain.geometry, ways)
+            hidden = ~shapely.covers(d.domain.outline.geometry, ways)
             self.adopted[inward[hidden | (nearest < away - noise[inward] / 16)]] = True
         normals = self.areas / np.maximum(self.measures, 1e-300)[:, None]
         self.directions[self.adopted] = normals[self.adopted]

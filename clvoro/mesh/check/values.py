@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...geometry.polygon import Polygon
-from ...geometry.sphere import Sphere
-from ..straightening import straighten
+from ..straightening import cell_quality
 from .findings import ROUNDINGS
 from .history import check_history
 
@@ -39,12 +37,7 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         error = (length - h) / np.minimum(length, h)
         counts = np.diff(d.neighbor_starts)
         perimeter = np.bincount(np.repeat(np.arange(n), counts), d.face_measures, minlength=n)
-        if isinstance(d.domain, Sphere):
-            quality = 4 * counts * np.tan(np.pi / counts) * d.volumes / perimeter**2
-        elif dim == 2:
-            quality = straighten(d, g.real).quality()
-        else:
-            quality = 36 * np.pi * d.volumes**2 / perimeter**3
+        quality = cell_quality(d, perimeter, g.real)
     check.note(
         "size_error",
         np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
@@ -57,7 +50,7 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         # A face as short as round-off may have the direction of the round-off.
         slivers = d.face_measures < ROUNDINGS * g.unit * (1 if dim == 2 else g.reach[g.owner])
         loose = np.bincount(g.owner, slivers, minlength=n) > 0
-        if isinstance(d.domain, Polygon):
+        if d.domain.cuts_cells:
             loose |= np.bincount(g.owner, d.neighbors < 0, minlength=n) > 0
         elif dim == 3:
             # The device includes faces that the diagram leaves out as narrow as round-off; slivers lie among these.
