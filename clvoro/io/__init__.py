@@ -59,10 +59,9 @@ READERS: dict[str, Callable[[str | PathLike[str]], Result | Diagram]] = {".vtu":
 def load(path: str | PathLike[str]) -> Result | Diagram:
     """Read a result or a diagram from a ``.npz`` or ``.vtu`` file of its `save`, or a mesh on a sphere from ``.nc``.
 
-    A ``.npz`` file holds everything. A ``.vtu`` file holds cells, sizes, errors and quality: the graph is computed
-    again, the history is empty, and a box without periodic directions is the bounding box of the cells. The file is not
-    trusted: nothing in it is executed, sizes are compared with the bytes in the file before memory is allocated, and
-    arrays must be consistent.
+    A ``.npz`` file holds everything. A ``.vtu`` file holds domain, cells, neighbors, sizes, errors and quality: other
+    measures are computed again, and the history is empty. The file is not trusted: nothing in it is executed, sizes are
+    compared with the bytes in the file before memory is allocated, and arrays must be consistent.
 
     A ``.nc`` file of a mesh on a sphere may also be of another program. Generators, cells, neighbors and the generators
     behind a boundary are those that were saved, up to round-off; the boundary has one name, and corners may have other

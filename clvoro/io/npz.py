@@ -19,19 +19,15 @@ from typing import Any
 import numpy as np
 
 from ..files import open_plain
-from ..geometry.box import Box
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
-from ..geometry.sphere import Sphere
-from ..geometry.sphere_region import SphereRegion
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from .arrays import FileError, explained, list_members, read_member, write_arrays
 from .contents import Contents
+from .domains import describe, described
 
 FORMAT, VERSION = "clvoro-result", 2
 
-_DOMAINS = {"Box": Box, "Polygon": Polygon.described, "Sphere": Sphere, "SphereRegion": SphereRegion}
 _NEEDED = ("about", "points", "target_size", "size_error", "quality", "history", "diagram.points")
 _FIELDS = tuple(field.name for field in dataclasses.fields(Result))
 _FORMER = {"size": "target_size", "error": "size_error"}
@@ -86,11 +82,7 @@ def write_npz(contents: Contents, path: Path) -> None:
     """Write all of `contents` to `path`. Equal contents give equal bytes."""
     diagram, result = contents.diagram, contents.result
     domain = diagram.domain
-    about: dict[str, Any] = {
-        "domain": {"kind": type(domain).__name__, **domain.describe()},
-        "settings": contents.settings,
-        "values": {},
-    }
+    about: dict[str, Any] = {"domain": describe(domain), "settings": contents.settings, "values": {}}
     arrays: dict[str, object] = {}
     for name in _FIELDS if result is not None else ("diagram",):
         value = getattr(contents if result is None else result, name)
@@ -177,11 +169,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
         if about.dtype.kind != "U" or about.shape != ():
             raise TypeError("about is not text")
         facts = json.loads(about.item())
-        description = dict(facts["domain"])
-        kind = description.pop("kind")
-        if kind not in _DOMAINS:
-            raise FileError(f"its domain is a {kind!r:.40}, which this version of clvoro does not have")
-        domain = _DOMAINS[kind](**description)
+        domain = described(facts["domain"])
         settings = dict(facts["settings"])
         values = {name: value for name, value in facts["values"].items() if name in _FIELDS}
         needed = set() if alone else {"converged", "stop_reason"}

@@ -19,9 +19,6 @@ from ..arguments import check_choice
 from ..finite_volumes.prisms import cell_loops
 from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
-from ..geometry.sphere import Sphere
-from ..geometry.sphere_region import SphereRegion
 from ..mesh.connectivity import face_corners, face_owners, next_faces, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
@@ -29,9 +26,8 @@ from ..mesh.geometry import polygon_areas
 from ..mesh.straightening import count_sides
 from .atomic import atomic_file
 from .contents import Contents
+from .domains import describe
 
-NAMES, CURVES = "clvoro names: ", "clvoro curves: "
-"""Beginning of the comment with names of boundaries."""
 SOLVER_MESH = "clvoro solver mesh: the cells are not those of a diagram"
 _POLYGON, _POLYHEDRON = 7, 42  # VTK_POLYGON, VTK_POLYHEDRON
 _BLOCK = 1 << 20
@@ -44,9 +40,9 @@ def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: Wall
     Cell data: `size` (h), `error` (signed) and `quality` of a result; `volume` (area in 2D); `sides` (in 3D
     `faces_of_cell`); `label` (row of the cell); `boundary` (see `largest_boundary`); for each name that the caller
     gave to a boundary `boundary:NAME` (1 where the cell has a face on it, else 0); the vector `generator`, from the
-    origin to the cell's generator; in a power diagram `weight`; and data of the caller. Comments hold the settings and
-    the caller's names of boundaries, field data a polygonal, periodic or spherical domain. In a periodic box cells are
-    not cut at the seams. On a sphere the corners of cells are on it, and VTK draws straight lines between them.
+    origin to the cell's generator; in a power diagram `weight`; and data of the caller. A comment holds the settings,
+    field data the domain (JSON as bytes), the neighbor across each face, and shifts at seams. In a periodic box cells
+    are not cut at the seams. On a sphere the corners of cells are on it, and VTK draws straight lines between them.
 
     With `walls` "straight" the cells are those of the solver mesh, with their volumes, and without the domain, as the
     file is no diagram to `load`.
@@ -68,7 +64,7 @@ def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: Wall
         values |= _solver_data(mesh)
     cells = [appended.add(name, array) for name, array in topology.items()]
     data = [appended.add(name, array) for name, array in values.items()]
-    about = _domain_data(diagram) if mesh is None else {}
+    about = _diagram_data(diagram) if mesh is None else {}
     field = [appended.add(name, array, tuples=True) for name, array in about.items()]
     note = "" if mesh is None else _comment(SOLVER_MESH) + "\n"
     compressor = ' compressor="vtkZLibDataCompressor"' if compress else ""
@@ -76,7 +72,7 @@ def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: Wall
 <VTKFile type="UnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" \
 header_type="UInt64"{compressor}>
 {_comment("clvoro settings: " + json.dumps(contents.settings, default=repr))}
-{note}{_domain_comments(diagram.domain)}\
+{note}\
 <UnstructuredGrid>
 {_field_data(field)}<Piece NumberOfPoints="{len(vertices)}" NumberOfCells="{n}">
 <Points>
@@ -99,43 +95,22 @@ _"""
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
 
 
-def _domain_data(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return field data with the domain, and with the parts of the graph that corners of cells do not define."""
-    domain = diagram.domain
-    if isinstance(domain, Sphere):
-        region = {}
-        if isinstance(domain, SphereRegion):
-            region = {
-                "region_within": np.asarray(domain.within),
-                "region_beyond": np.asarray(domain.beyond),
-                "region_area": np.array([domain.area]),
-            }
-        return {"sphere_radius": np.array([domain.radius]), **region}
-    if any(domain.periodic):
-        starts = face_corners(diagram)[0]
-        written = np.cumsum(np.diff(starts) > 0) - 1  # in 3D faces without vertices are left out
-        seam = np.flatnonzero(diagram.shifts.any(axis=1) & (np.diff(starts) > 0))
-        if domain.dim == 2:
-            written = np.arange(len(diagram.neighbors))
-        return {
-            "box_corners": in_space(np.array([domain.lower, domain.upper])),
-            "box_periodic": np.array(domain.periodic, np.uint8),
-            "seam_faces": written[seam].astype(np.int32),
-            "seam_neighbors": diagram.neighbors[seam],
-            "seam_shifts": in_space(diagram.shifts[seam]).astype(np.int32),
-        }
-    if not isinstance(domain, Polygon):
-        return {}
-    return {
-        "domain_vertices": in_space(domain.vertices),
-        "domain_ring_starts": domain.ring_starts,
-        "domain_piece_of_ring": domain.piece_of_ring,
-        **_polygon_graph(diagram),
-    }
+def _diagram_data(diagram: Diagram) -> dict[str, np.ndarray]:
+    """Return field data with the domain, and with what corners of cells do not define: the graph."""
+    about = np.frombuffer(json.dumps(describe(diagram.domain)).encode(), np.uint8)
+    # In 3D faces without vertices are left out.
+    starts = face_corners(diagram)[0] if diagram.domain.cell_dim == 3 else diagram.face_vertex_starts
+    written = np.diff(starts) > 0
+    found = {"domain": about, "neighbors": diagram.neighbors[written].astype(np.int32)}
+    if any(diagram.domain.periodic):
+        found["shifts"] = in_space(diagram.shifts[written]).astype(np.int32)
+    if diagram.domain.cuts_cells:
+        found["bridges"] = _bridges(diagram)
+    return found
 
 
-def _polygon_graph(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return the places of bridges between loops among corners, and the numbers of the edges at boundary faces.
+def _bridges(diagram: Diagram) -> np.ndarray:
+    """Return the places among the corners of cells where bridges between loops begin, and no faces.
 
     Corners alone do not distinguish a bridge from a slit without width in single precision.
     """
@@ -148,12 +123,7 @@ def _polygon_graph(diagram: Diagram) -> dict[str, np.ndarray]:
     place = np.arange(len(following)) - starts[cell] + np.maximum(2 * earlier - 1, 0)
     bridge = np.ones(len(diagram.cell_vertices), bool)
     bridge[diagram.cell_vertex_starts[cell] + place] = False
-    walls = np.flatnonzero(diagram.neighbors < 0)
-    return {
-        "bridges": np.flatnonzero(bridge).astype(np.int32),
-        "wall_faces": walls.astype(np.int32),
-        "wall_edges": (-1 - diagram.neighbors[walls]).astype(np.int32),
-    }
+    return np.flatnonzero(bridge).astype(np.int32)
 
 
 def _polygons(mesh: Diagram | Faces) -> dict[str, np.ndarray]:
@@ -303,17 +273,6 @@ def _packed(raw: bytes) -> bytes:
 def _comment(text: str) -> str:
     # Not a field of type String, because meshio cannot read such a file.
     return f"<!-- {text.replace('--', '- -')} -->"
-
-
-def _domain_comments(domain: Domain) -> str:
-    """Return lines with the caller's names of boundaries and with the curves, which the loader reads."""
-    values = domain.describe()
-    return "".join(
-        # A comment has no "--".
-        _comment(key + json.dumps(values[name]).replace("--", r"-\u002d")) + "\n"
-        for key, name in ((NAMES, "names"), (CURVES, "curves"))
-        if values.get(name)
-    )
 
 
 def _field_data(elements: list[str]) -> str:

@@ -130,7 +130,7 @@ def test_diagrams_of_a_device_can_be_pickled_and_listed():
     for name in ("volumes", "neighbors", "vertices", "cell_vertices", "shifts"):
         assert name in dir(again)
         assert np.array_equal(getattr(again, name), getattr(diagram, name))
-    assert "face_vertices" not in dir(again)  # only in 3D and in polygons
+    assert "face_vertices" in dir(again)
 
 
 def test_npz_knows_every_array_of_a_diagram():

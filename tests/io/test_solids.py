@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import json
 import struct
 import xml.etree.ElementTree as ElementTree
 import zlib
@@ -12,6 +13,7 @@ import pytest
 from clvoro import io
 from clvoro.errors import InputError
 from clvoro.io.contents import Contents
+from clvoro.io.domains import describe
 from clvoro.io.vtu import largest_boundary, polyhedra, write_vtu
 from clvoro.mesh.connectivity import face_corners, face_owners, take_rows
 from clvoro.mesh.diagram import Diagram
@@ -190,6 +192,8 @@ def test_vtu_holds_cells_and_data(result, tmp_path, compress):
         "label": np.arange(len(d), dtype=np.int32),
         "boundary": largest_boundary(d),
         "generator": d.points,
+        "domain": np.frombuffer(json.dumps(describe(d.domain)).encode(), np.uint8),
+        "neighbors": d.neighbors.astype(np.int32),
     }
     assert set(arrays) == set(expected)
     for name, values in expected.items():

@@ -6,7 +6,6 @@ known from the numbers of points and cells, or bounded by the size of the file, 
 
 from __future__ import annotations
 
-import json
 import struct
 import sys
 import zlib
@@ -17,7 +16,7 @@ from xml.parsers import expat
 import numpy as np
 
 from ..arrays import EXPANSION, LEAST, FileError
-from ..vtu import CURVES, NAMES, SOLVER_MESH
+from ..vtu import SOLVER_MESH
 
 LONGEST_HEAD = 1 << 22
 MARK = b'<AppendedData encoding="raw">\n_'
@@ -40,22 +39,10 @@ _USED = {
     "CellData.label",
     "CellData.sides",
     "CellData.faces_of_cell",
-    "FieldData.box_corners",
-    "FieldData.box_periodic",
-    "FieldData.seam_faces",
-    "FieldData.seam_neighbors",
-    "FieldData.seam_shifts",
-    "FieldData.domain_vertices",
-    "FieldData.domain_ring_starts",
-    "FieldData.domain_piece_of_ring",
-    "FieldData.domain_edge_numbers",
+    "FieldData.domain",
+    "FieldData.neighbors",
+    "FieldData.shifts",
     "FieldData.bridges",
-    "FieldData.wall_faces",
-    "FieldData.wall_edges",
-    "FieldData.sphere_radius",
-    "FieldData.region_within",
-    "FieldData.region_beyond",
-    "FieldData.region_area",
 }
 
 
@@ -69,8 +56,6 @@ class FileReader:
         self.points = self.cells = -1
         self.compressed = False
         self.entries: dict[str, tuple[str, int, int]] = {}
-        self.names: dict[str, list[int]] | None = None
-        self.curves: list[object] | None = None
         self._within: list[str] = []
         parser = expat.ParserCreate()
         parser.StartDoctypeDeclHandler = self._refuse
@@ -78,7 +63,10 @@ class FileReader:
         parser.StartElementHandler = self._element
         parser.EndElementHandler = lambda _: self._within.pop()
         parser.CommentHandler = self._comment
-        parser.Parse(head, False)
+        try:
+            parser.Parse(head, False)
+        except expat.ExpatError as error:
+            raise FileError(f"it is damaged or not from clvoro ({error})") from error
         if min(self.points, self.cells) < 0:
             raise FileError("it has no piece with points and cells")
 
@@ -86,15 +74,10 @@ class FileReader:
         raise FileError("it declares a document type or entities, which files of clvoro do not")
 
     def _comment(self, text: str) -> None:
-        text = text.strip()
-        if text == SOLVER_MESH:
+        if text.strip() == SOLVER_MESH:
             raise FileError(
                 "it holds the mesh for solvers, which is no diagram; load a .npz file, or a .vtu file with exact walls"
             )
-        if text.startswith(NAMES):
-            self.names = json.loads(text.removeprefix(NAMES))
-        if text.startswith(CURVES):
-            self.curves = json.loads(text.removeprefix(CURVES))
 
     def _element(self, tag: str, given: dict[str, str]) -> None:
         if tag == "VTKFile":

@@ -2,51 +2,45 @@
 
 from __future__ import annotations
 
+import json
 import os
-import struct
-import zlib
 from array import array
+from collections.abc import Mapping
 from itertools import pairwise
-from os import PathLike, fspath
-from xml.parsers import expat
+from os import PathLike
 
 import numpy as np
-from scipy.spatial import KDTree
 
-from ...errors import InputError
 from ...files import open_plain
-from ...geometry.box import Box
 from ...geometry.domain import Domain
-from ...geometry.polygon import Polygon
-from ...geometry.sphere import Sphere
-from ...geometry.sphere_region import SphereRegion
 from ...mesh.check.rebuilt import rebuild
-from ...mesh.connectivity import following
+from ...mesh.connectivity import face_owners, following
 from ...mesh.diagram import Diagram
 from ...mesh.results import HISTORY_DTYPE, Result
 from ...mesh.spherical import rebuild_on_sphere
-from ..arrays import FileError
-from ..vtu_checks import check_repeated
+from ...mesh.straightening import count_sides
+from ..arrays import FileError, explained
+from ..domains import described
 from .arrays import END, LONGEST_HEAD, MARK, FileReader
 
-_OFF_SPHERE = 1e-5
-"""Largest distance of a vertex from its sphere in units of the radius: round-off of float32, and more."""
+_OFF_SURFACE = 1e-5
+"""Largest distance of a position from a curved domain in units of its size: round-off of float32, and more."""
+_KINDS = {2: 7, 3: 42}
+"""VTK's polygon and polyhedron by the dimension of the cells."""
 
 
 def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
-    """Read the cells and cell data of a `.vtu` file of `Result.save` or `Diagram.save`.
+    """Read the cells and cell data of a `.vtu` file of `Result.save` or `Diagram.save`, with any domain.
 
-    The domain is the polygon or periodic box in the file, or else the bounding box of the vertices. The graph is
-    computed again from the corners that cells share. Volumes, sizes, errors and quality are those of the file. The
-    history is empty.
+    Domain, graph, volumes, sizes, errors and quality are those of the file. Other measures are computed again from the
+    corners of the cells. The history is empty.
 
     Raises
     ------
     InputError
         If the file is missing, damaged, truncated or not from clvoro; names the file and the fault.
     """
-    name = fspath(path)
-    try:
+    with explained(path, "a .vtu file that save wrote"):
         with open_plain(path) as file:
             head = file.read(LONGEST_HEAD)
             end = head.find(MARK)
@@ -57,53 +51,42 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
             file.seek(max(0, size - len(END)))
             if file.read() != END:
                 raise FileError("it is truncated, or has bytes behind its end")
-            reader = FileReader(head[:end], start, size)
-            arrays = reader.read_all(file)
-        return _assemble(arrays, reader)
-    except FileError as problem:
-        raise InputError(f"cannot read {name}: {problem}") from problem
-    except (
-        zlib.error,
-        struct.error,
-        ValueError,
-        OverflowError,
-        KeyError,
-        TypeError,
-        RecursionError,
-        expat.ExpatError,
-    ) as error:
-        raise InputError(f"cannot read {name}: it is damaged or not from clvoro ({error})") from error
-    except OSError as error:
-        raise InputError(f"cannot read {name}: {error.strerror or error}") from error
+            arrays = FileReader(head[:end], start, size).read_all(file)
+        return _assemble(arrays)
 
 
-def _assemble(arrays: dict[str, np.ndarray], reader: FileReader) -> Result | Diagram:
-    vertices = arrays["Points."].astype(float)
-    kinds = arrays["Cells.types"]
-    if not len(kinds) or not len(vertices) or not np.isfinite(vertices).all():
+def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
+    vertices, n = arrays["Points."].astype(float), len(arrays["Cells.types"])
+    if not n or not len(vertices) or not np.isfinite(vertices).all():
         raise FileError("it has no cells, or vertices that are not finite")
-    flat = bool((kinds == 7).all())
-    if not flat and not (kinds == 42).all():
-        raise FileError("its cells are neither all polygons nor all polyhedra")
-    dim = 2 if flat and "FieldData.sphere_radius" not in arrays else 3
-    x = np.ascontiguousarray(vertices[:, :dim])
-    domain = _domain(arrays, x, reader)
-    faces = _cell_polygons(arrays, len(x), domain) if flat else _cell_polyhedra(arrays, len(x))
-    owner = np.repeat(np.arange(len(kinds)), np.diff(faces["neighbor_starts"]))
-    neighbors = _neighbors(owner, faces.pop("starts"), faces.pop("corners"), x, domain)
-    if "FieldData.wall_faces" in arrays:
-        _set_walls(arrays, neighbors, domain)
-    across = _seam(arrays, neighbors, dim, len(kinds)) if any(domain.periodic) else {}
-    points = arrays["CellData.generator"][:, :dim].astype(float)
-    volumes = arrays["CellData.volume"].astype(float)
-    known = {"points": points, "volumes": volumes, "neighbors": neighbors, "vertices": x}
-    known |= {**faces, **across}
+    if "FieldData.domain" not in arrays:
+        raise FileError("it has no domain; it is not from clvoro, or from an earlier version: load its .npz file")
+    domain = described(json.loads(arrays["FieldData.domain"].tobytes()))
+    if not (arrays["Cells.types"] == _KINDS[domain.cell_dim]).all():
+        raise FileError(f"its cells are not those of a mesh in {domain}")
+    x = np.ascontiguousarray(vertices[:, : domain.dim])
+    points = np.ascontiguousarray(arrays["CellData.generator"][:, : domain.dim].astype(float))
+    for name, places in (("vertices", x), ("generators", points)) if domain.curved else ():
+        off = np.linalg.norm(domain.nearest(places) - places, axis=1)
+        if not (off < _OFF_SURFACE * domain.frame[1]).all():
+            raise FileError(f"its {name} are not on the {domain}")
+    known = _cell_polygons(arrays, len(x), domain) if domain.cell_dim == 2 else _cell_polyhedra(arrays, len(x))
+    walls, m = len(domain.boundary_index), known["neighbor_starts"][-1]
+    known |= {"points": points, "volumes": arrays["CellData.volume"].astype(float), "vertices": x}
+    known["neighbors"] = _indices(arrays["FieldData.neighbors"] + walls, n + walls, "neighbors") - walls
+    if len(known["neighbors"]) != m:
+        raise FileError(f"neighbors have {len(known['neighbors'])} entries, expected {m}: one per face")
+    if "FieldData.shifts" in arrays:
+        shifts = arrays["FieldData.shifts"]
+        if shifts.shape != (m, 3) or (np.abs(shifts.astype(float)) > 1).any():
+            raise FileError("its shifts differ from its cells")
+        known["shifts"] = shifts[:, : domain.dim].astype(np.int8)
     if "CellData.weight" in arrays:
         known["weights"] = arrays["CellData.weight"].astype(float)
     # The other arrays follow from the corners.
-    rest = rebuild_on_sphere if isinstance(domain, Sphere) else rebuild
+    rest = rebuild_on_sphere if domain.curved else rebuild
     diagram = Diagram(domain, {**known, **rest(Diagram(domain, known))})
-    check_repeated(arrays, diagram)
+    _check_repeated(arrays, diagram)
     of_run = [f"CellData.{name}" for name in ("size", "error", "quality")]
     if not set(of_run) & set(arrays):
         return diagram
@@ -120,124 +103,19 @@ def _assemble(arrays: dict[str, np.ndarray], reader: FileReader) -> Result | Dia
     )
 
 
-def _domain(arrays: dict[str, np.ndarray], x: np.ndarray, reader: FileReader) -> Domain:
-    """Return the domain in the file, or else the bounding box of the vertices."""
-    if "FieldData.sphere_radius" in arrays:
-        return _sphere(arrays, x, reader)
-    lower, upper, dim = x.min(axis=0), x.max(axis=0), x.shape[1]
-    if not (lower < upper).all():
-        raise FileError("its vertices lie on a line")
-    if "FieldData.box_periodic" in arrays:
-        return _periodic_box(arrays, dim, reader.names)
-    polygon = _polygon(arrays, reader) if dim == 2 else None
-    return polygon or Box(tuple(lower), tuple(upper), names=reader.names)
-
-
-def _sphere(arrays: dict[str, np.ndarray], x: np.ndarray, reader: FileReader) -> Sphere:
-    """Return the sphere in the file, or the part of it, on which all vertices and generators must be."""
-    radius = arrays["FieldData.sphere_radius"]
-    if radius.shape != (1,) or radius.dtype.kind != "f":
-        raise FileError(f"sphere_radius has shape {radius.shape} and dtype {radius.dtype}")
-    sphere = Sphere(float(radius[0]))
-    for name, places in (("vertices", x), ("generators", arrays["CellData.generator"])):
-        if not (np.abs(np.linalg.norm(places, axis=1) / sphere.radius - 1) < _OFF_SPHERE).all():
-            raise FileError(f"its {name} are not on the {sphere}")
-    if "FieldData.region_beyond" not in arrays:
-        return sphere
-    within, beyond, area = (arrays[f"FieldData.region_{k}"] for k in ("within", "beyond", "area"))
-    if area.shape != (1,):
-        raise FileError(f"region_area has shape {area.shape}")
-    return SphereRegion(sphere.radius, within=within, beyond=beyond, area=float(area[0]), names=reader.names)
-
-
-def _cell_polygons(arrays: dict[str, np.ndarray], v: int, domain: Domain) -> dict[str, np.ndarray]:
-    """Return the diagram's arrays of cells and faces in 2D, and `starts` and `corners` of the faces."""
-    cell_starts, corners = _polygons(arrays, v)
-    owner = np.repeat(np.arange(len(cell_starts) - 1), np.diff(cell_starts))
-    ends = np.stack([corners, corners[following(cell_starts)]], axis=1)
-    found = {"cell_vertex_starts": cell_starts, "cell_vertices": corners}
-    if not isinstance(domain, Polygon):
-        rows = cell_starts
-    else:
-        kept = ~_bridges(arrays, owner, ends)
-        ends = ends[kept]
-        counts = np.bincount(owner[kept], minlength=len(cell_starts) - 1)
-        rows = np.concatenate([[0], np.cumsum(counts)])
-    starts = 2 * np.arange(len(ends) + 1)
-    if isinstance(domain, Polygon):
-        found |= {"face_vertex_starts": starts, "face_vertices": ends.ravel()}
-    return {**found, "neighbor_starts": rows, "starts": starts, "corners": ends.ravel()}
-
-
-def _cell_polyhedra(arrays: dict[str, np.ndarray], v: int) -> dict[str, np.ndarray]:
-    """Return the diagram's arrays of faces in 3D, and again `starts` and `corners` of the faces."""
-    cell_starts, starts, corners = _polyhedra(arrays, v)
-    return {
-        "neighbor_starts": cell_starts,
-        "face_vertex_starts": starts,
-        "face_vertices": corners,
-        "starts": starts,
-        "corners": corners,
-    }
-
-
-def _periodic_box(arrays: dict[str, np.ndarray], dim: int, names: dict[str, list[int]] | None) -> Box:
-    """Return the periodic box in the file."""
-    corners = arrays["FieldData.box_corners"].reshape(2, 3)[:, :dim].astype(float)
-    axes = arrays["FieldData.box_periodic"]
-    if axes.shape != (dim,):
-        raise FileError(f"box_periodic has shape {axes.shape}, expected ({dim},)")
-    return Box(*corners.tolist(), periodic=tuple(bool(a) for a in axes), names=names)
-
-
-def _seam(arrays: dict[str, np.ndarray], neighbors: np.ndarray, dim: int, n: int) -> dict[str, np.ndarray]:
-    """Set the neighbors across the seams, where faces share no corners, and return the shifts."""
-    faces = _indices(arrays["FieldData.seam_faces"], len(neighbors), "seam_faces")
-    others = _indices(arrays["FieldData.seam_neighbors"], n, "seam_neighbors")
-    steps = arrays["FieldData.seam_shifts"].reshape(-1, 3)[:, :dim]
-    if not len(faces) == len(others) == len(steps) or (np.abs(steps.astype(float)) > 1).any():
-        raise FileError("its seams differ from its cells")
-    neighbors[faces] = others
-    shifts = np.zeros((len(neighbors), dim), np.int8)
-    shifts[faces] = steps
-    return {"shifts": shifts}
-
-
-def _polygon(arrays: dict[str, np.ndarray], reader: FileReader) -> Polygon | None:
-    """Return the polygonal domain in the file; None without one."""
-    prefix = "FieldData.domain_"
-    values = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-    if not values:
-        return None
-    if "vertices" in values:
-        values["vertices"] = values["vertices"].reshape(-1, 3)[:, :2]
-    return Polygon.described(**values, names=reader.names, curves=reader.curves)
-
-
-def _set_walls(arrays: dict[str, np.ndarray], neighbors: np.ndarray, domain: Domain) -> None:
-    """Set the edges at boundary faces that the file lists."""
-    faces = _indices(arrays["FieldData.wall_faces"], len(neighbors), "wall_faces")
-    edges = _indices(arrays["FieldData.wall_edges"], len(domain.boundary_index), "wall_edges")
-    if len(faces) != len(edges):
-        raise FileError("wall_faces and wall_edges differ in length")
-    neighbors[faces] = -1 - edges
-
-
-def _bridges(arrays: dict[str, np.ndarray], owner: np.ndarray, loops: np.ndarray) -> np.ndarray:
-    """Return which pairs of consecutive corners (m, 2) are bridges between loops of a cell, and not faces.
-
-    Without a list in the file, these are the pairs that the cell passes in both directions.
-    """
-    if "FieldData.bridges" in arrays:
-        found = np.zeros(len(loops), bool)
-        found[_indices(arrays["FieldData.bridges"], len(loops), "bridges")] = True
-        return found
-    low, high = loops.min(axis=1), loops.max(axis=1)
-    order = np.lexsort((high, low, owner))
-    same = np.all([np.diff(key[order]) == 0 for key in (owner, low, high)], axis=0)
-    found = np.zeros(len(loops), bool)
-    found[order[1:][same]] = found[order[:-1][same]] = True
-    return found & (low < high)
+def _cell_polygons(arrays: Mapping[str, np.ndarray], v: int, domain: Domain) -> dict[str, np.ndarray]:
+    """Return the diagram's arrays of cells and faces in 2D."""
+    corners = _indices(arrays["Cells.connectivity"], v, "corners")
+    starts = _starts(arrays["Cells.offsets"], len(corners), "offsets")
+    found = {"cell_vertex_starts": starts, "cell_vertices": corners, "neighbor_starts": starts}
+    if domain.cuts_cells:
+        kept = np.ones(len(corners), bool)
+        kept[_indices(arrays["FieldData.bridges"], len(corners), "bridges")] = False
+        ends = np.stack([corners, corners[following(starts)]], axis=1)[kept]
+        counts = np.bincount(np.repeat(np.arange(len(starts) - 1), np.diff(starts))[kept], minlength=len(starts) - 1)
+        found["neighbor_starts"] = np.concatenate([[0], np.cumsum(counts)])
+        found |= {"face_vertex_starts": 2 * np.arange(len(ends) + 1), "face_vertices": ends.ravel()}
+    return found
 
 
 def _indices(array: np.ndarray, bound: int, name: str) -> np.ndarray:
@@ -255,13 +133,8 @@ def _starts(ends: np.ndarray, total: int, name: str) -> np.ndarray:
     return starts
 
 
-def _polygons(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.ndarray]:
-    corners = _indices(arrays["Cells.connectivity"], v, "corners")
-    return _starts(arrays["Cells.offsets"], len(corners), "offsets"), corners
-
-
-def _polyhedra(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the starts of cells in the faces, the starts of faces in the corners, and the corners."""
+def _cell_polyhedra(arrays: Mapping[str, np.ndarray], v: int) -> dict[str, np.ndarray]:
+    """Return the diagram's arrays of faces in 3D."""
     stream = _indices(arrays["Cells.faces"], max(v, len(arrays["Cells.faces"])), "faces")
     ends = _starts(arrays["Cells.faceoffsets"], len(stream), "faceoffsets")
     counts, cells = array("q"), array("q", [0])  # places of the corner counts of faces
@@ -279,39 +152,42 @@ def _polyhedra(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.nd
     headers = np.array(counts, np.int64)
     faces = np.concatenate([[0], np.cumsum(stream[headers])])
     corners = np.delete(stream, np.concatenate([ends[:-1], headers]))
-    return np.array(cells, np.int64), faces, _indices(corners, v, "corners of faces")
+    return {
+        "neighbor_starts": np.array(cells, np.int64),
+        "face_vertex_starts": faces,
+        "face_vertices": _indices(corners, v, "corners of faces"),
+    }
 
 
-def _neighbors(owner: np.ndarray, starts: np.ndarray, corners: np.ndarray, x: np.ndarray, domain: Domain) -> np.ndarray:
-    """Return the neighbor across each face: the cell with a face of the same corners, or else the nearest wall."""
-    sides = np.diff(starts)
-    face = np.repeat(np.arange(len(sides)), sides)
-    ragged = corners[np.lexsort((corners, face))]
-    result = np.full(len(sides), np.iinfo(np.int64).min)
-    for k in np.unique(sides):
-        rows = np.flatnonzero(sides == k)
-        if k < 2:
-            raise FileError("a face has fewer than 2 corners")
-        keys = ragged[starts[rows][:, None] + np.arange(k)]
-        by = np.lexsort(keys.T[::-1])
-        same = (keys[by][1:] == keys[by][:-1]).all(axis=1)
-        a, b = rows[by[:-1][same]], rows[by[1:][same]]
-        result[a], result[b] = owner[b], owner[a]
-    alone = np.flatnonzero(result < 0)
-    sums = np.stack([np.bincount(face, column, len(sides)) for column in x[corners].T], axis=1)
-    middle = sums[alone] / sides[alone][:, None]
-    if isinstance(domain, SphereRegion):  # the wall is that of the removed cell across the face
-        result[alone] = -1 - KDTree(domain.beyond).query(middle)[1]
-        return result
-    if isinstance(domain, Sphere):
-        if len(alone):
-            raise FileError(f"cell {owner[alone[0]]} has a face that is no other cell's")
-        return result
-    if isinstance(domain, Polygon):
-        result[alone] = -1 - domain.nearest_edge(middle)[0]
-        return result
-    gaps = np.stack([middle - domain.lower, domain.upper - middle], axis=2)
-    gaps[:, np.array(domain.periodic)] = np.inf  # seams are not walls
-    gaps = gaps.reshape(len(alone), -1)
-    result[alone] = -1 - gaps.argmin(axis=1)
-    return result
+def _check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
+    """Check the `arrays` of a file that are not needed to make its `diagram` against that diagram.
+
+    Raises
+    ------
+    ValueError
+        Names the first array that differs.
+    """
+    n, v = len(diagram), len(diagram.vertices)
+    given = {"CellData.label": arrays["CellData.label"]}
+    expected: dict[str, np.ndarray] = {"CellData.label": np.arange(n)}
+    if diagram.domain.cell_dim == 2:
+        for name in ("Points.", "CellData.generator") if diagram.domain.dim == 2 else ():
+            given[f"z of {name}"] = z = arrays[name][:, 2]
+            expected[f"z of {name}"] = np.zeros(len(z))
+        given["CellData.sides"] = arrays["CellData.sides"]
+        expected["CellData.sides"] = count_sides(diagram)
+    else:
+        expected["CellData.faces_of_cell"] = np.diff(diagram.neighbor_starts)
+        # The corners of a cell, each once, in ascending order.
+        cell = np.repeat(face_owners(diagram).astype(np.int64), np.diff(diagram.face_vertex_starts))
+        keys = np.unique(cell * v + diagram.face_vertices)
+        expected["Cells.offsets"] = np.cumsum(np.bincount(keys // v, minlength=n))
+        expected["Cells.connectivity"] = keys % v
+        given = {name: arrays[name] for name in expected}
+    for name, values in expected.items():
+        if given[name].shape != values.shape:
+            raise ValueError(f"{name} has shape {given[name].shape}, expected {values.shape}")
+        wrong = np.flatnonzero(given[name] != values)
+        if len(wrong):
+            k = wrong[0]
+            raise ValueError(f"{name} is {given[name][k]} at {k}, expected {values[k]}")
