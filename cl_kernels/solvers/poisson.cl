@@ -53,7 +53,8 @@ inline REAL sum_measures(int k, int end, global const int *neighbors, global con
 
    The work-item of the lower cell writes the entry of both rows, so that A is symmetric to the last bit. l_ij is the
    mean of the two cells' measures of the face, which differ by round-off. The weight stays 0 for walls, for a face that
-   only one cell has (shorter than round-off), and for all but the first of several faces of two cells. */
+   only one cell has (shorter than round-off), and for all but the first of several faces of two cells. A ghost, j >= n,
+   has no row: its l_ij is the measure that cell i has. */
 kernel void assemble_laplacian(int n, int weighted, global const int *starts, global const int *neighbors,
                                global const FACE *face_measures, global const REAL *points, global const REAL *density,
                                global STORE *weights PERIOD_ARGS)
@@ -67,7 +68,7 @@ kernel void assemble_laplacian(int n, int weighted, global const int *starts, gl
         const int j = neighbors[k];
         if (j <= i)
             continue;
-        const int there = find_entry(i, j, last, starts, neighbors);
+        const int there = j < n ? find_entry(i, j, last, starts, neighbors) : k;
         if (there < 0)
             continue;
         if (SEVERAL && find_entry(j, i, last, starts, neighbors) < k)
@@ -78,7 +79,7 @@ kernel void assemble_laplacian(int n, int weighted, global const int *starts, gl
             square += d * d;
         }
         const REAL here = sum_measures(k, end, neighbors, face_measures);
-        const REAL other = sum_measures(there, starts[j + 1], neighbors, face_measures);
+        const REAL other = j < n ? sum_measures(there, starts[j + 1], neighbors, face_measures) : here;
         REAL weight = R(0.5) * (here + other) / sqrt(square);
         if (weighted)
             weight *= root_i * sqrt(density[j]);

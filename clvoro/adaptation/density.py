@@ -62,11 +62,12 @@ class Density:
         return w
 
     def _evaluate(self, t: Tessellation, h: cla.Array, w: CellWeights) -> cla.Array:
-        """Write the weights; return log h (n,)."""
-        log_h = self.engine.scratch(t.n)
+        """Write the weights; return log h, that of ghosts as well."""
+        log_h = self.engine.scratch(t.rows)
         self.engine.run(
             self._kernels.evaluate_density, -(-t.n // 4), t.n, t.volumes, h, w.density, w.weight, w.log_ratio, log_h
         )
+        t.forward(self.engine, log_h)
         return log_h
 
     def lloyd_weights(

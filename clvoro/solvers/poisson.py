@@ -148,10 +148,10 @@ class Poisson:
         neighbors : (m,) int32
             Negative entries are walls.
         face_measures : (m,) real or single
-        points : (n, d) real
-            Generators.
-        density : (n,) real, optional
-            rho > 0; rho_ij is the geometric mean. By default rho = 1.
+        points : (n or more, d) real
+            Generators, and ghosts that neighbors name.
+        density : (n or more,) real, optional
+            rho > 0, that of ghosts as well; rho_ij is the geometric mean. By default rho = 1.
         tolerance : float
             Tolerance of the solves to come. From `SINGLE_PRECISION_TOLERANCE` on weights and vectors are in float32.
 
@@ -167,10 +167,10 @@ class Poisson:
         """
         engine = self.engine
         n = len(starts) - 1
-        _check("points", points, (n, engine.dim))
+        _check("points", points, (max(n, len(points)), engine.dim))
         _check("face_measures", face_measures, neighbors.shape)
         if density is not None:
-            _check("density", density, (n,))
+            _check("density", density, (len(points),))
         store = np.dtype(np.float32) if tolerance >= SINGLE_PRECISION_TOLERANCE else engine.real
         weights = engine.scratch(len(neighbors), store)
         weights.fill(0)
@@ -216,7 +216,10 @@ class Poisson:
         return rhs
 
     def apply(self, laplacian: Laplacian, x: cla.Array, y: cla.Array) -> None:
-        """Enqueue y = A x, both in the precision of the weights; x may also be in that of the engine."""
+        """Enqueue y = A x, both in the precision of the weights; x may also be in that of the engine.
+
+        Of ghosts x has rows behind those of the n cells, which `Part.forward` fills.
+        """
         kernel, *args = self._launch(laplacian, x, y)
         self.engine.run_blocks(kernel, *args)
 

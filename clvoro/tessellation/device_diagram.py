@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from ..geometry.domain import Domain
+    from ..opencl.engine import Engine
     from .clipped.trim import Trimmed
+    from .part import Part
     from .periodic.ghost_images import Folded
 
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
@@ -135,6 +137,8 @@ class Tessellation:
     vertices : tuple of arrays
         In 3D, while generators move: the vertices as triples of faces, (2 m,) uint32, and the keys of the faces, (m,)
         uint32 (tessellation/polyhedra_update.cl); else empty.
+    part : Part, optional
+        The part whose rows `neighbors` and `points` name. None if these are the n generators, as in a folded diagram.
     folded : Folded, optional
         How the diagram was made from that of generators and images. None after an update, and without images.
     trimmed : Trimmed, optional
@@ -155,6 +159,7 @@ class Tessellation:
     covariances: cla.Array
     outlines: tuple[cla.Array, ...] = ()
     vertices: tuple[cla.Array, ...] = ()
+    part: Part | None = None
     folded: Folded | None = None
     trimmed: Trimmed | None = None
     round_off: int = 0
@@ -163,6 +168,16 @@ class Tessellation:
     def __post_init__(self) -> None:
         if self.sites is None:
             object.__setattr__(self, "sites", self.points)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of arrays of values that neighbors name: generators, and ghosts if there are any."""
+        return self.n if self.part is None else self.part.count
+
+    def forward(self, engine: Engine, values: cla.Array) -> None:
+        """Fill the rows of ghosts in `values` (rows, ...), if there are any."""
+        if self.part is not None:
+            self.part.forward(engine, values)
 
     @property
     def is_power(self) -> bool:

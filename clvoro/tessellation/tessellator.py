@@ -160,6 +160,14 @@ class Tessellator:
             whole = Part(n, n, sites, self.domain)
             return self._build(points, sites, n, cache(lambda: self._sorted(whole)), None, exact, complete)
 
+    def tessellate_part(self, part: Part, exact: bool = False) -> Tessellation:
+        """Return the diagram of a part whose ghosts are given, such as the halo of generators of other parts.
+
+        Cells are right as far as the ghosts surround them. Neighbors are rows of the part.
+        """
+        with self._in_units(part.points, part.count):
+            return replace(self._cells(part, self._sorted(part), exact, part.n_own), part=part)
+
     def _build(
         self,
         points: cla.Array,
@@ -170,25 +178,18 @@ class Tessellator:
         exact: bool,
         complete: bool,
     ) -> Tessellation:
-        steps, cells = self.steps, self.stages.cells
-        rows = None if previous is None or not cells.from_previous else steps.rows(previous)
+        steps = self.steps
+        rows = None if previous is None or not self.stages.cells.from_previous else steps.rows(previous)
         nearest = not (exact or self.weighted)
         steps.begin(n)
         while True:
             part = steps.extend(sites, n)
             binned = sort() if part.points is sites else self._sorted(part)
             try:
-                t = cells.tessellate(
-                    part.box,
-                    part.points,
-                    part.count,
-                    binned,
-                    exact=exact,
-                    previous=None if rows is None else steps.unfold(part, rows),
-                    # Ghosts without values need cells, since something cuts these.
-                    n_own=n if part.home is not None and not complete else part.count,
-                    halo_args=part.halo_args,
-                )
+                # Ghosts without values need cells, since something cuts these.
+                whole = complete or part.home is None
+                start = None if rows is None else steps.unfold(part, rows)
+                t = self._cells(part, binned, exact, part.count if whole else n, start)
             except CloseError:
                 if not steps.drop_ghosts():
                     raise
@@ -198,6 +199,14 @@ class Tessellator:
                 return replace(found, points=points, sites=sites)
             # Memory for the new diagram.
             del part, binned, t
+
+    def _cells(
+        self, part: Part, binned: BinnedPoints, exact: bool, rows: int, start: Tessellation | NeighborRows | None = None
+    ) -> Tessellation:
+        """Build the cells of the first `rows` generators, which may start from the neighbors in `start`."""
+        return self.stages.cells.tessellate(
+            part.box, part.points, part.count, binned, exact=exact, previous=start, n_own=rows, halo_args=part.halo_args
+        )
 
     def _sorted(self, part: Part) -> BinnedPoints:
         bins = self.stages.bins
