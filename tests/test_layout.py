@@ -56,6 +56,11 @@ UPWARD = {
 """Imports against the order, all inside methods of `Result`, `Diagram` and `Measures`: save, plot, check, transfer."""
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
 """Files directly in `clvoro/`, and in each of its folders."""
+DOMAINS = {"Box", "Polygon", "Sphere", "SphereRegion"}
+MOST_TYPE_TESTS, MOST_DIMENSIONS = 89, 94
+"""Tests of a domain's type outside of `geometry`, and comparisons of a dimension: both ask what a domain should say."""
+OF_DOMAINS = re.compile("polygon|sphere|periodic|weight", re.I)
+"""Words that the lowest package does not know."""
 OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")
 """An expression in Python that stands for the kernels of a file."""
 PARTS = {
@@ -200,6 +205,64 @@ def test_modules_import_each_other_in_no_circle():
         for name in ground:
             del left[name]
     assert not left, "modules that import each other, or import such modules"
+
+
+def words_in(node):
+    """Return the names and attributes in an expression."""
+    nodes = list(ast.walk(node))
+    return {n.id for n in nodes if isinstance(n, ast.Name)} | {n.attr for n in nodes if isinstance(n, ast.Attribute)}
+
+
+def test_domains_are_asked_not_told_apart():
+    """Whoever adds a domain writes one class: others ask it, and neither test its type nor compare its dimension."""
+    types, dimensions = [], []
+    for module, tree in modules().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
+                if words_in(node.args[1]) & DOMAINS and not module.startswith("geometry."):
+                    types.append(f"{module}: {ast.unparse(node)}")
+            elif isinstance(node, ast.Compare):
+                sides = {getattr(side, "id", getattr(side, "attr", "")) for side in (node.left, *node.comparators)}
+                if sides & {"dim", "cell_dim"}:
+                    dimensions.append(f"{module}: {ast.unparse(node)}")
+    assert len(types) <= MOST_TYPE_TESTS, types
+    assert len(dimensions) <= MOST_DIMENSIONS, dimensions
+
+
+def test_classes_have_names_of_their_own():
+    found = collections.defaultdict(list)
+    for module, tree in modules().items():
+        for node in tree.body:
+            if isinstance(node, ast.ClassDef):
+                found[node.name].append(module)
+    assert len(found) > 200, "no classes are found any more"
+    assert {name: where for name, where in found.items() if len(where) > 1} == {}
+
+
+def test_devices_know_no_domains():
+    """The lowest package builds kernels for macros and arguments, whatever they mean."""
+    files = [path for path in PACKAGE.glob("opencl/*.py") if OF_DOMAINS.search(text_of(path))]
+    assert files == []
+
+
+def test_writers_take_the_one_mesh():
+    """`Contents` holds a diagram and data of its cells; all else, such as edges and half-faces, are its views."""
+    takes = {
+        f"{module}.{node.name}": ast.unparse(node.args.args[0].annotation or node)
+        for module, tree in modules().items()
+        if module.split(".")[0] in ("io", "earth")
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("write_")
+    }
+    assert len(takes) > 8
+    others = {name for name, first in takes.items() if first != "Contents"}
+    assert others == {"io.arrays.write_arrays", "io.history.write_history"}
+
+
+def test_the_formatter_is_never_skipped():
+    folders = [folder for folder in (PACKAGE, HERE, HOUSE / "bench", HOUSE / "docs") if folder.is_dir()]
+    mark = "# fmt: " + "skip"
+    assert [path for folder in folders for path in folder.rglob("*.py") if mark in path.read_text()] == []
 
 
 def test_folders_stay_small():
