@@ -15,7 +15,8 @@ from unittest.mock import patch
 
 import pyopencl as cl
 
-from clvoro.adaptation import loop, preparation, run
+from clvoro.adaptation import run
+from clvoro.adaptation.plan import actions
 from clvoro.mesh import diagram
 from clvoro.opencl import device_array, engine, kernels, launch, workspace
 
@@ -31,11 +32,13 @@ PLACES: dict[str, list[tuple[Any, str]]] = {
         (workspace.Workspace, "take"),
         (device_array.DeviceArray, "__getitem__"),
     ],
-    "preparation, start": [(run, "Preparation"), (preparation.Preparation, "mesh")],
-    "steps": [(loop.Loop, "step")],
-    "history": [(loop.Loop, "add_row")],
-    "insertion, deletion, refinement": [(loop.Loop, name) for name in ("insert_delete", "correct_count", "refine")],
-    "result": [(loop.Loop, "result")],
+    "preparation, start": [(run, "prepare"), (run, "start")],
+    "steps": [(actions.Step, "apply")],
+    "history": [(run.Run, "_add_row")],
+    "insertion, deletion, refinement": [
+        (action, "apply") for action in (actions.InsertDelete, actions.CorrectCount, actions.Refine)
+    ],
+    "result": [(run.Run, "_read_result")],
     "reading the diagram": [(diagram.Diagram, "__getattr__")],
 }
 """Functions by part. A function's time does not include that of other parts that it calls."""

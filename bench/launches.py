@@ -21,7 +21,8 @@ import pyopencl as cl
 from _common import Report, counts, domain_of, heading, make_adapter, markdown, parser, test_field
 
 import clvoro
-from clvoro.adaptation.methods import Method, ProjectedMethod, WeightedMethod
+from clvoro.adaptation.methods import ProjectedMethod, WeightedMethod
+from clvoro.adaptation.motion import Method
 from clvoro.adaptation.plan.actions import Step
 from clvoro.adaptation.plan.schedule import adaptive_schedule
 from clvoro.adaptation.sampling.start import count_cells
@@ -76,10 +77,10 @@ def counted(
 def take_step(mesh: MeshState, method: Method) -> int:
     """Take a step as a run does; return the iterations of its solve."""
     with mesh.engine.workspace.frame():
-        solution = method.displace(mesh)
-        method.move(mesh)
+        displacement = method.step(mesh)
+        mesh.move(displacement)
     mesh.update()
-    return solution.iterations if solution else 0
+    return displacement.solution.iterations
 
 
 def measure(

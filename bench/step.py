@@ -31,7 +31,8 @@ import pyopencl as cl
 from _common import BOX, Report, clock_of, counts, heading, make_adapter, markdown, names, parser, test_field
 
 import clvoro
-from clvoro.adaptation.methods import Method, ProjectedMethod, WeightedMethod
+from clvoro.adaptation.methods import ProjectedMethod, WeightedMethod
+from clvoro.adaptation.motion import Displacement, Method
 from clvoro.adaptation.plan.actions import Step
 from clvoro.adaptation.plan.schedule import adaptive_schedule
 from clvoro.adaptation.stages import Stages
@@ -39,7 +40,6 @@ from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.profile import Profile, profiled_queue
 from clvoro.sizing import Sizing
-from clvoro.solvers.linear_system import Solution
 from clvoro.tessellation.device_diagram import Follow, Tessellation
 
 CELLS_OF_F2 = 22972
@@ -139,7 +139,7 @@ def take_steps(
     tessellator = mesh.tessellator
     original = tessellator.tessellate
     spent = 0.0
-    solutions: list[Solution | None] = []
+    made: list[Displacement] = []
 
     def tessellate(*args: Any, follow: Follow, **named: Any) -> Any:
         nonlocal spent
@@ -159,14 +159,14 @@ def take_steps(
     try:
         for _ in range(repeat):
             with mesh.engine.workspace.frame():
-                parts["displace"].append(timed(lambda: solutions.append(method.displace(mesh))))
-                moving = timed(lambda: method.move(mesh))
+                parts["displace"].append(timed(lambda: made.append(method.step(mesh))))
+                moving = timed(lambda: mesh.move(made[-1]))
             rest = moving + timed(mesh.update)
             parts["diagram"].append(spent)
             parts["rest"].append(rest - spent)
     finally:
         tessellator.tessellate = original  # type: ignore[method-assign]
-    return parts, sum(solution.iterations for solution in solutions if solution)
+    return parts, sum(displacement.solution.iterations for displacement in made)
 
 
 def measure(

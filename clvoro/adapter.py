@@ -11,27 +11,23 @@ from typing import TYPE_CHECKING, Literal, NoReturn
 import numpy as np
 import pyopencl as cl
 
-from .adaptation.diagnostics import warn_of_errors
 from .adaptation.estimates import check_memory
 from .adaptation.fixed_points import check_fixed
-from .adaptation.loop import INTERRUPTED
 from .adaptation.options import (
     Checkpoint,
     EffortName,
     MethodName,
     MultilevelOptions,
-    Options,
     PaperOptions,
     Start,
-    special,
-    split_start,
+    merged_options,
 )
-from .adaptation.preparation import Preparation
-from .adaptation.run import check_run, run_adaptation
+from .adaptation.preparation import prepare
+from .adaptation.run import Run, check_run
 from .adaptation.stages import Stages
 from .adaptation.transport.given import power_diagram_of, transport_to
 from .arguments import check_choice, check_points, coincident_named
-from .errors import InputError, InputTypeError, Interrupted, MemoryLimitError
+from .errors import InputError, InputTypeError, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.domain import Domain
 from .mesh.diagram import Diagram
@@ -175,7 +171,7 @@ class Adapter:
 
         return all_of_them
 
-    def _stages_for(self, domain: Domain) -> Stages:
+    def _engine_for(self, domain: Domain) -> Engine:
         if not isinstance(domain, Domain):
             hint = ""
             if type(domain).__module__.startswith("shapely"):
@@ -187,12 +183,14 @@ class Adapter:
             raise InputTypeError(
                 f"domain is a {type(domain).__name__}, expected a clvoro.Box, a clvoro.Polygon or a clvoro.Sphere{hint}"
             )
-        traits = domain.traits(self.dtype)
-        key = domain.dim, traits.macros
+        return Engine(self.ctx, self.queue, domain.dim, self.dtype, domain.traits(self.dtype))
+
+    def _stages_for(self, domain: Domain) -> Stages:
+        engine = self._engine_for(domain)
+        key = domain.dim, engine.traits.macros
         stages = self._stages.get(key)
-        if stages is None or stages.engine.traits != traits:
+        if stages is None or stages.engine.traits != engine.traits:
             # Stages of other periods are dropped. The programs are cached elsewhere and serve these, too.
-            engine = Engine(self.ctx, self.queue, domain.dim, self.dtype, traits)
             stages = self._stages[key] = Stages(engine)
         return stages
 
@@ -368,16 +366,15 @@ class Adapter:
         UnusedOptionWarning
             If an option is given that the method does not use.
         """
-        start, given = split_start(points)
-        merged = Options(
+        merged, own = merged_options(
+            points,
+            options,
             method=method,
-            start=start,
             effort=effort,
             seed=seed,
             max_steps=max_steps,
             n_cells=n_cells,
-            layers=layers,  # type: ignore[arg-type]
-            **special(options),
+            layers=layers,
         )
         check_choice("on_interrupt", on_interrupt, ("raise", "return"))
         check_run(domain, size, callback)
@@ -386,17 +383,79 @@ class Adapter:
             for kept in self._stages.values():
                 kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
             stages = self._stages_for(domain)
-            host = None if given is None else check_points(given, domain)
+            host = None if own is None else check_points(own, domain)
             wells = check_fixed(fixed, domain, self.dtype)
             with report_builds(stages.engine, self.on_build) as notice:
-                result = run_adaptation(
-                    stages, domain, size, host, wells, merged, files, self._shown(callback, notice), self.on_memory
-                )
-        if result.stop_reason == INTERRUPTED and on_interrupt == "raise":
-            raise Interrupted(result)
-        if merged.multilevel and result.converged:
-            warn_of_errors(result)
-        return result
+                shown = self._shown(callback, notice)
+                run = Run(stages, domain, size, host, wells, merged, files, shown, self.on_memory)
+                return run.conclude(on_interrupt)
+
+    def start(
+        self,
+        domain: Domain,
+        size: object,
+        effort: EffortName = "default",
+        *,
+        points: ArrayLike | Start = "density",
+        method: MethodName = "adaptive",
+        n_cells: int | None = None,
+        layers: Layers | Sequence[Layers] = (),
+        fixed: ArrayLike | None = None,
+        seed: int = 0,
+        max_steps: int | None = None,
+        options: MultilevelOptions | PaperOptions | None = None,
+        checkpoint: str | PathLike[str] | Checkpoint | None = None,
+    ) -> Run:
+        """Start a run that goes on step by step, shows its mesh at any time, and follows other size fields.
+
+        It has buffers of its own: the adapter may be used between two steps. Stepped to its end, it gives the same
+        mesh, to the last bit, as `run`.
+
+        Parameters
+        ----------
+        domain, size, effort, points, method, n_cells, layers, fixed, seed, max_steps, options, checkpoint
+            As those of `run`.
+
+        Returns
+        -------
+        Run
+
+        Raises
+        ------
+        InputError, InputTypeError, SizeFieldError, MemoryLimitError
+            As `run`.
+
+        Examples
+        --------
+        >>> run = clvoro.Adapter().start(clvoro.Box((0, 0), (1, 1)), 0.1, "fast")
+        >>> while run.step():
+        ...     quality = run.history["mean_quality"][-1]
+        >>> run.finish().converged
+        True
+        """
+        merged, own = merged_options(
+            points,
+            options,
+            method=method,
+            effort=effort,
+            seed=seed,
+            max_steps=max_steps,
+            n_cells=n_cells,
+            layers=layers,
+        )
+        check_run(domain, size, None)
+        files = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
+        stages = Stages(self._engine_for(domain))
+        with self._at_work(stages):
+            host = None if own is None else check_points(own, domain)
+            wells = check_fixed(fixed, domain, self.dtype)
+            shown = self._shown(None, None)
+            return Run(stages, domain, size, host, wells, merged, files, shown, self.on_memory, self._at_work)
+
+    @contextmanager
+    def _at_work(self, stages: Stages) -> Iterator[None]:
+        with self._alone(), report_builds(stages.engine, self.on_build):
+            yield
 
     def memory_needed(
         self,
@@ -434,15 +493,8 @@ class Adapter:
         >>> 5e6 < bytes_ < 6e6
         True
         """
-        start, given = split_start(points)
-        merged = Options(
-            method=method,
-            start=start,
-            n_cells=n_cells,
-            **special(options),
-            layers=layers,  # type: ignore[arg-type]
-        )
+        merged, own = merged_options(points, options, method=method, n_cells=n_cells, layers=layers)
         with self._alone():
             stages = self._stages_for(domain)
-            host = None if given is None else check_points(given, domain)
-            return Preparation(stages, domain, size, host, merged).memory
+            host = None if own is None else check_points(own, domain)
+            return prepare(stages, domain, size, host, merged).memory

@@ -1,16 +1,19 @@
-"""Checkpoints: the whole state of a run in one file, from which it continues with the same bits.
+"""Checkpoints: a run in one file, from which it continues.
 
-The file has everything that a step passes to the next one: generators in the order of the device, their diagram (the
-next one is updated from it), sizes, velocities, starts of the solvers, coarse levels of the multigrid, and the numbers
-on the host. The size field and the schedule are computed again and compared with the file.
+A checkpoint has what the rest of a run follows from: generators in the order of the device with their labels and
+velocities, starts of the solvers, weights, the history, and the state of the schedule. It is taken at the end of an
+action. The run that goes on computes everything else anew from there, and so does the run that is resumed: both have
+the same bits. The size field and the schedule are computed again and compared with the file.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import time
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,64 +22,22 @@ import numpy as np
 
 from ..arguments import check_path, warn
 from ..errors import CheckpointWarning, InputError, OutputError
-from ..mesh.results import Displacements
-from ..tessellation.cells import Cells
-from .fingerprint import schedule_digest
-from .methods import Method
+from ..geometry.domain import Domain
+from ..mesh.results import HISTORY_DTYPE, Displacements
+from .insertion_deletion import Generators
 from .plan.actions import Action, Step
-from .stages import Stages
+from .state import Arrays, MeshState, Setup
 
 if TYPE_CHECKING:
-    from .loop import Loop
+    from .run import Run
 
-FORMAT, VERSION = "clvoro-checkpoint", 9
-MESH = ("points", "labels", "velocity", "signatures", "ever_changed", "h", "potential")
-PER_FACE = ("neighbors", "face_measures", "face_centroids")
-DIAGRAM = ("starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances")
-VERTICES = {"triples": 2, "keys": 1}
-"""Arrays of a diagram in 3D that will be updated, and their entries per face. They may be longer than that."""
-
-
-@dataclasses.dataclass
-class Progress:
-    """How far a run has come.
-
-    Attributes
-    ----------
-    level : int
-        The present level; 0 is the finest.
-    n_start : int
-        Number of generators at the start.
-    started : int
-        Number of labels at the start: those of fixed generators that enter later are among them.
-    labeled : int
-        Number of labels when the last row of the history was added.
-    position : int
-        Number of actions done.
-    steps : int
-        Number of steps done.
-    rows : list of (1,) array
-        The history.
-    initial, final : Displacements or None
-        Of the first and of the last step. If the last step is not known in advance, they are evaluated again at the
-        end.
-    last : Method or None
-        Method of the last step.
-    elapsed : float
-        Seconds.
-    """
-
-    level: int
-    n_start: int
-    started: int
-    labeled: int
-    position: int = 0
-    steps: int = 0
-    rows: list[np.ndarray] = dataclasses.field(default_factory=list)
-    initial: Displacements | None = None
-    final: Displacements | None = None
-    last: Method | None = None
-    elapsed: float = 0.0
+FORMAT, VERSION = "clvoro-checkpoint", 10
+RENEWAL = 10
+"""Steps after which a run with checkpoints computes its mesh anew, and may write one. A new diagram and new coarse
+levels of the solvers take about as long as a step."""
+_GENERATORS = tuple(field.name for field in dataclasses.fields(Generators))
+_OTHERS = ("potential", "multipliers", "weights")
+_COUNTS = ("position", "level", "levels", "n_start", "started", "steps", "next_label", "pace")
 
 
 class Checkpointer:
@@ -105,7 +66,7 @@ class Checkpointer:
         self.schedule = schedule_digest(schedule)
         self._last = time.monotonic()
 
-    def offer(self, loop: Loop, stop: bool) -> None:
+    def write_if_due(self, run: Run, stop: bool) -> None:
         """Write a checkpoint if it is due, or if the run stops.
 
         If it cannot be written, because the disk is full for instance, the run continues and the last one stays.
@@ -113,13 +74,13 @@ class Checkpointer:
         if not stop and time.monotonic() - self._last < self.every:
             return
         try:
-            self.write(loop)
+            self.write(run)
         except OutputError as error:
             warn(f"{error}. The run continues without this checkpoint; the last one is unchanged", CheckpointWarning)
         self._last = time.monotonic()
 
-    def write(self, loop: Loop) -> None:
-        """Write the state of `loop` between two actions. The file is replaced when the new one is complete.
+    def write(self, run: Run) -> None:
+        """Write the state of `run` between two actions. The file is replaced when the new one is complete.
 
         Raises
         ------
@@ -128,48 +89,244 @@ class Checkpointer:
         """
         from ..io.arrays import write_arrays
 
-        mesh, t = loop.mesh, loop.mesh.t
-        arrays: dict[str, np.ndarray] = {f"mesh.{name}": getattr(mesh, name).get() for name in MESH}
-        if mesh.multipliers is not None:
-            arrays["multipliers"] = mesh.multipliers.get()
-        arrays["taken"] = mesh.taken
-        arrays["summaries"] = mesh.summaries.values.get()
-        starts = t.starts.get()
-        m = int(starts[-1])
-        for name in DIAGRAM:
-            array = getattr(t, name)
-            arrays[f"diagram.{name}"] = (array[:m] if name in PER_FACE else array).get()
-        for (name, per_face), array in zip(VERTICES.items(), t.vertices, strict=False):
-            arrays[f"vertices.{name}"] = array[: per_face * m].get()
-        for name, array in mesh.stages.poisson.save(mesh.labels).items():
-            arrays[f"multigrid.{name}"] = array
-        halo = mesh.tessellator.steps.halo
-        if halo is not None:
-            # The depth of the halo: in 3D the last bits of a cell depend on it.
-            arrays["seam.needed"] = halo.required.get()
+        mesh, kept = run.state, run.state.arrays
+        found = {name: getattr(kept.generators, name) for name in _GENERATORS}
+        found |= {name: getattr(kept, name) for name in _OTHERS if getattr(kept, name) is not None}
+        arrays = {f"mesh.{name}": array.get() for name, array in found.items()}
+        arrays |= {"mesh.h": mesh.h.get(), "taken": mesh.taken, "history": np.concatenate(run.rows)}
         for part in ("initial", "final"):
-            if getattr(loop, part) is not None:
-                for field in dataclasses.fields(Displacements):
-                    arrays[f"{part}.{field.name}"] = getattr(getattr(loop, part), field.name)
-        arrays["history"] = np.concatenate(loop.rows)
+            if getattr(run, part) is not None:
+                arrays |= {f"{part}.{name}": array for name, array in vars(getattr(run, part)).items()}
         state = {
-            "position": loop.position,
-            "level": loop.level,
-            "n_start": loop.n_start,
-            "started": loop.started,
-            "steps": loop.steps,
+            "position": run.position,
+            "level": run.level,
+            "levels": run.levels,
+            "near": run.near,
+            "n_start": run.n_start,
+            "started": run.started,
+            "steps": run.steps,
+            "pace": run.pace,
             "next_label": mesh.next_label,
-            "spare": len(t.neighbors) - m,
             "size_factor": float(mesh.size_factor).hex(),
-            "elapsed": time.perf_counter() - loop.began,
-            "methods": [state_of(method) for method in methods_of(loop.schedule)],
-            "capacities": capacities_of(mesh.stages),
-            "levels": loop.levels,
-            "seam_cells": 0 if halo is None else halo.cells,
+            "elapsed": time.perf_counter() - run.began,
+            "methods": [_state_of(method) for method in _methods_of(run.schedule)],
         }
         about = {"fingerprint": self.fingerprint, "schedule": self.schedule, "state": state}
         arrays["about"] = np.array(json.dumps(about))
         write_arrays(self.path, FORMAT, VERSION, arrays, compress=False)
+
+
+class Saved:
+    """A checkpoint that has been read and is valid in itself.
+
+    Parameters
+    ----------
+    path : str or path
+
+    Attributes
+    ----------
+    levels : int
+        Number of coarser levels of the run.
+    near : bool
+        Whether the run only corrects a given mesh.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, truncated or not a checkpoint.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        from ..io.arrays import read_arrays
+
+        self.name = check_path("resume", path)
+        self.arrays = read_arrays(self.name, FORMAT, VERSION)
+        version = self.arrays["version"].item()
+        if version != VERSION:
+            raise InputError(
+                f"cannot resume from {self.name}: it is a checkpoint of version {version}, expected {VERSION}, that of "
+                "this version of clvoro; start again without resume"
+            )
+        try:
+            about = json.loads(self.arrays["about"].item())
+            self.fingerprint, self.schedule = dict(about["fingerprint"]), str(about["schedule"])
+            self.state = state = dict(about["state"])
+            if any(type(state[name]) is not int or state[name] < 0 for name in _COUNTS):
+                raise ValueError("counts")
+            self.size_factor = float.fromhex(state["size_factor"])
+            self.elapsed = float(state["elapsed"])
+            self.levels, self.near = int(state["levels"]), bool(state["near"])
+            if not (0 < self.size_factor < np.inf and 0 <= self.elapsed < np.inf and state["level"] <= self.levels):
+                raise ValueError("size_factor")
+            self._check(len(self.fingerprint["domain"]["lower"]), np.dtype(self.fingerprint["dtype"]))
+        except (KeyError, ValueError, TypeError, AttributeError, IndexError, RecursionError) as error:
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception | str) -> InputError:
+        return InputError(f"cannot resume from {self.name}: it is damaged ({error!r:.200})")
+
+    def _check(self, d: int, real: np.dtype) -> None:
+        """Check shapes, types and numbers of the arrays."""
+        a = self.arrays
+        n = len(a["mesh.points"])
+        shapes: dict[str, tuple[tuple[int, ...], Any]] = {
+            **{f"mesh.{name}": ((n, d), real) for name in ("points", "velocity")},
+            **{f"mesh.{name}": ((n,), real) for name in ("ever_changed", "h", "potential", "weights")},
+            "mesh.labels": ((n,), np.int32),
+            "mesh.signatures": ((n,), np.uint64),
+            "mesh.multipliers": ((n,), np.float32),
+            "history": ((len(a["history"]),), HISTORY_DTYPE),
+            "taken": ((len(a["taken"]),), np.int32),
+        }
+        for name in {f"mesh.{name}" for name in _OTHERS} - a.keys():
+            del shapes[name]
+        for name, (shape, dtype) in shapes.items():
+            if a[name].shape != shape or a[name].dtype != dtype:
+                raise ValueError(f"{name} is {a[name].dtype} {a[name].shape}, expected {shape}")
+            if a[name].dtype.kind == "f" and not np.isfinite(a[name]).all():
+                raise ValueError(name)
+        labels = a["mesh.labels"]
+        known = n > 0 and labels.min() >= 0 and labels.max() < self.state["next_label"]
+        if not known or len(np.unique(labels)) < n:
+            raise ValueError("labels")
+        if not (a["mesh.h"] > 0).all():
+            raise ValueError("sizes")
+
+    def check_fingerprint(self, fingerprint: dict) -> None:
+        """Compare the checkpoint with the `fingerprint` of this run.
+
+        Raises
+        ------
+        InputError
+            If the domain or a setting differs; the message has the first one.
+        """
+        fingerprint = json.loads(json.dumps(fingerprint))
+        for name in {**self.fingerprint, **fingerprint}:
+            was, now = self.fingerprint.get(name), fingerprint.get(name)
+            if was == now:
+                continue
+            if name in ("points", "fixed"):
+                was, now = ("none" if v is None else f"others ({v:.8}...)" for v in (was, now))
+            if name == "domain":
+                was, now = (_domain_name(v) for v in (was, now))
+            raise InputError(
+                f"cannot resume from {self.name}: it is from a run with {name} = {was}, but this run has {name} = "
+                f"{now}; use the settings of that run, or start again without resume"
+            )
+
+    def mesh(self, setup: Setup, schedule: list[Action]) -> MeshState:
+        """Return the mesh of the saved run, for a run with this `schedule`.
+
+        Raises
+        ------
+        InputError
+            If schedule or size field differ from those of the saved run.
+        """
+        engine, a = setup.stages.engine, self.arrays
+        if self.schedule != schedule_digest(schedule) or self.state["position"] > len(schedule):
+            raise InputError(
+                f"cannot resume from {self.name}: its schedule differs, as with another version of clvoro; start again"
+            )
+        self._check_points(setup.domain)
+        on_device = {
+            name.removeprefix("mesh."): engine.upload(array, array.dtype)
+            for name, array in a.items()
+            if name.startswith("mesh.")
+        }
+        self._compare_sizes(setup, on_device.pop("h"), on_device["points"])
+        generators = Generators(**{name: on_device.pop(name) for name in _GENERATORS})
+        others = (on_device.get(name) for name in _OTHERS)
+        arrays = Arrays(generators, *others)  # type: ignore[arg-type]
+        return MeshState(setup, self.size_factor, arrays, next_label=self.state["next_label"], taken=a["taken"])
+
+    def _check_points(self, domain: Domain) -> None:
+        x = self.arrays["mesh.points"].astype(float)
+        lower, upper = (corner[: domain.dim] for corner in domain.device_corners(np.dtype(float)))
+        origin, scale = domain.frame
+        there = np.abs(domain.place(x * scale + origin, np.dtype(float)) - x).max() < 1e-3
+        if not (there and (x >= lower).all() and (x <= upper).all()):
+            raise self._damaged("points")
+
+    def _compare_sizes(self, setup: Setup, saved: Any, points: Any) -> None:
+        """Raise if the size field is not that of the saved run at generators that have its sizes."""
+        sizes, labels, domain = setup.stages.engine.empty(len(points)), self.arrays["mesh.labels"], setup.domain
+        setup.sizing.evaluate(points, len(points), sizes)
+        was, now = saved.get().astype(float), sizes.get().astype(float) * self.size_factor
+        moving = (labels >= setup.fixed) | (labels < setup.first_row)
+        off = np.where(moving, np.abs(now / was - 1), 0.0)
+        worst = int(np.argmax(off))
+        if not off[worst] <= 1e4 * np.finfo(saved.dtype).eps:
+            origin, scale = domain.frame
+            place, unit = self.arrays["mesh.points"][worst] * scale + origin, scale / self.size_factor
+            raise InputError(
+                f"cannot resume from {self.name}: its size field differs; at {place} the size of that run was "
+                f"{was[worst] * unit:.6g}, this field's is {now[worst] * unit:.6g}. Use the field of that run, or "
+                "start again"
+            )
+
+    def resume(self, run: Run) -> float:
+        """Give `run` the progress of the saved one; return the seconds that it had taken."""
+        state = self.state
+        for method, values in zip(_methods_of(run.schedule), state["methods"], strict=True):
+            for name in _state_of(method):
+                setattr(method, name, values[name])
+        for name in ("level", "n_start", "started", "position", "steps", "pace"):
+            setattr(run, name, state[name])
+        steps = [action for action in run.schedule[: run.position] if isinstance(action, Step)]
+        run.last = steps[-1].method if steps else None
+        run.rows = [row.reshape(1) for row in self.arrays["history"]]
+        run.initial, run.final = self._displacements("initial"), self._displacements("final")
+        return self.elapsed
+
+    def _displacements(self, part: str) -> Displacements | None:
+        saved = [self.arrays.get(f"{part}.{f.name}") for f in dataclasses.fields(Displacements)]
+        if any(array is None for array in saved):
+            return None
+        return Displacements(*saved)  # type: ignore[arg-type]
+
+
+def run_fingerprint(
+    domain: Domain, options: dict[str, Any], dtype: np.dtype, points: np.ndarray | None, fixed: np.ndarray | None = None
+) -> dict[str, Any]:
+    """Return plain values that identify a run. A checkpoint of another run is rejected."""
+    return {
+        "domain": domain_fingerprint(domain),
+        "dtype": dtype.name,
+        "points": None if points is None else _digest(points),
+        "fixed": _digest(fixed) if fixed is not None and len(fixed) else None,
+        **options,
+        "layers": [repr(layer) for layer in options["layers"]],
+    }
+
+
+def _digest(positions: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(positions).tobytes()).hexdigest()
+
+
+def domain_fingerprint(domain: Domain) -> dict[str, Any]:
+    """Return plain values that identify `domain` and determine the shapes of a file's arrays."""
+    described = json.dumps(domain.describe(), sort_keys=True)
+    return {
+        "kind": type(domain).__name__,
+        "lower": list(domain.lower),
+        "upper": list(domain.upper),
+        "periodic": list(domain.periodic),
+        "walls": len(domain.boundary_index),
+        "digest": hashlib.sha256(described.encode()).hexdigest(),
+    }
+
+
+def _domain_name(fingerprint: Any) -> str:
+    """Return a domain as it appears in errors, from its fingerprint or from any other value in its place."""
+    if not isinstance(fingerprint, dict):
+        return repr(fingerprint)
+    shown = {key: value for key, value in fingerprint.items() if key not in ("kind", "digest")}
+    return f"{fingerprint.get('kind')}({shown}, {fingerprint.get('digest')!s:.8}...)"
+
+
+def schedule_digest(schedule: Sequence[object]) -> str:
+    """Return a hash of a schedule that has not begun."""
+    return hashlib.sha256(repr(schedule).encode()).hexdigest()
 
 
 def _check_overwrite(path: str) -> None:
@@ -182,20 +339,14 @@ def _check_overwrite(path: str) -> None:
         )
 
 
-def methods_of(schedule: list[Action]) -> list[Any]:
+def _methods_of(schedule: list[Action]) -> list[Any]:
     """Return the methods of a schedule, each once, in the order of their first step."""
     return list({id(a.method): a.method for a in schedule if isinstance(a, Step)}.values())
 
 
-def state_of(method: Any) -> dict[str, float | int]:
+def _state_of(method: Any) -> dict[str, float | int]:
     """Return the state of a method between two steps: its numbers, if it is not frozen."""
     if type(method).__dataclass_params__.frozen:
         return {}
     values = {field.name: getattr(method, field.name) for field in dataclasses.fields(method)}
     return {k: v for k, v in values.items() if isinstance(v, (int, float))}
-
-
-def capacities_of(stages: Stages) -> list[int]:
-    """Return the capacities for faces that the kernels of the cells were built with."""
-    cells = stages.cells
-    return [cells.cell_capacity, cells.row_capacity] if isinstance(cells, Cells) else []

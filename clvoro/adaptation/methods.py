@@ -15,30 +15,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
+import pyopencl as cl
 
 from ..geometry.polygon import Polygon
+from ..opencl.device_array import buffer_of
 from ..solvers.components import balance_components
-from ..solvers.linear_system import Limits, Solution
+from ..solvers.linear_system import Limits
 from ..solvers.volume_projection import Penalty, Targets
 from .density import CellWeights
+from .motion import Displacement, Method
 from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod
 from .state import MeshState
-
-
-class Method(Protocol):
-    """A way to move generators."""
-
-    def displace(self, mesh: MeshState) -> Solution | None:
-        """Compute `mesh.lloyd` and `mesh.correction`, valid in the workspace's frame, and summarize their lengths."""
-        ...
-
-    def move(self, mesh: MeshState) -> None:
-        """Move the generators by these displacements. The diagram is then out of date."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -62,52 +53,38 @@ class Relaxation:
 
 
 @dataclass(frozen=True)
-class PublishedMethod:
+class PublishedMethod(Method):
     """The paper's method: Lloyd, Poisson, or both, with one alpha for all generators."""
 
     relaxation: Relaxation
     lloyd: bool
     poisson: bool
 
-    def displace(self, mesh: MeshState) -> Solution:
+    def step(self, mesh: MeshState) -> Displacement:
         """Evaluate both displacements, even if the method uses one: the history has both."""
-        stages, t, r = mesh.stages, mesh.t, self.relaxation
-        motion, poisson = stages.motion, stages.poisson
-        mesh.allocate_step()
-        mesh.lloyd = t.offsets
-        mesh.allocate_source()
-        poisson.subtract_mean_source(mesh.error, t.volumes, mesh.source)
-        balance_components(mesh.domain, t, mesh.source, t.volumes)
-        with mesh.engine.workspace.frame():
+        stages, t, r, engine = mesh.stages, mesh.t, self.relaxation, mesh.engine
+        motion, poisson, lloyd = stages.motion, stages.poisson, t.offsets
+        correction, source = engine.scratch(mesh.points.shape), engine.scratch(mesh.n)
+        poisson.subtract_mean_source(mesh.error, t.volumes, source)
+        balance_components(mesh.domain, t, source, t.volumes)
+        with engine.workspace.frame():
             laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=r.tolerance)
-            solution = poisson.solve(
-                laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, ordering=mesh.labels
-            )
-        motion.compute_potential_gradient(t, mesh.potential, mesh.correction)
-        mesh.summarize_displacements()
-        alpha = mesh.engine.cell_dim if r.alpha is None else r.alpha
-        motion.relax_correction(mesh.summaries, "correction", alpha, r.k, mesh.correction)
-        mesh.summarize_displacements()
-        mesh.zero_fixed(mesh.correction)
-        return solution
-
-    def move(self, mesh: MeshState) -> None:
-        """Move by the displacements that the method uses."""
-        mesh.zero_fixed(mesh.lloyd)
-        mesh.stages.motion.move_generators(
-            mesh.free,
-            mesh.points,
-            mesh.lloyd,
-            float(self.lloyd),
-            mesh.correction,
-            float(self.poisson),
-            mesh.h,
-            mesh.velocity,
-        )
+            solution = poisson.solve(laplacian, source, mesh.potential, tolerance=r.tolerance, ordering=mesh.labels)
+        motion.compute_potential_gradient(t, mesh.potential, correction)
+        mesh.summarize_displacements(lloyd, correction)
+        alpha = engine.cell_dim if r.alpha is None else r.alpha
+        motion.relax_correction(mesh.summaries, "correction", alpha, r.k, correction)
+        mesh.summarize_displacements(lloyd, correction)
+        if mesh.fixed:
+            lloyd = engine.scratch(lloyd.shape)
+            cl.enqueue_copy(engine.queue, buffer_of(lloyd), buffer_of(t.offsets), byte_count=lloyd.nbytes)
+            mesh.zero_fixed(lloyd)
+        mesh.zero_fixed(correction)
+        return Displacement(lloyd, correction, mesh.h, float(self.lloyd), float(self.poisson), solution=solution)
 
 
 @dataclass(frozen=True)
-class WeightedMethod:
+class WeightedMethod(Method):
     """Density-weighted centroids and the density-weighted Poisson equation, clipped per generator.
 
     div(rho grad phi) = rho (r - mean r), r = d log(L / h), is the linearized error of the volumes for a size field that
@@ -124,49 +101,36 @@ class WeightedMethod:
     max_cycles: int | None = None
     """Most cycles of multigrid; see `Poisson.solve`."""
 
-    def displace(self, mesh: MeshState) -> Solution:
+    def step(self, mesh: MeshState) -> Displacement:
         """Evaluate the weighted Lloyd displacement and the correction."""
-        stages, t = mesh.stages, mesh.t
+        stages, t, engine = mesh.stages, mesh.t, mesh.engine
         motion, poisson = stages.motion, stages.poisson
-        mesh.allocate_step()
-        mesh.allocate_source()
+        lloyd, correction = engine.scratch(mesh.points.shape), engine.scratch(mesh.points.shape)
+        source = engine.scratch(mesh.n)
         # The gradient is not needed afterwards, so it shares its memory with the correction.
-        w = mesh.lloyd_weights(gradient=mesh.correction)
-        mesh.zero_fixed(mesh.lloyd)
-        poisson.subtract_mean_source(w.log_ratio, w.weight, mesh.source)
-        balance_components(mesh.domain, t, mesh.source, w.weight)
-        with mesh.engine.workspace.frame():
+        w = stages.density.lloyd_weights(t, mesh.h, lloyd, correction)
+        mesh.zero_fixed(lloyd)
+        poisson.subtract_mean_source(w.log_ratio, w.weight, source)
+        balance_components(mesh.domain, t, source, w.weight)
+        with engine.workspace.frame():
             laplacian = poisson.assemble(
                 t.starts, t.neighbors, t.face_measures, mesh.points, w.density, tolerance=self.tolerance
             )
             # The labels are a new array whenever the order changes.
             solution = poisson.solve(
                 laplacian,
-                mesh.source,
+                source,
                 mesh.potential,
                 tolerance=self.tolerance,
                 ordering=mesh.labels,
                 from_zero=True,
                 max_cycles=self.max_cycles,
             )
-        motion.compute_potential_gradient(t, mesh.potential, mesh.correction)
-        mesh.summarize_displacements()
-        mesh.zero_fixed(mesh.correction)
-        return solution
-
-    def move(self, mesh: MeshState) -> None:
-        """Move by both, at most by k h."""
-        mesh.stages.motion.move_generators(
-            mesh.free,
-            mesh.points,
-            mesh.lloyd,
-            float(self.lloyd),
-            mesh.correction,
-            float(self.poisson),
-            mesh.local_length if self.cautious else mesh.h,
-            mesh.velocity,
-            clip=self.k,
-        )
+        motion.compute_potential_gradient(t, mesh.potential, correction)
+        mesh.summarize_displacements(lloyd, correction)
+        mesh.zero_fixed(correction)
+        unit = mesh.local_length if self.cautious else mesh.h
+        return Displacement(lloyd, correction, unit, float(self.lloyd), float(self.poisson), self.k, solution)
 
 
 AT_WALLS = 2.0
@@ -199,7 +163,7 @@ reached; with 30 to 60 the shape hardly improves any more. The smallest penalty 
 
 
 @dataclass
-class ProjectedMethod:
+class ProjectedMethod(Method):
     """Lloyd or quality descent with momentum, projected so that every cell keeps or gets its volume.
 
     Attributes
@@ -257,22 +221,22 @@ class ProjectedMethod:
     careful: bool = False
     steps: int = 0
 
-    def displace(self, mesh: MeshState) -> Solution:
+    def step(self, mesh: MeshState) -> Displacement:
         """Evaluate the descent, with momentum, and its projection."""
-        stages, t = mesh.stages, mesh.t
+        stages, t, engine = mesh.stages, mesh.t, mesh.engine
         relaxation, momentum, bad_cell_weight = self.relaxation, self.momentum, self.bad_cell_weight
         if mesh.walls.thin:
             relaxation, momentum = (min(relaxation, self.calm_relaxation), min(momentum, CALM_MOMENTUM))
             bad_cell_weight = min(bad_cell_weight, CALM_BAD_CELL_WEIGHT)
-        mesh.allocate_step()
-        gradient, log_ratio = mesh.engine.scratch(mesh.points.shape), mesh.engine.scratch(mesh.n)
-        with mesh.engine.workspace.frame():
+        lloyd, correction = engine.scratch(mesh.points.shape), engine.scratch(mesh.points.shape)
+        gradient, log_ratio = engine.scratch(mesh.points.shape), engine.scratch(mesh.n)
+        with engine.workspace.frame():
             still = relaxation == momentum == 0
             if self.gradient_from_field and (still or self.descent in ("quality", "edges")):
                 # Weighted centroids are not needed, either.
                 w: CellWeights = stages.density.cell_weights(t, mesh.h, log_ratio)
             else:
-                w = mesh.lloyd_weights(gradient, log_ratio)
+                w = stages.density.lloyd_weights(t, mesh.h, lloyd, gradient, log_ratio)
             mesh.follows_log_ratio = self.error_target > 0 or self.careful
             if self.error_target and self.steps > 2:
                 self._control_penalty(mesh.mean_log_ratio_error(w))
@@ -282,41 +246,41 @@ class ProjectedMethod:
                 beyond = mesh.mean_log_ratio_error(w) - MET_ERROR
                 penalty = max(penalty, EXACT_PENALTY_PER_ERROR * beyond)
             if self.gradient_from_field:
-                sizes = mesh.engine.scratch(mesh.n)
+                sizes = engine.scratch(mesh.n)
                 mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
             if self.descent == "surface" and t.vertices:
                 stages.surface_descent.descend(
-                    t, mesh.local_length, mesh.quality, mesh.lloyd, bad_cell_weight=self.bad_cell_weight, rate=self.rate
+                    t, mesh.local_length, mesh.quality, lloyd, bad_cell_weight=self.bad_cell_weight, rate=self.rate
                 )
             elif self.descent in ("quality", "edges"):
                 stages.quality_descent.descend(
                     t,
                     mesh.local_length,
                     mesh.quality,
-                    mesh.lloyd,
+                    lloyd,
                     quality_weight=float(self.descent == "quality"),
                     bad_cell_weight=bad_cell_weight,
                     rate=self.rate,
                 )
             if still:
-                mesh.lloyd.fill(0)
+                lloyd.fill(0)
             else:
-                stages.motion.add_momentum(relaxation, mesh.lloyd, mesh.velocity, momentum)
-            mesh.zero_fixed(mesh.lloyd)
+                stages.motion.add_momentum(relaxation, lloyd, mesh.velocity, momentum)
+            mesh.zero_fixed(lloyd)
             if self.descent == "quality":
-                mesh.walls.constrain(mesh, mesh.lloyd)
+                mesh.walls.constrain(mesh, lloyd)
             sums = None if self.correct_mean else stages.density.sum_log_ratio(w)
         warm = mesh.multipliers is not None
         if not warm:
-            mesh.multipliers = mesh.engine.zeros(mesh.n, np.float32)
+            mesh.multipliers = engine.zeros(mesh.n, np.float32)
         at_walls, most = (
             (AT_WALLS, MOST_AT_WALLS) if isinstance(mesh.domain, Polygon) else (AT_WALLS_OF_BOXES, math.inf)
         )
         solution = stages.volume_projection.project(
             t,
             Targets(mesh.local_length, gradient, log_ratio, mesh.quality, sums),
-            mesh.lloyd,
-            mesh.correction,
+            lloyd,
+            correction,
             Penalty(penalty, self.quality_scale, self.log_ratio_scale, at_walls, self.power, most),
             Limits(self.tolerance, self.iterations),
             labels=mesh.labels,
@@ -324,8 +288,8 @@ class ProjectedMethod:
             start=mesh.multipliers,
             warm=warm,
         )
-        mesh.summarize_displacements()
-        return solution
+        mesh.summarize_displacements(lloyd, correction)
+        return Displacement(lloyd, correction, mesh.local_length, bound=self.k, solution=solution)
 
     def _control_penalty(self, error: float) -> None:
         """Change the penalty towards the one that gives the error target."""
@@ -333,12 +297,6 @@ class ProjectedMethod:
         largest = max(3.0, PENALTY_PER_ERROR * self.error_target)
         least = min(1e-3, self.error_target)
         self.penalty = min(largest, max(least, self.penalty * min(1.33, max(0.75, change))))
-
-    def move(self, mesh: MeshState) -> None:
-        """Move by both, at most by k h."""
-        mesh.stages.motion.move_generators(
-            mesh.free, mesh.points, mesh.lloyd, 1.0, mesh.correction, 1.0, mesh.local_length, mesh.velocity, clip=self.k
-        )
 
 
 PUBLISHED = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")

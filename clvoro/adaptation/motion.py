@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl.array as cla
@@ -10,7 +12,11 @@ import pyopencl.array as cla
 from ..geometry.domain import Domain
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
+from ..solvers.linear_system import Solution
 from ..tessellation.device_diagram import Tessellation
+
+if TYPE_CHECKING:
+    from .state import MeshState
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,48 @@ class Moving:
     velocity: cla.Array
     labels: cla.Array
     fixed: int
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """What a step moves the generators by: ``lloyd_share * lloyd + correction_share * correction``, bounded.
+
+    Attributes
+    ----------
+    lloyd, correction : (n, d) real
+        Its two parts, valid to the end of the workspace's frame.
+    unit : (n,) real
+        Unit of the bound, a length for each generator.
+    lloyd_share, correction_share : float
+    bound : float
+        Largest displacement over `unit`; 0 for no bound.
+    solution : Solution
+        Of the linear system of the step.
+    """
+
+    lloyd: cla.Array
+    correction: cla.Array
+    unit: cla.Array
+    lloyd_share: float = 1.0
+    correction_share: float = 1.0
+    bound: float = 0.0
+    solution: Solution = field(default_factory=Solution.zero)
+
+
+class Method(ABC):
+    """A way to move generators.
+
+    Attributes
+    ----------
+    finished : bool or None
+        Whether the method has met a tolerance of its own; None if it has none, and error and quality decide.
+    """
+
+    finished: bool | None = None
+
+    @abstractmethod
+    def step(self, mesh: MeshState) -> Displacement:
+        """Return the displacement of one step, to the end of the workspace's frame, and summarize its lengths."""
 
 
 class Motion:
@@ -64,32 +112,18 @@ class Motion:
             self._kernels.relax_correction, len(u), summaries.values, summaries.slots[name], real(limit), real(k), u
         )
 
-    def move_generators(
-        self,
-        domain: Domain,
-        points: cla.Array,
-        lloyd: cla.Array,
-        a: float,
-        correction: cla.Array,
-        b: float,
-        h: cla.Array,
-        velocity: cla.Array,
-        clip: float = 0.0,
-    ) -> None:
-        """Move `points` (n, d) by a lloyd + b correction, at most by clip h (0: no bound), inside `domain`.
-
-        `velocity` (n, d) becomes the displacement.
-        """
+    def move_generators(self, domain: Domain, points: cla.Array, d: Displacement, velocity: cla.Array) -> None:
+        """Move `points` (n, d) by `d` inside `domain`. `velocity` (n, d) becomes what they have moved by."""
         real = self.engine.real.type
         self.engine.run_each(
             self._kernels.move_generators,
-            h.shape[0],
-            lloyd,
-            real(a),
-            correction,
-            real(b),
-            h,
-            real(clip),
+            d.unit.shape[0],
+            d.lloyd,
+            real(d.lloyd_share),
+            d.correction,
+            real(d.correction_share),
+            d.unit,
+            real(d.bound),
             *domain.device_args(self.engine),
             points,
             velocity,

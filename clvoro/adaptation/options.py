@@ -257,26 +257,22 @@ class Options:
         return self.method in _MULTILEVEL
 
 
-def split_start(points: ArrayLike | Start) -> tuple[str, ArrayLike | None]:
-    """Return how a random start is distributed, and the caller's generators if they are not random."""
-    return (points, None) if isinstance(points, str) else ("density", points)
-
-
-def special(options: object) -> dict[str, Any]:
-    """Return the values of the `options` of `Adapter.run` by name.
+def merged_options(points: ArrayLike | Start, options: object, **given: Any) -> tuple[Options, ArrayLike | None]:
+    """Return all options of `Adapter.run` in one place, and the caller's generators if `points` are not random.
 
     Raises
     ------
-    InputTypeError
+    InputError, InputTypeError
+        If a value is not as expected.
     """
-    if options is None:
-        return {}
-    if not isinstance(options, MultilevelOptions | PaperOptions):
+    if options is not None and not isinstance(options, MultilevelOptions | PaperOptions):
         raise InputTypeError(
             f"options is {options!r:.60} of type {type(options).__name__}, expected clvoro.MultilevelOptions (methods "
             "adaptive, exact, transport) or clvoro.PaperOptions (the other methods)"
         )
-    return dict(vars(options))
+    start, own = (points, None) if isinstance(points, str) else ("density", points)
+    special = {} if options is None else vars(options)
+    return Options(start=start, **given, **special), own
 
 
 def arguments_of_run(settings: Mapping[str, Any]) -> dict[str, Any]:

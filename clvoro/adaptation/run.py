@@ -1,29 +1,42 @@
-"""A run: preparation, start or restart, loop."""
+"""A run: the loop of the paper's Figure 1, displace, move, tessellate, record, until the schedule ends."""
 
 from __future__ import annotations
 
+import copy
+import time
 from collections.abc import Callable
-from typing import Any
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Literal
 
 import numpy as np
 
-from ..arguments import check_callable
-from ..errors import InputTypeError
+from ..arguments import check_callable, check_points
+from ..errors import InputTypeError, Interrupted
 from ..geometry.domain import Domain
-from ..mesh.results import Result
+from ..mesh.results import HISTORY_DTYPE, Displacements, Result
+from ..opencl.primitives import Summary
+from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
-from .checkpoint import Checkpointer
-from .fingerprint import run_fingerprint
-from .loop import Loop
+from .checkpoint import RENEWAL, Checkpointer, Saved, run_fingerprint
+from .diagnostics import warn_of_errors, warn_of_obtuse_triangles
+from .fixed_points import origins, put_back
+from .motion import Displacement, Method
 from .options import Checkpoint, Options, uses
+from .plan.actions import CorrectCount, Refine, Step
 from .plan.efforts import EFFORTS
-from .preparation import Preparation
-from .resume import Saved
+from .plan.schedule import work_of
+from .preparation import only_needs_correction, plan, prepare, start
 from .stages import Stages
 
+WINDOW = 10
+"""Steps over which error and quality are averaged to detect stagnation."""
 REACHED = 0.8
 """Share of an error target, larger than the effort's own, below which `trade` says where the error ends. Where such
 targets are met, the error is at least 0.82 of them (`bench/front.py`)."""
+INTERRUPTED, STOPPED, UNDER_WAY = "interrupted", "stopped by the callback", "under way"
+COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
+SETTLED = "tolerance of the moving mesh met"
+"""Reasons of converged runs."""
 
 
 def check_run(domain: object, size: object, callback: Callable[[np.void], object] | None) -> None:
@@ -40,97 +53,384 @@ def check_run(domain: object, size: object, callback: Callable[[np.void], object
         )
 
 
-def run_adaptation(
-    stages: Stages,
-    domain: Domain,
-    size: object,
-    points: np.ndarray | None,
-    fixed: np.ndarray,
-    options: Options,
-    files: Checkpoint,
-    callback: Callable[[np.void], object] | None,
-    on_memory: Callable[[float], object] | None,
-) -> Result:
-    """Return the result of a run.
+class Run:
+    """A run that goes on step by step, shows its mesh at any time, and follows other size fields.
 
-    If a periodic box has too few cells around it on the coarsest level, the run starts again with fewer levels.
-    `on_memory` is called once with the bytes that the run needs on the device, before it begins; `callback` with each
-    row of the history. Raises and warns as `Adapter.run` does.
+    `Adapter.start` begins one. The other attributes are for the actions of its schedule.
+
+    Attributes
+    ----------
+    steps : int
+        Number of steps done.
+    level : int
+        The present level; 0 is the finest.
+    stop_reason : str
+        Why the run has ended; "" while it goes on.
+
+    Examples
+    --------
+    >>> run = clvoro.Adapter().start(clvoro.Box((0, 0), (1, 1)), 0.1, "fast")
+    >>> while run.step() and run.steps < 3:
+    ...     error = run.history["mean_error"][-1]
+    >>> now, finished = run.mesh(), run.finish()
+    >>> now.stop_reason, finished.stop_reason
+    ('under way', 'plan completed')
+    >>> run.follow(0.09)
+    >>> len(run.finish().points) > len(finished.points)
+    True
     """
-    source = files.source
-    saved = None if source is None else Saved(source)
-    fingerprint = {}
-    if saved is not None or files.path is not None:
-        fingerprint = run_fingerprint(domain, vars(options), stages.engine.real, points, fixed)
-    if saved is not None:
-        saved.check_fingerprint(fingerprint)
-    max_levels = None if saved is None else saved.levels
-    while True:
-        prepared = Preparation(stages, domain, size, points, options, max_levels, fixed)
-        if on_memory is not None:
-            on_memory(prepared.memory)
-            on_memory = None
+
+    def __init__(
+        self,
+        stages: Stages,
+        domain: Domain,
+        size: object,
+        points: np.ndarray | None,
+        fixed: np.ndarray,
+        options: Options,
+        files: Checkpoint,
+        callback: Callable[[np.void], object] | None = None,
+        on_memory: Callable[[float], object] | None = None,
+        alone: Callable[[Stages], AbstractContextManager[object]] = nullcontext,
+    ) -> None:
+        self._stages, self._domain, self._fixed, self._options = stages, domain, fixed, options
+        self._files, self._callback, self._on_memory, self._alone = files, callback, on_memory, alone
+        self._begin(size, points, saved=None if files.source is None else Saved(files.source))
+
+    def _begin(
+        self, size: object, points: np.ndarray | None, max_levels: int | None = None, saved: Saved | None = None
+    ) -> None:
+        """Prepare a run, and make its first mesh or read it from a checkpoint."""
+        stages, options, files = self._stages, self._options, self._files
+        self._size, self._points = size, points
+        fingerprint: dict[str, Any] = {}
+        if saved is not None or files.path is not None:
+            fingerprint = run_fingerprint(self._domain, vars(options), stages.engine.real, points, self._fixed)
+        if saved is not None:
+            saved.check_fingerprint(fingerprint)
+            max_levels = saved.levels
+        prepared = prepare(stages, self._domain, size, points, options, max_levels, self._fixed)
+        self.levels = self.level = prepared.levels
+        if self._on_memory is not None:
+            self._on_memory(prepared.memory)
+            self._on_memory = None
+        if saved is None:
+            try:
+                self.state = start(prepared)
+            except FewCellsError as error:
+                self._begin_with_fewer_levels(error)
+                return
+            self.near = only_needs_correction(prepared, self.state)
+        else:
+            self.near = saved.near
+        planned = plan(prepared, self.near)
+        self.schedule, self.target = planned.schedule, float(prepared.target)
+        self.n_cells = options.n_cells if options.multilevel else None
+        self._tol = None if options.multilevel else options.tol
+        self._writer = None
+        if files.path is not None:
+            self._writer = Checkpointer(files.path, files.every, fingerprint, self.schedule)
+        self._renews, self.pace = saved is not None or self._writer is not None, RENEWAL if files.every else 0
+        if saved is not None:
+            self.state = saved.mesh(prepared.setup, self.schedule)
+        self.n_start, self.started = self.state.n, self.state.next_label
+        self.position = self.steps = self.obtuse = 0
+        self.rows: list[np.ndarray] = []
+        self.initial: Displacements | None = None
+        self.final: Displacements | None = None
+        self.last: Method | None = None
+        self.solution: Solution | None = None
+        self.stop_reason, self._stop = "", False
+        self._result: Result | None = None
+        elapsed = 0.0 if saved is None else saved.resume(self)
+        self.began, self.begun, self._renewed = time.perf_counter() - elapsed, self.steps, self.steps
+        self.labeled = self.started + sum(int(row["inserted"][0]) for row in self.rows)
+        done = work_of(self.schedule, self.levels, self.state.engine.cell_dim, self.target)
+        self._progress = [*done[1:], 1.0]
+        steps = [position for position, action in enumerate(self.schedule) if isinstance(action, Step)]
+        self._last_step = steps[-1] if steps and self._tol is None else None
+        settings = {
+            **vars(options),
+            "start": options.start if points is None else "points",
+            "levels": self.levels,
+            "error_target": planned.error_target,
+            "dtype": stages.engine.real.name,
+            "layers": [repr(layer) for layer in options.layers],
+            "fixed": len(self._fixed),
+        }
+        self._settings = {name: value for name, value in settings.items() if uses(options.method, name)}
+        if options.multilevel:
+            self._settings["trade"] = planned.trade
+
+    def _begin_with_fewer_levels(self, error: FewCellsError) -> None:
+        """Begin again after `error`: a periodic box has too few cells around it on the coarsest level."""
+        if self._options.levels != "auto" or self.levels == 0:
+            raise error
+        self._begin(self._size, self._points, self.levels - 1)
+
+    @property
+    def history(self) -> np.ndarray:
+        """The rows so far; see `Result.history`."""
+        return np.concatenate([np.empty(0, HISTORY_DTYPE), *self.rows], dtype=HISTORY_DTYPE)
+
+    def step(self) -> bool:
+        """Go on to the next row of the history: first the start, then one step at a time.
+
+        Returns
+        -------
+        bool
+            Whether there is one; False at the end.
+        """
+        with self._alone(self._stages):
+            return self._advance()
+
+    def finish(self, on_interrupt: Literal["raise", "return"] = "raise") -> Result:
+        """Go on to the end, and return the mesh.
+
+        Parameters
+        ----------
+        on_interrupt : "raise" or "return"
+            What Ctrl-C does: raise `Interrupted`, which carries the result so far, or return that result.
+
+        Raises
+        ------
+        Interrupted
+            On Ctrl-C.
+        """
+        with self._alone(self._stages):
+            return self.conclude(on_interrupt)
+
+    def mesh(self) -> Result:
+        """Return the mesh that the run would give if it ended now; the run goes on as if nothing had happened.
+
+        It is a mesh of the finest level and has the required number of cells. It needs the memory of another run.
+        """
+        with self._alone(self._stages):
+            if self.stop_reason:
+                return self.conclude()
+            other = copy.copy(self)
+            other.state, other.rows, other.last = self.state.copy(), [r.copy() for r in self.rows], copy.copy(self.last)
+            other.stop_reason = UNDER_WAY
+            return other._end()
+
+    def follow(self, size: object) -> None:
+        """Go on with another size field, from the generators that are there.
+
+        The run then does what a run from given points does: it only corrects and polishes a mesh that nearly has the
+        sizes. Its history begins anew, and `Result.origin` counts from the present generators.
+
+        Parameters
+        ----------
+        size : number, callable or clvoro.sizing field
+
+        Raises
+        ------
+        InputError, InputTypeError, SizeFieldError, MemoryLimitError
+            As `Adapter.run`.
+        """
+        with self._alone(self._stages):
+            check_run(self._domain, size, None)
+            if self._result is None:
+                origin, scale = self._domain.frame
+                points = self.state.to_host(self.state.points, scale) + origin
+            else:
+                points = self._result.points
+            self._begin(size, check_points(points, self._domain))
+
+    def _advance(self) -> bool:
+        """Do actions up to the next row of the history; return whether there is one."""
+        known = len(self.rows)
         try:
-            loop = _start(prepared, fingerprint, saved, files, callback)
-            result = loop.run(
-                options.n_cells if options.multilevel else None, float(prepared.target), _settings(prepared)
-            )
-            _note_end_of_trade(result, options)
-            return result
-        except FewCellsError:
-            if options.levels != "auto" or prepared.levels == 0:
-                raise
-            max_levels = prepared.levels - 1
+            if not self.rows:
+                self.record(0.0)
+                if self._stop:
+                    self._keep()
+            while len(self.rows) == known and not self.stop_reason:
+                self.stop_reason = self._end_reason(self.position == len(self.schedule))
+                if not self.stop_reason:
+                    self.schedule[self.position].apply(self)
+                    self.position += 1
+                    self._keep()
+        except FewCellsError as error:
+            self._begin_with_fewer_levels(error)
+            return self._advance()
+        return len(self.rows) > known
 
+    def _keep(self) -> None:
+        """At the end of an action, compute the mesh anew and write a checkpoint, if they are due."""
+        due = self._renews and self.steps - self._renewed >= self.pace
+        if due and not self._stop:
+            self.state, self._renewed = self.state.renewed(), self.steps
+        if self._writer is not None and (due or self._stop):
+            self._writer.write_if_due(self, self._stop)
 
-def _note_end_of_trade(result: Result, options: Options) -> None:
-    """Add to `trade` in the settings where the error ends, if it is far below the target of the caller."""
-    target, own = options.error_target, EFFORTS[options.effort].error_target
-    planar = result.diagram.domain.cell_dim == 2
-    if not (options.method == "adaptive" and planar and target and result.converged):
-        return
-    error = float(np.abs(result.size_error).mean())
-    if target > own and error < REACHED * target:
-        # Effort "fast" ends there because its steps end, not because the shape is as good as it gets.
-        why = "" if options.effort == "fast" else ", as larger errors hardly give a better shape"
-        result.settings["trade"] += f"; it ends at {error:.2g}{why}"
+    def conclude(self, on_interrupt: Literal["raise", "return"] = "raise") -> Result:
+        """Do as `finish`, for a caller that excludes other threads."""
+        if self._result is None:
+            try:
+                while self._advance():
+                    pass
+            except KeyboardInterrupt:
+                self.stop_reason = INTERRUPTED
+                self.state.update()
+            self._result = self._end()
+        if self._result.stop_reason == INTERRUPTED and on_interrupt == "raise":
+            raise Interrupted(self._result)
+        return self._result
 
+    @property
+    def fixed_count(self) -> int | None:
+        """Fixed number of cells of the present level; None if the size field determines it."""
+        return self.n_cells if self.level == 0 else None
 
-def _start(
-    prepared: Preparation,
-    fingerprint: dict[str, Any],
-    saved: Saved | None,
-    files: Checkpoint,
-    callback: Callable[[np.void], object] | None,
-) -> Loop:
-    """Return the loop at its beginning, or where it was saved."""
-    options, mesh, progress = prepared.options, None, None
-    if saved is None or prepared.may_need_correction_only:
-        mesh = prepared.mesh()
-    schedule = prepared.schedule(mesh)
-    writer = None
-    if files.path is not None:
-        writer = Checkpointer(files.path, files.every, fingerprint, schedule)
-    if saved is not None:
-        mesh = None  # free its memory
-        mesh = saved.restore(prepared.setup, schedule)
-        progress = saved.progress(schedule)
-    assert mesh is not None
-    tol = None if options.multilevel else options.tol
-    return Loop(mesh, schedule, prepared.levels, options.max_steps, tol, callback, writer, progress)
+    def note(self, displacement: Displacement) -> None:
+        """Keep the displacement of the first and of the last step on the host."""
+        if self.initial is None:
+            self.initial = self.state.displacements(displacement)
+        if self.position == self._last_step:
+            self.final = self.state.displacements(displacement)
+        self.solution = displacement.solution
 
+    def record(self, progress: float | None = None) -> None:
+        """Append a row to the history, and let the callback stop the run."""
+        self._add_row(self._progress[self.position] if progress is None else progress)
+        if self._callback is None:
+            return
+        answer = self._callback(self.rows[-1][0].copy())
+        try:
+            self._stop = bool(answer)
+        except ValueError as error:  # a NumPy array has no truth value
+            raise InputTypeError(
+                f"callback returned {answer!r:.60} of type {type(answer).__name__}, expected True to stop, False or "
+                f"None to go on ({error})"
+            ) from error
 
-def _settings(prepared: Preparation) -> dict[str, Any]:
-    """Return the settings for the result: those that the method uses."""
-    options = prepared.options
-    settings = {
-        **vars(options),
-        "start": options.start if prepared.points is None else "points",
-        "levels": prepared.levels,
-        "error_target": prepared.error_target,
-        "dtype": prepared.stages.engine.real.name,
-        "layers": [repr(layer) for layer in options.layers],
-        "fixed": len(prepared.fixed),
-    }
-    used = {name: value for name, value in settings.items() if uses(options.method, name)}
-    return {**used, "trade": prepared.trade} if options.multilevel else used
+    def _is_recorded(self) -> bool:
+        """Return whether the last row of the history describes the present mesh."""
+        if not self.rows:
+            return False
+        row, mesh = self.rows[-1][0], self.state
+        same = (row["step"], row["level"], row["cells"]) == (self.begun, self.level, mesh.n)
+        # Before the first step the sizes are not scaled to a fixed number.
+        scaled = self.fixed_count is None or self.steps > 0
+        return bool(same and scaled and self.labeled == mesh.next_label)
+
+    def _add_row(self, progress: float) -> None:
+        mesh = self.state
+        s, n, labeled = mesh.summaries.read(), mesh.n, mesh.next_label
+        row: dict[str, float] = dict.fromkeys(HISTORY_DTYPE.fields or (), 0)
+        row |= {"step": self.steps, "level": self.level, "cells": n, "progress": progress}
+        row |= self._qualities(s)
+        row["changed"], row["ever_changed"] = round(s["changed"].sum), s["ever_changed"].sum / n
+        # Each inserted generator gets a new label.
+        row["inserted"] = labeled - self.labeled
+        before = int(self.rows[-1]["cells"][0]) if self.rows else self.n_start
+        row["deleted"] = before + row["inserted"] - n
+        if self.solution is not None:
+            row["lloyd"], row["poisson"] = s["lloyd"].sum / n, s["correction"].sum / n
+            row["iterations"], row["residual"] = self.solution.iterations, self.solution.residual
+        row["seconds"] = time.perf_counter() - self.began
+        # Faster than one field after the other.
+        new = np.array([tuple(row.values())], HISTORY_DTYPE)
+        # Without a call in between: after an interruption there, insertions would be counted twice.
+        self.rows += [new]
+        self.labeled = labeled
+
+    def _qualities(self, s: dict[str, Summary]) -> dict[str, float]:
+        """Return errors, qualities and energy for a row of the history, from the summaries `s`."""
+        mesh, n = self.state, self.state.n
+        return {
+            "mean_error": s["error"].magnitude / n,
+            "max_error": s["error"].peak,
+            "mean_quality": s["quality"].sum / n,
+            "min_quality": s["quality"].least,
+            "energy": s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.cell_dim + 2),
+        }
+
+    def _end_reason(self, over: bool) -> str:
+        """Return why the run ends, or "" if it goes on. `over`: the schedule has ended."""
+        if self._stop:
+            return STOPPED
+        finished = None if self.last is None else self.last.finished
+        if finished is None and self._stalled():
+            return STALLED
+        if finished and self._tol:
+            return SETTLED
+        if over and self._tol is None:
+            return COMPLETED
+        used_up = self._options.max_steps is not None and self.steps >= self._options.max_steps
+        return "max_steps reached" if over or used_up else ""
+
+    def _stalled(self) -> bool:
+        """Return whether both mean error and mean quality have improved by less than `tol` over the last steps."""
+        if not self._tol or len(self.rows) <= 2 * WINDOW:
+            return False
+        history = np.concatenate(self.rows[-2 * WINDOW :])
+        old, new = history[:WINDOW], history[WINDOW:]
+        better_error = 1 - new["mean_error"].mean() / max(old["mean_error"].mean(), 1e-300)
+        better_quality = new["mean_quality"].mean() / old["mean_quality"].mean() - 1
+        return bool(max(better_error, better_quality) < self._tol)
+
+    def _end(self) -> Result:
+        """Return the result: it always has the required sizes and number of cells."""
+        while self.level > 0:
+            Refine().apply(self)
+        CorrectCount().apply(self)
+        if not self._is_recorded():
+            if self.steps:
+                self.state.walls.settle(self.state)
+            self.solution = None
+            self._add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
+        result = self._read_result()
+        if result.converged:
+            self._note_end_of_trade(result)
+            if self.obtuse:
+                warn_of_obtuse_triangles(result)
+            if self._options.multilevel:
+                warn_of_errors(result)
+        return result
+
+    def _read_result(self) -> Result:
+        """Read the mesh. Raises InputError if cells of nearly coincident generators are wrong because of round-off."""
+        mesh, final = self.state, self.final
+        if self.steps and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"]):
+            # The last step was not known in advance, or generators have changed since.
+            assert self.last is not None
+            with mesh.engine.workspace.frame():
+                final = mesh.displacements(self.last.step(mesh))
+        if mesh.finalize():
+            # Faces shorter than round-off may have changed, and with them the quality.
+            for name, value in self._qualities(mesh.summaries.read()).items():
+                self.rows[-1][name] = value
+        labels = mesh.ordered(mesh.labels)
+        size = mesh.to_host(mesh.h, mesh.domain.frame[1])
+        error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
+        diagram = mesh.fetch_diagram()
+        put_back(diagram, mesh.setup.points)
+        return Result(
+            points=diagram.points,
+            diagram=diagram,
+            target_size=size,
+            size_error=error,
+            quality=quality,
+            history=self.history,
+            converged=self.stop_reason in (COMPLETED, STALLED, SETTLED),
+            stop_reason=self.stop_reason,
+            initial=self.initial,
+            final=final,
+            size_factor=mesh.size_factor,
+            settings=dict(self._settings),
+            origin=origins(labels, self.started, mesh.taken),
+        )
+
+    def _note_end_of_trade(self, result: Result) -> None:
+        """Add to `trade` in the settings where the error ends, if it is far below the target of the caller."""
+        options = self._options
+        target, own = options.error_target, EFFORTS[options.effort].error_target
+        if options.method != "adaptive" or self._domain.cell_dim == 3 or not target:
+            return
+        error = float(np.abs(result.size_error).mean())
+        if target > own and error < REACHED * target:
+            # Effort "fast" ends there because its steps end, not because the shape is as good as it gets.
+            why = "" if options.effort == "fast" else ", as larger errors hardly give a better shape"
+            result.settings["trade"] += f"; it ends at {error:.2g}{why}"

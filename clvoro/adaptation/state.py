@@ -1,10 +1,13 @@
-"""The state of a mesh on the device, and what changes it."""
+"""The state of a mesh on the device: its arrays, and what changes them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -12,25 +15,112 @@ import pyopencl.array as cla
 
 from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
+from ..mesh.results import Displacements
 from ..opencl.device_array import buffer_of
+from ..opencl.engine import Engine
+from ..opencl.primitives import Summaries
 from ..sizing import Sizing
+from ..solvers.linear_system import Solution
 from ..tessellation.bins import BinnedPoints
 from ..tessellation.device_diagram import Tessellation
-from ..tessellation.readback.diagram import fetch_diagram
+from ..tessellation.readback.diagram import fetch_diagram, order_of
 from ..tessellation.tessellator import Tessellator
-from .arrays import Arrays, CellArrays, MeshArrays, Setup
-from .density import CellWeights, LloydWeights
+from .density import CellWeights
 from .descent.quality_descent import MOST_OBTUSE
 from .fixed_points import take_places
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
+from .motion import Displacement, Moving
 from .stages import Stages
 from .walls import Walls
 
+SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio", "weight")
 
-class MeshState(MeshArrays):
+
+@dataclass
+class CellArrays:
+    """Arrays (n,) real that follow from the generators; see `MeshState`."""
+
+    h: cla.Array
+    error: cla.Array
+    quality: cla.Array
+    local_length: cla.Array
+
+    @classmethod
+    def empty(cls, engine: Engine, n: int) -> CellArrays:
+        """Return new arrays for `n` cells."""
+        return cls(*(engine.empty(n) for _ in range(4)))
+
+
+@dataclass
+class Arrays:
+    """All arrays of one set of generators. An interruption leaves the old or the new set, never a mixture.
+
+    Everything else follows from `generators`, `potential`, `multipliers` and `weights`: checkpoints have these.
+    """
+
+    generators: Generators
+    potential: cla.Array | None = None
+    multipliers: cla.Array | None = None
+    weights: cla.Array | None = None
+    cells: CellArrays | None = None
+    tessellation: Tessellation | None = None
+
+    def kept(self) -> Arrays:
+        """Return those that checkpoints have, without copies."""
+        return Arrays(self.generators, self.potential, self.multipliers, self.weights)
+
+    def copy(self) -> Arrays:
+        """Return copies of those that checkpoints have."""
+        generators = Generators(**{name: array.copy() for name, array in vars(self.generators).items()})
+
+        def copied(array: cla.Array | None) -> cla.Array | None:
+            return None if array is None else array.copy()
+
+        return Arrays(generators, copied(self.potential), copied(self.multipliers), copied(self.weights))
+
+
+def _property(part: str, name: str) -> Any:
+    """Return a property for attribute `name` of `part` of `MeshState._data`."""
+    return property(attrgetter(f"_data.{part}.{name}"))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all levels of a run have in common.
+
+    Attributes
+    ----------
+    free : Domain
+        Part of the domain, in its frame, in which generators may move.
+    fixed : int
+        Generators with labels below `fixed` do not move.
+    points : (k, d) ndarray
+        Positions of those with the labels 0 to k - 1, on the finest level. Their cells have target sizes like all
+        others. The other fixed generators are those of layers: the size of their cells is their target size.
+    factor : float
+        Initial factor on the size field on the finest level.
+    """
+
+    stages: Stages
+    domain: Domain
+    sizing: Sizing
+    free: Domain
+    fixed: int
+    points: np.ndarray
+    factor: float = 1.0
+
+    @property
+    def first_row(self) -> int:
+        """Label of the first generator of layers."""
+        return len(self.points)
+
+    def on(self, engine: Engine) -> Setup:
+        """Return the same with stages of their own, on another `engine` of the same kind."""
+        return replace(self, stages=Stages(engine), sizing=self.sizing.on(engine))
+
+
+class MeshState:
     """Generators of one level with their diagram, sizes, error and quality, all on the device.
-
-    `MeshArrays` has the attributes that are arrays.
 
     Parameters
     ----------
@@ -38,12 +128,31 @@ class MeshState(MeshArrays):
     size_factor : float
         Factor on the size field: 2^k on level k above the finest.
     start : dict of device arrays, or Arrays
-        Points and labels of the generators, removed from the dict; or all arrays of a saved state.
+        Points and labels of the generators, removed from the dict; or those arrays of another mesh from which all
+        others follow (`Arrays.kept`).
     coarser : Tessellator, optional
         Tessellator of the coarser level.
+    next_label : int, optional
+        Label of the next generator; by default the number of generators.
+    taken : (k,) int32, optional
+        As the attribute; by default -1.
 
     Attributes
     ----------
+    n : int
+    points : (n, d) real
+        Normalized coordinates, in the order of the bins.
+    labels : (n,) int32
+        Permanent names of the generators.
+    velocity : (n, d) real
+        Displacement in the last step.
+    signatures : (n,) uint64
+        Hashes of the sets of neighbors; see `Metric.compare_neighbors`.
+    ever_changed : (n,) real
+        1 where the set of neighbors has changed in a step on this level, else 0.
+    h, error, quality : (n,) real
+    local_length : (n,) real
+        min(L, h), the unit of bounds of the motion.
     follows_log_ratio : bool
         Summarize log(L / h) with error and quality, so that `mean_log_ratio_error` needs no transfer of its own.
     taken : (k,) int32
@@ -52,19 +161,42 @@ class MeshState(MeshArrays):
         What made the present diagram, if it is a power diagram.
     """
 
+    points = _property("generators", "points")
+    labels = _property("generators", "labels")
+    velocity = _property("generators", "velocity")
+    signatures = _property("generators", "signatures")
+    ever_changed = _property("generators", "ever_changed")
+    h = _property("cells", "h")
+    error = _property("cells", "error")
+    quality = _property("cells", "quality")
+    local_length = _property("cells", "local_length")
+
     def __init__(
-        self, setup: Setup, size_factor: float, start: dict[str, cla.Array] | Arrays, coarser: Tessellator | None = None
+        self,
+        setup: Setup,
+        size_factor: float,
+        start: dict[str, cla.Array] | Arrays,
+        coarser: Tessellator | None = None,
+        next_label: int | None = None,
+        taken: np.ndarray | None = None,
     ) -> None:
-        super().__init__(setup, size_factor)
+        self.setup, self.size_factor = setup, size_factor
+        self.stages, self.domain, self.sizing = setup.stages, setup.domain, setup.sizing
+        self.free, self.fixed = setup.free, setup.fixed
+        self.engine = self.stages.engine
+        self.summaries = Summaries(self.engine, SUMMARIES)
+        self._ordered: cla.Array | None = None
         self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser)
         self.power: Tessellator | None = None
-        self.follows_log_ratio = False
-        self.taken = np.full(setup.first_row, -1, np.int32)
-        self._knows_log_ratio = False
+        self.follows_log_ratio = self._knows_log_ratio = False
+        self.taken = np.full(setup.first_row, -1, np.int32) if taken is None else taken
         if isinstance(start, Arrays):
-            self._data, self.next_label = start, len(start.generators)
+            self._data = start
+        n = len(start.generators) if isinstance(start, Arrays) else len(start["points"])
+        self.next_label = n if next_label is None else next_label
+        if isinstance(start, Arrays):
+            self.tessellate_anew()
             return
-        n = self.next_label = len(start["points"])
         start["velocity"] = self.engine.zeros(start["points"].shape)
         start["signatures"] = self.engine.zeros(n, np.uint64)
         start["ever_changed"] = self.engine.zeros(n)
@@ -89,19 +221,83 @@ class MeshState(MeshArrays):
         setup = Setup(stages, domain, sizing, domain if free is None else free, fixed, none)
         return cls(setup, size_factor, {"points": points, "labels": labels})
 
-    @classmethod
-    def restore(
-        cls,
-        setup: Setup,
-        size_factor: float,
-        generators: Generators,
-        h: cla.Array,
-        potential: cla.Array,
-        multipliers: cla.Array | None,
-    ) -> MeshState:
-        """Return a mesh from the arrays of another one. Its diagram is set afterwards."""
-        cells = CellArrays.empty(setup.stages.engine, len(generators), h, potential)
-        return cls(setup, size_factor, Arrays(generators, cells, None, multipliers))
+    def renewed(self) -> MeshState:
+        """Return this mesh with everything computed anew from its `Arrays.kept`, as a resumed run does.
+
+        This mesh and the diagram of all stages cannot be used afterwards.
+        """
+        self._data = self._data.kept()
+        self.stages.release()
+        return MeshState(self.setup, self.size_factor, self._data, next_label=self.next_label, taken=self.taken)
+
+    def copy(self) -> MeshState:
+        """Return a copy with stages of its own, whose diagram is computed anew."""
+        engine = self.engine
+        setup = self.setup.on(Engine(engine.ctx, engine.queue, engine.dim, engine.real, engine.traits))
+        return MeshState(setup, self.size_factor, self._data.copy(), next_label=self.next_label, taken=self.taken)
+
+    @property
+    def n(self) -> int:
+        """Number of generators."""
+        return self._data.generators.points.shape[0]
+
+    @property
+    def arrays(self) -> Arrays:
+        """All arrays."""
+        return self._data
+
+    @property
+    def tessellation(self) -> Tessellation | None:
+        """The present diagram; None before the first `update`."""
+        return self._data.tessellation
+
+    @tessellation.setter
+    def tessellation(self, t: Tessellation | None) -> None:
+        self._data.tessellation = t
+
+    @property
+    def t(self) -> Tessellation:
+        """The present diagram."""
+        assert self._data.tessellation is not None
+        return self._data.tessellation
+
+    @property
+    def potential(self) -> cla.Array:
+        """Solution of the last Poisson solve, the start of the next one, (n,) real; at first 0."""
+        if self._data.potential is None:
+            self._data.potential = self.engine.zeros(self.n)
+        return self._data.potential
+
+    @property
+    def multipliers(self) -> cla.Array | None:
+        """Solution of the last volume projection, the start of the next one, (n,) float32, if there is one."""
+        return self._data.multipliers
+
+    @multipliers.setter
+    def multipliers(self, array: cla.Array) -> None:
+        self._data.multipliers = array
+
+    @property
+    def moving(self) -> Moving:
+        """The generators, to be moved."""
+        return Moving(self.points, self.velocity, self.labels, self.fixed)
+
+    def ordered(self, array: cla.Array) -> np.ndarray:
+        """Return `array` (n, ...) on the host in the order of labels."""
+        # The labels are a new array whenever the order changes.
+        if self._ordered is not self.labels:
+            self._order, self._ordered = order_of(self.labels.get()), self.labels
+        return np.take(array.get(), self._order, axis=0)
+
+    def to_host(self, array: cla.Array, factor: float = 1.0) -> np.ndarray:
+        """Return `array` (n, ...) on the host in the order of labels, times `factor`."""
+        return np.multiply(self.ordered(array), factor, dtype=np.float64)
+
+    def displacements(self, d: Displacement) -> Displacements:
+        """Return the two parts of a displacement on the host."""
+        origin, scale = self.domain.frame
+        x = self.to_host(self.points, scale) + origin
+        return Displacements(x, self.to_host(d.lloyd, scale), self.to_host(d.correction, scale))
 
     @cached_property
     def walls(self) -> Walls:
@@ -139,7 +335,7 @@ class MeshState(MeshArrays):
         self.engine.workspace.clear()
 
     def update(self, first: bool = False, binned: BinnedPoints | None = None) -> None:
-        """Tessellate the present points, evaluate size, error and quality, and read the summaries.
+        """Tessellate the present points without weights, evaluate size, error and quality, and read the summaries.
 
         An update of the last diagram is evaluated before the host knows whether it is right. All that the host needs is
         read in one transfer: the report of the update, the summaries, and whether all sizes are valid.
@@ -159,6 +355,7 @@ class MeshState(MeshArrays):
             If a size is not positive and finite.
         """
         stages, data = self.stages, self._data
+        data.weights = None
         if data.cells is None:
             data.cells = CellArrays.empty(self.engine, self.n)
         previous = data.tessellation
@@ -175,6 +372,37 @@ class MeshState(MeshArrays):
             return self._read(report)
 
         data.tessellation = self.tessellator.tessellate(self.points, self.n, previous, binned=binned, follow=evaluate)
+
+    def tessellate_anew(self) -> None:
+        """Tessellate the present points without an earlier diagram, and evaluate size, error and quality."""
+        if self._data.weights is None:
+            self.update()
+            return
+        self._data.cells = CellArrays.empty(self.engine, self.n)
+        self.power = Tessellator(self.stages, self.domain, weighted=True)
+        self.sizing.evaluate(self.points, self.n, self.h, self.size_factor)
+        self.tessellation = self.power.tessellate_weighted(self.points, self._data.weights, self.n)
+        self.compare_and_evaluate()
+
+    def prescribe_volumes(self) -> Solution:
+        """Give the cells of a power diagram the volumes h^d, times the factor with which they fill the domain.
+
+        Damped Newton steps find the weights. Returns the last linear solve.
+        """
+        data, stages = self._data, self.stages
+        if self.power is None:
+            self.power = Tessellator(stages, self.domain, weighted=True)
+        self.sizing.evaluate(self.points, self.n, self.h, self.size_factor)
+        self.sizing.check(self.points, self.h, self.size_factor)
+        prescribed = stages.transport.prescribe_sizes(self.h)
+        data.tessellation, data.weights, newton = stages.transport.solve(
+            self.power, self.points, prescribed, data.weights
+        )
+        factor = newton.factor ** (1 / self.engine.cell_dim)
+        self.size_factor *= factor
+        stages.metric.scale_sizes(factor, self.h)
+        self.compare_and_evaluate()
+        return newton.solution
 
     def compare_and_evaluate(self, first: bool = False) -> None:
         """Compare the neighbors with those of the last diagram, and evaluate error and quality."""
@@ -198,20 +426,18 @@ class MeshState(MeshArrays):
             self._knows_log_ratio = self.follows_log_ratio
             self.summaries.collect_all({**own, **(others or {})}, self.n)
 
-    def move_by_displacements(self) -> None:
-        """Move the generators by `lloyd` and `correction`, in full."""
-        self.stages.motion.move_generators(
-            self.free, self.points, self.lloyd, 1.0, self.correction, 1.0, self.h, self.velocity
-        )
+    def move(self, d: Displacement) -> None:
+        """Move the generators. The diagram is then out of date."""
+        self.stages.motion.move_generators(self.free, self.points, d, self.velocity)
+
+    def summarize_displacements(self, lloyd: cla.Array, correction: cla.Array) -> None:
+        """Summarize the lengths of both displacements (n, d) over h."""
+        self.summaries.collect_lengths(("lloyd", "correction"), lloyd, correction, self.h)
 
     def zero_fixed(self, displacement: cla.Array) -> None:
         """Set `displacement` (n, d) to zero for fixed generators."""
         if self.fixed:
             self.stages.motion.zero_fixed_displacements(self.labels, self.fixed, displacement)
-
-    def lloyd_weights(self, gradient: cla.Array | None = None, log_ratio: cla.Array | None = None) -> LloydWeights:
-        """Evaluate density, log ratios and, as `lloyd`, weighted centroids: see `Density.lloyd_weights`."""
-        return self.stages.density.lloyd_weights(self.t, self.h, self.lloyd, gradient, log_ratio)
 
     def mean_log_ratio_error(self, w: CellWeights) -> float:
         """Return the mean of |log(L / h)|."""
@@ -322,9 +548,7 @@ class MeshState(MeshArrays):
             if not count or count > MOST_OBTUSE * self.n:
                 return count, False
             self.zero_fixed(displacement)
-            self.stages.motion.move_generators(
-                self.free, self.points, displacement, 1.0, displacement, 0.0, self.local_length, self.velocity, clip=0.5
-            )
+            self.move(Displacement(displacement, displacement, self.local_length, correction_share=0.0, bound=0.5))
         self.update()
         return count, True
 
@@ -365,9 +589,8 @@ class MeshState(MeshArrays):
             start["points"], start["labels"] = map(self.engine.upload, new, (None, np.int32))
         # Free the other arrays. After an interruption `update` computes them again.
         self._data = Arrays(self._data.generators)
-        mesh = MeshState(self.setup, self.size_factor / 2, start, self.tessellator)
-        mesh.next_label, mesh.taken = self.next_label + mesh.n - self.n, taken
-        return mesh
+        next_label = self.next_label + n - self.n
+        return MeshState(self.setup, self.size_factor / 2, start, self.tessellator, next_label, taken)
 
     def finalize(self) -> bool:
         """Free what only steps need, and evaluate the diagram in full precision, for `fetch_diagram`.

@@ -16,8 +16,7 @@ from .motion import Moving
 from .thin_walls import has_thin_walls
 
 if TYPE_CHECKING:
-    from .arrays import Setup
-    from .state import MeshState
+    from .state import MeshState, Setup
 
 SETTLING = 3
 """Projections at corners if a run does not end with a step: each turns generators by a small angle only."""

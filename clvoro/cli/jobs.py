@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from ..adaptation.loop import INTERRUPTED
 from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, warn_of_unused
+from ..adaptation.run import INTERRUPTED
 from ..errors import Aborted, ClvoroError, InputError, SolverWarning
 from ..finite_volumes.gate import Solver
 from ..finite_volumes.solver_mesh import WallShape

@@ -88,6 +88,10 @@ class Sizing:
             self._host_step = self._step(np.float64)
             self._host_field = self._with_device_parts(self.field)
 
+    def on(self, engine: Engine) -> Sizing:
+        """Return the same on another engine."""
+        return Sizing(engine, self.domain, self.field, self._gradient_step)
+
     def _step(self, real: object) -> float:
         """Return the step of the differences over h."""
         own = _GRADIENT_STEP[np.dtype(real)]  # type: ignore[call-overload]

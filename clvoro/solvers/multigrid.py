@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pyopencl.array as cla
 
 from ..opencl.engine import Engine
 from ..opencl.primitives import NamedArrays
-from .aggregation import Aggregates, Aggregation, Graph, PairInverse
+from .aggregation import Aggregation, Graph
 from .cycle import Cycle, Level
 
 _COARSEST = 64
@@ -18,72 +17,11 @@ _COARSEST = 64
 _MAX_LEVELS = 30
 _LEAST_COARSENING = 0.8
 """Ratio of the cells of two levels above which coarsening ends."""
-_GRAPH = ("starts", "columns", "weights")
-_AGGREGATES = ("aggregate", "starts", "members")
-
-
-@dataclass(frozen=True)
-class _SavedLevel:
-    """One level of what `Multigrid.save` returns, with all indices checked."""
-
-    n: int
-    partner: np.ndarray
-    graph: tuple[np.ndarray, ...]
-    aggregates: tuple[np.ndarray, ...]
-
-    @property
-    def n_coarse(self) -> int:
-        """Cells of the next level, 0 on the coarsest."""
-        return len(self.aggregates[1]) - 1 if self.aggregates else 0
-
-    @classmethod
-    def read(cls, arrays: Mapping[str, np.ndarray], depth: int, n: int) -> _SavedLevel:
-        """Return level `depth`, of `n` cells.
-
-        Raises
-        ------
-        KeyError, ValueError
-            If an array is missing, or an index leads outside of its array.
-        """
-        partner = arrays[f"{depth}.partner"]
-        _require(_is_within(partner, n, n))
-        graph: tuple[np.ndarray, ...] = ()
-        aggregates: tuple[np.ndarray, ...] = ()
-        if depth > 0:
-            starts, columns, weights = graph = tuple(arrays[f"{depth}.graph.{k}"] for k in _GRAPH)
-            m = len(columns)
-            _require(_are_starts(starts, n, m) and _is_within(columns, m, n))
-            _require(weights.shape == columns.shape and weights.dtype == np.float32)
-            _require(bool((weights >= 0).all() and np.isfinite(weights).all()))
-        if f"{depth}.aggregate" in arrays:
-            aggregate, starts, members = aggregates = tuple(arrays[f"{depth}.{k}"] for k in _AGGREGATES)
-            count = len(starts) - 1
-            _require(0 < count < n and depth < _MAX_LEVELS)
-            _require(_are_starts(starts, count, n) and _is_within(aggregate, n, count))
-            _require(_is_within(members, n, n))
-        return cls(n, partner, graph, aggregates)
 
 
 def _factor_size(n: int) -> int:
     """Return the number of entries of the factorized coarsest level."""
     return (2 * n + 2) * n
-
-
-def _require(condition: bool) -> None:
-    if not condition:
-        raise ValueError("the arrays do not describe a multigrid hierarchy")
-
-
-def _is_within(array: np.ndarray, length: int, end: int) -> bool:
-    """Return whether `array` holds `length` integers from 0 to below `end`."""
-    fits = array.shape == (length,) and array.dtype == np.int32
-    return fits and (length == 0 or (array.min() >= 0 and array.max() < end))
-
-
-def _are_starts(starts: np.ndarray, rows: int, length: int) -> bool:
-    """Return whether `starts` divides `length` entries into `rows` rows."""
-    fits = starts.shape == (rows + 1,) and starts.dtype == np.int32
-    return fits and starts[0] == 0 and starts[-1] == length and bool((np.diff(starts) >= 0).all())
 
 
 class Multigrid:
@@ -172,55 +110,6 @@ class Multigrid:
         self._aggregation.update_pairs(graph, finest.pairs)
         self._levels[0] = replace(finest, graph=graph)
         self._cycle.set_levels(self._levels, self._factor)
-
-    def save(self) -> dict[str, np.ndarray]:
-        """Return the arrays that `update_finest` needs: pairs, aggregates and coarse graphs, read from the device."""
-        arrays = {"exponent": np.array(self._aggregation.exponent)}
-        if self._factor is not None:
-            arrays["factor"] = self._factor.get()
-        for depth, level in enumerate(self._levels):
-            arrays[f"{depth}.partner"] = level.pairs.partner.get()
-            if level.aggregates is not None:
-                for name in _AGGREGATES:
-                    arrays[f"{depth}.{name}"] = getattr(level.aggregates, name).get()
-            if depth > 0:
-                for name in _GRAPH:
-                    arrays[f"{depth}.graph.{name}"] = getattr(level.graph, name).get()
-        return arrays
-
-    def restore(self, arrays: Mapping[str, np.ndarray], n: int) -> None:
-        """Set the levels to what `save` has returned, for `n` cells. `update_finest` must follow.
-
-        Raises
-        ------
-        KeyError, ValueError
-            If the arrays are not valid. Nothing is changed then.
-        """
-        saved = [_SavedLevel.read(arrays, 0, n)]
-        while saved[-1].aggregates:
-            saved.append(_SavedLevel.read(arrays, len(saved), saved[-1].n_coarse))
-        coarsest, factor = saved[-1].n, arrays.get("factor")
-        _require((factor is not None) == (coarsest <= _COARSEST))
-        _require(factor is None or factor.shape == (_factor_size(coarsest),))
-        self._aggregation.exponent = int(arrays["exponent"])
-        self._factor = None if factor is None else self._single.upload(factor, np.float32)
-        self._levels = [self._upload_level(level) for level in saved]
-        self._cycle.set_levels(self._levels, self._factor)
-
-    def _upload_level(self, level: _SavedLevel) -> Level:
-        """Return a saved level on the device. `update_finest` sets the graph and the blocks of the finest one."""
-        single, n = self._single, level.n
-        if level.graph:
-            graph = Graph(*(single.upload(a, d) for a, d in zip(level.graph, "iif", strict=True)))
-        else:
-            graph = Graph(single.empty(n + 1, np.int32), single.empty(1, np.int32), single.empty(1))
-        pairs = PairInverse(single.upload(level.partner, np.int32), single.empty(n), single.empty(n))
-        if level.graph:
-            self._aggregation.update_pairs(graph, pairs)
-        if not level.aggregates:
-            return Level(graph, pairs, None)
-        lists = (single.upload(a, np.int32) for a in level.aggregates)
-        return Level(graph, pairs, Aggregates(*lists))
 
     def _factorize(self, graph: Graph) -> None:
         """Factorize the coarsest level."""

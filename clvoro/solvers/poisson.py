@@ -7,7 +7,7 @@ equation.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -240,30 +240,6 @@ class Poisson:
             self._first_iterations = self._last_iterations = 0
         self._multigrid_of, self._ordering = laplacian, ordering
         return self._multigrid
-
-    def save(self, ordering: object) -> dict[str, np.ndarray]:
-        """Return what the next solve with this `ordering` reuses; nothing if it builds a new multigrid."""
-        if self._multigrid is None or not self._can_reuse(ordering):
-            return {}
-        iterations = np.array([self._first_iterations, self._last_iterations])
-        return {"iterations": iterations, **self._multigrid.save()}
-
-    def restore(self, arrays: Mapping[str, np.ndarray], ordering: object, n: int) -> None:
-        """Continue from what `save` has returned, with the present `ordering` of the `n` cells.
-
-        Raises
-        ------
-        KeyError, ValueError
-            If the arrays are not valid.
-        """
-        self._multigrid_of = self._ordering = None
-        if not arrays:
-            return
-        if self._multigrid is None:
-            self._multigrid = Multigrid(self.engine)
-        first, last = map(int, arrays["iterations"])
-        self._multigrid.restore(arrays, n)
-        self._first_iterations, self._last_iterations, self._ordering = first, last, ordering
 
     def _can_reuse(self, ordering: object) -> bool:
         """Return whether the coarse levels of the last multigrid serve for cells in this ordering."""

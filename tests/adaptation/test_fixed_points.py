@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.adaptation import loop
+from clvoro.adaptation import run as run_module
 from clvoro.adaptation.fixed_points import take_places
 from clvoro.errors import InputError, InputTypeError, MismatchWarning
 
@@ -48,8 +48,8 @@ def test_generators_stay_and_their_cells_have_the_sizes(ctx, monkeypatch, dtype,
         moved.append(np.abs(diagram.points[: len(positions)] - positions).max())
         return original(diagram, positions)
 
-    original = loop.put_back
-    monkeypatch.setattr(loop, "put_back", put_back)
+    original = run_module.put_back
+    monkeypatch.setattr(run_module, "put_back", put_back)
     run = {"fixed": fixed, "effort": "fast", "seed": 2, **more}
     mesh = clvoro.Adapter(ctx, dtype).run(domain, size, **run)
     k, at = len(fixed), domain.check_rows("fixed", fixed)

@@ -93,7 +93,7 @@ def test_insertions_and_deletions_match_the_labels(adapter):
 # Interruptions at any line.
 
 
-OWN = ("loop.py", "state.py", "images.py", "methods.py", "tessellator.py")
+OWN = ("run.py", "state.py", "images.py", "methods.py", "tessellator.py")
 
 
 class Pressed:

@@ -83,12 +83,12 @@ def check_steps(adapter, dim, n, group):
             with watching(engine.queue, tally) if k >= WARM_UP else watching(engine.queue, Tally()):
                 before = tally.reads
                 with engine.workspace.frame():
-                    solution = method.displace(mesh)
-                    method.move(mesh)
+                    displacement = method.step(mesh)
+                    mesh.move(displacement)
                 mesh.update()
                 if k >= WARM_UP:
                     reads.append(tally.reads - before)
-                    iterations += solution.iterations if solution else 0
+                    iterations += displacement.solution.iterations
         solving = sum(c for (stage, _), c in tally.calls.items() if stage.split("/")[-1] in SOLVERS)
         kind = f"{type(method).__name__} {is_exact(method)} {getattr(method, 'descent', '')}"
         name = f"{kind} {reads} {iterations} {tally.launches} {solving}"

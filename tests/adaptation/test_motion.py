@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clvoro.adaptation.motion import Motion
+from clvoro.adaptation.motion import Displacement, Motion
 from clvoro.geometry.box import Box
 from clvoro.opencl.primitives import Summaries
 from tests.reference import patch
@@ -87,9 +87,8 @@ def test_relax_nothing(engine):
 def move(engine, box, points, lloyd, a, correction, b, h, clip):
     on_device = engine.upload(points)
     velocity = engine.empty(points.shape)
-    Motion(engine).move_generators(
-        box, on_device, engine.upload(lloyd), a, engine.upload(correction), b, engine.upload(h), velocity, clip=clip
-    )
+    d = Displacement(engine.upload(lloyd), engine.upload(correction), engine.upload(h), a, b, clip)
+    Motion(engine).move_generators(box, on_device, d, velocity)
     return on_device.get(), velocity.get()
 
 

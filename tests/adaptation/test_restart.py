@@ -101,16 +101,11 @@ def test_held_count(adapter, first):
 
 
 def test_resumes_bit_for_bit(adapter, first, tmp_path):
-    path, size = tmp_path / "state", field(2, 0.012)
-    whole = adapter.run(BOXES[2], size, points=first[2].points)
-    adapter.run(
-        BOXES[2],
-        size,
-        points=first[2].points,
-        checkpoint=clvoro.Checkpoint(path, every=0),
-        callback=lambda row: row["step"] == 6,
-    )
-    rest = adapter.run(BOXES[2], size, points=first[2].points, checkpoint=clvoro.Checkpoint(resume=path))
+    path, size, points = tmp_path / "state", field(2, 0.012), first[2].points
+    every = {"checkpoint": clvoro.Checkpoint(path, every=0)}
+    whole = adapter.run(BOXES[2], size, points=points, **every)
+    adapter.run(BOXES[2], size, points=points, callback=lambda row: row["step"] == 6, **every)
+    rest = adapter.run(BOXES[2], size, points=points, checkpoint=clvoro.Checkpoint(resume=path))
     np.testing.assert_array_equal(rest.points, whole.points)
     np.testing.assert_array_equal(rest.history["mean_error"], whole.history["mean_error"])
 

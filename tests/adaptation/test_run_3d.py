@@ -7,7 +7,7 @@ import pytest
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.loop import Loop
+from clvoro.adaptation.plan.actions import count_changed
 from clvoro.adaptation.plan.efforts import EFFORTS_3D
 from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
 from tests.reference import diagrams3d as reference3d
@@ -286,8 +286,8 @@ def test_refinement_gives_the_number_of_the_next_level(adapter):
 def test_cells_are_coupled_again_after_a_change_of_their_number(rows, n, steps, changed):
     kind = [("level", int), ("cells", int)]
     rows = [np.array([row], kind) for row in rows]
-    loop = SimpleNamespace(rows=rows, level=0, mesh=SimpleNamespace(n=n))
-    assert Loop.count_changed(loop, steps) == changed
+    run = SimpleNamespace(rows=rows, level=0, state=SimpleNamespace(n=n))
+    assert count_changed(run, steps) == changed
 
 
 # Domains and size fields of all kinds.

@@ -5,7 +5,7 @@ import pytest
 
 from clvoro.adaptation.density import Density
 from clvoro.adaptation.metric import Metric
-from clvoro.adaptation.motion import Motion
+from clvoro.adaptation.motion import Displacement, Motion
 from clvoro.adaptation.refinement import Refinement
 from tests.reference import patch
 
@@ -93,7 +93,8 @@ def test_moves(engine, box, clip):
         assert not way.get()[held].any()
     for way, given in zip(ways, (lloyd, correction), strict=True):
         assert np.array_equal(way.get()[~held], given[~held])
-    Motion(engine).move_generators(box, on_device, ways[0], 0.7, ways[1], -1.3, engine.upload(h), velocity, clip=clip)
+    displacement = Displacement(*ways, engine.upload(h), 0.7, -1.3, clip)
+    Motion(engine).move_generators(box, on_device, displacement, velocity)
     new, moved = on_device.get(), velocity.get()
     assert np.array_equal(new[held], points[held])
     assert not moved[held].any()
@@ -115,9 +116,8 @@ def test_moves_longer_than_the_domain(engine, box):
     points = box.place(patch.random_points(N, 5608, box), engine.real)
     way = np.random.default_rng(5609).normal(0, 1e7, (N, box.dim))
     on_device, none = engine.upload(points), engine.upload(np.zeros_like(way))
-    Motion(engine).move_generators(
-        box, on_device, engine.upload(way), 1.0, none, 0.0, engine.upload(np.ones(N)), engine.empty((N, box.dim))
-    )
+    d = Displacement(engine.upload(way), none, engine.upload(np.ones(N)))
+    Motion(engine).move_generators(box, on_device, d, engine.empty((N, box.dim)))
     new, walls = on_device.get(), ~np.array(box.periodic)
     assert ((new >= 0) & (new <= box.extent)).all()
     assert all(len(np.unique(x)) == N for x in new[:, walls].T)

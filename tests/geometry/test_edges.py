@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 import clvoro
-from clvoro.adaptation.motion import Motion
+from clvoro.adaptation.motion import Displacement, Motion
 from clvoro.geometry.edge_bins import bin_edges
 from clvoro.opencl.engine import Engine
 from tests.reference.shores import POLYGONS, coast, scattered
@@ -28,7 +28,7 @@ def move(ctx, request):
         n = len(points)
         on_device, zeros = engine.upload(points), engine.zeros((n, 2))
         sizes, velocity = engine.upload(np.ones(n)), engine.empty((n, 2))
-        motion.move_generators(domain, on_device, engine.upload(way), 1.0, zeros, 0.0, sizes, velocity)
+        motion.move_generators(domain, on_device, Displacement(engine.upload(way), zeros, sizes), velocity)
         return on_device.get()
 
     moved.real = real

@@ -300,7 +300,7 @@ def test_files_hold_the_domain(tmp_path) -> None:
 
 
 def test_checkpoints_tell_domains_apart() -> None:
-    from clvoro.adaptation.fingerprint import run_fingerprint
+    from clvoro.adaptation.checkpoint import run_fingerprint
 
     domains = [clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE, [HOLE]), clvoro.Box((0, 0), (4, 3))]
     options: dict = {"layers": []}

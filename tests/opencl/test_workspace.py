@@ -188,8 +188,7 @@ def test_steps_allocate_nothing(engine, made, method):
     counts = []
     for _ in range(7):
         with engine.workspace.frame():
-            method.displace(mesh)
-            method.move(mesh)
+            mesh.move(method.step(mesh))
         mesh.update()
         counts.append(len(made))
     assert counts[3:] == counts[3:4] * 4
@@ -225,8 +224,7 @@ def test_released_stages_leave_no_memory(engine, monkeypatch):
         mesh = MeshState.create(stages, patch.BOX, size, engine.upload(host))
         for method in (PublishedMethod(Relaxation(), True, True), WeightedMethod(), ProjectedMethod()):
             with engine.workspace.frame():
-                method.displace(mesh)
-                method.move(mesh)
+                mesh.move(method.step(mesh))
             mesh.update()
         mesh.insert_delete()
         stages.poisson.set_up_multigrid(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import clvoro
-from clvoro.adaptation.resume import Saved
+from clvoro.adaptation.checkpoint import Saved
 from clvoro.cli import command as cli
 from clvoro.cli.cases import Case, toml
 from clvoro.cli.jobs import Job

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import clvoro
-from clvoro.adaptation.resume import Saved
+from clvoro.adaptation.checkpoint import Saved
 from clvoro.cli.cases import load_case
 from clvoro.cli.cases.schema import PolygonTable, load_array
 from clvoro.io.vtu_read import load_vtu

@@ -22,7 +22,7 @@ import numpy as np
 
 import clvoro
 import clvoro.io.vtu_read
-from clvoro.adaptation.resume import Saved
+from clvoro.adaptation.checkpoint import Saved
 
 OPTIONS = {"method": "adaptive", "effort": "fast", "seed": 3}
 SIZE = "0.03 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)"

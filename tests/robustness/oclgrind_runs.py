@@ -142,7 +142,7 @@ def power(domain: clvoro.Box | clvoro.Polygon, n: int) -> Work:
         x = np.random.default_rng(37).uniform(domain.lower, domain.upper, (4 * n, domain.dim))
         x = x[np.asarray(domain.contains(x))][:n]
         transport(adapter, domain, x)
-        plan: list[Action] = [Step(WeightedMethod()), Prescribe(moves=1)]
+        plan: list[Action] = [Step(WeightedMethod()), Prescribe(), Prescribe(move=True)]
         with mock.patch.object(preparation, "adaptive_schedule", return_value=plan):
             result = adapter.run(domain, Expression("1 + x"), points=x, n_cells=n)
         assert abs(result.diagram.volumes.sum() - domain.measure) < 1e-3 * domain.measure

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.adaptation.resume import Saved
+from clvoro.adaptation.checkpoint import Saved
 from clvoro.cli.cases import load_case, toml
 from clvoro.cli.cases.schema import load_array
 from clvoro.errors import InputError

@@ -19,7 +19,7 @@ import pytest
 
 import clvoro
 from clvoro.adaptation import checkpoint
-from clvoro.adaptation.resume import Saved
+from clvoro.adaptation.checkpoint import Saved
 from clvoro.cli import command as cli
 from clvoro.cli import outputs, progress
 from clvoro.errors import (

@@ -18,7 +18,7 @@ from ...errors import TangledMeshWarning
 from ...geometry.domain import Domain
 from ...opencl.engine import Engine
 from ...opencl.primitives import Summaries
-from ...solvers.linear_system import Solution
+from ..motion import Displacement, Method
 from .lattice import mirrored
 
 if TYPE_CHECKING:
@@ -137,8 +137,8 @@ class Mmpde:
         found = self._summaries.read()
         return found["energy"].sum, found["power"].sum, round(found["flat"].sum)
 
-    def bound_displacement(self, mesh: MeshState, share: float, room: cla.Array) -> None:
-        """Add `share` of the last displacement to `mesh.lloyd`, and bound its length."""
+    def bound_displacement(self, mesh: MeshState, descent: cla.Array, share: float, room: cla.Array) -> None:
+        """Add `share` of the last displacement to `descent` (n, d), and bound its length."""
         real = self.engine.real.type
         self.engine.run_each(
             self._kernels.bound_displacement,
@@ -149,12 +149,12 @@ class Mmpde:
             real(ROOM),
             mesh.local_length,
             room,
-            mesh.lloyd,
+            descent,
         )
 
 
 @dataclass
-class MmpdeMethod:
+class MmpdeMethod(Method):
     """Descent of Huang's functional, with Nesterov's momentum that restarts when the last step goes uphill.
 
     Attributes
@@ -181,12 +181,12 @@ class MmpdeMethod:
     steps: int = 0
     first: float = 0.0
     energy: float = 0.0
-    finished: bool = False
+    finished: bool | None = False
     warned: int = 0
     connections: Connections | None = field(default=None, repr=False)
 
-    def displace(self, mesh: MeshState) -> Solution:
-        """Evaluate the displacement as `mesh.lloyd`; `mesh.correction` is zero.
+    def step(self, mesh: MeshState) -> Displacement:
+        """Evaluate the displacement as `lloyd`; the correction is zero.
 
         Warns
         -----
@@ -196,20 +196,20 @@ class MmpdeMethod:
         engine, stage = mesh.engine, mesh.stages.mmpde
         if self.connections is None:
             self.connections = connect(engine, mesh.domain, self.lattice[mesh.labels.get()])
-        mesh.allocate_step()
-        mesh.correction.fill(0)
+        descent, correction = engine.scratch(mesh.points.shape), engine.scratch(mesh.points.shape)
+        correction.fill(0)
         room = engine.scratch(mesh.n)
         with engine.workspace.frame():
             gradient, sizes = engine.scratch(mesh.points.shape), engine.scratch(mesh.n)
             mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
-            energy, power, folded = stage.descend_functional(mesh, self.connections, gradient, mesh.lloyd, room)
+            energy, power, folded = stage.descend_functional(mesh, self.connections, gradient, descent, room)
         self._warn(folded, mesh.n)
         self._compare(energy)
         # Uphill: forget the last displacement.
         self.age = 0 if power > 0 else self.age + 1
-        stage.bound_displacement(mesh, min(MOST_MOMENTUM, self.age / (self.age + 3)), room)
-        mesh.summarize_displacements()
-        return Solution.zero()
+        stage.bound_displacement(mesh, descent, min(MOST_MOMENTUM, self.age / (self.age + 3)), room)
+        mesh.summarize_displacements(descent, correction)
+        return Displacement(descent, correction, mesh.h)
 
     def _compare(self, energy: float) -> None:
         """Finish if the functional has hardly decreased over a window of steps."""
@@ -230,7 +230,3 @@ class MmpdeMethod:
                 "the growth of the sizes (clvoro.sizing.Graded)",
                 TangledMeshWarning,
             )
-
-    def move(self, mesh: MeshState) -> None:
-        """Move by the displacement."""
-        mesh.move_by_displacements()

@@ -22,6 +22,7 @@ from ...arguments import warn
 from ...errors import TangledMeshWarning
 from ...geometry.domain import Domain
 from ...solvers.linear_system import Solution
+from ..motion import Displacement, Method
 from .lattice import mirrored
 
 if TYPE_CHECKING:
@@ -149,7 +150,7 @@ def _solve(matrix: scipy.sparse.csr_array, side: np.ndarray) -> tuple[np.ndarray
 
 
 @dataclass
-class MongeAmpereMethod:
+class MongeAmpereMethod(Method):
     """One step of Newton's method for the Monge-Ampere equation. `mesh.potential` is phi.
 
     Attributes
@@ -170,11 +171,11 @@ class MongeAmpereMethod:
     tolerance: float = 1e-3
     share: float = 1.0
     warned: int = 0
-    finished: bool = False
+    finished: bool | None = False
     map: LatticeMap | None = field(default=None, repr=False)
 
-    def displace(self, mesh: MeshState) -> Solution:
-        """Evaluate the displacement as `mesh.correction`; `mesh.lloyd` is zero.
+    def step(self, mesh: MeshState) -> Displacement:
+        """Evaluate the displacement as the correction; `lloyd` is zero.
 
         Warns
         -----
@@ -189,11 +190,11 @@ class MongeAmpereMethod:
         change, solution = self._step(mesh, phi)
         mesh.potential.set((change[labels] / scale**2).astype(mesh.engine.real))
         x = mesh.domain.place(self.map.place(change), np.dtype(np.float64))[labels]
-        mesh.allocate_step()
-        mesh.lloyd.fill(0)
-        mesh.correction.set((x - mesh.points.get()).astype(mesh.engine.real))
-        mesh.summarize_displacements()
-        return solution
+        lloyd, correction = mesh.engine.scratch(x.shape), mesh.engine.scratch(x.shape)
+        lloyd.fill(0)
+        correction.set((x - mesh.points.get()).astype(mesh.engine.real))
+        mesh.summarize_displacements(lloyd, correction)
+        return Displacement(lloyd, correction, mesh.h, solution=solution)
 
     def _step(self, mesh: MeshState, phi: np.ndarray) -> tuple[np.ndarray, Solution]:
         """Return phi after one step."""
@@ -243,10 +244,6 @@ class MongeAmpereMethod:
                 "the sizes (clvoro.sizing.Graded)",
                 TangledMeshWarning,
             )
-
-    def move(self, mesh: MeshState) -> None:
-        """Move by the displacement."""
-        mesh.move_by_displacements()
 
 
 def _slope(mesh: MeshState, x: np.ndarray) -> np.ndarray:

@@ -2,10 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
 
+from ..estimates import MOST_SURPLUS
 from ..insertion_deletion import CLIMB_STRAIN
-from ..methods import Method
+from ..motion import Displacement, Method
+
+if TYPE_CHECKING:
+    from ..run import Run
+
+SAMPLING_GAIN = 0.26
+"""The number of cells by sizes at the generators has an error. On the next finer level it is smaller by this factor:
+0.25 is that of a smooth field, and a kink adds a little."""
+LEAST_PROGRESS, MAX_OSCILLATIONS = 0.9, 2
+"""Corrections of the number of cells end if they oscillate: if the number of missing cells changes its sign so often
+without falling to this share of the smallest number so far. For smooth fields the sign changes at most once."""
+
+
+class Action(Protocol):
+    """A part of a schedule."""
+
+    def apply(self, run: Run) -> None:
+        """Do it."""
 
 
 @dataclass(frozen=True)
@@ -18,6 +38,27 @@ class Step:
     method: Method
     openings: int = 0
     recent: int = 0
+
+    def apply(self, run: Run) -> None:
+        """Take the step, and record it."""
+        if self.recent and not count_changed(run, self.recent):
+            return
+        run.begun = run.steps + 1
+        with run.state.engine.workspace.frame():
+            displacement = self.method.step(run.state)
+            run.note(displacement)
+            run.state.move(displacement)
+            run.state.walls.adjust(run.state)
+        run.state.update()
+        for _ in range(self.openings):
+            run.obtuse, opened = run.state.open_triangles()
+            if not opened:
+                break
+        if run.fixed_count is not None:
+            run.state.normalize_sizes()
+        run.last = self.method
+        run.steps += 1
+        run.record()
 
 
 @dataclass(frozen=True)
@@ -32,6 +73,16 @@ class InsertDelete:
     climb_strain: float = CLIMB_STRAIN
     least: float = 0.0
 
+    def apply(self, run: Run) -> None:
+        """Insert and delete."""
+        mesh = run.state
+        if self.least and abs(missing(run)) <= self.least * mesh.n:
+            return
+        # The solver cannot reuse its large buffers for other generators.
+        mesh.stages.clear_poisson()
+        most = math.inf if run.fixed_count is not None else max_cells(run)
+        mesh.insert_delete(round(self.nuclei * mesh.n), run.fixed_count, climb_strain=self.climb_strain, most=most)
+
 
 @dataclass(frozen=True)
 class RepairCells:
@@ -40,15 +91,33 @@ class RepairCells:
     deficit: float
     split: bool = False
 
+    def apply(self, run: Run) -> None:
+        """Delete or split them."""
+        run.state.stages.clear_poisson()
+        run.state.repair_cells(self.deficit, self.split)
+
 
 @dataclass(frozen=True)
 class Refine:
     """Refine to the next finer level."""
 
+    def apply(self, run: Run) -> None:
+        """Replace the mesh by the finer one."""
+        # The finer level needs another solver and more memory.
+        run.state.stages.clear_poisson()
+        run.state.engine.workspace.clear()
+        finer = run.state.refine(finest=run.level == 1)
+        # One assignment, because an interruption between two would leave a mesh that does not belong to its level.
+        run.state, run.level = finer, run.level - 1
+
 
 @dataclass(frozen=True)
 class ResetMomentum:
     """Set the velocities to zero."""
+
+    def apply(self, run: Run) -> None:
+        """Set them."""
+        run.state.velocity.fill(0)
 
 
 @dataclass(frozen=True)
@@ -62,17 +131,109 @@ class CorrectCount:
     share: float = 0.0
     ahead: float = 0.0
 
+    def apply(self, run: Run) -> None:
+        """Insert or delete until the number is right, or oscillates."""
+        mesh, least, before, oscillations = run.state, math.inf, 0.0, 0
+        while self.share or run.fixed_count is not None:
+            lack = missing_for_next_level(run, self.ahead) if self.ahead else missing(run)
+            if abs(lack) <= self.share * mesh.n:
+                break
+            # At jumps of h each new cell changes the required number, so that it can oscillate without end. Changes
+            # of one sign end by themselves.
+            if abs(lack) < LEAST_PROGRESS * least:
+                least, oscillations = abs(lack), 0
+            elif lack * before < 0:
+                oscillations += 1
+            before = lack
+            if oscillations == MAX_OSCILLATIONS:
+                break
+            target = mesh.n + round(lack) if self.ahead else run.fixed_count
+            most = math.inf if target is not None else max_cells(run)
+            inserted, deleted = mesh.insert_delete(0, target, climb=False, most=most)
+            if inserted == deleted:
+                break
+        if run.fixed_count is not None:
+            mesh.normalize_sizes()
+
 
 @dataclass(frozen=True)
 class BalanceCounts:
     """Insert and delete cells where parts of the domain have too few or too many; see `LocalCounts`."""
 
+    def apply(self, run: Run) -> None:
+        """Insert and delete them."""
+        run.state.balance_counts()
+
 
 @dataclass(frozen=True)
 class Prescribe:
-    """Give the cells their target volumes in a power diagram, again after each of `moves` moves to the centroids."""
+    """Give the cells of a power diagram their target volumes; with `move`, first move generators to the centroids.
 
-    moves: int = 0
+    The volumes are h^d times the factor that makes their sum that of the domain. With fixed volumes this descends the
+    transport cost, the sum of the integrals of |y - x_i|^2 (de Goes et al. 2012, ACM Trans. Graph. 31, 171).
+    """
+
+    move: bool = False
+
+    def apply(self, run: Run) -> None:
+        """Move, find the weights, and record them."""
+        mesh = run.state
+        if not self.move:
+            mesh.stages.clear_poisson()
+        run.begun = run.steps + 1
+        with mesh.engine.workspace.frame():
+            if self.move:
+                correction = mesh.engine.scratch(mesh.points.shape)
+                correction.fill(0)
+                mesh.summarize_displacements(mesh.t.offsets, correction)
+                displacement = Displacement(mesh.t.offsets, correction, mesh.h)
+                run.final = mesh.displacements(displacement)
+                mesh.move(displacement)
+            run.solution = mesh.prescribe_volumes()
+        run.steps += 1
+        run.record()
 
 
-Action = Step | InsertDelete | RepairCells | Refine | CorrectCount | BalanceCounts | ResetMomentum | Prescribe
+def count_changed(run: Run, steps: int) -> bool:
+    """Return whether the number of cells of this level has changed since the last `steps` steps."""
+    rows = [row[0] for row in run.rows[-steps:]]
+    return any(row["level"] == run.level and row["cells"] != run.state.n for row in rows)
+
+
+def missing(run: Run) -> float:
+    """Return the number of missing cells, by the fixed number or by the size field."""
+    if run.fixed_count is not None:
+        return float(run.fixed_count - run.state.n)
+    return min(run.state.missing_cells(), max_cells(run) - run.state.n)
+
+
+def max_cells(run: Run) -> float:
+    """Return the largest number of cells of this level, if there is no fixed number.
+
+    Sizes are evaluated at the generators. A small cell beside a jump of h covers a part of the coarse side and
+    requires more cells there, which require more in turn. Where h is smooth the number is close to the integral.
+    """
+    factor = 2.0 ** (run.state.engine.cell_dim * run.level)
+    rows = run.state.fixed - run.state.setup.first_row
+    return rows + (1 + MOST_SURPLUS) * run.target / factor
+
+
+def missing_for_next_level(run: Run, growth: float) -> float:
+    """Return how many cells are missing so that refinement gives the number of the next finer level.
+
+    Its number is `growth` times that by refinement now.
+
+    The sum of V rho differs from the integral, because h is sampled at the generators; on the next level the
+    difference is smaller by `SAMPLING_GAIN`. Refinement gives less than 2^d times as many cells, because cells at
+    walls have fewer neighbors; their share halves with each level.
+    """
+    mesh = run.state
+    factor = 2.0**mesh.engine.cell_dim
+    # The number of cells on this level according to the integral.
+    exact = run.target / factor**run.level
+    bias = min((mesh.n + mesh.missing_cells()) / exact - 1, MOST_SURPLUS)
+    lack = factor * mesh.n / (growth * mesh.refined_count()) - 1
+    wanted = exact * (1 + SAMPLING_GAIN * bias)
+    for level in range(run.level):
+        wanted *= 1 + lack / 2**level
+    return wanted - mesh.n

@@ -38,7 +38,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ..methods import Method, ProjectedMethod, WeightedMethod
+from ..methods import ProjectedMethod, WeightedMethod
+from ..motion import Method
 from .actions import Action, BalanceCounts, CorrectCount, InsertDelete, Refine, RepairCells, ResetMomentum, Step
 from .efforts import EFFORTS, EFFORTS_3D, Effort, choose_error_target
 
@@ -216,7 +217,9 @@ def _opened(schedule: list[Action], exact: int, openings: int) -> list[Action]:
     # Exact projections close some triangles again, and correct the sizes of opened ones.
     opening = steps[-OPENING_PROJECTIONS if exact else -1 :]
     for k in opening:
-        schedule[k] = replace(schedule[k], openings=openings)
+        step = schedule[k]
+        assert isinstance(step, Step)
+        schedule[k] = replace(step, openings=openings)
     before = steps[-min(len(steps), SETTLING_STEPS + exact)]
     repair = [RepairCells(math.inf), CorrectCount(COUNT_EXACTLY if exact else 0.0)]
     return [*schedule[:before], *repair, *schedule[before:]]

@@ -420,25 +420,6 @@ def test_coarse_levels_with_too_few_cells_are_left_out(double):
         double.run(box, 0.07, options=clvoro.MultilevelOptions(levels=1), max_steps=1)
 
 
-def test_resume(double, tmp_path):
-    """A resumed run has the same bits: incremental updates in 2D, the depth of the halo in 3D."""
-    for box, size in ((UNIT, SPOT), (CUBE, sizing.Constant(0.17))):
-        steps = []
-
-        def stop(row, steps=steps):
-            steps.append(row["step"])
-            return len(steps) == 6
-
-        options = {"seed": 2, "effort": "fast", "max_steps": 12}
-        whole = double.run(box, size, **options)
-        file = tmp_path / f"{box.dim}.checkpoint"
-        double.run(box, size, callback=stop, checkpoint=file, **options)
-        resumed = double.run(box, size, checkpoint=clvoro.Checkpoint(resume=file), **options)
-        assert resumed.points.tobytes() == whole.points.tobytes()
-        with pytest.raises(InputError, match="domain"):
-            double.run(clvoro.Box(box.lower, box.upper), size, checkpoint=clvoro.Checkpoint(resume=file), **options)
-
-
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("box", [CUBE, SLAB], ids=["cube", "slab"])
 def test_runs_3d(double, box):
@@ -604,22 +585,14 @@ def test_transfer_across_periodic_boundaries(adapter, periodic, order):
     assert mean_error(1200) < mean_error(300) / (1.6 if order == 1 else 2.4)
 
 
-@pytest.mark.sparse(2)
-@pytest.mark.parametrize("restored", [False, True])
-def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, restored):
+@pytest.mark.sparse(1)
+def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch):
     """A second attempt, after a halo that is too shallow, must not start from the graph of the first."""
-    from clvoro.adaptation.checkpoint import DIAGRAM
-
     n, stages = 300, adapter._stages_for(SLAB)
     points, begun = some_points(SLAB, n), []
     x = stages.engine.upload(SLAB.place(points, adapter.dtype))
     tessellator = Tessellator(stages, SLAB)
     previous = tessellator.tessellate(x, n)
-    if restored:
-        saved = {name: getattr(previous, name).get() for name in DIAGRAM}
-        m = saved["starts"][-1]
-        saved |= {name: saved[name][:m] for name in ("neighbors", "face_measures", "face_centroids")}
-        previous = tessellator.restore(x, saved, 0, ())
     rows = previous.starts.get(), previous.neighbors.get()[: previous.starts.get()[-1]]
     extend, unfold = GhostImages.extend, GhostImages.unfold
 
