@@ -18,13 +18,15 @@ arrays, and the fields of `clvoro.sizing`.
 `adapt` returns a `Result`, `voronoi` a `Diagram` of given generators; both have arrays, `save`, `plot`, `check` and
 `transfer`, and `load` reads a saved result. `power_diagram` takes generators with weights; `transport` finds those with
 which cells have given volumes (`Transported`). `Adapter` is the full interface, on a device of your choice, with
-`MultilevelOptions`, `PaperOptions` and `Checkpoint`; Ctrl-C raises `Interrupted`, which carries the mesh so far. Errors
-and warnings are in `clvoro.errors`, pictures in `clvoro.plotting`, times of kernels in `clvoro.profile`. The command is
+`MultilevelOptions`, `PaperOptions` and `Checkpoint`. Its `start` begins a `Run` that goes on step by step and follows
+other sizes. Ctrl-C raises `Interrupted`, which carries the mesh so far. Errors and warnings are in `clvoro.errors`,
+pictures in `clvoro.plotting`, times of kernels in `clvoro.profile`. The command is
 ``clvoro``; begin with ``clvoro --help``.
 """
 
 from . import curves, earth, sizing
 from .adaptation.options import Checkpoint, MultilevelOptions, PaperOptions
+from .adaptation.run import Run
 from .adapter import Adapter
 from .errors import ClvoroError, Interrupted
 from .geometry.boundary_layers import Layers
@@ -54,6 +56,7 @@ __all__ = [
     "PaperOptions",
     "Polygon",
     "Result",
+    "Run",
     "Sphere",
     "Transported",
     "adapt",

@@ -156,15 +156,21 @@ class Checkpoint:
 
     The file is replaced only when the new one is complete. A file that is not a checkpoint is never replaced.
 
+    A run with checkpoints computes its mesh anew from the generators after every tenth step, whether or not it writes
+    one there. So its mesh does not depend on the times of writing, and a resumed run has the same bits as one that was
+    not interrupted. A run without checkpoints has other bits, and a mesh as good.
+
     Parameters
     ----------
     path : path, optional
         File that the run writes at intervals, and when its callback stops it. With None nothing is written.
     every : float
-        Seconds between two checkpoints; 0 writes one after every step.
+        Least number of seconds between two checkpoints. With 0 the run computes its mesh anew, and writes a checkpoint,
+        after every step and after every change of the number of cells.
     resume : path or True, optional
         Checkpoint to continue from; True takes `path`, if that file exists. The other arguments of the run must be the
-        same as before. On the same device the run then ends with the same bits (`seconds` in the history apart).
+        same as before. On the same device the run then ends with the same bits (`seconds` in the history apart), unless
+        a callback has stopped it between two places where it computes its mesh anew.
 
     Raises
     ------

@@ -102,7 +102,6 @@ class Run:
     ) -> None:
         """Prepare a run, and make its first mesh or read it from a checkpoint."""
         stages, options, files = self._stages, self._options, self._files
-        self._size, self._points = size, points
         fingerprint: dict[str, Any] = {}
         if saved is not None or files.path is not None:
             fingerprint = run_fingerprint(self._domain, vars(options), stages.engine.real, points, self._fixed)
@@ -110,7 +109,6 @@ class Run:
             saved.check_fingerprint(fingerprint)
             max_levels = saved.levels
         prepared = prepare(stages, self._domain, size, points, options, max_levels, self._fixed)
-        self.levels = self.level = prepared.levels
         if self._on_memory is not None:
             self._on_memory(prepared.memory)
             self._on_memory = None
@@ -118,11 +116,13 @@ class Run:
             try:
                 self.state = start(prepared)
             except FewCellsError as error:
-                self._begin_with_fewer_levels(error)
+                self._begin(size, points, self._fewer_levels(prepared.levels, error))
                 return
             self.near = only_needs_correction(prepared, self.state)
         else:
             self.near = saved.near
+        self._size, self._points = size, points
+        self.levels = self.level = prepared.levels
         planned = plan(prepared, self.near)
         self.schedule, self.target = planned.schedule, float(prepared.target)
         self.n_cells = options.n_cells if options.multilevel else None
@@ -162,11 +162,11 @@ class Run:
         if options.multilevel:
             self._settings["trade"] = planned.trade
 
-    def _begin_with_fewer_levels(self, error: FewCellsError) -> None:
-        """Begin again after `error`: a periodic box has too few cells around it on the coarsest level."""
-        if self._options.levels != "auto" or self.levels == 0:
+    def _fewer_levels(self, levels: int, error: FewCellsError) -> int:
+        """Return fewer levels after `error`: a periodic box has too few cells around it on the coarsest of them."""
+        if self._options.levels != "auto" or levels == 0:
             raise error
-        self._begin(self._size, self._points, self.levels - 1)
+        return levels - 1
 
     @property
     def history(self) -> np.ndarray:
@@ -252,7 +252,7 @@ class Run:
                     self.position += 1
                     self._keep()
         except FewCellsError as error:
-            self._begin_with_fewer_levels(error)
+            self._begin(self._size, self._points, self._fewer_levels(self.levels, error))
             return self._advance()
         return len(self.rows) > known
 

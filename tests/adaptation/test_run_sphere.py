@@ -109,17 +109,6 @@ def test_warm_start(ctx):
     assert np.abs(again.size_error).mean() < 0.0025
 
 
-def test_checkpoint(ctx, quick, tmp_path):
-    """An interrupted run goes on to the same bits."""
-    whole, path = quick, tmp_path / "state"
-    part = clvoro.Adapter(ctx).run(
-        EARTH, SIZE, effort="fast", checkpoint=clvoro.Checkpoint(path, every=0), callback=lambda row: row["step"] >= 20
-    )
-    assert len(part.history) < len(whole.history)
-    rest = clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast", checkpoint=clvoro.Checkpoint(path, resume=True))
-    assert np.array_equal(rest.points, whole.points)
-
-
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_obtuse_triangles_are_opened(ctx, real):

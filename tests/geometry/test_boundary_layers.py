@@ -269,7 +269,7 @@ def test_sizes_are_met_where_columns_of_two_walls_come_close(adapter):
 def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
     layers = Layers(0.04, count=2, edges=range(4, 84))
     options = {"layers": layers, "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
-    whole = adapter.run(CHANNEL, 0.1, **options)
+    whole = adapter.run(CHANNEL, 0.1, checkpoint=clvoro.Checkpoint(tmp_path / "whole", every=0), **options)
     steps = []
     adapter.run(
         CHANNEL,

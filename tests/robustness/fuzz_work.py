@@ -162,10 +162,11 @@ def try_resumed(rng: np.random.Generator) -> str:
     if not isinstance(domain, clvoro.Polygon) and domain.dim == 2 and rng.random() < 0.2 and not any(domain.periodic):
         options["layers"] = few_layers(rng, domain, wild=False)
         options.pop("n_cells", None)
-    whole = run_by(clvoro.Adapter(adapter(real).ctx, real), *arguments, **options)
-    demand(whole, real)
-    left = int(rng.integers(1, len(whole.history) + 1))
     with tempfile.TemporaryDirectory() as folder:
+        every = clvoro.Checkpoint(Path(folder) / "whole", every=0)
+        whole = run_by(clvoro.Adapter(adapter(real).ctx, real), *arguments, checkpoint=every, **options)
+        demand(whole, real)
+        left = int(rng.integers(1, len(whole.history) + 1))
         state, rows = Path(folder) / "state", 0
 
         def stop(_: np.void) -> bool:
@@ -173,7 +174,7 @@ def try_resumed(rng: np.random.Generator) -> str:
             rows += 1
             return rows >= left
 
-        adapter(real).run(*arguments, callback=stop, checkpoint=state, **options)
+        adapter(real).run(*arguments, callback=stop, checkpoint=clvoro.Checkpoint(state, every=0), **options)
         if not state.exists():
             return "mesh"  # it had ended
         try:
@@ -217,10 +218,10 @@ def try_turns(rng: np.random.Generator) -> str:
     domain, real = some_domain(rng), some_real(rng)
     arguments = (domain, some_size(rng, domain, wild=False))
     options = some_options(rng, domain, real, wild=False) | {"effort": "fast"}
-    whole = run_by(clvoro.Adapter(adapter(real).ctx, real), *arguments, **options)
     kept = clvoro.Adapter(adapter(real).ctx, real)
     with tempfile.TemporaryDirectory() as folder:
-        state = Path(folder) / "state"
+        state, every = Path(folder) / "state", clvoro.Checkpoint(Path(folder) / "whole", every=0)
+        whole = run_by(clvoro.Adapter(adapter(real).ctx, real), *arguments, checkpoint=every, **options)
         between(rng, kept, real)
         kept.run(*arguments, checkpoint=clvoro.Checkpoint(state, every=0), **options)
         if not state.exists():

@@ -57,7 +57,9 @@ def place_of(state: Path) -> int | None:
 
 
 def main(times: int, seed: int, patience: float) -> int:
-    reference = clvoro.Adapter().run(BOX, clvoro.sizing.Expression(SIZE), **OPTIONS)
+    with tempfile.TemporaryDirectory() as name:
+        every = clvoro.Checkpoint(Path(name) / "state", every=0)
+        reference = clvoro.Adapter().run(BOX, clvoro.sizing.Expression(SIZE), checkpoint=every, **OPTIONS)
     rng, kills, reached, finished, places = random.Random(seed), 0, 0, 0, set()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -231,12 +231,15 @@ def test_a_checkpoint_that_does_not_fit_costs_neither_the_run_nor_the_one_before
     path = tmp_path / "state"
     options = {**FEW, "checkpoint": clvoro.Checkpoint(path, every=0)}
     both = clvoro.Checkpoint(path, every=0, resume=True)
-    whole = adapter.run(BOX, 0.15, callback=lambda row: row["step"] == 1, **options)
+    adapter.run(BOX, 0.15, callback=lambda row: row["step"] == 1, **options)
     before = path.read_bytes()
     monkeypatch.setattr(checkpoint.Checkpointer, "write", in_little_room(checkpoint.Checkpointer.write, 1000))
     with pytest.warns(CheckpointWarning, match="File too large.* The run continues"):
         result = adapter.run(BOX, 0.15, **{**options, "checkpoint": both})
-    whole = adapter.run(BOX, 0.15, **FEW)
+    other = clvoro.Checkpoint(tmp_path / "other", every=0)
+    monkeypatch.undo()
+    whole = adapter.run(BOX, 0.15, **{**options, "checkpoint": other})
+    (tmp_path / "other").unlink()
     assert np.array_equal(result.points, whole.points)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["state"]

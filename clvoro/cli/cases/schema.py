@@ -491,7 +491,7 @@ def with_kind(domain: object, place: str) -> object:
 # The case.
 
 
-class Run(Table):
+class RunSettings(Table):
     method: MethodName | None = None
     methods: Annotated[list[MethodName], Meta(min_length=1)] | None = None
     effort: EffortName | None = None
@@ -534,7 +534,7 @@ class CaseTable(Table, kw_only=True):
     title: Text | None = None
     domain: DomainTable
     size: Size
-    run: Run | None = None
+    run: RunSettings | None = None
     layers: Annotated[list[LayersTable], Meta(min_length=1)] | None = None
     sequence: Sequence | None = None
 
@@ -547,7 +547,7 @@ HOMES = {
     "the case itself, above all tables": _keys(CaseTable),
     "[domain]": _keys(*get_args(DomainTable)),
     "[size]": _keys(*get_args(Size)[1:]),
-    "[run]": _keys(Run),
+    "[run]": _keys(RunSettings),
     "[[layers]]": _keys(LayersTable),
     "[sequence]": _keys(Sequence),
 }
@@ -561,6 +561,6 @@ def check_case(content: object, place: str) -> CaseTable:
     return checks.check(CaseTable, content, place, HOMES)
 
 
-def check_run(content: Mapping[str, object], place: str) -> Run:
+def check_run(content: Mapping[str, object], place: str) -> RunSettings:
     """Check the settings of a run; see `checks.check`."""
-    return checks.check(Run, content, place, HOMES)
+    return checks.check(RunSettings, content, place, HOMES)
