@@ -109,6 +109,8 @@ class Run:
             saved.check_fingerprint(fingerprint)
             max_levels = saved.levels
         prepared = prepare(stages, self._domain, size, points, options, max_levels, self._fixed)
+        if hasattr(self, "state"):
+            stages.release()  # memory of the mesh that the run has had
         if self._on_memory is not None:
             self._on_memory(prepared.memory)
             self._on_memory = None
