@@ -40,6 +40,10 @@ class SizeFieldError(InputError):
     """A size field is not positive and finite on the domain; the message names the place."""
 
 
+class MissingLibraryError(ClvoroError):
+    """An optional library is not installed; the message names the extra that installs it."""
+
+
 class SolverError(ClvoroError, ArithmeticError):
     """A linear solve broke down (not positive definite, or not finite)."""
 
@@ -88,6 +92,10 @@ class EmptyCellsWarning(UserWarning):
 
 class MismatchWarning(UserWarning):
     """A part of the input does not match the domain or the sizes: units or positions probably differ."""
+
+
+class MissingPicturesWarning(UserWarning):
+    """A report has no pictures of a kind, for which a library is not installed; the message says what to install."""
 
 
 class ObtuseTrianglesWarning(UserWarning):

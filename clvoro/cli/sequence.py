@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..adaptation.options import Options, arguments_of_run, uses
+from ..errors import MissingLibraryError, MissingPicturesWarning
 from ..io import save
 from ..io.atomic import atomic_file, writing
 from ..mesh.results import Result
@@ -99,39 +100,18 @@ def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
 
 def _draw(shown: Mapping[float, Result], path: Path) -> None:
     """Draw frames side by side, colored by target size."""
-    from ..plotting import plot_cells, plot_globe
-    from ..plotting.colors import coloring, shared_limits
-    from ..plotting.globe import default_center
-    from ..plotting.legends import add_key
-    from ..plotting.pictures import render
-    from ..plotting.style import WIDTH, grid_height, new_figure, styled
+    from ..plotting.colors import shared_paint
+    from ..plotting.pictures import plot_side_by_side, render
 
-    results = list(shown.values())
-    domain = results[0].diagram.domain
-    columns = min(3, len(results))
-    lines = -(-len(results) // columns)
-    sizes = np.concatenate([r.target_size for r in results])
-    limits = shared_limits(results, "size")
-    lower, upper = domain.lower[:2], domain.upper[:2]
-    plot: Callable[..., Any] = plot_cells
-    if domain.curved:
-        plot = partial(plot_globe, center=default_center(results[0]))
-    with styled():
-        figure = new_figure(WIDTH, grid_height(lower, upper, lines, columns, 0.65, 0.3))
-        axes = figure.subplots(lines, columns, squeeze=False).ravel()
-        for ax, (time, result) in zip(axes, shown.items(), strict=False):
-            title = f"t = {time:.2f}, {len(result.points)} cells"
-            plot(result, "size", ax, limits=limits, key=False, title=title)
-            ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
-        for ax in axes[len(results) :]:
-            ax.set_axis_off()
-        drawn = (*axes[0].collections, *axes[0].images)
-        cells = next(item for item in drawn if item.get_array() is not None)
-        scheme = coloring("size", domain)
-        add_key(cells, list(axes), scheme, sizes, limits, below=True)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(path) as file:
-            file.write(render(figure))
+    panels = {f"t = {time:.2f}, {len(result.points)} cells": result for time, result in shown.items()}
+    try:
+        picture = render(plot_side_by_side(panels, shared_paint(list(shown.values()), "size"), "size", 3))
+    except MissingLibraryError as error:
+        warnings.warn(f"no picture of the frames: {error}", MissingPicturesWarning, stacklevel=2)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as file:
+        file.write(picture)
 
 
 def frames_line(rows: list[dict[str, Any]]) -> str:

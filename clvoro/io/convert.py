@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import ClvoroError
+from ..errors import MissingLibraryError
 from .vtu import cell_data, in_space, polyhedra
 
 if TYPE_CHECKING:
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 _VTK_POLYGON, _VTK_POLYHEDRON = 7, 42
 
 
-def missing(library: str, extra: str, what: str) -> ClvoroError:
+def missing(library: str, extra: str, what: str) -> MissingLibraryError:
     """Return the error for an optional library that is not installed."""
-    return ClvoroError(f"{what} needs {library}, which is not installed; run `pip install 'clvoro[{extra}]'`")
+    return MissingLibraryError(f"{what} needs {library}, which is not installed; run `pip install 'clvoro[{extra}]'`")
 
 
 def to_meshio(contents: Contents, with_data: bool = True) -> meshio.Mesh:

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from ..io.fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
     from ..io.polymesh import PatchType
     from ..plotting.colors import Color
-    from ..plotting.globe import Projection
-    from ..plotting.solids import View
+    from ..plotting.views import View
     from .diagram import Diagram
     from .faces import Faces
     from .results import Result
@@ -304,27 +303,7 @@ class MeshOutput:
         diagram: Any = getattr(self._self, "diagram", self._self)
         return make_solver_mesh(diagram, walls, collapse)
 
-    def plot(
-        self,
-        color: Color | Literal["default"] | ArrayLike = "default",
-        *,
-        label: str | None = None,
-        view: View | None = None,
-        ax: Any = None,
-        limits: tuple[float, float] | None = None,
-        window: tuple[ArrayLike, ArrayLike] | None = None,
-        normal: str | ArrayLike = "z",
-        through: ArrayLike | None = None,
-        cut: str | ArrayLike | None = "octant",
-        angles: tuple[float, float] | None = None,
-        projection: Projection = "orthographic",
-        center: ArrayLike | None = None,
-        across: float | None = None,
-        coasts: bool | None = None,
-        edges: bool = True,
-        key: bool = True,
-        title: str | None = None,
-    ) -> Any:
+    def plot(self, color: Color | ArrayLike | None = None, view: View | None = None, **options: Any) -> Any:
         """Draw the cells with Matplotlib.
 
         Parameters
@@ -332,34 +311,24 @@ class MeshOutput:
         color : str or (n,) array of real numbers, optional
             "quality", "sides", "skewness", "volume", for a result also "error" and "size", or data of your own. By
             default "error" for a result, "quality" for a diagram.
-        label : str, optional
-            Text at the color bar.
-        view : {"slices", "slice", "cutaway"}, optional
-            For 3D: planes along the axes and a cut-away view (the default), one plane, or a cut-away view.
-        ax : matplotlib axes, optional
-            Axes to draw into; not for "slices", which has several.
-        limits : (low, high), optional
-            Ends of the color scale; by default limits that hold 99 % of the cells, in a window of those in it.
-        window : (lower, upper), optional
-            For 2D and "slice": corners of the part to show; by default all of it. For the projection "plate" longitudes
-            and latitudes.
-        normal : {"x", "y", "z"} or 3 floats
-            For "slice": direction at right angles to the plane.
-        through : 3 floats, optional
-            For 3D: a point of the planes or of the cut.
-        cut, angles : optional
-            For "cutaway": the removed part, and azimuth and elevation of the viewer in degrees; see
-            `clvoro.plotting.plot_cutaway`.
-        projection : {"orthographic", "plate"}
-            For a sphere: the globe from far away, or longitudes and latitudes as coordinates.
-        center, across, coasts : optional
-            For a sphere: longitude and latitude in the middle, the angle that the picture spans in degrees, and whether
-            to draw coastlines; see `clvoro.plotting.plot_globe`.
-        edges : bool
-            Draw the faces; not for "slices", which always has them.
-        key : bool
-            Add the color bar (for "sides" the legend with the shares); not for "slices".
-        title : str, optional
+        view : {"cells", "globe", "slices", "slice", "cutaway"}, optional
+            A mesh in the plane has "cells", one on a sphere "globe". One in 3D has "slices" (the default; planes along
+            the axes and a cut-away view), "slice" and "cutaway".
+        **options
+            Those of the view, with their defaults:
+
+            ============  ======================================  ==========================================
+            view          function                                options
+            ============  ======================================  ==========================================
+            ``cells``     `clvoro.plotting.plot_cells`            ax, window, edges, key
+            ``globe``     `clvoro.plotting.plot_globe`            ax, projection, center, across, window,
+                                                                  coasts, edges, key
+            ``slices``    `clvoro.plotting.plot_slices`           through
+            ``slice``     `clvoro.plotting.plot_slice`            ax, normal, through, window, edges, key
+            ``cutaway``   `clvoro.plotting.plot_cutaway`          ax, cut, through, angles, edges, key
+            ============  ======================================  ==========================================
+
+            All have `label` (text at the color bar), `limits` (ends of the color scale) and `title`.
 
         Returns
         -------
@@ -368,33 +337,13 @@ class MeshOutput:
         Raises
         ------
         InputError, InputTypeError
-            If a color does not exist, or an option is for other pictures.
+            If a color does not exist, or the mesh has no such view, or the view no such option.
         ClvoroError
-            If Matplotlib is not installed.
+            If Matplotlib is not installed; for a mesh in 3D PyVista; for one on a sphere Cartopy.
         """
-        from ..plotting.solids import draw_mesh
+        from ..plotting import plot_mesh
 
-        chosen = self.default_color if isinstance(color, str) and color == "default" else color
-        return draw_mesh(
-            cast("Result | Diagram", self),
-            chosen,
-            view,
-            label=label,
-            ax=ax,
-            limits=limits,
-            window=window,
-            normal=normal,
-            through=through,
-            cut=cut,
-            angles=angles,
-            projection=projection,
-            center=center,
-            across=across,
-            coasts=coasts,
-            edges=edges,
-            key=key,
-            title=title,
-        )
+        return plot_mesh(self._self, self.default_color if color is None else color, view, **options)
 
     def to_pyvista(self, cell_data: Mapping[str, ArrayLike] | None = None) -> pyvista.UnstructuredGrid:
         """Return the cells as an unstructured grid of PyVista.

@@ -1,4 +1,7 @@
-"""Pictures of meshes and runs, and a page that shows them (needs Matplotlib, extra `plot`)."""
+"""Pictures of meshes and runs, and a page that shows them (needs Matplotlib, extra `plot`).
+
+Pictures in 3D also need PyVista (extra `pyvista`), those of spheres Cartopy (extra `maps`).
+"""
 
 from ..errors import ClvoroError
 
@@ -9,12 +12,14 @@ except ModuleNotFoundError as error:
 
 from .boundary import plot_boundaries
 from .cells import plot_cells, plot_size
-from .curves import plot_displacements, plot_history
-from .globe import plot_globe
+from .curves import plot_displacements, plot_distributions, plot_history
+from .globe import map_projection, plot_globe
 from .page import write_report
-from .solids import plot_cutaway, plot_distributions, plot_mesh, plot_slice, plot_slices
+from .solids import plot_cutaway, plot_slice, plot_slices
+from .views import plot_mesh
 
 __all__ = [
+    "map_projection",
     "plot_boundaries",
     "plot_cells",
     "plot_cutaway",

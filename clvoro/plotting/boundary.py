@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -11,9 +11,10 @@ from matplotlib.path import Path
 
 from ..errors import InputError
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
-from ..geometry.shapes import Edges
 from .style import METHOD_COLORS, WIDTH, frame_domain, interactive_figure, single_height, styled
+
+if TYPE_CHECKING:
+    from ..geometry.shapes import Edges
 
 _LINE = {"edgecolor": "#1A1A1A", "linewidth": 0.8, "facecolor": "none", "joinstyle": "round"}
 _MARGIN = 0.01  # of the longer side, around a whole domain
@@ -38,21 +39,21 @@ def plot_boundaries(domain: Domain, ax: Any = None, *, numbers: bool = False) ->
     Raises
     ------
     InputError
-        For a 3D domain.
+        For a domain in 3D or on a sphere.
     """
-    if domain.dim != 2:
-        raise InputError(f"plot_boundaries draws in two dimensions, and {domain} has three")
+    if domain.dim > 2:
+        raise InputError(f"plot_boundaries draws in the plane, and {domain} is in 3D or on a sphere")
     with styled():
         if ax is None:
             height = single_height(domain.lower, domain.upper, legend=True)
             ax = interactive_figure(WIDTH, height).add_subplot()
             frame_part(ax, domain, domain.lower, domain.upper)
         for k, name in enumerate(domain.boundary_names):
-            walls = np.flatnonzero(domain.boundary_index == k).tolist()
-            if isinstance(domain, Polygon):  # edges without length cannot be drawn
-                walls = [wall for wall in walls if domain.oriented.places[wall] >= 0]
-            curves = [domain.boundary(wall) for wall in walls]
-            segments = [np.vstack([c.begin, c.end]) for c in curves if isinstance(c, Edges)]
+            walls = np.flatnonzero(domain.boundary_index == k)
+            if domain.outline is not None:  # edges without length cannot be drawn
+                walls = walls[domain.outline.oriented.places[walls] >= 0]
+            curves = [cast("Edges", domain.boundary(wall)) for wall in walls.tolist()]
+            segments = [np.vstack([c.begin, c.end]) for c in curves]
             color = METHOD_COLORS[k % len(METHOD_COLORS)]
             style = _DASHES[k // len(METHOD_COLORS) % len(_DASHES)]
             lines = LineCollection(
@@ -73,31 +74,32 @@ def plot_boundaries(domain: Domain, ax: Any = None, *, numbers: bool = False) ->
     return ax.figure
 
 
-def outline_path(domain: Polygon) -> Path:
-    """Return the domain as a path: outer rings run counter-clockwise, holes clockwise."""
-    closed = [np.vstack([ring, ring[:1]]) for ring in domain.oriented.rings]
-    return Path.make_compound_path(*(Path(ring, closed=True) for ring in closed))
-
-
 def frame_part(ax: Any, domain: Domain, lower: Any, upper: Any, ticks: bool = True) -> None:
-    """Show the part of the domain from `lower` to `upper` to scale: a frame, and of a polygon its boundary.
+    """Show the part of the domain from `lower` to `upper` to scale: a frame, and its outline if it has one.
 
-    A polygon shown as a whole has no other frame.
+    An outline shown as a whole has no other frame.
     """
-    if not isinstance(domain, Polygon):
-        frame_domain(ax, lower, upper, ticks)
-        return
     whole = np.array_equal(lower, domain.lower) and np.array_equal(upper, domain.upper)
-    room = _MARGIN * domain.extent.max() if whole else 0.0
+    outline = _outline_path(domain)
+    room = _MARGIN * domain.extent.max() if whole and outline else 0.0
     frame_domain(ax, np.subtract(lower, room), np.add(upper, room), ticks)
-    if whole:
-        for spine in ax.spines.values():
-            spine.set_visible(False)
-    ax.add_patch(PathPatch(outline_path(domain), zorder=2.5, **_LINE))
+    if outline:
+        if whole:
+            for spine in ax.spines.values():
+                spine.set_visible(False)
+        ax.add_patch(PathPatch(outline, zorder=2.5, **_LINE))
 
 
-def clip_to_domain(ax: Any, domain: Domain, *artists: Any) -> None:
-    """Clip `artists` to the domain."""
-    if isinstance(domain, Polygon):
-        for artist in artists:
-            artist.set_clip_path(outline_path(domain), ax.transData)
+def clip_to_domain(ax: Any, domain: Domain, artist: Any) -> None:
+    """Clip `artist` to the outline of the domain."""
+    outline = _outline_path(domain)
+    if outline:
+        artist.set_clip_path(outline, ax.transData)
+
+
+def _outline_path(domain: Domain) -> Path | None:
+    """Return the outline as a path, or None: outer rings run counter-clockwise, holes clockwise."""
+    if domain.outline is None:
+        return None
+    closed = [np.vstack([ring, ring[:1]]) for ring in domain.outline.oriented.rings]
+    return Path.make_compound_path(*(Path(ring, closed=True) for ring in closed))

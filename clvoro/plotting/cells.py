@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -13,24 +14,20 @@ from numpy.typing import ArrayLike
 from ..arguments import format_point
 from ..errors import InputError
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
 from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from . import pixels
 from .boundary import clip_to_domain, frame_part
-from .colors import COLORINGS, Color, Coloring, cell_norm, coloring_of, picture_of, without_ends
+from .colors import COLORINGS, Color, Paint, paint_of, picture_of
 from .legends import add_color_bar, add_key, round_numbers
-from .style import WIDTH, corners_of, ends_of, interactive_figure, single_height, styled
+from .style import WIDTH, corners_of, interactive_figure, single_height, styled
 
-
-def require_plane(diagram: Diagram) -> None:
-    """Raise InputError unless the diagram is two-dimensional."""
-    if diagram.domain.dim != 2:
-        raise InputError(
-            "plot_cells draws in two dimensions, and this mesh has three; call result.plot(), plot_slice or "
-            "plot_cutaway, or save it with result.save('mesh.vtu') and open it in ParaView"
-        )
+_INK = np.full(3, 0.1)
+_LEAST = 0.06
+"""Width in points of the thinnest edges."""
+_SEAM = 0.25
+"""Width in points of an outline in the color of the cell. It hides gaps between cells from antialiasing."""
 
 
 def plot_cells(
@@ -52,6 +49,7 @@ def plot_cells(
     Parameters
     ----------
     mesh : Result or Diagram
+        In a box, periodic or not, or in a polygon.
     color : {"error", "quality", "size", "sides", "skewness", "volume"} or (n,) array of real numbers
         The paper's (3.1), its (4.1), the target size h, the number of faces, the skewness of the worst face, the area,
         or data of your own. A diagram has neither "error" nor "size".
@@ -76,110 +74,126 @@ def plot_cells(
     Raises
     ------
     InputError, InputTypeError
-        For an unknown color, an array of another shape, or a 3D mesh.
+        For an unknown color, an array of another shape, or a mesh in 3D or on a sphere.
     """
     result = picture_of(mesh)
     diagram = result.diagram
-    require_plane(diagram)
-    scheme = coloring_of(result, color, label)
-    whole = (diagram.domain.lower, diagram.domain.upper)
-    lower, upper = np.array(whole) if window is None else corners_of(window)
+    domain = diagram.domain
+    require_plane(domain, "plot_cells draws in the plane", "call result.plot(), or open mesh.vtu in ParaView")
+    lower, upper = np.array((domain.lower, domain.upper)) if window is None else corners_of(window)
+    cells, offsets = _cells_in(diagram, lower, upper)
+    if not len(cells):
+        raise InputError(
+            f"no cell is in the window {format_point(lower)}, {format_point(upper)}, expected a part of {domain}"
+        )
+    paint = paint_of(result, color, label, limits, np.unique(cells))
     with styled():
         if ax is None:
-            height = single_height(lower, upper, bool(scheme.classes), title is not None)
+            height = single_height(lower, upper, bool(paint.scheme.classes), title is not None)
             ax = interactive_figure(WIDTH, height).add_subplot()
-        shown, offsets = _cells_in(diagram, lower, upper)
-        if not len(shown):
-            raise InputError(
-                f"no cell is in the window {format_point(lower)}, {format_point(upper)}, expected a part of "
-                f"{diagram.domain}"
-            )
-        values = scheme.values(result)
-        seen = values if window is None else values[np.unique(shown)]
-        low, high = scheme.limits(seen) if limits is None else ends_of(limits)
-        if len(shown) > pixels.MOST_POLYGONS:
-            cells = pixels.add_image(ax, diagram, lower, upper, values, scheme, (low, high))
-            clip_to_domain(ax, diagram.domain, cells)
-        else:
-            cells = draw_cells(ax, diagram, shown, offsets, values, scheme, (low, high))
-        frame_part(ax, diagram.domain, lower, upper)
-        if edges:
-            draw_edges(ax, diagram, shown, offsets, np.subtract(upper, lower))
+        frame_part(ax, domain, lower, upper)
+        starts, corners = diagram.cell_vertex_starts, diagram.vertices[diagram.cell_vertices]
+        polygons = [corners[starts[i] : starts[i + 1]] + by for i, by in zip(cells, offsets, strict=True)]
+        bridged = (np.diff(starts) > np.diff(diagram.neighbor_starts))[cells]
+        image = draw_cells(ax, diagram, cells, polygons, paint, edges, bridged)
+        clip_to_domain(ax, domain, image)
         if title is not None:
             ax.set_title(title)
         if key:
-            add_key(cells, ax, scheme, seen, (low, high))
+            add_key(ax, paint if window is None else replace(paint, values=paint.values[np.unique(cells)]))
     return ax.figure
+
+
+def require_plane(domain: Domain, what: str, remedy: str) -> None:
+    """Raise InputError unless the domain is a part of a plane."""
+    if domain.dim > 2:
+        raise InputError(f"{what}, and {domain} is in 3D or on a sphere; {remedy}")
 
 
 def draw_cells(
     ax: Any,
     diagram: Diagram,
-    shown: np.ndarray,
-    offsets: np.ndarray,
-    values: np.ndarray,
-    scheme: Coloring,
-    limits: tuple[float, float],
-) -> PolyCollection:
-    """Add the filled polygons of the cells `shown` (indices), moved by `offsets`, to `ax`."""
-    starts, corners = diagram.cell_vertex_starts, diagram.vertices[diagram.cell_vertices]
-    bridged = np.diff(starts) > np.diff(diagram.neighbor_starts)
-    polygons = [corners[starts[i] : starts[i + 1]] + by for i, by in zip(shown, offsets, strict=True)]
-    cells = PolyCollection(
-        polygons,
-        array=without_ends(values[shown]),
-        cmap=scheme.color_map,
-        norm=cell_norm(scheme, limits),
-        # An outline in the color of the cell hides gaps between cells from antialiasing. Not a bridge between the loops
-        # of a cell: between its parts it may cross an island.
-        edgecolors="face",
-        linewidths=np.where(bridged, 0, 0.25)[shown] if bridged.any() else 0.25,
-        rasterized=len(shown) > 3000,
-    )
-    ax.add_collection(cells, autolim=False)
-    return cells
+    cells: np.ndarray,
+    polygons: Sequence[np.ndarray],
+    paint: Paint,
+    edges: bool = True,
+    bridged: np.ndarray | None = None,
+    positions: pixels.Positions | None = None,
+) -> Any:
+    """Add `polygons` (k, 2) of the rows `cells`, to `ax`, whose limits are set; return what covers the picture.
 
-
-def draw_edges(ax: Any, diagram: Diagram, shown: np.ndarray, offsets: np.ndarray, extent: np.ndarray) -> None:
-    """Add each face once, as a line; its width follows the size of its cells."""
-    neighbors, owner = diagram.neighbors, face_owners(diagram)
-    if not len(shown):
-        return
-    # At a wall there is only one cell.
-    beyond = np.where(neighbors >= 0, neighbors, owner)
-    lengths = np.sqrt(diagram.volumes)
-    thin, colors = edge_style(ax, np.minimum(lengths[owner], lengths[beyond]), extent)
-    # A seam has faces on both sides.
-    wanted = ((neighbors < owner) | diagram.shifts.any(axis=1)) & (thin > 0.06)
-    order = np.argsort(shown, kind="stable")
-    first, last = (np.searchsorted(shown[order], owner, side) for side in ("left", "right"))
-    counts = np.where(wanted, last - first, 0)  # images of the face's cell that are shown
-    once = np.repeat(np.arange(len(owner)), counts)
-    image = order[np.repeat(first, counts) + np.arange(len(once)) - np.repeat(np.cumsum(counts) - counts, counts)]
-    ends = diagram.vertices[face_ends(diagram)[once]] + offsets[image][:, None, :]
-    lines = LineCollection(
-        list(ends), colors=colors[once], linewidths=thin[once], capstyle="round", rasterized=len(once) > 9000
-    )
-    ax.add_collection(lines, autolim=False)
-
-
-def edge_style(ax: Any, lengths: np.ndarray, extent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return line widths in points and colors (n, 4) for edges of cells as long as `lengths`.
-
-    `extent` is the width and height of the shown part. Edges of very small cells get no width.
+    Many polygons become an image, for which `positions` is as in `pixels.add_image`. Cells with large faces are
+    drawn over it. `bridged` (n,) marks outlines that connect several loops.
     """
-    widths = np.clip(0.045 * points_per_unit(ax, extent) * lengths, 0.0, 0.7)
+    widths = edge_widths(ax, polygons) if edges else np.zeros(len(polygons))
+    image: Any = None
+    if len(cells) > pixels.MOST_POLYGONS:
+        image = pixels.add_image(ax, diagram, paint, positions)
+        shown = np.flatnonzero(widths > _LEAST)
+        cells, polygons, widths = cells[shown], [polygons[k] for k in shown.tolist()], widths[shown]
+        bridged = None if bridged is None else bridged[shown]
+    drawn = draw_polygons(ax, cells, polygons, paint, widths, bridged)
+    if edges and bridged is not None and bridged.any():
+        # A bridge between two loops is no face.
+        lines = face_ends(diagram)[np.isin(face_owners(diagram), cells[bridged])]
+        ax.add_collection(LineCollection(list(diagram.vertices[lines]), colors=[_INK], linewidths=0.4), autolim=False)
+    return drawn if image is None else image
+
+
+def draw_polygons(
+    ax: Any,
+    cells: np.ndarray,
+    polygons: Sequence[np.ndarray],
+    paint: Paint,
+    widths: np.ndarray,
+    bare: np.ndarray | None = None,
+    light: np.ndarray | None = None,
+) -> PolyCollection:
+    """Add filled polygons (k, 2) with outlines; those marked by `bare` have none. `light` (n,) dims their colors."""
+    colors = paint.rgba(cells)
+    if light is not None:
+        colors[:, :3] *= light[:, None]
     # The thinnest lines fade out: a sudden end of all lines would look like a feature of the mesh.
-    colors = np.full((len(widths), 4), 0.1)
-    colors[:, 3] = np.clip((widths - 0.06) / 0.14, 0, 1)
-    return widths, colors
+    alpha = 0.9 * np.clip((widths - _LEAST) / 0.14, 0, 1)[:, None]
+    lines = colors.copy()
+    lines[:, :3] += alpha * (_INK - colors[:, :3])
+    widths = np.maximum(widths, _SEAM)
+    drawn = PolyCollection(
+        list(polygons),
+        edgecolors=lines,
+        linewidths=widths if bare is None else np.where(bare, 0, widths),
+        joinstyle="round",
+        rasterized=len(polygons) > 3000,
+    )
+    if light is None:
+        drawn.set(array=paint.finite[cells], cmap=paint.scheme.color_map, norm=paint.norm)
+    else:
+        drawn.set_facecolor(colors)  # type: ignore[arg-type]
+    ax.add_collection(drawn, autolim=False)
+    return drawn
 
 
-def points_per_unit(ax: Any, extent: np.ndarray) -> float:
-    """Return the scale of a picture that shows a part of this width and height, points per unit of length."""
+def edge_widths(ax: Any, polygons: Sequence[np.ndarray]) -> np.ndarray:
+    """Return widths (n,) in points of the outlines of polygons: a part of their own width, 4 area / circumference."""
+    if not len(polygons):
+        return np.zeros(0)
+    starts = np.concatenate([[0], np.cumsum([len(p) for p in polygons])])
+    corners = np.concatenate(polygons)
+    corners = corners - np.repeat(corners[starts[:-1]], np.diff(starts), axis=0)
+    ahead = np.arange(1, len(corners) + 1)
+    ahead[starts[1:] - 1] = starts[:-1]
+    (x, y), (u, v) = corners.T, corners[ahead].T
+    area = 0.5 * np.abs(np.add.reduceat(x * v - y * u, starts[:-1]))
+    around = np.add.reduceat(np.hypot(u - x, v - y), starts[:-1])
+    width = 4 * area / np.where(around > 0, around, 1)
+    return np.clip(0.042 * points_per_unit(ax) * width, 0, 0.7)
+
+
+def points_per_unit(ax: Any) -> float:
+    """Return the scale of a picture whose limits are set, points per unit of length."""
     box = ax.get_position()
     width, height = ax.figure.get_size_inches() * (box.width, box.height) * 72
-    return float(min(width / extent[0], height / extent[1]))
+    return float(min(width / np.ptp(ax.get_xlim()), height / np.ptp(ax.get_ylim())))
 
 
 def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = None) -> Any:
@@ -201,19 +215,21 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
     Raises
     ------
     InputError
-        For a 3D domain.
+        For a domain in 3D or on a sphere.
     """
-    if domain.dim != 2:
-        raise InputError(f"the size field is drawn on 2D domains, and {domain} is in 3D; draw a slice of a mesh")
+    require_plane(domain, "the size field is drawn in the plane", "draw the sizes of a mesh")
     scheme = COLORINGS["size"]
     extent = domain.extent
     counts = np.maximum((extent * np.sqrt(60_000 / max(domain.measure, extent.prod() / 8))).astype(int), 2)
     x, y = (np.linspace(domain.lower[a], domain.upper[a], counts[a]) for a in (0, 1))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    shown, places = _inside(domain, points, 2 * float(np.hypot(*(extent / counts))))
+    # Up to the boundary, drawing interpolates between points inside and points just outside.
+    shown = domain.contains(points)
+    shown[~shown] = domain.boundary_distance(points[~shown]) <= 2 * float(np.hypot(*(extent / counts)))
     values = np.full(len(points), np.nan)
-    values[shown] = np.asarray(size(places), float)
-    low, high = scheme.limits(values[shown])
+    values[shown] = np.asarray(size(domain.nearest(points[shown])), float)
+    paint = Paint(scheme, values[shown], scheme.limits(values[shown]))
+    low, high = paint.limits
     values = np.ma.masked_invalid(values).reshape(len(y), len(x))
     with styled():
         if ax is None:
@@ -225,7 +241,7 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
             origin="lower",
             interpolation="bilinear",
             cmap=scheme.color_map,
-            norm=cell_norm(scheme, (low, high)),
+            norm=paint.norm,
         )
         levels = [t for t in round_numbers(low, high) if low * 1.02 < t < high * 0.98]
         if levels:
@@ -234,35 +250,34 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
             clip_to_domain(ax, domain, lines)
         frame_part(ax, domain, domain.lower, domain.upper)
         clip_to_domain(ax, domain, image)
-        add_color_bar(image, ax, scheme, values, (low, high))
+        add_color_bar(ax, paint)
     return ax.figure
 
 
-def _inside(domain: Domain, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return which `points` are in the domain or within `reach` of it, (n,) bool, and the nearest points inside.
+def images_in(domain: Domain, lower: np.ndarray, upper: np.ndarray, within: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the cells, or of a periodic domain also their images, that reach into a box.
 
-    Drawing up to the boundary interpolates between points inside and points just outside.
+    `lower` and `upper` (n, d) are the corners of the cells' bounding boxes, `within` those of the box.
+
+    Returns
+    -------
+    list of (rows (k,), offset (d,))
     """
-    shown = domain.contains(points)
-    if isinstance(domain, Polygon):
-        rest = np.flatnonzero(~shown)
-        shown[rest] = domain.boundary_distance(points[rest]) <= reach
-        return shown, domain.nearest(points[shown])
-    return shown, points[shown]
+    found = []
+    for step in product(*((0, -1, 1) if p else (0,) for p in domain.periodic)):
+        by = step * domain.extent
+        # An image must reach in by more than round-off.
+        slack = 1e-9 * domain.extent * any(step)
+        seen = ((upper + by >= within[0] + slack) & (lower + by <= within[1] - slack)).all(axis=1)
+        found.append((np.flatnonzero(seen), by))
+    return found
 
 
 def _cells_in(diagram: Diagram, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (k,) of the cells, or of their images, that reach into the window, and offsets (k, 2)."""
     starts = diagram.cell_vertex_starts[:-1]
     corners = diagram.vertices[diagram.cell_vertices]
-    low = np.minimum.reduceat(corners, starts, axis=0)
-    high = np.maximum.reduceat(corners, starts, axis=0)
-    cells, offsets = [], []
-    for step in product(*((-1, 0, 1) if p else (0,) for p in diagram.domain.periodic)):
-        by = step * diagram.domain.extent
-        # An image must reach in by more than round-off.
-        slack = 1e-9 * diagram.domain.extent * any(step)
-        seen = np.flatnonzero(((high + by >= lower + slack) & (low + by <= upper - slack)).all(axis=1))
-        cells.append(seen)
-        offsets.append(np.broadcast_to(by, (len(seen), 2)))
-    return np.concatenate(cells), np.concatenate(offsets)
+    low, high = (bound.reduceat(corners, starts, axis=0) for bound in (np.minimum, np.maximum))
+    images = images_in(diagram.domain, low, high, (lower, upper))
+    cells = np.concatenate([rows for rows, _ in images])
+    return cells, np.repeat([by for _, by in images], [len(rows) for rows, _ in images], axis=0)

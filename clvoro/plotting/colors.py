@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap, LogNorm, Normalize
 
 from ..errors import InputError, InputTypeError
 from ..geometry.domain import Domain
-from ..geometry.sphere import Sphere
+from ..geometry.sphere import EARTH_RADIUS
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..mesh.straightening import count_sides
-from .coasts import kilometer_of
-from .style import nice
+from .style import ends_of, nice
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -33,7 +33,8 @@ _FACES_LABELS = ("≤ 12", "13", "14", "15", "≥ 16")
 _FAR = 3.0
 """Values of the caller are cut from the color scale if the scale would be that many times as long with them."""
 
-# Blue and red around white, without the darkest tenth at either end: faces must stay visible.
+# Without their darkest parts, in which faces cannot be seen.
+_DARKLESS = ListedColormap(colormaps["viridis"](np.linspace(0.14, 1, 256)), "viridis without its darkest part")
 _DIVERGING = LinearSegmentedColormap.from_list("error", colormaps["RdBu_r"](np.linspace(0.09, 0.91, 65)))
 
 
@@ -111,8 +112,8 @@ COLORINGS = {
     "error": Coloring(
         "metric error $e$ [–]   (< 0 too small, > 0 too large)", lambda r: r.size_error, _DIVERGING, _symmetric
     ),
-    "quality": Coloring("cell quality $Q$ [–]", lambda r: r.quality, "viridis", _up_to_one),
-    "size": Coloring("target size $h$", lambda r: r.target_size, "viridis", _span, logarithmic=True),
+    "quality": Coloring("cell quality $Q$ [–]", lambda r: r.quality, _DARKLESS, _up_to_one),
+    "size": Coloring("target size $h$", lambda r: r.target_size, _DARKLESS, _span, logarithmic=True),
     "sides": Coloring(
         "number of sides",
         lambda r: np.clip(count_sides(r.diagram), 4, 8),
@@ -121,9 +122,12 @@ COLORINGS = {
         classes=tuple(f"{label} sides" for label in _SIDES_LABELS),
     ),
     "skewness": Coloring(
-        "skewness of the worst face [–]", lambda r: r.measures.worst_of_cell("skewness"), "viridis_r", _from_zero
+        "skewness of the worst face [–]",
+        lambda r: r.measures.worst_of_cell("skewness"),
+        _DARKLESS.reversed(),
+        _from_zero,
     ),
-    "volume": Coloring("area of the cell", lambda r: r.diagram.volumes, "viridis", _span, logarithmic=True),
+    "volume": Coloring("area of the cell", lambda r: r.diagram.volumes, _DARKLESS, _span, logarithmic=True),
 }
 """The quantities that `plot_cells` knows."""
 
@@ -206,7 +210,7 @@ def coloring_of(mesh: Result, color: Color | ArrayLike, label: str | None = None
     if values.shape != (n,):
         raise InputError(f"color has shape {values.shape}, expected ({n},): one number per cell")
     values = values.astype(float)
-    return Coloring(label or "", lambda _: values, "viridis", _most)
+    return Coloring(label or "", lambda _: values, _DARKLESS, _most)
 
 
 def coloring(name: str, domain: Domain | None = None) -> Coloring:
@@ -217,28 +221,74 @@ def coloring(name: str, domain: Domain | None = None) -> Coloring:
     known = COLORINGS if domain is None or domain.cell_dim == 2 else _SOLID_COLORINGS
     if not isinstance(name, str) or name not in known:
         raise InputError(f"color is {name!r:.60}, expected one of {', '.join(known)}")
-    kilometer = kilometer_of(domain.radius) if isinstance(domain, Sphere) else None
-    if kilometer is None or name not in _ON_EARTH:
+    kilometer = domain and domain.globe and kilometer_of(domain.globe.radius)
+    if not kilometer or name not in _ON_EARTH:
         return known[name]
     label, power = _ON_EARTH[name]
     return replace(known[name], label=label, unit=kilometer**power)
 
 
-def shared_limits(results: Sequence[Result], color: str) -> tuple[float, float]:
-    """Return one scale for the cells of all `results`."""
+def kilometer_of(radius: float) -> float | None:
+    """Return the length of a kilometer if `radius` is about that of the Earth in meters or kilometers, else None."""
+    units = (1000.0, 1.0)
+    return next((k for k in units if abs(radius / k / (EARTH_RADIUS / 1000) - 1) < 0.005), None)
+
+
+@dataclass(frozen=True)
+class Paint:
+    """The colors of values, usually one for each cell.
+
+    Attributes
+    ----------
+    scheme : Coloring
+    values : (n,) float
+    limits : (low, high)
+        Ends of the color scale.
+    """
+
+    scheme: Coloring
+    values: np.ndarray
+    limits: tuple[float, float]
+
+    @property
+    def norm(self) -> Normalize:
+        """The map from values to [0, 1]."""
+        low, high = self.limits
+        if self.scheme.classes:
+            return BoundaryNorm(np.linspace(low, high, len(self.scheme.classes) + 1), len(self.scheme.classes))
+        return LogNorm(low, high) if self.scheme.logarithmic and high > 3 * low > 0 else Normalize(low, high)
+
+    @property
+    def finite(self) -> np.ndarray:
+        """The values with infinite numbers replaced by large ones, as Matplotlib has no color for them."""
+        return np.clip(self.values, -1e30, 1e30)
+
+    def mappable(self) -> ScalarMappable:
+        """Return what Matplotlib's color bars need."""
+        return ScalarMappable(self.norm, self.scheme.color_map)
+
+    def rgba(self, rows: np.ndarray) -> np.ndarray:
+        """Return the colors (k, 4) of the values in `rows` (k,)."""
+        return np.asarray(self.mappable().to_rgba(np.ma.masked_invalid(self.finite[rows])))
+
+
+def paint_of(
+    result: Result,
+    color: Color | ArrayLike,
+    label: str | None = None,
+    limits: tuple[float, float] | None = None,
+    seen: np.ndarray | slice = slice(None),
+) -> Paint:
+    """Return the colors of the cells of `result`; without `limits` those of the cells `seen` set the scale."""
+    scheme = coloring_of(result, color, label)
+    values = scheme.values(result)
+    return Paint(scheme, values, scheme.limits(values[seen]) if limits is None else ends_of(limits))
+
+
+def shared_paint(results: Sequence[Result], color: str) -> Paint:
+    """Return one scale for the cells of all `results`, and the values of all."""
     scheme = coloring(color, results[0].diagram.domain)
-    return scheme.limits(np.concatenate([scheme.values(r) for r in results]))
-
-
-def cell_norm(scheme: Coloring, limits: tuple[float, float]) -> Normalize:
-    """Return the map of `scheme` from values to [0, 1]."""
-    low, high = limits
-    if isinstance(scheme.color_map, ListedColormap):
-        classes = scheme.color_map.N
-        return BoundaryNorm(np.linspace(low, high, classes + 1), classes)
-    return LogNorm(low, high) if scheme.logarithmic and high > 3 * low > 0 else Normalize(low, high)
-
-
-def without_ends(values: np.ndarray) -> np.ndarray:
-    """Return `values` with infinite numbers replaced by large ones, as Matplotlib has no color for them."""
-    return np.clip(values, -1e30, 1e30)
+    values = np.concatenate([scheme.values(r) for r in results])
+    low, high = scheme.limits(values)
+    # Errors above 1 would hide small ones.
+    return Paint(scheme, values, (max(low, -1.0), min(high, 1.0)) if color == "error" else (low, high))

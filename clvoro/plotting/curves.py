@@ -1,8 +1,9 @@
-"""Error and quality against steps (the paper's Figures 4, 5), and displacements (its Figure 6)."""
+"""Error and quality against steps (the paper's Figures 4, 5), displacements (its Figure 6), and histograms."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.spatial import KDTree
 
-from ..errors import InputError
-from ..mesh.results import Displacements, Result
+from ..mesh.results import Result
 from .boundary import frame_part
+from .cells import require_plane
+from .colors import paint_of
 from .style import METHOD_COLORS, WIDTH, interactive_figure, nice, styled, window_around_smallest
 
 _PANELS = {
@@ -88,10 +90,10 @@ def _drawable(values: np.ndarray, quantity: str) -> np.ndarray:
 
 
 def plot_displacements(result: Result, figure: Any = None) -> Any:
-    """Draw the Lloyd and the Poisson displacements of the first and of the last step.
+    """Draw the Lloyd and the Poisson displacements of the first and of the last step, in the plane.
 
-    Arrows have the length of the displacement times the factor in the panel's title. For a mesh with more than 2500
-    generators only a window around the smallest cells is shown, because arrows over the whole mesh would be too small.
+    Arrows have the length of the displacement times the factor in the panel's title. Of a mesh with more than 2500
+    generators a window around the smallest cells is shown, because arrows over the whole mesh would be too small.
 
     Returns
     -------
@@ -103,89 +105,100 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
     InputError
         For a mesh in 3D or on a sphere.
     """
-    if result.diagram.domain.dim != 2:
-        raise InputError(
-            "displacements are drawn in the plane, and this mesh is in 3D or on a sphere; plot its history"
-        )
+    domain = result.diagram.domain
+    require_plane(domain, "displacements are drawn in the plane", "plot its history")
     rows = [(n, d) for n, d in (("first", result.initial), ("last", result.final)) if d is not None]
     if not rows:
         return None
-    lower, upper = _shown_part(result)
+    few = len(result.points) <= MOST_ARROWS
+    lower, upper = np.array([domain.lower, domain.upper]) if few else window_around_smallest(result, 50)
     with styled():
         if figure is None:
-            figure = interactive_figure(WIDTH, displacements_height(result))
+            figure = interactive_figure(WIDTH, len(rows) * (WIDTH / 2 * float(np.divide(*(upper - lower)[::-1])) + 0.3))
         axes = figure.subplots(len(rows), 2, squeeze=False)
-        coarse = result.history["level"][0] > 0
         for axes_row, (when, field) in zip(axes, rows, strict=True):
-            field = _inside(field, lower, upper)
-            factors = _magnifications(field)
-            halves = (("Lloyd", field.lloyd, METHOD_COLORS[0]), ("Poisson", field.poisson, "#B34700"))
-            for ax, factor, (name, arrows, color) in zip(axes_row, factors, halves, strict=True):
-                word = "magnified" if factor > 1 else "reduced"
-                note = "to scale" if factor == 1 else f"{word} × {factor:g}"
-                step = "coarse step" if coarse and when == "first" else "step"
-                ax.set_title(f"{name}, {when} {step} ({note})")
-                _draw_arrows(ax, field.points, arrows * factor, color)
-                domain = result.diagram.domain
-                frame_part(ax, domain, lower, upper, ticks=len(result.points) > MOST_ARROWS)
-                ax.locator_params(nbins=4)
+            here = ((field.points >= lower) & (field.points <= upper)).all(axis=1)
+            points, both = field.points[here], (field.lloyd[here], field.poisson[here])
+            factors = _magnifications(points, both)
+            names = (("Lloyd", METHOD_COLORS[0]), ("Poisson", "#B34700"))
+            for ax, factor, arrows, (name, color) in zip(axes_row, factors, both, names, strict=True):
+                step = "coarse step" if result.history["level"][0] > 0 and when == "first" else "step"
+                ax.set_title(f"{name}, {when} {step} (× {factor:g})")
+                scale: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.0026}
+                ax.quiver(*points.T, *(factor * arrows.T), color=color, minlength=0.3, **scale)
+                frame_part(ax, domain, lower, upper, ticks=not few)
     return figure
 
 
-def displacements_height(result: Result) -> float:
-    """Return a height in inches for `plot_displacements`."""
-    extent = np.subtract(*_shown_part(result)[::-1])
-    rows = (result.initial is not None) + (result.final is not None)
-    ticks = 0.5 if len(result.points) > MOST_ARROWS else 0.0
-    return rows * ((WIDTH / 2 - ticks) * float(extent[1] / extent[0]) + 0.25 + 0.4 * ticks)
+def _magnifications(points: np.ndarray, fields: tuple[np.ndarray, np.ndarray]) -> list[float]:
+    """Return round factors that bring the long arrows of each field to about one spacing of the generators.
 
-
-def _shown_part(result: Result) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the domain, or of a window around the smallest cells."""
-    if len(result.points) <= MOST_ARROWS:
-        box = result.diagram.domain
-        return np.array(box.lower), np.array(box.upper)
-    return window_around_smallest(result, 50)
-
-
-def _inside(field: Displacements, lower: np.ndarray, upper: np.ndarray) -> Displacements:
-    """Return the part of `field` whose generators lie between two corners."""
-    here = ((field.points >= lower) & (field.points <= upper)).all(axis=1)
-    return Displacements(field.points[here], field.lloyd[here], field.poisson[here])
-
-
-def _magnifications(field: Displacements) -> tuple[float, float]:
-    """Round factors that bring the long arrows of each half to about one spacing of the generators.
-
-    If their factors are close, both use the smaller one, so that they can be compared.
+    If they are close, both are the smaller one, so that the fields can be compared.
     """
-    if len(field.points) < 2:
-        return 1.0, 1.0
-    nearest = min(7, len(field.points))
-    spacing = KDTree(field.points).query(field.points, k=nearest)[0][:, 1:].mean(axis=1)
-    factors = []
-    for arrows in (field.lloyd, field.poisson):
-        reaches = np.hypot(*arrows.T) / spacing
-        # Skip fixed generators, and a displacement that is only round-off.
-        moving = reaches[reaches > 1e-6]
-        factors.append(nice(1.0 / np.quantile(moving, _LONG), up=False) if moving.size else 1.0)
-    if max(factors) <= 2.5 * min(factors):
-        factors = [min(factors)] * 2
-    return factors[0], factors[1]
+    spacing = KDTree(points).query(points, k=min(7, len(points)))[0].reshape(len(points), -1)[:, 1:]
+    if not spacing.size:
+        return [1.0, 1.0]
+    reaches = [np.hypot(*arrows.T) / spacing.mean(axis=1) for arrows in fields]
+    # Without fixed generators, and displacements that are only round-off.
+    moving = [reach[reach > 1e-6] for reach in reaches]
+    factors = [nice(1.0 / np.quantile(m, _LONG), up=False) if m.size else 1.0 for m in moving]
+    return [min(factors)] * 2 if max(factors) <= 2.5 * min(factors) else factors
 
 
-def _draw_arrows(ax: Any, points: np.ndarray, arrows: np.ndarray, color: str) -> None:
-    ax.quiver(
-        *points.T,
-        *arrows.T,
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        width=0.0026,
-        headwidth=3.5,
-        headlength=4.5,
-        headaxislength=4,
-        minshaft=1.2,
-        minlength=0.3,
-        color=color,
-    )
+def plot_distributions(result: Result, figure: Any = None) -> Any:
+    """Draw histograms of error, quality and number of faces of the cells, and of the skewness of faces.
+
+    Bars have the colors of the cells in the other pictures.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    with styled():
+        figure = interactive_figure(WIDTH, 4.2) if figure is None else figure
+        panels = figure.subplots(2, 2).ravel()
+        if figure.get_layout_engine() is not None:  # space between titles and the numbers above
+            figure.get_layout_engine().set(hspace=0.08)
+        for ax, name in zip(panels, ("error", "quality", "sides", "skewness"), strict=True):
+            paint = paint_of(result, name)
+            scheme, limits = paint.scheme, paint.limits
+            if name == "sides":
+                values = np.diff(result.diagram.neighbor_starts)
+                edges = np.arange(values.min(), values.max() + 2) - 0.5
+                ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+            else:
+                values = result.measures.skewness if name == "skewness" else paint.values
+                values = values[np.isfinite(values)]
+                edges = np.linspace(*_range(values, name), 41)
+            counts, _ = np.histogram(values, edges)
+            middles = 0.5 * (edges[1:] + edges[:-1])
+            shown = np.clip(middles, limits[0] + 0.5, limits[1] - 0.5) if scheme.classes else middles
+            ax.bar(
+                middles,
+                100 * counts / max(len(values), 1),
+                np.diff(edges),
+                color=replace(paint, values=shown).rgba(np.arange(len(shown))),
+                edgecolor="#444444",
+                linewidth=0.3,
+            )
+            label = "skewness of the faces [–]" if name == "skewness" else scheme.label
+            ax.set_xlabel(label.split("   ")[0])
+            ax.set_ylabel("faces [%]" if name == "skewness" else "cells [%]")
+            ax.set_xlim(edges[0], edges[-1])
+            mean = float(values.mean())
+            ax.axvline(mean, color="#1A1A1A", lw=0.9, ls=(0, (4, 2)))
+            title = f"mean {mean:.3g}, from {values.min():.3g} to {values.max():.3g}"
+            ax.set_title(title.replace("-", "−"))
+    return figure
+
+
+def _range(values: np.ndarray, name: str) -> tuple[float, float]:
+    """Return the range of a histogram: 99.8 % of the values, with zero where it is meaningful."""
+    low, high = (float(q) for q in np.quantile(values, (0.001, 0.999)))
+    if name == "skewness":
+        low = 0.0
+    if name == "error":
+        low, high = -max(-low, high), max(-low, high)
+    if not high > low:
+        low, high = low - 0.5, high + 0.5
+    return low, high

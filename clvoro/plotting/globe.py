@@ -1,39 +1,40 @@
-"""Pictures of meshes on a sphere: the globe, or longitudes and latitudes."""
+"""Pictures of meshes on a sphere: maps in the projections of Cartopy (extra `maps`)."""
 
 from __future__ import annotations
 
-from typing import Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.patches import Circle
+from matplotlib.path import Path
 from numpy.typing import ArrayLike
 
 from ..arguments import check_number
 from ..errors import InputError
-from ..geometry.sphere import Sphere, directions
-from ..mesh.connectivity import face_owners
+from ..geometry.sphere import directions
+from ..io.convert import missing
+from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
-from . import pixels
-from .cells import edge_style, points_per_unit
-from .coasts import coastlines, is_earth
-from .colors import Color, Coloring, cell_norm, coloring_of, picture_of, without_ends
+from .cells import draw_cells
+from .colors import Color, kilometer_of, paint_of, picture_of
 from .legends import add_key
-from .projections import Orthographic, Plate, Polygons, unit_vectors
-from .style import WIDTH, ends_of, interactive_figure, single_height, styled
+from .solids import view_axes
+from .style import WIDTH, corners_of, interactive_figure, single_height, styled
+
+if TYPE_CHECKING:
+    from cartopy.crs import Projection as CartopyProjection
 
 Projection = Literal["orthographic", "plate"]
 
-_SMALLEST = 3.0
-"""Where cells are smaller, in points, the picture is an image: gaps between polygons would make stripes."""
-_FADE = 0.8
-"""Edges are as wide as those of cells that much smaller in a plane: rows of thin lines on a globe look like waves."""
+_RADIUS = 6371229.0
+"""Of the globe in projections, whatever that of the mesh is: Cartopy's tolerances are lengths on the Earth."""
+_STEP = 2.0  # longest straight part of an outline, degrees of a great circle
 _WIDE_LABELS = 0.35
 """Additional width of the labels of degrees and of large sizes beside a map, inches."""
 _CENTER = (0.0, 25.0)  # of the picture of a uniform mesh
-_STEPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30)  # of meridians and parallels, degrees
-_OUTLINE = {"edgecolor": "#1A1A1A", "linewidth": 0.8}
+_STEPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60)  # of meridians and parallels, degrees
+_SCALES = {"110m": 40.0, "50m": 8.0, "10m": 0.0}
+"""Scales of coastlines, and the smallest angle in degrees across a picture that has them."""
 
 
 def plot_globe(
@@ -41,7 +42,7 @@ def plot_globe(
     color: Color | ArrayLike = "error",
     ax: Any = None,
     *,
-    projection: Projection = "orthographic",
+    projection: Projection | CartopyProjection = "orthographic",
     center: ArrayLike | None = None,
     across: float | None = None,
     window: tuple[ArrayLike, ArrayLike] | None = None,
@@ -52,17 +53,17 @@ def plot_globe(
     key: bool = True,
     title: str | None = None,
 ) -> Any:
-    """Draw the cells of a mesh on a sphere.
+    """Draw the cells of a mesh on a sphere as a map.
 
     Parameters
     ----------
     mesh : Result or Diagram
     color : {"error", "quality", "size", "sides", "skewness", "volume"} or (n,) array of real numbers
         As for `plot_cells`.
-    ax : matplotlib axes, optional
-        Ordinary ones to draw into; a new figure by default.
-    projection : {"orthographic", "plate"}
-        The globe from far away, or longitudes and latitudes as coordinates (plate carrée).
+    ax : cartopy.mpl.geoaxes.GeoAxes, optional
+        A map to draw into, with its projection and its part of the sphere; a new figure by default.
+    projection : {"orthographic", "plate"} or cartopy.crs.Projection
+        The globe from far away, longitudes and latitudes as coordinates (plate carrée), or any other map.
     center : (lon, lat), degrees, optional
         The point in the middle; with "plate" only the longitude counts. By default where the cells are smallest.
     across : float, optional
@@ -70,8 +71,8 @@ def plot_globe(
     window : ((lon, lat), (lon, lat)), optional
         For "plate": lower left and upper right corner in degrees; by default the whole sphere.
     coasts : bool, optional
-        Draw the coastlines of the Earth, if Cartopy is installed and Natural Earth's data are on this computer. By
-        default on spheres as large as the Earth.
+        Draw the coastlines of the Earth, if Natural Earth's data are on this computer: nothing is downloaded here.
+        Cartopy's program ``cartopy_feature_download physical`` does that. By default on spheres as large as the Earth.
     label, limits, edges, key, title
         As for `plot_cells`.
 
@@ -83,39 +84,81 @@ def plot_globe(
     ------
     InputError, InputTypeError
         If the mesh is not on a sphere, a color does not exist, or an option is wrong or for the other projection.
+    MissingLibraryError
+        If Cartopy is not installed (``pip install "clvoro[maps]"``).
     """
     result = picture_of(mesh)
     diagram = result.diagram
-    sphere = require_sphere(diagram)
-    scheme = coloring_of(result, color, label)
-    view = _view(result, projection, center, across, window)
-    values = scheme.values(result)
-    ends = scheme.limits(values) if limits is None else ends_of(limits)
-    with styled():
-        if ax is None:
-            height = single_height(view.lower, view.upper, bool(scheme.classes), title is not None)
-            if isinstance(view, Plate) and not scheme.classes:
-                height -= _WIDE_LABELS * np.divide(*np.subtract(view.upper, view.lower)[::-1])
-            ax = interactive_figure(WIDTH, height).add_subplot()
-        _frame(ax, view)
-        cells = _draw(ax, diagram, view, values, scheme, ends, edges)
-        _draw_graticule(ax, view)
-        if is_earth(sphere.radius) if coasts is None else coasts:
-            _draw_coasts(ax, view)
-        if title is not None:
-            ax.set_title(title)
-        if key:
-            add_key(cells, ax, scheme, values, ends)
-    return ax.figure
-
-
-def require_sphere(diagram: Diagram) -> Sphere:
-    """Return the domain of a diagram on a sphere, or raise InputError."""
-    if not isinstance(diagram.domain, Sphere):
+    sphere = diagram.domain.globe
+    if sphere is None:
         raise InputError(
             f"plot_globe draws meshes on a sphere, and this one is in {diagram.domain}; call result.plot()"
         )
-    return diagram.domain
+    paint = paint_of(result, color, label, limits)
+    with styled():
+        if ax is None:
+            if center is None and not (projection == "plate" and window is None):
+                center = default_center(result)
+            ax = _new_map(projection, center, across, window, bool(paint.scheme.classes), title is not None)
+        elif not hasattr(ax, "projection"):
+            raise InputError(
+                "ax has no projection, expected a map of Cartopy: figure.add_subplot(projection=map_projection())"
+            )
+        source = ax.projection.as_geodetic()
+        if ax.projection.proj4_params["proj"] == "ortho":
+            angle = np.linspace(0, 2 * np.pi, 721)
+            ax.set_boundary(Path(ax.projection.x_limits[1] * np.column_stack([np.cos(angle), np.sin(angle)])))
+        cells, polygons = _polygons(diagram, ax.projection, source)
+        polygons, cells = _shown(ax, polygons, cells)
+
+        def positions(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            lonlat = source.transform_points(ax.projection, *places.T)[:, :2]
+            inside = np.isfinite(lonlat).all(axis=1)
+            return inside, sphere.positions(lonlat[inside])
+
+        image = draw_cells(ax, diagram, cells, polygons, paint, edges, positions=positions)
+        image.set_clip_path(ax.patch)
+        _draw_graticule(ax, source)
+        if kilometer_of(sphere.radius) is not None if coasts is None else coasts:
+            _draw_coasts(ax)
+        if title is not None:
+            ax.set_title(title)
+        if key:
+            add_key(ax, paint)
+    return ax.figure
+
+
+def map_projection(
+    projection: Projection | CartopyProjection = "orthographic", center: ArrayLike | None = None
+) -> CartopyProjection:
+    """Return a projection of Cartopy for axes: ``figure.add_subplot(projection=map_projection())``.
+
+    Parameters
+    ----------
+    projection, center
+        As for `plot_globe`; the center is by default (0, 25).
+
+    Raises
+    ------
+    InputError
+        If the projection is unknown, or the center no longitude and latitude.
+    MissingLibraryError
+        If Cartopy is not installed (``pip install "clvoro[maps]"``).
+    """
+    try:
+        from cartopy import crs
+    except ModuleNotFoundError as error:
+        raise missing("Cartopy", "maps", "a picture of a mesh on a sphere") from error
+    if isinstance(projection, crs.Projection):
+        return projection
+    if not isinstance(projection, str) or projection not in get_args(Projection):
+        names = ", ".join(get_args(Projection))
+        raise InputError(f"projection is {projection!r:.60}, expected one of {names}, or one of Cartopy's")
+    lon, lat = _CENTER if center is None else _pair("center", center)
+    globe = crs.Globe(ellipse=cast("str", None), semimajor_axis=_RADIUS, semiminor_axis=_RADIUS)
+    if projection == "plate":
+        return crs.PlateCarree(lon, globe=globe)
+    return crs.Orthographic(lon, lat, globe=globe)
 
 
 def default_center(result: Result) -> tuple[float, float]:
@@ -138,44 +181,30 @@ def default_center(result: Result) -> tuple[float, float]:
     return lon, lat
 
 
-def _view(result: Result, projection: Any, center: Any, across: Any, window: Any) -> Orthographic | Plate:
-    """Return the projection with the shown part, or raise InputError."""
-    if not isinstance(projection, str) or projection not in get_args(Projection):
-        raise InputError(f"projection is {projection!r:.60}, expected one of {', '.join(get_args(Projection))}")
-    point = default_center(result) if center is None else _pair("center", center)
-    if projection == "plate":
-        if across is not None:
-            raise InputError("across is for projection='orthographic'; give a window")
-        if window is None:
-            return Plate(point if center is not None else (0.0, 0.0))
-        return Plate(point, _corners(window))
-    if window is not None:
-        raise InputError("window is for projection='plate'; give center and across")
+def _new_map(projection: Any, center: Any, across: Any, window: Any, legend: bool, title: bool) -> Any:
+    """Return axes of a new figure that show a part of the sphere, or raise InputError."""
+    made = map_projection(projection, center)
+    for name, value, only in (("across", across, "orthographic"), ("window", window, "plate")):
+        if value is not None and not (isinstance(projection, str) and projection == only):
+            raise InputError(f"{name} is for projection={only!r}; leave it out")
+    (left, right), (bottom, top) = made.x_limits, made.y_limits
     if across is not None:
-        across = check_number("across", across, above=0)
-        if across > 180:
+        if check_number("across", across, above=0) > 180:
             raise InputError(f"across is {across:g}, expected an angle of at most 180 degrees")
-    return Orthographic(point, across)
-
-
-def _corners(window: Any) -> np.ndarray:
-    """Return a window in degrees as an array (2, 2), or raise InputError."""
-    try:
-        corners = np.asarray(window, float)
-    except (TypeError, ValueError):
-        corners = np.empty(0)
-    if (
-        corners.shape != (2, 2)
-        or not np.isfinite(corners).all()
-        or (corners[1] <= corners[0]).any()
-        or corners[1, 0] - corners[0, 0] > 360
-        or np.abs(corners[:, 1]).max() > 90
-    ):
-        raise InputError(
-            f"window is {window!r:.80}, expected two corners ((lon, lat), (lon, lat)) in degrees, the first one at the "
-            "lower left"
-        )
-    return corners
+        half = _RADIUS * np.sin(np.radians(across) / 2)
+        left, right, bottom, top = -half, half, -half, half
+    elif window is not None:
+        (left, bottom), (right, top) = corners_of(window)
+        if right - left > 360 or max(-bottom, top) > 90:
+            raise InputError(f"window is {window!r:.80}, expected longitudes and latitudes in degrees")
+        made = map_projection("plate", ((left + right) / 2, 0))
+        left, right = (left - right) / 2, (right - left) / 2
+    height = single_height((left, bottom), (right, top), legend, title)
+    height -= _WIDE_LABELS * (top - bottom) / (right - left) * (across is not None or projection != "orthographic")
+    ax: Any = interactive_figure(WIDTH, height).add_subplot(projection=made)
+    ax.set_xlim(left, right)
+    ax.set_ylim(bottom, top)
+    return ax
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
@@ -190,193 +219,119 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
     return float(pair[0]), float(pair[1])
 
 
-def _draw(
-    ax: Any,
-    diagram: Diagram,
-    view: Orthographic | Plate,
-    values: np.ndarray,
-    scheme: Coloring,
-    ends: tuple[float, float],
-    edges: bool,
-) -> Any:
-    """Add the cells, and edges where they are wide enough; return the mappable for a color bar."""
-    radius = cast("Sphere", diagram.domain).radius
-    points = diagram.points / radius
-    corners = diagram.vertices[diagram.cell_vertices] / radius
-    owner = face_owners(diagram)
-    reach = np.linalg.norm(corners - points[owner], axis=1)
-    reach = np.maximum.reduceat(reach, diagram.cell_vertex_starts[:-1])
-    cells = np.flatnonzero(view.reaches(points, reach))
-    widths, colors = _face_style(ax, diagram, view)
-    if len(cells) <= pixels.MOST_POLYGONS and not _has_tiny(ax, diagram, view, cells):
-        polygons = view.polygons(diagram, cells)
-        drawn: Any = _filled(polygons, values, scheme, ends)
-        ax.add_collection(drawn, autolim=False)
-    else:
-        drawn = pixels.add_image(ax, diagram, view.lower, view.upper, values, scheme, ends, view.directions)
-        wide = np.maximum.reduceat(widths > 0, diagram.neighbor_starts[:-1])
-        polygons = view.polygons(diagram, cells[wide[cells]] if edges else cells[:0])
-    if edges:
-        _draw_edges(ax, polygons, widths, colors)
-    if isinstance(view, Orthographic):
-        for artist in (*ax.collections, *ax.images):
-            artist.set_clip_path(Circle((0, 0), 1, transform=ax.transData))
-    return drawn
+def outlines(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
+    """Return the outlines of the cells with short steps along their arcs.
 
-
-def _has_tiny(ax: Any, diagram: Diagram, view: Orthographic | Plate, cells: np.ndarray) -> bool:
-    """Return whether a hundredth of the cells are too small for polygons."""
-    if not len(cells):
-        return False
-    lengths = _lengths(diagram, view)[cells] * points_per_unit(ax, view.upper - view.lower)
-    return bool(np.quantile(lengths, 0.01) < _SMALLEST)
-
-
-def _lengths(diagram: Diagram, view: Orthographic | Plate) -> np.ndarray:
-    """Return the widths of cells in the middle of the picture, (n,)."""
-    return np.sqrt(diagram.volumes) / cast("Sphere", diagram.domain).radius * view.unit
-
-
-def _filled(polygons: Polygons, values: np.ndarray, scheme: Coloring, ends: tuple[float, float]) -> PolyCollection:
-    return PolyCollection(
-        np.split(polygons.corners, polygons.starts[1:-1]) if len(polygons.cells) else [],
-        array=without_ends(values[polygons.cells]),
-        cmap=scheme.color_map,
-        norm=cell_norm(scheme, ends),
-        edgecolors="face",
-        linewidths=0.25,
-        rasterized=len(polygons.cells) > 3000,
-    )
-
-
-def _face_style(ax: Any, diagram: Diagram, view: Orthographic | Plate) -> tuple[np.ndarray, np.ndarray]:
-    """Return line widths (m,) and colors (m, 4) of half-faces; 0 where a line would be too thin.
-
-    Of two half-faces one has a width.
+    Returns
+    -------
+    starts : (n + 1,) int
+    points : (p, 3) float
+        Unit vectors, ``points[starts[i]:starts[i + 1]]`` counter-clockwise around cell i.
     """
-    owner, neighbor = face_owners(diagram), diagram.neighbors
-    lengths = _lengths(diagram, view)
-    smaller = _FADE * np.minimum(lengths[owner], lengths[np.where(neighbor < 0, owner, neighbor)])
-    smaller *= view.foreshortening(diagram.face_centroids / cast("Sphere", diagram.domain).radius)
-    widths, colors = edge_style(ax, smaller, view.upper - view.lower)
-    return np.where((neighbor < owner) & (widths > 0.06), widths, 0), colors
+    corners = diagram.vertices[diagram.cell_vertices]
+    starts = diagram.cell_vertex_starts
+    begin, end, middle = corners, corners[following(starts)], diagram.face_centroids
+    begin, middle, end = (x / np.linalg.norm(x, axis=1)[:, None] for x in (begin, middle, end))
+    # An even number of parts: both cells of a face have the same points, and one of them is the middle.
+    angle = np.degrees(np.arccos(np.clip((begin * middle).sum(axis=1), -1, 1)))
+    counts = np.where(angle > _STEP / 2, 2 * np.ceil(angle / _STEP).astype(int), 1)
+    ends = np.cumsum(counts)
+    arc = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(len(arc)) - (ends - counts)[arc]) / counts[arc]
+    early = share < 0.5
+    weight = np.where(early, 2 * share, 2 * share - 1)[:, None]
+    points = np.where(early[:, None], begin[arc], middle[arc]) * (1 - weight)
+    points += np.where(early[:, None], middle[arc], end[arc]) * weight
+    return np.concatenate([[0], ends])[starts], points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
-def _draw_edges(ax: Any, polygons: Polygons, widths: np.ndarray, colors: np.ndarray) -> None:
-    faces = polygons.faces
-    drawn = np.flatnonzero((faces >= 0) & (widths[faces] > 0))
-    lines = LineCollection(
-        list(polygons.sides()[drawn]),
-        colors=colors[faces[drawn]],
-        linewidths=widths[faces[drawn]],
-        capstyle="round",
-        rasterized=len(drawn) > 9000,
-    )
-    ax.add_collection(lines, autolim=False)
+def _polygons(diagram: Diagram, projection: CartopyProjection, source: Any) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return rows of cells (k,) and their polygons on the map, (c, 2) each; cells out of sight are left out.
 
+    Points are projected all at once. Only cells that the edge of a map cuts go through Cartopy one by one.
+    """
+    import shapely
 
-def _frame(ax: Any, view: Orthographic | Plate) -> None:
-    """Set the limits, and draw the limb of the globe or the frame of its part."""
-    ax.set_aspect("equal")
-    ax.set_xlim(view.lower[0], view.upper[0])
-    ax.set_ylim(view.lower[1], view.upper[1])
-    if isinstance(view, Orthographic):
-        ax.add_patch(Circle((0, 0), 1, facecolor="none", zorder=2.5, **_OUTLINE))
-        if view.whole:
-            ax.set_axis_off()
-    for spine in ax.spines.values():
-        spine.set_visible(True)
-
-
-def _draw_graticule(ax: Any, view: Orthographic | Plate) -> None:
-    """Add thin meridians and parallels, and their degrees where they cross the frame."""
-    steps = _steps(view)
-    fine = np.linspace(0, 1, 721)[:, None]
-    lines: list[np.ndarray] = []
-    ticks: dict[str, list[tuple[float, str]]] = {"x": [], "y": []}
-    lons, lats = _shown_degrees(view, steps)
-    for lon in lons:
-        # Of the meridians on a globe only four meet at a pole.
-        top = 90 if isinstance(view, Plate) or lon % 90 == 0 else 90 - min(steps)
-        parts = view.lines(unit_vectors((lon, -top) + fine * (0, 2 * top)))
-        lines += parts
-        ticks["x"] += [(x, _degrees(lon, "EW")) for p in parts for x in _crossings(p, 1, view)]
-    for lat in lats:
-        parts = view.lines(unit_vectors((-180, lat) + fine * (360, 0)))
-        lines += parts
-        ticks["y"] += [(y, _degrees(lat, "NS")) for p in parts for y in _crossings(p, 0, view)]
-    ax.add_collection(LineCollection(lines, colors="#1A1A1A", linewidths=0.35, alpha=0.35, zorder=2.2), autolim=False)
-    if isinstance(view, Plate):
-        inside = [lon for lon in lons if view.lower[0] <= lon <= view.upper[0]]
-        ticks = {"x": [(lon, _degrees(lon, "EW")) for lon in inside], "y": [(lat, _degrees(lat, "NS")) for lat in lats]}
-    sizes = view.upper - view.lower
-    for axis, room, size in ((ax.xaxis, 0.1, sizes[0]), (ax.yaxis, 0.05, sizes[1])):
-        shown = _apart(ticks[axis.axis_name], room * size)
-        axis.set_ticks([place for place, _ in shown], labels=[name for _, name in shown])
-
-
-def _steps(view: Orthographic | Plate) -> tuple[float, float]:
-    """Return the differences of longitude and latitude between lines of the graticule."""
-    middle = 0.0 if isinstance(view, Plate) else min(abs(float(view.towards[2])), 0.99)
-    spans = (view.span if view.whole else view.span / np.sqrt(1 - middle**2), view.span)
-    lon, lat = (next(s for s in reversed(_STEPS) if s <= max(x / 3.5, _STEPS[0])) for x in spans)
-    return lon, lat
-
-
-def _apart(ticks: list[tuple[float, str]], least: float) -> list[tuple[float, str]]:
-    """Return the ticks that have room for their labels, and none twice."""
-    kept: list[tuple[float, str]] = []
-    for place, name in sorted(ticks):
-        if not kept or place - kept[-1][0] >= least:
-            kept.append((place, name))
-    return kept
-
-
-def _shown_degrees(view: Orthographic | Plate, steps: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return longitudes and latitudes, multiples of `steps`, of lines that may be in the picture."""
-    if isinstance(view, Plate):
-        ranges = np.transpose([view.lower, view.upper])
-    else:
-        x, y = (np.linspace(view.lower[a], view.upper[a], 41) for a in (0, 1))
-        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        lonlat = Plate((0, 0)).flat(view.directions(places)[1])
-        middle = float(np.degrees(np.arctan2(view.towards[1], view.towards[0])))
-        lon = middle + (lonlat[:, 0] - middle + 180) % 360 - 180
-        ranges = np.array([(lon.min(), lon.max()), (lonlat[:, 1].min(), lonlat[:, 1].max())])
-        if view.whole:
-            ranges = np.array([(-180, 180 - steps[0]), (-90 + steps[1], 90 - steps[1])])
-    lons, lats = (
-        step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1)
-        for step, (low, high) in zip(steps, ranges, strict=True)
-    )
-    return lons, lats
-
-
-def _crossings(line: np.ndarray, axis: int, view: Orthographic | Plate) -> list[float]:
-    """Return where a line crosses the lower side (`axis` 1) or the left side (0) of the frame."""
-    if view.whole:
-        return []
-    side, other = view.lower[axis], 1 - axis
-    beyond = line[:, axis] - side
-    k = np.flatnonzero(beyond[:-1] * beyond[1:] < 0)
-    share = beyond[k] / (beyond[k] - beyond[k + 1])
-    places = line[k, other] + share * (line[k + 1, other] - line[k, other])
-    return places[(places > view.lower[other]) & (places < view.upper[other])].tolist()
-
-
-def _degrees(value: float, signs: str) -> str:
-    """Format a longitude or latitude as "30°W"."""
-    value = (value + 180) % 360 - 180 if signs == "EW" else value
-    letter = "" if value == 0 or value == -180 else signs[0 if value > 0 else 1]
-    return f"{abs(round(value, 6)):g}°{letter}"
-
-
-def _draw_coasts(ax: Any, view: Orthographic | Plate) -> None:
-    parts = [
-        part
-        for line in coastlines(view.span)
-        for part in view.lines(unit_vectors(line))
-        if (part.max(axis=0) >= view.lower).all() and (part.min(axis=0) <= view.upper).all()
+    starts, points = outlines(diagram)
+    lonlat = directions(points)
+    flat = projection.transform_points(source, *lonlat.T)[:, :2]
+    known: dict[str, Any] = projection.proj4_params
+    seen = np.isfinite(flat).all(axis=1)
+    in_sight = np.logical_or.reduceat(seen, starts[:-1])
+    if known["proj"] == "ortho" and not seen.all():
+        # Points behind the limb are moved outwards, the farther behind the farther, so that no side crosses the limb.
+        right, up, towards = view_axes((known["lon_0"], known["lat_0"]))
+        behind = points[~seen]
+        xy = np.column_stack([behind @ right, behind @ up])
+        length = np.maximum(np.linalg.norm(xy, axis=1), 1e-9)
+        flat[~seen] = _RADIUS * xy * ((1 - behind @ towards) / length)[:, None]
+        seen = np.ones(len(points), bool)
+    first, counts = starts[:-1], np.diff(starts)
+    whole = np.logical_and.reduceat(seen, first)
+    width = np.ptp(projection.x_limits)
+    jumps = np.abs(flat[following(starts), 0] - flat[:, 0]) > 0.4 * width
+    whole &= ~np.logical_or.reduceat(jumps | (np.abs(lonlat[:, 1]) > 90 - 1e-9), first)
+    cells = np.flatnonzero(whole & in_sight)
+    polygons = [flat[a : a + n] for a, n in zip(first[cells], counts[cells], strict=True)]
+    rest = np.flatnonzero(~whole & in_sight)
+    pieces = [
+        (row, np.asarray(part.exterior.coords)[:-1])
+        for row in rest.tolist()
+        for part in projection.project_geometry(shapely.Polygon(lonlat[starts[row] : starts[row + 1]]), source).geoms
     ]
-    lines = LineCollection(parts, colors="#000000", linewidths=0.9, zorder=2.3)
-    ax.add_collection(lines, autolim=False)
+    return np.concatenate([cells, [row for row, _ in pieces]]).astype(int), [*polygons, *(p for _, p in pieces)]
+
+
+def _shown(ax: Any, polygons: list[np.ndarray], cells: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return the polygons that reach into the limits of `ax`, and their cells."""
+    low, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
+    kept = [k for k, p in enumerate(polygons) if (p.max(axis=0) >= low).all() and (p.min(axis=0) <= high).all()]
+    return [polygons[k] for k in kept], cells[kept]
+
+
+def _draw_graticule(ax: Any, source: Any) -> None:
+    """Add thin meridians and parallels, on a rectangular map with their degrees where they cross the frame."""
+    x, y = np.meshgrid(*(np.linspace(low, high, 41) for low, high in (ax.get_xlim(), ax.get_ylim())))
+    lon, lat = source.transform_points(ax.projection, x, y)[:, :, :2].transpose(2, 0, 1)
+    rectangular = np.isfinite(lon[[0, 0, -1, -1], [0, -1, 0, -1]]).all()
+    middle = np.degrees(np.angle(np.nanmean(np.exp(1j * np.radians(np.where(np.isfinite(lon), lon, np.nan))))))
+    places = []
+    for degrees, about in ((lon, middle), (lat, 0.0)):
+        turned = (degrees[np.isfinite(degrees)] - about + 180) % 360 - 180 + about
+        low, high = turned.min(), turned.max()
+        step = next(s for s in _STEPS if s >= (high - low) / 7)
+        places.append(step * np.arange(np.ceil(low / step), np.floor(high / step) + 1))
+    lines = ax.gridlines(
+        xlocs=np.unique((places[0] + 180) % 360 - 180),
+        ylocs=places[1],
+        draw_labels={"bottom": "x", "left": "y"} if rectangular else False,
+        color="#1A1A1A",
+        linewidth=0.35,
+        alpha=0.35,
+        zorder=2.2,
+    )
+    lines.rotate_labels = False
+    lines.xlabel_style = lines.ylabel_style = {"size": 8}
+    ax.spines["geo"].set(linewidth=0.8, edgecolor="#1A1A1A")
+
+
+def _draw_coasts(ax: Any) -> None:
+    """Add coastlines, if their data are there."""
+    span = 180 * np.ptp(ax.get_ylim()) / np.ptp(ax.projection.y_limits)
+    fitting = [scale for scale, least in _SCALES.items() if span >= least][:1]
+    for scale in [*fitting, *(s for s in _SCALES if s not in fitting)]:
+        if _has_coasts(scale):
+            ax.coastlines(scale, linewidth=0.9, zorder=2.3)
+            return
+
+
+def _has_coasts(scale: str) -> bool:
+    """Return whether Natural Earth's coastlines of a scale are on this computer."""
+    from cartopy import config
+    from cartopy.io import Downloader
+
+    words = {"resolution": scale, "category": "physical", "name": "coastline"}
+    source = Downloader.from_config(("shapefiles", "natural_earth", *words.values()))
+    given = {"config": config, **words}
+    paths = (source.pre_downloaded_path(given), source.target_path(given))
+    return any(path is not None and path.exists() for path in paths)

@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, Locator, MaxNLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
-from .colors import Coloring
+from .colors import Paint
 from .style import is_flat
 
 _BELOW: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 45}
@@ -22,21 +22,18 @@ _APART = (0.15, 0.45)  # least distance of two numbers there, inches
 _BELOW_TICKS = 26  # from the axes to a legend below their numbers, points
 
 
-def add_key(
-    cells: Any, axes: Any, scheme: Coloring, values: np.ndarray, limits: tuple[float, float], below: bool = False
-) -> None:
+def add_key(axes: Any, paint: Paint, below: bool = False) -> None:
     """Add a color bar, or the legend of classes, beside or below `axes` (one or several)."""
-    if scheme.classes:
-        _add_classes(axes, scheme, values, limits)
+    if paint.scheme.classes:
+        _add_classes(axes, paint)
     else:
-        add_color_bar(cells, axes, scheme, values, limits, **(_BELOW if below else {}))
+        add_color_bar(axes, paint, **(_BELOW if below else {}))
 
 
-def add_color_bar(
-    cells: Any, axes: Any, scheme: Coloring, values: np.ndarray, limits: tuple[float, float], **options: Any
-) -> None:
+def add_color_bar(axes: Any, paint: Paint, **options: Any) -> None:
     """Add the scale beside `axes` (one or several), with arrows where values lie beyond it."""
-    low, high = limits
+    scheme, values, (low, high) = paint.scheme, paint.values, paint.limits
+    cells = paint.mappable()
     below, above = (bool((values < low * (1 - 1e-9 * np.sign(low))).any()), bool((values > high).any()))
     extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
     several = isinstance(axes, (list, np.ndarray))
@@ -137,9 +134,9 @@ def round_numbers(low: float, high: float) -> list[float]:
     return [t for t in numbers if low * 0.999 <= t <= high * 1.001]
 
 
-def _add_classes(axes: Any, scheme: Coloring, values: np.ndarray, limits: tuple[float, float]) -> None:
+def _add_classes(axes: Any, paint: Paint) -> None:
     """Write the classes and their shares of all cells below the picture."""
-    first = round(limits[0] + 0.5)
+    scheme, values, first = paint.scheme, paint.values, round(paint.limits[0] + 0.5)
     handles = [
         Patch(facecolor=color, edgecolor="#1A1A1A", linewidth=0.4, label=f"{label}: {_share(values == number)}")
         for number, (color, label) in enumerate(zip(scheme.color_map.colors, scheme.classes, strict=True), start=first)

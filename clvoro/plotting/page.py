@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import base64
 import html
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
-from ..geometry.polygon import Polygon
+from ..errors import MissingLibraryError, MissingPicturesWarning
 from ..io.atomic import atomic_file, writing
 from ..mesh.results import Result
 from ..mesh.summary import beside_boundary, summary
-from .pictures import pictures_of, render
+from .pictures import draw, pictures_of, render
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -83,6 +84,11 @@ def write_report(
     ------
     OutputError, MemoryError, or whatever Matplotlib raises
         The first error, after everything else has been written.
+
+    Warns
+    -----
+    MissingPicturesWarning
+        If pictures are left out, because PyVista (for meshes in 3D) or Cartopy (on spheres) is not installed.
     """
     if isinstance(results, Result):
         method = results.settings.get("method") or "result"
@@ -90,23 +96,28 @@ def write_report(
     target = Path(folder)
     with writing(target / "pictures"):
         (target / "pictures").mkdir(parents=True, exist_ok=True)
-    written, figures, failed = [], [], None
+    written, figures, failed, missing = [], [], None, ""
     pictures = pictures_of(results, initial, size)
-    for number, (name, caption, draw) in enumerate(pictures, 1):
+    for number, picture in enumerate(pictures, 1):
+        name, caption, _ = picture
         if tell is not None:
             tell(f"picture {number} of {len(pictures)}, {name}")
         try:
-            figure = draw()
+            figure = draw(picture)
             png = render(figure, "png", dpi)
             figures.append((caption, png))
             for kind in formats:
                 path = target / "pictures" / f"{name}.{kind}"
                 _write(path, png if kind == "png" else render(figure, kind, dpi))
                 written.append(path)
+        except MissingLibraryError as error:
+            missing = str(error)
         except Exception as error:  # raised below, after the other pictures
             failed = failed or error
     page = target / "report.html"
-    _write(page, _page(results, title, case, facts or {}, figures).encode())
+    _write(page, _page(results, title, case, facts or {}, figures, missing).encode())
+    if missing:
+        warnings.warn(f"the report has no pictures of the mesh: {missing}", MissingPicturesWarning, stacklevel=2)
     if failed is not None:
         raise failed
     return [page, *written]
@@ -118,7 +129,12 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _page(
-    results: Mapping[str, Result], title: str, case: str, facts: Mapping[str, str], figures: Sequence[tuple[str, bytes]]
+    results: Mapping[str, Result],
+    title: str,
+    case: str,
+    facts: Mapping[str, str],
+    figures: Sequence[tuple[str, bytes]],
+    missing: str,
 ) -> str:
     name, main = list(results.items())[-1]
     numbers = summary(main)
@@ -140,9 +156,9 @@ def _page(
     parts = [
         f"<h1>{_safe(title)}</h1><p class=what>{_safe(words)}</p><dl>{cards}</dl>",
         f"<h2>Runs</h2>{_table(results, name)}" if len(results) > 1 else f"<p>Stopped: {_safe(main.stop_reason)}.</p>",
-        f"<h2>Cells on the boundary</h2>{_apart(results, name)}" if isinstance(main.diagram.domain, Polygon) else "",
+        f"<h2>Cells on the boundary</h2>{_apart(results, name)}" if main.diagram.domain.cuts_cells else "",
         f"<h2>Measures for finite volumes</h2>{_measures(name, main)}",
-        "<h2>Pictures</h2>",
+        f"<h2>Pictures</h2><p>{_safe(missing)}</p>" if missing else "<h2>Pictures</h2>",
     ]
     for caption, png in figures:
         data = base64.b64encode(png).decode()

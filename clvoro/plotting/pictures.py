@@ -4,29 +4,32 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..geometry.sphere import Sphere
 from ..mesh.results import Result
-from . import cells as draw
-from .colors import coloring, shared_limits
-from .curves import displacements_height, plot_displacements, plot_history
-from .globe import default_center, plot_globe
-from .legends import add_color_bar
-from .slices import focus, new_slices, plot_slice
-from .solids import cutaway_height, plot_cutaway, plot_distributions
-from .style import WIDTH, grid_height, new_figure, single_height, styled, window_around_smallest
+from .cells import plot_size
+from .colors import Paint, shared_paint
+from .curves import plot_distributions, plot_history
+from .globe import default_center, map_projection
+from .legends import add_key
+from .solids import focus, plane_axes
+from .style import WIDTH, detached, grid_height, new_figure, styled, window_around_smallest
+from .views import plot_mesh, views_of
 
 Picture = tuple[str, str, Callable[[], Any]]
 """A picture: file name, caption, and the function that draws it."""
 
 FINE_MESH = 10_000
 """From this many cells on, the cells show the size field, not a raster."""
-MANY_SOLID_CELLS = 20_000
-"""From this many cells on, there is also a closer view of a 3D mesh."""
+MANY_CELLS = {"cells": 3000, "globe": 3000, "slices": 20_000}
+"""From this many cells on, by the view of a mesh, there is also a closer view."""
+_QUALITY = {
+    "cells": "1 is a regular polygon",
+    "globe": "1 is a regular polygon",
+    "slices": "1 is a ball, .75 a truncated octahedron",
+}
 
 
 def pictures_of(
@@ -44,168 +47,50 @@ def pictures_of(
         The size field h(points (n, 2)); without it, and in 3D, the sizes at the generators are shown.
     """
     name, main = list(results.items())[-1]
-    history: Picture = (
-        "history",
-        "Metric error and cell quality against the step: mean (full) and worst cell (dashed).",
-        lambda: plot_history(results, new_figure(WIDTH, 3.1)),
-    )
     panels = {**({"initial": initial} if initial is not None else {}), **results}
-    if isinstance(main.diagram.domain, Sphere):
-        return _globe_pictures(panels, history)
-    if main.diagram.domain.dim != 2:
-        return _solid_pictures(panels, history)
-    pictures: list[Picture] = [
-        ("size", "Target size h.", lambda: _size(main, size)),
-        ("cells", f"The mesh ({name}), colored by metric error.", lambda: _one(main, "error")),
-    ]
-    if len(panels) == 1:
-        caption = f"The mesh ({name}), colored by cell quality; 1 is a regular polygon."
-        pictures.append(("quality", caption, lambda: _one(main, "quality")))
+    domain = main.diagram.domain
+    view = views_of(domain)[0]
+    solid = view == "slices"
+    plain = {} if solid else {"edges": False}
+
+    def whole(color: str, **options: Any) -> Callable[[], Any]:
+        return lambda: plot_mesh(main, color, **options)
+
+    if view == "cells" and size is not None and len(main.points) <= FINE_MESH:
+        pictures: list[Picture] = [("size", "Target size h.", lambda: plot_size(size, domain))]
     else:
-        pictures += _comparisons(panels)
-    pictures.append(history)
-    if main.initial is not None or main.final is not None:
-        height = displacements_height(main)
-        pictures.append(
-            (
-                "displacements",
-                f"The two halves of a step's displacements ({name}): Lloyd's and the Poisson correction's.",
-                lambda: plot_displacements(main, new_figure(WIDTH, height)),
-            )
-        )
-    pictures.append(("sides", f"Cells by number of sides ({name}).", lambda: _one(main, "sides")))
-    if len(main.points) > 3000:
+        pictures = [("size", "Target size h at the generators.", whole("size", **plain))]
+    if view == "globe":
+        caption = "Target size h against longitude and latitude."
+        pictures.append(("plate", caption, whole("size", projection="plate", **plain)))
+    pictures.append(("cells", f"The mesh ({name}), colored by metric error.", whole("error")))
+    if solid:
+        pictures.append(("cutaway", f"A view into the mesh ({name}).", whole("error", view="cutaway")))
+    if solid or len(panels) == 1:
+        caption = f"The mesh ({name}), colored by cell quality; {_QUALITY[view]}."
+        pictures.append(("quality", caption, whole("quality")))
+    if len(panels) > 1:
+        error = "Metric error e, one scale for all: red cells are too large, blue ones too small."
+        quality = "Cell quality Q, one scale for all: 1 is a regular polygon (in 3D a ball)."
+        pictures += [
+            ("diagrams_error", error, lambda: _compare(panels, "error")),
+            ("diagrams_quality", quality, lambda: _compare(panels, "quality")),
+        ]
+    caption = "Metric error and cell quality against the step: mean (full) and worst cell (dashed)."
+    pictures.append(("history", caption, lambda: plot_history(results)))
+    if solid:
+        caption = f"Cells ({name}) by metric error, quality and number of faces; faces by skewness. Dashed: the mean."
+        pictures.append(("distributions", caption, lambda: plot_distributions(main)))
+    pictures.append(("sides", f"Cells by number of {'faces' if solid else 'sides'} ({name}).", whole("sides")))
+    if len(main.points) > MANY_CELLS[view]:
         pictures.append(("closer", f"Where the cells are smallest ({name}).", lambda: _closer(main)))
     return pictures
 
 
-def _solid_pictures(panels: Mapping[str, Result], history: Picture) -> list[Picture]:
-    """Return the pictures of 3D meshes: planes through them, and a view into the last one."""
-    name, main = list(panels.items())[-1]
-
-    def slices(color: str) -> Callable[[], Any]:
-        return lambda: new_slices(main, color)
-
-    pictures: list[Picture] = [
-        ("size", "Target size h at the generators, on planes through the smallest cells.", slices("size")),
-        ("cells", f"The mesh ({name}), colored by metric error.", slices("error")),
-        ("cutaway", f"A view into the mesh ({name}).", lambda: _cutaway(main)),
-        (
-            "quality",
-            f"The mesh ({name}), colored by cell quality; 1 is a ball, .75 a truncated octahedron.",
-            slices("quality"),
-        ),
-    ]
-    if len(panels) > 1:
-        pictures += _comparisons(panels)
-    pictures += [
-        history,
-        (
-            "distributions",
-            f"Cells ({name}) by metric error, quality and number of faces; faces by skewness. Dashed: the mean.",
-            lambda: plot_distributions(main, new_figure(WIDTH, 4.2)),
-        ),
-        ("sides", f"Cells by number of faces ({name}).", slices("sides")),
-    ]
-    if len(main.points) > MANY_SOLID_CELLS:
-        pictures.append(("closer", f"Where the cells are smallest ({name}).", lambda: _closer_slice(main)))
-    return pictures
-
-
-def _globe_pictures(panels: Mapping[str, Result], history: Picture) -> list[Picture]:
-    """Return the pictures of meshes on a sphere: the globe, longitudes and latitudes, and a closer view."""
-    name, main = list(panels.items())[-1]
-
-    def globe(color: str, **options: Any) -> Callable[[], Any]:
-        return lambda: _globe(main, color, **options)
-
-    pictures: list[Picture] = [
-        ("size", "Target size h, where cells are smallest.", globe("size", edges=False)),
-        ("plate", "Target size h against longitude and latitude.", globe("size", projection="plate", edges=False)),
-        ("cells", f"The mesh ({name}), colored by metric error.", globe("error")),
-    ]
-    if len(panels) == 1:
-        caption = f"The mesh ({name}), colored by cell quality; 1 is a regular polygon."
-        pictures.append(("quality", caption, globe("quality")))
-    else:
-        pictures += _comparisons(panels)
-    pictures += [history, ("sides", f"Cells by number of sides ({name}).", globe("sides"))]
-    if len(main.points) > 3000:
-        pictures.append(("closer", f"Where the cells are smallest ({name}).", lambda: _closer_globe(main)))
-    return pictures
-
-
-def _globe(result: Result, color: str, **options: Any) -> Any:
-    """Draw one large picture of the whole sphere."""
-    flat = options.get("projection") == "plate"
-    legend = bool(coloring(color).classes)
-    extent = (360, 180) if flat else (2, 2)
-    with styled():
-        figure = new_figure(WIDTH, single_height((0, 0), extent, legend))
-        return plot_globe(result, color, figure.add_subplot(), **options)
-
-
-def _closer_globe(result: Result) -> Any:
-    """Draw two parts around the region with the smallest cells, the second four times closer."""
-    smallest = float(np.quantile(result.target_size, 0.01))
-    radius = float(np.linalg.norm(result.points[0]))
-
-    def draw_part(ax: Any, across: int, limits: tuple[float, float]) -> None:
-        angle = min(float(np.degrees(across * smallest / radius)), 90.0)
-        plot_globe(result, "quality", ax, across=angle, limits=limits, key=False)
-
-    return _two_closer(result, draw_part)
-
-
-def _cutaway(result: Result) -> Any:
-    figure = new_figure(WIDTH, cutaway_height(result))
-    return plot_cutaway(result, "error", figure.add_subplot())
-
-
-def _closer_slice(result: Result) -> Any:
-    """Draw a square window around the smallest cell, on the plane of the largest section."""
-    normal = _largest_section(result)
-    axes = [a for a in range(3) if a != normal]
-    center = result.points[np.argmin(result.target_size)]
-    box = result.diagram.domain
-    lower, upper = np.array(box.lower)[axes], np.array(box.upper)[axes]
-    across = 60
-    span = np.minimum(across * float(result.target_size.min()), upper - lower)
-    corner = np.clip(center[axes] - span / 2, lower, upper - span)
-    with styled():
-        figure = new_figure(WIDTH, (WIDTH - 1.3) * float(span[1] / span[0]) + 0.6)
-    name = "xyz"[normal]
-    return plot_slice(
-        result,
-        "quality",
-        figure.add_subplot(),
-        normal=name,
-        through=center,
-        window=(corner, corner + span),
-        title=f"{across} $h_\\mathrm{{min}}$ across, ${name} = {center[normal]:.3g}$",
-    )
-
-
-def _largest_section(result: Result) -> int:
-    """Return the axis at right angles to the largest section of the domain; of several the last."""
-    extent = result.diagram.domain.extent
-    return int(np.flatnonzero(extent <= extent.min() * 1.001)[-1])
-
-
-def _comparisons(panels: Mapping[str, Result]) -> list[Picture]:
-    """Return the pictures of several meshes side by side."""
-    return [
-        (
-            "diagrams_error",
-            "Metric error e, one scale for all: red cells are too large, blue ones too small.",
-            lambda: _grid(panels, "error"),
-        ),
-        (
-            "diagrams_quality",
-            "Cell quality Q, one scale for all: 1 is a regular polygon (in 3D a ball).",
-            lambda: _grid(panels, "quality"),
-        ),
-    ]
+def draw(picture: Picture) -> Any:
+    """Return the figure of a picture; `matplotlib.pyplot` does not know it."""
+    with detached():
+        return picture[2]()
 
 
 def render(figure: Any, kind: str = "png", dpi: int = 170) -> bytes:
@@ -217,80 +102,93 @@ def render(figure: Any, kind: str = "png", dpi: int = 170) -> bytes:
         return buffer.getvalue()
 
 
-def _one(result: Result, color: str, **options: Any) -> Any:
-    """Draw one large picture of the whole domain."""
-    with styled():
-        box, legend = result.diagram.domain, bool(coloring(color).classes)
-        figure = new_figure(WIDTH, single_height(box.lower, box.upper, legend))
-        return draw.plot_cells(result, color, figure.add_subplot(), **options)
+def plot_side_by_side(panels: Mapping[str, Result], paint: Paint, color: str, columns: int) -> Any:
+    """Draw meshes side by side with one scale, on a new figure; the last one says which part is in the middle.
 
-
-def _size(result: Result, size: Callable[[np.ndarray], np.ndarray] | None) -> Any:
-    """Draw the target size: the field, or that of the cells if they resolve it better than a raster."""
-    if size is None or len(result.points) > FINE_MESH:
-        return _one(result, "size", edges=False)
-    with styled():
-        box = result.diagram.domain
-        figure = new_figure(WIDTH, single_height(box.lower, box.upper))
-        return draw.plot_size(size, box, figure.add_subplot())
-
-
-def _grid(panels: Mapping[str, Result], color: str) -> Any:
-    """Draw the meshes side by side with one scale."""
-    results = list(panels.values())
-    box = results[0].diagram.domain
-    scheme, limits = coloring(color, box), shared_limits(results, color)
-    if color == "error":  # a larger limit would hide small errors
-        limits = (max(limits[0], -1.0), min(limits[1], 1.0))
-    plot: Callable[..., Any] = draw.plot_cells
-    lower, upper = np.array(box.lower), np.array(box.upper)
-    if isinstance(box, Sphere):
-        plot = partial(plot_globe, center=default_center(results[-1]))
-        lower, upper = lower[:2], upper[:2]
-    elif box.dim == 3:
-        normal = _largest_section(results[-1])
-        plot = partial(plot_slice, normal="xyz"[normal], through=focus(results[-1]))
+    Parameters
+    ----------
+    panels : mapping
+        Results by their titles, in one domain.
+    paint : Paint
+        The scale, and the values of all.
+    """
+    *_, main = panels.values()
+    domain = main.diagram.domain
+    view = views_of(domain)[0]
+    lower, upper = np.array(domain.lower), np.array(domain.upper)
+    options: dict[str, Any] = {"limits": paint.limits, "key": False}
+    axes_options: dict[str, Any] = {}
+    if view == "globe":
+        axes_options = {"projection": map_projection(center=default_center(main))}
+    elif view == "slices":
+        normal = _largest_section(main)
+        options |= {"view": "slice", "normal": "xyz"[normal], "through": focus(main)}
         lower, upper = (np.delete(corner, normal) for corner in (lower, upper))
-    columns = 1 if len(results) == 1 else 2
-    rows = -(-len(results) // columns)
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
     with styled():
-        figure = new_figure(WIDTH, grid_height(lower, upper, rows, columns, 0.6, 0.28))
-        axes = figure.subplots(rows, columns, squeeze=False).ravel()
-        for letter, ax, (name, result) in zip("abcdefghij", axes, panels.items(), strict=False):
-            e, q = np.abs(result.size_error).mean(), result.quality.mean()
-            title = f"({letter}) {name}: mean $|e|$ {e:.3g}, mean $Q$ {q:.3f}"
-            plot(result, color, ax, limits=limits, key=False, title=title)
+        figure = new_figure(WIDTH, grid_height(lower, upper, rows, columns, 0.65, 0.3))
+        axes = figure.subplots(rows, columns, squeeze=False, subplot_kw=axes_options).ravel()
+        for ax, (title, result) in zip(axes, panels.items(), strict=False):
+            if view == "globe":
+                ax.set_global()
+            plot_mesh(result, color, ax=ax, title=title, **options)
             ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
-        for ax in axes[len(results) :]:
-            ax.set_axis_off()
-        values = np.concatenate([scheme.values(r) for r in results])
-        drawn = (*axes[0].collections, *axes[0].images)
-        cells = next(c for c in drawn if c.get_array() is not None)
-        add_color_bar(cells, axes, scheme, values, limits, location="bottom", shrink=0.6, aspect=45)
+        for ax in axes[len(panels) :]:
+            ax.set_visible(False)
+        add_key(axes, paint, below=True)
     return figure
 
 
+def _compare(panels: Mapping[str, Result], color: str) -> Any:
+    titled = {
+        f"({letter}) {name}: mean $|e|$ {np.abs(r.size_error).mean():.3g}, mean $Q$ {r.quality.mean():.3f}": r
+        for letter, (name, r) in zip("abcdefghij", panels.items(), strict=False)
+    }
+    return plot_side_by_side(titled, shared_paint(list(panels.values()), color), color, 2)
+
+
+def _largest_section(result: Result) -> int:
+    """Return the axis at right angles to the largest section of the domain; of several the last."""
+    extent = result.diagram.domain.extent
+    return int(np.flatnonzero(extent <= extent.min() * 1.001)[-1])
+
+
 def _closer(result: Result) -> Any:
-    """Draw two windows around the smallest cells, the second four times closer."""
-
-    def draw_part(ax: Any, across: int, limits: tuple[float, float]) -> None:
-        window = window_around_smallest(result, across)
-        draw.plot_cells(result, "quality", ax, limits=limits, window=window, key=False)
-        ax.locator_params(nbins=4)
-
-    return _two_closer(result, draw_part, 0.8)
-
-
-def _two_closer(result: Result, draw_part: Callable[[Any, int, tuple[float, float]], None], ratio: float = 1.0) -> Any:
-    """Draw two closer views, colored by quality; `ratio` is that of height and width."""
+    """Draw two parts around the smallest cells, the second four times closer, colored by quality."""
+    domain = result.diagram.domain
+    view = views_of(domain)[0]
+    paint = shared_paint([result], "quality")
+    options: dict[str, Any] = {"limits": paint.limits, "key": False}
+    smallest = float(np.quantile(result.target_size, 0.01))
     with styled():
-        figure = new_figure(WIDTH, WIDTH / 2 * ratio + 0.75)
-        axes = figure.subplots(1, 2)
-        limits = shared_limits([result], "quality")
-        for ax, across in zip(axes, (160, 40), strict=True):
-            draw_part(ax, across, limits)
-            ax.set_title(f"{across} $h_\\mathrm{{min}}$ across, where $h$ is smallest")
-        scheme = coloring("quality")
-        cells = next(c for c in (*axes[1].collections, *axes[1].images) if c.get_array() is not None)
-        add_color_bar(cells, axes, scheme, result.quality, limits, location="bottom", shrink=0.6, aspect=45)
+        figure = new_figure(WIDTH, WIDTH / 2 * (0.8 if view == "cells" else 1.0) + 0.75)
+        axes = []
+        for number, across in enumerate((160, 40), 1):
+            if domain.globe is not None:
+                half = min(across * smallest / domain.globe.radius, np.pi / 2) / 2
+                ax: Any = figure.add_subplot(1, 2, number, projection=map_projection(center=default_center(result)))
+                reach = ax.projection.x_limits[1] * np.sin(half)
+                ax.set(xlim=(-reach, reach), ylim=(-reach, reach))
+            else:
+                ax = figure.add_subplot(1, 2, number)
+            if view == "cells":
+                options["window"] = window_around_smallest(result, across)
+            elif view == "slices":
+                normal = _largest_section(result)
+                center = result.points[np.argmin(result.target_size)]
+                middle, lower, upper = (
+                    np.asarray(x) @ np.transpose(plane_axes(np.eye(3)[normal]))
+                    for x in (center, domain.lower, domain.upper)
+                )
+                span = np.minimum(across * float(result.target_size.min()), upper - lower)
+                corner = np.clip(middle - span / 2, lower, upper - span)
+                options |= {"view": "slice", "normal": "xyz"[normal], "through": center}
+                options["window"] = corner, corner + span
+            plot_mesh(
+                result, "quality", ax=ax, title=f"{across} $h_\\mathrm{{min}}$ across, where $h$ is smallest", **options
+            )
+            ax.locator_params(nbins=4)
+            axes.append(ax)
+        add_key(np.array(axes), paint, below=True)
     return figure

@@ -7,10 +7,11 @@ from typing import Any, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from matplotlib.axes import Axes
 from scipy.ndimage import distance_transform_edt
 
 from ..mesh.diagram import Diagram
-from .colors import Coloring, cell_norm, without_ends
+from .colors import Paint
 
 MOST_POLYGONS = 30_000
 """With more cells in a picture, it is an image."""
@@ -26,22 +27,14 @@ _last: WeakKeyDictionary[Diagram, tuple[np.ndarray, ...]] = WeakKeyDictionary()
 same part in several colors, so the cells are found once."""
 
 
-def add_image(
-    ax: Any,
-    diagram: Diagram,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    values: np.ndarray,
-    scheme: Coloring,
-    limits: tuple[float, float],
-    positions: Positions | None = None,
-) -> Any:
-    """Add an image of the mesh in the rectangle from `lower` to `upper` of the picture, and return it.
+def add_image(ax: Any, diagram: Diagram, paint: Paint, positions: Positions | None = None) -> Any:
+    """Add an image of the mesh that fills `ax`, whose limits are set, and return it.
 
-    `values` (n,) are those of the cells. `positions` returns for places (k, 2) in the picture which of them show the
-    mesh, (k,) bool, and where those are in the domain, (j, d). By default a place is its own position.
+    `positions` returns for places (k, 2) in the picture which of them show the mesh, (k,) bool, and where those are in
+    the domain, (j, d). By default a place is its own position.
     """
-    extent = np.subtract(upper, lower)
+    lower, upper = np.transpose([ax.get_xlim(), ax.get_ylim()])
+    extent = upper - lower
     box = ax.get_position()
     inches = ax.figure.get_size_inches() * (box.width, box.height)
     counts = np.maximum(np.ceil(PER_INCH * min(inches / extent) * extent), 2).astype(int)
@@ -54,15 +47,17 @@ def add_image(
         cells[inside] = diagram.locate(at)
         known = _last[diagram] = inside, at, _with_rim(cells.reshape(len(y), len(x)))
     # -1 leads to the last place.
-    shown = np.append(without_ends(values), np.nan)[known[2]]
-    return ax.imshow(
+    shown = np.append(paint.finite, np.nan)[known[2]]
+    # The method of plain axes: those of a map would look for its projection.
+    return Axes.imshow(
+        ax,
         np.ma.masked_invalid(shown),
         extent=(lower[0], upper[0], lower[1], upper[1]),
         origin="lower",
         # Colors are interpolated: between classes there are no further ones.
         interpolation_stage="rgba",
-        cmap=scheme.color_map,
-        norm=cell_norm(scheme, limits),
+        cmap=paint.scheme.color_map,
+        norm=paint.norm,
     )
 
 

@@ -1,69 +1,163 @@
-"""Pictures of a whole mesh by its dimension, the cut-away view of a 3D mesh, and histograms of measures."""
+"""Pictures of 3D meshes: planes through them, and views into them, by the filters of PyVista (extra `pyvista`).
+
+PyVista cuts the cells, and Matplotlib draws the polygons, so that no graphics driver is needed. The views are parallel
+projections. Along any line of sight the cells of a Voronoi diagram follow each other in the order of their generators:
+drawn in that order, each covers those behind it.
+"""
 
 from __future__ import annotations
 
-from inspect import signature
-from typing import Any, Literal, get_args
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.colors import Colormap
-from matplotlib.ticker import MaxNLocator
+from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from ..geometry.sphere import Sphere
+from ..io.convert import missing
+from ..io.vtu import polyhedra
+from ..mesh.connectivity import face_corners, take_rows
 from ..mesh.diagram import Diagram
-from ..mesh.output import MeshOutput
 from ..mesh.results import Result
-from .cells import plot_cells
-from .colors import Color, cell_norm, coloring, coloring_of, picture_of
-from .cutaway import VIEW, draw_cutaway, view_axes
-from .globe import plot_globe
+from .cells import draw_polygons, edge_widths, images_in
+from .colors import Color, Paint, paint_of, picture_of
 from .legends import add_key
-from .slices import as_normal, focus, plot_slice, plot_slices, require_space
-from .style import WIDTH, ends_of, interactive_figure, styled
+from .style import WIDTH, corners_of, frame_domain, interactive_figure, nice, styled
 
-__all__ = ["plot_cutaway", "plot_distributions", "plot_mesh", "plot_slice", "plot_slices"]
+if TYPE_CHECKING:
+    import pyvista
 
-View = Literal["slices", "slice", "cutaway"]
-
-
-def plot_mesh(mesh: Result | Diagram, color: Color | ArrayLike = "error", **options: Any) -> Any:
-    """Draw a mesh. The options are those of `Diagram.plot`."""
-    return MeshOutput.plot(mesh, color, **options)
+VIEW = (-60.0, 26.0)
+"""Azimuth and elevation of the viewer, degrees: x-max, y-min and z-max walls are in front."""
+_AXES = {"x": 0, "y": 1, "z": 2}
+_VTK_POLYHEDRON = 42
 
 
-def draw_mesh(mesh: Result | Diagram, color: Color | ArrayLike, view: Any, **options: Any) -> Any:
-    """Draw a mesh as a picture of the kind `view`; refuse options that only other kinds of pictures have.
+def plot_slice(
+    mesh: Result | Diagram,
+    color: Color | ArrayLike = "error",
+    ax: Any = None,
+    *,
+    normal: str | ArrayLike = "z",
+    through: ArrayLike | None = None,
+    label: str | None = None,
+    limits: tuple[float, float] | None = None,
+    window: tuple[ArrayLike, ArrayLike] | None = None,
+    edges: bool = True,
+    key: bool = True,
+    title: str | None = None,
+) -> Any:
+    """Draw the cross-sections of the cells of a 3D mesh in a plane.
 
-    The options are all those of `Diagram.plot`. Those with their default value are not refused.
+    Parameters
+    ----------
+    mesh : Result or Diagram
+        In a box, periodic or not.
+    color : {"error", "quality", "size", "sides", "skewness", "volume"} or (n,) array of real numbers
+        As for `plot_cells`.
+    ax : matplotlib axes, optional
+        Drawn into; a new figure by default.
+    normal : {"x", "y", "z"} or 3 floats
+        Direction at right angles to the plane.
+    through : 3 floats, optional
+        A point of the plane; by default among the smallest cells.
+    label, limits, edges, key, title
+        As for `plot_cells`.
+    window : (lower, upper), optional
+        Corners (2 floats each) of the part to show, in the picture's coordinates.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError
+        For a 2D mesh, an unknown color, or a plane outside of the domain.
+    MissingLibraryError
+        If PyVista is not installed (``pip install "clvoro[pyvista]"``).
     """
-    domain = picture_of(mesh).diagram.domain
-    flat = domain.cell_dim == 2
-    if flat and view is not None:
-        raise InputError(f"view is {view!r}, which is for meshes in 3D; leave it out")
-    if view is not None and view not in get_args(View):
-        raise InputError(f"view is {view!r}, expected one of {', '.join(get_args(View))}")
-    kind = "sphere" if isinstance(domain, Sphere) else "2D" if flat else view or "slices"
-    pictures = {
-        "2D": plot_cells,
-        "slices": plot_slices,
-        "slice": plot_slice,
-        "cutaway": plot_cutaway,
-        "sphere": plot_globe,
-    }
-    known = {name: signature(draw).parameters for name, draw in pictures.items()}
-    given = {}
-    for name, value in options.items():
-        default = signature(MeshOutput.plot).parameters[name].default
-        if value is default or (isinstance(value, str) and value == default):
-            continue
-        if name not in known[kind]:
-            fitting = ", ".join(k for k, names in known.items() if name in names)
-            raise InputError(f"{name} is for {fitting}, and this picture is {kind}; leave it out")
-        given[name] = value
-    return pictures[kind](mesh, color, **given)
+    result = picture_of(mesh)
+    diagram = result.diagram
+    require_space(diagram)
+    paint, direction, point = paint_of(result, color, label, limits), as_normal(normal), _point(result, through)
+    cells, polygons = cut_cells(diagram, direction, point)
+    if not len(cells):
+        raise InputError(f"the plane through {point.tolist()} does not intersect {diagram.domain}; give a point inside")
+    axis = int(np.argmax(np.abs(direction)))
+    aligned = bool(abs(direction[axis]) > 1 - 1e-9)
+    right, up = plane_axes(direction)
+    flat = [polygon @ np.stack([right, up], axis=1) for polygon in polygons]
+    # An oblique plane is shown as far as it cuts the box.
+    ends = np.array([diagram.domain.lower, diagram.domain.upper])
+    shown = np.stack([ends @ right, ends @ up], axis=1) if aligned else np.concatenate(flat)
+    lower, upper = (shown.min(axis=0), shown.max(axis=0)) if window is None else corners_of(window)
+    with styled():
+        if ax is None:
+            ax = interactive_figure(WIDTH, _slice_height(upper - lower)).add_subplot()
+        frame_domain(ax, lower, upper)
+        draw_polygons(ax, cells, flat, paint, edge_widths(ax, flat) if edges else np.zeros(len(flat)))
+        if aligned:
+            ax.set(xlabel="xyz"[int(np.argmax(right))], ylabel="xyz"[int(np.argmax(up))])
+        elif window is None:
+            ax.set_axis_off()
+        if title is not None or aligned:
+            ax.set_title(f"${'xyz'[axis]} = {point[axis]:.3g}$" if title is None else title)
+        if key:
+            add_key(ax, paint)
+    return ax.figure
+
+
+def plot_slices(
+    mesh: Result | Diagram,
+    color: Color | ArrayLike = "error",
+    figure: Any = None,
+    *,
+    through: ArrayLike | None = None,
+    label: str | None = None,
+    limits: tuple[float, float] | None = None,
+    title: str | None = None,
+) -> Any:
+    """Draw a 3D mesh on planes along the axes, all to one scale, with a cut-away view beside them.
+
+    For a long domain: the two planes along it.
+
+    Parameters
+    ----------
+    mesh, color, label, through, limits, title
+        As for `plot_slice`.
+    figure : matplotlib figure, optional
+        An empty one to draw into, of `slices_height`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError, MissingLibraryError
+        As for `plot_slice`.
+    """
+    result = picture_of(mesh)
+    diagram = result.diagram
+    require_space(diagram)
+    paint, point = paint_of(result, color, label, limits), _point(result, through)
+    normals, columns, widths, heights = _panels(diagram)
+    with styled():
+        if figure is None:
+            figure = interactive_figure(WIDTH, slices_height(diagram))
+        axes = figure.subplots(len(heights), columns, width_ratios=widths, height_ratios=heights, squeeze=False).ravel()
+        for ax, normal in zip(axes, normals, strict=False):
+            plot_slice(result, color, ax, normal=normal, through=point, limits=paint.limits, key=False)
+            ax.locator_params(nbins=5)
+        if len(normals) < len(axes):
+            _draw_cutaway(axes[-1], diagram, paint, "octant", point, VIEW)
+        if title is not None:
+            figure.suptitle(title, fontsize=10)
+        add_key(axes, paint, below=True)
+    return figure
 
 
 def plot_cutaway(
@@ -85,6 +179,7 @@ def plot_cutaway(
     Parameters
     ----------
     mesh : Result or Diagram
+        In a box. Where it is periodic, cells and their images end at its sides.
     color : {"error", "quality", "size", "sides", "skewness", "volume"} or (n,) array of real numbers
     ax : matplotlib axes, optional
         Two-dimensional ones to draw into; a new figure by default.
@@ -107,22 +202,21 @@ def plot_cutaway(
     ------
     InputError
         For a 2D mesh, an unknown color or cut.
+    MissingLibraryError
+        If PyVista is not installed (``pip install "clvoro[pyvista]"``).
     """
     result = picture_of(mesh)
     require_space(result.diagram)
-    scheme = coloring_of(result, color, label)
-    point = focus(result) if through is None else np.asarray(through, float)
-    what = _cut(cut, len(result.points), angles)
-    values = scheme.values(result)
-    ends = scheme.limits(values) if limits is None else ends_of(limits)
+    paint = paint_of(result, color, label, limits)
     with styled():
         if ax is None:
             ax = interactive_figure(WIDTH, cutaway_height(result, angles)).add_subplot()
-        shown = draw_cutaway(ax, result, values, scheme, ends, through=point, cut=what, view=angles, edges=edges)
+        _draw_cutaway(ax, result.diagram, paint, cut, _point(result, through), angles, edges)
+        _label_axes(ax, result.diagram, *view_axes(angles))
         if title is not None:
             ax.set_title(title)
         if key:
-            add_key(shown, ax, scheme, values, ends)
+            add_key(ax, paint)
     return ax.figure
 
 
@@ -133,8 +227,253 @@ def cutaway_height(result: Result, angles: tuple[float, float] = VIEW) -> float:
     return min(float((WIDTH - 0.9) * height / width), 1.1 * WIDTH) + 0.4
 
 
-def _cut(cut: Any, n: int, angles: tuple[float, float]) -> Any:
-    """Return `cut` as `draw_cutaway` takes it, or raise InputError."""
+def slices_height(diagram: Diagram) -> float:
+    """Height in inches that suits `plot_slices`."""
+    _, columns, widths, heights = _panels(diagram)
+    height = (WIDTH - 0.55 * columns) * sum(heights) / sum(widths)
+    return min(height, 1.6 * WIDTH) + 0.52 * len(heights) + 0.65
+
+
+def require_pyvista() -> Any:
+    """Return the module PyVista, or raise MissingLibraryError."""
+    try:
+        import pyvista
+    except ModuleNotFoundError as error:
+        raise missing("PyVista", "pyvista", "a picture of a 3D mesh") from error
+    return pyvista
+
+
+def require_space(diagram: Diagram) -> None:
+    """Raise InputError unless the diagram is three-dimensional."""
+    if diagram.domain.cell_dim != 3:
+        raise InputError("slices and cut-away views need cells in 3D, and these are in 2D; call result.plot()")
+
+
+def focus(result: Result) -> np.ndarray:
+    """Return the point that pictures of a 3D mesh show: among its smallest cells, well inside the domain."""
+    box = result.diagram.domain
+    smallest = result.points[result.target_size <= 1.1 * result.target_size.min()]
+    lower, extent = np.array(box.lower), box.extent
+    if len(smallest) > 0.5 * len(result.points):  # a uniform mesh
+        return lower + 0.5 * extent
+    # A round number for the titles; half a cell makes no difference.
+    step = nice(0.5 * float(result.target_size.min()), up=False)
+    center = np.round(smallest.mean(axis=0) / step) * step + 0.0
+    return np.clip(center, lower + 0.25 * extent, lower + 0.75 * extent)
+
+
+def as_normal(normal: str | ArrayLike) -> np.ndarray:
+    """Return a unit vector from "x", "y", "z" or three numbers, or raise InputError."""
+    if isinstance(normal, str) and normal in _AXES:
+        return np.eye(3)[_AXES[normal]]
+    try:
+        vector = np.asarray(normal, float)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
+        raise InputError(f"normal is {normal!r}, expected 'x', 'y', 'z' or three numbers not all 0")
+    return vector / np.linalg.norm(vector)
+
+
+def plane_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit vectors in the plane, to the right and up; along axes: x or y to the right, z or y up."""
+    normal = np.asarray(normal, float) / np.linalg.norm(normal)
+    if abs(normal[2]) < 1 - 1e-9:
+        up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
+        up /= np.linalg.norm(up)
+        right = np.cross(up, normal)
+        # Seen from the side with increasing coordinates to the right.
+        return (right if right[np.argmax(np.abs(right))] > 0 else -right), up
+    return np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+
+
+def view_axes(angles: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the picture's unit vectors: to the right, up, and towards the viewer."""
+    azimuth, elevation = (math.radians(angle) for angle in angles)
+    towards = np.array(
+        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+    )
+    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    return right, np.cross(towards, right), towards
+
+
+def cut_cells(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the cells (k,) that a plane cuts, and the polygons (c, 3) in which it does.
+
+    A face of the mesh that lies in the plane belongs to one of its cells. In a periodic box the images of cells that
+    reach into the box are cut, too; polygons end at its sides.
+    """
+    low, high = _bounds(diagram, (diagram.vertices - point) @ normal)
+    grid = _polyhedra(diagram, lambda rows, by: (low[rows] <= -by @ normal) & (high[rows] >= -by @ normal))
+    section = grid.slice(normal=normal, origin=point, generate_triangles=False)
+    return (section.cell_data["cell"], _polygons(section)) if section.n_cells else (np.zeros(0, int), [])
+
+
+def _bounds(diagram: Diagram, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each cell the lowest and the highest of the `values` of its vertices."""
+    starts, corners = face_corners(diagram)
+    starts, corners = np.minimum(starts[diagram.neighbor_starts[:-1]], len(corners) - 1), values[corners]
+    return np.minimum.reduceat(corners, starts, axis=0), np.maximum.reduceat(corners, starts, axis=0)
+
+
+def _polyhedra(diagram: Diagram, chosen: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> pyvista.UnstructuredGrid:
+    """Return cells as polyhedra. Where the box is periodic they end at its sides, and their images fill it.
+
+    They are those for which `chosen` is true, given the rows (k,) and the offset (3,) of an image. The cell data "cell"
+    are their rows, "generator" the positions of their generators or of images of these.
+    """
+    pyvista, domain = require_pyvista(), diagram.domain
+    described = polyhedra(diagram)
+    streams = np.concatenate([[0], described["faceoffsets"]])
+    box = np.array([domain.lower, domain.upper])
+    parts = []
+    for rows, by in images_in(domain, *_bounds(diagram, diagram.vertices), box):
+        rows = rows[chosen(rows, by)]
+        if not len(rows):
+            continue
+        starts, items = take_rows(streams, described["faces"], rows)
+        cells = np.insert(items.astype(np.int64), starts[:-1], np.diff(starts))
+        grid = pyvista.UnstructuredGrid(cells, np.full(len(rows), _VTK_POLYHEDRON, np.uint8), diagram.vertices + by)
+        grid.cell_data.update({"cell": rows, "generator": diagram.points[rows] + by})
+        parts.append(grid)
+    if not any(domain.periodic) or not parts:
+        return parts[0] if parts else pyvista.UnstructuredGrid()
+    return pyvista.merge(parts, merge_points=False).clip_box(box.T.ravel(), invert=False)
+
+
+def _polygons(surface: pyvista.PolyData) -> list[np.ndarray]:
+    """Return the corners (c, 3) of each polygon of a surface, counter-clockwise as seen from outside."""
+    pyvista, polygons = require_pyvista(), surface.GetPolys()
+    starts, corners = map(pyvista.convert_array, (polygons.GetOffsetsArray(), polygons.GetConnectivityArray()))
+    return np.split(np.asarray(surface.points)[corners], starts[1:-1])
+
+
+def kept_cells(cut: Any, through: np.ndarray, towards: np.ndarray, rows: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return which of the cells `rows` (k,), with generators at `places` (k, 3), stay, (k,) bool.
+
+    `cut` is "octant", a vector, None, or marks of the cells.
+    """
+    if cut is None:
+        return np.ones(len(rows), bool)
+    if isinstance(cut, str):  # remove the corner between the point and the viewer
+        return ~np.all((places - through) * np.where(towards >= 0, 1, -1) > 0, axis=1)
+    return cut[rows] if cut.dtype == bool else (places - through) @ cut <= 0
+
+
+def visible_faces(
+    diagram: Diagram, cut: Any, through: np.ndarray, towards: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+    """Return the faces of the kept cells that face the viewer, the farthest first.
+
+    Returns
+    -------
+    cells : (f,) int
+        The cell of each face.
+    polygons : list of (c, 3) float
+    normals : (f, 3) float
+    """
+    domain, neighbor = diagram.domain, np.maximum(diagram.neighbors, 0)
+    low, high = _bounds(diagram, diagram.vertices)
+
+    def bare(rows: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """Return which cells stay and have a face that is seen, or a part beyond a side of the box."""
+        stays = kept_cells(cut, through, towards, rows, diagram.points[rows] + by)
+        images = diagram.points[neighbor] + diagram.shifts * domain.extent + by
+        open_ = (diagram.neighbors < 0) | ~kept_cells(cut, through, towards, neighbor, images)
+        open_ = np.logical_or.reduceat(open_, diagram.neighbor_starts[:-1])[rows]
+        return stays & (
+            open_ | (low[rows] + by < domain.lower).any(axis=1) | (high[rows] + by > domain.upper).any(axis=1)
+        )
+
+    surface = _polyhedra(diagram, bare).extract_surface(algorithm="geometry")
+    if not surface.n_cells:
+        return np.zeros(0, int), [], np.zeros((0, 3))
+    polygons = _polygons(surface)
+    normals = np.array([np.cross(p - p[0], np.roll(p, -1, axis=0) - p[0]).sum(axis=0) for p in polygons])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    facing = np.flatnonzero(normals @ towards > 1e-9)
+    order = facing[np.argsort((surface.cell_data["generator"] @ towards)[facing], kind="stable")]
+    return surface.cell_data["cell"][order], [polygons[k] for k in order], normals[order]
+
+
+def _draw_cutaway(
+    ax: Any, diagram: Diagram, paint: Paint, cut: Any, through: np.ndarray, angles: Any, edges: bool = True
+) -> None:
+    """Add the view to `ax`: the faces of the kept cells that are seen, and the edges of the box."""
+    right, up, towards = view_axes(angles)
+    screen = np.stack([right, up], axis=1)
+    cells, polygons, normals = visible_faces(diagram, _cut(cut, len(diagram), towards), through, towards)
+    flat = [polygon @ screen for polygon in polygons]
+    corners = np.stack(np.meshgrid(*np.transpose([diagram.domain.lower, diagram.domain.upper])), axis=-1).reshape(-1, 3)
+    pairs = [(a, b) for i, a in enumerate(corners) for b in corners[i + 1 :] if np.count_nonzero(a != b) == 1]
+    frame = np.array(pairs) @ screen
+    lower, upper = frame.min(axis=(0, 1)), frame.max(axis=(0, 1))
+    margin = 0.02 * (upper - lower).max()
+    frame_domain(ax, lower - margin, upper + margin)
+    ax.set_axis_off()
+    ax.add_collection(LineCollection(list(frame), colors="#B0B0B0", linewidths=0.6, zorder=0))
+    # The light comes from above, a little from the left.
+    light = 0.5 * towards + 0.62 * up - 0.3 * right
+    shade = 0.72 + 0.28 * np.clip(normals @ light / np.linalg.norm(light), 0, 1)
+    draw_polygons(ax, cells, flat, paint, edge_widths(ax, flat) if edges else np.zeros(len(flat)), light=shade)
+
+
+def _label_axes(ax: Any, diagram: Diagram, right: np.ndarray, up: np.ndarray, towards: np.ndarray) -> None:
+    """Write the name and range of each axis beside an edge on the outline of the picture."""
+    box = np.array([diagram.domain.lower, diagram.domain.upper])
+    center, screen = box.mean(axis=0), np.stack([right, up], axis=1)
+    front = (towards > 0).astype(int)
+    for axis, name in enumerate("xyz"):
+        # An edge of the outline lies between a visible and a hidden wall. Take the lowest, for z the leftmost.
+        places = []
+        for flip in {0, 1, 2} - {axis}:
+            sides = np.where(np.arange(3) == flip, 1 - front, front)
+            places.append(np.where(np.arange(3) == axis, center, box[sides, np.arange(3)]) @ screen)
+        place = min(places, key=lambda flat: flat[0 if axis == 2 else 1])
+        edge = screen[axis] / np.linalg.norm(screen[axis])
+        outwards = np.array([-edge[1], edge[0]])
+        outwards *= np.sign(outwards @ (place - center @ screen)) or 1
+        ax.annotate(
+            f"${name}$ from {box[0, axis]:g} to {box[1, axis]:g}".replace("-", "−"),
+            place,
+            rotation=90 - (90 - math.degrees(math.atan2(edge[1], edge[0]))) % 180,  # in (-90, 90]
+            rotation_mode="default",
+            ha="center",
+            va="center",
+            xytext=tuple(16 * outwards),
+            textcoords="offset points",
+            fontsize=8,
+            color="#333333",
+            annotation_clip=False,
+        )
+
+
+def _panels(diagram: Diagram) -> tuple[list[str], int, list[float], list[float]]:
+    """Return the normals of the planes, the number of columns, and the widths and heights of the panels."""
+    x, y, z = (float(e) for e in diagram.domain.extent)
+    if max(x, y, z) <= 2.5 * min(x, y, z):
+        return ["y", "x", "z"], 2, [x, y], [z, y]
+    longest = int(np.argmax([x, y, z]))
+    if longest == 0:
+        return ["y", "z"], 1, [x], [z, y]
+    return (["x", "z"], 2, [y, x], [max(z, y)]) if longest == 1 else (["y", "x"], 2, [x, y], [z])
+
+
+def _slice_height(extent: np.ndarray) -> float:
+    """Height in inches of a picture of one plane."""
+    return min((WIDTH - 1.3) * float(extent[1] / extent[0]), 1.2 * WIDTH) + 0.6
+
+
+def _point(result: Result, through: ArrayLike | None) -> np.ndarray:
+    """Return the point that a picture is about, or raise InputError."""
+    point = focus(result) if through is None else np.asarray(through, float)
+    if point.shape != (3,):
+        raise InputError(f"through has shape {point.shape}, expected 3 coordinates")
+    return point
+
+
+def _cut(cut: Any, n: int, towards: np.ndarray) -> Any:
+    """Return `cut` as `kept_cells` takes it, or raise InputError."""
     if cut is None or (isinstance(cut, str) and cut == "octant"):
         return cut
     if not isinstance(cut, str):
@@ -143,75 +482,10 @@ def _cut(cut: Any, n: int, angles: tuple[float, float]) -> Any:
             if marks.shape != (n,):
                 raise InputError(f"cut has shape {marks.shape}, expected one mark per cell ({n},)")
             return marks
-    elif cut in "xyz" and len(cut) == 1:
-        normal = as_normal(cut)
-        return normal if view_axes(angles)[2] @ normal >= 0 else -normal
     try:
-        return as_normal(cut)
+        normal = as_normal(cut)
     except InputError as error:
         raise InputError(
             f"cut is {cut!r}, expected 'octant', 'x', 'y', 'z', three numbers, a mark per cell or None"
         ) from error
-
-
-def plot_distributions(result: Result, figure: Any = None) -> Any:
-    """Draw histograms of error, quality and number of faces of the cells, and of the skewness of faces.
-
-    Bars have the colors of the cells in the other pictures.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
-    with styled():
-        figure = interactive_figure(WIDTH, 4.2) if figure is None else figure
-        panels = figure.subplots(2, 2).ravel()
-        if figure.get_layout_engine() is not None:  # space between titles and the numbers above
-            figure.get_layout_engine().set(hspace=0.08)
-        for ax, name in zip(panels, ("error", "quality", "sides", "skewness"), strict=True):
-            scheme = coloring(name, result.diagram.domain)
-            if name == "sides":
-                values = np.diff(result.diagram.neighbor_starts)
-                edges = np.arange(values.min(), values.max() + 2) - 0.5
-                ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-            else:
-                values = result.measures.skewness if name == "skewness" else scheme.values(result)
-                values = values[np.isfinite(values)]
-                edges = np.linspace(*_range(values, name), 41)
-            counts, _ = np.histogram(values, edges)
-            middles = 0.5 * (edges[1:] + edges[:-1])
-            limits = scheme.limits(scheme.values(result))
-            color_map = scheme.color_map
-            if not isinstance(color_map, Colormap):
-                color_map = colormaps[color_map]
-            norm = cell_norm(scheme, limits)
-            shown = np.clip(middles, limits[0] + 0.5, limits[1] - 0.5) if scheme.classes else middles
-            ax.bar(
-                middles,
-                100 * counts / max(len(values), 1),
-                np.diff(edges),
-                color=color_map(np.clip(norm(shown), 0, 1) if not scheme.classes else norm(shown)),
-                edgecolor="#444444",
-                linewidth=0.3,
-            )
-            label = "skewness of the faces [–]" if name == "skewness" else scheme.label
-            ax.set_xlabel(label.split("   ")[0])
-            ax.set_ylabel("faces [%]" if name == "skewness" else "cells [%]")
-            ax.set_xlim(edges[0], edges[-1])
-            mean = float(values.mean())
-            ax.axvline(mean, color="#1A1A1A", lw=0.9, ls=(0, (4, 2)))
-            title = f"mean {mean:.3g}, from {values.min():.3g} to {values.max():.3g}"
-            ax.set_title(title.replace("-", "−"))
-    return figure
-
-
-def _range(values: np.ndarray, name: str) -> tuple[float, float]:
-    """Return the range of a histogram: 99.8 % of the values, with zero where it is meaningful."""
-    low, high = (float(q) for q in np.quantile(values, (0.001, 0.999)))
-    if name == "skewness":
-        low = 0.0
-    if name == "error":
-        low, high = -max(-low, high), max(-low, high)
-    if not high > low:
-        low, high = low - 0.5, high + 0.5
-    return low, high
+    return -normal if isinstance(cut, str) and normal @ towards < 0 else normal

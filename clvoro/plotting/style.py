@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -49,8 +52,23 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+_detached: ContextVar[bool] = ContextVar("_detached", default=False)
+
+
+@contextmanager
+def detached() -> Iterator[None]:
+    """Make figures that `matplotlib.pyplot` does not know, so that they need not be closed."""
+    token = _detached.set(True)
+    try:
+        yield
+    finally:
+        _detached.reset(token)
+
+
 def interactive_figure(width: float, height: float) -> Figure:
-    """Return an empty figure that `matplotlib.pyplot.show` shows."""
+    """Return an empty figure that `matplotlib.pyplot.show` shows, except within `detached`."""
+    if _detached.get():
+        return new_figure(width, height)
     from matplotlib import pyplot
 
     return pyplot.figure(figsize=(width, height), layout="constrained")
