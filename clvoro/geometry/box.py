@@ -144,7 +144,7 @@ class Box(Domain):
         """Return the signed distances (n, 2 d) of `points` to the planes of all sides, inf for periodic ones."""
         gaps = np.stack([np.subtract(points, self.lower), np.subtract(self.upper, points)], axis=2)
         gaps[:, np.array(self.periodic)] = np.inf
-        return gaps.reshape(len(points), -1)
+        return gaps.reshape(len(points), 2 * self.dim)
 
     def closest_walls(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, d) the side whose plane is the closest one, (n,) int."""

@@ -126,14 +126,14 @@ def draw_cells(
     drawn over it. `bridged` (n,) marks outlines that connect several loops.
     """
     widths = edge_widths(ax, polygons) if edges else np.zeros(len(polygons))
+    bridged = np.zeros(len(cells), bool) if bridged is None else bridged
     image: Any = None
     if len(cells) > pixels.MOST_POLYGONS:
         image = pixels.add_image(ax, diagram, paint, positions)
-        shown = np.flatnonzero(widths > _LEAST)
-        cells, polygons, widths = cells[shown], [polygons[k] for k in shown.tolist()], widths[shown]
-        bridged = None if bridged is None else bridged[shown]
+        shown = np.flatnonzero(widths > _LEAST).tolist()
+        cells, polygons, widths, bridged = cells[shown], [polygons[k] for k in shown], widths[shown], bridged[shown]
     drawn = draw_polygons(ax, cells, polygons, paint, widths, bridged)
-    if edges and bridged is not None and bridged.any():
+    if edges and bridged.any():
         # A bridge between two loops is no face.
         lines = face_ends(diagram)[np.isin(face_owners(diagram), cells[bridged])]
         ax.add_collection(LineCollection(list(diagram.vertices[lines]), colors=[_INK], linewidths=0.4), autolim=False)

@@ -108,7 +108,7 @@ def plot_globe(
         if ax.projection.proj4_params["proj"] == "ortho":
             angle = np.linspace(0, 2 * np.pi, 721)
             ax.set_boundary(Path(ax.projection.x_limits[1] * np.column_stack([np.cos(angle), np.sin(angle)])))
-        cells, polygons = _polygons(diagram, ax.projection, source)
+        cells, polygons = project_cells(diagram, ax.projection, source)
         polygons, cells = _shown(ax, polygons, cells)
 
         def positions(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -245,7 +245,7 @@ def outlines(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([[0], ends])[starts], points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
-def _polygons(diagram: Diagram, projection: CartopyProjection, source: Any) -> tuple[np.ndarray, list[np.ndarray]]:
+def project_cells(diagram: Diagram, projection: CartopyProjection, source: Any) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return rows of cells (k,) and their polygons on the map, (c, 2) each; cells out of sight are left out.
 
     Points are projected all at once. Only cells that the edge of a map cuts go through Cartopy one by one.
@@ -264,7 +264,7 @@ def _polygons(diagram: Diagram, projection: CartopyProjection, source: Any) -> t
         behind = points[~seen]
         xy = np.column_stack([behind @ right, behind @ up])
         length = np.maximum(np.linalg.norm(xy, axis=1), 1e-9)
-        flat[~seen] = _RADIUS * xy * ((1 - behind @ towards) / length)[:, None]
+        flat[~seen] = _RADIUS * xy * ((1 - (behind @ towards) ** 3) / length)[:, None]
         seen = np.ones(len(points), bool)
     first, counts = starts[:-1], np.diff(starts)
     whole = np.logical_and.reduceat(seen, first)

@@ -336,9 +336,10 @@ def _polyhedra(diagram: Diagram, chosen: Callable[[np.ndarray, np.ndarray], np.n
         grid = pyvista.UnstructuredGrid(cells, np.full(len(rows), _VTK_POLYHEDRON, np.uint8), diagram.vertices + by)
         grid.cell_data.update({"cell": rows, "generator": diagram.points[rows] + by})
         parts.append(grid)
-    if not any(domain.periodic) or not parts:
-        return parts[0] if parts else pyvista.UnstructuredGrid()
-    return pyvista.merge(parts, merge_points=False).clip_box(box.T.ravel(), invert=False)
+    whole = pyvista.merge(parts, merge_points=False) if len(parts) > 1 else (*parts, pyvista.UnstructuredGrid())[0]
+    for axis in np.flatnonzero(domain.periodic):
+        whole = whole.clip("xyz"[axis], origin=box[0], invert=False).clip("xyz"[axis], origin=box[1])
+    return whole
 
 
 def _polygons(surface: pyvista.PolyData) -> list[np.ndarray]:

@@ -82,17 +82,19 @@ def test_views(diagram):
         seen = colored(figure).get_array()
         assert len(seen) < 30
         assert colored(figure).get_clim() == (seen.min(), seen.max())
-        with pytest.raises(InputError, match="view is 'slice', which is for meshes in 3D"):
+        with pytest.raises(InputError, match="view is 'slice', expected one of cells for this mesh"):
             diagram.plot(view="slice")
-        with pytest.raises(InputError, match="cut is for cutaway, and this picture is 2D"):
+        with pytest.raises(InputError, match="cut is an option of the view cutaway; the view cells has ax, label"):
             diagram.plot(cut=None)
     else:
         assert diagram.plot(view="slice", normal="x").axes[0].get_xlabel() == "y"
         diagram.plot(view="cutaway", cut=POINTS[:, 0] < 0.5, angles=(30, 30))
-        with pytest.raises(InputError, match="ax is for 2D, slice, cutaway, sphere, and this picture"):
+        with pytest.raises(InputError, match="ax is an option of the view cells and globe and slice and cutaway"):
             diagram.plot(ax="any")
         with pytest.raises(InputError, match="view is 'all', expected one of slices, slice"):
             diagram.plot(view="all")
+        with pytest.raises(InputError, match="colour is no option; the view slices has figure, through"):
+            diagram.plot(colour="size")
 
 
 @pytest.mark.parametrize(

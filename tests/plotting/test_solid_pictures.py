@@ -1,19 +1,20 @@
 """Pictures of 3D meshes show the cells that a plane cuts, or that a viewer sees."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
 import shapely
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import PolyCollection
 from matplotlib.path import Path
 from scipy.spatial import cKDTree
 
 from clvoro import Adapter, Box
-from clvoro.errors import InputError
-from clvoro.mesh.connectivity import face_corners, face_owners, following
+from clvoro.errors import ClvoroError, InputError, MissingPicturesWarning
 from clvoro.plotting import (
     page,
+    pictures,
     plot_cells,
     plot_cutaway,
     plot_displacements,
@@ -23,10 +24,7 @@ from clvoro.plotting import (
     plot_slices,
     write_report,
 )
-from clvoro.plotting.cutaway import VIEW, kept_cells, view_axes, visible_faces
-from clvoro.plotting.pictures import pictures_of
-from clvoro.plotting.section import cut_cells, plane_axes
-from clvoro.plotting.slices import focus
+from clvoro.plotting.solids import VIEW, cut_cells, focus, kept_cells, plane_axes, view_axes, visible_faces
 from tests.reference import solids
 
 LOWER, UPPER = (-1.0, 0.0, 2.0), (1.0, 1.0, 3.5)
@@ -43,10 +41,10 @@ def has_color_bar(figure):
     return len(ax.child_axes) == 1  # beside the picture, as high
 
 
-def polygon_areas(section, normal):
-    corners, nexts = section.corners, section.corners[following(section.starts)]
-    doubled = np.cross(corners, nexts) @ (normal / np.linalg.norm(normal))
-    return 0.5 * np.add.reduceat(doubled, section.starts[:-1])
+def flattened(polygons, normal):
+    """Polygons of a plane in the picture's coordinates, by shapely."""
+    axes = np.stack(plane_axes(np.array(normal, float)), axis=1)
+    return [shapely.Polygon(polygon @ axes) for polygon in polygons]
 
 
 @pytest.mark.sparse(2)
@@ -54,24 +52,19 @@ def polygon_areas(section, normal):
 def test_section_is_that_of_the_cells(result, normal):
     """A point of the plane is in the polygon of the cell whose generator is nearest."""
     d = result.diagram
-    normal, point = np.array(normal, float), np.array([0.1, 0.45, 2.9])
-    section = cut_cells(d, normal, point)
+    normal, point = np.array(normal, float) / np.linalg.norm(normal), np.array([0.1, 0.45, 2.9])
+    cells, polygons = cut_cells(d, normal, point)
     right, up = plane_axes(normal)
-    for axis in (right, up):
-        assert axis @ normal == pytest.approx(0, abs=1e-14)
     rng = np.random.default_rng(5)
     places = point + rng.uniform(-1.5, 1.5, (900, 1)) * right + rng.uniform(-1.5, 1.5, (900, 1)) * up
     places = places[d.domain.contains(places)]
     assert len(places) > 100
     nearest = cKDTree(d.points).query(places)[1]
-    paths = {}
-    for k, cell in enumerate(section.cells):
-        corners = section.corners[section.starts[k] : section.starts[k + 1]]
-        paths[cell] = Path(np.stack([corners @ right, corners @ up], axis=1))
-    flat = np.stack([places @ right, places @ up], axis=1)
-    found = np.array([[cell for cell, p in paths.items() if p.contains_point(x)] for x in flat])
-    assert np.array_equal(found[:, 0], nearest)
-    assert (polygon_areas(section, normal) > 0).all()
+    flat = flattened(polygons, normal)
+    tree = shapely.STRtree(flat)
+    which, found = tree.query(shapely.points(places @ np.stack([right, up], axis=1)), "within")
+    assert np.array_equal(which, np.arange(len(places)))
+    assert np.array_equal(cells[found], nearest)
 
 
 def test_section_covers_the_plane_once_even_along_faces():
@@ -79,11 +72,11 @@ def test_section_covers_the_plane_once_even_along_faces():
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     d = solids.solid_diagram((0, 0, 0), (3, 4, 2), points)
     for height in (0.5, 1.0, 1.0 + 1e-15, 2.0):
-        section = cut_cells(d, (0, 0, 1), (0, 0, height))
-        assert len(section.cells) == 12
-        assert polygon_areas(section, np.array([0, 0, 1.0])) == pytest.approx(1)
-        assert (points[section.cells, 2] < height + 1e-9).all()
-    assert len(cut_cells(d, (0, 0, 1), (0, 0, 2.5)).cells) == 0
+        _, polygons = cut_cells(d, np.array([0, 0, 1.0]), np.array([0, 0, height]))
+        flat = flattened(polygons, (0, 0, 1))
+        assert [p.area for p in flat] == pytest.approx(12 * [1])
+        assert shapely.union_all(flat).area == pytest.approx(12)
+    assert len(cut_cells(d, np.array([0, 0, 1.0]), np.array([0, 0, 2.5]))[0]) == 0
 
 
 @pytest.mark.sparse(2)
@@ -92,7 +85,7 @@ def test_slice_is_drawn_with_its_values(result, color):
     figure = plot_slice(result, color, normal="y", through=(0, 0.3, 3))
     ax = figure.axes[0]
     (cells,) = (c for c in ax.collections if isinstance(c, PolyCollection))
-    section = cut_cells(result.diagram, (0, 1, 0), (0, 0.3, 3))
+    rows, polygons = cut_cells(result.diagram, np.array([0, 1.0, 0]), np.array([0, 0.3, 3]))
     values = {
         "error": result.size_error,
         "quality": result.quality,
@@ -100,65 +93,53 @@ def test_slice_is_drawn_with_its_values(result, color):
         "sides": np.clip(np.diff(result.diagram.neighbor_starts), 12, 16),
         "skewness": result.measures.worst_of_cell("skewness"),
     }[color]
-    np.testing.assert_array_equal(cells.get_array(), values[section.cells])
-    for path, a, b in zip(cells.get_paths(), section.starts[:-1], section.starts[1:], strict=True):
-        np.testing.assert_array_equal(path.vertices[:-1], section.corners[a:b][:, [0, 2]])
+    np.testing.assert_array_equal(cells.get_array(), values[rows])
+    for path, polygon in zip(cells.get_paths(), polygons, strict=True):
+        np.testing.assert_array_equal(path.vertices[:-1], polygon[:, [0, 2]])
     assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_title()) == ("x", "z", "$y = 0.3$")
     assert ax.get_xlim() == pytest.approx((-1, 1))
     assert ax.get_ylim() == pytest.approx((2, 3.5))
     assert ax.get_aspect() == 1
 
 
-def test_every_side_of_a_slice_is_drawn_once(result):
-    ax = plot_slice(result, normal="z", through=(0, 0, 2.7)).axes[0]
-    (lines,) = (c for c in ax.collections if isinstance(c, LineCollection))
-    drawn = sum(np.hypot(*(b - a)) for a, b in lines.get_segments())
-    section = cut_cells(result.diagram, (0, 0, 1), (0, 0, 2.7))
-    lengths = np.linalg.norm(section.edges[:, 1] - section.edges[:, 0], axis=1)
-    walls = result.diagram.neighbors[section.rows] < 0
-    # Edges of cells that are too small to be seen are left out. These cells are all large enough.
-    assert drawn == pytest.approx(lengths[walls].sum() + lengths[~walls].sum() / 2)
-    assert lengths[walls].sum() == pytest.approx(6)
-
-
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("cut", ["octant", (0.0, -1.0, 0.0), None])
-def test_what_is_drawn_last_is_what_the_viewer_sees(result, cut):
-    """The first kept cell on a line of sight is that of the last polygon drawn there."""
+@pytest.mark.parametrize("periodic", [False, True])
+def test_what_is_drawn_last_is_what_the_viewer_sees(ctx, result, cut, periodic):
+    """The first kept cell, or image of one, on a line of sight is that of the last polygon drawn there."""
     d = result.diagram
+    if periodic:
+        d = Adapter(ctx).diagram(Box(LOWER, UPPER, periodic=(True, True, False)), d.points)
     right, up, towards = view_axes(VIEW)
-    through = np.array([0.1, 0.5, 2.7])
-    kept = kept_cells(d, cut if cut is None or isinstance(cut, str) else np.array(cut), through, towards)
-    assert kept.all() == (cut is None)
-    rows, normals = visible_faces(d, kept, towards)
+    screen = np.stack([right, up], axis=1)
+    through, what = np.array([0.1, 0.5, 2.7]), cut if cut is None or isinstance(cut, str) else np.array(cut)
+    cells, polygons, normals = visible_faces(d, what, through, towards)
     assert (normals @ towards > 0).all()
-    starts, corners = face_corners(d)
-    owner = face_owners(d)
-    paths = []
-    for row in rows:
-        loop = d.vertices[corners[starts[row] : starts[row + 1]]]
-        paths.append(Path(np.stack([loop @ right, loop @ up], axis=1)))
-    rng = np.random.default_rng(31)
-    tree = cKDTree(d.points)
-    steps = np.linspace(4, -4, 8001)
+    for polygon, normal in zip(polygons, normals, strict=True):
+        assert np.abs((polygon - polygon[0]) @ normal).max() < 1e-7
+    steps = np.array([(i, j, 0) for i in (0, -1, 1) for j in (0, -1, 1)]) if periodic else np.zeros((1, 3))
+    images = (d.points + (steps * d.domain.extent)[:, None]).reshape(-1, 3)
+    rows = np.tile(np.arange(len(d)), len(steps))
+    kept = kept_cells(what, through, towards, rows, images)
+    tree = cKDTree(images)
+    paths = [Path(polygon @ screen) for polygon in polygons]
+    rng, along = np.random.default_rng(31), np.linspace(4, -4, 8001)
     seen = wrong = 0
-    for anchor in rng.uniform(LOWER, UPPER, (60, 3)):
-        ray = anchor + steps[:, None] * towards
-        ray = ray[d.domain.contains(ray)]
-        nearest = tree.query(ray)[1]
-        first = nearest[kept[nearest]][:1]
-        place = (anchor @ right, anchor @ up)
-        drawn = [owner[row] for row, path in zip(rows, paths, strict=True) if path.contains_point(place)]
+    for anchor in rng.uniform(LOWER, UPPER, (40, 3)):
+        ray = anchor + along[:, None] * towards
+        nearest = tree.query(ray[((ray >= LOWER) & (ray <= UPPER)).all(axis=1)])[1]
+        first = rows[nearest[kept[nearest]][:1]]
+        drawn = [cell for cell, path in zip(cells, paths, strict=True) if path.contains_point(anchor @ screen)]
         seen += len(first)
         wrong += len(first) != bool(drawn) or (len(first) and first[0] != drawn[-1])
-    assert seen > 40
+    assert seen > 25
     # A ray may pass a corner of a cell between two of its steps.
     assert wrong <= 1
 
 
 def test_octant_that_is_cut_out_faces_the_viewer(result):
     towards = view_axes(VIEW)[2]
-    kept = kept_cells(result.diagram, "octant", np.array([0.0, 0.5, 2.75]), towards)
+    kept = kept_cells("octant", np.array([0.0, 0.5, 2.75]), towards, np.arange(150), result.points)
     gone = result.points[~kept]
     assert len(gone) > 5
     assert ((gone - [0.0, 0.5, 2.75]) * [1, -1, 1] > 0).all()
@@ -201,9 +182,9 @@ def test_result_plots_itself(result):
     assert has_color_bar(result.plot("size", view="cutaway", cut="y"))
     with pytest.raises(InputError, match="view is 'front'"):
         result.plot(view="front")
-    with pytest.raises(InputError, match=r"plot_slice.*ParaView"):
+    with pytest.raises(InputError, match="ParaView"):
         plot_cells(result)
-    with pytest.raises(InputError, match="this mesh is in 3D"):
+    with pytest.raises(InputError, match="is in 3D"):
         plot_displacements(result)
     with pytest.raises(InputError, match="is in 3D"):
         plot_size(lambda x: x[:, 0], result.diagram.domain)
@@ -267,11 +248,12 @@ def test_report_of_a_solid(result, tmp_path, monkeypatch):
 
 
 def test_closer_look_at_a_large_mesh(result, monkeypatch):
-    monkeypatch.setattr("clvoro.plotting.pictures.MANY_SOLID_CELLS", 100)
+    monkeypatch.setitem(pictures.MANY_CELLS, "slices", 100)
     sharp = dataclasses.replace(result, target_size=np.where(np.arange(150) == 7, 0.005, 0.2))
-    (draw,) = (d for name, _, d in pictures_of({"coupled": sharp}) if name == "closer")
-    ax = draw().axes[0]
-    assert np.ptp(ax.get_xlim()) == pytest.approx(60 * 0.005)
+    (draw,) = (d for name, _, d in pictures.pictures_of({"coupled": sharp}) if name == "closer")
+    wide, close = draw().axes[:2]
+    assert np.ptp(wide.get_xlim()) == pytest.approx(160 * 0.005)
+    assert np.ptp(close.get_xlim()) == pytest.approx(40 * 0.005)
 
 
 @pytest.mark.slow
@@ -289,46 +271,39 @@ def periodic(ctx):
     return solids.solid_result(Adapter(ctx).diagram(box, points))
 
 
-def clipped_area(section, lower, upper, right, up):
-    """Area of the polygons inside of the box, by shapely."""
-    window = shapely.box(lower @ right, lower @ up, upper @ right, upper @ up)
-    flat = np.stack([section.corners @ right, section.corners @ up], axis=1)
-    polygons = [shapely.Polygon(p) for p in np.split(flat, section.starts[1:-1])]
-    return sum(p.intersection(window).area for p in polygons), shapely.union_all(polygons), window
-
-
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, 1, 0)])
-def test_section_of_a_periodic_box_covers_its_whole_width(periodic, normal):
-    d = periodic.diagram
-    lower, upper = np.array(d.domain.lower), np.array(d.domain.upper)
-    section = cut_cells(d, np.array(normal), lower + 0.1 * d.domain.extent)
-    area, union, window = clipped_area(section, lower, upper, *plane_axes(np.array(normal)))
-    assert union.buffer(1e-9).covers(window)
-    assert area == pytest.approx(window.area, rel=1e-9)  # and covers it once
+def test_section_of_a_periodic_box_covers_it_once(periodic, normal):
+    d, normal = periodic.diagram, np.array(normal, float)
+    lower, upper = np.array([d.domain.lower, d.domain.upper])
+    flat = flattened(cut_cells(d, normal, lower + 0.1 * d.domain.extent)[1], normal)
+    axes = np.stack(plane_axes(normal), axis=1)
+    window = shapely.box(*(lower @ axes), *(upper @ axes))
+    assert sum(p.area for p in flat) == pytest.approx(window.area, rel=1e-9)
+    assert shapely.union_all(flat).symmetric_difference(window).area < 1e-7
 
 
-def test_cutaway_of_a_periodic_box_is_closed(periodic):
-    """Faces at seams are drawn: the visible faces project to the silhouette of all cells."""
+def test_cutaway_of_a_periodic_box_has_its_flat_sides(periodic):
     d = periodic.diagram
     right, up, towards = view_axes(VIEW)
-    rows, normals = visible_faces(d, np.ones(len(d), bool), towards)
-    assert d.shifts[rows].any(axis=1).any()
-    starts, corners = face_corners(d)
-    faces = [d.vertices[corners[starts[r] : starts[r + 1]]] for r in range(len(starts) - 1)]
-    flat = [shapely.Polygon(np.stack([f @ right, f @ up], axis=1)).buffer(0) for f in faces if len(f)]
-    seen = [shapely.Polygon(np.stack([f @ right, f @ up], axis=1)).buffer(0) for f in (faces[r] for r in rows)]
-    assert shapely.union_all(seen).area == pytest.approx(shapely.union_all(flat).area, rel=1e-9)
-    for row, normal in zip(rows, normals, strict=True):
-        corners = faces[row] - faces[row][0]
-        assert np.abs(corners @ normal).max() < 1e-7
+    screen = np.stack([right, up], axis=1)
+    areas = []
+    for cut in (None, "octant"):
+        _, polygons, _ = visible_faces(d, cut, np.array([0.0, 0.5, 2.75]), towards)
+        corners = np.concatenate(polygons)
+        assert ((corners > np.subtract(LOWER, 1e-7)) & (corners < np.add(UPPER, 1e-7))).all()
+        on_sides = [p @ screen for p in polygons if (np.ptp(p, axis=0) < 1e-7).any()]
+        areas.append(shapely.union_all([shapely.Polygon(p) for p in on_sides]).area)
+    assert areas[0] == pytest.approx(np.abs(towards) @ (np.prod(d.domain.extent) / d.domain.extent), rel=1e-6)
+    assert 0.5 * areas[0] < areas[1] < 0.9 * areas[0]
 
 
-def test_cutaway_of_a_periodic_box_is_not_cropped(periodic):
-    (ax, *_) = plot_cutaway(periodic, "quality").axes
-    drawn = np.concatenate([path.vertices for path in ax.collections[1].get_paths()])
-    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    assert left < drawn[:, 0].min()
-    assert drawn[:, 0].max() < right
-    assert bottom < drawn[:, 1].min()
-    assert drawn[:, 1].max() < top
+def test_without_pyvista(result, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    for view in ("slices", "slice", "cutaway"):
+        with pytest.raises(ClvoroError, match=r"needs PyVista.*pip install 'clvoro\[pyvista\]'"):
+            result.plot(view=view)
+    with pytest.warns(MissingPicturesWarning, match=r"no pictures of the mesh.*clvoro\[pyvista\]"):
+        files = write_report(result, tmp_path, dpi=30)
+    assert {f.stem for f in files} == {"report", "history", "distributions"}
+    assert "pip install &#x27;clvoro[pyvista]&#x27;" in files[0].read_text(encoding="utf-8")

@@ -4,17 +4,20 @@ import sys
 
 import numpy as np
 import pytest
+import shapely
+from cartopy import crs
+from cartopy.mpl.geoaxes import GeoAxes
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
-from scipy.spatial import SphericalVoronoi
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
 
 import clvoro
-from clvoro.errors import InputError
-from clvoro.mesh.diagram import Diagram
-from clvoro.plotting import coasts, pixels, plot_cells, plot_globe, plot_slice
-from clvoro.plotting.globe import default_center
+from clvoro.errors import ClvoroError, InputError, MissingPicturesWarning
+from clvoro.plotting import globe, map_projection, pixels, plot_cells, plot_globe, plot_slice, write_report
+from clvoro.plotting.colors import kilometer_of
+from clvoro.plotting.globe import default_center, outlines, project_cells
 from clvoro.plotting.pictures import pictures_of
-from clvoro.plotting.projections import Orthographic, Plate, outlines, unit_vectors
 from tests.reference.netcdf_files import result_of
 
 SPHERE = clvoro.Sphere(2.0)
@@ -52,152 +55,42 @@ def mesh(adapter):
     return adapter.run(SPHERE, size, effort="fast")
 
 
-@pytest.fixture(scope="module")
-def cube():
-    """Six cells of 109 degrees across, corners included, as SciPy finds them."""
-    points = np.concatenate([np.eye(3), -np.eye(3)])
-    found = SphericalVoronoi(points)
-    found.sort_vertices_of_regions()
-    rings = []
-    for point, ring in zip(points, found.regions, strict=True):
-        a, b = found.vertices[ring[:2]] - point
-        rings.append(np.array(ring if np.cross(a, b) @ point > 0 else ring[::-1]))
-    begin, end = (found.vertices[np.concatenate(r)] for r in (rings, [np.roll(r, -1) for r in rings]))
-    middle = (begin + end) / np.linalg.norm(begin + end, axis=1)[:, None]
-    starts = 4 * np.arange(7)
-    arrays = {
-        "points": 2 * points,
-        "vertices": 2 * found.vertices,
-        "cell_vertex_starts": starts,
-        "cell_vertices": np.concatenate(rings),
-        "neighbor_starts": starts,
-        "face_measures": 2 * np.arccos((begin * end).sum(axis=1)),
-        "face_centroids": 2 * middle,
-    }
-    return Diagram(SPHERE, arrays)
-
-
-def test_the_cell_opposite_to_the_viewer_is_seen_around_the_others(cube):
-    # The viewer is opposite to a point near a corner of cell 5, which reaches beyond the limb on the other side.
-    hidden = cube.cell_vertices[cube.cell_vertex_starts[5]]
-    direction = cube.vertices[hidden] / 2 + 0.1 * cube.points[5] / 2
-    lon, lat = SPHERE.lonlat(-direction[None])[0]
-    view = Orthographic((lon, lat))
-    polygons = view.polygons(cube, np.arange(6))
-    assert polygons.cells[0] == 5
-    assert area(drawn(polygons)[0]) == pytest.approx(np.pi, rel=1e-3)
-    test_polygons_cover_the_picture_once(cube, view)
-
-
-def drawn(polygons):
-    return np.split(polygons.corners, polygons.starts[1:-1])
-
-
-def area(ring):
-    x, y = ring.T
-    return 0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1))
-
-
-def winding(ring, places):
-    """Return how many times `ring` runs around each of `places`."""
-    to = ring[None] - places[:, None]
-    angle = np.arctan2(to[..., 1], to[..., 0])
-    turns = np.diff(angle, axis=1, append=angle[:, :1])
-    turns -= 2 * np.pi * np.round(turns / (2 * np.pi))
-    return np.round(turns.sum(axis=1) / (2 * np.pi)).astype(int)
-
-
-VIEWS = [Orthographic((-45, 30)), Orthographic((0, 90)), Orthographic((180, 0)), Plate((0, 0)), Plate((-150, 0))]
+VIEWS = [("orthographic", (-45, 30)), ("orthographic", (0, 90)), ("plate", (0, 0)), ("plate", (-150, 0)), ("robinson",)]
 
 
 @pytest.mark.sparse(6)
 @pytest.mark.parametrize("view", VIEWS)
 def test_polygons_cover_the_picture_once(diagram, view):
-    polygons = view.polygons(diagram, np.arange(len(diagram)))
-    places = view.lower + np.random.default_rng(8).random((700, 2)) * (view.upper - view.lower)
-    # Chords of arcs of two degrees lie within 2e-4 of the limb.
-    places = places[np.hypot(*places.T) < 0.999] if isinstance(view, Orthographic) else places
-    inside, directions = view.directions(places)
-    assert inside.all()
-    cell = diagram.locate(SPHERE.radius * directions)
-    counts, last = np.zeros(len(places), int), np.full(len(places), -1)
-    rings = drawn(polygons)
-    # The whole disk is drawn below the others.
-    below = np.array([isinstance(view, Orthographic) and abs(area(r) - np.pi) < 0.01 for r in rings])
-    assert below.sum() <= 1
-    for ring, i, under in zip(rings, polygons.cells, below, strict=True):
-        around = winding(ring, places)
-        assert set(around) <= {0, 1}  # counter-clockwise
-        counts += 0 if under else around
-        last[around == 1] = i
-    assert counts.max() == 1
-    if not below.any():
-        assert counts.min() == 1
-    # Chords of arcs: up to 2e-4 of the globe, and near poles 4 degrees of longitude.
-    assert np.mean(last != cell) < 0.005
-
-
-def test_copies_at_the_limits_of_longitude(diagram):
-    view = Plate((0, 0))
-    polygons = view.polygons(diagram, np.arange(len(diagram)))
-    low, high = ([f(r[:, 0]) for r in drawn(polygons)] for f in (np.min, np.max))
-    low, high, cells = np.array(low), np.array(high), polygons.cells
-    assert (low < 180).all()
-    assert (high > -180).all()
-    twice = np.bincount(cells, minlength=len(diagram)) == 2
-    for i in np.flatnonzero(twice):
-        at = np.sort(low[cells == i])
-        assert at[1] - at[0] == pytest.approx(360)
-    assert set(cells[(low < -180 - 1e-6) | (high > 180 + 1e-6)]) <= set(np.flatnonzero(twice))
-    assert set(cells) == set(range(len(diagram)))
-
-
-def test_poles_are_lines(adapter):
-    points = [(0, 90), *[(lon, 20) for lon in range(0, 360, 45)], *[(lon, -50) for lon in range(0, 360, 90)]]
-    diagram = adapter.diagram(SPHERE, SPHERE.positions(points))
-    rings, cells = (lambda p: (drawn(p), p.cells))(Plate((0, 0)).polygons(diagram, np.arange(13)))
-    around = [ring for ring, i in zip(rings, cells, strict=True) if i == 0]
-    assert all(np.ptp(ring[:, 0]) == pytest.approx(360) for ring in around)
-    assert all((ring[:, 1] == 90).sum() == 2 for ring in around)
-    # The four southern cells meet in a corner at the pole, and share its line.
-    assert sum((ring[:, 1] < -89.9).sum() >= 2 for ring in rings) >= 4
+    projection = crs.Robinson() if view == ("robinson",) else map_projection(*view)
+    source = projection.as_geodetic()
+    cells, polygons = project_cells(diagram, projection, source)
+    low, high = np.transpose([projection.x_limits, projection.y_limits])
+    places = low + np.random.default_rng(8).random((900, 2)) * (high - low)
+    lonlat = source.transform_points(projection, *places.T)[:, :2]
+    seen = np.isfinite(lonlat).all(axis=1)
+    seen &= np.hypot(*places.T) < 0.99 * high[1] if view[0] == "orthographic" else seen
+    if view == ("robinson",):
+        seen &= shapely.Polygon(projection.boundary).contains(shapely.points(places))
+    places, cell = places[seen], diagram.locate(SPHERE.positions(lonlat[seen]))
+    tree = shapely.STRtree([shapely.Polygon(p).buffer(0) for p in polygons])
+    which, found = tree.query(shapely.points(places), "within")
+    # Chords of arcs lie within 2e-4 of the globe from them, and near poles within 4 degrees of longitude.
+    counts = np.bincount(which, minlength=len(places))
+    assert np.mean(counts != 1) < 0.01
+    assert np.mean(cells[found] != cell[which]) < 0.01
 
 
 def test_outlines_follow_arcs(diagram):
-    starts, points, faces = outlines(diagram, np.arange(len(diagram)))
+    starts, points = outlines(diagram)
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=1e-14)
-    begin = diagram.vertices[diagram.cell_vertices] / SPHERE.radius
-    first = np.flatnonzero(np.diff(faces, prepend=-1))
-    np.testing.assert_allclose(points[first], begin[faces[first]], atol=1e-12)
-    middle = diagram.face_centroids[faces] / SPHERE.radius
-    normal = np.cross(begin[faces], middle)
-    length = np.linalg.norm(normal, axis=1)
-    clear = length > 1e-6
-    off = np.abs((points * normal).sum(axis=1))[clear] / length[clear]
-    assert off.max() < 1e-8  # the plane of an arc of 1e-6 is known to about 1e-10 over its length
     rows = np.repeat(np.arange(len(diagram)), np.diff(starts))
-    same = rows[1:] == rows[:-1]
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)[same]
+    steps = np.linalg.norm(points - np.roll(points, -1, axis=0), axis=1)[:-1][rows[1:] == rows[:-1]]
     assert np.degrees(steps.max()) < 3  # 2 degrees, a little unequal
-
-
-def test_the_back_is_hidden():
-    view = Orthographic((20, 10))
-    points = np.random.default_rng(1).normal(size=(500, 3))
-    points /= np.linalg.norm(points, axis=1)[:, None]
-    flat = view.flat(points)
-    behind = points @ view.towards < 0
-    assert (np.hypot(*flat[behind].T) > 1).all()
-    assert (np.hypot(*flat[~behind].T) <= 1 + 1e-12).all()
-    _, again = view.directions(flat[~behind])
-    np.testing.assert_allclose(again, points[~behind], atol=1e-7)
-    middle = view.flat(unit_vectors(np.array([(20.0, 10.0)])))
-    np.testing.assert_allclose(middle, 0, atol=1e-15)
-    east, north = view.flat(unit_vectors(np.array([(21.0, 10.0), (20.0, 11.0)])))
-    assert east[0] > 0
-    assert north[1] > 0
-    lines = view.lines(unit_vectors(np.column_stack([np.arange(361), np.zeros(361)])))
-    assert all((np.hypot(*line.T) < 1 + 1e-12).all() for line in lines)
+    # A point of a face is as near to the generator of its cell as to the next one.
+    generators = diagram.points / SPHERE.radius
+    own = np.linalg.norm(points - generators[rows], axis=1)
+    nearest, _ = cKDTree(generators).query(points)
+    np.testing.assert_allclose(own, nearest, atol=1e-7)
 
 
 def collections(figure, kind):
@@ -227,29 +120,25 @@ def test_values_are_those_of_the_cells(mesh, color, options):
         assert len(values) < 0.2 * len(wanted)
 
 
-def test_edges_are_drawn_once_and_only_if_legible(mesh):
-    lines, _ = collections(mesh.plot(projection="plate", coasts=False), LineCollection)
-    middles = np.array([segment.mean(axis=0) for segment in lines.get_segments()])
-    _, counts = np.unique(middles.round(6), axis=0, return_counts=True)
-    assert counts.max() == 1
-    assert len(middles) >= len(mesh.diagram.faces)
-    assert len(collections(mesh.plot(edges=False, coasts=False), LineCollection)) == 1
-    widths = lines.get_linewidths()
-    assert min(widths) > 0.06
-    # On the globe, lines fade towards the limb.
-    lines, _ = collections(mesh.plot(coasts=False), LineCollection)
-    off = np.array([np.hypot(*segment.mean(axis=0)) for segment in lines.get_segments()])
-    assert off.max() < 0.9999
-    assert np.mean(np.array(lines.get_linewidths())[off > 0.97]) < 0.6 * np.median(lines.get_linewidths())
+def test_edges_are_as_thin_as_their_cells_look(mesh):
+    (cells,) = collections(mesh.plot(coasts=False), PolyCollection)
+    widths = cells.get_linewidths()
+    middles = np.array([path.vertices[:-1].mean(axis=0) for path in cells.get_paths()])
+    off = np.hypot(*middles.T) / middles.max()
+    # On the globe, lines become thinner towards the limb.
+    assert np.mean(np.array(widths)[off > 0.97]) < 0.6 * np.median(widths)
+    (plain,) = collections(mesh.plot(coasts=False, edges=False), PolyCollection)
+    plain.update_scalarmappable()
+    np.testing.assert_array_equal(plain.get_edgecolor(), plain.get_facecolor())
 
 
 def test_pixels_show_the_cells_they_are_in(mesh, monkeypatch):
     monkeypatch.setattr(pixels, "MOST_POLYGONS", 10)
     monkeypatch.setattr(pixels, "PER_INCH", 10)
     own = np.arange(len(mesh.points))
-    figure = mesh.plot(own, center=(-45, 40))
+    figure = mesh.plot(own, center=(-45, 40), edges=False)
     (image,) = figure.axes[0].images
-    assert not collections(figure, PolyCollection)
+    assert not collections(figure, PolyCollection)[0].get_paths()
     shown = image.get_array()
     middle = np.array(shown.shape) // 2
     assert 40 < shown.shape[0] == shown.shape[1] < 80
@@ -258,7 +147,7 @@ def test_pixels_show_the_cells_they_are_in(mesh, monkeypatch):
     near = np.linalg.norm(mesh.points - mesh.points[around], axis=1) < 0.4
     assert near[int(shown[tuple(middle)])]
     # From another side, the same pixels show other cells.
-    (image,) = mesh.plot(own, center=(135, -40)).axes[0].images
+    (image,) = mesh.plot(own, center=(135, -40), edges=False).axes[0].images
     assert not near[int(image.get_array()[tuple(middle)])]
 
 
@@ -273,13 +162,27 @@ def test_center(mesh, adapter):
 def test_longitudes_of_windows_go_on(mesh):
     figure = mesh.plot(projection="plate", window=((150, -30), (210, 30)))
     ax = figure.axes[0]
-    assert ax.get_xlim() == (150, 210)
+    assert ax.get_xlim() == (-30, 30)  # around 180 degrees
     (cells,) = collections(figure, PolyCollection)
     corners = np.concatenate([path.vertices for path in cells.get_paths()])
-    assert corners[:, 0].min() < 150
-    assert corners[:, 0].max() > 210
-    names = [tick.get_text() for tick in ax.get_xticklabels()]
-    assert names == ["150°E", "165°E", "180°", "165°W", "150°W"]
+    assert corners[:, 0].min() < -30
+    assert corners[:, 0].max() > 30
+    figure.draw_without_rendering()
+    (lines,) = ax.gridliners if hasattr(ax, "gridliners") else [a for a in ax.artists if hasattr(a, "xlabel_artists")]
+    names = {label.get_text() for label in lines.xlabel_artists if label.get_visible()}
+    assert {"160°E", "180°", "160°W"} <= names
+
+
+def test_other_projections_and_maps_of_the_caller(mesh):
+    assert mesh.plot(projection=crs.Robinson()).axes[0].projection == crs.Robinson()
+    ax = Figure().add_subplot(projection=map_projection("plate", (100, 0)))
+    ax.set(xlim=(-20, 20), ylim=(-10, 30))
+    assert mesh.plot("quality", ax=ax, key=False) is ax.figure
+    assert ax.get_xlim() == (-20, 20)
+    (cells,) = [c for c in ax.collections if isinstance(c, PolyCollection)]
+    assert 0 < len(cells.get_paths()) < 0.2 * len(mesh.points)
+    with pytest.raises(InputError, match="ax has no projection, expected a map of Cartopy"):
+        mesh.plot(ax=Figure().add_subplot())
 
 
 @pytest.mark.parametrize(
@@ -294,8 +197,8 @@ def test_longitudes_of_windows_go_on(mesh):
         ({"window": ((0, 0), (1, 1))}, "window is for projection='plate'"),
         ({"window": ((0, 0), (-1, 1)), "projection": "plate"}, "expected two corners"),
         ({"window": 3, "projection": "plate"}, "expected two corners"),
-        ({"view": "slice"}, "view is 'slice', which is for meshes in 3D"),
-        ({"cut": None}, "cut is for cutaway, and this picture is sphere"),
+        ({"view": "slice"}, "view is 'slice', expected one of globe for this mesh"),
+        ({"cut": None}, "cut is an option of the view cutaway; the view globe has ax, projection"),
     ],
 )
 def test_bad_options(mesh, options, message):
@@ -311,7 +214,7 @@ def test_other_pictures_refuse(mesh, adapter):
     plane = adapter.diagram(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.6)])
     with pytest.raises(InputError, match="draws meshes on a sphere"):
         plot_globe(plane)
-    with pytest.raises(InputError, match="projection is for sphere, and this picture is 2D"):
+    with pytest.raises(InputError, match="projection is an option of the view globe; the view cells has"):
         plane.plot(projection="plate")
 
 
@@ -327,19 +230,36 @@ def test_pictures_of_a_report(mesh, number):
 
 
 def test_coasts(mesh, monkeypatch):
-    coasts._read.cache_clear()
-    monkeypatch.setitem(sys.modules, "cartopy", None)
-    assert coasts.coastlines(180.0) == []
-    mesh.plot(coasts=True)
-    coasts._read.cache_clear()
     asked = []
-    line = np.column_stack([np.linspace(-80, 10, 50), np.linspace(10, 60, 50)])
-    monkeypatch.setattr(coasts, "_read", lambda scale: asked.append(scale) or [line])
-    count = [len(collections(mesh.plot(coasts=c), LineCollection)) for c in (None, True)]
-    assert count == [2, 3]  # by default none on a sphere of this size
-    mesh.plot(coasts=True, across=5.0)
-    assert asked == ["110m", "10m"]
-    assert [coasts.is_earth(r) for r in (6371229.0, 6371.0, 1.0, 1737400.0)] == [True, True, False, False]
+    monkeypatch.setattr(GeoAxes, "coastlines", lambda ax, scale, **_: asked.append(scale))
+    monkeypatch.setattr(globe, "_has_coasts", lambda scale: False)
+    mesh.plot(coasts=True)  # without data there are none, and none are downloaded
+    monkeypatch.setattr(globe, "_has_coasts", lambda scale: scale != "50m")
+    mesh.plot()  # by default none on a sphere of this size
+    assert asked == []
+    for across in (None, 20.0, 5.0):
+        mesh.plot(coasts=True, across=across)
+    assert asked == ["110m", "110m", "10m"]
+    assert [kilometer_of(r) for r in (6371229.0, 6371.0, 1.0, 1737400.0)] == [1000, 1, None, None]
+
+
+def test_data_of_coasts_are_found(tmp_path, monkeypatch):
+    import cartopy
+
+    monkeypatch.setitem(cartopy.config, "data_dir", tmp_path)
+    assert not globe._has_coasts("110m")
+    (tmp_path / "shapefiles/natural_earth/physical").mkdir(parents=True)
+    (tmp_path / "shapefiles/natural_earth/physical/ne_110m_coastline.shp").touch()
+    assert globe._has_coasts("110m")
+
+
+def test_without_cartopy(mesh, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cartopy", None)
+    with pytest.raises(ClvoroError, match=r"needs Cartopy.*pip install 'clvoro\[maps\]'"):
+        mesh.plot()
+    with pytest.warns(MissingPicturesWarning, match=r"no pictures of the mesh.*clvoro\[maps\]"):
+        files = write_report(mesh, tmp_path, dpi=30)
+    assert {f.stem for f in files} == {"report", "history"}
 
 
 @pytest.mark.sparse(2)
