@@ -333,7 +333,7 @@ def test_arrays_are_read_only(result, tmp_path):
 
 
 def test_colors(result):
-    refused(lambda: result.plot(None), "expected one of error", kind=InputTypeError)
+    refused(lambda: result.plot(object()), "expected one of error", kind=InputTypeError)
     refused(lambda: result.plot(result.size_error[1:]), "one number per cell", kind=InputError)
 
 

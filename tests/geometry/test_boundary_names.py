@@ -246,7 +246,7 @@ def test_plots_show_the_names(meshed) -> None:
     assert len({tuple(c.get_color()[0]) for c in lines.values()}) == len(lines)
     over = result.plot("volume")
     assert plot_boundaries(clvoro.Box((0, 0), (1, 1)), over.axes[0]) is over
-    with pytest.raises(InputError, match="two dimensions"):
+    with pytest.raises(InputError, match="draws in the plane"):
         plot_boundaries(clvoro.Box((0, 0, 0), (1, 1, 1)))
 
 

@@ -93,8 +93,8 @@ def test_views(diagram):
             diagram.plot(ax="any")
         with pytest.raises(InputError, match="view is 'all', expected one of slices, slice"):
             diagram.plot(view="all")
-        with pytest.raises(InputError, match="colour is no option; the view slices has figure, through"):
-            diagram.plot(colour="size")
+        with pytest.raises(InputError, match="hue is no option; the view slices has figure, through"):
+            diagram.plot(hue="size")
 
 
 @pytest.mark.parametrize(
