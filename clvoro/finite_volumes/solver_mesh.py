@@ -1,4 +1,4 @@
-"""The mesh as a solver sees it: straight walls, short faces collapsed, bad cells repaired."""
+"""The mesh as a solver sees it: straight walls, short faces collapsed."""
 
 from __future__ import annotations
 
@@ -46,33 +46,26 @@ def make_solver_mesh(
 
 
 def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray) -> Faces:
-    """Take the faces of `diagram`, straighten its walls, collapse short faces, and repair bad cells."""
+    """Take the faces of `diagram`, or make straight walls, and collapse short faces."""
     from .collapse import collapse_short
-    from .convex_corners import join_faces, move_concave_points
-    from .repair.relaxation import relax_points
     from .short_edges import collapse_short_edges
-    from .straight_walls import straight_walls
+    from .walls import straight_walls
 
-    faces = faces_with_seams(diagram)
-    mesh = replace(
-        faces,
-        points=faces.points.astype(np.float64, copy=False),
-        corners=faces.corners.astype(np.int64 if faces.dim == 2 else np.int32, copy=False),
-        diagram=None,
-    )
+    outline = diagram.domain.outline if walls == "straight" else None
+    if outline is not None:
+        mesh = straight_walls(diagram, outline, parts)
+    else:
+        faces = faces_with_seams(diagram)
+        mesh = replace(
+            faces,
+            points=faces.points.astype(np.float64, copy=False),
+            corners=faces.corners.astype(np.int64 if faces.dim == 2 else np.int32, copy=False),
+            diagram=None,
+        )
     if mesh.dim == 3:
         return collapse_short(mesh, diagram) if collapse else mesh.compact()
-    straight = walls == "straight" and diagram.domain.outline is not None
-    if straight:
-        mesh = straight_walls(join_faces(mesh), diagram, parts)
-    if collapse:
-        mesh = collapse_short_edges(mesh, parts)
-    if straight:
-        mesh = move_concave_points(mesh)
-    if collapse:
-        mesh = relax_points(mesh, parts, straight)
-    mesh = mesh.compact()
-    if straight and abs(mesh.area_change) > _LARGE_CHANGE:
+    mesh = (collapse_short_edges(mesh, parts) if collapse else mesh).compact()
+    if outline is not None and abs(mesh.area_change) > _LARGE_CHANGE:
         warn(
             f"straight walls change the area of the domain by {100 * mesh.area_change:+.2g} %: its boundary has "
             "features as large as the cells. Use smaller cells there, or keep the exact walls with walls='exact'",

@@ -559,6 +559,26 @@ class Polygon(Domain):
         found = self.oriented.tree.query(shapely.points(points), predicate="dwithin", distance=distance)
         return found[0], found[1]
 
+    def crossings(self, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Find where segments from `begin` (n, 2) to `end` (n, 2) cross the boundary.
+
+        Returns
+        -------
+        rows, edges : (k,) int
+            Segment, and oriented edge.
+        t, u : (k,) float64
+            Place along the segment and along the edge, from 0 to 1.
+        """
+        segments = shapely.linestrings(np.stack([begin, end], axis=1))
+        rows, edges = self.oriented.tree.query(segments, predicate="intersects")
+        along, way = self.oriented.along[edges], (end - begin)[rows]
+        turn = way[:, 0] * along[:, 1] - way[:, 1] * along[:, 0]
+        rows, edges, along, way, turn = (a[turn != 0] for a in (rows, edges, along, way, turn))
+        apart = self.oriented.vertices[edges] - begin[rows]
+        t = (apart[:, 0] * along[:, 1] - apart[:, 1] * along[:, 0]) / turn
+        u = (apart[:, 0] * way[:, 1] - apart[:, 1] * way[:, 0]) / turn
+        return rows, edges, np.clip(t, 0, 1), np.clip(u, 0, 1)
+
     def is_slit(self, points: np.ndarray, within: float) -> np.ndarray:
         """Return for each of `points` (n, 2) whether separate parts of the boundary are within `within`; (n,) bool."""
         rows, edges = self.oriented.tree.query(shapely.points(points), predicate="dwithin", distance=within)

@@ -261,10 +261,10 @@ class MeshOutput:
         Parameters
         ----------
         walls : {"straight", "exact"}
-            With "straight", in 2D: the wall faces of a cell that turn by at most 30 degrees in sum become one straight
-            face, and so do farther turns that are smaller than a quarter of the cell. A face end that is nearer to a
-            corner of the domain than 0.4 of the smaller cell moves into it. Faces of different names remain
-            apart. The change of area is the mesh's `area_change`.
+            With "straight", in a polygon: each cell is convex. It has one straight face where it meets the boundary, or
+            several with the convex corners of the domain and the ends of its named parts between them. A face ends in
+            a corner of the domain that is near. What is smaller than a cell is left out. The change of area is the
+            mesh's `area_change`.
         collapse : bool
             Whether the ends of short faces become one point: in 2D of faces shorter than 0.055 times the size of
             the smaller cell and 0.2 times the width of the thinner one, while cells remain convex. Corners and ends
@@ -272,9 +272,7 @@ class MeshOutput:
             with h the cube root of the smaller cell's volume; so are faces smaller than 0.02 h^2 whose skewness
             exceeds 1.8. Faces may then be
             slightly warped: their flatness is at least 0.95. Points on the box stay on it, so that the cells still fill
-            it. What would make a cell concave is left as it is. In 2D, skew faces, faces far from orthogonal and
-            cells that are not convex are then repaired: points around them move, those on straight walls along the
-            boundary, and a few faces connect other cells than in the diagram.
+            it. What would make a cell concave is left as it is.
 
         Returns
         -------
@@ -289,7 +287,8 @@ class MeshOutput:
         Warns
         -----
         MismatchWarning
-            If straight walls change the area by more than 1 % of the domain.
+            If straight walls change the area by more than 1 % of the domain, or leave out parts as large as half a
+            cell; says where.
 
         Examples
         --------

@@ -1,1 +1,0 @@
-"""Repair of solver meshes in 2D: points move, and faces connect other cells."""

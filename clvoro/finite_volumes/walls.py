@@ -1,0 +1,458 @@
+"""Walls in 2D: what the cells of a polygon look like in the mesh for solvers.
+
+Each cell is taken without the boundary first: convex, between the bisectors with other generators. A vertex of these
+cells has a name, the three generators that meet there. The boundary is asked once for each name, so that all cells with
+the vertex agree: does it lie inside, outside, or on the boundary? Then
+
+- a face between two vertices inside stays as it is,
+- a face that leaves the domain ends where it crosses the boundary,
+- a face outside vanishes,
+- a gap that is left in the outline of a cell is closed along the boundary: by one straight face, or by several with the
+  convex corners of the domain and the ends of its named parts between them.
+
+Runs let faces end in the re-entrant corners of the domain. So all cells are convex, and what is smaller than a cell is
+left out: needles, slits, stairs of pixels, points in which islands touch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, Delaunay
+
+from ..arguments import format_point, warn
+from ..errors import MismatchWarning
+from ..geometry.polygon import Polygon
+from ..geometry.ring_coordinate import RingCoordinate
+from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
+from ..mesh.straightening import WALL_CORNER, cross
+
+FAR = 20.0
+"""Distance of four additional generators, which close all cells, over the extent of the domain."""
+ON_WALL = 0.1
+"""Vertices that are nearer to the boundary than this lie on it, over the width of the thinnest cell there."""
+BEHIND_WALL = 2.0
+"""Length over that distance from which on a face that leads outward from a vertex on the boundary is kept."""
+SNAP_RE_ENTRANT, SNAP_CONVEX = 0.25, 0.12
+"""A face ends in a corner of the domain that is nearer than this along the boundary, over the width of its cells."""
+LEAST_BULGE, LARGEST_BULGE = 0.1, 2.0
+"""Distances from a straight face over the size of the cell at which a vertex of the domain becomes a corner of it."""
+FILLED = 0.5
+"""Share of the triangle of a corner and the ends of the face that must lie in the domain, or it is cut off."""
+AROUND = 4.0
+"""Largest area between a wall face and the boundary behind it, over that of the cell."""
+LEFT_OUT = 0.5
+"""Share of a cell from which on a part of the domain that is left out, or land that is added, is reported."""
+INSIDE, ON, OUTSIDE = 1, 0, -1
+"""Places of a vertex."""
+
+
+@dataclass(frozen=True)
+class ConvexFaces:
+    """The faces between the convex cells of generators in the whole plane.
+
+    Attributes
+    ----------
+    left, right : (f,) int
+        Generators on both sides of the way from `begin` to `end`.
+    begin, end : (f,) int
+        Rows of `vertices`.
+    vertices : (v, 2) float64
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    begin: np.ndarray
+    end: np.ndarray
+    vertices: np.ndarray
+
+
+def convex_faces(points: np.ndarray, weights: np.ndarray, extent: float) -> ConvexFaces:
+    """Return the faces of the power diagram of `points` (n, 2) with `weights` (n,).
+
+    Without weights its dual is the Delaunay triangulation, else the lower hull of the points (x, y, x^2 + y^2 - w)
+    (Aurenhammer 1987, SIAM J. Comput. 16, 78). Its vertices within `extent` are right.
+    """
+    n, low = len(points), points.min(axis=0)
+    extent = max(extent, float(np.sqrt(np.ptp(weights))))
+    around = np.array([(1.0, 0.3), (-0.3, 1.0), (-1.0, -0.3), (0.3, -1.0)])
+    x = np.concatenate([points - low, FAR * extent * around])
+    w = np.concatenate([weights, np.full(4, weights.min())])
+    if np.ptp(weights):
+        hull = ConvexHull(np.column_stack([x, (x**2).sum(axis=1) - w]))
+        lower = hull.equations[:, 2] < 0
+        triangles, neighbors = hull.simplices[lower], hull.neighbors[lower]
+        neighbors = np.where(lower, np.cumsum(lower) - 1, -1)[neighbors]
+    else:
+        dual = Delaunay(x)
+        triangles, neighbors = dual.simplices, dual.neighbors
+    a, b, c = x[triangles].swapaxes(0, 1)
+    turned = cross(b - a, c - a) < 0
+    triangles, neighbors = (np.where(turned[:, None], t[:, [0, 2, 1]], t) for t in (triangles, neighbors))
+    a, b, c = x[triangles].swapaxes(0, 1)
+    ab, ac = b - a, c - a
+    wa, wb, wc = w[triangles].T
+    # The point v of equal power: 2 ab . (v - a) = |ab|^2 - (wb - wa), and the same with c.
+    p, q = (ab**2).sum(axis=1) - (wb - wa), (ac**2).sum(axis=1) - (wc - wa)
+    across = np.column_stack([p * ac[:, 1] - q * ab[:, 1], q * ab[:, 0] - p * ac[:, 0]])
+    vertices = low + a + across / (2 * cross(ab, ac))[:, None]
+    # The face between the generators of a side leads from the triangle on its right to that on its left.
+    left, right = triangles[:, [1, 2, 0]].ravel(), triangles[:, [2, 0, 1]].ravel()
+    here, there = np.repeat(np.arange(len(triangles)), 3), neighbors.ravel()
+    once = (left < n) & (right < n) & (there > here)
+    return ConvexFaces(left[once], right[once], there[once], here[once], vertices)
+
+
+def straight_walls(diagram: Diagram, domain: Polygon, parts: np.ndarray) -> Faces:
+    """Return the mesh for solvers of `diagram` in `domain`; see the head of this module.
+
+    Parameters
+    ----------
+    diagram : Diagram
+    domain : Polygon
+        That of the diagram.
+    parts : (k,) int
+        Index of the named part of the boundary for each wall. A face on the boundary has walls of one part.
+
+    Warns
+    -----
+    MismatchWarning
+        If parts of the domain as large as half a cell are left out, or land of that size is added; says where.
+    """
+    maker = _WallMaker(diagram, domain, parts)
+    maker.place_vertices()
+    maker.cut_faces()
+    maker.name_points()
+    maker.move_into_corners()
+    maker.close_cells()
+    maker.warn_of_left_out()
+    return maker.faces()
+
+
+class _WallMaker:
+    """The steps from convex cells to a mesh, and what they find.
+
+    Attributes
+    ----------
+    convex : ConvexFaces
+    size : (n,) float64
+        Square root of the area of each cell.
+    width : (f,) float64
+        The least size, or distance to another generator, of the two cells of each face.
+    least : (v,) float64
+        The least width of the faces at each vertex.
+    place : (v,) int
+        `INSIDE`, `ON` (the boundary) or `OUTSIDE`.
+    kept : (f,) bool
+        Whether a part of the face lies inside.
+    crossed : (f, 2) float64
+        Position on the boundary where the face ends, for both ends; nan for an end in a vertex.
+    ends : (f, 2) int
+        Points of the faces that are kept.
+    points : (p, 2) float64
+    position : (p,) float64
+        Position of points on the boundary; nan for others.
+    walls : list of (cell, position of the wall, first point, second point)
+    more : list of (2,) float64
+        Further points, behind `points`.
+    left_out : list of (area, place)
+    """
+
+    def __init__(self, diagram: Diagram, domain: Polygon, parts: np.ndarray) -> None:
+        self.diagram, self.domain, self.rings = diagram, domain, domain.oriented
+        self.generators = diagram.points
+        self.along = RingCoordinate(domain)
+        part = parts[self.rings.edge_numbers]
+        self.changes_part = np.empty(len(part), bool)
+        self.changes_part[self.rings.next_vertex] = part != part[self.rings.next_vertex]
+        self.convex = f = convex_faces(self.generators, diagram.weights, float(domain.extent.max()))
+        self.size = np.sqrt(diagram.volumes)
+        apart = np.linalg.norm(self.generators[f.right] - self.generators[f.left], axis=1)
+        width = self.size.copy()
+        for cell in (f.left, f.right):
+            np.minimum.at(width, cell, apart)
+        self.width = np.minimum(width[f.left], width[f.right])
+        self.left_out: list[tuple[float, np.ndarray]] = []
+
+    def place_vertices(self) -> None:
+        """Ask the boundary for the place of each vertex."""
+        f, v = self.convex, self.convex.vertices
+        self.least = np.full(len(v), np.inf)
+        for end in (f.begin, f.end):
+            np.minimum.at(self.least, end, self.width)
+        used = np.flatnonzero(np.isfinite(self.least))
+        self.place = np.full(len(v), OUTSIDE)
+        self.place[used[self.domain.covers(v[used])]] = INSIDE
+        reach = ON_WALL * self.least[used, None]
+        near = ((v[used] >= self.domain.lower - reach) & (v[used] <= self.domain.upper + reach)).all(axis=1)
+        rows, _ = self.domain.edges_within(v[used[near]], reach[near, 0])
+        self.place[used[near][rows]] = ON
+
+    def cut_faces(self) -> None:
+        """Find the part of each face that is kept."""
+        f, x = self.convex, self.generators
+        begin, end = self.place[f.begin], self.place[f.end]
+        self.kept = (begin >= ON) & (end >= ON)
+        self.crossed = np.full((len(begin), 2), np.nan)
+        # A face along a wall separates two cells only if these see each other.
+        along = np.flatnonzero((begin == ON) & (end == ON))
+        self.kept[along[self.domain.crossings(x[f.left[along]], x[f.right[along]])[0]]] = False
+        cut = np.flatnonzero((begin + end < 2 * INSIDE) & ((begin != ON) | (end != ON)))
+        a, way = f.vertices[f.begin[cut]], f.vertices[f.end[cut]] - f.vertices[f.begin[cut]]
+        parts, whole = self._parts_inside(a, way), [0.0, 1.0, np.nan, np.nan]
+        length = np.maximum(np.hypot(*way.T), 1e-300)
+        middle = (((x[f.left[cut]] + x[f.right[cut]]) / 2 - a) * way).sum(axis=1) / length / length
+        margin = ON_WALL * self.width[cut] / length
+        for k, face in enumerate(cut.tolist()):
+            on = begin[face] == ON, end[face] == ON
+            self.kept[face] = bool(parts[k])
+            if not parts[k]:
+                continue
+            if begin[face] == INSIDE:
+                part = parts[k][0] if not on[1] or parts[k][-1][1] < 1 - BEHIND_WALL * margin[k] else whole
+            elif end[face] == INSIDE:
+                part = parts[k][-1] if not on[0] or parts[k][0][0] > BEHIND_WALL * margin[k] else whole
+            else:
+                part = max(parts[k], key=lambda p: (p[0] <= middle[k] <= p[1], p[1] - p[0]))
+            first, last, at_first, at_last = part
+            self.kept[face] = not any(on) or last - first >= BEHIND_WALL * margin[k]
+            self.crossed[face, 0] = np.nan if on[0] and first < margin[k] else at_first
+            self.crossed[face, 1] = np.nan if on[1] and last > 1 - margin[k] else at_last
+
+    def _parts_inside(self, a: np.ndarray, way: np.ndarray) -> list[list[list[float]]]:
+        """Return the parts of segments from `a` (k, 2) to `a + way` that lie inside, a list for each segment.
+
+        A part has its begin and end, from 0 to 1 along the segment, and the positions on the boundary there; nan at an
+        end of the segment. Between two crossings a segment is inside or outside: its middle tells.
+        """
+        row, edge, t, u = self.domain.crossings(a, a + way)
+        ends = np.arange(len(a))
+        row, t = np.concatenate([ends, row, ends]), np.concatenate([np.zeros(len(a)), t, np.ones(len(a))])
+        blank = np.full(len(a), np.nan)
+        s = np.concatenate([blank, self.along.position(edge, u), blank])
+        kind = np.repeat([0, 1, 2], [len(a), len(edge), len(a)])
+        order = np.lexsort((t, kind, row))
+        row, t, s = row[order], t[order], s[order]
+        middle = (t[:-1] + t[1:]) / 2
+        inside = (row[:-1] == row[1:]) & self.domain.covers(a[row[:-1]] + middle[:, None] * way[row[:-1]])
+        parts: list[list[list[float]]] = [[] for _ in range(len(a))]
+        for k in np.flatnonzero(inside).tolist():
+            mine = parts[row[k]]
+            if mine and mine[-1][1] == t[k] and inside[k - 1]:
+                mine[-1][1::2] = [float(t[k + 1]), float(s[k + 1])]
+            else:
+                mine.append([float(t[k]), float(t[k + 1]), float(s[k]), float(s[k + 1])])
+        return parts
+
+    def name_points(self) -> None:
+        """Give each end of a kept face its point.
+
+        A vertex inside is one point. A vertex on the boundary is one point for all cells around it that kept faces
+        join: the two sides of a thin wall have a point each.
+        """
+        f, n = self.convex, len(self.generators)
+        kept = np.flatnonzero(self.kept)
+        vertex, crossed = np.stack([f.begin[kept], f.end[kept]], axis=1), self.crossed[kept]
+        is_crossing = ~np.isnan(crossed)
+        on = ~is_crossing & (self.place[vertex] == ON)
+        inner = ~is_crossing & ~on
+        ends = np.empty(vertex.shape, np.int64)
+        used, ends[inner] = np.unique(vertex[inner], return_inverse=True)
+        count, crossings = len(used), np.count_nonzero(is_crossing)
+        ends[is_crossing] = count + np.arange(crossings)
+        row, side = np.nonzero(on)
+        at = vertex[row, side].astype(np.int64)
+        keys = np.concatenate([at * n + f.left[kept[row]], at * n + f.right[kept[row]]])
+        nodes, where = np.unique(keys, return_inverse=True)
+        here, there = where.reshape(2, -1)
+        graph = coo_array((np.ones(len(here)), (here, there)), (len(nodes), len(nodes)))
+        _, group = connected_components(graph, directed=False)
+        ends[on] = count + crossings + group[here]
+        at, cell = np.divmod(nodes[np.unique(group, return_index=True)[1]], n)
+        feet = self._feet(f.vertices[at], self.generators[cell], ON_WALL * self.least[at])
+        self.position = np.concatenate([np.full(count, np.nan), crossed[is_crossing], feet])
+        self.points = np.full((len(self.position), 2), np.nan)
+        self.points[:count] = f.vertices[used]
+        self.ends = np.full((len(self.kept), 2), -1)
+        self.ends[kept] = ends
+
+    def _feet(self, points: np.ndarray, sights: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return positions within `reach` of `points` (k, 2): re-entrant corners, else on edges that face `sights`."""
+        row, edge = self.domain.edges_within(points, 1.001 * reach)
+        begin, way = self.rings.vertices[edge], self.rings.along[edge]
+        share = np.clip(((points[row] - begin) * way).sum(axis=1) / self.rings.lengths[edge] ** 2, 0, 1)
+        at_corner = (self.rings.turns[edge] < -WALL_CORNER) & (np.hypot(*(begin - points[row]).T) <= reach[row])
+        share[at_corner] = 0
+        off = np.hypot(*(begin + share[:, None] * way - points[row]).T)
+        order = np.lexsort((off, cross(way, sights[row] - begin) <= 0, ~at_corner, row))
+        order = order[np.diff(row[order], prepend=-1) > 0]
+        return self.along.position(edge[order], share[order])
+
+    def move_into_corners(self) -> None:
+        """Move the nearest face end on the boundary into each corner of the domain and each end of a named part."""
+        width = np.full(len(self.points), np.inf)
+        for end in self.ends[self.kept].T:
+            np.minimum.at(width, end, self.width[self.kept])
+        on = np.flatnonzero(~np.isnan(self.position))
+        turns, begins = self.rings.turns, self.along.begins
+        corners = np.flatnonzero((np.abs(turns) > WALL_CORNER) | self.changes_part)
+        reach = np.where(turns[corners] < -WALL_CORNER, SNAP_RE_ENTRANT, SNAP_CONVEX)
+        s, ring, near = self.position[on], self.along.ring_of(self.position[on]), []
+        ring_of_corner = self.along.ring_of(begins[corners])
+        for r in np.intersect1d(ring, ring_of_corner).tolist():
+            here, mine = np.flatnonzero(ring == r), np.flatnonzero(ring_of_corner == r)
+            place = np.searchsorted(begins[corners[mine]], s[here])
+            for k in (mine[place % len(mine)], mine[place - 1]):
+                gap = np.abs(begins[corners[k]] - s[here])
+                gap = np.minimum(gap, self.along.span(r)[1] - gap)
+                near += [(g, c, p) for g, c, p in zip(gap, k, on[here], strict=True) if g <= reach[c] * width[p]]
+        taken: set[int] = set()
+        moved: set[int] = set()
+        for _, corner, point in sorted(near):
+            if corner not in taken and point not in moved:
+                taken.add(corner)
+                moved.add(point)
+                self.position[point] = begins[corners[corner]]
+        self.points[on] = self.along.points(self.position[on])
+
+    def close_cells(self) -> None:
+        """Close the gaps in the outlines of cells along the boundary."""
+        f, n = self.convex, len(self.generators)
+        kept = np.flatnonzero(self.kept)
+        cell = np.concatenate([f.left[kept], f.right[kept]])
+        toward = self.generators[f.right[kept]] - self.generators[f.left[kept]]
+        toward = np.concatenate([toward, -toward])
+        ends = np.concatenate([self.ends[kept], self.ends[kept][:, ::-1]])
+        # The faces around a convex cell follow each other as their normals do.
+        order = np.lexsort((np.arctan2(toward[:, 1], toward[:, 0]), cell))
+        cell, ends = cell[order], ends[order]
+        starts = np.searchsorted(cell, np.arange(n + 1))
+        filled = np.diff(starts) > 0
+        after = np.arange(1, len(cell) + 1)
+        after[starts[1:][filled] - 1] = starts[:-1][filled]
+        gaps = np.flatnonzero(ends[:, 1] != ends[after, 0])
+        self.walls: list[tuple[int, float, int, int]] = []
+        self.more: list[np.ndarray] = []
+        for c, p, q in zip(cell[gaps].tolist(), ends[gaps, 1].tolist(), ends[after[gaps], 0].tolist(), strict=True):
+            corners, positions = self._chain(c, p, q)
+            count = len(self.points) + len(self.more)
+            self.more += corners
+            names = [p, *range(count, count + len(corners)), q]
+            self.walls += [(c, s, *pair) for s, pair in zip(positions, pairwise(names), strict=True)]
+        for c in np.flatnonzero(~filled).tolist():
+            self._take_piece(c)
+
+    def _take_piece(self, cell: int) -> None:
+        """Give a cell without neighbors the outer ring of its piece of the domain."""
+        piece = self.domain.piece_of(self.generators[cell : cell + 1])[0]
+        ring = int(np.flatnonzero(self.domain.piece_of_ring == piece)[0])
+        first, last = self.along.ring_starts[ring : ring + 2].tolist()
+        begin, k = len(self.points) + len(self.more), last - first
+        self.more += list(self.rings.vertices[first:last])
+        middles = self.along.position(np.arange(first, last), np.full(k, 0.5)).tolist()
+        self.walls += [(cell, s, begin + i, begin + (i + 1) % k) for i, s in enumerate(middles)]
+
+    def _chain(self, cell: int, p: int, q: int) -> tuple[list[np.ndarray], list[float]]:
+        """Return the corners of `cell` between its points `p` and `q`, and the position of each wall between them."""
+        s, t = self.position[[p, q]].tolist()
+        ring, other = self.along.ring_of(np.array([s, t])).tolist()
+        if ring != other or np.isnan(s + t):
+            return [], [t if np.isnan(s) else s]
+        begin, total = self.along.span(ring)
+        way = (t - s) % total
+        path, a, b = self._vertices_between(ring, s, way), self.points[p], self.points[q]
+        if _area(np.concatenate([a[None], self.rings.vertices[path], b[None]])) > AROUND * self.size[cell] ** 2:
+            path, way = path[:0], 0.0  # the ends are in the opposite order, as where a cell touches the boundary
+        x = self.rings.vertices[path]
+        chosen: list[int] = []
+        for low, high in pairwise([-1, *np.flatnonzero(self.changes_part[path]).tolist(), len(path)]):
+            u, v = a if low < 0 else x[low], b if high == len(path) else x[high]
+            chosen += [] if low < 0 else [low]
+            chosen += self._bulges(u, v, x, range(low + 1, high), self.size[cell])
+        self._note(cell, np.concatenate([a[None], x, b[None], x[chosen][::-1]]))
+        marks = [0.0, *((self.along.begins[path[chosen]] - s) % total).tolist(), way]
+        return list(x[chosen]), [begin + (s - begin + (m + n) / 2) % total for m, n in pairwise(marks)]
+
+    def _vertices_between(self, ring: int, s: float, way: float) -> np.ndarray:
+        """Return the vertices of the domain between position `s` and that after `way`, without both ends, (k,) int."""
+        first, last = self.along.ring_starts[ring : ring + 2].tolist()
+        begin, total = self.along.span(ring)
+        begins, end = self.along.begins[first:last], begin + (s - begin + way) % total
+        low = int(np.searchsorted(begins, s, side="right"))
+        high = int(np.searchsorted(begins, end, side="left"))
+        count = high - low + (last - first if end < s or s + way > begin + total else 0)
+        return first + (low + np.arange(max(count, 0))) % (last - first)
+
+    def _bulges(self, a: np.ndarray, b: np.ndarray, x: np.ndarray, among: range, size: float) -> list[int]:
+        """Return the places `among` the points `x` (k, 2) that become corners of a convex chain from `a` to `b`."""
+        length = float(np.hypot(*(b - a)))
+        if not among or length == 0:
+            return []
+        off = cross(x[among.start : among.stop] - a, (b - a)[None]) / length
+        off[off > LARGEST_BULGE * size] = -1
+        k = int(off.argmax())
+        area = _area(np.concatenate([a[None], x[among.start : among.stop], b[None]]))
+        if off[k] < LEAST_BULGE * size or area < FILLED * off[k] * length / 2:
+            return []
+        k = among[k]
+        before = self._bulges(a, x[k], x, range(among.start, k), size)
+        return [*before, k, *self._bulges(x[k], b, x, range(k + 1, among.stop), size)]
+
+    def _note(self, cell: int, loop: np.ndarray) -> None:
+        """Note the area of `loop` (k, 2), between the boundary and the walls of a cell, if it is large."""
+        area = abs(_area(loop))
+        if area > LEFT_OUT * self.size[cell] ** 2:
+            self.left_out.append((area, loop[len(loop) // 2]))
+
+    def warn_of_left_out(self) -> None:
+        """Warn of parts of the domain that are left out, and of islands that no cell has a wall on."""
+        used = np.unique(self.along.ring_of(np.array([wall[1] for wall in self.walls])))
+        left = [(area, place) for area, place in self.left_out if area < self.domain.measure / 2]
+        for ring, x in enumerate(self.rings.rings):
+            if ring not in used:
+                left.append((abs(_area(x)), x.mean(axis=0)))
+        if not left:
+            return
+        area, place = max(left, key=lambda item: item[0])
+        what = "1 part" if len(left) == 1 else f"{len(left)} parts"
+        warn(
+            f"the mesh for solvers leaves out {what} of the boundary that cells do not resolve, as bays and islands "
+            f"within a cell; the largest is at {format_point(place)} and has an area of {area:.3g}. Use smaller cells "
+            "there, or drop what is smaller than a cell first, as domain.simplified(size) does",
+            MismatchWarning,
+        )
+
+    def faces(self) -> Faces:
+        """Return the mesh."""
+        kept = np.flatnonzero(self.kept & (self.ends[:, 0] != self.ends[:, 1]))
+        left, right = self.convex.left[kept], self.convex.right[kept]
+        ends = np.where((left > right)[:, None], self.ends[kept][:, ::-1], self.ends[kept])
+        owner, neighbor = np.minimum(left, right), np.maximum(left, right)
+        order = np.lexsort((neighbor, owner))
+        cell, position, *points = map(np.array, zip(*self.walls, strict=True))
+        wall = self.rings.edge_numbers[self.along.edges(position)]
+        by_wall = np.lexsort((cell, wall))
+        count = len(kept) + len(cell)
+        return Faces(
+            domain=self.domain,
+            generators=self.generators,
+            points=np.concatenate([self.points, self.more]) if self.more else self.points,
+            starts=2 * np.arange(count + 1),
+            corners=np.concatenate([ends[order], np.column_stack(points)[by_wall]]).ravel(),
+            owner=np.concatenate([owner[order], cell[by_wall]]).astype(np.int32),
+            neighbor=np.concatenate([neighbor[order], -1 - wall[by_wall]]).astype(np.int32),
+            twin=np.full(count, -1),
+            shift=np.zeros((count, 2), np.int8),
+            half_face=np.full(count, -1),
+        ).compact()
+
+
+def _area(loop: np.ndarray) -> float:
+    """Return the area within points (k, 2), positive if they run counter-clockwise."""
+    x = loop - loop[0]
+    return float(cross(x, np.roll(x, -1, axis=0)).sum()) / 2
