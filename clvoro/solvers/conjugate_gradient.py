@@ -73,7 +73,8 @@ class ConjugateGradient:
         Parameters
         ----------
         operator : Operator
-        rhs, x : (n,) real, device
+        rhs : (n,) real, device
+        x : (n or ``operator.columns``,) real, device
         precondition : (n,) store or callable (r, u, work)
             Inverse of a diagonal, or a function that enqueues u = M^-1 r, M symmetric positive definite, all in
             `store`. It may overwrite `work`.
@@ -285,7 +286,8 @@ class _Iteration:
         self._rhs, self._x = rhs, x
         self._kernels = k = solver.kernels_in(store)
         scratch = self._engine.scratch
-        self._r, self._u, self._p, self._q = (scratch(n, store) for _ in range(4))
+        self._r, self._u, self._q = (scratch(n, store) for _ in range(3))
+        self._p = scratch(operator.columns or n, store)
         # On CPUs it costs more to evaluate directions of neighbors again than to store them.
         self._merged = operator.rows is not None and self._engine.group_size > 1
         directions = (self._p, scratch(n, store)) if self._merged else (self._p, self._p)

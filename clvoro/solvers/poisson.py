@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl.array as cla
@@ -20,6 +21,9 @@ from ..opencl.launch import COSTS_ON_CPU, CostFactors, Launch, cost_factors, one
 from .conjugate_gradient import CURVATURE, ConjugateGradient
 from .linear_system import BreakdownError, Limits, Operator, Precondition, Solution
 from .multigrid import Multigrid
+
+if TYPE_CHECKING:
+    from ..tessellation.part import Part
 
 SINGLE_PRECISION_TOLERANCE = 1e-3
 """Tolerance from which on weights and the iteration's vectors are in float32 and the recurrence's residual is trusted.
@@ -69,11 +73,14 @@ class Laplacian:
         Neighbors of the diagram: walls are negative.
     weights : (m,) real or float32
         w_ij = rho_ij l_ij / d_ij; 0 at walls.
+    part : Part, optional
+        The part whose rows `neighbors` names, if it has ghosts.
     """
 
     starts: cla.Array
     neighbors: cla.Array
     weights: cla.Array
+    part: Part | None = None
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -137,6 +144,7 @@ class Poisson:
         density: cla.Array | None = None,
         *,
         tolerance: float = 0.0,
+        part: Part | None = None,
     ) -> Laplacian:
         """Assemble the Poisson matrix, the paper's (3.2) integrated over the cells.
 
@@ -154,6 +162,8 @@ class Poisson:
             rho > 0, that of ghosts as well; rho_ij is the geometric mean. By default rho = 1.
         tolerance : float
             Tolerance of the solves to come. From `SINGLE_PRECISION_TOLERANCE` on weights and vectors are in float32.
+        part : Part, optional
+            The part whose rows `neighbors` names, if it has ghosts.
 
         Returns
         -------
@@ -187,7 +197,7 @@ class Poisson:
             weights,
             *self.engine.period_args,
         )
-        return Laplacian(starts, neighbors, weights)
+        return Laplacian(starts, neighbors, weights, part)
 
     def inverse_diagonal(self, laplacian: Laplacian) -> cla.Array:
         """Return the inverse row sums of the weights (n,), 0 for a sum of 0, in the workspace."""
@@ -218,10 +228,9 @@ class Poisson:
     def apply(self, laplacian: Laplacian, x: cla.Array, y: cla.Array) -> None:
         """Enqueue y = A x, both in the precision of the weights; x may also be in that of the engine.
 
-        Of ghosts x has rows behind those of the n cells, which `Part.forward` fills.
+        If the Laplacian has a part, x has rows of ghosts, which are filled.
         """
-        kernel, *args = self._launch(laplacian, x, y)
-        self.engine.run_blocks(kernel, *args)
+        self._apply_of(laplacian)(x, y)
 
     def set_up_multigrid(self, laplacian: Laplacian, ordering: object = None) -> Multigrid:
         """Return the preconditioner for `laplacian`, built unless it was built last. `solve` calls this.
@@ -298,14 +307,22 @@ class Poisson:
         SolverError
             If a number is not finite, or the iteration breaks down with Jacobi's preconditioner.
         """
-        n = len(laplacian)
+        n, part = len(laplacian), laplacian.part
         _check("rhs", rhs, (n,))
-        _check("potential", potential, (n,))
+        _check("potential", potential, (n if part is None else part.count,))
         if preconditioner not in _PRECONDITIONERS:
             raise InputError(f"preconditioner got {preconditioner!r}, expected one of {_PRECONDITIONERS}")
         if not tolerance > 0:
             raise InputError(f"tolerance got {tolerance!r}, expected a number > 0, such as 1e-8")
-        operator = Operator(self._apply_of(laplacian), writes_curvature=True, singular=True, rows=laplacian.rows)
+        operator = Operator(
+            self._apply_of(laplacian),
+            writes_curvature=True,
+            singular=True,
+            rows=laplacian.rows if part is None else None,
+            columns=None if part is None else part.count,
+        )
+        if part is not None:
+            preconditioner = "jacobi"  # multigrid knows no ghosts
         system = _Equation(laplacian, operator, rhs, potential, tolerance)
         if preconditioner == "auto":
             one_group = n <= one_group_limit(self.engine)
@@ -389,6 +406,8 @@ class Poisson:
         last: list = [None, None, None]
 
         def apply(x: cla.Array, y: cla.Array) -> None:
+            if laplacian.part is not None:
+                laplacian.part.forward(self.engine, x)
             if last[0] is not x or last[1] is not y:
                 last[:] = x, y, Launch(self.engine, *self._launch(laplacian, x, y))
             last[2]()
