@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -104,7 +104,6 @@ class Job:
         from .. import Adapter, create_context
 
         arguments = self.case.run_arguments()
-        self._refuse_unknown(arguments)
         size = self._during("preparing the size field", self.case.size_field)
         warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
         self._refuse_formats()
@@ -206,14 +205,6 @@ class Job:
                 shown = time.monotonic()
 
         return tell
-
-    def _refuse_unknown(self, arguments: dict[str, Any]) -> None:
-        known = {option.name for option in fields(Options)} | {"points", "fixed"}
-        for name in arguments:
-            if name not in known:
-                raise InputError(
-                    f"{self.case.name}: run.{name} is not a setting of this version of clvoro; leave it out"
-                )
 
     def _refuse_formats(self) -> None:
         """Raise an error before the run if a format cannot hold its mesh, or an option is for another format."""
