@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mesh.connectivity import following, take_rows
-from ..mesh.geometry import Geometry, cell_geometry, face_geometry, polygon_areas, smaller_size, sum_rows
+from ..mesh.geometry import Geometry, cell_geometry, face_geometry, smaller_size, sum_rows
 from .prisms import polyhedra
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 PLANAR_COSINE = 1e-6
 """Two faces of a cell are concave if a center is nearer to the other's plane than this, over the distance of both."""
 _TINY = 1e-150
+_ROOTS = {2: np.sqrt, 3: np.cbrt}
 _PAIRS = 1 << 22
 """Pairs of faces that are compared at a time."""
 
@@ -304,9 +305,7 @@ class SolverMeasures:
     @cached_property
     def sizes(self) -> np.ndarray:
         """Size of each cell: its volume to the power 1/3, in 2D the root of its area, (n,)."""
-        if self.mesh.dim == 3:
-            return np.cbrt(np.maximum(self.geometry.volumes, 0))
-        return np.sqrt(np.maximum(polygon_areas(self.mesh), 0))
+        return _ROOTS[self.mesh.dim](np.maximum(self.mesh.volumes, 0))
 
     @cached_property
     def _face_sizes(self) -> np.ndarray:

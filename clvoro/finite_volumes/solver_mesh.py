@@ -39,7 +39,7 @@ def make_solver_mesh(
     if not collapse:
         return _made(diagram, walls, collapse, parts)
     kept: dict[tuple[str, bytes], Faces] = vars(diagram).setdefault("_solver_meshes", {})
-    key = (walls, parts.tobytes()) if diagram.domain.dim == 2 else ("", b"")
+    key = ("" if diagram.domain.outline is None else walls, parts.tobytes())
     if key not in kept:
         kept[key] = _made(diagram, walls, collapse, parts)
     return kept[key]
@@ -47,24 +47,15 @@ def make_solver_mesh(
 
 def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray) -> Faces:
     """Take the faces of `diagram`, or make straight walls, and collapse short faces."""
-    from .collapse import collapse_short
-    from .short_edges import collapse_short_edges
     from .walls import straight_walls
 
     outline = diagram.domain.outline if walls == "straight" else None
     if outline is not None:
         mesh = straight_walls(diagram, outline, parts)
     else:
-        faces = faces_with_seams(diagram)
-        mesh = replace(
-            faces,
-            points=faces.points.astype(np.float64, copy=False),
-            corners=faces.corners.astype(np.int64 if faces.dim == 2 else np.int32, copy=False),
-            diagram=None,
-        )
-    if mesh.dim == 3:
-        return collapse_short(mesh, diagram) if collapse else mesh.compact()
-    mesh = (collapse_short_edges(mesh, parts) if collapse else mesh).compact()
+        mesh = faces_with_seams(diagram)
+        mesh = replace(mesh, points=mesh.points.astype(np.float64, copy=False), diagram=None)
+    mesh = _COLLAPSED[mesh.dim](mesh, diagram, parts, collapse)
     if outline is not None and abs(mesh.area_change) > _LARGE_CHANGE:
         warn(
             f"straight walls change the area of the domain by {100 * mesh.area_change:+.2g} %: its boundary has "
@@ -72,6 +63,25 @@ def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray)
             MismatchWarning,
         )
     return mesh
+
+
+def _collapsed_polygons(mesh: Faces, diagram: Diagram, parts: np.ndarray, collapse: bool) -> Faces:
+    from .short_edges import collapse_short_edges
+
+    del diagram
+    mesh = replace(mesh, corners=mesh.corners.astype(np.int64, copy=False))
+    return (collapse_short_edges(mesh, parts) if collapse else mesh).compact()
+
+
+def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, collapse: bool) -> Faces:
+    from .collapse import collapse_short
+
+    del parts
+    mesh = replace(mesh, corners=mesh.corners.astype(np.int32, copy=False))
+    return collapse_short(mesh, diagram) if collapse else mesh.compact()
+
+
+_COLLAPSED = {2: _collapsed_polygons, 3: _collapsed_polyhedra}
 
 
 def check_not_sphere(diagram: Diagram, why: str, instead: str) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import MissingLibraryError
-from .vtu import cell_data, in_space, polyhedra
+from .vtu import KINDS, cell_data, in_space, polyhedra
 
 if TYPE_CHECKING:
     import meshio
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from ..mesh.diagram import Diagram
     from .contents import Contents
-
-_VTK_POLYGON, _VTK_POLYHEDRON = 7, 42
 
 
 def missing(library: str, extra: str, what: str) -> MissingLibraryError:
@@ -31,7 +29,7 @@ def to_meshio(contents: Contents, with_data: bool = True) -> meshio.Mesh:
     except ModuleNotFoundError as error:
         raise missing("meshio", "formats", "to_meshio()") from error
     diagram = contents.diagram
-    blocks, rows = _polygons(diagram) if diagram.domain.cell_dim == 2 else _polyhedra(diagram)
+    blocks, rows = _BLOCKS[diagram.domain.cell_dim](diagram)
     data = cell_data(contents) if with_data else {}
     return meshio.Mesh(
         in_space(diagram.vertices), blocks, cell_data={name: [_known(v)[k] for k in rows] for name, v in data.items()}
@@ -45,16 +43,12 @@ def to_pyvista(contents: Contents) -> pyvista.UnstructuredGrid:
     except ModuleNotFoundError as error:
         raise missing("PyVista", "pyvista", "to_pyvista()") from error
     diagram = contents.diagram
-    n = len(diagram)
-    if diagram.domain.cell_dim == 2:
-        kind, starts, items = _VTK_POLYGON, diagram.cell_vertex_starts, diagram.cell_vertices
-    else:
-        described = polyhedra(diagram)
-        kind, items = _VTK_POLYHEDRON, described["faces"]
-        starts = np.concatenate([[0], described["faceoffsets"]])
+    kind = KINDS[diagram.domain.cell_dim]
+    ends, items = (kind.topology(diagram)[name] for name in kind.stream)
+    starts = np.concatenate([[0], ends])
     # The number of items precedes the items of each cell.
     cells = np.insert(items.astype(np.int64), starts[:-1], np.diff(starts))
-    grid = pyvista.UnstructuredGrid(cells, np.full(n, kind, np.uint8), in_space(diagram.vertices))
+    grid = pyvista.UnstructuredGrid(cells, np.full(len(diagram), kind.number, np.uint8), in_space(diagram.vertices))
     for name, values in cell_data(contents).items():
         grid.cell_data[name] = np.array(values)
     return grid
@@ -87,6 +81,9 @@ def _polyhedra(diagram: Diagram) -> tuple[list[Any], list[np.ndarray]]:
         blocks.append((f"polyhedron{k}", of_cells))
         rows.append(cells)
     return blocks, rows
+
+
+_BLOCKS = {2: _polygons, 3: _polyhedra}
 
 
 def _known(values: np.ndarray) -> np.ndarray:

@@ -87,6 +87,9 @@ class VoronoiMesh3D(_AtGenerators, Mesh):
     """A mesh of FiPy in 3D, with ``physicalFaces`` by the names of the domain's boundaries."""
 
 
+_KINDS = {2: VoronoiMesh2D, 3: VoronoiMesh3D}
+
+
 def make_fipy_mesh(diagram: Diagram, walls: WallShape) -> VoronoiMesh2D | VoronoiMesh3D:
     """Return the mesh of FiPy of `diagram`; see `Diagram.to_fipy`."""
     domain = diagram.domain
@@ -105,8 +108,7 @@ def make_fipy_mesh(diagram: Diagram, walls: WallShape) -> VoronoiMesh2D | Vorono
     seam = kept[mesh.twin[kept] >= 0]
     place[mesh.twin[seam]] = place[seam]
     starts, items = _cell_faces(mesh)
-    kind = VoronoiMesh2D if domain.dim == 2 else VoronoiMesh3D
-    made = kind(
+    made = _KINDS[domain.dim](
         mesh,
         kept,
         vertexCoords=mesh.points.T.copy(),

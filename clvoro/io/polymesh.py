@@ -71,7 +71,7 @@ def poly_mesh(
     counts = np.bincount(groups, minlength=len(parts.names)).tolist()
     made = [FoamPatch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]
     made += cyclic_patches(mesh)
-    if domain.dim == 2:
+    if len(cells) > len(mesh):
         made += [FoamPatch("back", "empty", mesh.n_cells), FoamPatch("front", "empty", mesh.n_cells)]
     own = {patch.name for patch in made[len(parts.names) :]}
     clash = [name for name in parts.names if name in own]

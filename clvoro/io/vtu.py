@@ -10,6 +10,8 @@ import json
 import struct
 import sys
 import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -22,14 +24,12 @@ from ..geometry.domain import Domain
 from ..mesh.connectivity import face_corners, face_owners, next_faces, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
-from ..mesh.geometry import polygon_areas
 from ..mesh.straightening import count_sides
 from .atomic import atomic_file
 from .contents import Contents
 from .domains import describe
 
 SOLVER_MESH = "clvoro solver mesh: the cells are not those of a diagram"
-_POLYGON, _POLYHEDRON = 7, 42  # VTK_POLYGON, VTK_POLYHEDRON
 _BLOCK = 1 << 20
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 
@@ -54,11 +54,9 @@ def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: Wall
     mesh = make_solver_mesh(diagram) if walls == "straight" else None
     vertices = diagram.vertices if mesh is None else mesh.points
     points = appended.add(None, in_space(vertices))
-    if diagram.domain.cell_dim == 2:
-        kind, topology = _POLYGON, _polygons(diagram if mesh is None else mesh)
-    else:
-        kind, topology = _POLYHEDRON, polyhedra(diagram if mesh is None else mesh)
-    topology["types"] = np.full(n, kind, np.uint8)
+    kind = KINDS[diagram.domain.cell_dim]
+    topology = kind.topology(diagram if mesh is None else mesh)
+    topology["types"] = np.full(n, kind.number, np.uint8)
     values = cell_data(contents)
     if mesh is not None:
         values |= _solver_data(mesh)
@@ -98,9 +96,7 @@ _"""
 def _diagram_data(diagram: Diagram) -> dict[str, np.ndarray]:
     """Return field data with the domain, and with what corners of cells do not define: the graph."""
     about = np.frombuffer(json.dumps(describe(diagram.domain)).encode(), np.uint8)
-    # In 3D faces without vertices are left out.
-    starts = face_corners(diagram)[0] if diagram.domain.cell_dim == 3 else diagram.face_vertex_starts
-    written = np.diff(starts) > 0
+    written = KINDS[diagram.domain.cell_dim].written(diagram)
     found = {"domain": about, "neighbors": diagram.neighbors[written].astype(np.int32)}
     if any(diagram.domain.periodic):
         found["shifts"] = in_space(diagram.shifts[written]).astype(np.int32)
@@ -147,10 +143,9 @@ def _half_faces(mesh: Diagram | Faces) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def _solver_data(mesh: Faces) -> dict[str, np.ndarray]:
     """Return the cell data that differ from those of the diagram."""
     counts = np.bincount(mesh.sides()[0], minlength=mesh.n_cells)
-    flat = mesh.dim == 2
     return {
-        "volume": polygon_areas(mesh) if flat else mesh.measures.geometry.volumes,
-        "sides" if flat else "faces_of_cell": counts.astype(np.int32),
+        "volume": mesh.volumes,
+        KINDS[mesh.dim].counts: counts.astype(np.int32),
         **_on_boundaries(mesh.domain, mesh.owner, mesh.neighbor, mesh.n_cells),
     }
 
@@ -189,17 +184,58 @@ def polyhedra(mesh: Diagram | Faces) -> dict[str, np.ndarray]:
     }
 
 
+def _every_face(diagram: Diagram) -> np.ndarray:
+    return np.ones(len(diagram.neighbors), bool)
+
+
+def _faces_with_corners(diagram: Diagram) -> np.ndarray:
+    return np.diff(face_corners(diagram)[0]) > 0
+
+
+def _count_faces(diagram: Diagram) -> np.ndarray:
+    return np.bincount(face_owners(diagram)[_faces_with_corners(diagram)], minlength=len(diagram))
+
+
+@dataclass(frozen=True)
+class CellKind:
+    """What a file has of cells of one dimension.
+
+    Attributes
+    ----------
+    number : int
+        VTK's number of the kind.
+    counts : str
+        Name of the cell data with the numbers of sides or faces.
+    stream : (str, str)
+        Names of the arrays with the ends of the cells' parts and their items.
+    topology, count, written : functions
+        Of a diagram: VTK's arrays (also of a mesh for solvers), numbers of sides or faces, and which half-faces are
+        written.
+    """
+
+    number: int
+    counts: str
+    stream: tuple[str, str]
+    topology: Callable[[Diagram | Faces], dict[str, np.ndarray]]
+    count: Callable[[Diagram], np.ndarray]
+    written: Callable[[Diagram], np.ndarray]
+
+
+KINDS = {
+    2: CellKind(7, "sides", ("offsets", "connectivity"), _polygons, count_sides, _every_face),
+    3: CellKind(42, "faces_of_cell", ("faceoffsets", "faces"), polyhedra, _count_faces, _faces_with_corners),
+}
+"""VTK's polygons and polyhedra, by the dimension of the cells."""
+
+
 def cell_data(contents: Contents) -> dict[str, np.ndarray]:
     """Return the cell data by name. Vectors have three coordinates, as VTK requires."""
-    diagram = contents.diagram
-    flat, n = diagram.domain.cell_dim == 2, len(diagram)
-    # In 3D count the faces that are written: those with vertices.
-    seen = np.diff(face_corners(diagram)[0]) > 0
-    counts = count_sides(diagram) if flat else np.bincount(face_owners(diagram)[seen], minlength=n)
+    diagram, n = contents.diagram, len(contents.diagram)
+    kind = KINDS[diagram.domain.cell_dim]
     return {
         **contents.of_run,
         "volume": diagram.volumes,
-        "sides" if flat else "faces_of_cell": counts.astype(np.int32),
+        kind.counts: kind.count(diagram).astype(np.int32),
         "label": np.arange(n, dtype=np.int32),
         "boundary": largest_boundary(diagram),
         **_on_boundaries(diagram.domain, face_owners(diagram), diagram.neighbors, n),

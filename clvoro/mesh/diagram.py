@@ -404,7 +404,7 @@ class Diagram(MeshOutput):
         if solver is None:
             if walls is not None:
                 raise InputError(f"walls is {walls!r:.60}, and no solver; say which one: solver='openfoam'")
-            from .check import check_diagram
+            from .check.mesh import check_diagram
 
             return check_diagram(self)
         from ..finite_volumes.gate import check_for_solver

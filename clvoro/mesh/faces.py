@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .connectivity import face_corners, face_keys, face_owners, following, inverse, slices, take_rows
-from .geometry import face_geometry
+from .geometry import face_vectors, polygon_areas
 from .read_only import Sealed, read_only
 
 if TYPE_CHECKING:
@@ -125,11 +125,7 @@ class Faces(Sealed):
         if self.diagram is not None:
             made = _geometry_of_diagram(self, self.diagram)
             return {name: read_only(values) for name, values in made.items()}
-        if self.dim == 3:
-            center, vector = face_geometry(self.points, self.starts, self.corners)
-        else:
-            a, b = self.points[self.corners.reshape(-1, 2)].swapaxes(0, 1)
-            center, vector = (a + b) / 2, np.stack([(b - a)[:, 1], -(b - a)[:, 0]], axis=1)
+        center, vector = face_vectors(self.points, self.starts, self.corners)
         area = np.linalg.norm(vector, axis=1)
         normal = vector / np.where(area > 0, area, 1)[:, None]
         return {"area": read_only(area), "normal": read_only(normal), "center": read_only(center)}
@@ -215,6 +211,11 @@ class Faces(Sealed):
         return SolverMeasures(self)
 
     @cached_property
+    def volumes(self) -> np.ndarray:
+        """Volume of each cell, (n,) float64; area in 2D."""
+        return read_only(polygon_areas(self)) if self.dim == 2 else self.measures.geometry.volumes
+
+    @cached_property
     def area_change(self) -> float:
         """Volume (2D: area) of all cells minus that of the domain, over that of the domain; 0 up to round-off.
 
@@ -222,12 +223,8 @@ class Faces(Sealed):
         """
         walls, low = self.starts[self.n_inner :], np.array(self.domain.lower)
         corners = self.points[self.corners[walls[0] :]] - low
-        if self.dim == 2:
-            a, b = corners.reshape(-1, 2, 2).swapaxes(0, 1)
-            total = float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2)
-        else:
-            centers, areas = face_geometry(corners, walls - walls[0], np.arange(len(corners)))
-            total = float((centers * areas).sum() / 3)
+        centers, areas = face_vectors(corners, walls - walls[0], np.arange(len(corners)))
+        total = float((centers * areas).sum() / self.dim)
         change = total / self.domain.measure - 1
         return change if abs(change) > 1e-12 else 0.0
 

@@ -44,6 +44,14 @@ class Geometry(Sealed):
     volumes: np.ndarray
 
 
+def face_vectors(points: np.ndarray, starts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return centers and area vectors of faces, (f, d) each; in 2D of edges, to the right of the way along them."""
+    if points.shape[1] == 3:
+        return face_geometry(points, starts, corners)
+    a, b = points[corners.reshape(-1, 2)].swapaxes(0, 1)
+    return (a + b) / 2, np.stack([(b - a)[:, 1], -(b - a)[:, 0]], axis=1)
+
+
 def face_geometry(points: np.ndarray, starts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centers and area vectors of faces, (f, 3) each.
 

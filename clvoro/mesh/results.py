@@ -131,7 +131,7 @@ class Result(Sealed, MeshOutput):
         """
         if solver is not None or walls is not None:
             return self.diagram.check(solver, walls=walls)
-        from .check import check_result
+        from .check.mesh import check_result
 
         return check_result(self)
 

@@ -14,19 +14,17 @@ import numpy as np
 from ...files import open_plain
 from ...geometry.domain import Domain
 from ...mesh.check.rebuilt import rebuild
-from ...mesh.connectivity import face_owners, following
+from ...mesh.connectivity import following
 from ...mesh.diagram import Diagram
 from ...mesh.results import HISTORY_DTYPE, Result
 from ...mesh.spherical import rebuild_on_sphere
-from ...mesh.straightening import count_sides
 from ..arrays import FileError, explained
 from ..domains import described
+from ..vtu import KINDS
 from .arrays import END, LONGEST_HEAD, MARK, FileReader
 
 _OFF_SURFACE = 1e-5
 """Largest distance of a position from a curved domain in units of its size: round-off of float32, and more."""
-_KINDS = {2: 7, 3: 42}
-"""VTK's polygon and polyhedron by the dimension of the cells."""
 
 
 def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
@@ -62,7 +60,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
     if "FieldData.domain" not in arrays:
         raise FileError("it has no domain; it is not from clvoro, or from an earlier version: load its .npz file")
     domain = described(json.loads(arrays["FieldData.domain"].tobytes()))
-    if not (arrays["Cells.types"] == _KINDS[domain.cell_dim]).all():
+    if not (arrays["Cells.types"] == KINDS[domain.cell_dim].number).all():
         raise FileError(f"its cells are not those of a mesh in {domain}")
     x = np.ascontiguousarray(vertices[:, : domain.dim])
     points = np.ascontiguousarray(arrays["CellData.generator"][:, : domain.dim].astype(float))
@@ -70,7 +68,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
         off = np.linalg.norm(domain.nearest(places) - places, axis=1)
         if not (off < _OFF_SURFACE * domain.frame[1]).all():
             raise FileError(f"its {name} are not on the {domain}")
-    known = _cell_polygons(arrays, len(x), domain) if domain.cell_dim == 2 else _cell_polyhedra(arrays, len(x))
+    known = _READERS[domain.cell_dim](arrays, len(x), domain)
     walls, m = len(domain.boundary_index), known["neighbor_starts"][-1]
     known |= {"points": points, "volumes": arrays["CellData.volume"].astype(float), "vertices": x}
     known["neighbors"] = _indices(arrays["FieldData.neighbors"] + walls, n + walls, "neighbors") - walls
@@ -133,8 +131,9 @@ def _starts(ends: np.ndarray, total: int, name: str) -> np.ndarray:
     return starts
 
 
-def _cell_polyhedra(arrays: Mapping[str, np.ndarray], v: int) -> dict[str, np.ndarray]:
+def _cell_polyhedra(arrays: Mapping[str, np.ndarray], v: int, domain: Domain) -> dict[str, np.ndarray]:
     """Return the diagram's arrays of faces in 3D."""
+    del domain
     stream = _indices(arrays["Cells.faces"], max(v, len(arrays["Cells.faces"])), "faces")
     ends = _starts(arrays["Cells.faceoffsets"], len(stream), "faceoffsets")
     counts, cells = array("q"), array("q", [0])  # places of the corner counts of faces
@@ -159,35 +158,28 @@ def _cell_polyhedra(arrays: Mapping[str, np.ndarray], v: int) -> dict[str, np.nd
     }
 
 
+_READERS = {2: _cell_polygons, 3: _cell_polyhedra}
+
+
 def _check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
     """Check the `arrays` of a file that are not needed to make its `diagram` against that diagram.
 
     Raises
     ------
-    ValueError
+    FileError
         Names the first array that differs.
     """
-    n, v = len(diagram), len(diagram.vertices)
-    given = {"CellData.label": arrays["CellData.label"]}
-    expected: dict[str, np.ndarray] = {"CellData.label": np.arange(n)}
-    if diagram.domain.cell_dim == 2:
-        for name in ("Points.", "CellData.generator") if diagram.domain.dim == 2 else ():
-            given[f"z of {name}"] = z = arrays[name][:, 2]
-            expected[f"z of {name}"] = np.zeros(len(z))
-        given["CellData.sides"] = arrays["CellData.sides"]
-        expected["CellData.sides"] = count_sides(diagram)
-    else:
-        expected["CellData.faces_of_cell"] = np.diff(diagram.neighbor_starts)
-        # The corners of a cell, each once, in ascending order.
-        cell = np.repeat(face_owners(diagram).astype(np.int64), np.diff(diagram.face_vertex_starts))
-        keys = np.unique(cell * v + diagram.face_vertices)
-        expected["Cells.offsets"] = np.cumsum(np.bincount(keys // v, minlength=n))
-        expected["Cells.connectivity"] = keys % v
-        given = {name: arrays[name] for name in expected}
+    kind = KINDS[diagram.domain.cell_dim]
+    expected = {f"Cells.{name}": values for name, values in kind.topology(diagram).items()}
+    expected |= {"CellData.label": np.arange(len(diagram)), f"CellData.{kind.counts}": kind.count(diagram)}
+    given = {name: arrays[name] for name in expected}
+    for name in ("Points.", "CellData.generator"):
+        given[f"z of {name}"] = rest = arrays[name][:, diagram.domain.dim :].ravel()
+        expected[f"z of {name}"] = np.zeros(len(rest))
     for name, values in expected.items():
         if given[name].shape != values.shape:
-            raise ValueError(f"{name} has shape {given[name].shape}, expected {values.shape}")
+            raise FileError(f"{name} has shape {given[name].shape}, expected {values.shape}")
         wrong = np.flatnonzero(given[name] != values)
         if len(wrong):
             k = wrong[0]
-            raise ValueError(f"{name} is {given[name][k]} at {k}, expected {values[k]}")
+            raise FileError(f"{name} is {given[name][k]} at {k}, expected {values[k]}")

@@ -44,11 +44,11 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         lambda i: f"size_error[{i}] is {e[i]:.10g}, volume and size give {error[i]:.10g} (the paper's 3.1)",
     )
     # Measures from the corners in a file, and straightened boundaries, have the round-off of positions.
-    rounding = ROUNDINGS * g.unit * counts * (1 if dim == 2 else g.reach) / perimeter
+    rounding = ROUNDINGS * g.unit * counts * g.reach ** (dim - 2) / perimeter
     off = np.abs(q - quality) - 64 * eps * (1 + quality)
     if not g.remade:
         # A face as short as round-off may have the direction of the round-off.
-        slivers = d.face_measures < ROUNDINGS * g.unit * (1 if dim == 2 else g.reach[g.owner])
+        slivers = d.face_measures < ROUNDINGS * g.unit * g.reach[g.owner] ** (dim - 2)
         loose = np.bincount(g.owner, slivers, minlength=n) > 0
         if d.domain.cuts_cells:
             loose |= np.bincount(g.owner, d.neighbors < 0, minlength=n) > 0
