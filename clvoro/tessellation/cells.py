@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +29,6 @@ from .device_diagram import (
     NeighborRows,
     OpenCellError,
     Tessellation,
-    restored,
 )
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
 
@@ -123,16 +122,6 @@ class Cells:
     def reserve(self, n: int) -> None:
         """Make room for `n` cells."""
         self._reserve(n)
-
-    def restore(
-        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int, vertices: Sequence[np.ndarray] = ()
-    ) -> Tessellation:
-        """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces."""
-        n, m = len(points), len(saved["neighbors"])
-        self._reserve(n)
-        self._reserve_faces(n, m + spare)
-        faces = {name: array[: m + spare] for name, array in self._of_faces.items()}
-        return restored(points, {**self._views, **faces}, saved)
 
     @framed
     def tessellate(

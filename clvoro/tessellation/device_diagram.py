@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pyopencl.array as cla
@@ -14,8 +14,6 @@ from ..errors import InputError
 from ..geometry.sphere import directions, farthest_place
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from ..geometry.domain import Domain
     from ..opencl.engine import Engine
     from .clipped.trim import Trimmed
@@ -215,17 +213,3 @@ class NeighborRows:
         """Return a copy of the graph of `t`, or of the convex cells that it was cut from."""
         whole = t if t.trimmed is None else t.trimmed.convex
         return cls(whole.n, whole.starts.copy(), whole.neighbors.copy())
-
-
-def restored(points: cla.Array, arrays: Mapping[str, cla.Array], saved: Mapping[str, np.ndarray]) -> Tessellation:
-    """Return the diagram of `points` with `saved` copied into `arrays`, by the names of the fields of `Tessellation`.
-
-    Arrays may have more rows; these become zero.
-    """
-    for name, array in arrays.items():
-        known = len(saved[name])
-        array[:known].set(saved[name])
-        if len(array) > known:
-            array[known:].fill(0)
-    fields: dict[str, Any] = dict(arrays)
-    return Tessellation(n=len(points), points=points, **fields)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -31,7 +30,7 @@ from .cut_cells import (
     capacity_defines,
     clip_each,
 )
-from .device_diagram import EXACT_SHARE, FULL, ROUGH_SHARE, CloseError, NeighborRows, Tessellation, restored
+from .device_diagram import EXACT_SHARE, FULL, ROUGH_SHARE, CloseError, NeighborRows, Tessellation
 from .periodic.halo import halo_defines
 from .teams import TEAM, TeamKernel, are_for_new_cells, has_warps, team_defines
 from .weight_bounds import WeightBounds
@@ -134,20 +133,6 @@ class Polyhedra:
             self._of_vertices = None
             self._of_vertices = (self.engine.empty(2 * m, np.uint32), self.engine.empty(m, np.uint32))
         return self._of_vertices
-
-    def restore(
-        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int, vertices: Sequence[np.ndarray] = ()
-    ) -> Tessellation:
-        """Return the `saved` diagram of `points` (n, 3), with room for `spare` more half-faces."""
-        n, m = len(points), len(saved["neighbors"]) + spare
-        cells = self._cell_rows(n)
-        faces = {name: array[:m] for name, array in self._faces(m).items()}
-        t = restored(points, {**cells, **faces}, saved)
-        if vertices:
-            t = replace(t, vertices=self._vertices(m))
-            for array, values in zip(t.vertices, vertices, strict=True):
-                array[: len(values)].set(values)
-        return t
 
     @framed
     def tessellate(

@@ -20,9 +20,6 @@ from .teams import TEAM, TeamKernel, are_for, has_warps, team_defines
 
 MORE = 8
 """Room for further neighbors of a cell, as in `tessellation/polyhedra_update.cl`."""
-NO_CORNERS = 0
-"""The fourth number of the first triple of a cell without triples."""
-NO_NEIGHBOR = np.iinfo(np.int32).min
 MAX_ROUNDS = 8
 """Most rounds of making cells again; after that the diagram is built from scratch."""
 MAX_SHARE = 0.5
@@ -31,16 +28,6 @@ ALL_CELLS, MARKED_CELLS = 0, 1
 """Which cells `update_cells` updates: all, or those marked by a check."""
 SPARE = 0.25
 """Room for cells that gain faces, over the half-faces of the previous diagram."""
-
-
-def are_triples(starts: np.ndarray, saved: np.ndarray) -> bool:
-    """Return whether `saved` triples (2 m,) uint32 name only faces of their rows, given by `starts` (n + 1,)."""
-    triples = saved.view(np.uint8).reshape(-1, 4)
-    counts = np.diff(starts)
-    known = triples[2 * starts[:-1], 3] != NO_CORNERS
-    used = np.arange(len(triples)) - np.repeat(2 * starts[:-1], 2 * counts) < np.repeat(2 * counts - 4, 2 * counts)
-    limits = np.repeat(np.where(known, counts, 256), 2 * counts)
-    return bool((~used | (triples[:, :3].max(axis=1) < limits)).all())
 
 
 class PolyhedraUpdate:

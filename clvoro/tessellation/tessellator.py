@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -242,22 +242,6 @@ class Tessellator:
     def laplacian_measures(self, t: Tessellation) -> cla.Array:
         """Return the face measures of `t` for a Poisson matrix (see `GhostImages.scale_far_measures`)."""
         return t.face_measures if t.folded is None else self.stages.ghost_images.scale_far_measures(t, t.folded.codes)
-
-    def restore(
-        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int, vertices: Sequence[np.ndarray] = ()
-    ) -> Tessellation:
-        """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces.
-
-        It uses the arrays of the stage that makes the next diagram, to save memory. `vertices` are those of
-        the diagram, if it had any.
-        """
-        if self.domain.cuts_cells:
-            # The convex diagram is not saved. A new diagram has the same bits.
-            t = self.tessellate(points, len(points))
-            self.stages.bins.clear()
-            return t
-        cells = self.stages.cells if self.steps.halo is None else self.stages.folded_cells
-        return cells.restore(points, saved, spare, vertices)
 
     @contextmanager
     def _in_units(self, points: cla.Array, n: int) -> Iterator[None]:

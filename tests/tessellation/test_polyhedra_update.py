@@ -10,7 +10,7 @@ from clvoro.adaptation.descent.surface_descent import SurfaceDescent
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
-from clvoro.tessellation.polyhedra_update import PolyhedraUpdate, are_triples
+from clvoro.tessellation.polyhedra_update import PolyhedraUpdate
 from tests.reference import patch
 
 BOX = clvoro.Box((0, 0, 0), (1, 1, 0.75))
@@ -94,16 +94,6 @@ class Carried:
             self.t = t
             self.compare(x)
         return t is not None
-
-    def save_and_restore(self):
-        """Continue from a copy on the host, as a resumed run."""
-        t, m = self.t, self.t.starts.get()[-1]
-        names = "neighbors", "face_measures", "face_centroids"
-        saved = {name: getattr(t, name).get()[:m] for name in names}
-        saved |= {name: getattr(t, name).get() for name in ("starts", "volumes", "offsets", "covariances")}
-        vertices = t.vertices[0].get()[: 2 * m], t.vertices[1].get()[:m]
-        self.cells, self.update = Polyhedra(self.engine), PolyhedraUpdate(self.engine)
-        self.t = self.cells.restore(t.points, saved, len(t.neighbors) - m, vertices)
 
     def compare(self, x):
         """Compare the diagram with one made anew."""
@@ -228,23 +218,20 @@ def test_coinciding_generators_are_left_to_a_new_diagram(engine):
 
 
 @pytest.mark.sparse(1)
-def test_same_bits_again_and_from_saved_vertices(engine):
+def test_same_bits_again(engine):
     rng = np.random.default_rng(13)
     moves = 0.02 * spacing(POINTS["random"]) * rng.uniform(-1, 1, (3, N, 3))
     found = []
-    for again in (False, False, True):
+    for _ in range(2):
         carried = Carried(engine, POINTS["random"])
         points = relaxed(carried, POINTS["random"], 4)
         for move in moves:
             points = points + move
-            if again:
-                carried.save_and_restore()
             assert carried.move(points)
         t, m = carried.t, carried.t.starts.get()[-1]
         found.append([getattr(t, name).get()[: t.n].tobytes() for name in ("volumes", "offsets")])
         found[-1].append(t.neighbors.get()[:m].tobytes())
     assert found[0] == found[1]
-    assert found[0] == found[2]
 
 
 @pytest.mark.slow
@@ -276,13 +263,3 @@ def test_same_bits_with_four_and_eight_lanes(ctx, monkeypatch):
             ]
         )
     assert found[0] == found[1]
-
-
-def test_damaged_triples_are_found(engine):
-    carried = Carried(engine, POINTS["random"])
-    relaxed(carried, POINTS["random"], 3)
-    starts, triples = carried.t.starts.get(), carried.t.vertices[0].get()
-    triples = triples[: 2 * starts[-1]]
-    assert are_triples(starts, triples)
-    triples[2 * starts[5]] |= 0xFF
-    assert not are_triples(starts, triples)
