@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
-from .boundary_names import BoundaryNames, Walls
+from .boundary_names import Walls
 from .domain import LARGEST_EDGE, Domain
-from .shapes import Edges
-from .surface import Surface, box_surface
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Box(Domain):
     """Axis-aligned box in 2D or 3D.
 
@@ -58,7 +55,7 @@ class Box(Domain):
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     periodic: tuple[bool, ...] = False  # type: ignore[assignment]
-    names: Mapping[str, Walls] | None = field(default=None, compare=False)
+    names: Mapping[str, Walls] | None = None
 
     def __post_init__(self) -> None:
         try:
@@ -95,93 +92,10 @@ class Box(Domain):
         periodic = f", periodic={self.periodic}" if any(self.periodic) else ""
         return f"Box(lower={self.lower}, upper={self.upper}{periodic})"
 
-    def _default_names(self) -> BoundaryNames:
-        sides = [f"{axis}{end}" for axis in "xyz"[: self.dim] for end in ("Min", "Max")]
-        walls = np.flatnonzero(~np.repeat(self.periodic, 2))
-        index = np.full(len(sides), -1, np.int32)
-        index[walls] = np.arange(len(walls))
-        return BoundaryNames(tuple(sides[w] for w in walls), index, "side")
-
-    def boundary(self, walls: Walls | None = None) -> Edges | Surface:
-        """Return sides as a shape for `clvoro.sizing.Distance`: segments in 2D, triangles in 3D.
-
-        Parameters
-        ----------
-        walls : int, str, or a sequence of them, optional
-            Numbers or names of sides; by default all that are not periodic.
-
-        Raises
-        ------
-        InputError, InputTypeError
-            If a side or name does not exist, or the box has no walls.
-        """
-        chosen = self.boundaries.select("boundary", walls)
-        if not chosen.size:
-            raise InputError(f"{self} is periodic in every direction, expected a box with a boundary")
-        lower, upper = np.array(self.lower), np.array(self.upper)
-        if self.dim == 3:
-            whole = box_surface(lower, upper)
-            sides = whole.triangles.reshape(6, 2, 3)[[4, 5, 2, 3, 0, 1]]
-            return Surface(whole.vertices, sides[chosen].reshape(-1, 3), "boundary")
-        corners = np.array([(0, 1), (0, 0), (1, 0), (1, 1)])  # counter-clockwise, side 0 first
-        order = np.array([0, 2, 1, 3])[chosen]  # place of each side in this order
-        x = np.where(corners, upper, lower)
-        return Edges(x[order], x[(order + 1) % 4])
-
-    @property
-    def boundary_measure(self) -> float:
-        """Length or area of all sides, periodic ones included."""
-        return float(2 * sum(np.prod(np.delete(self.extent, a)) for a in range(self.dim)))
-
-    def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return outward unit normals of sides (k,) int, and a point on each, (k, d) each."""
-        axis, upper = walls // 2, walls % 2
-        normals = np.zeros((len(walls), self.dim))
-        normals[np.arange(len(walls)), axis] = 2.0 * upper - 1
-        return normals, np.array([self.lower, self.upper])[upper]
-
-    def _gaps(self, points: np.ndarray) -> np.ndarray:
-        """Return the signed distances (n, 2 d) of `points` to the planes of all sides, inf for periodic ones."""
-        gaps = np.stack([np.subtract(points, self.lower), np.subtract(self.upper, points)], axis=2)
-        gaps[:, np.array(self.periodic)] = np.inf
-        return gaps.reshape(len(points), 2 * self.dim)
-
-    def closest_walls(self, points: np.ndarray) -> np.ndarray:
-        """Return for each of `points` (n, d) the side whose plane is the closest one, (n,) int."""
-        return self._gaps(points).argmin(axis=1)
-
-    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each of `points` (n, d) to the walls, inside and outside; (n,), inf without walls."""
-        gaps = self._gaps(points)
-        outside = np.linalg.norm(np.minimum(gaps, 0), axis=1)
-        return np.where(outside > 0, outside, gaps.min(axis=1))
-
-    def inner_points(self) -> np.ndarray:
-        """Return the center, (1, d)."""
-        return (np.array([self.lower]) + self.upper) / 2
-
-    def nearest(self, points: np.ndarray) -> np.ndarray:
-        """Return the nearest point of the box to each of `points` (n, d)."""
-        return np.where(self.periodic, points, np.clip(points, self.lower, self.upper))
-
-    @property
-    def measure(self) -> float:
-        """Area or volume."""
-        return float(np.prod(self.extent))
-
     def describe(self) -> dict[str, Any]:
         """Return the arguments of this box as numbers, strings and lists."""
         corners = {"lower": self.lower, "upper": self.upper, "periodic": self.periodic}
         return corners | ({"names": dict(self.names)} if self.names else {})
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool.
-
-        In a periodic direction every finite coordinate is inside.
-        """
-        points = check_rows("points", points, self.dim)
-        inside = (points >= self.lower) & (points <= self.upper)
-        return np.all(inside | (np.array(self.periodic) & np.isfinite(points)), axis=1)
 
 
 def _directions(periodic: object, dim: int) -> tuple[bool, ...]:

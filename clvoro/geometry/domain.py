@@ -14,13 +14,13 @@ from ..arguments import check_rows, format_point
 from ..errors import InputError
 from ..opencl.engine import PLAIN, Traits
 from .boundary_names import BoundaryNames, Walls
+from .shapes import Edges
+from .surface import Surface, box_surface
 
 if TYPE_CHECKING:
     from ..opencl.engine import Engine
     from .polygon import Polygon
-    from .shapes import Edges
     from .sphere import Sphere
-    from .surface import Surface
 
 LARGEST_EDGE = 1e50
 """Longest edge of a domain, and the inverse of the shortest: fifth powers of lengths must not overflow float64."""
@@ -43,7 +43,7 @@ class Chart(NamedTuple):
 
 
 class Domain(ABC):
-    """The region to mesh.
+    """The region to mesh: a box between two corners in all that a class does not say otherwise.
 
     Attributes
     ----------
@@ -57,9 +57,9 @@ class Domain(ABC):
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
-    names: Mapping[str, Walls] | None
+    names: Mapping[str, Walls] | None = None
 
-    @property
+    @cached_property
     def periodic(self) -> tuple[bool, ...]:
         """Directions in which the domain is periodic. By default none."""
         return (False,) * self.dim
@@ -104,20 +104,24 @@ class Domain(ABC):
         return 1
 
     @property
-    @abstractmethod
     def measure(self) -> float:
         """Area or volume."""
+        return float(np.prod(self.extent))
 
     # The boundary: walls are the sides of a box or the edges of a polygon.
 
-    @abstractmethod
-    def _default_names(self) -> BoundaryNames:
+    def default_names(self) -> BoundaryNames:
         """Return the parts of the boundary with their default names."""
+        sides = [f"{axis}{end}" for axis in "xyz"[: self.dim] for end in ("Min", "Max")]
+        walls = np.flatnonzero(~np.repeat(self.periodic, 2))
+        index = np.full(len(sides), -1, np.int32)
+        index[walls] = np.arange(len(walls))
+        return BoundaryNames(tuple(sides[w] for w in walls), index, "side")
 
     @cached_property
     def boundaries(self) -> BoundaryNames:
         """The parts of the boundary, with the caller's names."""
-        default = self._default_names()
+        default = self.default_names()
         return default.renamed(f"{type(self).__name__} names", self.names) if self.names else default
 
     @property
@@ -134,43 +138,63 @@ class Domain(ABC):
         return self.boundaries.index
 
     @property
-    @abstractmethod
     def boundary_measure(self) -> float:
-        """Length or area of the walls; at least that of all walls' faces."""
+        """Length or area of all sides, periodic ones included."""
+        return float(2 * sum(np.prod(np.delete(self.extent, a)) for a in range(self.dim)))
 
-    @abstractmethod
     def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return outward unit normals of `walls` (k,) int, and a point on each, (k, d) each."""
-
-    def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the normals (k, d) of `walls` (k,) int, and the signed distances (k,) of `points` (k, d) from them.
-
-        On a part of a sphere the normal leads to the removed generator, and the distance is half of that way.
-        """
-        normals, anchors = self.wall_planes(walls)
-        return normals, ((anchors - points) * normals).sum(axis=1)
-
-    def mirrored(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return the mirror images (k, d) of `points` (k, d) behind `walls` (k,) int; there the removed generators."""
-        normals, gaps = self.toward_walls(walls, points)
-        return points + 2 * gaps[:, None] * normals
+        """Return outward unit normals of sides (k,) int, and a point on each, (k, d) each."""
+        axis, upper = walls // 2, walls % 2
+        normals = np.zeros((len(walls), self.dim))
+        normals[np.arange(len(walls)), axis] = 2.0 * upper - 1
+        return normals, np.array([self.lower, self.upper])[upper]
 
     def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return the distance of each of `points` (k, d) to its wall of `walls` (k,); by default to the plane."""
         normals, anchors = self.wall_planes(walls)
         return np.abs(((points - anchors) * normals).sum(axis=1))
 
-    @abstractmethod
+    def _gaps(self, points: np.ndarray) -> np.ndarray:
+        """Return the signed distances (n, 2 d) of `points` to the planes of all sides, inf for periodic ones."""
+        gaps = np.stack([np.subtract(points, self.lower), np.subtract(self.upper, points)], axis=2)
+        gaps[:, np.array(self.periodic)] = np.inf
+        return gaps.reshape(len(points), 2 * self.dim)
+
     def closest_walls(self, points: np.ndarray) -> np.ndarray:
-        """Return for each of `points` (n, d) the number of the closest wall, (n,) int; -1 without walls."""
+        """Return for each of `points` (n, d) the side whose plane is the closest one, (n,) int."""
+        return self._gaps(points).argmin(axis=1)
 
-    @abstractmethod
     def boundary_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each of `points` (n, d) to the boundary, inside and outside; (n,), inf without one."""
+        """Return the distance of each of `points` (n, d) to the walls, inside and outside; (n,), inf without walls."""
+        gaps = self._gaps(points)
+        outside = np.linalg.norm(np.minimum(gaps, 0), axis=1)
+        return np.where(outside > 0, outside, gaps.min(axis=1))
 
-    @abstractmethod
     def boundary(self, walls: Walls | None = None) -> Edges | Surface:
-        """Return walls as a shape for `clvoro.sizing.Distance`: numbers, names, or by default all."""
+        """Return sides as a shape for `clvoro.sizing.Distance`: segments in 2D, triangles in 3D.
+
+        Parameters
+        ----------
+        walls : int, str, or a sequence of them, optional
+            Numbers or names of sides; by default all that are not periodic.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If a side or name does not exist, or the box has no walls.
+        """
+        chosen = self.boundaries.select("boundary", walls)
+        if not chosen.size:
+            raise InputError(f"{self} is periodic in every direction, expected a box with a boundary")
+        lower, upper = np.array(self.lower), np.array(self.upper)
+        if self.dim == 3:
+            whole = box_surface(lower, upper)
+            sides = whole.triangles.reshape(6, 2, 3)[[4, 5, 2, 3, 0, 1]]
+            return Surface(whole.vertices, sides[chosen].reshape(-1, 3), "boundary")
+        corners = np.array([(0, 1), (0, 0), (1, 0), (1, 1)])  # counter-clockwise, side 0 first
+        order = np.array([0, 2, 1, 3])[chosen]  # place of each side in this order
+        x = np.where(corners, upper, lower)
+        return Edges(x[order], x[(order + 1) % 4])
 
     def _checked_names(self) -> dict[str, list[int]] | None:
         """Check the caller's names, and return them with the numbers of their walls; None without names."""
@@ -179,17 +203,45 @@ class Domain(ABC):
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Return the domain as a dictionary of numbers, strings and lists, for files."""
+        """Return the arguments of the domain as numbers, strings and lists, for files."""
 
-    @abstractmethod
+    @classmethod
+    def described(cls, **values: Any) -> Domain:
+        """Return the domain from the values that `describe` returns."""
+        return cls(**values)
+
+    kinds: ClassVar[dict[str, type[Domain]]] = {}
+    """All classes of domains by their names, for files."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        Domain.kinds[cls.__name__] = cls
+
+    # Equal domains have equal descriptions; names may differ.
+
+    @cached_property
+    def _identity(self) -> dict[str, Any]:
+        return {key: value for key, value in self.describe().items() if key != "names"}
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{key}={value}' for key, value in self.describe().items())})"
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return self is other or self._identity == other._identity
+
+    def __hash__(self) -> int:
+        return hash((type(self), self.lower, self.upper))
+
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return for each of `points` (n, d) whether it lies in the domain, boundary included; (n,) bool.
+        """Return for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool.
 
-        Raises
-        ------
-        InputError, InputTypeError
-            If `points` is not an array of numbers of that shape.
+        In a periodic direction every finite coordinate is inside.
         """
+        points = check_rows("points", points, self.dim)
+        inside = (points >= self.lower) & (points <= self.upper)
+        return np.all(inside | (np.array(self.periodic) & np.isfinite(points)), axis=1)
 
     def check_rows(self, name: str, points: object) -> np.ndarray:
         """Return `points`, an array_like of real numbers, as a float64 array (n, d); see `arguments.check_rows`."""
@@ -227,13 +279,13 @@ class Domain(ABC):
         """Return for each of `points` (n, d) in the domain the piece that holds it, (n,) int; -1 elsewhere."""
         return np.where(self.contains(points), 0, -1)
 
-    @abstractmethod
     def inner_points(self) -> np.ndarray:
-        """Return a point inside of each piece, (n_pieces, d), not on its boundary."""
+        """Return the center, (1, d)."""
+        return (np.array([self.lower]) + self.upper) / 2
 
-    @abstractmethod
     def nearest(self, points: np.ndarray) -> np.ndarray:
-        """Return the nearest point of the domain to each of `points` (n, d): the point itself if it is inside."""
+        """Return the nearest point of the box to each of `points` (n, d)."""
+        return np.where(self.periodic, points, np.clip(points, self.lower, self.upper))
 
     def chart(self) -> Chart:
         """Return the domain in which generators are drawn and sizes are integrated: itself, unless it is curved."""

@@ -366,7 +366,8 @@ class Polygon(Domain):
         """Area, with one rounding per ring and one for the sum."""
         return self._measure
 
-    def _default_names(self) -> BoundaryNames:
+    def default_names(self) -> BoundaryNames:
+        """Return the parts of the boundary with their default names."""
         first = np.diff(self.piece_of_ring, prepend=-1) > 0
         names = [
             (f"outer-{o}" if self.n_pieces > 1 else "outer") if is_outer else f"hole-{h}"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -38,7 +36,7 @@ def farthest_place(points: np.ndarray) -> tuple[float, float, float]:
     return float(lon), float(lat), float(np.degrees(2 * np.arcsin(min(chord.max() / 2, 1))))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sphere(Domain):
     """The surface of a sphere around the origin.
 
@@ -87,11 +85,6 @@ class Sphere(Domain):
         return (self.radius,) * 3
 
     @property
-    def names(self) -> Mapping[str, Walls] | None:  # type: ignore[override]
-        """None: a sphere has no boundary."""
-        return None
-
-    @property
     def cell_dim(self) -> int:
         """2: cells have areas."""
         return 2
@@ -123,12 +116,8 @@ class Sphere(Domain):
         """Return an infinite distance for each of `points` (n, 3): (n,)."""
         return np.full(len(points), np.inf)
 
-    @cached_property
-    def boundaries(self) -> BoundaryNames:  # type: ignore[override]
-        """No parts."""
-        return self._default_names()
-
-    def _default_names(self) -> BoundaryNames:
+    def default_names(self) -> BoundaryNames:
+        """Return the parts of the boundary with their default names."""
         return BoundaryNames((), np.empty(0, np.int32), "side")
 
     def boundary(self, walls: Walls | None = None) -> NoReturn:

@@ -73,19 +73,6 @@ class SphereRegion(Sphere):
             raise InputError(f"SphereRegion area is {self.area:g}, expected at most that of the sphere, {whole:g}")
         object.__setattr__(self, "names", self._checked_names())
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, SphereRegion):
-            return NotImplemented
-        return self is other or self._content == other._content
-
-    def __hash__(self) -> int:
-        return hash(self._content)
-
-    @cached_property
-    def _content(self) -> tuple[object, ...]:
-        arrays = (np.asarray(x).tobytes() for x in (self.within, self.beyond))
-        return (self.radius, self.area, *arrays)
-
     def __repr__(self) -> str:
         share = self.area / Sphere(self.radius).measure
         return f"SphereRegion({share:.3%} of Sphere(radius={self.radius!r}), {', '.join(self.boundary_names)})"
@@ -95,13 +82,8 @@ class SphereRegion(Sphere):
         """Area."""
         return self.area
 
-    @cached_property
-    def boundaries(self) -> BoundaryNames:  # type: ignore[override]
-        """The parts of the boundary, with the caller's names."""
-        default = self._default_names()
-        return default.renamed("SphereRegion names", self.names) if self.names else default
-
-    def _default_names(self) -> BoundaryNames:
+    def default_names(self) -> BoundaryNames:
+        """Return the parts of the boundary with their default names."""
         return BoundaryNames((COAST,), np.zeros(len(np.asarray(self.beyond)), np.int32), "wall")
 
     def boundary(self, walls: Walls | None = None) -> NoReturn:
