@@ -154,6 +154,19 @@ class Domain(ABC):
         normals, anchors = self.wall_planes(walls)
         return np.abs(((points - anchors) * normals).sum(axis=1))
 
+    def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the normals (k, d) of `walls` (k,) int, and the signed distances (k,) of `points` (k, d) from them.
+
+        On a part of a sphere the normal leads to the removed generator, and the distance is half of that way.
+        """
+        normals, anchors = self.wall_planes(walls)
+        return normals, ((anchors - points) * normals).sum(axis=1)
+
+    def mirrored(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the mirror images (k, d) of `points` (k, d) behind `walls` (k,) int; there the removed generators."""
+        normals, gaps = self.toward_walls(walls, points)
+        return points + 2 * gaps[:, None] * normals
+
     def _gaps(self, points: np.ndarray) -> np.ndarray:
         """Return the signed distances (n, 2 d) of `points` to the planes of all sides, inf for periodic ones."""
         gaps = np.stack([np.subtract(points, self.lower), np.subtract(self.upper, points)], axis=2)
@@ -209,6 +222,27 @@ class Domain(ABC):
     def described(cls, **values: Any) -> Domain:
         """Return the domain from the values that `describe` returns."""
         return cls(**values)
+
+    def as_values(self) -> dict[str, Any]:
+        """Return what `describe` returns, and the name of the class as "kind"."""
+        return {"kind": type(self).__name__, **self.describe()}
+
+    @staticmethod
+    def of_values(values: Mapping[str, Any]) -> Domain:
+        """Return the domain from the values that `as_values` returns.
+
+        Raises
+        ------
+        InputError, InputTypeError, ValueError, TypeError
+            If there is no class of this name, or the values do not describe a domain.
+        """
+        arguments = dict(values)
+        kind = arguments.pop("kind", None)
+        if kind not in Domain.kinds:
+            raise InputError(
+                f"the domain is a {kind!r:.40}, expected one of {', '.join(Domain.kinds)}; import its class before"
+            )
+        return Domain.kinds[kind].described(**arguments)
 
     kinds: ClassVar[dict[str, type[Domain]]] = {}
     """All classes of domains by their names, for files."""
