@@ -223,27 +223,6 @@ class Domain(ABC):
         """Return the domain from the values that `describe` returns."""
         return cls(**values)
 
-    def as_values(self) -> dict[str, Any]:
-        """Return what `describe` returns, and the name of the class as "kind"."""
-        return {"kind": type(self).__name__, **self.describe()}
-
-    @staticmethod
-    def of_values(values: Mapping[str, Any]) -> Domain:
-        """Return the domain from the values that `as_values` returns.
-
-        Raises
-        ------
-        InputError, InputTypeError, ValueError, TypeError
-            If there is no class of this name, or the values do not describe a domain.
-        """
-        arguments = dict(values)
-        kind = arguments.pop("kind", None)
-        if kind not in Domain.kinds:
-            raise InputError(
-                f"the domain is a {kind!r:.40}, expected one of {', '.join(Domain.kinds)}; import its class before"
-            )
-        return Domain.kinds[kind].described(**arguments)
-
     kinds: ClassVar[dict[str, type[Domain]]] = {}
     """All classes of domains by their names, for files."""
 

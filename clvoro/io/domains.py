@@ -5,14 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ..geometry.box import Box
+from ..geometry import box, polygon, sphere, sphere_region  # noqa: F401 - so that their classes are found by name
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
-from ..geometry.sphere import Sphere
-from ..geometry.sphere_region import SphereRegion
 from .arrays import FileError
-
-_DOMAINS = {"Box": Box, "Polygon": Polygon.described, "Sphere": Sphere, "SphereRegion": SphereRegion}
 
 
 def describe(domain: Domain) -> dict[str, Any]:
@@ -26,10 +21,11 @@ def described(description: Mapping[str, Any]) -> Domain:
     Raises
     ------
     FileError
-        If this version of clvoro has no such domain.
+        If no class of this name is known.
     """
     values = dict(description)
     kind = values.pop("kind")
-    if kind not in _DOMAINS:
-        raise FileError(f"its domain is a {kind!r:.40}, which this version of clvoro does not have")
-    return _DOMAINS[kind](**values)
+    if kind not in Domain.kinds:
+        known = ", ".join(Domain.kinds)
+        raise FileError(f"its domain is a {kind!r:.40}, expected one of {known}; import the class before")
+    return Domain.kinds[kind].described(**values)
