@@ -87,7 +87,7 @@ class Cells:
         """The capacities, for building kernels that work on the rows."""
         return {"CELL_CAPACITY": self.cell_capacity, "ROW_CAPACITY": self.row_capacity, "SLOT": SLOT}
 
-    def _reserve(self, n: int) -> None:
+    def reserve(self, n: int) -> None:
         """Allocate the arrays per cell for `n` generators."""
         engine, d = self.engine, self.engine.dim
         if n > self._capacity:
@@ -118,10 +118,6 @@ class Cells:
                 "face_centroids": engine.empty((most, d), engine.face),
             }
             self._room = most
-
-    def reserve(self, n: int) -> None:
-        """Make room for `n` cells."""
-        self._reserve(n)
 
     @framed
     def tessellate(
@@ -160,7 +156,7 @@ class Cells:
         if self.row_capacity > ROW_CAPACITY and n > self._enlarged_for:
             # The capacities were enlarged for a smaller mesh: start again with the default ones.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
-        self._reserve(n)
+        self.reserve(n)
         spare, whole = spare_slots(n), False
         while True:
             with engine.workspace.frame():

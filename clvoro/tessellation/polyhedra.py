@@ -177,7 +177,7 @@ class Polyhedra:
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
         with engine.workspace.frame():
             # Updates, and the descent of the surface, need the vertices.
-            keep = not exact and (rows < n if halo_args else rows == n) and self._bounds is None
+            keep = not exact and (rows < n or not halo_args) and self._bounds is None
             if self._bounds is not None:
                 halo_args = (*halo_args, *self._bounds.build(box, points, n))
             cut = self._cut(box, points, n, binned, first, previous, rows, share, halo_args, keep)

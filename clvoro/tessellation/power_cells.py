@@ -40,7 +40,7 @@ class PowerCells(Cells):
         is open in a folded graph.
         """
         n, old = previous.n, (previous.starts, previous.neighbors)
-        self._reserve(n)
+        self.reserve(n)
         rows = self.take_rows(n, spare=spare_slots(n))
         self.engine.run_each(
             self._kernels.clip_by_rings,

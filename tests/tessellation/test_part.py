@@ -174,6 +174,13 @@ def test_a_periodic_box_that_is_not_folded(ctx, dim, real):
         for name in ("gradient", "lloyd", "weight"):
             one, other = getattr(ours, name).get(), getattr(theirs, name).get()
             assert np.abs(one - other).max() < noise * np.abs(other).max(), name
+        if t.vertices:
+            quality, ways = engine.upload(rng.uniform(0.5, 1, n)), []
+            for made, own in ((alone, unfolded), (t, stages)):
+                ways.append(own.engine.zeros((n, dim)))
+                own.surface_descent.descend(made, h, quality, ways[-1], bad_cell_weight=5.0, rate=0.05)
+            one, other = (way.get() for way in ways)
+            assert np.abs(one - other).max() < noise * np.abs(other).max() < 1
         source, potentials = rng.standard_normal(n) / n, []
         for part, made, poisson in ((alone.part, alone, unfolded.poisson), (None, t, stages.poisson)):
             phi = poisson.engine.zeros(made.rows)

@@ -42,7 +42,7 @@ class SurfaceDescent:
         """
         engine, k, real = self.engine, self._kernels, self.engine.real.type
         with engine.workspace.frame():
-            forces = engine.scratch((t.n, 2))
+            forces = engine.scratch((t.rows, 2))
             engine.run_each(
                 k.compute_surface_forces,
                 t.n,
@@ -53,6 +53,7 @@ class SurfaceDescent:
                 real(bad_cell_weight),
                 forces,
             )
+            t.forward(engine, forces)
             engine.run_each(
                 k.descend_surface,
                 t.n,
