@@ -13,7 +13,8 @@
 kernel void evaluate_density(const int size, global const REAL *volumes, global const REAL *h, global REAL *density,
                              global REAL *weight, global REAL *log_ratio, global REAL *log_h)
 {
-    const int begin = 4 * get_global_id(0);
+    LONG_ITEM(quad);
+    const int begin = 4 * quad;
     if (begin >= size)
         return;
     if (begin + 4 <= size) {
@@ -80,7 +81,7 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
                          global const REAL *points, global const REAL *log_h, global const REAL *offsets,
                          global const REAL *covariances, global REAL *gradient, global REAL *lloyd PERIOD_ARGS)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     MANY(REAL) sums[CELL_DIM][CELL_DIM], rises[CELL_DIM];
     REAL m[CELL_DIM][CELL_DIM], b[CELL_DIM], g[CELL_DIM];
     EACH_COMPONENT (p) {
@@ -157,15 +158,15 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
    of generators changes the mean; motion cannot correct it, insertion and deletion can. */
 kernel void sum_log_ratio(const int size, global const REAL *weight, global const REAL *log_ratio, global REAL *partial)
 {
-    local REAL scratch[GROUP_SIZE];
+    LONG_GROUP;
     Sum weighed = SUM_ZERO, total = SUM_ZERO;
-    for (BLOCK_LOOP(i, size)) {
+    for (GROUP_LOOP(i, size)) {
         sum_add(&weighed, weight[i] * log_ratio[i]);
         sum_add(&total, weight[i]);
     }
-    const REAL sums[2] = {group_sum(weighed.value, scratch), group_sum(total.value, scratch)};
-    if (get_local_id(0) == 0) {
-        partial[get_group_id(0)] = sums[0];
-        partial[get_num_groups(0) + get_group_id(0)] = sums[1];
+    const REAL sums[2] = {group_sum(weighed.value, group), group_sum(total.value, group)};
+    if (GROUP_ITEM == 0) {
+        partial[group.id] = sums[0];
+        partial[group.count + group.id] = sums[1];
     }
 }

@@ -129,7 +129,7 @@ kernel void score_pairs(const int size, global const int *starts, global const i
                         global const REAL *points, global const int2 *kinds, global const float4 *strain,
                         const int at_walls, global int *partners, global REAL *pull, global ulong *keys PERIOD_ARGS)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     REAL best = 0, rank = 0;
     int partner = -1;
     const int2 kind = kinds[i];
@@ -388,7 +388,7 @@ kernel void apply_changes(const int size, global const int *place, global const 
                           global REAL *new_ever_changed, global const int *starts, global const int *neighbors,
                           global const FACE *face_centroids OUTLINE_ARGS)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     const bool kept = place[i + 1] > place[i], born = birth_place[i + 1] > birth_place[i];
     REAL x[DIM], y[DIM], child[DIM];
     bool moved = false;

@@ -5,18 +5,25 @@
 #error "build with -DGROUP_SIZE=work-items per group"
 #endif
 
+/* The first item of block g of `groups`. */
+inline int block_start(int n, int g, int groups)
+{
+    return (int)(((long)n * g) / groups);
+}
+
 inline int block_begin(int n)
 {
-    return (int)(((long)n * get_group_id(0)) / get_num_groups(0));
+    return block_start(n, get_group_id(0), get_num_groups(0));
 }
 
 inline int block_end(int n)
 {
-    return (int)(((long)n * (get_group_id(0) + 1)) / get_num_groups(0));
+    return block_start(n, get_group_id(0) + 1, get_num_groups(0));
 }
 
 /* for (BLOCK_LOOP(i, n)) { ... } */
-#define BLOCK_LOOP(i, n)                                                                                               \
-    int i = block_begin(n) + get_local_id(0), i##_end = block_end(n);                                                  \
+#define BLOCK_LOOP(i, n) LOOP_OF_ITEM(i, n, get_group_id(0), get_num_groups(0), get_local_id(0))
+#define LOOP_OF_ITEM(i, n, group, groups, item)                                                                        \
+    int i = block_start(n, group, groups) + item, i##_end = block_start(n, group + 1, groups);                         \
     i < i##_end;                                                                                                       \
     i += GROUP_SIZE

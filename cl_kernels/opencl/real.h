@@ -62,6 +62,9 @@
     const int i = get_global_id(0);                                                                                    \
     if (i >= size)                                                                                                     \
     return
+/* The same at the beginning of a kernel with a long body, which for PoCL becomes a function; see
+   clvoro/opencl/program.py. Short bodies stay in kernels, where PoCL vectorizes them across work-items. */
+#define LONG_ITEM WORK_ITEM
 
 /* a b - c d, with an error of 1 ulp even if the products cancel (Kahan): the determinant of two vectors. */
 inline REAL difference_of_products(REAL a, REAL b, REAL c, REAL d)

@@ -4,6 +4,29 @@
    All functions contain barriers. A kernel must not return before a barrier, not even with all work-items: PoCL
    miscompiles this for groups of more than one item. Use a loop without iterations instead. */
 
+/* A work-group: its number, the number of groups, and memory that its items share. Kernels begin with LONG_GROUP, and
+   pass `group` to functions. Functions do not ask for the group themselves, and have no barriers where a group is one
+   item: PoCL would paste them into their callers. */
+typedef struct {
+    int id, count;
+    local REAL *scratch;
+} group_t;
+#define MAKE_GROUP                                                                                                     \
+    local REAL scratch_of_group[GROUP_SIZE];                                                                           \
+    const group_t group = {get_group_id(0), get_num_groups(0), scratch_of_group}
+#define LONG_GROUP MAKE_GROUP
+#if GROUP_SIZE > 1
+#define GROUP_ITEM get_local_id(0)
+#define GROUP_BARRIER barrier(CLK_GLOBAL_MEM_FENCE)
+#else
+#define GROUP_ITEM 0
+#define GROUP_BARRIER
+#endif
+#define IS_FIRST_ITEM (group.id == 0 && GROUP_ITEM == 0)
+
+/* for (GROUP_LOOP(i, n)) { ... }: the same items as BLOCK_LOOP. */
+#define GROUP_LOOP(i, n) LOOP_OF_ITEM(i, n, group.id, group.count, GROUP_ITEM)
+
 /* Running sum of one work-item, which on a CPU adds up many thousands of terms; compensated (Kahan) in float32. */
 typedef struct {
     REAL value;
@@ -36,11 +59,12 @@ inline void sum_add(Sum *s, REAL x)
 #endif
 }
 
-/* Sum (maximum) over the work-items of a group, returned to each; `scratch` has GROUP_SIZE entries. */
-inline REAL group_sum(REAL x, local REAL *scratch)
+/* Sum (maximum) over the work-items of a group, returned to each. */
+inline REAL group_sum(REAL x, group_t group)
 {
 #if GROUP_SIZE > 1
     const int me = get_local_id(0);
+    local REAL *scratch = group.scratch;
     barrier(CLK_LOCAL_MEM_FENCE);
     scratch[me] = x;
     for (int half_ = GROUP_SIZE / 2; half_ > 0; half_ /= 2) {
@@ -54,10 +78,11 @@ inline REAL group_sum(REAL x, local REAL *scratch)
     return x;
 }
 
-inline REAL group_max(REAL x, local REAL *scratch)
+inline REAL group_max(REAL x, group_t group)
 {
 #if GROUP_SIZE > 1
     const int me = get_local_id(0);
+    local REAL *scratch = group.scratch;
     barrier(CLK_LOCAL_MEM_FENCE);
     scratch[me] = x;
     for (int half_ = GROUP_SIZE / 2; half_ > 0; half_ /= 2) {
@@ -71,19 +96,25 @@ inline REAL group_max(REAL x, local REAL *scratch)
     return x;
 }
 
-/* Sum (maximum) of the partial values of a block-wise kernel, one per group. */
-inline REAL total_sum(global const REAL *partial, local REAL *scratch)
+/* Sum of the partial values of `count` groups of an earlier kernel. */
+inline REAL sum_of_groups(global const REAL *partial, int count, group_t group)
 {
     REAL x = 0;
-    for (int g = get_local_id(0); g < (int)get_num_groups(0); g += GROUP_SIZE)
+    for (int g = GROUP_ITEM; g < count; g += GROUP_SIZE)
         x += partial[g];
-    return group_sum(x, scratch);
+    return group_sum(x, group);
 }
 
-inline REAL total_max(global const REAL *partial, local REAL *scratch)
+/* Sum (maximum) of the partial values of as many groups as there are now. */
+inline REAL total_sum(global const REAL *partial, group_t group)
+{
+    return sum_of_groups(partial, group.count, group);
+}
+
+inline REAL total_max(global const REAL *partial, group_t group)
 {
     REAL x = partial[0];
-    for (int g = get_local_id(0); g < (int)get_num_groups(0); g += GROUP_SIZE)
+    for (int g = GROUP_ITEM; g < group.count; g += GROUP_SIZE)
         x = fmax(x, partial[g]);
-    return group_max(x, scratch);
+    return group_max(x, group);
 }

@@ -54,7 +54,7 @@ kernel void count_cubes(const int size, const int rows, global const int *items,
 kernel void order_places(const int size, const int rows, global const int *items, global const int2 *bins,
                          global const int4 *grid_shapes, global const int *starts, global int *order)
 {
-    WORK_ITEM(cube);
+    LONG_ITEM(cube);
     int n = starts[cube];
     descent_t way; /* position on the curve */
     begin_descent(&way, (int4)(0));
@@ -88,7 +88,7 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
                            const double4 box_lower, const double4 box_upper, const double first_reach, const int room,
                            CELL_OUTPUT_ARGS HALO_ARGS)
 {
-    WORK_ITEM(stretch);
+    LONG_ITEM(stretch);
     output_t out = {room,     items,     reach,   row_places, row_counts,  labels,       report,
                     measures, centroids, volumes, offsets,    covariances, with_corners, corners};
 #ifdef HALO

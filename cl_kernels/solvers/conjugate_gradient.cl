@@ -40,11 +40,11 @@
 
 /* The sums and the maximum that center and scale r = b - w; r = b if the start is zero (`from_zero`). */
 inline void add_right_sides(int n, int from_zero, global const REAL *b, global const STORE *w, global REAL *partial,
-                            local REAL *scratch)
+                            group_t group)
 {
     Sum sum_b = SUM_ZERO, sum_r = SUM_ZERO;
     REAL max_b = 0;
-    for (BLOCK_LOOP(i, n)) {
+    for (GROUP_LOOP(i, n)) {
         const REAL bi = b[i];
         sum_add(&sum_b, bi);
         sum_add(&sum_r, from_zero ? bi : bi - w[i]);
@@ -52,29 +52,28 @@ inline void add_right_sides(int n, int from_zero, global const REAL *b, global c
     }
     PUT(SUM_B, sum_b.value);
     PUT(START, sum_r.value);
-    max_b = group_max(max_b, scratch);
-    if (get_local_id(0) == 0)
-        ROW(MAX_B)[get_group_id(0)] = max_b;
+    max_b = group_max(max_b, group);
+    if (GROUP_ITEM == 0)
+        ROW(MAX_B)[group.id] = max_b;
 }
 
 kernel void sum_right_sides(int n, int from_zero, global const REAL *b, global const STORE *w, global REAL *partial)
 {
-    local REAL scratch[GROUP_SIZE];
-    add_right_sides(n, from_zero, b, w, partial, scratch);
+    LONG_GROUP;
+    add_right_sides(n, from_zero, b, w, partial, group);
 }
 
 /* r = 2^e (r - mean r) with `center`, else r = 2^e r; p = 0; x = 0 with `from_zero`. NORM_B, NORM_R = |b|^2, |r|^2
    after the same scaling and centering. state[1] = 2^-e, state[2] = the part of |b|^2 that centering has removed. */
 inline void set_residual(int n, int from_zero, int center, global const REAL *b, global const STORE *w, global REAL *x,
-                         global STORE *r, global STORE *p, global REAL *partial, global REAL *state,
-                         local REAL *scratch)
+                         global STORE *r, global STORE *p, global REAL *partial, global REAL *state, group_t group)
 {
-    const REAL mean_b = center ? total_sum(ROW(SUM_B), scratch) / n : 0;
-    const REAL mean_r = center ? total_sum(ROW(START), scratch) / n : 0;
-    const REAL max_b = total_max(ROW(MAX_B), scratch);
+    const REAL mean_b = center ? total_sum(ROW(SUM_B), group) / n : 0;
+    const REAL mean_r = center ? total_sum(ROW(START), group) / n : 0;
+    const REAL max_b = total_max(ROW(MAX_B), group);
     const int exponent = max_b > 0 && max_b <= REAL_MAX ? clamp(-ilogb(max_b), -EXPONENT_LIMIT, EXPONENT_LIMIT) : 0;
     Sum norm_b = SUM_ZERO, norm_r = SUM_ZERO, sum_r = SUM_ZERO, sum_x = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) {
+    for (GROUP_LOOP(i, n)) {
         const REAL bi = ldexp(b[i] - mean_b, exponent);
         const STORE ri = ldexp((from_zero ? b[i] : b[i] - w[i]) - mean_r, exponent);
         r[i] = ri;
@@ -90,7 +89,7 @@ inline void set_residual(int n, int from_zero, int center, global const REAL *b,
     PUT(NORM_R(0), norm_r.value);
     PUT(SUM_R(0), sum_r.value);
     PUT(SUM_X, sum_x.value);
-    if (get_global_id(0) == 0) {
+    if (IS_FIRST_ITEM) {
         const REAL taken = ldexp(mean_b, exponent);
         state[1] = ldexp(R(1), -exponent);
         state[2] = n * taken * taken;
@@ -101,28 +100,19 @@ kernel void start_residual(int n, int from_zero, int center, global const REAL *
                            global REAL *x, global STORE *r, global STORE *p, global REAL *partial, global REAL *state,
                            global int *counts)
 {
-    local REAL scratch[GROUP_SIZE];
-    if (get_global_id(0) == 0)
+    LONG_GROUP;
+    if (IS_FIRST_ITEM)
         counts[UPDATES] = 0;
-    set_residual(n, from_zero, center, b, w, x, r, p, partial, state, scratch);
-}
-
-/* Sum of row q over `groups` work-groups, in a kernel of one work-group: the same bits as `total_sum`. */
-inline REAL total_of_row(global const REAL *partial, int q, int groups, local REAL *scratch)
-{
-    REAL sum = 0;
-    for (int g = get_local_id(0); g < groups; g += GROUP_SIZE)
-        sum += partial[q * groups + g];
-    return group_sum(sum, scratch);
+    set_residual(n, from_zero, center, b, w, x, r, p, partial, state, group);
 }
 
 /* state[4] = |b|^2, state[5] = |r|^2, for the host. One work-group. */
 kernel void read_norms(global const REAL *partial, global REAL *state, const int groups)
 {
-    local REAL scratch[GROUP_SIZE];
-    const REAL norm_b = total_of_row(partial, NORM_B, groups, scratch);
-    const REAL norm_r = total_of_row(partial, NORM_R(0), groups, scratch);
-    if (get_local_id(0) == 0) {
+    LONG_GROUP;
+    const REAL norm_b = sum_of_groups(partial + NORM_B * groups, groups, group);
+    const REAL norm_r = sum_of_groups(partial + NORM_R(0) * groups, groups, group);
+    if (GROUP_ITEM == 0) {
         state[4] = norm_b;
         state[5] = norm_r;
     }
@@ -130,10 +120,10 @@ kernel void read_norms(global const REAL *partial, global REAL *state, const int
 
 /* u = D^-1 r and gamma = (r, u), for the first iteration. */
 inline void apply_jacobi(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
-                         global REAL *partial, local REAL *scratch)
+                         global REAL *partial, group_t group)
 {
     Sum gamma = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) {
+    for (GROUP_LOOP(i, n)) {
         const STORE ui = inverse_diagonal[i] * r[i];
         u[i] = ui;
         sum_add(&gamma, (REAL)r[i] * ui);
@@ -144,16 +134,16 @@ inline void apply_jacobi(int n, global const STORE *inverse_diagonal, global con
 kernel void precondition_jacobi(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
                                 global REAL *partial)
 {
-    local REAL scratch[GROUP_SIZE];
-    apply_jacobi(n, inverse_diagonal, r, u, partial, scratch);
+    LONG_GROUP;
+    apply_jacobi(n, inverse_diagonal, r, u, partial, group);
 }
 
 /* Row q of partial = (a, b). */
 kernel void dot_product(int n, int q, global const STORE *a, global const STORE *b, global REAL *partial)
 {
-    local REAL scratch[GROUP_SIZE];
+    LONG_GROUP;
     Sum sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, n))
+    for (GROUP_LOOP(i, n))
         sum_add(&sum, (REAL)a[i] * b[i]);
     PUT(q, sum.value);
 }
@@ -161,14 +151,14 @@ kernel void dot_product(int n, int q, global const STORE *a, global const STORE 
 /* beta of iteration k. record[k].running becomes 0, as *end does instead of n, if |r| is within the tolerance, or if a
    value is not positive or not finite. */
 inline REAL find_beta(int k, int n, REAL tolerance, global const REAL *partial, global REAL *state, global REAL *record,
-                      local REAL *scratch, int *end)
+                      group_t group, int *end)
 {
-    const int first = get_global_id(0) == 0;
+    const int first = IS_FIRST_ITEM;
     global REAL *now = record + 4 * k;
     global const REAL *last = now - 4;
     const int over = k > 0 && !(last[RECORD_RUNNING] != 0 && last[RECORD_CURVATURE] > 0);
-    const REAL norm = total_sum(ROW(NORM_R(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
-    const REAL norm_b = total_sum(ROW(NORM_B), scratch);
+    const REAL norm = total_sum(ROW(NORM_R(k)), group), gamma = total_sum(ROW(GAMMA(k)), group);
+    const REAL norm_b = total_sum(ROW(NORM_B), group);
     const REAL target = k > 0 ? state[0] : tolerance * tolerance * norm_b;
     const int running = !over && norm > target && norm <= REAL_MAX && gamma > 0;
     if (first)
@@ -185,19 +175,19 @@ inline REAL find_beta(int k, int n, REAL tolerance, global const REAL *partial, 
 
 /* p = u + beta p. */
 inline void step_direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p,
-                           global const REAL *partial, global REAL *state, global REAL *record, local REAL *scratch)
+                           global const REAL *partial, global REAL *state, global REAL *record, group_t group)
 {
     int end;
-    const REAL beta = find_beta(k, n, tolerance, partial, state, record, scratch, &end);
-    for (BLOCK_LOOP(i, end))
+    const REAL beta = find_beta(k, n, tolerance, partial, state, record, group, &end);
+    for (GROUP_LOOP(i, end))
         p[i] = u[i] + beta * p[i];
 }
 
 kernel void update_direction(global int *counts, int n, REAL tolerance, global const STORE *u, global STORE *p,
                              global const REAL *partial, global REAL *state, global REAL *record)
 {
-    local REAL scratch[GROUP_SIZE];
-    step_direction(number_of_direction(counts), n, tolerance, u, p, partial, state, record, scratch);
+    LONG_GROUP;
+    step_direction(number_of_direction(counts, group), n, tolerance, u, p, partial, state, record, group);
 }
 
 /* Both in one launch, p = u + beta old and q = A p, with A in sparse rows: p_j is evaluated for each neighbor. */
@@ -209,12 +199,12 @@ kernel void apply_to_direction(global int *counts, int n, REAL tolerance, global
                                global const STORE *old, global STORE *p, global STORE *q, global REAL *partial,
                                global REAL *state, global REAL *record)
 {
-    local REAL scratch[GROUP_SIZE];
+    LONG_GROUP;
     int end;
-    const int k = number_of_direction(counts);
-    const REAL beta = find_beta(k, n, tolerance, partial, state, record, scratch, &end);
+    const int k = number_of_direction(counts, group);
+    const REAL beta = find_beta(k, n, tolerance, partial, state, record, group, &end);
     Sum product = SUM_ZERO;
-    for (BLOCK_LOOP(i, end)) {
+    for (GROUP_LOOP(i, end)) {
         const STORE pi = ENTRY_OF_DIRECTION(i);
         const STORE qi = direction_difference(i, n, starts, columns, weights, u, old, beta);
         p[i] = pi;
@@ -232,13 +222,13 @@ typedef struct {
 } Step;
 
 inline Step step_length(int k, int n, int center, global const REAL *partial, global REAL *state, global REAL *record,
-                        local REAL *scratch)
+                        group_t group)
 {
     global REAL *now = record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;
     Step s;
-    const REAL curvature = total_sum(ROW(CURVATURE), scratch);
-    if (running && get_global_id(0) == 0) {
+    const REAL curvature = total_sum(ROW(CURVATURE), group);
+    if (running && IS_FIRST_ITEM) {
         now[RECORD_CURVATURE] = curvature;
         if (k == 0)
             state[0] = state[3];
@@ -246,7 +236,7 @@ inline Step step_length(int k, int n, int center, global const REAL *partial, gl
     s.end = running && curvature > 0 ? n : 0;
     s.alpha = now[RECORD_GAMMA] / curvature;
     s.alpha_x = s.alpha * state[1];
-    s.mean = center ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
+    s.mean = center ? total_sum(ROW(SUM_R(k)), group) / n : 0;
     return s;
 }
 
@@ -255,12 +245,12 @@ inline Step step_length(int k, int n, int center, global const REAL *partial, gl
 kernel void record_norm(global const int *counts, global const REAL *partial, global const REAL *state,
                         global REAL *record, const int groups)
 {
-    local REAL scratch[GROUP_SIZE];
+    LONG_GROUP;
     const int k = counts[UPDATES];
     global REAL *now = record + 4 * k;
-    const REAL norm = total_of_row(partial, NORM_R(k), groups, scratch);
-    const REAL norm_b = total_of_row(partial, NORM_B, groups, scratch);
-    if (get_local_id(0) == 0) {
+    const REAL norm = sum_of_groups(partial + NORM_R(k) * groups, groups, group);
+    const REAL norm_b = sum_of_groups(partial + NORM_B * groups, groups, group);
+    if (GROUP_ITEM == 0) {
         now[RECORD_NORM] = norm;
         now[RECORD_RUNNING] = !(norm <= state[0]);
         now[RECORD_CURVATURE] = 1;
@@ -270,11 +260,11 @@ kernel void record_norm(global const int *counts, global const REAL *partial, gl
 }
 
 /* Row SUM_X of partial = sum x, for `center_solution`, unless the iteration is over. */
-inline void put_sum_of_solution(const Step *s, const Sum *sum_x, global REAL *partial, local REAL *scratch)
+inline void put_sum_of_solution(const Step *s, const Sum *sum_x, global REAL *partial, group_t group)
 {
-    const REAL sum = group_sum(sum_x->value, scratch);
-    if (s->end > 0 && get_local_id(0) == 0)
-        ROW(SUM_X)[get_group_id(0)] = sum;
+    const REAL sum = group_sum(sum_x->value, group);
+    if (s->end > 0 && GROUP_ITEM == 0)
+        ROW(SUM_X)[group.id] = sum;
 }
 
 /* x += alpha p, r -= alpha q. */
@@ -282,11 +272,11 @@ kernel void update_solution(global int *counts, int n, int center, global const 
                             global REAL *x, global STORE *r, global REAL *partial, global REAL *state,
                             global REAL *record)
 {
-    local REAL scratch[GROUP_SIZE];
-    const int k = number_of_update(counts);
-    const Step s = step_length(k, n, center, partial, state, record, scratch);
+    LONG_GROUP;
+    const int k = number_of_update(counts, group);
+    const Step s = step_length(k, n, center, partial, state, record, group);
     Sum norm = SUM_ZERO, sum = SUM_ZERO, sum_x = SUM_ZERO;
-    for (BLOCK_LOOP(i, s.end)) {
+    for (GROUP_LOOP(i, s.end)) {
         const STORE ri = r[i] - s.mean - s.alpha * q[i];
         const REAL xi = x[i] + s.alpha_x * p[i];
         x[i] = xi;
@@ -297,17 +287,17 @@ kernel void update_solution(global int *counts, int n, int center, global const 
     }
     PUT(NORM_R(k + 1), norm.value);
     PUT(SUM_R(k + 1), sum.value);
-    put_sum_of_solution(&s, &sum_x, partial, scratch);
+    put_sum_of_solution(&s, &sum_x, partial, group);
 }
 
 /* x += alpha p, r -= alpha q, u = D^-1 r, and gamma of the next iteration. */
 inline void step_jacobi(int k, int n, int center, global const STORE *inverse_diagonal, global const STORE *p,
                         global const STORE *q, global REAL *x, global STORE *r, global STORE *u, global REAL *partial,
-                        global REAL *state, global REAL *record, local REAL *scratch)
+                        global REAL *state, global REAL *record, group_t group)
 {
-    const Step s = step_length(k, n, center, partial, state, record, scratch);
+    const Step s = step_length(k, n, center, partial, state, record, group);
     Sum norm = SUM_ZERO, gamma = SUM_ZERO, sum = SUM_ZERO, sum_x = SUM_ZERO;
-    for (BLOCK_LOOP(i, s.end)) {
+    for (GROUP_LOOP(i, s.end)) {
         const STORE ri = r[i] - s.mean - s.alpha * q[i], ui = inverse_diagonal[i] * ri;
         const REAL xi = x[i] + s.alpha_x * p[i];
         x[i] = xi;
@@ -321,23 +311,24 @@ inline void step_jacobi(int k, int n, int center, global const STORE *inverse_di
     PUT(NORM_R(k + 1), norm.value);
     PUT(SUM_R(k + 1), sum.value);
     PUT(GAMMA(k + 1), gamma.value);
-    put_sum_of_solution(&s, &sum_x, partial, scratch);
+    put_sum_of_solution(&s, &sum_x, partial, group);
 }
 
 kernel void update_solution_jacobi(global int *counts, int n, int center, global const STORE *inverse_diagonal,
                                    global const STORE *p, global const STORE *q, global REAL *x, global STORE *r,
                                    global STORE *u, global REAL *partial, global REAL *state, global REAL *record)
 {
-    local REAL scratch[GROUP_SIZE];
-    step_jacobi(number_of_update(counts), n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
+    LONG_GROUP;
+    step_jacobi(number_of_update(counts, group), n, center, inverse_diagonal, p, q, x, r, u, partial, state, record,
+                group);
 }
 
 /* x -= mean x. */
 kernel void center_solution(int n, global REAL *x, global const REAL *partial)
 {
-    local REAL scratch[GROUP_SIZE];
-    const REAL mean = total_sum(ROW(SUM_X), scratch) / n;
-    for (BLOCK_LOOP(i, n))
+    LONG_GROUP;
+    const REAL mean = total_sum(ROW(SUM_X), group) / n;
+    for (GROUP_LOOP(i, n))
         x[i] -= mean;
 }
 
@@ -351,53 +342,53 @@ kernel void solve_by_group(int n, int from_zero, int center, int max_iterations,
                            global REAL *x, global STORE *r, global STORE *u, global STORE *p, global STORE *q,
                            global REAL *partial, global REAL *state)
 {
-    local REAL scratch[GROUP_SIZE];
+    LONG_GROUP;
     global REAL *record = state + STATE;
     const int n_start = from_zero ? 0 : n;
-    for (BLOCK_LOOP(i, n_start)) {
+    for (GROUP_LOOP(i, n_start)) {
         REAL sum = 0;
         for (int k = starts[i]; k < starts[i + 1]; ++k)
             if (columns[k] >= 0)
                 sum += weights[k] * (x[i] - x[columns[k]]);
         q[i] = sum;
     }
-    add_right_sides(n, from_zero, b, q, partial, scratch);
-    barrier(CLK_GLOBAL_MEM_FENCE);
-    set_residual(n, from_zero, center, b, q, x, r, p, partial, state, scratch);
-    barrier(CLK_GLOBAL_MEM_FENCE);
+    add_right_sides(n, from_zero, b, q, partial, group);
+    GROUP_BARRIER;
+    set_residual(n, from_zero, center, b, q, x, r, p, partial, state, group);
+    GROUP_BARRIER;
     const REAL norm_b = partial[NORM_B], norm_r = partial[NORM_R(0)], least = 8 * REAL_EPS;
     bool running = max_iterations > 0 && norm_b > least * least * state[2] &&
                    norm_r > converged_ratio * converged_ratio * norm_b &&
                    norm_r <= stagnated_ratio * stagnated_ratio * norm_b;
-    if (get_local_id(0) == 0) {
+    if (GROUP_ITEM == 0) {
         state[4] = norm_b;
         state[5] = norm_r;
         record[RECORD_RUNNING] = 0;
         record[RECORD_NORM] = norm_r;
     }
-    apply_jacobi(running ? n : 0, inverse_diagonal, r, u, partial, scratch);
+    apply_jacobi(running ? n : 0, inverse_diagonal, r, u, partial, group);
     for (int k = 0; running; ++k) {
-        barrier(CLK_GLOBAL_MEM_FENCE);
-        step_direction(k, n, tolerance, u, p, partial, state, record, scratch);
-        barrier(CLK_GLOBAL_MEM_FENCE);
+        GROUP_BARRIER;
+        step_direction(k, n, tolerance, u, p, partial, state, record, group);
+        GROUP_BARRIER;
         const int end = record[4 * k + RECORD_RUNNING] != 0 ? n : 0;
         Sum product = SUM_ZERO;
-        for (BLOCK_LOOP(i, end)) {
+        for (GROUP_LOOP(i, end)) {
             const STORE qi = row_difference(i, n, starts, columns, weights, p);
             q[i] = qi;
             sum_add(&product, (REAL)p[i] * qi);
         }
         PUT(CURVATURE, product.value);
-        barrier(CLK_GLOBAL_MEM_FENCE);
-        step_jacobi(k, n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
+        GROUP_BARRIER;
+        step_jacobi(k, n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, group);
         running = end > 0 && partial[CURVATURE] > 0 && k + 1 < max_iterations;
     }
-    barrier(CLK_GLOBAL_MEM_FENCE);
+    GROUP_BARRIER;
     const int centered = center ? n : 0;
     Sum sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, centered))
+    for (GROUP_LOOP(i, centered))
         sum_add(&sum, x[i]);
-    const REAL mean = group_sum(sum.value, scratch) / n;
-    for (BLOCK_LOOP(j, centered))
+    const REAL mean = group_sum(sum.value, group) / n;
+    for (GROUP_LOOP(j, centered))
         x[j] -= mean;
 }

@@ -2,14 +2,14 @@
    Include after reduce.h. */
 
 /* Row q of `partial`: one value per work-group. */
-#define ROW(q) (partial + (q)*get_num_groups(0))
+#define ROW(q) (partial + (q)*group.count)
 
-/* Write the sum over the work-group to row q. `scratch` has GROUP_SIZE entries. */
+/* Write the sum over the work-group to row q. */
 #define PUT(q, sum)                                                                                                    \
     {                                                                                                                  \
-        const REAL put_ = group_sum((sum), scratch);                                                                   \
-        if (get_local_id(0) == 0)                                                                                      \
-            ROW(q)[get_group_id(0)] = put_;                                                                            \
+        const REAL put_ = group_sum((sum), group);                                                                     \
+        if (GROUP_ITEM == 0)                                                                                           \
+            ROW(q)[group.id] = put_;                                                                                   \
     }
 
 /* Numbers of launches so far: `counts` tells the kernels of an iteration its number k, so that their arguments are the
@@ -18,18 +18,18 @@
 #define UPDATES 0
 #define DIRECTIONS 1
 
-inline int number_of_direction(global int *counts)
+inline int number_of_direction(global int *counts, group_t group)
 {
     const int k = counts[UPDATES];
-    if (get_global_id(0) == 0)
+    if (IS_FIRST_ITEM)
         counts[DIRECTIONS] = k + 1;
     return k;
 }
 
-inline int number_of_update(global int *counts)
+inline int number_of_update(global int *counts, group_t group)
 {
     const int k = counts[DIRECTIONS] - 1;
-    if (get_global_id(0) == 0)
+    if (IS_FIRST_ITEM)
         counts[UPDATES] = k + 1;
     return k;
 }

@@ -104,9 +104,9 @@ kernel void invert_diagonal(int n, global const int *starts, global const STORE 
 kernel void apply_laplacian(int n, int q, global const int *starts, global const int *columns,
                             global const STORE *weights, global const STORE *x, global STORE *y, global REAL *partial)
 {
-    local REAL scratch[GROUP_SIZE];
+    LONG_GROUP;
     Sum product = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) {
+    for (GROUP_LOOP(i, n)) {
         const STORE yi = row_difference(i, n, starts, columns, weights, x);
         y[i] = yi;
         sum_add(&product, (REAL)x[i] * yi);
@@ -130,9 +130,9 @@ kernel void apply_laplacian_full(int n, global const int *starts, global const i
 /* Rows 0 and 1 of partial: sum V s and sum V. */
 kernel void sum_sources(int n, global const REAL *source, global const REAL *volumes, global REAL *partial)
 {
-    local REAL scratch[GROUP_SIZE];
+    LONG_GROUP;
     Sum moment = SUM_ZERO, volume = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) {
+    for (GROUP_LOOP(i, n)) {
         sum_add(&moment, volumes[i] * source[i]);
         sum_add(&volume, volumes[i]);
     }
@@ -144,9 +144,9 @@ kernel void sum_sources(int n, global const REAL *source, global const REAL *vol
 kernel void subtract_mean_source(int n, global const REAL *source, global const REAL *volumes, global REAL *rhs,
                                  global const REAL *partial)
 {
-    local REAL scratch[GROUP_SIZE];
-    const REAL moment = total_sum(ROW(0), scratch), volume = total_sum(ROW(1), scratch);
+    LONG_GROUP;
+    const REAL moment = total_sum(ROW(0), group), volume = total_sum(ROW(1), group);
     const REAL mean = moment / volume;
-    for (BLOCK_LOOP(i, n))
+    for (GROUP_LOOP(i, n))
         rhs[i] = volumes[i] * (source[i] - mean);
 }

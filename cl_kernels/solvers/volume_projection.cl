@@ -33,15 +33,6 @@
 #define GAMMA(k) (2 + ((k)&1))
 #define CURVATURE 4
 
-/* Sum of the partial values of `groups` work-groups of an earlier kernel: the same bits as `total_sum` there. */
-inline REAL sum_of_groups(global const REAL *partial, int groups, local REAL *scratch)
-{
-    REAL sum = 0;
-    for (int g = get_local_id(0); g < groups; g += GROUP_SIZE)
-        sum += partial[g];
-    return group_sum(sum, scratch);
-}
-
 /* eps = min(3, penalty (1 + q^2 / quality_scale^2)) / (1 + (r / log_ratio_scale)^power), q = (1 - Q) / sqrt Q.
 
    Q is the least quality of the cell and its neighbors; q is close to -log Q, without a logarithm. Bad cells and their
@@ -81,15 +72,15 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
                                 const int mean_groups, global const int *labels, const int fixed, const int warm,
                                 global const float *start PERIOD_ARGS)
 {
-    local REAL scratch[GROUP_SIZE];
-    const REAL weighed = sum_of_groups(mean_partial, mean_groups, scratch);
-    const REAL weight = sum_of_groups(mean_partial + mean_groups, mean_groups, scratch);
+    LONG_GROUP;
+    const REAL weighed = sum_of_groups(mean_partial, mean_groups, group);
+    const REAL weight = sum_of_groups(mean_partial + mean_groups, mean_groups, group);
     const REAL mean = mean_groups > 0 ? weighed / weight : 0;
-    if (get_global_id(0) == 0)
+    if (IS_FIRST_ITEM)
         counts[UPDATES] = 0;
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
-    const int faces = starts[n], until = starts[block_end(n)];
-    for (BLOCK_LOOP(i, n)) {
+    const int faces = starts[n], until = starts[block_start(n, group.id + 1, group.count)];
+    for (GROUP_LOOP(i, n)) {
         REAL x[DIM];
         float self[CELL_DIM], change = 0;
         const REAL hi = h[i], unit = 1 / hi, content = CELL_DIM == 2 ? hi * hi : hi * hi * hi;
@@ -218,21 +209,19 @@ typedef struct {
         global STORE *s, global STORE *u, global STORE *y, global STORE *r, global STORE *z, global REAL *partial,     \
         global REAL *record
 #define ITERATION                                                                                                      \
-    {                                                                                                                  \
-        n, max_iterations, room, warm, tolerance, starts, neighbors, rows, columns, own, eps, inverse_diagonal, p, s,  \
-            u, y, r, z, partial, record                                                                                \
-    }
+    n, max_iterations, room, warm, tolerance, starts, neighbors, rows, columns, own, eps, inverse_diagonal, p, s, u,   \
+        y, r, z, partial, record
 
 /* p = z + beta p, s = B^T z + beta s. record[k].running becomes 0 if |r| is within the tolerance, if `max_iterations`
    are done, or if a value is not positive or not finite. */
-inline void step_projection_direction(int k, const iteration_t *it, local REAL *scratch)
+inline void step_projection_direction(int k, const iteration_t *it, group_t group)
 {
     global REAL *partial = it->partial, *now = it->record + 4 * k;
     global const REAL *last = now - 4;
-    const int first = get_global_id(0) == 0;
+    const int first = IS_FIRST_ITEM;
     const int start = it->warm != 0;
     const int stopped = k > 0 && !(last[RECORD_RUNNING] != 0 && (last[RECORD_CURVATURE] > 0 || k == start));
-    const REAL norm = total_sum(ROW(NORM(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
+    const REAL norm = total_sum(ROW(NORM(k)), group), gamma = total_sum(ROW(GAMMA(k)), group);
     const REAL target = it->tolerance * it->tolerance * (k > 0 ? it->record[RECORD_NORM] : norm);
     const int running =
         !stopped && k < it->max_iterations && norm > target && norm <= REAL_MAX && (gamma > 0 || k < start);
@@ -244,7 +233,7 @@ inline void step_projection_direction(int k, const iteration_t *it, local REAL *
     const STORE beta = k > start ? gamma / last[RECORD_GAMMA] : 0;
     const int end = running ? it->n : 0, faces = it->starts[it->n];
     Sum curvature = SUM_ZERO;
-    for (BLOCK_LOOP(i, end)) {
+    for (GROUP_LOOP(i, end)) {
         const STORE zi = it->z[i], pi = k > start ? zi + beta * it->p[i] : zi;
         STORE sum[CELL_DIM];
         EACH_COMPONENT (a)
@@ -268,19 +257,19 @@ inline void step_projection_direction(int k, const iteration_t *it, local REAL *
 }
 
 /* y += alpha p, u -= alpha s, r -= alpha (B s + eps p), z = D^-1 r. */
-inline void step_projection(int k, const iteration_t *it, local REAL *scratch)
+inline void step_projection(int k, const iteration_t *it, group_t group)
 {
     global REAL *partial = it->partial, *now = it->record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;
-    const REAL curvature = total_sum(ROW(CURVATURE), scratch);
-    if (running && get_global_id(0) == 0)
+    const REAL curvature = total_sum(ROW(CURVATURE), group);
+    if (running && IS_FIRST_ITEM)
         now[RECORD_CURVATURE] = curvature;
     /* A start of 0 has curvature 0. */
     const int ahead = curvature > 0, first_direction = k < it->warm;
     const STORE alpha = ahead ? now[RECORD_GAMMA] / curvature : 0;
     const int end = running && (ahead || first_direction) ? it->n : 0, faces = it->starts[it->n];
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
-    for (BLOCK_LOOP(i, end)) {
+    for (GROUP_LOOP(i, end)) {
         const STORE pi = it->p[i];
         STORE q = it->eps[i] * pi;
         it->y[i] = (k > 0 ? it->y[i] : 0) + alpha * pi;
@@ -309,30 +298,30 @@ inline void step_projection(int k, const iteration_t *it, local REAL *scratch)
 
 kernel void update_projection_direction(ITERATION_ARGS, global int *counts)
 {
-    local REAL scratch[GROUP_SIZE];
-    const iteration_t it = ITERATION;
-    step_projection_direction(number_of_direction(counts), &it, scratch);
+    LONG_GROUP;
+    const iteration_t it = {ITERATION};
+    step_projection_direction(number_of_direction(counts, group), &it, group);
 }
 
 kernel void update_projection(ITERATION_ARGS, global int *counts)
 {
-    local REAL scratch[GROUP_SIZE];
-    const iteration_t it = ITERATION;
-    step_projection(number_of_update(counts), &it, scratch);
+    LONG_GROUP;
+    const iteration_t it = {ITERATION};
+    step_projection(number_of_update(counts, group), &it, group);
 }
 
 /* All iterations by one work-group, for few cells. */
 kernel void project_by_group(ITERATION_ARGS)
 {
-    local REAL scratch[GROUP_SIZE];
-    const iteration_t it = ITERATION;
+    LONG_GROUP;
+    const iteration_t it = {ITERATION};
     bool running = true;
     for (int k = 0; running; ++k) {
-        step_projection_direction(k, &it, scratch);
-        barrier(CLK_GLOBAL_MEM_FENCE);
+        step_projection_direction(k, &it, group);
+        GROUP_BARRIER;
         running = record[4 * k + RECORD_RUNNING] != 0;
-        step_projection(k, &it, scratch);
-        barrier(CLK_GLOBAL_MEM_FENCE);
+        step_projection(k, &it, group);
+        GROUP_BARRIER;
     }
 }
 

@@ -137,7 +137,7 @@ kernel void sort_bins(const int size, global const int2 *bins, global const int 
                       global const FRAME *grid_frames, global const int4 *grid_shapes, global int *items,
                       global float *reach, global float *spacing)
 {
-    WORK_ITEM(b);
+    LONG_ITEM(b);
     const int g = bin_grid[b];
     const int4 shape = grid_shapes[g];
     if (b - shape.s0 == shape.s1 * shape.s2 * shape.s3)

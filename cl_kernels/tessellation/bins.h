@@ -11,6 +11,7 @@
 #define FRAME REAL4
 #define FRAME_INVERSE(f) ((f).s3)
 #define BIN_ARGS global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes
+#define BINS bins, grid_frames, grid_shapes
 
 /* Bin index along one axis. It is monotone in x, also after rounding: a range of x covers its bins. A NaN goes to bin
    0, so that no index leaves the grid. */

@@ -16,9 +16,11 @@
 /* Cells of a power diagram may be empty. */
 #define TOO_FEW(n) ((n) == 1 || (n) == 2)
 #define CLIP_BOUND_ARGS BOUND_ARGS
+#define CLIP_BOUNDS BOUNDS
 #else
 #define TOO_FEW(n) ((n) < 3)
 #define CLIP_BOUND_ARGS
+#define CLIP_BOUNDS
 #endif
 
 /* Per item p in bin order: the cell of generator i = items[p] as its list of neighbors, counter-clockwise.
@@ -37,7 +39,7 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
                           const REAL4 box_upper, const int some, global int *rows, global int *row_counts,
                           global int *places, global int *flags CLIP_BOUND_ARGS)
 {
-    WORK_ITEM(p);
+    LONG_ITEM(p);
     const int i = items[p];
     if (i >= rows_wanted || (some && row_counts[i]))
         return;
@@ -152,7 +154,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
                                 const REAL4 box_upper, const int repaired, const REAL share, global const int *marks,
                                 global int *fits, global uint *keep, global int *counts, global int *flags)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     counts[i] = 0;
     if (flags[FLAG_MARKED]) {
         if (marks[i])
@@ -268,7 +270,7 @@ kernel void measure_faces(const int size, global const int *starts, global const
                           global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
                           global REAL *measures, global REAL *centroids)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     SITE(x, i, points);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};

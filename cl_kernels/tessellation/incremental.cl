@@ -174,6 +174,7 @@ kernel void begin_update(const int size, global int *marks, global int *places, 
                          const int first_spare, const int slot_count)
 {
     WORK_ITEM(i);
+    SHORT_LOOP
     for (int f = 0; i == 0 && f < flag_count; ++f)
         flags[f] = f == 3 ? first_spare : f == 4 ? slot_count : 0;
     marks[i] = 0;
@@ -250,7 +251,7 @@ kernel void clip_marked(const int size, global const int *listed, const int roun
                         global const int *old_starts, global const int *old_neighbors, global const REAL *points,
                         const REAL4 box_lower, const REAL4 box_upper, global int *fits, global int *flags)
 {
-    WORK_ITEM(w);
+    LONG_ITEM(w);
     const int count = count_of_round(round, flags);
     if (w >= count)
         return;
@@ -318,7 +319,7 @@ kernel void check_clipped(const int size, global const int *listed, const int ro
                           global const int *old_starts, global const int *old_neighbors, global const REAL *points,
                           const REAL4 box_lower, const REAL4 box_upper, global int *marks, global int *fits)
 {
-    WORK_ITEM(w);
+    LONG_ITEM(w);
     if (w >= count_of_round(round, flags))
         return;
     const int i = listed[w];

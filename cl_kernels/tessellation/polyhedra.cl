@@ -109,9 +109,10 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
                            global const int *old_neighbors, const int again, const int room, const REAL share,
                            CELL_OUTPUT_ARGS CELL_ARGS HALO_ARGS CLIP_BOUND_ARGS)
 {
-    TAKE_CELL(cell);
+    LONG_ITEM(k);
+    TAKE_CELL(cell, k);
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
-    EACH_CELL (p) {
+    EACH_CELL (p, k) {
         const int i = items[p];
         if (i >= rows || (again && row_counts[i] != UNFINISHED))
             continue;
@@ -261,7 +262,7 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
                                    global const REAL *points, const REAL share, global uchar *kept, global int *counts,
                                    global int *report PERIOD_ARGS)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     const int n = COUNT_OF(row_counts[i]);
     const bool certain = (row_counts[i] & CERTAIN) != 0;
     counts[i] = n;

@@ -196,6 +196,7 @@ kernel void begin_cell_updates(const int size, const int used, const int report_
     marks[i] = 0;
     for (int k = 0; k < MORE; ++k)
         more[MORE * i + k] = NO_NEIGHBOR;
+    SHORT_LOOP
     for (int k = 0; i == 0 && k < report_size; ++k)
         report[k] = k == REPORT_FACES ? used : 0;
 }
@@ -214,7 +215,7 @@ kernel void update_cells(const int size, const int which, global const int *list
                          const REAL4 box_lower, const REAL4 box_upper, const int room, CELL_OUTPUT_ARGS,
                          global uint *keys, global int *changed, global int *more, global int *marks PERIOD_ARGS)
 {
-    WORK_ITEM(item);
+    LONG_ITEM(item);
     if (which == MARKED_CELLS && item >= report[REPORT_PLACED])
         return;
     if (item == 0)
@@ -297,7 +298,7 @@ kernel void check_cells(const int size, const int room, global int *report, glob
                         global const int *row_counts, global const int *labels, global const REAL *measures,
                         global const uint *keys, global const int *changed, global int *marks)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     const bool full = report[REPORT_FACES] > room;
     if (i == 0) {
         report[REPORT_PLACED] = 0; /* for the next round */

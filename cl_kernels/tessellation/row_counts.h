@@ -18,6 +18,8 @@
     global int *row_places, global int *row_counts, global int *labels, global REAL *measures, global REAL *centroids, \
         global REAL *volumes, global REAL *offsets, global REAL *covariances, global int *report,                      \
         const int with_corners, global uchar4 *corners
+#define CELL_OUTPUT                                                                                                    \
+    row_places, row_counts, labels, measures, centroids, volumes, offsets, covariances, report, with_corners, corners
 
 #define NO_CORNERS 0    /* the vertices are not known */
 #define NEW_CORNERS 1   /* they are those of a new cell */

@@ -181,12 +181,51 @@ def text_for_driver(
     device = ctx.devices[0]
     options = (*options, *device_options(device))
     if on_pocl(device):
-        text = NO_ABI_WARNINGS + text
+        text = NO_ABI_WARNINGS + with_long_bodies_once(text)
     if needs_static_functions(device):
         text = STATIC_FUNCTIONS + text
     if short and has_short_declarations(ctx):
         text, options = f"{source_text('opencl/pocl_builtins.h')}\n{text}", (*options, "-D_OPENCL_H_")
     return text, options
+
+
+_LONG_KERNEL = re.compile(
+    r"^kernel void (\w+)\(([^)]*)\)\n\{\n    LONG_(ITEM\(\w+\)|GROUP);(.*?)^\}$", re.DOTALL | re.MULTILINE
+)
+
+
+def with_long_bodies_once(text: str) -> str:
+    """Return `text` with the bodies of kernels that begin with LONG_ITEM or LONG_GROUP in functions.
+
+    PoCL compiles a kernel three times: itself, and with its body in two launchers. Functions that it calls are compiled
+    once, if they contain no barrier and do not ask for the work-item. Lines keep their numbers.
+    """
+
+    def split(found: re.Match[str]) -> str:
+        name, given, kind, body = found.groups()
+        given = " ".join(given.split())
+        if kind == "GROUP":
+            begin, first, more = "MAKE_GROUP", "group_t group", "group"
+        else:
+            more = kind[len("ITEM(") : -1]
+            begin, first = f"WORK_ITEM({more})", f"int {more}"
+        return (
+            f"OUT_OF_LINE void {name}_once(const {first}, {given})\n{{\n{body}}} "
+            f"kernel void {name}({given}) {{ {begin}; {name}_once({more}, {_passed(given, text)}); }}"
+        )
+
+    return _LONG_KERNEL.sub(split, text)
+
+
+def _passed(given: str, text: str) -> str:
+    """Return the arguments of a call with the parameters `given`. PERIOD_ARGS there are PERIODS in a call."""
+    calls = []
+    for part in given.split(","):
+        words = re.findall(r"\w+", part)
+        macros = [word.removesuffix("_ARGS") for word in words if word.endswith("_ARGS")]
+        names = [f"{m}S" if f"#define {m}S" in text else m for m in macros]
+        calls.append(" ".join([*words[: len(words) - len(macros)][-1:], *names]))
+    return ", ".join(calls)
 
 
 def device_options(device: cl.Device) -> tuple[str, ...]:

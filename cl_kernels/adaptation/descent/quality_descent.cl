@@ -20,7 +20,8 @@ kernel void compute_cell_forces(const int size, global const int *starts, global
                                 global const REAL *volumes, global const REAL *quality, global const REAL *h,
                                 const REAL quality_weight, const REAL bad_cell_weight, global REAL4 *forces)
 {
-    const int begin = 4 * get_global_id(0), count = min(4, size - begin);
+    LONG_ITEM(quad);
+    const int begin = 4 * quad, count = min(4, size - begin);
     REAL q[4] = {1, 1, 1, 1};
     for (int c = 0; c < count; ++c)
         q[c] = fmax(quality[begin + c], R(1e-6));
@@ -166,7 +167,7 @@ kernel void descend_quality(const int size, global const int *starts, global con
                             const REAL close_stiffness, const REAL full_rate,
                             global REAL *lloyd OUTLINE_ARGS PERIOD_ARGS)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     const rows_t rows = {starts, neighbors, face_measures, face_centroids};
     const repulsion_t edges = {short_edge, stiffness}, pairs = {close, close_stiffness};
     SITE(x, i, points);

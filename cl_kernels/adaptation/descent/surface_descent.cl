@@ -19,7 +19,7 @@ kernel void compute_surface_forces(const int size, global const int *starts, glo
                                    global const REAL *volumes, global const REAL *quality, const REAL bad_cell_weight,
                                    global REAL2 *forces)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     REAL surface = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k)
         surface += face_measures[k];
@@ -119,7 +119,7 @@ kernel void descend_surface(const int size, global const int *starts, global con
                             global const REAL2 *forces, const REAL rate, const REAL max_displacement,
                             global REAL *lloyd PERIOD_ARGS)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     const int begin = starts[i], faces = starts[i + 1] - begin;
     if (faces > MOST_FACES || corners[2 * begin].s3 == NO_CORNERS)
         return;

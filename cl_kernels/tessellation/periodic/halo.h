@@ -49,6 +49,9 @@ typedef struct {
     , const int halo_own, const REAL4 halo_period, BLOCK_ARGS, const REAL halo_sideways, const REAL halo_outwards,     \
         const float halo_kept, global const float *halo_depths, global const int *halo_extremes,                       \
         global int *halo_requests, global int *halo_too_shallow, global const int *halo_most
+#define HALOS                                                                                                          \
+    , halo_own, halo_period, block_from, block_length, block_count, halo_sideways, halo_outwards, halo_kept,           \
+        halo_depths, halo_extremes, halo_requests, halo_too_shallow, halo_most
 #define MAKE_HALO                                                                                                      \
     MAKE_BLOCKS;                                                                                                       \
     halo_t halo = {halo_own,    halo_period, blocks,      halo_sideways, halo_outwards,   halo_kept,                   \
@@ -227,4 +230,5 @@ inline void check_vertex_ball(const REAL *x, REAL w, int i, REAL4 at, const REAL
 
 #else
 #define HALO_ARGS
+#define HALOS
 #endif

@@ -37,8 +37,9 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
                           global const int *starts, global const int *neighbors, global int *capacities,
                           global int *corner_counts, global int *half_face_counts, global int *full CELL_ARGS)
 {
-    TAKE_CELL(cell);
-    EACH_CELL (i) {
+    LONG_ITEM(k);
+    TAKE_CELL(cell, k);
+    EACH_CELL (i, k) {
         if (capacities[i] != 0)
             continue;
 #ifdef WEIGHTED
@@ -114,8 +115,9 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
                          global float *sharpness, global int *corner_faces, global int *owners, global int *same,
                          global int *half_face_labels, global int *loop_starts, global int *loops CELL_ARGS)
 {
-    TAKE_CELL(cell);
-    EACH_CELL (i) {
+    LONG_ITEM(k);
+    TAKE_CELL(cell, k);
+    EACH_CELL (i, k) {
         if (capacities[i] != FACE_CAPACITY)
             continue;
         const int base = corner_starts[i];
