@@ -142,3 +142,22 @@ def test_vectors_of_eight_doubles_give_no_warnings(ctx, capfd):
     assert "warning" not in capfd.readouterr().err
     program.compile_text(ctx, "#warning seen\n" + text, (), short=False)
     assert "warning" in capfd.readouterr().err
+
+
+def test_long_kernels_call_their_body(ctx):
+    """Lines keep their numbers. All long kernels are found, and macros of arguments become those of calls."""
+    text = (
+        "#define PERIODS , periods\n"
+        "kernel void move(const int size, global REAL *x,\n"
+        "                 const REAL h PERIOD_ARGS)\n"
+        "{\n    LONG_ITEM(i);\n    x[i] = h;\n}\n"
+    )
+    split = program.with_long_bodies_once(text)
+    given = "const int size, global REAL *x, const REAL h PERIOD_ARGS"
+    assert split.splitlines()[1] == f"OUT_OF_LINE void move_once(const int i, {given})"
+    assert f"}} kernel void move({given}) {{ WORK_ITEM(i); move_once(i, size, x, h PERIODS); }}" in split
+    files = [path.relative_to(program.kernel_folder()).as_posix() for path in program.kernel_folder().rglob("*.cl")]
+    for name in files:
+        text = source_text(name)
+        long = text.count("    LONG_ITEM(") + text.count("    LONG_GROUP;")
+        assert program.with_long_bodies_once(text).count("_once(const ") == long, name
