@@ -13,7 +13,7 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
                             global const REAL *covariances, global const REAL *h, global REAL *error,
                             global REAL *quality, global REAL *energy, global REAL *local_length OUTLINE_ARGS)
 {
-    LONG_ITEM(i);
+    WORK_ITEM(i);
     const REAL volume = volumes[i];
 #if CELL_DIM == 2
     const REAL length = sqrt(volume);

@@ -154,7 +154,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
                                 const REAL4 box_upper, const int repaired, const REAL share, global const int *marks,
                                 global int *fits, global uint *keep, global int *counts, global int *flags)
 {
-    LONG_ITEM(i);
+    WORK_ITEM(i);
     counts[i] = 0;
     if (flags[FLAG_MARKED]) {
         if (marks[i])
