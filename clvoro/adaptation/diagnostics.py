@@ -13,7 +13,6 @@ from ..errors import InputError, MismatchWarning, ObtuseTrianglesWarning, Precis
 from ..geometry.boundary_layers import Layers, columns_of
 from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
-from ..geometry.sphere import Sphere
 from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
@@ -85,7 +84,7 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
         text = f"the domain is narrower than half a cell: {here}cells there are long and reach from wall to wall"
     else:
         text = f"the domain has a dead end that is narrower than a cell: {here}cells there have poor shapes"
-    remedy = ", or fill it: domain.simplified(size) does" if isinstance(domain, Polygon) else ""
+    remedy = ", or fill it: domain.simplified(size) does" if domain.outline is not None else ""
     warn(f"{text}. Use smaller sizes there, as sizing.FeatureSize does{remedy}", MismatchWarning)
 
 
@@ -96,8 +95,8 @@ def narrow_parts(
 
     See `find_narrow_parts`.
     """
-    if isinstance(domain, Polygon):
-        return find_narrow_parts(domain, size)
+    if domain.outline is not None:
+        return find_narrow_parts(domain.outline, size)
     center = (np.array(domain.lower) + domain.upper) / 2
     widths = np.where(domain.periodic, np.inf, domain.extent)
     strait = NarrowPart(center, float(widths.min()), float(size(center[None])[0]))
@@ -149,7 +148,7 @@ def warn_of_errors(result: Result) -> None:
     wanted, made = (float(sizes[worst]), float(diagram.volumes[worst]) ** (1 / diagram.domain.cell_dim))
     if len(diagram) == 1 and 2 * made**diagram.domain.cell_dim < wanted**diagram.domain.cell_dim:
         return  # `CoarseSizeWarning` says it before the run
-    place = _place(diagram.domain, result.points[worst])
+    place = diagram.domain.place_name(result.points[worst])
     near = [worst, *_ring(diagram, worst)]
     steep = any(abs(math.log(sizes[j] / sizes[i])) > math.log(STEEP) for i in near for j in _ring(diagram, i))
     if steep and any(diagram.shifts[slice(*diagram.neighbor_starts[i : i + 2])].any() for i in near):
@@ -162,8 +161,8 @@ def warn_of_errors(result: Result) -> None:
             "sizes change there by more than cells can follow from one to the next: bound their growth, as by "
             "sizing.Graded(size, growth=1.2), or use more cells"
         )
-    elif isinstance(diagram.domain, Polygon) and len(diagram) > FEW_CELLS:
-        why = _why_in_polygon(diagram.domain, result.points[worst], wanted)
+    elif diagram.domain.outline is not None and len(diagram) > FEW_CELLS:
+        why = _why_in_polygon(diagram.domain.outline, result.points[worst], wanted)
     else:
         why = (
             f"the domain has a measure of {diagram.domain.measure:.6g}, which cells of this size do not fill evenly: "
@@ -197,14 +196,6 @@ def _ring(diagram: Diagram, i: int) -> np.ndarray:
     return row[row >= 0]
 
 
-def _place(domain: Domain, x: np.ndarray) -> str:
-    """Return a position as text: longitude and latitude on a sphere, coordinates elsewhere."""
-    if isinstance(domain, Sphere):
-        lon, lat = domain.lonlat(x[None])[0]
-        return f"longitude {lon:.6g}, latitude {lat:.6g}"
-    return format_point(x)
-
-
 def warn_of_obtuse_triangles(result: Result) -> None:
     """Warn if a mesh on a sphere has obtuse triangles, and name the worst.
 
@@ -231,7 +222,7 @@ def warn_of_obtuse_triangles(result: Result) -> None:
     some = f"{grid.obtuse} obtuse triangles" if grid.obtuse > 1 else "an obtuse triangle"
     warn(
         f"the mesh has {some}, which C grids do not allow, with an angle of up to {grid.angles[k]:.1f} degrees at "
-        f"{_place(diagram.domain, vertex)}; {why}",
+        f"{diagram.domain.place_name(vertex)}; {why}",
         ObtuseTrianglesWarning,
     )
 
@@ -270,12 +261,12 @@ def check_precision(sizing: Sizing, domain: Domain, points: np.ndarray, factor: 
         remedy = "use a smaller domain or larger sizes"
     least = int(np.argmin(h))
     if h[least] < spacing:
-        where = _place(domain, points[least])
+        where = domain.place_name(points[least])
         raise InputError(
             f"the size field is {h[least]:.3g} at {where}, but positions in {real} are "
             f"{spacing:.3g} apart in this domain: generators would coincide; {remedy}"
         )
-    if isinstance(domain, Sphere):
+    if domain.curved:
         short = spacing > MAX_EDGE_ERROR * SHORTEST_EDGE * h
         if short.any():
             warn(

@@ -12,7 +12,6 @@ from scipy.spatial import KDTree
 
 from ..arguments import check_points, coincident_pair, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
-from ..geometry.box import Box
 from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
@@ -82,7 +81,7 @@ def check_room(points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarra
             f"fixed[{i}] is at {format_point(points[i])}, in the layers or next to them, expected generators beyond "
             "them; move it, or leave out the layers of this wall"
         )
-    depth = wall_distances(points, domain) / h
+    depth = domain.boundary_distance(points) / h
     i = int(depth.argmin())
     if depth[i] < ON_WALL:
         raise InputError(
@@ -114,20 +113,10 @@ def check_room(points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarra
         )
 
 
-def wall_distances(points: np.ndarray, domain: Domain) -> np.ndarray:
-    """Return the distances (k,) of `points` (k, d) inside `domain` from its boundary, infinite without one."""
-    if isinstance(domain, Polygon):
-        return shapely.distance(shapely.points(points), domain.geometry.boundary)
-    if not isinstance(domain, Box):
-        return np.full(len(points), np.inf)
-    gaps = np.minimum(points - domain.lower, domain.upper - points)
-    return np.where(domain.periodic, np.inf, gaps).min(axis=1)
-
-
 def in_frame(points: np.ndarray, domain: Domain) -> tuple[np.ndarray, np.ndarray | None]:
     """Return `points` in the device's coordinates and float64, and the periods (d,) for `KDTree`, if there are any."""
     x, real = domain.place(points, np.dtype(np.float64)), np.dtype(np.float64)
-    return x, domain.periods(real) if isinstance(domain, Box) and any(domain.periodic) else None
+    return x, domain.periods(real) if any(domain.periodic) else None
 
 
 def take_places(
@@ -160,8 +149,8 @@ def take_places(
         tree = KDTree(points[others].astype(np.float64), boxsize=periods, balanced_tree=False)
         near = tree.query(x[waiting], k=count)
         distance, index = (np.reshape(found, (-1, count)) for found in near)
-        if isinstance(domain, Polygon):
-            hidden = ~_sees(domain, fixed[waiting, None], points[others[index]])
+        if domain.outline is not None:
+            hidden = ~_sees(domain.outline, fixed[waiting, None], points[others[index]])
             distance = np.where(hidden, BEHIND_WALL * distance, distance)
         used = np.zeros(len(others), bool)
         for k in np.argsort(distance, axis=None, kind="stable").tolist():

@@ -20,7 +20,6 @@ from typing import Literal
 import numpy as np
 import pyopencl as cl
 
-from ..geometry.polygon import Polygon
 from ..opencl.device_array import buffer_of
 from ..solvers.components import balance_components
 from ..solvers.linear_system import Limits
@@ -273,9 +272,7 @@ class ProjectedMethod(Method):
         warm = mesh.multipliers is not None
         if not warm:
             mesh.multipliers = engine.zeros(mesh.n, np.float32)
-        at_walls, most = (
-            (AT_WALLS, MOST_AT_WALLS) if isinstance(mesh.domain, Polygon) else (AT_WALLS_OF_BOXES, math.inf)
-        )
+        at_walls, most = (AT_WALLS, MOST_AT_WALLS) if mesh.domain.cuts_cells else (AT_WALLS_OF_BOXES, math.inf)
         solution = stages.volume_projection.project(
             t,
             Targets(mesh.local_length, gradient, log_ratio, mesh.quality, sums),

@@ -10,7 +10,6 @@ import numpy as np
 from ..arguments import coincident_named, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
 from ..geometry.boundary_layers import apart_from, count_rows, free_domain, place_layers
-from ..geometry.box import Box
 from ..geometry.domain import Domain
 from ..geometry.geojson import may_be_degrees
 from ..geometry.sphere import Sphere
@@ -178,7 +177,7 @@ def _check_together(domain: Domain, points: np.ndarray | None, fixed: np.ndarray
         )
     if method not in MOVING:
         return
-    if not isinstance(domain, Box) or any(domain.periodic):
+    if not domain.plain:
         raise InputError(
             f"domain is {domain!r:.80}, expected a Box with walls for method {method!r}, which maps a lattice onto it; "
             "use method='adaptive'"

@@ -69,7 +69,7 @@ class Refinement:
             *t.outlines,
         )
         # Several cells that are much larger than the edges of the boundary can bring one at the same corner.
-        if isinstance(domain, Polygon) and len(finer) <= most_checked(domain):
+        if domain.outline is not None and len(finer) <= most_checked(domain.outline):
             return self._without_coincident(finer, n)
         return finer
 

@@ -9,7 +9,6 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ..geometry.polygon import Polygon
 from ..opencl.device_array import buffer_of
 from .corners import PlacedCorners, find_corners
 from .motion import Moving
@@ -45,14 +44,13 @@ class Walls:
         self.corners: PlacedCorners | None = None
         self.thin = False
         self.free = setup.free
-        domain = setup.domain
-        if not isinstance(domain, Polygon):
+        domain = setup.domain.outline
+        if domain is None:
             return
         # `normalize_sizes` changes the factor by little: all of a level, also resumed, has the same corners.
         level = round(math.log2(size_factor / setup.factor))
         h = 2.0**level * setup.factor * np.asarray(setup.sizing(domain.oriented.vertices), float)
-        free = setup.free if isinstance(setup.free, Polygon) else None
-        groups = find_corners(domain, h, free)
+        groups = find_corners(domain, h, setup.free.outline)
         if len(groups):
             self.corners = PlacedCorners(setup.stages.engine, domain, groups)
         self.thin = self.corners is not None and has_thin_walls(domain, h)

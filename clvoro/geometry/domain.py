@@ -84,6 +84,11 @@ class Domain(ABC):
     and each face stores both of its ends."""
 
     @property
+    def plain(self) -> bool:
+        """Whether the domain is its bounding box, with walls on all sides."""
+        return not (self.curved or self.cuts_cells or any(self.periodic))
+
+    @property
     def globe(self) -> Sphere | None:
         """The sphere whose longitudes and latitudes positions have, or None."""
         return None

@@ -42,7 +42,7 @@ def transfer_values(
             f"onto is a mesh of {target.domain}, the values are on {source.domain}; expected the same domain: make "
             "both meshes with one domain"
         )
-    on_host = source.domain.cuts_cells or source.domain.curved or any(source.domain.periodic)
+    on_host = not source.domain.plain
     if on_host and source.domain.cell_dim == 3:
         raise InputError(
             f"the meshes are of {source.domain}; expected a domain with walls, since transfer in 3D periodic boxes is "

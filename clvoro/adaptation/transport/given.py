@@ -9,7 +9,6 @@ import shapely
 from ...arguments import check_integer, check_number, check_points, coincident_named, warn
 from ...errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWarning
 from ...geometry.domain import Domain
-from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
 from ...mesh.transported import Transported
 from ...solvers.transport import TOLERANCE
@@ -146,9 +145,9 @@ def _check_volumes(volumes: np.ndarray, domain: Domain, rounding: float) -> None
 
 def _check_pieces(points: np.ndarray, volumes: np.ndarray, domain: Domain, rounding: float) -> None:
     """Raise InputError unless `volumes` fill each piece of the domain that holds the generators `points`."""
-    if not isinstance(domain, Polygon) or domain.n_pieces == 1:
+    if domain.outline is None or domain.n_pieces == 1:
         return
-    for k, piece in enumerate(shapely.get_parts(domain.geometry)):
+    for k, piece in enumerate(shapely.get_parts(domain.outline.geometry)):
         inside = shapely.dwithin(piece, shapely.points(points), 0)
         total = float(volumes[inside].sum())
         if not abs(total - piece.area) <= max(SUM_TOLERANCE, rounding) * domain.measure:

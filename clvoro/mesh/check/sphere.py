@@ -29,8 +29,8 @@ class SphereCells(Rebuilt):
     """
 
     def __init__(self, d: Diagram, dtype: object = None, real: np.dtype | None = None) -> None:
-        sphere, n = d.domain, len(d)
-        assert isinstance(sphere, Sphere)
+        sphere, n = d.domain.globe, len(d)
+        assert sphere is not None
         self.real = find_precision(d, dtype) if real is None else real
         radius, fine = sphere.radius, float(np.finfo(float).eps)
         eps = float(np.finfo(self.real).eps)
@@ -96,7 +96,7 @@ class SphereCells(Rebuilt):
 
 def rebuild_cells(diagram: Diagram, dtype: object = None) -> Rebuilt:
     """Return the rebuilt cells of a diagram in a box, in a polygon or on a sphere; `dtype` as for `find_precision`."""
-    made = SphereCells if isinstance(diagram.domain, Sphere) else Rebuilt
+    made = SphereCells if diagram.domain.curved else Rebuilt
     return made(diagram, dtype)
 
 
