@@ -364,8 +364,6 @@ def test_same_bits_twice(adapter, name):
 def test_2d_arrays_are_missing(adapter64):
     diagram = adapter64.diagram(BOX, POINTS["three"])
     assert not hasattr(diagram, "cell_vertices")
-    plane = adapter64.diagram(clvoro.Box((0, 0), (1, 1)), POINTS["three"][:, :2] / 2)
-    assert not hasattr(plane, "face_vertices")
 
 
 def test_degenerate_sets(adapter64):

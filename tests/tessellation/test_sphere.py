@@ -34,7 +34,7 @@ def tessellate(ctx, points, real="float64"):
     stages.bins.renumber(binned, n)
     tessellator = Tessellator(stages, UNIT)
     t = tessellator.tessellate(ordered, n, exact=True)
-    return tessellator, tessellator.final(t)[0], order
+    return tessellator, tessellator.final(t), order
 
 
 def as_cycle(row):
