@@ -291,7 +291,6 @@ def _estimate_memory(
     if any(domain.periodic) and tree is not None:
         images = expected_images(domain, sizing, most * tree.integral / required, tree)
     field_bytes = sizing.device_bytes + sizing.bytes_for(most)
-    check_memory(engine, most, domain, Extras(images, 0.0, field_bytes, 0.0), power=power)
     if domain.outline is not None and tree is not None:
         boundary = expected_boundary_cells(domain.outline, lambda p: (required / most) ** 0.5 * sizing(p))
     needed = check_memory(engine, most, domain, Extras(images, surplus, field_bytes, boundary), power=power)
