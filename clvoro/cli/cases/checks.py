@@ -123,9 +123,9 @@ def _explain(message: str, kind: Any, content: object, place: str, homes: Mappin
     expected = re.sub("`([a-z]+)`", lambda word: _WORDS.get(word[1], word[0]), expected)
     if "[...]" in path:  # it does not say which
         got_type = re.sub("`([a-z]+)`.*", lambda word: _WORDS.get(word[1], word[0]), text.partition(", got ")[2])
-        return f"{where} has a value that is {got_type}, expected {expected}"
+        return f"{where} has a value that is {got_type or 'out of bounds'}, expected {expected}"
     hint = ""
-    if "a table" not in expected and isinstance(got, Mapping):
+    if "a list" in expected and "a table" not in expected and isinstance(got, Mapping):
         hint = "; put it in [ ], or under a heading in double brackets"
     return f"{where} is {got!r:.200}, expected {expected}{hint}"
 
