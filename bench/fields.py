@@ -113,11 +113,10 @@ def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
     from matplotlib import patheffects
 
     from clvoro.plotting.cells import plot_cells
-    from clvoro.plotting.colors import coloring
+    from clvoro.plotting.colors import Paint, coloring
     from clvoro.plotting.legends import add_color_bar
     from clvoro.plotting.style import new_figure, styled
 
-    scheme = coloring("size")
     halo = [patheffects.Stroke(linewidth=2.2, foreground="white"), patheffects.Normal()]
     with styled():
         figure = new_figure(10.5, 5.7)
@@ -139,9 +138,8 @@ def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
                 bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
             )
         everything = np.concatenate([result.target_size for _, result in results])
-        add_color_bar(
-            axes[0].collections[0], axes, scheme, everything, LIMITS, location="bottom", shrink=0.5, aspect=50
-        )
+        paint = Paint(coloring("size"), everything, LIMITS)
+        add_color_bar(axes, paint, location="bottom", shrink=0.5, aspect=50)
         figure.savefig(path, dpi=150, pil_kwargs={"optimize": True})
 
 

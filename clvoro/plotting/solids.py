@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..io.convert import missing
-from ..io.vtu import polyhedra
-from ..mesh.connectivity import face_corners, take_rows
+from ..mesh.connectivity import face_corners, following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .cells import draw_polygons, edge_widths, images_in
@@ -323,16 +322,24 @@ def _polyhedra(diagram: Diagram, chosen: Callable[[np.ndarray, np.ndarray], np.n
     are their rows, "generator" the positions of their generators or of images of these.
     """
     pyvista, domain = require_pyvista(), diagram.domain
-    described = polyhedra(diagram)
-    streams = np.concatenate([[0], described["faceoffsets"]])
+    faces = face_corners(diagram)
     box = np.array([domain.lower, domain.upper])
-    parts = []
-    for rows, by in images_in(domain, *_bounds(diagram, diagram.vertices), box):
+    parts, images = [], [(np.arange(len(diagram)), np.zeros(3))]
+    if any(domain.periodic):
+        images = images_in(domain, *_bounds(diagram, diagram.vertices), box)
+    for rows, by in images:
         rows = rows[chosen(rows, by)]
         if not len(rows):
             continue
-        starts, items = take_rows(streams, described["faces"], rows)
-        cells = np.insert(items.astype(np.int64), starts[:-1], np.diff(starts))
+        # The items of a cell: their number, that of its faces, and for each face that of its corners and the corners.
+        first, half_faces = take_rows(diagram.neighbor_starts, np.arange(len(faces[0]) - 1), rows)
+        starts, corners = take_rows(*faces, half_faces)
+        shown = np.diff(starts) > 0
+        counts = np.diff(np.concatenate([[0], np.cumsum(shown)])[first])
+        ends = np.concatenate([[0], np.cumsum(np.diff(starts) + shown)])[first]
+        stream = np.insert(corners.astype(np.int64), starts[:-1][shown], np.diff(starts)[shown])
+        heads = np.column_stack([np.diff(ends) + 1, counts]).ravel()
+        cells = np.insert(stream, np.repeat(ends[:-1], 2), heads)
         grid = pyvista.UnstructuredGrid(cells, np.full(len(rows), _VTK_POLYHEDRON, np.uint8), diagram.vertices + by)
         grid.cell_data.update({"cell": rows, "generator": diagram.points[rows] + by})
         parts.append(grid)
@@ -374,23 +381,23 @@ def visible_faces(
     normals : (f, 3) float
     """
     domain, neighbor = diagram.domain, np.maximum(diagram.neighbors, 0)
-    low, high = _bounds(diagram, diagram.vertices)
+    low, high = _bounds(diagram, diagram.vertices) if any(domain.periodic) else (diagram.points, diagram.points)
 
     def bare(rows: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """Return which cells stay and have a face that is seen, or a part beyond a side of the box."""
+        """Return which cells stay and have a face that is seen, or a part beyond a seam."""
         stays = kept_cells(cut, through, towards, rows, diagram.points[rows] + by)
         images = diagram.points[neighbor] + diagram.shifts * domain.extent + by
-        open_ = (diagram.neighbors < 0) | ~kept_cells(cut, through, towards, neighbor, images)
-        open_ = np.logical_or.reduceat(open_, diagram.neighbor_starts[:-1])[rows]
-        return stays & (
-            open_ | (low[rows] + by < domain.lower).any(axis=1) | (high[rows] + by > domain.upper).any(axis=1)
-        )
+        seen = (diagram.neighbors < 0) | ~kept_cells(cut, through, towards, neighbor, images)
+        seen = np.logical_or.reduceat(seen, diagram.neighbor_starts[:-1])[rows]
+        return stays & (seen | ((low[rows] + by < domain.lower) | (high[rows] + by > domain.upper)).any(axis=1))
 
     surface = _polyhedra(diagram, bare).extract_surface(algorithm="geometry")
     if not surface.n_cells:
         return np.zeros(0, int), [], np.zeros((0, 3))
     polygons = _polygons(surface)
-    normals = np.array([np.cross(p - p[0], np.roll(p, -1, axis=0) - p[0]).sum(axis=0) for p in polygons])
+    starts = np.concatenate([[0], np.cumsum([len(p) for p in polygons])])
+    arms = np.concatenate([p - p[0] for p in polygons])
+    normals = np.add.reduceat(np.cross(arms, arms[following(starts)]), starts[:-1], axis=0)
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
     facing = np.flatnonzero(normals @ towards > 1e-9)
     order = facing[np.argsort((surface.cell_data["generator"] @ towards)[facing], kind="stable")]
