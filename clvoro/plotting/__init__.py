@@ -12,7 +12,7 @@ except ModuleNotFoundError as error:
 
 from .boundary import plot_boundaries
 from .cells import plot_cells, plot_size
-from .curves import plot_displacements, plot_distributions, plot_history
+from .curves import plot_distributions, plot_history
 from .globe import map_projection, plot_globe
 from .page import write_report
 from .solids import plot_cutaway, plot_slice, plot_slices
@@ -23,7 +23,6 @@ __all__ = [
     "plot_boundaries",
     "plot_cells",
     "plot_cutaway",
-    "plot_displacements",
     "plot_distributions",
     "plot_globe",
     "plot_history",

@@ -1,4 +1,4 @@
-"""Error and quality against steps (the paper's Figures 4, 5), displacements (its Figure 6), and histograms."""
+"""Error and quality against steps (the paper's Figures 4, 5), and histograms."""
 
 from __future__ import annotations
 
@@ -9,21 +9,15 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
-from scipy.spatial import KDTree
 
 from ..mesh.results import Result
-from .boundary import frame_part
-from .cells import require_plane
 from .colors import paint_of
-from .style import METHOD_COLORS, WIDTH, interactive_figure, nice, styled, window_around_smallest
+from .style import METHOD_COLORS, WIDTH, interactive_figure, styled
 
 _PANELS = {
     "error": ("metric error $|e|$ [–]", ("mean_error", "mean"), ("max_error", "largest")),
     "quality": ("cell quality $Q$ [–]", ("mean_quality", "mean"), ("min_quality", "worst cell")),
 }
-_LONG = 0.97  # share of the arrows that are at most one spacing long
-MOST_ARROWS = 2500
-"""Of a mesh with more generators, the displacements are shown where the cells are smallest."""
 
 
 def plot_history(results: Mapping[str, Result], figure: Any = None) -> Any:
@@ -87,62 +81,6 @@ def _history_panel(ax: Any, results: Mapping[str, Result], quantity: str) -> Non
 def _drawable(values: np.ndarray, quantity: str) -> np.ndarray:
     """Replace values that a logarithmic axis cannot show by gaps."""
     return np.where(values > 0, values, np.nan) if quantity == "error" else values
-
-
-def plot_displacements(result: Result, figure: Any = None) -> Any:
-    """Draw the Lloyd and the Poisson displacements of the first and of the last step, in the plane.
-
-    Arrows have the length of the displacement times the factor in the panel's title. Of a mesh with more than 2500
-    generators a window around the smallest cells is shown, because arrows over the whole mesh would be too small.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        None if the run recorded no displacements.
-
-    Raises
-    ------
-    InputError
-        For a mesh in 3D or on a sphere.
-    """
-    domain = result.diagram.domain
-    require_plane(domain, "displacements are drawn in the plane", "plot its history")
-    rows = [(n, d) for n, d in (("first", result.initial), ("last", result.final)) if d is not None]
-    if not rows:
-        return None
-    few = len(result.points) <= MOST_ARROWS
-    lower, upper = np.array([domain.lower, domain.upper]) if few else window_around_smallest(result, 50)
-    with styled():
-        if figure is None:
-            figure = interactive_figure(WIDTH, len(rows) * (WIDTH / 2 * float(np.divide(*(upper - lower)[::-1])) + 0.3))
-        axes = figure.subplots(len(rows), 2, squeeze=False)
-        for axes_row, (when, field) in zip(axes, rows, strict=True):
-            here = ((field.points >= lower) & (field.points <= upper)).all(axis=1)
-            points, both = field.points[here], (field.lloyd[here], field.poisson[here])
-            factors = _magnifications(points, both)
-            names = (("Lloyd", METHOD_COLORS[0]), ("Poisson", "#B34700"))
-            for ax, factor, arrows, (name, color) in zip(axes_row, factors, both, names, strict=True):
-                step = "coarse step" if result.history["level"][0] > 0 and when == "first" else "step"
-                ax.set_title(f"{name}, {when} {step} (× {factor:g})")
-                scale: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.0026}
-                ax.quiver(*points.T, *(factor * arrows.T), color=color, minlength=0.3, **scale)
-                frame_part(ax, domain, lower, upper, ticks=not few)
-    return figure
-
-
-def _magnifications(points: np.ndarray, fields: tuple[np.ndarray, np.ndarray]) -> list[float]:
-    """Return round factors that bring the long arrows of each field to about one spacing of the generators.
-
-    If they are close, both are the smaller one, so that the fields can be compared.
-    """
-    spacing = KDTree(points).query(points, k=min(7, len(points)))[0].reshape(len(points), -1)[:, 1:]
-    if not spacing.size:
-        return [1.0, 1.0]
-    reaches = [np.hypot(*arrows.T) / spacing.mean(axis=1) for arrows in fields]
-    # Without fixed generators, and displacements that are only round-off.
-    moving = [reach[reach > 1e-6] for reach in reaches]
-    factors = [nice(1.0 / np.quantile(m, _LONG), up=False) if m.size else 1.0 for m in moving]
-    return [min(factors)] * 2 if max(factors) <= 2.5 * min(factors) else factors
 
 
 def plot_distributions(result: Result, figure: Any = None) -> Any:

@@ -15,7 +15,7 @@ from .curves import plot_distributions, plot_history
 from .globe import default_center, map_projection
 from .legends import add_key
 from .solids import focus, plane_axes
-from .style import WIDTH, detached, grid_height, new_figure, styled, window_around_smallest
+from .style import WIDTH, detached, grid_height, new_figure, styled
 from .views import plot_mesh, views_of
 
 Picture = tuple[str, str, Callable[[], Any]]
@@ -160,35 +160,29 @@ def _closer(result: Result) -> Any:
     view = views_of(domain)[0]
     paint = shared_paint([result], "quality")
     options: dict[str, Any] = {"limits": paint.limits, "key": False}
-    smallest = float(np.quantile(result.target_size, 0.01))
+    axes_options: dict[str, Any] = {}
+    smallest, center = float(result.target_size.min()), result.points[np.argmin(result.target_size)]
+    plane = np.eye(domain.dim, 2)
+    if view == "globe":
+        axes_options = {"projection": map_projection(center=default_center(result))}
+    elif view == "slices":
+        normal = _largest_section(result)
+        plane = np.stack(plane_axes(np.eye(3)[normal]), axis=1)
+        options |= {"view": "slice", "normal": "xyz"[normal], "through": center}
+    lower, upper, middle = (np.asarray(x) @ plane for x in (domain.lower, domain.upper, center))
     with styled():
-        figure = new_figure(WIDTH, WIDTH / 2 * (0.8 if view == "cells" else 1.0) + 0.75)
-        axes = []
-        for number, across in enumerate((160, 40), 1):
+        figure = new_figure(WIDTH, WIDTH / 2 + 0.75)
+        axes = figure.subplots(1, 2, subplot_kw=axes_options)
+        for ax, across in zip(axes, (160, 40), strict=True):
             if domain.globe is not None:
-                half = min(across * smallest / domain.globe.radius, np.pi / 2) / 2
-                ax: Any = figure.add_subplot(1, 2, number, projection=map_projection(center=default_center(result)))
-                reach = ax.projection.x_limits[1] * np.sin(half)
+                reach = np.sin(min(across * smallest / domain.globe.radius, np.pi / 2) / 2) * ax.projection.x_limits[1]
                 ax.set(xlim=(-reach, reach), ylim=(-reach, reach))
             else:
-                ax = figure.add_subplot(1, 2, number)
-            if view == "cells":
-                options["window"] = window_around_smallest(result, across)
-            elif view == "slices":
-                normal = _largest_section(result)
-                center = result.points[np.argmin(result.target_size)]
-                middle, lower, upper = (
-                    np.asarray(x) @ np.transpose(plane_axes(np.eye(3)[normal]))
-                    for x in (center, domain.lower, domain.upper)
-                )
-                span = np.minimum(across * float(result.target_size.min()), upper - lower)
+                span = np.minimum(across * smallest, upper - lower)
                 corner = np.clip(middle - span / 2, lower, upper - span)
-                options |= {"view": "slice", "normal": "xyz"[normal], "through": center}
                 options["window"] = corner, corner + span
-            plot_mesh(
-                result, "quality", ax=ax, title=f"{across} $h_\\mathrm{{min}}$ across, where $h$ is smallest", **options
-            )
+            title = f"{across} $h_\\mathrm{{min}}$ across, where $h$ is smallest"
+            plot_mesh(result, "quality", ax=ax, title=title, **options)
             ax.locator_params(nbins=4)
-            axes.append(ax)
-        add_key(np.array(axes), paint, below=True)
+        add_key(axes, paint, below=True)
     return figure

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from ..errors import InputError
-from ..mesh.results import Result
 
 WIDTH = 7.0
 """Width of a full-width picture, inches."""
@@ -153,18 +152,3 @@ def single_height(lower: Any, upper: Any, legend: bool = False, title: bool = Fa
     width = WIDTH - (0.55 if legend or flat else 1.5)
     below = 0.35 * legend + 0.65 * flat
     return float(width * extent[1] / extent[0] + 0.4 + below + 0.25 * title)
-
-
-def window_around_smallest(result: Result, across: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of a window `across` times as wide as the smallest target size.
-
-    It is four fifths as high as wide, lies in the domain, and has in its middle the leftmost of the
-    cells whose target size is within a tenth of the smallest: the nose of a wing section.
-    """
-    box = result.diagram.domain
-    lower, upper, extent = np.array(box.lower), np.array(box.upper), box.extent
-    smallest = np.flatnonzero(result.target_size <= 1.1 * result.target_size.min())
-    center = result.points[smallest[np.argmin(result.points[smallest, 0])]]
-    span = np.minimum(np.array([across, 0.8 * across]) * float(result.target_size.min()), extent)
-    corner = np.clip(center - span / 2, lower, upper - span)
-    return corner, corner + span

@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.quiver import Quiver
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.plotting import page, pixels, plot_cells, plot_displacements, plot_history, plot_size, write_report
-from clvoro.plotting.curves import MOST_ARROWS, _magnifications
+from clvoro.plotting import page, pictures, pixels, plot_cells, plot_history, plot_size, write_report
 from clvoro.plotting.legends import short
 from clvoro.plotting.pictures import pictures_of, render
-from clvoro.plotting.style import nice, window_around_smallest
+from clvoro.plotting.style import nice
 
 BOX = clvoro.Box((-1, 2), (1, 3))
 
@@ -155,17 +153,6 @@ def test_numbers_of_a_scale_are_short(value, text):
     assert short(value) == text
 
 
-def test_arrows_are_about_a_spacing_long():
-    """Long displacements are reduced, short ones magnified, and generators that are held do not count."""
-    grid = np.stack(np.meshgrid(*2 * [np.arange(10.0)]), axis=-1).reshape(-1, 2)
-    held = np.arange(100) % 4 > 0
-    arrows = np.where(held[:, None], 0, [1.0, 0.0])
-    for length, factor in ((30.0, 0.02), (0.9, 1.0), (0.013, 50.0)):
-        # The six nearest points are at distances 1 to sqrt(2), at the edge at slightly more.
-        assert 0.5 <= length * factor <= 2
-        assert _magnifications(grid, (length * arrows, length * arrows)) == [factor, factor]
-
-
 def test_limits_and_window_are_taken(result):
     window = ((0.0, 2.4), (0.3, 2.6))
     figure = plot_cells(result, "quality", window=window, limits=(0.25, 0.75))
@@ -263,48 +250,24 @@ def test_history_is_drawn_as_recorded(results):
     assert {"lloyd", "coupled"} <= {t.get_text() for t in figure.legends[0].get_texts()}
 
 
-def test_displacements_say_their_magnification(result):
-    figure = plot_displacements(result)
-    wanted = (result.initial.lloyd, result.initial.poisson, result.final.lloyd, result.final.poisson)
-    assert len(figure.axes) == 4
-    for ax, vectors in zip(figure.axes, wanted, strict=True):
-        (quiver,) = [c for c in ax.collections if isinstance(c, Quiver)]
-        factor = float(re.search(r"× ([\d.e+]+)", ax.get_title())[1])
-        assert np.stack([quiver.U, quiver.V], axis=1) == pytest.approx(factor * vectors)
-        assert quiver.scale == 1.0
-        assert quiver.angles == "xy"
-
-
-def test_displacements_of_a_large_mesh_are_those_in_a_window(result):
-    rng = np.random.default_rng(8)
-    n = MOST_ARROWS + 100
-    points = rng.random((n, 2)) * BOX.extent + BOX.lower
-    field = clvoro.Displacements(points, 1e-3 * rng.random((n, 2)), 1e-3 * rng.random((n, 2)))
-    large = dataclasses.replace(result, points=points, target_size=np.full(n, 0.004), initial=None, final=field)
-    lower, upper = window_around_smallest(large, 50)
-    figure = plot_displacements(large)
-    inside = ((points >= lower) & (points <= upper)).all(axis=1)
-    assert 0 < inside.sum() < n
-    assert len(figure.axes) == 2
-    assert figure.axes[0].collections[0].N == inside.sum()
-
-
-def test_window_stays_in_the_domain(result):
-    lower, upper = window_around_smallest(result, 10)
-    assert (lower >= BOX.lower).all()
-    assert (upper <= BOX.upper).all()
-    assert (upper - lower) == pytest.approx(np.array([10, 8]) * result.target_size.min())
-    lower, upper = window_around_smallest(result, 1e6)
-    assert lower == pytest.approx(BOX.lower)
-    assert upper == pytest.approx(BOX.upper)
-
-
 @pytest.mark.parametrize(
     ("value", "up", "rounded"),
     [(0.3, True, 0.5), (0.3, False, 0.2), (5.0, True, 5.0), (5.0, False, 5.0), (0.0, True, 1.0)],
 )
 def test_round_numbers(value, up, rounded):
     assert nice(value, up) == rounded
+
+
+def test_a_closer_look_stays_in_the_domain(result, monkeypatch):
+    monkeypatch.setitem(pictures.MANY_CELLS, "cells", 10)
+    (draw,) = (d for name, _, d in pictures_of({"coupled": result}) if name == "closer")
+    wide, close = draw().axes[:2]
+    assert wide.get_xlim() == (BOX.lower[0], BOX.upper[0])
+    small = dataclasses.replace(result, target_size=np.where(np.arange(len(result.points)) == 3, 0.004, 0.1))
+    (draw,) = (d for name, _, d in pictures_of({"coupled": small}) if name == "closer")
+    wide, close = draw().axes[:2]
+    assert np.ptp(close.get_xlim()) == pytest.approx(0.16)
+    assert np.mean(close.get_xlim()) == pytest.approx(result.points[3, 0], abs=0.16)
 
 
 @pytest.mark.slow

@@ -17,7 +17,6 @@ from clvoro.plotting import (
     pictures,
     plot_cells,
     plot_cutaway,
-    plot_displacements,
     plot_distributions,
     plot_size,
     plot_slice,
@@ -184,8 +183,6 @@ def test_result_plots_itself(result):
         result.plot(view="front")
     with pytest.raises(InputError, match="ParaView"):
         plot_cells(result)
-    with pytest.raises(InputError, match="is in 3D"):
-        plot_displacements(result)
     with pytest.raises(InputError, match="is in 3D"):
         plot_size(lambda x: x[:, 0], result.diagram.domain)
 
