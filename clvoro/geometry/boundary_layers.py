@@ -192,9 +192,9 @@ def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
 
 def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
     """Return a domain in 2D as a polygon, and the number in `domain` of each of its oriented edges."""
-    if isinstance(domain, Polygon):
-        return domain, domain.oriented.edge_numbers
-    if not isinstance(domain, Box) or domain.dim != 2 or all(domain.periodic):
+    if domain.outline is not None:
+        return domain.outline, domain.outline.oriented.edge_numbers
+    if domain.dim != 2 or all(domain.periodic):
         raise InputTypeError(f"layers are for a Box with walls or a Polygon in 2D, not for {domain}")
     (a, b), (c, d) = domain.lower, domain.upper
     return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.array([2, 1, 3, 0])
@@ -273,7 +273,7 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
         If nothing is left.
     """
     distances = [float(layer.rows[-1]) + _APART * layer.width for layer in layers]
-    if isinstance(domain, Box):
+    if domain.outline is None:
         corners = np.array([domain.lower, domain.upper])
         for layer, distance in zip(layers, distances, strict=True):
             for wall in domain.boundaries.select("Layers edges", layer.edges).tolist():
@@ -282,7 +282,9 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
                 corners[end, axis] = (min if end else max)(corners[end, axis], moved)
         if not (corners[0] < corners[1]).all():
             raise InputError(_NO_ROOM)
-        return _FreeBox(tuple(corners[0]), tuple(corners[1]), domain.periodic, whole=domain)
+        free = Box(tuple(corners[0]), tuple(corners[1]), domain.periodic)
+        object.__setattr__(free, "framed_by", domain)
+        return free
     polygon, _ = as_polygon(domain)
     # Merged to long lines first: the strips around thousands of short edges would overlap many times.
     strips = [
@@ -301,18 +303,6 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
     inner = Polygon.from_shapely(shapely.MultiPolygon(parts))
     inner.framed_by = polygon
     return inner
-
-
-@dataclass(frozen=True)
-class _FreeBox(Box):
-    """A box with the frame of another box."""
-
-    whole: Box = None  # type: ignore[assignment]
-
-    @property
-    def frame(self) -> tuple[np.ndarray, float]:
-        """Origin and scale of the device's coordinates: those of the whole box."""
-        return self.whole.frame
 
 
 def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray:

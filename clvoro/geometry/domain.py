@@ -311,13 +311,19 @@ class Domain(ABC):
 
     # The device's view.
 
+    framed_by: Domain | None = None
+    """The domain that this one is a part of; its frame is used on the device."""
+
     @property
     def frame(self) -> tuple[np.ndarray, float]:
         """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1].
 
         The scale is a power of two, so scaling is exact.
         """
-        return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
+        if self.framed_by is not None:
+            return self.framed_by.frame
+        lower, upper = self.clip_box
+        return lower, 2.0 ** math.ceil(math.log2((upper - lower).max()))
 
     def periods(self, real: np.dtype) -> np.ndarray:
         """Return the lengths of periods in the device's coordinates, (d,) float64; 0 across walls.

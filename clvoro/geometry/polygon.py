@@ -197,8 +197,6 @@ class Polygon(Domain):
         return self.vertices, self.ring_starts, self.piece_of_ring
 
     cuts_cells = True
-    framed_by: Polygon | None = None
-    """The polygon that this one is a part of; its frame is used on the device."""
 
     @property
     def outline(self) -> Polygon:
@@ -610,12 +608,6 @@ class Polygon(Domain):
             return self.framed_by.clip_box
         margin = _MARGIN * self.extent.max()
         return self.lower - np.full(2, margin), self.upper + np.full(2, margin)
-
-    @property
-    def frame(self) -> tuple[np.ndarray, float]:
-        """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1]."""
-        lower, upper = self.clip_box
-        return lower, 2.0 ** math.ceil(math.log2((upper - lower).max()))
 
     def traits(self, real: np.dtype) -> Traits:
         """Return for what kernels are built."""
