@@ -5,23 +5,28 @@ import numpy as np
 import pytest
 
 import clvoro
+from clvoro.errors import InputError
 from clvoro.geometry.boundary_names import BoundaryNames
 from clvoro.geometry.domain import Domain
-from clvoro.io import load
 
 
 class Slab(Domain):
-    """The space between two plates, periodic along them."""
+    """The space between two plates across the last axis, periodic along them."""
 
-    def __init__(self, length, bottom, top):
-        self.lower, self.upper = (0.0, bottom), (length, top)
-        self.periodic, self.names = (True, False), None
+    def __init__(self, *size):
+        self.lower, self.upper = (0.0,) * len(size), size
+        self.periodic = (True,) * (len(size) - 1) + (False,)
 
     def default_names(self):
-        return BoundaryNames(("bottom", "top"), np.array([-1, -1, 0, 1], np.int32), "plate")
+        seams = [-1] * (2 * self.dim - 2)
+        return BoundaryNames(("bottom", "top"), np.array([*seams, 0, 1], np.int32), "plate")
 
     def describe(self):
-        return {"length": self.upper[0], "bottom": self.lower[1], "top": self.upper[1]}
+        return {"size": self.upper}
+
+    @classmethod
+    def described(cls, size):
+        return cls(*size)
 
 
 class Corner(clvoro.Polygon):
@@ -35,12 +40,11 @@ class Corner(clvoro.Polygon):
         return {"cut": self.cut}
 
     @classmethod
-    def described(cls, **values):
-        return cls(**values)
+    def described(cls, cut):
+        return cls(cut)
 
 
-OWN = {"slab": Slab(3.0, 1.0, 2.0), "corner": Corner(0.4)}
-BOUNDARIES = {"slab": ("bottom", "top"), "corner": ("oblique", "outer")}
+OWN = {"slab": Slab(3.0, 1.0), "slab in 3D": Slab(1.0, 2.0, 0.5), "corner": Corner(0.4)}
 
 
 @pytest.fixture(params=OWN)
@@ -48,26 +52,40 @@ def domain(request):
     return OWN[request.param]
 
 
-def test_diagram(domain):
-    points = np.array(domain.lower) + domain.extent * np.random.default_rng(1).random((60, 2))
-    points = points[domain.contains(points)]
-    diagram = clvoro.voronoi(domain, points)
-    assert diagram.check().ok
-    assert diagram.volumes.sum() == pytest.approx(domain.measure)
+def points_in(domain, n):
+    points = np.array(domain.lower) + domain.extent * np.random.default_rng(1).random((n, domain.dim))
+    return points[domain.contains(points)]
+
+
+def test_diagrams_are_right_and_come_back_from_files(domain, tmp_path):
+    diagram = clvoro.voronoi(domain, points_in(domain, 60))
+    assert diagram.check()
     assert diagram.domain is domain
-
-
-def test_run(domain, tmp_path):
-    size = clvoro.sizing.Distance(domain, 0.05, growth=1.3)
-    mesh = clvoro.adapt(domain, size, effort="fast")
-    assert mesh.check().ok
-    for name in domain.boundary_names:
-        assert len(mesh.diagram.boundary_cells(name)) > 5
+    assert diagram.volumes.sum() == pytest.approx(domain.measure)
+    assert all(len(diagram.boundary_cells(name)) for name in domain.boundary_names)
     for path in (tmp_path / "mesh.npz", tmp_path / "mesh.vtu"):
-        mesh.save(path)
-        back = load(path)
-        assert back.diagram.domain == domain
-        assert np.array_equal(back.diagram.neighbors, mesh.diagram.neighbors)
-    assert np.array_equal(mesh.transfer(np.ones(len(mesh.points)), mesh), np.ones(len(mesh.points)))
+        diagram.save(path)
+        back = clvoro.load(path)
+        assert back.domain == domain
+        assert back.check()
+        assert np.array_equal(back.neighbors, diagram.neighbors)
+
+
+@pytest.mark.parametrize("name", ["slab", "corner"])
+def test_runs(name):
+    domain = OWN[name]
+    first = domain.boundary_names[0]
+    size = clvoro.sizing.Distance(domain.boundary(first), 0.05, growth=1.3)
+    mesh = clvoro.adapt(domain, size, effort="fast", layers=clvoro.Layers(0.01, 2, edges=first))
+    assert mesh.check()
+    assert abs(mesh.size_error).mean() < 0.1
+    assert np.ptp(mesh.transfer(np.ones(len(mesh.points)), mesh)) < 1e-14
     mesh.plot("size")
     plt.close("all")
+
+
+def test_a_file_with_an_unknown_class_says_what_to_do(tmp_path, monkeypatch):
+    clvoro.voronoi(OWN["slab"], points_in(OWN["slab"], 9)).save(tmp_path / "mesh.npz")
+    monkeypatch.delitem(Domain.kinds, "Slab")
+    with pytest.raises(InputError, match=r"mesh\.npz.* is a 'Slab', expected one of Box, .*; import the class"):
+        clvoro.load(tmp_path / "mesh.npz")
