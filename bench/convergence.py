@@ -38,7 +38,7 @@ from _common import (
 )
 
 import clvoro
-from clvoro.adaptation.plan.schedule import EXACT_STEPS, EXACT_STEPS_3D
+from clvoro.adaptation.tuning import EXACT_STEPS, EXACT_STEPS_3D
 
 LARGE = ("F4",)
 AT_LEAST = ("mean_quality", "min_quality", "mean_quality_all")

@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from .run import Run
 
 FORMAT, VERSION = "clvoro-checkpoint", 10
-RENEWAL = 10
-"""Steps after which a run with checkpoints computes its mesh anew, and may write one. A new diagram and new coarse
-levels of the solvers take about as long as a step."""
 _GENERATORS = tuple(field.name for field in dataclasses.fields(Generators))
 _OTHERS = ("potential", "multipliers", "weights")
 _COUNTS = ("position", "level", "levels", "n_start", "started", "steps", "next_label", "pace")

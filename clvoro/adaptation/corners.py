@@ -21,30 +21,23 @@ from ..mesh.straightening import cross
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 from .motion import Moving
+from .tuning import (
+    BEND_REACH,
+    CANDIDATE_REACH,
+    FAN,
+    FARTHEST_REACH,
+    GROUP_REACH,
+    JOINED,
+    LEAST_SPACING,
+    LEAST_TURN,
+    POCKET_SPACING,
+    POCKETS,
+    SHARP_REACH,
+    SHARP_TURN,
+    SPACING,
+    WALL_REACH,
+)
 
-SHARP_REACH, REACH = 0.05, 0.35
-"""Distances over h along the boundary from a corner: over the first its turns are added, over the second the boundary
-is a straight line."""
-SHARP_TURN, LEAST_TURN = np.radians(20), np.radians(30)
-"""Least turns of a corner over both distances."""
-SPACING, LEAST_SPACING, FAN = 1.1, 0.15, 0.5
-"""Spacing of corners over h: ``SPACING - FAN * turn``, for the mean turn of two corners, but at least `LEAST_SPACING`.
-Cells fan out around a corner, so sharp corners may be close to each other."""
-POCKETS, POCKET_SPACING = (0.01, 0.35), 0.75
-"""Areas over h^2, inside the domain, between the boundary and the segment from one corner to another. No cell fits in
-such a pocket, as on a staircase: its corners are at least `POCKET_SPACING` apart, over h. On a smaller one the boundary
-is straight."""
-JOINED = 1.6
-"""Distance over h, the larger one of both, up to which two corners may share a generator. They belong to the same group
-then."""
-CANDIDATE_REACH, FARTHEST_REACH = 2.2, 3.0
-"""Largest distance over h of a generator from a corner that it may share; the same where no generator is near, because
-sizes grow steeply from the corner, or a cell is missing there."""
-NEAR = 2 * FARTHEST_REACH
-"""Distance over h up to which a group has to know the corners of other groups, so that no two groups move the same
-generator."""
-WALL_REACH = 0.5
-"""Distance over h along the boundary from a corner up to which cells at the wall are candidates."""
 GROUP = 4
 """Work-items per work-group. There are few work-items, and each does much."""
 MOST_IN_GROUP, MOST_MOVED = 8, 48
@@ -100,7 +93,7 @@ def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) ->
     turned, bend = np.empty(len(x)), np.empty(len(x))
     for a, b in pairwise(oriented.ring_starts.tolist()):
         turned[a:b] = _turned(x[a:b], turns[a:b], SHARP_REACH * h[a:b])
-        bend[a:b] = _bend(x[a:b], turned[a:b], REACH * h[a:b])
+        bend[a:b] = _bend(x[a:b], turned[a:b], BEND_REACH * h[a:b])
     sharp = np.flatnonzero((turned < -SHARP_TURN) & (turns < 0) & (bend > LEAST_TURN))
     sharp = sharp[_is_free(domain, free, x[sharp])]
     # The sharpest first: `_spaced` leaves out vertices that are too close to an earlier one.
@@ -236,7 +229,7 @@ def _walls(domain: Polygon, corners: np.ndarray, h: np.ndarray) -> tuple[np.ndar
         a, b = oriented.ring_starts[r : r + 2].tolist()
         ends, slack = [], 0.0
         for way in (1, -1):
-            here, left, at = oriented.vertices[v], REACH * h[v], v
+            here, left, at = oriented.vertices[v], BEND_REACH * h[v], v
             for _ in range(b - a):
                 after = a + (at - a + way) % (b - a)
                 step = oriented.vertices[after] - here
@@ -280,7 +273,7 @@ def _others(x: np.ndarray, h: np.ndarray, starts: np.ndarray) -> tuple[np.ndarra
     """Return the corners of other groups near each group."""
     found: list[np.ndarray] = []
     if len(x):
-        near = KDTree(x).query_ball_point(x, NEAR * h)
+        near = KDTree(x).query_ball_point(x, GROUP_REACH * h)
         row = np.repeat(np.arange(len(x)), [len(rows) for rows in near])
         pair = np.concatenate([np.array(rows, int) for rows in near])
         # Each of two corners knows the other one if one of them is large enough.

@@ -16,15 +16,7 @@ from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import read_only
-
-CLOSE, AT_WALL, ON_WALL = 0.4, 0.2, 0.01
-"""Distances over h below which a run warns of two fixed generators or of one near a wall, and refuses one on a wall.
-
-Cells have their sizes at any distance (`bench/fixed_points.py --near`). In 2D, at the distances of the warnings, the
-centroid of the cell is 0.2 h from its generator, and Q is above 0.9; on a wall, or at the place of another one, that is
-0.4 h and 0.84."""
-CANDIDATES, BEHIND_WALL = 8, 4.0
-"""Others near a fixed generator that are compared, and the factor on the distance of those behind a wall."""
+from .tuning import AT_WALL, BEHIND_WALL, CANDIDATES, CLOSE, ON_WALL
 
 
 def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:

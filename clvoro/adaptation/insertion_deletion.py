@@ -16,26 +16,22 @@ from ..opencl.device_array import read_number
 from ..opencl.engine import Engine
 from ..opencl.primitives import NamedArrays, Scan
 from ..tessellation.device_diagram import Tessellation
+from .tuning import (
+    CLIMB_STRAIN,
+    LOG_RATIO_RINGS,
+    MAX_CHANGE,
+    NUCLEATION_STRAIN,
+    NUCLEUS_RINGS,
+    PAIR_RINGS,
+    REPAIRED_SHARE,
+    ROUNDS,
+    SHIFT_STEP,
+    SHIFTS,
+    SPLIT_DISTANCE,
+    WALL_STRAIN,
+)
 
-CLIMB_STRAIN = 0.06
-"""Strain across a dislocation (a 5-sided and a 7-sided cell) above which it climbs."""
-WALL_STRAIN = 0.3
-"""Strain that keeps a dislocation from ending at the wall beside it."""
-NUCLEATION_STRAIN = 0.22
-"""Anisotropy of the lattice above which a pair of dislocations may be nucleated."""
-PAIR_RINGS, NUCLEUS_RINGS, LOG_RATIO_RINGS = 4, 6, 3
-"""Rings of cells between sites that change in the same call, so that their displacements do not interact."""
-ROUNDS = 3
-"""Rounds of choosing sites. Each takes the strongest of the remaining sites."""
-SHIFTS, SHIFT_STEP = 51, 0.01
-"""Shifts of the threshold that are tried to bring the number of generators closest to the required one."""
 HISTOGRAM = 128  # a power of two, so that bins are divided evenly down to single keys
-SPLIT_DISTANCE = 0.3
-"""Half the initial distance over h of the two halves of a split cell."""
-MAX_CHANGE = 0.05
-"""Share of the generators that one call may insert or delete to correct their number."""
-REPAIRED_SHARE = 1e-3
-"""Share of the cells that one call may repair."""
 
 
 @dataclass(frozen=True)

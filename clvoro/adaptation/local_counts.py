@@ -18,30 +18,20 @@ from ..opencl.device_array import read_numbers
 from ..opencl.engine import Engine
 from ..opencl.workspace import framed
 from ..solvers.components import balance_components, connected_components
+from .tuning import (
+    BALANCE_TOLERANCE,
+    BLOCKED_RINGS,
+    LARGEST_OFFSET,
+    LEAST_CHANGES,
+    LEAST_GAIN,
+    LEAST_OFFSET,
+    PIECE,
+    SITE_RINGS,
+)
 
 if TYPE_CHECKING:
     from .density import CellWeights
     from .state import MeshState
-
-LEAST_GAIN = 2.0
-"""Half the sum of |u|^2 / h^2 over the cells that an insertion or deletion must save. With 1 to 4 the motor and the
-river of `bench/solver_ready.py`, exact, have no squeezed cells at walls (by a prototype in NumPy, two starts each). In
-most open domains there is no site where 2 is to be gained."""
-SITE_RINGS, BLOCKED_RINGS = 12, 3
-"""Least number of rings of cells between two sites of the same round, and of different rounds. With 6 or 8 rings there
-are up to 1.2 times as many changes, some of which undo others. Where a part lacks more cells than there is room for,
-the next balance adds them, when cells have moved."""
-LEAST_CHANGES = 1e-4
-"""Share of the cells that a round has to insert or delete, if there is to be another one. With at most 30 rounds, 239,
-533 and 529 cells at walls of Lake Huron, Chesapeake Bay and Stockholm in `bench/coasts.py`, exact, have Q below 0.75,
-now 7, 64 and 165. Rounds until no site gains enough take 1.5 times as long in Chesapeake Bay, for as many cells."""
-LEAST_OFFSET, PIECE, LARGEST_OFFSET = 0.25, 900.0, 3.0
-"""The offset of the potential for each cell that a piece of the domain lacks is `PIECE` over the number of its cells,
-at least `LEAST_OFFSET` and at most `LEAST_GAIN`. In domains of one piece it is `LEAST_OFFSET`. The whole offset is at
-most `LARGEST_OFFSET`. It favors insertions: in a piece of few cells each missing cell is inserted; elsewhere eight may
-be missing."""
-TOLERANCE = 3e-2
-"""Relative residual of the potential. Solves take 0.7 times the time of 1e-2, for as many squeezed cells."""
 
 
 def offset_of(missing: np.ndarray | float, cells: np.ndarray | float) -> np.ndarray:
@@ -93,7 +83,7 @@ class LocalCounts:
             array.fill(0)
         missing, total = mesh.missing_cells(w), 0
         pieces = PieceCounts(mesh, w) if mesh.domain.n_pieces > 1 else None
-        laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=TOLERANCE)
+        laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=BALANCE_TOLERANCE)
         for turn in count():
             offset = real(offset_of(missing, math.inf) if pieces is None else 0)
             if turn:
@@ -115,7 +105,12 @@ class LocalCounts:
             engine.run_each(k.try_changes, n, w.weight, changes, chosen, potential, offset, before, source)
             balance_components(mesh.domain, t, source, w.weight)
             poisson.solve(
-                laplacian, source, potential, tolerance=TOLERANCE, preconditioner="multigrid", from_zero=turn == 0
+                laplacian,
+                source,
+                potential,
+                tolerance=BALANCE_TOLERANCE,
+                preconditioner="multigrid",
+                from_zero=turn == 0,
             )
             if turn == 0:
                 continue

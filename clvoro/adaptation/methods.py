@@ -29,6 +29,16 @@ from .motion import Displacement, Method
 from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod
 from .state import MeshState
+from .tuning import (
+    AT_WALLS,
+    AT_WALLS_OF_BOXES,
+    CALM_BAD_CELL_WEIGHT,
+    CALM_MOMENTUM,
+    EXACT_PENALTY_PER_ERROR,
+    MET_ERROR,
+    MOST_AT_WALLS,
+    PENALTY_PER_ERROR,
+)
 
 
 @dataclass(frozen=True)
@@ -130,35 +140,6 @@ class WeightedMethod(Method):
         mesh.zero_fixed(correction)
         unit = mesh.local_length if self.cautious else mesh.h
         return Displacement(lloyd, correction, unit, float(self.lloyd), float(self.poisson), self.k, solution)
-
-
-AT_WALLS = 2.0
-"""In polygons, the quality scale of cells on walls over that of the others. Measured on three wings, gear and harbor of
-`bench/solver_ready.py`, best: mean |e| at walls falls from 0.0073 .. 0.0114 to 0.0048 .. 0.0072, mean Q there stays.
-With 5 or more, cells in the slots of the motor lose their sizes for good."""
-AT_WALLS_OF_BOXES = 10.0
-"""The same in boxes, in 2D. Measured on F3, best, four starts: mean |e| at walls falls from 0.0100 to 0.0045, the mean
-of the least Q changes from 0.932 to 0.934; default, three starts: from 0.0057 to 0.0024, and by -0.001; in the periodic
-channel of `bench/solver_ready.py`, best: from 0.0127 to 0.0058, and by -0.003. In a box of 560 cells, fast, eight
-starts, the mean Q changes by -0.0016."""
-MOST_AT_WALLS = 0.4
-"""In polygons, the largest penalty of cells on walls. Walls limit the quality of these cells, so they would give up
-their sizes for little: with default settings mean |e| at walls is 0.0109 on the coast of `bench/solver_ready.py`,
-0.0037 on the gear and 0.0070 on F2 in the coast of `bench/polygon.py` without it, and 0.0050, 0.0010 and 0.0011 with
-it. The mean Q there changes by 0.0005 on F2. On the coast, best, five starts, it is 0.0050 to 0.0072; with 0.15 in
-place of 0.4 the largest three become 0.0048 or less. But then more cells at walls have a low quality with method
-"exact": 12 in place of 7 in the bay, 66 in place of 57 on the coast."""
-CALM_MOMENTUM, CALM_BAD_CELL_WEIGHT = 0.7, 20.0
-"""Largest parameters at thin walls, where larger steps part the pairs of generators. Measured on a slit, twelve starts:
-the least Q is 0.84. With the default's relaxation of 3.2, or with its weight of 40, it is below 0.6 in four or five."""
-EXACT_PENALTY_PER_ERROR, MET_ERROR = 4.0, 1e-3
-"""Least penalty of exact projections in polygons, for each mean |log(L / h)| above the second number. Cells must pass
-through narrow parts of the domain where they have too few on one side; with a small penalty they are squeezed there.
-Measured on the motor of `bench/solver_ready.py` with method "exact", before the numbers of cells were balanced: 17
-cells at walls have Q below 0.75 without it, 4 with it and with `GRADUAL_PENALTIES`."""
-PENALTY_PER_ERROR = 750.0
-"""Largest penalty over the error target, for targets above 0.004. With a penalty of 3 no mean error above 0.024 is
-reached; with 30 to 60 the shape hardly improves any more. The smallest penalty is 1e-3, or a smaller target."""
 
 
 @dataclass

@@ -19,7 +19,6 @@ from ..sizing.gaps import NARROW
 from ..sizing.layers import limit_beside_layers
 from ..sizing.on_domain import on_domain
 from ..tessellation.power import require_power_domain
-from .descent.quality_descent import OPENINGS
 from .diagnostics import check_precision, narrow_parts, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import Extras, check_memory, expected_boundary_cells, expected_images, expected_surplus
 from .fixed_points import check_room, take_places
@@ -27,24 +26,25 @@ from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
 from .options import Options
 from .plan.actions import Action, Prescribe
-from .plan.efforts import LEAST_STEEP, choose_error_target, is_near, steep_share
-from .plan.schedule import CELLS_ACROSS, MOVES, adaptive_schedule, auto_levels, repeated_schedule
+from .plan.efforts import choose_error_target, is_near, steep_share
+from .plan.schedule import adaptive_schedule, auto_levels, repeated_schedule
 from .sampling.charts import charted
 from .sampling.quadrature import DensityTree
 from .sampling.start import density_tree, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-
-GRADIENT_STEP = 0.2
-"""Step over h of the differences for the gradient of the size field in exact projections."""
-LEAST_ON_SPHERE, LEAST_ADAPTED = 4, 20
-"""Least numbers of cells on a sphere: fewer leave a half of it free, at once or while sizes are corrected."""
-EVEN_ON_SPHERE = 200
-"""Random generators that are fewer may leave a half of a sphere free. The start is an even spiral then."""
-_PLACES = 2000
-"""Places on a sphere at which sizes are compared with its radius."""
-STEPS = 100
-"""Default number of steps of a method that repeats one kind of step."""
+from .tuning import (
+    CELLS_ACROSS,
+    EVEN_ON_SPHERE,
+    GRADIENT_STEP,
+    LEAST_ADAPTED,
+    LEAST_ON_SPHERE,
+    LEAST_STEEP,
+    MOVES,
+    OPENINGS,
+    SIZES_ON_SPHERE,
+    STEPS,
+)
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ def _check_on_sphere(
     sphere: Sphere, sizing: Sizing, tree: DensityTree | None, required: float, target: int, options: Options
 ) -> None:
     """Raise if cells are too few or too large. `required` cells have the sizes of the field itself."""
-    n_cells, places = options.n_cells, sphere.spiral_points(_PLACES)
+    n_cells, places = options.n_cells, sphere.spiral_points(SIZES_ON_SPHERE)
     if tree is not None:
         scale = 1.0 if n_cells is None else (required / n_cells) ** 0.5
         h = scale * sizing(places)

@@ -11,14 +11,7 @@ from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 from ..tessellation.device_diagram import Tessellation
-
-SHORT_FACE = 0.02
-"""Share of a cell's length (squared in 3D) below which a face brings no new generator."""
-COINCIDENT = 256
-"""Distance in ulps below which new generators in polygons count as coincident."""
-CHECKED, CHECKED_PER_EDGE = 5000, 4
-"""Number of generators, in all or per edge of the boundary, up to which this is checked, on the host. It only happens
-with cells larger than the edges."""
+from .tuning import CHECKED, CHECKED_PER_EDGE, COINCIDENT, SHORT_FACE
 
 
 def most_checked(domain: Polygon) -> int:

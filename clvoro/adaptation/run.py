@@ -17,7 +17,7 @@ from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from ..opencl.primitives import Summary
 from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
-from .checkpoint import RENEWAL, Checkpointer, Saved, run_fingerprint
+from .checkpoint import Checkpointer, Saved, run_fingerprint
 from .diagnostics import warn_of_errors, warn_of_obtuse_triangles
 from .fixed_points import origins, put_back
 from .motion import Displacement, Method
@@ -27,12 +27,8 @@ from .plan.efforts import EFFORTS
 from .plan.schedule import work_of
 from .preparation import only_needs_correction, plan, prepare, start
 from .stages import Stages
+from .tuning import REACHED, RENEWAL, WINDOW
 
-WINDOW = 10
-"""Steps over which error and quality are averaged to detect stagnation."""
-REACHED = 0.8
-"""Share of an error target, larger than the effort's own, below which `trade` says where the error ends. Where such
-targets are met, the error is at least 0.82 of them (`bench/front.py`)."""
 INTERRUPTED, STOPPED, UNDER_WAY = "interrupted", "stopped by the callback", "under way"
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
 SETTLED = "tolerance of the moving mesh met"

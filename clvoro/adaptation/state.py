@@ -26,11 +26,11 @@ from ..tessellation.device_diagram import Tessellation
 from ..tessellation.readback.diagram import fetch_diagram, order_of
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights
-from .descent.quality_descent import MOST_OBTUSE
 from .fixed_points import take_places
-from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
+from .insertion_deletion import CellSizes, Change, Generators, Outcome
 from .motion import Displacement, Moving
 from .stages import Stages
+from .tuning import CLIMB_STRAIN, MOST_OBTUSE
 from .walls import Walls
 
 SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio", "weight")

@@ -10,10 +10,7 @@ from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 from .motion import Moving
-
-DEPTHS = (0.1, 0.2, 0.3)
-"""Depths over h behind a wall. If one of them is in the domain again, the wall is thin."""
-MOST_SAMPLES = 64
+from .tuning import DEPTHS, MOST_SAMPLES
 
 
 def has_thin_walls(domain: Polygon, h: np.ndarray) -> bool:

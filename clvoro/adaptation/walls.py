@@ -13,12 +13,10 @@ from ..opencl.device_array import buffer_of
 from .corners import PlacedCorners, find_corners
 from .motion import Moving
 from .thin_walls import has_thin_walls
+from .tuning import SETTLING
 
 if TYPE_CHECKING:
     from .state import MeshState, Setup
-
-SETTLING = 3
-"""Projections at corners if a run does not end with a step: each turns generators by a small angle only."""
 
 
 class Walls:

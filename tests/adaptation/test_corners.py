@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import KDTree
 
 import clvoro
-from clvoro.adaptation import corners
+from clvoro.adaptation import corners, tuning
 from clvoro.adaptation.corners import find_corners
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
@@ -57,13 +57,13 @@ def test_vertices_near_an_earlier_one_that_is_kept_are_left_out():
         for j in kept:
             size = min(h[i], h[j])
             gap = np.hypot(*(x[i] - x[j])) / size
-            fan = corners.SPACING - corners.FAN * (bend[i] + bend[j]) / 2
-            close |= gap < max(fan, corners.LEAST_SPACING)
+            fan = tuning.SPACING - tuning.FAN * (bend[i] + bend[j]) / 2
+            close |= gap < max(fan, tuning.LEAST_SPACING)
             if (i < second) == (j < second):
                 a, b = (first, second) if i < second else (second, end)
                 area = pocket(x[a:b], i - a, j - a) / size**2
-                is_pocket = corners.POCKETS[0] < area < corners.POCKETS[1]
-                in_pocket |= is_pocket and gap < corners.POCKET_SPACING
+                is_pocket = tuning.POCKETS[0] < area < tuning.POCKETS[1]
+                in_pocket |= is_pocket and gap < tuning.POCKET_SPACING
         pockets += in_pocket and not close
         if not (close or in_pocket):
             kept.append(i)
@@ -122,7 +122,7 @@ def test_stairs_that_are_finer_than_the_cells(adapter):
     domain = clvoro.Polygon([(0, 0), (1, 0), *stairs])
     groups, found = corners_of(domain, 0.12)
     found = found[groups.angles > np.pi]  # the others are tips
-    assert KDTree(found).query(found, k=2)[0][:, 1].min() > corners.POCKET_SPACING * 0.12
+    assert KDTree(found).query(found, k=2)[0][:, 1].min() > tuning.POCKET_SPACING * 0.12
     result = adapter.run(domain, 0.12, effort="fast")
     assert result.summary()["boundary_mean_error"] < 0.04
 

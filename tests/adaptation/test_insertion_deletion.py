@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from clvoro.adaptation.insertion_deletion import (
+from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion
+from clvoro.adaptation.tuning import (
     CLIMB_STRAIN,
     LOG_RATIO_RINGS,
     MAX_CHANGE,
@@ -13,10 +14,6 @@ from clvoro.adaptation.insertion_deletion import (
     PAIR_RINGS,
     REPAIRED_SHARE,
     SPLIT_DISTANCE,
-    CellSizes,
-    Change,
-    Generators,
-    InsertionDeletion,
 )
 from clvoro.geometry.box import Box
 from tests.reference import patch

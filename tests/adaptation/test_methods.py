@@ -5,8 +5,6 @@ import pytest
 
 from clvoro import sizing
 from clvoro.adaptation.methods import (
-    AT_WALLS_OF_BOXES,
-    PENALTY_PER_ERROR,
     PUBLISHED,
     ProjectedMethod,
     PublishedMethod,
@@ -16,6 +14,7 @@ from clvoro.adaptation.methods import (
 )
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
+from clvoro.adaptation.tuning import AT_WALLS_OF_BOXES, PENALTY_PER_ERROR
 from clvoro.errors import SizeFieldError
 from clvoro.sizing import Sizing
 from clvoro.solvers.linear_system import Limits

@@ -6,8 +6,9 @@ import shapely
 from scipy.spatial import cKDTree
 
 import clvoro
-from clvoro.adaptation.refinement import SHORT_FACE, Refinement, most_checked
+from clvoro.adaptation.refinement import Refinement, most_checked
 from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.tuning import SHORT_FACE
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
 from tests.reference.shores import POLYGONS, lattice, scattered

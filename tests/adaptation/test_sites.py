@@ -3,15 +3,8 @@
 import numpy as np
 import pytest
 
-from clvoro.adaptation.insertion_deletion import (
-    CLIMB_STRAIN,
-    SHIFT_STEP,
-    SHIFTS,
-    SPLIT_DISTANCE,
-    WALL_STRAIN,
-    InsertionDeletion,
-    _Marks,
-)
+from clvoro.adaptation.insertion_deletion import InsertionDeletion, _Marks
+from clvoro.adaptation.tuning import CLIMB_STRAIN, SHIFT_STEP, SHIFTS, SPLIT_DISTANCE, WALL_STRAIN
 from tests.reference import patch
 
 N = 400

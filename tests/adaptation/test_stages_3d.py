@@ -5,10 +5,11 @@ import pytest
 from scipy.spatial import KDTree
 
 from clvoro.adaptation.density import Density
-from clvoro.adaptation.insertion_deletion import MAX_CHANGE, CellSizes, Change, Generators, InsertionDeletion
+from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion
 from clvoro.adaptation.metric import Metric
 from clvoro.adaptation.motion import Motion
 from clvoro.adaptation.refinement import Refinement
+from clvoro.adaptation.tuning import MAX_CHANGE
 from clvoro.geometry.box import Box
 from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.poisson import Poisson

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pyopencl as cl
 
-from clvoro.adaptation.refinement import SHORT_FACE
 from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.tuning import SHORT_FACE
 from clvoro.geometry.box import Box
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins

@@ -14,6 +14,7 @@ from ...opencl.device_array import read_number
 from ...opencl.engine import Engine
 from ...opencl.primitives import Scan
 from ...tessellation.device_diagram import Tessellation
+from ..tuning import FULL_RATE
 
 
 @dataclass(frozen=True)
@@ -35,25 +36,10 @@ SHORT_EDGES = Repulsion(0.2, 2.0)
 """How both ends of an edge repel each other.
 
 In a step the length of an edge between four cells on a square changes by up to 4 rate stiffness times the length that
-is missing. Measured on seven fields and domains, three to five starts each: lengths of 0.15 to 0.25 and a stiffness of
-1.75 to 5 give the same sizes and quality.
+is missing.
 """
 CLOSE_PAIRS = Repulsion(0.5, 3.0)
 """How neighboring generators repel each other. In a hexagonal lattice they are 1.07 h apart."""
-
-FULL_RATE = 5.0
-"""Largest omega h^2 / A up to which a generator moves at the full rate; h^2 / A is 1.15 where a cell has its size.
-
-E is as stiff as the weights of bad cells are large. Without this limit the default in a coast of 10,000 edges has a
-least Q of 0.918 and 0.922 in place of 0.925 and 0.928 with the steep ridge and the steep circles, and a largest |e| of
-0.119 and 0.115 in place of 0.108 and 0.115 (the rows of `bench/polygon.py`, medians of seven starts)."""
-
-OPENINGS = 12
-"""Most times that obtuse triangles are opened. After one, others may be obtuse. Two are enough for most meshes; none of
-the runs in bench/sphere.py --openings keeps an obtuse triangle."""
-
-MOST_OBTUSE = 0.02
-"""Obtuse triangles per cell beyond which they are left: sizes jump from cell to cell, and no small moves open them."""
 
 
 class QualityDescent:

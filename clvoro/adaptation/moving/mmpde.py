@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from ..state import MeshState
 
 RATE = 0.4
-"""Step of the descent, over the inverse of the estimated second derivative. Measured on the test fields of
-bench/_common.py: 0.25 is slower, from 0.5 on the last steps oscillate."""
+"""Step of the descent, over the inverse of the estimated second derivative."""
 MOST_MOMENTUM = 0.99
 """Largest share of the last displacement that is added. After m steps without a restart it is m / (m + 3)."""
 WINDOW = 10

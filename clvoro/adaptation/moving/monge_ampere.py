@@ -38,8 +38,7 @@ LEAST_STRETCH = 0.3
 CONVERGED = {np.dtype(np.float64): 1e-6, np.dtype(np.float32): 1e-3}
 """Standard deviation of the logarithm of rho det(I + H) that is not reduced any more."""
 TOLERANCE, MOST_ITERATIONS = 1e-2, 2000
-"""Limits of the linear solves. Measured on F2 and S2, a factorization takes as long in 2D, and ten times as long in
-3D."""
+"""Limits of the linear solves."""
 ANCHOR = 1e-6
 """Share of the mean diagonal that is added, because constants are in the null space: the solution is then exact up to a
 constant on the right side, and one in phi."""

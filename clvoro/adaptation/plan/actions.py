@@ -7,18 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from ..estimates import MOST_SURPLUS
-from ..insertion_deletion import CLIMB_STRAIN
 from ..motion import Displacement, Method
+from ..tuning import CLIMB_STRAIN, LEAST_PROGRESS, MAX_OSCILLATIONS, SAMPLING_GAIN
 
 if TYPE_CHECKING:
     from ..run import Run
-
-SAMPLING_GAIN = 0.26
-"""The number of cells by sizes at the generators has an error. On the next finer level it is smaller by this factor:
-0.25 is that of a smooth field, and a kink adds a little."""
-LEAST_PROGRESS, MAX_OSCILLATIONS = 0.9, 2
-"""Corrections of the number of cells end if they oscillate: if the number of missing cells changes its sign so often
-without falling to this share of the smallest number so far. For smooth fields the sign changes at most once."""
 
 
 class Action(Protocol):

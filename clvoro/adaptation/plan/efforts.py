@@ -7,26 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..tuning import DEFICIT_3D, NEAR_COUNT, NEAR_ERROR, SINGLE_LEVEL_ERROR_TARGET, STEEP, STEEPEST, WALL_DEFICIT
 from .actions import RepairCells
-
-NEAR_ERROR, NEAR_COUNT = 0.15, 0.02
-"""Mean |e|, and share of missing cells, up to which a given mesh is only corrected. Measured on F2 (see
-bench/restart.py): beyond them cells lose quality that only insertion and deletion restore."""
-DEFICIT_3D = 0.36
-"""1 - mean Q in 3D up to which a mesh counts as smoothed: a random one has 0.47, one of any effort at most 0.33."""
-WALL_DEFICIT = 0.49
-"""1 - mean Q that walls and unrelieved strain cost in 2D, times the square root of the number of cells."""
-
-STEEP, STEEPEST = 0.1, 0.18
-"""Slopes |grad h| between which the error target grows from `Effort.error_target` to `Effort.steep_error_target`.
-
-The metric h^-2 has a curvature of -|grad h|^2 where h is linear, and a lattice of hexagons follows it only with strain
-and dislocations. Measured on sixteen fields (default effort, mean |e| .0024): 1 - mean Q is about .006 + .06 |grad h|,
-so .985 is met up to a slope of .14."""
-LEAST_STEEP = 0.01
-"""Share of steep cells up to which a field counts as smooth."""
-SINGLE_LEVEL_ERROR_TARGET = 0.0017
-"""Largest error target with one level. A mesh that is small enough for one level can reach a smaller error."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +38,7 @@ class Effort:
         Coupled steps on the coarsest level, on the levels between, and on the finest.
     sweeps : tuple of int
         Sweeps (insert/delete, then glide) on the finest level, on the next coarser one, and so on. The last number
-        holds for all coarser levels. From the third finest level on, more of them give no better mesh: default on F2
-        and F3 (bench/convergence.py and bench/front.py, three to ten starts each) has the same sizes and quality with
-        20 there as with fewer.
+        holds for all coarser levels.
     alone : int
         Sweeps if there are no coarser levels; in 3D, steps of gliding before the last ones.
     glide : int
@@ -71,9 +51,7 @@ class Effort:
         The same where sizes are steepest (see `choose_error_target`), in 2D. The mean |e| is then at most 0.015.
     relaxation, momentum : float
         Parameters of gliding. A heavy ball with momentum m is stable up to a relaxation of 2 (1 + m), as a perfect
-        lattice relaxes by at most the whole displacement per step of Lloyd's. Measured on F1 to F3, default, ten starts
-        each: 3.2 with 0.8 in place of 1.3 with 0.7 raises the mean Q by 0.0008 to 0.0019 and the least Q by 0.003 to
-        0.013 for the same work.
+        lattice relaxes by at most the whole displacement per step of Lloyd's.
     calm_relaxation : float
         Relaxation of gliding at thin walls; see `CALM_MOMENTUM`.
     polish_momentum : float
@@ -88,16 +66,10 @@ class Effort:
         Parameters of polishing: see `ProjectedMethod`. The last one is relative to the error target.
     loose_bad_cells : float
         Largest factor on the weight of bad cells with an error target above the effort's own; up to it the factor is
-        the ratio of the two. Measured on F3 and circles with the targets of `bench/front.py --goals`, default, six
-        starts each: the least Q grows by 0.005 and 0.002, the largest |e| by 0.008 and 0.002. With the effort's own
-        target nothing is gained, and the largest |e| grows. "fast" has too few steps: on the ridge the mean |e| would
-        grow from 0.0137 to 0.0145.
+        the ratio of the two.
     largest_log_ratio_scale : float
         Largest scale of log(L / h) in the penalty, with an error target above the effort's own. It bounds the largest
-        error. The power is 4 then. Measured on F3, circles and two ridges with targets 0.014 to 0.2: at the same mean
-        error the mean Q is larger than with a power of 2 by up to 0.0003, and with target 0.2 the largest |e| is 0.20
-        to 0.24 in place of 0.21 to 0.29. On the way there the scale grows like the power 1.5 of the target. In place of
-        a multiple of it, that raises the mean Q by 0.0003 and the least by 0.002 to 0.005.
+        error. The power is 4 then. On the way there the scale grows like the power 1.5 of the target.
     repairs : tuple of (int, RepairCells)
         Repairs of the worst cells, each before this step of polishing. Some steps follow the last one.
     deficit : float
@@ -107,10 +79,9 @@ class Effort:
     recouple : int
         In 3D, coupled steps after each correction of the number of cells on a coarser level.
     loose : LoosePolish, optional
-        In 2D. With the default and target 0.2 mean |e| on F3 ends at 0.0356, mean Q at 0.9984.
+        In 2D.
     separate : int
-        Steps of separating, in 2D. Measured on eleven fields, four starts each: after one no edge is shorter than
-        0.07 h, after two 0.09 h.
+        Steps of separating, in 2D.
     """
 
     start: int
@@ -258,12 +229,7 @@ EFFORTS_3D = {
     ),
 }
 """The same in 3D. On a coarser level `couple` steps come before the first correction of the number of cells, and
-`recouple` after each of two. On the finest level there are `couple_finest`, and as many again after a correction.
-
-Measured on S1, S2 and S3 (see bench/convergence.py), default, two to five starts each: 16 steps of gliding with a
-relaxation of 2.5 and a momentum of 0.9, then 8 of polishing, give S2 and S3 the mean Q of 20 with 1.5 and 0.8, then 20,
-and S1 0.001 less. 12 or 16 coupled steps at the start, in place of 30 or 40, change neither sizes nor
-least quality; they cost "fast" 0.0015 of mean Q on S2, nothing elsewhere."""
+`recouple` after each of two. On the finest level there are `couple_finest`, and as many again after a correction."""
 
 
 def is_near(dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float) -> bool:

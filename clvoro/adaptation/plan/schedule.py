@@ -40,104 +40,52 @@ from dataclasses import replace
 
 from ..methods import ProjectedMethod, WeightedMethod
 from ..motion import Method
+from ..tuning import (
+    COARSE_PENALTY,
+    COARSE_TOLERANCE,
+    COARSEST,
+    COUNT_CLIMB_STRAIN,
+    COUNT_EXACTLY,
+    COUNT_FINEST_3D,
+    COUNT_LEAST,
+    COUNT_SHARE,
+    EXACT_ITERATIONS,
+    EXACT_PENALTY,
+    EXACT_STEPS,
+    EXACT_TOLERANCE,
+    GLIDE_TOLERANCE,
+    GRADUAL_ITERATIONS,
+    GRADUAL_NEWTON_STEPS,
+    GRADUAL_PENALTIES,
+    GRADUAL_TOLERANCE,
+    LOOSE_POLISH_3D,
+    NEAR_PENALTY,
+    NEWTON_ITERATIONS_3D,
+    NEWTON_PENALTY,
+    NEWTON_QUALITY_SCALE,
+    NEWTON_STEPS,
+    NEWTON_TOLERANCES_3D,
+    OPENING_PROJECTIONS,
+    POLISH_COUNT_3D,
+    POLISH_GROWTH_3D,
+    POLISH_MOMENTUM_3D,
+    POLISH_RATE_3D,
+    POLISH_TOLERANCE,
+    PROJECT_STEPS,
+    SEPARATE_PENALTY,
+    SETTLE_PENALTY_3D,
+    SETTLING_STEPS,
+    SINGLE_LEVEL_QUALITY_SCALE,
+    START_TOLERANCE,
+    STEP_CELLS,
+    STRIDE,
+    TIGHT,
+)
 from .actions import Action, BalanceCounts, CorrectCount, InsertDelete, Refine, RepairCells, ResetMomentum, Step
 from .efforts import EFFORTS, EFFORTS_3D, Effort, choose_error_target
 
-COARSEST = {2: 1400, 3: 1500}
-"""Approximate number of cells of the coarsest level by dimension. A step on fewer cells is not much cheaper (see
-`STEP_CELLS`). Measured on F2 with 23,000 to 100,000 cells, half as many and one more level give no better mesh."""
-CELLS_ACROSS = 5.0
-"""Least number of cells between layers on coarser levels. Layers are as fine there as on the finest level, and cells do
-not spread past them. In a bank of tubes with two coarse cells between them, mean |e| is 0.02 to 0.1; without coarser
-levels it is 0.002."""
-STEP_CELLS = 3000
-"""Cost of the launches of a step, as a number of cells."""
-SINGLE_LEVEL_QUALITY_SCALE = 0.15
-"""Smallest quality scale with one level. Measured on F1 (600 cells), thirty starts: the median of the largest error is
-0.010 instead of 0.013 (in three of twenty other starts above 0.02, at most 0.030), for 0.01 of the smallest Q."""
-COUNT_SHARE = 0.03
-"""Share of the cells by which their number may differ before dislocations climb."""
-COUNT_LEAST = 1e-3
-"""The same while polishing, because few steps are left for a new cell to improve."""
-COUNT_EXACTLY = 1e-6
-"""The same after cells have been repaired, if sizes are to be exact. More cells are deleted than split; measured on F2,
-two missing cells cost a mean error of 3e-5. Otherwise the better quality is kept."""
-COUNT_CLIMB_STRAIN = 0.3
-"""Strain above which dislocations climb while polishing: only the number of cells makes them climb."""
-START_TOLERANCE = 3e-2
-"""Relative residual of Poisson solves in 2D on the coarsest of several levels. Measured on F2 and F3, three starts
-each, 11,000 to 300,000 cells: a tenth changes neither sizes nor quality."""
 COUPLE = WeightedMethod(cautious=True, tolerance=0.2, max_cycles=1)
-"""Weighted steps after refinement, and all in 3D: one cycle of multigrid; the next steps reduce what remains. More
-accurate solves change mean |e| by at most 1 % and mean Q by 0.0004 (F1 to F3, S1 to S3, by a script not kept)."""
-GLIDE_TOLERANCE, POLISH_TOLERANCE = 0.3, 1e-2
-"""Relative residuals of projections while gliding and polishing. Each projection starts from the last solution.
-Measured on F2 and F3, six starts each: sizes and quality equal those of a tenth of these, for half the iterations. From
-0.6 on, and 0.3 in polishing, the largest errors grow; with a million cells from 0.03 in polishing."""
-COARSE_PENALTY, COARSE_TOLERANCE = 0.3, 0.1
-"""Penalty and relative residual of projections on coarser levels in 3D."""
-POLISH_MOMENTUM_3D, POLISH_RATE_3D = 0.5, 0.055
-"""Share of the last displacement, and step length, of polishing in 3D, where the weight of cells is about 7.5. Measured
-on S2, eight steps: with twice the rate, or a momentum of 0.8, the largest errors grow and quality falls."""
-POLISH_GROWTH_3D = 1.016
-"""Factor by which polishing raises the number after refinement: it widens small faces, so cells have more neighbors."""
-COUNT_FINEST_3D = {False: 3e-3, True: 1e-4}
-"""Share of the cells by which their number may differ on the finest of several levels in 3D, without and with exact
-sizes. Lengths then differ by a third of it."""
-POLISH_COUNT_3D = 5e-3
-"""Share of the cells by which their number may differ while polishing in 3D. Only fields with few, steep cells do."""
-LOOSE_POLISH_3D, SETTLE_PENALTY_3D = 2.0, 0.7
-"""Polishing in 3D aims at so many times the error target; one projection with this penalty then meets it. Measured on
-S3, the largest error is half of that of polishing alone, for 0.0007 of mean Q."""
-EXACT_PENALTY, EXACT_TOLERANCE, EXACT_ITERATIONS = 1e-2, 0.1, 30
-"""Penalty of the first exact projections in boxes in 2D, and limits of all. Each projection starts from the solution of
-the last, and what a solve leaves is no more than the error of the linearization.
-
-Smooth errors would take the most iterations; a Poisson correction removes them before Newton's steps. Measured on F1 to
-F3 and circles, two starts each: without it, with the penalty 1e-3, 45 iterations and a tolerance of 1e-3, exact
-projections take three times as many iterations for errors as large."""
-NEWTON_PENALTY, NEWTON_ITERATIONS_3D, NEWTON_TOLERANCES_3D = 1e-3, 45, (0.1, 0.03, 0.03)
-"""Penalty of Newton's steps, the last exact projections, and their limits in 3D. With 0.01 in all of them they take
-a third more iterations, and the mean |e| on S2 is 3e-7 in place of 7e-7."""
-PROJECT_STEPS, NEWTON_STEPS = 3, 3
-"""Number of exact projections before Newton's steps in boxes in 2D, and of those. The first of those also separates
-vertices. For each one less before them the mean Q falls by 0.0001."""
-EXACT_STEPS, EXACT_STEPS_3D = PROJECT_STEPS + 1 + NEWTON_STEPS, len(NEWTON_TOLERANCES_3D)
-"""Number of steps of the last phase of method "exact" in boxes, the Poisson correction among them."""
-GRADUAL_PENALTIES = ((0.1, 0.03), (0.03, 0.03), (0.01, 0.03), *[(1e-3, 0.0)] * 6)
-"""In polygons: penalty, and scale of the quality in it (see `Penalty`), of each step before Newton's.
-
-With the steps of boxes, but no Poisson correction, which raises the mean |e| of river and motor of
-`bench/solver_ready.py` from 0.002 to 0.005 and 0.008, there are 31 and 206 cells at walls with Q below 0.75 in three
-meshes of bay and coast in place of 23 and 166, and mean |e| at walls of the river is 0.0009 in place of 0.0002."""
-GRADUAL_TOLERANCE, GRADUAL_ITERATIONS, GRADUAL_NEWTON_STEPS = 1e-3, 45, 2
-"""Limits of the exact projections in polygons, and the number of Newton's steps, which all separate vertices."""
-NEWTON_QUALITY_SCALE = 0.1
-"""In polygons: scale of the quality in the penalty of Newton's steps. Bad cells may miss their size a little."""
-
-SEPARATE_PENALTY = 20.0
-"""Penalty of the last steps, which only push short edges apart, so that sizes change little.
-
-Measured on three fields, three starts each: with 3 the projection undoes a part and costs 0.0003 of mean Q, with 40 the
-largest error on F1 doubles."""
-SETTLING_STEPS = 4
-"""Steps of polishing and separation after the last cells of four sides have been deleted."""
-OPENING_PROJECTIONS = 4
-"""Number of the last exact projections after each of which obtuse triangles are opened."""
-TIGHT = 0.43
-"""Share of the effort's error target below which polishing begins with a penalty that is smaller in proportion, the
-number of cells is exact, and grad log h comes from the field. With target 1e-4 the mean |e| on F3, circles and a ridge
-is 0.9e-4 to 1.4e-4 then, in place of 1.7e-4 to 6e-4."""
-MOVES = 1
-"""Moves to the centroids of power cells.
-
-The first one raises Q above that of "exact" (bench/methods.py). More of them do not pay where h is steep: the volumes
-follow from h at the generators, so that moves up the gradient of h amplify each other.
-"""
-STRIDE = 2.0
-"""Largest displacement over h of a stride."""
-NEAR_PENALTY = 0.03
-"""Initial penalty of polishing a corrected mesh: a larger one would give up the sizes first."""
+"""Weighted steps after refinement, and all in 3D: one cycle of multigrid; the next steps reduce what remains."""
 
 
 def auto_levels(n: float, dim: int) -> int:

@@ -8,16 +8,9 @@ import pytest
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.plan.efforts import (
-    EFFORTS,
-    EFFORTS_3D,
-    SINGLE_LEVEL_ERROR_TARGET,
-    STEEP,
-    STEEPEST,
-    choose_error_target,
-    steep_share,
-)
+from clvoro.adaptation.plan.efforts import EFFORTS, EFFORTS_3D, choose_error_target, steep_share
 from clvoro.adaptation.sampling.start import density_tree
+from clvoro.adaptation.tuning import SINGLE_LEVEL_ERROR_TARGET, STEEP, STEEPEST
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 RIDGE = sizing.Expression("0.0095 + 0.14 * fabs(y - 0.75 - 0.3 * sin(1.6 * pi * x))")
