@@ -41,7 +41,7 @@ def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: Wall
     `faces_of_cell`); `label` (row of the cell); `boundary` (see `largest_boundary`); for each name that the caller
     gave to a boundary `boundary:NAME` (1 where the cell has a face on it, else 0); the vector `generator`, from the
     origin to the cell's generator; in a power diagram `weight`; and data of the caller. A comment holds the settings,
-    field data the domain (JSON as bytes), the neighbor across each face, and shifts at seams. In a periodic box cells
+    field data the domain (JSON as bytes), and what is behind the faces on walls and at seams. In a periodic box cells
     are not cut at the seams. On a sphere the corners of cells are on it, and VTK draws straight lines between them.
 
     With `walls` "straight" the cells are those of the solver mesh, with their volumes, and without the domain, as the
@@ -94,12 +94,20 @@ _"""
 
 
 def _diagram_data(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return field data with the domain, and with what corners of cells do not define: the graph."""
+    """Return field data with the domain, and with what corners of cells do not define: the graph at walls and seams."""
     about = np.frombuffer(json.dumps(describe(diagram.domain)).encode(), np.uint8)
     written = KINDS[diagram.domain.cell_dim].written(diagram)
-    found = {"domain": about, "neighbors": diagram.neighbors[written].astype(np.int32)}
+    lone = diagram.neighbors < 0
     if any(diagram.domain.periodic):
-        found["shifts"] = in_space(diagram.shifts[written]).astype(np.int32)
+        lone |= diagram.shifts.any(axis=1)
+    border = np.flatnonzero(written & lone)
+    found = {
+        "domain": about,
+        "border_faces": (np.cumsum(written) - 1)[border].astype(np.int32),
+        "border_neighbors": diagram.neighbors[border].astype(np.int32),
+    }
+    if any(diagram.domain.periodic):
+        found["border_shifts"] = in_space(diagram.shifts[border]).astype(np.int32)
     if diagram.domain.cuts_cells:
         found["bridges"] = _bridges(diagram)
     return found

@@ -167,7 +167,7 @@ class Diagram(MeshOutput):
         if name == "weights":
             return np.zeros(len(self.points))
         if name == "face_vertex_starts":
-            return 2 * np.arange(len(self.neighbors) + 1, dtype=np.int32)
+            return 2 * np.arange(len(self.cell_vertices) + 1, dtype=np.int32)
         from .connectivity import following
 
         corners = self.cell_vertices

@@ -330,9 +330,10 @@ def _geometry_of_diagram(f: Faces, diagram: Diagram) -> dict[str, np.ndarray]:
     domain, points, inner = f.domain, f.generators, f.neighbor >= 0
     walls = -1 - f.neighbor[~inner]
     center = diagram.face_centroids[f.half_face].astype(float)
-    flipped = (face_owners(diagram)[f.half_face] != f.owner) | (diagram.shifts[f.half_face] != f.shift).any(axis=1)
-    if flipped.any():  # only the neighbor has the face, so its position is beside the neighbor
-        center = center + np.where(flipped[:, None], f.shift * domain.extent, 0.0)
+    if any(domain.periodic):  # where only the neighbor has the face, its position is beside the neighbor
+        away = face_owners(diagram)[f.half_face] != f.owner
+        away |= (diagram.shifts[f.half_face] != f.shift).any(axis=1)
+        center = center + np.where(away[:, None], f.shift * domain.extent, 0.0)
     normal, distance = np.empty((len(f), f.dim)), np.empty(len(f))
     across = points[f.neighbor[inner]] + f.shift[inner] * domain.extent
     between = across - points[f.owner[inner]]

@@ -145,16 +145,6 @@ def polygon_areas(mesh: Faces) -> np.ndarray:
     return np.bincount(cell, cross(p, q), mesh.n_cells) / 2
 
 
-def polygon_centroids(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
-    """Return area and centroid of each cell in 2D, (n,) and (n, 2)."""
-    cell, p, q, origins = polygon_sides(mesh)
-    n, twice = mesh.n_cells, cross(p, q)
-    area = np.bincount(cell, twice, n)
-    safe = np.where(area > 0, area, np.inf)
-    middle = sum_rows(cell, twice[:, None] * (p + q), n) / (3 * safe)[:, None]
-    return area / 2, origins + middle
-
-
 def turns(corners: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the angle by which polygons turn to the left in each corner, (k,), -pi to pi.
 

@@ -193,7 +193,8 @@ def test_vtu_holds_cells_and_data(result, tmp_path, compress):
         "boundary": largest_boundary(d),
         "generator": d.points,
         "domain": np.frombuffer(json.dumps(describe(d.domain)).encode(), np.uint8),
-        "neighbors": d.neighbors.astype(np.int32),
+        "border_faces": np.flatnonzero(d.neighbors < 0).astype(np.int32),
+        "border_neighbors": d.neighbors[d.neighbors < 0].astype(np.int32),
     }
     assert set(arrays) == set(expected)
     for name, values in expected.items():

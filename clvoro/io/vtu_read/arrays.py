@@ -40,8 +40,9 @@ _USED = {
     "CellData.sides",
     "CellData.faces_of_cell",
     "FieldData.domain",
-    "FieldData.neighbors",
-    "FieldData.shifts",
+    "FieldData.border_faces",
+    "FieldData.border_neighbors",
+    "FieldData.border_shifts",
     "FieldData.bridges",
 }
 

@@ -14,7 +14,7 @@ import numpy as np
 from ...files import open_plain
 from ...geometry.domain import Domain
 from ...mesh.check.rebuilt import rebuild
-from ...mesh.connectivity import following
+from ...mesh.connectivity import face_owners, following
 from ...mesh.diagram import Diagram
 from ...mesh.results import HISTORY_DTYPE, Result
 from ...mesh.spherical import rebuild_on_sphere
@@ -69,16 +69,8 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
         if not (off < _OFF_SURFACE * domain.frame[1]).all():
             raise FileError(f"its {name} are not on the {domain}")
     known = _READERS[domain.cell_dim](arrays, len(x), domain)
-    walls, m = len(domain.boundary_index), known["neighbor_starts"][-1]
     known |= {"points": points, "volumes": arrays["CellData.volume"].astype(float), "vertices": x}
-    known["neighbors"] = _indices(arrays["FieldData.neighbors"] + walls, n + walls, "neighbors") - walls
-    if len(known["neighbors"]) != m:
-        raise FileError(f"neighbors have {len(known['neighbors'])} entries, expected {m}: one per face")
-    if "FieldData.shifts" in arrays:
-        shifts = arrays["FieldData.shifts"]
-        if shifts.shape != (m, 3) or (np.abs(shifts.astype(float)) > 1).any():
-            raise FileError("its shifts differ from its cells")
-        known["shifts"] = shifts[:, : domain.dim].astype(np.int8)
+    known |= _graph(arrays, Diagram(domain, known))
     if "CellData.weight" in arrays:
         known["weights"] = arrays["CellData.weight"].astype(float)
     # The other arrays follow from the corners.
@@ -114,6 +106,43 @@ def _cell_polygons(arrays: Mapping[str, np.ndarray], v: int, domain: Domain) -> 
         found["neighbor_starts"] = np.concatenate([[0], np.cumsum(counts)])
         found |= {"face_vertex_starts": 2 * np.arange(len(ends) + 1), "face_vertices": ends.ravel()}
     return found
+
+
+def _graph(arrays: Mapping[str, np.ndarray], d: Diagram) -> dict[str, np.ndarray]:
+    """Return the neighbors: on walls and at seams those in the file, else the cells with a face of the same corners."""
+    starts, corners, owner = d.face_vertex_starts, d.face_vertices, face_owners(d)
+    walls, m = len(d.domain.boundary_index), len(starts) - 1
+    border = _indices(arrays["FieldData.border_faces"], m, "border_faces")
+    behind = _indices(arrays["FieldData.border_neighbors"] + walls, len(d) + walls, "border_neighbors") - walls
+    if len(border) != len(behind):
+        raise FileError("border_faces and border_neighbors differ in length")
+    sides = np.diff(starts)
+    face = np.repeat(np.arange(m), sides)
+    ragged = corners[np.lexsort((corners, face))]
+    inner = np.ones(m, bool)
+    inner[border] = False
+    neighbors = np.full(m, len(d))
+    neighbors[border] = behind
+    for k in np.unique(sides):
+        rows = np.flatnonzero((sides == k) & inner)
+        if k < 2:
+            raise FileError("a face has fewer than 2 corners")
+        keys = ragged[starts[rows][:, None] + np.arange(k)]
+        by = np.lexsort(keys.T[::-1])
+        same = (keys[by][1:] == keys[by][:-1]).all(axis=1)
+        a, b = rows[by[:-1][same]], rows[by[1:][same]]
+        neighbors[a], neighbors[b] = owner[b], owner[a]
+    alone = np.flatnonzero(neighbors == len(d))
+    if len(alone):
+        raise FileError(f"cell {owner[alone[0]]} has a face that is no other cell's")
+    if "FieldData.border_shifts" not in arrays:
+        return {"neighbors": neighbors}
+    steps = arrays["FieldData.border_shifts"]
+    if steps.shape != (len(border), 3) or (np.abs(steps.astype(float)) > 1).any():
+        raise FileError("its seams differ from its cells")
+    shifts = np.zeros((m, d.domain.dim), np.int8)
+    shifts[border] = steps[:, : d.domain.dim]
+    return {"neighbors": neighbors, "shifts": shifts}
 
 
 def _indices(array: np.ndarray, bound: int, name: str) -> np.ndarray:
