@@ -73,7 +73,8 @@ def arrays_of(mesh: clvoro.Diagram | clvoro.Result | Arrays) -> Arrays:
         return mesh
     result = isinstance(mesh, clvoro.Result)
     diagram = mesh.diagram if result else mesh
-    found = {name: getattr(diagram, attribute, None) for name, attribute in DIAGRAM.items()}
+    derived = () if "face_vertices" in diagram._arrays else ("face_vertex_starts", "face_vertices")
+    found = {name: getattr(diagram, attribute, None) for name, attribute in DIAGRAM.items() if name not in derived}
     if result:
         found |= {name: getattr(mesh, attribute) for name, attribute in RESULT.items()}
         found["points"] = mesh.points
