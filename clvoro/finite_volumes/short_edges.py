@@ -17,10 +17,10 @@ SHORT, THIN = 0.055, 0.2
 """A face is short if it is shorter than both, over the smaller size of its cells and over the width of the thinner one.
 
 Between columns of boundary layers cells are much longer than wide: there the second one holds."""
-_STRAIGHT = 2e-5
+STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell; OpenFOAM counts cells with less than about 1e-6 as concave."""
 _ROUNDS = 12
-_FREE, _WALL, CORNER = range(3)
+_FREE, WALL, CORNER = range(3)
 """Kinds of points: of two with different kinds, the one of the larger kind stays."""
 
 
@@ -86,7 +86,7 @@ class _Round:
         first, second = self.images[ends].T
         # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
         tried = (ratio < 1) & (mesh.twin < np.arange(len(ends))) & (first != second)
-        tried &= self.kind[ends].min(axis=1) == np.where(mesh.neighbor >= 0, _FREE, _WALL)
+        tried &= self.kind[ends].min(axis=1) == np.where(mesh.neighbor >= 0, _FREE, WALL)
         tried[failed] = False
         faces = np.flatnonzero(tried)
         self.faces = self._independent(faces[np.argsort(ratio[faces], kind="stable")])
@@ -150,7 +150,7 @@ class _Round:
             (q, kind <= other),
         ):
             turn = _least_turns(self._moved(choice)[corners], after)
-            good = simple & (turn >= np.minimum(least, _STRAIGHT))
+            good = simple & (turn >= np.minimum(least, STRAIGHT))
             accepted = allowed & ~done & (np.bincount(face, ~good, len(done)) == 0)
             target[accepted] = choice[accepted]
             done |= accepted
@@ -206,7 +206,7 @@ def point_kinds(mesh: Faces, parts: np.ndarray, images: np.ndarray | None = None
     met = np.bincount(images[a], minlength=classes) + np.bincount(images[b], minlength=classes)
     turn = np.abs(np.arctan2(cross(behind[:, :2], ahead[:, :2]), (behind[:, :2] * ahead[:, :2]).sum(axis=1)))
     smooth = (met == 2) & (turn < WALL_CORNER) & (ahead[:, 2] == behind[:, 2])
-    return np.where(met == 0, _FREE, np.where(smooth, _WALL, CORNER))[images]
+    return np.where(met == 0, _FREE, np.where(smooth, WALL, CORNER))[images]
 
 
 def _least_turns(corners: np.ndarray, starts: np.ndarray) -> np.ndarray:

@@ -47,6 +47,7 @@ def make_solver_mesh(
 
 def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray) -> Faces:
     """Take the faces of `diagram`, or make straight walls, and collapse short faces."""
+    from .dead_ends import open_dead_ends
     from .walls import straight_walls
 
     outline = diagram.domain.outline if walls == "straight" else None
@@ -56,6 +57,8 @@ def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray)
         mesh = faces_with_seams(diagram)
         mesh = replace(mesh, points=mesh.points.astype(np.float64, copy=False), diagram=None)
     mesh = _COLLAPSED[mesh.dim](mesh, diagram, parts, collapse)
+    if outline is not None and collapse:
+        mesh = open_dead_ends(mesh, parts)
     if outline is not None and abs(mesh.area_change) > _LARGE_CHANGE:
         warn(
             f"straight walls change the area of the domain by {100 * mesh.area_change:+.2g} %: its boundary has "

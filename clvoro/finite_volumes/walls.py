@@ -48,6 +48,8 @@ AROUND = 4.0
 """Largest area between a wall face and the boundary behind it, over that of the cell."""
 LEFT_OUT = 0.5
 """Share of a cell from which on a part of the domain that is left out, or land that is added, is reported."""
+NO_LENGTH = 1e-9
+"""Length of a face over the size of its cell at which its ends are one point."""
 INSIDE, ON, OUTSIDE = 1, 0, -1
 """Places of a vertex."""
 
@@ -161,6 +163,8 @@ class _WallMaker:
     more : list of (2,) float64
         Further points, behind `points`.
     left_out : list of (area, place)
+    farthest : (n,) float64
+        Largest distance of a corner from the straight wall face of each cell.
     """
 
     def __init__(self, diagram: Diagram, domain: Polygon, parts: np.ndarray) -> None:
@@ -338,6 +342,7 @@ class _WallMaker:
         gaps = np.flatnonzero(ends[:, 1] != ends[after, 0])
         self.walls: list[tuple[int, float, int, int]] = []
         self.more: list[np.ndarray] = []
+        self.farthest = np.where(np.diff(starts) > 1, LARGEST_BULGE, np.inf) * self.size
         for c, p, q in zip(cell[gaps].tolist(), ends[gaps, 1].tolist(), ends[after[gaps], 0].tolist(), strict=True):
             corners, positions = self._chain(c, p, q)
             count = len(self.points) + len(self.more)
@@ -373,7 +378,7 @@ class _WallMaker:
         for low, high in pairwise([-1, *np.flatnonzero(self.changes_part[path]).tolist(), len(path)]):
             u, v = a if low < 0 else x[low], b if high == len(path) else x[high]
             chosen += [] if low < 0 else [low]
-            chosen += self._bulges(u, v, x, range(low + 1, high), self.size[cell])
+            chosen += self._bulges(u, v, x, range(low + 1, high), cell)
         self._note(cell, np.concatenate([a[None], x, b[None], x[chosen][::-1]]))
         marks = [0.0, *((self.along.begins[path[chosen]] - s) % total).tolist(), way]
         return list(x[chosen]), [begin + (s - begin + (m + n) / 2) % total for m, n in pairwise(marks)]
@@ -388,20 +393,20 @@ class _WallMaker:
         count = high - low + (last - first if end < s or s + way > begin + total else 0)
         return first + (low + np.arange(max(count, 0))) % (last - first)
 
-    def _bulges(self, a: np.ndarray, b: np.ndarray, x: np.ndarray, among: range, size: float) -> list[int]:
+    def _bulges(self, a: np.ndarray, b: np.ndarray, x: np.ndarray, among: range, cell: int) -> list[int]:
         """Return the places `among` the points `x` (k, 2) that become corners of a convex chain from `a` to `b`."""
         length = float(np.hypot(*(b - a)))
         if not among or length == 0:
             return []
         off = cross(x[among.start : among.stop] - a, (b - a)[None]) / length
-        off[off > LARGEST_BULGE * size] = -1
+        off[off > self.farthest[cell]] = -1
         k = int(off.argmax())
         area = _area(np.concatenate([a[None], x[among.start : among.stop], b[None]]))
-        if off[k] < LEAST_BULGE * size or area < FILLED * off[k] * length / 2:
+        if off[k] < LEAST_BULGE * self.size[cell] or area < FILLED * off[k] * length / 2:
             return []
         k = among[k]
-        before = self._bulges(a, x[k], x, range(among.start, k), size)
-        return [*before, k, *self._bulges(x[k], b, x, range(k + 1, among.stop), size)]
+        before = self._bulges(a, x[k], x, range(among.start, k), cell)
+        return [*before, k, *self._bulges(x[k], b, x, range(k + 1, among.stop), cell)]
 
     def _note(self, cell: int, loop: np.ndarray) -> None:
         """Note the area of `loop` (k, 2), between the boundary and the walls of a cell, if it is large."""
@@ -429,27 +434,36 @@ class _WallMaker:
 
     def faces(self) -> Faces:
         """Return the mesh."""
-        kept = np.flatnonzero(self.kept & (self.ends[:, 0] != self.ends[:, 1]))
+        kept = np.flatnonzero(self.kept)
         left, right = self.convex.left[kept], self.convex.right[kept]
         ends = np.where((left > right)[:, None], self.ends[kept][:, ::-1], self.ends[kept])
         owner, neighbor = np.minimum(left, right), np.maximum(left, right)
         order = np.lexsort((neighbor, owner))
-        cell, position, *points = map(np.array, zip(*self.walls, strict=True))
+        cell, position, *wall_ends = map(np.array, zip(*self.walls, strict=True))
         wall = self.rings.edge_numbers[self.along.edges(position)]
         by_wall = np.lexsort((cell, wall))
-        count = len(kept) + len(cell)
-        return Faces(
+        points = np.concatenate([self.points, self.more]) if self.more else self.points
+        ends = np.concatenate([ends[order], np.column_stack(wall_ends)[by_wall]])
+        owner = np.concatenate([owner[order], cell[by_wall]]).astype(np.int32)
+        # Corners of two rings that touch are one point, and faces without length vanish.
+        short = np.hypot(*(points[ends[:, 1]] - points[ends[:, 0]]).T) <= NO_LENGTH * self.size[owner]
+        graph = coo_array((np.ones(np.count_nonzero(short)), tuple(ends[short].T)), (len(points), len(points)))
+        _, group = connected_components(graph, directed=False)
+        ends = np.unique(group, return_index=True)[1][group][ends]
+        count = len(ends)
+        made = Faces(
             domain=self.domain,
             generators=self.generators,
-            points=np.concatenate([self.points, self.more]) if self.more else self.points,
+            points=points,
             starts=2 * np.arange(count + 1),
-            corners=np.concatenate([ends[order], np.column_stack(points)[by_wall]]).ravel(),
-            owner=np.concatenate([owner[order], cell[by_wall]]).astype(np.int32),
+            corners=ends.ravel(),
+            owner=owner,
             neighbor=np.concatenate([neighbor[order], -1 - wall[by_wall]]).astype(np.int32),
             twin=np.full(count, -1),
             shift=np.zeros((count, 2), np.int8),
             half_face=np.full(count, -1),
-        ).compact()
+        )
+        return made.take_faces(ends[:, 0] != ends[:, 1])
 
 
 def _area(loop: np.ndarray) -> float:

@@ -1,0 +1,48 @@
+"""Cells at dead ends get a second neighbor; faces across channels that are one cell wide are tilted."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from tests.finite_volumes.test_straight_walls import concave_by, polygons
+
+ROOM = np.array([(0.0, 0), (3, 0), (3, 3), (2, 3), (2, 5.2), (1, 5.2), (1, 3), (0, 3)])
+"""A room of three by three cells, and a channel that is one cell wide and ends after two."""
+
+
+@pytest.fixture(scope="module")
+def room(ctx) -> clvoro.Diagram:
+    x, y = np.meshgrid([0.5, 1.5, 2.5], [0.5, 1.5, 2.5])
+    rows = np.column_stack([x.ravel(), y.ravel()]) + np.random.default_rng(3).uniform(-0.1, 0.1, (9, 2))
+    rows[[6, 7, 8]] = (0.6, 2.6), (1.5, 2.6), (2.4, 2.6)
+    channel = [(1.5, 3.4), (1.5, 4.4)]
+    return clvoro.Adapter(ctx).diagram(clvoro.Polygon(ROOM), np.concatenate([rows, channel]))
+
+
+def test_all_determinants_are_large(room):
+    before, after = room.solver_mesh(collapse=False), room.solver_mesh()
+    assert before.measures.determinant.min() < 1e-12
+    assert after.measures.determinant.min() > 1e-3
+    assert room.check(solver="openfoam")
+
+
+def test_cells_stay_convex_and_fill_the_domain(room):
+    cells = polygons(room.solver_mesh())
+    assert max(map(concave_by, cells)) < 1e-6
+    assert sum(p.area for p in cells) == pytest.approx(room.domain.measure, rel=1e-12)
+
+
+def test_a_cell_has_one_face_on_a_wall(room):
+    """OpenFOAM counts a cell with two faces in one plane as concave."""
+    mesh = room.solver_mesh()
+    walls = list(zip(mesh.owner[mesh.n_inner :].tolist(), mesh.neighbor[mesh.n_inner :].tolist(), strict=True))
+    assert len(set(walls)) == len(walls)
+
+
+def test_a_channel_of_cells_is_accepted(ctx):
+    """Both faces of each cell are parallel at first."""
+    channel = clvoro.Polygon([(0, 0), (6, 0), (6, 1), (0, 1)])
+    diagram = clvoro.Adapter(ctx).diagram(channel, np.column_stack([np.arange(6) + 0.5, np.full(6, 0.5)]))
+    mesh = diagram.solver_mesh()
+    assert mesh.measures.determinant.min() > 1e-3
+    assert sum(p.area for p in polygons(mesh)) == pytest.approx(6, rel=1e-12)
