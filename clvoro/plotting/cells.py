@@ -20,7 +20,7 @@ from ..mesh.results import Result
 from . import pixels
 from .boundary import clip_to_domain, frame_part
 from .colors import COLORINGS, Color, Paint, paint_of, picture_of
-from .legends import add_color_bar, add_key, round_numbers
+from .legends import add_color_bar, finished, round_numbers
 from .style import WIDTH, corners_of, interactive_figure, single_height, styled
 
 _INK = np.full(3, 0.1)
@@ -97,11 +97,8 @@ def plot_cells(
         bridged = (np.diff(starts) > np.diff(diagram.neighbor_starts))[cells]
         image = draw_cells(ax, diagram, cells, polygons, paint, edges, bridged)
         clip_to_domain(ax, domain, image)
-        if title is not None:
-            ax.set_title(title)
-        if key:
-            add_key(ax, paint if window is None else replace(paint, values=paint.values[np.unique(cells)]))
-    return ax.figure
+        seen = paint if window is None else replace(paint, values=paint.values[np.unique(cells)])
+        return finished(ax, seen, key, title)
 
 
 def require_plane(domain: Domain, what: str, remedy: str) -> None:

@@ -17,7 +17,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .cells import draw_cells
 from .colors import Color, kilometer_of, paint_of, picture_of
-from .legends import add_key
+from .legends import finished
 from .solids import view_axes
 from .style import WIDTH, corners_of, interactive_figure, single_height, styled
 
@@ -121,11 +121,7 @@ def plot_globe(
         _draw_graticule(ax, source)
         if kilometer_of(sphere.radius) is not None if coasts is None else coasts:
             _draw_coasts(ax)
-        if title is not None:
-            ax.set_title(title)
-        if key:
-            add_key(ax, paint)
-    return ax.figure
+        return finished(ax, paint, key, title)
 
 
 def map_projection(

@@ -30,6 +30,15 @@ def add_key(axes: Any, paint: Paint, below: bool = False) -> None:
         add_color_bar(axes, paint, **(_BELOW if below else {}))
 
 
+def finished(ax: Any, paint: Paint, key: bool, title: str | None) -> Any:
+    """Add the title and the key to the picture in `ax`, and return its figure."""
+    if title is not None:
+        ax.set_title(title)
+    if key:
+        add_key(ax, paint)
+    return ax.figure
+
+
 def add_color_bar(axes: Any, paint: Paint, **options: Any) -> None:
     """Add the scale beside `axes` (one or several), with arrows where values lie beyond it."""
     scheme, values, (low, high) = paint.scheme, paint.values, paint.limits

@@ -155,7 +155,7 @@ def _page(
     words = "; ".join([f"method {name}", *(f"{k} {v}" for k, v in facts.items())])
     parts = [
         f"<h1>{_safe(title)}</h1><p class=what>{_safe(words)}</p><dl>{cards}</dl>",
-        f"<h2>Runs</h2>{_table(results, name)}" if len(results) > 1 else f"<p>Stopped: {_safe(main.stop_reason)}.</p>",
+        f"<h2>Runs</h2>{_runs(results, name)}" if len(results) > 1 else f"<p>Stopped: {_safe(main.stop_reason)}.</p>",
         f"<h2>Cells on the boundary</h2>{_apart(results, name)}" if main.diagram.domain.cuts_cells else "",
         f"<h2>Measures for finite volumes</h2>{_measures(name, main)}",
         f"<h2>Pictures</h2><p>{_safe(missing)}</p>" if missing else "<h2>Pictures</h2>",
@@ -182,20 +182,15 @@ def _page(
 def _measures(name: str, result: Result) -> str:
     """Return the table of `Result.measures`, with explanations."""
     s = result.measures.summary()
-    rows = (
-        ("faces per cell", s["mean_faces"], None),
-        ("skewness", s["mean_skewness"], s["max_skewness"]),
-        ("angle of centroids [°]", s["mean_centroid_angle"], s["max_centroid_angle"]),
-        ("smallest over largest face of a cell", s["mean_face_ratio"], s["min_face_ratio"]),
-        ("volumes of neighbors, larger over smaller", s["mean_volume_ratio"], s["max_volume_ratio"]),
-    )
-    body = "".join(
-        f"<tr><td>{_safe(what)}</td><td>{mean:.4g}</td><td>{'' if worst is None else f'{worst:.3g}'}</td></tr>"
-        for what, mean, worst in rows
-    )
+    rows = [
+        ("faces per cell", f"{s['mean_faces']:.4g}", ""),
+        ("skewness", f"{s['mean_skewness']:.4g}", f"{s['max_skewness']:.3g}"),
+        ("angle of centroids [°]", f"{s['mean_centroid_angle']:.4g}", f"{s['max_centroid_angle']:.3g}"),
+        ("smallest over largest face of a cell", f"{s['mean_face_ratio']:.4g}", f"{s['min_face_ratio']:.3g}"),
+        ("volumes of neighbors, larger over smaller", f"{s['mean_volume_ratio']:.4g}", f"{s['max_volume_ratio']:.3g}"),
+    ]
     return (
-        f"<table class=measures><thead><tr><th>{_safe(name)}</th><th>mean</th><th>worst</th></tr></thead>"
-        f"<tbody>{body}</tbody></table><p class=what>With the unknowns at the generators there is no "
+        f"{_table((name, 'mean', 'worst'), rows)}<p class=what>With the unknowns at the generators there is no "
         "non-orthogonality; the angle is what remains between a face's normal and the line from centroid to "
         "centroid. Skewness: from a face's centroid to that line of the generators, over their distance.</p>"
     )
@@ -207,33 +202,29 @@ def _apart(results: Mapping[str, Result], main: str) -> str:
     for method, result in results.items():
         for part, s in beside_boundary(result).items():
             numbers = (f"{s['mean_error']:.4f}", f"{s['mean_quality']:.4f}", f"{s['min_quality']:.3f}")
-            texts = (method, f"{part} cells", str(s["cells"]), *(numbers if s["cells"] else ("–",) * 3))
-            columns = "".join(f"<td>{_safe(t)}</td>" for t in texts)
-            rows.append(f"<tr{' class=main' if method == main else ''}>{columns}</tr>")
-    names = ("method", "", "number", "mean |e|", "mean Q", "min Q")
-    head = "".join(f"<th>{_safe(n)}</th>" for n in names)
-    return f"<table class=measures><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+            rows.append((method, f"{part} cells", str(s["cells"]), *(numbers if s["cells"] else ("–",) * 3)))
+    return _table(("method", "", "number", "mean |e|", "mean Q", "min Q"), rows, main)
 
 
-def _table(results: Mapping[str, Result], main: str) -> str:
-    names = ("method", "steps", "mean |e|", "max |e|", "mean Q", "min Q", "seconds", "stopped")
+def _runs(results: Mapping[str, Result], main: str) -> str:
+    """Return the table of the runs."""
     rows = []
     for method, result in results.items():
         s = summary(result)
-        texts = (
-            method,
-            str(s["steps"]),
-            f"{s['mean_error']:.4f}",
-            f"{s['max_error']:.3f}",
-            f"{s['mean_quality']:.4f}",
-            f"{s['min_quality']:.3f}",
-            f"{s['seconds']:.2f}",
-            s["stop_reason"],
-        )
-        columns = "".join(f"<td>{_safe(t)}</td>" for t in texts)
-        rows.append(f"<tr{' class=main' if method == main else ''}>{columns}</tr>")
-    head = "".join(f"<th>{_safe(n)}</th>" for n in names)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+        errors = (f"{s['mean_error']:.4f}", f"{s['max_error']:.3f}")
+        qualities = (f"{s['mean_quality']:.4f}", f"{s['min_quality']:.3f}")
+        rows.append((method, str(s["steps"]), *errors, *qualities, f"{s['seconds']:.2f}", s["stop_reason"]))
+    return _table(("method", "steps", "mean |e|", "max |e|", "mean Q", "min Q", "seconds", "stopped"), rows, main, "")
+
+
+def _table(names: Sequence[str], rows: Sequence[Sequence[str]], main: str = "", kind: str = " class=measures") -> str:
+    """Return a table; rows that begin with `main` are set off."""
+    head = "".join(f"<th>{_safe(name)}</th>" for name in names)
+    body = [
+        f"<tr{' class=main' if main and row[0] == main else ''}>{''.join(f'<td>{_safe(t)}</td>' for t in row)}</tr>"
+        for row in rows
+    ]
+    return f"<table{kind}><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
 
 def _safe(text: object) -> str:

@@ -22,7 +22,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .cells import draw_polygons, edge_widths, images_in
 from .colors import Color, Paint, paint_of, picture_of
-from .legends import add_key
+from .legends import add_key, finished
 from .style import WIDTH, corners_of, frame_domain, interactive_figure, nice, styled
 
 if TYPE_CHECKING:
@@ -102,11 +102,9 @@ def plot_slice(
             ax.set(xlabel="xyz"[int(np.argmax(right))], ylabel="xyz"[int(np.argmax(up))])
         elif window is None:
             ax.set_axis_off()
-        if title is not None or aligned:
-            ax.set_title(f"${'xyz'[axis]} = {point[axis]:.3g}$" if title is None else title)
-        if key:
-            add_key(ax, paint)
-    return ax.figure
+        if title is None and aligned:
+            title = f"${'xyz'[axis]} = {point[axis]:.3g}$"
+        return finished(ax, paint, key, title)
 
 
 def plot_slices(
@@ -212,11 +210,7 @@ def plot_cutaway(
             ax = interactive_figure(WIDTH, cutaway_height(result, angles)).add_subplot()
         _draw_cutaway(ax, result.diagram, paint, cut, _point(result, through), angles, edges)
         _label_axes(ax, result.diagram, *view_axes(angles))
-        if title is not None:
-            ax.set_title(title)
-        if key:
-            add_key(ax, paint)
-    return ax.figure
+        return finished(ax, paint, key, title)
 
 
 def cutaway_height(result: Result, angles: tuple[float, float] = VIEW) -> float:
