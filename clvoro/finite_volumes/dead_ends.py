@@ -11,7 +11,7 @@ from itertools import takewhile
 import numpy as np
 
 from ..mesh.faces import Faces
-from ..mesh.geometry import polygon_centroids, turns
+from ..mesh.geometry import turns
 from .short_edges import STRAIGHT, WALL, point_kinds
 
 LEAST_DETERMINANT = 2e-3
@@ -59,7 +59,7 @@ class _Edit:
         self.old, self.points = mesh, list(mesh.points)
         self.ends = mesh.corners.reshape(-1, 2).tolist()
         self.owner, self.neighbor = mesh.owner.tolist(), mesh.neighbor.tolist()
-        self.centroids = polygon_centroids(mesh)[1]
+        self.centroids = mesh.measures.geometry.centroids[:, :2]
         self.slides = point_kinds(mesh, parts) == WALL
         self.starts, sides = mesh.cell_faces()
         self.faces = mesh.sides()[1][sides]
