@@ -42,7 +42,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import Report, best, clock_of, counts, heading, make_adapter, names, parser
+from _common import Report, best, clock_of, counts, heading, make_adapter, names, parser, shown
 
 import clvoro
 from clvoro.opencl.engine import Engine
@@ -305,25 +305,21 @@ def scipy_time(points: np.ndarray, clock: Callable[[], float]) -> float:
     return best(1, lambda: Voronoi(points), clock)[0]
 
 
-def shown(figure: str, scale: float, form: str) -> Callable[[dict[str, Any]], str]:
-    return lambda r: format(r[figure] * scale, form) if figure in r else ""
-
-
 COLUMNS = {
     "points": lambda r: r["set"],
     "cells": lambda r: f"{r['cells']:,}",
     "start": lambda r: r["start"],
-    "order ms": shown("order", 1e3, ".1f"),
-    "bins ms": shown("bins", 1e3, ".1f"),
-    "diagram ms": shown("diagram", 1e3, ".1f"),
-    "clip ms": shown("clip", 1e3, ".1f"),
-    "match ms": shown("match", 1e3, ".1f"),
-    "measure ms": shown("measure", 1e3, ".1f"),
-    "clip M/s": shown("clip_rate", 1e-6, ".2f"),
-    "bins to graph M/s": shown("graph_rate", 1e-6, ".2f"),
-    "order to graph M/s": shown("whole_rate", 1e-6, ".2f"),
-    "SciPy s": shown("scipy", 1, ".2f"),
-    "x SciPy": shown("over_scipy", 1, ".0f"),
+    "order ms": shown("order", ".1f", 1e3),
+    "bins ms": shown("bins", ".1f", 1e3),
+    "diagram ms": shown("diagram", ".1f", 1e3),
+    "clip ms": shown("clip", ".1f", 1e3),
+    "match ms": shown("match", ".1f", 1e3),
+    "measure ms": shown("measure", ".1f", 1e3),
+    "clip M/s": shown("clip_rate", ".2f", 1e-6),
+    "bins to graph M/s": shown("graph_rate", ".2f", 1e-6),
+    "order to graph M/s": shown("whole_rate", ".2f", 1e-6),
+    "SciPy s": shown("scipy", ".2f"),
+    "x SciPy": shown("over_scipy", ".0f"),
 }
 
 

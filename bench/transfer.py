@@ -16,11 +16,10 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import FIRST_SEED, Report, counts, heading, make_adapter, parser
+from _common import FIRST_SEED, Report, counts, heading, make_adapter, parser, shown
 
 import clvoro
 
@@ -70,10 +69,6 @@ def measure(
         "mass": abs(mass) / float(old.volumes @ np.abs(values)),
         "beyond": max(carried.max() - values.max(), values.min() - carried.min(), 0.0),
     }
-
-
-def shown(figure: str, form: str) -> Callable[[dict[str, Any]], str]:
-    return lambda r: "" if r[figure] is None else format(r[figure], form)
 
 
 COLUMNS = {

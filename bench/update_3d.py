@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import CUBE, Report, clock_of, counts, heading, make_adapter, names, parser, test_field
+from _common import CUBE, Report, clock_of, counts, heading, make_adapter, names, parser, shown, test_field
 
 import clvoro
 from clvoro.opencl.engine import Engine
@@ -124,10 +124,6 @@ def run(adapter: clvoro.Adapter, factor: float, updated: bool, clock: Callable[[
         "error": float(np.abs(result.size_error).mean()),
         "quality": float(result.quality.mean()),
     }
-
-
-def shown(name: str, form: str) -> Callable[[dict[str, Any]], str]:
-    return lambda r: format(r[name], form) if name in r else ""
 
 
 def main() -> None:
