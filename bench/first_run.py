@@ -1,12 +1,13 @@
 """How long the first run takes: separate processes with empty kernel caches.
 
-    python bench/first_run.py [--repeat N] [--warm] [--json]
+    python bench/first_run.py [--repeat N] [--warm] [--programs] [--json]
     python bench/first_run.py --record
 
-A box in 2D (625 cells) and one in 3D (1000 cells) are adapted with default options. Printed are the medians
-of the seconds that a process takes to import the package, to make an adapter, and to run. The processor time of the
-process tells what others on the machine cannot disturb. `--warm` repeats the runs with full caches. `--record` writes
-`clvoro/opencl/first_kernels.json`: which kernels a first run needs, in which order.
+A box in 2D (625 cells) and one in 3D (1000 cells) are adapted with default options. Printed are the machine, the number
+of programs and kernels that are built, and the medians of the seconds that a process takes to import the package, to
+make an adapter, and to run. The processor time includes that of workers, and is disturbed less by others on the
+machine. `--warm` repeats the runs with full caches. `--programs` prints the seconds of processor time per program.
+`--record` writes `clvoro/opencl/first_kernels.json`: which kernels a first run needs, in which order.
 """
 
 from __future__ import annotations
@@ -40,9 +41,45 @@ adapter = clvoro.Adapter()
 marks.append(clocks())
 adapter.run({domain}, {size})
 marks.append(clocks())
+from clvoro.opencl import prebuild
+prebuild._stop_workers()
+marks[-1] = marks[-1][0], clocks()[1]
 names = "import", "adapter", "run"
 spent = {{n: [b[i] - a[i] for i in (0, 1)] for n, a, b in zip(names, marks, marks[1:])}}
 print(json.dumps(spent))
+"""
+PROGRAMS = """
+import json, resource
+import numpy as np, pyopencl as cl
+import clvoro
+from clvoro.opencl import prebuild, program
+def clock():
+    own, ended = (resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime
+ctx = clvoro.create_context()
+engine = clvoro.Adapter(ctx)._stages_for({domain}).engine
+recorded = prebuild._record()[prebuild.kind_of(engine)]
+work = prebuild._work(engine, recorded)
+zeros = cl.Buffer(ctx, cl.mem_flags.COPY_HOST_PTR, hostbuf=np.zeros(1 << 20, np.uint8))
+rows, began = [], clock()
+for index, (stage, _) in enumerate(recorded["programs"]):
+    built, kernels, ready = program.compile_text(ctx, *work.programs[index]), 0, clock()
+    for launch in work.launches:
+        if launch.program == index:
+            kernel, kernels = cl.Kernel(built, launch.kernel), kernels + 1
+            kernel.set_args(*(np.zeros(size, np.uint8) if size else zeros for size in launch.sizes))
+            cl.enqueue_nd_range_kernel(engine.queue, kernel, (launch.group,), (launch.group,)).wait()
+    rows.append([stage, kernels, ready - began, clock() - ready])
+    began = clock()
+print(json.dumps(rows))
+"""
+MACHINE = """
+import json, os, pathlib
+import clvoro
+device = clvoro.create_context().devices[0]
+text = pathlib.Path("/proc/cpuinfo").read_text() if os.path.exists("/proc/cpuinfo") else ""
+flags = [name for name in ("avx512f", "avx2") if name in text][:1]
+print(json.dumps(f"{{device.platform.version}}, {{device.name}}, {{os.cpu_count()}} cores, {{' '.join(flags)}}"))
 """
 RECORDER = """
 import json, sys
@@ -94,7 +131,10 @@ def in_process(code: str, cache: str | None) -> object:
         env |= {"POCL_CACHE_DIR": f"{cache}/pocl", "XDG_CACHE_HOME": cache, "CUDA_CACHE_PATH": f"{cache}/cuda"}
         Path(cache, "pocl").mkdir(exist_ok=True)
     ended = subprocess.run([sys.executable, "-c", code], env=env, check=True, capture_output=True, text=True)
-    return json.loads(ended.stdout.splitlines()[-1])
+    found = json.loads(ended.stdout.splitlines()[-1])
+    if cache is not None and isinstance(found, dict):
+        found["built"] = [len(list(Path(cache).rglob(name))) for name in ("program.bc", "*.so")]
+    return found
 
 
 def record_kind(kind: str) -> tuple[str, dict[str, list]]:
@@ -121,6 +161,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeat", type=int, default=3, help="processes for each kind (3)")
     parser.add_argument("--warm", action="store_true", help="with full caches as well")
+    parser.add_argument("--programs", action="store_true", help="the processor time of each program")
     parser.add_argument("--record", action="store_true", help="write the record of kernels")
     parser.add_argument("--json", action="store_true", help="print one JSON object per line instead")
     options = parser.parse_args()
@@ -128,7 +169,8 @@ def main() -> None:
         write_record()
         return
     if not options.json:
-        print("kind     cache  import  adapter    run   adapter + run: seconds, of processor time")
+        print(in_process(MACHINE.format(), None))
+        print("kind     cache  programs  kernels  import  adapter    run   adapter + run: seconds, of processor time")
     for kind, (domain, size) in KINDS.items():
         found: dict[str, list] = {"empty": [], "full": []}
         for _ in range(options.repeat):
@@ -140,15 +182,20 @@ def main() -> None:
         for state, runs in found.items():
             if not runs:
                 continue
+            programs, kernels = runs[0].pop("built")
             wall, busy = ({name: statistics.median(r[name][i] for r in runs) for name in runs[0]} for i in (0, 1))
             total, used = (sum(x[name] for name in ("adapter", "run")) for x in (wall, busy))
             if options.json:
-                print(json.dumps({"kind": kind, "cache": state, **wall, "processor": used}))
+                print(json.dumps({"kind": kind, "cache": state, **wall, "processor": used, "kernels": kernels}))
             else:
                 print(
-                    f"{kind}   {state:5}  {wall['import']:6.2f}  {wall['adapter']:7.2f}  {wall['run']:5.2f}   "
-                    f"{total:20.2f}  {used:17.2f}"
+                    f"{kind}   {state:5}  {programs:8}  {kernels:7}  {wall['import']:6.2f}  {wall['adapter']:7.2f}  "
+                    f"{wall['run']:5.2f}   {total:20.2f}  {used:17.2f}"
                 )
+        if options.programs:
+            with tempfile.TemporaryDirectory() as cache:
+                for stage, count, of_program, of_kernels in in_process(PROGRAMS.format(domain=domain), cache):
+                    print(f"  {stage:36} {of_program:5.2f} s, {count:2} kernels {of_kernels:5.2f} s")
 
 
 if __name__ == "__main__":
