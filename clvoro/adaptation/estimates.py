@@ -88,8 +88,9 @@ def estimate_memory(
     one.
     """
     extras = Extras() if extras is None else extras
-    traits, space = engine.traits, clipping_space(n) if engine.cell_dim == 3 else 0.0
-    kind = "curved" if traits.curved else "cut" if traits.cut else "plane" if engine.cell_dim == 2 else "space"
+    traits = engine.traits
+    kind = "curved" if traits.curved else "cut" if traits.cut else {2: "plane", 3: "space"}[engine.cell_dim]
+    space = clipping_space(n) if kind == "space" else 0.0
     work = ("power " if power else "") + ("run" if run else "diagram")
     n *= 1 + extras.surplus
     cells = n

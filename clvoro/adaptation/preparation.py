@@ -264,7 +264,7 @@ def _least_cells(domain: Domain, adapted: bool) -> int:
 def _warn_of_coarse_size(domain: Domain, required: float) -> None:
     message = (
         f"h is larger than the domain: the size field requires {required:.2g} cells in a domain of "
-        f"{'area' if domain.cell_dim == 2 else 'volume'} {domain.measure:.6g}, and the mesh has a single cell; do "
+        f"the measure {domain.measure:.6g}, and the mesh has a single cell; do "
         "h and the domain have the same unit of length?"
     )
     if domain.outline is not None and may_be_degrees(domain.lower, domain.upper):

@@ -181,8 +181,8 @@ class SolverMeasures:
         scaled = areas / (mean / np.maximum(counts, 1))[cell][:, None]
         products = (scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 9)
         tensors = sum_rows(cell, products, n).reshape(-1, 3, 3)
-        if self.mesh.dim == 2:
-            tensors[:, 2, 2] = 1
+        for a in range(self.mesh.dim, 3):
+            tensors[:, a, a] = 1
         return np.where(counts > 0, np.abs(np.linalg.det(tensors)) / 8, 0.0)
 
     @cached_property

@@ -98,11 +98,11 @@ class Box(Domain):
         return corners | ({"names": dict(self.names)} if self.names else {})
 
 
-def _directions(periodic: object, dim: int) -> tuple[bool, ...]:
-    """Return one bool for each of `dim` directions."""
-    values = [periodic] * dim if isinstance(periodic, bool | np.bool_) else periodic
+def _directions(periodic: object, count: int) -> tuple[bool, ...]:
+    """Return one bool for each of `count` directions."""
+    values = [periodic] * count if isinstance(periodic, bool | np.bool_) else periodic
     if not isinstance(values, list | tuple | np.ndarray) or any(not isinstance(v, bool | np.bool_) for v in values):
         raise InputTypeError(f"Box got periodic {periodic!r}, expected True, False or one of them for each direction")
-    if len(values) != dim:
-        raise InputError(f"Box got periodic {periodic!r} for {len(values)} directions, expected {dim}")
+    if len(values) != count:
+        raise InputError(f"Box got periodic {periodic!r} for {len(values)} directions, expected {count}")
     return tuple(bool(v) for v in values)

@@ -285,6 +285,11 @@ class Domain(ABC):
         """Return `cell_dim` orthogonal unit vectors tangential to the domain at `points` (n, d), each (n, d)."""
         return tuple(np.broadcast_to(axis, np.shape(points)) for axis in np.eye(self.dim))
 
+    def require_plane(self, what: str, remedy: str) -> None:
+        """Raise InputError, which begins with `what` and ends with `remedy`, unless the domain is part of a plane."""
+        if self.dim > 2:
+            raise InputError(f"{what}, and {self} is in 3D or on a sphere; {remedy}")
+
     def place_name(self, x: np.ndarray) -> str:
         """Return a position (d,) in words, for messages."""
         return format_point(x)

@@ -11,7 +11,6 @@ from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
-from ..finite_volumes.solver_mesh import check_not_sphere
 from ..mesh.connectivity import take_rows
 from ..mesh.faces import Faces
 from ..mesh.read_only import Sealed
@@ -126,15 +125,10 @@ def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
     """Return the DISV grid of `diagram`; see `Diagram.to_disv`."""
     domain = diagram.domain
     diagram.demand_voronoi("to_disv")
-    check_not_sphere(
-        diagram,
+    domain.require_plane(
         "DISV grids are layers of cells in the plane",
-        "project the region and mesh it as a clvoro.Polygon, or save as .nc",
+        "project the region, mesh it as a clvoro.Polygon, and give MODFLOW the layers",
     )
-    if domain.dim != 2:
-        raise InputError(
-            "DISV grids are layers of 2D cells, and this diagram is in 3D; mesh the plane and give MODFLOW the layers"
-        )
     if any(domain.periodic):
         raise InputError("DISV grids have no periodic sides, and this box has; use a box without periodic directions")
     mesh = _without_empty_faces(diagram.solver_mesh(walls, collapse=False))

@@ -177,9 +177,9 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
             raise KeyError("values")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FileError(f"its description is damaged ({error})") from error
-    coordinates = arrays["diagram.points"].shape[1]
-    if coordinates != domain.dim:
-        raise FileError(f"its points have {coordinates} coordinates in {domain}")
+    points = arrays["diagram.points"]
+    if points.shape[1:] != np.shape(domain.lower):
+        raise FileError(f"its points have {points.shape[1]} coordinates in {domain}")
     for name in Diagram._NAMES:
         if not name.startswith(_not_in(domain)) and f"diagram.{name}" not in arrays:
             raise FileError(f"it has no diagram.{name}")

@@ -486,11 +486,7 @@ class Diagram(MeshOutput):
         >>> [cell.bounds for cell in d.to_shapely()]
         [(0.0, 0.0, 1.0, 1.0), (1.0, 0.0, 2.0, 1.0)]
         """
-        if self.domain.dim != 2:
-            where = "in 3D" if self.domain.cell_dim == 3 else f"on {self.domain}"
-            raise InputError(
-                f"shapely has polygons in the plane, and this diagram is {where}; use to_pyvista() or to_meshio()"
-            )
+        self.domain.require_plane("shapely has polygons in the plane", "use to_pyvista() or to_meshio()")
         return self._shapes.copy()
 
     @cached_property

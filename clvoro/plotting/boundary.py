@@ -9,7 +9,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
-from ..errors import InputError
 from ..geometry.domain import Domain
 from .style import METHOD_COLORS, WIDTH, frame_domain, interactive_figure, single_height, styled
 
@@ -41,8 +40,7 @@ def plot_boundaries(domain: Domain, ax: Any = None, *, numbers: bool = False) ->
     InputError
         For a domain in 3D or on a sphere.
     """
-    if domain.dim > 2:
-        raise InputError(f"plot_boundaries draws in the plane, and {domain} is in 3D or on a sphere")
+    domain.require_plane("plot_boundaries draws in the plane", "call result.plot()")
     with styled():
         if ax is None:
             height = single_height(domain.lower, domain.upper, legend=True)

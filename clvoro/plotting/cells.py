@@ -79,7 +79,7 @@ def plot_cells(
     result = picture_of(mesh)
     diagram = result.diagram
     domain = diagram.domain
-    require_plane(domain, "plot_cells draws in the plane", "call result.plot(), or open mesh.vtu in ParaView")
+    domain.require_plane("plot_cells draws in the plane", "call result.plot(), or open mesh.vtu in ParaView")
     lower, upper = np.array((domain.lower, domain.upper)) if window is None else corners_of(window)
     cells, offsets = _cells_in(diagram, lower, upper)
     if not len(cells):
@@ -99,12 +99,6 @@ def plot_cells(
         clip_to_domain(ax, domain, image)
         seen = paint if window is None else replace(paint, values=paint.values[np.unique(cells)])
         return finished(ax, seen, key, title)
-
-
-def require_plane(domain: Domain, what: str, remedy: str) -> None:
-    """Raise InputError unless the domain is a part of a plane."""
-    if domain.dim > 2:
-        raise InputError(f"{what}, and {domain} is in 3D or on a sphere; {remedy}")
 
 
 def draw_cells(
@@ -214,7 +208,7 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
     InputError
         For a domain in 3D or on a sphere.
     """
-    require_plane(domain, "the size field is drawn in the plane", "draw the sizes of a mesh")
+    domain.require_plane("the size field is drawn in the plane", "draw the sizes of a mesh")
     scheme = COLORINGS["size"]
     extent = domain.extent
     counts = np.maximum((extent * np.sqrt(60_000 / max(domain.measure, extent.prod() / 8))).astype(int), 2)

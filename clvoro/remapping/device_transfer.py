@@ -138,7 +138,7 @@ class ConservativeTransfer:
     def _build(self, faces: int) -> None:
         """Build the kernels for pieces of up to `faces` faces."""
         self._faces = faces
-        name = "CELL_CAPACITY" if self.engine.dim == 2 else "FACE_CAPACITY"
+        name = {2: "CELL_CAPACITY", 3: "FACE_CAPACITY"}[self.engine.dim]
         self._kernels = self.engine.kernels("remapping/transfer", {name: faces})
         # On a CPU the private arrays of a whole work-group lie on one thread's stack: large ones need groups of one.
         self._group = None if faces == FACES[self.engine.dim] else 1

@@ -78,7 +78,7 @@ class Field:
 
     def check_dim(self, dim: int) -> None:
         """Raise InputError if the field is not for `dim` dimensions."""
-        if self.dim is not None and self.dim != dim:
+        if self.dim not in (None, dim):
             raise InputError(
                 f"the size field {self!r} is for {self.dim} dimensions, got a domain or points "
                 f"of {dim}; build it with {dim} coordinates"

@@ -24,6 +24,12 @@ from .polyhedra_update import PolyhedraUpdate
 from .power_cells import PowerCells
 
 Stage = TypeVar("Stage")
+CELLS = {(2, False): Cells, (2, True): PowerCells, (3, False): Polyhedra, (3, True): Polyhedra}
+"""What builds cells, by their dimension and whether generators have weights."""
+FOLDED = {(2, False): FoldedCells, (2, True): FoldedPowerCells}
+"""The same without images of periodic boxes, where `CELLS` do not do this as well."""
+UPDATES = {2: IncrementalUpdate, 3: PolyhedraUpdate}
+"""What updates diagrams, by the dimension of cells."""
 
 
 def made_by(kind: Callable[[Engine], Stage]) -> cached_property[Stage]:
@@ -61,16 +67,13 @@ class TessellationStages:
     @cached_property
     def cells(self) -> Cells | Polyhedra:
         """What builds cells of this dimension, with weights if the engine has them."""
-        if self.engine.cell_dim == 3:
-            return Polyhedra(self.engine)
-        return (PowerCells if self.engine.traits.site_values else Cells)(self.engine)
+        return CELLS[self.engine.cell_dim, bool(self.engine.traits.site_values)](self.engine)
 
     @cached_property
     def folded_cells(self) -> Cells | Polyhedra:
         """What builds the cells of a periodic box without its images; in 3D `cells` does this as well."""
-        if self.engine.cell_dim == 3:
-            return self.cells
-        return (FoldedPowerCells if self.engine.traits.site_values else FoldedCells)(self.engine)
+        made = FOLDED.get((self.engine.cell_dim, bool(self.engine.traits.site_values)))
+        return self.cells if made is None else made(self.engine)
 
     @property
     def ring_cells(self) -> PowerCells | None:
@@ -81,7 +84,7 @@ class TessellationStages:
     @cached_property
     def update(self) -> Update:
         """What updates diagrams of such cells."""
-        return (PolyhedraUpdate if self.engine.cell_dim == 3 else IncrementalUpdate)(self.engine)
+        return UPDATES[self.engine.cell_dim](self.engine)
 
     @cached_property
     def weighted(self) -> TessellationStages:

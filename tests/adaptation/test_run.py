@@ -598,7 +598,7 @@ def test_sizes_in_another_unit(adapter):
         warnings.simplefilter("error", CoarseSizeWarning)
         adapter.run(BOX, 2.7, effort="fast")  # 0.51 cells
         adapter.run(BOX, 100, effort="fast", n_cells=2)
-    with pytest.warns(CoarseSizeWarning, match=r"0\.00038 cells in a domain of area 3\.75") as caught:
+    with pytest.warns(CoarseSizeWarning, match=r"0\.00038 cells in a domain of the measure 3\.75") as caught:
         assert len(adapter.run(BOX, 100, effort="fast").points) == 1
     assert caught[0].filename == __file__
 

@@ -274,7 +274,7 @@ def test_a_missing_fipy_is_named(lake, monkeypatch):
 
 def test_grids_that_solvers_lack_are_refused():
     cube = clvoro.voronoi(clvoro.Box((0, 0, 0), (1, 1, 1)), [(0.2, 0.5, 0.5), (0.7, 0.5, 0.5)])
-    with pytest.raises(InputError, match="layers of 2D cells, and this diagram is in 3D"):
+    with pytest.raises(InputError, match=r"layers of cells in the plane, and Box.* is in 3D"):
         cube.to_disv()
     torus = clvoro.voronoi(clvoro.Box((0, 0), (1, 1), periodic=(True, False)), [(0.2, 0.5), (0.7, 0.5)])
     with pytest.raises(InputError, match="no periodic sides"):

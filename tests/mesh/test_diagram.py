@@ -267,7 +267,7 @@ def test_cells_on_boundaries(ctx):
 def test_to_shapely(case):
     diagram, noise = case
     if diagram.domain.dim == 3:
-        with pytest.raises(InputError, match="in 3D; use to_pyvista"):
+        with pytest.raises(InputError, match="in 3D or on a sphere; use to_pyvista"):
             diagram.to_shapely()
         return
     shapes = diagram.to_shapely()
