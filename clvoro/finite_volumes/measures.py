@@ -331,9 +331,7 @@ class SolverMeasures:
     @cached_property
     def smallest_face(self) -> np.ndarray:
         """Area of the smallest face of each cell over the square of the smaller size of its cells; 2D: length, (n,)."""
-        if self.mesh.dim == 2:
-            return self.shortest_edge
-        return self._least(np.linalg.norm(self.geometry.areas, axis=1) / self._face_sizes**2)
+        return self._least(self.mesh.area / self._face_sizes ** (self.mesh.dim - 1))
 
     def line(self) -> str:
         """Return the worst of the measures as one line of text."""

@@ -275,7 +275,7 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
     )
     middle = d.face_centroids - d.points[g.owner]
     off = np.linalg.norm(middle - g.middles, axis=1)
-    if d.domain.cell_dim == 3:
+    if g.edges is not None:
         # The centroid of a needle is uncertain along it: compare first moments.
         off = np.minimum(off, off * g.measures / np.maximum(g.reach[g.owner], 1e-150) ** 2)
     check.note(
@@ -293,7 +293,7 @@ def _check_closed(check: Check, g: Rebuilt, slack: float) -> None:
     """Check that the faces of each cell close it: at edges in 3D, and as a sum of vectors."""
     d = check.diagram
     dim, n = d.domain.dim, len(d)
-    if dim == 3:
+    if g.edges is not None:
         face, a, b = g.edges
         key = (g.owner[face].astype(np.int64), np.minimum(a, b), np.maximum(a, b))
         order = np.lexsort(key[::-1])
@@ -314,7 +314,7 @@ def _check_closed(check: Check, g: Rebuilt, slack: float) -> None:
     gap = np.stack([np.bincount(g.owner, g.areas[:, k], minlength=n) for k in range(dim)], axis=1)
     gap = np.linalg.norm(gap, axis=1)
     bound = np.full(n, slack)
-    if dim == 3:
+    if g.edges is not None:
         # Between neighboring faces slits may remain, as wide as the round-off of their bisectors.
         near = np.full(n, np.inf)
         np.minimum.at(near, g.owner, g.spacings)

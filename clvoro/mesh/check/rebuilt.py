@@ -61,6 +61,8 @@ class Rebuilt:
         positions.
     """
 
+    edges: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    """In 3D each edge of each face: the face, and the vertices from which and to which it runs; (k,) each."""
     directions: np.ndarray
     """(m, d): unit vectors from the generator to that of the neighbor or to the wall; normals of adopted faces."""
     adopted: np.ndarray
@@ -169,6 +171,7 @@ class Rebuilt:
         lacks. The middle of such an edge lies on another open edge of the cell; at a missing face it does not. The
         tolerance is that of bisectors (see `doubts`) for a tolerance `slack` of positions.
         """
+        assert self.edges is not None
         spacings = self.spacings[self.edges[0][places]]
         width = slack * (1 + np.linalg.norm(self._tails[places], axis=1) / spacings)
         result = np.zeros(len(places), bool)
@@ -218,6 +221,7 @@ class Rebuilt:
         return Doubts(ends, ends, swept + per_cell**2)
 
     def _doubts_3d(self, per_cell: np.ndarray) -> Doubts:
+        assert self.edges is not None
         face, key = self.edges[0], self.cells.astype(np.int64) * self._vertex_count + self.corners
         _, first, group = np.unique(key, return_index=True, return_inverse=True)
         k, cells = len(first), self.cells[first]
