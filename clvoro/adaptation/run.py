@@ -25,7 +25,7 @@ from .options import Checkpoint, Options, uses
 from .plan.actions import CorrectCount, Refine, Step
 from .plan.efforts import EFFORTS
 from .plan.schedule import work_of
-from .preparation import only_needs_correction, plan, prepare, start
+from .preparation import Plan, Prepared, only_needs_correction, plan, prepare, start
 from .stages import Stages
 from .tuning import REACHED, RENEWAL, WINDOW
 
@@ -120,17 +120,23 @@ class Run:
         else:
             self.near = saved.near
         self._size, self._points = size, points
-        self.levels = self.level = prepared.levels
         planned = plan(prepared, self.near)
-        self.schedule, self.target = planned.schedule, float(prepared.target)
-        self.n_cells = options.n_cells if options.multilevel else None
-        self._tol = None if options.multilevel else options.tol
         self._writer = None
         if files.path is not None:
-            self._writer = Checkpointer(files.path, files.every, fingerprint, self.schedule)
+            self._writer = Checkpointer(files.path, files.every, fingerprint, planned.schedule)
         self._renews, self.pace = saved is not None or self._writer is not None, RENEWAL if files.every else 0
         if saved is not None:
-            self.state = saved.mesh(prepared.setup, self.schedule)
+            self.state = saved.mesh(prepared.setup, planned.schedule)
+        self._set_out(prepared, planned, saved)
+        self._settings = self._describe(planned)
+
+    def _set_out(self, prepared: Prepared, planned: Plan, saved: Saved | None) -> None:
+        """Set how far the run has come: it begins, or it goes on where it was saved."""
+        multilevel = self._options.multilevel
+        self.schedule, self.target = planned.schedule, float(prepared.target)
+        self.levels = self.level = prepared.levels
+        self.n_cells = self._options.n_cells if multilevel else None
+        self._tol = None if multilevel else self._options.tol
         self.n_start, self.started = self.state.n, self.state.next_label
         self.position = self.steps = self.obtuse = 0
         self.rows: list[np.ndarray] = []
@@ -147,18 +153,21 @@ class Run:
         self._progress = [*done[1:], 1.0]
         steps = [position for position, action in enumerate(self.schedule) if isinstance(action, Step)]
         self._last_step = steps[-1] if steps and self._tol is None else None
+
+    def _describe(self, planned: Plan) -> dict[str, Any]:
+        """Return the settings for the result: those that the method uses."""
+        options = self._options
         settings = {
             **vars(options),
-            "start": options.start if points is None else "points",
+            "start": options.start if self._points is None else "points",
             "levels": self.levels,
             "error_target": planned.error_target,
-            "dtype": stages.engine.real.name,
+            "dtype": self._stages.engine.real.name,
             "layers": [repr(layer) for layer in options.layers],
             "fixed": len(self._fixed),
         }
-        self._settings = {name: value for name, value in settings.items() if uses(options.method, name)}
-        if options.multilevel:
-            self._settings["trade"] = planned.trade
+        used = {name: value for name, value in settings.items() if uses(options.method, name)}
+        return {**used, "trade": planned.trade} if options.multilevel else used
 
     def _fewer_levels(self, levels: int, error: FewCellsError) -> int:
         """Return fewer levels after `error`: a periodic box has too few cells around it on the coarsest of them."""
