@@ -218,7 +218,7 @@ def coloring(name: str, domain: Domain | None = None) -> Coloring:
 
     On the Earth the numbers are in kilometers.
     """
-    known = COLORINGS if domain is None or domain.cell_dim == 2 else _SOLID_COLORINGS
+    known = {2: COLORINGS, 3: _SOLID_COLORINGS}[2 if domain is None else domain.cell_dim]
     if not isinstance(name, str) or name not in known:
         raise InputError(f"color is {name!r:.60}, expected one of {', '.join(known)}")
     kilometer = domain and domain.globe and kilometer_of(domain.globe.radius)

@@ -31,7 +31,7 @@ def views_of(domain: Domain) -> tuple[str, ...]:
     """Return the views of meshes in `domain`, the default first."""
     if domain.curved:
         return ("globe",)
-    return ("cells",) if domain.cell_dim == 2 else ("slices", "slice", "cutaway")
+    return {2: ("cells",), 3: ("slices", "slice", "cutaway")}[domain.cell_dim]
 
 
 def plot_mesh(

@@ -124,20 +124,13 @@ class Distance(Field):
         radius = np.maximum(self._radius, 0)
         around = 2 * np.pi * radius
         counts = np.maximum(np.maximum(length, around) / spacing, 1)
-        if self.dim == 3:
-            counts = np.maximum(counts, 4 * np.pi * (radius / spacing) ** 2)
+        counts = np.maximum(counts, {2: 0.0, 3: 4 * np.pi * (radius / spacing) ** 2}[self._begin.shape[1]])
         counts *= min(1.0, _LANDMARKS / counts.sum())
         counts = np.ceil(counts).astype(int)
         item = np.repeat(np.arange(len(counts)), counts)
         t = (np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[item]
         points = self._begin[item] + t[:, None] * (self._end - self._begin)[item]
-        if self.dim == 2:
-            offset = np.column_stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)])
-        else:  # a spiral from pole to pole, in golden angles, for spheres
-            z = 1 - 2 * (t + 0.5 / counts[item])
-            turn = np.pi * (3 - math.sqrt(5)) * t * counts[item]
-            flat = np.sqrt(1 - z**2)
-            offset = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+        offset = {2: _on_circles, 3: _on_spheres}[self._begin.shape[1]](t, counts[item])
         return np.concatenate([points + radius[item, None] * offset, self._end])
 
     def warnings(self, domain: Domain) -> list[str]:
@@ -244,6 +237,20 @@ class Distance(Field):
 
     def __repr__(self) -> str:
         return f"Distance({len(self.shapes)} shapes, h_min={self.h_min:g}, slope={self.slope:g}, h_max={self.h_max:g})"
+
+
+def _on_circles(t: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return points on the unit circle, `t` from 0 to 1 around it."""
+    del counts
+    return np.column_stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)])
+
+
+def _on_spheres(t: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return points on the unit sphere, on a spiral of `counts` points in golden angles: `t` from 0 to 1 along it."""
+    z = 1 - 2 * (t + 0.5 / counts)
+    turn = np.pi * (3 - math.sqrt(5)) * t * counts
+    flat = np.sqrt(1 - z**2)
+    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
 
 
 def _item_boxes(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -230,6 +230,8 @@ EFFORTS_3D = {
 }
 """The same in 3D. On a coarser level `couple` steps come before the first correction of the number of cells, and
 `recouple` after each of two. On the finest level there are `couple_finest`, and as many again after a correction."""
+EFFORTS_OF = {2: EFFORTS, 3: EFFORTS_3D}
+"""By the dimension of cells."""
 
 
 def is_near(dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float) -> bool:
@@ -244,7 +246,7 @@ def is_near(dim: int, effort: str, n: int, missing: float, mean_error: float, me
     mean_quality : float
         Mean of Q.
     """
-    deficit = EFFORTS[effort].deficit + WALL_DEFICIT / math.sqrt(n) if dim == 2 else DEFICIT_3D
+    deficit = {2: EFFORTS[effort].deficit + WALL_DEFICIT / math.sqrt(n), 3: DEFICIT_3D}[dim]
     return mean_error <= NEAR_ERROR and abs(missing) <= NEAR_COUNT * n and 1 - mean_quality <= deficit
 
 

@@ -82,7 +82,7 @@ from ..tuning import (
     TIGHT,
 )
 from .actions import Action, BalanceCounts, CorrectCount, InsertDelete, Refine, RepairCells, ResetMomentum, Step
-from .efforts import EFFORTS, EFFORTS_3D, Effort, choose_error_target
+from .efforts import EFFORTS_OF, Effort, choose_error_target
 
 COUPLE = WeightedMethod(cautious=True, tolerance=0.2, max_cycles=1)
 """Weighted steps after refinement, and all in 3D: one cycle of multigrid; the next steps reduce what remains."""
@@ -127,13 +127,13 @@ def adaptive_schedule(
         How often the last steps open obtuse triangles, at most. Some steps before them cells of four sides are deleted,
         and those of eight split: a cell of four sides has an obtuse triangle.
     narrow_parts : bool
-        The domain may have parts that few cells join. In 2D the number of cells in each part is then balanced before
+        The domain, in 2D, may have parts that few cells join. The number of cells in each part is then balanced before
         each refinement, which multiplies what a part lacks, before polishing, and after each repair. The penalty of
         exact projections falls step by step (see `GRADUAL_PENALTIES`).
     """
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
     projections = EXACT_STEPS if exact else 0
-    if narrow_parts and dim == 2:
+    if narrow_parts:
         polish = schedule.index(ResetMomentum()) - 1
         for k in reversed(range(len(schedule))):
             if k == polish or schedule[k] == Refine() or isinstance(schedule[k - 1], RepairCells):
@@ -176,14 +176,13 @@ def _opened(schedule: list[Action], exact: int, openings: int) -> list[Action]:
 def _several_kinds(
     dim: int, effort: str, levels: int, exact: bool, error_target: float | None, warm: bool, near: bool
 ) -> list[Action]:
-    settings = (EFFORTS if dim == 2 else EFFORTS_3D)[effort]
+    settings = EFFORTS_OF[dim][effort]
     if error_target is None:
         error_target = choose_error_target(dim, effort, levels, near)
     if near:
         return list(_correction(dim, settings, exact, error_target))
-    if dim == 3:
-        return list(_adaptive_3d(settings, levels, exact, error_target, warm))
-    return list(_adaptive_2d(settings, levels, exact, error_target, warm))
+    adaptive = {2: _adaptive_2d, 3: _adaptive_3d}[dim]
+    return list(adaptive(settings, levels, exact, error_target, warm))
 
 
 def _adaptive_2d(effort: Effort, levels: int, exact: bool, error_target: float, warm: bool) -> Iterator[Action]:
@@ -240,7 +239,7 @@ def _correction(dim: int, effort: Effort, exact: bool, error_target: float) -> I
     yield ResetMomentum()
     # The worst cells are as good as before, so there are no repairs.
     effort = replace(effort, repairs=())
-    yield from (_finish_2d if dim == 2 else _finish_3d)(effort, exact, error_target, NEAR_PENALTY)
+    yield from {2: _finish_2d, 3: _finish_3d}[dim](effort, exact, error_target, NEAR_PENALTY)
 
 
 def _finish_2d(effort: Effort, exact: bool, error_target: float, penalty: float) -> Iterator[Action]:

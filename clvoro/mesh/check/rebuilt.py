@@ -78,7 +78,7 @@ class Rebuilt:
         self.unit = float(np.finfo(self.real).eps) * size + np.finfo(float).eps * far
         self.owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
         self.directions, self.spacings = _across(d, self.owner)
-        (self._set_polygons if dim == 2 else self._set_polyhedra)(d)
+        {2: self._set_polygons, 3: self._set_polyhedra}[dim](d)
         self.measures = np.linalg.norm(self.areas, axis=1)
         self._find_adopted(d)
         # The cell as the sum of the cones from its generator to its faces.
