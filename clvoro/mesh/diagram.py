@@ -301,7 +301,7 @@ class Diagram(MeshOutput):
         return make_cell(self, i)
 
     def locate(self, points: ArrayLike) -> np.ndarray:
-        """Return the cell that holds each of some points.
+        """Return the cell that holds each of some points, in a box, a polygon or on a sphere.
 
         A point on a face is in one of the cells that meet there.
 
@@ -335,7 +335,7 @@ class Diagram(MeshOutput):
         return Locator(self)
 
     def triangles(self) -> np.ndarray:
-        """Return the dual triangulation in the plane: triples of generators whose cells meet in a vertex.
+        """Return the dual triangulation in 2D or on a sphere: triples of generators whose cells meet in a vertex.
 
         They are the Delaunay triangles whose circumcenter lies in the domain. Where more than three cells meet, as in a
         square lattice, the polygon of their generators is divided into triangles.
@@ -370,7 +370,7 @@ class Diagram(MeshOutput):
     def check(self, solver: Solver, *, walls: WallShape | None = None) -> SolverReport: ...
 
     def check(self, solver: Solver | None = None, *, walls: WallShape | None = None) -> Report | SolverReport:
-        """Verify the diagram on the host: graph, faces, volumes, and the Voronoi property.
+        """Verify the diagram, in any domain, on the host: graph, faces, volumes, and the Voronoi property.
 
         Parameters
         ----------
@@ -467,7 +467,7 @@ class Diagram(MeshOutput):
     default_color = "quality"
 
     def to_shapely(self) -> np.ndarray:
-        """Return the cells of a diagram in 2D as polygons of shapely.
+        """Return the cells of a diagram in 2D, in a box or a polygon, as polygons of shapely.
 
         Returns
         -------

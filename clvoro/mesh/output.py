@@ -74,7 +74,9 @@ class MeshOutput:
         return cast("Mesh", take_subset(cast("Diagram", self), keep, boundary))
 
     def boundary_cells(self, boundary: Walls | None = None) -> np.ndarray:
-        """Return the indices of the cells with a face on the boundary, (k,), ascending.
+        """Return the indices of the cells with a face on the boundary of a box, a polygon or a part of a sphere, (k,).
+
+        They are ascending.
 
         Parameters
         ----------
@@ -254,6 +256,8 @@ class MeshOutput:
     def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> Faces:
         """Return the mesh as a finite-volume solver sees it: points, and each face with corners, owner and neighbor.
 
+        The mesh is in a box, also a periodic one, or in a polygon, in 2D or 3D.
+
         Solvers reject or mistrust cells that are not convex, and faces that are much smaller than their cells. The
         diagram itself has such cells where the boundary has corners or is finer than the mesh. With `collapse` the
         diagram keeps the mesh, so that `check` and `save` do not make it again.
@@ -345,7 +349,7 @@ class MeshOutput:
         return plot_mesh(self._self, self.default_color if color is None else color, view, **options)
 
     def to_pyvista(self, cell_data: Mapping[str, ArrayLike] | None = None) -> pyvista.UnstructuredGrid:
-        """Return the cells as an unstructured grid of PyVista.
+        """Return the cells in a box, a polygon or on a sphere as an unstructured grid of PyVista.
 
         Parameters
         ----------
@@ -370,7 +374,7 @@ class MeshOutput:
         return to_pyvista(self._self, cell_data)
 
     def to_meshio(self, cell_data: Mapping[str, ArrayLike] | None = None) -> meshio.Mesh:
-        """Return the cells as a mesh of meshio.
+        """Return the cells in a box, a polygon or on a sphere as a mesh of meshio.
 
         Parameters
         ----------
@@ -395,7 +399,7 @@ class MeshOutput:
         return to_meshio(self._self, cell_data)
 
     def to_disv(self, walls: WallShape = "straight") -> Disv:
-        """Return the cells as a grid for MODFLOW 6's DISV package, as FloPy takes it.
+        """Return the cells in a box or a polygon in 2D as a grid for MODFLOW 6's DISV package, as FloPy takes it.
 
         The cell centers are the generators: control-volume finite differences need the line between two centers
         perpendicular to the face, and that is the Voronoi property. FloPy is not needed here.
@@ -431,7 +435,7 @@ class MeshOutput:
         return to_disv(self._self, walls)
 
     def to_fipy(self, walls: WallShape = "straight") -> VoronoiMesh2D | VoronoiMesh3D:
-        """Return the cells as a mesh of FiPy.
+        """Return the cells in a box, also a periodic one, or in a polygon as a mesh of FiPy.
 
         The cell centers are the generators. The center of a face is where the line between two generators crosses it,
         on walls the foot of the generator's perpendicular. There FiPy's two-point flux has no error of first order.
