@@ -184,35 +184,6 @@ def picture_of(mesh: Result | Diagram) -> Result:
     return mesh
 
 
-def coloring_of(mesh: Result, color: Color | ArrayLike, label: str | None = None) -> Coloring:
-    """Return the coloring for the cells of `mesh`: by its name, or for an array with one number per cell.
-
-    Raises
-    ------
-    InputError, InputTypeError
-        If there is no such color, or the array has another shape or no real numbers.
-    """
-    if isinstance(color, str):
-        if isinstance(mesh, DiagramPicture) and color in _OF_RUNS:
-            others = [name for name in COLORINGS if name not in _OF_RUNS]
-            raise InputError(
-                f"color is {color!r}, which a diagram without sizes does not have, expected one of {', '.join(others)} "
-                "or an array"
-            )
-        scheme = coloring(color, mesh.diagram.domain)
-        return scheme if label is None else replace(scheme, label=label)
-    values = np.asarray(color)
-    n = len(mesh.points)
-    if values.dtype.kind not in "fiub":
-        raise InputTypeError(
-            f"color is {color!r:.60}, expected one of {', '.join(COLORINGS)}, or an array of real numbers"
-        )
-    if values.shape != (n,):
-        raise InputError(f"color has shape {values.shape}, expected ({n},): one number per cell")
-    values = values.astype(float)
-    return Coloring(label or "", lambda _: values, _DARKLESS, _most)
-
-
 def coloring(name: str, domain: Domain | None = None) -> Coloring:
     """Return the coloring of that name for cells of `domain`, by default in the plane, or raise InputError.
 
@@ -279,8 +250,34 @@ def paint_of(
     limits: tuple[float, float] | None = None,
     seen: np.ndarray | slice = slice(None),
 ) -> Paint:
-    """Return the colors of the cells of `result`; without `limits` those of the cells `seen` set the scale."""
-    scheme = coloring_of(result, color, label)
+    """Return the colors of the cells of `result`: by their name, or for an array with one number per cell.
+
+    Without `limits` the cells `seen` set the scale.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If there is no such color, or the array has another shape or no real numbers.
+    """
+    if isinstance(color, str):
+        if isinstance(result, DiagramPicture) and color in _OF_RUNS:
+            others = [name for name in COLORINGS if name not in _OF_RUNS]
+            raise InputError(
+                f"color is {color!r}, which a diagram without sizes does not have, expected one of {', '.join(others)} "
+                "or an array"
+            )
+        scheme = coloring(color, result.diagram.domain)
+        scheme = scheme if label is None else replace(scheme, label=label)
+    else:
+        own = np.asarray(color)
+        if own.dtype.kind not in "fiub":
+            raise InputTypeError(
+                f"color is {color!r:.60}, expected one of {', '.join(COLORINGS)}, or an array of real numbers"
+            )
+        if own.shape != (len(result.points),):
+            raise InputError(f"color has shape {own.shape}, expected ({len(result.points)},): one number per cell")
+        own = own.astype(float)
+        scheme = Coloring(label or "", lambda _: own, _DARKLESS, _most)
     values = scheme.values(result)
     return Paint(scheme, values, scheme.limits(values[seen]) if limits is None else ends_of(limits))
 
