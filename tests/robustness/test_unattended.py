@@ -143,14 +143,14 @@ def test_the_process_ends_by_its_exit_code_and_a_message():
 
 
 def pressing(monkeypatch, number):
-    plain = progress.Progress.__call__
+    plain = progress.ProgressDisplay.__call__
 
     def press(self, row):
         plain(self, row)
         if row["step"] == 1:
             signal.raise_signal(number)
 
-    monkeypatch.setattr(progress.Progress, "__call__", press)
+    monkeypatch.setattr(progress.ProgressDisplay, "__call__", press)
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGXCPU"])
