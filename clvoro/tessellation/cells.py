@@ -126,8 +126,8 @@ class Cells:
         points: cla.Array,
         n: int,
         binned: BinnedPoints,
-        exact: bool = True,
         previous: Tessellation | NeighborRows | None = None,
+        exact: bool = True,
         n_own: int | None = None,
         halo_args: tuple[object, ...] = (),
     ) -> Tessellation:
@@ -135,11 +135,11 @@ class Cells:
 
         Parameters
         ----------
+        previous, halo_args : optional
+            As in 3D (`Polyhedra.tessellate`). In 2D they are not needed.
         exact : bool
             Reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
             otherwise more than `ROUGH_SHARE`.
-        previous, halo_args : optional
-            As in 3D (`Polyhedra.tessellate`). In 2D they are not needed.
         n_own : int, optional
             Number of cells to build, those of the first generators. Their faces with other cells are not matched.
 
