@@ -1,7 +1,7 @@
 """Whole runs, from nothing to a finished mesh: time per cell, its growth, and its parts.
 
     python bench/run.py [--sizes 1e4,1e5,1e6] [--efforts fast,default] [--methods adaptive]
-                        [--no-profile] [--parts] [--device NAME] [--dtype float32] [--json]
+                        [--no-profile] [--device NAME] [--dtype float32] [--json]
 
 The field is F2, h = 0.002 + 0.08 d (d the distance to a circle), times the factor that makes the
 count; sizes over 1 : 40 or so. A run counts the cells, samples the start, adapts it over all
@@ -10,8 +10,7 @@ levels and fetches the diagram. Kernels are built before, by a smaller run of ea
 "work" is in steps of the finest level; "s per step" is the run's time over it. The shares are of
 the device time of all kernels, by its events, in a second run ("s profiled"): "solve" all linear
 systems, "diagram" binning, clipping and measuring with the scans. "outside" is the part of the
-time in which no kernel runs: the host enqueues, reads scalars, allocates, waits. `--parts` prints
-what the host does: processor time of its thread by part, in one more run (see `_host_parts.py`).
+time in which no kernel runs: the host enqueues, reads scalars, allocates, waits.
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ from _common import (
     test_field,
     work,
 )
-from _host_parts import REST, host_parts
 
 import clvoro
 from clvoro.opencl.profile import Profile
@@ -67,9 +65,7 @@ def run_once(adapter: clvoro.Adapter, n: int, effort: str, method: str) -> tuple
     return result, time.perf_counter() - start
 
 
-def measure(
-    adapter: clvoro.Adapter, profiled: bool, by_parts: bool, n: int, effort: str, method: str
-) -> dict[str, Any]:
+def measure(adapter: clvoro.Adapter, profiled: bool, n: int, effort: str, method: str) -> dict[str, Any]:
     began = time.thread_time()
     result, seconds = run_once(adapter, n, effort, method)
     host = time.thread_time() - began
@@ -103,11 +99,6 @@ def measure(
             "diagram_share": profile.of(*TESSELLATION) / total,
             "programs": {name: cost.seconds / total for name, cost in sorted(profile.stages().items())},
         }
-    if by_parts:
-        with host_parts() as parts:
-            timed = parts.timed(REST, run_once)
-            timed(adapter, n, effort, method)
-        record["parts"] = {name: {"calls": parts.calls[name], "seconds": parts.seconds[name]} for name in parts.seconds}
     return record
 
 
@@ -164,16 +155,6 @@ def programs(records: list[dict[str, Any]]) -> list[list[str]]:
     return rows
 
 
-def shares_of_the_host(records: list[dict[str, Any]]) -> list[list[str]]:
-    """Return calls and seconds of each part of the host's work, in the largest run of each kind."""
-    rows = []
-    for kind in dict.fromkeys((r["method"], r["effort"]) for r in records):
-        mine = [r for r in records if (r["method"], r["effort"]) == kind and "parts" in r]
-        for name, part in mine[-1]["parts"].items() if mine else ():
-            rows.append([*kind, f"{mine[-1]['cells']:,}", name, f"{part['calls']:,}", f"{part['seconds']:.2f}"])
-    return rows
-
-
 def main() -> None:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[10**4, 10**5, 10**6])
@@ -182,7 +163,6 @@ def main() -> None:
     options_of.add_argument(
         "--profile", action=argparse.BooleanOptionalAction, default=True, help="run once more for the shares"
     )
-    options_of.add_argument("--parts", action="store_true", help="run once more for the parts of the host's work")
     options = options_of.parse_args()
 
     adapter = make_adapter(options)
@@ -192,7 +172,7 @@ def main() -> None:
             run_once(adapter, BEFORE, effort, method)
             for n in options.sizes:
                 try:
-                    record = measure(adapter, options.profile, options.parts, n, effort, method)
+                    record = measure(adapter, options.profile, n, effort, method)
                 except clvoro.ClvoroError as error:
                     print(f"{method} {effort} {n:,}: {error}", file=sys.stderr)
                     continue
@@ -203,13 +183,6 @@ def main() -> None:
         print(markdown(header, scaling(report.records)) + "\n")
         if options.profile:
             print(markdown(["method", "effort", "cells", "share of device time"], programs(report.records)) + "\n")
-        if options.parts:
-            print(
-                markdown(
-                    ["method", "effort", "cells", "part of the host's work", "calls", "seconds"],
-                    shares_of_the_host(report.records),
-                )
-            )
 
 
 if __name__ == "__main__":
