@@ -19,7 +19,7 @@ LEAST_DETERMINANT = 2e-3
 TILT, MOST_TILT = 0.12, 0.4
 """How far the ends of a face move, over its length, and at most over that of a face on the wall."""
 STRIP, BESIDE = 0.4, 0.1
-"""Where a cell at a dead end meets the second neighbor: share of the face between them, and of the way to a centroid."""
+"""Where cells at dead ends meet the second neighbor: share of the face between them, and of the way to a centroid."""
 ROUNDS = 4
 
 Side = tuple[int, int, int]
