@@ -17,6 +17,8 @@ SHORT, THIN = 0.055, 0.2
 """A face is short if it is shorter than both, over the smaller size of its cells and over the width of the thinner one.
 
 Between columns of boundary layers cells are much longer than wide: there the second one holds."""
+SKEW, LONGEST = 2.0, 0.3
+"""Faces with a larger skewness may be so long, in place of `SHORT`."""
 STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell; OpenFOAM counts cells with less than about 1e-6 as concave."""
 _ROUNDS = 12
@@ -48,6 +50,24 @@ def collapse_short_edges(mesh: Faces, parts: np.ndarray) -> Faces:
         else:
             failed = np.concatenate([failed, current.faces])
     return mesh
+
+
+def drop_skew_corners(mesh: Faces, parts: np.ndarray) -> Faces:
+    """Return a mesh in 2D without those corners between two wall faces of one cell that make one of the two skew."""
+    skew = np.zeros(len(mesh), bool)
+    skew[mesh.n_inner :] = mesh.measures.skewness[mesh.n_inner : len(mesh)] > SKEW
+    ends, drop = mesh.corners.reshape(-1, 2).copy(), np.zeros(len(mesh), bool)
+    twice, walls = np.bincount(mesh.corners, minlength=len(mesh.points)) == 2, slice(mesh.n_inner, None)
+    begins_at = dict(zip(ends[walls, 0].tolist(), range(mesh.n_inner, len(mesh)), strict=True))
+    part = np.full(len(mesh), -1)
+    part[walls] = parts[-1 - mesh.neighbor[walls]]
+    for f in np.flatnonzero(twice[ends[:, 1]]).tolist():
+        g = begins_at.get(int(ends[f, 1]), f)
+        same = f != g and mesh.owner[f] == mesh.owner[g] and part[f] == part[g] >= 0
+        if same and (skew[f] or skew[g]) and not (drop[f] or drop[g]):
+            ends[f, 1] = ends[g, 1]
+            drop[g] = True
+    return replace(mesh, corners=ends.ravel()).take_faces(~drop).compact()
 
 
 class _Round:
@@ -82,6 +102,8 @@ class _Round:
         self.images = mesh.images if any(mesh.domain.periodic) else np.arange(v)
         self.kind = point_kinds(mesh, parts, self.images)
         ratio = _lengths_over_limits(mesh, broken)
+        if not broken.size:
+            ratio[(ratio < LONGEST / SHORT) & (mesh.measures.skewness[: len(mesh)] > SKEW)] *= SHORT / LONGEST
         ends = mesh.corners.reshape(-1, 2)
         first, second = self.images[ends].T
         # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.

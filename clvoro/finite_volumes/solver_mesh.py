@@ -48,6 +48,7 @@ def make_solver_mesh(
 def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray) -> Faces:
     """Take the faces of `diagram`, or make straight walls, and collapse short faces."""
     from .dead_ends import open_dead_ends
+    from .short_edges import drop_skew_corners
     from .walls import straight_walls
 
     outline = diagram.domain.outline if walls == "straight" else None
@@ -58,7 +59,7 @@ def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray)
         mesh = replace(mesh, points=mesh.points.astype(np.float64, copy=False), diagram=None)
     mesh = _COLLAPSED[mesh.dim](mesh, diagram, parts, collapse)
     if outline is not None and collapse:
-        mesh = open_dead_ends(mesh, parts)
+        mesh = open_dead_ends(drop_skew_corners(mesh, parts), parts)
     if outline is not None and abs(mesh.area_change) > _LARGE_CHANGE:
         warn(
             f"straight walls change the area of the domain by {100 * mesh.area_change:+.2g} %: its boundary has "

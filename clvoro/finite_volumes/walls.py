@@ -270,20 +270,36 @@ class _WallMaker:
         count, crossings = len(used), np.count_nonzero(is_crossing)
         ends[is_crossing] = count + np.arange(crossings)
         row, side = np.nonzero(on)
-        at = vertex[row, side].astype(np.int64)
-        keys = np.concatenate([at * n + f.left[kept[row]], at * n + f.right[kept[row]]])
-        nodes, where = np.unique(keys, return_inverse=True)
-        here, there = where.reshape(2, -1)
-        graph = coo_array((np.ones(len(here)), (here, there)), (len(nodes), len(nodes)))
+        at, face = vertex[row, side], kept[row]
+        feet = self._feet(f.vertices[at], self._ahead_of(at, vertex[row, 1 - side], face), ON_WALL * self.least[at])
+        # Two faces end in one point if a cell lies between them, and they come to the same side of the wall.
+        cells = np.concatenate([f.left[face], f.right[face]]).astype(np.int64)
+        key, of_end = np.tile(at, 2) * n + cells, np.tile(np.arange(len(at)), 2)
+        order = np.argsort(key, kind="stable")
+        one, two = of_end[order[:-1]], of_end[order[1:]]
+        near = (np.diff(key[order]) == 0) & self._are_near(feet[one], feet[two], 2 * ON_WALL * self.least[at[one]])
+        graph = coo_array((np.ones(np.count_nonzero(near)), (one[near], two[near])), (len(at), len(at)))
         _, group = connected_components(graph, directed=False)
-        ends[on] = count + crossings + group[here]
-        at, cell = np.divmod(nodes[np.unique(group, return_index=True)[1]], n)
-        feet = self._feet(f.vertices[at], self.generators[cell], ON_WALL * self.least[at])
+        ends[on] = count + crossings + group
+        feet = feet[np.unique(group, return_index=True)[1]]
         self.position = np.concatenate([np.full(count, np.nan), crossed[is_crossing], feet])
         self.points = np.full((len(self.position), 2), np.nan)
         self.points[:count] = f.vertices[used]
         self.ends = np.full((len(self.kept), 2), -1)
         self.ends[kept] = ends
+
+    def _ahead_of(self, vertex: np.ndarray, other: np.ndarray, face: np.ndarray) -> np.ndarray:
+        """Return points on faces before they reach `vertex`, half a width of their cells away, (k, 2)."""
+        x = self.convex.vertices[vertex]
+        way = self.convex.vertices[other] - x
+        length = np.maximum(np.hypot(*way.T), 1e-300)
+        return x + np.minimum(1, self.width[face] / 2 / length)[:, None] * way
+
+    def _are_near(self, s: np.ndarray, t: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return whether positions on the boundary are on one ring and not farther apart than `reach`, (k,) bool."""
+        ring, gap = self.along.ring_of(s), np.abs(s - t)
+        total = np.diff(self.along.begins[self.along.ring_starts])[ring]
+        return (ring == self.along.ring_of(t)) & (np.minimum(gap, total - gap) <= reach)
 
     def _feet(self, points: np.ndarray, sights: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return positions within `reach` of `points` (k, 2): re-entrant corners, else on edges that face `sights`."""
