@@ -40,8 +40,8 @@ BEHIND_WALL = 2.0
 """Length over that distance from which on a face that leads outward from a vertex on the boundary is kept."""
 SNAP_RE_ENTRANT, SNAP_CONVEX = 0.25, 0.12
 """A face ends in a corner of the domain that is nearer than this along the boundary, over the width of its cells."""
-LEAST_BULGE, LARGEST_BULGE = 0.1, 2.0
-"""Distances from a straight face over the size of the cell at which a vertex of the domain becomes a corner of it."""
+LEAST_BULGE = 0.1
+"""Distance from a straight face over the size of the cell at which a vertex of the domain becomes a corner of it."""
 FILLED = 0.5
 """Share of the triangle of a corner and the ends of the face that must lie in the domain, or it is cut off."""
 AROUND = 4.0
@@ -163,8 +163,6 @@ class _WallMaker:
     more : list of (2,) float64
         Further points, behind `points`.
     left_out : list of (area, place)
-    farthest : (n,) float64
-        Largest distance of a corner from the straight wall face of each cell.
     """
 
     def __init__(self, diagram: Diagram, domain: Polygon, parts: np.ndarray) -> None:
@@ -358,7 +356,6 @@ class _WallMaker:
         gaps = np.flatnonzero(ends[:, 1] != ends[after, 0])
         self.walls: list[tuple[int, float, int, int]] = []
         self.more: list[np.ndarray] = []
-        self.farthest = np.where(np.diff(starts) > 1, LARGEST_BULGE, np.inf) * self.size
         for c, p, q in zip(cell[gaps].tolist(), ends[gaps, 1].tolist(), ends[after[gaps], 0].tolist(), strict=True):
             corners, positions = self._chain(c, p, q)
             count = len(self.points) + len(self.more)
@@ -415,7 +412,6 @@ class _WallMaker:
         if not among or length == 0:
             return []
         off = cross(x[among.start : among.stop] - a, (b - a)[None]) / length
-        off[off > self.farthest[cell]] = -1
         k = int(off.argmax())
         area = _area(np.concatenate([a[None], x[among.start : among.stop], b[None]]))
         if off[k] < LEAST_BULGE * self.size[cell] or area < FILLED * off[k] * length / 2:

@@ -145,7 +145,7 @@ def test_openfoam_has_the_names(meshed, tmp_path, walls) -> None:
                 assert off.max() < 1e-14
             else:  # chords cut corners that turn by little
                 assert count > 0
-                assert off.max() < 0.05
+                assert off.max() < 0.3 * np.sqrt(result.diagram.volumes.max())
                 assert np.median(off) < 1e-14
 
 

@@ -108,7 +108,7 @@ def test_measures_are_those_of_the_whole_mesh(globe, part):
     here, whole = part.measures, globe.measures
     for name in ("quality", "face_ratio", "faces"):
         assert np.array_equal(getattr(here, name), getattr(whole, name)[kept])
-    np.testing.assert_allclose(here.skewness, whole.skewness[of], rtol=1e-14)
+    np.testing.assert_allclose(here.skewness, whole.skewness[of], rtol=1e-13)  # differences of positions
     assert (here.centroid_angle[~here.inner] == 0).all()
     grid, all_around = here.c_grid, whole.c_grid
     assert len(grid.angles) < len(all_around.angles)
