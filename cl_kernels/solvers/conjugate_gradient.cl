@@ -263,7 +263,7 @@ kernel void record_norm(global const int *counts, global const REAL *partial, gl
 inline void put_sum_of_solution(const Step *s, const Sum *sum_x, global REAL *partial, group_t group)
 {
     const REAL sum = group_sum(sum_x->value, group);
-    if (s->end > 0 && GROUP_ITEM == 0)
+    if (GROUP_ITEM == 0 && s->end > 0)
         ROW(SUM_X)[group.id] = sum;
 }
 

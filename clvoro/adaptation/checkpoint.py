@@ -254,7 +254,8 @@ class Saved:
         worst = int(np.argmax(off))
         if not off[worst] <= 1e4 * np.finfo(saved.dtype).eps:
             origin, scale = domain.frame
-            place, unit = self.arrays["mesh.points"][worst] * scale + origin, scale / self.size_factor
+            place = domain.place_name(self.arrays["mesh.points"][worst] * scale + origin)
+            unit = scale / self.size_factor
             raise InputError(
                 f"cannot resume from {self.name}: its size field differs; at {place} the size of that run was "
                 f"{was[worst] * unit:.6g}, this field's is {now[worst] * unit:.6g}. Use the field of that run, or "

@@ -93,6 +93,9 @@ class Run:
         self._files, self._callback, self._on_memory, self._alone = files, callback, on_memory, alone
         self._begin(size, points, saved=None if files.source is None else Saved(files.source))
 
+    def __repr__(self) -> str:
+        return f"Run({self.steps} steps, {self.state.n} cells on level {self.level}; {self.stop_reason or UNDER_WAY})"
+
     def _begin(
         self, size: object, points: np.ndarray | None, max_levels: int | None = None, saved: Saved | None = None
     ) -> None:
