@@ -18,7 +18,7 @@ SHORT, THIN = 0.055, 0.2
 
 Between columns of boundary layers cells are much longer than wide: there the second one holds."""
 SKEW, LONGEST = 2.0, 0.3
-"""Faces with a larger skewness may be so long, in place of `SHORT`."""
+"""Faces with a larger skewness, or with an end where a cell is not convex, may be so long, in place of `SHORT`."""
 STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell; OpenFOAM counts cells with less than about 1e-6 as concave."""
 _ROUNDS = 12
@@ -102,9 +102,12 @@ class _Round:
         self.images = mesh.images if any(mesh.domain.periodic) else np.arange(v)
         self.kind = point_kinds(mesh, parts, self.images)
         ratio = _lengths_over_limits(mesh, broken)
-        if not broken.size:
-            ratio[(ratio < LONGEST / SHORT) & (mesh.measures.skewness[: len(mesh)] > SKEW)] *= SHORT / LONGEST
         ends = mesh.corners.reshape(-1, 2)
+        if not broken.size:
+            bent = np.zeros(v, bool)
+            bent[self.loop[turns(mesh.points[self.loop], following(self.starts)) < STRAIGHT]] = True
+            bad = bent[ends].any(axis=1) | (mesh.measures.skewness[: len(mesh)] > SKEW)
+            ratio[bad & (ratio < LONGEST / SHORT)] *= SHORT / LONGEST
         first, second = self.images[ends].T
         # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
         tried = (ratio < 1) & (mesh.twin < np.arange(len(ends))) & (first != second)

@@ -201,15 +201,13 @@ class _WallMaker:
         begin, end = self.place[f.begin], self.place[f.end]
         self.kept = (begin >= ON) & (end >= ON)
         self.crossed = np.full((len(begin), 2), np.nan)
-        # A face along a wall separates two cells only if these see each other.
-        along = np.flatnonzero((begin == ON) & (end == ON))
-        self.kept[along[self.domain.crossings(x[f.left[along]], x[f.right[along]])[0]]] = False
         cut = np.flatnonzero((begin + end < 2 * INSIDE) & ((begin != ON) | (end != ON)))
         a, way = f.vertices[f.begin[cut]], f.vertices[f.end[cut]] - f.vertices[f.begin[cut]]
         parts, whole = self._parts_inside(a, way), [0.0, 1.0, np.nan, np.nan]
         length = np.maximum(np.hypot(*way.T), 1e-300)
         middle = (((x[f.left[cut]] + x[f.right[cut]]) / 2 - a) * way).sum(axis=1) / length / length
         margin = ON_WALL * self.width[cut] / length
+        spans = np.stack([f.vertices[f.begin], f.vertices[f.end]], axis=1)
         for k, face in enumerate(cut.tolist()):
             on = begin[face] == ON, end[face] == ON
             self.kept[face] = bool(parts[k])
@@ -222,9 +220,19 @@ class _WallMaker:
             else:
                 part = max(parts[k], key=lambda p: (p[0] <= middle[k] <= p[1], p[1] - p[0]))
             first, last, at_first, at_last = part
+            spans[face] = a[k] + np.array([[first], [last]]) * way[k]
             self.kept[face] = not any(on) or last - first >= BEHIND_WALL * margin[k]
             self.crossed[face, 0] = np.nan if on[0] and first < margin[k] else at_first
             self.crossed[face, 1] = np.nan if on[1] and last > 1 - margin[k] else at_last
+        # Without a vertex inside, a face may lie on the far side of a thin wall from one of its cells.
+        loose = np.flatnonzero(self.kept & (begin != INSIDE) & (end != INSIDE))
+        for cells in (f.left, f.right):
+            seen = np.zeros(len(loose), bool)
+            for share in (0.25, 0.5, 0.75):
+                places = (1 - share) * spans[loose, 0] + share * spans[loose, 1]
+                hidden = self.domain.crossings(x[cells[loose]], places)[0]
+                seen |= np.bincount(hidden, minlength=len(loose)) == 0
+            self.kept[loose[~seen]] = False
 
     def _parts_inside(self, a: np.ndarray, way: np.ndarray) -> list[list[list[float]]]:
         """Return the parts of segments from `a` (k, 2) to `a + way` that lie inside, a list for each segment.
