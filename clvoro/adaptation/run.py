@@ -147,7 +147,7 @@ class Run:
         self.final: Displacements | None = None
         self.last: Method | None = None
         self.solution: Solution | None = None
-        self.stop_reason, self._stop = "", False
+        self.stop_reason, self._stop, self._acts = "", False, False
         self._result: Result | None = None
         elapsed = 0.0 if saved is None else saved.resume(self)
         self.began, self.begun, self._renewed = time.perf_counter() - elapsed, self.steps, self.steps
@@ -218,6 +218,7 @@ class Run:
         with self._alone(self._stages):
             if self.stop_reason:
                 return self.conclude()
+            self._mend()
             other = copy.copy(self)
             other.state, other.rows, other.last = self.state.copy(), [r.copy() for r in self.rows], copy.copy(self.last)
             other.stop_reason = UNDER_WAY
@@ -250,6 +251,7 @@ class Run:
     def _advance(self) -> bool:
         """Do actions up to the next row of the history; return whether there is one."""
         known = len(self.rows)
+        self._mend()
         try:
             if not self.rows:
                 self.record(0.0)
@@ -258,13 +260,21 @@ class Run:
             while len(self.rows) == known and not self.stop_reason:
                 self.stop_reason = self._end_reason(self.position == len(self.schedule))
                 if not self.stop_reason:
+                    self._acts = True
                     self.schedule[self.position].apply(self)
+                    self._acts = False
                     self.position += 1
                     self._keep()
         except FewCellsError as error:
             self._begin(self._size, self._points, self._fewer_levels(self.levels, error))
             return self._advance()
         return len(self.rows) > known
+
+    def _mend(self) -> None:
+        """Compute the mesh of the present generators, if an error or Ctrl-C has ended an action halfway."""
+        if self._acts:
+            self.state.update()
+            self._acts = False
 
     def _keep(self) -> None:
         """At the end of an action, compute the mesh anew and write a checkpoint, if they are due."""
@@ -283,6 +293,7 @@ class Run:
             except KeyboardInterrupt:
                 self.stop_reason = INTERRUPTED
                 self.state.update()
+                self._acts = False
             self._result = self._end()
         if self._result.stop_reason == INTERRUPTED and on_interrupt == "raise":
             raise Interrupted(self._result)

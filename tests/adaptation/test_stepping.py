@@ -5,6 +5,7 @@ import pytest
 
 import clvoro
 from clvoro.adaptation.run import COMPLETED, UNDER_WAY
+from clvoro.adaptation.state import MeshState
 from clvoro.errors import InputError, SizeFieldError
 
 FEW = {"effort": "fast", "seed": 4}
@@ -99,3 +100,25 @@ def test_a_run_shows_its_start(ctx):
     assert run.step()
     assert run.mesh().history["step"].tolist() == [0]
     assert run.history["step"].tolist() == [0]
+
+
+@pytest.mark.parametrize("at", [5, 9])
+def test_a_run_goes_on_after_an_interrupted_step(adapter, monkeypatch, at):
+    """Ctrl-C comes when the generators have changed, and their mesh is not there yet."""
+    run = adapter.start(clvoro.Box((0, 0), (1, 1)), 0.06, "fast")
+    update, calls = MeshState.update, []
+
+    def interrupted(self, *args, **options):
+        calls.append(None)
+        if len(calls) == at:
+            raise KeyboardInterrupt
+        return update(self, *args, **options)
+
+    monkeypatch.setattr(MeshState, "update", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        while run.step():
+            pass
+    shown, result = run.mesh(), run.finish()
+    assert shown.check()
+    assert result.check()
+    assert (shown.stop_reason, result.stop_reason) == ("under way", "plan completed")
