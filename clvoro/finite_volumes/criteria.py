@@ -107,11 +107,12 @@ class SolverReport(Verdict):
 
 @dataclass(frozen=True)
 class Rows:
-    """Places, (k, 3), with their cells, (k,) or None for the cells themselves."""
+    """Places, (k, 3), with their cells, (k,) or None for cells themselves; whether each is judged, (k,) bool."""
 
     places: np.ndarray
     cells: np.ndarray | None
     dim: int
+    judged: np.ndarray | None = None
 
     def __call__(
         self,
@@ -125,6 +126,11 @@ class Rows:
         failing: np.ndarray | None = None,
     ) -> Criterion:
         """Return a criterion: the worst of `values` (k,), the limit, and the cell with the worst one."""
+        if self.judged is not None:
+            rows = np.flatnonzero(self.judged)
+            cells = rows if self.cells is None else self.cells[rows]
+            only, mask = Rows(self.places[rows], cells, self.dim), None if failing is None else failing[rows]
+            return only(name, values[rows], limit, above=above, demanded=demanded, strict=strict, failing=mask)
         if not len(values):
             return Criterion(name, 0.0 if above else np.inf, limit, above, demanded, 0)
         bad = failing

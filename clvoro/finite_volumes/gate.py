@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from ..arguments import check_choice
-from ..errors import InputError
+from ..arguments import check_choice, format_point, warn
+from ..errors import InputError, MismatchWarning
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .criteria import Criterion, Rows, SolverReport
@@ -50,8 +50,60 @@ SOLVERS: dict[str, Callable[[Diagram, WallShape | None], SolverReport]] = {"open
 """The check of a diagram for each solver; `earth` adds models on C grids."""
 
 
-def _openfoam(mesh: Faces) -> list[Criterion]:
-    """Return the criteria of `checkMesh -allGeometry -allTopology` of OpenFOAM v1912."""
+def warn_of_rejection(mesh: Faces) -> None:
+    """Warn if OpenFOAM rejects a mesh in 2D for a cell at a wall.
+
+    Only these cells are checked, since the boundary deforms few others: that costs little.
+
+    Warns
+    -----
+    MismatchWarning
+        Names the criteria, and the worst place of the first one.
+    """
+    at_wall, k = np.zeros(mesh.n_cells, bool), mesh.n_inner
+    at_wall[mesh.owner[k:]] = True
+    kept, (a, b) = at_wall.copy(), (mesh.owner[:k], mesh.neighbor[:k])
+    kept[a[at_wall[b]]] = kept[b[at_wall[a]]] = True
+    part = _part_of(mesh, kept)
+    failed = [c for c in _openfoam(part, at_wall[kept]) if c.demanded and not c.ok]
+    if not failed:
+        return
+    first = failed[0]
+    at = "" if first.place is None else f" at {format_point(first.place)}"
+    also = f", and {', '.join(c.name for c in failed[1:])}" if failed[1:] else ""
+    warn(
+        f"OpenFOAM's checkMesh rejects this mesh: {first.name} is {first.value:.3g}, expected "
+        f"{'at most' if first.above else 'at least'} {first.limit:.3g}{at}{also}; check(solver='openfoam') lists all. "
+        "Use smaller cells there, or drop what is smaller than a cell first, as domain.simplified(size) does",
+        MismatchWarning,
+    )
+
+
+def _part_of(mesh: Faces, kept: np.ndarray) -> Faces:
+    """Return the mesh in 2D of the cells that are `kept`, (n,) bool; their faces towards others are on wall 0."""
+    cells, k = np.flatnonzero(kept), mesh.n_inner
+    place = np.full(mesh.n_cells, -1)
+    place[cells] = np.arange(len(cells))
+    here, there = kept[mesh.owner], np.zeros(len(mesh), bool)
+    there[:k] = kept[mesh.neighbor[:k]]
+    both, one = np.flatnonzero(here & there), np.flatnonzero(here ^ there)
+    rows = np.concatenate([both, one])
+    ends, turned = mesh.corners.reshape(-1, 2)[rows], ~here[rows]
+    owner = place[np.where(turned, mesh.neighbor[rows], mesh.owner[rows])]
+    neighbor = np.where(mesh.neighbor[one] < 0, mesh.neighbor[one], -1)
+    taken = mesh.take_faces(
+        rows,
+        generators=mesh.generators[cells],
+        corners=np.where(turned[:, None], ends[:, ::-1], ends).ravel(),
+        starts=2 * np.arange(len(rows) + 1),
+        owner=owner.astype(np.int32),
+        neighbor=np.concatenate([place[mesh.neighbor[both]], neighbor]).astype(np.int32),
+    )
+    return taken.compact()
+
+
+def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
+    """Return the criteria of `checkMesh -allGeometry -allTopology` of OpenFOAM v1912, for the cells `judged`."""
     if mesh.dim == 2:
         broken = simple_loops(mesh)[2]
         if broken.size:
@@ -63,8 +115,11 @@ def _openfoam(mesh: Faces) -> list[Criterion]:
     g, owner = m.geometry, m.cells.owner
     coupled = m.coupled
     angle = m.non_orthogonality
-    cells, faces = Rows(g.centroids, None, mesh.dim), Rows(g.centers, owner, mesh.dim)
-    between = Rows(g.centers[coupled], owner[coupled], mesh.dim)
+    judged = np.ones(mesh.n_cells, bool) if judged is None else judged
+    of_faces = judged[owner]
+    of_faces[: mesh.n_inner] |= judged[mesh.neighbor[: mesh.n_inner]]
+    cells, faces = Rows(g.centroids, None, mesh.dim, judged), Rows(g.centers, owner, mesh.dim, of_faces)
+    between = Rows(g.centers[coupled], owner[coupled], mesh.dim, of_faces[coupled])
     corners = m.cells.points[m.cells.corners]
     span = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     edges = m.edges

@@ -12,6 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from ..errors import InputError, InputTypeError
+from ..finite_volumes.gate import warn_of_rejection
 from ..finite_volumes.prisms import polyhedra
 from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.boundary_names import Walls
@@ -61,12 +62,19 @@ def poly_mesh(
         If `patches` names walls that do not exist, or a wall twice; if `types` names a patch or type that does not
         exist; if `thickness` is not positive, or given in 3D; if a name is that of a cyclic or empty patch; or for a
         cell around an island, as a face of OpenFOAM has no hole.
+
+    Warns
+    -----
+    MismatchWarning
+        If OpenFOAM rejects the mesh in a polygon with straight walls, for a cell at a wall; says where.
     """
     domain = diagram.domain
     parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
     kinds = _kinds(parts.names, types)
     mesh = make_solver_mesh(diagram, walls, walls == "straight", parts.index)
     cells = polyhedra(mesh, thickness)
+    if domain.outline is not None and walls == "straight":
+        warn_of_rejection(mesh)
     groups = parts.index[-1 - mesh.neighbor[mesh.n_inner : mesh.n_outer]]
     counts = np.bincount(groups, minlength=len(parts.names)).tolist()
     made = [FoamPatch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]

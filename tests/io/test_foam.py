@@ -7,8 +7,11 @@ import shutil
 import numpy as np
 import pytest
 
-from clvoro import io
-from clvoro.errors import InputError, InputTypeError
+import clvoro
+from clvoro import Polygon, io
+from clvoro.arguments import format_point
+from clvoro.errors import InputError, InputTypeError, MismatchWarning
+from clvoro.finite_volumes.gate import warn_of_rejection
 from clvoro.io import foam
 from clvoro.io.check_mesh import check_case
 from tests.io.test_io import make_result
@@ -322,3 +325,36 @@ def test_places_without_a_folder_are_named(solid, tmp_path):
         io.save(solid, tmp_path / "file" / "polyMesh")
     with pytest.raises(InputError, match="folder cannot be created"):
         io.save(solid, tmp_path / "file" / "case.foam")
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_meshes_that_openfoam_rejects_give_one_warning(ctx, tmp_path, recwarn, rows):
+    """All faces between the cells of one row are parallel; two cells are too few to tilt them."""
+    x, y = np.meshgrid([0.5, 1.5], np.arange(rows) + 0.5)
+    domain = Polygon([(0, 0), (2, 0), (2, rows), (0, rows)])
+    diagram = clvoro.Adapter(ctx).diagram(domain, np.column_stack([x.ravel(), y.ravel()]))
+    diagram.save(tmp_path / "polyMesh")
+    told = [str(w.message) for w in recwarn if w.category is MismatchWarning]
+    assert bool(diagram.check(solver="openfoam")) == (rows == 2)
+    assert len(told) == (rows == 1)
+    if told:
+        assert "rejects this mesh: determinant is 0, expected at least 0.001 at (0.5, 0.5); check(" in told[0]
+
+
+@pytest.mark.parametrize("bad", [False, True])
+def test_the_cells_at_walls_are_judged_as_in_the_whole_mesh(ctx, bad, recwarn):
+    """A needle between cells, or none, in a mesh with many cells that no wall is near."""
+    x, y = np.meshgrid(np.arange(9) + 0.5, np.arange(9) + 0.5)
+    points = np.column_stack([x.ravel(), y.ravel()]) + np.random.default_rng(2).uniform(-0.1, 0.1, (81, 2))
+    needle = [(5, 9), (4.9, 5.3), (4.8, 9)] if bad else []
+    domain = Polygon([(0, 0), (9, 0), (9, 9), *needle, (0, 9)])
+    diagram = clvoro.Adapter(ctx).diagram(domain, points[domain.covers(points)])
+    mesh, report = diagram.solver_mesh(), diagram.check(solver="openfoam")
+    recwarn.clear()
+    warn_of_rejection(mesh)
+    failed = [c for c in report.criteria if c.demanded and not c.ok]
+    assert bool(failed) == bad
+    assert len(recwarn) == len(failed[:1])
+    for c in failed[:1]:
+        assert f"{c.name} is {c.value:.3g}, " in str(recwarn[0].message)
+        assert format_point(c.place) in str(recwarn[0].message)
