@@ -27,6 +27,7 @@ from ..mesh.results import Result
 from ..mesh.summary import boundary_line, summary
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..opencl.profile import Profile
+from ..opencl.program import build_seconds
 from .cases import Case
 from .formats import MESH_FILES, PLANE
 from .outputs import check_folder, do_all, refuse_own_files, require_plots
@@ -389,6 +390,8 @@ class Job:
                 f"{s['max_error']:10.3f}{s['mean_quality']:9.4f}{s['min_quality']:8.3f}"
                 f"{s['seconds']:9.2f}  {s['stop_reason']}"
             )
+        if build_seconds() > 2:
+            print(f"{build_seconds():.1f} of these seconds built kernels, which the driver keeps for later runs")
         for name, result in results.items():
             if "trade" in result.settings:
                 print(f"{name}: {result.settings['trade']}")

@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike
 
+from ..arguments import format_point
 from ..errors import InputError
 from ..io.convert import missing
 from ..mesh.connectivity import face_corners, following, take_rows
@@ -84,7 +85,7 @@ def plot_slice(
     paint, direction, point = paint_of(result, color, label, limits), as_normal(normal), _point(result, through)
     cells, polygons = cut_cells(diagram, direction, point)
     if not len(cells):
-        raise InputError(f"the plane through {point.tolist()} does not intersect {diagram.domain}; give a point inside")
+        raise InputError(f"the plane through {format_point(point)} does not intersect {diagram.domain}; give a point inside")
     axis = int(np.argmax(np.abs(direction)))
     aligned = bool(abs(direction[axis]) > 1 - 1e-9)
     right, up = plane_axes(direction)
@@ -102,8 +103,10 @@ def plot_slice(
             ax.set(xlabel="xyz"[int(np.argmax(right))], ylabel="xyz"[int(np.argmax(up))])
         elif window is None:
             ax.set_axis_off()
-        if title is None and aligned:
-            title = f"${'xyz'[axis]} = {point[axis]:.3g}$"
+        if title is None:
+            x = ", ".join(f"{value:.3g}" for value in point)
+            n = ", ".join(f"{value:.2g}" for value in direction)
+            title = f"${'xyz'[axis]} = {point[axis]:.3g}$" if aligned else f"plane through ({x}), normal ({n})"
         return finished(ax, paint, key, title)
 
 
