@@ -85,7 +85,8 @@ def plot_slice(
     paint, direction, point = paint_of(result, color, label, limits), as_normal(normal), _point(result, through)
     cells, polygons = cut_cells(diagram, direction, point)
     if not len(cells):
-        raise InputError(f"the plane through {format_point(point)} does not intersect {diagram.domain}; give a point inside")
+        place = format_point(point)
+        raise InputError(f"the plane through {place} does not intersect {diagram.domain}; give a point inside")
     axis = int(np.argmax(np.abs(direction)))
     aligned = bool(abs(direction[axis]) > 1 - 1e-9)
     right, up = plane_axes(direction)
