@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import orjson
 
-from ..errors import InputError
+from ..errors import InputError, InputTypeError
 from ..finite_volumes.solver_mesh import WallShape, check_not_sphere
 from ..geometry.boundary_names import Walls
 from ..mesh.connectivity import slices
@@ -60,6 +60,8 @@ def write_foam(
         raise InputError(
             f"cannot write cell_data to {path}: OpenFOAM's polyMesh holds none; save as .vtu or leave it out"
         )
+    if not isinstance(binary, bool | np.bool_):
+        raise InputTypeError(f"binary is {binary!r:.60} of type {type(binary).__name__}, expected True or False")
     mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls)
     inner = mesh.n_inner
     marker = path if path.suffix.lower() == ".foam" else None

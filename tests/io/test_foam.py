@@ -358,3 +358,11 @@ def test_the_cells_at_walls_are_judged_as_in_the_whole_mesh(ctx, bad, recwarn):
     for c in failed[:1]:
         assert f"{c.name} is {c.value:.3g}, " in str(recwarn[0].message)
         assert format_point(c.place) in str(recwarn[0].message)
+
+
+@pytest.mark.parametrize("binary", ["no", 2, None])
+def test_binary_is_a_truth_value(plane, tmp_path, binary):
+    """A text such as "no" would be true."""
+    with pytest.raises(InputTypeError, match=r"binary is .*, expected True or False"):
+        foam.write_foam(io.contents.Contents.of(plane), tmp_path / "polyMesh", binary=binary)
+    assert not list(tmp_path.iterdir())
