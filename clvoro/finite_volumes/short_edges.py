@@ -107,7 +107,7 @@ class _Round:
             bent = np.zeros(v, bool)
             bent[self.loop[turns(mesh.points[self.loop], following(self.starts)) < STRAIGHT]] = True
             bad = bent[ends].any(axis=1) | (mesh.measures.skewness[: len(mesh)] > SKEW)
-            ratio[bad & (ratio < LONGEST / SHORT)] *= SHORT / LONGEST
+            ratio[bad] = _lengths_over_limits(mesh, broken, LONGEST)[bad]
         first, second = self.images[ends].T
         # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
         tried = (ratio < 1) & (mesh.twin < np.arange(len(ends))) & (first != second)
@@ -198,7 +198,7 @@ class _Round:
         return made.take_faces(ends[:, 0] != ends[:, 1]).compact()
 
 
-def _lengths_over_limits(mesh: Faces, broken: np.ndarray) -> np.ndarray:
+def _lengths_over_limits(mesh: Faces, broken: np.ndarray, short: float = SHORT) -> np.ndarray:
     """Return the length of each face over that below which it is short, (f,).
 
     The width of a cell is 4 times its area over its perimeter; `broken` are cells that are no simple polygons.
@@ -208,7 +208,7 @@ def _lengths_over_limits(mesh: Faces, broken: np.ndarray) -> np.ndarray:
     both = np.concatenate([mesh.owner, mesh.neighbor[: mesh.n_inner]])
     perimeter = np.bincount(both, np.concatenate([lengths, lengths[: mesh.n_inner]]), mesh.n_cells)
     area = np.maximum(polygon_areas(mesh), 0)
-    limit = np.minimum(SHORT * np.sqrt(area), THIN * 4 * area / np.maximum(perimeter, 1e-300))
+    limit = np.minimum(short * np.sqrt(area), THIN * 4 * area / np.maximum(perimeter, 1e-300))
     limit[broken] = 0
     return lengths / np.maximum(smaller_size(mesh.owner, mesh.neighbor, limit), 1e-300)
 

@@ -134,3 +134,13 @@ def test_rows_of_neighboring_columns_share_faces(ctx):
     assert np.isclose(after.geometry.volumes.sum(), before.geometry.volumes.sum(), rtol=1e-12)
     assert after.non_orthogonality.max() < 5
     assert not after.concave.any()
+
+
+def test_flat_cells_of_layers_keep_their_faces(ctx):
+    """Their corners are straight, as where a cell is hardly convex, but their faces are as long as they are thin."""
+    domain = clvoro.Polygon([(0, 0), (2, 0), (2, 1), (0, 1)], [circle(60, 0.2)], names={"body": range(4, 64)})
+    layers = clvoro.Layers(0.001, count=4, growth=1.3, spacing=0.03, edges="body")
+    size = clvoro.sizing.Distance(domain.boundary("body"), 0.03, slope=0.2, h_max=0.1)
+    mesh = clvoro.Adapter(ctx).run(domain, size, "fast", layers=layers).solver_mesh()
+    assert mesh.measures.non_orthogonality.max() < 30
+    assert not mesh.measures.concave.any()
