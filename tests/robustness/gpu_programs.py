@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -151,7 +152,7 @@ def programs_of_a_first_run(ctx: cl.Context, dim: int, dtype: str) -> list[Sourc
 
 def compile_for(target: str, source: Source, folder: Path, *more: str, optimize: str = "-O1") -> tuple[str, str]:
     """Return the text that clang makes of `source`, and its messages."""
-    stem = f"{abs(hash((target, source, more, optimize))):x}"
+    stem = uuid.uuid4().hex  # two programs may be the same text, at the same time
     given, made = folder / f"{stem}.cl", folder / f"{stem}.s"
     given.write_text(source.text)
     flags = [clang() or "clang", *CLANG, optimize, "-Wall", "-Wno-unused", *TARGETS[target], *source.options, *more]
