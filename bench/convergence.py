@@ -1,7 +1,7 @@
 """Size error, quality and work of each method on seven size fields, against targets.
 
     python bench/convergence.py [--fields F1,F3] [--rows default,exact] [--seeds 3] [--large]
-                                [--device NAME] [--dtype float32] [--json]
+                                [--processor-time] [--device NAME] [--dtype float32] [--json]
 
 The output is a Markdown table. A row is one method on one field, with the median (smallest .. largest) over
 `--seeds` random starts and the target. A row holds if all starts meet the target. `--large` adds the rows with
@@ -9,7 +9,7 @@ a million cells. The script returns 1 if a row does not hold.
 
 Quality and the share of six-sided cells are those of cells away from the walls; "all Q" is mean and minimum of
 all cells. Work is in steps of the finest level: a step on a quarter of the cells counts a quarter. Errors are
-absolute: no common factor is removed.
+absolute: no common factor is removed. With `--processor-time`, seconds are processor time over the compute units.
 
 The 3D fields S1, S2 and S3 have a separate table. Quality is the isoperimetric quotient 36 pi V^2 / S^3
 (.753 for the truncated octahedron), and "finest steps" counts the steps of the finest level alone.
@@ -18,7 +18,7 @@ The 3D fields S1, S2 and S3 have a separate table. Quality is the isoperimetric 
 from __future__ import annotations
 
 import sys
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,6 +26,7 @@ import numpy as np
 from _common import (
     FIRST_SEED,
     Report,
+    clock_of,
     domain_of,
     figures,
     heading,
@@ -107,11 +108,11 @@ def is_solid(name: str) -> bool:
     return domain_of(name).dim == 3
 
 
-def measure(adapter: clvoro.Adapter, row: Row, name: str, seed: int) -> dict[str, float]:
+def measure(adapter: clvoro.Adapter, row: Row, name: str, seed: int, clock: Callable[[], float]) -> dict[str, float]:
     """Run `row` on the field of that name and return its figures."""
-    start = time.perf_counter()
+    start = clock()
     result = adapter.run(domain_of(name), test_field(name), seed=seed, **row.arguments)
-    seconds = time.perf_counter() - start
+    seconds = clock() - start
     history = result.history
     measured = {
         **figures(result.diagram, result.target_size, result.quality),
@@ -220,12 +221,14 @@ def main() -> int:
     options_of.add_argument("--rows", type=names, default=known, help=", ".join(known))
     options_of.add_argument("--seeds", type=int, default=1, metavar="N", help="random starts (1)")
     options_of.add_argument("--large", action="store_true", help="also F4, a million cells")
+    options_of.add_argument("--processor-time", action="store_true")
     options = options_of.parse_args()
     for what, given, allowed in (("row", options.rows, known), ("field", options.fields, fields)):
         if unknown := sorted(set(given) - set(allowed)):
             options_of.error(f"no {what} {', '.join(unknown)}; there are {', '.join(allowed)}")
 
     adapter = make_adapter(options)
+    clock = clock_of(options, adapter)
     flat, solid = Report(options.json, COLUMNS), Report(options.json, SOLID_COLUMNS)
     # Build the kernels, so that the times of rows do not include it.
     for name in {"S1" if is_solid(name) else "F1" for name in options.fields}:
@@ -235,7 +238,7 @@ def main() -> int:
             asked = row.name in options.rows and name in options.fields
             if not asked or (name in LARGE and not options.large):
                 continue
-            runs = [measure(adapter, row, name, FIRST_SEED + 17 * k) for k in range(options.seeds)]
+            runs = [measure(adapter, row, name, FIRST_SEED + 17 * k, clock) for k in range(options.seeds)]
             record = judge(row, name, runs)
             report = solid if is_solid(name) else flat
             report.add(record, f"{row.name} on {name}: {'yes' if record['holds'] else 'no'}")

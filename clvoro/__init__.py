@@ -41,7 +41,7 @@ from .opencl import profile
 from .opencl.devices import create_context, list_devices
 from .shared import adapt, power_diagram, transport, voronoi
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Adapter",

@@ -243,6 +243,11 @@ class Options:
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
         check_choice("points", self.start, STARTS)
+        if self.effort not in EFFORTS and not isinstance(self.effort, str):
+            raise InputTypeError(
+                f"effort is {self.effort!r:.60} of type {type(self.effort).__name__}, expected one of "
+                f"{', '.join(EFFORTS)}; the size comes second and the effort third: run(domain, size, 'default')"
+            )
         check_choice("effort", self.effort, EFFORTS)
         layers: object = self.layers  # the caller may give one Layers
         if not isinstance(layers, Layers | Sequence):

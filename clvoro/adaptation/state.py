@@ -457,11 +457,12 @@ class MeshState:
         return self.summaries.read_one("weight").sum - self.n
 
     def normalize_sizes(self) -> None:
-        """Scale the size field by the factor that makes the mean of log(L / h) zero."""
+        """Scale the size field by the factor that makes the mean of log(L / h) zero; cells of layers have h = L."""
         with self.engine.workspace.frame():
             w = self.stages.density.cell_weights(self.t, self.h)
             self.summaries.collect("log_ratio", w.log_ratio, self.n)
-        factor = math.exp(self.summaries.read_one("log_ratio").sum / self.n / self.engine.cell_dim)
+        free = self.n - max(self.fixed - self.setup.first_row, 0)
+        factor = math.exp(self.summaries.read_one("log_ratio").sum / free / self.engine.cell_dim)
         self.size_factor *= factor
         self.stages.metric.scale_sizes(factor, self.h)
         self.evaluate_metric()

@@ -89,9 +89,19 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
 
 
 def save(
-    mesh: Result | Diagram, path: str | PathLike[str], *, cell_data: Mapping[str, ArrayLike] | None = None
+    mesh: Result | Diagram,
+    path: str | PathLike[str],
+    *,
+    cell_data: Mapping[str, ArrayLike] | None = None,
+    **others: object,
 ) -> None:
     """Write a mesh in a box, a polygon or on a sphere to `path`; the suffix selects the format; see `Diagram.save`."""
+    for name in others:
+        fits = [_METHODS[kind] for kind, names in _OPTIONS.items() if name in names]
+        remedy = "write " + " or ".join(f"mesh.{method}(path, {name}=...)" for method in fits)
+        raise InputTypeError(
+            f"save has no option {name!r}, expected path and cell_data; {remedy if fits else 'leave it out'}"
+        )
     write(mesh, path, cell_data)
 
 
@@ -163,6 +173,7 @@ _WRITERS: dict[str, Callable[..., None]] = {
     ".graph": write_metis,
 }
 _KINDS = {".foam": "OpenFOAM", ".nc": "netCDF", ".vtu": ".vtu"}
+_METHODS = {".foam": "to_openfoam", ".nc": "to_netcdf", ".vtu": "to_vtu"}
 _OPTIONS = {
     ".foam": ("patches", "types", "thickness", "binary", "walls"),
     ".nc": ("convention", "units"),

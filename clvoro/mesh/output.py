@@ -100,7 +100,9 @@ class MeshOutput:
         diagram: Any = getattr(self._self, "diagram", self._self)
         return boundary_cells(diagram, boundary)
 
-    def save(self, path: str | PathLike[str], *, cell_data: Mapping[str, ArrayLike] | None = None) -> None:
+    def save(
+        self, path: str | PathLike[str], *, cell_data: Mapping[str, ArrayLike] | None = None, **others: object
+    ) -> None:
         """Write the mesh to `path`; the suffix selects the format.
 
         The file of a diagram has no sizes, errors and history. Meshes in boxes, polygons and on spheres are written in
@@ -129,17 +131,19 @@ class MeshOutput:
             Data of your own by name, (n,) or (n, k) arrays of real numbers: cell data in ``.vtu`` and ``.vtk``,
             variables in ``.nc``, members ``cell_data.<name>`` in ``.npz``, which `clvoro.load` leaves out. Other
             formats hold none.
+        **others
+            Refused: options of one format belong to its method, which the error names.
 
         Raises
         ------
         InputError, InputTypeError
-            If the format is unknown or cannot hold the cells, or the file cannot be written. An existing file is then
-            unchanged.
+            If the format is unknown or cannot hold the cells, an option is given, or the file cannot be written. An
+            existing file is then unchanged.
         """
         from ..io import save
 
         # Not `_self`: `clvoro.io.save` may get an object that is no mesh, which it refuses.
-        save(cast("Result | Diagram", self), path, cell_data=cell_data)
+        save(cast("Result | Diagram", self), path, cell_data=cell_data, **others)
 
     def to_openfoam(
         self,

@@ -33,6 +33,9 @@ _FACES_LABELS = ("≤ 12", "13", "14", "15", "≥ 16")
 _FAR = 3.0
 """Values of the caller are cut from the color scale if the scale would be that many times as long with them."""
 
+_BEYOND_BEST = 3.0
+"""End of a scale of errors for several meshes, in units of the end for the best of them."""
+
 # Without their darkest parts, in which faces cannot be seen.
 _DARKLESS = ListedColormap(colormaps["viridis"](np.linspace(0.14, 1, 256)), "viridis without its darkest part")
 _DIVERGING = LinearSegmentedColormap.from_list("error", colormaps["RdBu_r"](np.linspace(0.09, 0.91, 65)))
@@ -283,9 +286,14 @@ def paint_of(
 
 
 def shared_paint(results: Sequence[Result], color: str) -> Paint:
-    """Return one scale for the cells of all `results`, and the values of all."""
+    """Return one scale for the cells of all `results`, and the values of all.
+
+    That of errors ends at the largest of the mesh that has the smallest, or a few times as far: others would be hidden.
+    """
     scheme = coloring(color, results[0].diagram.domain)
-    values = np.concatenate([scheme.values(r) for r in results])
-    low, high = scheme.limits(values)
-    # Errors above 1 would hide small ones.
-    return Paint(scheme, values, (max(low, -1.0), min(high, 1.0)) if color == "error" else (low, high))
+    values = [scheme.values(r) for r in results]
+    low, high = scheme.limits(np.concatenate(values))
+    if color == "error":
+        high = min(high, 1.0, _BEYOND_BEST * min(scheme.limits(v)[1] for v in values))
+        low = -high
+    return Paint(scheme, np.concatenate(values), (low, high))

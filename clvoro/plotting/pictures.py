@@ -70,7 +70,7 @@ def pictures_of(
         caption = f"The mesh ({name}), colored by cell quality; {_QUALITY[view]}."
         pictures.append(("quality", caption, whole("quality")))
     if len(panels) > 1:
-        error = "Metric error e, one scale for all: red cells are too large, blue ones too small."
+        error = "Metric error e, one scale for all, up to three times the errors of the best: red is too large."
         quality = "Cell quality Q, one scale for all: 1 is a regular polygon (in 3D a ball)."
         pictures += [
             ("diagrams_error", error, lambda: _compare(panels, "error")),

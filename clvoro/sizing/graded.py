@@ -16,6 +16,7 @@ from ..opencl.host_memory import host_memory
 from .advice import coverage_warnings
 from .arguments import check_slope
 from .field import Field, as_field, count_parts
+from .on_domain import on_domain
 from .raster import Raster
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ class Graded(Field):
         if box is not None and not isinstance(box, Domain):
             raise InputTypeError(f"Graded box is {type(box).__name__}, expected a clvoro.Box or clvoro.Polygon")
         if box is not None:
-            self.field.check_dim(box.dim)
+            on_domain(box, self.field).check_dim(box.dim)
         self.box, self.dim = box, self.field.dim if box is None else box.dim
         self.resolution = None if resolution is None else _check_resolution(resolution, self.dim)
         self._rasters: dict[tuple, Raster] = {}

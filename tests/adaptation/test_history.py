@@ -132,6 +132,12 @@ RUNS = {
 }
 
 
+def test_the_last_row_is_that_of_the_mesh_with_layers_and_a_number_of_cells(adapter):
+    result = adapter.run(FLAT, SIZE, "fast", n_cells=400, **RUNS["layers"][1])
+    assert len(result.points) == 400
+    assert result.check(), result.check()
+
+
 def press_anywhere(adapter, kind, times):
     """During a step, a refinement or a correction of the count: the mesh is valid, and its history ends with it."""
     domain, options = RUNS[kind]

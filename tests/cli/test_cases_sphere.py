@@ -131,6 +131,13 @@ def test_grids_go_with_the_case(tmp_path):
     assert on_domain(SPHERE, load_case(out / "case.toml").size_field())(X).min() > 70
 
 
+def test_graded_sizes():
+    field = "[size.field]\nkind = 'expression'\nexpression = 'lat > 0 ? 50 : 200'\n"
+    found = sizes(f"[size]\nkind = 'graded'\nslope = 0.2\n{field}")
+    arc = 1000 * np.maximum(-np.arcsin(X[:, 2] / 1000), 0)
+    assert found == pytest.approx(np.minimum(50 + 0.2 * arc, 200), abs=6)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -139,7 +146,6 @@ def test_grids_go_with_the_case(tmp_path):
         ("kind='caps'\nh_max=1\nregions=[{center=[0,0],radius=1,size=1}]", "none of growth, slope"),
         ("kind='caps'\nh_max=1\nregions=[{center=[0,99],radius=1,size=1}]\nslope=1", "latitude"),
         ("kind='feature'", "a polygon in"),
-        ("kind='graded'\nslope=1\nfield=1", "'graded', which is not for Sphere"),
         ("kind='hessian'\nfile='h.npy'\neps=1", "'hessian', which is not for Sphere"),
         ("kind='distance'\nh_min=1\nslope=1\nshapes=[{kind='boundary'}]", "no boundary"),
         ("kind='distance'\nh_min=1\nslope=1\nshapes=[{kind='box'}]", "box without corners"),

@@ -199,7 +199,7 @@ Shape = (
 
 # Size fields.
 
-_ON_SPHERE = "caps, distance, expression, raster or a combination of them"
+_ON_SPHERE = "caps, distance, expression, graded, raster or a combination of them"
 
 
 class ConstantTable(Kind, tag="constant"):
@@ -318,7 +318,6 @@ class GradedTable(Kind, tag="graded"):
     resolution: Annotated[int, Meta(ge=2)] | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
-        _require(not domain.curved, self, _ON_SPHERE, domain)
         return sizing.Graded(build_size(self.field, folder, domain), box=domain, **self.given("field"))
 
 
