@@ -12,9 +12,9 @@ diagram are moved, inserted and deleted until its cells have that size and are n
 True
 
 Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shapely), with `Layers` along walls, and
-`Sphere`, for global models; `earth` has sizes by longitude and latitude, and finds the cells of oceans and limited
-areas. `curves` has circles, ellipses, wing sections and splines for boundaries. Sizes: numbers, functions of NumPy
-arrays, and the fields of `clvoro.sizing`.
+`Sphere`, for global models, and `Solid`, the inside of a triangulated surface; `earth` has sizes by longitude and
+latitude, and finds the cells of oceans and limited areas. `curves` has circles, ellipses, wing sections and splines
+for boundaries. Sizes: numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`.
 `adapt` returns a `Result`, `voronoi` a `Diagram` of given generators; both have arrays, `save`, `plot`, `check` and
 `transfer`, and `load` reads a saved result. `power_diagram` takes generators with weights; `transport` finds those with
 which cells have given volumes (`Transported`). `Adapter` is the full interface, on a device of your choice, with
@@ -32,6 +32,7 @@ from .errors import ClvoroError, Interrupted
 from .geometry.boundary_layers import Layers
 from .geometry.box import Box
 from .geometry.polygon import Polygon
+from .geometry.solid.solid import Solid
 from .geometry.sphere import Sphere
 from .io import load
 from .mesh.diagram import Diagram
@@ -57,6 +58,7 @@ __all__ = [
     "Polygon",
     "Result",
     "Run",
+    "Solid",
     "Sphere",
     "Transported",
     "adapt",

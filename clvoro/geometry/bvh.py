@@ -68,7 +68,16 @@ class Tree:
     def nearest2(
         self, points: np.ndarray, bound2: np.ndarray, distance2: Callable[[np.ndarray, np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Return the smallest squared distance of each of `points` to the items, but at most `bound2`, (n,).
+        """Return the smallest squared distance of each of `points` (n, d) to the items, but at most `bound2`, (n,).
+
+        See `nearest`.
+        """
+        return self.nearest(points, bound2, distance2)[0]
+
+    def nearest(
+        self, points: np.ndarray, bound2: np.ndarray, distance2: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the squared distance of each of `points` to the nearest item, at most `bound2`, and that item.
 
         Parameters
         ----------
@@ -77,28 +86,62 @@ class Tree:
             Items beyond this squared distance are skipped; a tighter bound is faster.
         distance2 : callable
             Returns the squared distances of points (m, d) to items (m,), given by index.
+
+        Returns
+        -------
+        (n,) float, (n,) int
+            Of items at the same distance the first one counts; -1 where no item is within the bound.
         """
-        best2 = bound2.copy()
+        best2, best = bound2.copy(), np.full(len(points), -1)
         d = points.shape[1]
         for first in range(0, len(points), _BLOCK):
             who = np.arange(first, min(first + _BLOCK, len(points)))
+            reach2 = (
+                best2.copy()
+            )  # an upper bound: each box holds an item, which is no farther than its farthest corner
             node = np.zeros(len(who), np.int64)
             for level in range(self.levels + 1):
                 box = self.boxes[node + (1 << level) - 1]
-                x = points[who]
-                away = np.maximum(np.maximum(box[:, :d] - x, x - box[:, d:]), 0)
-                near = (away**2).sum(axis=1) <= best2[who]
+                low, high = box[:, :d] - points[who], points[who] - box[:, d:]
+                away2 = (np.maximum(np.maximum(low, high), 0) ** 2).sum(axis=1)
+                farthest2 = (np.minimum(low, high) ** 2).sum(axis=1) * (1 + 1e-12)
+                np.minimum.at(reach2, who, farthest2)
+                near = away2 <= reach2[who]
                 who, node = who[near], node[near]
                 if level < self.levels:
                     who, node = np.repeat(who, 2), np.repeat(2 * node, 2)
                     node[1::2] += 1
             starts = self.starts(self.levels)
-            for slot in range(_LEAF):
-                place = starts[node] + slot
-                inside = place < starts[node + 1]
-                found = distance2(points[who[inside]], self.order[place[inside]])
-                np.minimum.at(best2, who[inside], found)
-        return best2
+            place = starts[node][:, None] + np.arange(_LEAF)
+            inside = place < starts[node + 1][:, None]
+            who, item = np.repeat(who, inside.sum(axis=1)), self.order[place[inside]]
+            found = distance2(points[who], item)
+            order = np.lexsort((item, found, who))
+            order = order[np.diff(who[order], prepend=-1) > 0]
+            order = order[found[order] <= best2[who[order]]]
+            best2[who[order]], best[who[order]] = found[order], item[order]
+        return best2, best
+
+    def meeting(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return all pairs of a box with the corners `low`, `high` (n, d) and an item whose leaf it meets.
+
+        The pairs are sorted by box and item.
+        """
+        d = low.shape[1]
+        who, node = np.arange(len(low)), np.zeros(len(low), np.int64)
+        for level in range(self.levels + 1):
+            box = self.boxes[node + (1 << level) - 1]
+            meet = ((box[:, :d] <= high[who]) & (low[who] <= box[:, d:])).all(axis=1)
+            who, node = who[meet], node[meet]
+            if level < self.levels:
+                who, node = np.repeat(who, 2), np.repeat(2 * node, 2)
+                node[1::2] += 1
+        starts = self.starts(self.levels)
+        place = starts[node][:, None] + np.arange(_LEAF)
+        inside = place < starts[node + 1][:, None]
+        who, item = np.repeat(who, inside.sum(axis=1)), self.order[place[inside]]
+        order = np.lexsort((item, who))
+        return who[order], item[order]
 
     def overlaps(self) -> tuple[np.ndarray, np.ndarray]:
         """Return all pairs of items i < j whose leaves are the same or have overlapping boxes, two arrays (m,) int.

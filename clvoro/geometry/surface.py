@@ -15,6 +15,7 @@ from ..arguments import format_point
 from ..errors import InputError, InputTypeError
 from ..files import open_plain, unlogged
 from .bvh import Tree
+from .columns import Columns
 from .shapes import coordinates
 from .triangles import crossing, triangle_distance2
 
@@ -168,9 +169,16 @@ class Surface:
         return Tree(self.corners.min(axis=1), self.corners.max(axis=1))
 
     @cached_property
-    def _merged(self) -> np.ndarray:
-        """Triangles (t, 3) with one index for all vertices at the same place."""
+    def columns(self) -> Columns:
+        """The triangles in columns along one axis, for winding numbers."""
+        vertices, triangles = self.welded
+        return Columns(vertices[triangles])
+
+    @cached_property
+    def welded(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places (p, 3) and triangles (t, 3), with one place for all vertices that are joined."""
         unique, places = np.unique(self.vertices + 0.0, axis=0, return_inverse=True)
+        places = places.reshape(-1)
         if self.join > 0:
             from scipy.sparse import coo_array
             from scipy.sparse.csgraph import connected_components
@@ -179,8 +187,9 @@ class Surface:
             near = KDTree(unique).query_pairs(self.join, output_type="ndarray")
             shape = (len(unique), len(unique))
             graph = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=shape)
-            places = connected_components(graph, directed=False)[1][places.reshape(-1)]
-        return places.reshape(-1)[self.triangles]
+            joined = connected_components(graph, directed=False)[1]
+            unique, places = unique[np.unique(joined, return_index=True)[1]], joined[places]
+        return unique, places[self.triangles]
 
     @cached_property
     def _edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -188,7 +197,7 @@ class Surface:
 
         Triangles without three distinct corners are left out.
         """
-        merged = self._merged
+        merged = self.welded[1]
         whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
         ends = np.stack([merged[whole], np.roll(merged[whole], -1, axis=1)], axis=2).reshape(-1, 2)
         edges, first, count = np.unique(np.sort(ends, axis=1), axis=0, return_index=True, return_counts=True)
@@ -273,9 +282,8 @@ class Surface:
     def contains(self, points: object) -> np.ndarray:
         """Return for each of `points` (n, 3) whether it lies inside the closed surface, (n,) bool.
 
-        By the winding number: the sum of the solid angles of all triangles over 4 pi, rounded to an integer (van
-        Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30 (1983) 125). Exact for points that are not on the surface.
-        Costs n t operations on the host. All triangles must have the same orientation, inwards or outwards.
+        By the winding number; see `Columns`. Exact for points that are not on the surface. All triangles must have the
+        same orientation, inwards or outwards.
 
         Raises
         ------
@@ -283,22 +291,7 @@ class Surface:
             If the surface is not closed.
         """
         self.require_closed()
-        x = coordinates("points", points, 2)
-        inside = np.zeros(len(x), bool)
-        rows = max(1, _BLOCK // len(self.corners))
-        for first in range(0, len(x), rows):
-            v = self.corners - x[first : first + rows, None, None]
-            length = np.linalg.norm(v, axis=-1)
-            a, b, c = np.moveaxis(v, -2, 0)
-            la, lb, lc = np.moveaxis(length, -1, 0)
-            # tan(angle / 2) = a . (b x c) / (abc + (a.b) c + (b.c) a + (c.a) b)
-            volume = np.einsum("...k,...k->...", a, np.cross(b, c))
-            rest = la * lb * lc
-            for p, q, r in ((a, b, lc), (b, c, la), (c, a, lb)):
-                rest += np.einsum("...k,...k->...", p, q) * r
-            angle = 2 * np.arctan2(volume, rest)
-            inside[first : first + rows] = np.abs(angle.sum(axis=1)) > 2 * np.pi
-        return inside
+        return self.columns.winding(coordinates("points", points, 2)) != 0
 
     def distance2(self, points: np.ndarray) -> np.ndarray:
         """Return the squared distances of `points` (n, 3) to the surface, (n,) float64."""

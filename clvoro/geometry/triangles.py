@@ -38,6 +38,45 @@ def triangle_distance2(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return np.where(inside, height / np.where(inside, area2, 1), best2)
 
 
+def closest_on_triangle(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return the weights (m, 3) of the corners in the point of each triangle (m, 3, 3) nearest to each point x (m, 3).
+
+    A weight is exactly 0 where that point lies on the opposite side.
+    """
+    sides = np.roll(corners, -1, axis=1) - corners
+    normal = np.cross(sides[:, 0], sides[:, 1])
+    area2 = _dot(normal, normal)
+    weights = np.zeros((len(x), 3))
+    inside = area2 > 0
+    for k in range(3):
+        part = _dot(np.cross(sides[:, k], x - corners[:, k]), normal)
+        weights[:, (k + 2) % 3] = part / np.where(area2 > 0, area2, 1)
+        inside &= part >= 0
+    best2 = np.where(inside, -1.0, np.inf)
+    for k in range(3):
+        v, side = x - corners[:, k], sides[:, k]
+        length2 = _dot(side, side)
+        t = np.clip(np.divide(_dot(v, side), length2, out=np.zeros(len(x)), where=length2 > 0), 0, 1)
+        v = v - t[:, None] * side
+        d2 = _dot(v, v)
+        closer = d2 < best2
+        best2 = np.where(closer, d2, best2)
+        weights[closer, k], weights[closer, (k + 1) % 3], weights[closer, (k + 2) % 3] = 1 - t[closer], t[closer], 0
+    return weights
+
+
+def pierced(begin: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return where each segment from `begin` to `end` (m, 3) meets its triangle (m, 3, 3): the share (m,), or inf."""
+    along = end - begin
+    a, b, c = np.moveaxis(corners - begin[:, None], 1, 0)
+    normal = np.cross(b - a, c - a)
+    slope = _dot(normal, along)
+    share = np.divide(_dot(normal, a), slope, out=np.full(len(begin), np.inf), where=slope != 0)
+    sides = np.stack([_dot(along, np.cross(p, q)) for p, q in ((a, b), (b, c), (c, a))])
+    meets = ((sides >= 0).all(axis=0) | (sides <= 0).all(axis=0)) & (share >= 0) & (share <= 1)
+    return np.where(meets, share, np.inf)
+
+
 def crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return for pairs of triangles a, b (m, 3, 3) whether their interiors intersect, (m,) bool.
 

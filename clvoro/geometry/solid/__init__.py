@@ -1,0 +1,1 @@
+"""The solid: a domain in space whose boundary is a triangulated surface."""

@@ -1,0 +1,544 @@
+"""The solid: a domain in space whose boundary is a triangulated surface."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ...arguments import check_rows, format_point
+from ...errors import InputError
+from ..boundary_names import BoundaryNames, Walls
+from ..bvh import Tree
+from ..columns import Columns
+from ..domain import Domain
+from ..surface import Surface
+from ..triangles import closest_on_triangle, pierced, triangle_distance2
+from .creases import (
+    CONCAVE,
+    CONVEX,
+    connect,
+    corner_normals,
+    dihedral_turns,
+    find_creases,
+    pair_sides,
+    triangle_normals,
+)
+
+_ON = 1e-12  # of the diagonal: points this close to the surface lie on it
+_EDGE = 1e-9  # weight of a corner below which a foot lies on the opposite side
+_MARGIN = 0.05  # of the longest edge, by which the clip box is larger than the region
+
+
+@dataclass(frozen=True)
+class Feet:
+    """The nearest points of a surface.
+
+    Attributes
+    ----------
+    triangle : (n,) int
+        -1 where nothing is near.
+    weights : (n, 3) float
+        Weights of the triangle's corners in the foot; exactly 0 for the corner opposite to a side that it lies on.
+    point : (n, 3) float
+    distance : (n,) float
+        inf where nothing is near.
+    """
+
+    triangle: np.ndarray
+    weights: np.ndarray
+    point: np.ndarray
+    distance: np.ndarray
+
+
+@dataclass(frozen=True)
+class OwnPlanes:
+    """The planes that cut the cells of generators near walls.
+
+    Attributes
+    ----------
+    row : (k,) int
+        The generator, ascending; for each one by patch.
+    patch : (k,) int32
+    foot : (k, 3) float
+        A point of the plane: the nearest point of the patch.
+    normal : (k, 3) float
+        Unit normal, out of the region.
+    depth : (k,) float
+        Distance of the generator from the plane, positive.
+    behind : (b,) int
+        Generators that are behind the plane of their nearest patch, so that it cannot cut their cell.
+    """
+
+    row: np.ndarray
+    patch: np.ndarray
+    foot: np.ndarray
+    normal: np.ndarray
+    depth: np.ndarray
+    behind: np.ndarray
+
+
+class Solid(Domain):
+    """The inside of a closed triangulated surface.
+
+    The surface is divided at its creases into smooth patches. A patch is a wall: a face on patch k has the neighbor
+    -1 - k.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float
+        Vertices at the same place count as one.
+    triangles : (t, 3) int
+        Indices into `vertices`, counter-clockwise seen from outside of the region.
+    groups : (t,) int, optional
+        A number for each triangle. Triangles of different groups belong to different patches, even on a flat wall.
+    group_names : sequence of str, optional
+        The names of the groups 0, 1, ...; by default ``group-0``, ... Without `groups` the whole surface has the first
+        one; by default ``wall``.
+    names : mapping, optional
+        Names of boundaries, each with its patches: numbers, names of groups, or a sequence of them.
+    angle : float
+        Edges at which the surface turns by more than this are creases, in degrees.
+    join : float
+        Distance within which vertices count as one.
+    name : str
+        Name of the solid in error messages.
+
+    Attributes
+    ----------
+    surface : Surface
+        The surface, with one vertex for each place.
+    patch : (t,) int32
+        The smooth patch of each triangle.
+    creases : Creases
+    corners : (c,) int
+        Vertices where chains of creases meet, end or turn sharply.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If the surface is not closed, or a number or name is wrong.
+
+    Examples
+    --------
+    >>> cube = clvoro.Solid.box((0, 0, 0), (1, 1, 1))
+    >>> cube.measure, len(cube.creases), len(cube.corners)
+    (1.0, 12, 8)
+    """
+
+    def __init__(
+        self,
+        vertices: object,
+        triangles: object,
+        groups: object = None,
+        group_names: Sequence[str] | None = None,
+        names: Mapping[str, Walls] | None = None,
+        angle: float = 30.0,
+        join: float = 0.0,
+        name: str = "Solid",
+    ):
+        given = Surface(vertices, triangles, name, join)
+        given.require_closed()
+        places, merged = given.welded
+        whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
+        group = np.zeros(len(merged), np.int64) if groups is None else np.asarray(groups, np.int64)
+        self._group, merged = group[whole], merged[whole]
+        self.surface = Surface(places, merged, name)
+        self.angle = float(angle)
+        self._group_names = ("wall",) if group_names is None and groups is None else tuple(group_names or ())
+        vertices, triangles = self.surface.vertices, self.surface.triangles
+        self.twin, bad = pair_sides(vertices, triangles)
+        if bad.size:
+            k, s = divmod(int(bad[0]), 3)
+            raise InputError(
+                f"{name} has {len(bad)} sides of triangles whose neighbor is oriented differently, the first at "
+                f"{format_point(vertices[triangles[k, s]])}; expected all triangles counter-clockwise seen from outside"
+            )
+        self.normals, self._areas = triangle_normals(vertices, triangles, self.twin)
+        turns = dihedral_turns(vertices, triangles, self.twin, self.normals)
+        across = self._group[self.twin // 3] != np.repeat(self._group, 3)
+        border = (np.abs(turns) > math.radians(self.angle)) | across
+        self.patch, self.creases, self.corners = find_creases(vertices, triangles, self.twin, turns, border)
+        self.n_patches = int(self.patch.max()) + 1
+        lower, upper = vertices[triangles].min(axis=(0, 1)), vertices[triangles].max(axis=(0, 1))
+        self.lower, self.upper = tuple(lower.tolist()), tuple(upper.tolist())
+        self.names = names
+        self.names = self._checked_names()
+
+    @classmethod
+    def from_arrays(cls, vertices: object, triangles: object, **options: Any) -> Solid:
+        """Return the solid inside of a surface; `options` are those of `Solid`."""
+        return cls(vertices, triangles, **options)
+
+    @classmethod
+    def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Solid:
+        """Return a box; its sides have the names xMin, xMax, yMin, ..."""
+        from .primitives import box
+
+        return cls(**{**box(lower, upper), **options})
+
+    @classmethod
+    def ball(cls, center: Sequence[float], radius: float, edge: float | None = None, **options: Any) -> Solid:
+        """Return a ball. `edge` is the length of the triangles' edges; by default a sixteenth of the radius."""
+        from .primitives import ball
+
+        return cls(**{**ball(center, radius, edge), **options})
+
+    @classmethod
+    def cylinder(
+        cls, begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None = None, **options: Any
+    ) -> Solid:
+        """Return a cylinder around the axis from `begin` to `end`, with the boundaries side, bottom and top."""
+        from .primitives import cylinder
+
+        return cls(**{**cylinder(begin, end, radius, edge), **options})
+
+    # Where points are.
+
+    @cached_property
+    def _diagonal(self) -> float:
+        return float(np.linalg.norm(self.extent))
+
+    @cached_property
+    def _spacing(self) -> float:
+        """Typical length of the triangles' edges."""
+        return math.sqrt(2 * self.boundary_measure / len(self.patch))
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 3) whether it lies in the solid, walls included; (n,) bool."""
+        x = check_rows("points", points, 3)
+        inside = self.surface.columns.winding(x) > 0
+        outside = np.flatnonzero(~inside & np.isfinite(x).all(axis=1))
+        inside[outside] = self.feet(x[outside], _ON * self._diagonal).triangle >= 0
+        return inside
+
+    def feet(self, points: np.ndarray, reach: float = math.inf) -> Feet:
+        """Return the nearest point of the surface to each of `points` (n, 3), within `reach`."""
+        return self._feet(points, reach, self.surface.tree, np.arange(len(self.patch)))
+
+    def _feet(self, x: np.ndarray, reach: float, tree: Tree, items: np.ndarray) -> Feet:
+        corners = self.surface.corners[items]
+        bound2 = np.full(len(x), reach * reach)
+        if reach > self._spacing:
+            close = np.flatnonzero(np.isfinite(x).all(axis=1))
+            vertex = KDTree(self.surface.vertices[np.unique(self.surface.triangles[items])])
+            bound2[close] = np.minimum(bound2[close], (vertex.query(x[close])[0] + _ON * self._diagonal) ** 2)
+        best2, item = tree.nearest(x, bound2, lambda y, k: triangle_distance2(y, corners[k]))
+        found = item >= 0
+        weights = np.zeros((len(x), 3))
+        weights[found] = closest_on_triangle(x[found], corners[item[found]])
+        point = np.einsum("nk,nkd->nd", weights, corners[item])
+        triangle = np.where(found, items[item], -1)
+        return Feet(triangle, weights, point, np.where(found, np.sqrt(best2), math.inf))
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of `points` (n, 3) to the surface, negative inside; (n,)."""
+        x = check_rows("points", points, 3)
+        return np.where(self.surface.columns.winding(x) > 0, -1, 1) * self.feet(x).distance
+
+    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (n, 3) to the surface, inside and outside; (n,)."""
+        return self.feet(check_rows("points", points, 3)).distance
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return the nearest point of the solid to each of `points` (n, 3)."""
+        x = check_rows("points", points, 3)
+        return np.where(self.contains(x)[:, None], x, self.feet(x).point)
+
+    def closest_walls(self, points: np.ndarray) -> np.ndarray:
+        """Return the patch nearest to each of `points` (n, 3), (n,) int."""
+        return self.patch[self.feet(points).triangle].astype(np.int64)
+
+    # What cuts cells.
+
+    @cached_property
+    def corner_normals(self) -> np.ndarray:
+        """Unit normals of the patches at the triangles' corners, (t, 3, 3). Between them they are interpolated."""
+        return corner_normals(self.surface.vertices, self.surface.triangles, self.normals, self.patch)
+
+    @cached_property
+    def side_kinds(self) -> np.ndarray:
+        """Kinds (t, 3) int8 of the triangles' sides, from corner k to k + 1: `SMOOTH`, `CONVEX` or `CONCAVE`."""
+        kinds = np.zeros((len(self.patch), 3), np.int8)
+        ends = np.stack([self.surface.triangles, np.roll(self.surface.triangles, -1, axis=1)], axis=2)
+        for column in range(2):
+            item = self.creases.triangles[:, column]
+            edge = self.creases.edges[:, ::-1] if column else self.creases.edges
+            side = (ends[item] == edge[:, None]).all(axis=2).argmax(axis=1)
+            kinds[item, side] = np.where(self.creases.concave, CONCAVE, CONVEX)
+        return kinds
+
+    @cached_property
+    def corner_kinds(self) -> np.ndarray:
+        """Kinds (t, 3) int8 of the triangles' corners: the largest of the patch's sides that end there."""
+        kinds = np.maximum(self.side_kinds, np.roll(self.side_kinds, 1, axis=1))
+        key = self.surface.triangles * self.n_patches + self.patch[:, None]
+        _, place = np.unique(key, return_inverse=True)
+        most = np.zeros(int(place.max()) + 1, np.int8)
+        np.maximum.at(most, place.reshape(-1), kinds.reshape(-1))
+        return most[place.reshape(-1)].reshape(-1, 3)
+
+    def foot_kinds(self, feet: Feet) -> np.ndarray:
+        """Return the kinds (n,) of feet: `CONCAVE` on concave creases, where a patch does not go on; else smaller."""
+        zero = feet.weights <= _EDGE
+        kinds = np.zeros(len(zero), np.int8)
+        for k in range(3):
+            side = zero[:, (k + 2) % 3] & ~zero[:, k] & ~zero[:, (k + 1) % 3]
+            kinds[side] = self.side_kinds[feet.triangle[side], k]
+            corner = zero[:, (k + 1) % 3] & zero[:, (k + 2) % 3]
+            kinds[corner] = self.corner_kinds[feet.triangle[corner], k]
+        return kinds
+
+    @cached_property
+    def _patches(self) -> list[tuple[np.ndarray, Tree]]:
+        """The triangles of each patch, and a tree of them."""
+        order = np.argsort(self.patch, kind="stable")
+        parts = np.split(order, np.searchsorted(self.patch[order], np.arange(1, self.n_patches)))
+        low, high = self.surface.corners.min(axis=1), self.surface.corners.max(axis=1)
+        return [(part, Tree(low[part], high[part])) for part in parts]
+
+    def own_planes(self, points: np.ndarray, reach: float | np.ndarray, normals: np.ndarray | None = None) -> OwnPlanes:
+        """Return the planes that cut the cells of generators: those of all patches near them.
+
+        The plane of a patch touches it at the foot, its point nearest to the generator. A patch whose foot lies on a
+        concave crease gives none, since it does not go on there; nor does one that other walls hide, or that is seen
+        from behind.
+
+        Parameters
+        ----------
+        points : (n, 3) float
+            Generators in the solid.
+        reach : float or (n,) float
+            Patches within this distance count.
+        normals : (t, 3, 3) float, optional
+            Normals at the triangles' corners; by default `corner_normals`.
+        """
+        x = check_rows("points", points, 3)
+        reach = np.broadcast_to(np.asarray(reach, float), len(x))
+        normals = self.corner_normals if normals is None else normals
+        found: list[tuple[np.ndarray, ...]] = []
+        for k, (items, tree) in enumerate(self._patches):
+            d = 3
+            away = np.maximum(np.maximum(tree.boxes[0, :d] - x, x - tree.boxes[0, d:]), 0)
+            rows = np.flatnonzero((away**2).sum(axis=1) <= reach**2)
+            if not rows.size:
+                continue
+            feet = self._feet(x[rows], float(reach[rows].max()), tree, items)
+            near = np.flatnonzero(feet.distance <= reach[rows])
+            feet = Feet(*(array[near] for array in (feet.triangle, feet.weights, feet.point, feet.distance)))
+            normal = np.einsum("nk,nkd->nd", feet.weights, normals[feet.triangle])
+            normal /= np.linalg.norm(normal, axis=1)[:, None]
+            kind = self.foot_kinds(feet)
+            found.append((rows[near], np.full(len(near), k, np.int32), feet.point, normal, feet.distance, kind))
+        if not found:
+            none = np.zeros(0, np.int64)
+            return OwnPlanes(none, none.astype(np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), none)
+        row, patch, foot, normal, distance, kind = (np.concatenate(part) for part in zip(*found, strict=True))
+        order = np.lexsort((patch, row))
+        row, patch, foot, normal, distance, kind = (
+            array[order] for array in (row, patch, foot, normal, distance, kind)
+        )
+        depth = np.einsum("ij,ij->i", foot - x[row], normal)
+        first = np.full(len(x), math.inf)
+        np.minimum.at(first, row, distance)
+        nearest = distance == first[row]
+        behind = np.unique(row[nearest & (depth <= 0) & (kind < CONCAVE)])
+        sound = (depth > 0) & (kind < CONCAVE)
+        doubtful = np.flatnonzero(sound & ~nearest)
+        sound[doubtful] = self.visible(x[row[doubtful]], foot[doubtful])
+        return OwnPlanes(row[sound], patch[sound], foot[sound], normal[sound], depth[sound], behind)
+
+    def visible(self, points: np.ndarray, feet: np.ndarray) -> np.ndarray:
+        """Return whether no other wall is between each point (n, 3) and its foot on the surface, (n,) bool."""
+        end = points + (1 - 1e-6) * (feet - points)
+        who, item = self.surface.tree.meeting(np.minimum(points, end), np.maximum(points, end))
+        seen = np.ones(len(points), bool)
+        for first in range(0, len(who), 1 << 18):
+            w, k = who[first : first + (1 << 18)], item[first : first + (1 << 18)]
+            seen[w[np.isfinite(pierced(points[w], end[w], self.surface.corners[k]))]] = False
+        return seen
+
+    # The protocol of domains.
+
+    def default_names(self) -> BoundaryNames:
+        """Return the patches with the names of their groups."""
+        group = np.zeros(self.n_patches, np.int64)
+        group[self.patch] = self._group
+        used, index = np.unique(group, return_inverse=True)
+        known = self._group_names
+        names = tuple(known[g] if g < len(known) else f"group-{g}" for g in used.tolist())
+        return BoundaryNames(names, index.reshape(-1).astype(np.int32), "patch")
+
+    cuts_cells = False
+
+    @property
+    def plain(self) -> bool:
+        """A solid does not fill its bounding box."""
+        return False
+
+    @property
+    def measure(self) -> float:
+        """Volume."""
+        return self._volume
+
+    @cached_property
+    def _volume(self) -> float:
+        center = np.add(self.lower, self.upper) / 2
+        a, b, c = np.moveaxis(self.surface.corners - center, 1, 0)
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+    @property
+    def boundary_measure(self) -> float:
+        """Area of the surface."""
+        return float(self._areas.sum())
+
+    @property
+    def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of a box a little larger than the region."""
+        margin = _MARGIN * self.extent.max()
+        return np.array(self.lower) - margin, np.array(self.upper) + margin
+
+    def boundary(self, walls: Walls | None = None) -> Surface:
+        """Return patches as a shape for `clvoro.sizing.Distance`; by default all.
+
+        Parameters
+        ----------
+        walls : int, str, or a sequence of them, optional
+            Numbers or names of patches.
+        """
+        chosen = self.boundaries.select("boundary", walls)
+        return Surface(self.surface.vertices, self.surface.triangles[np.isin(self.patch, chosen)], "boundary")
+
+    @cached_property
+    def shells(self) -> tuple[int, np.ndarray]:
+        """Number of connected parts of the surface, and the part of each triangle, (t,) int."""
+        side = np.arange(len(self.twin))
+        return connect(len(self.patch), np.column_stack([side, self.twin]) // 3)
+
+    @cached_property
+    def _pieces(self) -> list[np.ndarray]:
+        """The triangles of each separate piece of the region: an outer shell, and those of its cavities."""
+        count, shell = self.shells
+        corners = self.surface.corners
+        center = np.add(self.lower, self.upper) / 2
+        a, b, c = np.moveaxis(corners - center, 1, 0)
+        volume = np.bincount(shell, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, count)
+        outer = [s for s in np.argsort(volume) if volume[s] > 0]  # the smallest first
+        parts = {s: [np.flatnonzero(shell == s)] for s in outer}
+        around = {s: Columns(corners[parts[s][0]]) for s in outer} if len(outer) > 1 else {}
+        for s in np.flatnonzero(volume <= 0):
+            mine = np.flatnonzero(shell == s)
+            place = corners[mine[:1]].mean(axis=1)
+            holder = next((o for o in outer if o in around and around[o].winding(place)[0] > 0), outer[-1])
+            parts[holder].append(mine)
+        return [np.concatenate(parts[s]) for s in sorted(outer)]
+
+    @property
+    def n_pieces(self) -> int:
+        """Number of separate pieces. Each one needs a generator."""
+        return len(self._pieces)
+
+    def piece_of(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 3) the piece that holds it, (n,) int; -1 outside."""
+        x = check_rows("points", points, 3)
+        piece = np.where(self.contains(x), 0, -1)
+        if self.n_pieces == 1:
+            return piece
+        left = np.flatnonzero(piece == 0)
+        if left.size:
+            near = np.full((self.n_pieces, len(left)), -1.0)
+            for p, items in enumerate(self._pieces):
+                near[p] = Columns(self.surface.corners[items]).winding(x[left]) > 0
+            piece[left] = near.argmax(axis=0)
+        return piece
+
+    def inner_points(self) -> np.ndarray:
+        """Return a point inside of each piece, (n_pieces, 3), away from its walls."""
+        return np.array([self._inner_point(items) for items in self._pieces])
+
+    def _inner_point(self, items: np.ndarray) -> np.ndarray:
+        corners = self.surface.corners[items]
+        largest = np.argsort(-self._areas[items], kind="stable")[:16]
+        begin = corners[largest].mean(axis=1)
+        inward = -self.normals[items[largest]] * self._diagonal
+        best, most = begin[0], -1.0
+        for x, v in zip(begin, inward, strict=True):
+            share = pierced(np.broadcast_to(x, (len(items), 3)), np.broadcast_to(x + v, (len(items), 3)), corners)
+            share = share[share > 1e-9]
+            if share.size:
+                middle = x + 0.5 * share.min() * v
+                room = float(self.feet(middle[None]).distance[0])
+                if room > most and self.contains(middle[None])[0]:
+                    best, most = middle, room
+        return best
+
+    def share_within(self, lower: np.ndarray, upper: np.ndarray) -> float:
+        """Return the share of the solid in a part of its bounding box, to about a percent of that part."""
+        k = (np.arange(24) + 0.5) / 24
+        at = np.stack(np.meshgrid(k, k, k, indexing="ij"), axis=-1).reshape(-1, 3)
+        inside = self.surface.columns.winding(lower + at * (upper - lower)) > 0
+        return float(inside.mean() * np.prod(upper - lower) / self.measure)
+
+    def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (k, 3) to its patch of `walls` (k,)."""
+        return self._wall_feet(walls, points)[2]
+
+    def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the normals (k, 3) of `walls` (k,) at the feet of `points` (k, 3), and the distances (k,) to them."""
+        point, normal, _ = self._wall_feet(walls, points)
+        return normal, np.einsum("ij,ij->i", point - points, normal)
+
+    def _wall_feet(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return foot, normal and distance of each of `points` on its patch."""
+        foot, normal, distance = np.zeros((len(walls), 3)), np.zeros((len(walls), 3)), np.zeros(len(walls))
+        for k in np.unique(walls):
+            rows = np.flatnonzero(walls == k)
+            items, tree = self._patches[k]
+            feet = self._feet(points[rows], math.inf, tree, items)
+            mean = np.einsum("nk,nkd->nd", feet.weights, self.corner_normals[feet.triangle])
+            foot[rows], distance[rows] = feet.point, feet.distance
+            normal[rows] = mean / np.linalg.norm(mean, axis=1)[:, None]
+        return foot, normal, distance
+
+    # Files.
+
+    def describe(self) -> dict[str, Any]:
+        """Return the arguments of this solid as numbers and strings; arrays are compressed."""
+        return {
+            "vertices": _packed(self.surface.vertices, "<f8"),
+            "triangles": _packed(self.surface.triangles, "<i8"),
+            "groups": _packed(self._group, "<i8"),
+            "group_names": list(self._group_names),
+            "angle": self.angle,
+            **({"names": dict(self.names)} if self.names else {}),
+        }
+
+    @classmethod
+    def described(cls, **values: Any) -> Solid:
+        """Return the solid from the values that `describe` returns."""
+        values["vertices"] = _unpacked(values["vertices"], "<f8").reshape(-1, 3)
+        values["triangles"] = _unpacked(values["triangles"], "<i8").reshape(-1, 3)
+        values["groups"] = _unpacked(values["groups"], "<i8")
+        return cls(**values)
+
+    def __repr__(self) -> str:
+        return f"Solid({len(self.patch)} triangles, {self.n_patches} patches, volume {self.measure:.6g})"
+
+    def __hash__(self) -> int:
+        return int(hashlib.sha256(self.surface.vertices.tobytes()).hexdigest()[:15], 16)
+
+
+def _packed(array: np.ndarray, dtype: str) -> str:
+    return base64.b64encode(zlib.compress(np.ascontiguousarray(array, dtype).tobytes(), 6)).decode("ascii")
+
+
+def _unpacked(text: str, dtype: str) -> np.ndarray:
+    return np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype).copy()

@@ -1,0 +1,120 @@
+"""Solids: where points are, patches and creases, the planes that cut cells; against formulas and slow references."""
+
+import numpy as np
+import pytest
+
+from clvoro import Solid
+from clvoro.geometry.columns import Columns
+from clvoro.geometry.triangles import closest_on_triangle, pierced
+
+
+def winding(corners, points):
+    """The winding number as the sum of solid angles (van Oosterom and Strackee)."""
+    v = corners - points[:, None, None]
+    length = np.linalg.norm(v, axis=-1)
+    a, b, c = np.moveaxis(v, -2, 0)
+    la, lb, lc = np.moveaxis(length, -1, 0)
+    rest = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    return 2 * np.arctan2(np.einsum("...k,...k->...", a, np.cross(b, c)), rest).sum(axis=1) / (4 * np.pi)
+
+
+def around(solid, n, seed=0):
+    """Points in a box somewhat larger than the solid."""
+    return np.random.default_rng(seed).uniform(
+        solid.lower - 0.1 * solid.extent, solid.upper + 0.1 * solid.extent, (n, 3)
+    )
+
+
+def frames(inner, outer):
+    """A box with a box-shaped cavity: the sides of the inner one point into the cavity."""
+    a, b = Solid.box(*outer), Solid.box(*inner)
+    triangles = np.vstack([a.surface.triangles, b.surface.triangles[:, ::-1] + len(a.surface.vertices)])
+    return Solid(np.vstack([a.surface.vertices, b.surface.vertices]), triangles)
+
+
+SOLIDS = {
+    "box": Solid.box((0, 0, 0), (1, 2, 3)),
+    "ball": Solid.ball((1, 2, 3), 2, edge=0.5),
+    "cylinder": Solid.cylinder((0, 0, 0), (1, 1, 1), 0.7, edge=0.2),
+    "cavity": frames(((1, 1, 1), (2, 2, 2)), ((0, 0, 0), (3, 3, 4))),
+}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_points_inside_are_those_with_winding_number_one(name):
+    solid = SOLIDS[name]
+    x = around(solid, 2000)
+    wound = winding(solid.surface.corners, x)
+    assert np.array_equal(solid.surface.columns.winding(x), np.rint(wound))
+    assert np.array_equal(solid.contains(x), np.rint(wound) > 0)
+    distance = solid.signed_distance(x)
+    assert np.array_equal(distance < 0, np.rint(wound) > 0)
+    slow = np.full(len(x), np.inf)
+    for triangle in solid.surface.corners:
+        corners = np.broadcast_to(triangle, (len(x), 3, 3))
+        foot = np.einsum("nk,nkd->nd", closest_on_triangle(x, corners), corners)
+        slow = np.minimum(slow, np.linalg.norm(x - foot, axis=1))
+    assert np.abs(distance) == pytest.approx(slow, abs=1e-12)
+    assert solid.contains(solid.surface.vertices).all()
+    assert solid.contains(solid.surface.corners.mean(axis=1)).all()
+    assert solid.contains(solid.inner_points()).all()
+    assert (solid.boundary_distance(solid.nearest(x)) < np.abs(distance) * (distance < 0) + 1e-12).all()
+
+
+def test_rays_through_edges_and_vertices_count_once():
+    """A lattice whose rays meet vertices, edges and vertical sides of the surface."""
+    solid = Solid.box((0, 0, 0), (1, 1, 1))
+    x = np.stack(np.meshgrid(*3 * [np.arange(-0.25, 1.5, 0.25)], indexing="ij"), axis=-1).reshape(-1, 3)
+    off = (solid.boundary_distance(x) > 0) & np.isfinite(x).all(axis=1)
+    wound = Columns(solid.surface.corners).winding(x)
+    assert np.array_equal(wound[off], np.rint(winding(solid.surface.corners, x[off])))
+    assert np.array_equal(solid.contains(x), ((x >= 0) & (x <= 1)).all(axis=1))
+
+
+@pytest.mark.parametrize("name", ["box", "ball", "cylinder"])
+def test_own_planes_are_tangential_and_keep_their_generators(name):
+    solid = SOLIDS[name]
+    x = around(solid, 3000, 1)
+    x = x[solid.contains(x)]
+    planes = solid.own_planes(x, 0.5)
+    assert not planes.behind.size
+    assert np.abs(np.linalg.norm(planes.normal, axis=1) - 1).max() < 1e-12
+    assert planes.depth == pytest.approx(((planes.foot - x[planes.row]) * planes.normal).sum(axis=1))
+    for k in range(solid.n_patches):
+        mine = planes.row[planes.patch == k]
+        assert np.array_equal(mine, np.flatnonzero(solid.wall_distance(np.full(len(x), k), x) <= 0.5))
+
+
+def test_segments_meet_triangles_where_a_linear_system_says():
+    rng = np.random.default_rng(4)
+    begin, end, corners = rng.normal(size=(300, 3)), rng.normal(size=(300, 3)), rng.normal(size=(300, 3, 3))
+    share = pierced(begin, end, corners)
+    for p, q, (a, b, c), t in zip(begin, end, corners, share, strict=True):
+        at, u, v = np.linalg.solve(np.column_stack([q - p, a - b, a - c]), a - p)
+        meets = 0 <= at <= 1 and u >= 0 and v >= 0 and u + v <= 1
+        assert np.isfinite(t) == meets
+        assert not meets or t == pytest.approx(at)
+    assert np.isfinite(share).sum() > 5
+
+
+def test_box_cylinder_and_cavity_have_their_patches_and_creases():
+    box, cylinder, cavity = SOLIDS["box"], SOLIDS["cylinder"], SOLIDS["cavity"]
+    assert box.boundary_names == ("xMin", "xMax", "yMin", "yMax", "zMin", "zMax")
+    assert np.degrees(box.creases.angle) == pytest.approx(90)
+    assert (box.creases.n_chains, len(box.corners), box.boundary_measure) == (12, 8, pytest.approx(22))
+    assert cylinder.boundary_names == ("side", "bottom", "top")
+    assert (cylinder.creases.n_chains, len(cylinder.corners)) == (2, 0)
+    assert cylinder.creases.closed(0)
+    assert not cylinder.creases.concave.any()
+    assert (cavity.measure, cavity.n_pieces, cavity.n_patches) == (pytest.approx(35), 1, 12)
+    assert cavity.creases.concave.sum() == 12
+    assert np.degrees(cavity.creases.angle[cavity.creases.concave]) == pytest.approx(270)
+
+
+def test_a_solid_comes_back_from_its_description():
+    solid = SOLIDS["cylinder"]
+    again = Solid.described(**solid.describe())
+    assert again == solid
+    assert hash(again) == hash(solid)
+    assert again.boundary_names == solid.boundary_names
+    assert again != SOLIDS["ball"]
