@@ -257,7 +257,7 @@ def test_writers_take_the_one_mesh():
     }
     assert len(takes) > 8
     others = {name for name, first in takes.items() if first != "Contents"}
-    assert others == {"io.arrays.write_arrays", "io.history.write_history"}
+    assert others == {"io.arrays.write_arrays", "io.convert.write_history"}
 
 
 def test_the_formatter_is_never_skipped():

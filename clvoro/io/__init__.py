@@ -17,11 +17,9 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .atomic import check_writable, make_folder
 from .contents import Contents
+from .convert import check_polygons, write_foreign, write_history, write_metis
 from .disv import Disv, DisvBoundary, make_disv
 from .foam import write_foam
-from .formats import check_polygons, write_foreign
-from .history import write_history
-from .metis import write_metis
 from .npz import load as load_npz
 from .npz import write_npz
 from .ugrid import write_ugrid

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError, InputTypeError
+from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
+from .arrays import FileError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -122,3 +124,24 @@ def _in_known_type(array: np.ndarray) -> np.ndarray:
         if np.can_cast(array.dtype, kind):
             return array.astype(kind)
     return array.astype(np.float64)  # uint64
+
+
+def describe(domain: Domain) -> dict[str, Any]:
+    """Return a domain of any kind as numbers, strings and lists."""
+    return {"kind": type(domain).__name__, **domain.describe()}
+
+
+def described(description: Mapping[str, Any]) -> Domain:
+    """Return the domain that `describe` has described.
+
+    Raises
+    ------
+    FileError
+        If no class of this name is known.
+    """
+    values = dict(description)
+    kind = values.pop("kind")
+    if kind not in Domain.kinds:
+        known = ", ".join(Domain.kinds)
+        raise FileError(f"its domain is a {kind!r:.40}, expected one of {known}; import the class before")
+    return Domain.kinds[kind].described(**values)

@@ -1,12 +1,20 @@
-"""Diagrams as meshes of other libraries: meshio and PyVista."""
+"""Diagrams for other programs: meshio and the formats that it writes, PyVista, METIS, tables of the history."""
 
 from __future__ import annotations
 
+import contextlib
+import csv
+import io
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import MissingLibraryError
+from ..errors import ClvoroError, InputError, MissingLibraryError
+from ..mesh.results import Result
+from .atomic import atomic_file, atomic_folder
+from .contents import Contents
 from .vtu import KINDS, cell_data, in_space, polyhedra
 
 if TYPE_CHECKING:
@@ -14,7 +22,6 @@ if TYPE_CHECKING:
     import pyvista
 
     from ..mesh.diagram import Diagram
-    from .contents import Contents
 
 
 def missing(library: str, extra: str, what: str) -> MissingLibraryError:
@@ -89,3 +96,102 @@ _BLOCKS = {2: _polygons, 3: _polyhedra}
 def _known(values: np.ndarray) -> np.ndarray:
     """Return integers in 64 bits: VTK does not read the name that meshio writes for 32 bits."""
     return values.astype(np.int64) if values.dtype.kind == "i" else values
+
+
+# Formats in which meshio writes polygons with any number of sides. In others it drops them with a warning only. The
+# value says whether it writes cell data, too.
+_POLYGONS = {".vtk": True, ".ply": False, ".obj": False}
+
+_SAFE = (
+    ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .nc (QGIS, UGRID, MPAS), .info (METIS), .vtk, .ply or .obj"
+)
+
+_PICTURE = "it is no mesh file; write mesh.plot().savefig(path)"
+_LAYER = (
+    "save as .nc, which QGIS opens as a mesh, or write geopandas.GeoDataFrame(geometry=mesh.to_shapely(), "
+    "crs=...).to_file(path)"
+)
+_INSTEAD = {**dict.fromkeys((".png", ".pdf", ".svg"), _PICTURE), **dict.fromkeys((".shp", ".geojson", ".gpkg"), _LAYER)}
+
+
+def write_foreign(contents: Contents, path: Path) -> None:
+    """Write the cells in the format that the suffix of `path` names."""
+    suffix = path.suffix.lower()
+    if suffix not in _POLYGONS:
+        why = f"{suffix} is unknown or cannot hold polygons" if suffix else "it has no suffix"
+        why = _INSTEAD.get(suffix, f"{why}; use {_SAFE}")
+        raise InputError(f"cannot write {path}: {why}")
+    check_polygons(contents, path)
+    with_data = _POLYGONS[suffix]
+    if contents.extra and not with_data:
+        raise InputError(
+            f"cannot write cell_data to {path}: {suffix} holds no data of cells; save as .vtu or .vtk, or leave it out"
+        )
+    try:
+        mesh = to_meshio(contents, with_data)
+    except ClvoroError as error:
+        raise InputError(
+            f'cannot write {path}: {suffix} needs meshio; run `pip install "clvoro[formats]"`, or save as .vtu or .npz'
+        ) from error
+    # meshio prints warnings to the terminal. Errors are exceptions.
+    with atomic_folder(path) as temporary, contextlib.redirect_stdout(io.StringIO()):
+        mesh.write(temporary)
+
+
+def check_polygons(contents: Contents, path: Path) -> None:
+    """Refuse a mesh whose cells are no polygons."""
+    if contents.diagram.domain.cell_dim != 2:
+        raise InputError(
+            f"cannot write {path}: the mesh has 3 dimensions, and {path.suffix.lower()} is for polygons in the plane "
+            "or on a sphere; save it as .vtu, .foam or .npz"
+        )
+
+
+_CHUNK = 1 << 16
+
+
+def write_metis(contents: Contents, path: Path) -> None:
+    """Write the neighbors of each cell: METIS' graph format, MPAS' `graph.info`.
+
+    The first line has the numbers of cells and of pairs of neighbors. Line i + 1 has the neighbors of the i-th cell,
+    counted from 1, ascending. Neighbors share a face that has a measure; each is listed once, and no cell is its own
+    neighbor, as METIS requires.
+
+    Raises
+    ------
+    InputError
+        If there are data of the caller, which the format does not hold.
+    """
+    if contents.extra:
+        raise InputError(f"cannot write cell_data to {path}: a graph for METIS holds none; save as .nc or leave it out")
+    faces, n = contents.diagram.faces, len(contents.diagram)
+    i, j = (ends[: faces.n_inner].astype(np.int64) for ends in (faces.owner, faces.neighbor))
+    pairs = np.unique(np.concatenate([i * n + j, j * n + i]))
+    pairs = pairs[pairs // n != pairs % n]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(pairs // n, minlength=n))])
+    neighbors = pairs % n + 1
+    with atomic_file(path) as file:
+        file.write(f"{n} {len(pairs) // 2}\n".encode())
+        for first in range(0, n, _CHUNK):
+            rows = starts[first : first + _CHUNK + 1]
+            form = "".join(" ".join(["%d"] * k) + "\n" for k in np.diff(rows).tolist())
+            file.write((form % tuple(neighbors[rows[0] : rows[-1]].tolist())).encode())
+
+
+def write_history(result: Result, path: str | PathLike[str]) -> None:
+    """Write `result.history` as CSV: a line of names, then one line per step.
+
+    Floats have as many digits as are needed to read them back exactly.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    with atomic_file(path) as file:
+        text = io.TextIOWrapper(file, encoding="ascii", newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(result.history.dtype.names or ())
+        writer.writerows(result.history.tolist())
+        text.flush()
+        text.detach()

@@ -1,23 +1,167 @@
-"""Write the files of OpenFOAM's polyMesh; `polymesh` makes the mesh."""
+"""Meshes of OpenFOAM: points, faces between cells, and the boundary as patches; a case around them.
+
+In 2D the cells become one layer of prisms between two patches of type `empty`.
+
+The seams of a periodic box become one pair of cyclic patches for each periodic direction. Cells are not cut at the
+seams, so some faces lie between a cell and an image that is shifted in two or three directions. They are in the pair of
+the first of these directions. The vector from a face to the one across then differs within a patch. OpenFOAM of
+openfoam.com (tested: v1912) accepts that from a patch with the transform `noOrdering`, whose faces it takes in the
+order of the file; `translational` demands one vector for all.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 import orjson
 
 from ..errors import InputError, InputTypeError
-from ..finite_volumes.solver_mesh import WallShape, check_not_sphere
+from ..finite_volumes.gate import warn_of_rejection
+from ..finite_volumes.prisms import polyhedra
+from ..finite_volumes.solver_mesh import WallShape, check_not_sphere, make_solver_mesh
 from ..geometry.boundary_names import Walls
 from ..mesh.connectivity import slices
+from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import Contents
-from .cyclic import FoamPatch
-from .polymesh import PatchType, poly_mesh
+
+
+@dataclass(frozen=True)
+class FoamPatch:
+    """A part of the boundary.
+
+    Attributes
+    ----------
+    name, kind : str
+    size : int
+        Number of faces.
+    across : str
+        Of a cyclic patch: name of the patch across the seam. Its faces are the images of those of this one, in the same
+        order, and each begins with the image of the same corner.
+    separation : tuple of float
+        Of a cyclic patch: vector from its faces to those across; empty if it differs from face to face.
+    """
+
+    name: str
+    kind: str
+    size: int
+    across: str = ""
+    separation: tuple[float, ...] = ()
+
+
+def cyclic_patches(mesh: Faces) -> list[FoamPatch]:
+    """Return the pairs of patches of the faces at seams, in the order of the faces: upper, lower, upper, ..."""
+    made: list[FoamPatch] = []
+    shifts = mesh.shift[mesh.n_outer :].astype(np.int64)
+    axes = np.argmax(shifts != 0, axis=1)
+    for axis in np.unique(axes).tolist():
+        both = shifts[axes == axis]
+        steps = both[: len(both) // 2]
+        upper, lower = (f"{'xyz'[axis]}{end}" for end in ("Max", "Min"))
+        there = back = ()
+        if (steps == steps[0]).all():
+            period = np.pad(steps[0] * np.array(mesh.domain.extent), (0, 3 - mesh.dim))
+            there, back = tuple((0 - period).tolist()), tuple(period.tolist())
+        made.append(FoamPatch(upper, "cyclic", len(steps), lower, there))
+        made.append(FoamPatch(lower, "cyclic", len(steps), upper, back))
+    return made
+
+
+PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
+"""Types of patches for `poly_mesh`."""
+
+
+def poly_mesh(
+    diagram: Diagram,
+    patches: Mapping[str, Walls] | None = None,
+    types: Mapping[str, PatchType] | None = None,
+    thickness: float | None = None,
+    walls: WallShape = "straight",
+) -> tuple[Faces, list[FoamPatch], float]:
+    """Describe `diagram` for OpenFOAM; faces without measure and points without a face are left out.
+
+    The patches are the boundaries of the domain by their names, then one pair of cyclic patches for each periodic
+    direction (see `cyclic`), then in 2D `back` and `front`. Cells of a periodic box are not cut at its seams.
+
+    Parameters
+    ----------
+    patches : mapping, optional
+        Names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls that are not
+        mentioned keep the name that the domain gives them.
+    types : mapping, optional
+        Type of each patch by name: "wall", "patch", "symmetry" or "symmetryPlane". By default "wall".
+    thickness : float, optional
+        In 2D: height of the prisms, whose bottoms are at z = 0. By default the mean width of a cell.
+    walls : {"straight", "exact"}, optional
+        See `Diagram.solver_mesh`.
+
+    Returns
+    -------
+    Faces
+        The cells as polyhedra. The faces of the patches follow those between two cells, patch by patch.
+    list of Patch
+    float
+        `Faces.area_change` of the mesh, in 2D of its polygons.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If `patches` names walls that do not exist, or a wall twice; if `types` names a patch or type that does not
+        exist; if `thickness` is not positive, or given in 3D; if a name is that of a cyclic or empty patch; or for a
+        cell around an island, as a face of OpenFOAM has no hole.
+
+    Warns
+    -----
+    MismatchWarning
+        If OpenFOAM rejects the mesh in a polygon with straight walls, for a cell at a wall; says where.
+    """
+    domain = diagram.domain
+    parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
+    kinds = _kinds(parts.names, types)
+    mesh = make_solver_mesh(diagram, walls, walls == "straight", parts.index)
+    cells = polyhedra(mesh, thickness)
+    if domain.outline is not None and walls == "straight":
+        warn_of_rejection(mesh)
+    groups = parts.index[-1 - mesh.neighbor[mesh.n_inner : mesh.n_outer]]
+    counts = np.bincount(groups, minlength=len(parts.names)).tolist()
+    made = [FoamPatch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]
+    made += cyclic_patches(mesh)
+    if len(cells) > len(mesh):
+        made += [FoamPatch("back", "empty", mesh.n_cells), FoamPatch("front", "empty", mesh.n_cells)]
+    own = {patch.name for patch in made[len(parts.names) :]}
+    clash = [name for name in parts.names if name in own]
+    if clash:
+        raise InputError(
+            f"the boundary {clash[0]!r} has the name of a patch that OpenFOAM needs here; choose another name"
+        )
+    order = np.arange(len(cells))
+    order[mesh.n_inner : mesh.n_outer] = mesh.n_inner + np.argsort(groups, kind="stable")
+    return cells.take_faces(order), made, mesh.area_change
+
+
+def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> list[str]:
+    """Return the type of each patch."""
+    known = get_args(PatchType)
+    given = {} if types is None else types
+    if not isinstance(given, Mapping):
+        raise InputTypeError(
+            f"types is {types!r:.60} of type {type(types).__name__}, expected a mapping from names of patches to "
+            "types, such as {'inlet': 'patch'}"
+        )
+    for name, kind in given.items():
+        if name not in names:
+            raise InputError(f"types has {name!r:.60}, expected names of patches: {', '.join(names)}")
+        if kind not in known:
+            raise InputError(f"types has {kind!r:.60} for {name}, expected one of {', '.join(known)}")
+    return [given.get(name, "wall") for name in names]
+
 
 _FILES = {
     "points": "vectorField",

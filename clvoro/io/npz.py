@@ -23,8 +23,7 @@ from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from .arrays import FileError, explained, list_members, read_member, write_arrays
-from .contents import Contents
-from .domains import describe, described
+from .contents import Contents, describe, described
 
 FORMAT, VERSION = "clvoro-result", 2
 

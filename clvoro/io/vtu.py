@@ -26,8 +26,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.straightening import count_sides
 from .atomic import atomic_file
-from .contents import Contents
-from .domains import describe
+from .contents import Contents, describe
 
 SOLVER_MESH = "clvoro solver mesh: the cells are not those of a diagram"
 _BLOCK = 1 << 20

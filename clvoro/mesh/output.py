@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..geometry.boundary_names import Walls
     from ..io.disv import Disv
     from ..io.fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
-    from ..io.polymesh import PatchType
+    from ..io.foam import PatchType
     from ..plotting.colors import Color
     from ..plotting.views import View
     from .diagram import Diagram

@@ -120,7 +120,7 @@ def test_names_of_cyclic_patches_are_reserved(ctx, tmp_path):
     points = np.random.default_rng(2).random((30, 2))
     diagram = clvoro.Adapter(ctx).diagram(box, points)
     with pytest.raises(InputError, match="boundary 'xMin' has the name of a patch"):
-        io.polymesh.poly_mesh(diagram)
+        io.foam.poly_mesh(diagram)
 
 
 @pytest.mark.sparse(2)
@@ -135,7 +135,7 @@ def test_as_openfoam_checks_it(result, tmp_path):
 def test_one_cell_is_its_own_neighbor(ctx, tmp_path):
     box = clvoro.Box((0, 0), (1, 2), periodic=True)
     diagram = clvoro.Adapter(ctx).diagram(box, np.array([[0.3, 0.4]]))
-    mesh, patches, _ = io.polymesh.poly_mesh(diagram)
+    mesh, patches, _ = io.foam.poly_mesh(diagram)
     assert mesh.n_inner == 0
     assert {p.name for p in patches} == {"xMin", "xMax", "yMin", "yMax", "back", "front"}
 

@@ -20,7 +20,7 @@ import clvoro
 from clvoro import io
 from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.box import Box
-from clvoro.io import formats, npz
+from clvoro.io import convert, npz
 from clvoro.io.contents import Contents
 from clvoro.io.vtu import write_vtu
 from clvoro.mesh.diagram import Diagram
@@ -324,7 +324,7 @@ def test_vtu_settings_are_in_a_well_formed_head(result, tmp_path):
     assert json.loads(settings)["seed"] == 7
 
 
-@pytest.mark.parametrize("suffix", formats._POLYGONS)
+@pytest.mark.parametrize("suffix", convert._POLYGONS)
 def test_formats_through_meshio_keep_every_polygon(result, tmp_path, suffix, capsys):
     meshio = pytest.importorskip("meshio")
     path = tmp_path / f"mesh{suffix}"
@@ -337,7 +337,7 @@ def test_formats_through_meshio_keep_every_polygon(result, tmp_path, suffix, cap
     assert found == sorted(tuple(d.cell_vertices[s[i] : s[i + 1]]) for i in range(len(d)))
     # .obj and .ply are text with some 16 digits.
     np.testing.assert_allclose(mesh.points[:, :2], d.vertices, rtol=0, atol=1e-14)
-    if formats._POLYGONS[suffix]:
+    if convert._POLYGONS[suffix]:
         errors = np.sort(np.concatenate(mesh.cell_data["error"]))
         np.testing.assert_array_equal(errors, np.sort(result.size_error))
     assert [p.name for p in tmp_path.iterdir()] == [path.name]

@@ -12,8 +12,7 @@ import pytest
 
 from clvoro import io
 from clvoro.errors import InputError
-from clvoro.io.contents import Contents
-from clvoro.io.domains import describe
+from clvoro.io.contents import Contents, describe
 from clvoro.io.vtu import largest_boundary, polyhedra, write_vtu
 from clvoro.mesh.connectivity import face_corners, face_owners, take_rows
 from clvoro.mesh.diagram import Diagram

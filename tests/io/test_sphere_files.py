@@ -269,7 +269,7 @@ def test_graph_for_metis_in_parts(ctx, tmp_path, monkeypatch):
     room = clvoro.Box((0, 0), (1, 1))
     diagram = clvoro.Adapter(ctx).diagram(room, random_points(room, 50))
     diagram.save(tmp_path / "whole.info")
-    monkeypatch.setattr("clvoro.io.metis._CHUNK", 7)
+    monkeypatch.setattr("clvoro.io.convert._CHUNK", 7)
     diagram.save(tmp_path / "parts.info")
     assert (tmp_path / "parts.info").read_bytes() == (tmp_path / "whole.info").read_bytes()
     with pytest.raises(InputError, match="cell_data"):
