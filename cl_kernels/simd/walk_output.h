@@ -1,4 +1,5 @@
 /* The test of traced cells for certainty, and their output. */
+#include "tessellation/own_planes.h"
 #include "tessellation/row_counts.h"
 #include "tessellation/periodic/halo.h"
 #include "simd/edge_walk.h"
@@ -20,6 +21,10 @@ typedef struct {
     global uchar4 *corners;
 #ifdef HALO
     halo_t halo;
+#endif
+#ifdef SOLID
+    global const float *own_found;
+    global float *own_reach;
 #endif
 } output_t;
 
@@ -93,6 +98,14 @@ inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t
     vstore8(done, 0, lanes);
     vstore8(reach, 0, reaches);
     int total = 0, made = 0;
+#ifdef SOLID
+    for (int lane = 0; lane < LANES; ++lane)
+        if (lanes[lane]) {
+            const double radius2 = reaches[lane] * reaches[lane] / 4;
+            lanes[lane] = knows_walls(out->items[places[lane]], radius2, out->own_found, out->own_reach);
+        }
+    done = vload8(0, lanes) != 0;
+#endif
     for (int lane = 0; lane < LANES; ++lane) {
         total += lanes[lane] ? cells->faces[lane] : 0;
         made += lanes[lane] != 0;

@@ -81,12 +81,11 @@ kernel void order_places(const int size, const int rows, global const int *items
 }
 
 /* Per stretch of that order: the cells of its generators (see `clip_polyhedra`), or row_counts[i] = UNFINISHED for a
-   cell that remains to be clipped. `first_reach` is the first search radius, in units of `spacing`. In a periodic box
-   the balls around the vertices are tested. */
+   cell that remains to be clipped, such as those near walls of a solid. `first_reach` is the first search radius, in
+   units of `spacing`. In a periodic box the balls around the vertices are tested. */
 kernel void walk_all_cells(const int size, const int rows, global const int *order, global const double *binned,
                            global const int *items, global const float *spacing, global float *reach, BIN_ARGS,
-                           const double4 box_lower, const double4 box_upper, const double first_reach, const int room,
-                           CELL_OUTPUT_ARGS HALO_ARGS)
+                           CLIP_BOX_ARGS, const double first_reach, const int room, CELL_OUTPUT_ARGS HALO_ARGS)
 {
     LONG_ITEM(stretch);
     output_t out = {room,     items,     reach,   row_places, row_counts,  labels,       report,
@@ -94,6 +93,10 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
 #ifdef HALO
     MAKE_HALO;
     out.halo = halo;
+#endif
+#ifdef SOLID
+    out.own_found = own_found;
+    out.own_reach = own_reach;
 #endif
     const search_t in = {binned, bins, grid_frames, grid_shapes, box_lower, box_upper};
     runs_t runs;
@@ -118,6 +121,10 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
         for (int lane = 0; lane < LANES; ++lane) {
             if (wanted[lane] && rounds[lane]++ < MAX_ROUNDS)
                 continue;
+#ifdef SOLID
+            for (; next < end && own_rows[items[order[next]]].s1 > 0; ++next)
+                row_counts[items[order[next]]] = UNFINISHED;
+#endif
             wanted[lane] = guessed[lane] = next < end ? -1 : 0;
             if (next < end) {
                 const int place = order[next];

@@ -71,6 +71,17 @@ inline void check_cell_balls(const CELL *cell, int i, REAL4 place, const halo_t 
 #define CLIP_BOUNDS
 #endif
 
+/* Whether planes of its own cut the cell. Neighbors then may differ about common faces, which must be matched. */
+inline bool has_own_planes(const CELL *cell)
+{
+    bool found = false;
+#ifdef SOLID
+    for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
+        found |= cell->labels[f] < 0;
+#endif
+    return found;
+}
+
 /* A cell without faces. */
 inline void write_empty_cell(int i, global int *row_places, global int *row_counts, global REAL *volumes,
                              global REAL *offsets, global REAL *covariances)
@@ -104,10 +115,9 @@ inline REAL needed_radius(const CELL *cell, REAL4 x CLIP_BOUND_ARGS)
    A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
    S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20. */
 kernel void clip_polyhedra(const int size, const int rows, global const REAL *binned, global const int *items,
-                           global float *reach, BIN_ARGS, global const REAL *points, const REAL4 box_lower,
-                           const REAL4 box_upper, const int warm, global const int *old_starts,
-                           global const int *old_neighbors, const int again, const int room, const REAL share,
-                           CELL_OUTPUT_ARGS CELL_ARGS HALO_ARGS CLIP_BOUND_ARGS)
+                           global float *reach, BIN_ARGS, global const REAL *points, CLIP_BOX_ARGS, const int warm,
+                           global const int *old_starts, global const int *old_neighbors, const int again,
+                           const int room, const REAL share, CELL_OUTPUT_ARGS CELL_ARGS HALO_ARGS CLIP_BOUND_ARGS)
 {
     LONG_ITEM(k);
     TAKE_CELL(cell, k);
@@ -117,10 +127,9 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         if (i >= rows || (again && row_counts[i] != UNFINISHED))
             continue;
         const REAL4 x = SITE_IN_SPACE(binned, p);
-        start_polyhedron(cell, x, box_lower, box_upper);
-        int flag = 0;
+        int flag = flag_of(start_cell(cell, i, x, points, CLIP_BOX));
         REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* a radius of 0 would never widen */
-        if (warm) {
+        if (warm && flag == 0) {
             flag = flag_of(clip_polyhedron_by_row(cell, i, x, old_starts, old_neighbors, points));
             w = needed_radius(cell, x CLIP_BOUNDS);
         }
@@ -137,9 +146,12 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
             inner = w;
             w = need < 4 * w ? need : 2 * w;
         }
+#ifdef SOLID
+        flag = flag == 0 && !knows_walls(i, cell->reach2, own_found, own_reach) ? FLAG_UNKNOWN : flag;
+#endif
         if (flag != 0) {
             atomic_or(report, flag);
-            row_counts[i] = flag == FLAG_FULL ? UNFINISHED : 0;
+            row_counts[i] = flag == FLAG_FULL || flag == FLAG_UNKNOWN ? UNFINISHED : 0;
             continue;
         }
 #ifdef WEIGHTED
@@ -165,7 +177,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         const REAL reach_length = sqrt(cell->reach2), near2 = sqrt(REAL_EPS) * cell->reach2;
         const REAL slim = 512 * noise_length(reach_length);
         int count = 0;
-        bool doubtful = cell->torn, narrow = false;
+        bool doubtful = cell->torn || has_own_planes(cell), narrow = false;
         REAL volume = 0, lost = 0;
         REAL4 first = 0; /* moments x, y, z */
         for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1)) {
@@ -250,13 +262,27 @@ inline REAL rounded_area(int i, int begin, int count, global const int *labels, 
     return surface * fmin(64 * REAL_EPS * surface / (least * least), sqrt(REAL_EPS));
 }
 
+/* Whether a wall cuts one of two cells with these rows. In a solid each cell has planes of its own, so that the cells
+   need not agree about a face there. */
+inline bool touches_walls(global const int *labels, int begin, int count, int other, int other_count)
+{
+    bool found = false;
+#ifdef SOLID
+    for (int k = begin; k < begin + count; ++k)
+        found |= labels[k] < 0;
+    for (int k = other; k < other + other_count; ++k)
+        found |= labels[k] < 0;
+#endif
+    return found;
+}
+
 /* Per generator i: kept[k] of each of its faces, and the number kept. Where any cell is doubtful, round-off may let one
    of two cells have a face of zero area that the other does not have. Such a face is dropped, so that the graph is
    symmetric. The cell is flagged as collapsed if the face is wider than round-off explains, or if the areas of its
    faces and those of its neighbors differ by more than a share of the cell. In a power diagram cells may be so small
    that they are uncertain, as long as that is no more than the round-off of a neighbor. Faces of a neighbor without a
-   row are not compared, nor are those of two certain cells. In a diagram with ghost images the periods are 0. While
-   cells are missing or wrong, this and the next two kernels do nothing. */
+   row are not compared, nor are those of two certain cells, nor those at walls of a solid. In a diagram with ghost
+   images the periods are 0. While cells are missing or wrong, this and the next two kernels do nothing. */
 kernel void match_polyhedron_faces(const int size, global const int *row_places, global const int *row_counts,
                                    global const int *labels, global const REAL *measures, global const REAL *volumes,
                                    global const REAL *points, const REAL share, global uchar *kept, global int *counts,
@@ -284,6 +310,11 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
             while (q < m && row[q] != i)
                 ++q;
             mutual = q < m;
+            if (touches_walls(labels, row_places[i], n, row_places[j], m)) {
+                kept[k] = mutual;
+                count += mutual;
+                continue;
+            }
             const REAL distance = distance_between(points, i, j PERIODS);
             const REAL other = mutual ? measures[row_places[j] + q] : 0;
             apart += fabs(measures[k] - other) * distance / 6;

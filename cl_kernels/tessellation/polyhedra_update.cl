@@ -35,15 +35,18 @@ inline void add_plane(corners_t *cell, int label, REAL4 x, const rows_t *in)
 }
 
 /* Start with the planes of the previous neighbors of generator i at x, and of further ones in ascending order. Returns
-   the number of the former; -1 if there is no room. */
+   the number of the former; -1 if there is no room, or the cell is to be clipped. */
 inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *further, const rows_t *in)
 {
     const int start = in->starts[i], n = in->starts[i + 1] - start;
     cell->faces = 0;
     if (n > MOST_FACES)
         return -1;
-    for (int k = 0; k < n; ++k)
+    for (int k = 0; k < n; ++k) {
+        if (HAD_WALLS(in->neighbors[start + k]))
+            return -1;
         add_plane(cell, in->neighbors[start + k], x, in);
+    }
     for (int last = NO_NEIGHBOR; further;) {
         int next = INT_MAX;
         for (int m = 0; m < MORE; ++m) {
@@ -62,9 +65,15 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
 }
 
 /* Keep the cell of generator i at x within the walls: those that it does not have become further neighbors. True if
-   there is none. */
+   there is none. In a solid nothing is done. */
 inline bool keep_in_box(const corners_t *cell, int i, REAL4 x, const rows_t *in, global int *marks)
 {
+#ifdef SOLID
+    bool cut = MAY_MEET_WALLS(i, cell->reach2, in);
+    for (int v = 0; v < cell->corners && !cut; ++v)
+        cut = is_behind_walls(corner_place(cell, v), in);
+    return !cut;
+#endif
     const REAL reach = sqrt(cell->reach2), noise = 64 * REAL_EPS * (1 + reach);
     const REAL4 low = x - in->box_lower, high = in->box_upper - x;
     const REAL rooms[6] = {low.s0, high.s0, low.s1, high.s1, low.s2, high.s2};
@@ -212,8 +221,8 @@ kernel void begin_cell_updates(const int size, const int used, const int report_
 kernel void update_cells(const int size, const int which, global const int *listed, global const int *further,
                          global const int *old_starts, global const int *old_neighbors, const int known,
                          global const uchar4 *old_corners, global const uint *old_keys, global const REAL *points,
-                         const REAL4 box_lower, const REAL4 box_upper, const int room, CELL_OUTPUT_ARGS,
-                         global uint *keys, global int *changed, global int *more, global int *marks PERIOD_ARGS)
+                         CLIP_BOX_ARGS, const int room, CELL_OUTPUT_ARGS, global uint *keys, global int *changed,
+                         global int *more, global int *marks PERIOD_ARGS)
 {
     LONG_ITEM(item);
     if (which == MARKED_CELLS && item >= report[REPORT_PLACED])
@@ -221,7 +230,7 @@ kernel void update_cells(const int size, const int which, global const int *list
     if (item == 0)
         report[REPORT_MARKED] = 0; /* they are counted again */
     const int what = which == ALL_CELLS ? item : listed[item], i = max(what, ~what);
-    const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS};
+    const rows_t in = ROWS(i);
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
     global const int *added = which == MARKED_CELLS ? further + MORE * item : 0;
     corners_t cell;

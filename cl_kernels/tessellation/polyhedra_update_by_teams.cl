@@ -30,6 +30,9 @@ typedef struct {
     uint walls;
 } placed_t;
 
+/* Walls of a solid may cut the cell. */
+#define CUT_BY_WALLS (~(uint)0)
+
 /* Whether a cell with vertices as far as `reach` crosses a wall at the distance `room`, toward which its vertices
    extend by `extent`. */
 inline bool crosses(REAL room, REAL reach, REAL extent)
@@ -40,7 +43,8 @@ inline bool crosses(REAL room, REAL reach, REAL extent)
 
 /* Find the vertices, TEAM at once, and sum them up; see place_corners. `fits` becomes whether no vertex lies beyond
    another face. The sums are incomplete if one does. */
-inline bool team_place(local team_cell_t *at, team_t *team, REAL4 x, const rows_t *in, placed_t *placed, bool *fits)
+inline bool team_place(local team_cell_t *at, team_t *team, int i, REAL4 x, const rows_t *in, placed_t *placed,
+                       bool *fits)
 {
     local corners_t *cell = &at->cell;
     const int lane = team->lane, corner_count = cell->corners, faces = cell->faces;
@@ -99,6 +103,7 @@ inline bool team_place(local team_cell_t *at, team_t *team, REAL4 x, const rows_
 
     REAL far2 = 0;
     REAL4 below = 0, above = 0;
+    bool behind = false;
     for (int v = lane; v < corner_count; v += TEAM) {
         const REAL4 place = corner_place(cell, v);
         const places_t y = {place.s0, place.s1, place.s2};
@@ -114,6 +119,7 @@ inline bool team_place(local team_cell_t *at, team_t *team, REAL4 x, const rows_
         far2 = y2 > far2 ? y2 : far2;
         below = fmax(below, -place);
         above = fmax(above, place);
+        behind |= is_behind_walls(place, in);
     }
     const REAL reach2 = team_largest(team, far2), reach = sqrt(reach2);
     const REAL4 low = x - in->box_lower, high = in->box_upper - x;
@@ -122,6 +128,10 @@ inline bool team_place(local team_cell_t *at, team_t *team, REAL4 x, const rows_
                        (uint)crosses(low.s2, reach, below.s2) << 4 | (uint)crosses(high.s2, reach, above.s2) << 5;
     placed->reach2 = reach2;
     placed->walls = team_or(team, walls);
+#ifdef SOLID
+    if (team_ballot(team, behind) != 0 || MAY_MEET_WALLS(i, reach2, in))
+        placed->walls = CUT_BY_WALLS;
+#endif
     *fits = team_ballot(team, !fit) == 0;
     return team_ballot(team, !good || (has_face && !(cell->planes[lane].s3 > LEAST_NEAREST2 * reach2))) == 0;
 }
@@ -246,9 +256,9 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
                                              global const int *further, global const int *old_starts,
                                              global const int *old_neighbors, const int known,
                                              global const uchar4 *old_corners, global const uint *old_keys,
-                                             global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
-                                             const int room, CELL_OUTPUT_ARGS, global uint *keys, global int *changed,
-                                             global int *more, global int *marks PERIOD_ARGS)
+                                             global const REAL *points, CLIP_BOX_ARGS, const int room, CELL_OUTPUT_ARGS,
+                                             global uint *keys, global int *changed, global int *more,
+                                             global int *marks PERIOD_ARGS)
 {
     local team_cell_t shared;
     local team_cell_t *at = &shared;
@@ -257,7 +267,7 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
     if (item >= size || (which == MARKED_CELLS && item >= report[REPORT_PLACED]))
         return;
     const int what = which == ALL_CELLS ? item : listed[item], i = max(what, ~what);
-    const rows_t in = {old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS};
+    const rows_t in = ROWS(i);
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
     team_t team = {at->words, lane, 0};
     if (lane < 3)
@@ -286,6 +296,10 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
     }
     if (what < 0 || before < 4 || faces > MOST_FACES)
         return;
+#ifdef SOLID
+    if (team_ballot(&team, lane < before && HAD_WALLS(old_neighbors[start + lane])) != 0)
+        return;
+#endif
     if (lane < before)
         cell->labels[lane] = old_neighbors[start + lane];
     TEAM_SYNC();
@@ -307,14 +321,14 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
         if (turn == 1 && !team_repair(at, &team, faces, good ? before : 0, x, &in, marks))
             return;
         bool fits;
-        good = team_place(at, &team, x, &in, &placed, &fits);
+        good = team_place(at, &team, i, x, &in, &placed, &fits);
         kept = turn == 0 && faces == before;
         done = good && fits && (turn == 1 || kept);
     }
     if (!done || !has_nearest_images(placed.reach2, &in))
         return;
     if (placed.walls != 0) {
-        if ((placed.walls >> lane) & 1)
+        if (placed.walls != CUT_BY_WALLS && (placed.walls >> lane) & 1)
             add_neighbor(i, -1 - lane, &in, marks);
         return;
     }

@@ -4,6 +4,7 @@
    The polyhedron is simple: three faces meet in every vertex (where more do, vertices coincide). Its dual is a
    triangulated sphere: a vertex is the triangle of its three faces, counter-clockwise seen from outside. */
 #include "geometry/weights.h"
+#include "tessellation/own_planes.h"
 
 #ifndef FACE_CAPACITY
 #error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 32"
@@ -79,7 +80,7 @@ typedef struct {
     REALS x[VERTEX_CAPACITY / CELL_LANES], y[VERTEX_CAPACITY / CELL_LANES], z[VERTEX_CAPACITY / CELL_LANES];
     REALS beyond[VERTEX_CAPACITY / CELL_LANES]; /* signed distances from a bisector, times |d| */
     REAL4 planes[FACE_CAPACITY];                /* of a face: d, level; the plane is y.d = level */
-    int labels[FACE_CAPACITY];                  /* of a face: a generator, or -1 - wall */
+    int labels[FACE_CAPACITY];                  /* of a face: a generator, -1 - wall, or a side of the clip box */
     INDEX4 faces[VERTEX_CAPACITY];              /* of a vertex, counter-clockwise: a, b, c */
     INDEX4 links[VERTEX_CAPACITY]; /* of a vertex: the other ends of the edges between a and b, b and c, c and a */
     int n;                         /* vertices */
@@ -212,7 +213,7 @@ inline void start_polyhedron(CELL *cell, REAL4 x, REAL4 lower, REAL4 upper)
     for (int v = 0; v < 8; ++v)
         start_vertex(cell, v, low, high);
     for (int w = 0; w < 6; ++w)
-        cell->labels[w] = -1 - w;
+        cell->labels[w] = BOX_LABEL(w);
     cell->planes[0] = (REAL4)(-1, 0, 0, -low.s0);
     cell->planes[1] = (REAL4)(1, 0, 0, high.s0);
     cell->planes[2] = (REAL4)(0, -1, 0, -low.s1);

@@ -41,6 +41,7 @@
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */
 #define FLAG_DOUBT 8     /* no error: there are doubtful cells, whose faces must be matched */
 #define FLAG_NARROW 16   /* no error: some faces may be no wider than round-off; see consistency.cl */
+#define FLAG_UNKNOWN 128 /* the surface of a solid is not known as far as a cell reaches */
 #define FLAG_UNEVEN 64   /* no error: two cells differ about their common face by more than a small share of one */
 
 /* Reserve a range in the arrays of faces. Its position depends on the order of work-items, its content does not. */
@@ -52,6 +53,6 @@ inline int take_places(global int *report, int count)
 /* Whether all cells are known, and right. */
 inline bool are_complete(global const int *report)
 {
-    const int errors = FLAG_FULL | FLAG_COINCIDE | FLAG_COLLAPSED;
+    const int errors = FLAG_FULL | FLAG_COINCIDE | FLAG_COLLAPSED | FLAG_UNKNOWN;
     return (report[REPORT_FLAGS] & errors) == 0 && report[REPORT_UNFINISHED] == 0 && report[REPORT_MARKED] == 0;
 }

@@ -1,6 +1,7 @@
 /* Cells in 3D that are updated, alone or by teams; see polyhedra_update.cl. */
 #include "geometry/domain.h"
 #include "tessellation/corner_shares.h"
+#include "tessellation/own_planes.h"
 
 #define ALL_FACES (-1)
 #define MORE 8 /* room for further neighbors of a cell */
@@ -31,7 +32,25 @@ typedef struct {
 #ifdef PERIODIC
     REAL4 periods;
 #endif
+#ifdef SOLID
+    int2 own_row;
+    global const int *own_labels;
+    global const REAL4 *own_planes;
+    global const float *own_found;
+    global float *own_reach;
+#endif
 } rows_t;
+
+/* The rows for generator i, from the arguments of a kernel. */
+#ifdef SOLID
+#define OWN_ROW(i) , own_rows[i], own_labels, own_planes, own_found, own_reach
+#else
+#define OWN_ROW(i)
+#endif
+#define ROWS(i)                                                                                                        \
+    {                                                                                                                  \
+        old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS OWN_ROW(i)                               \
+    }
 
 /* The plane (p, d^2) between a generator at x and a neighbor or wall. */
 inline REAL4 plane_of_face(int label, REAL4 x, const rows_t *in)
@@ -70,6 +89,26 @@ inline bool names_neighbor(int label, int i, const rows_t *in)
         found |= in->neighbors[k] == label;
     return found;
 }
+
+/* In a solid cells that had a face on a wall, or cross a plane of their own, are clipped. Whether vertex y of a cell is
+   beyond such a plane; and whether walls may cut the cell of generator i otherwise. */
+#ifdef SOLID
+inline bool is_behind_walls(REAL4 y, const rows_t *in)
+{
+    bool behind = false;
+    for (int k = in->own_row.s0; k < in->own_row.s0 + in->own_row.s1; ++k) {
+        const REAL4 plane = in->own_planes[k];
+        behind |= fma(plane.s0, y.s0, fma(plane.s1, y.s1, plane.s2 * y.s2)) > plane.s3;
+    }
+    return behind;
+}
+#define HAD_WALLS(label) ((label) < 0)
+#define MAY_MEET_WALLS(i, reach2, in) (!knows_walls(i, reach2, (in)->own_found, (in)->own_reach))
+#else
+#define is_behind_walls(y, in) false
+#define HAD_WALLS(label) false
+#define MAY_MEET_WALLS(i, reach2, in) false
+#endif
 
 /* Make `label` a further neighbor of i, unless it was one; i is clipped if there is no room. */
 inline void add_neighbor(int i, int label, const rows_t *in, global int *marks)

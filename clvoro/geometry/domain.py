@@ -18,9 +18,12 @@ from .shapes import Edges
 from .surface import Surface, box_surface
 
 if TYPE_CHECKING:
+    import pyopencl.array as cla
+
     from ..opencl.engine import Engine
     from .polygon import Polygon
     from .sphere import Sphere
+    from .wall_triangles import WallTriangles
 
 LARGEST_EDGE = 1e50
 """Longest edge of a domain, and the inverse of the shortest: fifth powers of lengths must not overflow float64."""
@@ -31,6 +34,14 @@ class ClipBox(Protocol):
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners in the device's coordinates, padded to four numbers as kernels take them."""
+        ...
+
+    def clip_args(self, engine: Engine) -> tuple[object, ...]:
+        """Return the CLIP_BOX_ARGS of kernels in 3D (tessellation/own_planes.h)."""
+        ...
+
+    def look_farther(self, points: cla.Array) -> None:
+        """Find walls of a solid as far as cells of `points` (n, 3) reach; kernels have noted that."""
         ...
 
 
@@ -377,8 +388,22 @@ class Domain(ABC):
             known[real] = corners[0], corners[1]
         return known[real]
 
+    @property
+    def wall_triangles(self) -> WallTriangles | None:
+        """The triangles whose planes cut the cells near them, in a solid; else None."""
+        return None
+
+    def clip_args(self, engine: Engine) -> tuple[object, ...]:
+        """Return the CLIP_BOX_ARGS of kernels in 3D for cells that nothing but the box bounds."""
+        return self.device_corners(engine.real)
+
+    def look_farther(self, points: cla.Array) -> None:
+        """Do nothing: there are no walls but the box."""
+
     def traits(self, real: np.dtype) -> Traits:
         """Return for what kernels are built, with the periods in the device's coordinates."""
+        if self.wall_triangles is not None:
+            return Traits(("SOLID",))
         if not any(self.periodic):
             return PLAIN
         x, y, z = [float(period) for period in self.periods(real)] + [0.0] * (3 - self.dim)
@@ -386,4 +411,5 @@ class Domain(ABC):
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the arguments of kernels with DOMAIN_ARGS; see geometry/domain.h."""
-        return *self.device_corners(engine.real), *engine.period_args
+        walls = () if self.wall_triangles is None else self.wall_triangles.arguments(engine, self.frame)
+        return *self.device_corners(engine.real), *walls, *engine.period_args

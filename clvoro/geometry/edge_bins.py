@@ -76,7 +76,7 @@ def bin_edges(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndar
     # Each edge crosses a range of rows, and in each row a range of bins.
     first = np.clip(np.floor(np.minimum(a, b)[:, 1] - slack), 0, counts[1] - 1).astype(int)
     last = np.clip(np.floor(np.maximum(a, b)[:, 1] + slack), 0, counts[1] - 1).astype(int)
-    number, row = _ranges(first, last)
+    number, row = ranges(first, last)
     along = b[number] - a[number]
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (np.stack([row - slack, row + 1 + slack]) - a[number, 1]) / along[:, 1]
@@ -85,7 +85,7 @@ def bin_edges(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndar
     x = a[number, 0] + t * along[:, 0]
     left = np.clip(np.floor(x.min(axis=0) - slack), 0, counts[0] - 1).astype(int)
     right = np.clip(np.floor(x.max(axis=0) + slack), 0, counts[0] - 1).astype(int)
-    entry, column = _ranges(left, right)
+    entry, column = ranges(left, right)
     bins = row[entry] * counts[0] + column
     order = np.argsort(bins, kind="stable")
     starts = np.searchsorted(bins[order], np.arange(counts.prod() + 1))
@@ -93,7 +93,7 @@ def bin_edges(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndar
     return frame, np.array([*counts, 0, 0], np.int32), starts.astype(np.int32), number[entry][order]
 
 
-def _ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return all pairs (i, k) with first[i] <= k <= last[i]."""
     lengths = last - first + 1
     i = np.repeat(np.arange(len(first)), lengths)

@@ -30,7 +30,7 @@ from .cut_cells import (
     capacity_defines,
     clip_each,
 )
-from .device_diagram import EXACT_SHARE, FULL, ROUGH_SHARE, CloseError, NeighborRows, Tessellation
+from .device_diagram import EXACT_SHARE, FULL, ROUGH_SHARE, UNKNOWN, CloseError, NeighborRows, Tessellation
 from .periodic.halo import halo_defines
 from .teams import TEAM, TeamKernel, are_for_new_cells, has_warps, team_defines
 from .weight_bounds import WeightBounds
@@ -218,7 +218,6 @@ class Polyhedra:
         faces = self._take_faces(most if rows != self._n else max(most, self._room))
         self._n = rows
         places, counts = engine.scratch(rows, np.int32), engine.scratch(rows, np.int32)
-        lower, upper = box.device_corners(engine.real)
         cells = self._cell_rows(rows)
         warm = previous is not None and previous.n == rows
         old = (previous.starts, previous.neighbors) if previous is not None and warm else (counts, counts)
@@ -229,6 +228,7 @@ class Polyhedra:
         corners = engine.scratch(2 * self._room, np.uint32) if keep else None
         while True:
             cut = CutCells(places, counts, *faces, cells, self._room, corners, faces[0])
+            clip_args = box.clip_args(engine)
             room, written = np.int32(self._room), cut.output(self._report)
             if walk is not None and not again:
                 with engine.workspace.frame():
@@ -242,8 +242,7 @@ class Polyhedra:
                         binned.items,
                         binned.spacing,
                         *search,
-                        lower,
-                        upper,
+                        *clip_args,
                         first_reach,
                         room,
                         *written,
@@ -257,8 +256,7 @@ class Polyhedra:
                 binned.items,
                 *search,
                 points,
-                lower,
-                upper,
+                *clip_args,
                 np.int32(warm),
                 *old,
                 some,
@@ -273,7 +271,7 @@ class Polyhedra:
                 clip = self._kernels(capacity).clip_polyhedra
                 clip_each(engine, clip, capacity, n, cell_args, halo_args)
             flags, m = (int(v) for v in self._report.get()[:2])
-            if flags & ~(FULL | HARMLESS):
+            if flags & ~(FULL | UNKNOWN | HARMLESS):
                 return None
             if m > self._room:
                 # Repeat all: faces beyond the capacity were lost.
@@ -282,6 +280,10 @@ class Polyhedra:
                 corners = engine.scratch(2 * self._room, np.uint32) if keep else None
                 capacity, again = FACE_CAPACITY, False
                 self._begin_report()
+            elif flags & UNKNOWN:
+                box.look_farther(points)
+                again = True
+                self._begin_report(flags & HARMLESS, m)
             elif flags & FULL:
                 # Clip only the cells with too many faces, with a larger capacity.
                 capacity, again = GROWTH * capacity, True
@@ -332,7 +334,7 @@ class Polyhedra:
             binned.items,
             *search,
             points,
-            *box.device_corners(engine.real),
+            *box.clip_args(engine),
             np.int32(1),
             *old,
             np.int32(1),

@@ -151,7 +151,7 @@ class _Rounds:
             np.int32(bool(previous.vertices)),
             *old,
             points,
-            *box.device_corners(engine.real),
+            *box.clip_args(engine),
             np.int32(self.room),
             *self.cut.output(report),
             self.cut.keys,

@@ -56,6 +56,9 @@ class DomainSteps:
         """Make ghosts fewer, because generators appear too close; return whether that is possible."""
         return False
 
+    def find_walls(self, part: Part, binned: BinnedPoints, previous: Tessellation | None) -> None:
+        """Find what bounds the new cells of `part` besides its box. `previous` has the same generators."""
+
     def rows(self, previous: Tessellation) -> Tessellation | NeighborRows:
         """Return the graph from which new cells may start, as long as they are built."""
         return previous

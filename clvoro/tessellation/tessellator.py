@@ -14,6 +14,7 @@ from ..geometry.domain import Domain
 from .bins import BinnedPoints
 from .clipped.cut import Cut
 from .device_diagram import CloseError, Follow, NeighborRows, Tessellation, read_report
+from .own_planes import SolidWalls
 from .part import Part
 from .periodic.images import Images
 from .power import Rings, require_power_domain
@@ -65,6 +66,8 @@ class Tessellator:
             self.steps: DomainSteps = Images(self.stages, domain, halo)
         elif domain.outline is not None:
             self.steps = Cut(self.stages, domain.outline, spacing)
+        elif domain.wall_triangles is not None:
+            self.steps = SolidWalls(self.stages, domain, domain.wall_triangles, spacing)
         else:
             self.steps = DomainSteps(self.stages, domain)
         self.rings = Rings(self.stages, domain) if weighted else None
@@ -185,6 +188,7 @@ class Tessellator:
         while True:
             part = steps.extend(sites, n)
             binned = sort() if part.points is sites else self._sorted(part)
+            steps.find_walls(part, binned, previous)
             try:
                 # Ghosts without values need cells, since something cuts these.
                 whole = complete or part.home is None

@@ -15,12 +15,12 @@
    loops (3 c,)                corners, counter-clockwise from outside */
 
 /* The cell of generator i; false if there is not enough room. */
-inline bool make_cell(CELL *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper, global const int *starts,
+inline bool make_cell(CELL *cell, int i, global const REAL *points, CLIP_BOX_ARGS, global const int *starts,
                       global const int *neighbors)
 {
     const REAL4 x = SITE_IN_SPACE(points, i);
-    start_polyhedron(cell, x, lower, upper);
-    return clip_polyhedron_by_row(cell, i, x, starts, neighbors, points) != CLIP_FULL;
+    return start_cell(cell, i, x, points, CLIP_BOX) != CLIP_FULL &&
+           clip_polyhedron_by_row(cell, i, x, starts, neighbors, points) != CLIP_FULL;
 }
 
 inline bool is_in_row(int label, int begin, int end, global const int *labels)
@@ -33,9 +33,9 @@ inline bool is_in_row(int label, int begin, int end, global const int *labels)
 
 /* Per generator i with capacities[i] = 0: how many corners and half-faces its cell has; then capacities[i] is
    FACE_CAPACITY. full[0] is set if a cell needs more room. */
-kernel void count_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
-                          global const int *starts, global const int *neighbors, global int *capacities,
-                          global int *corner_counts, global int *half_face_counts, global int *full CELL_ARGS)
+kernel void count_corners(const int size, global const REAL *points, CLIP_BOX_ARGS, global const int *starts,
+                          global const int *neighbors, global int *capacities, global int *corner_counts,
+                          global int *half_face_counts, global int *full CELL_ARGS)
 {
     LONG_ITEM(k);
     TAKE_CELL(cell, k);
@@ -49,7 +49,7 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
             continue;
         }
 #endif
-        if (!make_cell(cell, i, points, box_lower, box_upper, starts, neighbors)) {
+        if (!make_cell(cell, i, points, CLIP_BOX, starts, neighbors)) {
             atomic_or(full, 1);
             continue;
         }
@@ -109,11 +109,11 @@ inline void list_loops(CELL *cell, int base, int half_face, int end, global cons
 /* Per generator i with capacities[i] = FACE_CAPACITY: its corners (c, 3), relative to x_i, how sharp each is, the
    labels of their faces (c, 3), counter-clockwise, their owner, and its half-faces. same[u] is the least corner of the
    cell that lies where corner u does, joined to it by edges of zero length. */
-kernel void list_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
-                         global const int *starts, global const int *neighbors, global const int *capacities,
-                         global const int *corner_starts, global const int *half_face_starts, global REAL *corners,
-                         global float *sharpness, global int *corner_faces, global int *owners, global int *same,
-                         global int *half_face_labels, global int *loop_starts, global int *loops CELL_ARGS)
+kernel void list_corners(const int size, global const REAL *points, CLIP_BOX_ARGS, global const int *starts,
+                         global const int *neighbors, global const int *capacities, global const int *corner_starts,
+                         global const int *half_face_starts, global REAL *corners, global float *sharpness,
+                         global int *corner_faces, global int *owners, global int *same, global int *half_face_labels,
+                         global int *loop_starts, global int *loops CELL_ARGS)
 {
     LONG_ITEM(k);
     TAKE_CELL(cell, k);
@@ -128,7 +128,7 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
             continue;
         }
 #endif
-        make_cell(cell, i, points, box_lower, box_upper, starts, neighbors);
+        make_cell(cell, i, points, CLIP_BOX, starts, neighbors);
         REAL least = 4 * noise_length(sqrt(cell->reach2));
         for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
             if (cell->labels[f] >= 0)

@@ -47,6 +47,13 @@ class ExtendedBox:
         corners[:, : len(self.lower)] = self.lower, self.upper
         return corners[0], corners[1]
 
+    def clip_args(self, engine: Engine) -> tuple[object, ...]:
+        """Return the CLIP_BOX_ARGS of kernels."""
+        return self.device_corners(engine.real)
+
+    def look_farther(self, points: cla.Array) -> None:
+        """Do nothing: there are no walls."""
+
 
 @dataclass(frozen=True)
 class Folded:

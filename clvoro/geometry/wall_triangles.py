@@ -1,0 +1,154 @@
+"""The surface of a solid as walls of cells on the device: triangles in uniform bins; see geometry/walls.h."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from scipy.ndimage import distance_transform_cdt
+
+from .edge_bins import ranges
+
+if TYPE_CHECKING:
+    from ..opencl.engine import Engine
+    from ..opencl.workspace import Workspace
+
+SMOOTH, CONVEX, CONCAVE = 0, 1, 2
+"""Kinds of edges and corners of triangles: within a patch, on a convex crease, on a concave one."""
+SAGITTA = 1 / 12
+"""Mean height of a curved surface over a wall face, times curvature over area."""
+LEAST_SIDE, LARGEST_SIDE = 24, 112
+"""Bins along the longest side."""
+_SLACK = 1e-3
+"""Of a bin, more than round-off in single precision."""
+_BLOCK = 1 << 20
+"""Pairs of a triangle and a bin that are tested at once."""
+
+
+class WallTriangles:
+    """Triangles of smooth patches as arguments of kernels: WALL_ARGS. They are freed with the workspace of the engine.
+
+    Parameters
+    ----------
+    corners : (t, 3, 3) float
+        Positions, counter-clockwise from outside of the region.
+    patch : (t,) int
+        Number of the patch: faces there have the label ``-1 - patch``.
+    normals : (t, 3, 3) float
+        Unit normals of the patch at the corners, out of the region.
+    curvature : (t, 3) float
+        Mean curvature of the patch at the corners, 1 / length; positive where the region is convex.
+    edges : (t, 3) int
+        `SMOOTH`, `CONVEX` or `CONCAVE` for the edge from corner s to corner s + 1.
+    ends : (t, 3) int
+        The same for corner s: `CONCAVE` where a concave crease of the patch passes or ends.
+    """
+
+    def __init__(
+        self,
+        corners: np.ndarray,
+        patch: np.ndarray,
+        normals: np.ndarray,
+        curvature: np.ndarray,
+        edges: np.ndarray,
+        ends: np.ndarray,
+    ) -> None:
+        sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        kept = np.linalg.norm(sides, axis=1) > 0
+        self.corners, self.patch = np.asarray(corners, float)[kept], np.asarray(patch)[kept]
+        self.normals, self.curvature = np.asarray(normals, float)[kept], np.asarray(curvature, float)[kept]
+        self.edges, self.ends = np.asarray(edges)[kept], np.asarray(ends)[kept]
+        self._known: WeakKeyDictionary[Workspace, dict[object, tuple[object, ...]]] = WeakKeyDictionary()
+
+    def __len__(self) -> int:
+        return len(self.patch)
+
+    def planes(self, scale: float, size: Callable[[np.ndarray], np.ndarray] | None) -> np.ndarray:
+        """Return the normals at the corners, and by how much planes are moved inwards there, (t, 3, 4).
+
+        Parameters
+        ----------
+        scale : float
+            Unit of the shift.
+        size : callable, optional
+            Size h of cells at points (k, 3), (k,); without it nothing is moved.
+        """
+        shift = np.zeros(self.curvature.shape)
+        if size is not None and self.curvature.any():
+            h = np.asarray(size(self.corners.reshape(-1, 3)), float).reshape(shift.shape)
+            shift = SAGITTA * self.curvature * h**2 / scale
+        return np.concatenate([self.normals, shift[..., None]], axis=2)
+
+    def arguments(self, engine: Engine, frame: tuple[np.ndarray, float]) -> tuple[object, ...]:
+        """Return WALL_ARGS in the coordinates ``(x - origin) / scale`` of `frame`; see geometry/walls.h."""
+        there = self._known.setdefault(engine.workspace, {})
+        if engine.real not in there:
+            origin, scale = frame
+            corners = (self.corners - origin) / scale
+            bins, shape, starts, listed, clear = bin_triangles(corners)
+            kinds = np.concatenate([self.edges, self.ends], axis=1) @ (4 ** np.arange(6))
+            there[engine.real] = (
+                bins.astype(engine.real),
+                shape,
+                engine.upload(starts, np.int32),
+                engine.upload(listed, np.int32),
+                engine.upload(clear, np.uint8),
+                engine.upload(np.concatenate([corners, np.zeros((len(self), 3, 1))], axis=2)),
+                engine.upload(np.column_stack([self.patch, kinds]), np.int32),
+            )
+        return there[engine.real]
+
+
+def bin_triangles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Sort triangles with `corners` (t, 3, 3) into bins.
+
+    Returns
+    -------
+    frame : (4,) float
+        Origin (3) and 1 / width of a bin.
+    shape : (4,) int32
+        Number of bins along x, y and z, and 0.
+    starts : (bins + 1,) int32
+        Place in `listed` of the first triangle of each bin; x runs fastest.
+    listed : int
+        The triangles that pass through each bin, or so near to it that round-off matters, in ascending order.
+    clear : (bins,) uint8
+        Number of steps from each bin to the next one with a triangle, at most 255.
+    """
+    lower, upper = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    extent = upper - lower
+    side = np.clip(2 * np.sqrt(len(corners)), LEAST_SIDE, LARGEST_SIDE)
+    width = extent.max() * (1 + 1e-6) / side
+    counts = np.maximum(np.ceil(extent / width).astype(int), 1)
+    x = (corners - lower) / width
+    first = np.clip(np.floor(x.min(axis=1) - _SLACK), 0, counts - 1).astype(int)
+    last = np.clip(np.floor(x.max(axis=1) + _SLACK), 0, counts - 1).astype(int)
+    normals = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    found: list[np.ndarray] = []
+    sizes = np.cumsum((last - first + 1).prod(axis=1))
+    begin = 0
+    while begin < len(x):
+        before = sizes[begin - 1] if begin else 0
+        end = max(begin + 1, int(np.searchsorted(sizes, before + _BLOCK)))
+        number, z = ranges(first[begin:end, 2], last[begin:end, 2])
+        row, y = ranges(first[begin:end, 1][number], last[begin:end, 1][number])
+        number, z = number[row], z[row]
+        row, along = ranges(first[begin:end, 0][number], last[begin:end, 0][number])
+        number, y, z = number[row] + begin, y[row], z[row]
+        middle = np.column_stack([along, y, z]) + 0.5
+        off = np.abs(((middle - x[number, 0]) * normals[number]).sum(axis=1))
+        near = off <= (0.5 + _SLACK) * np.abs(normals[number]).sum(axis=1)
+        bins = (z[near] * counts[1] + y[near]) * counts[0] + along[near]
+        found.append(np.column_stack([bins, number[near]]))
+        begin = end
+    pairs = np.concatenate(found)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    bins, listed = pairs[order].T
+    starts = np.searchsorted(bins, np.arange(counts.prod() + 1))
+    empty = (np.diff(starts) == 0).reshape(counts[::-1])
+    clear = np.minimum(distance_transform_cdt(empty, "chessboard"), 255).astype(np.uint8)
+    frame = np.array([*lower, 1 / width])
+    return frame, np.array([*counts, 0], np.int32), starts.astype(np.int32), listed, clear.ravel()
