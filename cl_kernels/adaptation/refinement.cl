@@ -28,6 +28,10 @@ inline bool is_wall_side(int k, int begin, int end, global const int *neighbors,
                   (face_measures[m] == face_measures[k] && m > k);
     return longest;
 }
+#elif defined(SOLID)
+/* Not at small faces on a second patch beside a crease. */
+#define is_wall_side(k, begin, end, neighbors, face_measures, volume)                                                  \
+    (neighbors[k] < 0 && face_measures[k] > R(0.2) * cbrt(volume) * cbrt(volume))
 #else
 #define is_wall_side(k, begin, end, neighbors, face_measures, volume) (neighbors[k] < 0)
 #endif
@@ -102,6 +106,22 @@ kernel void place_new_generators(const int size, global const int *starts, globa
             keep_separate(x, y, h[i] / 16, place_at_face(x, m, j, way, fixed, tangents, DOMAIN), DOMAIN);
             child[0] = y[0];
             child[1] = y[1];
+#elif defined(SOLID)
+            /* From the generator toward the wall face: half of the way, if that is not much less than h. */
+            const REAL m[3] = {face_centroids[3 * k], face_centroids[3 * k + 1], face_centroids[3 * k + 2]};
+            const REAL gap = sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2]), most = h[i];
+            REAL normal[3], x[3], y[3];
+            EACH_AXIS (a) {
+                normal[a] = -m[a] / gap;
+                x[a] = points[3 * i + a];
+            }
+            const REAL room = free_depth(i, most, gap, normal, starts, neighbors, points PERIODS);
+            const REAL way = gap > most / 8 || room < 3 * gap ? fmax(gap / 2, gap - most / 4) : gap - room / 2;
+            EACH_AXIS (a)
+                y[a] = x[a] - way * normal[a];
+            keep_inside(x, y, DOMAIN);
+            EACH_AXIS (a)
+                child[a] = y[a];
 #else
             const int wall = -1 - j, axis = wall / 2;
             const REAL level = wall % 2 ? upper[axis] : lower[axis];
@@ -146,6 +166,17 @@ kernel void place_new_generators(const int size, global const int *starts, globa
             }
             child[0] = y[0];
             child[1] = y[1];
+#elif defined(SOLID)
+            /* Around a concave crease: toward the common face. */
+            const REAL x[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
+            REAL y[3] = {child[0], child[1], child[2]};
+            if (exit_parameter(x, y, DOMAIN) <= 1) {
+                EACH_AXIS (a)
+                    y[a] = x[a] + face_centroids[3 * k + a];
+                keep_inside(x, y, DOMAIN);
+                EACH_AXIS (a)
+                    child[a] = y[a];
+            }
 #endif
         } else {
             continue;

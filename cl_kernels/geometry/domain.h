@@ -15,6 +15,13 @@
 #include "geometry/edges.h"
 #define keep_inside keep_inside_polygon
 #define reflect_inside reflect_inside_polygon
+#elif defined(SOLID)
+#include "geometry/walls.h"
+#define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper, WALL_ARGS
+#define DOMAIN box_lower, box_upper, WALL
+#define keep_inside keep_inside_solid
+#define reflect_inside keep_inside_solid
+#define exit_parameter exit_from_solid
 #elif defined(SPHERE)
 #define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper
 #define DOMAIN box_lower, box_upper
@@ -97,6 +104,22 @@ inline void onto_sphere(REAL *y)
     const REAL length = sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2]);
     EACH_AXIS (a)
         y[a] /= length;
+}
+#elif defined(SOLID)
+/* Parameter t in [0, 1] at which the path from x to y leaves the domain first; 2 if it stays inside. */
+inline REAL exit_from_solid(const REAL *x, const REAL *y, DOMAIN_ARGS)
+{
+    const REAL4 from = (REAL4)(x[0], x[1], x[2], 0), way = (REAL4)(y[0] - x[0], y[1] - x[1], y[2] - x[2], 0);
+    return exit_through_wall(from, way, WALL);
+}
+
+/* Moves the target y of a generator at x into the domain: if the path leaves it, half-way to the boundary. */
+inline void keep_inside_solid(const REAL *x, REAL *y, DOMAIN_ARGS)
+{
+    const REAL t = exit_parameter(x, y, DOMAIN);
+    if (t <= 1)
+        EACH_AXIS (a)
+            y[a] = x[a] + t / 2 * (y[a] - x[a]);
 }
 #elif !defined(POLYGON)
 /* Move the target y of a generator at x into the domain: to the nearest wall, or to its image along a period. */

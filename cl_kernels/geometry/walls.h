@@ -6,7 +6,8 @@
    wall_listed     the triangles
    wall_clear      (bins) steps to the next bin with a triangle
    wall_corners    (3 t) corners, counter-clockwise from outside
-   wall_kinds      (t) patch; kinds of the edges from corner s to s + 1 and of the corners, two bits each */
+   wall_kinds      (t) patch; kinds of the edges from corner s to s + 1 and of the corners, two bits each: 0 within a
+                   patch, 1 on a convex crease, 2 on a concave one */
 #include "opencl/real.h"
 
 #define WALL_ARGS                                                                                                      \
@@ -16,7 +17,6 @@
 
 #define EDGE_KIND(kinds, s) ((kinds) >> (2 * (s)) & 3)
 #define CORNER_KIND(kinds, s) ((kinds) >> (6 + 2 * (s)) & 3)
-#define CONVEX_CREASE 1
 #define CONCAVE_CREASE 2
 
 inline REAL4 cross_of_walls(REAL4 a, REAL4 b)

@@ -47,8 +47,10 @@ kernel void evaluate_size_gradient(const int size, global const REAL *restrict p
     for (int a = 0; a < DIM; ++a) {
         const REAL here = x[a];
         REAL ahead = fmin(here + step, upper[a]), behind = fmax(here - step, lower[a]);
-#ifdef POLYGON
-        REAL y[DIM] = {x[0], x[1]};
+#if defined(POLYGON) || defined(SOLID)
+        REAL y[DIM];
+        EACH_AXIS (b)
+            y[b] = x[b];
         y[a] = ahead;
         if (exit_parameter(x, y, DOMAIN) <= 1)
             ahead = here;

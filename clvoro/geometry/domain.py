@@ -40,8 +40,8 @@ class ClipBox(Protocol):
         """Return the CLIP_BOX_ARGS of kernels in 3D (tessellation/own_planes.h)."""
         ...
 
-    def look_farther(self, points: cla.Array) -> None:
-        """Find walls of a solid as far as cells of `points` (n, 3) reach; kernels have noted that."""
+    def look_farther(self, points: cla.Array) -> bool:
+        """Find walls of a solid as far as cells of `points` (n, 3) reach; kernels have noted that. True in a solid."""
         ...
 
 
@@ -397,8 +397,9 @@ class Domain(ABC):
         """Return the CLIP_BOX_ARGS of kernels in 3D for cells that nothing but the box bounds."""
         return self.device_corners(engine.real)
 
-    def look_farther(self, points: cla.Array) -> None:
-        """Do nothing: there are no walls but the box."""
+    def look_farther(self, points: cla.Array) -> bool:
+        """Return False: there are no walls but the box."""
+        return False
 
     def traits(self, real: np.dtype) -> Traits:
         """Return for what kernels are built, with the periods in the device's coordinates."""

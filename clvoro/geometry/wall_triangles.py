@@ -38,8 +38,6 @@ class WallTriangles:
         Number of the patch: faces there have the label ``-1 - patch``.
     normals : (t, 3, 3) float
         Unit normals of the patch at the corners, out of the region.
-    curvature : (t, 3) float
-        Mean curvature of the patch at the corners, 1 / length; positive where the region is convex.
     edges : (t, 3) int
         `SMOOTH`, `CONVEX` or `CONCAVE` for the edge from corner s to corner s + 1.
     ends : (t, 3) int
@@ -47,18 +45,12 @@ class WallTriangles:
     """
 
     def __init__(
-        self,
-        corners: np.ndarray,
-        patch: np.ndarray,
-        normals: np.ndarray,
-        curvature: np.ndarray,
-        edges: np.ndarray,
-        ends: np.ndarray,
+        self, corners: np.ndarray, patch: np.ndarray, normals: np.ndarray, edges: np.ndarray, ends: np.ndarray
     ) -> None:
         sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         kept = np.linalg.norm(sides, axis=1) > 0
         self.corners, self.patch = np.asarray(corners, float)[kept], np.asarray(patch)[kept]
-        self.normals, self.curvature = np.asarray(normals, float)[kept], np.asarray(curvature, float)[kept]
+        self.normals = np.asarray(normals, float)[kept]
         self.edges, self.ends = np.asarray(edges)[kept], np.asarray(ends)[kept]
         self._known: WeakKeyDictionary[Workspace, dict[object, tuple[object, ...]]] = WeakKeyDictionary()
 
@@ -75,10 +67,10 @@ class WallTriangles:
         size : callable, optional
             Size h of cells at points (k, 3), (k,); without it nothing is moved.
         """
-        shift = np.zeros(self.curvature.shape)
-        if size is not None and self.curvature.any():
+        shift = np.zeros(self.edges.shape)
+        if size is not None:
             h = np.asarray(size(self.corners.reshape(-1, 3)), float).reshape(shift.shape)
-            shift = SAGITTA * self.curvature * h**2 / scale
+            shift = SAGITTA * mean_curvature(self.corners, self.normals)[:, None] * h**2 / scale
         return np.concatenate([self.normals, shift[..., None]], axis=2)
 
     def arguments(self, engine: Engine, frame: tuple[np.ndarray, float]) -> tuple[object, ...]:
@@ -99,6 +91,18 @@ class WallTriangles:
                 engine.upload(np.column_stack([self.patch, kinds]), np.int32),
             )
         return there[engine.real]
+
+
+def mean_curvature(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return half the divergence of `normals` (t, 3, 3) interpolated in triangles with `corners` (t, 3, 3), (t,).
+
+    It is 1 / R on a ball of radius R, and 0 on planes.
+    """
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    twice = np.linalg.norm(across, axis=1)
+    opposite = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
+    slopes = np.cross((across / twice[:, None])[:, None], opposite) / twice[:, None, None]
+    return (slopes * normals).sum(axis=(1, 2)) / 2
 
 
 def bin_triangles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

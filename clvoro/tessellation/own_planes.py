@@ -10,13 +10,8 @@ import pyopencl.array as cla
 from ..geometry.domain import Domain
 from ..geometry.wall_triangles import WallTriangles
 from ..opencl.engine import Engine
+from ..opencl.kernels import Kernels
 from .bins import BinnedPoints
-from .cut_cells import CutCells
-from .device_diagram import Follow, Tessellation
-from .part import Part
-from .polyhedra import Polyhedra
-from .stages import TessellationStages
-from .steps import DomainSteps, Sort
 
 FIRST_REACH = 1.6
 """How far the surface is searched about a new generator, in units of the local spacing of bins."""
@@ -26,7 +21,7 @@ PLANES_PER_CELL = 1.0
 """First guess of own planes per generator."""
 
 
-class OwnPlanes:
+class SolidBox:
     """The box around a solid, and the planes of walls that cut the cells of generators in it: a `ClipBox`.
 
     Parameters
@@ -78,7 +73,7 @@ class OwnPlanes:
         engine.run_each(kernel, n, binned.items, binned.spacing, np.float32(FIRST_REACH), self._reach)
 
     @property
-    def _kernels(self):  # noqa: ANN202
+    def _kernels(self) -> Kernels:
         return self.engine.kernels("tessellation/own_planes", {"MOST_OWN": self._most})
 
     def find(self, points: cla.Array) -> None:
@@ -114,53 +109,7 @@ class OwnPlanes:
     def _reserve(self, room: int) -> None:
         self._labels, self._planes = self.engine.empty(room, np.int32), self.engine.empty((room, 4))
 
-    def look_farther(self, points: cla.Array) -> None:
-        """Find the planes again, since cells reach farther than the surface was known."""
+    def look_farther(self, points: cla.Array) -> bool:
+        """Find the planes again, since cells reach farther than the surface was known. Returns True."""
         self.find(points)
-
-
-class SolidWalls(DomainSteps):
-    """The steps in a solid: cells are cut by planes of their own.
-
-    Parameters
-    ----------
-    size : callable, optional
-        See `OwnPlanes`.
-    """
-
-    box: OwnPlanes
-
-    def __init__(
-        self,
-        stages: TessellationStages,
-        domain: Domain,
-        walls: WallTriangles,
-        size: Callable[[np.ndarray], np.ndarray] | None = None,
-    ) -> None:
-        super().__init__(stages, domain)
-        self.box = OwnPlanes(stages.engine, domain, walls, size)
-
-    def extend(self, sites: cla.Array, n: int) -> Part:
-        """Return the part of the first `n` of `sites`."""
-        return Part(n, n, sites, self.box)
-
-    def find_walls(self, part: Part, binned: BinnedPoints, previous: Tessellation | None) -> None:
-        """Find the planes that cut the cells of `part`."""
-        if previous is None:
-            self.box.guess(binned, part.n_own)
-        self.box.find(part.points)
-
-    def finish_updated(self, t: Tessellation, points: cla.Array, n: int) -> Tessellation | None:
-        """Return `t` with its walls."""
-        return t
-
-    def update(
-        self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
-    ) -> Tessellation | None:
-        """Update `previous` incrementally; cells at walls are clipped anew."""
-
-        def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
-            cells.clip_rest(cut, report, self.box, sites, sort(), previous)
-
-        self.box.find(sites)
-        return self.stages.update.update(self.stages.cells, self.box, sites, previous, follow=follow, clip=clip)
+        return True

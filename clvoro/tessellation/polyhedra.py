@@ -281,8 +281,7 @@ class Polyhedra:
                 capacity, again = FACE_CAPACITY, False
                 self._begin_report()
             elif flags & UNKNOWN:
-                box.look_farther(points)
-                again = True
+                again = box.look_farther(points)
                 self._begin_report(flags & HARMLESS, m)
             elif flags & FULL:
                 # Clip only the cells with too many faces, with a larger capacity.

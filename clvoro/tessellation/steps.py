@@ -1,7 +1,7 @@
 """What a domain adds to the steps of a tessellator, ``extend -> bins -> build or update -> finish``.
 
-`DomainSteps` is what boxes with walls and spheres need: nothing. `Images` in `periodic/images.py` makes ghost images
-and folds diagrams, `Cut` in `clipped/cut.py` lets a boundary cut them.
+`DomainSteps` is what boxes with walls and spheres need: nothing. `SolidWalls` finds the walls of solids, `Images` in
+`periodic/images.py` makes ghost images and folds diagrams, `Cut` in `clipped/cut.py` lets a boundary cut them.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..geometry.domain import ClipBox, Domain
+from ..geometry.wall_triangles import WallTriangles
 from .bins import BinnedPoints
 from .cut_cells import CutCells
 from .device_diagram import Follow, NeighborRows, Tessellation
+from .own_planes import SolidBox
 from .part import Part
 from .periodic.halo import Halo
 from .polyhedra import Polyhedra
@@ -99,4 +101,47 @@ class DomainSteps:
         def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
             cells.clip_rest(cut, report, self.box, sites, sort(), previous)
 
+        return self.stages.update.update(self.stages.cells, self.box, sites, previous, follow=follow, clip=clip)
+
+
+class SolidWalls(DomainSteps):
+    """The steps in a solid: cells are cut by planes of their own.
+
+    Parameters
+    ----------
+    size : callable, optional
+        See `SolidBox`.
+    """
+
+    box: SolidBox
+
+    def __init__(
+        self,
+        stages: TessellationStages,
+        domain: Domain,
+        walls: WallTriangles,
+        size: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> None:
+        super().__init__(stages, domain)
+        self.box = SolidBox(stages.engine, domain, walls, size)
+
+    def extend(self, sites: cla.Array, n: int) -> Part:
+        """Return the part of the first `n` of `sites`."""
+        return Part(n, n, sites, self.box)
+
+    def find_walls(self, part: Part, binned: BinnedPoints, previous: Tessellation | None) -> None:
+        """Find the planes that cut the cells of `part`."""
+        if previous is None:
+            self.box.guess(binned, part.n_own)
+        self.box.find(part.points)
+
+    def update(
+        self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
+    ) -> Tessellation | None:
+        """Update `previous` incrementally; cells at walls are clipped anew."""
+
+        def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
+            cells.clip_rest(cut, report, self.box, sites, sort(), previous)
+
+        self.box.find(sites)
         return self.stages.update.update(self.stages.cells, self.box, sites, previous, follow=follow, clip=clip)

@@ -14,12 +14,11 @@ from ..geometry.domain import Domain
 from .bins import BinnedPoints
 from .clipped.cut import Cut
 from .device_diagram import CloseError, Follow, NeighborRows, Tessellation, read_report
-from .own_planes import SolidWalls
 from .part import Part
 from .periodic.images import Images
 from .power import Rings, require_power_domain
 from .stages import TessellationStages
-from .steps import DomainSteps, Sort
+from .steps import DomainSteps, SolidWalls, Sort
 
 
 class Tessellator:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 _LEAST = 1e-12  # share of a box below which it counts as outside
 _SLIVER = 1e-9  # share of a box that may be outside if it counts as inside
+_SIDE = 3  # points along each edge of a box that a surface cuts
 _COLLECTION = 7  # shapely's number of a GeometryCollection
 _PLAIN_TRIES = 20  # draws in a cut box before they are moved towards its inner point
 
@@ -63,31 +64,112 @@ class FullCoverage:
         return 1.0
 
 
-class PolygonCoverage(FullCoverage):
-    """Boxes over a polygonal domain, cut by its boundary.
-
-    The part of a box is cut from the part of its parent, so that the time depends on the edges near the box only.
+class CutCoverage(FullCoverage):
+    """Boxes that the boundary of a domain cuts.
 
     Attributes
     ----------
     share : (m,) float
-        Share of each box's area inside the domain; exactly 0 or 1 up to slivers.
-    inner : (m, 2) float
+        Share of each box's measure inside the domain; exactly 0 or 1 up to slivers.
+    inner : (m, d) float
         A point in the part of the box inside the domain, for cut boxes.
     """
 
-    def __init__(self, boxes: BoxTree, domain: Polygon):
+    def __init__(self, boxes: BoxTree, domain: Domain):
         super().__init__(boxes)
         self.domain = domain
         m = len(boxes)
-        self.share, self.inner = np.ones(m), np.zeros((m, 2))
-        self._parts = np.full(m, None, object)
-        self._cut(np.full(m, domain.geometry), np.arange(m))
+        self.share, self.inner = np.ones(m), np.zeros((m, boxes.dim))
 
     @property
     def occupied(self) -> np.ndarray:
         """Return for each box whether a part of it is inside the domain, (m,) bool."""
         return self.share > 0
+
+    def scale_by_share(self, values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """Return `values` (c, ...) of the boxes where `chosen` is true times their share inside the domain."""
+        return values * self.share[chosen]
+
+    def move_inside(self, points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """Return `points` (c, p, d), with those outside the domain replaced by the inner point of their box."""
+        share = self.share[chosen]
+        cut = np.flatnonzero((share > 0) & (share < 1))
+        mine = points[cut]
+        out = ~self.contains(mine.reshape(-1, mine.shape[2])).reshape(mine.shape[:2])
+        points = points.copy()
+        points[cut] = np.where(out[:, :, None], self.inner[chosen][cut][:, None, :], mine)
+        return points
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) in the boxes whether it is inside the domain, (n,) bool."""
+        return self.domain.contains(points)
+
+    def _nearer(self, x: np.ndarray, box: np.ndarray, cut: np.ndarray, attempt: int) -> None:
+        """Move those points of `x` (n, d) in `cut` boxes towards the inner points, after many attempts."""
+        share = 0.5 ** max(0, attempt - _PLAIN_TRIES)
+        if share < 1:
+            inner = self.inner[box[cut]]
+            x[cut] = inner + share * (x[cut] - inner)
+
+
+class SolidCoverage(CutCoverage):
+    """Boxes over a solid, cut by its surface. Shares are those of a grid of points, scaled to the volume of the solid.
+
+    Parameters
+    ----------
+    boxes : BoxTree
+    domain : Domain
+        One with `wall_triangles`.
+    """
+
+    def __init__(self, boxes: BoxTree, domain: Domain):
+        super().__init__(boxes, domain)
+        self._sample(np.arange(len(boxes)))
+
+    def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Split the boxes where `chosen` (m,) is true; see `BoxTree.split`."""
+        parent, child = self.boxes.split(chosen)
+        self.share, self.inner = self.share[parent], self.inner[parent]
+        self._sample(np.flatnonzero((child >= 0) & (self.share > 0) & (self.share < 1)))
+        return parent, child
+
+    def _sample(self, rows: np.ndarray) -> None:
+        """Find the shares of the boxes `rows`."""
+        middle = self.boxes.points(np.full((1, 3), 0.5), rows)[:, 0]
+        reach = np.linalg.norm(self.boxes.edges(rows), axis=1) / 2
+        cut = self.domain.boundary_distance(middle) <= reach
+        self.share[rows[~cut]] = self.contains(middle[~cut])
+        at = (np.stack(np.meshgrid(*[np.arange(_SIDE)] * 3), axis=-1).reshape(-1, 3) + 0.5) / _SIDE
+        points = self.boxes.points(at, rows[cut])
+        inside = self.contains(points.reshape(-1, 3)).reshape(points.shape[:2])
+        # A box with all points inside is cut nevertheless.
+        self.share[rows[cut]] = np.minimum(inside.mean(axis=1), 1 - _SLIVER)
+        self.inner[rows[cut]] = points[np.arange(len(points)), inside.argmax(axis=1)]
+        volumes = self.boxes.volumes()
+        part = (self.share > 0) & (self.share < 1)
+        whole, parts = volumes[self.share == 1].sum(), (volumes * self.share)[part].sum()
+        if parts > 0:
+            self.share[part] *= max(self.domain.measure - whole, 0.1 * parts) / parts
+
+    def draw(self, at: np.ndarray, box: np.ndarray, attempt: int) -> np.ndarray:
+        """Return the points at relative positions `at` (n, 3) in the boxes `box` (n,); see `FullCoverage.draw`."""
+        x = super().draw(at, box, attempt)
+        self._nearer(x, box, np.flatnonzero(self.share[box] != 1), attempt)
+        return x
+
+
+class PolygonCoverage(CutCoverage):
+    """Boxes over a polygonal domain, cut by its boundary.
+
+    The part of a box is cut from the part of its parent, so that the time depends on the edges near the box only.
+    """
+
+    def __init__(self, boxes: BoxTree, domain: Polygon):
+        super().__init__(boxes, domain)
+        self.domain: Polygon = domain
+        m = len(boxes)
+        self._parts = np.full(m, None, object)
+        self._cut(np.full(m, domain.geometry), np.arange(m))
 
     def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Split the boxes where `chosen` (m,) is true; see `BoxTree.split`."""
@@ -120,20 +202,6 @@ class PolygonCoverage(FullCoverage):
         parts[(share == 0) | (share == 1)] = None
         self.share[rows], self.inner[rows], self._parts[rows] = share, inner, parts
 
-    def scale_by_share(self, values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """Return `values` (c, ...) of the boxes where `chosen` is true times their share inside the domain."""
-        return values * self.share[chosen]
-
-    def move_inside(self, points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """Return `points` (c, p, 2), with those outside the domain replaced by the inner point of their box."""
-        share = self.share[chosen]
-        cut = np.flatnonzero((share > 0) & (share < 1))
-        mine = points[cut]
-        out = ~self.domain.covers(mine.reshape(-1, 2)).reshape(mine.shape[:2])
-        points = points.copy()
-        points[cut] = np.where(out[:, :, None], self.inner[chosen][cut][:, None, :], mine)
-        return points
-
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, 2) in the boxes whether it is inside the domain, (n,) bool."""
         return self.domain.covers(points)
@@ -149,10 +217,7 @@ class PolygonCoverage(FullCoverage):
         if cut.size:
             bounds = shapely.bounds(self._parts[box[cut]])
             x[cut] = bounds[:, :2] + at[cut] * (bounds[:, 2:] - bounds[:, :2])
-            nearer = 0.5 ** max(0, attempt - _PLAIN_TRIES)
-            if nearer < 1:
-                inner = self.inner[box[cut]]
-                x[cut] = inner + nearer * (x[cut] - inner)
+            self._nearer(x, box, cut, attempt)
         return x
 
     def relative_edges(self, box: np.ndarray) -> np.ndarray:
@@ -167,4 +232,6 @@ class PolygonCoverage(FullCoverage):
 
 def coverage_of(boxes: BoxTree, domain: Domain) -> FullCoverage:
     """Return the coverage of `domain` by `boxes`."""
+    if domain.wall_triangles is not None:
+        return SolidCoverage(boxes, domain)
     return FullCoverage(boxes) if domain.outline is None else PolygonCoverage(boxes, domain.outline)

@@ -14,7 +14,7 @@ from ...geometry.domain import Domain
 from ...sizing import as_field
 from .box_tree import BoxTree
 from .charts import charted
-from .coverage import PolygonCoverage, coverage_of
+from .coverage import CutCoverage, coverage_of
 from .quadrature import DensityTree
 
 _ATTEMPTS = 40
@@ -257,6 +257,8 @@ def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) ->
     if domain.outline is not None:
         margin = _ULPS * float(np.finfo(working.dtype).eps) * scale
         return domain.outline.contains_well(points, margin)
+    if domain.wall_triangles is not None:
+        return domain.contains(points)
     lower, upper = (((np.array(c) - origin) / scale).astype(working.dtype) for c in (domain.lower, domain.upper))
     bad = ((working <= lower) | (working >= upper)).any(axis=1)
     bad |= ((points <= domain.lower) | (points >= domain.upper)).any(axis=1)
@@ -283,11 +285,11 @@ def _in_all_pieces(domain: Domain, points: np.ndarray) -> np.ndarray:
 def _uniform_in(domain: Domain, rng: np.random.Generator) -> Callable[[int], np.ndarray]:
     """Return a function that draws a number of uniform random points in the domain.
 
-    In a polygon points are drawn in boxes over it, at least half of whose area is inside. Those outside are rejected.
+    In a polygon or solid points are drawn in boxes, at least half of which is inside. Those outside are rejected.
     """
     boxes = BoxTree(domain)
     coverage = coverage_of(boxes, domain)
-    if not isinstance(coverage, PolygonCoverage):
+    if not isinstance(coverage, CutCoverage):
         return lambda n: domain.lower + domain.extent * rng.random((n, domain.dim))
     while True:
         areas = np.where(coverage.occupied, boxes.volumes(), 0)
@@ -297,11 +299,11 @@ def _uniform_in(domain: Domain, rng: np.random.Generator) -> Callable[[int], np.
     ends = np.cumsum(areas) / areas.sum()
 
     def place(n: int) -> np.ndarray:
-        found = np.empty((0, 2))
+        found = np.empty((0, domain.dim))
         while len(found) < n:
             m = 2 * (n - len(found)) + 16
             box = np.minimum(np.searchsorted(ends, rng.random(m), side="right"), len(boxes) - 1)
-            x = boxes.points(rng.random((m, 1, 2)), box)[:, 0]
+            x = boxes.points(rng.random((m, 1, domain.dim)), box)[:, 0]
             found = np.concatenate([found, x[coverage.contains(x)]])
         return found[:n]
 

@@ -22,6 +22,7 @@ from ..columns import Columns
 from ..domain import Domain
 from ..surface import Surface
 from ..triangles import closest_on_triangle, pierced, triangle_distance2
+from ..wall_triangles import WallTriangles
 from .creases import (
     CONCAVE,
     CONVEX,
@@ -285,6 +286,11 @@ class Solid(Domain):
         most = np.zeros(int(place.max()) + 1, np.int8)
         np.maximum.at(most, place.reshape(-1), kinds.reshape(-1))
         return most[place.reshape(-1)].reshape(-1, 3)
+
+    @cached_property
+    def wall_triangles(self) -> WallTriangles:
+        """The surface as kernels take it."""
+        return WallTriangles(self.surface.corners, self.patch, self.corner_normals, self.side_kinds, self.corner_kinds)
 
     def foot_kinds(self, feet: Feet) -> np.ndarray:
         """Return the kinds (n,) of feet: `CONCAVE` on concave creases, where a patch does not go on; else smaller."""

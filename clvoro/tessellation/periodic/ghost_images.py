@@ -51,8 +51,9 @@ class ExtendedBox:
         """Return the CLIP_BOX_ARGS of kernels."""
         return self.device_corners(engine.real)
 
-    def look_farther(self, points: cla.Array) -> None:
-        """Do nothing: there are no walls."""
+    def look_farther(self, points: cla.Array) -> bool:
+        """Return False: there are no walls."""
+        return False
 
 
 @dataclass(frozen=True)
