@@ -1,0 +1,1 @@
+"""The mesh of a solid: cells of a Voronoi diagram that end at a triangulated surface, by names of vertices."""

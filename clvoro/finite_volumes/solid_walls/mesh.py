@@ -1,0 +1,314 @@
+"""Make the mesh of a solid from its generators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ...mesh.connectivity import distinct, following, take_rows
+from ...mesh.faces import Faces
+from .chains import Crossings, cross_cells
+from .pierce import IN, WALL, pierce_edges, sides
+from .polygons import Divider, chain_loops, open_sides
+from .trimmed_faces import TrimmedFaces, trim_faces
+from .wall_surface import WallSurface, nearest
+
+if TYPE_CHECKING:
+    from ...geometry.solid.solid import Solid
+    from ...mesh.diagram import Diagram
+
+OUTSIDE = 1.6
+"""Distance of outer generators from the surface, over h."""
+_CLEAR = 1.4
+"""Least distance of outer generators from the whole surface, over h: no cell is that wide at a wall."""
+
+
+@dataclass(frozen=True)
+class SolidMesh:
+    """The mesh of a solid.
+
+    Attributes
+    ----------
+    faces : Faces
+    odd : (k,) int
+        Cells whose wall could not be divided by creases.
+    lost : (k,) int
+        Generators without a cell.
+    """
+
+    faces: Faces
+    odd: np.ndarray
+    lost: np.ndarray
+
+
+def outer_generators(solid: Solid, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return points (m, 3) outside of `solid` that bound the cells of generators at its surface.
+
+    They are farther from each point of the solid than its nearest generator is. So they do not change the diagram
+    inside.
+
+    Parameters
+    ----------
+    points : (n, 3) float
+        Generators inside.
+    sizes : (n,) float
+        h at the generators.
+    """
+    surface = WallSurface(solid)
+    near = np.flatnonzero(surface.touches(points, 1.5 * sizes))
+    _, foot, distance = surface.closest(points[near])
+    near, foot, distance = near[np.abs(distance) < 1.5 * sizes[near]], *_where(foot, distance, sizes[near])
+    h = sizes[near]
+    normal = foot - points[near]
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    normal *= np.where(distance > 0, -1, 1)[:, None]
+    placed = foot + OUTSIDE * h[:, None] * normal
+    clear = surface.closest(placed)[2] > _CLEAR * h
+    return placed[clear]
+
+
+def _where(foot: np.ndarray, distance: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    kept = np.abs(distance) < 1.5 * h
+    return foot[kept], distance[kept]
+
+
+def solid_mesh(solid: Solid, points: np.ndarray, sizes: np.ndarray, diagram: Diagram) -> SolidMesh:
+    """Return the mesh of a solid.
+
+    Parameters
+    ----------
+    solid : Solid
+    points : (n, 3) float
+        Generators inside.
+    sizes : (n,) float
+        h at the generators.
+    diagram : Diagram
+        Of the generators, and of `outer_generators` after them, in a box around the solid.
+    """
+    return _Maker(solid, points, sizes, diagram).mesh()
+
+
+class _Maker:
+    """Makes the mesh; vertices are those of the diagram, then piercings of edges, crossings of creases, and corners.
+
+    Attributes
+    ----------
+    points : (v, 3) float
+    site : (v,) int
+        See `WallSurface`; -1 for vertices inside.
+    """
+
+    def __init__(self, solid: Solid, generators: np.ndarray, sizes: np.ndarray, diagram: Diagram) -> None:
+        self.solid, self.surface = solid, WallSurface(solid)
+        self.generators, self.sizes, self.n = generators, sizes, len(generators)
+        f = diagram.faces
+        rows = np.flatnonzero((f.owner < self.n) & (f.neighbor >= 0) & (f.neighbor < self.n))
+        self.owner, self.neighbor = f.owner[rows].astype(np.int64), f.neighbor[rows].astype(np.int64)
+        self.starts, self.corners = take_rows(f.starts, f.corners.astype(np.int64), rows)
+        self.points = np.array(f.points, float)
+        self.tree = KDTree(generators)
+
+    def mesh(self) -> SolidMesh:
+        """Return the mesh."""
+        near = self._near_faces()
+        parts = self._trim(near)
+        parts = self._to_creases(parts)
+        far = np.setdiff1d(np.arange(len(self.owner)), near, assume_unique=True)
+        polygons = self._wall_polygons(parts, far)
+        return self._assemble(far, parts, polygons)
+
+    def _near_faces(self) -> np.ndarray:
+        """Return the faces both of whose cells may reach the surface."""
+        face = np.repeat(np.arange(len(self.owner)), np.diff(self.starts))
+        reach = np.zeros(self.n)
+        for cells in (self.owner, self.neighbor):
+            away = self.points[self.corners] - self.generators[cells[face]]
+            np.maximum.at(reach, cells[face], (away**2).sum(axis=1))
+        near = self.surface.touches(self.generators, np.sqrt(reach) + 0.1 * self.sizes)
+        return np.flatnonzero(near[self.owner] & near[self.neighbor])
+
+    def _trim(self, near: np.ndarray) -> TrimmedFaces:
+        """Decide about the vertices and edges of the faces `near`, and return their parts inside."""
+        starts, corners = take_rows(self.starts, self.corners, near)
+        h_face = np.minimum(self.sizes[self.owner[near]], self.sizes[self.neighbor[near]])
+        used = distinct(corners)
+        h = np.full(len(self.points), np.inf)
+        np.minimum.at(h, corners, np.repeat(h_face, np.diff(starts)))
+        triangle, foot, distance = self.surface.closest(self.points[used])
+        side = np.full(len(self.points), IN, np.int8)
+        side[used] = sides(distance, h[used])
+        on = side[used] == WALL
+        self.site = np.full(len(self.points), -1)
+        at = used[on]
+        self.site[at], self.points[at] = self._sited(foot[on], triangle[on], h[at])
+        signed = np.zeros(len(self.points))
+        signed[used] = np.where(on, 0, distance)
+        # Edges, each once.
+        after = corners[following(starts)]
+        v = len(self.points)
+        keys, edges = np.unique(np.minimum(corners, after) * v + np.maximum(corners, after), return_inverse=True)
+        a, b = keys // v, keys % v
+        on_crease = np.where(self.site >= self.surface.n_patches, self.site, -1)
+        h_edge = np.minimum(h[a], h[b])
+        pierced = pierce_edges(
+            self.surface,
+            self.points[a],
+            self.points[b],
+            np.stack([signed[a], signed[b]], axis=1),
+            np.stack([on_crease[a], on_crease[b]], axis=1),
+            h_edge,
+        )
+        site, placed = self._sited(pierced.points, pierced.triangles, h_edge[pierced.edge])
+        self.points = np.concatenate([self.points, placed])
+        self.site = np.concatenate([self.site, site])
+        parts = trim_faces(
+            self.surface, starts, corners, edges, corners == a[edges], side, pierced, self.points, h_face
+        )
+        return TrimmedFaces(near[parts.face], parts.starts, parts.items, parts.chord)
+
+    def _sited(self, foot: np.ndarray, triangle: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.surface.sites(foot, triangle, h)
+
+    def _to_creases(self, parts: TrimmedFaces) -> TrimmedFaces:
+        """Put a vertex on the crease between the two ends of a chord that lie on different patches."""
+        after = parts.items[following(parts.starts)]
+        chords = np.flatnonzero(parts.chord)
+        one, other = self.site[parts.items[chords]], self.site[after[chords]]
+        apart = self.surface.common(one, other)[0] == 0
+        chords, one, other = chords[apart], one[apart], other[apart]
+        face = parts.face[np.searchsorted(parts.starts, chords, "right") - 1]
+        crossings = cross_cells(self.surface, self.generators, self.tree, self.sizes)
+        sites = self.surface.n_patches + crossings.edge
+        middle = (self.points[parts.items[chords]] + self.points[after[chords]]) / 2
+        rank = self._match(crossings, self.owner[face] * self.n + self.neighbor[face], one, other, middle)
+        first = len(self.points)
+        self.points = np.concatenate([self.points, crossings.points])
+        self.site = np.concatenate([self.site, sites])
+        self.unmatched = int(np.count_nonzero(rank < 0))
+        rows, taken = chords[rank >= 0], rank[rank >= 0]
+        counts = np.diff(parts.starts)
+        added = np.bincount(np.searchsorted(parts.starts, rows, "right") - 1, minlength=len(counts))
+        return TrimmedFaces(
+            parts.face,
+            np.concatenate([[0], np.cumsum(counts + added)]),
+            np.insert(parts.items, rows + 1, first + taken),
+            np.insert(parts.chord, rows + 1, True),
+        )
+
+    def _match(
+        self, crossings: Crossings, face: np.ndarray, one: np.ndarray, other: np.ndarray, middle: np.ndarray
+    ) -> np.ndarray:
+        """Return for each chord the crossing on its face that lies on patches of both ends, the nearest; or -1.
+
+        `face` (k,) are keys of faces, `one` and `other` (k,) the sites of the ends, `middle` (k, 3) middles of chords.
+        """
+        found = np.full(len(face), -1)
+        key = crossings.cells[:, 0] * self.n + crossings.cells[:, 1]
+        low, high = np.searchsorted(key, face, "left"), np.searchsorted(key, face, "right")
+        counts = high - low
+        row = np.repeat(np.arange(len(face)), counts)
+        which = low[row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+        site = self.surface.n_patches + crossings.edge[which]
+        fits = (self.surface.common(site, one[row])[0] > 0) & (self.surface.common(site, other[row])[0] > 0)
+        row, which = row[fits], which[fits]
+        far = ((crossings.points[which] - middle[row]) ** 2).sum(axis=1)
+        order = np.lexsort((far, row))
+        first = np.unique(row[order], return_index=True)[1]
+        found[row[order[first]]] = which[order[first]]
+        return found
+
+    def _wall_polygons(self, parts: TrimmedFaces, far: np.ndarray) -> Divider:
+        """Close the cells at the surface."""
+        with_chord = parts.face[np.searchsorted(parts.starts, np.flatnonzero(parts.chord), "right") - 1]
+        is_open = np.zeros(self.n, bool)
+        is_open[self.owner[with_chord]] = is_open[self.neighbor[with_chord]] = True
+        far = far[is_open[self.owner[far]] | is_open[self.neighbor[far]]]
+        starts, corners = take_rows(self.starts, self.corners, far)
+        faces = np.repeat(np.concatenate([parts.face, far]), np.concatenate([np.diff(parts.starts), np.diff(starts)]))
+        here = np.concatenate([parts.items, corners])
+        after = np.concatenate([parts.items[following(parts.starts)], corners[following(starts)]])
+        cell = np.concatenate([self.owner[faces], self.neighbor[faces]])
+        begin, end = np.concatenate([here, after]), np.concatenate([after, here])
+        mine = is_open[cell]
+        cell, begin, end = open_sides(cell[mine], begin[mine], end[mine])
+        label = self._labels(cell, begin, end)
+        order, starts = chain_loops(cell, begin, end, label)
+        cell, begin, label = cell[order], begin[order], label[order]
+        corner_vertex: dict[int, int] = {}
+        taken = self.site[begin] - self.surface.first_corner
+        for vertex, c in zip(begin[taken >= 0].tolist(), taken[taken >= 0].tolist(), strict=True):
+            corner_vertex[c] = vertex
+        corners_of: dict[int, list[int]] = {}
+        for c, i in enumerate(nearest(self.tree, self.surface.corners)[1].tolist()):
+            if c not in corner_vertex:
+                corners_of.setdefault(i, []).append(c)
+        new_points: list[np.ndarray] = []
+
+        def vertex_of(c: int) -> int:
+            if c not in corner_vertex:
+                corner_vertex[c] = len(self.points) + len(new_points)
+                new_points.append(self.surface.corners[c])
+            return corner_vertex[c]
+
+        divider = Divider(self.surface, corners_of, vertex_of)
+        counts = np.diff(starts)
+        uniform = np.minimum.reduceat(label, starts[:-1]) == np.maximum.reduceat(label, starts[:-1])
+        self.plain = take_rows(starts, begin, np.flatnonzero(uniform))
+        self.plain_cell, self.plain_patch = cell[starts[:-1][uniform]], label[starts[:-1][uniform]]
+        del counts
+        for k in np.flatnonzero(~uniform).tolist():
+            s = slice(starts[k], starts[k + 1])
+            divider.divide(int(cell[starts[k]]), begin[s].tolist(), label[s].tolist())
+        if new_points:
+            self.points = np.concatenate([self.points, new_points])
+        return divider
+
+    def _labels(self, cell: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Return the patch of each side at a wall: that of both ends, or the nearest to its middle."""
+        count, label = self.surface.common(self.site[begin], self.site[end])
+        rows = np.flatnonzero(count != 1)
+        middle = (self.points[begin[rows]] + self.points[end[rows]]) / 2
+        middle += 0.05 * (self.generators[cell[rows]] - middle)
+        near = self.surface.patch[self.surface.closest(middle)[0]].astype(np.int64)
+        for end_site in (self.site[begin[rows]], self.site[end[rows]]):
+            fits = self.surface.common(near, end_site)[0] > 0
+            near = np.where(fits | (count[rows] == 0), near, label[rows])
+        label[rows] = near
+        return label
+
+    def _assemble(self, far: np.ndarray, parts: TrimmedFaces, divider: Divider) -> SolidMesh:
+        """Put all faces together."""
+        starts, corners = take_rows(self.starts, self.corners, far)
+        owner = np.concatenate([self.owner[far], self.owner[parts.face]])
+        neighbor = np.concatenate([self.neighbor[far], self.neighbor[parts.face]])
+        counts = np.concatenate([np.diff(starts), np.diff(parts.starts)])
+        items = np.concatenate([corners, parts.items])
+        p = divider.polygons
+        wall_counts = np.concatenate([np.diff(self.plain[0]), [len(loop) for loop in p.loops]]).astype(np.int64)
+        wall_items = np.concatenate([self.plain[1], np.array([v for loop in p.loops for v in loop], np.int64)])
+        wall_owner = np.concatenate([self.plain_cell, np.array(p.cell, np.int64)])
+        wall_patch = np.concatenate([self.plain_patch, np.array(p.patch, np.int64)])
+        inner = np.lexsort((neighbor, owner))
+        walls = np.lexsort((wall_owner, wall_patch))
+        one = take_rows(np.concatenate([[0], np.cumsum(counts)]), items, inner)
+        two = take_rows(np.concatenate([[0], np.cumsum(wall_counts)]), wall_items, walls)
+        f = len(inner) + len(walls)
+        owner = np.concatenate([owner[inner], wall_owner[walls]])
+        neighbor = np.concatenate([neighbor[inner], -1 - wall_patch[walls]])
+        faces = Faces(
+            domain=self.solid,
+            generators=self.generators,
+            points=self.points,
+            starts=np.concatenate([one[0], one[0][-1] + two[0][1:]]),
+            corners=np.concatenate([one[1], two[1]]).astype(np.int32),
+            owner=owner.astype(np.int32),
+            neighbor=neighbor.astype(np.int32),
+            twin=np.full(f, -1),
+            shift=np.zeros((f, 3), np.int8),
+            half_face=np.full(f, -1),
+        ).compact()
+        seen = np.bincount(owner, minlength=self.n) + np.bincount(neighbor[neighbor >= 0], minlength=self.n)
+        return SolidMesh(faces, np.unique(np.array(p.odd, np.int64)), np.flatnonzero(seen == 0))

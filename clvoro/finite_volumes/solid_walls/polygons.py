@@ -1,0 +1,187 @@
+"""Wall polygons: the loops in which cells end at the surface of a solid, divided by its creases and corners."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .wall_surface import WallSurface
+
+
+@dataclass
+class WallPolygons:
+    """Faces of cells on the surface.
+
+    Attributes
+    ----------
+    cell, patch : list of int
+    loops : list of list of int
+        Corners, counter-clockwise as seen from outside of the cell.
+    odd : list of int
+        Cells whose loop could not be divided by creases.
+    """
+
+    cell: list[int] = field(default_factory=list)
+    patch: list[int] = field(default_factory=list)
+    loops: list[list[int]] = field(default_factory=list)
+    odd: list[int] = field(default_factory=list)
+
+    def add(self, cell: int, patch: int, loop: list[int]) -> None:
+        """Add a face, unless it has no area."""
+        loop = [a for k, a in enumerate(loop) if a != loop[k - 1]]
+        if len(loop) >= 3:
+            self.cell.append(cell)
+            self.patch.append(patch)
+            self.loops.append(loop)
+
+
+def open_sides(cell: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sides of faces, given as seen from cells, that no other face of the cell has, turned around."""
+    size = int(max(begin.max(initial=0), end.max(initial=0))) + 1
+    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    forward = begin < end
+    order = np.lexsort((high, low, cell))
+    key_cell, key_edge = cell[order], low[order] * size + high[order]
+    new = np.ones(len(order), bool)
+    new[1:] = (key_cell[1:] != key_cell[:-1]) | (key_edge[1:] != key_edge[:-1])
+    first = np.flatnonzero(new)
+    if not len(first):
+        return cell[:0], begin[:0], end[:0]
+    balance = np.add.reduceat(np.where(forward[order], 1, -1), first)
+    rows = order[first[balance != 0]]
+    up = balance[balance != 0] < 0  # the missing side runs the other way
+    return cell[rows], np.where(up, low[rows], high[rows]), np.where(up, high[rows], low[rows])
+
+
+def chain_loops(
+    cell: np.ndarray, begin: np.ndarray, end: np.ndarray, label: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sides in the order of loops, and where each loop begins and the last one ends.
+
+    At a vertex where a cell has several sides, those follow one another whose labels are equal.
+    """
+    size = int(max(begin.max(initial=0), end.max(initial=0))) + 1
+    out, into = cell * size + begin, cell * size + end
+    by_begin = np.lexsort((label, out))
+    by_end = np.lexsort((label, into))
+    # As many sides begin as end at each vertex of a cell: they are matched in this order.
+    after = np.empty(len(cell), np.int64)
+    if not np.array_equal(out[by_begin], into[by_end]):
+        sound = np.isin(into, out) & np.isin(out, into)
+        raise ValueError(f"{np.count_nonzero(~sound)} sides of cells at walls are open")
+    after[by_end] = by_begin
+    # The least side of each loop is its head; the others are ranked by doubling.
+    n = len(cell)
+    head, jump = np.arange(n), after.copy()
+    while True:
+        lower = np.minimum(head, head[jump])
+        if (lower == head).all():
+            break
+        head, jump = lower, jump[jump]
+    is_head = head == np.arange(n)
+    rank, jump = np.where(is_head, 0, 1), np.where(is_head, np.arange(n), 0)
+    before = np.empty(n, np.int64)
+    before[after] = np.arange(n)
+    jump = np.where(is_head, np.arange(n), before)
+    while (jump != head).any():
+        rank = rank + rank[jump]
+        jump = jump[jump]
+    order = np.lexsort((rank, head))
+    starts = np.append(np.flatnonzero(np.diff(head[order], prepend=-1) != 0), n)
+    return order, starts
+
+
+class Divider:
+    """Divides loops between patches.
+
+    Parameters
+    ----------
+    surface : WallSurface
+    corners_of : dict
+        Corners (numbers) in the interior of each cell.
+    vertex_of_corner : callable
+        Returns the vertex of a corner.
+    """
+
+    def __init__(self, surface: WallSurface, corners_of: dict[int, list[int]], vertex_of_corner) -> None:
+        self.surface, self.corners_of, self.vertex_of_corner = surface, corners_of, vertex_of_corner
+        self.polygons = WallPolygons()
+
+    def divide(self, cell: int, loop: list[int], labels: list[int]) -> None:
+        """Divide one loop: `labels` are the patches of the sides that begin in the vertices of `loop`."""
+        runs = _runs(loop, labels)
+        corners = list(self.corners_of.get(cell, ()))
+        add = self.polygons.add
+        while len(runs) > 2:
+            done = self._cut_by_corner(cell, runs, corners) or self._cut_between(cell, runs)
+            if not done:
+                self.polygons.odd.append(cell)
+                k = min(range(len(runs)), key=lambda i: len(runs[i][1]))
+                add(cell, runs[k][0], runs[k][1])
+                _replace(runs, k, [runs[k][1][0], runs[k][1][-1]])
+        if len(runs) == 1:
+            add(cell, runs[0][0], runs[0][1][:-1])
+            return
+        (p, one), (q, other) = runs
+        between = [
+            self.vertex_of_corner(c)
+            for c in corners
+            if {p, q} <= set(self.surface.patches_of(self.surface.first_corner + c))
+        ][:1]
+        add(cell, p, one + between)
+        add(cell, q, other + between[::-1])
+
+    def _cut_by_corner(self, cell: int, runs: list[tuple[int, list[int]]], corners: list[int]) -> bool:
+        """Cut off a run whose patch meets those of both neighbors in a corner."""
+        n = len(runs)
+        for c in corners:
+            patches = set(self.surface.patches_of(self.surface.first_corner + c))
+            for k in range(n):
+                p, q, r = runs[k - 1][0], runs[k][0], runs[(k + 1) % n][0]
+                if p != r and {p, q, r} <= patches:
+                    x = self.vertex_of_corner(c)
+                    run = runs[k][1]
+                    self.polygons.add(cell, q, [*run, x])
+                    before, after = runs[k - 1], runs[(k + 1) % n]
+                    runs[k - 1] = (before[0], [*before[1], x])
+                    runs[(k + 1) % n] = (after[0], [x, *after[1]])
+                    del runs[k]
+                    if len(runs) == 2:
+                        corners.remove(c)
+                    return True
+        return False
+
+    def _cut_between(self, cell: int, runs: list[tuple[int, list[int]]]) -> bool:
+        """Cut off a run between two runs of one patch."""
+        n = len(runs)
+        found = [k for k in range(n) if runs[k - 1][0] == runs[(k + 1) % n][0]]
+        if not found or n < 4:
+            return False
+        k = min(found, key=lambda i: len(runs[i][1]))
+        self.polygons.add(cell, runs[k][0], runs[k][1])
+        _replace(runs, k, [runs[k][1][0], runs[k][1][-1]])
+        return True
+
+
+def _replace(runs: list[tuple[int, list[int]]], k: int, chord: list[int]) -> None:
+    """Give a run with the patch of the run before it the place of run `k`, and join runs of one patch."""
+    runs[k] = (runs[k - 1][0], chord)
+    vertices: list[int] = []
+    labels: list[int] = []
+    for patch, run in runs:
+        vertices += run[:-1]
+        labels += [patch] * (len(run) - 1)
+    runs[:] = _runs(vertices, labels)
+
+
+def _runs(loop: list[int], labels: list[int]) -> list[tuple[int, list[int]]]:
+    """Return the runs of sides with one label: label and vertices, ends included."""
+    n = len(loop)
+    cuts = [k for k in range(n) if labels[k] != labels[k - 1]]
+    if not cuts:
+        return [(labels[0], [*loop, loop[0]])]
+    found = []
+    for a, b in zip(cuts, [*cuts[1:], cuts[0] + n], strict=True):
+        found.append((labels[a], [loop[k % n] for k in range(a, b + 1)]))
+    return found

@@ -1,0 +1,171 @@
+"""The surface of a solid as its mesh asks for it: closest points, sides, patches, creases and corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ...geometry.bvh import Tree
+from ...mesh.connectivity import take_rows
+
+if TYPE_CHECKING:
+    from ...geometry.solid.solid import Solid
+
+SNAP_CREASE = 0.06
+"""Wall vertices this close to a crease, as a share of h, are moved onto it."""
+SNAP_CORNER = 0.12
+"""The same for corners."""
+
+
+class WallSurface:
+    """Answers of a solid's surface to the mesh.
+
+    A wall vertex lies on a patch, on a crease or on a corner. Its `site` says where: site k is patch k; the edges of
+    creases follow, and then the corners.
+
+    Parameters
+    ----------
+    solid : Solid
+    """
+
+    def __init__(self, solid: Solid) -> None:
+        self.solid = solid
+        self.vertices, self.triangles = solid.surface.vertices, solid.surface.triangles
+        self.patch = solid.patch
+        self.n_patches = solid.n_patches
+        self.ends = self.vertices[solid.creases.edges]  # (e, 2, 3)
+        self.corners = self.vertices[solid.corners]
+
+    @property
+    def first_corner(self) -> int:
+        """Site of the first corner."""
+        return self.n_patches + len(self.ends)
+
+    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the closest triangle (k,), the point on it (k, 3), and the distance (k,), negative inside."""
+        feet = self.solid.feet(points)
+        inside = self.solid.surface.columns.winding(points) > 0
+        return feet.triangle, feet.point, np.where(inside, -feet.distance, feet.distance)
+
+    def touches(self, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (k, 3) whether the surface may lie within `reach` (k,)."""
+        found = np.zeros(len(points), bool)
+        found[near_items(self.solid.surface.tree, points, reach)[0]] = True
+        return found
+
+    @cached_property
+    def _crease_tree(self) -> Tree:
+        return Tree(self.ends.min(axis=1), self.ends.max(axis=1))
+
+    @cached_property
+    def _corner_tree(self) -> KDTree:
+        return KDTree(self.corners)
+
+    def nearest_crease(self, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nearest edge of a crease within `reach` (k,), or -1, and the point on it (k, 3)."""
+        edge, foot = np.full(len(points), -1), points.copy()
+        if not len(self.ends) or not len(points):
+            return edge, foot
+        who, item = near_items(self._crease_tree, points, reach)
+        begin, along = self.ends[item, 0], self.ends[item, 1] - self.ends[item, 0]
+        share = ((points[who] - begin) * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300)
+        there = begin + np.clip(share, 0, 1)[:, None] * along
+        far = ((points[who] - there) ** 2).sum(axis=1)
+        rows = np.flatnonzero(far <= reach[who] ** 2)
+        order = rows[np.lexsort((item[rows], far[rows], who[rows]))]
+        first = np.unique(who[order], return_index=True)[1]
+        edge[who[order[first]]], foot[who[order[first]]] = item[order[first]], there[order[first]]
+        return edge, foot
+
+    def sites(self, points: np.ndarray, triangles: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sites (k,) of wall vertices at `points` (k, 3) on `triangles`, and where they lie there (k, 3).
+
+        A corner is the site of one vertex only: the nearest.
+        """
+        site = self.patch[triangles].astype(np.int64)
+        edge, foot = self.nearest_crease(points, SNAP_CREASE * h)
+        site[edge >= 0] = self.n_patches + edge[edge >= 0]
+        if len(self.corners) and len(points):
+            far, corner = nearest(self._corner_tree, points)
+            rows = np.flatnonzero(far <= SNAP_CORNER * h)
+            rows = rows[np.argsort(far[rows], kind="stable")]
+            rows = rows[np.unique(corner[rows], return_index=True)[1]]
+            site[rows], foot[rows] = self.first_corner + corner[rows], self.corners[corner[rows]]
+        return site, foot
+
+    @cached_property
+    def _site_patches(self) -> tuple[np.ndarray, np.ndarray]:
+        """Patches of each site, ascending, as ragged rows."""
+        size = len(self.vertices)
+        place = np.full(size, -1)
+        place[self.solid.corners] = np.arange(len(self.corners))
+        at, patch = place[self.triangles].ravel(), np.repeat(self.patch, 3)
+        pairs = np.unique(np.stack([at[at >= 0], patch[at >= 0]]), axis=1)
+        counts = np.concatenate(
+            [
+                np.ones(self.n_patches, int),
+                np.full(len(self.ends), 2),
+                np.bincount(pairs[0], minlength=len(self.corners)),
+            ]
+        )
+        items = [np.arange(self.n_patches), np.sort(self.solid.creases.patches, axis=1).ravel(), pairs[1]]
+        return np.concatenate([[0], np.cumsum(counts)]), np.concatenate(items).astype(np.int64)
+
+    def patches_of(self, site: int) -> list[int]:
+        """Return the patches that meet at a site."""
+        starts, items = self._site_patches
+        return items[starts[site] : starts[site + 1]].tolist()
+
+    def common(self, one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how many patches the sites `one` and `other` (k,) share, and the least of them or -1, (k,) each."""
+        size = self.first_corner + len(self.corners)
+        keys, place = np.unique(one * size + other, return_inverse=True)
+        starts, items = self._site_patches
+        counts_a, a = take_rows(starts, items, keys // size)
+        counts_b, b = take_rows(starts, items, keys % size)
+        rows = np.concatenate([np.repeat(np.arange(len(keys)), np.diff(c)) for c in (counts_a, counts_b)])
+        pairs = rows * self.n_patches + np.concatenate([a, b])
+        pairs.sort()
+        shared = pairs[:-1][pairs[1:] == pairs[:-1]]
+        shared = np.unique(shared)
+        number, least = np.bincount(shared // self.n_patches, minlength=len(keys)), np.full(len(keys), -1)
+        least[(shared // self.n_patches)[::-1]] = (shared % self.n_patches)[::-1]
+        return number[place], least[place]
+
+
+def nearest(tree: KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance to the nearest point of `tree` and its row, (k,) each; none if there are no `points`."""
+    if not len(points):
+        return np.zeros(0), np.zeros(0, np.int64)
+    far, row = tree.query(points)
+    return np.asarray(far), np.asarray(row)
+
+
+def near_items(
+    tree: Tree, points: np.ndarray, reach: np.ndarray, block: int = 1 << 16
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of a point and an item of `tree` whose leaf is not farther from it than `reach` (k,)."""
+    found: list[Sequence[np.ndarray]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
+    leaf = tree.starts(tree.levels)
+    for first in range(0, len(points), block):
+        who = np.arange(first, min(first + block, len(points)))
+        node = np.zeros(len(who), np.int64)
+        for level in range(tree.levels + 1):
+            box = tree.boxes[node + (1 << level) - 1]
+            x = points[who]
+            away = np.maximum(np.maximum(box[:, :3] - x, x - box[:, 3:]), 0)
+            near = np.einsum("ij,ij->i", away, away) <= reach[who] ** 2
+            who, node = who[near], node[near]
+            if level < tree.levels:
+                who, node = np.repeat(who, 2), np.repeat(2 * node, 2)
+                node[1::2] += 1
+        counts = leaf[node + 1] - leaf[node]
+        row = np.repeat(np.arange(len(node)), counts)
+        place = leaf[node][row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+        found.append((who[row], tree.order[place]))
+    who, item = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return who, item

@@ -1,0 +1,109 @@
+"""Meshes of solids: cells that end at a triangulated surface."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.finite_volumes.solid_walls.mesh import outer_generators, solid_mesh
+from clvoro.mesh.connectivity import following
+
+H = 0.25
+
+
+def el():
+    """Return an L: a square of 2 without a quarter, of height 1."""
+    flat = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], float)
+    n = len(flat)
+    vertices = np.concatenate([np.column_stack([flat, np.full(n, z)]) for z in (0.0, 1.0)])
+    cap = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)])
+    k = np.arange(n)
+    after = (k + 1) % n
+    side = np.concatenate([np.stack([k, after, after + n], axis=1), np.stack([k, after + n, k + n], axis=1)])
+    return clvoro.Solid(vertices, np.concatenate([cap[:, ::-1], cap + n, side]))
+
+
+SOLIDS = {
+    "cube": lambda: clvoro.Solid.box((0, 0, 0), (1.2, 1, 1)),
+    "L": el,
+    "cylinder": lambda: clvoro.Solid.cylinder((0, 0, 0), (0, 0, 1), 0.7, edge=0.07),
+    "ball": lambda: clvoro.Solid.ball((0, 0, 0), 0.8, edge=0.08),
+}
+
+
+def generators(solid):
+    """Return a lattice that is a little disturbed, away from walls; around the crease of the L it is regular."""
+    k = [np.arange(low + H / 2, high, H) for low, high in zip(solid.lower, solid.upper, strict=True)]
+    x = np.stack(np.meshgrid(*k, indexing="ij"), axis=-1).reshape(-1, 3)
+    fixed = (np.abs(x[:, :2] - 1) < 0.6 * H).all(axis=1)
+    x += np.where(fixed, 0, 0.1)[:, None] * H * np.random.default_rng(1).uniform(-1, 1, x.shape)
+    return x[solid.signed_distance(x) < -0.2 * H]
+
+
+@pytest.fixture(scope="module", params=SOLIDS)
+def made(request, ctx):
+    solid = SOLIDS[request.param]()
+    x = generators(solid)
+    h = np.full(len(x), H)
+    outer = outer_generators(solid, x, h)
+    box = clvoro.Box(np.subtract(solid.lower, 4 * H), np.add(solid.upper, 4 * H))
+    mesh = solid_mesh(solid, x, h, clvoro.Adapter(ctx).diagram(box, np.concatenate([x, outer])))
+    assert not len(mesh.odd)
+    assert not len(mesh.lost)
+    return solid, mesh.faces
+
+
+def sides_of_cells(faces):
+    """Return cell, begin and end of each side of each face as seen from each of its cells."""
+    face = np.repeat(np.arange(len(faces)), np.diff(faces.starts))
+    here, after = faces.corners, faces.corners[following(faces.starts)]
+    inner = faces.neighbor[face] >= 0
+    return (
+        np.concatenate([faces.owner[face], faces.neighbor[face][inner]]),
+        np.concatenate([here, after[inner]]),
+        np.concatenate([after, here[inner]]),
+    )
+
+
+def test_cells_are_closed(made):
+    _, faces = made
+    cell, begin, end = sides_of_cells(faces)
+    there = np.stack([cell, begin, end], axis=1)
+    back = np.stack([cell, end, begin], axis=1)
+    assert len(np.unique(there, axis=0)) == len(there)
+    assert np.array_equal(np.unique(there, axis=0), np.unique(back, axis=0))
+    vertices = np.bincount(np.unique(there[:, :2], axis=0)[:, 0])
+    edges = np.bincount(cell) / 2
+    counts = np.bincount(np.concatenate([faces.owner, faces.neighbor[faces.neighbor >= 0]]))
+    assert np.array_equal(vertices - edges + counts, np.full(faces.n_cells, 2))
+
+
+def test_faces_are_in_order(made):
+    _, faces = made
+    k = faces.n_inner
+    key = faces.owner[:k].astype(int) * faces.n_cells + faces.neighbor[:k]
+    assert (np.diff(key) > 0).all()
+    assert (faces.owner[:k] < faces.neighbor[:k]).all()
+    assert (np.diff(-faces.neighbor[k:]) >= 0).all()
+    assert (faces.neighbor[k:] < 0).all()
+
+
+def test_volumes_fill_the_solid(made):
+    solid, faces = made
+    assert (faces.volumes > 0.2 * H**3).all()
+    curved = solid.n_patches < 4
+    assert faces.volumes.sum() == pytest.approx(solid.measure, rel=0.1 if curved else 1e-12)
+
+
+def test_wall_vertices_lie_on_the_surface(made):
+    solid, faces = made
+    walls = np.unique(faces.corners[faces.starts[faces.n_inner] :])
+    assert solid.boundary_distance(faces.points[walls]).max() < 1e-9
+    # Corners are vertices.
+    for corner in solid.surface.vertices[solid.corners]:
+        assert np.abs(faces.points[walls] - corner).max(axis=1).min() < 1e-12
+
+
+def test_a_cell_has_one_polygon_on_each_patch(made):
+    _, faces = made
+    walls = np.stack([faces.owner, faces.neighbor], axis=1)[faces.n_inner :]
+    assert len(np.unique(walls, axis=0)) == len(walls)
