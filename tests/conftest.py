@@ -61,7 +61,7 @@ def invokers_in_memory():
 
 
 UNOPTIMIZED = re.compile(
-    "-D(REAL=float|PERIODIC|POLYGON|SPHERE|WEIGHTED|(CELL|FACE)_CAPACITY=(?!24$|32$)|GROUP_SIZE=(?!1$))"
+    "-D(REAL=float|PERIODIC|POLYGON|SOLID|SPHERE|WEIGHTED|(CELL|FACE)_CAPACITY=(?!24$|32$)|GROUP_SIZE=(?!1$))"
 )
 """Macros of programs that the fast tests build without optimization: all but those for boxes with walls in float64, for
 single work-items and cells of the first capacities."""

@@ -65,8 +65,7 @@ inline REAL crossing_of(int t, REAL4 x, REAL4 way, global const REAL4 *wall_corn
 inline REAL exit_through_wall(REAL4 x, REAL4 way, WALL_ARGS)
 {
     REAL first = 2;
-    EACH_TRIANGLE(t, fmin(x, x + way), fmax(x, x + way))
-    {
+    EACH_TRIANGLE (t, fmin(x, x + way), fmax(x, x + way)) {
         const REAL at = crossing_of(t, x, way, wall_corners);
         first = fmin(first, at);
     }

@@ -14,6 +14,9 @@
 /* Share of the way to a foot that must be free. */
 #define FREE_SHARE R(0.999)
 
+/* Triangles that are remembered. */
+#define KNOWN 32
+
 typedef struct {
     REAL s, t, d2; /* the point a + s (b - a) + t (c - a), and its squared distance */
     int kind;      /* of the edge or corner that it lies on */
@@ -59,9 +62,9 @@ inline foot_t foot_on_triangle(REAL4 a, REAL4 b, REAL4 c, int kinds)
 inline bool is_free(REAL4 x, REAL4 way, WALL_ARGS)
 {
     const REAL4 most = FREE_SHARE * way;
-    EACH_TRIANGLE(t, fmin(x, x + most), fmax(x, x + most))
-    if (crossing_of(t, x, most, wall_corners) <= 1)
-        return false;
+    EACH_TRIANGLE (t, fmin(x, x + most), fmax(x, x + most))
+        if (crossing_of(t, x, most, wall_corners) <= 1)
+            return false;
     return true;
 }
 
@@ -94,8 +97,13 @@ kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS
     const REAL reach2 = reach * reach;
     int patches[MOST_OWN], triangles[MOST_OWN], order[MOST_OWN], n = 0;
     foot_t feet[MOST_OWN];
-    EACH_TRIANGLE(t, x - reach, x + reach)
-    {
+    int known[KNOWN]; /* triangles that have been seen in another bin */
+    for (int k = 0; k < KNOWN; ++k)
+        known[k] = -1;
+    EACH_TRIANGLE (t, x - reach, x + reach) {
+        if (known[t % KNOWN] == t)
+            continue;
+        known[t % KNOWN] = t;
         const int2 kinds = wall_kinds[t];
         const foot_t foot = foot_on_triangle(wall_corners[3 * t] - x, wall_corners[3 * t + 1] - x,
                                              wall_corners[3 * t + 2] - x, kinds.s1);

@@ -30,7 +30,15 @@ LARGEST_EDGE = 1e50
 
 
 class ClipBox(Protocol):
-    """The box that clips cells: a `Domain`, or a box that a stage makes. Stages use nothing else of a domain."""
+    """The box that clips cells: a `Domain`, or a box that a stage makes. Stages use nothing else of a domain.
+
+    Attributes
+    ----------
+    plane_count : int
+        Number of planes of walls that cut single cells, in a solid.
+    """
+
+    plane_count: int
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners in the device's coordinates, padded to four numbers as kernels take them."""
@@ -392,6 +400,9 @@ class Domain(ABC):
     def wall_triangles(self) -> WallTriangles | None:
         """The triangles whose planes cut the cells near them, in a solid; else None."""
         return None
+
+    plane_count: ClassVar[int] = 0
+    """There are no walls but the box; see `ClipBox`."""
 
     def clip_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the CLIP_BOX_ARGS of kernels in 3D for cells that nothing but the box bounds."""

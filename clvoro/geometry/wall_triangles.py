@@ -19,8 +19,9 @@ SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of edges and corners of triangles: within a patch, on a convex crease, on a concave one."""
 SAGITTA = 1 / 12
 """Mean height of a curved surface over a wall face, times curvature over area."""
-LEAST_SIDE, LARGEST_SIDE = 24, 112
-"""Bins along the longest side."""
+SIDE_PER_ROOT, LEAST_SIDE, LARGEST_SIDE = 0.4, 48, 128
+"""Bins along the longest side, per square root of the number of triangles, and limits: bins are as wide as triangles,
+so that few triangles are in several of them."""
 _SLACK = 1e-3
 """Of a bin, more than round-off in single precision."""
 _BLOCK = 1 << 20
@@ -123,7 +124,7 @@ def bin_triangles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
     """
     lower, upper = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     extent = upper - lower
-    side = np.clip(2 * np.sqrt(len(corners)), LEAST_SIDE, LARGEST_SIDE)
+    side = np.clip(SIDE_PER_ROOT * np.sqrt(len(corners)), LEAST_SIDE, LARGEST_SIDE)
     width = extent.max() * (1 + 1e-6) / side
     counts = np.maximum(np.ceil(extent / width).astype(int), 1)
     x = (corners - lower) / width

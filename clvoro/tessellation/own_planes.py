@@ -34,6 +34,8 @@ class SolidBox:
 
     Attributes
     ----------
+    plane_count : int
+        Number of planes in the latest diagram.
     outside : int
         Number of generators outside of the patch that is nearest to them, in the latest diagram.
     """
@@ -46,6 +48,7 @@ class SolidBox:
         size: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
         self.engine, self.domain, self.outside = engine, domain, 0
+        self.plane_count = 0
         origin, scale = domain.frame
         self._walls = walls.arguments(engine, (origin, scale))
         self._normals = engine.upload(walls.planes(scale, size))
@@ -103,7 +106,7 @@ class SolidBox:
             elif count > len(self._labels):
                 self._reserve(count + count // 4)
             else:
-                self.count = count
+                self.plane_count = count
                 return
 
     def _reserve(self, room: int) -> None:

@@ -13,7 +13,7 @@ from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.workspace import framed
 from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_SIZE, CutCells
-from .device_diagram import ROUGH_SHARE, Follow, Tessellation, read_report
+from .device_diagram import ROUGH_SHARE, UNKNOWN, Follow, Tessellation, read_report
 from .polyhedra import Polyhedra
 from .rounds import with_room
 from .teams import TEAM, TeamKernel, are_for, has_warps, team_defines
@@ -26,6 +26,8 @@ MAX_SHARE = 0.5
 """Largest share of cells to make again in one round. Beyond it a new diagram costs less."""
 ALL_CELLS, MARKED_CELLS = 0, 1
 """Which cells `update_cells` updates: all, or those marked by a check."""
+FACES_AT_WALL = 17
+"""Faces of a cell at a wall, rather too many."""
 SPARE = 0.25
 """Room for cells that gain faces, over the half-faces of the previous diagram."""
 
@@ -90,6 +92,9 @@ class PolyhedraUpdate:
             else:
                 found = self._report.get().tolist()
             flags, used, left, marked, kept = found[:REPORT_LISTED]
+            if flags & UNKNOWN and box.look_farther(points):
+                flags &= ~UNKNOWN
+                self._report[0].set(np.int32(flags))
             if flags & ~HARMLESS or max(left, marked) > most:
                 return None
             if marked or left:
@@ -139,24 +144,16 @@ class _Rounds:
         self._by_team = by_team
         self._n, before = previous.n, len(previous.neighbors)
         n, most = previous.n, max(int(MAX_SHARE * previous.n), 1)
-        self.room = int((1 + SPARE) * before) + 64
+        # Cells at walls of a solid are clipped anew, to other places.
+        self.room = int((1 + SPARE) * before + min(box.plane_count, n) * FACES_AT_WALL) + 64
         self.cut = cells.take_cells(n, self.room)
         self._changed, self._marks, self._listed = (engine.scratch(n, np.int32) for _ in range(3))
         self._more = engine.scratch(n * MORE, np.int32)
         self._further = engine.scratch(most * MORE, np.int32)
         old = previous.vertices or (self._listed, self._listed)
-        self._fixed = (
-            previous.starts,
-            previous.neighbors,
-            np.int32(bool(previous.vertices)),
-            *old,
-            points,
-            *box.clip_args(engine),
-            np.int32(self.room),
-            *self.cut.output(report),
-            self.cut.keys,
-            self._changed,
-        )
+        self._box = box
+        self._before = (previous.starts, previous.neighbors, np.int32(bool(previous.vertices)), *old, points)
+        self._output = (np.int32(self.room), *self.cut.output(report), self.cut.keys, self._changed)
         engine.run_each(
             kernels.begin_cell_updates, n, np.int32(before), np.int32(REPORT_SIZE), report, self._marks, self._more
         )
@@ -168,7 +165,9 @@ class _Rounds:
             np.int32(which),
             self._listed,
             self._further,
-            *self._fixed,
+            *self._before,
+            *self._box.clip_args(engine),
+            *self._output,
             self._more,
             self._marks,
             *engine.period_args,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pyopencl.array as cla
@@ -40,6 +41,7 @@ class ExtendedBox:
 
     lower: np.ndarray
     upper: np.ndarray
+    plane_count: ClassVar[int] = 0
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners, padded to four numbers."""

@@ -1,0 +1,154 @@
+"""Walls of solids on the device: each cell is cut by planes of its own."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.geometry.solid.solid import Solid
+from clvoro.opencl.engine import Engine
+from clvoro.tessellation.own_planes import SolidBox
+from clvoro.tessellation.stages import TessellationStages
+from clvoro.tessellation.tessellator import Tessellator
+
+REALS = [np.dtype(np.float64), np.dtype(np.float32)]
+
+
+def corner(lengths=(2.0, 2.0, 1.0), notch=(1.0, 1.0, 1.0)):
+    """Return a box without a box at its upper corner: one concave crease if the notch is as high as the box."""
+    lattice = [np.unique([0.0, a - b, a]) for a, b in zip(lengths, notch, strict=True)]
+    full = np.ones([len(axis) - 1 for axis in lattice], bool)
+    full[-1, -1, -1] = False
+    return lattice_solid(lattice, full)
+
+
+def lattice_solid(lattice, full):
+    """Return the union of the boxes of a lattice where `full` is true."""
+    corners, triangles = [], []
+    padded = np.pad(full, 1)
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for step in (-1, 1):
+            inner = np.argwhere(full & ~np.roll(padded, -step, axis)[1:-1, 1:-1, 1:-1])
+            for cell in inner:
+                quad = []
+                for a, b in ((0, 0), (1, 0), (1, 1), (0, 1)):
+                    at = cell.copy()
+                    at[axis] += step > 0
+                    at[u] += a
+                    at[v] += b
+                    quad.append([lattice[k][at[k]] for k in range(3)])
+                first = len(corners)
+                corners += quad[::step]
+                triangles += [(first, first + 1, first + 2), (first, first + 2, first + 3)]
+    return Solid(np.array(corners), np.array(triangles))
+
+
+SOLIDS = {
+    "box": lambda: Solid.box((0, 0, 0), (1, 1, 1)),
+    "L": corner,
+    "Fichera": lambda: corner((2.0, 2.0, 2.0)),
+    "cylinder": lambda: Solid.cylinder((0, 0, 0), (0, 0, 2), 1.0, edge=0.2),
+    "ball": lambda: Solid.ball((0, 0, 0), 1.0, edge=0.2),
+}
+
+
+def inner_points(solid, n, seed=0):
+    rng = np.random.default_rng(seed)
+    x = solid.lower + solid.extent * rng.random((4 * n, 3))
+    return x[solid.contains(x)][:n]
+
+
+class Device:
+    """Diagrams of a solid from random generators."""
+
+    def __init__(self, ctx, solid, real, points):
+        adapter = clvoro.Adapter(ctx, dtype=real.name)
+        self.engine = Engine(adapter.ctx, adapter.queue, 3, real, solid.traits(real))
+        self.stages = TessellationStages(self.engine)
+        self.tessellator = Tessellator(self.stages, solid)
+        placed = self.engine.upload(solid.place(points, real))
+        binned = self.stages.bins.build(solid, placed, len(points))
+        self.points = binned.points[: len(points)].copy()
+
+    def diagram(self, previous=None):
+        return self.tessellator.tessellate(self.points, len(self.points), previous)
+
+    def move(self, t, share):
+        self.points = self.engine.upload(self.points.get() + share * t.offsets.get())
+
+
+def rows_of(t):
+    starts = t.starts.get()
+    return [frozenset(t.neighbors.get()[a:b].tolist()) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+
+
+@pytest.mark.parametrize("real", REALS, ids=str)
+@pytest.mark.parametrize("name", SOLIDS)
+def test_planes_are_those_of_the_reference(ctx, name, real):
+    solid = SOLIDS[name]()
+    device = Device(ctx, solid, real, inner_points(solid, 300))
+    box = SolidBox(device.engine, solid, solid.wall_triangles)
+    n, scale = len(device.points), solid.frame[1]
+    binned = device.stages.bins.build(solid, device.points, n)
+    box.guess(binned, n)
+    box.find(device.points)
+    x = device.points.get().astype(float) * scale + solid.frame[0]
+    reach = box._reach.get().astype(float) * scale
+    expected = solid.own_planes(x, reach)
+    rows, labels, planes = (a.get() for a in (box._rows, box._labels, box._planes))
+    found = np.concatenate([np.arange(first, first + count) for first, count in rows])
+    owner = np.repeat(np.arange(n), rows[:, 1])
+    order = np.lexsort((-labels[found], owner))
+    owner, found = owner[order], found[order]
+    assert box.outside == len(expected.behind) == 0
+    assert (owner == expected.row).all() and (-1 - labels[found] == expected.patch).all()
+    assert np.abs(planes[found, :3] - expected.normal).max() < 1e3 * np.finfo(real).eps
+    assert np.abs(planes[found, 3] * scale - expected.depth).max() < 1e2 * np.finfo(real).eps
+
+
+@pytest.mark.parametrize("real", REALS, ids=str)
+@pytest.mark.parametrize("name", ["box", "Fichera"])
+def test_updates_are_new_diagrams(ctx, name, real):
+    solid = SOLIDS[name]()
+    device = Device(ctx, solid, real, inner_points(solid, 1500))
+    t = device.diagram()
+    for _ in range(6):
+        device.move(t, 1.0)
+        t = device.diagram()
+    t, made = device.diagram(), 0
+    for _ in range(3):
+        device.move(t, 0.1)
+        before = device.stages.update.update
+        outcomes = []
+        device.stages.update.update = lambda *args, **options: outcomes.append(before(*args, **options)) or outcomes[-1]
+        t = device.diagram(t)
+        device.stages.update.update = before
+        made += outcomes[0] is not None
+    volumes, rows = t.volumes.get(), rows_of(t)
+    fresh = device.diagram()
+    assert made > 0
+    assert np.allclose(volumes, fresh.volumes.get(), rtol=0, atol=1e3 * np.finfo(real).eps * volumes.mean())
+    assert rows == rows_of(fresh)
+    assert all(i in rows[j] for i, row in enumerate(rows) for j in row if j >= 0)
+    total = volumes.sum(dtype=float) * solid.frame[1] ** 3 / solid.measure
+    assert total == pytest.approx(1, abs=1e3 * float(np.finfo(real).eps) if name == "box" else 0.02)
+
+
+@pytest.mark.parametrize("real", REALS, ids=str)
+def test_nothing_leaks_through_a_thin_plate(ctx, real):
+    h = 0.15
+    lattice = [np.array([0, 0.9, 0.9 + 2 * h, 2.1]), np.array([0, 0.6, 1.4, 2]), np.array([0, 0.6, 1.4, 2])]
+    full = np.ones((3, 3, 3), bool)
+    full[1, 1, 1] = False  # a plate in the fluid
+    solid = lattice_solid(lattice, full)
+    device = Device(ctx, solid, real, inner_points(solid, round(solid.measure / h**3)))
+    t = device.diagram()
+    for _ in range(5):
+        device.move(t, 0.9)
+        t = device.diagram(t)
+    x = t.points.get().astype(float) * solid.frame[1] + solid.frame[0]
+    side = np.where(np.abs(x[:, 1:] - 1).max(axis=1) < 0.4 - h, np.sign(x[:, 0] - 0.9 - h), 0)
+    rows = rows_of(t)
+    assert (np.abs(side) > 0).sum() > 100
+    assert not any(side[i] * side[j] < 0 for i, row in enumerate(rows) for j in row if j >= 0)
+    assert t.volumes.get().sum(dtype=float) * solid.frame[1] ** 3 == pytest.approx(solid.measure, rel=0.02)
