@@ -128,10 +128,9 @@ def _fold(mesh: Faces, diagram: Diagram) -> tuple[MergingCells, np.ndarray]:
         mesh.half_face[upper],
         SMALL_FACE,
     )
-    for wall in np.unique(-1 - mesh.neighbor[mesh.neighbor < 0]).tolist():
-        axis, upper_side = divmod(wall, 2)
-        plane = (mesh.domain.upper if upper_side else mesh.domain.lower)[axis]
-        cells.points[cells.walls & (1 << wall) > 0, axis] = plane
+    on = np.flatnonzero(cells.walls)
+    here = cells.points[on]
+    cells.points[on] = mesh.domain.onto_walls(here, here, cells.walls[on], cells.wall_sets)
     return cells, upper
 
 

@@ -120,7 +120,9 @@ class MergingCells:
     ----------
     points : (v, 3) float
     walls : (v,) int
-        Bit k is set if the vertex lies on wall k.
+        The set of walls that the vertex lies on, a row of `wall_sets`.
+    wall_sets : list of tuple of int
+        Walls, ascending; the first set is empty.
     begin, count : (f,) int
         The corners of face i are ``corners[begin[i]:begin[i] + count[i]]``, counter-clockwise as seen from outside of
         the owner; none if the face is gone.
@@ -135,7 +137,7 @@ class MergingCells:
     centroids : (n, 3) float
         Where the cells had their centroids before all merges.
     changed, edited : (f,) bool
-        Faces that a merge has changed, in this round and in any.
+        Faces that a merge has changed, in this round and in any; all are edited at first in a solid.
     """
 
     def __init__(
@@ -160,10 +162,8 @@ class MergingCells:
         self.sizes, self.centroids, self.small = np.cbrt(diagram.volumes), diagram.centroids, small
         self.limits = DefectLimits()
         v = len(points)
-        self.walls = np.zeros(v, np.int64)
-        outer = np.flatnonzero(self.neighbor < 0)
-        wall_of = np.repeat(-1 - self.neighbor[outer], self.count[outer])
-        np.bitwise_or.at(self.walls, take_rows(starts, self.corners, outer)[1], 1 << wall_of)
+        self.walls, self.wall_sets = _sets_of_walls(starts, self.corners, self.neighbor, v)
+        self._within: dict[tuple[int, int], bool] = {}
         self.at_vertex = _Finder(starts, corners, v)
         both = np.stack([self.owner, np.maximum(self.neighbor, -1)], axis=1).ravel()
         self.at_cell = _Finder(None, both, self.n)
@@ -173,6 +173,7 @@ class MergingCells:
         self.now_code = np.zeros(v, np.int64)
         self.touched = np.zeros(self.n, bool)
         self.changed, self.edited = np.zeros((2, len(self.owner)), bool)
+        self.edited[:] = diagram.domain.wall_triangles is not None  # there faces are not quite plane
         self._places = [np.full(k, -1, np.int32) for k in (v, self.n, len(self.owner))]
 
     # Positions.
@@ -190,6 +191,16 @@ class MergingCells:
 
         Those of faces that no merge has changed are the diagram's, up to round-off.
         """
+        centers, normals = np.empty((2, 3, len(faces)))
+        rows = np.flatnonzero(~self.edited[faces])
+        centers[:, rows], normals[:, rows] = self._geometry_of_diagram(faces[rows])
+        rows = np.flatnonzero(self.edited[faces])
+        starts, places = self.face_corners(faces[rows])
+        x = self.positions(self.corners[places], self.codes[places])
+        centers[:, rows], normals[:, rows] = loop_geometry(x, starts)
+        return centers, normals
+
+    def _geometry_of_diagram(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         d, half, i, j = self.diagram, self.half_face[faces], self.owner[faces], self.neighbor[faces]
         normals = d.points.take(np.maximum(j, 0), axis=0).T + self.offsets(self.face_codes[faces])
         normals -= d.points.take(i, axis=0).T
@@ -198,12 +209,7 @@ class MergingCells:
         normals[:, wall] = 0
         normals[axis, wall] = 2 * upper - 1
         normals *= d.face_measures.take(half) / lengths(normals)
-        centers = np.ascontiguousarray(d.face_centroids.take(half, axis=0).T)
-        rows = np.flatnonzero(self.edited[faces])
-        starts, places = self.face_corners(faces[rows])
-        x = self.positions(self.corners[places], self.codes[places])
-        centers[:, rows], normals[:, rows] = loop_geometry(x, starts)
-        return centers, normals
+        return np.ascontiguousarray(d.face_centroids.take(half, axis=0).T), normals
 
     def face_corners(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return starts and places of the corners of `faces`."""
@@ -347,8 +353,7 @@ class MergingCells:
         x = self.positions(merges.vertices, merges.codes).T
         size = np.diff(merges.starts)
         mean = sum_columns(group, x.T, g).T / size[:, None]
-        walls = np.bitwise_or.reduceat(self.walls[merges.vertices], merges.starts[:-1])
-        complete = self.walls[merges.vertices] == walls[group]
+        anchor = self._anchors(merges)
         targets = np.full((g, 1 + _TRIES, 3), np.nan)
         far = ((x - mean[group]) ** 2).sum(axis=1)
         order = np.lexsort((far, group))
@@ -356,23 +361,38 @@ class MergingCells:
         early = rank < _TRIES
         targets[group[order][early], 1 + rank[early]] = x[order][early]
         targets[:, 0] = mean
-        # The coordinates of walls are those of a vertex on all of them.
-        rows = np.flatnonzero(complete)
-        anchor = np.full(g, -1)
-        anchor[group[rows[::-1]]] = rows[::-1]
-        for axis in range(3):
-            fixed = walls & (3 << (2 * axis)) > 0
-            targets[fixed, :, axis] = np.where(
-                np.isnan(targets[fixed, :, axis]), np.nan, x[anchor[fixed], axis][:, None]
-            )
+        walls = self.walls[merges.vertices[np.maximum(anchor, 0)]]
+        fixed = np.flatnonzero((anchor >= 0) & (walls > 0))
+        place = self.diagram.domain.onto_walls
+        for attempt in range(1 + _TRIES):
+            there = targets[fixed, attempt]
+            targets[fixed, attempt] = place(there, x[anchor[fixed]], walls[fixed], self.wall_sets)
         targets[anchor < 0] = np.nan
         return targets
+
+    def _anchors(self, merges: Merges) -> np.ndarray:
+        """Return the first vertex of each group, as its place, that lies on all walls of the group; -1 without one."""
+        ids = self.walls[merges.vertices]
+        if not ids.any():
+            return merges.starts[:-1].copy()
+        size = np.array([len(walls) for walls in self.wall_sets])[ids]
+        most = np.maximum.reduceat(size, merges.starts[:-1])
+        rows = np.flatnonzero(size == most[merges.group])
+        anchor = np.full(len(merges.sets), -1)
+        anchor[merges.group[rows[::-1]]] = rows[::-1]
+        theirs = ids[anchor[merges.group]]
+        for one, other in set(zip(ids[ids != theirs].tolist(), theirs[ids != theirs].tolist(), strict=True)):
+            if (one, other) not in self._within:
+                self._within[one, other] = set(self.wall_sets[one]) <= set(self.wall_sets[other])
+            if not self._within[one, other]:
+                anchor[merges.group[(ids == one) & (theirs == other)]] = -1
+        return anchor
 
     def _commit(self, merges: Merges, around: Neighborhood, done: np.ndarray, targets: np.ndarray) -> None:
         """Merge the sets `done` (k,) bool, whose vertices meet in `targets` (g, 3)."""
         yes, heads = done[merges.sets], merges.heads
-        walls = np.bitwise_or.reduceat(self.walls[merges.vertices], merges.starts[:-1])
-        self.points[heads[yes]], self.walls[heads[yes]] = targets[yes], walls[yes]
+        self.points[heads[yes]] = targets[yes]
+        self.walls[heads[yes]] = self.walls[merges.vertices[self._anchors(merges)[yes]]]
         rank = np.arange(len(merges.vertices)) - merges.starts[merges.group]
         rows = np.flatnonzero(yes[merges.group] & (rank > 0))
         gone, into = merges.vertices[rows], heads[merges.group[rows]]
@@ -393,3 +413,24 @@ class MergingCells:
             self.codes[there] = around.codes[places]
         self.changed[faces] = self.edited[faces] = True
         self.touched[around.cells[done[around.set_of_cell]]] = True
+
+
+def _sets_of_walls(
+    starts: np.ndarray, corners: np.ndarray, neighbor: np.ndarray, count: int
+) -> tuple[np.ndarray, list[tuple[int, ...]]]:
+    """Return for each of `count` vertices its set of walls, and the sets, the first of which is empty."""
+    outer = np.flatnonzero(neighbor < 0)
+    at, vertices = take_rows(starts, corners, outer)
+    wall = np.repeat(-1 - neighbor[outer], np.diff(at))
+    size = int(wall.max(initial=0)) + 1
+    vertex, wall = np.divmod(distinct(vertices.astype(np.int64) * size + wall), size)
+    # Each round replaces the set of walls so far and the next wall by one number.
+    found, sets = np.zeros(count, np.int64), [()]
+    place = np.arange(len(vertex)) - np.searchsorted(vertex, vertex)
+    for step in range(int(place.max(initial=-1)) + 1):
+        rows = np.flatnonzero(place == step)
+        key = found[vertex[rows]] * size + wall[rows]
+        new = distinct(key)
+        found[vertex[rows]] = len(sets) + np.searchsorted(new, key)
+        sets += [(*sets[k // size], k % size) for k in new.tolist()]
+    return found, sets

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
@@ -196,6 +196,22 @@ class Domain(ABC):
         gaps = np.stack([np.subtract(points, self.lower), np.subtract(self.upper, points)], axis=2)
         gaps[:, np.array(self.periodic)] = np.inf
         return gaps.reshape(len(points), 2 * self.dim)
+
+    def onto_walls(
+        self, points: np.ndarray, anchors: np.ndarray, rows: np.ndarray, sets: Sequence[tuple[int, ...]]
+    ) -> np.ndarray:
+        """Return `points` (k, d) moved onto all walls of their sets, given `anchors` (k, d) that are there.
+
+        `rows` (k,) are the places of their sets of walls in `sets`. Coordinates that are nan stay so.
+        """
+        del anchors
+        moved = points.copy()
+        for row in np.unique(rows).tolist():
+            here = np.flatnonzero(rows == row)
+            for side in sets[row]:
+                axis, above = divmod(side, 2)
+                moved[here, axis] = (self.upper if above else self.lower)[axis]
+        return np.where(np.isnan(points), np.nan, moved)
 
     def closest_walls(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, d) the side whose plane is the closest one, (n,) int."""

@@ -66,7 +66,7 @@ class Faces(Sealed):
         Place of the face in the arrays of the diagram that have one entry per half-face, as ``face_measures``; -1 for a
         face that the diagram does not have.
     diagram : Diagram or None
-        The diagram that the measures of the faces come from.
+        The diagram that the measures of the faces come from; None if they follow from the corners, as in a solid.
     """
 
     domain: Domain
@@ -321,7 +321,7 @@ def make_faces(diagram: Diagram) -> Faces:
         twin=np.full(len(rows), -1),
         shift=np.where(flipped[:, None], -shift, shift) if flipped.any() else shift,
         half_face=rows,
-        diagram=diagram,
+        diagram=diagram if diagram.domain.wall_triangles is None else None,
     )
 
 

@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import KDTree
 
+from ...arguments import format_point
+from ...errors import InputError
 from ...mesh.connectivity import distinct, following, take_rows
+from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from .chains import Crossings, cross_cells
 from .pierce import IN, WALL, pierce_edges, sides
@@ -18,7 +21,6 @@ from .wall_surface import WallSurface, nearest
 
 if TYPE_CHECKING:
     from ...geometry.solid.solid import Solid
-    from ...mesh.diagram import Diagram
 
 OUTSIDE = 1.6
 """Distance of outer generators from the surface, over h."""
@@ -89,6 +91,48 @@ def solid_mesh(solid: Solid, points: np.ndarray, sizes: np.ndarray, diagram: Dia
         Of the generators, and of `outer_generators` after them, in a box around the solid.
     """
     return _Maker(solid, points, sizes, diagram).mesh()
+
+
+def solid_diagram(solid: Solid, points: np.ndarray, sizes: np.ndarray, whole: Diagram) -> Diagram:
+    """Return the mesh of a solid as a diagram, without short edges; see `solid_mesh`.
+
+    Raises
+    ------
+    InputError
+        If generators have no cell, as the solid is too thin there.
+    """
+    made = solid_mesh(solid, points, sizes, whole)
+    if len(made.lost):
+        place = format_point(points[made.lost[0]])
+        raise InputError(
+            f"{solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first at "
+            f"{place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
+        )
+    return diagram_of(made.faces)
+
+
+def diagram_of(faces: Faces) -> Diagram:
+    """Return the mesh `faces` in 3D as a diagram; all measures follow from the corners."""
+    starts, places = faces.cell_faces()
+    face = faces.sides()[1][places]
+    back = places >= len(faces)
+    corner_starts, corners = take_rows(faces.starts, faces.corners, face, back)
+    geometry = faces.measures.geometry
+    return Diagram(
+        faces.domain,
+        {
+            "points": faces.generators,
+            "volumes": geometry.volumes,
+            "centroids": geometry.centroids,
+            "neighbor_starts": starts.astype(np.int32),
+            "neighbors": np.where(back, faces.owner[face], faces.neighbor[face]).astype(np.int32),
+            "face_measures": faces.area[face],
+            "face_centroids": faces.center[face],
+            "vertices": faces.points,
+            "face_vertex_starts": corner_starts.astype(np.int32),
+            "face_vertices": corners.astype(np.int32),
+        },
+    )
 
 
 class _Maker:

@@ -254,6 +254,12 @@ class Solid(Domain):
         x = check_rows("points", points, 3)
         return np.where(self.contains(x)[:, None], x, self.feet(x).point)
 
+    def onto_walls(
+        self, points: np.ndarray, anchors: np.ndarray, rows: np.ndarray, sets: Sequence[tuple[int, ...]]
+    ) -> np.ndarray:
+        """Return `anchors` (k, 3), since other points may be off the surface."""
+        return np.where(np.isnan(points), np.nan, anchors)
+
     def closest_walls(self, points: np.ndarray) -> np.ndarray:
         """Return the patch nearest to each of `points` (n, 3), (n,) int."""
         return self.patch[self.feet(points).triangle].astype(np.int64)

@@ -36,6 +36,10 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
     InputError
         If round-off has made cells wrong.
     """
+    if domain.wall_triangles is not None:
+        from .solid import fetch_mesh
+
+        return fetch_mesh(engine, domain, t, labels)
     reader = _DiagramReader(engine, domain, t, labels, copy)
     if reader.whole.round_off & UNEVEN:
         assert reader.faces
