@@ -332,7 +332,7 @@ class MeshState:
         stages.bins.renumber(binned, n)
         self.update(first, binned)
         stages.bins.clear()
-        self.engine.workspace.clear()
+        self.engine.workspace.shrink()
 
     def update(self, first: bool = False, binned: BinnedPoints | None = None) -> None:
         """Tessellate the present points without weights, evaluate size, error and quality, and read the summaries.
@@ -480,7 +480,7 @@ class MeshState:
         The number of generators changes towards `n_cells`, by default that of the size field, but not above `most`.
         """
         # This takes more memory than a step.
-        self.engine.workspace.clear()
+        self.engine.workspace.shrink()
         with self.engine.workspace.frame():
             w = self.stages.density.cell_weights(self.t, self.h)
             missing = self.missing_cells(w) if n_cells is None else float(n_cells - self.n)
@@ -500,7 +500,7 @@ class MeshState:
 
     def repair_cells(self, deficit: float, split: bool) -> tuple[int, int]:
         """Delete or split the worst cells (see `InsertionDeletion.repair_cells`); return the numbers of both."""
-        self.engine.workspace.clear()
+        self.engine.workspace.shrink()
         new = self.stages.insertion_deletion.repair_cells(
             self.free, self.t, self.quality, self._data.generators, self.next_label, deficit, split, self.fixed
         )
@@ -515,7 +515,7 @@ class MeshState:
         """
         stages, engine, new = self.stages, self.engine, None
         stages.clear_poisson()
-        engine.workspace.clear()
+        engine.workspace.shrink()
         with engine.workspace.frame():
             w = stages.density.cell_weights(self.t, self.h)
             changes = engine.scratch(self.n, np.int32)
@@ -531,7 +531,7 @@ class MeshState:
 
     def _replace(self, rows: dict[str, cla.Array], counts: tuple[int, int]) -> tuple[int, int]:
         """Replace the generators by `rows`, if there are any; return the numbers of insertions and deletions."""
-        self.engine.workspace.clear()
+        self.engine.workspace.shrink()
         self.stages.insertion_deletion.clear()
         if rows:
             self.next_label += counts[0]
@@ -599,7 +599,7 @@ class MeshState:
         Return whether the diagram has been computed again for that.
         """
         self.stages.clear_poisson()
-        self.engine.workspace.clear()
+        self.engine.workspace.shrink()
         tessellator, sites = self._latest_tessellator, self.t.sites
         again = not tessellator.is_complete(self.t)
         if again:

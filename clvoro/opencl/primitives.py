@@ -16,6 +16,7 @@ from numpy.typing import DTypeLike
 
 from .device_array import buffer_of, make_array
 from .engine import Engine
+from .workspace import KEPT
 
 AT_ONCE = 8
 """Largest number of arrays that one launch summarizes."""
@@ -246,7 +247,9 @@ class NamedArrays:
         return part
 
     def clear(self, *names: object) -> None:
-        """Free all arrays, or those whose names begin with one of `names`."""
+        """Free all arrays, or those whose names begin with one of `names`, if there are more than `KEPT` bytes."""
+        if sum(array.nbytes for array in self._arrays.values()) <= KEPT:
+            return
         gone = [n for n in self._arrays if not names or n[0] in names]
         for name in gone:
             del self._arrays[name]

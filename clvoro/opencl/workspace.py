@@ -34,6 +34,9 @@ SLACK = 1.05
 for that, the factor grows by itself: otherwise two needs that alternate would free and allocate in every step."""
 LOOSEST, SMALL = 4, 4096
 """A buffer may have so many times the bytes of its array, or so many bytes in any case."""
+KEPT = 1 << 23
+"""Bytes up to which memory is kept that is not needed for a while. To allocate it again takes as long as a step of a
+small mesh."""
 SPARE = 32
 """A new buffer has a 32nd more bytes than needed, because the next step may need a little more."""
 
@@ -107,6 +110,11 @@ class Workspace:
         self._path = [_Taken(None, 0, 0)]
         self._nodes = 0
         self._most, self._slack = 0, SLACK
+
+    def shrink(self) -> None:
+        """Free all memory, if it is more than `KEPT` bytes and no frame is open."""
+        if sum(size for size, _ in self._sizes) > KEPT:
+            self.clear()
 
     def frame(self) -> Workspace:
         """Return a context manager; at its end all arrays taken inside are given back."""

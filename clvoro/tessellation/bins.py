@@ -23,6 +23,8 @@ SPACING_COUNT = 8
 _ZERO = np.zeros(1, np.int32)
 _WORK = ("_keys", "_counts", "_grid_of", "_grid_items", "_starts", "_flags", "_sizes")
 """Buffers that only `build` uses."""
+KEPT_FOR = 1 << 16
+"""Number of generators up to which buffers are kept."""
 MAX_CHILD_SIDE = 64
 """Most bins per axis of a grid below the first."""
 MAX_LEVELS = 8
@@ -132,12 +134,17 @@ class Bins:
         cl.enqueue_fill(self.engine.queue, buffer_of(array), _ZERO, count * size, offset=first * size)
 
     def clear(self) -> None:
-        """Free all buffers."""
-        self._free([name for name in vars(self) if isinstance(getattr(self, name), cla.Array)])
+        """Free all buffers, if they are not small."""
+        if self._capacity[0] > KEPT_FOR:
+            self._free(self._names())
 
     def clear_work(self) -> None:
-        """Free the buffers that only `build` uses; the next `build` allocates them again."""
-        self._free([name for name in _WORK if hasattr(self, name)])
+        """Free the buffers that only `build` uses, if they are not small; the next `build` allocates them again."""
+        if self._capacity[0] > KEPT_FOR:
+            self._free([name for name in _WORK if hasattr(self, name)])
+
+    def _names(self) -> list[str]:
+        return [name for name in vars(self) if isinstance(getattr(self, name), cla.Array)]
 
     def _free(self, names: list[str]) -> None:
         for name in names:
@@ -156,7 +163,7 @@ class Bins:
         sides = np.maximum(1, np.ceil((upper - lower) / edge).astype(int))
         root_bins = int(np.prod(sides)) + 1
         if not self._capacity[0]:
-            self.clear()
+            self._free(self._names())
         self._reserve(n, root_bins + n // 2)
         self._clear(self._counts, 0, root_bins)
         frame, shape = np.zeros(4, engine.real), np.ones(4, np.int32)

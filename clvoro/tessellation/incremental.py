@@ -68,7 +68,7 @@ class IncrementalUpdate:
             t = self._update(cells, box, points, previous, follow)
         if t is None:
             # Free the work arrays of the steps, because the bins need memory.
-            self.engine.workspace.clear()
+            self.engine.workspace.shrink()
         self._last = None if t is None else ref(t)
         return t
 

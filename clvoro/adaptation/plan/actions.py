@@ -98,7 +98,7 @@ class Refine:
         """Replace the mesh by the finer one."""
         # The finer level needs another solver and more memory.
         run.state.stages.clear_poisson()
-        run.state.engine.workspace.clear()
+        run.state.engine.workspace.shrink()
         finer = run.state.refine(finest=run.level == 1)
         # One assignment, because an interruption between two would leave a mesh that does not belong to its level.
         run.state, run.level = finer, run.level - 1

@@ -135,5 +135,5 @@ class Images(DomainSteps):
                 follow(t, None)
                 return t
         # Images and their bins need memory.
-        stages.engine.workspace.clear()
+        stages.engine.workspace.shrink()
         return None
