@@ -1,17 +1,51 @@
 #include "tessellation/clipped/outline.h"
 #include "tessellation/roundness.h"
 
+/* A hash of a neighbor. The sum of hashes does not depend on the order of the faces. */
+inline ulong hash64(ulong v)
+{
+    v += 0x9e3779b97f4a7c15UL;
+    v = (v ^ (v >> 30)) * 0xbf58476d1ce4e5b9UL;
+    v = (v ^ (v >> 27)) * 0x94d049bb133111ebUL;
+    return v ^ (v >> 31);
+}
+
+/* changed = 1 if the set of neighbors of generator i differs from that of the last call, by its hash in signatures[i];
+   ever_changed = 1 if it has ever differed; with `first` there was no call. Walls are neighbors. labels are permanent.
+ */
+inline void compare_neighbors(int i, global const int *starts, global const int *neighbors, global const int *labels,
+                              bool first, global ulong *signatures, global REAL *changed, global REAL *ever_changed)
+{
+    ulong signature = 0;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbors[k];
+        signature += hash64(j < 0 ? (ulong)(long)j : (ulong)labels[j]);
+    }
+    const int differs = !first && signature != signatures[i];
+    signatures[i] = signature;
+    changed[i] = differs;
+    ever_changed[i] = first ? 0 : fmax(ever_changed[i], (REAL)differs);
+}
+
+/* What to do with the neighbors. */
+#define COMPARE 1
+#define COMPARE_FIRST 2
+
 /* Error, quality, energy and local length of the cell of generator i, one work-item per generator.
 
    error         e = (L - h) / min(L, h), L = V^(1/d)             (the paper's 3.1)
    local_length  min(L, h), the unit of bounds of the motion
    energy        integral of |y - x_i|^2 over the cell            (the paper's 2.3)
    quality       2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1; trimmed cells have their own)
-                 3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
+                 3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient
+
+   `comparison` says whether neighbors are compared as well. */
 kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts,
                             global const FACE *face_measures, global const REAL *offsets,
                             global const REAL *covariances, global const REAL *h, global REAL *error,
-                            global REAL *quality, global REAL *energy, global REAL *local_length OUTLINE_ARGS)
+                            global REAL *quality, global REAL *energy, global REAL *local_length,
+                            const int comparison, global const int *neighbors, global const int *labels,
+                            global ulong *signatures, global REAL *changed, global REAL *ever_changed OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     const REAL volume = volumes[i];
@@ -46,34 +80,8 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
     const REAL target = h[i];
     local_length[i] = fmin(length, target);
     error[i] = (length - target) / fmin(length, target);
-}
-
-/* A hash of a neighbor. The sum of hashes does not depend on the order of the faces. */
-inline ulong hash64(ulong v)
-{
-    v += 0x9e3779b97f4a7c15UL;
-    v = (v ^ (v >> 30)) * 0xbf58476d1ce4e5b9UL;
-    v = (v ^ (v >> 27)) * 0x94d049bb133111ebUL;
-    return v ^ (v >> 31);
-}
-
-/* changed[i] = 1 if the set of neighbors differs from that of the last call, by its hash in signatures[i];
-   ever_changed[i] = 1 if it has ever differed. One work-item per generator. Walls are neighbors. labels are permanent.
- */
-kernel void compare_neighbors(const int size, global const int *starts, global const int *neighbors,
-                              global const int *labels, const int first, global ulong *signatures, global REAL *changed,
-                              global REAL *ever_changed)
-{
-    WORK_ITEM(i);
-    ulong signature = 0;
-    for (int k = starts[i]; k < starts[i + 1]; ++k) {
-        const int j = neighbors[k];
-        signature += hash64(j < 0 ? (ulong)(long)j : (ulong)labels[j]);
-    }
-    const int differs = !first && signature != signatures[i];
-    signatures[i] = signature;
-    changed[i] = differs;
-    ever_changed[i] = first ? 0 : fmax(ever_changed[i], (REAL)differs);
+    if (comparison)
+        compare_neighbors(i, starts, neighbors, labels, comparison == COMPARE_FIRST, signatures, changed, ever_changed);
 }
 
 /* h[i] = L_i for generators of layers, first <= labels[i] < fixed: their size is right. But a cell much larger than

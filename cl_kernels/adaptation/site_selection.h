@@ -1,17 +1,26 @@
 /* Selection of sites where generators are inserted or deleted. Each generator has a key. The strongest sites that are
    several rings of cells apart are chosen. One work-item per generator. */
 #include "adaptation/site_key.h"
+#include "opencl/blocks.h"
+#include "opencl/reduce.h"
 
-/* spread[i] = largest key of i and its neighbors. */
-kernel void spread_keys(const int size, global const int *starts, global const int *neighbors, global const ulong *keys,
-                        global ulong *spread)
+/* Block-wise: one[i] = largest key of i and its neighbors. One group may do more than one ring: the second is from
+   `one` to `other`, the third back. */
+kernel void spread_keys(const int n, const int rings, global const int *starts, global const int *neighbors,
+                        global const ulong *keys, global ulong *one, global ulong *other)
 {
-    WORK_ITEM(i);
-    ulong key = keys[i];
-    for (int k = starts[i]; k < starts[i + 1]; ++k)
-        if (neighbors[k] >= 0)
-            key = max(key, keys[neighbors[k]]);
-    spread[i] = key;
+    for (int ring = 0; ring < rings; ++ring) {
+        global ulong *to = ring & 1 ? other : one;
+        for (BLOCK_LOOP(i, n)) {
+            ulong key = keys[i];
+            for (int k = starts[i]; k < starts[i + 1]; ++k)
+                if (neighbors[k] >= 0)
+                    key = max(key, keys[neighbors[k]]);
+            to[i] = key;
+        }
+        keys = to;
+        GROUP_BARRIER;
+    }
 }
 
 /* A site is chosen if its key is the largest in the rings around it. `chosen` collects several rounds. */

@@ -51,6 +51,39 @@ inline float penalty_of(float penalty, float quality_scale, float least_quality,
     return e / (1 + (power == 4 ? square * square : square));
 }
 
+/* The arguments of the iteration. */
+typedef struct {
+    int n, max_iterations, room, warm;
+    REAL tolerance;
+    global const int *starts, *neighbors;
+    global const float *rows, *columns;
+    global const STORE *own, *eps, *inverse;
+    global STORE *p, *s, *u, *y, *r, *z;
+    global REAL *partial, *record;
+} iteration_t;
+
+#define ITERATION_ARGS                                                                                                 \
+    const int n, const int max_iterations, const int room, const int warm, const REAL tolerance,                       \
+        global const int *starts, global const int *neighbors, global float *rows, global float *columns,              \
+        global STORE *own, global STORE *eps, global STORE *inverse, global STORE *p, global STORE *s,                 \
+        global STORE *u, global STORE *y, global STORE *r, global STORE *z, global REAL *partial, global REAL *record
+#define ITERATION                                                                                                      \
+    n, max_iterations, room, warm, tolerance, starts, neighbors, rows, columns, own, eps, inverse, p, s, u, y, r, z,   \
+        partial, record
+
+/* The further arguments of the assembly. */
+#define ASSEMBLY_ARGS                                                                                                  \
+    global const FACE *face_measures, global const FACE *face_centroids, global const REAL *volumes,                   \
+        global const REAL *points, global const REAL *gradient, global const REAL *h, global const REAL *quality,      \
+        global const REAL *log_ratio, global REAL *displacement, const REAL penalty, const REAL quality_scale,         \
+        const REAL wall_penalty, const REAL wall_quality_scale, const REAL log_ratio_scale, const int power,           \
+        global const REAL *mean_partial, const int mean_groups, global const int *labels, const int fixed,             \
+        global float *start
+#define ASSEMBLY                                                                                                       \
+    face_measures, face_centroids, volumes, points, gradient, h, quality, log_ratio, displacement, penalty,            \
+        quality_scale, wall_penalty, wall_quality_scale, log_ratio_scale, power, mean_partial, mean_groups, labels,    \
+        fixed, start
+
 /* Assemble the operator and the right side, one work-item per generator i of a block:
 
      own[i] = dr_i/dx_i h_i      rows[k] = dr_i/dx_j h_j      columns[k] = dr_j/dx_i h_i   for face k = (i, j)
@@ -60,24 +93,11 @@ inline float penalty_of(float penalty, float quality_scale, float least_quality,
    `sum_log_ratio` over so many groups are in `mean_partial`. rows and columns have one array of `room` entries per
    component; entries of walls are 0. Generators with labels below `fixed` do not move. Lengths are divided by h before
    they are rounded, so that sizes of any magnitude are in range. */
-kernel void assemble_projection(int n, const int room, global const int *starts, global const int *neighbors,
-                                global const FACE *face_measures, global const FACE *face_centroids,
-                                global const REAL *volumes, global const REAL *points, global const REAL *gradient,
-                                global const REAL *h, global const REAL *quality, global const REAL *log_ratio,
-                                global const REAL *displacement, const REAL penalty, const REAL quality_scale,
-                                const REAL wall_penalty, const REAL wall_quality_scale, const REAL log_ratio_scale,
-                                const int power, global float *rows, global float *columns, global STORE *own,
-                                global STORE *eps, global STORE *inverse_diagonal, global STORE *r, global STORE *z,
-                                global REAL *partial, global int *counts, global const REAL *mean_partial,
-                                const int mean_groups, global const int *labels, const int fixed, const int warm,
-                                global const float *start PERIOD_ARGS)
+inline void assemble_rows(ITERATION_ARGS, ASSEMBLY_ARGS PERIOD_ARGS, group_t group)
 {
-    LONG_GROUP;
     const REAL weighed = sum_of_groups(mean_partial, mean_groups, group);
     const REAL weight = sum_of_groups(mean_partial + mean_groups, mean_groups, group);
     const REAL mean = mean_groups > 0 ? weighed / weight : 0;
-    if (IS_FIRST_ITEM)
-        counts[UPDATES] = 0;
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
     const int faces = starts[n], until = starts[block_start(n, group.id + 1, group.count)];
     for (GROUP_LOOP(i, n)) {
@@ -172,10 +192,10 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
         const float base = on_wall ? wall_penalty : penalty, scale = on_wall ? wall_quality_scale : quality_scale;
         const REAL ratio = log_ratio[i] - mean;
         const float e = penalty_of(base, scale, least_quality, log_ratio_scale, power, ratio);
-        const REAL inverse = 1 / (diagonal + e), b = ratio + change;
+        const REAL reciprocal = 1 / (diagonal + e), b = ratio + change;
         eps[i] = e;
-        inverse_diagonal[i] = inverse;
-        const REAL first = warm ? start[i] : inverse * b;
+        inverse[i] = reciprocal;
+        const REAL first = warm ? start[i] : reciprocal * b;
         r[i] = b;
         z[i] = first;
         sum_add(&norm, b * b);
@@ -185,32 +205,19 @@ kernel void assemble_projection(int n, const int room, global const int *starts,
     PUT(GAMMA(0), gamma.value);
 }
 
+kernel void assemble_projection(ITERATION_ARGS, global int *counts, ASSEMBLY_ARGS PERIOD_ARGS)
+{
+    LONG_GROUP;
+    if (IS_FIRST_ITEM)
+        counts[UPDATES] = 0;
+    assemble_rows(ITERATION, ASSEMBLY PERIODS, group);
+}
+
 /* For AT_ONCE faces from f on: the cells across them (any cell for walls), and the derivatives across them, 0 for walls
    and for faces of other rows. */
 #define FACING(f) max(TAKE(int, it->neighbors, f, faces), (MANY(int))(0))
 #define DERIVATIVE(across, f, a)                                                                                       \
     CONVERT(STORE, select((MANY(float))(0), TAKE(float, across + (a)*it->room, f, faces), inside))
-
-/* The arguments of the iteration. */
-typedef struct {
-    int n, max_iterations, room, warm;
-    REAL tolerance;
-    global const int *starts, *neighbors;
-    global const float *rows, *columns;
-    global const STORE *own, *eps, *inverse_diagonal;
-    global STORE *p, *s, *u, *y, *r, *z;
-    global REAL *partial, *record;
-} iteration_t;
-
-#define ITERATION_ARGS                                                                                                 \
-    const int n, const int max_iterations, const int room, const int warm, const REAL tolerance,                       \
-        global const int *starts, global const int *neighbors, global const float *rows, global const float *columns,  \
-        global const STORE *own, global const STORE *eps, global const STORE *inverse_diagonal, global STORE *p,       \
-        global STORE *s, global STORE *u, global STORE *y, global STORE *r, global STORE *z, global REAL *partial,     \
-        global REAL *record
-#define ITERATION                                                                                                      \
-    n, max_iterations, room, warm, tolerance, starts, neighbors, rows, columns, own, eps, inverse_diagonal, p, s, u,   \
-        y, r, z, partial, record
 
 /* p = z + beta p, s = B^T z + beta s. record[k].running becomes 0 if |r| is within the tolerance, if `max_iterations`
    are done, or if a value is not positive or not finite. */
@@ -286,7 +293,7 @@ inline void step_projection(int k, const iteration_t *it, group_t group)
                 sum += DERIVATIVE(it->rows, f, a) * PICK(STORE, it->s, j, CELL_DIM, a);
             q += SUM(STORE, sum);
         }
-        const STORE ri = it->r[i] - alpha * q, zi = it->inverse_diagonal[i] * ri;
+        const STORE ri = it->r[i] - alpha * q, zi = it->inverse[i] * ri;
         it->r[i] = ri;
         it->z[i] = zi;
         sum_add(&norm, (REAL)ri * ri);
@@ -310,26 +317,10 @@ kernel void update_projection(ITERATION_ARGS, global int *counts)
     step_projection(number_of_update(counts, group), &it, group);
 }
 
-/* All iterations by one work-group, for few cells. */
-kernel void project_by_group(ITERATION_ARGS)
+/* The correction h u of generator i, and y as the start of the next projection. */
+inline void put_correction(int i, global const STORE *u, global const STORE *y, global const REAL *h,
+                           global const REAL *points, global REAL *correction, global float *start)
 {
-    LONG_GROUP;
-    const iteration_t it = {ITERATION};
-    bool running = true;
-    for (int k = 0; running; ++k) {
-        step_projection_direction(k, &it, group);
-        GROUP_BARRIER;
-        running = record[4 * k + RECORD_RUNNING] != 0;
-        step_projection(k, &it, group);
-        GROUP_BARRIER;
-    }
-}
-
-/* correction = h u, and y as the start of the next projection. One work-item per generator. */
-kernel void write_correction(const int size, global const STORE *u, global const STORE *y, global const REAL *h,
-                             global const REAL *points, global REAL *correction, global float *start)
-{
-    WORK_ITEM(i);
     start[i] = y[i];
 #ifdef SPHERE
     const float x[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
@@ -341,4 +332,42 @@ kernel void write_correction(const int size, global const STORE *u, global const
     EACH_AXIS (a)
         correction[DIM * i + a] = h[i] * u[DIM * i + a];
 #endif
+}
+
+/* One work-item per generator. */
+kernel void write_correction(const int size, global const STORE *u, global const STORE *y, global const REAL *h,
+                             global const REAL *points, global REAL *correction, global float *start)
+{
+    WORK_ITEM(i);
+    put_correction(i, u, y, h, points, correction, start);
+}
+
+/* All of the projection by one work-group, for few cells. The correction is 0 if there is no iteration. If a number is
+   not finite, the displacement becomes 0 as well: the host learns of it later. */
+kernel void project_by_group(ITERATION_ARGS, global REAL *correction, ASSEMBLY_ARGS PERIOD_ARGS)
+{
+    LONG_GROUP;
+    assemble_rows(ITERATION, ASSEMBLY PERIODS, group);
+    GROUP_BARRIER;
+    const iteration_t it = {ITERATION};
+    int k = 0;
+    for (bool running = true; running; k += running) {
+        step_projection_direction(k, &it, group);
+        GROUP_BARRIER;
+        running = record[4 * k + RECORD_RUNNING] != 0;
+        step_projection(k, &it, group);
+        GROUP_BARRIER;
+    }
+    const REAL curvature = k > 0 ? record[4 * (k - 1) + RECORD_CURVATURE] : 1;
+    const bool flat = !(curvature > 0), sound = record[4 * k + RECORD_NORM] <= REAL_MAX && (!flat || curvature == 0);
+    const int moving = sound && k - flat > 0 ? n : 0;
+    for (GROUP_LOOP(i, moving))
+        put_correction(i, u, y, h, points, correction, start);
+    for (GROUP_LOOP(i, n - moving)) {
+        EACH_AXIS (a) {
+            correction[DIM * i + a] = 0;
+            if (!sound)
+                displacement[DIM * i + a] = 0;
+        }
+    }
 }

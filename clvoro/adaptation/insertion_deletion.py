@@ -12,8 +12,8 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..geometry.domain import Domain
-from ..opencl.device_array import read_number
 from ..opencl.engine import Engine
+from ..opencl.launch import one_group_limit
 from ..opencl.primitives import NamedArrays, Scan
 from ..tessellation.device_diagram import Tessellation
 from .tuning import (
@@ -95,6 +95,7 @@ class InsertionDeletion:
         self.engine = engine
         self._scan = Scan(engine)
         self._room = NamedArrays(engine)
+        self._one_group_limit = one_group_limit(engine)
         self._kernels = engine.kernels(
             "adaptation/insertion_deletion",
             {
@@ -377,10 +378,12 @@ class InsertionDeletion:
         """Return the largest key within `rings` rings of each generator."""
         engine, n = self.engine, t.n
         into, other = (self._room("spread", turn, size=n, dtype=np.uint64) for turn in range(2))
-        for _ in range(rings):
-            engine.run_each(self._kernels.spread_keys, n, t.starts, t.neighbors, source, into)
+        groups, at_once = (1, rings) if n <= self._one_group_limit else (engine.groups, 1)
+        for _ in range(rings // at_once):
+            graph = t.starts, t.neighbors
+            engine.run_groups(self._kernels.spread_keys, groups, n, at_once, *graph, source, into, other)
             source, into, other = into, other, into
-        return source
+        return source if at_once % 2 else into
 
     def choose_once(self, t: Tessellation, keys: cla.Array, rings: int, labels: cla.Array, fixed: int) -> cla.Array:
         """Return the keys of the sites that are the strongest within `rings` rings, away from fixed generators."""
@@ -424,9 +427,11 @@ class InsertionDeletion:
     ) -> Outcome | None:
         """Carry out the marked changes."""
         engine, n = self.engine, t.n
-        self._scan.exclusive(marks.kept, marks.kept, n)
-        self._scan.exclusive(marks.born, marks.born, n)
-        deleted, inserted = n - read_number(marks.kept, n), read_number(marks.born, n)
+        totals = self._room("totals", size=2, dtype=np.int32)
+        for place, counts in enumerate((marks.kept, marks.born)):
+            self._scan.exclusive(counts, counts, n, total=(totals, place))
+        kept, inserted = totals.get().tolist()
+        deleted = n - kept
         m = n - deleted + inserted
         if m == 0 or (deleted == 0 and inserted == 0):
             return None

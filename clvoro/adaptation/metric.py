@@ -2,11 +2,34 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pyopencl.array as cla
 
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
+
+
+class Neighborhoods(NamedTuple):
+    """Sets of neighbors that are compared with those of the last evaluation, on the device.
+
+    Attributes
+    ----------
+    labels : (n,) int32
+    signatures : (n,) uint64
+        Hashes of the sets of the last evaluation; become those of this one.
+    changed, ever_changed : (n,) real
+        Become 1 where the sets differ; `ever_changed` stays 1.
+    first : bool
+        There was no evaluation: the hashes are only set.
+    """
+
+    labels: cla.Array
+    signatures: cla.Array
+    changed: cla.Array
+    ever_changed: cla.Array
+    first: bool = False
 
 
 class Metric:
@@ -25,10 +48,15 @@ class Metric:
         quality: cla.Array,
         energy: cla.Array,
         local_length: cla.Array,
+        compared: Neighborhoods | None = None,
     ) -> None:
         """Write the signed error (3.1), the quality (4.1), the energy (2.3) of each cell, and min(L, h); all (n,)."""
         exact = t.face_measures.dtype == self.engine.real
         kernels = self._exact if exact else self._kernels
+        sets = (0, *[t.starts] * 5)
+        if compared is not None:
+            *arrays, first = compared
+            sets = (2 if first else 1, t.neighbors, *arrays)
         self.engine.run_each(
             kernels.evaluate_metric,
             t.n,
@@ -42,32 +70,8 @@ class Metric:
             quality,
             energy,
             local_length,
+            *sets,
             *t.outlines,
-        )
-
-    def compare_neighbors(
-        self,
-        t: Tessellation,
-        labels: cla.Array,
-        first: bool,
-        signatures: cla.Array,
-        changed: cla.Array,
-        ever_changed: cla.Array,
-    ) -> None:
-        """Write 1 to `changed` (n,) and `ever_changed` (n,) where the set of neighbors differs from the last call.
-
-        `signatures` (n,) uint64 are the hashes to compare; with `first` they are only set.
-        """
-        self.engine.run_each(
-            self._kernels.compare_neighbors,
-            t.n,
-            t.starts,
-            t.neighbors,
-            labels,
-            np.int32(first),
-            signatures,
-            changed,
-            ever_changed,
         )
 
     def set_fixed_sizes(self, labels: cla.Array, first: int, fixed: int, volumes: cla.Array, h: cla.Array) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
@@ -28,6 +27,7 @@ from ..tessellation.tessellator import Tessellator
 from .density import CellWeights
 from .fixed_points import take_places
 from .insertion_deletion import CellSizes, Change, Generators, Outcome
+from .metric import Neighborhoods
 from .motion import Displacement, Moving
 from .stages import Stages
 from .tuning import CLIMB_STRAIN, MOST_OBTUSE
@@ -147,7 +147,7 @@ class MeshState:
     velocity : (n, d) real
         Displacement in the last step.
     signatures : (n,) uint64
-        Hashes of the sets of neighbors; see `Metric.compare_neighbors`.
+        Hashes of the sets of neighbors; see `Neighborhoods`.
     ever_changed : (n,) real
         1 where the set of neighbors has changed in a step on this level, else 0.
     h, error, quality : (n,) real
@@ -408,23 +408,22 @@ class MeshState:
         """Compare the neighbors with those of the last diagram, and evaluate error and quality."""
         with self.engine.workspace.frame():
             changed = self.engine.scratch(self.n)
-            self.stages.metric.compare_neighbors(
-                self.t, self.labels, first, self.signatures, changed, self.ever_changed
-            )
-            self.evaluate_metric({"changed": changed, "ever_changed": self.ever_changed})
+            self.evaluate_metric(Neighborhoods(self.labels, self.signatures, changed, self.ever_changed, first))
 
-    def evaluate_metric(self, others: Mapping[str, cla.Array] | None = None) -> None:
-        """Evaluate and summarize error and quality, and summarize `others` by name."""
+    def evaluate_metric(self, compared: Neighborhoods | None = None) -> None:
+        """Evaluate and summarize error and quality, and compare neighbors."""
         if self.fixed > self.setup.first_row:
             self.stages.metric.set_fixed_sizes(self.labels, self.setup.first_row, self.fixed, self.t.volumes, self.h)
         with self.engine.workspace.frame():
             energy = self.engine.scratch(self.n)
-            self.stages.metric.evaluate(self.t, self.h, self.error, self.quality, energy, self.local_length)
+            self.stages.metric.evaluate(self.t, self.h, self.error, self.quality, energy, self.local_length, compared)
             own = {"error": self.error, "quality": self.quality, "energy": energy}
+            if compared is not None:
+                own |= {"changed": compared.changed, "ever_changed": compared.ever_changed}
             if self.follows_log_ratio:
                 own["log_ratio"] = self.stages.density.cell_weights(self.t, self.h).log_ratio
             self._knows_log_ratio = self.follows_log_ratio
-            self.summaries.collect_all({**own, **(others or {})}, self.n)
+            self.summaries.collect_all(own, self.n)
 
     def move(self, d: Displacement) -> None:
         """Move the generators. The diagram is then out of date."""

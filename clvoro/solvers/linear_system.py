@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl.array as cla
@@ -44,6 +45,30 @@ class Solution:
     def zero(cls) -> Solution:
         """Return the outcome for a right side of zero."""
         return cls(0, 0.0, np.zeros(1), True, "zero right side")
+
+
+class SolutionToRead(Solution):
+    """A solution that the host reads when one of its attributes is first used, so that it need not wait before.
+
+    Parameters
+    ----------
+    read : callable
+        Returns the solution. It is called once.
+    """
+
+    def __init__(self, read: Callable[[], Solution]) -> None:
+        vars(self)["_read"] = read
+
+    def read(self) -> None:
+        """Read the solution, if it has not been read."""
+        if "_read" in vars(self):
+            vars(self).update(vars(vars(self).pop("_read")()))
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or "_read" not in vars(self):
+            raise AttributeError(name)
+        self.read()
+        return getattr(self, name)
 
 
 class BreakdownError(SolverError):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from typing import NamedTuple
+from weakref import ReferenceType, ref
 
 import numpy as np
 import pyopencl.array as cla
@@ -20,7 +21,7 @@ from ..opencl.launch import Launch, one_group_limit
 from ..opencl.workspace import framed
 from ..tessellation.device_diagram import Tessellation
 from .conjugate_gradient import RECORD_CURVATURE, RECORD_NORM, RECORD_RUNNING
-from .linear_system import Limits, Solution
+from .linear_system import Limits, Solution, SolutionToRead
 
 SINGLE_PRECISION_TOLERANCE = 1e-4
 """Tolerance from which on the vectors of the iteration are in single precision."""
@@ -77,11 +78,11 @@ class _Arrays(NamedTuple):
     rows: cla.Array
     columns: cla.Array
     own: cla.Array
-    s: cla.Array
-    u: cla.Array
     eps: cla.Array
     inverse: cla.Array
     p: cla.Array
+    s: cla.Array
+    u: cla.Array
     y: cla.Array
     r: cla.Array
     z: cla.Array
@@ -97,7 +98,7 @@ class VolumeProjection:
     Conjugate gradients with a diagonal preconditioner start from y = 0, or along the last solution. An iteration takes
     two kernels. The host enqueues as many iterations as the last solve took, and one more, and then reads their record.
     The iterate is frozen on the device when the tolerance is met, so the result does not depend on when the host reads.
-    One work-group does all iterations where cells are few.
+    Where cells are few one work-group does all of it, and the host reads the record when the solution is first used.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -108,6 +109,7 @@ class VolumeProjection:
         self._counts = engine.empty(2, np.int32)
         self._kernels: dict[np.dtype, Kernels] = {}
         self._ahead = 8
+        self._unread: ReferenceType[SolutionToRead] | None = None
         self._one_group_limit = one_group_limit(engine)
 
     def _kernels_in(self, store: np.dtype) -> Kernels:
@@ -122,9 +124,10 @@ class VolumeProjection:
         engine, d = self.engine, self.engine.cell_dim
         if 4 * (max_iterations + 1) > len(self._record):
             self._record = engine.zeros(4 * (max_iterations + 1))
-        shapes = ((d, m), np.dtype(np.float32), 2), ((n, d), store, 3), (n, store, 6)
-        take = engine.scratch
-        return _Arrays(*(take(shape, real) for shape, real, count in shapes for _ in range(count)))
+        vector, number = ((n, d), store), (n, store)
+        derivatives = ((d, m), np.dtype(np.float32))
+        shapes = derivatives, derivatives, vector, number, number, number, vector, vector, *[number] * 3
+        return _Arrays(*(engine.scratch(*shape) for shape in shapes))
 
     @framed
     def project(
@@ -166,23 +169,50 @@ class VolumeProjection:
         Raises
         ------
         SolverError
-            If a number is not finite.
+            If a number is not finite: where cells are few when the solution is first used, with both displacements 0.
         """
+        unread = None if self._unread is None else self._unread()
+        if unread is not None:
+            unread.read()
         engine, n, m = self.engine, t.n, t.neighbors.shape[0]
-        real, tolerance, most = engine.real.type, limits.tolerance, limits.max_iterations
-        single = tolerance >= SINGLE_PRECISION_TOLERANCE
+        real, most = engine.real.type, limits.max_iterations
+        single = limits.tolerance >= SINGLE_PRECISION_TOLERANCE
         store = np.dtype(np.float32) if single else engine.real
         v, k = self._reserve(n, m, store, most), self._kernels_in(store)
         start = engine.scratch(n, np.float32) if start is None else start
-        groups = 1 if n <= self._one_group_limit else engine.groups
-        sums = (self._partial, 0) if targets.sums is None else (targets.sums, len(targets.sums) // 2)
-        Launch(
-            engine,
-            k.assemble_projection,
-            n,
-            m,
-            t.starts,
-            t.neighbors,
+        iteration = (n, most, m, int(warm), real(limits.tolerance), t.starts, t.neighbors, *v, self._partial)
+        assembly = self._assembly(t, targets, displacement, penalty, t.starts if labels is None else labels, fixed)
+        given, rest = (*iteration, self._record), (*assembly, start, *engine.period_args)
+        if n <= self._one_group_limit:
+            Launch(engine, k.project_by_group, *given, correction, *rest, groups=1)()
+            solution = SolutionToRead(lambda: self._solution(self._read(most), limits.tolerance))
+            self._unread = ref(solution)
+            return solution
+        Launch(engine, k.assemble_projection, *given, self._counts, *rest)()
+        rows = self._iterate(
+            Launch(engine, k.update_projection_direction, *given, self._counts),
+            Launch(engine, k.update_projection, *given, self._counts),
+            most,
+        )
+        solution = self._solution(rows, limits.tolerance)
+        if solution.iterations:
+            engine.run_each(k.write_correction, n, v.u, v.y, targets.h, t.points, correction, start)
+        else:
+            correction.fill(0)
+        return solution
+
+    def _assembly(
+        self,
+        t: Tessellation,
+        targets: Targets,
+        displacement: cla.Array,
+        penalty: Penalty,
+        labels: cla.Array,
+        fixed: int,
+    ) -> tuple[object, ...]:
+        """Return ASSEMBLY_ARGS of volume_projection.cl but for the start."""
+        real, sums = self.engine.real.type, targets.sums
+        return (
             t.face_measures,
             t.face_centroids,
             t.volumes,
@@ -198,60 +228,10 @@ class VolumeProjection:
             real(penalty.at_walls * penalty.quality_scale),
             real(penalty.log_ratio_scale),
             penalty.power,
-            v.rows,
-            v.columns,
-            v.own,
-            v.eps,
-            v.inverse,
-            v.r,
-            v.z,
-            self._partial,
-            self._counts,
-            *sums,
-            t.starts if labels is None else labels,
+            *((self._partial, 0) if sums is None else (sums, len(sums) // 2)),
+            labels,
             fixed,
-            int(warm),
-            start,
-            *engine.period_args,
-            groups=groups,
-        )()
-        iteration = (
-            n,
-            most,
-            m,
-            int(warm),
-            real(tolerance),
-            t.starts,
-            t.neighbors,
-            v.rows,
-            v.columns,
-            v.own,
-            v.eps,
-            v.inverse,
-            v.p,
-            v.s,
-            v.u,
-            v.y,
-            v.r,
-            v.z,
-            self._partial,
-            self._record,
         )
-        if groups == 1:
-            Launch(engine, k.project_by_group, *iteration, groups=1)()
-            rows = self._read(most)
-        else:
-            rows = self._iterate(
-                Launch(engine, k.update_projection_direction, *iteration, self._counts),
-                Launch(engine, k.update_projection, *iteration, self._counts),
-                most,
-            )
-        solution = self._solution(rows, tolerance)
-        if solution.iterations:
-            engine.run_each(k.write_correction, n, v.u, v.y, targets.h, t.points, correction, start)
-        else:
-            correction.fill(0)
-        return solution
 
     def _iterate(self, direction: Launch, update: Launch, most: int) -> list[list[float]]:
         """Iterate until the tolerance is met, or `most` times; return the record up to there or further."""

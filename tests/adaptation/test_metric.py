@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clvoro.adaptation.metric import Metric
+from clvoro.adaptation.metric import Metric, Neighborhoods
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.device_diagram import Tessellation
 from tests.reference import diagrams as reference
@@ -17,9 +17,9 @@ def engine(ctx, request):
     return patch.make_engine(ctx, request.param)
 
 
-def evaluate(engine, t, h):
+def evaluate(engine, t, h, compared=None):
     out = [engine.empty(t.n) for _ in range(4)]
-    Metric(engine).evaluate(t, engine.upload(h), *out)
+    Metric(engine).evaluate(t, engine.upload(h), *out, compared)
     return [a.get() for a in out]
 
 
@@ -112,9 +112,13 @@ def neighbor_sets(t, labels):
     }
 
 
+def compare_neighbors(engine, t, labels, first, *arrays):
+    evaluate(engine, t, np.ones(N), Neighborhoods(engine.upload(labels, np.int32), *arrays, first))
+
+
 def test_compare_neighbors(ctx):
     engine = patch.make_engine(ctx)
-    metric, rng = Metric(engine), np.random.default_rng(717)
+    rng = np.random.default_rng(717)
     labels = rng.permutation(5 * N)[:N].astype(np.int32)  # any distinct names
     points = patch.random_points(N, 31)
     signatures, changed = engine.zeros(N, np.uint64), engine.empty(N)
@@ -122,7 +126,7 @@ def test_compare_neighbors(ctx):
 
     def compare(points, labels, first):
         t = patch.tessellate(engine, points)
-        metric.compare_neighbors(t, engine.upload(labels, np.int32), first, signatures, changed, ever)
+        compare_neighbors(engine, t, labels, first, signatures, changed, ever)
         return neighbor_sets(t, labels), changed.get(), ever.get()
 
     before, now, so_far = compare(points, labels, True)
@@ -143,16 +147,16 @@ def test_compare_neighbors(ctx):
 def test_neighbor_changes_ignore_order_and_numbering(ctx):
     """In another order the same cells have other indices, but the same labels, and so the same neighbors."""
     engine = patch.make_engine(ctx)
-    metric, order = Metric(engine), np.random.default_rng(3).permutation(N)
+    order = np.random.default_rng(3).permutation(N)
     points, labels = patch.random_points(N, 31), np.arange(N) + 7
     signatures, changed, ever = engine.zeros(N, np.uint64), engine.empty(N), engine.zeros(N)
     t = patch.tessellate(engine, points)
-    metric.compare_neighbors(t, engine.upload(labels, np.int32), True, signatures, changed, ever)
+    compare_neighbors(engine, t, labels, True, signatures, changed, ever)
     moved = engine.upload(signatures.get()[order], np.uint64)
     t = patch.tessellate(engine, points[order])
-    metric.compare_neighbors(t, engine.upload(labels[order], np.int32), False, moved, changed, ever)
+    compare_neighbors(engine, t, labels[order], False, moved, changed, ever)
     assert not changed.get().any()
-    metric.compare_neighbors(t, engine.upload(labels, np.int32), False, moved, changed, ever)
+    compare_neighbors(engine, t, labels, False, moved, changed, ever)
     assert changed.get().all(), "other names are other neighbors"
 
 

@@ -293,10 +293,22 @@ def test_start(engine, points, of):
 
 
 def test_not_finite(engine, points):
-    r = log_ratios(points)
+    """Where the host learns of it later, nothing moves; a further projection does not hide the error."""
+    r, stage = log_ratios(points), VolumeProjection(engine)
     r[7] = np.nan
+    t, gradient = patch.tessellate(engine, points), np.tile(SLOPE, (N, 1))
+    targets = Targets(*map(engine.upload, (sizes(points), gradient, r, np.ones(N))))
+    moves = engine.upload(np.full((2, N, 2), 0.3))
+    both = [moves[0].copy(), moves[1].copy()]
+    solutions = []
+
+    def project_twice():
+        solutions.append(stage.project(t, targets, *both, Penalty(0.1), Limits(1e-6, 9)))
+        assert not any(move.get().any() for move in both)
+        stage.project(t, targets, *both, Penalty(0.1), Limits(1e-6, 90))
+
     with pytest.raises(SolverError, match="not finite"):
-        project(engine, points, sizes(points), np.tile(SLOPE, (N, 1)), r, np.zeros((N, 2)), eps=0.1, max_iterations=9)
+        project_twice()
 
 
 def test_penalty_of_bad_cells(engine, points, assembled):
