@@ -43,9 +43,9 @@ inline void compare_neighbors(int i, global const int *starts, global const int 
 kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts,
                             global const FACE *face_measures, global const REAL *offsets,
                             global const REAL *covariances, global const REAL *h, global REAL *error,
-                            global REAL *quality, global REAL *energy, global REAL *local_length,
-                            const int comparison, global const int *neighbors, global const int *labels,
-                            global ulong *signatures, global REAL *changed, global REAL *ever_changed OUTLINE_ARGS)
+                            global REAL *quality, global REAL *energy, global REAL *local_length, const int comparison,
+                            global const int *neighbors, global const int *labels, global ulong *signatures,
+                            global REAL *changed, global REAL *ever_changed OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     const REAL volume = volumes[i];
