@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
@@ -177,7 +177,7 @@ def _spaced(rings: OrientedRings, bend: np.ndarray, h: np.ndarray, order: np.nda
         return order
     x, bend, h = rings.vertices[order], bend[order], h[order]
     pockets = _Pockets(rings)
-    tree, kept = KDTree(x), np.ones(len(order), bool)
+    tree, kept = scipy.spatial.KDTree(x), np.ones(len(order), bool)
     for k in range(len(order)):
         if not kept[k]:
             continue
@@ -255,7 +255,7 @@ def _grouped(x: np.ndarray, h: np.ndarray) -> list[list[int]]:
     group: list[list[int]] = [[k] for k in range(len(x))]
     if len(x) < 2:
         return group
-    pairs = KDTree(x).query_pairs(JOINED * float(h.max()), output_type="ndarray")
+    pairs = scipy.spatial.KDTree(x).query_pairs(JOINED * float(h.max()), output_type="ndarray")
     gaps = np.hypot(*(x[pairs[:, 0]] - x[pairs[:, 1]]).T)
     close = gaps < JOINED * h[pairs].max(axis=1)
     pairs, gaps = pairs[close], gaps[close]
@@ -273,7 +273,7 @@ def _others(x: np.ndarray, h: np.ndarray, starts: np.ndarray) -> tuple[np.ndarra
     """Return the corners of other groups near each group."""
     found: list[np.ndarray] = []
     if len(x):
-        near = KDTree(x).query_ball_point(x, GROUP_REACH * h)
+        near = scipy.spatial.KDTree(x).query_ball_point(x, GROUP_REACH * h)
         row = np.repeat(np.arange(len(x)), [len(rows) for rows in near])
         pair = np.concatenate([np.array(rows, int) for rows in near])
         # Each of two corners knows the other one if one of them is large enough.

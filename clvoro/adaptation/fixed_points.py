@@ -7,8 +7,8 @@ begins. Coarser levels do not have them, as they may be close together for the c
 from __future__ import annotations
 
 import numpy as np
+import scipy
 import shapely
-from scipy.spatial import KDTree
 
 from ..arguments import check_points, coincident_pair, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
@@ -91,7 +91,7 @@ def check_room(points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarra
     if len(everything) == 1:
         return
     x, periods = in_frame(everything, domain)
-    distance, other = KDTree(x, boxsize=periods).query(x[: len(points)], k=2)
+    distance, other = scipy.spatial.KDTree(x, boxsize=periods).query(x[: len(points)], k=2)
     near = distance[:, 1] * domain.frame[1] / h
     i = int(near.argmin())
     j = int(np.asarray(other)[i, 1])
@@ -138,7 +138,7 @@ def take_places(
     while (places < 0).any() and len(others):
         waiting = np.flatnonzero(places < 0)
         count = min(CANDIDATES, len(others))
-        tree = KDTree(points[others].astype(np.float64), boxsize=periods, balanced_tree=False)
+        tree = scipy.spatial.KDTree(points[others].astype(np.float64), boxsize=periods, balanced_tree=False)
         near = tree.query(x[waiting], k=count)
         distance, index = (np.reshape(found, (-1, count)) for found in near)
         if domain.outline is not None:

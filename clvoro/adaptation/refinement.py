@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pyopencl.array as cla
-from scipy.spatial import KDTree
+import scipy
 
 from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
@@ -69,7 +69,7 @@ class Refinement:
     def _without_coincident(self, finer: cla.Array, n: int) -> cla.Array:
         """Return the generators without new ones (from row `n` on) that coincide with others."""
         host = finer.get()
-        pairs = KDTree(host).query_pairs(COINCIDENT * np.finfo(host.dtype).eps, output_type="ndarray")
+        pairs = scipy.spatial.KDTree(host).query_pairs(COINCIDENT * np.finfo(host.dtype).eps, output_type="ndarray")
         close = np.unique(pairs.max(axis=1))
         close = close[close >= n]
         return self.engine.upload(np.delete(host, close, axis=0)) if len(close) else finer

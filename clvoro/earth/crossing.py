@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ..geometry.sphere import Sphere
 from ..geometry.sphere_region import SphereRegion
@@ -26,7 +26,7 @@ def cells_across(diagram: Diagram, sphere: Sphere, line: np.ndarray) -> np.ndarr
     if isinstance(sphere, SphereRegion):
         unit = np.concatenate([unit, sphere.beyond])
     unit = unit / np.linalg.norm(unit, axis=1)[:, None]
-    tree = KDTree(unit)
+    tree = scipy.spatial.KDTree(unit)
     path = sphere.positions(_divided(line)) / sphere.radius
     cells = np.asarray(tree.query(path)[1])
     begin, end, first, last = path[:-1], path[1:], cells[:-1], cells[1:]

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from ..errors import InputError
 from ..io.contents import Contents
@@ -152,8 +151,8 @@ def _walk_around(halves: HalfEdges) -> _Around:
     h = len(halves.cell)
     onward = halves.twin[halves.previous]
     joined = np.flatnonzero(onward >= 0)
-    graph = coo_array((np.ones(len(joined), np.int8), (joined, onward[joined])), shape=(h, h))
-    label = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array((np.ones(len(joined), np.int8), (joined, onward[joined])), shape=(h, h))
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     # Vertices are numbered by their lowest half-edge. At the boundary the first edge is the one on it.
     rank = np.lexsort((np.arange(h), halves.twin >= 0, label))
     begins = rank[np.flatnonzero(np.diff(label[rank], prepend=-1))]

@@ -16,8 +16,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from ..arguments import check_choice, check_integer, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
@@ -309,8 +308,8 @@ def _large_parts(diagram: Diagram, water: np.ndarray, least_cells: int | None) -
     joined = np.flatnonzero(diagram.neighbors >= 0)
     joined = joined[water[owner[joined]] & water[diagram.neighbors[joined]]]
     pairs = owner[joined], diagram.neighbors[joined]
-    graph = coo_array((np.ones(len(joined), np.int8), pairs), shape=(n, n))
-    part = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array((np.ones(len(joined), np.int8), pairs), shape=(n, n))
+    part = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     if least_cells is None:
         areas = np.bincount(part, np.where(water, diagram.volumes, 0))
         return water & (part == areas.argmax())

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
+import scipy
 
 from ..mesh.connectivity import distinct, following, slices, take_ranges, take_rows
 from ..mesh.diagram import Diagram

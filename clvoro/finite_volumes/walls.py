@@ -20,9 +20,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, Delaunay
+import scipy
 
 from ..arguments import format_point, warn
 from ..errors import MismatchWarning
@@ -86,12 +84,12 @@ def convex_faces(points: np.ndarray, weights: np.ndarray, extent: float) -> Conv
     x = np.concatenate([points - low, FAR * extent * around])
     w = np.concatenate([weights, np.full(4, weights.min())])
     if np.ptp(weights):
-        hull = ConvexHull(np.column_stack([x, (x**2).sum(axis=1) - w]))
+        hull = scipy.spatial.ConvexHull(np.column_stack([x, (x**2).sum(axis=1) - w]))
         lower = hull.equations[:, 2] < 0
         triangles, neighbors = hull.simplices[lower], hull.neighbors[lower]
         neighbors = np.where(lower, np.cumsum(lower) - 1, -1)[neighbors]
     else:
-        dual = Delaunay(x)
+        dual = scipy.spatial.Delaunay(x)
         triangles, neighbors = dual.simplices, dual.neighbors
     a, b, c = x[triangles].swapaxes(0, 1)
     turned = cross(b - a, c - a) < 0
@@ -284,8 +282,8 @@ class _WallMaker:
         order = np.argsort(key, kind="stable")
         one, two = of_end[order[:-1]], of_end[order[1:]]
         near = (np.diff(key[order]) == 0) & self._are_near(feet[one], feet[two], 2 * ON_WALL * self.least[at[one]])
-        graph = coo_array((np.ones(np.count_nonzero(near)), (one[near], two[near])), (len(at), len(at)))
-        _, group = connected_components(graph, directed=False)
+        graph = scipy.sparse.coo_array((np.ones(np.count_nonzero(near)), (one[near], two[near])), (len(at), len(at)))
+        _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
         ends[on] = count + crossings + group
         feet = feet[np.unique(group, return_index=True)[1]]
         self.position = np.concatenate([np.full(count, np.nan), crossed[is_crossing], feet])
@@ -467,8 +465,10 @@ class _WallMaker:
         owner = np.concatenate([owner[order], cell[by_wall]]).astype(np.int32)
         # Corners of two rings that touch are one point, and faces without length vanish.
         short = np.hypot(*(points[ends[:, 1]] - points[ends[:, 0]]).T) <= NO_LENGTH * self.size[owner]
-        graph = coo_array((np.ones(np.count_nonzero(short)), tuple(ends[short].T)), (len(points), len(points)))
-        _, group = connected_components(graph, directed=False)
+        graph = scipy.sparse.coo_array(
+            (np.ones(np.count_nonzero(short)), tuple(ends[short].T)), (len(points), len(points))
+        )
+        _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
         ends = np.unique(group, return_index=True)[1][group][ends]
         count = len(ends)
         made = Faces(

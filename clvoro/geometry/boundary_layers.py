@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import shapely
-from scipy.spatial import KDTree
 
 from ..arguments import check_integer, check_number
 from ..errors import InputError, InputTypeError
@@ -153,7 +153,11 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     kept[kept] = _distances(points[kept], segments) >= _OWN * wall[kept]
     points, limit = points[kept], limit[kept]
     # In every chain the nearest rows to the wall come first. Of two generators too near, drop the later one.
-    close = KDTree(points).query_pairs(limit.max(), output_type="ndarray") if len(points) else np.empty((0, 2), int)
+    close = (
+        scipy.spatial.KDTree(points).query_pairs(limit.max(), output_type="ndarray")
+        if len(points)
+        else np.empty((0, 2), int)
+    )
     apart = np.hypot(*(points[close[:, 0]] - points[close[:, 1]]).T)
     close = close[apart < np.minimum(limit[close[:, 0]], limit[close[:, 1]])]
     gone = np.zeros(len(points), bool)
@@ -307,5 +311,5 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
 
 def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray:
     """Return the `points` (n, 2) that lie in the `free` domain and differ from all `rows` (k, 2)."""
-    apart = free.contains(points) & (KDTree(rows).query(points)[0] > 0)
+    apart = free.contains(points) & (scipy.spatial.KDTree(rows).query(points)[0] > 0)
     return points[apart]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-from scipy.spatial import ConvexHull, KDTree
+import scipy
 
 from ..arguments import check_integer, check_number, check_rows
 from ..errors import InputError
@@ -31,7 +31,7 @@ def directions(points: np.ndarray) -> np.ndarray:
 def farthest_place(points: np.ndarray) -> tuple[float, float, float]:
     """Return longitude and latitude of about the place farthest from `points` on the unit sphere, and that distance."""
     places = Sphere(1).spiral_points(4000)
-    chord = np.asarray(KDTree(points).query(places)[0])
+    chord = np.asarray(scipy.spatial.KDTree(points).query(places)[0])
     lon, lat = directions(places[chord.argmax() :][:1])[0]
     return float(lon), float(lat), float(np.degrees(2 * np.arcsin(min(chord.max() / 2, 1))))
 
@@ -170,7 +170,7 @@ class Sphere(Domain):
         one = np.array([(a, b * golden, 0.0) for a in (1, -1) for b in (1, -1)])
         x = np.concatenate([one, np.roll(one, 1, axis=1), np.roll(one, 2, axis=1)])
         x /= np.linalg.norm(x[0])
-        triangles = ConvexHull(x).simplices
+        triangles = scipy.spatial.ConvexHull(x).simplices
         for _ in range(k):
             pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
             edges, of = np.unique(pairs, axis=0, return_inverse=True)

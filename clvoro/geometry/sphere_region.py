@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ..arguments import check_number, check_rows
 from ..errors import InputError
@@ -114,7 +114,7 @@ class SphereRegion(Sphere):
 
     def closest_walls(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, 3) on the boundary the wall towards the closest removed cell, (n,) int."""
-        return np.asarray(KDTree(self.beyond).query(points)[1])
+        return np.asarray(scipy.spatial.KDTree(self.beyond).query(points)[1])
 
     def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return unit vectors (k, 3) from `points` to the removed generators behind `walls`, and half the ways (k,)."""
@@ -128,8 +128,8 @@ class SphereRegion(Sphere):
         return np.asarray(self.beyond)[walls]
 
     @cached_property
-    def _tree(self) -> KDTree:
-        return KDTree(np.concatenate([self.within, self.beyond]))
+    def _tree(self) -> scipy.spatial.KDTree:
+        return scipy.spatial.KDTree(np.concatenate([self.within, self.beyond]))
 
     def traits(self, real: np.dtype) -> Traits:
         """Raise an error, because a mesh is made on the whole sphere before cells are removed."""

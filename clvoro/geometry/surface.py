@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 
 from ..arguments import format_point
 from ..errors import InputError, InputTypeError
@@ -180,14 +181,10 @@ class Surface:
         unique, places = np.unique(self.vertices + 0.0, axis=0, return_inverse=True)
         places = places.reshape(-1)
         if self.join > 0:
-            from scipy.sparse import coo_array
-            from scipy.sparse.csgraph import connected_components
-            from scipy.spatial import KDTree
-
-            near = KDTree(unique).query_pairs(self.join, output_type="ndarray")
+            near = scipy.spatial.KDTree(unique).query_pairs(self.join, output_type="ndarray")
             shape = (len(unique), len(unique))
-            graph = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=shape)
-            joined = connected_components(graph, directed=False)[1]
+            graph = scipy.sparse.coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=shape)
+            joined = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
             unique, places = unique[np.unique(joined, return_index=True)[1]], joined[places]
         return unique, places[self.triangles]
 
@@ -295,10 +292,8 @@ class Surface:
 
     def distance2(self, points: np.ndarray) -> np.ndarray:
         """Return the squared distances of `points` (n, 3) to the surface, (n,) float64."""
-        from scipy.spatial import KDTree
-
         used = self.vertices[np.unique(self.triangles)]
-        bound = KDTree(used).query(points)[0] * (1 + 1e-12)
+        bound = scipy.spatial.KDTree(used).query(points)[0] * (1 + 1e-12)
         return self.tree.nearest2(points, bound**2, lambda x, item: triangle_distance2(x, self.corners[item]))
 
     def landmarks(self, spacing: float, most: int) -> np.ndarray:

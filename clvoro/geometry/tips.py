@@ -9,7 +9,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from .polygon import Polygon
 
@@ -62,7 +62,7 @@ def find_tips(
     order = order[np.lexsort((order, angle[order].round(9)))]
     kept = np.zeros(len(order), bool)
     if len(order):
-        near = KDTree(x[order]).query_ball_point(x[order], _SPACING * h[order])
+        near = scipy.spatial.KDTree(x[order]).query_ball_point(x[order], _SPACING * h[order])
         for k, others in enumerate(near):
             kept[k] = not kept[others].any()
     tips = np.sort(order[kept])

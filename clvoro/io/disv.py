@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
@@ -115,8 +114,8 @@ def _without_empty_faces(mesh: Faces) -> Faces:
         return mesh
     # Several such faces may be in a row. All their ends become the first one.
     size = len(mesh.points)
-    graph = coo_array((short[short], ends[short].T), shape=(size, size))
-    label = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array((short[short], ends[short].T), shape=(size, size))
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     into = np.unique(label, return_index=True)[1][label]
     return replace(mesh, corners=into[mesh.corners]).take_faces(~short).compact()
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.io import netcdf_file
+import scipy
 
 from ..errors import InputError
 from .atomic import atomic_file
@@ -120,7 +120,7 @@ class NetCDF:
     def write(self) -> None:
         """Write the file; call it once. Equal contents give equal bytes."""
         with atomic_file(self.path) as file:
-            made = netcdf_file(file, "w", version=2)
+            made = scipy.io.netcdf_file(file, "w", version=2)
             for name, value in self.attributes.items():
                 setattr(made, name, value)
             for name, length in self.dimensions.items():

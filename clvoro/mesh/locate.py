@@ -5,23 +5,23 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 import shapely
-from scipy.spatial import KDTree
 
 if TYPE_CHECKING:
     from .diagram import Diagram
 
 
-def power_tree(diagram: Diagram, places: np.ndarray, periods: np.ndarray) -> KDTree:
+def power_tree(diagram: Diagram, places: np.ndarray, periods: np.ndarray) -> scipy.spatial.KDTree:
     """Return a search tree of the generators at `places` (n, d); 0 in `periods` stands for walls.
 
     In a power diagram a further coordinate is sqrt(max w - w_i): the square of the distance from a point with 0 there
     is |y - x_i|^2 - w_i + max w (Aurenhammer 1987). `lifted` adds the coordinate to points.
     """
     if not diagram.is_power:
-        return KDTree(places, boxsize=periods)
+        return scipy.spatial.KDTree(places, boxsize=periods)
     heights = np.sqrt(diagram.weights.max() - diagram.weights)
-    return KDTree(np.column_stack([places, heights]), boxsize=np.append(periods, 0.0))
+    return scipy.spatial.KDTree(np.column_stack([places, heights]), boxsize=np.append(periods, 0.0))
 
 
 def lifted(diagram: Diagram, places: np.ndarray) -> np.ndarray:

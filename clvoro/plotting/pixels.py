@@ -7,8 +7,8 @@ from typing import Any, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
-from scipy.ndimage import distance_transform_edt
 
 from ..mesh.diagram import Diagram
 from .colors import Paint
@@ -66,5 +66,7 @@ def _with_rim(cells: np.ndarray) -> np.ndarray:
     outside = cells < 0
     if not outside.any() or outside.all():
         return cells
-    distances, nearest = cast("tuple[np.ndarray, np.ndarray]", distance_transform_edt(outside, return_indices=True))
+    distances, nearest = cast(
+        "tuple[np.ndarray, np.ndarray]", scipy.ndimage.distance_transform_edt(outside, return_indices=True)
+    )
     return np.where(distances <= _RIM, cells[tuple(nearest)], -1)

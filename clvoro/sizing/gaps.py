@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ..geometry.polygon import Polygon
 
@@ -186,7 +186,7 @@ def _balls(
     met = np.zeros(n, bool)
     # First until no vertex is inside: the search for a vertex is much faster than that for an edge.
     vertices = domain.oriented.vertices
-    tree, active = KDTree(vertices), np.arange(n)
+    tree, active = scipy.spatial.KDTree(vertices), np.arange(n)
     while active.size:
         center = points[active] + radius[active, None] * normal[active]
         distance, nearest = tree.query(center)

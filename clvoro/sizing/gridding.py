@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 
 from ..errors import InputError, InputTypeError
 from ..geometry.shapes import coordinates
@@ -56,9 +57,10 @@ def fill_missing(what: str, values: Any, missing: str, spacing: np.ndarray) -> n
         )
     if gaps.all():
         raise InputError(f"{what} are all missing, {gaps.size} of them; expected some numbers")
-    from scipy.ndimage import distance_transform_edt
 
-    found: Any = distance_transform_edt(gaps, sampling=spacing[::-1], return_distances=False, return_indices=True)
+    found: Any = scipy.ndimage.distance_transform_edt(
+        gaps, sampling=spacing[::-1], return_distances=False, return_indices=True
+    )
     return array[tuple(found)]
 
 
@@ -122,22 +124,20 @@ def grid_scattered(
 
 
 def _interpolate(x: np.ndarray, values: np.ndarray, nodes: np.ndarray, method: str) -> np.ndarray:
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import KDTree, QhullError
 
     found = np.full(len(nodes), np.nan)
     if method == "linear":
         _check_duplicates(x, values)
         try:
-            found = LinearNDInterpolator(x, values)(nodes)
-        except QhullError as error:
+            found = scipy.interpolate.LinearNDInterpolator(x, values)(nodes)
+        except scipy.spatial.QhullError as error:
             raise InputError(
                 f"Scattered cannot triangulate its {len(x)} points: they are too few or lie on a "
                 "line or plane; pass method='nearest'"
             ) from error
     outside = np.isnan(found)
     if outside.any():
-        found[outside] = values[KDTree(x).query(nodes[outside])[1]]
+        found[outside] = values[scipy.spatial.KDTree(x).query(nodes[outside])[1]]
     return found
 
 

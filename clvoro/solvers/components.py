@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 if TYPE_CHECKING:
     import pyopencl.array as cla
@@ -58,11 +59,10 @@ def connected_components(t: Tessellation) -> np.ndarray:
     in all of them, and a piece without a generator consists of parts of cells and connects them.
     """
     # This import takes 0.2 s, and most runs do without it.
-    from scipy.sparse import csgraph, csr_array
 
     starts = t.starts.get()
     other = t.neighbors[: starts[-1]].get()
     walls = other < 0
     other[walls] = np.repeat(np.arange(t.n, dtype=other.dtype), np.diff(starts))[walls]
-    graph = csr_array((np.ones(len(other), np.int8), other, starts), shape=(t.n, t.n))
-    return csgraph.connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.csr_array((np.ones(len(other), np.int8), other, starts), shape=(t.n, t.n))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]

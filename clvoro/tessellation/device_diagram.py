@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pyopencl.array as cla
-from scipy.spatial import KDTree
+import scipy
 
 from ..errors import InputError
 from ..geometry.sphere import directions, farthest_place
@@ -71,7 +71,7 @@ class CloseError(InputError):
 
     def __init__(self, points: cla.Array, n: int) -> None:
         x = points.get()[:n].astype(np.float64)
-        gaps = KDTree(x).query(x, k=2)[0][:, 1]
+        gaps = scipy.spatial.KDTree(x).query(x, k=2)[0][:, 1]
         first = gaps.argmin()
         self.place, self.gap, self.real = x[first], float(gaps[first]), points.dtype
         super().__init__(self._text(self.place, self.gap))

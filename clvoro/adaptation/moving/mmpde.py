@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl.array as cla
-from scipy.spatial import Delaunay
+import scipy
 
 from ...arguments import warn
 from ...errors import TangledMeshWarning
@@ -72,7 +72,7 @@ def connect(engine: Engine, domain: Domain, points: np.ndarray) -> Connections:
     spacing = (domain.measure / n) ** (1 / d)
     images = mirrored(points, np.array(domain.lower), np.array(domain.upper), IMAGE_DEPTH * spacing)
     shaken = images.points + np.random.default_rng(7).uniform(-1, 1, images.points.shape) * JITTER * spacing
-    simplices = Delaunay(shaken).simplices
+    simplices = scipy.spatial.Delaunay(shaken).simplices
     simplices = simplices[(simplices < n).any(axis=1)]
     corners = images.points[simplices]
     longest = np.max(

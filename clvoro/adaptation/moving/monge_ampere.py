@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse
-from scipy.spatial import KDTree
+import scipy
 
 from ...arguments import warn
 from ...errors import TangledMeshWarning
@@ -60,7 +59,7 @@ class LatticeMap:
         n, d = points.shape
         spacing = (domain.measure / n) ** (1 / d)
         images = mirrored(points, self.lower, self.upper, REACH * spacing)
-        lists = KDTree(points).query_ball_tree(KDTree(images.points), REACH * spacing)
+        lists = scipy.spatial.KDTree(points).query_ball_tree(scipy.spatial.KDTree(images.points), REACH * spacing)
         counts = np.array([len(found) for found in lists])
         rows, near = np.repeat(np.arange(n), counts), np.concatenate(lists).astype(int)
         # Each point is in its own list. Its entry is zero.

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 
 from ...errors import InputError
 from ...files import open_plain
@@ -98,11 +99,9 @@ def _from_netcdf(path: Path, variable: str | None) -> Any:
 
 def _from_classic(file: Any, path: Path, variable: str | None) -> Labeled:
     """Read netCDF-3."""
-    from scipy.io import netcdf_file
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with netcdf_file(file, "r", mmap=False, maskandscale=True) as held:
+        with scipy.io.netcdf_file(file, "r", mmap=False, maskandscale=True) as held:
             known = held.variables
 
             def lengths(item: Any) -> list[int]:

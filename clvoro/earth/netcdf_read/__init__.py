@@ -9,7 +9,7 @@ import os
 from os import PathLike
 
 import numpy as np
-from scipy.io import netcdf_file
+import scipy
 
 from ...errors import InputError
 from ...files import open_plain
@@ -41,7 +41,7 @@ def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
             if head == _HDF5:
                 raise FileError("it is netCDF-4, expected netCDF-3; convert it by `nccopy -k nc6 FILE NEW`")
             file.seek(0)
-            with netcdf_file(file, mmap=False) as found:
+            with scipy.io.netcdf_file(file, mmap=False) as found:
                 cells = _read(Variables(found))
         diagram = make_diagram(cells)
     except FileError as problem:

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
+import scipy
 
 from ...geometry.sphere import Sphere
 from ...geometry.sphere_region import SphereRegion
@@ -139,9 +137,9 @@ def _removed(
         raise FileError("its boundary has no face with a length")
     other = np.where(usable[:, None], other, own)
     away = np.linalg.norm(other - own, axis=1)
-    near = KDTree(other).query_pairs(_SAME * float(away[usable].min()), output_type="ndarray")
-    graph = coo_array((np.ones(len(near), np.int8), (near[:, 0], near[:, 1])), (len(own),) * 2)
-    label = connected_components(graph, directed=False)[1]
+    near = scipy.spatial.KDTree(other).query_pairs(_SAME * float(away[usable].min()), output_type="ndarray")
+    graph = scipy.sparse.coo_array((np.ones(len(near), np.int8), (near[:, 0], near[:, 1])), (len(own),) * 2)
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     # The longest face of each removed cell places its generator best. Walls are in the order of their first faces.
     rank = np.lexsort((-lengths, ~usable, label))
     best = rank[np.flatnonzero(np.diff(label[rank], prepend=-1))]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.io import netcdf_file
+import scipy
 
 from ...geometry.sphere import EARTH_RADIUS, Sphere
 from ...io.arrays import FileError
@@ -19,7 +19,7 @@ _PLANE = "it is a mesh in the plane, expected one on a sphere; load a .npz or .v
 class Variables:
     """The variables and attributes of an open file."""
 
-    def __init__(self, file: netcdf_file) -> None:
+    def __init__(self, file: scipy.io.netcdf_file) -> None:
         self._file = file
 
     def __contains__(self, name: str) -> bool:

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 from ...arguments import check_integer, check_rows, format_point
 from ...errors import InputError
@@ -98,9 +99,8 @@ def spline(
 
 def _spline_span(lengths: np.ndarray, points: np.ndarray, ends: str) -> Span:
     # Imported when it is needed: this takes a fifth of the time of importing clvoro.
-    from scipy.interpolate import CubicSpline
 
-    curve = CubicSpline(lengths, points, bc_type=ends)
+    curve = scipy.interpolate.CubicSpline(lengths, points, bc_type=ends)
     slope = curve.derivative()
     return Span(
         float(lengths[0]), float(lengths[-1]), lambda t: (curve(t), slope(t)), max(SAMPLES, 8 * (len(points) - 1))

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse
-import scipy.spatial
+import scipy
 import shapely
 
 if TYPE_CHECKING:

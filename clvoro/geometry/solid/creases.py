@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of the sides and corners of triangles; a patch goes on across smooth and convex ones."""
@@ -154,8 +153,8 @@ def dihedral_turns(vertices: np.ndarray, triangles: np.ndarray, twin: np.ndarray
 
 def connect(n: int, pairs: np.ndarray) -> tuple[int, np.ndarray]:
     """Return the number of components of a graph of n nodes with edges `pairs` (m, 2), and that of each node."""
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    count, label = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    count, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     first = np.unique(label, return_index=True)[1]
     rank = np.empty(count, np.int64)
     rank[np.argsort(first)] = np.arange(count)

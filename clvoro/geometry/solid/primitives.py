@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 
 from ..surface import box_surface
 
@@ -32,9 +33,8 @@ def ball(center: Sequence[float], radius: float, edge: float | None) -> dict[str
     golden = (1 + math.sqrt(5)) / 2
     corner = np.array([(s, t * golden, 0) for s in (-1, 1) for t in (-1, 1)])
     corner = np.concatenate([np.roll(corner, k, axis=1) for k in range(3)])
-    from scipy.spatial import ConvexHull
 
-    sides = ConvexHull(corner).simplices
+    sides = scipy.spatial.ConvexHull(corner).simplices
     a, b, c = np.moveaxis(corner[sides], 1, 0)
     flip = np.einsum("ij,ij->i", a, np.cross(b, c)) < 0
     sides = np.where(flip[:, None], sides[:, ::-1], sides)

@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ...arguments import check_rows, format_point
 from ...errors import InputError
@@ -230,7 +230,7 @@ class Solid(Domain):
         bound2 = np.full(len(x), reach * reach)
         if reach > self._spacing:
             close = np.flatnonzero(np.isfinite(x).all(axis=1))
-            vertex = KDTree(self.surface.vertices[np.unique(self.surface.triangles[items])])
+            vertex = scipy.spatial.KDTree(self.surface.vertices[np.unique(self.surface.triangles[items])])
             bound2[close] = np.minimum(bound2[close], (vertex.query(x[close])[0] + _ON * self._diagonal) ** 2)
         best2, item = tree.nearest(x, bound2, lambda y, k: triangle_distance2(y, corners[k]))
         found = item >= 0

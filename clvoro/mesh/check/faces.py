@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from ..connectivity import face_ends, face_keys, plane_shares, take_rows
 from .findings import ROUNDINGS
@@ -82,8 +81,8 @@ def _euler_characteristic(d: Diagram) -> int | None:
 
 def _count_components(n: int, i: np.ndarray, j: np.ndarray) -> int:
     """Return the number of connected components of a graph with n nodes and the edges i to j."""
-    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(n, n))
-    return int(connected_components(graph, directed=False)[0])
+    graph = scipy.sparse.coo_array((np.ones(len(i), np.int8), (i, j)), shape=(n, n))
+    return int(scipy.sparse.csgraph.connected_components(graph, directed=False)[0])
 
 
 def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 import shapely
-from scipy.spatial import KDTree
 
 from ...geometry.polygon import BOUNDARY_SHIFTS
 from ..connectivity import face_ends, next_faces
@@ -109,7 +109,7 @@ def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     wrong = np.flatnonzero((np.abs(turns - 1) > 1e-3) & (near > slack))
     if wrong.size and len(d) > 1:
         # Of two generators on the boundary at one place within round-off, either one may have all of the cell.
-        beside = KDTree(d.points).query(d.points[wrong], k=2)[0][:, 1]
+        beside = scipy.spatial.KDTree(d.points).query(d.points[wrong], k=2)[0][:, 1]
         wrong = wrong[(beside > slack) | (domain.boundary_distance(d.points[wrong]) > slack)]
     check.note(
         "generators in their cells",
@@ -119,7 +119,13 @@ def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
 
 
 def hidden(
-    d: Diagram, domain: Polygon, tree: KDTree, places: np.ndarray, corners: np.ndarray, slack: float, unit: float
+    d: Diagram,
+    domain: Polygon,
+    tree: scipy.spatial.KDTree,
+    places: np.ndarray,
+    corners: np.ndarray,
+    slack: float,
+    unit: float,
 ) -> np.ndarray:
     """Return those of `places` in the cells' `corners` from which one of the nearest generators is not visible.
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 import shapely
-from scipy.spatial import KDTree
 
 from ..connectivity import face_ends, neighbor_points, next_faces
 
@@ -157,7 +157,7 @@ class Rebuilt:
             own = d.points[self.owner[inward]]
             places = own + self.middles[inward]
             away = np.linalg.norm(self.middles[inward], axis=1)
-            nearest = KDTree(d.points).query(places)[0]
+            nearest = scipy.spatial.KDTree(d.points).query(places)[0]
             ways = shapely.linestrings(np.stack([own, places], axis=1))
             hidden = ~shapely.covers(d.domain.outline.geometry, ways)
             self.adopted[inward[hidden | (nearest < away - noise[inward] / 16)]] = True

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import pyopencl.array as cla
+import scipy
 
 from ...geometry.domain import ClipBox, Domain
 from ...mesh.diagram import Diagram
@@ -104,16 +105,13 @@ def merge_ends(corners: np.ndarray, starts: np.ndarray, dropped: np.ndarray) -> 
     dropped : (k,) int
         Faces that are left out.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     count = int(corners.max(initial=-1)) + 1
     ends = np.arange(1, starts[-1] + 1)
     filled = np.diff(starts) > 0  # cells of power diagrams may be empty
     ends[starts[1:][filled] - 1] = starts[:-1][filled]
     pairs = corners[dropped], corners[ends[dropped]]
-    graph = coo_array((np.ones(len(dropped), np.int8), pairs), (count, count))
-    parts = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array((np.ones(len(dropped), np.int8), pairs), (count, count))
+    parts = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     return np.unique(parts, return_index=True)[1][parts][corners]
 
 
