@@ -27,10 +27,6 @@ inline void compare_neighbors(int i, global const int *starts, global const int 
     ever_changed[i] = first ? 0 : fmax(ever_changed[i], (REAL)differs);
 }
 
-/* What to do with the neighbors. */
-#define COMPARE 1
-#define COMPARE_FIRST 2
-
 /* Error, quality, energy and local length of the cell of generator i, one work-item per generator.
 
    error         e = (L - h) / min(L, h), L = V^(1/d)             (the paper's 3.1)
@@ -39,7 +35,7 @@ inline void compare_neighbors(int i, global const int *starts, global const int 
    quality       2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1; trimmed cells have their own)
                  3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient
 
-   `comparison` says whether neighbors are compared as well. */
+   Neighbors are compared as well if `comparison` is 1, or 2 the first time. */
 kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts,
                             global const FACE *face_measures, global const REAL *offsets,
                             global const REAL *covariances, global const REAL *h, global REAL *error,
@@ -81,7 +77,7 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
     local_length[i] = fmin(length, target);
     error[i] = (length - target) / fmin(length, target);
     if (comparison)
-        compare_neighbors(i, starts, neighbors, labels, comparison == COMPARE_FIRST, signatures, changed, ever_changed);
+        compare_neighbors(i, starts, neighbors, labels, comparison == 2, signatures, changed, ever_changed);
 }
 
 /* h[i] = L_i for generators of layers, first <= labels[i] < fixed: their size is right. But a cell much larger than
