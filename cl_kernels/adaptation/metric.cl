@@ -35,9 +35,10 @@ inline void compare_neighbors(int i, global const int *starts, global const int 
    quality       2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1; trimmed cells have their own)
                  3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient
 
-   Neighbors are compared as well if `comparison` is 1, or 2 the first time. */
+   Measures of faces are in FACE, or with `exact` in REAL. Neighbors are compared as well if `comparison` is 1, or 2 the
+   first time. */
 kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts,
-                            global const FACE *face_measures, global const REAL *offsets,
+                            global const void *face_measures, const int exact, global const REAL *offsets,
                             global const REAL *covariances, global const REAL *h, global REAL *error,
                             global REAL *quality, global REAL *energy, global REAL *local_length, const int comparison,
                             global const int *neighbors, global const int *labels, global ulong *signatures,
@@ -56,7 +57,7 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
     const int begin = starts[i], end = starts[i + 1];
     REAL surface = 0;
     for (int k = begin; k < end; ++k)
-        surface += face_measures[k];
+        surface += exact ? ((global const REAL *)face_measures)[k] : ((global const FACE *)face_measures)[k];
 #if CELL_DIM == 2
     quality[i] = polygon_quality(end - begin, volume, surface);
 #else

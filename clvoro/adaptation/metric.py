@@ -38,7 +38,6 @@ class Metric:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels = engine.kernels("adaptation/metric")
-        self._exact = engine.kernels("adaptation/metric", {"FACE": engine.name_of(engine.real)})
 
     def evaluate(
         self,
@@ -51,18 +50,17 @@ class Metric:
         compared: Neighborhoods | None = None,
     ) -> None:
         """Write the signed error (3.1), the quality (4.1), the energy (2.3) of each cell, and min(L, h); all (n,)."""
-        exact = t.face_measures.dtype == self.engine.real
-        kernels = self._exact if exact else self._kernels
         sets = (0, *[t.starts] * 5)
         if compared is not None:
             *arrays, first = compared
             sets = (2 if first else 1, t.neighbors, *arrays)
         self.engine.run_each(
-            kernels.evaluate_metric,
+            self._kernels.evaluate_metric,
             t.n,
             t.volumes,
             t.starts,
             t.face_measures,
+            int(t.face_measures.dtype == self.engine.real),
             t.offsets,
             t.covariances,
             h,
