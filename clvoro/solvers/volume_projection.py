@@ -119,15 +119,19 @@ class VolumeProjection:
             )
         return self._kernels[store]
 
-    def _reserve(self, n: int, m: int, store: np.dtype, max_iterations: int) -> _Arrays:
-        """Return the arrays for `n` cells and `m` faces, and enlarge the record for `max_iterations`."""
+    def _reserve(self, n: int, rows: int, m: int, store: np.dtype, max_iterations: int) -> _Arrays:
+        """Return the arrays for `n` cells and `m` faces, and enlarge the record for `max_iterations`.
+
+        Those that neighbors are read from have `rows` rows: cells and ghosts.
+        """
         engine, d = self.engine, self.engine.cell_dim
         if 4 * (max_iterations + 1) > len(self._record):
             self._record = engine.zeros(4 * (max_iterations + 1))
         vector, number = ((n, d), store), (n, store)
         derivatives = ((d, m), np.dtype(np.float32))
-        shapes = derivatives, derivatives, vector, number, number, number, vector, vector, *[number] * 3
-        return _Arrays(*(engine.scratch(*shape) for shape in shapes))
+        shapes = {name: number for name in _Arrays._fields} | {name: vector for name in ("own", "u")}
+        shapes |= {"rows": derivatives, "columns": derivatives, "s": ((rows, d), store), "z": (rows, store)}
+        return _Arrays(*(engine.scratch(*shape) for shape in shapes.values()))
 
     @framed
     def project(
@@ -178,22 +182,20 @@ class VolumeProjection:
         real, most = engine.real.type, limits.max_iterations
         single = limits.tolerance >= SINGLE_PRECISION_TOLERANCE
         store = np.dtype(np.float32) if single else engine.real
-        v, k = self._reserve(n, m, store, most), self._kernels_in(store)
+        v, k = self._reserve(n, t.rows, m, store, most), self._kernels_in(store)
         start = engine.scratch(n, np.float32) if start is None else start
         iteration = (n, most, m, int(warm), real(limits.tolerance), t.starts, t.neighbors, *v, self._partial)
-        assembly = self._assembly(t, targets, displacement, penalty, t.starts if labels is None else labels, fixed)
+        assembly = self._assembly(t, targets, displacement, penalty, labels, fixed)
         given, rest = (*iteration, self._record), (*assembly, start, *engine.period_args)
-        if n <= self._one_group_limit:
+        if n <= self._one_group_limit and t.part is None:
             Launch(engine, k.project_by_group, *given, correction, *rest, groups=1)()
             solution = SolutionToRead(lambda: self._solution(self._read(most), limits.tolerance))
             self._unread = ref(solution)
             return solution
         Launch(engine, k.assemble_projection, *given, self._counts, *rest)()
-        rows = self._iterate(
-            Launch(engine, k.update_projection_direction, *given, self._counts),
-            Launch(engine, k.update_projection, *given, self._counts),
-            most,
-        )
+        direction, update = k.update_projection_direction, k.update_projection
+        launches = (Launch(engine, kernel, *given, self._counts) for kernel in (direction, update))
+        rows = self._iterate(t, v, *launches, most)
         solution = self._solution(rows, limits.tolerance)
         if solution.iterations:
             engine.run_each(k.write_correction, n, v.u, v.y, targets.h, t.points, correction, start)
@@ -207,21 +209,25 @@ class VolumeProjection:
         targets: Targets,
         displacement: cla.Array,
         penalty: Penalty,
-        labels: cla.Array,
+        labels: cla.Array | None,
         fixed: int,
     ) -> tuple[object, ...]:
         """Return ASSEMBLY_ARGS of volume_projection.cl but for the start."""
         real, sums = self.engine.real.type, targets.sums
+
+        def of_all(values: cla.Array) -> cla.Array:
+            return t.with_ghosts(self.engine, values)
+
         return (
             t.face_measures,
             t.face_centroids,
-            t.volumes,
+            of_all(t.volumes),
             t.points,
             targets.gradient,
-            targets.h,
-            targets.quality,
+            of_all(targets.h),
+            of_all(targets.quality),
             targets.log_ratio,
-            displacement,
+            of_all(displacement),
             real(penalty.eps),
             real(penalty.quality_scale),
             real(min(penalty.eps, penalty.most_at_walls)),
@@ -229,18 +235,22 @@ class VolumeProjection:
             real(penalty.log_ratio_scale),
             penalty.power,
             *((self._partial, 0) if sums is None else (sums, len(sums) // 2)),
-            labels,
+            t.starts if labels is None else of_all(labels),
             fixed,
         )
 
-    def _iterate(self, direction: Launch, update: Launch, most: int) -> list[list[float]]:
+    def _iterate(self, t: Tessellation, v: _Arrays, direction: Launch, update: Launch, most: int) -> list[list[float]]:
         """Iterate until the tolerance is met, or `most` times; return the record up to there or further."""
+        engine = self.engine
+        t.forward(engine, v.z)
         direction()
         done, ahead = 0, self._ahead
         while True:
             end = min(done + ahead, most)
             for _ in range(done, end):
+                t.forward(engine, v.s)
                 update()
+                t.forward(engine, v.z)
                 direction()
             rows = self._read(end)
             if not all(row[RECORD_RUNNING] for row in rows):

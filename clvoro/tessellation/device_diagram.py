@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 import scipy
 
 from ..errors import InputError
 from ..geometry.sphere import directions, farthest_place
+from ..opencl.device_array import buffer_of
 
 if TYPE_CHECKING:
     from ..geometry.domain import Domain
@@ -176,6 +178,15 @@ class Tessellation:
         """Fill the rows of ghosts in `values` (rows, ...), if there are any."""
         if self.part is not None:
             self.part.forward(engine, values)
+
+    def with_ghosts(self, engine: Engine, values: cla.Array) -> cla.Array:
+        """Return `values` (n, ...) and behind them those of ghosts, in the workspace; `values` if there are none."""
+        if self.part is None:
+            return values
+        extended = engine.scratch((self.rows, *values.shape[1:]), values.dtype)
+        cl.enqueue_copy(engine.queue, buffer_of(extended), buffer_of(values), byte_count=values.nbytes)
+        self.forward(engine, extended)
+        return extended
 
     @property
     def is_power(self) -> bool:

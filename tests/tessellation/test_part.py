@@ -7,6 +7,8 @@ import pytest
 
 from clvoro.adaptation.stages import Stages
 from clvoro.geometry.box import Box
+from clvoro.solvers.linear_system import Limits
+from clvoro.solvers.volume_projection import Penalty, Targets
 from clvoro.tessellation.part import Home, Part
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
@@ -181,6 +183,24 @@ def test_a_periodic_box_that_is_not_folded(ctx, dim, real):
                 own.surface_descent.descend(made, h, quality, ways[-1], bad_cell_weight=5.0, rate=0.05)
             one, other = (way.get() for way in ways)
             assert np.abs(one - other).max() < noise * np.abs(other).max() < 1
+        quality, ratio, move = rng.uniform(0.5, 1, n), rng.normal(0, 0.3, n), 0.01 * rng.normal(size=(n, dim))
+        gradient, labels, corrections = rng.normal(size=(n, dim)), rng.permutation(n), []
+        for made, own in ((alone, unfolded), (t, stages)):
+            *given, moves = map(own.engine.upload, (h.get(), gradient, ratio, quality, move))
+            corrections.append(own.engine.empty((n, dim)))
+            outcome = own.volume_projection.project(
+                made,
+                Targets(*given),
+                moves,
+                corrections[-1],
+                Penalty(0.2, 0.3, 0.4),
+                Limits(1e-10 if real == np.float64 else 1e-5, 400),
+                labels=own.engine.upload(labels, np.int32),
+                fixed=n // 5,
+            )
+            assert outcome.converged
+        one, other = (correction.get() for correction in corrections)
+        assert np.abs(one - other).max() < 1e-4 * np.abs(other).max(), "derivatives are in single precision"
         source, potentials = rng.standard_normal(n) / n, []
         for part, made, poisson in ((alone.part, alone, unfolded.poisson), (None, t, stages.poisson)):
             phi = poisson.engine.zeros(made.rows)
