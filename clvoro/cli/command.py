@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, InputTypeError, OutputError
-from .formats import MESH_FILES
+from .formats import MESH_FILES, NAMES
 from .streams import steady_streams
 
 OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
@@ -34,7 +34,7 @@ examples:
   clvoro run paper                      the paper's validation case, into out/paper
   clvoro run airfoil --device gpu       a wing section on a GPU
   clvoro cases paper > my.toml          a case file to start from
-  clvoro run my.toml --effort fast --out result --format foam
+  clvoro run my.toml --effort fast --out result --format openfoam
   clvoro run my.toml --checkpoint my.state                   and, after a crash,
   clvoro run my.toml --checkpoint my.state --resume my.state
   clvoro convert result/mesh.npz mesh.nc
@@ -121,8 +121,9 @@ def _add_output(run: Any) -> None:
         metavar="LIST",
         type=_mesh_formats,
         default=(),
-        help=f"further mesh files, such as foam,nc: {', '.join(MESH_FILES)}",
+        help=f"further mesh files, such as openfoam,nc: {', '.join(MESH_FILES)}",
     )
+    _add_types(run)
     _add_walls(run)
     run.add_argument(
         "--check-solver",
@@ -140,6 +141,17 @@ def _add_output(run: Any) -> None:
     run.add_argument("--profile", action="store_true", help="print where the time goes, by stage and by kernel")
     run.add_argument("--quiet", "-q", action="store_true", help="print errors only")
     run.add_argument("--json", action="store_true", help="print one JSON object per finished run")
+
+
+def _add_types(command: Any) -> None:
+    command.add_argument(
+        "--types",
+        metavar="LIST",
+        type=_patch_types,
+        default={},
+        help="types of OpenFOAM's patches, such as top=symmetry,left=patch: wall, patch, symmetry or symmetryPlane "
+        "(default: patch for names like inlet, outlet and open, else wall)",
+    )
 
 
 def _add_walls(command: Any, more: str = "") -> None:
@@ -163,6 +175,7 @@ def _add_convert(commands: Any) -> None:
     convert.add_argument(
         "--convention", choices=("ugrid", "mpas", "scrip"), help="content of a .nc file (default: ugrid)"
     )
+    _add_types(convert)
     _add_walls(convert, more="; of a .vtu file: as in the domain is the default")
 
 
@@ -172,15 +185,16 @@ def _add_check(commands: Any) -> None:
         help="verify meshes: volumes, graph, faces, the Voronoi property, error and quality",
         description="Verify meshes that clvoro wrote, on the host alone, and print each violation with its place. "
         "With --for openfoam: print each criterion of its checkMesh, with value, limit and worst place. "
-        "With --for mpas: the same for models on C grids, on spheres and in boxes in 2D. "
+        "With --for mpas: the same for models on C grids, on spheres and in the plane. With --for modflow: the same "
+        "for MODFLOW 6's DISV grids. OpenFOAM's meshes (a file .foam, a case, a folder polyMesh) are read as they are. "
         "Exit code 0: all is right; 1: something is wrong; 2: a file cannot be read.",
     )
     check.set_defaults(work=_check)
-    check.add_argument("files", metavar="FILE", nargs="+", help="mesh.npz, mesh.vtu, or mesh.nc on a sphere")
+    check.add_argument("files", metavar="FILE", nargs="+", help="mesh.npz, mesh.vtu, mesh.nc on a sphere, or mesh.foam")
     check.add_argument(
         "--for",
         dest="solver",
-        choices=("openfoam", "mpas"),
+        choices=("openfoam", "mpas", "modflow"),
         help="check by the criteria of this solver, which need not be installed, instead",
     )
     _add_walls(check)
@@ -189,13 +203,25 @@ def _add_check(commands: Any) -> None:
 
 def _mesh_formats(text: str) -> tuple[str, ...]:
     """Return the formats in `text`, separated by commas."""
-    formats = tuple(part.strip().lower() for part in text.split(","))
+    parts = (part.strip().lower() for part in text.split(","))
+    formats = tuple(dict.fromkeys(NAMES.get(part, part) for part in parts))
     for name in formats:
         if name not in MESH_FILES:
             raise argparse.ArgumentTypeError(
                 f"{name!r} is not a mesh format, expected one or more of {', '.join(MESH_FILES)}"
             )
     return formats
+
+
+def _patch_types(text: str) -> dict[str, str]:
+    """Return the types of patches in `text`, as NAME=TYPE separated by commas."""
+    found = {}
+    for part in text.split(","):
+        name, separator, kind = (word.strip() for word in part.partition("="))
+        if not (name and separator and kind):
+            raise argparse.ArgumentTypeError(f"{part!r} is not NAME=TYPE, expected such as inlet=patch,outlet=patch")
+        found[name] = kind
+    return found
 
 
 def _path(text: str) -> Path:
@@ -297,6 +323,7 @@ def _run(arguments: argparse.Namespace) -> int:
         checkpoint_every=arguments.checkpoint_every,
         resume=arguments.resume,
         walls=arguments.walls,
+        types=arguments.types,
         solver=arguments.check_solver,
     )
     if job.run():
@@ -311,6 +338,9 @@ def _level_count(text: str | None) -> str | int | None:
 
 def _readable(name: str) -> str:
     """Return `name` if its suffix is that of a mesh that `load` reads."""
+    from ..io.foam_read import refuse_polymesh
+
+    refuse_polymesh(name)
     if Path(name).suffix.lower() not in (".npz", ".vtu", ".nc"):
         raise InputError(f"{name} cannot be read, expected a .npz, .vtu or .nc file")
     return name
@@ -318,26 +348,25 @@ def _readable(name: str) -> str:
 
 def _convert(arguments: argparse.Namespace) -> int:
     from ..io import load, write
+    from .outputs import written_names
     from .progress import during
 
     mesh = load(_readable(arguments.mesh))
-    options = {"convention": arguments.convention, "walls": arguments.walls}
+    options = {"convention": arguments.convention, "walls": arguments.walls, "types": arguments.types or None}
     during(f"writing {arguments.out}", False, lambda: write(mesh, arguments.out, **options))
-    print(f"written: {arguments.out}")
+    print(f"written: {written_names(arguments.out)}")
     return OK
 
 
 def _check(arguments: argparse.Namespace) -> int:
     import json
 
-    from ..io import load
     from .progress import during
 
     code = OK
     for name in arguments.files:
         try:
-            check = partial(load(_readable(name)).check, arguments.solver, walls=arguments.walls)
-            report = during(f"{name}: checking", False, check)
+            report = during(f"{name}: checking", False, partial(_verdict, name, arguments))
         except InputError as error:  # the other files are checked all the same
             code = _complain(error, BAD_INPUT)
             continue
@@ -347,6 +376,22 @@ def _check(arguments: argparse.Namespace) -> int:
             print(f"{name}: {report}")
         code = code or (OK if report else FAILED)
     return code
+
+
+def _verdict(name: str, arguments: argparse.Namespace) -> Any:
+    """Return the report on one mesh file."""
+    from ..io import load
+    from ..io.foam_read import check_polymesh, polymesh_folder
+
+    folder = polymesh_folder(name)
+    if folder is None:
+        return load(_readable(name)).check(arguments.solver, walls=arguments.walls)
+    if arguments.solver not in (None, "openfoam") or arguments.walls is not None:
+        given = "--walls" if arguments.solver in (None, "openfoam") else f"--for {arguments.solver}"
+        raise InputError(
+            f"{name} is a mesh for OpenFOAM, and {given} is for mesh.npz and mesh.vtu of the same run; check those"
+        )
+    return check_polymesh(folder)
 
 
 def _devices(_: argparse.Namespace) -> int:

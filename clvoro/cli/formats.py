@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 MESH_FILES = {
-    "foam": ("mesh.foam", None),
+    "openfoam": ("mesh.foam", None),
     "nc": ("mesh.nc", "ugrid"),
     "mpas": ("mesh-mpas.nc", "mpas"),
     "scrip": ("mesh-scrip.nc", "scrip"),
@@ -13,5 +13,7 @@ MESH_FILES = {
     "metis": ("graph.info", None),
 }
 """By the name of the format: the file, and its convention, which `clvoro.io.write` takes."""
+NAMES = {"foam": "openfoam", "ugrid": "nc", "info": "metis"}
+"""Formats that are also known by a suffix or a convention."""
 PLANE = ("nc", "mpas", "vtk", "ply", "obj")
 """Formats that hold polygons only."""

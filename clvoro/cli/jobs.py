@@ -23,6 +23,7 @@ from ..finite_volumes.gate import Solver
 from ..finite_volumes.solver_mesh import WallShape
 from ..io import save, write, write_history
 from ..io.check_mesh import run_check_mesh
+from ..io.foam import PatchType, patch_types
 from ..mesh.results import Result
 from ..mesh.summary import boundary_line, summary
 from ..opencl.memory_limits import available_memory, in_bytes
@@ -71,6 +72,8 @@ class Job:
         As `Adapter.run` takes them; for one method only.
     walls : "straight", "exact" or None
         As `save` takes it, for the mesh file of OpenFOAM and the check.
+    types : dict
+        Types of OpenFOAM's patches by name, before those of the case.
     solver : "openfoam" or None
         Check the mesh by the criteria of this solver, and with its own program if that is installed.
     """
@@ -88,6 +91,7 @@ class Job:
     checkpoint_every: float | None = None
     resume: Path | None = None
     walls: WallShape | None = None
+    types: dict[str, PatchType] = field(default_factory=dict)
     solver: Solver | None = None
     interrupted: bool = field(default=False, init=False)
     rejected: bool = field(default=False, init=False)
@@ -108,6 +112,8 @@ class Job:
         size = self._during("preparing the size field", self.case.size_field)
         warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
         self._refuse_formats()
+        self.case = self.case.with_patches(self.types)
+        patch_types(self.case.domain.boundary_names, self.case.patches)
         files = self._checkpoints()
         named = {"checkpoint": self.checkpoint, "resume": self.resume}
         named |= {source.name: source for source in self.case.sources()}
@@ -209,12 +215,14 @@ class Job:
 
     def _refuse_formats(self) -> None:
         """Raise an error before the run if a format cannot hold its mesh, or an option is for another format."""
-        if self.walls is not None and self.solver is None and "foam" not in self.mesh_formats:
+        if self.walls is not None and self.solver is None and "openfoam" not in self.mesh_formats:
             raise InputError(
-                f"walls is {self.walls!r}, and no mesh is written for OpenFOAM; add --format foam, or leave it out"
+                f"walls is {self.walls!r}, and no mesh is written for OpenFOAM; add --format openfoam, or leave it out"
             )
-        if self.case.domain.curved and (self.solver is not None or "foam" in self.mesh_formats):
-            what = "format foam" if self.solver is None else f"check-solver {self.solver}"
+        if self.types and "openfoam" not in self.mesh_formats:
+            raise InputError("types are given, and no mesh is written for OpenFOAM; add --format openfoam")
+        if self.case.domain.curved and (self.solver is not None or "openfoam" in self.mesh_formats):
+            what = "format openfoam" if self.solver is None else f"check-solver {self.solver}"
             raise InputError(
                 f"{self.case.name}: {what} is for meshes in boxes and polygons, and the domain is a sphere; expected "
                 "--format mpas or nc, and clvoro check --for mpas"
@@ -226,7 +234,7 @@ class Job:
         for kind in self.mesh_formats:
             if kind in PLANE and self.case.domain.cell_dim != 2:
                 raise InputError(
-                    f"{self.case.name}: format {kind} is for meshes in 2D, and the domain is in 3D; expected foam"
+                    f"{self.case.name}: format {kind} is for meshes in 2D, and the domain is in 3D; expected openfoam"
                 )
 
     def _checkpoints(self) -> Checkpoint | None:
@@ -281,9 +289,11 @@ class Job:
         ]
         for kind in self.mesh_formats:
             name, convention = MESH_FILES[kind]
-            walls = self.walls if kind == "foam" else None
-            task = partial(write, main, self.out / name, convention=convention, walls=walls)
-            work = "solver mesh" if kind == "foam" else name
+            options: dict[str, Any] = {"convention": convention}
+            if kind == "openfoam":
+                options = {"walls": self.walls, "types": self.case.patches}
+            task = partial(write, main, self.out / name, **options)
+            work = "solver mesh" if kind == "openfoam" else name
             tasks.append(partial(self._during, f"writing the {work}", task))
         for other, result in others:
             tasks.append(partial(save, result, self.out / f"mesh-{other}.npz"))
@@ -399,10 +409,19 @@ class Job:
                 print(f"{name}: {result.measures.line()}")
             if result.diagram.domain.cuts_cells:
                 print(f"{name}: {boundary_line(result)}")
-        first = "report.html" if self.report else "mesh.vtu"
-        print(f"written: {self.out / first} and the files beside it")
+        print(f"written into {self.out}: {', '.join(self._written(results))}")
         for name, profile in profiles.items():
             print(f"\nwhere the time of {name} went:\n{profile.table()}")
+
+    def _written(self, results: dict[str, Result]) -> list[str]:
+        """Return the names of all files and folders that the run has written."""
+        *others, _ = results
+        found = ["mesh.vtu", "mesh.npz", "history.csv"]
+        for kind in self.mesh_formats:
+            found.append(MESH_FILES[kind][0] + " (with constant/polyMesh)" * (kind == "openfoam"))
+        found += [name for other in others for name in (f"mesh-{other}.npz", f"history-{other}.csv")]
+        found += ["case.toml", *self.case.copies()]
+        return found + ["report.html", "pictures/"] * self.report
 
 
 def _plain(value: Any) -> Any:

@@ -47,6 +47,12 @@ def check_folder(folder: Path) -> None:
             )
 
 
+def written_names(path: Path) -> str:
+    """Return the name of a written file, for a file ``.foam`` with that of its mesh."""
+    mesh = path.parent / "constant" / "polyMesh"
+    return f"{path} (with {mesh})" if path.suffix.lower() == ".foam" else str(path)
+
+
 def do_all(tasks: Iterable[Callable[[], object]]) -> None:
     """Call all `tasks`, even if some fail; raise the last error and print the earlier ones."""
     failed: Exception | None = None

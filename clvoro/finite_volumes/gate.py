@@ -16,7 +16,7 @@ from .measures import SolverMeasures
 from .prisms import simple_loops
 from .solver_mesh import WallShape, make_solver_mesh
 
-Solver = Literal["openfoam", "mpas"]
+Solver = Literal["openfoam", "mpas", "modflow"]
 """Solvers whose criteria are known."""
 LEAST_MEASURE = 1e-300
 """OpenFOAM's VSMALL: least area of a face and volume of a cell."""
@@ -43,11 +43,16 @@ def _check_for_openfoam(diagram: Diagram, walls: WallShape | None) -> SolverRepo
         )
     walls = "straight" if walls is None else walls
     mesh = make_solver_mesh(diagram, walls, walls == "straight")
-    return SolverReport("openfoam", tuple(_openfoam(mesh)), mesh.n_cells, len(mesh), mesh.area_change)
+    return openfoam_report(mesh, mesh.area_change)
+
+
+def openfoam_report(mesh: Faces, area_change: float = 0.0) -> SolverReport:
+    """Check the solver mesh `mesh` by the criteria of OpenFOAM."""
+    return SolverReport("openfoam", tuple(_openfoam(mesh)), mesh.n_cells, len(mesh), area_change)
 
 
 SOLVERS: dict[str, Callable[[Diagram, WallShape | None], SolverReport]] = {"openfoam": _check_for_openfoam}
-"""The check of a diagram for each solver; `earth` adds models on C grids."""
+"""The check of a diagram for each solver; `io` adds MODFLOW, `earth` models on C grids."""
 
 
 def warn_of_rejection(mesh: Faces) -> None:
@@ -104,13 +109,8 @@ def _part_of(mesh: Faces, kept: np.ndarray) -> Faces:
 
 def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
     """Return the criteria of `checkMesh -allGeometry -allTopology` of OpenFOAM v1912, for the cells `judged`."""
-    if mesh.dim == 2:
-        broken = simple_loops(mesh)[2]
-        if broken.size:
-            cell = int(broken[0])
-            place = mesh.points[mesh.corners.reshape(-1, 2)[mesh.owner == cell]].reshape(-1, 2).mean(axis=0)
-            here = tuple(place.tolist())
-            return [Criterion("cells around islands", len(broken), 0, True, True, len(broken), cell, here)]
+    if mesh.dim == 2 and (around := around_islands(mesh)) is not None:
+        return [around]
     m = mesh.measures
     g, owner = m.geometry, m.cells.owner
     coupled = m.coupled
@@ -149,8 +149,17 @@ def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
         between("interpolation weight", m.weight[coupled], 0.05, above=False),
         between("volume ratio", m.volume_ratio[coupled], 0.01, above=False),
     ]
-    regions = _regions(mesh)
-    return [*made, Criterion("regions", regions, 1, True, False, regions - 1)]
+    return [*made, regions(mesh)]
+
+
+def around_islands(mesh: Faces) -> Criterion | None:
+    """Return the cells in 2D around islands as a criterion that fails, or None if there are none."""
+    broken = simple_loops(mesh)[2]
+    if not broken.size:
+        return None
+    cell = int(broken[0])
+    place = mesh.points[mesh.corners.reshape(-1, 2)[mesh.owner == cell]].reshape(-1, 2).mean(axis=0)
+    return Criterion("cells around islands", len(broken), 0, True, True, len(broken), cell, tuple(place.tolist()))
 
 
 def _cells_of_edges(m: SolverMeasures) -> np.ndarray:
@@ -160,11 +169,12 @@ def _cells_of_edges(m: SolverMeasures) -> np.ndarray:
     return found
 
 
-def _regions(mesh: Faces) -> int:
-    """Return the number of connected parts of the mesh."""
+def regions(mesh: Faces) -> Criterion:
+    """Return the number of connected parts of the mesh as a criterion."""
     import scipy.sparse
 
     joined = np.flatnonzero(mesh.neighbor >= 0)
     pair = (mesh.owner[joined], mesh.neighbor[joined])
     graph = scipy.sparse.coo_array((np.ones(len(joined)), pair), (mesh.n_cells, mesh.n_cells))
-    return int(scipy.sparse.csgraph.connected_components(graph, directed=False)[0])
+    found = int(scipy.sparse.csgraph.connected_components(graph, directed=False)[0])
+    return Criterion("regions", found, 1, True, False, found - 1)

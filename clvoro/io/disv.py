@@ -9,6 +9,8 @@ import numpy as np
 import scipy
 
 from ..errors import InputError
+from ..finite_volumes.criteria import Criterion, Rows, SolverReport
+from ..finite_volumes.gate import LEAST_MEASURE, SOLVERS, around_islands, regions
 from ..finite_volumes.prisms import cell_loops
 from ..mesh.connectivity import take_rows
 from ..mesh.faces import Faces
@@ -20,6 +22,9 @@ if TYPE_CHECKING:
 
 _EMPTY = 1e-13
 """Length of faces that are left out, over the extent of the domain."""
+_OBLIQUE = 1.0
+"""Angle in degrees between a face's normal and the line between its centers, above which the mesh is warned of: fluxes
+then need MODFLOW's option XT3D."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +125,8 @@ def _without_empty_faces(mesh: Faces) -> Faces:
     return replace(mesh, corners=into[mesh.corners]).take_faces(~short).compact()
 
 
-def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
-    """Return the DISV grid of `diagram`; see `Diagram.to_disv`."""
+def _disv_mesh(diagram: Diagram, walls: WallShape) -> Faces:
+    """Return the mesh that a DISV grid consists of, or raise an error for one that DISV cannot hold."""
     domain = diagram.domain
     diagram.demand_voronoi("to_disv")
     domain.require_plane(
@@ -130,7 +135,45 @@ def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
     )
     if any(domain.periodic):
         raise InputError("DISV grids have no periodic sides, and this box has; use a box without periodic directions")
-    mesh = _without_empty_faces(diagram.solver_mesh(walls, collapse=False))
+    return _without_empty_faces(diagram.solver_mesh(walls, collapse=False))
+
+
+def check_for_modflow(diagram: Diagram, walls: WallShape | None) -> SolverReport:
+    """Check `diagram` by what MODFLOW 6 demands of a DISV grid, and control-volume finite differences of its cells.
+
+    Raises
+    ------
+    InputError
+        In 3D, on a sphere and in a periodic box.
+    """
+    mesh = _disv_mesh(diagram, walls or "straight")
+    around = around_islands(mesh)
+    made = [around] if around is not None else _criteria(mesh)
+    return SolverReport("modflow", tuple(made), mesh.n_cells, len(mesh), mesh.area_change)
+
+
+SOLVERS["modflow"] = check_for_modflow
+
+
+def _criteria(mesh: Faces) -> list[Criterion]:
+    inner = np.arange(mesh.n_inner)
+    own, other = mesh.owner[inner], mesh.neighbor[inner]
+    line = mesh.generators[other] - mesh.generators[own]
+    across = np.abs(np.cross(line, mesh.normal[inner]))
+    angle = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", line, mesh.normal[inner])))
+    cells, faces = Rows(mesh.generators, None, 2), Rows(mesh.center[inner], own, 2)
+    return [
+        cells("vertices of a cell", np.bincount(mesh.sides()[0], minlength=mesh.n_cells), 3, above=False),
+        cells("cell area", mesh.volumes, LEAST_MEASURE, above=False),
+        faces("center to face", np.minimum(mesh.near[inner], mesh.far[inner]), LEAST_MEASURE, above=False),
+        faces("angle to the normal", angle, _OBLIQUE, demanded=False),
+        regions(mesh),
+    ]
+
+
+def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
+    """Return the DISV grid of `diagram`; see `Diagram.to_disv`."""
+    domain, mesh = diagram.domain, _disv_mesh(diagram, walls)
     starts, loops = cell_loops(mesh)
     cells = np.arange(mesh.n_cells)
     found = DisvBoundaries()

@@ -11,6 +11,7 @@ order of the file; `translational` demands one vector for all.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -76,6 +77,9 @@ def cyclic_patches(mesh: Faces) -> list[FoamPatch]:
 
 PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
 """Types of patches for `poly_mesh`."""
+_OPEN_PARTS = ("inlet", "outlet", "inflow", "outflow", "farfield", "freestream", "atmosphere")
+_OPEN_WORDS = {"open", "opening", "openings"}
+"""Parts of a name, and whole words in it, that say that a fluid crosses the boundary."""
 
 
 def poly_mesh(
@@ -96,7 +100,7 @@ def poly_mesh(
         Names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls that are not
         mentioned keep the name that the domain gives them.
     types : mapping, optional
-        Type of each patch by name: "wall", "patch", "symmetry" or "symmetryPlane". By default "wall".
+        Type of each patch by name: "wall", "patch", "symmetry" or "symmetryPlane". By default that of `default_type`.
     thickness : float, optional
         In 2D: height of the prisms, whose bottoms are at z = 0. By default the mean width of a cell.
     walls : {"straight", "exact"}, optional
@@ -124,7 +128,7 @@ def poly_mesh(
     """
     domain = diagram.domain
     parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
-    kinds = _kinds(parts.names, types)
+    kinds = patch_types(parts.names, types)
     mesh = make_solver_mesh(diagram, walls, walls == "straight", parts.index)
     cells = polyhedra(mesh, thickness)
     if domain.outline is not None and walls == "straight":
@@ -146,8 +150,30 @@ def poly_mesh(
     return cells.take_faces(order), made, mesh.area_change
 
 
-def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> list[str]:
-    """Return the type of each patch."""
+def default_type(name: str) -> PatchType:
+    """Return the type of a patch by its name: "patch" for inlets, outlets and open boundaries, else "wall".
+
+    Examples
+    --------
+    >>> [default_type(name) for name in ("inlet", "left_outlet2", "farField", "ocean-open", "inletWall", "xMin")]
+    ['patch', 'patch', 'patch', 'patch', 'wall', 'wall']
+    """
+    words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name)]
+    if "wall" in words or "walls" in words:
+        return "wall"
+    joined = "".join(words)
+    is_open = any(part in joined for part in _OPEN_PARTS) or _OPEN_WORDS.intersection(words)
+    return "patch" if is_open else "wall"
+
+
+def patch_types(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> list[PatchType]:
+    """Return the type of each patch: that of `types`, else that of its name.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If `types` names a patch or a type that does not exist.
+    """
     known = get_args(PatchType)
     given = {} if types is None else types
     if not isinstance(given, Mapping):
@@ -160,7 +186,7 @@ def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> lis
             raise InputError(f"types has {name!r:.60}, expected names of patches: {', '.join(names)}")
         if kind not in known:
             raise InputError(f"types has {kind!r:.60} for {name}, expected one of {', '.join(known)}")
-    return [given.get(name, "wall") for name in names]
+    return [given.get(name, default_type(name)) for name in names]
 
 
 _FILES = {

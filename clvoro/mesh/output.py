@@ -168,8 +168,9 @@ class MeshOutput:
             Names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls that are
             not mentioned keep the name that the domain gives them.
         types : mapping, optional
-            Type of each patch by name, "wall" (the default), "patch", "symmetry" or "symmetryPlane". Inlets, outlets
-            and far fields need "patch": ``types={"inlet": "patch"}``.
+            Type of each patch by name: "wall", "patch", "symmetry" or "symmetryPlane", as in
+            ``types={"top": "symmetry"}``. By default "patch" where the name says that the boundary is open, such as
+            inlet, outlet, far-field or open, and "wall" elsewhere.
         thickness : float, optional
             For a mesh in 2D: height of the layer of prisms. By default the mean width of a cell.
         binary : bool

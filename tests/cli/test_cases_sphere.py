@@ -253,7 +253,7 @@ def test_meshes_are_checked_and_converted(here, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("run", "small.toml", "--format", "foam"), "format foam is for meshes in boxes"),
+        (("run", "small.toml", "--format", "foam"), "format openfoam is for meshes in boxes"),
         (("run", "small.toml", "--check-solver", "openfoam"), "check-solver openfoam is for"),
         (("check", "--for", "openfoam", "a/mesh.npz"), "solver='mpas'"),
         (("convert", "a/mesh.npz", "a.foam"), "convention='mpas'"),

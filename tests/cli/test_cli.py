@@ -66,7 +66,10 @@ def test_run_writes_everything(here, capsys, monkeypatch):
     }
     printed = capsys.readouterr()
     assert printed.err == ""  # no progress in a log before its first time has come
-    assert "report.html" in printed.out
+    last = printed.out.splitlines()[-1]
+    folder, _, names = last.partition(": ")
+    assert folder == "written into out/small"
+    assert {name.rstrip("/") for name in names.split(", ")} == written
     mesh = load(out / "mesh.npz")
     row = re.search(r"^coupled +(\d+) +(\d+) +([\d.]+)", printed.out, re.MULTILINE)
     assert (int(row[1]), int(row[2])) == (len(mesh.points), 4)
@@ -77,16 +80,79 @@ def test_further_formats(here, capsys):
     options = ["--method", "lloyd", "--no-report", "--quiet", "--format", "foam,nc", "--out", "a"]
     assert call("run", "small.toml", *options) == cli.OK
     assert (here / "a/constant/polyMesh/owner").is_file()
+    assert call("check", "a", "a/mesh.foam", "a/constant/polyMesh") == cli.OK
+    assert capsys.readouterr().out.count("openfoam: accepted") == 3
+    assert call("check", "--for", "modflow", "a/mesh.npz", "a/mesh.foam") == cli.BAD_INPUT
+    printed = capsys.readouterr()
+    assert "modflow: accepted" in printed.out
+    assert "a/mesh.foam is a mesh for OpenFOAM, and --for modflow is for mesh.npz" in printed.err
+    assert call("convert", "a/mesh.foam", "b.vtu") == cli.BAD_INPUT
+    assert "OpenFOAM's meshes have no generators; load the mesh.npz or mesh.vtu" in capsys.readouterr().err
     assert (here / "a/mesh.nc").read_bytes().startswith((b"CDF", b"\x89HDF"))
     # A second run may replace them.
     assert call("run", "small.toml", *options) == cli.OK
+
+
+PATCHED = """
+size = 0.3
+[domain]
+lower = [0, 0]
+upper = [1, 1]
+names = {inlet = "xMin", sea-open = "xMax"}
+[patches]
+yMax = "symmetry"
+[run]
+effort = "fast"
+"""
+
+
+def test_types_of_patches_are_those_of_the_case_of_options_and_of_names(here):
+    (here / "patched.toml").write_text(PATCHED)
+    options = ["--no-report", "--quiet", "--format", "openfoam"]
+
+    def types(folder):
+        text = (here / folder / "constant/polyMesh/boundary").read_text()
+        return dict(re.findall(r"([\w-]+)\s*\{\s*type\s+(\w+)", text))
+
+    assert call("run", "patched.toml", *options, "--types", "yMin=symmetryPlane,sea-open=wall", "--out", "a") == cli.OK
+    planes = {"back": "empty", "front": "empty"}
+    expected = {"inlet": "patch", "sea-open": "wall", "yMin": "symmetryPlane", "yMax": "symmetry", **planes}
+    assert types("a") == expected
+    assert call("run", "a/case.toml", *options, "--out", "b") == cli.OK
+    assert types("b") == expected
+    assert call("convert", "a/mesh.npz", "c/c.foam", "--types", "inlet=wall") == cli.OK
+    assert types("c") == {"inlet": "wall", "sea-open": "patch", "yMin": "wall", "yMax": "wall", **planes}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("yMax =", "yMx =", "patched.toml: patches is 'yMx', expected the name of a boundary: inlet, sea-open, yMin"),
+        (
+            '"symmetry"',
+            '"symetry"',
+            "patches.yMax is 'symetry' (did you mean 'symmetry'?); expected one of patch, symmetry",
+        ),
+        ("[patches]", "[[layers]]\nheight = 0.1\nedges = 'inlte'\n[patches]", "layers[0].edges is 'inlte', expected"),
+        (
+            "size = 0.3",
+            "size = {kind = 'min', fields = [1, {kind = 'distance', h_min = 1, slope = 1, "
+            "shapes = [{kind = 'boundary', edges = ['inlte']}]}]}",
+            "patched.toml: size.fields[1].shapes[0].edges is 'inlte', expected the name of a boundary",
+        ),
+    ],
+)
+def test_names_of_boundaries_are_refused_with_their_key(here, capsys, old, new, says):
+    (here / "patched.toml").write_text(PATCHED.replace(old, new))
+    assert call("run", "patched.toml") == cli.BAD_INPUT
+    assert says in capsys.readouterr().err
 
 
 def test_formats_that_are_refused(here, capsys):
     with pytest.raises(SystemExit) as left:
         call("run", "small.toml", "--format", "foam,stl")
     assert left.value.code == cli.BAD_INPUT
-    assert "'stl' is not a mesh format, expected one or more of foam, nc" in capsys.readouterr().err
+    assert "'stl' is not a mesh format, expected one or more of openfoam, nc" in capsys.readouterr().err
     assert call("run", "sphere", "--format", "nc", "--out", "b") == cli.BAD_INPUT
     assert "format nc is for meshes in 2D" in capsys.readouterr().err
     assert not (here / "b").exists()
@@ -97,7 +163,8 @@ def test_convert(here, capsys):
     capsys.readouterr()
     for name in ("copy.vtu", "copy.npz", "copy.foam", "copy.nc"):
         assert call("convert", "a/mesh.npz", name) == cli.OK
-        assert capsys.readouterr().out == f"written: {name}\n"
+        more = " (with constant/polyMesh)" if name == "copy.foam" else ""
+        assert capsys.readouterr().out == f"written: {name}{more}\n"
         assert (here / name).exists()
     assert np.array_equal(load(here / "copy.npz").points, load(here / "a/mesh.npz").points)
     assert call("convert", "copy.vtu", "again.nc", "--convention", "mpas") == cli.OK

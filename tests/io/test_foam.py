@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import warnings
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from clvoro.errors import InputError, InputTypeError, MismatchWarning
 from clvoro.finite_volumes.gate import warn_of_rejection
 from clvoro.io import foam
 from clvoro.io.check_mesh import check_case
+from clvoro.io.foam_read import check_polymesh
 from tests.io.test_io import make_result
 from tests.reference import solids
 
@@ -366,3 +368,51 @@ def test_binary_is_a_truth_value(plane, tmp_path, binary):
     with pytest.raises(InputTypeError, match=r"binary is .*, expected True or False"):
         foam.write_foam(io.contents.Contents.of(plane), tmp_path / "polyMesh", binary=binary)
     assert not list(tmp_path.iterdir())
+
+
+PERIODIC = [(True, False), True]
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize(
+    "domain",
+    [
+        clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(True, False, False)),
+        *(clvoro.Box((0, 0), (2, 1), periodic=sides) for sides in PERIODIC),
+        Polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]),
+    ],
+    ids=["solid", "channel", "torus", "L"],
+)
+def test_a_written_mesh_is_checked_as_the_mesh_itself(domain, binary, tmp_path):
+    points = domain.lower + np.random.default_rng(5).random((40 if domain.dim == 2 else 60, domain.dim)) * domain.extent
+    mesh = clvoro.voronoi(domain, points[domain.contains(points)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mesh.to_openfoam(tmp_path / "polyMesh", binary=binary)
+    made, own = check_polymesh(tmp_path / "polyMesh"), mesh.check(solver="openfoam")
+    assert [c.name for c in made.criteria] == [c.name for c in own.criteria]
+    for one, other in zip(made.criteria, own.criteria, strict=True):
+        assert one.count == other.count
+        assert one.value == pytest.approx(other.value, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("points", lambda text: text[: len(text) // 2], "damaged|numbers"),
+        ("owner", lambda text: text.replace("\n0\n", "\n-1\n"), "do not fit"),
+        ("faces", lambda text: text.replace("4(", "3(", 1), "expected as many|damaged"),
+        ("boundary", lambda text: text.replace("nFaces", "faces"), "nFaces"),
+        ("neighbour", lambda text: "solid", "no head FoamFile"),
+        ("points", None, "cannot be read"),
+    ],
+)
+def test_damaged_meshes_are_refused(plane, tmp_path, name, change, says):
+    plane.to_openfoam(tmp_path / "polyMesh")
+    file = tmp_path / "polyMesh" / name
+    if change is None:
+        file.unlink()
+    else:
+        file.write_text(change(file.read_text()))
+    with pytest.raises(InputError, match=says):
+        check_polymesh(tmp_path / "polyMesh")

@@ -62,7 +62,9 @@ class Case:
             raise InputError(f"{place} not a case: it is nested too deep") from error
         checked.name = file_name(Path(name).stem if checked.name is None else checked.name, f"{place} name")
         checked.title = checked.title or checked.name
-        return cls(msgspec.to_builtins(checked), checked.domain.build(folder), folder)
+        table, domain = msgspec.to_builtins(checked), checked.domain.build(folder)
+        _check_walls(table, domain, place)
+        return cls(table, domain, folder)
 
     @property
     def name(self) -> str:
@@ -78,6 +80,15 @@ class Case:
     def run(self) -> dict[str, Any]:
         """The keys of the file's `[run]` table."""
         return self.table.get("run", {})
+
+    @property
+    def patches(self) -> dict[str, Any]:
+        """Types of OpenFOAM's patches by name: the file's `[patches]` table."""
+        return self.table.get("patches", {})
+
+    def with_patches(self, types: Mapping[str, str]) -> Case:
+        """Return this case with other types of patches."""
+        return replace(self, table={**self.table, "patches": {**self.patches, **types}}) if types else self
 
     @property
     def frames(self) -> int:
@@ -135,6 +146,10 @@ class Case:
             node[key] = target
         return moved, taken
 
+    def copies(self) -> list[str]:
+        """Return the names of the copies of the case's files that `write` makes."""
+        return list(self._moved()[1])
+
     def text(self, header: tuple[str, ...] = ()) -> str:
         """Return the text of `case.toml`."""
         return toml.write(self._moved()[0], header)
@@ -161,6 +176,32 @@ def _files(node: Any) -> Iterator[tuple[dict[str, Any], str]]:
             yield from _files(item)
     if isinstance(node, dict):
         yield from ((node, key) for key in ("file", "points", "fixed") if isinstance(node.get(key), str))
+
+
+def _check_walls(table: dict[str, Any], domain: Domain, place: str) -> None:
+    """Check all walls that a case names, and the types of patches.
+
+    Raises
+    ------
+    InputError
+        With the key, its value, and the names of the boundaries.
+    """
+    for key, node in _tables({key: table[key] for key in ("size", "layers") if key in table}, place):
+        if node.get("edges") is not None and (key.startswith(f"{place} layers") or node.get("kind") == "boundary"):
+            domain.boundaries.select(f"{key}.edges", node["edges"])
+    for name in table.get("patches", {}):
+        domain.boundaries.select(f"{place} patches", name)
+
+
+def _tables(node: Any, place: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Iterate over the tables below `node` and their places."""
+    if isinstance(node, dict):
+        yield place, node
+    below = node.items() if isinstance(node, dict) else enumerate(node)
+    for key, item in below:
+        if isinstance(item, (dict, list)):
+            inner = f"{place}[{key}]" if isinstance(key, int) else f"{place}{' ' if place.endswith(':') else '.'}{key}"
+            yield from _tables(item, inner)
 
 
 def _at(node: Any, time: float) -> Any:

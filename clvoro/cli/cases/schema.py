@@ -28,6 +28,7 @@ from ...geometry.domain import Domain
 from ...geometry.polygon import Polygon
 from ...geometry.sphere import Sphere
 from ...io.arrays import read_array
+from ...io.foam import PatchType
 from . import checks
 from .files import locate
 from .grids import read_grid
@@ -536,6 +537,7 @@ class CaseTable(Table, kw_only=True):
     run: RunSettings | None = None
     layers: Annotated[list[LayersTable], Meta(min_length=1)] | None = None
     sequence: Sequence | None = None
+    patches: dict[str, PatchType] | None = None
 
 
 def _keys(*tables: type[Table]) -> set[str]:
