@@ -51,6 +51,9 @@ class CGridMeasures:
         Distance from the generator to the centroid over the square root of the cell's area; 0 in a centroidal diagram.
     edge_ratio : (n,) float
         Shortest over longest edge of the cell.
+    off_bisector : (m,) float
+        Distance of the ends of the edge from the bisector of its generators, over the distance of these. It is not 0
+        where a part of a cell that the boundary of a polygon cuts off belongs to another cell. 0 on walls.
     inner : (m,) bool
         Whether the half-face is between two cells.
     vertex_cells : (k,) int
@@ -66,6 +69,7 @@ class CGridMeasures:
     length_ratio: np.ndarray
     centroid_offset: np.ndarray
     edge_ratio: np.ndarray
+    off_bisector: np.ndarray
     inner: np.ndarray
     vertex_cells: np.ndarray
     first: np.ndarray
@@ -107,18 +111,18 @@ class CGridMeasures:
 
 
 def measure_c_grid(diagram: Diagram) -> CGridMeasures:
-    """Measure a diagram on a sphere, or in a box in 2D, as a C grid.
+    """Measure a diagram on a sphere or in the plane as a C grid.
 
     Raises
     ------
     InputError
-        In 3D, and in polygonal domains, where edges of one cell need not be on bisectors.
+        In 3D.
     """
     d, domain = diagram, diagram.domain
     diagram.demand_voronoi("c_grid")
-    if domain.cell_dim != 2 or domain.cuts_cells:
+    if domain.cell_dim != 2:
         raise InputError(
-            f"measures for C grids are for meshes on a Sphere and in a Box in 2D, not for {domain}; use the other "
+            f"measures for C grids are for meshes on a Sphere and in the plane, not for {domain}; use the other "
             "entries of measures"
         )
     owner, inner = face_owners(d), d.neighbors >= 0
@@ -152,9 +156,20 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
         np.where(inner, d.face_measures / distance, 0.0),
         away / np.sqrt(d.volumes),
         ratio,
+        _off_bisector(d, own, line),
         inner,
         *_cells_around(d, corners, after),
     )
+
+
+def _off_bisector(d: Diagram, own: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Return how far edges are from the bisectors of their generators; see `CGridMeasures`."""
+    if not d.domain.cuts_cells:
+        return np.zeros(len(line))
+    ends = d.vertices[face_ends(d)] - own[:, None]
+    square = np.maximum((line**2).sum(axis=1), 1e-300)
+    shares = (ends * line[:, None]).sum(axis=2) / square[:, None]
+    return np.where(line.any(axis=1), np.abs(shares - 0.5).max(axis=1), 0.0)
 
 
 def _angles(vertex: np.ndarray, middle: np.ndarray, normal: np.ndarray, distance: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from ..finite_volumes.gate import LEAST_MEASURE
 from ..finite_volumes.solver_mesh import WallShape
 from ..mesh.connectivity import face_ends, face_keys, face_owners
 from ..mesh.diagram import Diagram
+from ..mesh.faces import OFF_BISECTOR
 from .c_grid import RIGHT_ANGLE, measure_c_grid
 
 _SHORTEST_EDGE = 1e-6
@@ -30,7 +31,7 @@ def check_for_mpas(diagram: Diagram, walls: WallShape | None) -> SolverReport:
     Raises
     ------
     InputError
-        In 3D and in polygonal domains, or if `walls` is given.
+        In 3D, or if `walls` is given.
     """
     if walls is not None:
         raise InputError(f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out")
@@ -38,6 +39,28 @@ def check_for_mpas(diagram: Diagram, walls: WallShape | None) -> SolverReport:
     if domain.globe:
         made = [criterion.on_sphere(domain.globe) for criterion in made]
     return SolverReport("mpas", tuple(made), len(diagram), faces, 0.0)
+
+
+def _at_walls(diagram: Diagram, edges: Rows, off_bisector: np.ndarray) -> list[Criterion]:
+    """Return what walls that cut cells may break: edges on bisectors, three at each vertex."""
+    if not diagram.domain.cuts_cells:
+        return []
+    f = diagram.faces
+    ends = f.corners.reshape(-1, 2)
+    count = np.bincount(ends.ravel(), minlength=len(f.points))
+    at_wall, row = np.unique(ends[f.n_inner :], return_index=True)
+    vertices = Rows(f.points[at_wall], f.owner[f.n_inner :][row // 2], f.dim)
+    return [
+        edges("edge off its bisector", off_bisector, OFF_BISECTOR),
+        vertices("edges at a vertex", count[at_wall], 3),
+    ]
+
+
+def coast_faults(diagram: Diagram) -> list[Criterion]:
+    """Return the criteria that the walls of a polygon break, so that no model on a C grid can use the mesh."""
+    names = ("edge off its bisector", "edges at a vertex")
+    found = [c for c in _criteria(diagram) if c.name in names] if diagram.domain.cuts_cells else []
+    return [c for c in found if not c.ok]
 
 
 def _criteria(diagram: Diagram) -> list[Criterion]:
@@ -51,6 +74,7 @@ def _criteria(diagram: Diagram) -> list[Criterion]:
     places, cell = d.vertices[face_ends(d)[m.corners, 0]], owner[m.corners]
     corners, vertices = Rows(places, cell, dim), Rows(places[m.first], cell[m.first], dim)
     return [
+        *_at_walls(diagram, edges, m.off_bisector[inner]),
         cells("edges of a cell", np.diff(d.neighbor_starts), 3, above=False),
         cells("cell area", d.volumes, LEAST_MEASURE, above=False),
         edges("edge length over distance", m.length_ratio[inner], _SHORTEST_EDGE, above=False),

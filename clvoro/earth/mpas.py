@@ -12,10 +12,13 @@ from pathlib import Path
 import numpy as np
 import scipy
 
+from ..arguments import format_point
 from ..errors import InputError
 from ..io.contents import Contents
 from ..io.half_edges import HalfEdges, half_edges
 from ..io.netcdf import NetCDF, squared
+from ..mesh.diagram import Diagram
+from .criteria import coast_faults
 from .mpas_shape import Shape, coordinates, describe, measure
 from .trisk import find_weights
 
@@ -39,6 +42,7 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     diagram.demand_voronoi("an MPAS file")
     halves = half_edges(diagram, glued=True)
     _check_loops(halves, path)
+    _check_coasts(diagram, path)
     shape = measure(diagram, halves)
     periods = np.where(domain.periodic, domain.extent, 0.0)
     _check_reach(shape.reach, periods, path)
@@ -187,6 +191,27 @@ def _check_loops(halves: HalfEdges, path: Path) -> None:
             f"cannot write {path}: cell {several[0]} ({several.size} in all) goes around a part of the boundary, and "
             "cells in MPAS have no holes; use smaller cells there, leave out the hole, or leave out convention='mpas'"
         )
+
+
+def _check_coasts(diagram: Diagram, path: Path) -> None:
+    """Refuse cells that a wall has cut so that edges are off bisectors, or four meet."""
+    faults = coast_faults(diagram)
+    if faults:
+        said = [
+            f"{_FAULTS[c.name]}: {c.count}, the worst {c.value:.3g} at {format_point(c.place or ())}" for c in faults
+        ]
+        raise InputError(
+            f"cannot write {path}: models on C grids have three edges at each vertex, on the bisectors of cells, and "
+            f"the walls of {diagram.domain} break that ({'; '.join(said)}). Mesh a box or a larger polygon, "
+            "and remove cells: mesh.subset(polygon) keeps those with their generators in polygon; "
+            "mesh.boundary_cells() lists the cells at walls"
+        )
+
+
+_FAULTS = {
+    "edge off its bisector": "edges off the bisector of their cells",
+    "edges at a vertex": "vertices with more edges",
+}
 
 
 def _check_reach(reach: np.ndarray, periods: np.ndarray, path: Path) -> None:

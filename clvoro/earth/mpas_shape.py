@@ -130,23 +130,19 @@ def _east_and_north(sphere: Sphere, points: np.ndarray) -> tuple[np.ndarray, np.
 def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
     """Return lengths and areas in the plane.
 
-    An edge on the boundary is at its middle, and its distance of generators is sqrt(3) times its length, as in the
-    tools of MPAS.
+    An edge on a wall is at its middle, and its distance of generators is sqrt(3) times its length, as in the tools of
+    MPAS. Behind an edge towards a removed cell is the generator of that one.
     """
-    own, first, edge = diagram.points[halves.cell], halves.first, halves.edge
+    own, first = diagram.points[halves.cell], halves.first
     # Relative to the generators of the cells.
     begin, end = (diagram.vertices[v] - own for v in (halves.begin, halves.end))
-    inner = halves.twin >= 0
+    behind = diagram.neighbors[halves.rows]
+    inner = (behind >= 0) | diagram.domain.removed_behind(-1 - behind)
     line, middle = np.zeros_like(own), (begin + end) / 2
     line[inner] = neighbor_points(diagram, halves.rows[inner]) - own[inner]
     lengths = diagram.face_measures[halves.rows[first]]
     distances = np.where(inner[first], np.hypot(*line[first].T), np.sqrt(3) * lengths)
-    # In polygons a cell may include a part of another region, whose edges lie on no bisector of its generator.
-    # Files of others may have generators at one place. They are refused later.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.abs(((middle - line / 2) * line).sum(axis=1))[first] / distances
-    on_bisector = inner[first] & (off <= _roundings(diagram, distances))
-    foot = np.where(on_bisector[edge][:, None], line / 2, middle)
+    foot = np.where(inner[:, None], line / 2, middle)
     kites = (_cross(begin, foot) + _cross(foot[halves.previous], begin)) / 2
     along = (end - begin)[first]
     outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
@@ -160,18 +156,6 @@ def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
         np.arctan2(normals[:, 1], normals[:, 0]),
         np.abs([begin, line]).max(axis=(0, 1)),
     )
-
-
-def _roundings(diagram: Diagram, distances: np.ndarray) -> np.ndarray:
-    """Return the tolerance for the distance of edges to bisectors, for generators `distances` (e,) apart; (e,)."""
-    domain = diagram.domain
-    single, double = (domain.place(diagram.points, np.dtype(t)) for t in (np.float32, np.float64))
-    # Positions that single precision represents exactly were computed in it.
-    eps = np.finfo(np.float32 if np.array_equal(single, double) else np.float64).eps
-    places = eps * domain.extent.max() + np.finfo(np.float64).eps * np.abs(diagram.vertices).max()
-    # The smaller the angle between two bisectors, the larger the round-off of their corner, and its distance from the
-    # third bisector.
-    return np.sqrt(eps) * distances + 64 * places
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -82,7 +82,8 @@ def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, colla
 
     del parts
     mesh = replace(mesh, corners=mesh.corners.astype(np.int32, copy=False))
-    return collapse_short(mesh, diagram) if collapse else mesh.compact()
+    whole = mesh.domain.uncut is mesh.domain  # what short edges may become depends on the sides of a box
+    return collapse_short(mesh, diagram) if collapse and whole else mesh.compact()
 
 
 _COLLAPSED = {2: _collapsed_polygons, 3: _collapsed_polyhedra}

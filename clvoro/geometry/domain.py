@@ -98,7 +98,7 @@ class Domain(ABC):
         """Whether cells are pieces of a curved surface."""
         return self.cell_dim < self.dim
 
-    cuts_cells: ClassVar[bool] = False
+    cuts_cells: bool = False
     """Whether the boundary cuts cells anywhere. Cells at walls then need not be convex, they may have several loops,
     and each face stores both of its ends."""
 
@@ -116,6 +116,11 @@ class Domain(ABC):
     def outline(self) -> Polygon | None:
         """The polygon whose edges are the boundary and cut the cells, or None."""
         return None
+
+    @property
+    def uncut(self) -> Domain:
+        """The domain before `subset` removed cells of its mesh: itself, unless it is what is left."""
+        return self
 
     @property
     def extent(self) -> np.ndarray:
@@ -172,6 +177,10 @@ class Domain(ABC):
         normals = np.zeros((len(walls), self.dim))
         normals[np.arange(len(walls)), axis] = 2.0 * upper - 1
         return normals, np.array([self.lower, self.upper])[upper]
+
+    def removed_behind(self, walls: np.ndarray) -> np.ndarray:
+        """Return for each of `walls` (k,) int whether a cell that `subset` removed is behind it, (k,) bool."""
+        return np.zeros(len(walls), bool)
 
     def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return the distance of each of `points` (k, d) to its wall of `walls` (k,); by default to the plane."""

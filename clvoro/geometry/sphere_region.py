@@ -86,6 +86,10 @@ class SphereRegion(Sphere):
         """Return the parts of the boundary with their default names."""
         return BoundaryNames((COAST,), np.zeros(len(np.asarray(self.beyond)), np.int32), "wall")
 
+    def removed_behind(self, walls: np.ndarray) -> np.ndarray:
+        """Return for each of `walls` (k,) int whether a removed cell is behind it: always, (k,) bool."""
+        return np.ones(len(walls), bool)
+
     def boundary(self, walls: Walls | None = None) -> NoReturn:
         """Raise an error, because the boundary consists of arcs, for which there is no shape."""
         del walls

@@ -46,7 +46,7 @@ class Diagram(MeshOutput):
 
     Attributes
     ----------
-    domain : Box, Polygon, Sphere or SphereRegion
+    domain : Box, Polygon, Sphere, SphereRegion or Subdomain
     points : (n, d) float64
         Generators, in the domain's unit of length.
     volumes : (n,) float64
@@ -374,13 +374,14 @@ class Diagram(MeshOutput):
 
         Parameters
         ----------
-        solver : {"openfoam", "mpas"}, optional
+        solver : {"openfoam", "mpas", "modflow"}, optional
             Check the mesh that a solver gets instead, by that solver's criteria. "openfoam": those of `checkMesh
             -allGeometry -allTopology` of OpenFOAM v1912, by its formulas, for the mesh that `save` writes. OpenFOAM
-            need not be installed. "mpas", on a sphere and in a box in 2D: what models on C grids need, such as vertices
-            inside of their Delaunay triangles; see `Measures.c_grid`.
+            need not be installed. "mpas", on a sphere and in the plane: what models on C grids need, such as vertices
+            inside of their Delaunay triangles; see `Measures.c_grid`. "modflow", in the plane: what MODFLOW 6 needs of
+            a DISV grid.
         walls : {"straight", "exact"}, optional
-            With solver "openfoam": as for `save`.
+            With solvers "openfoam" and "modflow": as for `to_openfoam` and `to_disv`.
 
         Returns
         -------
@@ -392,7 +393,8 @@ class Diagram(MeshOutput):
         ------
         InputError
             If the solver or `walls` is something else, or `walls` is given without that solver, or the solver has no
-            meshes of such a domain: "openfoam" on a sphere, "mpas" in 3D and in a polygonal domain.
+            meshes of such a domain: "openfoam" on a sphere, "mpas" in 3D, "modflow" in 3D, on a sphere and in a
+            periodic box.
 
         Examples
         --------

@@ -42,7 +42,7 @@ class Faces(Sealed):
 
     Attributes
     ----------
-    domain : Box, Polygon, Sphere or SphereRegion
+    domain : Box, Polygon, Sphere, SphereRegion or Subdomain
     generators : (n, d) float64
         Cell i is that of generator i.
     points : (v, d) float64

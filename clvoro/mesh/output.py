@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from ..finite_volumes.solver_mesh import WallShape
     from ..geometry.boundary_names import Walls
+    from ..geometry.domain import Domain
     from ..io.disv import Disv
     from ..io.fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
     from ..io.foam import PatchType
@@ -36,17 +37,20 @@ class MeshOutput:
     def _self(self) -> Result | Diagram:
         return cast("Result | Diagram", self)
 
-    def subset(self: Mesh, keep: ArrayLike, boundary: str = "coast") -> Mesh:
-        """Return the mesh without some of its cells, on a sphere.
+    def subset(self: Mesh, keep: ArrayLike | Domain, boundary: str = "coast") -> Mesh:
+        """Return the mesh without some of its cells, in a box or a polygon, or on a sphere.
 
-        The cells that are left do not change. Their faces towards removed cells become faces on a boundary. The domain
-        of the new mesh is a `clvoro.geometry.sphere_region.SphereRegion`. `clvoro.earth` finds the cells of oceans
-        and of limited areas.
+        The cells that are left do not change. Their faces towards removed cells become faces on a boundary. So all
+        faces are on bisectors, as models on C grids need it at coasts. The domain of the new mesh is a
+        `clvoro.geometry.subdomain.Subdomain`, on a sphere a `clvoro.geometry.sphere_region.SphereRegion`.
+        `clvoro.earth` finds the cells of oceans and of limited areas on a sphere. Meshes for OpenFOAM of a part
+        of a box in 3D keep their short edges.
 
         Parameters
         ----------
-        keep : (n,) array of bool
-            Which cells are left; they keep their order.
+        keep : (n,) array of bool, or domain
+            Which cells are left; they keep their order. A domain, such as a `clvoro.Polygon`, keeps the cells that have
+            their generators in it.
         boundary : str
             Name of the new boundary. A mesh that has a boundary already keeps the name of that one.
 
@@ -59,7 +63,8 @@ class MeshOutput:
         Raises
         ------
         InputError, InputTypeError
-            If the mesh is not on a sphere, `keep` is not one bool per cell or has no True, or `boundary` is not a word.
+            If `keep` is not one bool per cell or has no True, or `boundary` is no word or another boundary's name;
+            for power diagrams.
 
         Examples
         --------
@@ -68,6 +73,14 @@ class MeshOutput:
         >>> north = globe.subset(earth.lonlat(globe.points)[:, 1] > 10, "open")
         >>> len(globe), len(north), north.domain.boundary_names
         (162, 65, ('open',))
+
+        A lake on a C grid:
+
+        >>> lake = clvoro.Polygon([(1, 1), (4, 0.8), (3, 2.5), (1.2, 3)])
+        >>> points = np.random.default_rng(1).random((400, 2)) * 5
+        >>> cells = clvoro.voronoi(clvoro.Box((0, 0), (5, 5)), points).subset(lake)
+        >>> len(cells), cells.domain.boundary_names[-1]
+        (64, 'coast')
         """
         from .subset import take_subset
 

@@ -1,16 +1,19 @@
-"""Meshes on a sphere from which cells are removed."""
+"""Meshes from which cells are removed."""
 
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import TypeVar, cast
 
 import numpy as np
 
 from ..errors import InputError, InputTypeError
+from ..geometry.domain import Domain
 from ..geometry.sphere import Sphere
 from ..geometry.sphere_region import COAST, SphereRegion
-from .connectivity import face_owners
+from ..geometry.subdomain import Subdomain
+from .connectivity import face_owners, neighbor_points, take_rows
 from .diagram import Diagram
 from .results import HISTORY_DTYPE, Result
 
@@ -20,19 +23,17 @@ Mesh = TypeVar("Mesh", Result, Diagram)
 def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     """Return `mesh` without the cells where `keep` is False; see `MeshOutput.subset`."""
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
-    if diagram.domain.globe is None:
-        raise InputError(
-            f"subset() is for meshes on a sphere, and this one is in {diagram.domain}; for another domain make a new "
-            "mesh in a clvoro.Polygon with holes"
-        )
-    kept = check_mask("keep", keep, len(diagram))
+    diagram.demand_voronoi("subset")
+    kept = keep.contains(diagram.points) if isinstance(keep, Domain) else check_mask("keep", keep, len(diagram))
     if not kept.any():
         raise InputError(
             f"keep selects none of the {len(kept)} cells, expected at least one that is True; is it the opposite mask?"
         )
     if kept.all():
         return mesh
-    part = _subset_diagram(diagram, diagram.domain.globe, kept, boundary)
+    globe = diagram.domain.globe
+    make = _in_space if globe is None else partial(_on_sphere, sphere=globe)
+    part = make(diagram, kept, boundary)
     if not isinstance(mesh, Result):
         return cast("Mesh", part)
     taken = {name: getattr(mesh, name)[kept] for name in ("target_size", "size_error", "quality")}
@@ -70,18 +71,56 @@ def check_mask(name: str, mask: object, n: int) -> np.ndarray:
     return array
 
 
-def _subset_diagram(d: Diagram, sphere: Sphere, kept: np.ndarray, boundary: str) -> Diagram:
+def _in_space(d: Diagram, kept: np.ndarray, boundary: str) -> Diagram:
+    """Return the kept cells in a box or polygon; faces towards removed cells become walls of a `Subdomain`."""
+    number, owner = np.cumsum(kept) - 1, face_owners(d)
+    faces = np.flatnonzero(kept[owner])
+    behind = d.neighbors[faces]
+    whole = d.domain.uncut
+    w = len(whole.boundary_index)
+    lost = (behind >= 0) & ~kept[np.maximum(behind, 0)]
+    cut = lost.copy()
+    cut[behind < 0] = d.domain.removed_behind(-1 - behind[behind < 0])
+    neighbors = np.where(behind < 0, behind, number[np.maximum(behind, 0)])
+    neighbors[cut] = -1 - w - np.arange(cut.sum())
+    within, beyond = d.points[owner[faces[cut]]], neighbor_points(d, faces[cut])
+    labels = np.full(len(behind), boundary, object)
+    old = cut & (behind < 0)
+    labels[old] = [d.domain.boundary_names[k] for k in d.domain.boundary_index[-1 - behind[old]]]
+    domain = Subdomain(whole, within, beyond, float(d.volumes[kept].sum()), _names(labels[cut].tolist(), w))
+    arrays = {name: getattr(d, name)[kept] for name in ("points", "volumes", "centroids")}
+    arrays |= {name: getattr(d, name)[faces] for name in ("shifts", "face_measures", "face_centroids")}
+    arrays["shifts"] = np.where(cut[:, None], 0, arrays["shifts"]).astype(np.int8)
+    arrays["neighbor_starts"] = np.concatenate([[0], np.cumsum(np.diff(d.neighbor_starts)[kept])]).astype(np.int32)
+    arrays["neighbors"] = neighbors.astype(np.int32)
+    rows = {"cell_vertex": np.flatnonzero(kept), "face_vertex": faces}
+    corners = {}
+    for name, own in rows.items():
+        starts = f"{name}_starts"
+        if starts in d._arrays:
+            arrays[starts], items = take_rows(getattr(d, starts), getattr(d, _CORNERS[name]), own)
+            arrays[starts], corners[name] = arrays[starts].astype(np.int32), items
+    used, renumbered = np.unique(np.concatenate([*corners.values()]), return_inverse=True)
+    parts = np.split(renumbered.ravel().astype(np.int32), np.cumsum([len(c) for c in corners.values()])[:-1])
+    arrays |= {_CORNERS[name]: part for name, part in zip(corners, parts, strict=True)}
+    return Diagram(domain, {**arrays, "vertices": d.vertices[used]})
+
+
+_CORNERS = {"cell_vertex": "cell_vertices", "face_vertex": "face_vertices"}
+
+
+def _on_sphere(d: Diagram, kept: np.ndarray, boundary: str, sphere: Sphere) -> Diagram:
     """Return the kept cells; faces towards removed cells become faces on the boundary."""
     number = np.cumsum(kept) - 1
     owner = face_owners(d)
     faces = np.flatnonzero(kept[owner])
     behind = d.neighbors[faces]
-    lost = (behind >= 0) & ~kept[behind]
+    lost = (behind >= 0) & ~kept[np.maximum(behind, 0)]
     former, removed = np.unique(-1 - behind[behind < 0]), np.unique(behind[lost])
     neighbors = np.where(
         behind < 0,
         -1 - np.searchsorted(former, -1 - behind),
-        np.where(lost, -1 - len(former) - np.searchsorted(removed, behind), number[behind]),
+        np.where(lost, -1 - len(former) - np.searchsorted(removed, behind), number[np.maximum(behind, 0)]),
     )
     labels = [sphere.boundary_names[k] for k in sphere.boundary_index[former]]
     labels += [boundary] * len(removed)
@@ -110,10 +149,10 @@ def _subset_diagram(d: Diagram, sphere: Sphere, kept: np.ndarray, boundary: str)
     return Diagram(region, arrays)
 
 
-def _names(labels: list[str]) -> dict[str, list[int]] | None:
-    """Return the numbers of walls by name, without those of the default name."""
+def _names(labels: list[str], first: int = 0) -> dict[str, list[int]] | None:
+    """Return the numbers of walls by name, from `first` on, without those of the default name."""
     names: dict[str, list[int]] = {}
     for k, label in enumerate(labels):
         if label != COAST:
-            names.setdefault(label, []).append(k)
+            names.setdefault(label, []).append(first + k)
     return names or None

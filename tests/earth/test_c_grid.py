@@ -194,12 +194,20 @@ def test_box_with_walls(ctx):
 def test_other_domains_are_refused():
     points = np.random.default_rng(8).random((20, 3))
     solid = solid_diagram((0, 0, 0), (1, 1, 1), points)
-    flat = clvoro.voronoi(clvoro.Polygon([(0, 0), (1, 0), (0, 1)]), [(0.2, 0.2), (0.4, 0.4)])
-    for diagram in (solid, flat):
-        with pytest.raises(InputError, match="on a Sphere and in a Box in 2D"):
-            _ = diagram.measures.c_grid
-        with pytest.raises(InputError, match="on a Sphere and in a Box in 2D"):
-            diagram.check(solver="mpas")
+    with pytest.raises(InputError, match="on a Sphere and in the plane"):
+        _ = solid.measures.c_grid
+    with pytest.raises(InputError, match="on a Sphere and in the plane"):
+        solid.check(solver="mpas")
+
+
+def test_convex_polygons_are_as_boxes(ctx):
+    points = np.random.default_rng(8).random((60, 2))
+    boxes = clvoro.Box((0, 0), (1, 1)), clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1)])
+    box, polygon = (clvoro.Adapter(ctx).diagram(domain, points).check(solver="mpas") for domain in boxes)
+    assert polygon["edges at a vertex"].ok
+    assert polygon["edge off its bisector"].ok
+    for criterion in box.criteria:
+        assert polygon[criterion.name].value == pytest.approx(criterion.value, rel=1e-9)
 
 
 def test_summary_has_them_on_spheres(globe):

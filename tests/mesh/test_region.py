@@ -215,8 +215,6 @@ def test_wrong_masks_are_refused(globe, keep, kind, message):
 
 
 def test_wrong_meshes_and_names_are_refused(ctx, globe, part):
-    with pytest.raises(InputError, match=r"subset\(\) is for meshes on a sphere"):
-        clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0), (1, 1)), [(0.5, 0.5)]).subset([True])
     with pytest.raises(InputError, match="has the name 'the coast', expected a word"):
         globe.subset(globe.points[:, 0] > 0, "the coast")
     with pytest.raises(InputError, match="make the mesh on the Sphere, then remove cells"):

@@ -54,6 +54,14 @@ MESHES = {
 """Domains and generators. In "shore" and "slit" the boundary divides cells; their far pieces belong to other cells."""
 
 
+PLANE = {
+    **{name: mesh for name, mesh in MESHES.items() if name not in ("shore", "slit", "two pieces")},
+    "shore, cut": MESHES["shore"],
+    "torus, cut": MESHES["torus"],
+}
+"""Those that C grids can use. From "cut" ones cells are removed: those at walls, and those around a point."""
+
+
 def around_an_island() -> tuple[clvoro.Polygon, np.ndarray]:
     """Four square cells, within one of which there is an island."""
     square = np.array([(0.0, 0), (2, 0), (2, 2), (0, 2)])
@@ -77,8 +85,13 @@ def result_of(diagram: Diagram) -> Result:
 
 
 def made(ctx, name: str, dtype: str = "float64") -> Result:
-    """Return the mesh of `MESHES` with this name."""
-    return result_of(clvoro.Adapter(ctx, dtype).diagram(*MESHES[name]()))
+    """Return the mesh of `MESHES` or `PLANE` with this name."""
+    diagram = clvoro.Adapter(ctx, dtype).diagram(*{**MESHES, **PLANE}[name]())
+    if "cut" in name:
+        kept = np.linalg.norm(diagram.points - diagram.points[7], axis=1) > 0.2
+        kept[diagram.boundary_cells()] = False
+        diagram = diagram.subset(kept)
+    return result_of(diagram)
 
 
 @dataclass(repr=False)

@@ -118,8 +118,9 @@ def _explain(message: str, kind: Any, content: object, place: str, homes: Mappin
             known += [_WORDS[name] for name in names if name in _WORDS]
             for values in (k.value_type for k in others if isinstance(k, inspect.DictType)):
                 known += [str(word) for word in getattr(values, "values", ())]
-                key = next((key for key, word in got.items() if word not in known), "")
-                where, got = _below(where, key), got.get(key)
+            if isinstance(got, Mapping):
+                key = next(key for key, word in got.items() if word not in known)
+                where, got = _below(where, key), got[key]
         return f"{where} is {got!r:.60}{_nearest(got, known)}; expected one of {', '.join(known)}"
     if not text.startswith("Expected"):  # an error of a table as a whole
         return f"{where} {text}"

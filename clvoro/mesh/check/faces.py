@@ -64,9 +64,10 @@ def check_corners(check: Check) -> None:
 def _euler_characteristic(d: Diagram) -> int | None:
     """Return vertices - faces + cells of a mesh without gaps; None where parts of a boundary touch in a vertex.
 
-    It is 2 for each connected part of a sphere, less one for each of its boundaries, as that of a rectangle.
+    It is 2 for each connected part of a sphere, less one for each of its boundaries, as that of a rectangle: the plane
+    is a part of a sphere.
     """
-    if not d.domain.curved:
+    if d.domain.plain:
         return 1
     owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
     walls = d.neighbors < 0

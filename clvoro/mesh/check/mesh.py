@@ -168,7 +168,7 @@ def _check_shifts(check: Check) -> None:
         walls = np.flatnonzero(j < 0)
         check.note(
             "walls",
-            periodic[(-1 - j[walls]) // 2],
+            d.domain.boundary_index[-1 - j[walls]] < 0,
             lambda k: f"face {walls[k]} leads to wall {-1 - j[walls[k]]}, across a periodic axis",
             stop=True,
         )
@@ -250,7 +250,7 @@ def _check_inside(check: Check, slack: float) -> None:
         lambda i: f"generator {i} at {d.points[i]} lies outside {domain}",
     )
     outside = np.flatnonzero(~domain.contains(d.vertices))
-    if domain.cuts_cells:  # vertices on oblique edges have round-off
+    if not domain.plain:  # vertices on oblique walls have round-off
         outside = outside[domain.boundary_distance(d.vertices[outside]) > slack]
     check.note(
         "vertices inside",

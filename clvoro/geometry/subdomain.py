@@ -1,0 +1,187 @@
+"""A part of a box or a polygon: the cells of a mesh that are left when others are removed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ..arguments import check_number, check_rows
+from ..errors import InputError
+from .boundary_names import BoundaryNames, Walls
+from .domain import Domain
+from .sphere_region import COAST
+
+if TYPE_CHECKING:
+    from ..opencl.engine import Traits
+
+_ROUNDINGS = 64 * float(np.finfo(np.float32).eps)
+"""Distance to a generator, over itself, by which a point may be beyond the boundary: that of meshes in float32."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Subdomain(Domain):
+    """Part of a `Box` or `Polygon`: the domain of a mesh after `Diagram.subset` has removed cells from it.
+
+    Its walls are those of the whole domain, then one for each face towards a removed cell, which lies on the bisector
+    of two generators: that of its cell, and that of the removed cell.
+
+    Parameters
+    ----------
+    whole : Domain
+        The domain of the mesh before cells were removed.
+    within, beyond : (k, d) array
+        Generators on both sides of each face towards a removed cell, in a periodic box the nearest images.
+    area : float
+        Measure of the cells that are left.
+    names : mapping, optional
+        Names of boundaries, each with its walls. Faces towards removed cells that are not mentioned are the "coast".
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If the arrays do not have this shape, a number is not finite or the area not positive, or names are wrong.
+    """
+
+    whole: Domain
+    within: np.ndarray
+    beyond: np.ndarray
+    area: float
+    names: Mapping[str, Walls] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper", "periodic", "cuts_cells"):
+            object.__setattr__(self, name, getattr(self.whole, name))
+        for name in ("within", "beyond"):
+            what = f"Subdomain {name}"
+            points = np.array(check_rows(what, getattr(self, name), self.dim))
+            if not len(points) or not np.isfinite(points).all():
+                raise InputError(f"{what} has {len(points)} rows, expected one or more of finite numbers")
+            points.setflags(write=False)
+            object.__setattr__(self, name, points)
+        if self.within.shape != self.beyond.shape or (self.within == self.beyond).all(axis=1).any():
+            raise InputError("Subdomain within and beyond differ in shape or have equal rows, expected pairs of points")
+        check_number("Subdomain area", self.area, above=0)
+        object.__setattr__(self, "names", self._checked_names())
+
+    def __repr__(self) -> str:
+        return f"Subdomain({self.area / self.whole.measure:.3%} of {self.whole!r}, {', '.join(self.boundary_names)})"
+
+    @property
+    def measure(self) -> float:
+        """Area or volume."""
+        return float(self.area)
+
+    @property
+    def plain(self) -> bool:
+        """Whether the domain is its bounding box: never."""
+        return False
+
+    @property
+    def uncut(self) -> Domain:
+        """The domain before cells were removed."""
+        return self.whole
+
+    @property
+    def n_whole(self) -> int:
+        """Number of walls of the whole domain, which come first."""
+        return len(self.whole.boundary_index)
+
+    @property
+    def boundary_measure(self) -> float:
+        """Length or area of the whole domain's boundary, which serves as a scale."""
+        return self.whole.boundary_measure
+
+    def default_names(self) -> BoundaryNames:
+        """Return the parts of the boundary with their default names: those of the whole domain, and the coast."""
+        known = self.whole.boundaries
+        names = known.names if COAST in known.names else (*known.names, COAST)
+        cut = np.full(len(self.beyond), names.index(COAST), np.int32)
+        return BoundaryNames(names, np.concatenate([known.index, cut]).astype(np.int32), "wall")
+
+    def removed_behind(self, walls: np.ndarray) -> np.ndarray:
+        """Return for each of `walls` (k,) int whether a removed cell is behind it, (k,) bool."""
+        return walls >= self.n_whole
+
+    def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return outward unit normals of `walls` (k,) int, and a point on each, (k, d) each."""
+        cut = self.removed_behind(walls)
+        pairs = walls[cut] - self.n_whole
+        normals, anchors = np.zeros((len(walls), self.dim)), np.zeros((len(walls), self.dim))
+        normals[~cut], anchors[~cut] = self.whole.wall_planes(walls[~cut])
+        way = self.beyond[pairs] - self.within[pairs]
+        normals[cut] = way / np.linalg.norm(way, axis=1)[:, None]
+        anchors[cut] = self.within[pairs] + way / 2
+        return normals, anchors
+
+    def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (k, d) to its wall of `walls` (k,)."""
+        cut = self.removed_behind(walls)
+        found = np.zeros(len(walls))
+        found[~cut] = self.whole.wall_distance(walls[~cut], points[~cut])
+        found[cut] = super().wall_distance(walls[cut], points[cut])
+        return found
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) whether it lies in a cell that is left, on the boundary included."""
+        points = check_rows("points", points, self.dim)
+        return self.whole.contains(points) & (self._beyond_by(points) <= 0)
+
+    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return a lower bound of the distance of each of `points` (n, d) to the boundary, (n,)."""
+        return np.minimum(self.whole.boundary_distance(points), np.abs(self._beyond_by(points)))
+
+    def closest_walls(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) on the boundary the closest wall, (n,) int."""
+        found = self.whole.closest_walls(points)
+        middles = (self.within + self.beyond) / 2
+        away, pair = KDTree(middles).query(points)
+        at_cut = away < self.whole.boundary_distance(points)
+        return np.where(at_cut, self.n_whole + np.asarray(pair), found)
+
+    def _beyond_by(self, points: np.ndarray) -> np.ndarray:
+        """Return half of by how much each of `points` is nearer to a removed generator than to one that is left."""
+        here, there = (tree.query(self.whole.wrap(points))[0] for tree in self._trees)
+        return (here - there) / 2 - _ROUNDINGS * here
+
+    @cached_property
+    def _trees(self) -> tuple[KDTree, KDTree]:
+        images = [self.extent * shift for shift in np.ndindex(*(3 if p else 1 for p in self.periodic))]
+        back = np.where(self.periodic, self.extent, 0.0)
+        near = [np.concatenate([x + move - back for move in images]) for x in (self.within, self.beyond)]
+        return KDTree(near[0]), KDTree(near[1])
+
+    def boundary(self, walls: Walls | None = None) -> NoReturn:
+        """Raise an error, because the boundary changes with the mesh."""
+        del walls
+        raise InputError(
+            f"the boundary of {self} is no shape for sizes; choose sizes in the whole domain, then remove cells"
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """Return the arguments of this domain as numbers, strings and lists."""
+        return {
+            "whole": {"kind": type(self.whole).__name__, **self.whole.describe()},
+            "within": self.within.tolist(),
+            "beyond": self.beyond.tolist(),
+            "area": float(self.area),
+            **({"names": dict(self.names)} if self.names else {}),
+        }
+
+    @classmethod
+    def described(cls, **values: Any) -> Subdomain:
+        """Return the domain from the values that `describe` returns."""
+        whole = dict(values.pop("whole"))
+        return cls(Domain.kinds[whole.pop("kind")].described(**whole), **values)
+
+    def traits(self, real: np.dtype) -> Traits:
+        """Raise an error, because a mesh is made in the whole domain before cells are removed."""
+        del real
+        raise InputError(
+            f"the domain is a {self}, which is for meshes from which cells were removed; make the mesh in the whole "
+            "domain, then remove cells with its subset()"
+        )

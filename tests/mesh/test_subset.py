@@ -1,0 +1,108 @@
+"""Meshes in boxes and polygons from which cells were removed."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.errors import InputError, InputTypeError
+from clvoro.geometry.subdomain import Subdomain
+from tests.reference.netcdf_files import random_points, result_of
+
+L_SHAPE = clvoro.Polygon([(0, 0), (2, 0), (2, 2), (1, 2), (1, 1), (0, 1)], names={"river": [0]})
+DOMAINS = {
+    "box": clvoro.Box((0, 0), (2, 2), names={"inlet": "xMin"}),
+    "channel": clvoro.Box((0, 0), (2, 2), periodic=(True, False)),
+    "torus": clvoro.Box((0, 0), (2, 2), periodic=True),
+    "polygon": L_SHAPE,
+    "solid": clvoro.Box((0, 0, 0), (2, 2, 2), periodic=(False, False, True)),
+}
+
+
+@pytest.fixture(scope="module", params=DOMAINS)
+def whole(request, ctx):
+    domain = DOMAINS[request.param]
+    points = np.random.default_rng(12).random((400 if domain.dim == 2 else 150, domain.dim)) * 2
+    return clvoro.Adapter(ctx).diagram(domain, points[domain.contains(points)])
+
+
+@pytest.fixture(scope="module")
+def keep(whole):
+    return np.linalg.norm(whole.points - (1.3, 1, 1)[: whole.domain.dim], axis=1) > 0.4
+
+
+@pytest.fixture(scope="module")
+def part(whole, keep):
+    return whole.subset(keep, "hole")
+
+
+def test_kept_cells_do_not_change(whole, keep, part):
+    rows = np.flatnonzero(keep)
+    assert np.array_equal(part.points, whole.points[keep])
+    for new, old in enumerate(rows):
+        one, other = part.cell(new), whole.cell(old)
+        assert one.volume == other.volume
+        for k, (a, b) in enumerate(zip(one.neighbors, other.neighbors, strict=True)):
+            assert (rows[a] if a >= 0 else a) == b if b < 0 or keep[b] else a < -len(whole.domain.boundary_index)
+            assert one.areas[k] == other.areas[k]
+    assert part.domain.measure == pytest.approx(whole.volumes[keep].sum(), rel=1e-14)
+    assert part.domain.boundary_names[0] == "hole"
+    beside = np.flatnonzero(whole.adjacency[:, ~keep].sum(axis=1) > 0)
+    assert rows[part.boundary_cells("hole")].tolist() == [i for i in beside if keep[i]]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".vtu"])
+def test_parts_are_checked_saved_and_cut_again(part, tmp_path, suffix):
+    again = part.subset(part.points[:, 0] > 0.5)
+    for diagram in (part, again):
+        diagram.check().demand()
+        diagram.save(tmp_path / f"part{suffix}")
+        loaded = clvoro.load(tmp_path / f"part{suffix}")
+        assert loaded.domain == diagram.domain
+        assert loaded.domain.boundary_names == diagram.domain.boundary_names
+        loaded.check().demand()
+    assert {"hole", "coast"} <= set(again.domain.boundary_names)
+
+
+def test_faces_towards_removed_cells_know_their_generators(whole, keep, part):
+    faces = part.faces
+    walls = -1 - faces.neighbor[faces.n_inner :]
+    cut = part.domain.removed_behind(walls)
+    assert cut.sum() == len(part.domain.beyond)
+    mirrored = part.domain.mirrored(walls[cut], part.points[faces.owner[faces.n_inner :][cut]])
+    away = np.abs(whole.domain.wrap(mirrored)[:, None] - whole.points[~keep]).max(axis=2).min(axis=1)
+    assert away.max() < 1e-12
+    assert part.domain.contains(part.points).all()
+    assert not part.domain.contains(whole.points[~keep]).any()
+
+
+def test_solvers_get_parts(part, tmp_path):
+    part.to_openfoam(tmp_path / "polyMesh")
+    assert "hole" in (tmp_path / "polyMesh" / "boundary").read_text()
+
+
+def test_a_result_and_a_domain_select_cells(ctx):
+    box = DOMAINS["box"]
+    result = result_of(clvoro.Adapter(ctx).diagram(box, random_points(box, 200)))
+    part = result.subset(L_SHAPE)
+    assert np.array_equal(part.points, result.points[L_SHAPE.contains(result.points)])
+    assert len(part.target_size) == len(part)
+    assert result.subset(np.ones(200, bool)) is result
+
+
+def test_wrong_parts_are_refused(ctx, part, whole):
+    with pytest.raises(InputTypeError, match="keep has dtype int64"):
+        whole.subset(np.arange(len(whole)))
+    with pytest.raises(InputError, match="keep selects none"):
+        whole.subset(np.zeros(len(whole), bool))
+    with pytest.raises(InputError, match="make the mesh in the whole domain, then remove cells"):
+        clvoro.Adapter(ctx).run(part.domain, 0.1)
+    with pytest.raises(InputError, match="is no shape for sizes"):
+        part.domain.boundary()
+    known = part.domain.describe()
+    for changes, says in (
+        ({"area": -1.0}, "area"),
+        ({"within": known["within"][:-1]}, "differ in shape"),
+        ({"beyond": np.full_like(known["beyond"], np.nan)}, "finite"),
+    ):
+        with pytest.raises(InputError, match=says):
+            Subdomain.described(**{**known, **changes})
