@@ -67,7 +67,7 @@ PARTS = {
     "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
     "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
     "solvers.transport": {"solvers.poisson"},
-    "tessellation.power_cells": {"tessellation.cells", "tessellation.weight_bounds"},
+    "tessellation.cells": {"tessellation.weight_bounds"},
     "tessellation.polyhedra": {"tessellation.weight_bounds"},
     "tessellation.periodic.ghost_images": {"tessellation.part"},
     "tessellation.incremental": {"tessellation.cells"},

@@ -31,6 +31,7 @@ from .device_diagram import (
     Tessellation,
 )
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
+from .weight_bounds import WeightBounds
 
 CELL_CAPACITY = 24
 """Most faces of a cell while it is clipped."""
@@ -48,23 +49,34 @@ FIRST_REACH = 1.9
 
 
 class Cells:
-    """Tessellate a box in 2D, or a sphere.
+    """Tessellate a box in 2D, or a sphere; with an engine for power diagrams by points with weights (n, 3).
 
     Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
     one is complete.
+
+    Parameters
+    ----------
+    engine : Engine
+    folded : bool
+        For the folded diagrams of a periodic box, in which a neighbor is the nearest image of its generator: they are
+        updated, or made by `clip_by_rings`. The periods are built into the kernels, which compute corners from
+        differences of positions.
+
+    Attributes
+    ----------
+    lanes : int
+        Cells that one work-item measures or checks.
     """
 
-    lanes = 1
-    """Cells that one work-item measures or checks."""
     hulls_from = 1000
     """Number of generators from which CPUs use `hulls.cl`. For fewer, its build takes longer than it saves."""
     from_previous = False
     """Whether new cells may start from the neighbors in an earlier diagram, and updates need bins."""
-    searches = True
-    """Whether neighbors are searched in bins."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, folded: bool = False) -> None:
         self.engine = engine
+        self._bounds = WeightBounds(engine) if engine.traits.site_values else None
+        self._folds = {f"FOLD_{a}": engine.traits.periods[a].hex() for a in range(2)} if folded else {}
         self._scan = Scan(engine)
         self._capacity = self._room = self._n = self._enlarged_for = 0
         self._flags = engine.empty(FLAGS, np.int32)
@@ -74,18 +86,28 @@ class Cells:
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
         self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
         engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
-        in_lanes = engine.group_size == 1 and engine.real == np.float64
+        in_lanes = engine.group_size == 1 and engine.real == np.float64 and self._bounds is None
         self.lanes = LANES if in_lanes else 1
         self._kernels = engine.kernels("tessellation/cells", {**defines, "IN_LANES": int(self.lanes > 1)})
         self._hulls = None
-        if self.lanes > 1 and self.searches:
+        if in_lanes and not self._folds:
             hulls = {"SLOT": SLOT, "MAX_DEPTH": MAX_LEVELS, "EIGHTS": EIGHTS}
             self._hulls = engine.kernels("simd/hulls", hulls)
 
     @property
     def defines(self) -> dict[str, object]:
-        """The capacities, for building kernels that work on the rows."""
-        return {"CELL_CAPACITY": self.cell_capacity, "ROW_CAPACITY": self.row_capacity, "SLOT": SLOT}
+        """The capacities and periods, for building kernels that work on the rows."""
+        capacities: dict[str, object] = {
+            "CELL_CAPACITY": self.cell_capacity,
+            "ROW_CAPACITY": self.row_capacity,
+            "SLOT": SLOT,
+        }
+        return capacities | self._folds
+
+    def clear(self) -> None:
+        """Free all buffers of cells and faces."""
+        self._of_cells, self._of_faces, self._views = {}, {}, {}
+        self._capacity, self._room, self._n = 0, 0, -1
 
     def reserve(self, n: int) -> None:
         """Allocate the arrays per cell for `n` generators."""
@@ -187,7 +209,7 @@ class Cells:
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         hulls = self._hulls if total >= self.hulls_from else None
         some = hulls is not None
-        bounds = self._search_bounds(box, points, total)
+        bounds = () if self._bounds is None else self._bounds.build(box, points, total)
         if hulls is not None:
             engine.run_each(
                 hulls.wrap_all_hulls,
@@ -231,9 +253,34 @@ class Cells:
             some = True
             self._reset_flags(n, len(rows.counts), byte_count=4)
 
-    def _search_bounds(self, box: ClipBox, points: cla.Array, total: int) -> tuple[object, ...]:
-        """Return what else the search for neighbors of the first `total` points needs."""
-        return ()
+    @framed
+    def clip_by_rings(
+        self, box: ClipBox, points: cla.Array, previous: NeighborRows, exact: bool
+    ) -> Tessellation | None:
+        """Tessellate by `points` with weights (n, 3), starting from the neighbors in `previous`.
+
+        The result is right if the sum of its volumes is that of the domain. None if a cell has too many faces, or
+        is open in a folded graph.
+        """
+        n, old = previous.n, (previous.starts, previous.neighbors)
+        self.reserve(n)
+        rows = self.take_rows(n, spare=spare_slots(n))
+        self.engine.run_each(
+            self._kernels.clip_by_rings,
+            n,
+            points,
+            *box.device_corners(self.engine.real),
+            *old,
+            rows.slots,
+            rows.counts,
+            rows.places,
+            rows.flags,
+        )
+        same = rows.places, rows.places
+        flags, m = self._match(rows, box, points, n, *same, exact)
+        if flags & ~DOUBT:
+            return None
+        return self.measure(rows, box, points, n, *same, m, flags, exact)
 
     def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
         """Return `t`, a diagram of `box`, with face measures and centroids in full precision, in new arrays."""

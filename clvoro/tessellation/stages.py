@@ -17,17 +17,13 @@ from .cells import Cells
 from .clipped.trim import Trim
 from .device_diagram import Follow, Tessellation, read_report
 from .incremental import IncrementalUpdate
-from .periodic.folded import FoldedCells, FoldedPowerCells
 from .periodic.ghost_images import GhostImages
 from .polyhedra import Polyhedra
 from .polyhedra_update import PolyhedraUpdate
-from .power_cells import PowerCells
 
 Stage = TypeVar("Stage")
-CELLS = {(2, False): Cells, (2, True): PowerCells, (3, False): Polyhedra, (3, True): Polyhedra}
-"""What builds cells, by their dimension and whether generators have weights."""
-FOLDED = {(2, False): FoldedCells, (2, True): FoldedPowerCells}
-"""The same without images of periodic boxes, where `CELLS` do not do this as well."""
+CELLS = {2: Cells, 3: Polyhedra}
+"""What builds cells, by their dimension."""
 UPDATES = {2: IncrementalUpdate, 3: PolyhedraUpdate}
 """What updates diagrams, by the dimension of cells."""
 
@@ -67,19 +63,18 @@ class TessellationStages:
     @cached_property
     def cells(self) -> Cells | Polyhedra:
         """What builds cells of this dimension, with weights if the engine has them."""
-        return CELLS[self.engine.cell_dim, bool(self.engine.traits.site_values)](self.engine)
+        return CELLS[self.engine.cell_dim](self.engine)
 
     @cached_property
     def folded_cells(self) -> Cells | Polyhedra:
         """What builds the cells of a periodic box without its images; in 3D `cells` does this as well."""
-        made = FOLDED.get((self.engine.cell_dim, bool(self.engine.traits.site_values)))
-        return self.cells if made is None else made(self.engine)
+        return Cells(self.engine, folded=True) if isinstance(self.cells, Cells) else self.cells
 
     @property
-    def ring_cells(self) -> PowerCells | None:
+    def ring_cells(self) -> Cells | None:
         """What builds cells with weights from the neighbors in an earlier diagram: in 2D and float64."""
         cells = self.folded_cells if self.engine.traits.periods else self.cells
-        return cells if isinstance(cells, PowerCells) and self.engine.real == np.float64 else None
+        return cells if isinstance(cells, Cells) and self.engine.real == np.float64 else None
 
     @cached_property
     def update(self) -> Update:
@@ -96,7 +91,7 @@ class TessellationStages:
     def clear_folded_cells(self) -> None:
         """Free the buffers of `folded_cells`, if it exists; its kernels stay."""
         cells = vars(self).get("folded_cells")
-        if isinstance(cells, FoldedCells):
+        if isinstance(cells, Cells):
             cells.clear()
 
     def release(self) -> None:
