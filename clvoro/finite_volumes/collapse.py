@@ -33,7 +33,7 @@ _SURE = 1.05
 """Margin of the suspects: areas of the diagram differ a little from those of the mesh."""
 
 
-def collapse_short(mesh: Faces, diagram: Diagram) -> Faces:
+def collapse_short(mesh: Faces, diagram: Diagram, unwanted: np.ndarray | None = None) -> Faces:
     """Return `mesh` without edges shorter than 0.02 h and faces smaller than 0.001 h^2, where its cells stay valid.
 
     Faces smaller than 0.02 h^2 whose skewness exceeds 1.8 are collapsed, too.
@@ -48,11 +48,17 @@ def collapse_short(mesh: Faces, diagram: Diagram) -> Faces:
     mesh : Faces
         Of the diagram, in 3D.
     diagram : Diagram
+    unwanted : (f,) bool, optional
+        Faces that are collapsed whatever their size.
     """
     suspects = _suspects(mesh, diagram)
+    if unwanted is not None:
+        suspects |= unwanted
     if not suspects.any():
         return mesh.compact()
     cells, faces = _fold(mesh, diagram)
+    if unwanted is not None:
+        cells.unwanted = unwanted[faces]
     scan = _Scan(cells, np.flatnonzero(suspects[faces]))
     cells.prepare(scan.vertices)
     for cells.limits in LIMITS:
@@ -196,6 +202,7 @@ class _Scan:
         self.small = area < SMALL_FACE * h**2
         rows = ~self.small & (area < _SKEWED_FACE * h**2) & (cells.neighbor[self.faces] >= 0)
         self.small[rows] = self._skewness(np.flatnonzero(rows), x, twice) > SKEWED
+        self.small |= cells.unwanted[self.faces]
 
     @property
     def flagged(self) -> np.ndarray:

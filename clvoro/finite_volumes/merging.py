@@ -134,6 +134,8 @@ class MergingCells:
         Packed offset of the neighbor's image.
     touched : (n,) bool
         Cells that a merge has changed.
+    unwanted : (f,) bool
+        Faces that are collapsed whatever their size.
     centroids : (n, 3) float
         Where the cells had their centroids before all merges.
     changed, edited : (f,) bool
@@ -174,6 +176,7 @@ class MergingCells:
         self.touched = np.zeros(self.n, bool)
         self.changed, self.edited = np.zeros((2, len(self.owner)), bool)
         self.edited[:] = diagram.domain.wall_triangles is not None  # there faces are not quite plane
+        self.unwanted = np.zeros(len(self.owner), bool)
         self._places = [np.full(k, -1, np.int32) for k in (v, self.n, len(self.owner))]
 
     # Positions.

@@ -13,7 +13,9 @@ from ...errors import InputError
 from ...mesh.connectivity import distinct, following, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
+from ..collapse import collapse_short
 from .chains import Crossings, cross_cells
+from .mend import narrow_faces
 from .pierce import IN, WALL, pierce_edges, sides
 from .polygons import Divider, chain_loops, open_sides
 from .trimmed_faces import TrimmedFaces, trim_faces
@@ -108,7 +110,8 @@ def solid_diagram(solid: Solid, points: np.ndarray, sizes: np.ndarray, whole: Di
             f"{solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first at "
             f"{place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
         )
-    return diagram_of(made.faces)
+    diagram = diagram_of(made.faces)
+    return diagram_of(collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes)))
 
 
 def diagram_of(faces: Faces) -> Diagram:

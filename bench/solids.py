@@ -1,0 +1,157 @@
+"""Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
+
+    python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
+                           [--keep FOLDER] [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
+
+The solids are in `bench/_solid_shapes.py`; they need trimesh, manifold3d, shapely, networkx and, for the gyroid,
+scikit-image. Each is meshed at two uniform sizes with default settings, and written as polyMesh. A row has the number
+of cells, mean |e| of the sizes and mean isoperimetric quotient, the largest and mean non-orthogonality, the largest
+skewness, the number of concave cells, the volume of all cells over that of the solid, and the verdict.
+
+--runs is a list of efforts and "exact". With `--booleans N` the solids are N random booleans of boxes, balls and
+cylinders. Pictures show each mesh cut open, with the patches in colors.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _common import Report, heading, make_adapter, names, parser
+from _solid_shapes import SHAPES, random_part, solid_of
+
+import clvoro
+from clvoro.errors import ClvoroError
+from clvoro.io.check_mesh import CheckMeshResult, check_case
+
+NUMBER = r"([-+.\deE]*\d)"
+FIGURES = {
+    "non_orthogonality": rf"non-orthogonality Max: {NUMBER}",
+    "mean_non_orthogonality": rf"non-orthogonality Max: {NUMBER} average: {NUMBER}",
+    "skewness": rf"Max skewness = {NUMBER}",
+    "concave": r"Concave cells .*number of cells: (\d+)",
+}
+COLUMNS = {
+    "solid": lambda r: r["solid"],
+    "run": lambda r: r["run"],
+    "h": lambda r: f"{r['h']:g}",
+    "cells": lambda r: r["cells"],
+    "s": lambda r: f"{r['seconds']:.1f}",
+    "mean e": lambda r: f"{r['error']:.4f}",
+    "quotient": lambda r: f"{r['quotient']:.3f}",
+    "non-orth. max, mean": lambda r: f"{r['non_orthogonality']:.1f}, {r['mean_non_orthogonality']:.2f}",
+    "skewness": lambda r: f"{r['skewness']:.2f}",
+    "concave": lambda r: f"{r['concave']:.0f}",
+    "volume": lambda r: f"{r['volume']:.5f}",
+    "checkMesh": lambda r: "Mesh OK" if r["ok"] else f"fails: {r['complaints'][:120]}",
+}
+
+
+def figures_of(verdict: CheckMeshResult) -> dict[str, Any]:
+    """Return the figures in the output of checkMesh, and what it says of the mesh."""
+    matches = {name: re.search(pattern, verdict.text) for name, pattern in FIGURES.items()}
+    found = {k: float(m.group(m.lastindex or 1)) if m else 0.0 for k, m in matches.items()}
+    return {**found, "ok": verdict.ok, "complaints": "; ".join(line[:60] for line in verdict.complaints)}
+
+
+def quotient(diagram: clvoro.Diagram) -> float:
+    """Return the mean over the cells of 36 pi V^2 / A^3."""
+    area = np.add.reduceat(diagram.face_measures, diagram.neighbor_starts[:-1])
+    return float((36 * np.pi * diagram.volumes**2 / area**3).mean())
+
+
+def measure(adapter: clvoro.Adapter, solid: clvoro.Solid, h: float, case: Path, **settings: Any) -> dict[str, Any]:
+    """Adapt, write and check a mesh; return its figures."""
+    begin = time.perf_counter()
+    result = adapter.run(solid, h, **settings)
+    seconds = time.perf_counter() - begin
+    result.save(case / "constant" / "polyMesh")
+    verdict = check_case(case)
+    (case / "checkMesh.log").write_text(verdict.text)
+    d = result.diagram
+    return {
+        "result": result,
+        "cells": len(d),
+        "seconds": seconds,
+        "error": float(np.abs(result.size_error).mean()),
+        "quotient": quotient(d),
+        "volume": float(d.volumes.sum() / solid.measure),
+        **figures_of(verdict),
+    }
+
+
+def draw(result: clvoro.Result, path: Path, title: str) -> None:
+    """Draw the mesh, cut open, with the patches in colors."""
+    from clvoro.plotting.solids import plot_cutaway
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_cutaway(result, "boundary", title=title).savefig(path, dpi=150)
+
+
+def main() -> None:
+    """Run the bench."""
+    options_of = parser(__doc__)
+    options_of.add_argument("--only", default="", metavar="NAMES", help=", ".join(SHAPES))
+    options_of.add_argument("--runs", default="default", metavar="NAMES", help="efforts, and exact")
+    options_of.add_argument("--seeds", type=int, default=0, metavar="N", help="one run with each of 1 to N")
+    options_of.add_argument("--resolutions", default="0,1", metavar="NUMBERS", help="0: coarse, 1: fine")
+    options_of.add_argument("--booleans", type=int, default=0, metavar="N", help="random solids in place of those")
+    options_of.add_argument("--size", type=float, default=0.12, help="of the cells of random solids")
+    options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
+    options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
+    options = options_of.parse_args()
+    if shutil.which("checkMesh") is None:
+        raise SystemExit("checkMesh is not installed; Debian has it in the package openfoam")
+    adapter = make_adapter(options)
+    report = Report(options.json, COLUMNS)
+    levels = [int(k) for k in names(options.resolutions)]
+    cases: list[tuple[str, Any, float]] = []
+    if options.booleans:
+        cases = [(f"boolean {k}", lambda k=k: random_part(k), options.size) for k in range(options.booleans)]
+    else:
+        for name in names(options.only) or SHAPES:
+            make, sizes = SHAPES[name]
+            cases += [(name, make, sizes[k]) for k in levels]
+    runs = [(run, {"method": "exact"} if run == "exact" else {"effort": run}) for run in names(options.runs)]
+    seeds = [{"seed": k + 1} for k in range(options.seeds)] or [{}]
+    for name, make, h in cases:
+        for run, settings in runs:
+            for seed in seeds:
+                label = f"{name}-{run}-{h:g}-{seed.get('seed', 0)}".replace(" ", "-")
+                row: dict[str, Any] = {"solid": name, "run": run, "h": h, **dict.fromkeys(_EMPTY, float("nan"))}
+                with tempfile.TemporaryDirectory() as folder:
+                    case = Path(folder) if options.keep is None else options.keep / label
+                    try:
+                        row |= measure(adapter, solid_of(make()), h, case, **settings, **seed)
+                        if options.pictures is not None:
+                            draw(row["result"], options.pictures / f"{label}.png", f"{name}, h = {h:g}")
+                    except ClvoroError as error:
+                        row |= {"ok": False, "cells": 0, "complaints": f"{type(error).__name__}: {error}"}
+                    except Exception:  # what must never happen is a row, too
+                        row |= {"ok": False, "cells": 0, "complaints": traceback.format_exc(limit=-1)[-100:]}
+                row.pop("result", None)
+                report.add(row, f"{label}: {'OK' if row['ok'] else row['complaints']}")
+    good = sum(row["ok"] for row in report.records)
+    report.finish(heading(adapter, f"{good} of {len(report.records)} meshes pass checkMesh"))
+
+
+_EMPTY = (
+    "seconds",
+    "error",
+    "quotient",
+    "non_orthogonality",
+    "mean_non_orthogonality",
+    "skewness",
+    "concave",
+    "volume",
+)
+
+
+if __name__ == "__main__":
+    main()
