@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 _LEAF = 4  # items per leaf at most
-_BLOCK = 1 << 18  # points per batch
+_BLOCK = 1 << 9  # points per batch: its pairs with boxes and items stay in the caches
 
 
 class Tree:

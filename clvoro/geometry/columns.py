@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_BLOCK = 1 << 20  # pairs of a point and a triangle per batch
+_BLOCK = 1 << 15  # pairs of a point and a triangle per batch
 _MOST = 1 << 20  # columns at most
 
 
@@ -33,6 +33,9 @@ class Columns:
         # Axes in the order (across, axis) are turned like (x, y, z), or not.
         self.turn = -1 if self.axis == 1 else 1
         self.corners = corners
+        low, high = flat.min(axis=1), flat.max(axis=1)
+        self._bounds = low[:, 0], high[:, 0], low[:, 1], high[:, 1], corners[:, :, self.axis].max(axis=1)
+        self._sides = [self._side(flat[:, k], flat[:, (k + 1) % 3]) for k in range(3)]
         each = np.where(seen, count.prod(axis=1), 0)
         item = np.repeat(np.arange(len(corners)), each)
         place = np.arange(len(item)) - np.repeat(np.cumsum(each) - each, each)
@@ -57,6 +60,18 @@ class Columns:
     def _column(self, flat: np.ndarray, across: np.ndarray, step: np.ndarray, shape: np.ndarray) -> np.ndarray:
         return np.clip(np.floor((flat - self.low[across]) / step), 0, shape - 1).astype(np.int64)
 
+    @staticmethod
+    def _side(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return sides from p to q (t, 2) upwards, as both of their triangles take them.
+
+        Two coordinates of the lower end, the vector (two arrays), the height of the upper end, and 1 or -1 for sides
+        that are reversed.
+        """
+        upwards = (p[:, 1] < q[:, 1]) | ((p[:, 1] == q[:, 1]) & (p[:, 0] < q[:, 0]))
+        begin, end = np.where(upwards[:, None], p, q), np.where(upwards[:, None], q, p)
+        along = end - begin
+        return *begin.T.copy(), *along.T.copy(), end[:, 1].copy(), np.where(upwards, 1.0, -1.0)
+
     def winding(self, points: np.ndarray) -> np.ndarray:
         """Return how often the surface winds around each of `points` (n, 3), (n,) int: 1 inside, 0 outside.
 
@@ -70,36 +85,34 @@ class Columns:
         ends = np.cumsum(count)
         for begin, end in _batches(ends):
             mine, n = who[begin:end], count[begin:end]
-            point = np.repeat(mine, n)
-            place = np.arange(len(point)) - np.repeat(np.cumsum(n) - n, n)
+            local = np.repeat(np.arange(end - begin), n)
+            place = np.arange(len(local)) - np.repeat(np.cumsum(n) - n, n)
             item = self.items[np.repeat(self.starts[column[begin:end]], n) + place]
-            wound += np.bincount(point, self._crossed(points[point], item), len(points)).astype(np.int64)
+            crossed = self._crossed(points[mine[local]], item)
+            wound[mine] += np.bincount(local, crossed, end - begin).astype(np.int64)
         return self.turn * wound
 
     def _crossed(self, x: np.ndarray, item: np.ndarray) -> np.ndarray:
         """Return how a ray from each point x (m, 3) crosses its triangle: 1, -1 or 0."""
-        u, v = self.across
-        above = self.corners[item, :, self.axis].max(axis=1) > x[:, self.axis]
-        wound = np.zeros(len(x), np.int64)
-        rows = np.flatnonzero(above)
-        x, item = x[rows], item[rows]
-        corner = self.corners[item]
-        sides = np.zeros((len(x), 3))  # twice the areas of the point and each side
-        turn = np.zeros(len(x), np.int64)
+        u, v, w = (np.ascontiguousarray(x[:, a]) for a in (*self.across, self.axis))
+        low_u, high_u, low_v, high_v, high_w = self._bounds
+        near = (low_u[item] <= u) & (u <= high_u[item]) & (low_v[item] <= v) & (v <= high_v[item]) & (high_w[item] > w)
+        rows = np.flatnonzero(near)
+        u, v, w, item = u[rows], v[rows], w[rows], item[rows]
+        areas = np.zeros((3, len(item)))  # twice the areas of the point and each side
+        turn = np.zeros(len(item), np.int64)
         for k in range(3):
-            p, q = corner[:, k], corner[:, (k + 1) % 3]
-            up = p[:, v] < q[:, v]
-            swap = up | ((p[:, v] == q[:, v]) & (p[:, u] < q[:, u]))
-            lo, hi = np.where(swap[:, None], p, q), np.where(swap[:, None], q, p)
-            side = (hi[:, u] - lo[:, u]) * (x[:, v] - lo[:, v]) - (hi[:, v] - lo[:, v]) * (x[:, u] - lo[:, u])
-            sides[:, k] = np.where(swap, side, -side)
-            meets = (p[:, v] > x[:, v]) != (q[:, v] > x[:, v])
-            turn += np.where(meets & (side > 0), np.where(up, 1, -1), 0)
-        weight = np.maximum(sides * np.where(turn < 0, -1, 1)[:, None], 0)
-        total = weight.sum(axis=1)
-        weight = np.where(total[:, None] > 0, weight / np.where(total > 0, total, 1)[:, None], 1 / 3)
-        height = (weight * corner[:, [2, 0, 1], self.axis]).sum(axis=1)
-        wound[rows] = np.where(height > x[:, self.axis], turn, 0)
+            begin_u, begin_v, along_u, along_v, end_v, up = (part[item] for part in self._sides[k])
+            area = along_u * (v - begin_v) - along_v * (u - begin_u)
+            areas[k] = up * area
+            turn += np.where((begin_v <= v) & (v < end_v) & (area > 0), up, 0).astype(np.int64)
+        weight = np.maximum(areas * np.where(turn < 0, -1, 1), 0)
+        total = weight.sum(axis=0)
+        weight = np.where(total > 0, weight / np.where(total > 0, total, 1), 1 / 3)
+        heights = self.corners[item, :, self.axis]
+        height = weight[0] * heights[:, 2] + weight[1] * heights[:, 0] + weight[2] * heights[:, 1]
+        wound = np.zeros(len(x), np.int64)
+        wound[rows] = np.where(height > w, turn, 0)
         return wound
 
 

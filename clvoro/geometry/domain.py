@@ -305,6 +305,24 @@ class Domain(ABC):
         inside = (points >= self.lower) & (points <= self.upper)
         return np.all(inside | (np.array(self.periodic) & np.isfinite(points)), axis=1)
 
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) whether it lies in the domain; on a wall it may or may not. Fast."""
+        return self.contains(points)
+
+    def contains_well(self, points: np.ndarray, margin: float) -> np.ndarray:
+        """Return for each of `points` (n, d) whether it is inside, at least `margin` from the boundary."""
+        return self.contains(points) & (self.boundary_distance(points) >= margin)
+
+    def meets_wall(self, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        """Return for boxes with the corners `lower`, `upper` (n, d) whether walls may meet them, (n,) bool."""
+        middle, reach = (lower + upper) / 2, np.linalg.norm(upper - lower, axis=1) / 2
+        return self.boundary_distance(middle) <= reach
+
+    def just_inside(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) the nearest wall's point, moved inwards by `depth` (n,)."""
+        normals, gaps = self.toward_walls(self.closest_walls(points), points)
+        return points + (gaps - depth)[:, None] * normals
+
     def check_rows(self, name: str, points: object) -> np.ndarray:
         """Return `points`, an array_like of real numbers, as a float64 array (n, d); see `arguments.check_rows`."""
         return check_rows(name, points, self.dim)

@@ -18,7 +18,7 @@ from ..files import open_plain, unlogged
 from .bvh import Tree
 from .columns import Columns
 from .shapes import coordinates
-from .triangles import crossing, triangle_distance2
+from .triangles import crossing, packed_rows, packed_weights
 
 _FORMATS = ("stl", "obj", "ply", "off")
 _BLOCK = 1 << 18  # pairs of triangles, or of a point and a triangle, per batch
@@ -150,6 +150,11 @@ class Surface:
     def corners(self) -> np.ndarray:
         """Corners of the triangles, (t, 3, 3) float."""
         return self.vertices[self.triangles]
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """What distances to the triangles need, (t, 21); see `packed_rows`."""
+        return packed_rows(self.corners)
 
     @cached_property
     def _unit_corners(self) -> np.ndarray:
@@ -294,7 +299,7 @@ class Surface:
         """Return the squared distances of `points` (n, 3) to the surface, (n,) float64."""
         used = self.vertices[np.unique(self.triangles)]
         bound = scipy.spatial.KDTree(used).query(points)[0] * (1 + 1e-12)
-        return self.tree.nearest2(points, bound**2, lambda x, item: triangle_distance2(x, self.corners[item]))
+        return self.tree.nearest2(points, bound**2, lambda x, item: packed_weights(x, self.rows[item])[2])
 
     def landmarks(self, spacing: float, most: int) -> np.ndarray:
         """Return at most `most` points on the surface, about `spacing` apart."""
@@ -312,26 +317,12 @@ class Surface:
     def packed(self, origin: np.ndarray, scale: float, real: np.dtype) -> tuple[np.ndarray, Tree]:
         """Return the triangles as the device takes them, (t, 21) in the order of the tree, and the tree.
 
-        A row has a corner a; the sides b - a and c - a; two vectors whose products with x - a are the coordinates s and
-        t of x along the sides; the unit normal; and 1 / length^2 of b - a, c - a and c - b. Coordinates are
-        x' = (x - origin) / scale. They are rounded to `real` first, so that the rest is consistent with them. The
-        normal of a triangle thinner than 1e-7 of its length is 0: it counts as its three sides.
+        See `packed_rows`. Coordinates are x' = (x - origin) / scale. They are rounded to `real` first, so that the rest
+        is consistent with them.
         """
         corners = ((self.corners - origin) / scale).astype(real)
         tree = Tree(corners.min(axis=1), corners.max(axis=1))
-        corners = corners[tree.order].astype(float)
-        a, side1, side2 = (corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal = np.cross(side1, side2)
-        double_area = np.linalg.norm(normal, axis=1)
-        length2 = np.column_stack([(v**2).sum(axis=1) for v in (side1, side2, side2 - side1)])
-        longest = length2.max(axis=1)
-        sound = double_area > 1e-7 * longest
-        normal = np.where(sound[:, None], normal / np.where(sound, double_area, 1)[:, None], 0)
-        over = np.divide(1, double_area, out=np.zeros_like(double_area), where=sound)[:, None]
-        s, t = np.cross(side2, normal) * over, np.cross(normal, side1) * over
-        tiny = 4 * float(np.finfo(real).tiny)
-        inverse = np.divide(1, length2, out=np.zeros_like(length2), where=length2 > tiny)
-        return np.hstack([a, side1, side2, s, t, normal, inverse]), tree
+        return packed_rows(corners[tree.order].astype(float), real), tree
 
     def __len__(self) -> int:
         return len(self.triangles)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 _TOUCH = 1e-9  # of the size of a pair: a smaller overlap counts as contact
 
@@ -20,51 +21,6 @@ def segment_distance2(x: np.ndarray, begin: np.ndarray, vector: np.ndarray) -> n
     return _dot(v, v)
 
 
-def triangle_distance2(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return the squared distances of points (m, 3) to triangles (m, 3, 3), row by row.
-
-    The distance is that to the plane if the foot of the perpendicular is in the triangle, that is, if
-    n . (side x (x - corner)) >= 0 for all three sides. Otherwise it is that to the nearest side.
-    """
-    sides = np.roll(corners, -1, axis=1) - corners
-    normal = np.cross(sides[:, 0], sides[:, 1])
-    area2 = _dot(normal, normal)
-    inside = area2 > 0
-    best2 = np.full(len(x), np.inf)
-    for k in range(3):
-        best2 = np.minimum(best2, segment_distance2(x, corners[:, k], sides[:, k]))
-        inside &= _dot(np.cross(sides[:, k], x - corners[:, k]), normal) >= 0
-    height = _dot(x - corners[:, 0], normal) ** 2
-    return np.where(inside, height / np.where(inside, area2, 1), best2)
-
-
-def closest_on_triangle(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return the weights (m, 3) of the corners in the point of each triangle (m, 3, 3) nearest to each point x (m, 3).
-
-    A weight is exactly 0 where that point lies on the opposite side.
-    """
-    sides = np.roll(corners, -1, axis=1) - corners
-    normal = np.cross(sides[:, 0], sides[:, 1])
-    area2 = _dot(normal, normal)
-    weights = np.zeros((len(x), 3))
-    inside = area2 > 0
-    for k in range(3):
-        part = _dot(np.cross(sides[:, k], x - corners[:, k]), normal)
-        weights[:, (k + 2) % 3] = part / np.where(area2 > 0, area2, 1)
-        inside &= part >= 0
-    best2 = np.where(inside, -1.0, np.inf)
-    for k in range(3):
-        v, side = x - corners[:, k], sides[:, k]
-        length2 = _dot(side, side)
-        t = np.clip(np.divide(_dot(v, side), length2, out=np.zeros(len(x)), where=length2 > 0), 0, 1)
-        v = v - t[:, None] * side
-        d2 = _dot(v, v)
-        closer = d2 < best2
-        best2 = np.where(closer, d2, best2)
-        weights[closer, k], weights[closer, (k + 1) % 3], weights[closer, (k + 2) % 3] = 1 - t[closer], t[closer], 0
-    return weights
-
-
 def pierced(begin: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Return where each segment from `begin` to `end` (m, 3) meets its triangle (m, 3, 3): the share (m,), or inf."""
     along = end - begin
@@ -75,6 +31,69 @@ def pierced(begin: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarr
     sides = np.stack([_dot(along, np.cross(p, q)) for p, q in ((a, b), (b, c), (c, a))])
     meets = ((sides >= 0).all(axis=0) | (sides <= 0).all(axis=0)) & (share >= 0) & (share <= 1)
     return np.where(meets, share, np.inf)
+
+
+def packed_rows(corners: np.ndarray, real: DTypeLike = np.float64) -> np.ndarray:
+    """Return what distances to triangles (t, 3, 3) need, (t, 21).
+
+    A row has a corner a; the sides b - a and c - a; two vectors whose products with x - a are the coordinates s and t
+    of x along the sides; the unit normal; and 1 / length^2 of b - a, c - a and c - b, or 0 where that overflows `real`.
+    The normal of a triangle thinner than 1e-7 of its length is 0: it counts as its three sides.
+    """
+    a, side1, side2 = (corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = np.cross(side1, side2)
+    double_area = np.linalg.norm(normal, axis=1)
+    length2 = np.column_stack([(v**2).sum(axis=1) for v in (side1, side2, side2 - side1)])
+    longest = length2.max(axis=1)
+    sound = double_area > 1e-7 * longest
+    normal = np.where(sound[:, None], normal / np.where(sound, double_area, 1)[:, None], 0)
+    over = np.divide(1, double_area, out=np.zeros_like(double_area), where=sound)[:, None]
+    s, t = np.cross(side2, normal) * over, np.cross(normal, side1) * over
+    tiny = 4 * float(np.finfo(real).tiny)
+    inverse = np.divide(1, length2, out=np.zeros_like(length2), where=length2 > tiny)
+    return np.hstack([a, side1, side2, s, t, normal, inverse])
+
+
+def packed_weights(x: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where the point of each triangle nearest to each point x (m, 3) is, and the squared distance.
+
+    Parameters
+    ----------
+    x : (m, 3) float
+    rows : (m, 21) float
+        The triangles, from `packed_rows`.
+
+    Returns
+    -------
+    s, t : (m,) float
+        The point is a + s (b - a) + t (c - a). On a side s, t or 1 - s - t is 0 to round-off.
+    distance2 : (m,) float
+    """
+    x0, x1, x2 = (x - rows[:, :3]).T
+
+    def along(k: int) -> np.ndarray:
+        return x0 * rows[:, k] + x1 * rows[:, k + 1] + x2 * rows[:, k + 2]
+
+    s, t, height = along(9), along(12), along(15)
+    outside = np.flatnonzero(~((s >= 0) & (t >= 0) & (s + t <= 1) & rows[:, 15:18].any(axis=1)))
+    distance2 = height * height
+    if outside.size:
+        x0, x1, x2, rows = x0[outside], x1[outside], x2[outside], rows[outside]
+        u, v = along(3), along(6)
+        sides = (rows[:, 6:9] - rows[:, 3:6]).T
+        y0, y1, y2 = x0 - rows[:, 3], x1 - rows[:, 4], x2 - rows[:, 5]
+        w = y0 * sides[0] + y1 * sides[1] + y2 * sides[2]
+        p, q, r = (np.clip(value * rows[:, 18 + k], 0, 1) for k, value in enumerate((u, v, w)))
+        best = np.full(len(outside), np.inf)
+        for first, second in ((p, 0 * p), (0 * q, q), (1 - r, r)):
+            z = (y - first * rows[:, 3 + k] - second * rows[:, 6 + k] for k, y in enumerate((x0, x1, x2)))
+            d2 = sum(part * part for part in z)
+            closer = d2 < best
+            best = np.where(closer, d2, best)
+            s[outside] = np.where(closer, first, s[outside])
+            t[outside] = np.where(closer, second, t[outside])
+        distance2[outside] = best
+    return s, t, distance2
 
 
 def crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:

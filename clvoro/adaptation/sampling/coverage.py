@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _LEAST = 1e-12  # share of a box below which it counts as outside
 _SLIVER = 1e-9  # share of a box that may be outside if it counts as inside
-_SIDE = 3  # points along each edge of a box that a surface cuts
+_MOST_ROOTS = 1 << 16  # boxes among which a first one inside of a solid is sought
 _COLLECTION = 7  # shapely's number of a GeometryCollection
 _PLAIN_TRIES = 20  # draws in a cut box before they are moved towards its inner point
 
@@ -28,6 +28,9 @@ class FullCoverage:
         Changed by `split`.
     """
 
+    correction: np.ndarray | float = 1.0
+    """By what the last split has changed the shares of the boxes that it split, (c,): 1 if they are exact."""
+
     def __init__(self, boxes: BoxTree):
         self.boxes = boxes
 
@@ -39,6 +42,10 @@ class FullCoverage:
     def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Split the boxes where `chosen` (m,) is true; see `BoxTree.split`."""
         return self.boxes.split(chosen)
+
+    def balance(self) -> float:
+        """Return the measure of the domain in units of that of all shares."""
+        return 1.0
 
     def scale_by_share(self, values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Return `values` (c, ...) of the boxes where `chosen` is true times their share inside the domain."""
@@ -113,48 +120,122 @@ class CutCoverage(FullCoverage):
 
 
 class SolidCoverage(CutCoverage):
-    """Boxes over a solid, cut by its surface. Shares are those of a grid of points, scaled to the volume of the solid.
+    """Boxes over a domain in space, whose shares inside are counted at samples.
 
-    Parameters
+    The shares of the parts of a box are scaled so that their sum is that of the box, and those of all boxes to the
+    measure of the domain. Boxes that the surface does not meet are examined no more.
+
+    Attributes
     ----------
-    boxes : BoxTree
-    domain : Domain
-        One with `wall_triangles`.
+    share : (m,) float
+        Share of each box's volume inside the domain.
+    inner : (m, d) float
+        A point inside the domain and the box, for cut boxes with a share.
     """
 
     def __init__(self, boxes: BoxTree, domain: Domain):
         super().__init__(boxes, domain)
-        self._sample(np.arange(len(boxes)))
+        m, dim = len(boxes), boxes.dim
+        self.share, self.inner, self._cut = np.zeros(m), np.zeros((m, dim)), np.ones(m, bool)
+        self._examine(np.arange(m))
+        while self.share.sum() == 0 and m < _MOST_ROOTS:  # a thin solid in a large box
+            self.boxes.split(np.ones(m, bool))
+            m = len(boxes)
+            self.share, self.inner, self._cut = np.zeros(m), np.zeros((m, dim)), np.ones(m, bool)
+            self._examine(np.arange(m))
+        volumes = boxes.volumes()
+        self._conserve(np.flatnonzero(self._cut), np.zeros(m, np.int64), np.array([domain.measure]), volumes)
 
     def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Split the boxes where `chosen` (m,) is true; see `BoxTree.split`."""
         parent, child = self.boxes.split(chosen)
-        self.share, self.inner = self.share[parent], self.inner[parent]
-        self._sample(np.flatnonzero((child >= 0) & (self.share > 0) & (self.share < 1)))
+        before, one = self.share, np.ones(len(parent))
+        self.share, self.inner, self._cut = (a[parent] for a in (self.share, self.inner, self._cut))
+        rows = np.flatnonzero((child >= 0) & self._cut & (self.share > 0))
+        if rows.size:
+            self._examine(rows)
+            family = parent[rows]
+            count = np.bincount(family, minlength=len(before))
+            self._conserve(rows[self._cut[rows]], parent, before * count, one)
+        after = np.bincount(parent, self.share, len(before)) / np.bincount(parent, one, len(before))
+        self.correction = np.divide(after, before, out=np.ones(len(before)), where=before > 0)[chosen]
         return parent, child
 
-    def _sample(self, rows: np.ndarray) -> None:
-        """Find the shares of the boxes `rows`."""
-        middle = self.boxes.points(np.full((1, 3), 0.5), rows)[:, 0]
-        reach = np.linalg.norm(self.boxes.edges(rows), axis=1) / 2
-        cut = self.domain.boundary_distance(middle) <= reach
-        self.share[rows[~cut]] = self.contains(middle[~cut])
-        at = (np.stack(np.meshgrid(*[np.arange(_SIDE)] * 3), axis=-1).reshape(-1, 3) + 0.5) / _SIDE
-        points = self.boxes.points(at, rows[cut])
-        inside = self.contains(points.reshape(-1, 3)).reshape(points.shape[:2])
-        # A box with all points inside is cut nevertheless.
-        self.share[rows[cut]] = np.minimum(inside.mean(axis=1), 1 - _SLIVER)
-        self.inner[rows[cut]] = points[np.arange(len(points)), inside.argmax(axis=1)]
-        volumes = self.boxes.volumes()
-        part = (self.share > 0) & (self.share < 1)
-        whole, parts = volumes[self.share == 1].sum(), (volumes * self.share)[part].sum()
-        if parts > 0:
-            self.share[part] *= max(self.domain.measure - whole, 0.1 * parts) / parts
+    def _conserve(self, cut: np.ndarray, family: np.ndarray, wanted: np.ndarray, volume: np.ndarray) -> None:
+        """Change the shares of the cut boxes so that the volumes of each family sum up to `wanted`, if they can.
+
+        Parameters
+        ----------
+        cut : (c,) int
+        family : (m,) int
+            Of each box.
+        wanted : (f,) float
+        volume : (m,) float
+            Of each box.
+        """
+        part = volume[cut] * self.share[cut]
+        kin = family[cut]
+        has = np.bincount(kin, part, len(wanted))
+        room = np.bincount(kin, np.where(part > 0, volume[cut] - part, 0), len(wanted))
+        whole = np.bincount(family, volume * self.share, len(wanted)) - has
+        lacks = wanted - whole - has
+        with np.errstate(divide="ignore", invalid="ignore"):
+            more = np.where(room > 0, np.clip(lacks / room, 0, 1), 0)[kin]
+            less = np.where(has > 0, np.clip(-lacks / has, 0, 0.99), 0)[kin]
+        share = self.share[cut]
+        self.share[cut] = np.where(share > 0, share + more * (1 - share) - less * share, 0)
+
+    def _examine(self, rows: np.ndarray) -> None:
+        """Find the shares and inner points of the boxes `rows`."""
+        corners = self.boxes.points(np.array([[0.0] * self.boxes.dim, [1.0] * self.boxes.dim]), rows)
+        cut = self.domain.meets_wall(corners[:, 0], corners[:, 1])
+        self._cut[rows] = cut
+        center = corners.mean(axis=1)
+        self.share[rows] = self.domain.covers(center)
+        self.inner[rows] = center
+        rows, corners, center = rows[cut], corners[cut], center[cut]
+        if not rows.size:
+            return
+        k = 2 if len(rows) > 1 << 15 else 3 if len(rows) > 1 << 12 else 5
+        at = (np.stack(np.meshgrid(*[np.arange(k)] * self.boxes.dim, indexing="ij"), axis=-1) + 0.5) / k
+        at = at.reshape(-1, self.boxes.dim)
+        x = self.boxes.points(at, rows)
+        inside = self.domain.covers(x.reshape(-1, self.boxes.dim)).reshape(len(rows), -1)
+        self.share[rows] = inside.mean(axis=1)
+        first = np.argsort(np.abs(at - 0.5).max(axis=1), kind="stable")  # samples near the center are preferred
+        best = first[inside[:, first].argmax(axis=1)]
+        self.inner[rows] = x[np.arange(len(rows)), best]
+        # A part thinner than the distance of samples: a point just inside of the surface.
+        thin = np.flatnonzero(~inside.any(axis=1))
+        found = self.domain.just_inside(center[thin], 1e-3 * (corners[thin, 1] - corners[thin, 0]).min(axis=1))
+        there = ((found > corners[thin, 0]) & (found < corners[thin, 1])).all(axis=1) & self.domain.covers(found)
+        self.inner[rows[thin[there]]] = found[there]
+        self.share[rows[thin[there]]] = 0.25 / len(at)
+
+    def balance(self) -> float:
+        """Return the measure of the domain in units of that of all shares."""
+        return self.domain.measure / float((self.share * self.boxes.volumes()).sum())
+
+    def move_inside(self, points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """Return `points` (c, p, d), with those outside the domain replaced by the inner point of their box."""
+        cut = np.flatnonzero(self._cut[chosen])
+        mine = points[cut]
+        out = ~self.domain.covers(mine.reshape(-1, self.boxes.dim)).reshape(mine.shape[:2])
+        points = points.copy()
+        points[cut] = np.where(out[:, :, None], self.inner[chosen][cut][:, None, :], mine)
+        return points
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 3) in the boxes whether it is inside the domain, (n,) bool."""
+        return self.domain.covers(points)
 
     def draw(self, at: np.ndarray, box: np.ndarray, attempt: int) -> np.ndarray:
-        """Return the points at relative positions `at` (n, 3) in the boxes `box` (n,); see `FullCoverage.draw`."""
+        """Return the points at relative positions `at` (n, d) in [0, 1] in the boxes `box` (n,).
+
+        After many attempts those in cut boxes approach its inner point.
+        """
         x = super().draw(at, box, attempt)
-        self._nearer(x, box, np.flatnonzero(self.share[box] != 1), attempt)
+        self._nearer(x, box, np.flatnonzero(self._cut[box]), attempt)
         return x
 
 

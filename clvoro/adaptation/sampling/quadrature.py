@@ -127,6 +127,7 @@ class DensityTree:
             if not chosen.any():
                 break
             self._refine(chosen)
+        self.cells *= self.coverage.balance()
 
     @property
     def integral(self) -> float:
@@ -261,7 +262,7 @@ class DensityTree:
         first = np.searchsorted(parent, np.arange(len(chosen)))
         self._landmark_box = first[box] + child_rank
         fresh = child >= 0
-        before = self.cells[chosen]
+        before = self.cells[chosen] * self.coverage.correction
         for name in ("cells", "_differences", "_low", "_high", "slopes", "slopes_of_size"):
             setattr(self, name, getattr(self, name)[parent])
         self._integrate(fresh)

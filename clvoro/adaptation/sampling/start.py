@@ -258,7 +258,7 @@ def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) ->
         margin = _ULPS * float(np.finfo(working.dtype).eps) * scale
         return domain.outline.contains_well(points, margin)
     if domain.wall_triangles is not None:
-        return domain.contains(points)
+        return domain.contains_well(points, _ULPS * float(np.finfo(working.dtype).eps) * scale)
     lower, upper = (((np.array(c) - origin) / scale).astype(working.dtype) for c in (domain.lower, domain.upper))
     bad = ((working <= lower) | (working >= upper)).any(axis=1)
     bad |= ((points <= domain.lower) | (points >= domain.upper)).any(axis=1)

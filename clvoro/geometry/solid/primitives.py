@@ -64,10 +64,11 @@ def turned(begin: Sequence[float], end: Sequence[float], flat: np.ndarray) -> np
 
 def cylinder(begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None) -> dict[str, Any]:
     """Return a cylinder around the axis from `begin` to `end`, with the groups side, bottom and top."""
-    edge = radius / _FINE if edge is None else edge
     height = float(np.linalg.norm(np.subtract(end, begin)))
+    rise = radius if edge is None else edge
+    edge = radius / _FINE if edge is None else edge
     n = max(12, math.ceil(2 * math.pi * radius / edge))
-    rows = max(1, round(height / edge))
+    rows = max(1, round(height / rise))
     turn = 2 * math.pi * np.arange(n) / n
     ring = np.column_stack([radius * np.cos(turn), radius * np.sin(turn)])
     z = height * np.arange(rows + 1) / rows

@@ -21,7 +21,7 @@ from ..bvh import Tree
 from ..columns import Columns
 from ..domain import Domain
 from ..surface import Surface
-from ..triangles import closest_on_triangle, pierced, triangle_distance2
+from ..triangles import packed_weights, pierced
 from ..wall_triangles import WallTriangles
 from .creases import (
     CONCAVE,
@@ -48,7 +48,7 @@ class Feet:
     triangle : (n,) int
         -1 where nothing is near.
     weights : (n, 3) float
-        Weights of the triangle's corners in the foot; exactly 0 for the corner opposite to a side that it lies on.
+        Weights of the triangle's corners in the foot; 0 to round-off for the corner opposite to a side that it lies on.
     point : (n, 3) float
     distance : (n,) float
         inf where nothing is near.
@@ -58,6 +58,44 @@ class Feet:
     weights: np.ndarray
     point: np.ndarray
     distance: np.ndarray
+
+
+class NearestTriangles:
+    """Some triangles of a surface, to find the nearest points on them.
+
+    Parameters
+    ----------
+    surface : Surface
+    items : (m,) int
+        The triangles.
+    """
+
+    def __init__(self, surface: Surface, items: np.ndarray):
+        self.items = items
+        self.corners, self._rows = surface.corners[items], surface.rows[items]
+        self._tree = Tree(self.corners.min(axis=1), self.corners.max(axis=1))
+        self._vertices = scipy.spatial.KDTree(surface.vertices[np.unique(surface.triangles[items])])
+        self._tie = _ON * float(np.ptp(surface.vertices, axis=0).max())
+
+    def near(self, x: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return which of the points x (n, 3) are within `reach` (n,) of the bounding box, (n,) bool."""
+        low, high = self._tree.boxes[0, :3], self._tree.boxes[0, 3:]
+        return (np.maximum(np.maximum(low - x, x - high), 0) ** 2).sum(axis=1) <= reach**2
+
+    def feet(self, x: np.ndarray, reach: float) -> Feet:
+        """Return the nearest point of the triangles to each of the points x (n, 3), within `reach`."""
+        bound2 = np.full(len(x), reach * reach)
+        close = np.flatnonzero(np.isfinite(x).all(axis=1))
+        if reach > self._tie:
+            vertex = self._vertices.query(x[close], distance_upper_bound=reach)[0]
+            bound2[close] = np.minimum(bound2[close], (vertex + self._tie) ** 2)
+        best2, item = self._tree.nearest(x, bound2, lambda y, k: packed_weights(y, self._rows[k])[2])
+        found = item >= 0
+        weights = np.zeros((len(x), 3))
+        s, t, _ = packed_weights(x[found], self._rows[item[found]])
+        weights[found] = np.column_stack([1 - s - t, s, t])
+        point = np.einsum("nk,nkd->nd", weights, self.corners[item])
+        return Feet(np.where(found, self.items[item], -1), weights, point, np.where(found, np.sqrt(best2), math.inf))
 
 
 @dataclass(frozen=True)
@@ -208,42 +246,35 @@ class Solid(Domain):
     def _diagonal(self) -> float:
         return float(np.linalg.norm(self.extent))
 
-    @cached_property
-    def _spacing(self) -> float:
-        """Typical length of the triangles' edges."""
-        return math.sqrt(2 * self.boundary_measure / len(self.patch))
-
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, 3) whether it lies in the solid, walls included; (n,) bool."""
         x = check_rows("points", points, 3)
-        inside = self.surface.columns.winding(x) > 0
+        inside = self.covers(x)
         outside = np.flatnonzero(~inside & np.isfinite(x).all(axis=1))
         inside[outside] = self.feet(x[outside], _ON * self._diagonal).triangle >= 0
         return inside
 
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 3) whether it lies in the solid, (n,) bool; on a wall it may or may not."""
+        return self.surface.columns.winding(points) > 0
+
+    @cached_property
+    def _whole(self) -> NearestTriangles:
+        """All triangles, for nearest points."""
+        return NearestTriangles(self.surface, np.arange(len(self.patch)))
+
     def feet(self, points: np.ndarray, reach: float = math.inf) -> Feet:
         """Return the nearest point of the surface to each of `points` (n, 3), within `reach`."""
-        return self._feet(points, reach, self.surface.tree, np.arange(len(self.patch)))
+        return self._whole.feet(np.asarray(points, float), reach)
 
-    def _feet(self, x: np.ndarray, reach: float, tree: Tree, items: np.ndarray) -> Feet:
-        corners = self.surface.corners[items]
-        bound2 = np.full(len(x), reach * reach)
-        if reach > self._spacing:
-            close = np.flatnonzero(np.isfinite(x).all(axis=1))
-            vertex = scipy.spatial.KDTree(self.surface.vertices[np.unique(self.surface.triangles[items])])
-            bound2[close] = np.minimum(bound2[close], (vertex.query(x[close])[0] + _ON * self._diagonal) ** 2)
-        best2, item = tree.nearest(x, bound2, lambda y, k: triangle_distance2(y, corners[k]))
-        found = item >= 0
-        weights = np.zeros((len(x), 3))
-        weights[found] = closest_on_triangle(x[found], corners[item[found]])
-        point = np.einsum("nk,nkd->nd", weights, corners[item])
-        triangle = np.where(found, items[item], -1)
-        return Feet(triangle, weights, point, np.where(found, np.sqrt(best2), math.inf))
+    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return triangle (n,) int, foot (n, 3) and distance (n,), negative inside, of `points` (n, 3)."""
+        feet = self.feet(points)
+        return feet.triangle, feet.point, np.where(self.covers(points), -1, 1) * feet.distance
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of `points` (n, 3) to the surface, negative inside; (n,)."""
-        x = check_rows("points", points, 3)
-        return np.where(self.surface.columns.winding(x) > 0, -1, 1) * self.feet(x).distance
+        return self.closest(check_rows("points", points, 3))[2]
 
     def boundary_distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of each of `points` (n, 3) to the surface, inside and outside; (n,)."""
@@ -310,12 +341,11 @@ class Solid(Domain):
         return kinds
 
     @cached_property
-    def _patches(self) -> list[tuple[np.ndarray, Tree]]:
-        """The triangles of each patch, and a tree of them."""
+    def _patches(self) -> list[NearestTriangles]:
+        """The triangles of each patch, for nearest points."""
         order = np.argsort(self.patch, kind="stable")
         parts = np.split(order, np.searchsorted(self.patch[order], np.arange(1, self.n_patches)))
-        low, high = self.surface.corners.min(axis=1), self.surface.corners.max(axis=1)
-        return [(part, Tree(low[part], high[part])) for part in parts]
+        return [NearestTriangles(self.surface, part) for part in parts]
 
     def own_planes(self, points: np.ndarray, reach: float | np.ndarray, normals: np.ndarray | None = None) -> OwnPlanes:
         """Return the planes that cut the cells of generators: those of all patches near them.
@@ -337,13 +367,11 @@ class Solid(Domain):
         reach = np.broadcast_to(np.asarray(reach, float), len(x))
         normals = self.corner_normals if normals is None else normals
         found: list[tuple[np.ndarray, ...]] = []
-        for k, (items, tree) in enumerate(self._patches):
-            d = 3
-            away = np.maximum(np.maximum(tree.boxes[0, :d] - x, x - tree.boxes[0, d:]), 0)
-            rows = np.flatnonzero((away**2).sum(axis=1) <= reach**2)
+        for k, part in enumerate(self._patches):
+            rows = np.flatnonzero(part.near(x, reach))
             if not rows.size:
                 continue
-            feet = self._feet(x[rows], float(reach[rows].max()), tree, items)
+            feet = part.feet(x[rows], float(reach[rows].max()))
             near = np.flatnonzero(feet.distance <= reach[rows])
             feet = Feet(*(array[near] for array in (feet.triangle, feet.weights, feet.point, feet.distance)))
             normal = np.einsum("nk,nkd->nd", feet.weights, normals[feet.triangle])
@@ -389,12 +417,22 @@ class Solid(Domain):
         names = tuple(known[g] if g < len(known) else f"group-{g}" for g in used.tolist())
         return BoundaryNames(names, index.reshape(-1).astype(np.int32), "patch")
 
-    cuts_cells = False
-
     @property
     def plain(self) -> bool:
         """A solid does not fill its bounding box."""
         return False
+
+    def contains_well(self, points: np.ndarray, margin: float) -> np.ndarray:
+        """Return for each of `points` (n, 3) whether it is inside and at least `margin` from the surface, (n,) bool."""
+        inside = self.covers(points)
+        inside[inside] = self.feet(points[inside], margin).triangle < 0
+        return inside
+
+    def meets_wall(self, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        """Return for boxes with the corners `lower`, `upper` (n, 3) whether triangles may meet them, (n,) bool."""
+        met = np.zeros(len(lower), bool)
+        met[self.surface.tree.meeting(lower, upper)[0]] = True
+        return met
 
     @property
     def measure(self) -> float:
@@ -496,8 +534,13 @@ class Solid(Domain):
         """Return the share of the solid in a part of its bounding box, to about a percent of that part."""
         k = (np.arange(24) + 0.5) / 24
         at = np.stack(np.meshgrid(k, k, k, indexing="ij"), axis=-1).reshape(-1, 3)
-        inside = self.surface.columns.winding(lower + at * (upper - lower)) > 0
+        inside = self.covers(lower + at * (upper - lower))
         return float(inside.mean() * np.prod(upper - lower) / self.measure)
+
+    def just_inside(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 3) the nearest point of the surface, moved inwards by `depth` (n,)."""
+        feet = self.feet(points)
+        return feet.point - depth[:, None] * self.normals[feet.triangle]
 
     def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return the distance of each of `points` (k, 3) to its patch of `walls` (k,)."""
@@ -513,8 +556,7 @@ class Solid(Domain):
         foot, normal, distance = np.zeros((len(walls), 3)), np.zeros((len(walls), 3)), np.zeros(len(walls))
         for k in np.unique(walls):
             rows = np.flatnonzero(walls == k)
-            items, tree = self._patches[k]
-            feet = self._feet(points[rows], math.inf, tree, items)
+            feet = self._patches[k].feet(points[rows], math.inf)
             mean = np.einsum("nk,nkd->nd", feet.weights, self.corner_normals[feet.triangle])
             foot[rows], distance[rows] = feet.point, feet.distance
             normal[rows] = mean / np.linalg.norm(mean, axis=1)[:, None]

@@ -5,7 +5,7 @@ import pytest
 
 from clvoro import Solid
 from clvoro.geometry.columns import Columns
-from clvoro.geometry.triangles import closest_on_triangle, pierced
+from clvoro.geometry.triangles import packed_rows, packed_weights, pierced
 
 
 def winding(corners, points):
@@ -16,6 +16,19 @@ def winding(corners, points):
     la, lb, lc = np.moveaxis(length, -1, 0)
     rest = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
     return 2 * np.arctan2(np.einsum("...k,...k->...", a, np.cross(b, c)), rest).sum(axis=1) / (4 * np.pi)
+
+
+def away(x, triangle):
+    """Distances to one triangle: to its plane above it, and else to its sides."""
+    sides = np.roll(triangle, -1, axis=0) - triangle
+    normal = np.cross(sides[0], sides[1])
+    best = np.full(len(x), np.inf)
+    above = np.full(len(x), bool(normal.any()))
+    for a, side in zip(triangle, sides, strict=True):
+        t = np.clip((x - a) @ side / max(side @ side, 1e-300), 0, 1)
+        best = np.minimum(best, np.linalg.norm(x - a - t[:, None] * side, axis=1))
+        above &= np.cross(side, x - a) @ normal >= 0
+    return np.where(above, np.abs((x - triangle[0]) @ normal) / max(np.linalg.norm(normal), 1e-300), best)
 
 
 def around(solid, n, seed=0):
@@ -51,9 +64,7 @@ def test_points_inside_are_those_with_winding_number_one(name):
     assert np.array_equal(distance < 0, np.rint(wound) > 0)
     slow = np.full(len(x), np.inf)
     for triangle in solid.surface.corners:
-        corners = np.broadcast_to(triangle, (len(x), 3, 3))
-        foot = np.einsum("nk,nkd->nd", closest_on_triangle(x, corners), corners)
-        slow = np.minimum(slow, np.linalg.norm(x - foot, axis=1))
+        slow = np.minimum(slow, away(x, triangle))
     assert np.abs(distance) == pytest.approx(slow, abs=1e-12)
     assert solid.contains(solid.surface.vertices).all()
     assert solid.contains(solid.surface.corners.mean(axis=1)).all()
@@ -83,6 +94,25 @@ def test_own_planes_are_tangential_and_keep_their_generators(name):
     for k in range(solid.n_patches):
         mine = planes.row[planes.patch == k]
         assert np.array_equal(mine, np.flatnonzero(solid.wall_distance(np.full(len(x), k), x) <= 0.5))
+
+
+@pytest.mark.parametrize("kind", ["any", "two corners at one place", "corners on a line", "a point"])
+def test_distances_to_triangles(kind):
+    rng = np.random.default_rng(7)
+    x, corners = rng.normal(size=(500, 3)), rng.normal(size=(500, 3, 3))
+    if kind == "two corners at one place":
+        corners[:, 2] = corners[:, 1]
+    elif kind == "corners on a line":
+        corners[:, 2] = 0.3 * corners[:, 0] + 0.7 * corners[:, 1]
+    elif kind == "a point":
+        corners[:] = corners[:, :1]
+    s, t, distance2 = packed_weights(x, packed_rows(corners))
+    slow = [away(p[None], triangle)[0] for p, triangle in zip(x, corners, strict=True)]
+    assert np.sqrt(distance2) == pytest.approx(slow, abs=1e-7)
+    weights = np.column_stack([1 - s - t, s, t])
+    foot = np.einsum("nk,nkd->nd", weights, corners)
+    assert weights.min() > -1e-15
+    assert np.linalg.norm(x - foot, axis=1) == pytest.approx(slow, abs=1e-7)
 
 
 def test_segments_meet_triangles_where_a_linear_system_says():
