@@ -193,6 +193,10 @@ def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
         raise InputError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
+FIRST_ROWS = "numpy.sort(numpy.unique({}, axis=0, return_index=True)[1])"
+"""Rows of an array without those that are equal to an earlier one, in their order."""
+
+
 @contextmanager
 def coincident_named(points: np.ndarray, domain: Domain, real: np.dtype) -> Iterator[None]:
     """Name the caller's coincident points in an error by which the device has found that some coincide."""
@@ -205,5 +209,5 @@ def coincident_named(points: np.ndarray, domain: Domain, real: np.dtype) -> Iter
         other = "" if real == np.float64 else " or use dtype='float64'"
         raise InputError(
             f"points[{pair[0]}] and points[{pair[1]}] coincide in {real}, expected distinct "
-            f"generators; remove duplicates (numpy.unique(points, axis=0)){other}"
+            f"generators; keep the first of each: points[{FIRST_ROWS.format('points')}]{other}"
         ) from error

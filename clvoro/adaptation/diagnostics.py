@@ -55,7 +55,7 @@ def warn_of_mismatches(field: Field, domain: Domain, layers: Sequence[Layers]) -
     -----
     MismatchWarning
     """
-    found = field.warnings(domain)
+    found = domain.warnings() + field.warnings(domain)
     for k, layer in enumerate(layers):
         found += layer_mismatches(f"layers[{k}]", layer, field, domain)
     for text in found:

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 import shapely
 
-from ..arguments import check_points, coincident_pair, format_point, warn
+from ..arguments import FIRST_ROWS, check_points, coincident_pair, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
@@ -31,6 +31,8 @@ def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
         return np.empty((0, domain.dim))
     if isinstance(fixed, str | bool):
         raise InputTypeError(f"fixed is {fixed!r}, expected positions of generators, an array of shape (k, d)")
+    if isinstance(next(iter(np.ravel(np.asarray(fixed, object))), None), shapely.Geometry):
+        fixed = _coordinates(fixed)
     if not len(domain.check_rows("fixed", fixed)):
         return np.empty((0, domain.dim))
     array = check_points(fixed, domain, "fixed")
@@ -41,9 +43,24 @@ def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
         i, j = pair
         raise InputError(
             f"fixed[{i}] and fixed[{j}] coincide in {real} at {format_point(array[i])}, expected distinct generators; "
-            "remove duplicates (numpy.unique(fixed, axis=0))"
+            f"keep the first of each: fixed[{FIRST_ROWS.format('fixed')}]"
         )
     return array
+
+
+def _coordinates(points: object) -> np.ndarray:
+    """Return the coordinates of shapely points: a Point, a MultiPoint, or a sequence of Points.
+
+    Raises
+    ------
+    InputTypeError
+        For other geometries.
+    """
+    parts = shapely.get_parts(np.atleast_1d(np.asarray(points, object)))
+    other = [part for part in parts if not isinstance(part, shapely.Point) or part.is_empty]
+    if other:
+        raise InputTypeError(f"fixed has {other[0]!r:.60}, expected points: an array (k, d), or shapely Points")
+    return shapely.get_coordinates(parts, include_z=bool(len(parts) and shapely.has_z(parts).all()))
 
 
 def check_room(points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarray, h: np.ndarray) -> None:

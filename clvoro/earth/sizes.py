@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arguments import check_number
-from ..errors import InputError, InputTypeError
+from ..arguments import check_number, warn
+from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.box import Box
 from ..geometry.domain import Domain
 from ..geometry.sphere import Sphere, directions
@@ -31,6 +31,7 @@ SAGITTA = 1e-3
 MOST_CHORDS, LONGEST_CHORD = 1 << 18, np.radians(1)
 _DEGREES = 180 / math.pi
 _SLACK = 1e-3  # degrees by which a raster may reach beyond a pole, as corners in float32 do
+_SEAM = 1e-3  # difference of two columns at one longitude, over their values
 _GLOBAL = 359.0  # degrees of longitude from which on a raster goes around the sphere
 
 
@@ -139,6 +140,7 @@ def _closed(raster: Raster, nodes: np.ndarray, spacing: float) -> Raster:
     """Return a raster that goes around the sphere, its columns at `nodes`, with one more column at both sides."""
     values = raster.values
     if nodes[-1] - nodes[0] > _GLOBAL:  # the last column repeats the first one
+        _warn_of_seam(raster, values)
         values, nodes = values[:, :-1], nodes[:-1]
     values = np.concatenate([values[:, -1:], values, values[:, :1]], axis=1)
     south, north = raster.lower[1], raster.upper[1]
@@ -147,6 +149,21 @@ def _closed(raster: Raster, nodes: np.ndarray, spacing: float) -> Raster:
         values = np.pad(values, ((1, 1), (0, 0)), mode="edge")
         south, north = south - half, north + half
     return Raster(values, (nodes[0] - spacing, south), (nodes[0] + 360, north), outside=raster.outside)
+
+
+def _warn_of_seam(raster: Raster, values: np.ndarray) -> None:
+    """Warn if the first and last columns, which are at one longitude, have different values."""
+    first, last = values[:, 0], values[:, -1]
+    off = np.abs(last - first) / np.maximum(np.abs(first), np.abs(last))
+    row = int(off.argmax())
+    if off[row] > _SEAM:
+        lat = raster.lower[1] + row * (raster.upper[1] - raster.lower[1]) / max(len(values) - 1, 1)
+        warn(
+            f"{raster!r} has different values at longitudes {raster.lower[0]:g} and {raster.upper[0]:g}, which are the "
+            f"same place: at latitude {lat:.3g} {first[row]:.6g} and {last[row]:.6g}. The last column is left out; "
+            "make the first and the last one equal",
+            MismatchWarning,
+        )
 
 
 class ArcDistance(Distance):

@@ -347,6 +347,10 @@ class Domain(ABC):
         """Return `cell_dim` orthogonal unit vectors tangential to the domain at `points` (n, d), each (n, d)."""
         return tuple(np.broadcast_to(axis, np.shape(points)) for axis in np.eye(self.dim))
 
+    def warnings(self) -> list[str]:
+        """Return warnings for plausible mistakes in the domain, for a run. By default there are none."""
+        return []
+
     def require_plane(self, what: str, remedy: str) -> None:
         """Raise InputError, which begins with `what` and ends with `remedy`, unless the domain is part of a plane."""
         if self.dim > 2:

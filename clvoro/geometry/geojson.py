@@ -21,14 +21,24 @@ from ..files import LONGEST_GEOMETRY, read_text
 _GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECASE)
 _ALIKE = 0.95  # lengths of degrees of longitude and latitude with at least this ratio count as equal
 _FAR = 3  # a domain so many times its extent away from the equator has longitudes and latitudes
+FOREIGN = (".shp", ".gpkg", ".kml", ".gml", ".fgb")
+"""Files of maps that GeoPandas and GDAL read."""
 _DEEPEST = 8  # nested parentheses: a MULTIPOLYGON has three, and GEOS uses a stack frame for each
 
 
+def _parts_of(geometry: Any) -> list[Any]:
+    """Return the geometries in a collection, also in collections within it."""
+    inside = getattr(geometry, "geoms", None) if geometry.geom_type == "GeometryCollection" else None
+    return [geometry] if inside is None else [part for item in inside for part in _parts_of(item)]
+
+
 def pieces_of_shape(geometry: Any) -> list[list[np.ndarray]]:
-    """Return the rings of a shapely Polygon or MultiPolygon, piece by piece."""
+    """Return the rings of a shapely Polygon or MultiPolygon, or of those in a collection, piece by piece."""
+    if getattr(geometry, "geom_type", "") == "GeometryCollection":  # lines and points have no area
+        geometry = shapely.union_all([part for part in _parts_of(geometry) if "Polygon" in part.geom_type])
     kind = getattr(geometry, "geom_type", type(geometry).__name__)
     if kind not in ("Polygon", "MultiPolygon"):
-        several = isinstance(geometry, list | tuple | np.ndarray) or kind == "GeometryCollection"
+        several = isinstance(geometry, list | tuple | np.ndarray)
         hint = "; pass shapely.union_all(polygons)" if several else ""
         raise InputTypeError(f"geometry is a {kind}, expected a shapely Polygon or MultiPolygon{hint}")
     parts = geometry.geoms if kind == "MultiPolygon" else [geometry]
@@ -101,7 +111,7 @@ def read_geojson(source: Any) -> tuple[Any, str]:
         try:
             text = read_text(source, LONGEST_GEOMETRY)
         except (OSError, UnicodeDecodeError) as error:
-            foreign = Path(source).suffix.lower() in (".shp", ".gpkg", ".kml")
+            foreign = Path(source).suffix.lower() in FOREIGN
             hint = "; write Polygon.from_shapely(geopandas.read_file(path).union_all())"
             raise InputError(f"cannot read {name} ({error}), expected GeoJSON{hint if foreign else ''}") from error
     try:
@@ -159,20 +169,30 @@ def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
         x = np.concatenate([np.asarray(ring, float).reshape(-1, 2) for p in pieces for ring in p])
     except (ValueError, TypeError):  # `make_rings` raises a better error
         return
-    if not len(x) or not may_be_degrees(x.min(axis=0).tolist(), x.max(axis=0).tolist()):
-        return
-    if not isinstance(system, str) and np.abs(x).min(axis=0)[1] < _FAR * np.ptp(x, axis=0).max():
-        return
+    if len(x) and may_be_degrees(x.min(axis=0).tolist(), x.max(axis=0).tolist()):
+        text = squeezed(x, name, system if isinstance(system, str) else None)
+        if text:
+            warn(text, MismatchWarning)
+
+
+def squeezed(x: np.ndarray, name: str, system: str | None = None) -> str:
+    """Return a warning if `x` (k, 2) look like degrees whose lengths differ, else an empty text.
+
+    Without a coordinate reference `system` they are degrees only if they lie far from the equator for their extent.
+    """
+    fits = may_be_degrees(x.min(axis=0).tolist(), x.max(axis=0).tolist())
+    if not fits or (system is None and np.abs(x).min(axis=0)[1] < _FAR * np.ptp(x, axis=0).max()):
+        return ""
     latitude = float(np.abs(x[:, 1]).max())
-    if math.cos(math.radians(latitude)) < _ALIKE:
-        known = isinstance(system, str)
-        has = f"longitudes and latitudes ({system})" if known else "coordinates like degrees"
-        warn(
-            f"{name} has {has}, which are used as lengths in the plane: at latitude "
-            f"{latitude:.3g} cells would be {math.cos(math.radians(latitude)):.2g} times as wide as high; project the "
-            f"coordinates first{', or remove the crs if they are projected' if known else ''}",
-            MismatchWarning,
-        )
+    ratio = math.cos(math.radians(latitude))
+    if ratio >= _ALIKE:
+        return ""
+    has = "coordinates like degrees" if system is None else f"longitudes and latitudes ({system})"
+    return (
+        f"{name} has {has}, which are used as lengths in the plane: at latitude {latitude:.3g} cells would be "
+        f"{ratio:.2g} times as wide as high; project the coordinates first"
+        f"{', or remove the crs if they are projected' if system else ''}"
+    )
 
 
 _MEMBERS = {"FeatureCollection": "features", "GeometryCollection": "geometries"}

@@ -22,7 +22,7 @@ from .curved_edges import CurvedEdges
 from .curves import Curve
 from .domain import Domain
 from .edge_bins import EdgeBins
-from .geojson import pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt
+from .geojson import pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt, squeezed
 from .rings import OrientedRings, make_rings, project, signed_area
 from .shapes import Edges
 from .simplification import pieces_of, simplify
@@ -122,7 +122,10 @@ class Polygon(Domain):
 
     @classmethod
     def from_shapely(cls, geometry: Any, names: Mapping[str, Walls] | None = None) -> Polygon:
-        """Make a domain of a shapely Polygon or MultiPolygon; z coordinates are dropped."""
+        """Make a domain of a shapely Polygon or MultiPolygon; z coordinates are dropped.
+
+        Of a GeometryCollection, as `shapely.make_valid` returns it, the polygons count.
+        """
         return cls.from_pieces(pieces_of_shape(geometry), names)
 
     @classmethod
@@ -166,7 +169,9 @@ class Polygon(Domain):
         """
         pieces, own_names = pieces_of_geojson(source)
         try:
-            return cls.from_pieces(pieces, own_names if names is None else names)
+            made = cls.from_pieces(pieces, own_names if names is None else names)
+            made.projected = True
+            return made
         except InputError as error:
             if isinstance(source, Mapping) or str(source).lstrip().startswith("{"):
                 raise
@@ -197,6 +202,13 @@ class Polygon(Domain):
         return self.vertices, self.ring_starts, self.piece_of_ring
 
     cuts_cells = True
+    projected = False
+    """Whether it is known that the coordinates are no degrees, or said that they are."""
+
+    def warnings(self) -> list[str]:
+        """Return a warning if the coordinates look like longitudes and latitudes."""
+        text = "" if self.projected else squeezed(self.vertices, "the domain")
+        return [text] if text else []
 
     @property
     def outline(self) -> Polygon:

@@ -356,7 +356,7 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
     ]
     more = len(there) - _NAMED
     where = " and ".join([*there[:_NAMED], *([f"edges of {more} more rings"] if more > 0 else [])])
-    remedy = "correct it (shapely.make_valid suggests how)"
+    remedy = "correct it, as Polygon.from_shapely(shapely.make_valid(shapely.Polygon(ring))) does"
     if len(there) > 1:
         remedy = "move one of the rings, or unite or cut them in shapely and use Polygon.from_shapely"
     if shape.geom_type == "MultiPolygon":  # each piece is valid

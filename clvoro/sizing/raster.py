@@ -43,10 +43,11 @@ class Raster(Field):
         pixels.
     missing : "error" or "nearest"
         Whether missing values (NaN, or masked by NumPy) are rejected or filled with the nearest value.
-    outside : "nearest" or "error", optional
-        Whether points outside of the box get the nearest value of the array, or raise an error. (With "centers" the
-        nearest value is used within half a pixel of the sides in any case.) By default "nearest", and a run warns
-        (`MismatchWarning`) if less than half of the domain is covered.
+    outside : "nearest", "error" or "ignore", optional
+        Whether points outside of the box get the nearest value of the array, raise an error, or have no size: with
+        "ignore" h is infinite there, so that `minimum` takes another field, as for a fine tile in a coarse one. (With
+        "centers" the nearest value is used within half a pixel of the sides in any case.) By default "nearest", and a
+        run warns (`MismatchWarning`) if less than half of the domain is covered.
 
     Raises
     ------
@@ -75,8 +76,8 @@ class Raster(Field):
         missing: str = "error",
         outside: str | None = None,
     ):
-        if outside not in (None, "nearest", "error"):
-            raise InputError(f"Raster got outside={outside!r}, expected 'nearest' or 'error'")
+        if outside not in (None, "nearest", "error", "ignore"):
+            raise InputError(f"Raster got outside={outside!r}, expected 'nearest', 'error' or 'ignore'")
         self.outside = outside
         low, high = check_box("Raster", np.shape(values), lower, upper, at)
         counts = np.array(np.shape(values)[::-1])
@@ -129,7 +130,7 @@ class Raster(Field):
         return self._coverage_warnings(domain)
 
     def _coverage_warnings(self, domain: Domain) -> list[str]:
-        remedy = "give a larger raster, or outside='nearest' to confirm"
+        remedy = "give a larger raster, outside='nearest' to confirm, or outside='ignore' for a tile in minimum(...)"
         return coverage_warnings(repr(self), domain, self.lower, self.upper, remedy)
 
     def _check_outside(self, points: np.ndarray) -> None:
@@ -157,13 +158,16 @@ class Raster(Field):
             index = np.minimum(first + corner, self._counts - 1)
             w = np.prod(np.where(corner, weight, 1 - weight), axis=1)
             total += w * self.values[tuple(index.T[::-1])]
+        if self.outside == "ignore":
+            total[((points < self.lower) | (points > self.upper)).any(axis=1)] = np.inf
         return total
 
     def _emit(self, writer: CodeWriter) -> str:
         # A box contains a domain if it contains its corners.
         domain = writer.domain
         self._check_outside(np.array([domain.lower, domain.upper]))
-        if (self.upper < domain.lower).any() or (self.lower > domain.upper).any():
+        beside = (self.upper < domain.lower).any() or (self.lower > domain.upper).any()
+        if beside and self.outside != "ignore":
             raise InputError(
                 f"{self!r} lies beside the domain, from {list(domain.lower)} to {list(domain.upper)}, expected an "
                 "overlap; do units and the order of the coordinates (x, y) agree?"
@@ -172,7 +176,11 @@ class Raster(Field):
         shift = -writer.normalize(origin) * (gain * writer.scale)
         at = writer.store(gain * writer.scale, shift, self.values / writer.scale)
         counts = ", ".join(map(str, [*self._counts.tolist(), 1][:3]))
-        return writer.variable(f"size_raster(x, data + {at}, {counts})")
+        value = f"size_raster(x, data + {at}, {counts})"
+        if self.outside == "ignore":
+            box = writer.store(writer.normalize(self.lower), writer.normalize(self.upper))
+            value = f"size_box_distance2(x, data + {box}) > 0 ? SIZE_LARGEST : {value}"
+        return writer.variable(value)
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.values.shape))

@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
+import shapely
 
 import clvoro
 from clvoro import sizing
@@ -219,6 +220,27 @@ def test_no_warning_for_projected_coordinates(latitude, crs):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         clvoro.Polygon.from_geojson(lake(latitude, crs))
+
+
+RING = [(-70.5, 60.5), (-70.5, 61.5), (-69.0, 61.5), (-69.0, 60.5)]
+PLAN = [(-70.5, 0.5), (-69.0, 0.5), (-69.0, 61.5), (-70.5, 61.5)]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        clvoro.Polygon,
+        lambda ring: clvoro.Polygon.from_shapely(shapely.Polygon(ring)),
+        lambda ring: clvoro.Polygon.from_wkt(shapely.Polygon(ring).wkt),
+    ],
+)
+def test_degrees_are_warned_of_however_they_come(adapter, make):
+    with pytest.warns(MismatchWarning, match="the domain has coordinates like degrees"):
+        adapter.run(make(RING), 0.5, max_steps=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MismatchWarning)
+        make(RING)  # it may be an area on a sphere
+        adapter.run(make(PLAN), 0.8, max_steps=0)
 
 
 def test_degrees_with_sizes_in_meters(ctx):

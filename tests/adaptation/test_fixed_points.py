@@ -5,10 +5,11 @@ import warnings
 
 import numpy as np
 import pytest
+import shapely
 
 import clvoro
 from clvoro.adaptation import run as run_module
-from clvoro.adaptation.fixed_points import take_places
+from clvoro.adaptation.fixed_points import check_fixed, take_places
 from clvoro.errors import InputError, InputTypeError, MismatchWarning
 
 BOX = clvoro.Box((0, 0), (2, 1))
@@ -174,3 +175,29 @@ def test_positions_that_are_near_each_other_or_a_wall_give_a_warning(adapter, fi
     assert np.array_equal(mesh.points[: len(fixed)], fixed)
     if text is not None:
         assert re.search(text, found[0]), found[0]
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        shapely.MultiPoint([(0.3, 0.4), (0.7, 0.6)]),
+        [shapely.Point(0.3, 0.4), shapely.Point(0.7, 0.6)],
+        np.array([shapely.Point(0.3, 0.4), shapely.Point(0.7, 0.6)]),
+    ],
+)
+def test_points_of_shapely(points):
+    box = clvoro.Box((0, 0), (1, 1))
+    assert check_fixed(points, box, np.dtype(float)).tolist() == [[0.3, 0.4], [0.7, 0.6]]
+    with pytest.raises(InputTypeError, match=r"LINESTRING.*expected points"):
+        check_fixed(shapely.LineString([(0, 0), (1, 1)]), box, np.dtype(float))
+
+
+def test_the_remedy_for_equal_points_keeps_their_order():
+    fixed = np.array([(0.7, 0.6), (0.3, 0.4), (0.7, 0.6), (0.1, 0.9)])
+    box = clvoro.Box((0, 0), (1, 1))
+    with pytest.raises(InputError, match=r"keep the first of each: (fixed\[.*\])$") as raised:
+        check_fixed(fixed, box, np.dtype(float))
+    remedy = str(raised.value).split("keep the first of each: ")[1]
+    kept = eval(remedy, {"numpy": np, "fixed": fixed})
+    assert kept.tolist() == fixed[[0, 1, 3]].tolist()
+    check_fixed(kept, box, np.dtype(float))

@@ -127,7 +127,7 @@ def test_what_is_refused(text: str, says: str) -> None:
 
 def test_edges_of_a_boundary_must_be_there() -> None:
     shape = "\n[size]\nkind = 'distance'\nh_min = 0.1\nslope = 0.5\nshapes = [{ kind = 'boundary', edges = [8] }]\n"
-    with pytest.raises(InputError, match=r"boundary has edge 8, .* from 0 to 7"):
+    with pytest.raises(InputError, match=r"edges has edge 8, .* from 0 to 7"):
         Case.from_toml(RINGS + shape, "my.toml").size_field()
     box = "[domain]\nlower = [0, 0]\nupper = [1, 1]\n"
     with pytest.raises(InputError, match=r"boundary has side 8, .* from 0 to 3"):
@@ -207,3 +207,9 @@ def test_layers_of_a_case(tmp_path):
     assert again.run_arguments()["layers"] == [around, below]
     with pytest.raises(InputError, match=r"edges\[0\] is 0\.5, expected a whole number or a text"):
         Case.from_toml(LAYERED.replace("edges = [0]", "edges = [0.5]"), "layered")
+
+
+def test_shapefiles_are_refused_with_a_command(tmp_path):
+    (tmp_path / "case.toml").write_text('size = 1\n[domain]\npolygon = "lake.shp"\n')
+    with pytest.raises(InputError, match=r"domain\.polygon names .*ogr2ogr -t_srs EPSG:NUMBER lake\.geojson lake\.shp"):
+        load_case(tmp_path / "case.toml")

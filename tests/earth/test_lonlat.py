@@ -162,3 +162,12 @@ def test_whole_degrees_are_not_taken_for_radians():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         earth.Caps([((0, 0), 3e6, 9e4)], 27e4, 1.1)
+
+
+def test_columns_of_one_longitude_that_differ_are_warned_of(recwarn):
+    h = np.full((19, 37), 5e5)
+    earth.LonLat(sizing.Raster(h, (-180, -90), (180, 90)))
+    assert not recwarn
+    h[9, -1] = 2e5
+    with pytest.warns(MismatchWarning, match="longitudes -180 and 180, which are the same place: at latitude 0 5.*2"):
+        earth.LonLat(sizing.Raster(h, (-180, -90), (180, 90)))

@@ -714,3 +714,17 @@ def test_numpy_combines_fields():
     ):
         assert isinstance(made, sizing.Field)
         assert np.array_equal(made(points), expected)
+
+
+def test_a_tile_refines_where_it_is(ctx):
+    coarse = sizing.Raster(np.full((6, 10), 400.0), (0, 0), (10e3, 6e3))
+    tile = sizing.Raster(np.full((11, 11), 60.0), (4e3, 2e3), (5e3, 3e3), outside="ignore")
+    both = sizing.minimum(coarse, tile)
+    points = np.array([(9e3, 5e3), (4.5e3, 2.5e3), (4e3, 2e3), (3.9e3, 2e3)])
+    assert both(points).tolist() == pytest.approx([400, 60, 60, 400])
+    assert np.isinf(tile(points)).tolist() == [True, False, False, True]
+    domain = Box((0, 0), (10e3, 6e3))
+    inside = points[[0, 1, 3]]
+    for dtype in ("float64", "float32"):
+        result = Adapter(ctx, dtype).run(domain, both, points=inside, max_steps=0, method="lloyd")
+        assert result.target_size.tolist() == pytest.approx([400, 60, 400], rel=1e-6)

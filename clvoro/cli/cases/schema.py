@@ -25,6 +25,7 @@ from ...files import LONGEST_GEOMETRY, read_text
 from ...geometry.box import Box
 from ...geometry.curves import Curve
 from ...geometry.domain import Domain
+from ...geometry.geojson import FOREIGN
 from ...geometry.polygon import Polygon
 from ...geometry.sphere import Sphere
 from ...io.arrays import read_array
@@ -265,7 +266,7 @@ class ArrayTable(Kind):
 class RasterTable(ArrayTable, tag="raster"):
     MAKE = sizing.Raster
     variable: Text | None = None
-    outside: Literal["nearest", "error"] | None = None
+    outside: Literal["nearest", "error", "ignore"] | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
         path = folder / self.file
@@ -452,6 +453,11 @@ class PolygonTable(Kind, tag="polygon"):
         if self.file is None:
             return Polygon(_ring(self.outer), [_ring(hole) for hole in self.holes or []], self.names)
         path = locate(folder, self.file)
+        if path.suffix.lower() in FOREIGN:
+            raise InputError(
+                f"domain.polygon names {str(path)!r}, expected GeoJSON or well-known text; convert it, with GDAL: "
+                f"ogr2ogr -t_srs EPSG:NUMBER {path.stem}.geojson {path.name}, where NUMBER is a projection in meters"
+            )
         if path.suffix.lower() not in (".wkt", ".txt"):
             return Polygon.from_geojson(path, self.names)
         try:
