@@ -70,6 +70,50 @@ kernel void move_generators(const int size, global const REAL *lloyd, const REAL
     }
 }
 
+/* Moves generators out of the balls of fixed ones, to the nearest point of the sphere; `passes` times, as balls
+   overlap. Generators with labels first, first + 1, ... have the balls ball_starts[0] ... ball_starts[1] - 1, and so
+   on; a ball has DIM coordinates and a radius. Whoever is in a ball is a neighbor of one of its generators. */
+kernel void leave_balls(const int size, global const int *starts, global const int *neighbors, global const int *labels,
+                        const int fixed, const int first, const int count, global const int *ball_starts,
+                        global const REAL *balls, const int passes, DOMAIN_ARGS, global REAL *points,
+                        global REAL *velocity)
+{
+    WORK_ITEM(i);
+    if (labels[i] < fixed)
+        return;
+    REAL x[DIM], y[DIM];
+    bool moved = false;
+    EACH_AXIS (a)
+        y[a] = x[a] = points[DIM * i + a];
+    for (int pass = 0; pass < passes; ++pass)
+        for (int k = starts[i]; k < starts[i + 1]; ++k) {
+            const int g = neighbors[k] < 0 ? -1 : labels[neighbors[k]] - first;
+            if (g < 0 || g >= count)
+                continue;
+            for (int b = ball_starts[g]; b < ball_starts[g + 1]; ++b) {
+                global const REAL *ball = balls + (DIM + 1) * b;
+                REAL d[DIM], d2 = 0;
+                EACH_AXIS (a) {
+                    d[a] = DIFFERENCE(a, ball[a], y[a]);
+                    d2 += d[a] * d[a];
+                }
+                if (d2 >= ball[DIM] * ball[DIM] || d2 == 0)
+                    continue;
+                const REAL out = ball[DIM] / sqrt(d2) - 1;
+                EACH_AXIS (a)
+                    y[a] += out * d[a];
+                moved = true;
+            }
+        }
+    if (!moved)
+        return;
+    reflect_inside(x, y, DOMAIN);
+    EACH_AXIS (a) {
+        points[DIM * i + a] = y[a];
+        velocity[DIM * i + a] += DIFFERENCE(a, x[a], y[a]);
+    }
+}
+
 /* displacement = 0 for fixed generators, labels[i] < fixed. */
 kernel void zero_fixed_displacements(const int size, global const int *labels, const int fixed,
                                      global REAL *displacement)

@@ -6,6 +6,9 @@ begins. Coarser levels do not have them, as they may be close together for the c
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import scipy
 import shapely
@@ -13,10 +16,11 @@ import shapely
 from ..arguments import FIRST_ROWS, check_points, coincident_pair, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
+from ..geometry.line_pairs import LinePairs, place_pairs
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import read_only
-from .tuning import AT_WALL, BEHIND_WALL, CANDIDATES, CLOSE, ON_WALL
+from .tuning import AT_WALL, BEHIND_WALL, CANDIDATES, CLEARINGS, CLOSE, ON_WALL
 
 
 def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
@@ -122,6 +126,58 @@ def check_room(points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarra
         )
 
 
+def place_beside_lines(
+    domain: Domain, free: Domain, wells: np.ndarray, size: Callable[[np.ndarray], np.ndarray]
+) -> LinePairs:
+    """Return the generators beside the lines of `domain`, in its part `free` without layers.
+
+    Parameters
+    ----------
+    wells : (k, 2) array
+        Fixed generators of the caller.
+    size : callable
+        Sizes (n,) at points (n, 2).
+
+    Raises
+    ------
+    InputError
+        If a generator of the caller is too near to a line for the size there.
+
+    Warns
+    -----
+    MismatchWarning
+        If a line is left out at a place without room, or in layers; says where.
+    """
+    assert domain.lines is not None
+    network = domain.lines.network(free)
+    pairs = place_pairs(free, network, size)
+    if free is not domain:
+        if domain.lines.inside(free).length < (1 - 1e-9) * domain.lines.inside(domain).length:
+            warn(
+                "lines end where the layers of walls begin, which have generators of their own; leave out the layers "
+                "of the walls that the lines reach, if faces have to lie on them there",
+                MismatchWarning,
+            )
+    if len(pairs.dropped):
+        x = pairs.dropped[0]
+        warn(
+            f"lines have no room at {format_point(x)}: they are too near to each other or meet at too small an angle "
+            f"for the size there, {float(np.asarray(size(x[None]))[0]):.3g}. A part of a line without faces on it "
+            "begins there; use smaller sizes around it, or leave out one of the lines",
+            MismatchWarning,
+        )
+    if len(wells) and len(pairs.centers):
+        gaps = np.linalg.norm(domain.wrap(wells)[:, None] - domain.wrap(pairs.centers), axis=2) / pairs.radii
+        i, b = np.unravel_index(gaps.argmin(), gaps.shape)
+        if gaps[i, b] < 1:
+            raise InputError(
+                f"fixed[{i}] is at {format_point(wells[i])}, {gaps[i, b] * pairs.radii[b]:.3g} from a line at "
+                f"{format_point(pairs.centers[b])}, expected at least {pairs.radii[b]:.3g} for the size there; move it "
+                "or use smaller sizes"
+            )
+    return pairs
+
+
 def in_frame(points: np.ndarray, domain: Domain) -> tuple[np.ndarray, np.ndarray | None]:
     """Return `points` in the device's coordinates and float64, and the periods (d,) for `KDTree`, if there are any."""
     x, real = domain.place(points, np.dtype(np.float64)), np.dtype(np.float64)
@@ -173,6 +229,45 @@ def take_places(
     points[places[there]], labels[places[there]] = positions[there], names[there]
     points = np.concatenate([points, positions[~there]])
     return points, np.concatenate([labels, names[~there]]), taken
+
+
+def clear_balls(
+    points: np.ndarray, labels: np.ndarray, pairs: LinePairs, domain: Domain, n_fixed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return generators and labels without those in the balls beside lines: they move out, or are left out.
+
+    Parameters and returned arrays are as those of `take_places`.
+    """
+    origin, scale = domain.frame
+    centers, radii = (pairs.centers - origin) / scale, pairs.radii / scale
+    period = domain.periods(np.dtype(np.float64)) if any(domain.periodic) else np.zeros(domain.dim)
+    tree = KDTree(np.mod(centers, np.where(period > 0, period, np.inf)), boxsize=period)
+    moving = np.flatnonzero(labels >= n_fixed)
+    x = points[moving].astype(np.float64)
+    here: Any = np.arange(len(x))
+    for _ in range(CLEARINGS):
+        near = tree.query_ball_point(np.mod(x[here], np.where(period > 0, period, np.inf)), radii.max())
+        row = np.repeat(here, [len(balls) for balls in near])
+        ball = np.concatenate([np.empty(0, int), *(np.array(balls, int) for balls in near)]).astype(int)
+        way = x[row] - centers[ball]
+        way -= period * np.rint(way / np.where(period > 0, period, np.inf))
+        depth = np.linalg.norm(way, axis=1) / radii[ball]
+        inner = depth < 1 - 1e-9
+        row, way, depth = row[inner], way[inner], depth[inner]
+        # Out of the ball of which the generator is deepest inside.
+        order = np.argsort(depth, kind="stable")
+        here, first = np.unique(row[order], return_index=True)
+        chosen = order[first]
+        if not len(here):
+            break
+        x[here] += way[chosen] * (1 / np.maximum(depth[chosen], 1e-3) - 1)[:, None]
+    inside = domain.contains(x * scale + origin)
+    inside[here] = False
+    points = points.copy()
+    points[moving[inside]] = domain.place(x[inside] * scale + origin, points.dtype)
+    kept = np.ones(len(points), bool)
+    kept[moving[~inside]] = False
+    return points[kept], labels[kept]
 
 
 def _sees(domain: Polygon, a: np.ndarray, b: np.ndarray) -> np.ndarray:

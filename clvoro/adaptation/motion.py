@@ -14,6 +14,7 @@ from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..solvers.linear_system import Solution
 from ..tessellation.device_diagram import Tessellation
+from .tuning import BALL_PASSES
 
 if TYPE_CHECKING:
     from .state import MeshState
@@ -79,6 +80,26 @@ class Method(ABC):
         """Return the displacement of one step, to the end of the workspace's frame, and summarize its lengths."""
 
 
+@dataclass(frozen=True)
+class Balls:
+    """Balls around fixed generators, in the device's coordinates, that other generators do not enter.
+
+    Attributes
+    ----------
+    first, count : int
+        Labels of these generators: `first`, `first` + 1, ...
+    starts : (count + 1,) int32
+        Balls of each of them.
+    spheres : (k, d + 1) real
+        Centers and radii.
+    """
+
+    first: int
+    count: int
+    starts: cla.Array
+    spheres: cla.Array
+
+
 class Motion:
     """The kernels of `motion.cl`."""
 
@@ -127,6 +148,25 @@ class Motion:
             *domain.device_args(self.engine),
             points,
             velocity,
+        )
+
+    def leave_balls(self, domain: Domain, t: Tessellation, balls: Balls, moving: Moving) -> None:
+        """Move generators out of `balls`; `t` is a diagram of nearly the same generators."""
+        self.engine.run_each(
+            self._kernels.leave_balls,
+            t.n,
+            t.starts,
+            t.neighbors,
+            moving.labels,
+            np.int32(moving.fixed),
+            np.int32(balls.first),
+            np.int32(balls.count),
+            balls.starts,
+            balls.spheres,
+            np.int32(BALL_PASSES),
+            *domain.device_args(self.engine),
+            moving.points,
+            moving.velocity,
         )
 
     def zero_fixed_displacements(self, labels: cla.Array, fixed: int, displacement: cla.Array) -> None:

@@ -12,16 +12,17 @@ from ..errors import CoarseSizeWarning, InputError, SizeFieldError
 from ..geometry.boundary_layers import apart_from, count_rows, free_domain, place_layers
 from ..geometry.domain import Domain
 from ..geometry.geojson import may_be_degrees
+from ..geometry.line_pairs import place_pairs
 from ..geometry.sphere import Sphere
 from ..sizing import Sizing, as_field
 from ..sizing.field import Field
 from ..sizing.gaps import NARROW
-from ..sizing.layers import limit_beside_layers
+from ..sizing.layers import limit_beside_layers, limit_beside_lines
 from ..sizing.on_domain import on_domain
 from ..tessellation.power import require_power_domain
 from .diagnostics import check_precision, narrow_parts, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import Extras, check_memory, expected_boundary_cells, expected_images, expected_surplus
-from .fixed_points import check_room, take_places
+from .fixed_points import check_room, place_beside_lines
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
 from .options import Options
@@ -132,6 +133,8 @@ def prepare(
     _check_together(domain, points, fixed, options)
     given_field = on_domain(domain, as_field(size))
     rows, free, field = _place_layers(stages, domain, given_field, options, len(fixed))
+    if domain.lines is not None:
+        field = limit_beside_lines(field, place_pairs(free, domain.lines.network(free), field))
     sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
     # The other methods keep the number of given points.
     kept = points is not None and not options.multilevel
@@ -143,7 +146,16 @@ def prepare(
         warn_of_narrow_parts(domain, lambda x: factor * sizing(x))
     if len(fixed):
         check_room(fixed, domain, free, rows, factor * sizing(fixed))
-    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor)
+    pairs = None
+    if domain.lines is not None:
+        pairs = place_beside_lines(domain, free, fixed, lambda x: factor * np.asarray(sizing(x)))
+        fixed = np.concatenate([fixed, pairs.points])
+        if len(fixed) > target:
+            raise InputError(
+                f"the mesh has {target} cells, but {len(fixed)} generators are beside the lines or fixed, expected at "
+                "least as many cells; use smaller sizes, or more cells"
+            )
+    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, pairs)
     lattice = lattice_points(domain, target) if options.method in MOVING else None
     levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0
     if options.levels == "auto" and max_levels is not None:
@@ -158,10 +170,9 @@ def _check_together(domain: Domain, points: np.ndarray | None, fixed: np.ndarray
     n_cells, method = options.n_cells, options.method
     if method == "transport":
         require_power_domain(domain)
-    if len(fixed) and method in ("transport", *MOVING):
-        raise InputError(
-            f"fixed generators are given, but method {method!r} moves all generators; use method='adaptive' or 'exact'"
-        )
+    if (len(fixed) or domain.lines) and method in ("transport", *MOVING):
+        given = "fixed generators are given" if len(fixed) else "the domain has lines"
+        raise InputError(f"{given}, but method {method!r} moves all generators; use method='adaptive' or 'exact'")
     kept = points is not None and not options.multilevel
     if points is not None and kept and n_cells not in (None, len(points)):
         raise InputError(
@@ -348,7 +359,7 @@ def start(prepared: Prepared) -> MeshState:
     labels = np.arange(setup.first_row, setup.first_row + len(host), dtype=np.int32)
     taken = np.full(len(fixed), -1, np.int32)
     if len(taken) and levels == 0:
-        placed, labels, taken = take_places(placed, labels, fixed, domain, setup.fixed)
+        placed, labels, taken = setup.place_fixed(placed, labels)
     with coincident_named(host, domain, engine.real):
         arrays = {"points": engine.upload(placed), "labels": engine.upload(labels, np.int32)}
         next_label = setup.first_row + len(host)

@@ -13,6 +13,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..geometry.domain import Domain
+from ..geometry.line_pairs import LinePairs
 from ..mesh.diagram import Diagram
 from ..mesh.results import Displacements
 from ..opencl.device_array import buffer_of
@@ -25,12 +26,12 @@ from ..tessellation.device_diagram import Tessellation
 from ..tessellation.readback.diagram import fetch_diagram, order_of
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights
-from .fixed_points import take_places
+from .fixed_points import clear_balls, take_places
 from .insertion_deletion import CellSizes, Change, Generators, Outcome
 from .metric import Neighborhoods
-from .motion import Displacement, Moving
+from .motion import Balls, Displacement, Moving
 from .stages import Stages
-from .tuning import CLIMB_STRAIN, MOST_OBTUSE
+from .tuning import CLIMB_STRAIN, MOST_OBTUSE, SQUEEZED
 from .walls import Walls
 
 SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio", "weight")
@@ -95,10 +96,13 @@ class Setup:
     fixed : int
         Generators with labels below `fixed` do not move.
     points : (k, d) ndarray
-        Positions of those with the labels 0 to k - 1, on the finest level. Their cells have target sizes like all
-        others. The other fixed generators are those of layers: the size of their cells is their target size.
+        Positions of those with the labels 0 to k - 1, on the finest level: first those of the caller, whose cells have
+        target sizes like all others, then those beside lines. The other fixed generators are those of layers. The size
+        of the cells beside lines and in layers is their target size.
     factor : float
         Initial factor on the size field on the finest level.
+    pairs : LinePairs or None
+        Generators beside lines: the last of `points`.
     """
 
     stages: Stages
@@ -108,11 +112,24 @@ class Setup:
     fixed: int
     points: np.ndarray
     factor: float = 1.0
+    pairs: LinePairs | None = None
+
+    @property
+    def first_sized(self) -> int:
+        """Label of the first generator beside lines or of layers."""
+        return len(self.points) - (0 if self.pairs is None else len(self.pairs.points))
 
     @property
     def first_row(self) -> int:
         """Label of the first generator of layers."""
         return len(self.points)
+
+    def place_fixed(self, points: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return generators and labels with the fixed ones, and whose places these have taken; see `take_places`."""
+        points, labels, taken = take_places(points, labels, self.points, self.domain, self.fixed)
+        if self.pairs is not None:
+            points, labels = clear_balls(points, labels, self.pairs, self.domain, self.fixed)
+        return points, labels, taken
 
     def on(self, engine: Engine) -> Setup:
         """Return the same with stages of their own, on another `engine` of the same kind."""
@@ -304,6 +321,18 @@ class MeshState:
         """Corners and thin walls of the domain, for the cells of this level."""
         return Walls(self.setup, self.size_factor)
 
+    @cached_property
+    def balls(self) -> Balls | None:
+        """Balls beside lines, which have generators on the finest level only."""
+        pairs = self.setup.pairs
+        if pairs is None or round(math.log2(self.size_factor / self.setup.factor)):
+            return None
+        origin, scale = self.domain.frame
+        spheres = np.column_stack([(pairs.centers - origin) / scale, pairs.radii / scale])[pairs.balls]
+        engine, count = self.engine, len(pairs.points)
+        starts = engine.upload(pairs.ball_starts, np.int32)
+        return Balls(self.setup.first_row - count, count, starts, engine.upload(spheres))
+
     def _target_sizes(self, points: np.ndarray) -> np.ndarray:
         """Return the target size at `points` (k, d) on this level, (k,)."""
         return self.size_factor * np.asarray(self.sizing(points))
@@ -412,8 +441,9 @@ class MeshState:
 
     def evaluate_metric(self, compared: Neighborhoods | None = None) -> None:
         """Evaluate and summarize error and quality, and compare neighbors."""
-        if self.fixed > self.setup.first_row:
-            self.stages.metric.set_fixed_sizes(self.labels, self.setup.first_row, self.fixed, self.t.volumes, self.h)
+        first = self.setup.first_sized
+        if self.fixed > first:
+            self.stages.metric.set_fixed_sizes(self.labels, first, self.fixed, self.t.volumes, self.h)
         with self.engine.workspace.frame():
             energy = self.engine.scratch(self.n)
             self.stages.metric.evaluate(self.t, self.h, self.error, self.quality, energy, self.local_length, compared)
@@ -428,6 +458,8 @@ class MeshState:
     def move(self, d: Displacement) -> None:
         """Move the generators. The diagram is then out of date."""
         self.stages.motion.move_generators(self.free, self.points, d, self.velocity)
+        if self.balls is not None:
+            self.stages.motion.leave_balls(self.free, self.t, self.balls, self.moving)
 
     def summarize_displacements(self, lloyd: cla.Array, correction: cla.Array) -> None:
         """Summarize the lengths of both displacements (n, d) over h."""
@@ -528,6 +560,26 @@ class MeshState:
         del new
         return self._replace(rows, counts)
 
+    def delete_squeezed(self) -> None:
+        """Delete small cells beside lines: generators that are squeezed between balls cannot move away."""
+        if self.balls is None:
+            return
+        stages, engine = self.stages, self.engine
+        stages.clear_poisson()
+        engine.workspace.clear()
+        with engine.workspace.frame():
+            ratio = stages.density.cell_weights(self.t, self.h).log_ratio.get()
+            small = (ratio < engine.cell_dim * math.log(SQUEEZED)) & (self.labels.get() >= self.fixed)
+            sites = engine.zeros(self.n, np.uint64), engine.upload(small, np.uint64)
+            new = None
+            if small.any():
+                new = stages.insertion_deletion.split_delete(
+                    self.free, self.t, self._data.generators, self.next_label, sites, self.fixed
+                )
+        rows, counts = _take_apart(new)
+        del new
+        self._replace(rows, counts)
+
     def _replace(self, rows: dict[str, cla.Array], counts: tuple[int, int]) -> tuple[int, int]:
         """Replace the generators by `rows`, if there are any; return the numbers of insertions and deletions."""
         self.engine.workspace.shrink()
@@ -585,7 +637,7 @@ class MeshState:
         taken = self.taken
         if finest and len(taken):
             host = start["points"].get(), start["labels"].get()
-            *new, taken = take_places(*host, self.setup.points, self.domain, self.fixed)
+            *new, taken = self.setup.place_fixed(*host)
             start["points"], start["labels"] = map(self.engine.upload, new, (None, np.int32))
         # Free the other arrays. After an interruption `update` computes them again.
         self._data = Arrays(self._data.generators)

@@ -193,3 +193,11 @@ CLOSE, AT_WALL, ON_WALL = 0.4, 0.2, 0.01
 """Distances below which a run warns of two fixed generators or of one near a wall, and refuses one on a wall."""
 CANDIDATES, BEHIND_WALL = 8, 4.0
 """Others near a fixed generator that are compared, and the factor on the distance of those behind a wall."""
+
+# Generators beside lines.
+
+SQUEEZED = 0.6
+"""Sizes over h below which cells beside lines are deleted."""
+BALL_PASSES, CLEARINGS = 3, 10
+"""How often a step moves a generator out of the balls around lines, which overlap; the same at the start of the finest
+level, where generators that are still in a ball are left out."""

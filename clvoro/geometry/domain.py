@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pyopencl.array as cla
 
     from ..opencl.engine import Engine
+    from .lines import Lines
     from .polygon import Polygon
     from .sphere import Sphere
     from .wall_triangles import WallTriangles
@@ -72,11 +73,50 @@ class Domain(ABC):
         Directions in which the domain is periodic.
     names : mapping or None
         The caller's names of boundaries.
+    lines : Lines or None
+        Lines inside, on which faces of cells lie; see `with_lines`.
     """
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     names: Mapping[str, Walls] | None = None
+    lines: Lines | None = None
+
+    def with_lines(self, lines: object) -> Domain:
+        """Return the same domain in 2D with lines inside, on which faces of the cells of a run lie.
+
+        Such lines are faults, breaklines, rivers, borders of materials. Generators stand beside them in pairs that are
+        mirror images, about h apart, and do not move. Lines may cross, end anywhere, and reach walls.
+
+        Parameters
+        ----------
+        lines : array_like, curve, shapely geometry, GeoJSON, or list of them
+            One or more lines: their vertices (k, 2); curves of `clvoro.curves`; lines, or polygons whose rings are
+            lines, of shapely; or a path, text or dict of GeoJSON. What is outside of the domain is left out.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If the domain is not in the plane, or `lines` are no lines or not in the domain.
+
+        Examples
+        --------
+        >>> fault = [(0.3, 0.2), (1.6, 0.8)]
+        >>> ground = clvoro.Box((0, 0), (2, 1)).with_lines([fault, [(0, 0.6), (2, 0.5)]])
+        >>> mesh = clvoro.adapt(ground, 0.1, "fast")
+        >>> covered = mesh.diagram.faces.area[mesh.diagram.line_faces].sum() / ground.lines.inside(ground).length
+        >>> round(float(covered), 9), sorted(set(mesh.diagram.cell_region.tolist()))
+        (1.0, [0, 1])
+        """
+        from .lines import Lines
+
+        self.require_plane("lines are in the plane", "leave them out")
+        made = type(self).described(**self.describe())
+        found = Lines(lines)
+        if not len(found.network(made).chains):
+            raise InputError(f"lines are outside of {self}, expected a part of one inside; do units of length agree?")
+        vars(made)["lines"] = found
+        return made
 
     @cached_property
     def periodic(self) -> tuple[bool, ...]:

@@ -173,7 +173,7 @@ _WRITERS: dict[str, Callable[..., None]] = {
 _KINDS = {".foam": "OpenFOAM", ".nc": "netCDF", ".vtu": ".vtu"}
 _METHODS = {".foam": "to_openfoam", ".nc": "to_netcdf", ".vtu": "to_vtu"}
 _OPTIONS = {
-    ".foam": ("patches", "types", "thickness", "binary", "walls"),
+    ".foam": ("patches", "types", "thickness", "binary", "walls", "zones"),
     ".nc": ("convention", "units"),
     ".vtu": ("walls",),
 }

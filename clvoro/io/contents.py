@@ -79,6 +79,12 @@ class Contents:
         return {} if self.result is None else self.result.settings
 
     @property
+    def with_regions(self) -> dict[str, np.ndarray]:
+        """The caller's data, and the region of each cell if the domain has lines."""
+        of_lines = {} if self.diagram.domain.lines is None else {"region": self.diagram.cell_region}
+        return of_lines | self.extra
+
+    @property
     def of_run(self) -> dict[str, np.ndarray]:
         """Cell data of the run: size, error and quality; empty for a diagram."""
         r = self.result
@@ -128,7 +134,8 @@ def _in_known_type(array: np.ndarray) -> np.ndarray:
 
 def describe(domain: Domain) -> dict[str, Any]:
     """Return a domain of any kind as numbers, strings and lists."""
-    return {"kind": type(domain).__name__, **domain.describe()}
+    lines = {} if domain.lines is None else {"lines": domain.lines.describe()}
+    return {"kind": type(domain).__name__, **domain.describe(), **lines}
 
 
 def described(description: Mapping[str, Any]) -> Domain:
@@ -144,4 +151,6 @@ def described(description: Mapping[str, Any]) -> Domain:
     if kind not in Domain.kinds:
         known = ", ".join(Domain.kinds)
         raise FileError(f"its domain is a {kind!r:.40}, expected one of {known}; import the class before")
-    return Domain.kinds[kind].described(**values)
+    lines = values.pop("lines", None)
+    domain = Domain.kinds[kind].described(**values)
+    return domain if lines is None else domain.with_lines(lines)

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import orjson
@@ -26,12 +26,15 @@ from ..errors import InputError, InputTypeError
 from ..finite_volumes.gate import warn_of_rejection
 from ..finite_volumes.prisms import polyhedra
 from ..finite_volumes.solver_mesh import WallShape, check_not_sphere, make_solver_mesh
-from ..geometry.boundary_names import Walls
+from ..geometry.boundary_names import WORD, Walls
 from ..mesh.connectivity import slices
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import Contents
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
@@ -196,6 +199,7 @@ _FILES = {
     "boundary": "polyBoundaryMesh",
     "faces": "faceList",
 }
+_ZONES = ("cellZones", "faceZones")
 _BYTE_ORDER = {"little": "LSB", "big": "MSB"}[sys.byteorder]
 _CHUNK = 1 << 14
 
@@ -208,6 +212,7 @@ def write_foam(
     thickness: float | None = None,
     binary: bool = False,
     walls: WallShape = "straight",
+    zones: Mapping[str, ArrayLike] | None = None,
 ) -> None:
     """Write a polyMesh.
 
@@ -220,6 +225,9 @@ def write_foam(
         See `poly_mesh`. The note in the file `points` says by how much straight walls change the area.
     binary : bool, optional
         Write numbers as bytes: labels of 32 bits and scalars of 64.
+    zones : mapping, optional
+        Zones of cells by name, one bool per cell each; see `MeshOutput.to_openfoam`. Without zones the files of those
+        of an earlier mesh are removed.
     """
     check_not_sphere(
         contents.diagram,
@@ -228,8 +236,10 @@ def write_foam(
     )
     if contents.extra:
         raise InputError(
-            f"cannot write cell_data to {path}: OpenFOAM's polyMesh holds none; save as .vtu or leave it out"
+            f"cannot write cell_data to {path}: OpenFOAM's polyMesh holds none; save as .vtu, write cells that belong "
+            "together as zones (mesh.to_openfoam(path, zones={name: mask})), or leave it out"
         )
+    of_cells = _zones(contents.diagram, zones)
     if not isinstance(binary, bool | np.bool_):
         raise InputTypeError(f"binary is {binary!r:.60} of type {type(binary).__name__}, expected True or False")
     mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls)
@@ -259,17 +269,25 @@ def write_foam(
             "neighbour": _text(inner, _labels(mesh.neighbor[:inner])),
         }
     lists["boundary"] = _text(len(made), [_boundary(made, inner).encode("ascii")])
+    if of_cells:
+        lists["cellZones"] = _text(len(of_cells), [_zone(name, rows, "cell") for name, rows in of_cells.items()])
+    on_lines = _faces_on_lines(contents.diagram, mesh)
+    if len(on_lines):
+        lists["faceZones"] = _text(1, [_zone("lines", on_lines, "face")])
     # `faces` is moved last: a case without it is recognized as incomplete.
     with atomic_folder(folder / "faces") as target:
-        for name in _FILES:
-            head = _header(name, notes.get(name, ""), binary and name != "boundary")
+        for name in [*(zone for zone in _ZONES if zone in lists), *_FILES]:
+            head = _header(name, notes.get(name, ""), binary and name not in ("boundary", *_ZONES))
             with open(target.with_name(name), "wb") as file:
                 file.write(head.encode("ascii"))
                 file.writelines(lists[name])
+    for name in _ZONES:
+        if name not in lists:
+            (folder / name).unlink(missing_ok=True)
 
 
 def _header(name: str, note: str, binary: bool) -> str:
-    kind = "faceCompactList" if binary and name == "faces" else _FILES[name]
+    kind = "faceCompactList" if binary and name == "faces" else _FILES.get(name, "regIOobject")
     noted = f'    note        "{note}";\n' if note else ""
     arch = f'    arch        "{_BYTE_ORDER};label=32;scalar=64";\n' if binary else ""
     return (
@@ -277,6 +295,50 @@ def _header(name: str, note: str, binary: bool) -> str:
         f"    class       {kind};\n{noted}"
         f'    location    "constant/polyMesh";\n    object      {name};\n}}\n\n'
     )
+
+
+def _zones(diagram: Diagram, given: Mapping[str, ArrayLike] | None) -> dict[str, np.ndarray]:
+    """Return the cells of each zone: parts between the lines of the domain, and those that the caller gives."""
+    found = {}
+    if diagram.domain.lines is not None:
+        regions = diagram.cell_region
+        found = {f"region-{k}": np.flatnonzero(regions == k) for k in range(regions.max() + 1)}
+    if not isinstance(given, Mapping | None):
+        raise InputTypeError(
+            f"zones is a {type(given).__name__}, expected a mapping from names to one bool per cell, such as "
+            "{'pipe': surface.contains(mesh.points)}"
+        )
+    for name, values in (given or {}).items():
+        if not isinstance(name, str) or not WORD.fullmatch(name) or name in found:
+            raise InputError(
+                f"zones has the name {name!r:.60}, expected a word of ASCII letters, digits, _, . and -, and another "
+                "one than region-0, region-1, ... in a domain with lines; choose another name"
+            )
+        mask = np.asarray(values)
+        if mask.dtype != bool or mask.shape != (len(diagram),):
+            raise InputError(
+                f"zones[{name!r}] has dtype {mask.dtype} and shape {mask.shape}, expected {len(diagram)} bool, one per "
+                "cell; write a comparison, such as mesh.points[:, 0] > 0"
+            )
+        found[name] = np.flatnonzero(mask)
+    return found
+
+
+def _faces_on_lines(diagram: Diagram, mesh: Faces) -> np.ndarray:
+    """Return the inner faces of a mesh for OpenFOAM that lie on the lines of the domain: those of two cells there."""
+    rows, n = diagram.line_faces, len(diagram)
+    of_lines = diagram.faces.owner[rows].astype(np.int64) * n + diagram.faces.neighbor[rows]
+    inner = slice(mesh.n_inner)
+    return np.flatnonzero(np.isin(mesh.owner[inner].astype(np.int64) * n + mesh.neighbor[inner], of_lines))
+
+
+def _zone(name: str, rows: np.ndarray, kind: Literal["cell", "face"]) -> bytes:
+    """Return a zone of cells or faces as text."""
+    labels = b"\n".join([b"%d" % len(rows), b"(", _numbers(rows).replace(b",", b"\n"), b")"])
+    body = b"    type %bZone;\n    %bLabels List<label>\n%b;\n" % (kind.encode(), kind.encode(), labels)
+    if kind == "face":
+        body += b"    flipMap List<bool> %d(%b);\n" % (len(rows), b" ".join([b"0"] * len(rows)))
+    return b"%b\n{\n%b}\n" % (name.encode(), body)
 
 
 def _bytes(values: np.ndarray, dtype: type) -> Iterator[bytes]:

@@ -50,7 +50,7 @@ class NetCDF:
     def __init__(
         self, path: Path, contents: Contents, dimensions: Mapping[str, int], attributes: Mapping[str, str | np.generic]
     ) -> None:
-        self.path, self.dimensions, self.extra = path, dict(dimensions), contents.extra
+        self.path, self.dimensions, self.extra = path, dict(dimensions), contents.with_regions
         settings = json.dumps(contents.settings, default=repr)
         self.attributes = {**attributes, "source": "clvoro", "clvoro_settings": settings}
         self._variables: dict[str, _Variable] = {}

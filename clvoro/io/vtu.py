@@ -248,7 +248,7 @@ def cell_data(contents: Contents) -> dict[str, np.ndarray]:
         **_on_boundaries(diagram.domain, face_owners(diagram), diagram.neighbors, n),
         "generator": in_space(diagram.points),
         **({"weight": diagram.weights} if diagram.is_power else {}),
-        **{k: in_space(v) if v.shape[1:] == (2,) else v for k, v in contents.extra.items()},
+        **{k: in_space(v) if v.shape[1:] == (2,) else v for k, v in contents.with_regions.items()},
     }
 
 

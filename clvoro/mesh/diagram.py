@@ -271,6 +271,25 @@ class Diagram(MeshOutput):
         graph = scipy.sparse.coo_array((np.concatenate([area, area]), both), (len(self), len(self)))
         return graph.tocsr()
 
+    @cached_property
+    def cell_region(self) -> np.ndarray:
+        """The part of the domain between its lines that each generator is in, (n,) int32; 0 is the largest part.
+
+        All formats of files hold it, if the domain has lines: as cell data, or as zones of cells for OpenFOAM.
+        """
+        if self.domain.lines is None:
+            return np.zeros(len(self), np.int32)
+        return self.domain.lines.region_of(self.domain, self.points)
+
+    @cached_property
+    def line_faces(self) -> np.ndarray:
+        """Rows of `faces` on the lines of the domain, (k,) int, such as those with the leakage of a fault."""
+        lines, f = self.domain.lines, self.faces
+        if lines is None:
+            return np.empty(0, np.int64)
+        ends = f.points[f.corners.reshape(-1, 2)[: f.n_inner]]
+        return np.flatnonzero(lines.covers(self.domain, ends))
+
     def cell(self, i: int) -> Cell:
         """Return one cell: generator, centroid, volume, neighbors, vertices and faces.
 

@@ -167,6 +167,7 @@ class MeshOutput:
         thickness: float | None = None,
         binary: bool = False,
         walls: WallShape = "straight",
+        zones: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         """Write the mesh in a box or a polygon for OpenFOAM.
 
@@ -193,6 +194,10 @@ class MeshOutput:
             straight face where they turn by at most 30 degrees in sum, face ends near a corner of the domain move into
             it, and short edges are collapsed. Solvers reject cells that are not convex. With "exact" all faces are
             those of the diagram.
+        zones : mapping, optional
+            Zones of cells by name, each with one bool per cell, as ``{"pipe": surface.contains(mesh.points)}``:
+            sources, porous media, parts that rotate. If the domain has lines, the parts between them are the zones
+            ``region-0``, ``region-1``, ..., and the faces on them the zone of faces ``lines``.
 
         Raises
         ------
@@ -202,6 +207,7 @@ class MeshOutput:
         from ..io import write
 
         options = {"patches": patches, "types": types, "thickness": thickness, "binary": binary, "walls": walls}
+        options["zones"] = zones
         write(self._self, path, kind=".foam", **options)
 
     def to_netcdf(

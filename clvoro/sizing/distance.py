@@ -14,6 +14,7 @@ from ..errors import InputError, InputTypeError
 from ..geometry import curves
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
+from ..geometry.lines import Lines
 from ..geometry.shapes import Circle, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface
 from ..geometry.triangles import segment_distance2
@@ -29,7 +30,7 @@ _FAR = 100  # diagonals of the domain beyond which a shape is probably in anothe
 # Kinds of items on the device: see size_item_distance2.
 _STRAIGHT, _ROUND, _TRIANGLE = 0, 1, 2
 
-Curve = Circle | Segment | Polyline | Edges | curves.Curve
+Curve = Circle | Segment | Polyline | Edges | curves.Curve | Lines
 Shape = Curve | Surface | Domain
 
 

@@ -127,6 +127,7 @@ class CorrectCount:
     def apply(self, run: Run) -> None:
         """Insert or delete until the number is right, or oscillates."""
         mesh, least, before, oscillations = run.state, math.inf, 0.0, 0
+        mesh.delete_squeezed()
         while self.share or run.fixed_count is not None:
             lack = missing_for_next_level(run, self.ahead) if self.ahead else missing(run)
             if abs(lack) <= self.share * mesh.n:

@@ -424,12 +424,28 @@ def _ring(ring: Any) -> Any:
     return [item.build(Path()) if isinstance(item, CurveTable) else item for item in ring]
 
 
+Line = RingCurve | Annotated[list[Plane], Meta(min_length=2)]
+
+
+def _with_lines(domain: Any, lines: Text | list[Line] | None, folder: Path) -> Any:
+    """Return `domain` with the lines of a table: a file of GeoJSON, or a list of lines."""
+    if lines is None:
+        return domain
+    if isinstance(lines, str):
+        return domain.with_lines(locate(folder, lines))
+    return domain.with_lines([line.build(folder) if isinstance(line, CurveTable) else line for line in lines])
+
+
 class BoxTable(Kind, tag="box"):
     MAKE = Box
     lower: Point
     upper: Point
     periodic: bool | list[bool] | None = None
     names: Names | None = None
+    lines: Text | list[Line] | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        return _with_lines(Box(**self.given("lines")), self.lines, folder)
 
 
 class PolygonTable(Kind, tag="polygon"):
@@ -439,6 +455,7 @@ class PolygonTable(Kind, tag="polygon"):
     holes: list[Ring] | None = None
     names: Names | None = None
     simplified: Positive | None = None
+    lines: Text | list[Line] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -447,7 +464,8 @@ class PolygonTable(Kind, tag="polygon"):
 
     def build(self, folder: Path, domain: Any = None) -> Polygon:
         domain = self._whole(folder)
-        return domain if self.simplified is None else domain.simplified(self.simplified)
+        made = domain if self.simplified is None else domain.simplified(self.simplified)
+        return _with_lines(made, self.lines, folder)
 
     def _whole(self, folder: Path) -> Polygon:
         if self.file is None:

@@ -1,0 +1,277 @@
+"""Lines inside a domain in 2D, on which faces of cells lie: faults, breaklines, borders of materials, rivers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from os import PathLike
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import shapely
+
+from ..arguments import format_point
+from ..errors import InputError, InputTypeError
+from .curves import Curve
+from .geojson import read_geojson
+
+if TYPE_CHECKING:
+    from .domain import Domain
+
+_SNAP = 1e-7  # of the domain: an end that is so near to another line, or to a wall, lies on it
+_SAGITTA = 0.15  # of a chord: largest distance of its middle from the curve
+_EXPECTED = "points (k, 2), curves of clvoro.curves, lines or polygons of shapely, GeoJSON, or a list of these"
+
+
+class Network(NamedTuple):
+    """The lines in a domain, divided where they meet.
+
+    Attributes
+    ----------
+    nodes : (k, 2) float64
+        Ends of chains. Ends that differ by a period are one node.
+    chains : list of (m, 2) float64
+    ends : (c, 2) int
+        The nodes at both ends of each chain.
+    """
+
+    nodes: np.ndarray
+    chains: list[np.ndarray]
+    ends: np.ndarray
+
+
+class Lines:
+    """Lines inside a domain; `Domain.with_lines` makes them. Also a shape for `clvoro.sizing.Distance`.
+
+    Attributes
+    ----------
+    paths : tuple of (k, 2) float64
+        The vertices of each line. Curves are polylines within their tolerance.
+    """
+
+    def __init__(self, source: object) -> None:
+        self.paths = tuple(_without_repetitions(path) for path in _paths(source))
+        if not self.paths:
+            raise InputError(f"lines is empty, expected {_EXPECTED}")
+        for k, path in enumerate(self.paths):
+            path.setflags(write=False)
+            if len(path) < 2:
+                raise InputError(f"lines[{k}] is a single point, {format_point(path[0])}, expected a line")
+
+    def __repr__(self) -> str:
+        return f"Lines({len(self.paths)} lines with {sum(map(len, self.paths))} vertices)"
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def describe(self) -> list[list[list[float]]]:
+        """Return the vertices as lists, for files."""
+        return [path.tolist() for path in self.paths]
+
+    def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the ends (m, 2), (m, 2) and radii (m,) of all segments, for `sizing.Distance`."""
+        begin = np.concatenate([path[:-1] for path in self.paths])
+        return begin, np.concatenate([path[1:] for path in self.paths]), np.zeros(len(begin))
+
+    @property
+    def geometry(self) -> Any:
+        """All lines as a shapely MultiLineString."""
+        return shapely.MultiLineString(list(self.paths))
+
+    def inside(self, domain: Domain) -> Any:
+        """Return the part of the lines in `domain` but not on its walls, divided where lines meet, as shapely lines."""
+        extent = domain.extent
+        outline = domain.outline
+        region = _box(domain) if outline is None else outline.geometry
+        snap = _SNAP * float(extent.max())
+        copies = [self.geometry]
+        for axis in np.flatnonzero(domain.periodic).tolist():
+            copies += [_moved(line, axis, sign * extent[axis]) for line in copies for sign in (-1, 1)]
+        lines = shapely.get_parts(shapely.union_all(copies))
+        ends = shapely.multipoints(np.concatenate([shapely.get_coordinates(line)[[0, -1]] for line in lines]))
+        joined = shapely.unary_union(shapely.snap(shapely.multilinestrings(lines), ends, snap))
+        parts = shapely.get_parts(shapely.intersection(joined, region))
+        parts = parts[(shapely.get_type_id(parts) == 1) & (shapely.length(parts) > snap)]
+        walls = wall_lines(domain)
+        kept = [piece for part in parts for piece in _beside(part, walls, snap)]
+        return shapely.line_merge(shapely.multilinestrings(kept)) if kept else shapely.MultiLineString()
+
+    def network(self, domain: Domain) -> Network:
+        """Return the part of the lines in `domain`, divided where they meet."""
+        merged = self.inside(domain)
+        chains = [shapely.get_coordinates(line) for line in shapely.get_parts(merged)]
+        if not chains:
+            return Network(np.empty((0, 2)), [], np.empty((0, 2), int))
+        ends = np.concatenate([chain[[0, -1]] for chain in chains])
+        step = _SNAP * float(domain.extent.max())
+        # Seams: the same place at both sides.
+        place = np.rint((domain.wrap(ends + step / 2) - domain.lower) / step).astype(np.int64)
+        _, first, index = np.unique(place, axis=0, return_index=True, return_inverse=True)
+        return Network(ends[first], chains, np.reshape(index, (-1, 2)))
+
+    def covers(self, domain: Domain, segments: np.ndarray) -> np.ndarray:
+        """Return which of `segments` (n, 2, 2) lie on the lines with both ends and the chord between; (n,) bool."""
+        within = 10 * _SNAP * float(domain.extent.max())  # in float32, too
+        middles = segments.mean(axis=1)
+        ends = segments + (domain.wrap(middles) - middles)[:, None]
+        lines = shapely.union_all([self.inside(domain), *self._at_seams(domain)])
+        shapely.prepare(lines)
+        on = shapely.dwithin(shapely.points(ends), lines, within).all(axis=1)
+        lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
+        # Between two points of a curve its chord leaves it.
+        on[on] = shapely.distance(shapely.points(ends[on].mean(axis=1)), lines) < np.maximum(
+            _SAGITTA * lengths[on], within
+        )
+        return on
+
+    def _at_seams(self, domain: Domain) -> list[Any]:
+        """Return the images of the lines beyond the periodic sides."""
+        inside, axes = self.inside(domain), np.flatnonzero(domain.periodic).tolist()
+        return [_moved(inside, axis, sign * domain.extent[axis]) for axis in axes for sign in (-1, 1)]
+
+    def regions(self, domain: Domain) -> list[Any]:
+        """Return the parts into which the lines divide `domain`, as shapely polygons, the largest first.
+
+        Parts that are joined by a periodic seam are one multipolygon.
+        """
+        outline = domain.outline
+        region = _box(domain) if outline is None else outline.geometry
+        # Lines of an end that misses a wall by round-off reach it.
+        boundary = region.boundary
+        lines = shapely.snap(self.inside(domain), boundary, _SNAP * float(domain.extent.max()))
+        parts = shapely.get_parts(shapely.polygonize([shapely.unary_union([lines, boundary])]))
+        parts = parts[shapely.intersects(region, shapely.point_on_surface(parts))]
+        joined = _joined_at_seams(list(parts), domain)
+        return sorted(joined, key=lambda part: (-round(part.area / domain.measure, 9), *part.bounds))
+
+    def region_of(self, domain: Domain, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) the number of its part in `regions`, (n,) int32."""
+        parts = self.regions(domain)
+        found = np.zeros(len(points), np.int32)
+        places = shapely.points(domain.wrap(points))
+        rows, numbers = shapely.STRtree(parts).query_nearest(places, all_matches=False)
+        found[rows] = numbers
+        return found
+
+
+def _paths(source: object) -> Iterator[np.ndarray]:
+    """Yield the vertices (k, 2) of all lines of `source`."""
+    if isinstance(source, Lines):
+        yield from source.paths
+    elif isinstance(source, Curve):
+        vertices = source.vertices
+        yield np.concatenate([vertices, vertices[:1]]) if source.closed else vertices
+    elif isinstance(source, shapely.Geometry):
+        yield from _of_shape(source)
+    elif isinstance(source, Mapping | str | PathLike) or hasattr(source, "__geo_interface__"):
+        found, name = read_geojson(source)
+        yield from _of_geojson(found, name)
+    else:
+        yield from _of_sequence(source)
+
+
+def _of_sequence(source: Any) -> Iterator[np.ndarray]:
+    array: np.ndarray
+    try:
+        array = np.asarray(source, dtype=float)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.ndim == 2 and array.shape[1] == 2:
+        if not np.isfinite(array).all():
+            raise InputError(
+                f"lines has the vertex {array[~np.isfinite(array).all(axis=1)][0]}, expected finite numbers"
+            )
+        yield array.copy()
+        return
+    if (
+        not isinstance(source, list | tuple | np.ndarray)
+        or not len(source)
+        or (np.ndim(source[0]) == 0 and (isinstance(source[0], int | float)))
+    ):
+        raise InputTypeError(f"lines has {source!r:.60}, expected {_EXPECTED}")
+    for item in source:
+        yield from _paths(item)
+
+
+def _of_shape(shape: Any) -> Iterator[np.ndarray]:
+    for part in shapely.get_parts(shape):
+        if part.geom_type in ("Polygon", "MultiPolygon"):
+            part = part.boundary
+        if part.geom_type in ("MultiLineString", "GeometryCollection"):
+            yield from _of_shape(part)
+        elif part.geom_type in ("LineString", "LinearRing") and not part.is_empty:
+            yield shapely.get_coordinates(part)
+        else:
+            raise InputTypeError(f"lines has a {part.geom_type}, expected {_EXPECTED}")
+
+
+def _of_geojson(node: Any, name: str) -> Iterator[np.ndarray]:
+    kind = node.get("type") if isinstance(node, Mapping) else None
+    if kind == "FeatureCollection":
+        for feature in node.get("features") or ():
+            yield from _of_geojson(feature, name)
+    elif kind == "Feature":
+        yield from _of_geojson(node.get("geometry"), name)
+    else:
+        try:
+            shape = shapely.geometry.shape(dict(node))
+        except Exception as error:
+            raise InputError(f"{name} has {node!r:.60} ({error!s:.100}), expected GeoJSON with lines") from error
+        yield from _of_shape(shape)
+
+
+def _without_repetitions(path: np.ndarray) -> np.ndarray:
+    """Return the vertices without those equal to the one before."""
+    path = np.asarray(path, float)
+    return path[np.concatenate([[True], (np.diff(path, axis=0) != 0).any(axis=1)])]
+
+
+def _moved(shape: Any, axis: int, distance: float) -> Any:
+    """Return a shape of shapely, moved along an axis."""
+    way = np.where(np.arange(2) == axis, distance, 0.0)
+    return shapely.transform(shape, lambda x: x + way)
+
+
+def _box(domain: Domain) -> Any:
+    (a, b), (c, d) = domain.lower, domain.upper
+    return shapely.box(a, b, c, d)
+
+
+def wall_lines(domain: Domain) -> Any:
+    """Return the walls of a domain in 2D as shapely lines."""
+    if all(domain.periodic):
+        return shapely.MultiLineString()
+    boundary: Any = domain.boundary()
+    begin, end, _ = boundary.items()
+    return shapely.multilinestrings(np.stack([begin, end], axis=1))
+
+
+def _beside(line: Any, walls: Any, within: float) -> list[Any]:
+    """Return the segments of a line that do not run along the walls, as lines."""
+    if walls.is_empty:
+        return [line]
+    points = shapely.get_coordinates(line)
+    middle = shapely.points((points[1:] + points[:-1]) / 2)
+    on = shapely.distance(shapely.points(points), walls) < within
+    along = on[1:] & on[:-1] & (shapely.distance(middle, walls) < within)
+    if not along.any():
+        return [line]
+    rest: Any = shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1)[~along])
+    return list(rest)
+
+
+def _joined_at_seams(parts: list[Any], domain: Domain) -> list[Any]:
+    """Join parts that share a piece of a periodic seam."""
+    for axis in np.flatnonzero(domain.periodic).tolist():
+        k = 0
+        while k < len(parts):
+            moved = _moved(parts[k], axis, float(domain.extent[axis]))
+            shared = shapely.length(shapely.intersection(moved, np.array(parts, object)))
+            mates = [j for j in np.flatnonzero(shared > _SNAP * float(domain.extent.max())).tolist() if j != k]
+            if mates:
+                j = mates[0]
+                both = shapely.multipolygons([*shapely.get_parts(parts[k]), *shapely.get_parts(parts[j])])
+                parts = [part for m, part in enumerate(parts) if m not in (j, k)] + [both]
+                k = 0
+            else:
+                k += 1
+    return parts
