@@ -16,7 +16,7 @@ import shapely
 from ..arguments import FIRST_ROWS, check_points, coincident_pair, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
-from ..geometry.line_pairs import LinePairs, place_pairs
+from ..geometry.lines.pairs import LinePairs, place_pairs
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import read_only
@@ -241,7 +241,7 @@ def clear_balls(
     origin, scale = domain.frame
     centers, radii = (pairs.centers - origin) / scale, pairs.radii / scale
     period = domain.periods(np.dtype(np.float64)) if any(domain.periodic) else np.zeros(domain.dim)
-    tree = KDTree(np.mod(centers, np.where(period > 0, period, np.inf)), boxsize=period)
+    tree = scipy.spatial.KDTree(np.mod(centers, np.where(period > 0, period, np.inf)), boxsize=period)
     moving = np.flatnonzero(labels >= n_fixed)
     x = points[moving].astype(np.float64)
     here: Any = np.arange(len(x))

@@ -12,7 +12,7 @@ from ..errors import CoarseSizeWarning, InputError, SizeFieldError
 from ..geometry.boundary_layers import apart_from, count_rows, free_domain, place_layers
 from ..geometry.domain import Domain
 from ..geometry.geojson import may_be_degrees
-from ..geometry.line_pairs import place_pairs
+from ..geometry.lines.pairs import place_pairs
 from ..geometry.sphere import Sphere
 from ..sizing import Sizing, as_field
 from ..sizing.field import Field

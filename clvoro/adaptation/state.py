@@ -13,7 +13,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..geometry.domain import Domain
-from ..geometry.line_pairs import LinePairs
+from ..geometry.lines.pairs import LinePairs
 from ..mesh.diagram import Diagram
 from ..mesh.results import Displacements
 from ..opencl.device_array import buffer_of

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pyopencl.array as cla
 
     from ..opencl.engine import Engine
-    from .lines import Lines
+    from .lines.lines import Lines
     from .polygon import Polygon
     from .sphere import Sphere
     from .wall_triangles import WallTriangles
@@ -108,7 +108,7 @@ class Domain(ABC):
         >>> round(float(covered), 9), sorted(set(mesh.diagram.cell_region.tolist()))
         (1.0, [0, 1])
         """
-        from .lines import Lines
+        from .lines.lines import Lines
 
         self.require_plane("lines are in the plane", "leave them out")
         made = type(self).described(**self.describe())

@@ -14,7 +14,7 @@ from ..errors import InputError, InputTypeError
 from ..geometry import curves
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
-from ..geometry.lines import Lines
+from ..geometry.lines.lines import Lines
 from ..geometry.shapes import Circle, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface
 from ..geometry.triangles import segment_distance2

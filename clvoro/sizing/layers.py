@@ -9,7 +9,7 @@ import numpy as np
 
 from ..geometry.boundary_layers import Layers, chosen_segments, outer_segments
 from ..geometry.domain import Domain
-from ..geometry.line_pairs import LinePairs
+from ..geometry.lines.pairs import LinePairs
 from ..geometry.shapes import Edges
 from .distance import Distance
 from .field import Field, as_field, minimum

@@ -7,7 +7,7 @@ import pytest
 
 import clvoro
 from clvoro.errors import InputError, MismatchWarning
-from clvoro.geometry.line_pairs import place_pairs
+from clvoro.geometry.lines.pairs import place_pairs
 
 from ..geometry.test_lines import BED, BOX, FAULT, PAIRS
 

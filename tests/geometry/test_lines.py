@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
-from clvoro.geometry.line_pairs import place_pairs
+from clvoro.geometry.lines.pairs import place_pairs
 
 BOX = clvoro.Box((0, 0), (2, 1))
 FAULT, BED = [(0.3, 0.2), (1.6, 0.8)], [(0.0, 0.6), (2.0, 0.5)]

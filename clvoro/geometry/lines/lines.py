@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import shapely
 
-from ..arguments import format_point
-from ..errors import InputError, InputTypeError
-from .curves import Curve
-from .geojson import read_geojson
+from ...arguments import format_point
+from ...errors import InputError, InputTypeError
+from ..curves import Curve
+from ..geojson import read_geojson
 
 if TYPE_CHECKING:
-    from .domain import Domain
+    from ..domain import Domain
 
 _SNAP = 1e-7  # of the domain: an end that is so near to another line, or to a wall, lies on it
 _SAGITTA = 0.15  # of a chord: largest distance of its middle from the curve

@@ -15,10 +15,10 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import shapely
-from scipy.spatial import KDTree
 
-from .domain import Domain
+from ..domain import Domain
 from .lines import Network, wall_lines
 
 _RADIUS = math.sqrt(0.5)  # of a circle, over the mean of its chords: square cells
@@ -405,7 +405,7 @@ class _Placing:
         for i in np.flatnonzero(~inside | (depth < _DEPTH * heights)).tolist():
             self.blame_at(layout, points[i], i)
         period = np.where(domain.periodic, domain.extent, 0.0)
-        tree = KDTree(domain.wrap(points) - domain.lower, boxsize=period)
+        tree = scipy.spatial.KDTree(domain.wrap(points) - domain.lower, boxsize=period)
         centers = domain.wrap(np.array(layout.centers)) - domain.lower
         for b, inner in enumerate(tree.query_ball_point(centers, np.array(layout.radii) * (1 - 1e-7))):
             for i in set(inner).difference(layout.members[b]):

@@ -1,0 +1,1 @@
+"""Lines inside a domain in 2D, and the generators beside them."""
