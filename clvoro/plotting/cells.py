@@ -139,9 +139,13 @@ def draw_polygons(
     widths: np.ndarray,
     bare: np.ndarray | None = None,
     light: np.ndarray | None = None,
+    colors: np.ndarray | None = None,
 ) -> PolyCollection:
-    """Add filled polygons (k, 2) with outlines; those marked by `bare` have none. `light` (n,) dims their colors."""
-    colors = paint.rgba(cells)
+    """Add filled polygons (k, 2) with outlines; those marked by `bare` have none.
+
+    `light` (n,) dims their `colors` (n, 4), by default those of the cells.
+    """
+    colors = paint.rgba(cells) if colors is None else colors.copy()
     if light is not None:
         colors[:, :3] *= light[:, None]
     # The thinnest lines fade out: a sudden end of all lines would look like a feature of the mesh.

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from ..arguments import format_point
 from ..errors import InputError
@@ -24,7 +26,7 @@ from ..mesh.results import Result
 from .cells import draw_polygons, edge_widths, images_in
 from .colors import Color, Paint, paint_of, picture_of
 from .legends import add_key, finished
-from .style import WIDTH, corners_of, frame_domain, interactive_figure, nice, styled
+from .style import METHOD_COLORS, WIDTH, corners_of, frame_domain, interactive_figure, nice, styled
 
 if TYPE_CHECKING:
     import pyvista
@@ -172,6 +174,7 @@ def plot_cutaway(
     label: str | None = None,
     limits: tuple[float, float] | None = None,
     edges: bool = True,
+    walls: bool = False,
     key: bool = True,
     title: str | None = None,
 ) -> Any:
@@ -192,6 +195,8 @@ def plot_cutaway(
         The point; by default among the smallest cells.
     angles : (azimuth, elevation), degrees
         Direction of the viewer.
+    walls : bool
+        Give faces on walls a color for each wall: for each side of a box, and for each smooth patch of a solid.
     label, limits, edges, key, title
         As for `plot_cells`.
 
@@ -212,7 +217,7 @@ def plot_cutaway(
     with styled():
         if ax is None:
             ax = interactive_figure(WIDTH, cutaway_height(result, angles)).add_subplot()
-        _draw_cutaway(ax, result.diagram, paint, cut, _point(result, through), angles, edges)
+        _draw_cutaway(ax, result.diagram, paint, cut, _point(result, through), angles, edges, walls)
         _label_axes(ax, result.diagram, *view_axes(angles))
         return finished(ax, paint, key, title)
 
@@ -402,8 +407,25 @@ def visible_faces(
     return surface.cell_data["cell"][order], [polygons[k] for k in order], normals[order]
 
 
+def _walls_of(diagram: Diagram, polygons: list[np.ndarray]) -> np.ndarray:
+    """Return the wall of each polygon, (f,) int; -1 for others."""
+    starts, corners = take_rows(*face_corners(diagram), np.flatnonzero(diagram.neighbors < 0))
+    counts = np.maximum(np.diff(starts), 1)
+    middles = np.add.reduceat(diagram.vertices[corners], starts[:-1]) / counts[:, None]
+    far, row = KDTree(middles).query([polygon.mean(axis=0) for polygon in polygons])
+    walls = -1 - diagram.neighbors[diagram.neighbors < 0]
+    return np.where(np.asarray(far) < 1e-6 * diagram.domain.extent.max(), walls[row], -1)
+
+
 def _draw_cutaway(
-    ax: Any, diagram: Diagram, paint: Paint, cut: Any, through: np.ndarray, angles: Any, edges: bool = True
+    ax: Any,
+    diagram: Diagram,
+    paint: Paint,
+    cut: Any,
+    through: np.ndarray,
+    angles: Any,
+    edges: bool = True,
+    walls: bool = False,
 ) -> None:
     """Add the view to `ax`: the faces of the kept cells that are seen, and the edges of the box."""
     right, up, towards = view_axes(angles)
@@ -421,7 +443,12 @@ def _draw_cutaway(
     # The light comes from above, a little from the left.
     light = 0.5 * towards + 0.62 * up - 0.3 * right
     shade = 0.72 + 0.28 * np.clip(normals @ light / np.linalg.norm(light), 0, 1)
-    draw_polygons(ax, cells, flat, paint, edge_widths(ax, flat) if edges else np.zeros(len(flat)), light=shade)
+    widths, colors = edge_widths(ax, flat) if edges else np.zeros(len(flat)), paint.rgba(cells)
+    if walls and polygons:
+        wall = _walls_of(diagram, polygons)
+        hues = np.array([to_rgba(color) for color in METHOD_COLORS])
+        colors[wall >= 0] = 0.5 + 0.5 * hues[wall[wall >= 0] % len(hues)]
+    draw_polygons(ax, cells, flat, paint, widths, light=shade, colors=colors)
 
 
 def _label_axes(ax: Any, diagram: Diagram, right: np.ndarray, up: np.ndarray, towards: np.ndarray) -> None:
