@@ -17,7 +17,6 @@ left out: needles, slits, stairs of pixels, points in which islands touch.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -157,9 +156,8 @@ class _WallMaker:
     points : (p, 2) float64
     position : (p,) float64
         Position of points on the boundary; nan for others.
-    walls : list of (cell, position of the wall, first point, second point)
-    more : list of (2,) float64
-        Further points, behind `points`.
+    walls : tuple of (w,) int, (w,) float64 and (w, 2) int
+        Faces on the boundary: cell, position on the boundary, points.
     left_out : list of (area, place)
     """
 
@@ -177,6 +175,7 @@ class _WallMaker:
         for cell in (f.left, f.right):
             np.minimum.at(width, cell, apart)
         self.width = np.minimum(width[f.left], width[f.right])
+        self.walls = np.empty(0, np.int64), np.empty(0), np.empty((0, 2), np.int64)
         self.left_out: list[tuple[float, np.ndarray]] = []
 
     def place_vertices(self) -> None:
@@ -201,27 +200,29 @@ class _WallMaker:
         self.crossed = np.full((len(begin), 2), np.nan)
         cut = np.flatnonzero((begin + end < 2 * INSIDE) & ((begin != ON) | (end != ON)))
         a, way = f.vertices[f.begin[cut]], f.vertices[f.end[cut]] - f.vertices[f.begin[cut]]
-        parts, whole = self._parts_inside(a, way), [0.0, 1.0, np.nan, np.nan]
+        row, parts = self._parts_inside(a, way)
         length = np.maximum(np.hypot(*way.T), 1e-300)
         middle = (((x[f.left[cut]] + x[f.right[cut]]) / 2 - a) * way).sum(axis=1) / length / length
         margin = ON_WALL * self.width[cut] / length
+        on = np.column_stack([begin[cut] == ON, end[cut] == ON])
+        # From a vertex inside the part there. A face that both vertices have is whole if it nearly reaches the other.
+        low, high, m = parts[:, 0], parts[:, 1], middle[row]
+        order = np.lexsort((low - high, (low > m) | (m > high), row))
+        first, last = np.searchsorted(row, np.arange(len(cut))), np.searchsorted(row, np.arange(len(cut)), "right") - 1
+        seen = first <= last
+        first, last, best = (np.minimum(rows, max(len(row) - 1, 0)) for rows in (first, last, order[first * seen]))
+        from_begin, from_end = begin[cut] == INSIDE, end[cut] == INSIDE
+        part = parts[np.where(from_begin, first, np.where(from_end, last, best))]
+        gap = BEHIND_WALL * margin
+        whole = from_begin & on[:, 1] & (high[last] >= 1 - gap)
+        whole |= ~from_begin & from_end & on[:, 0] & (low[first] <= gap)
+        part[whole] = 0, 1, np.nan, np.nan
+        self.kept[cut] = seen & (~on.any(axis=1) | (part[:, 1] - part[:, 0] >= gap))
+        part[on[:, 0] & (part[:, 0] < margin), 2] = np.nan
+        part[on[:, 1] & (part[:, 1] > 1 - margin), 3] = np.nan
+        self.crossed[cut] = part[:, 2:]
         spans = np.stack([f.vertices[f.begin], f.vertices[f.end]], axis=1)
-        for k, face in enumerate(cut.tolist()):
-            on = begin[face] == ON, end[face] == ON
-            self.kept[face] = bool(parts[k])
-            if not parts[k]:
-                continue
-            if begin[face] == INSIDE:
-                part = parts[k][0] if not on[1] or parts[k][-1][1] < 1 - BEHIND_WALL * margin[k] else whole
-            elif end[face] == INSIDE:
-                part = parts[k][-1] if not on[0] or parts[k][0][0] > BEHIND_WALL * margin[k] else whole
-            else:
-                part = max(parts[k], key=lambda p: (p[0] <= middle[k] <= p[1], p[1] - p[0]))
-            first, last, at_first, at_last = part
-            spans[face] = a[k] + np.array([[first], [last]]) * way[k]
-            self.kept[face] = not any(on) or last - first >= BEHIND_WALL * margin[k]
-            self.crossed[face, 0] = np.nan if on[0] and first < margin[k] else at_first
-            self.crossed[face, 1] = np.nan if on[1] and last > 1 - margin[k] else at_last
+        spans[cut] = a[:, None] + part[:, :2, None] * way[:, None]
         # Without a vertex inside, a face may lie on the far side of a thin wall from one of its cells.
         loose = np.flatnonzero(self.kept & (begin != INSIDE) & (end != INSIDE))
         for cells in (f.left, f.right):
@@ -232,8 +233,8 @@ class _WallMaker:
                 seen |= np.bincount(hidden, minlength=len(loose)) == 0
             self.kept[loose[~seen]] = False
 
-    def _parts_inside(self, a: np.ndarray, way: np.ndarray) -> list[list[list[float]]]:
-        """Return the parts of segments from `a` (k, 2) to `a + way` that lie inside, a list for each segment.
+    def _parts_inside(self, a: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parts of segments from `a` (k, 2) to `a + way` that lie inside: segments (p,) and parts (p, 4).
 
         A part has its begin and end, from 0 to 1 along the segment, and the positions on the boundary there; nan at an
         end of the segment. Between two crossings a segment is inside or outside: its middle tells.
@@ -248,14 +249,9 @@ class _WallMaker:
         row, t, s = row[order], t[order], s[order]
         middle = (t[:-1] + t[1:]) / 2
         inside = (row[:-1] == row[1:]) & self.domain.covers(a[row[:-1]] + middle[:, None] * way[row[:-1]])
-        parts: list[list[list[float]]] = [[] for _ in range(len(a))]
-        for k in np.flatnonzero(inside).tolist():
-            mine = parts[row[k]]
-            if mine and mine[-1][1] == t[k] and inside[k - 1]:
-                mine[-1][1::2] = [float(t[k + 1]), float(s[k + 1])]
-            else:
-                mine.append([float(t[k]), float(t[k + 1]), float(s[k]), float(s[k + 1])])
-        return parts
+        begins = np.flatnonzero(inside & ~np.concatenate([[False], inside[:-1]]))
+        ends = np.flatnonzero(inside & ~np.concatenate([inside[1:], [False]])) + 1
+        return row[begins], np.column_stack([t[begins], t[ends], s[begins], s[ends]])
 
     def name_points(self) -> None:
         """Give each end of a kept face its point.
@@ -360,14 +356,7 @@ class _WallMaker:
         after = np.arange(1, len(cell) + 1)
         after[starts[1:][filled] - 1] = starts[:-1][filled]
         gaps = np.flatnonzero(ends[:, 1] != ends[after, 0])
-        self.walls: list[tuple[int, float, int, int]] = []
-        self.more: list[np.ndarray] = []
-        for c, p, q in zip(cell[gaps].tolist(), ends[gaps, 1].tolist(), ends[after[gaps], 0].tolist(), strict=True):
-            corners, positions = self._chain(c, p, q)
-            count = len(self.points) + len(self.more)
-            self.more += corners
-            names = [p, *range(count, count + len(corners)), q]
-            self.walls += [(c, s, *pair) for s, pair in zip(positions, pairwise(names), strict=True)]
+        self._close(cell[gaps], np.column_stack([ends[gaps, 1], ends[after[gaps], 0]]))
         for c in np.flatnonzero(~filled).tolist():
             self._take_piece(c)
 
@@ -376,65 +365,114 @@ class _WallMaker:
         piece = self.domain.piece_of(self.generators[cell : cell + 1])[0]
         ring = int(np.flatnonzero(self.domain.piece_of_ring == piece)[0])
         first, last = self.along.ring_starts[ring : ring + 2].tolist()
-        begin, k = len(self.points) + len(self.more), last - first
-        self.more += list(self.rings.vertices[first:last])
-        middles = self.along.position(np.arange(first, last), np.full(k, 0.5)).tolist()
-        self.walls += [(cell, s, begin + i, begin + (i + 1) % k) for i, s in enumerate(middles)]
+        k = last - first
+        begin = len(self.points) + np.arange(k)
+        self.points = np.concatenate([self.points, self.rings.vertices[first:last]])
+        middles = self.along.position(np.arange(first, last), np.full(k, 0.5))
+        self._add_walls(np.full(k, cell), middles, np.column_stack([begin, np.roll(begin, -1)]))
 
-    def _chain(self, cell: int, p: int, q: int) -> tuple[list[np.ndarray], list[float]]:
-        """Return the corners of `cell` between its points `p` and `q`, and the position of each wall between them."""
-        s, t = self.position[[p, q]].tolist()
-        ring, other = self.along.ring_of(np.array([s, t])).tolist()
-        if ring != other or np.isnan(s + t):
-            return [], [t if np.isnan(s) else s]
-        begin, total = self.along.span(ring)
-        way = (t - s) % total
-        path, a, b = self._vertices_between(ring, s, way), self.points[p], self.points[q]
-        if _area(np.concatenate([a[None], self.rings.vertices[path], b[None]])) > AROUND * self.size[cell] ** 2:
-            path, way = path[:0], 0.0  # the ends are in the opposite order, as where a cell touches the boundary
-        x = self.rings.vertices[path]
-        chosen: list[int] = []
-        for low, high in pairwise([-1, *np.flatnonzero(self.changes_part[path]).tolist(), len(path)]):
-            u, v = a if low < 0 else x[low], b if high == len(path) else x[high]
-            chosen += [] if low < 0 else [low]
-            chosen += self._bulges(u, v, x, range(low + 1, high), cell)
-        self._note(cell, np.concatenate([a[None], x, b[None], x[chosen][::-1]]))
-        marks = [0.0, *((self.along.begins[path[chosen]] - s) % total).tolist(), way]
-        return list(x[chosen]), [begin + (s - begin + (m + n) / 2) % total for m, n in pairwise(marks)]
+    def _add_walls(self, cell: np.ndarray, position: np.ndarray, ends: np.ndarray) -> None:
+        """Add faces on the boundary: cells, positions of their walls, and two points each."""
+        added = cell, position, ends
+        self.walls = tuple(np.concatenate(pair) for pair in zip(self.walls, added, strict=True))
 
-    def _vertices_between(self, ring: int, s: float, way: float) -> np.ndarray:
-        """Return the vertices of the domain between position `s` and that after `way`, without both ends, (k,) int."""
-        first, last = self.along.ring_starts[ring : ring + 2].tolist()
-        begin, total = self.along.span(ring)
-        begins, end = self.along.begins[first:last], begin + (s - begin + way) % total
-        low = int(np.searchsorted(begins, s, side="right"))
-        high = int(np.searchsorted(begins, end, side="left"))
-        count = high - low + (last - first if end < s or s + way > begin + total else 0)
-        return first + (low + np.arange(max(count, 0))) % (last - first)
+    def _close(self, cell: np.ndarray, gap: np.ndarray) -> None:
+        """Close the gaps from points `gap[:, 0]` to `gap[:, 1]` of cells (g,), with corners of the domain between."""
+        s, t = self.position[gap].T
+        ring, other = self.along.ring_of(s), self.along.ring_of(t)
+        joined = (ring == other) & ~np.isnan(s + t)
+        self._add_walls(cell[~joined], np.where(np.isnan(s), t, s)[~joined], gap[~joined])
+        cell, gap, s, t, ring = (values[joined] for values in (cell, gap, s, t, ring))
+        begin = self.along.begins[self.along.ring_starts[:-1]][ring]
+        total = self.along.begins[self.along.ring_starts[1:]][ring] - begin
+        way, (first, count) = (t - s) % total, self._vertices_between(ring, s, t)
+        # Chains: the first point, the vertices between, the last point.
+        chain, path = self._chains(ring, first, count, gap)
+        starts = np.concatenate([[0], np.cumsum(count + 2)])
+        around = _areas(chain, starts[:-1], starts[1:] - 1)
+        # The ends are in the opposite order where a cell touches the boundary.
+        wrong = around > AROUND * self.size[cell] ** 2
+        count[wrong], way[wrong] = 0, 0
+        if wrong.any():
+            chain, path = self._chains(ring, first, count, gap)
+            starts = np.concatenate([[0], np.cumsum(count + 2)])
+        row = np.repeat(np.arange(len(cell)), count + 2)
+        chosen = (path < 0) | self.changes_part[path]
+        self._choose_corners(chain, chosen, self.size[cell][row])
+        kept = np.flatnonzero(chosen)
+        added = path[kept] >= 0
+        names = np.empty(len(kept), np.int64)
+        names[added] = len(self.points) + np.arange(np.count_nonzero(added))
+        self.points = np.concatenate([self.points, chain[kept[added]]])
+        row = row[kept]
+        kept_starts = np.searchsorted(row, np.arange(len(cell) + 1))
+        names[kept_starts[:-1]], names[kept_starts[1:] - 1] = gap.T
+        marks = (self.along.begins[path[kept]] - s[row]) % total[row]
+        marks[kept_starts[:-1]], marks[kept_starts[1:] - 1] = 0, way
+        side = np.flatnonzero(row[:-1] == row[1:])
+        middles = s[row[side]] - begin[row[side]] + (marks[side] + marks[side + 1]) / 2
+        self._add_walls(
+            cell[row[side]],
+            begin[row[side]] + middles % total[row[side]],
+            np.column_stack([names[side], names[side + 1]]),
+        )
+        # What lies between the boundary and the walls.
+        off = _areas(chain, starts[:-1], starts[1:] - 1) - _areas(chain[kept], kept_starts[:-1], kept_starts[1:] - 1)
+        large = np.flatnonzero(np.abs(off) > LEFT_OUT * self.size[cell] ** 2)
+        places = chain[(starts[:-1] + starts[1:])[large] // 2]
+        self.left_out += list(zip(np.abs(off[large]).tolist(), places, strict=True))
 
-    def _bulges(self, a: np.ndarray, b: np.ndarray, x: np.ndarray, among: range, cell: int) -> list[int]:
-        """Return the places `among` the points `x` (k, 2) that become corners of a convex chain from `a` to `b`."""
-        length = float(np.hypot(*(b - a)))
-        if not among or length == 0:
-            return []
-        off = cross(x[among.start : among.stop] - a, (b - a)[None]) / length
-        k = int(off.argmax())
-        area = _area(np.concatenate([a[None], x[among.start : among.stop], b[None]]))
-        if off[k] < LEAST_BULGE * self.size[cell] or area < FILLED * off[k] * length / 2:
-            return []
-        k = among[k]
-        before = self._bulges(a, x[k], x, range(among.start, k), cell)
-        return [*before, k, *self._bulges(x[k], b, x, range(k + 1, among.stop), cell)]
+    def _vertices_between(self, ring: np.ndarray, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first vertex of the domain after positions `s` (g,), and how many there are before `t`."""
+        first, last = self.along.ring_starts[ring], self.along.ring_starts[ring + 1]
+        low = np.maximum(np.searchsorted(self.along.begins, s, side="right"), first)
+        high = np.clip(np.searchsorted(self.along.begins, t, side="left"), first, last)
+        count = np.maximum(high - low + np.where(t < s, last - first, 0), 0)
+        return low, count
 
-    def _note(self, cell: int, loop: np.ndarray) -> None:
-        """Note the area of `loop` (k, 2), between the boundary and the walls of a cell, if it is large."""
-        area = abs(_area(loop))
-        if area > LEFT_OUT * self.size[cell] ** 2:
-            self.left_out.append((area, loop[len(loop) // 2]))
+    def _chains(
+        self, ring: np.ndarray, first: np.ndarray, count: np.ndarray, gap: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the points along the boundary for each gap, (k, 2), and their vertices of the domain; -1 for ends."""
+        starts = np.concatenate([[0], np.cumsum(count + 2)])
+        row = np.repeat(np.arange(len(count)), count + 2)
+        begin, size = self.along.ring_starts[:-1], np.diff(self.along.ring_starts)
+        path = first[row] + np.arange(starts[-1]) - starts[row] - 1
+        path = begin[ring][row] + (path - begin[ring][row]) % size[ring][row]
+        chain = self.rings.vertices[path]
+        for end, points in ((starts[:-1], gap[:, 0]), (starts[1:] - 1, gap[:, 1])):
+            chain[end], path[end] = self.points[points], -1
+        return chain, path
+
+    def _choose_corners(self, chain: np.ndarray, chosen: np.ndarray, size: np.ndarray) -> None:
+        """Choose among the points of chains those that become corners of convex cells, between the `chosen` ones.
+
+        As in the algorithm of Douglas and Peucker the point farthest from a straight face divides it, if it is far
+        enough outside, and the domain fills the triangle; then both halves are treated alike.
+        """
+        ends = np.flatnonzero(chosen)
+        low, high = ends[:-1], ends[1:]
+        low, high = low[high - low > 1], high[high - low > 1]
+        while low.size:
+            starts = np.concatenate([[0], np.cumsum(high - low - 1)])
+            row = np.repeat(np.arange(len(low)), np.diff(starts))
+            place = low[row] + 1 + np.arange(starts[-1]) - starts[row]
+            side = chain[high] - chain[low]
+            length = np.hypot(*side.T)
+            off = cross(chain[place] - chain[low][row], side[row]) / np.maximum(length, 1e-300)[row]
+            farthest = np.maximum.reduceat(off, starts[:-1])
+            hit = np.flatnonzero(off == farthest[row])
+            middle = place[hit[np.searchsorted(row[hit], np.arange(len(low)))]]
+            filled = _areas(chain, low, high) >= FILLED * farthest * length / 2
+            divided = (length > 0) & (farthest >= LEAST_BULGE * size[low]) & filled
+            low, middle, high = low[divided], middle[divided], high[divided]
+            chosen[middle] = True
+            low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
+            low, high = low[high - low > 1], high[high - low > 1]
 
     def warn_of_left_out(self) -> None:
         """Warn of parts of the domain that are left out, and of islands that no cell has a wall on."""
-        used = np.unique(self.along.ring_of(np.array([wall[1] for wall in self.walls])))
+        used = np.unique(self.along.ring_of(self.walls[1]))
         left = [(area, place) for area, place in self.left_out if area < self.domain.measure / 2]
         for ring, x in enumerate(self.rings.rings):
             if ring not in used:
@@ -457,11 +495,10 @@ class _WallMaker:
         ends = np.where((left > right)[:, None], self.ends[kept][:, ::-1], self.ends[kept])
         owner, neighbor = np.minimum(left, right), np.maximum(left, right)
         order = np.lexsort((neighbor, owner))
-        cell, position, *wall_ends = map(np.array, zip(*self.walls, strict=True))
+        cell, position, wall_ends = self.walls
         wall = self.rings.edge_numbers[self.along.edges(position)]
-        by_wall = np.lexsort((cell, wall))
-        points = np.concatenate([self.points, self.more]) if self.more else self.points
-        ends = np.concatenate([ends[order], np.column_stack(wall_ends)[by_wall]])
+        by_wall, points = np.lexsort((cell, wall)), self.points
+        ends = np.concatenate([ends[order], wall_ends[by_wall]])
         owner = np.concatenate([owner[order], cell[by_wall]]).astype(np.int32)
         # Corners of two rings that touch are one point, and faces without length vanish.
         short = np.hypot(*(points[ends[:, 1]] - points[ends[:, 0]]).T) <= NO_LENGTH * self.size[owner]
@@ -488,5 +525,13 @@ class _WallMaker:
 
 def _area(loop: np.ndarray) -> float:
     """Return the area within points (k, 2), positive if they run counter-clockwise."""
-    x = loop - loop[0]
-    return float(cross(x, np.roll(x, -1, axis=0)).sum()) / 2
+    return float(_areas(loop, np.array([0]), np.array([len(loop) - 1]))[0])
+
+
+def _areas(points: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Return the area within the `points` (k, 2) from each `first` to each `last` (g,), negative if clockwise."""
+    starts = np.concatenate([[0], np.cumsum(last - first)])
+    row = np.repeat(np.arange(len(first)), last - first)
+    place = first[row] + np.arange(starts[-1]) - starts[row]
+    base = points[first][row]
+    return np.bincount(row, cross(points[place] - base, points[place + 1] - base), len(first)) / 2
