@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from ..mesh.connectivity import following, take_rows
 from ..mesh.faces import Faces
-from ..mesh.geometry import polygon_areas, smaller_size, turns
+from ..mesh.geometry import polygon_areas, polygon_sides, smaller_size, sum_rows, turns
 from ..mesh.straightening import WALL_CORNER, cross
 from .independent import independent
 from .prisms import simple_loops
@@ -39,16 +40,17 @@ def collapse_short_edges(mesh: Faces, parts: np.ndarray) -> Faces:
     parts : (k,) int
         Index of the named part of the boundary for each wall.
     """
-    failed = np.empty(0, np.int64)
+    failed, together = np.empty(0, np.int64), True
     for _ in range(_ROUNDS):
-        current = _Round(mesh, parts, failed)
+        current = _Round(mesh, parts, failed, together)
         if not current.faces.size:
             break
-        target, done = current.find_targets()
+        target, done = current.find_common_targets() if together else current.find_targets()
         if done.any():
             mesh, failed = current.collapsed(target, done), np.empty(0, np.int64)
-        else:
+        elif not together:
             failed = np.concatenate([failed, current.faces])
+        together = False
     return mesh
 
 
@@ -71,7 +73,7 @@ def drop_skew_corners(mesh: Faces, parts: np.ndarray) -> Faces:
 
 
 class _Round:
-    """Short faces that share no cell, and the points that move if they collapse.
+    """Short faces that share no cell, or only no point, and the points that move if they collapse.
 
     Attributes
     ----------
@@ -94,8 +96,8 @@ class _Round:
         The point that takes its place: where two ends of a face merge, one of them.
     """
 
-    def __init__(self, mesh: Faces, parts: np.ndarray, failed: np.ndarray) -> None:
-        """Choose among the short faces of `mesh` without those of `failed`."""
+    def __init__(self, mesh: Faces, parts: np.ndarray, failed: np.ndarray, together: bool) -> None:
+        """Choose among the short faces of `mesh` without those of `failed`; those chosen `together` may share cells."""
         self.mesh, v = mesh, len(mesh.points)
         self.starts, self.loop, broken = simple_loops(mesh)
         self.cell = np.repeat(np.arange(mesh.n_cells), np.diff(self.starts))
@@ -106,7 +108,7 @@ class _Round:
         if not broken.size:
             bent = np.zeros(v, bool)
             bent[self.loop[turns(mesh.points[self.loop], following(self.starts)) < STRAIGHT]] = True
-            bad = bent[ends].any(axis=1) | (mesh.measures.skewness[: len(mesh)] > SKEW)
+            bad = bent[ends].any(axis=1) | (plane_skewness(mesh) > SKEW)
             ratio[bad] = _lengths_over_limits(mesh, broken, LONGEST)[bad]
         first, second = self.images[ends].T
         # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
@@ -114,7 +116,8 @@ class _Round:
         tried &= self.kind[ends].min(axis=1) == np.where(mesh.neighbor >= 0, _FREE, WALL)
         tried[failed] = False
         faces = np.flatnonzero(tried)
-        self.faces = self._independent(faces[np.argsort(ratio[faces], kind="stable")])
+        faces = faces[np.argsort(ratio[faces], kind="stable")]
+        self.faces = self._apart(faces) if together else self._independent(faces)
         self.a, self.b = ends[self.faces].T
         face_of = np.full(self.images.max(initial=-1) + 1, -1)  # of each class
         face_of[first[self.faces]] = face_of[second[self.faces]] = np.arange(len(self.faces))
@@ -135,6 +138,12 @@ class _Round:
         ranks = np.repeat(np.tile(np.arange(len(faces)), 2), np.diff(starts))
         return faces[independent(ranks, touched, np.arange(len(faces)), n)]
 
+    def _apart(self, faces: np.ndarray) -> np.ndarray:
+        """Return those of `faces`, the first ones preferred, that share no point with one another, nor its images."""
+        ends = self.images[self.mesh.corners.reshape(-1, 2)[faces]]
+        rows = np.repeat(np.arange(len(faces)), 2)
+        return faces[independent(rows, ends.ravel(), np.arange(len(faces)), self.images.max(initial=-1) + 1)]
+
     def _follow_images(self) -> tuple[np.ndarray, np.ndarray]:
         """Return `shift` and `into`."""
         points, v = self.mesh.points, len(self.mesh.points)
@@ -152,50 +161,91 @@ class _Round:
 
     def find_targets(self) -> tuple[np.ndarray, np.ndarray]:
         """Return to which place both ends of each face can move, (e, 2), and whether they can, (e,) bool."""
-        touched = np.unique(self.cell[self.face_of[self.loop] >= 0])
-        before, corners = take_rows(self.starts, self.loop, touched)
-        row = np.repeat(np.arange(len(touched)), np.diff(before))
-        face = np.full(len(touched), -1)
-        np.maximum.at(face, row, self.face_of[corners])
-        least = _least_turns(self.mesh.points[corners], before)
-        kept = self.into[corners] != self.into[corners[following(before)]]
-        left = np.bincount(row, kept, len(touched)).astype(int)
-        after, corners = np.concatenate([[0], np.cumsum(left)]), self.into[corners[kept]]
-        # Beside an island a cell would touch itself if it has both ends of the face, but not the face.
-        key = np.sort(row[kept] * len(self.mesh.points) + corners)
-        simple = left >= 3
-        simple[key[1:][np.diff(key) == 0] // len(self.mesh.points)] = False
         p, q = self.mesh.points[self.a], self.mesh.points[self.b]
         kind, other = self.kind[self.a], self.kind[self.b]
-        done, target = np.zeros(len(self.faces), bool), p.copy()
+        done, target, every = np.zeros(len(self.faces), bool), p.copy(), np.ones(len(self.faces), bool)
         for choice, allowed in (
             # The middle of two points on a wall may be off a curve.
             ((p + q) / 2, (kind == _FREE) & (other == _FREE)),
             (p, kind >= other),
             (q, kind <= other),
         ):
-            turn = _least_turns(self._moved(choice)[corners], after)
-            good = simple & (turn >= np.minimum(least, STRAIGHT))
-            accepted = allowed & ~done & (np.bincount(face, ~good, len(done)) == 0)
+            accepted = allowed & ~done & self._are_good(choice, every)
             target[accepted] = choice[accepted]
             done |= accepted
         return target, done
 
-    def _moved(self, target: np.ndarray, done: np.ndarray | None = None) -> np.ndarray:
-        """Return the points, (v, 2), where both ends of the faces `done` (all by default) go to `target` (e, 2)."""
-        moving = self.face_of >= 0
-        if done is not None:
-            moving &= done[self.face_of]
+    def find_common_targets(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the same for faces that may share cells, of which all that make one cell bad stay as they are."""
+        p, q = self.mesh.points[self.a], self.mesh.points[self.b]
+        kind, other = self.kind[self.a], self.kind[self.b]
+        target = np.where(((kind == _FREE) & (other == _FREE))[:, None], (p + q) / 2, q)
+        target[kind > other] = p[kind > other]
+        done = np.ones(len(self.faces), bool)
+        while (bad := done & ~self._are_good(target, done)).any():
+            done &= ~bad
+        return target, done
+
+    def _are_good(self, target: np.ndarray, done: np.ndarray) -> np.ndarray:
+        """Return for each face whether all cells around it remain convex if the faces `done` (e,) collapse, (e,)."""
+        before, corners, row, least = self._around
+        face, into = self.face_of[corners], self._into(done)[corners]
+        kept = into != into[following(before)]
+        left = np.bincount(row, kept, len(least)).astype(int)
+        after, into = np.concatenate([[0], np.cumsum(left)]), into[kept]
+        # Beside an island a cell would touch itself if it has both ends of the face, but not the face.
+        key = np.sort(row[kept] * len(self.mesh.points) + into)
+        bad = left < 3
+        bad[key[1:][np.diff(key) == 0] // len(self.mesh.points)] = True
+        bad |= ~(_least_turns(self._moved(target, done)[into], after) >= np.minimum(least, STRAIGHT))
+        return np.bincount(face[face >= 0], bad[row[face >= 0]], len(done)) == 0
+
+    @cached_property
+    def _around(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The cells around the faces as ragged rows of points, the row of each point, and the cells' least turns."""
+        touched = np.unique(self.cell[self.face_of[self.loop] >= 0])
+        starts, corners = take_rows(self.starts, self.loop, touched)
+        row = np.repeat(np.arange(len(touched)), np.diff(starts))
+        return starts, corners, row, _least_turns(self.mesh.points[corners], starts)
+
+    def _into(self, done: np.ndarray) -> np.ndarray:
+        """Return the point that takes the place of each, (v,), if the faces `done` (e,) collapse."""
+        return np.where((self.face_of >= 0) & done[self.face_of], self.into, np.arange(len(self.into)))
+
+    def _moved(self, target: np.ndarray, done: np.ndarray) -> np.ndarray:
+        """Return the points, (v, 2), where both ends of the faces `done` (e,) go to `target` (e, 2)."""
+        moving = (self.face_of >= 0) & done[self.face_of]
         points, face = self.mesh.points.copy(), self.face_of[moving]
         points[moving] = target[face] + self.shift[moving] * np.array(self.mesh.domain.extent)
         return points
 
     def collapsed(self, target: np.ndarray, done: np.ndarray) -> Faces:
         """Return the mesh in which both ends of the faces `done` (e,) are at `target` (e, 2)."""
-        into = np.where((self.face_of >= 0) & done[self.face_of], self.into, np.arange(len(self.into)))
-        ends = into[self.mesh.corners].reshape(-1, 2)
+        ends = self._into(done)[self.mesh.corners].reshape(-1, 2)
         made = replace(self.mesh, points=self._moved(target, done), corners=ends.ravel())
         return made.take_faces(ends[:, 0] != ends[:, 1]).compact()
+
+
+def plane_skewness(mesh: Faces) -> np.ndarray:
+    """Return `mesh.measures.skewness` of a mesh in 2D without its prisms, (f,)."""
+    cell, p, q, origins = polygon_sides(mesh)
+    twice = cross(p, q)
+    area = np.maximum(np.bincount(cell, twice, mesh.n_cells), 1e-300)
+    centroids = origins + sum_rows(cell, twice[:, None] * (p + q), mesh.n_cells) / (3 * area)[:, None]
+    a, b = mesh.points[mesh.corners.reshape(-1, 2)].swapaxes(0, 1)
+    way = b - a
+    length = np.maximum(np.hypot(*way.T), 1e-300)
+    way /= length[:, None]
+    arm = (a + b) / 2 - centroids[mesh.owner]
+    normal = np.column_stack([way[:, 1], -way[:, 0]])
+    line = normal * (normal * arm).sum(axis=1)[:, None]
+    inner = mesh.neighbor >= 0
+    across = centroids[mesh.neighbor[inner]] + mesh.shift[inner] * np.array(mesh.domain.extent)
+    line[inner] = across - centroids[mesh.owner[inner]]
+    least = np.where(inner, 0.2, 0.4) * np.hypot(*line.T)
+    along = (normal * line).sum(axis=1) + 1e-300
+    offset = arm - ((normal * arm).sum(axis=1) / along)[:, None] * line
+    return np.hypot(*offset.T) / np.maximum(np.maximum(length / 2, least), 1e-300)
 
 
 def _lengths_over_limits(mesh: Faces, broken: np.ndarray, short: float = SHORT) -> np.ndarray:
