@@ -12,6 +12,7 @@ import numpy as np
 
 from ..mesh.faces import Faces
 from ..mesh.geometry import turns
+from .measures import PlaneMeasures
 from .short_edges import STRAIGHT, WALL, point_kinds
 
 LEAST_DETERMINANT = 2e-3
@@ -40,7 +41,7 @@ def open_dead_ends(mesh: Faces, parts: np.ndarray) -> Faces:
         Index of the named part of the boundary for each wall.
     """
     for _ in range(ROUNDS):
-        bad = np.flatnonzero(mesh.measures.determinant < LEAST_DETERMINANT)
+        bad = np.flatnonzero(PlaneMeasures(mesh).determinant < LEAST_DETERMINANT)
         if not bad.size or mesh.n_cells < 3:
             return mesh
         edit = _Edit(mesh, parts)
@@ -59,7 +60,7 @@ class _Edit:
         self.old, self.points = mesh, list(mesh.points)
         self.ends = mesh.corners.reshape(-1, 2).tolist()
         self.owner, self.neighbor = mesh.owner.tolist(), mesh.neighbor.tolist()
-        self.centroids = mesh.measures.geometry.centroids[:, :2]
+        self.centroids = PlaneMeasures(mesh).centroids
         self.slides = point_kinds(mesh, parts) == WALL
         self.starts, sides = mesh.cell_faces()
         self.faces = mesh.sides()[1][sides]

@@ -69,7 +69,7 @@ def warn_of_rejection(mesh: Faces) -> None:
     at_wall[mesh.owner[k:]] = True
     kept, (a, b) = at_wall.copy(), (mesh.owner[:k], mesh.neighbor[:k])
     kept[a[at_wall[b]]] = kept[b[at_wall[a]]] = True
-    part = _part_of(mesh, kept)
+    part, _ = mesh.part(kept)
     failed = [c for c in _openfoam(part, at_wall[kept]) if c.demanded and not c.ok]
     if not failed:
         return
@@ -82,29 +82,6 @@ def warn_of_rejection(mesh: Faces) -> None:
         "Use smaller cells there, or drop what is smaller than a cell first, as domain.simplified(size) does",
         MismatchWarning,
     )
-
-
-def _part_of(mesh: Faces, kept: np.ndarray) -> Faces:
-    """Return the mesh in 2D of the cells that are `kept`, (n,) bool; their faces towards others are on wall 0."""
-    cells, k = np.flatnonzero(kept), mesh.n_inner
-    place = np.full(mesh.n_cells, -1)
-    place[cells] = np.arange(len(cells))
-    here, there = kept[mesh.owner], np.zeros(len(mesh), bool)
-    there[:k] = kept[mesh.neighbor[:k]]
-    both, one = np.flatnonzero(here & there), np.flatnonzero(here ^ there)
-    rows = np.concatenate([both, one])
-    ends, turned = mesh.corners.reshape(-1, 2)[rows], ~here[rows]
-    owner = place[np.where(turned, mesh.neighbor[rows], mesh.owner[rows])]
-    neighbor = np.where(mesh.neighbor[one] < 0, mesh.neighbor[one], -1)
-    taken = mesh.take_faces(
-        rows,
-        generators=mesh.generators[cells],
-        corners=np.where(turned[:, None], ends[:, ::-1], ends).ravel(),
-        starts=2 * np.arange(len(rows) + 1),
-        owner=owner.astype(np.int32),
-        neighbor=np.concatenate([place[mesh.neighbor[both]], neighbor]).astype(np.int32),
-    )
-    return taken.compact()
 
 
 def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mesh.connectivity import following, take_rows
-from ..mesh.geometry import Geometry, cell_geometry, face_geometry, smaller_size, sum_rows
+from ..mesh.geometry import Geometry, cell_geometry, face_geometry, face_vectors, polygon_sides, smaller_size, sum_rows
+from ..mesh.straightening import cross
 from .prisms import polyhedra
 
 if TYPE_CHECKING:
@@ -362,6 +363,60 @@ class SolverMeasures:
             for share in (0.1, 1, 10):
                 found[f"{name}_percentile_{share:g}"] = float(np.percentile(values, share))
         return found
+
+
+class PlaneMeasures:
+    """Measures of faces and cells of a mesh in 2D: those of its prisms, in a fraction of the time.
+
+    Attributes
+    ----------
+    areas : (n,) float64
+    centroids : (n, 2) float64
+    """
+
+    def __init__(self, mesh: Faces) -> None:
+        self.mesh = mesh
+        cell, p, q, origins = polygon_sides(mesh)
+        twice = cross(p, q)
+        self.areas = np.bincount(cell, twice, mesh.n_cells) / 2
+        moments = np.stack([np.bincount(cell, twice * sums, mesh.n_cells) for sums in (p + q).T], axis=1)
+        self.centroids = origins + moments / (6 * np.maximum(self.areas, _TINY**2))[:, None]
+        self.inner = mesh.neighbor >= 0
+        self.centers, self.vectors = face_vectors(mesh.points, mesh.starts, mesh.corners)
+        self.lengths = np.maximum(np.hypot(*self.vectors.T), _TINY)
+        self.normals = self.vectors / self.lengths[:, None]
+        self._arms = self.centers - self.centroids[mesh.owner]
+        self._along = (self.normals * self._arms).sum(axis=1)
+        self._lines = self.normals * self._along[:, None]
+        across = self.centroids[mesh.neighbor[self.inner]] + mesh.shift[self.inner] * np.array(mesh.domain.extent)
+        self._lines[self.inner] = across - self.centroids[mesh.owner[self.inner]]
+
+    @cached_property
+    def skewness(self) -> np.ndarray:
+        """See `SolverMeasures.skewness`, (f,)."""
+        least = np.where(self.inner, 0.2, 0.4) * np.hypot(*self._lines.T)
+        along = (self.normals * self._lines).sum(axis=1) + _TINY
+        offset = self._arms - (self._along / along)[:, None] * self._lines
+        return np.hypot(*offset.T) / (np.maximum(self.lengths / 2, least) + _TINY)
+
+    @cached_property
+    def non_orthogonality(self) -> np.ndarray:
+        """See `SolverMeasures.non_orthogonality`, (f,)."""
+        across = np.abs(cross(self._lines, self.normals))
+        angle = np.degrees(np.arctan2(across, (self._lines * self.normals).sum(axis=1)))
+        return np.where(self.inner, angle, 0.0)
+
+    @cached_property
+    def determinant(self) -> np.ndarray:
+        """See `SolverMeasures.determinant`, (n,)."""
+        mesh, n = self.mesh, self.mesh.n_cells
+        k = np.flatnonzero(self.inner)
+        once = k[mesh.twin[k] < 0]
+        cell = np.concatenate([mesh.owner[k], mesh.neighbor[once]])
+        x, y = np.concatenate([self.vectors[k], self.vectors[once]]).T
+        mean = np.bincount(cell, np.hypot(x, y), n) / np.maximum(np.bincount(cell, minlength=n), 1)
+        xx, xy, yy = (np.bincount(cell, product, n) for product in (x * x, x * y, y * y))
+        return np.abs(xx * yy - xy * xy) / np.maximum(mean, _TINY) ** 4 / 8
 
 
 def _mean_angle(degrees: np.ndarray) -> float:

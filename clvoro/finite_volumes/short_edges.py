@@ -9,9 +9,10 @@ import numpy as np
 
 from ..mesh.connectivity import following, take_rows
 from ..mesh.faces import Faces
-from ..mesh.geometry import polygon_areas, polygon_sides, smaller_size, sum_rows, turns
+from ..mesh.geometry import polygon_areas, smaller_size, turns
 from ..mesh.straightening import WALL_CORNER, cross
 from .independent import independent
+from .measures import PlaneMeasures
 from .prisms import simple_loops
 
 SHORT, THIN = 0.055, 0.2
@@ -57,7 +58,7 @@ def collapse_short_edges(mesh: Faces, parts: np.ndarray) -> Faces:
 def drop_skew_corners(mesh: Faces, parts: np.ndarray) -> Faces:
     """Return a mesh in 2D without those corners between two wall faces of one cell that make one of the two skew."""
     skew = np.zeros(len(mesh), bool)
-    skew[mesh.n_inner :] = mesh.measures.skewness[mesh.n_inner : len(mesh)] > SKEW
+    skew[mesh.n_inner :] = PlaneMeasures(mesh).skewness[mesh.n_inner :] > SKEW
     ends, drop = mesh.corners.reshape(-1, 2).copy(), np.zeros(len(mesh), bool)
     twice, walls = np.bincount(mesh.corners, minlength=len(mesh.points)) == 2, slice(mesh.n_inner, None)
     begins_at = dict(zip(ends[walls, 0].tolist(), range(mesh.n_inner, len(mesh)), strict=True))
@@ -108,7 +109,7 @@ class _Round:
         if not broken.size:
             bent = np.zeros(v, bool)
             bent[self.loop[turns(mesh.points[self.loop], following(self.starts)) < STRAIGHT]] = True
-            bad = bent[ends].any(axis=1) | (plane_skewness(mesh) > SKEW)
+            bad = bent[ends].any(axis=1) | (PlaneMeasures(mesh).skewness > SKEW)
             ratio[bad] = _lengths_over_limits(mesh, broken, LONGEST)[bad]
         first, second = self.images[ends].T
         # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
@@ -224,28 +225,6 @@ class _Round:
         ends = self._into(done)[self.mesh.corners].reshape(-1, 2)
         made = replace(self.mesh, points=self._moved(target, done), corners=ends.ravel())
         return made.take_faces(ends[:, 0] != ends[:, 1]).compact()
-
-
-def plane_skewness(mesh: Faces) -> np.ndarray:
-    """Return `mesh.measures.skewness` of a mesh in 2D without its prisms, (f,)."""
-    cell, p, q, origins = polygon_sides(mesh)
-    twice = cross(p, q)
-    area = np.maximum(np.bincount(cell, twice, mesh.n_cells), 1e-300)
-    centroids = origins + sum_rows(cell, twice[:, None] * (p + q), mesh.n_cells) / (3 * area)[:, None]
-    a, b = mesh.points[mesh.corners.reshape(-1, 2)].swapaxes(0, 1)
-    way = b - a
-    length = np.maximum(np.hypot(*way.T), 1e-300)
-    way /= length[:, None]
-    arm = (a + b) / 2 - centroids[mesh.owner]
-    normal = np.column_stack([way[:, 1], -way[:, 0]])
-    line = normal * (normal * arm).sum(axis=1)[:, None]
-    inner = mesh.neighbor >= 0
-    across = centroids[mesh.neighbor[inner]] + mesh.shift[inner] * np.array(mesh.domain.extent)
-    line[inner] = across - centroids[mesh.owner[inner]]
-    least = np.where(inner, 0.2, 0.4) * np.hypot(*line.T)
-    along = (normal * line).sum(axis=1) + 1e-300
-    offset = arm - ((normal * arm).sum(axis=1) / along)[:, None] * line
-    return np.hypot(*offset.T) / np.maximum(np.maximum(length / 2, least), 1e-300)
 
 
 def _lengths_over_limits(mesh: Faces, broken: np.ndarray, short: float = SHORT) -> np.ndarray:

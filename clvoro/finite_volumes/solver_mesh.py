@@ -48,6 +48,7 @@ def make_solver_mesh(
 def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray) -> Faces:
     """Take the faces of `diagram`, or make straight walls, and collapse short faces."""
     from .dead_ends import open_dead_ends
+    from .relaxation import relax_bad_faces
     from .short_edges import drop_skew_corners
     from .walls import straight_walls
 
@@ -60,6 +61,7 @@ def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray)
     mesh = _COLLAPSED[mesh.dim](mesh, diagram, parts, collapse)
     if outline is not None and collapse:
         mesh = open_dead_ends(drop_skew_corners(mesh, parts), parts)
+        mesh = relax_bad_faces(mesh, parts)
     if outline is not None and abs(mesh.area_change) > _LARGE_CHANGE:
         warn(
             f"straight walls change the area of the domain by {100 * mesh.area_change:+.2g} %: its boundary has "

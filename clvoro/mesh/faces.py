@@ -269,6 +269,31 @@ class Faces(Sealed):
         taken = {name: getattr(self, name)[rows] for name in ("owner", "neighbor", "shift", "half_face")}
         return replace(self, **{**taken, "twin": place[self.twin[rows]], **arrays})
 
+    def part(self, kept: np.ndarray) -> tuple[Faces, np.ndarray]:
+        """Return the mesh in 2D of the cells that are `kept`, (n,) bool, and the number of each of its points.
+
+        Faces towards other cells are on wall 0.
+        """
+        cells, k = np.flatnonzero(kept), self.n_inner
+        place = np.full(self.n_cells, -1)
+        place[cells] = np.arange(len(cells))
+        here, there = kept[self.owner], np.zeros(len(self), bool)
+        there[:k] = kept[self.neighbor[:k]]
+        both, one = np.flatnonzero(here & there), np.flatnonzero(here ^ there)
+        rows = np.concatenate([both, one])
+        ends, turned = self.corners.reshape(-1, 2)[rows], ~here[rows]
+        owner = place[np.where(turned, self.neighbor[rows], self.owner[rows])]
+        neighbor = np.where(self.neighbor[one] < 0, self.neighbor[one], -1)
+        taken = self.take_faces(
+            rows,
+            generators=self.generators[cells],
+            corners=np.where(turned[:, None], ends[:, ::-1], ends).ravel(),
+            starts=2 * np.arange(len(rows) + 1),
+            owner=owner.astype(np.int32),
+            neighbor=np.concatenate([place[self.neighbor[both]], neighbor]).astype(np.int32),
+        )
+        return taken.compact(), np.unique(ends)
+
     def compact(self) -> Faces:
         """Return the mesh without points that no face has."""
         used = np.zeros(len(self.points), bool)
