@@ -416,7 +416,7 @@ class PlaneMeasures:
         x, y = np.concatenate([self.vectors[k], self.vectors[once]]).T
         mean = np.bincount(cell, np.hypot(x, y), n) / np.maximum(np.bincount(cell, minlength=n), 1)
         xx, xy, yy = (np.bincount(cell, product, n) for product in (x * x, x * y, y * y))
-        return np.abs(xx * yy - xy * xy) / np.maximum(mean, _TINY) ** 4 / 8
+        return np.abs(xx * yy - xy * xy) / np.maximum(mean**4, _TINY**2) / 8
 
 
 def _mean_angle(degrees: np.ndarray) -> float:

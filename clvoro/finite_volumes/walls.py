@@ -25,6 +25,7 @@ from ..arguments import format_point, warn
 from ..errors import MismatchWarning
 from ..geometry.polygon import Polygon
 from ..geometry.ring_coordinate import RingCoordinate
+from ..geometry.rings import OrientedRings
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.straightening import WALL_CORNER, cross
@@ -156,18 +157,19 @@ class _WallMaker:
     points : (p, 2) float64
     position : (p,) float64
         Position of points on the boundary; nan for others.
-    walls : tuple of (w,) int, (w,) float64 and (w, 2) int
-        Faces on the boundary: cell, position on the boundary, points.
+    walls : tuple of (w,) int, (w,) int and (w, 2) int
+        Faces on the boundary: cells, walls, points.
     left_out : list of (area, place)
     """
 
     def __init__(self, diagram: Diagram, domain: Polygon, parts: np.ndarray) -> None:
-        self.diagram, self.domain, self.rings = diagram, domain, domain.oriented
+        self.diagram, self.domain = diagram, domain
+        self.rings = domain.oriented
         self.generators = diagram.points
-        self.along = RingCoordinate(domain)
-        part = parts[self.rings.edge_numbers]
-        self.changes_part = np.empty(len(part), bool)
-        self.changes_part[self.rings.next_vertex] = part != part[self.rings.next_vertex]
+        self.along = RingCoordinate(domain, self.rings)
+        self.changes_part = _changes(self.rings, parts)
+        walks, self.place_in_walk = self.rings.walks()
+        self.walks = RingCoordinate(domain, walks), _changes(walks, parts)
         self.convex = f = convex_faces(self.generators, diagram.weights, float(domain.extent.max()))
         self.size = np.sqrt(diagram.volumes)
         apart = np.linalg.norm(self.generators[f.right] - self.generators[f.left], axis=1)
@@ -175,7 +177,7 @@ class _WallMaker:
         for cell in (f.left, f.right):
             np.minimum.at(width, cell, apart)
         self.width = np.minimum(width[f.left], width[f.right])
-        self.walls = np.empty(0, np.int64), np.empty(0), np.empty((0, 2), np.int64)
+        self.walls = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2), np.int64)
         self.left_out: list[tuple[float, np.ndarray]] = []
 
     def place_vertices(self) -> None:
@@ -356,7 +358,17 @@ class _WallMaker:
         after = np.arange(1, len(cell) + 1)
         after[starts[1:][filled] - 1] = starts[:-1][filled]
         gaps = np.flatnonzero(ends[:, 1] != ends[after, 0])
-        self._close(cell[gaps], np.column_stack([ends[gaps, 1], ends[after[gaps], 0]]))
+        cell, gap = cell[gaps], np.column_stack([ends[gaps, 1], ends[after[gaps], 0]])
+        positions = self.position[gap]
+        left = self._close(cell, gap, self.along, self.changes_part, positions)
+        # Around a point in which rings touch the boundary of a cell may lead from one to the other.
+        cell, gap, positions = cell[left], gap[left], positions[left]
+        edge = self.along.edges(np.nan_to_num(positions))
+        share = (positions - self.along.begins[edge]) / self.rings.lengths[edge]
+        walks, changes = self.walks
+        left = self._close(cell, gap, walks, changes, walks.position(self.place_in_walk[edge], share))
+        edge = edge[left, np.isnan(positions[left, 1]) * -1 + 1]
+        self._add_walls(cell[left], self.rings.edge_numbers[edge], gap[left])
         for c in np.flatnonzero(~filled).tolist():
             self._take_piece(c)
 
@@ -364,40 +376,45 @@ class _WallMaker:
         """Give a cell without neighbors the outer ring of its piece of the domain."""
         piece = self.domain.piece_of(self.generators[cell : cell + 1])[0]
         ring = int(np.flatnonzero(self.domain.piece_of_ring == piece)[0])
-        first, last = self.along.ring_starts[ring : ring + 2].tolist()
-        k = last - first
-        begin = len(self.points) + np.arange(k)
+        first, last = self.rings.ring_starts[ring : ring + 2].tolist()
+        begin = len(self.points) + np.arange(last - first)
         self.points = np.concatenate([self.points, self.rings.vertices[first:last]])
-        middles = self.along.position(np.arange(first, last), np.full(k, 0.5))
-        self._add_walls(np.full(k, cell), middles, np.column_stack([begin, np.roll(begin, -1)]))
+        wall = self.rings.edge_numbers[first:last]
+        self._add_walls(np.full(last - first, cell), wall, np.column_stack([begin, np.roll(begin, -1)]))
 
-    def _add_walls(self, cell: np.ndarray, position: np.ndarray, ends: np.ndarray) -> None:
-        """Add faces on the boundary: cells, positions of their walls, and two points each."""
-        added = cell, position, ends
-        self.walls = tuple(np.concatenate(pair) for pair in zip(self.walls, added, strict=True))
+    def _add_walls(self, cell: np.ndarray, wall: np.ndarray, ends: np.ndarray) -> None:
+        """Add faces on the boundary: cells, walls, and two points each."""
+        cells, walls, points = self.walls
+        self.walls = np.append(cells, cell), np.append(walls, wall), np.concatenate([points, ends])
 
-    def _close(self, cell: np.ndarray, gap: np.ndarray) -> None:
-        """Close the gaps from points `gap[:, 0]` to `gap[:, 1]` of cells (g,), with corners of the domain between."""
-        s, t = self.position[gap].T
-        ring, other = self.along.ring_of(s), self.along.ring_of(t)
-        joined = (ring == other) & ~np.isnan(s + t)
-        self._add_walls(cell[~joined], np.where(np.isnan(s), t, s)[~joined], gap[~joined])
+    def _close(
+        self, cell: np.ndarray, gap: np.ndarray, along: RingCoordinate, changes: np.ndarray, positions: np.ndarray
+    ) -> np.ndarray:
+        """Close gaps from points `gap[:, 0]` to `gap[:, 1]` of cells (g,), with corners of the domain between.
+
+        The ends are at `positions` (g, 2) `along` the boundary, whose part changes where `changes` is set.
+
+        Returns
+        -------
+        left : (k,) int
+            Gaps whose ends are on two rings, or in the opposite order, as where a cell touches the boundary.
+        """
+        if not len(cell):
+            return np.empty(0, np.int64)
+        every, rings = np.arange(len(cell)), along.rings
+        s, t = self._on_one_ring(along, gap, positions).T
+        ring = along.ring_of(s)
+        joined = (ring == along.ring_of(t)) & ~np.isnan(s + t)
+        every, cell, gap, s, t, ring = (values[joined] for values in (every, cell, gap, s, t, ring))
+        chain, path, starts = self._chains(along, ring, s, t, gap)
+        joined = _areas(chain, starts[:-1], starts[1:] - 1) <= AROUND * self.size[cell] ** 2
+        left = np.setdiff1d(np.arange(len(positions)), every[joined])
         cell, gap, s, t, ring = (values[joined] for values in (cell, gap, s, t, ring))
-        begin = self.along.begins[self.along.ring_starts[:-1]][ring]
-        total = self.along.begins[self.along.ring_starts[1:]][ring] - begin
-        way, (first, count) = (t - s) % total, self._vertices_between(ring, s, t)
-        # Chains: the first point, the vertices between, the last point.
-        chain, path = self._chains(ring, first, count, gap)
-        starts = np.concatenate([[0], np.cumsum(count + 2)])
-        around = _areas(chain, starts[:-1], starts[1:] - 1)
-        # The ends are in the opposite order where a cell touches the boundary.
-        wrong = around > AROUND * self.size[cell] ** 2
-        count[wrong], way[wrong] = 0, 0
-        if wrong.any():
-            chain, path = self._chains(ring, first, count, gap)
-            starts = np.concatenate([[0], np.cumsum(count + 2)])
-        row = np.repeat(np.arange(len(cell)), count + 2)
-        chosen = (path < 0) | self.changes_part[path]
+        chain, path, starts = self._chains(along, ring, s, t, gap)
+        begin = along.begins[along.ring_starts[:-1]][ring]
+        total = along.begins[along.ring_starts[1:]][ring] - begin
+        row = np.repeat(np.arange(len(cell)), np.diff(starts))
+        chosen = (path < 0) | changes[path]
         self._choose_corners(chain, chosen, self.size[cell][row])
         kept = np.flatnonzero(chosen)
         added = path[kept] >= 0
@@ -407,42 +424,60 @@ class _WallMaker:
         row = row[kept]
         kept_starts = np.searchsorted(row, np.arange(len(cell) + 1))
         names[kept_starts[:-1]], names[kept_starts[1:] - 1] = gap.T
-        marks = (self.along.begins[path[kept]] - s[row]) % total[row]
-        marks[kept_starts[:-1]], marks[kept_starts[1:] - 1] = 0, way
+        marks = (along.begins[path[kept]] - s[row]) % total[row]
+        marks[kept_starts[:-1]], marks[kept_starts[1:] - 1] = 0, (t - s) % total
         side = np.flatnonzero(row[:-1] == row[1:])
         middles = s[row[side]] - begin[row[side]] + (marks[side] + marks[side + 1]) / 2
-        self._add_walls(
-            cell[row[side]],
-            begin[row[side]] + middles % total[row[side]],
-            np.column_stack([names[side], names[side + 1]]),
-        )
+        edges = along.edges(begin[row[side]] + middles % total[row[side]])
+        self._add_walls(cell[row[side]], rings.edge_numbers[edges], np.column_stack([names[side], names[side + 1]]))
         # What lies between the boundary and the walls.
         off = _areas(chain, starts[:-1], starts[1:] - 1) - _areas(chain[kept], kept_starts[:-1], kept_starts[1:] - 1)
         large = np.flatnonzero(np.abs(off) > LEFT_OUT * self.size[cell] ** 2)
         places = chain[(starts[:-1] + starts[1:])[large] // 2]
         self.left_out += list(zip(np.abs(off[large]).tolist(), places, strict=True))
+        return left
 
-    def _vertices_between(self, ring: np.ndarray, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the first vertex of the domain after positions `s` (g,), and how many there are before `t`."""
-        first, last = self.along.ring_starts[ring], self.along.ring_starts[ring + 1]
-        low = np.maximum(np.searchsorted(self.along.begins, s, side="right"), first)
-        high = np.clip(np.searchsorted(self.along.begins, t, side="left"), first, last)
-        count = np.maximum(high - low + np.where(t < s, last - first, 0), 0)
-        return low, count
+    def _on_one_ring(self, along: RingCoordinate, gap: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Return the `positions` of the ends of gaps, (g, 2), on one ring where the boundary passes a point twice.
+
+        Where rings touch, a point has a position on each: of all pairs the shortest way is taken.
+        """
+        x, positions = along.rings.vertices, positions.copy()
+        _, same, count = np.unique(x, axis=0, return_inverse=True, return_counts=True)
+        touching = np.flatnonzero(count[same.ravel()] > 1)
+        if not touching.size:
+            return positions
+        reach = NO_LENGTH * float(self.domain.extent.max())
+        met = KDTree(x[touching]).query_ball_point(self.points[gap], reach)
+        for g in np.flatnonzero([any(row) for row in met]).tolist():
+            pairs = [along.begins[touching[v]] if v else [s] for v, s in zip(met[g], positions[g], strict=True)]
+            s, t = (a.ravel() for a in np.meshgrid(*pairs, indexing="ij"))
+            ring = along.ring_of(s)
+            total = np.diff(along.begins[along.ring_starts])[ring]
+            way = np.where((ring == along.ring_of(t)) & (s != t), (t - s) % total, np.inf)
+            if np.isfinite(way.min()):
+                positions[g] = s[way.argmin()], t[way.argmin()]
+        return positions
 
     def _chains(
-        self, ring: np.ndarray, first: np.ndarray, count: np.ndarray, gap: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the points along the boundary for each gap, (k, 2), and their vertices of the domain; -1 for ends."""
+        self, along: RingCoordinate, ring: np.ndarray, s: np.ndarray, t: np.ndarray, gap: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the way along the boundary for each gap: the first point, the vertices between, the last point.
+
+        Ragged rows: points (k, 2), vertices of the domain (k,), -1 for both ends, and starts.
+        """
+        begin, end = along.ring_starts[ring], along.ring_starts[ring + 1]
+        first = np.maximum(np.searchsorted(along.begins, s, side="right"), begin)
+        last = np.clip(np.searchsorted(along.begins, t, side="left"), begin, end)
+        count = np.maximum(last - first + np.where(t < s, end - begin, 0), 0)
         starts = np.concatenate([[0], np.cumsum(count + 2)])
         row = np.repeat(np.arange(len(count)), count + 2)
-        begin, size = self.along.ring_starts[:-1], np.diff(self.along.ring_starts)
         path = first[row] + np.arange(starts[-1]) - starts[row] - 1
-        path = begin[ring][row] + (path - begin[ring][row]) % size[ring][row]
-        chain = self.rings.vertices[path]
-        for end, points in ((starts[:-1], gap[:, 0]), (starts[1:] - 1, gap[:, 1])):
-            chain[end], path[end] = self.points[points], -1
-        return chain, path
+        path = begin[row] + (path - begin[row]) % (end - begin)[row]
+        chain = along.rings.vertices[path]
+        for place, points in ((starts[:-1], gap[:, 0]), (starts[1:] - 1, gap[:, 1])):
+            chain[place], path[place] = self.points[points], -1
+        return chain, path, starts
 
     def _choose_corners(self, chain: np.ndarray, chosen: np.ndarray, size: np.ndarray) -> None:
         """Choose among the points of chains those that become corners of convex cells, between the `chosen` ones.
@@ -472,7 +507,7 @@ class _WallMaker:
 
     def warn_of_left_out(self) -> None:
         """Warn of parts of the domain that are left out, and of islands that no cell has a wall on."""
-        used = np.unique(self.along.ring_of(self.walls[1]))
+        used = np.unique(self.along.ring_of(self.along.begins[self.rings.places[self.walls[1]]]))
         left = [(area, place) for area, place in self.left_out if area < self.domain.measure / 2]
         for ring, x in enumerate(self.rings.rings):
             if ring not in used:
@@ -495,8 +530,7 @@ class _WallMaker:
         ends = np.where((left > right)[:, None], self.ends[kept][:, ::-1], self.ends[kept])
         owner, neighbor = np.minimum(left, right), np.maximum(left, right)
         order = np.lexsort((neighbor, owner))
-        cell, position, wall_ends = self.walls
-        wall = self.rings.edge_numbers[self.along.edges(position)]
+        cell, wall, wall_ends = self.walls
         by_wall, points = np.lexsort((cell, wall)), self.points
         ends = np.concatenate([ends[order], wall_ends[by_wall]])
         owner = np.concatenate([owner[order], cell[by_wall]]).astype(np.int32)
@@ -521,6 +555,13 @@ class _WallMaker:
             half_face=np.full(count, -1),
         )
         return made.take_faces(ends[:, 0] != ends[:, 1])
+
+
+def _changes(rings: OrientedRings, parts: np.ndarray) -> np.ndarray:
+    """Return whether the named part of the boundary changes in each vertex of `rings`, (k,) bool."""
+    part, found = parts[rings.edge_numbers], np.empty(len(rings.vertices), bool)
+    found[rings.next_vertex] = part != part[rings.next_vertex]
+    return found
 
 
 def _area(loop: np.ndarray) -> float:

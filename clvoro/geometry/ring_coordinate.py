@@ -5,23 +5,24 @@ from __future__ import annotations
 import numpy as np
 
 from .polygon import Polygon
+from .rings import OrientedRings
 
 
 class RingCoordinate:
-    """The length along the rings of a polygon, one ring after the other, with the domain on the left.
+    """The length along the rings of a polygon, or its walks, one ring after the other, with the domain on the left.
 
     The positions of a ring reach from that of its first vertex to that of the next ring's first vertex, without it.
 
     Attributes
     ----------
     begins : (k + 1,) float64
-        Position of each vertex of `domain.oriented`, and the length of all rings.
+        Position of each vertex of `rings`, and the length of all rings.
     ring_starts : (r + 1,) int64
         First vertex of each ring.
     """
 
-    def __init__(self, domain: Polygon) -> None:
-        self.domain, self.rings = domain, domain.oriented
+    def __init__(self, domain: Polygon, rings: OrientedRings) -> None:
+        self.domain, self.rings = domain, rings
         self.begins = np.concatenate([[0.0], np.cumsum(self.rings.lengths)])
         self.ring_starts = self.rings.ring_starts.astype(np.int64)
 

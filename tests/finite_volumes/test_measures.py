@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 import clvoro
-from clvoro.finite_volumes.measures import SolverMeasures
+from clvoro.finite_volumes.measures import PlaneMeasures, SolverMeasures
 from tests.finite_volumes.test_straight_walls import ELL, SQUARE, circle, polygons
 from tests.io.test_foam import check_mesh, needs_openfoam
 from tests.reference import solids
@@ -158,3 +158,13 @@ def test_edges_and_faces_have_percentiles(ctx):
         least = s[f"min_{kind}"]
         assert 0 < least <= s[f"{kind}_percentile_0.1"] <= s[f"{kind}_percentile_1"]
         assert s[f"{kind}_percentile_1"] < s[f"{kind}_percentile_10"] < 1
+
+
+@pytest.mark.parametrize("name", ["corner", "periodic"])
+def test_measures_in_the_plane_are_those_of_prisms(ctx, name):
+    mesh = diagram_of(name, ctx).solver_mesh()
+    plane, prisms = PlaneMeasures(mesh), mesh.measures
+    assert np.allclose(plane.centroids, prisms.geometry.centroids[:, :2], rtol=0, atol=1e-12)
+    assert np.allclose(plane.skewness, prisms.skewness[: len(mesh)], rtol=0, atol=1e-10)
+    assert np.allclose(plane.non_orthogonality, prisms.non_orthogonality[: len(mesh)], rtol=0, atol=1e-6)
+    assert np.allclose(plane.determinant, prisms.determinant, rtol=1e-9, atol=1e-12)
