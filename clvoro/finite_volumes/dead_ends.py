@@ -92,7 +92,8 @@ class _Edit:
         inner = [side for side in loop if self.other(side[0], cell) >= 0]
         if len(inner) == 1:
             before = self.other(inner[0][0], cell)
-            any(self._share(cell, before, inner[0][0], forward) for forward in (True, False))
+            ways = [(how, forward) for how in (self._share, self._reach) for forward in (True, False)]
+            any(how(cell, before, inner[0][0], forward) for how, forward in ways)
             return
         for face, a, b in inner:
             if self._tilt(cell, face, a, b):
@@ -138,6 +139,45 @@ class _Edit:
             self.ends[own][self.ends[own].index(p)] = along[1]
             self.dropped.append(walls[0][0])
         self.ends.append([r, q] if (far < cell) == forward else [q, r])
+        self.owner.append(min(far, cell))
+        self.neighbor.append(max(far, cell))
+        self.touched |= {cell, before, far}
+        return True
+
+    def _reach(self, cell: int, before: int, face: int, forward: bool) -> bool:
+        """Let the cell beyond cell `before` reach to `cell` at one end of `face`, as at the mouth of a pocket."""
+        loop = self.loop(before)
+        k = next((i for i, side in enumerate(loop) if side[0] == face), None)
+        if k is None:
+            return False
+        q, p = loop[k][1:] if forward else loop[k][:0:-1]
+        rest = [*loop[k + 1 :], *loop[:k]][:: 1 if forward else -1]
+        wall, w = None, p
+        if self.other(rest[0][0], before) < 0:
+            wall, w = rest[0][0], rest[0][2 if forward else 1]
+            rest = rest[1:]
+        far, r = self.other(rest[0][0], before) if rest else -1, len(self.points)
+        if far in (-1, cell) or far < 0 or {cell, before, far} & self.touched or not (wall is None or self.slides[w]):
+            return False
+        x, y = self.points[p], self.points[q]
+        ahead = np.array([y[1] - x[1], x[0] - y[0]]) if forward else np.array([x[1] - y[1], y[0] - x[0]])
+        self.points.append(x + STRIP * (y - x) + TILT * ahead)
+        loops = [[side[1] for side in self.loop(c)] for c in (before, far, cell)]
+        after = [
+            [r if v == w else v for v in loops[0] if v == w or v != p],
+            [v for u in loops[1] for v in (([r, p] if forward else [p, r]) if u == w else [u])],
+            [v for u in loops[2] for v in (([p, r] if forward else [r, p]) if u == p else [u])],
+        ]
+        if not all(map(self._is_convex, after)):
+            self.points.pop()
+            return False
+        for f, old in ((face, p), (rest[0][0], w)):
+            self.ends[f][self.ends[f].index(old)] = r
+        if wall is not None:
+            own = next(f for f in self.faces_of(far) if self.neighbor[f] < 0 and w in self.ends[f])
+            self.ends[own][self.ends[own].index(w)] = p
+            self.dropped.append(wall)
+        self.ends.append([p, r] if (cell < far) == forward else [r, p])
         self.owner.append(min(far, cell))
         self.neighbor.append(max(far, cell))
         self.touched |= {cell, before, far}

@@ -48,6 +48,8 @@ LEFT_OUT = 0.5
 """Share of a cell from which on a part of the domain that is left out, or land that is added, is reported."""
 NO_LENGTH = 1e-9
 """Length of a face over the size of its cell at which its ends are one point."""
+CLOSED = 1e-3
+"""Width of a throat over the size of its cells at which it closes: a determinant of OpenFOAM vanishes there."""
 INSIDE, ON, OUTSIDE = 1, 0, -1
 """Places of a vertex."""
 
@@ -448,7 +450,7 @@ class _WallMaker:
         if not touching.size:
             return positions
         reach = NO_LENGTH * float(self.domain.extent.max())
-        met = KDTree(x[touching]).query_ball_point(self.points[gap], reach)
+        met = scipy.spatial.KDTree(x[touching]).query_ball_point(self.points[gap], reach)
         for g in np.flatnonzero([any(row) for row in met]).tolist():
             pairs = [along.begins[touching[v]] if v else [s] for v, s in zip(met[g], positions[g], strict=True)]
             s, t = (a.ravel() for a in np.meshgrid(*pairs, indexing="ij"))
@@ -534,8 +536,11 @@ class _WallMaker:
         by_wall, points = np.lexsort((cell, wall)), self.points
         ends = np.concatenate([ends[order], wall_ends[by_wall]])
         owner = np.concatenate([owner[order], cell[by_wall]]).astype(np.int32)
-        # Corners of two rings that touch are one point, and faces without length vanish.
-        short = np.hypot(*(points[ends[:, 1]] - points[ends[:, 0]]).T) <= NO_LENGTH * self.size[owner]
+        # Corners of two rings that touch are one point, faces without length vanish, and narrow throats close.
+        is_throat = np.arange(len(ends)) < len(kept)
+        is_throat &= ~np.isnan(np.append(self.position, np.full(len(points) - len(self.position), np.nan))[ends]).any(1)
+        least = np.where(is_throat, CLOSED, NO_LENGTH) * self.size[owner]
+        short = np.hypot(*(points[ends[:, 1]] - points[ends[:, 0]]).T) <= least
         graph = scipy.sparse.coo_array(
             (np.ones(np.count_nonzero(short)), tuple(ends[short].T)), (len(points), len(points))
         )
