@@ -32,13 +32,15 @@ for number, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signa
 
 
 @pytest.fixture(scope="session", autouse=True)
-def hulls_for_small_meshes():
-    """Let the small meshes of tests exercise the hulls, too."""
+def lanes_for_small_meshes():
+    """Let the small meshes of tests exercise the cells in vector lanes, too."""
     from clvoro.tessellation.cells import Cells
+    from clvoro.tessellation.polyhedra import Polyhedra
 
-    before, Cells.hulls_from = Cells.hulls_from, 0
+    before = Cells.hulls_from, Polyhedra.walks_from
+    Cells.hulls_from = Polyhedra.walks_from = 0
     yield
-    Cells.hulls_from = before
+    Cells.hulls_from, Polyhedra.walks_from = before
 
 
 class Invokers(dict):

@@ -14,6 +14,7 @@ from ..errors import ClvoroError, MemoryLimitError
 from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
+from ..opencl.kernels import Kernels
 from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
@@ -54,6 +55,8 @@ class Polyhedra:
 
     from_previous = True
     """Whether new cells may start from the neighbors in an earlier diagram, and updates need bins."""
+    walks_from = 15_000
+    """Number of cells from which CPUs use `walks.cl`. For fewer, its build takes longer than it saves."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -66,12 +69,11 @@ class Polyhedra:
                 "tessellation/polyhedra_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
             )
             self._team = TeamKernel(engine.queue.device, by_teams, "clip_polyhedra_by_teams")
-        self._wrap = None
+        self._walks: Kernels | None = None
         self._bounds = WeightBounds(engine) if engine.traits.site_values else None
         if self._bounds is None and engine.group_size == 1 and engine.real == np.float64:
             defines = {"STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine)}
             self._walks = engine.kernels("simd/walks", defines)
-            self._wrap = self._walks.walk_all_cells
         self._report = engine.empty(REPORT_SIZE, np.int32)
         self._capacity = self._room = self._n = 0
         self._of_vertices: tuple[cla.Array, cla.Array] | None = None
@@ -221,7 +223,8 @@ class Polyhedra:
         cells = self._cell_rows(rows)
         warm = previous is not None and previous.n == rows
         old = (previous.starts, previous.neighbors) if previous is not None and warm else (counts, counts)
-        capacity, again, walk = FACE_CAPACITY, False, self._wrap
+        capacity, again = FACE_CAPACITY, False
+        walk = None if self._walks is None or rows < self.walks_from else self._walks.walk_all_cells
         first_reach = engine.real.type(FIRST_REACH)
         self._begin_report()
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
@@ -429,6 +432,7 @@ class Polyhedra:
     def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:
         """Return the items of the first `rows` generators in an order that keeps neighbors close."""
         engine, k = self.engine, self._walks
+        assert k is not None
         cubes = math.prod(-(-side // CUBE) for side in binned.sides)
         starts, order = engine.scratch(cubes + 1, np.int32), engine.scratch(rows, np.int32)
         bins = np.int32(rows), binned.items, binned.bins, binned.grid_shapes

@@ -31,13 +31,14 @@ from clvoro.sizing import Ball, Circle, ClosedPolyline, Distance, Expression, Gr
 from clvoro.tessellation import teams
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT
+from clvoro.tessellation.polyhedra import Polyhedra
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.patch import BOX as PATCH
 from tests.reference.patch import hexagons, tessellate
 from tests.robustness.gpu_like import use_groups
 from tests.robustness.oclgrind_runs import COMB, RUNS, large
 
-Cells.hulls_from = 0  # hulls for small meshes, too
+Cells.hulls_from = Polyhedra.walks_from = 0  # lanes for small meshes, too
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 GRADED = "0.12 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)"

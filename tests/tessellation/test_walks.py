@@ -18,7 +18,7 @@ UNFINISHED, CERTAIN = np.iinfo(np.int32).min, 1 << 30
 def engine(ctx):
     adapter = clvoro.Adapter(ctx, dtype="float64")
     made = Engine(adapter.ctx, adapter.queue, 3, np.dtype(float))
-    if Polyhedra(made)._wrap is None:
+    if Polyhedra(made)._walks is None:
         pytest.skip("cells are walked on CPUs")
     return made
 
@@ -89,7 +89,7 @@ def walked(engine, points, rows=None):
     sizes = [(40 * n,), (40 * n, 3), (rows,), (rows, 3), (rows, 6)]
     report = engine.zeros(2, np.int32)
     engine.run_each(
-        cells._wrap,
+        cells._walks.walk_all_cells,
         -(-rows // STRETCH),
         np.int32(rows),
         cells._ordered(b, rows),
@@ -142,7 +142,7 @@ def tessellations(engine, points, rows=None):
     for walk in (True, False):
         cells, binned = Polyhedra(engine), Bins(engine).build(CUBE, x, n)
         if not walk:
-            cells._wrap = None
+            cells._walks = None
         t = cells.tessellate(CUBE, x, n, binned, exact=False, n_own=rows)
         radii = np.zeros(n)
         radii[binned.items.get()[:n]] = binned.reach.get()[:n]

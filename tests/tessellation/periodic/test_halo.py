@@ -123,9 +123,9 @@ def check_depths(adapter, box, points, walks):
     """Check that every block is as deep as the balls require, and little deeper."""
     n, dim, real, stages = len(points), box.dim, adapter.dtype, adapter._stages_for(box)
     if not walks:
-        if dim == 2 or stages.cells._wrap is None:
+        if dim == 2 or stages.cells._walks is None:
             pytest.skip("cells are made in one way only")
-        stages.cells._wrap = None
+        stages.cells._walks = None
     x = stages.engine.upload(box.place(points, real))
     periodic = Tessellator(stages, box)
     for _ in range(5):  # depths converge to those required
