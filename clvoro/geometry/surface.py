@@ -181,8 +181,8 @@ class Surface:
         return Columns(vertices[triangles])
 
     @cached_property
-    def welded(self) -> tuple[np.ndarray, np.ndarray]:
-        """Places (p, 3) and triangles (t, 3), with one place for all vertices that are joined."""
+    def _joined(self) -> tuple[np.ndarray, np.ndarray]:
+        """The places (p, 3), and that of each vertex, (v,) int."""
         unique, places = np.unique(self.vertices + 0.0, axis=0, return_inverse=True)
         places = places.reshape(-1)
         if self.join > 0:
@@ -191,6 +191,17 @@ class Surface:
             graph = scipy.sparse.coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=shape)
             joined = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
             unique, places = unique[np.unique(joined, return_index=True)[1]], joined[places]
+        return unique, places
+
+    @property
+    def places(self) -> np.ndarray:
+        """The place of each vertex in `welded`, (v,) int."""
+        return self._joined[1]
+
+    @cached_property
+    def welded(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places (p, 3) and triangles (t, 3), with one place for all vertices that are joined."""
+        unique, places = self._joined
         return unique, places[self.triangles]
 
     @cached_property

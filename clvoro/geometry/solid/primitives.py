@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 import scipy
+import shapely
 
+from ...errors import InputError
+from ..polygon import Polygon
 from ..surface import box_surface
 
 _FINE = 16  # edges of triangles per radius
@@ -52,7 +55,7 @@ def ball(center: Sequence[float], radius: float, edge: float | None) -> dict[str
     return {"vertices": vertices, "triangles": same.reshape(-1)[triangles], "group_names": ("wall",)}
 
 
-def turned(begin: Sequence[float], end: Sequence[float], flat: np.ndarray) -> np.ndarray:
+def placed(begin: Sequence[float], end: Sequence[float], flat: np.ndarray) -> np.ndarray:
     """Return points (n, 3), given in axes of which the third leads from `begin` to `end`, in the axes of space."""
     along = np.subtract(end, begin).astype(float)
     along = along / np.linalg.norm(along)
@@ -86,8 +89,131 @@ def cylinder(begin: Sequence[float], end: Sequence[float], radius: float, edge: 
     bottom = np.column_stack([np.full(n, len(wall)), after, k])
     top = np.column_stack([np.full(n, len(wall) + 1), n * rows + k, n * rows + after])
     return {
-        "vertices": turned(begin, end, flat),
+        "vertices": placed(begin, end, flat),
         "triangles": np.concatenate([side, bottom, top]),
         "groups": np.repeat([0, 1, 2], [len(side), n, n]),
         "group_names": ("side", "bottom", "top"),
+    }
+
+
+def turned(profile: Sequence[Sequence[float]], edge: float | None) -> dict[str, Any]:
+    """Return what a closed profile of points (radius, height) sweeps around the z axis.
+
+    Each edge of the profile is a group, numbered from 0; edges on the axis have no surface.
+    """
+    points = np.asarray(profile, float)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
+        raise InputError(f"Solid.turned got a profile of shape {points.shape}, expected (m, 2) finite numbers, m >= 3")
+    if (points[:, 0] < 0).any():
+        raise InputError(f"Solid.turned got the radius {points[:, 0].min():g}, expected none below 0: (radius, height)")
+    following = np.roll(points, -1, axis=0)
+    turn = (points[:, 0] * following[:, 1] - following[:, 0] * points[:, 1]).sum()
+    order = range(len(points)) if turn > 0 else range(len(points) - 1, -1, -1)
+    largest = points[:, 0].max()
+    n = max(12, math.ceil(2 * math.pi * largest / (largest / _FINE if edge is None else edge)))
+    angle = 2 * math.pi * np.arange(n) / n
+    radius, height = points[:, 0, None], np.broadcast_to(points[:, 1, None], (len(points), n))
+    vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=2).reshape(-1, 3)
+    k = np.arange(n)
+    after = (k + 1) % n
+    triangles, groups = [], []
+    for i in order:
+        j = (i + (1 if turn > 0 else -1)) % len(points)
+        a, b = n * i, n * j
+        if points[i, 0] > 0:
+            triangles.append(np.column_stack([a + k, a + after, b + after]))
+        if points[j, 0] > 0:
+            triangles.append(np.column_stack([a + k, b + after, b + k]))
+        new = int(points[i, 0] > 0) + int(points[j, 0] > 0)
+        groups.append(np.full(new * n, i if turn > 0 else j))
+    names = tuple(f"edge-{i}" for i in range(len(points)))
+    vertices[np.repeat(points[:, 0] == 0, n), :2] = 0
+    return {
+        "vertices": vertices,
+        "triangles": np.concatenate(triangles),
+        "groups": np.concatenate(groups),
+        "group_names": names,
+    }
+
+
+def cone(begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None) -> dict[str, Any]:
+    """Return a cone with the base around `begin` and the tip `end`, with the groups bottom and side."""
+    height = float(np.linalg.norm(np.subtract(end, begin)))
+    made = turned([(0, 0), (radius, 0), (0, height)], edge)
+    return {**made, "vertices": placed(begin, end, made["vertices"]), "group_names": ("bottom", "side")}
+
+
+def torus(center: Sequence[float], radius: float, tube: float, edge: float | None) -> dict[str, Any]:
+    """Return a torus around an axis in z."""
+    n = max(12, math.ceil(2 * math.pi * tube / (tube / _FINE if edge is None else edge)))
+    angle = 2 * math.pi * np.arange(n) / n
+    profile = np.column_stack([radius + tube * np.cos(angle), tube * np.sin(angle)])
+    made = turned(profile.tolist(), tube / _FINE if edge is None else edge)
+    return {
+        "vertices": made["vertices"] + np.asarray(center, float),
+        "triangles": made["triangles"],
+        "group_names": ("wall",),
+    }
+
+
+def extruded(polygon: Polygon, bottom: float, top: float) -> dict[str, Any]:
+    """Return a polygon with its holes between two heights. The groups are those of the polygon, bottom and top."""
+    if not bottom < top:
+        raise InputError(f"Solid.extruded got bottom {bottom!r} and top {top!r}, expected bottom < top")
+    flat = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(polygon.geometry)))
+    flat = flat.reshape(-1, 4, 2)[:, :3]
+    a, b, c = np.moveaxis(flat, 1, 0)
+    clockwise = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    flat[clockwise] = flat[clockwise, ::-1]
+
+    def lifted(points: np.ndarray, z: float) -> np.ndarray:
+        return np.concatenate([points, np.full((*points.shape[:-1], 1), z)], axis=-1)
+
+    outline = polygon.oriented
+    begin, end, wall = outline.vertices, outline.vertices[outline.next_vertex], outline.edge_numbers
+    p, q, r, s = lifted(begin, bottom), lifted(end, bottom), lifted(end, top), lifted(begin, top)
+    corners = np.concatenate(
+        [lifted(flat[:, ::-1], bottom), lifted(flat, top), np.stack([p, q, r], axis=1), np.stack([p, r, s], axis=1)]
+    )
+    names = (*polygon.boundary_names, "bottom", "top")
+    part = polygon.boundary_index[wall]
+    lids = np.repeat([len(names) - 2, len(names) - 1], len(flat))
+    return {
+        "vertices": corners.reshape(-1, 3),
+        "triangles": np.arange(3 * len(corners)).reshape(-1, 3),
+        "groups": np.concatenate([lids, part, part]),
+        "group_names": names,
+    }
+
+
+def polyhedron(normals: object, offsets: object) -> dict[str, Any]:
+    """Return the convex polyhedron of the points x with normals . x <= offsets; each half-space is a group."""
+    n, d = np.atleast_2d(np.asarray(normals, float)), np.atleast_1d(np.asarray(offsets, float))
+    if n.ndim != 2 or n.shape[1] != 3 or d.shape != (len(n),) or not (np.isfinite(n).all() and np.isfinite(d).all()):
+        raise InputError(
+            f"Solid.polyhedron got normals {n.shape} and offsets {d.shape}, expected (m, 3) and (m,) numbers"
+        )
+    length = np.linalg.norm(n, axis=1)
+    if not length.all():
+        raise InputError(f"Solid.polyhedron got normals[{int(length.argmin())}] of length 0, expected a direction")
+    n, d = n / length[:, None], d / length
+    # The center of the largest ball inside: max r with n . x + r <= d.
+    found = scipy.optimize.linprog([0, 0, 0, -1], np.column_stack([n, np.ones(len(n))]), d, bounds=[(None, None)] * 4)
+    if found.status != 0 or found.x[3] <= 0:
+        raise InputError(
+            "Solid.polyhedron got half-spaces whose common part is empty or not bounded; add or move planes"
+        )
+    points = scipy.spatial.HalfspaceIntersection(np.column_stack([n, -d]), found.x[:3]).intersections
+    hull = scipy.spatial.ConvexHull(points)
+    group = np.abs(hull.equations[:, :3] @ n.T - 1).argmin(axis=1)
+    a, b, c = np.moveaxis(points[hull.simplices], 1, 0)
+    flip = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    triangles = np.where(flip[:, None], hull.simplices[:, ::-1], hull.simplices)
+    size = float(np.ptp(points, axis=0).max())
+    return {
+        "vertices": points,
+        "triangles": triangles,
+        "groups": group,
+        "group_names": tuple(f"plane-{k}" for k in range(len(n))),
+        "join": 1e-9 * size,
     }

@@ -6,33 +6,28 @@ import base64
 import hashlib
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import numpy as np
 import scipy
 
-from ...arguments import check_rows, format_point
-from ...errors import InputError
+from ...arguments import check_rows, format_point, warn
+from ...errors import InputError, MismatchWarning
 from ..boundary_names import BoundaryNames, Walls
 from ..bvh import Tree
 from ..columns import Columns
 from ..domain import Domain
+from ..polygon import Polygon
 from ..surface import Surface
 from ..triangles import packed_weights, pierced
 from ..wall_triangles import WallTriangles
-from .creases import (
-    CONCAVE,
-    CONVEX,
-    connect,
-    corner_normals,
-    dihedral_turns,
-    find_creases,
-    pair_sides,
-    triangle_normals,
-)
+from .checks import repaired, require_bounding, require_no_crossings, sharp_edges
+from .creases import CONCAVE, CONVEX, connect, corner_normals, dihedral_turns, find_creases, triangle_normals
+from .stations import Stations, place_stations
 
 _ON = 1e-12  # of the diagonal: points this close to the surface lie on it
 _EDGE = 1e-9  # weight of a corner below which a foot lies on the opposite side
@@ -150,6 +145,11 @@ class Solid(Domain):
         Distance within which vertices count as one.
     name : str
         Name of the solid in error messages.
+    repair : bool
+        Whether to join vertices across small gaps, remove duplicate triangles and orient the others, with a warning
+        that says what was done. Holes, overlaps and intersections stay errors.
+    creases : (e, 2) int, optional
+        More edges at which patches end, as pairs of vertices.
 
     Attributes
     ----------
@@ -164,7 +164,13 @@ class Solid(Domain):
     Raises
     ------
     InputError, InputTypeError
-        If the surface is not closed, or a number or name is wrong.
+        If the surface is not closed, intersects itself, or its normals do not point outwards; or a number or name is
+        wrong.
+
+    Warns
+    -----
+    MismatchWarning
+        If the surface was repaired, or has edges sharper than 10 degrees.
 
     Examples
     --------
@@ -183,34 +189,72 @@ class Solid(Domain):
         angle: float = 30.0,
         join: float = 0.0,
         name: str = "Solid",
+        repair: bool = False,
+        creases: object = None,
     ):
         given = Surface(vertices, triangles, name, join)
-        given.require_closed()
+        group = _checked_groups(name, groups, len(given))
+        self.repairs: tuple[str, ...] = ()
+        given_area, given_volume = _areas(given.corners), _volume(given.corners)
+        if repair:
+            given, group, done = repaired(given, group)
+            self.repairs = tuple(done)
         places, merged = given.welded
+        self._places = given.places
         whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
-        group = np.zeros(len(merged), np.int64) if groups is None else np.asarray(groups, np.int64)
         self._group, merged = group[whole], merged[whole]
         self.surface = Surface(places, merged, name)
+        self.twin = require_bounding(given, places, merged)
+        if not (isinstance(angle, Real) and 0 < angle < 180):
+            raise InputError(f"{name} angle is {angle!r}, expected degrees between 0 and 180")
         self.angle = float(angle)
         self._group_names = ("wall",) if group_names is None and groups is None else tuple(group_names or ())
         vertices, triangles = self.surface.vertices, self.surface.triangles
-        self.twin, bad = pair_sides(vertices, triangles)
-        if bad.size:
-            k, s = divmod(int(bad[0]), 3)
-            raise InputError(
-                f"{name} has {len(bad)} sides of triangles whose neighbor is oriented differently, the first at "
-                f"{format_point(vertices[triangles[k, s]])}; expected all triangles counter-clockwise seen from outside"
-            )
         self.normals, self._areas = triangle_normals(vertices, triangles, self.twin)
         turns = dihedral_turns(vertices, triangles, self.twin, self.normals)
         across = self._group[self.twin // 3] != np.repeat(self._group, 3)
-        border = (np.abs(turns) > math.radians(self.angle)) | across
+        border = (np.abs(turns) > math.radians(self.angle)) | across | self._drawn(creases)
         self.patch, self.creases, self.corners = find_creases(vertices, triangles, self.twin, turns, border)
         self.n_patches = int(self.patch.max()) + 1
         lower, upper = vertices[triangles].min(axis=(0, 1)), vertices[triangles].max(axis=(0, 1))
         self.lower, self.upper = tuple(lower.tolist()), tuple(upper.tolist())
         self.names = names
         self.names = self._checked_names()
+        require_no_crossings(self.surface)
+        if self.repairs:
+            before, after = float(np.nansum(given_area)), self.boundary_measure
+            warn(
+                f"{name} was repaired: {'; '.join(self.repairs)}. Its area was {before:.6g} and is {after:.6g}, its "
+                f"volume was {given_volume:.6g} and is {self.measure:.6g}",
+                MismatchWarning,
+            )
+        sharp = sharp_edges(self.creases.angle)
+        if sharp.size:
+            where = vertices[self.creases.edges[sharp[0]]].mean(axis=0)
+            warn(
+                f"{name} has {len(sharp)} edges sharper than 10 degrees, the first at {format_point(where)}; cells "
+                "there are poor. Blunt them by about h, or use smaller sizes there",
+                MismatchWarning,
+            )
+
+    def _drawn(self, creases: object) -> np.ndarray:
+        """Return the sides of triangles (3 t,) that are among the edges `creases`, given as places of vertices."""
+        triangles = self.surface.triangles
+        if creases is None:
+            return np.zeros(3 * len(triangles), bool)
+        edges = np.asarray(creases)
+        if edges.ndim != 2 or edges.shape[1] != 2 or edges.dtype.kind not in "iu":
+            raise InputError(
+                f"{self.surface.name} creases have shape {edges.shape}, expected pairs of vertices (e, 2) int"
+            )
+        n = len(self.surface.vertices)
+        if edges.size and not (0 <= edges.min() and edges.max() < len(self._places)):
+            raise InputError(
+                f"{self.surface.name} creases have vertices up to {edges.max()}, expected those of the surface"
+            )
+        edges = np.sort(self._places[edges], axis=1)
+        ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        return np.isin(ends @ (n, 1), edges @ (n, 1))
 
     @classmethod
     def from_arrays(cls, vertices: object, triangles: object, **options: Any) -> Solid:
@@ -223,6 +267,51 @@ class Solid(Domain):
         from .primitives import box
 
         return cls(**{**box(lower, upper), **options})
+
+    @classmethod
+    def cone(
+        cls, begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None = None, **options: Any
+    ) -> Solid:
+        """Return a cone from its base around `begin` to its tip `end`, with the boundaries bottom and side."""
+        from .primitives import cone
+
+        return cls(**{**cone(begin, end, radius, edge), **options})
+
+    @classmethod
+    def torus(
+        cls, center: Sequence[float], radius: float, tube: float, edge: float | None = None, **options: Any
+    ) -> Solid:
+        """Return a torus around an axis in z: a tube of the radius `tube` around a circle of `radius`."""
+        from .primitives import torus
+
+        return cls(**{**torus(center, radius, tube, edge), **options})
+
+    @classmethod
+    def turned(cls, profile: Sequence[Sequence[float]], edge: float | None = None, **options: Any) -> Solid:
+        """Return what a closed profile of points (radius, height) sweeps around the z axis.
+
+        The boundaries are edge-0, edge-1, ..., one for each edge of the profile that is not on the axis.
+        """
+        from .primitives import turned
+
+        return cls(**{**turned(profile, edge), **options})
+
+    @classmethod
+    def extruded(cls, polygon: Polygon, bottom: float, top: float, **options: Any) -> Solid:
+        """Return a `Polygon`, with its holes, between two heights; its boundaries, and those named bottom and top."""
+        from .primitives import extruded
+
+        return cls(**{**extruded(polygon, bottom, top), **options})
+
+    @classmethod
+    def polyhedron(cls, normals: object, offsets: object, **options: Any) -> Solid:
+        """Return the convex polyhedron of the points x with normals (m, 3) . x <= offsets (m,).
+
+        The boundaries are plane-0, plane-1, ...
+        """
+        from .primitives import polyhedron
+
+        return cls(**{**polyhedron(normals, offsets), **options})
 
     @classmethod
     def ball(cls, center: Sequence[float], radius: float, edge: float | None = None, **options: Any) -> Solid:
@@ -396,6 +485,13 @@ class Solid(Domain):
         sound[doubtful] = self.visible(x[row[doubtful]], foot[doubtful])
         return OwnPlanes(row[sound], patch[sound], foot[sound], normal[sound], depth[sound], behind)
 
+    def stations(self, size: Callable[[np.ndarray], np.ndarray] | float) -> Stations:
+        """Return generators around concave creases and corners, for sizes h: a number, or a function of points (n, 3).
+
+        Faces between their cells meet in the creases, so that no cell is concave there.
+        """
+        return place_stations(self, size if callable(size) else lambda x: np.full(len(x), float(size)))
+
     def visible(self, points: np.ndarray, feet: np.ndarray) -> np.ndarray:
         """Return whether no other wall is between each point (n, 3) and its foot on the surface, (n,) bool."""
         end = points + (1 - 1e-6) * (feet - points)
@@ -441,9 +537,7 @@ class Solid(Domain):
 
     @cached_property
     def _volume(self) -> float:
-        center = np.add(self.lower, self.upper) / 2
-        a, b, c = np.moveaxis(self.surface.corners - center, 1, 0)
-        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+        return _volume(self.surface.corners)
 
     @property
     def boundary_measure(self) -> float:
@@ -588,6 +682,29 @@ class Solid(Domain):
 
     def __hash__(self) -> int:
         return int(hashlib.sha256(self.surface.vertices.tobytes()).hexdigest()[:15], 16)
+
+
+def _volume(corners: np.ndarray) -> float:
+    """Return the volume inside of triangles (t, 3, 3)."""
+    a, b, c = np.moveaxis(corners - corners.mean(axis=(0, 1)), 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+def _areas(corners: np.ndarray) -> np.ndarray:
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+
+
+def _checked_groups(name: str, groups: object, count: int) -> np.ndarray:
+    """Return the group of each triangle, (t,) int64; 0 by default."""
+    if groups is None:
+        return np.zeros(count, np.int64)
+    array = np.asarray(groups)
+    if array.shape != (count,) or array.dtype.kind not in "iu" or (array < 0).any():
+        raise InputError(
+            f"{name} groups have shape {array.shape} and dtype {array.dtype}, expected one number, 0 or more, for each "
+            f"of the {count} triangles"
+        )
+    return array.astype(np.int64)
 
 
 def _packed(array: np.ndarray, dtype: str) -> str:

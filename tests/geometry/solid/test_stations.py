@@ -1,0 +1,91 @@
+"""Generators around concave creases: their bisectors contain the creases, and their cells have the size h."""
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree
+
+from clvoro import Polygon, Solid
+from clvoro.geometry.solid.stations import chain_line
+
+L = Solid.extruded(Polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]), 0, 1)
+
+
+def cubes(*places):
+    """Unit cubes at integer places, as one solid; common sides are left out."""
+    quads = {}
+    for place in places:
+        for axis in range(3):
+            for up in (0, 1):
+                u, v = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
+                a = np.array(place) + up * np.eye(3, dtype=int)[axis]
+                ring = [a, a + u, a + u + v, a + v] if up else [a, a + v, a + u + v, a + u]
+                key = frozenset(map(lambda p: tuple(p.tolist()), ring))
+                quads[key] = None if key in quads else ring
+    rings = np.array([ring for ring in quads.values() if ring is not None], float)
+    corner = 4 * np.arange(len(rings))[:, None]
+    return Solid(rings.reshape(-1, 3), np.vstack([corner + np.array(t) for t in ((0, 1, 2), (0, 2, 3))]))
+
+
+FICHERA = cubes(*[(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1) if (i, j, k) != (1, 1, 1)])
+BOSS = cubes(*[(i, j, 0) for i in range(3) for j in range(3)], (1, 1, 1))
+STEPPED = Solid.turned([(0, 0), (1, 0), (1, 0.6), (0.5, 0.6), (0.5, 1.2), (0, 1.2)], edge=0.02)
+
+
+def ties(stations, points, k):
+    """Distances (n, k) of points to their nearest generators, in units of the smallest of them."""
+    distance = KDTree(stations.points).query(points, k=k)[0]
+    return distance / distance[:, :1]
+
+
+@pytest.mark.parametrize(("solid", "count"), [(L, 3 * 5), (FICHERA, 3 * 15 - 3 + 1), (BOSS, None), (STEPPED, None)])
+def test_creases_are_equidistant_from_the_generators_around_them(solid, count):
+    h = 0.2
+    stations = solid.stations(h)
+    assert len(stations.left_out) == 0
+    assert count is None or len(stations) == count
+    assert (solid.signed_distance(stations.points) < -0.3 * h).all()
+    concave = np.unique(solid.creases.chain[solid.creases.concave])
+    assert concave.size
+    for chain in concave:
+        line = chain_line(solid, chain)
+        at = np.linspace(0, line.at[-1], 200)
+        assert ties(stations, line.along(line.points, at), 3) == pytest.approx(
+            1, abs=1e-9 if solid is not STEPPED else 0.08
+        )
+    if solid is FICHERA:
+        assert ties(stations, np.array([[1.0, 1, 1]]), 7) == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("solid", [L, FICHERA])
+def test_cells_of_stations_have_the_size_that_is_asked_for(solid):
+    """With a lattice around them; cells are cut by the planes of the walls near them."""
+    h = 0.2
+    points = solid.stations(h).points
+    n = len(points)
+    axis = np.arange(0.1, 2, 0.2)
+    lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    lattice = lattice[(solid.signed_distance(lattice) < -0.05) & (KDTree(points).query(lattice)[0] > 0.05)]
+    x = np.vstack([points, lattice])
+    planes = solid.own_planes(points, 1.4 * h)
+    tree = KDTree(x)
+    for i in range(n):
+        j = np.array([q for q in tree.query_ball_point(x[i], 3 * h) if q != i])
+        d = x[j] - x[i]
+        mine = planes.row == i
+        cut = np.column_stack([d, -np.einsum("ij,ij->i", d, (x[j] + x[i]) / 2)])
+        own = np.column_stack([planes.normal[mine], -(planes.normal[mine] * planes.foot[mine]).sum(axis=1)])
+        volume = ConvexHull(HalfspaceIntersection(np.vstack([cut, own]), x[i]).intersections).volume
+        assert volume ** (1 / 3) == pytest.approx(h, rel=0.02)
+
+
+def test_stations_follow_the_sizes_along_a_crease():
+    tall = Solid.extruded(Polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]), 0, 4)
+    stations = tall.stations(lambda x: 0.05 + 0.05 * x[:, 2])
+    z = np.unique(np.round(stations.points[:, 2], 9))
+    middle = (z[1:] + z[:-1]) / 2
+    assert np.diff(z) == pytest.approx(0.05 + 0.05 * middle, rel=0.03)
+    assert len(stations) == 3 * len(z)
+
+
+def test_solids_without_concave_creases_have_no_stations():
+    assert len(Solid.box((0, 0, 0), (1, 1, 1)).stations(0.1)) == 0
