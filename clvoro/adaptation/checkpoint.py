@@ -220,17 +220,19 @@ class Saved:
             If schedule or size field differ from those of the saved run.
         """
         engine, a = setup.stages.engine, self.arrays
+        self._check_points(setup.domain)
+        saved, points = (engine.upload(a[f"mesh.{name}"], a[f"mesh.{name}"].dtype) for name in ("h", "points"))
+        self._compare_sizes(setup, saved, points)  # first: another size field has another schedule, too
         if self.schedule != schedule_digest(schedule) or self.state["position"] > len(schedule):
             raise InputError(
-                f"cannot resume from {self.name}: its schedule differs, as with another version of clvoro; start again"
+                f"cannot resume from {self.name}: its plan of steps differs, as with another size "
+                "field or version of clvoro; use those of that run, or start again without resume"
             )
-        self._check_points(setup.domain)
         on_device = {
             name.removeprefix("mesh."): engine.upload(array, array.dtype)
             for name, array in a.items()
-            if name.startswith("mesh.")
+            if name.startswith("mesh.") and name != "mesh.h"
         }
-        self._compare_sizes(setup, on_device.pop("h"), on_device["points"])
         generators = Generators(**{name: on_device.pop(name) for name in _GENERATORS})
         others = (on_device.get(name) for name in _OTHERS)
         arrays = Arrays(generators, *others)  # type: ignore[arg-type]

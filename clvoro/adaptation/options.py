@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -59,7 +60,7 @@ _NUMBERS: dict[str, Callable[[str, object], float]] = {
     "seed": partial(check_integer, least=0, most=np.inf),
     "max_steps": partial(check_integer, least=0, most=_MOST_STEPS),
     "n_cells": partial(check_integer, least=1),
-    "every": partial(check_number, least=0),
+    "every": lambda name, value: math.inf if value == math.inf else check_number(name, value, least=0),
 }
 
 
@@ -163,10 +164,11 @@ class Checkpoint:
     Parameters
     ----------
     path : path, optional
-        File that the run writes at intervals, and when its callback stops it. With None nothing is written.
+        File that the run writes at intervals, and when its callback or Ctrl-C stops it. With None nothing is written.
     every : float
-        Least number of seconds between two checkpoints. With 0 the run computes its mesh anew, and writes a checkpoint,
-        after every step and after every change of the number of cells.
+        Least number of seconds between two checkpoints. With `math.inf` there is only the one of a run that is stopped,
+        and a run that is not has the bits of one without checkpoints. With 0 the run computes its mesh anew, and writes
+        a checkpoint, after every step and after every change of the number of cells.
     resume : path or True, optional
         Checkpoint to continue from; True takes `path`, if that file exists. The other arguments of the run must be the
         same as before. On the same device the run then ends with the same bits (`seconds` in the history apart), unless

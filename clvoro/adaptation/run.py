@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -127,7 +128,8 @@ class Run:
         self._writer = None
         if files.path is not None:
             self._writer = Checkpointer(files.path, files.every, fingerprint, planned.schedule)
-        self._renews, self.pace = saved is not None or self._writer is not None, RENEWAL if files.every else 0
+        self._renews = saved is not None or (self._writer is not None and files.every < math.inf)
+        self.pace = RENEWAL if files.every else 0
         if saved is not None:
             self.state = saved.mesh(prepared.setup, planned.schedule)
         self._set_out(prepared, planned, saved)
@@ -292,8 +294,12 @@ class Run:
                     pass
             except KeyboardInterrupt:
                 self.stop_reason = INTERRUPTED
+                # Of a step that has not ended the generators are good: the run that is resumed does it again.
+                resumable = not self._acts or isinstance(self.schedule[self.position], Step)
                 self.state.update()
                 self._acts = False
+                if self._writer is not None and resumable and self.rows:
+                    self._writer.write_if_due(self, stop=True)
             self._result = self._end()
         if self._result.stop_reason == INTERRUPTED and on_interrupt == "raise":
             raise Interrupted(self._result)

@@ -27,8 +27,8 @@ exit codes:
   2    bad usage or input, or the output folder cannot be made;
        check: a file cannot be read
   3    no usable device
-  130  interrupted (Ctrl-C, SIGTERM, SIGHUP, SIGXCPU; the mesh so far has been
-       written)
+  130  interrupted (Ctrl-C, SIGTERM, SIGHUP, SIGXCPU; the mesh so far and a
+       checkpoint have been written)
 
 examples:
   clvoro run paper                      the paper's validation case, into out/paper
@@ -109,7 +109,12 @@ def _add_settings(run: Any) -> None:
 
 
 def _add_checkpoints(run: Any) -> None:
-    run.add_argument("--checkpoint", metavar="FILE", type=_path, help="write the state of the run there")
+    run.add_argument(
+        "--checkpoint",
+        metavar="FILE",
+        type=_path,
+        help="write the state of the run there (default: OUT/run.checkpoint, only if it is stopped)",
+    )
     run.add_argument("--checkpoint-every", metavar="SECONDS", type=float, help="time between checkpoints (default: 60)")
     run.add_argument("--resume", metavar="FILE", type=_path, help="continue from a checkpoint of the same case")
 
@@ -246,6 +251,7 @@ def _carry_out(argv: Sequence[str] | None) -> int:
     """Run one command; turn errors into a message and an exit code."""
     try:
         arguments = build_parser().parse_args(argv)
+        arguments.given = sys.argv[1:] if argv is None else argv
         with warnings.catch_warnings():
             warnings.showwarning = _warning_printer()
             return arguments.work(arguments)
@@ -324,6 +330,7 @@ def _run(arguments: argparse.Namespace) -> int:
         resume=arguments.resume,
         walls=arguments.walls,
         types=arguments.types,
+        command=tuple(arguments.given),
         solver=arguments.check_solver,
     )
     if job.run():

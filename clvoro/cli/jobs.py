@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import shlex
 import signal
 import sys
 import time
@@ -38,6 +40,8 @@ from .sequence import frames_line, run_frames
 _REPEATED = ("effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k", "seed", "dtype")
 """Settings that `case.toml` of the output fixes, so that other defaults of later versions do not change the run."""
 
+STATE = "run.checkpoint"
+"""Checkpoint in the output folder of a run that is stopped, unless --checkpoint names another one."""
 _MANY = 5000
 """From this many cells on, the writing of files and pictures is announced."""
 _STOPPING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGXCPU")
@@ -72,6 +76,8 @@ class Job:
         As `Adapter.run` takes them; for one method only.
     walls : "straight", "exact" or None
         As `save` takes it, for the mesh file of OpenFOAM and the check.
+    command : tuple of str
+        The arguments of the command, to be repeated after an interruption.
     types : dict
         Types of OpenFOAM's patches by name, before those of the case.
     solver : "openfoam" or None
@@ -93,6 +99,7 @@ class Job:
     walls: WallShape | None = None
     types: dict[str, PatchType] = field(default_factory=dict)
     solver: Solver | None = None
+    command: tuple[str, ...] = ()
     interrupted: bool = field(default=False, init=False)
     rejected: bool = field(default=False, init=False)
 
@@ -119,6 +126,8 @@ class Job:
         named |= {source.name: source for source in self.case.sources()}
         refuse_own_files(self.out, named)
         check_folder(self.out)
+        if files is not None and self.checkpoint is None and self.resume is None:
+            (self.out / STATE).unlink(missing_ok=True)  # of an earlier run
         if self.report:
             require_plots()
         dtype = self.case.run.get("dtype", "float64")
@@ -152,6 +161,7 @@ class Job:
                     self.case, adapter, last, self.out, lambda: self.interrupted, self.report, self._now_and_then()
                 )
         self._summarize(results, where, profiles)
+        self._tell_how_to_continue(files)
         if self.solver is not None:
             self._check_for_solver(results)
         if frames and not self.quiet and not self.as_json:
@@ -248,8 +258,22 @@ class Job:
                 f"{self.case.name}: {next(iter(given))} is for a run of one method, and the case has "
                 f"{len(self.case.methods)}; choose one with --method"
             )
+        if len(self.case.methods) > 1:
+            return None
+        if self.checkpoint is None:  # written only if the run is stopped
+            return Checkpoint(self.out / STATE, math.inf, self.resume)
         every = Checkpoint.every if self.checkpoint_every is None else self.checkpoint_every
-        return Checkpoint(self.checkpoint, every, self.resume) if given else None
+        return Checkpoint(self.checkpoint, every, self.resume)
+
+    def _tell_how_to_continue(self, files: Checkpoint | None) -> None:
+        """After an interruption, print the command that continues."""
+        if not self.interrupted or files is None or not Path(str(files.path)).exists():
+            return
+        words = list(self.command)
+        for option in [word for word in words if word.startswith("--resume")]:
+            at = words.index(option)
+            del words[at : at + (1 if "=" in option else 2)]
+        print(f"clvoro: to go on: {shlex.join(['clvoro', *words, '--resume', str(files.path)])}", file=sys.stderr)
 
     @contextmanager
     def _stopping_cleanly(self) -> Iterator[None]:

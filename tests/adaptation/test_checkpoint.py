@@ -365,3 +365,21 @@ def test_command_line_stops_at_sigterm_and_resumes(tmp_path, capsys):
     assert "seed = 0" in capsys.readouterr().err
     assert cli.main([*again, "--method", "coupled,lloyd"]) == 2
     assert "--method" in capsys.readouterr().err
+
+
+def test_an_endless_interval_keeps_the_bits_and_writes_what_is_interrupted(ctx, tmp_path):
+    adapter, box, file = clvoro.Adapter(ctx), clvoro.Box((0, 0), (1, 1)), tmp_path / "run.checkpoint"
+    whole = adapter.run(box, 0.2)
+    kept = adapter.run(box, 0.2, checkpoint=clvoro.Checkpoint(file, np.inf))
+    assert np.array_equal(kept.points, whole.points)
+    assert not file.exists()
+
+    def press(row):
+        if row["step"] == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(clvoro.Interrupted):
+        adapter.run(box, 0.2, checkpoint=clvoro.Checkpoint(file, np.inf), callback=press)
+    resumed = adapter.run(box, 0.2, checkpoint=clvoro.Checkpoint(resume=file))
+    assert resumed.stop_reason == whole.stop_reason
+    assert len(resumed.history) >= len(whole.history)

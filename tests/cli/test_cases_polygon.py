@@ -130,7 +130,7 @@ def test_edges_of_a_boundary_must_be_there() -> None:
     with pytest.raises(InputError, match=r"edges has edge 8, .* from 0 to 7"):
         Case.from_toml(RINGS + shape, "my.toml").size_field()
     box = "[domain]\nlower = [0, 0]\nupper = [1, 1]\n"
-    with pytest.raises(InputError, match=r"boundary has side 8, .* from 0 to 3"):
+    with pytest.raises(InputError, match=r"edges has side 8, .* from 0 to 3"):
         Case.from_toml(box + shape, "my.toml").size_field()
     with pytest.raises(InputError, match="a polygon in"):
         Case.from_toml(box + "\n[size]\nkind = 'feature'\n", "my.toml").size_field()

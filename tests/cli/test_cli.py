@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -297,6 +298,34 @@ def test_interrupt_keeps_what_there_is(here, monkeypatch, capsys, last_step):
     assert (out / "report.html").exists() == report
     assert not list(out.glob("*-lloyd*"))
     assert "interrupted" in (out / "case.toml").read_text().splitlines()[0]
+
+
+def test_an_interrupted_run_prints_the_command_that_continues(here, monkeypatch, capsys):
+    plain, last = progress.ProgressDisplay.__call__, [3]
+
+    def pressing(self, row):
+        plain(self, row)
+        if row["step"] in last:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(progress.ProgressDisplay, "__call__", pressing)
+    (here / "one.toml").write_text(ROUND)
+    command = ["run", "one.toml", "--no-report", "--out", "my out", "--seed", "4"]
+    assert call(*command) == cli.INTERRUPTED
+    said = next(line for line in capsys.readouterr().err.splitlines() if "to go on: " in line)
+    words = shlex.split(said.split("to go on: ")[1])
+    assert words == ["clvoro", *command, "--resume", "my out/run.checkpoint"]
+    last[:] = [9]
+    assert call(*words[1:]) == cli.INTERRUPTED  # once more
+    assert f"to go on: {shlex.join(words)}" in capsys.readouterr().err
+    assert load(here / "my out/mesh.npz").history["step"].tolist() == list(range(10))
+    last.clear()
+    assert call(*words[1:]) == cli.OK
+    assert load(here / "my out/mesh.npz").stop_reason == "plan completed"
+    # Another size field is named as such.
+    (here / "one.toml").write_text(ROUND.replace("size = 0.08", "size = 0.05"))
+    assert call(*words[1:]) == cli.BAD_INPUT
+    assert "its size field differs; at (" in capsys.readouterr().err
 
 
 def test_failure_of_a_later_method_keeps_the_earlier_ones(here, monkeypatch, capsys):
