@@ -22,8 +22,7 @@ from _common import FIRST_SEED, make_adapter, parser
 
 import clvoro
 from clvoro.cli.cases import load_case
-from clvoro.mesh.results import Result
-from clvoro.mesh.summary import summary
+from clvoro.mesh.results import Result, summary
 
 METHODS = ("lloyd", "poisson", "coupled")
 

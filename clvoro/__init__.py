@@ -36,8 +36,7 @@ from .geometry.solid.solid import Solid
 from .geometry.sphere import Sphere
 from .io import load
 from .mesh.diagram import Diagram
-from .mesh.results import Displacements, Result
-from .mesh.transported import Transported
+from .mesh.results import Displacements, Result, Transported
 from .opencl import profile
 from .opencl.devices import create_context, list_devices
 from .shared import adapt, power_diagram, transport, voronoi

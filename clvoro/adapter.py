@@ -31,8 +31,7 @@ from .errors import InputError, InputTypeError, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.domain import Domain
 from .mesh.diagram import Diagram
-from .mesh.results import Result
-from .mesh.transported import Transported
+from .mesh.results import Result, Transported
 from .opencl import devices as device
 from .opencl.build_notice import BuildNotice, report_builds
 from .opencl.engine import Engine

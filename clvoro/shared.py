@@ -14,8 +14,7 @@ from .errors import DeviceError
 from .geometry.boundary_layers import Layers
 from .geometry.domain import Domain
 from .mesh.diagram import Diagram
-from .mesh.results import Result
-from .mesh.transported import Transported
+from .mesh.results import Result, Transported
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

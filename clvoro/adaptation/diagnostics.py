@@ -17,8 +17,8 @@ from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..sizing import Sizing
+from ..sizing.feature import NARROW, NarrowPart, find_narrow_parts
 from ..sizing.field import Field
-from ..sizing.gaps import NARROW, NarrowPart, find_narrow_parts
 
 COARSER, FINER = 2.0, 1e-3
 """Ratios of the sizes of layers and of the field beside them that indicate a mistake."""

@@ -15,10 +15,9 @@ from ..geometry.geojson import may_be_degrees
 from ..geometry.lines.pairs import place_pairs
 from ..geometry.sphere import Sphere
 from ..sizing import Sizing, as_field
-from ..sizing.field import Field
-from ..sizing.gaps import NARROW
-from ..sizing.layers import limit_beside_layers, limit_beside_lines
-from ..sizing.on_domain import on_domain
+from ..sizing.distance import limit_beside_layers, limit_beside_lines
+from ..sizing.feature import NARROW
+from ..sizing.field import Field, on_domain
 from ..tessellation.power import require_power_domain
 from .diagnostics import check_precision, narrow_parts, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import Extras, check_memory, expected_boundary_cells, expected_images, expected_surplus

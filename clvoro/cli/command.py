@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, InputTypeError, OutputError
-from .formats import MESH_FILES, NAMES
-from .streams import steady_streams
+from .outputs import MESH_FILES, NAMES
+from .progress import steady_streams
 
 OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 

@@ -26,14 +26,12 @@ from ..finite_volumes.solver_mesh import WallShape
 from ..io import save, write, write_history
 from ..io.check_mesh import run_check_mesh
 from ..io.foam import PatchType, patch_types
-from ..mesh.results import Result
-from ..mesh.summary import boundary_line, summary
+from ..mesh.results import Result, boundary_line, summary
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..opencl.profile import Profile
 from ..opencl.program import build_seconds
 from .cases import Case
-from .formats import MESH_FILES, PLANE
-from .outputs import check_folder, do_all, refuse_own_files, require_plots
+from .outputs import MESH_FILES, PLANE, check_folder, do_all, refuse_own_files, require_plots
 from .progress import ProgressDisplay, during
 from .sequence import frames_line, run_frames
 

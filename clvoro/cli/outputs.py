@@ -83,3 +83,20 @@ def require_plots() -> None:
         raise ClvoroError(
             f"the report needs Matplotlib, which cannot be used ({error}); repair it, or run with --no-report"
         ) from error
+
+
+MESH_FILES = {
+    "openfoam": ("mesh.foam", None),
+    "nc": ("mesh.nc", "ugrid"),
+    "mpas": ("mesh-mpas.nc", "mpas"),
+    "scrip": ("mesh-scrip.nc", "scrip"),
+    "vtk": ("mesh.vtk", None),
+    "ply": ("mesh.ply", None),
+    "obj": ("mesh.obj", None),
+    "metis": ("graph.info", None),
+}
+"""By the name of the format: the file, and its convention, which `clvoro.io.write` takes."""
+NAMES = {"foam": "openfoam", "ugrid": "nc", "info": "metis"}
+"""Formats that are also known by a suffix or a convention."""
+PLANE = ("nc", "mpas", "vtk", "ply", "obj")
+"""Formats that hold polygons only."""

@@ -7,7 +7,7 @@ the solver "mpas" (`finite_volumes.gate`).
 
 from ..finite_volumes.gate import SOLVERS
 from ..io import CONVENTIONS, READERS
-from . import on_sphere  # noqa: F401  registers its functions
+from . import graded  # noqa: F401  registers size fields on spheres
 from .criteria import check_for_mpas
 from .lonlat_grid import from_xarray
 from .mpas import write_mpas

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.spherical_triangles import triangle_areas
+from ..geometry.sphere import triangle_areas
 from ..mesh.connectivity import face_ends, face_keys, face_owners, neighbor_points, next_faces
 from ..mesh.diagram import Diagram
 

@@ -1,4 +1,4 @@
-"""Bounded growth on a sphere: `Graded` along great circles."""
+"""Size fields on a sphere: those of two dimensions take longitudes and latitudes, and growth is along great circles."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.sphere import Sphere
 from ..opencl.engine import Engine
+from ..sizing.distance import Distance
 from ..sizing.evaluation import Sizing
-from ..sizing.field import Field
+from ..sizing.field import Combined, Field, Scaled, on_domain
 from ..sizing.gradation import Gradation, globe_columns
 from ..sizing.graded import BATCH, MOST_NODES, Graded, default_engine
 from ..sizing.raster import Raster
-from .sizes import LonLat
+from .sizes import ArcDistance, LonLat
 
 if TYPE_CHECKING:
     from ..geometry.domain import Domain
@@ -147,3 +148,21 @@ def _nodes(sphere: Sphere, nx: int, column: np.ndarray, row: np.ndarray) -> np.n
     """Return the positions (n, 3) of nodes of a grid with `nx` columns."""
     spacing = 360 / nx
     return sphere.positions(np.column_stack([column + 0.5, row + 0.5]) * spacing - (180, 90))
+
+
+@on_domain.register
+def on_sphere(domain: Sphere, field: Field) -> Field:
+    """Return `field` for a sphere: fields of two dimensions are functions of longitude and latitude.
+
+    Raises
+    ------
+    InputError
+        For a `Graded` field with a box.
+    """
+    if isinstance(field, (Scaled, Combined)):
+        return field.map_parts(lambda part: on_sphere(domain, part))
+    if isinstance(field, Graded):
+        return ArcGraded(field, on_sphere(domain, field.field), domain)
+    if field.dim != 2 or isinstance(field, (LonLat, ArcDistance)):
+        return field
+    return ArcDistance(field, domain) if isinstance(field, Distance) else LonLat(field)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, InputTypeError
-from ..sizing.gridding import fill_missing
-from ..sizing.raster import Raster
+from ..sizing.raster import Raster, fill_missing
 
 MOST_VALUES = 1 << 24
 """Most values of a uniform grid that stands for one of varying spacing."""

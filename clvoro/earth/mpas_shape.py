@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.domain import Domain
-from ..geometry.sphere import Sphere
-from ..geometry.spherical_triangles import triangle_areas
+from ..geometry.sphere import Sphere, triangle_areas
 from ..io.half_edges import HalfEdges
 from ..mesh.connectivity import neighbor_points
 from ..mesh.diagram import Diagram

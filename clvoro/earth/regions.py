@@ -20,14 +20,12 @@ import scipy
 
 from ..arguments import check_choice, check_integer, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
-from ..geometry.sphere import Sphere
-from ..mesh.connectivity import face_owners
+from ..geometry.sphere import Sphere, SphereRegion
+from ..mesh.connectivity import face_owners, following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..mesh.subset import check_mask
-from .crossing import cells_across, rings_around
 from .shapes import area_of, lines_of
-from .straits import widen_straits
 
 if TYPE_CHECKING:
     import shapely
@@ -320,3 +318,167 @@ def _large_parts(diagram: Diagram, water: np.ndarray, least_cells: int | None) -
             f"least_cells is {least}, and the largest part that is left has {sizes.max():.0f} cells; use a smaller one"
         )
     return water & (sizes[part] >= least)
+
+
+_STEP = 0.1
+"""Length in degrees of the arcs by which lines in longitude and latitude are approximated."""
+_TIE = 1e-12
+"""Difference of distances, in units of the radius, below which two generators are equally near."""
+
+
+def cells_across(diagram: Diagram, sphere: Sphere, line: np.ndarray) -> np.ndarray:
+    """Return the cells that a line (k, 2) of continuous longitudes and latitudes crosses, ascending.
+
+    Cells that follow each other along the line have a common face. Where the line goes through a vertex of more than
+    three cells, those beside it are added. Parts of the line outside of the mesh are skipped.
+    """
+    n, unit = len(diagram), diagram.points
+    if isinstance(sphere, SphereRegion):
+        unit = np.concatenate([unit, sphere.beyond])
+    unit = unit / np.linalg.norm(unit, axis=1)[:, None]
+    tree = scipy.spatial.KDTree(unit)
+    path = sphere.positions(_divided(line)) / sphere.radius
+    cells = np.asarray(tree.query(path)[1])
+    begin, end, first, last = path[:-1], path[1:], cells[:-1], cells[1:]
+    found, pairs = [cells], [np.empty((0, 2), np.int64)]
+    while True:
+        some = first != last
+        begin, end, first, last = begin[some], end[some], first[some], last[some]
+        if not len(first):
+            break
+        # Where the arc crosses the bisector of the cells of its ends: between them, unless a third one is nearer.
+        normal = unit[last] - unit[first]
+        a, b = _heights(normal, begin, end)
+        middle = begin + np.clip(a / np.maximum(a + b, 1e-300), 0, 1)[:, None] * (end - begin)
+        middle /= np.linalg.norm(middle, axis=1)[:, None]
+        distance, nearest = (np.asarray(x) for x in tree.query(middle))
+        own = np.linalg.norm(middle - unit[first], axis=1)
+        third = (distance < own - _TIE) & (nearest != first) & (nearest != last)
+        pairs.append(np.column_stack([first, last])[~third])
+        found.append(nearest[third])
+        begin, middle, end = begin[third], middle[third], end[third]
+        first, nearest, last = first[third], nearest[third], last[third]
+        begin, end = np.concatenate([begin, middle]), np.concatenate([middle, end])
+        first, last = np.concatenate([first, nearest]), np.concatenate([nearest, last])
+    crossed = np.unique(np.concatenate(found))
+    beside = _common_neighbors(diagram, np.concatenate(pairs))
+    return np.union1d(crossed[crossed < n], beside)
+
+
+def rings_around(diagram: Diagram, inside: np.ndarray, count: int) -> np.ndarray:
+    """Return 0 for cells inside, k for those in the k-th ring of neighbors around them, else -1; (n,) int32."""
+    inner = diagram.neighbors >= 0
+    i, j = face_owners(diagram)[inner], diagram.neighbors[inner]
+    ring = np.where(inside, 0, -1).astype(np.int32)
+    for k in range(1, count + 1):
+        front = j[ring[i] == k - 1]
+        ring[front[ring[front] < 0]] = k
+    return ring
+
+
+def _heights(normal: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances of both ends from the planes with these normals, not negative."""
+    a, b = -(normal * begin).sum(axis=1), (normal * end).sum(axis=1)
+    return np.maximum(a, 0), np.maximum(b, 0)
+
+
+def _divided(line: np.ndarray) -> np.ndarray:
+    """Return the line with more positions, at most `_STEP` apart."""
+    steps = np.abs(np.diff(line, axis=0)).max(axis=1)
+    counts = np.maximum(np.ceil(steps / _STEP), 1).astype(int)
+    segment = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(len(segment)) - (np.cumsum(counts) - counts)[segment]) / counts[segment]
+    made = line[segment] + share[:, None] * (line[segment + 1] - line[segment])
+    made = np.concatenate([made, line[-1:]])
+    made[:, 0] = np.mod(made[:, 0], 360)
+    return made
+
+
+def _common_neighbors(diagram: Diagram, pairs: np.ndarray) -> np.ndarray:
+    """Return the cells that are neighbors of both cells of a pair that are not neighbors of each other."""
+    n = len(diagram)
+    pairs = np.unique(pairs[(pairs < n).all(axis=1)], axis=0)
+    starts, neighbors = diagram.neighbor_starts, diagram.neighbors
+    found = [np.empty(0, np.int64)]
+    for i, j in pairs.tolist():
+        around, others = (neighbors[starts[k] : starts[k + 1]] for k in (i, j))
+        if j not in around:
+            both = np.intersect1d(around, others)
+            found.append(both[both >= 0])
+    return np.unique(np.concatenate(found))
+
+
+def narrow_cells(diagram: Diagram, water: np.ndarray) -> np.ndarray:
+    """Return which water cells have land on two sides, so that water is one cell wide there: (n,) bool.
+
+    The neighbors around such a cell form two or more runs of water with land between them.
+    """
+    wet = (diagram.neighbors >= 0) & water[diagram.neighbors]
+    ends = wet & ~wet[following(diagram.neighbor_starts)]
+    return water & (np.bincount(face_owners(diagram), ends, len(diagram)) >= 2)
+
+
+def widen_straits(diagram: Diagram, water: np.ndarray, fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return `water` with more cells, so that no strait is a single cell wide, and the cells where that is impossible.
+
+    Beside a narrow cell one run of land between two runs of water becomes water, the shortest one that can. A land cell
+    can become water if its neighbors in the water form a single run. Then land and water keep their connected parts: no
+    land bridge opens, and no island disappears.
+
+    Parameters
+    ----------
+    diagram : Diagram
+    water, fixed : (n,) bool
+        Water cells, and land cells that stay land.
+
+    Returns
+    -------
+    water : (n,) bool
+    left : (k,) int
+        Cells that are still narrow.
+    """
+    wet = water.copy()
+    starts, neighbors = diagram.neighbor_starts.tolist(), diagram.neighbors
+    while True:
+        changed = False
+        for cell in np.flatnonzero(narrow_cells(diagram, wet)).tolist():
+            ring = neighbors[starts[cell] : starts[cell + 1]].tolist()
+            runs = _land_runs(ring, wet)
+            if len(runs) < 2:
+                continue  # widened from another cell
+            for run in sorted(runs, key=len):
+                if _flood(run, wet, fixed, starts, neighbors):
+                    changed = True
+                    break
+        if not changed:
+            return wet, np.flatnonzero(narrow_cells(diagram, wet))
+
+
+def _land_runs(ring: list[int], wet: np.ndarray) -> list[list[int]]:
+    """Return the runs of land among the neighbors around a cell; -1 and below are land, too."""
+    is_wet = [j >= 0 and bool(wet[j]) for j in ring]
+    first = next((k for k, here in enumerate(is_wet) if here), 0)
+    runs: list[list[int]] = []
+    before = True
+    for k in range(first, first + len(ring)):
+        here = is_wet[k % len(ring)]
+        if not here:
+            runs = [*runs, []] if before else runs
+            runs[-1].append(ring[k % len(ring)])
+        before = here
+    return runs
+
+
+def _flood(run: list[int], wet: np.ndarray, fixed: np.ndarray, starts: list[int], neighbors: np.ndarray) -> bool:
+    """Make a run of land cells water, from its begin on; if one of them must stay land, change nothing."""
+    done: list[int] = []
+    for cell in run:
+        if cell >= 0 and not fixed[cell]:
+            ring = neighbors[starts[cell] : starts[cell + 1]].tolist()
+            if len(_land_runs(ring, wet)) == 1:
+                wet[cell] = True
+                done.append(cell)
+                continue
+        wet[done] = False
+        return False
+    return True

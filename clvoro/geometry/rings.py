@@ -18,8 +18,8 @@ import shapely
 
 from ..arguments import check_rows, format_point
 from ..errors import InputError, InputTypeError
-from .angles import angles
 from .curved_edges import CurvedEdges, has_curves, unroll
+from .curves.curve import angles
 from .domain import LARGEST_EDGE
 
 SHORTEST_EDGE = 1e-12

@@ -14,7 +14,7 @@ from ..arguments import check_number, check_rows
 from ..errors import InputError
 from .boundary_names import BoundaryNames, Walls
 from .domain import Domain
-from .sphere_region import COAST
+from .sphere import COAST
 
 if TYPE_CHECKING:
     from ..opencl.engine import Traits

@@ -21,10 +21,9 @@ if TYPE_CHECKING:
     from ..finite_volumes.gate import Solver, SolverReport
     from ..finite_volumes.solver_mesh import WallShape
     from ..geometry.domain import Domain
-    from .cell import Cell
     from .check.findings import Report
     from .faces import Faces
-    from .locate import Locator
+    from .lookup import Cell, Locator
     from .quality import Measures
     from .results import Result
 
@@ -301,7 +300,7 @@ class Diagram(MeshOutput):
         Returns
         -------
         Cell
-            See `clvoro.mesh.cell.Cell`.
+            See `clvoro.mesh.lookup.Cell`.
 
         Raises
         ------
@@ -315,7 +314,7 @@ class Diagram(MeshOutput):
         >>> cell.volume, len(cell.vertices), len(cell.faces), sorted(cell.neighbors.tolist())
         (1.0, 8, 6, [-6, -5, -4, -3, -1, 1])
         """
-        from .cell import make_cell
+        from .lookup import make_cell
 
         return make_cell(self, i)
 
@@ -349,7 +348,7 @@ class Diagram(MeshOutput):
 
     @cached_property
     def _locator(self) -> Locator:
-        from .locate import Locator
+        from .lookup import Locator
 
         return Locator(self)
 
@@ -369,7 +368,7 @@ class Diagram(MeshOutput):
         InputError
             In 3D, and in periodic boxes, where corners of triangles may be images.
         """
-        from .delaunay import dual_triangles
+        from .lookup import dual_triangles
 
         return dual_triangles(self)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..geometry.spherical_triangles import arc_excess
+from ..geometry.sphere import arc_excess
 from .connectivity import face_ends, face_owners, following
 from .diagram import Diagram
 

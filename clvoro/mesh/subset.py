@@ -10,8 +10,7 @@ import numpy as np
 
 from ..errors import InputError, InputTypeError
 from ..geometry.domain import Domain
-from ..geometry.sphere import Sphere
-from ..geometry.sphere_region import COAST, SphereRegion
+from ..geometry.sphere import COAST, Sphere, SphereRegion
 from ..geometry.subdomain import Subdomain
 from .connectivity import face_owners, neighbor_points, take_rows
 from .diagram import Diagram

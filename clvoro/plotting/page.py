@@ -13,8 +13,7 @@ import numpy as np
 
 from ..errors import MissingLibraryError, MissingPicturesWarning
 from ..io.atomic import atomic_file, writing
-from ..mesh.results import Result
-from ..mesh.summary import beside_boundary, summary
+from ..mesh.results import Result, beside_boundary, summary
 from .pictures import draw, pictures_of, render
 
 _STYLE = """

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.diagram import Diagram
-from ..mesh.locate import Locator
+from ..mesh.lookup import Locator
 from .host_transfer import CellSums, find_defect, fit_linear_functions
 from .spherical_pieces import TangentCells
 

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..geometry.spherical_triangles import arc_excess
+from ..geometry.sphere import arc_excess
 from ..mesh.connectivity import face_owners, following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.spherical import bisector_corners

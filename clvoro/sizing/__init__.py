@@ -16,8 +16,7 @@ from .distance import Distance
 from .evaluation import Sizing
 from .expression import Expression
 from .feature import FeatureSize
-from .field import Constant, Field, as_field, maximum, minimum
-from .function import Function
+from .field import Constant, Field, Function, as_field, maximum, minimum
 from .graded import Graded
 from .raster import Raster, Scattered
 from .solution import gradient_size, hessian_size

@@ -1,9 +1,9 @@
-"""A size field that grows with the distance to curves and surfaces."""
+"""Distances to shapes, and sizes that grow with them, also from boundary layers."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -12,14 +12,16 @@ import shapely
 
 from ..errors import InputError, InputTypeError
 from ..geometry import curves
+from ..geometry.boundary_layers import Layers, chosen_segments, outer_segments
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
 from ..geometry.lines.lines import Lines
+from ..geometry.lines.pairs import LinePairs
 from ..geometry.shapes import Circle, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface
 from ..geometry.triangles import segment_distance2
 from .arguments import check_positive, check_slope
-from .field import Field
+from .field import Field, as_field, minimum
 
 if TYPE_CHECKING:
     from .codegen import CodeWriter
@@ -259,3 +261,42 @@ def _item_boxes(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple
     # box of a circle by an ulp, so boxes are widened.
     wide = (np.maximum(radius, 0) * (1 + 4 * np.finfo(radius.dtype).eps))[:, None]
     return np.minimum(begin, end) - wide, np.maximum(begin, end) + wide
+
+
+_GROWTH = 1.2
+"""Growth of sizes beyond layers of constant height."""
+_SMALLER = 0.8
+"""Sizes beside lines that count as smaller than the size field, as a share of it."""
+_CLASS = 1.4
+"""Columns whose widths differ by less than this factor have one distance field."""
+
+
+def limit_beside_layers(size: object, domain: Domain, layers: Sequence[Layers]) -> Field:
+    """Return `size`, limited to sizes that grow into the domain from the widths of the columns at the last row."""
+    field = as_field(size)
+    for layer in layers:
+        slope = math.log(layer.growth if layer.growth > 1 else _GROWTH)
+        segments, widths = outer_segments(domain, layer)
+        if not len(segments):
+            segments = chosen_segments(domain, layer)
+            widths = np.full(len(segments), layer.width)
+        field = _limited(field, segments, widths, layer.width, slope)
+    return field
+
+
+def limit_beside_lines(field: Field, pairs: LinePairs) -> Field:
+    """Return `field`, limited beside lines whose cells are smaller, as lines are near to each other there."""
+    smaller = pairs.sizes < _SMALLER * np.asarray(field(pairs.chords.mean(axis=1)), float)
+    return _limited(field, pairs.chords[smaller], pairs.sizes[smaller], 1.0, math.log(_GROWTH))
+
+
+def _limited(field: Field, segments: np.ndarray, widths: np.ndarray, width: float, slope: float) -> Field:
+    """Return `field`, limited to sizes that grow from the `widths` (k,) at `segments` (k, 2, 2).
+
+    Those of one class, counted from `width`, have one distance field.
+    """
+    classes = np.floor(np.log(widths / width) / math.log(_CLASS) + 0.5)
+    for one in np.unique(classes):
+        row = Edges(*np.moveaxis(segments[classes == one], 1, 0))
+        field = minimum(field, Distance(row, h_min=float(widths[classes == one].mean()), slope=slope))
+    return field

@@ -8,10 +8,9 @@ import numpy as np
 
 from ..arguments import format_point
 from ..errors import SizeFieldError
-from .advice import advice_for_size
+from .arguments import advice_for_size
 from .codegen import generate_code
-from .field import Constant, Field, as_field
-from .on_domain import on_domain
+from .field import Constant, Field, as_field, on_domain
 
 if TYPE_CHECKING:
     import pyopencl.array as cla

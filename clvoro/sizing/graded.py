@@ -13,10 +13,8 @@ from ..errors import InputError, InputTypeError, MemoryLimitError
 from ..geometry.domain import Domain
 from ..opencl.engine import PLAIN, Engine, Traits
 from ..opencl.host_memory import host_memory
-from .advice import coverage_warnings
-from .arguments import check_slope
-from .field import Field, as_field, count_parts
-from .on_domain import on_domain
+from .arguments import check_slope, coverage_warnings
+from .field import Field, as_field, count_parts, on_domain
 from .raster import Raster
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ import numpy as np
 
 from ..errors import InputError, InputTypeError
 from .arguments import check_positive
-from .gridding import fill_missing
-from .raster import Raster, check_box
+from .raster import Raster, check_box, fill_missing
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

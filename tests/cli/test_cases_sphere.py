@@ -12,7 +12,7 @@ from clvoro.cli import command as cli
 from clvoro.cli.cases import Case, load_case, toml
 from clvoro.errors import InputError
 from clvoro.io import load
-from clvoro.sizing.on_domain import on_domain
+from clvoro.sizing.field import on_domain
 
 HEAD = "[domain]\nkind = 'sphere'\nradius = 1000.0\n"
 SPHERE = clvoro.Sphere(1000)

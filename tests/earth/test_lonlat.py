@@ -10,7 +10,7 @@ import clvoro
 from clvoro import earth, sizing
 from clvoro.errors import ClvoroError, MismatchWarning
 from clvoro.opencl.engine import Engine
-from clvoro.sizing.on_domain import on_domain
+from clvoro.sizing.field import on_domain
 
 EARTH = clvoro.Sphere()
 POINTS = np.concatenate(

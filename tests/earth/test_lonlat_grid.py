@@ -8,7 +8,7 @@ import pytest
 import clvoro
 from clvoro import earth, sizing
 from clvoro.errors import ClvoroError
-from clvoro.sizing.on_domain import on_domain
+from clvoro.sizing.field import on_domain
 
 EARTH = clvoro.Sphere()
 RNG = np.random.default_rng(12)

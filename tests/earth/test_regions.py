@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components, shortest_path
 
 import clvoro
 from clvoro import earth
-from clvoro.earth.straits import narrow_cells, widen_straits
+from clvoro.earth.regions import narrow_cells, widen_straits
 from clvoro.errors import InputError, InputTypeError, MismatchWarning
 from tests.reference.spheres import grid_of_rings, random_points
 

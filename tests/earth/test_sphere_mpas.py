@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import SphericalVoronoi
 
 import clvoro
-from clvoro.geometry.spherical_triangles import arc_excess, triangle_areas
+from clvoro.geometry.sphere import arc_excess, triangle_areas
 from tests.earth.test_netcdf_mpas import MEASURES, TABLES, Mesh, check_divergence, check_energy, matrix, slow_weights
 from tests.reference.globes import CASES, arcs, is_double, made, triangles
 

@@ -624,7 +624,7 @@ def test_size_is_evaluated_inside_only(result) -> None:
 def test_boundary_cells_are_reported_separately(result, tmp_path, monkeypatch) -> None:
     """With the figures of all pictures, which are not rendered."""
     pytest.importorskip("matplotlib")
-    from clvoro.mesh.summary import boundary_line, summary
+    from clvoro.mesh.results import boundary_line, summary
     from clvoro.plotting import page as module
     from clvoro.plotting import write_report
 
@@ -648,7 +648,7 @@ def test_boundary_cells_are_reported_separately(result, tmp_path, monkeypatch) -
 
 
 def test_a_piece_with_one_cell_has_no_inner_cells(ctx) -> None:
-    from clvoro.mesh.summary import boundary_line, summary
+    from clvoro.mesh.results import boundary_line, summary
 
     alone = mesh(ctx, Polygon(SQUARE), 1)
     assert summary(alone)["inner_mean_error"] is None

@@ -8,7 +8,7 @@ import pytest
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
-from clvoro.geometry.sphere_region import SphereRegion
+from clvoro.geometry.sphere import SphereRegion
 from clvoro.mesh.diagram import Diagram
 from clvoro.mesh.results import HISTORY_DTYPE
 from tests.reference.netcdf_files import result_of

@@ -8,8 +8,7 @@ from scipy.spatial import SphericalVoronoi
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.mesh.check.rebuilt import find_precision
-from clvoro.mesh.check.sphere import SphereCells
+from clvoro.mesh.check.rebuilt import SphereCells, find_precision
 from clvoro.mesh.diagram import Diagram
 from tests.mesh.test_check import add, names_of, of_diagram, put, spoilt, swap
 

@@ -12,7 +12,7 @@ from clvoro import sizing
 from clvoro.adaptation.sampling.start import sample_uniform
 from clvoro.errors import InputError, InputTypeError
 from clvoro.opencl.engine import Engine
-from clvoro.sizing.gaps import FACING
+from clvoro.sizing.feature import FACING
 from tests.reference.polygons import HOLE, SQUARE, ragged
 
 CIRCLE = np.column_stack([f(np.arange(200) * math.pi / 100) for f in (np.cos, np.sin)])

@@ -14,8 +14,8 @@ from clvoro import Box, earth, sizing
 from clvoro.errors import InputError, InputTypeError, MemoryLimitError, SizeFieldError
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.host_memory import host_memory
+from clvoro.sizing.field import on_domain
 from clvoro.sizing.gradation import Gradation, globe_columns
-from clvoro.sizing.on_domain import on_domain
 
 
 def jacobi(values, spacing, slope):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...arguments import format_point
 from ...errors import InputTypeError, SizeFieldError
-from ...sizing.advice import advice_for_size
+from ...sizing.arguments import advice_for_size
 from .box_tree import BoxTree, hilbert_tables
 from .coverage import coverage_of
 

@@ -10,7 +10,7 @@ from ...arguments import check_integer, check_number, check_points, coincident_n
 from ...errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWarning
 from ...geometry.domain import Domain
 from ...mesh.diagram import Diagram
-from ...mesh.transported import Transported
+from ...mesh.results import Transported
 from ...solvers.transport import TOLERANCE
 from ...tessellation.readback.diagram import fetch_diagram
 from ...tessellation.tessellator import Tessellator

@@ -4,9 +4,7 @@ A curve takes the place of a ring of a `clvoro.Polygon`, or of some vertices wit
 whose vertices lie on the curve. The domain keeps the curve itself.
 """
 
-from .conics import arc, circle, ellipse
 from .curve import Curve
-from .naca import naca
-from .splines import spline
+from .forms import arc, circle, ellipse, naca, spline
 
 __all__ = ["Curve", "arc", "circle", "ellipse", "naca", "spline"]

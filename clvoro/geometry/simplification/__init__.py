@@ -5,7 +5,6 @@ points on the boundary whose circumcircles are smaller than that disc (alpha sha
 1983). Each triangle is water or land. To fill a bay is to turn its triangles into land.
 """
 
-from .simplify import simplify
-from .thinning import DEFAULT_NAME, pieces_of
+from .simplify import DEFAULT_NAME, pieces_of, simplify
 
 __all__ = ["DEFAULT_NAME", "pieces_of", "simplify"]

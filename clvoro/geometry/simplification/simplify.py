@@ -1,8 +1,10 @@
-"""Fill narrow water, drop small land, and thin what is left."""
+"""Domains without what is finer than the cells."""
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -11,12 +13,181 @@ import shapely
 
 from ...arguments import check_number, format_point
 from ...errors import InputError, InputTypeError
-from .narrow import SCALES, narrow_water, small_islands, small_land
-from .thinning import large_pieces, thinned
-from .triangles import Triangles, divided_boundary
+from .triangles import SCALES, Parts, Triangles, divided_boundary, narrow_water, small_islands, small_land
 
 if TYPE_CHECKING:
     from ..polygon import Polygon
+
+LEAST_PIECE = 4.0
+"""Least area over h^2 of a piece of the domain that remains."""
+_APART = 0.01
+"""Distance over h by which the boundary is moved at a point where the water touches itself."""
+_TRIES = 6
+
+DEFAULT_NAME = re.compile(r"(outer|hole)(-\d+)?")
+"""The names of rings that have none of their own, such as "outer" and "hole-1"."""
+
+
+def pieces_of(domain: Polygon) -> list[tuple[list[np.ndarray], dict[str, list[int]]]]:
+    """Return the rings of each piece, and the names of its edges but for those of rings without a name."""
+    found, rings = [], domain.rings
+    for piece in range(domain.n_pieces):
+        rows = np.flatnonzero(domain.piece_of_ring == piece)
+        edges = slice(domain.ring_starts[rows[0]], domain.ring_starts[rows[-1] + 1])
+        index, names = domain.boundaries.index[edges], {}
+        for part in np.unique(index).tolist():
+            name = domain.boundaries.names[part]
+            if DEFAULT_NAME.fullmatch(name) is None:
+                names[name] = np.flatnonzero(index == part).tolist()
+        found.append(([rings[row] for row in rows], names))
+    return found
+
+
+def large_pieces(triangles: Triangles) -> list[list[tuple[np.ndarray, np.ndarray]]]:
+    """Return the rings of all pieces of more than a few cells, the outer one first: vertices (k, 2) and sizes (k,)."""
+    pieces = Parts(triangles, triangles.water)
+    triangles.water = pieces.chosen(pieces.area > LEAST_PIECE * pieces.h**2)
+    shore, near, corners = triangles.shores(), triangles.neighbors, triangles.corners
+    t, k = np.nonzero(shore)
+    number = np.full(shore.shape, -1)
+    number[t, k] = np.arange(len(t))
+    point, end = corners[t, (k + 1) % 3], corners[t, (k + 2) % 3]
+    # The next side: turn about the end through water.
+    after, turning, s, side = np.empty_like(t), np.arange(len(t)), t, (k + 1) % 3
+    while len(turning):
+        there = shore[s, side]
+        after[turning[there]] = number[s[there], side[there]]
+        turning, s = turning[~there], near[s, side][~there]
+        side = ((corners[s] == end[turning, None]).argmax(axis=1) + 2) % 3
+    x, h = _apart(triangles.x, point, after, triangles.h[point]), triangles.h[point]
+    follow = x[after] - x
+    before = np.empty_like(after)
+    before[after] = np.arange(len(after))
+    last = x - x[before]
+    bend = np.abs(last[:, 0] * follow[:, 1] - last[:, 1] * follow[:, 0])
+    straight = bend < 1e-9 * np.hypot(*last.T) * np.hypot(*follow.T)
+    kept = ~straight | (point < triangles.n_vertices)
+    piece_of = np.zeros(len(corners), np.int64)
+    piece_of[pieces.row] = pieces.part
+    found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    following, left = after.tolist(), [True] * len(after)
+    for first in range(len(left)):
+        ring, at = [], first
+        while left[at]:
+            left[at] = False
+            ring.append(at)
+            at = following[at]
+        if ring:
+            row = np.array(ring)[kept[ring]]
+            found.setdefault(int(piece_of[t[first]]), []).append((x[row], h[row]))
+    return [sorted(rings, key=lambda ring: -_area(ring[0])) for rings in found.values()]
+
+
+def _area(ring: np.ndarray) -> float:
+    """Return the area within a ring; negative if it runs clockwise."""
+    x, y = (ring - ring[0]).T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
+
+def _apart(x: np.ndarray, point: np.ndarray, after: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Return the positions of the points of rings: where the water touches itself, they move into it."""
+    found = x[point]
+    rows = np.flatnonzero(np.bincount(point)[point] > 1)
+    before = np.empty_like(after)
+    before[after] = np.arange(len(after))
+    ahead, back = (x[point[way[rows]]] - found[rows] for way in (after, before))
+    first, last = (np.arctan2(way[:, 1], way[:, 0]) for way in (ahead, back))
+    angle = first + 0.5 * np.mod(last - first, 2 * math.pi)
+    near = np.minimum(np.hypot(*ahead.T), np.hypot(*back.T))
+    way = np.minimum(_APART * h[rows], near / 4)
+    found[rows] += way[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return found
+
+
+def thinned(
+    domain: Polygon, water: list[list[tuple[np.ndarray, np.ndarray]]], tolerance: float
+) -> tuple[list[list[np.ndarray]], dict[str, list[int]]]:
+    """Return the rings of pieces of `water` with fewer vertices, and the edges of each name."""
+    rings = [_Ring(domain, *ring, tolerance) for piece in water for ring in piece]
+    first = np.cumsum([0] + [len(piece) for piece in water])
+    for k in range(_TRIES):
+        rows = [ring.kept() for ring in rings]
+        thin = [ring.x[row] for ring, row in zip(rings, rows, strict=True)]
+        pieces = [thin[i:j] for i, j in itertools.pairwise(first)]
+        if shapely.MultiPolygon([(p[0], p[1:]) for p in pieces]).is_valid:
+            break
+        crossing = _crossing(thin)
+        if k == _TRIES - 2 or not crossing.any():
+            crossing[:] = True
+        ends = np.cumsum([len(row) for row in rows])[:-1]
+        for ring, row, again in zip(rings, rows, np.split(crossing, ends), strict=True):
+            ring.share[again[np.searchsorted(row, np.arange(len(ring.x)), "right") - 1]] = -1
+    names: dict[str, list[int]] = {}
+    given = domain.boundaries.names
+    named = {n for n in given if not DEFAULT_NAME.fullmatch(n) or n in (domain.names or ())}
+    parts = np.concatenate([ring.part[row] for ring, row in zip(rings, rows, strict=True)])
+    for edge, part in enumerate(parts.tolist()):
+        if given[part] in named:
+            names.setdefault(given[part], []).append(edge)
+    return pieces, names
+
+
+def _crossing(rings: list[np.ndarray]) -> np.ndarray:
+    """Return which edges of all rings, (k,) bool, touch an edge that does not follow or precede them."""
+    ends = np.concatenate([np.stack([x, np.roll(x, -1, axis=0)], axis=1) for x in rings])
+    ring = np.repeat(np.arange(len(rings)), [len(x) for x in rings])
+    after = np.arange(1, len(ends) + 1)
+    last = np.flatnonzero(np.diff(ring, append=-1))
+    after[last] = np.append(0, last[:-1] + 1)
+    lines = shapely.linestrings(ends)
+    a, b = shapely.STRtree(lines).query(lines, predicate="intersects")
+    found = np.zeros(len(ends), bool)
+    found[a[(a != b) & (after[a] != b) & (after[b] != a)]] = True
+    return found
+
+
+class _Ring:
+    """One ring (k, 2). Vertices have a size, and a tolerance as a share of it; edges have a named part."""
+
+    def __init__(self, domain: Polygon, x: np.ndarray, h: np.ndarray, tolerance: float) -> None:
+        self.x, self.h, self.share = x, h, np.full(len(x), tolerance or -1.0)
+        edges, _ = domain.nearest_edge((x + np.roll(x, -1, axis=0)) / 2)
+        self.part = domain.boundaries.index[edges]
+
+    def kept(self) -> np.ndarray:
+        """Return the vertices, ascending, from whose polyline all others are at most `share` times the size away."""
+        k = len(self.x)
+        ends = np.flatnonzero(self.part != np.roll(self.part, 1))
+        if len(ends) < 2:
+            # A vertex of the convex hull, and the one that is farthest from it.
+            center = self.x.mean(axis=0)
+            first = int(ends[0]) if len(ends) else int(np.argmax(np.hypot(*(self.x - center).T)))
+            far = int(np.argmax(np.hypot(*(self.x - self.x[first]).T)))
+            ends = np.unique([first, far])
+        ends = np.union1d(ends, np.flatnonzero(self.share < 0))
+        rows = np.setdiff1d(np.arange(ends[0], ends[0] + k), ends)
+        ends = np.append(ends, ends[0] + k)
+        while len(rows):  # between kept vertices that are too far from each other
+            part = np.searchsorted(ends, rows)
+            begin = self.x[ends[part - 1] % k]
+            along, way = self.x[ends[part] % k] - begin, self.x[rows % k] - begin
+            square = np.maximum((along**2).sum(axis=1), 1e-300)
+            t = np.clip((way * along).sum(axis=1) / square, 0, 1)
+            off = np.hypot(*(way - t[:, None] * along).T) / self.h[rows % k] - self.share[rows % k]
+            first = np.flatnonzero(np.diff(part, prepend=0))
+            number = np.cumsum(np.diff(part, prepend=0) > 0) - 1
+            worst = np.maximum.reduceat(off, first)[number]
+            far = np.flatnonzero((off == worst) & (off > 0))
+            far = far[np.unique(number[far], return_index=True)[1]]
+            again = worst > 0
+            again[far] = False
+            ends, rows = np.sort(np.append(ends, rows[far])), rows[again]
+        kept = np.zeros(k, bool)
+        kept[ends % k] = True
+        if kept.sum() < 3:
+            return np.arange(k)
+        return np.flatnonzero(kept)
+
 
 Sizes = Callable[[np.ndarray], np.ndarray]
 

@@ -1,0 +1,363 @@
+"""Meshes on spheres from netCDF files by MPAS, UGRID and SCRIP."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import scipy
+
+from ..errors import InputError
+from ..files import open_plain
+from ..geometry.sphere import EARTH_RADIUS, Sphere, SphereRegion, triangle_areas
+from ..io.arrays import FileError
+from ..mesh.connectivity import following
+from ..mesh.diagram import Diagram
+from ..mesh.results import HISTORY_DTYPE, Result
+from ..mesh.spherical import rebuild_on_sphere
+
+OFF_SPHERE = 1e-5
+"""Largest distance of a position from its sphere in units of the radius: round-off of float32, and more."""
+_SAME = 0.05
+"""Positions of removed generators are the same if they are nearer to each other than this share of the least distance
+from their cells."""
+
+
+@dataclass
+class MeshInFile:
+    """The cells of a mesh on a sphere, as a file has them.
+
+    Attributes
+    ----------
+    radius : float
+    points, vertices : (n, 3), (v, 3) float64
+        Generators and corners on the sphere.
+    counts : (n,) int
+        Numbers of corners of the cells.
+    corners : (m,) int
+        Corners of the cells, one cell after the other, counter-clockwise.
+    middles : (m, 3) float64, optional
+        For the face from each corner to the next the middle of the arc between its generators.
+    of_run : three (n,) float64, optional
+        Size, error and quality.
+    """
+
+    radius: float
+    points: np.ndarray
+    vertices: np.ndarray
+    counts: np.ndarray
+    corners: np.ndarray
+    middles: np.ndarray | None = None
+    of_run: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+
+def make_diagram(cells: MeshInFile) -> Diagram:
+    """Return the diagram of `cells`; without the whole sphere it is that of a `SphereRegion`.
+
+    Raises
+    ------
+    FileError
+        If positions are not on the sphere, a cell has fewer than two corners or is not counter-clockwise, or a face
+        is in more than two cells.
+    """
+    n, radius = len(cells.points), cells.radius
+    if not n or not np.isfinite(radius) or radius <= 0:
+        raise FileError(f"it has {n} cells on a sphere of radius {radius:g}")
+    for name, places in (("generators", cells.points), ("corners", cells.vertices)):
+        off = np.abs(np.linalg.norm(places, axis=1) / radius - 1)
+        if not (off < OFF_SPHERE).all():
+            k = int(np.argmax(~(off < OFF_SPHERE)))
+            raise FileError(f"{name}[{k}] is {places[k]}, not on the sphere of radius {radius:g}")
+    if cells.counts.min() < 2:
+        raise FileError(f"cell {cells.counts.argmin()} has {cells.counts.min()} corners")
+    starts = np.concatenate([[0], np.cumsum(cells.counts)])
+    owner = np.repeat(np.arange(n), cells.counts)
+    ends = np.stack([cells.corners, cells.corners[following(starts)]], axis=1)
+    x, v = cells.points / radius, cells.vertices / radius
+    areas = np.bincount(owner, triangle_areas(x[owner], v[ends[:, 0]], v[ends[:, 1]]), n)
+    if not (areas > 0).all():
+        k = int(np.argmax(~(areas > 0)))
+        raise FileError(f"cell {k} does not surround its generator counter-clockwise")
+    volumes = areas * radius**2
+    neighbors = _neighbors(owner, ends, len(v))
+    alone = np.flatnonzero(neighbors < 0)
+    sphere = Sphere(radius)
+    if len(alone):
+        beyond, walls = _removed(cells, owner[alone], ends[alone], alone)
+        neighbors[alone] = -1 - walls
+        area = min(float(volumes.sum()), sphere.measure)
+        within = cells.points[np.unique(owner[alone])]
+        sphere = SphereRegion(radius, within=within, beyond=beyond, area=area)
+    known = {
+        "points": cells.points,
+        "volumes": volumes,
+        "neighbor_starts": starts.astype(np.int32),
+        "neighbors": neighbors.astype(np.int32),
+        "vertices": cells.vertices,
+        "cell_vertex_starts": starts.astype(np.int32),
+        "cell_vertices": cells.corners.astype(np.int32),
+    }
+    return Diagram(sphere, {**known, **rebuild_on_sphere(Diagram(sphere, known))})
+
+
+def _neighbors(owner: np.ndarray, ends: np.ndarray, v: int) -> np.ndarray:
+    """Return the cell with the opposite of each face (m, 2); -1 without one."""
+    here, there = ends[:, 0] * v + ends[:, 1], ends[:, 1] * v + ends[:, 0]
+    order = np.argsort(here)
+    ranked = here[order]
+    same = np.flatnonzero(ranked[1:] == ranked[:-1])
+    if len(same):
+        a, b = owner[order[same[0]]], owner[order[same[0] + 1]]
+        raise FileError(f"cells {a} and {b} are on the same side of a face")
+    place = np.minimum(np.searchsorted(ranked, there), len(ranked) - 1)
+    return np.where(ranked[place] == there, owner[order[place]], -1)
+
+
+def _removed(
+    cells: MeshInFile, owner: np.ndarray, ends: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the generators of removed cells (b, 3), and which of them is behind each boundary face (k,).
+
+    A face is on the bisector of both generators. So the other one is the reflection of that of the cell, through the
+    middle of the arc between them, or else at the plane of the face.
+    """
+    radius = cells.radius
+    own = cells.points[owner] / radius
+    v, w = (cells.vertices[ends[:, k]] / radius for k in (0, 1))
+    lengths = np.linalg.norm(w - v, axis=1)
+    if cells.middles is not None:
+        middle = cells.middles[faces] / np.linalg.norm(cells.middles[faces], axis=1)[:, None]
+        other = 2 * (own * middle).sum(axis=1)[:, None] * middle - own
+    else:
+        normal = np.cross(v, w - v)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            normal /= np.linalg.norm(normal, axis=1)[:, None]
+        other = own - 2 * (own * normal).sum(axis=1)[:, None] * normal
+    usable = np.isfinite(other).all(axis=1)
+    if not usable.any():
+        raise FileError("its boundary has no face with a length")
+    other = np.where(usable[:, None], other, own)
+    away = np.linalg.norm(other - own, axis=1)
+    near = scipy.spatial.KDTree(other).query_pairs(_SAME * float(away[usable].min()), output_type="ndarray")
+    graph = scipy.sparse.coo_array((np.ones(len(near), np.int8), (near[:, 0], near[:, 1])), (len(own),) * 2)
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    # The longest face of each removed cell places its generator best. Walls are in the order of their first faces.
+    rank = np.lexsort((-lengths, ~usable, label))
+    best = rank[np.flatnonzero(np.diff(label[rank], prepend=-1))]
+    return radius * other[best], label
+
+
+_PLANE = "it is a mesh in the plane, expected one on a sphere; load a .npz or .vtu file instead"
+
+
+class Variables:
+    """The variables and attributes of an open file."""
+
+    def __init__(self, file: scipy.io.netcdf_file) -> None:
+        self._file = file
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._file.variables
+
+    def names(self) -> list[str]:
+        """Return the names of all variables."""
+        return list(self._file.variables)
+
+    def about(self, name: str, key: str) -> Any:
+        """Return an attribute of a variable, texts as str; None without it."""
+        return _plain(getattr(self._file.variables[name], key, None))
+
+    def attribute(self, key: str) -> Any:
+        """Return an attribute of the file; None without it."""
+        return _plain(getattr(self._file, key, None))
+
+    def real(self, *names: str) -> np.ndarray:
+        """Return the columns of the variables `names` as float64, (n, k), or (n, m, k) of tables."""
+        return np.stack([self._array(name, "f").astype(float) for name in names], axis=-1)
+
+    def integer(self, name: str) -> np.ndarray:
+        """Return a variable as int64."""
+        return self._array(name, "iu").astype(np.int64)
+
+    def _array(self, name: str, kinds: str) -> np.ndarray:
+        if name not in self:
+            raise FileError(f"it lacks the variable {name}")
+        found = np.array(self._file.variables[name].data)
+        if found.dtype.kind not in kinds:
+            raise FileError(f"its variable {name} has the type {found.dtype}")
+        if kinds == "f" and not np.isfinite(found).all():
+            raise FileError(f"its variable {name} has values that are not finite")
+        return found
+
+
+def read_mpas(file: Variables) -> MeshInFile | None:
+    """Return the cells of a file by the MPAS mesh specification; None for other files."""
+    if "verticesOnCell" not in file:
+        return None
+    if str(file.attribute("on_a_sphere")).strip().upper() != "YES":
+        raise FileError(_PLANE)
+    radius = float(np.ravel(file.attribute("sphere_radius"))[0])
+    points, vertices, edges = (file.real(*(f"{axis}{what}" for axis in "xyz")) for what in ("Cell", "Vertex", "Edge"))
+    counts, table = file.integer("nEdgesOnCell"), file.integer("verticesOnCell")
+    ends = _ragged(table, counts, len(vertices), 1, "verticesOnCell")
+    of_faces = _ragged(file.integer("edgesOnCell"), counts, len(edges), 1, "edgesOnCell")
+    # Vertex k of a cell lies between its edges k and k + 1, so that it ends edge k.
+    corners = np.empty_like(ends)
+    corners[following(np.concatenate([[0], np.cumsum(counts)]))] = ends
+    return MeshInFile(radius, points, vertices, counts, corners, edges[of_faces])
+
+
+def read_ugrid(file: Variables) -> MeshInFile | None:
+    """Return the cells of a file by UGRID with longitudes and latitudes; None for other files.
+
+    The coordinates of faces are taken as the generators.
+    """
+    meshes = [k for k in file.names() if file.about(k, "cf_role") == "mesh_topology"]
+    if not meshes:
+        return None
+    mesh = meshes[0]
+    nodes, faces = (_lonlat_names(file, file.about(mesh, f"{what}_coordinates")) for what in ("node", "face"))
+    if nodes is None:
+        raise FileError(_PLANE)
+    if faces is None:
+        raise FileError(
+            "its faces have no longitudes and latitudes, which are the generators; pass generators to clvoro.voronoi"
+        )
+    radius = _radius(file)
+    sphere = Sphere(radius)
+    name = str(file.about(mesh, "face_node_connectivity"))
+    table = file.integer(name)
+    first = int(np.ravel(file.about(name, "start_index") or 0)[0])
+    fill = file.about(name, "_FillValue")
+    there = table >= first if fill is None else (table != np.ravel(fill)[0])
+    vertices = sphere.positions(file.real(*nodes))
+    counts = there.sum(axis=1)
+    corners = _ragged(table, counts, len(vertices), first, name)
+    of_run = [f for f in ("size", "error", "quality") if f in file]
+    of_cells = tuple(file.real(f)[:, 0] for f in of_run) if len(of_run) == 3 else None
+    points = sphere.positions(file.real(*faces))
+    return MeshInFile(radius, points, vertices, counts, corners, of_run=of_cells)  # type: ignore[arg-type]
+
+
+def read_scrip(file: Variables) -> MeshInFile | None:
+    """Return the cells of a file by SCRIP of clvoro; None for other files.
+
+    SCRIP has the corners of each cell on their own. Those at the same place are one.
+    """
+    if "grid_corner_lon" not in file:
+        return None
+    if "generator_lon" not in file:
+        raise FileError(
+            "it has centers and corners, and SCRIP has no generators; pass the centers to clvoro.voronoi for the mesh "
+            "around them"
+        )
+    radius = _radius(file)
+    sphere = Sphere(radius)
+    around = file.real("grid_corner_lon", "grid_corner_lat")
+    n, most = around.shape[:2]
+    around = around.reshape(-1, 2)
+    around[:, 0] = np.where(np.abs(around[:, 1]) == 90, 0, np.mod(around[:, 0], 360))
+    lonlat, place = np.unique(around, axis=0, return_inverse=True)
+    table = place.reshape(n, most)
+    # Cells of fewer corners repeat the last one.
+    counts = 1 + (table != table[:, -1:]).sum(axis=1)
+    corners = table[np.arange(most) < counts[:, None]]
+    points = sphere.positions(file.real("generator_lon", "generator_lat"))
+    return MeshInFile(radius, points, sphere.positions(lonlat), counts, corners)
+
+
+READERS: tuple[Callable[[Variables], MeshInFile | None], ...] = (read_mpas, read_ugrid, read_scrip)
+
+
+def _ragged(table: np.ndarray, counts: np.ndarray, bound: int, first: int, name: str) -> np.ndarray:
+    """Return the first `counts[i]` items of each row, numbered from 0."""
+    if table.ndim != 2 or counts.shape != table.shape[:1] or (counts > table.shape[1]).any():
+        raise FileError(f"{name} has shape {table.shape}, which differs from the numbers of edges")
+    found = table[np.arange(table.shape[1]) < counts[:, None]] - first
+    if len(found) and not (found.min() >= 0 and found.max() < bound):
+        raise FileError(f"{name} has an index out of range")
+    return found
+
+
+def _lonlat_names(file: Variables, coordinates: object) -> tuple[str, str] | None:
+    """Return the longitude and the latitude among the names in `coordinates`; None without them."""
+    found = {}
+    for name in str(coordinates or "").split():
+        if name in file:
+            units = str(file.about(name, "units") or "").lower()
+            for axis, direction in (("lon", "east"), ("lat", "north")):
+                standard = str(file.about(name, "standard_name") or "")
+                if units.startswith("degree") and (direction in units or standard.startswith(axis)):
+                    found[axis] = name
+    return (found["lon"], found["lat"]) if len(found) == 2 else None
+
+
+def _radius(file: Variables) -> float:
+    """Return the radius of the sphere; that of the Earth in meters if the file has none."""
+    own = file.attribute("sphere_radius")
+    if own is None:
+        for name in file.names():
+            own = file.about(name, "earth_radius") if own is None else own
+    return EARTH_RADIUS if own is None else float(np.ravel(own)[0])
+
+
+def _plain(value: Any) -> Any:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+
+
+_HDF5 = b"\x89HDF"
+
+
+def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
+    """Read the cells of a mesh on a sphere from a file by the MPAS mesh specification, UGRID or SCRIP.
+
+    Neighbors, areas, arcs and centroids are computed from generators and corners. A UGRID file of a `Result` gives a
+    `Result`; others give a `Diagram`.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, of another format, of a mesh in the plane, or without generators; names the
+        file and the fault.
+    """
+    name = os.fspath(path)
+    try:
+        with open_plain(path) as file:
+            head = file.read(4)
+            if head == _HDF5:
+                raise FileError("it is netCDF-4, expected netCDF-3; convert it by `nccopy -k nc6 FILE NEW`")
+            file.seek(0)
+            with scipy.io.netcdf_file(file, mmap=False) as found:
+                cells = _read(Variables(found))
+        diagram = make_diagram(cells)
+    except FileError as problem:
+        raise InputError(f"cannot read {name}: {problem}") from problem
+    except OSError as error:
+        raise InputError(f"cannot read {name}: {error.strerror or error}") from error
+    except Exception as error:  # of SciPy's reader, on damaged files
+        raise InputError(f"cannot read {name}: it is damaged or no netCDF-3 ({error})") from error
+    if cells.of_run is None:
+        return diagram
+    size, error, quality = cells.of_run
+    return Result(
+        points=diagram.points,
+        diagram=diagram,
+        target_size=size,
+        size_error=error,
+        quality=quality,
+        history=np.zeros(0, HISTORY_DTYPE),
+        converged=False,
+        stop_reason="read from a .nc file",
+    )
+
+
+def _read(file: Variables) -> MeshInFile:
+    for reader in READERS:
+        cells = reader(file)
+        if cells is not None:
+            return cells
+    raise FileError("it has no mesh by MPAS, UGRID or SCRIP")
