@@ -49,7 +49,9 @@ LEFT_OUT = 0.5
 NO_LENGTH = 1e-9
 """Length of a face over the size of its cell at which its ends are one point."""
 CLOSED = 1e-3
-"""Width of a throat over the size of its cells at which it closes: a determinant of OpenFOAM vanishes there."""
+"""Length of a face between two points on the boundary over the size of its cell at which they are one.
+
+So throats close, of which a determinant of OpenFOAM would vanish, and the mouths of slits."""
 INSIDE, ON, OUTSIDE = 1, 0, -1
 """Places of a vertex."""
 
@@ -537,9 +539,9 @@ class _WallMaker:
         ends = np.concatenate([ends[order], wall_ends[by_wall]])
         owner = np.concatenate([owner[order], cell[by_wall]]).astype(np.int32)
         # Corners of two rings that touch are one point, faces without length vanish, and narrow throats close.
-        is_throat = np.arange(len(ends)) < len(kept)
-        is_throat &= ~np.isnan(np.append(self.position, np.full(len(points) - len(self.position), np.nan))[ends]).any(1)
-        least = np.where(is_throat, CLOSED, NO_LENGTH) * self.size[owner]
+        on_boundary = np.ones(len(points), bool)
+        on_boundary[: len(self.position)] = ~np.isnan(self.position)
+        least = np.where(on_boundary[ends].all(axis=1), CLOSED, NO_LENGTH) * self.size[owner]
         short = np.hypot(*(points[ends[:, 1]] - points[ends[:, 0]]).T) <= least
         graph = scipy.sparse.coo_array(
             (np.ones(np.count_nonzero(short)), tuple(ends[short].T)), (len(points), len(points))
