@@ -36,8 +36,7 @@ from .opencl import devices as device
 from .opencl.build_notice import BuildNotice, report_builds
 from .opencl.engine import Engine
 from .opencl.probe import check_process
-from .tessellation.readback.diagram import fetch_diagram
-from .tessellation.tessellator import Tessellator
+from .tessellation.readback.diagram import make_diagram
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, DTypeLike
@@ -229,15 +228,9 @@ class Adapter:
     def _diagram(self, domain: Domain, points: ArrayLike) -> Diagram:
         stages = self._stages_for(domain)
         host = check_points(points, domain)
-        n, engine = len(host), stages.engine
-        check_memory(engine, n, domain, run=False)
-        binned = stages.bins.build(domain, engine.upload(domain.place(host, self.dtype)), n)
-        labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
+        check_memory(stages.engine, len(host), domain, run=False)
         with coincident_named(host, domain, self.dtype):
-            tessellator = Tessellator(stages, domain)
-            stages.bins.renumber(binned, n)
-            t = tessellator.final(tessellator.tessellate(sorted_points, n, exact=True, binned=binned, complete=True))
-        return fetch_diagram(engine, domain, t, labels)
+            return make_diagram(stages, domain, host)
 
     def power_diagram(self, domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
         """Return the power diagram of `points` with `weights` in a box or a polygon; see `clvoro.power_diagram`."""

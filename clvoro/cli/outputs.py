@@ -87,6 +87,7 @@ def require_plots() -> None:
 
 MESH_FILES = {
     "openfoam": ("mesh.foam", None),
+    "cgns": ("mesh.cgns", None),
     "nc": ("mesh.nc", "ugrid"),
     "mpas": ("mesh-mpas.nc", "mpas"),
     "scrip": ("mesh-scrip.nc", "scrip"),

@@ -16,6 +16,7 @@ from ..finite_volumes.solver_mesh import WallShape, check_not_sphere
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .atomic import check_writable, make_folder
+from .cgns import write_cgns
 from .contents import Contents
 from .convert import check_polygons, write_foreign, write_history, write_metis
 from .disv import Disv, DisvBoundary, make_disv
@@ -166,6 +167,7 @@ _WRITERS: dict[str, Callable[..., None]] = {
     ".npz": write_npz,
     ".vtu": write_vtu,
     ".foam": write_foam,
+    ".cgns": write_cgns,
     ".nc": _write_netcdf,
     ".info": write_metis,
     ".graph": write_metis,

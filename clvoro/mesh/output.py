@@ -127,6 +127,8 @@ class MeshOutput:
             For ParaView and other VTK programs, and for `clvoro.load`; `to_vtu` has options.
         ``.../constant/polyMesh`` or ``CASE/name.foam``
             A folder for OpenFOAM, alone or within a case that ParaView opens, too; `to_openfoam` has options.
+        ``.cgns``
+            CGNS (HDF5): polyhedra as NGON_n and NFACE_n, boundaries by their names, and cell data; with h5py.
         ``.nc``
             Meshes in 2D and on spheres as netCDF by UGRID; `to_netcdf` has other conventions.
         ``.info``, ``.graph``

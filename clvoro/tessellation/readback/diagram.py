@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy as shallow_copy
 from functools import cached_property
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pyopencl.array as cla
@@ -14,9 +15,14 @@ from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ...opencl.primitives import Gather, Lists
 from ..device_diagram import UNEVEN, CloseError, Tessellation
+from ..stages import TessellationStages
+from ..tessellator import Tessellator
 from ..topology3d.consistency import SharedFaces, share_faces
 from ..vertices import VertexNumbering, Vertices
 from .cut_faces import CutFaces, chain_faces, join_loops
+
+if TYPE_CHECKING:
+    from ...geometry.solid.solid import Solid
 
 SMALL_FACE = 1e-3
 """Share of the mean face: areas of smaller ones are compared with those of their vertices, where these were merged."""
@@ -40,11 +46,22 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
     if domain.wall_triangles is not None:
         from .solid import fetch_mesh
 
-        return fetch_mesh(engine, domain, t, labels)
+        return fetch_mesh(engine, cast("Solid", domain), t, labels)
     reader = _DiagramReader(engine, domain, t, labels, copy)
     if reader.whole.round_off & UNEVEN:
         assert reader.faces
     return reader.diagram()
+
+
+def make_diagram(stages: TessellationStages, domain: Domain, points: np.ndarray) -> Diagram:
+    """Return the diagram of `points` (n, d), which are in `domain`, made on the device."""
+    engine, n = stages.engine, len(points)
+    binned = stages.bins.build(domain, engine.upload(domain.place(points, engine.real)), n)
+    labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
+    tessellator = Tessellator(stages, domain)
+    stages.bins.renumber(binned, n)
+    t = tessellator.final(tessellator.tessellate(sorted_points, n, exact=True, binned=binned, complete=True))
+    return fetch_diagram(engine, domain, t, labels)
 
 
 def order_of(labels: np.ndarray) -> np.ndarray:

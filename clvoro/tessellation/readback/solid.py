@@ -7,19 +7,18 @@ import pyopencl.array as cla
 
 from ...finite_volumes.solid_walls.mesh import outer_generators, solid_diagram
 from ...geometry.box import Box
-from ...geometry.domain import Domain
+from ...geometry.solid.solid import Solid
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ..device_diagram import Tessellation
 from ..stages import TessellationStages
-from ..tessellator import Tessellator
-from .diagram import fetch_diagram, order_of
+from .diagram import make_diagram, order_of
 
 _MARGIN = 4.0
 """Distance of the box that holds all generators from the solid, over the largest h."""
 
 
-def fetch_mesh(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array) -> Diagram:
+def fetch_mesh(engine: Engine, domain: Solid, t: Tessellation, labels: cla.Array) -> Diagram:
     """Return the mesh of a solid with rows in the order of `labels` (n,).
 
     The cells of `t` are cut by planes of their own, and do not fit together. Those of the mesh are those of the Voronoi
@@ -36,17 +35,7 @@ def fetch_mesh(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Arra
     sizes = scale * np.cbrt(t.volumes.get()[: t.n][order].astype(float))
     outer = outer_generators(domain, points, sizes)
     reach = _MARGIN * sizes.max()
-    box = Box(np.subtract(domain.lower, reach), np.add(domain.upper, reach))
-    whole = make_diagram(engine.replaced(traits=box.traits(engine.real)), box, np.concatenate([points, outer]))
+    box = Box(tuple(np.subtract(domain.lower, reach).tolist()), tuple(np.add(domain.upper, reach).tolist()))
+    stages = TessellationStages(engine.replaced(traits=box.traits(engine.real)))
+    whole = make_diagram(stages, box, np.concatenate([points, outer]))
     return solid_diagram(domain, points, sizes, whole)
-
-
-def make_diagram(engine: Engine, domain: Domain, points: np.ndarray) -> Diagram:
-    """Return the diagram of `points` in `domain`, made on the device."""
-    stages, n = TessellationStages(engine), len(points)
-    binned = stages.bins.build(domain, engine.upload(domain.place(points, engine.real)), n)
-    labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
-    tessellator = Tessellator(stages, domain)
-    stages.bins.renumber(binned, n)
-    t = tessellator.final(tessellator.tessellate(sorted_points, n, exact=True, binned=binned, complete=True))
-    return fetch_diagram(engine, domain, t, labels)
