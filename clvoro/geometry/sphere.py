@@ -403,6 +403,28 @@ class SphereRegion(Sphere):
         """Return for each of `points` (n, 3) on the boundary the wall towards the closest removed cell, (n,) int."""
         return np.asarray(scipy.spatial.KDTree(self.beyond).query(points)[1])
 
+    def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the plane of one face of each of `walls` (k,) int: outward unit normals and points, (k, 3) each.
+
+        It is the face towards the generator that is left and closest to the removed one.
+        """
+        there = np.asarray(self.beyond)[walls]
+        here = np.asarray(self.within)[scipy.spatial.KDTree(self.within).query(there)[1]]
+        way = there - here
+        return way / np.linalg.norm(way, axis=1)[:, None], here + way / 2
+
+    def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return half the ways from `points` (k, 3) to the removed generators behind `walls` (k,) int, (k,)."""
+        return self.toward_walls(walls, points)[1]
+
+    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return a lower bound of the distance of each of `points` (n, 3) to the boundary, (n,).
+
+        It is half of by how much a point is closer to the generators on one side than to those on the other.
+        """
+        here, there = (scipy.spatial.KDTree(x).query(points)[0] for x in (self.within, self.beyond))
+        return np.abs(here - there) / 2
+
     def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return unit vectors (k, 3) from `points` to the removed generators behind `walls`, and half the ways (k,)."""
         ways = self.mirrored(walls, points) - points

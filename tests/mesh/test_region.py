@@ -57,6 +57,24 @@ def test_kept_cells_do_not_change(globe, part):
     assert part.domain.measure == pytest.approx(globe.volumes[rows].sum(), rel=1e-15)
 
 
+def test_the_distance_from_the_boundary_is_that_of_its_faces(part):
+    """0 at corners on the boundary, elsewhere at most the distance from them."""
+    domain, f = part.domain, part.faces
+    outer = np.flatnonzero(f.boundary >= 0)
+    wall = -1 - f.neighbor[outer]
+    own, beyond = part.points[f.owner[outer]], domain.beyond[wall]
+    edge = part.vertices[f.corners.reshape(-1, 2)[outer]].reshape(-1, 3)
+    assert domain.boundary_distance(edge) == pytest.approx(0, abs=1e-9 * EARTH.radius)
+    exact = np.linalg.norm(part.points[:, None] - edge, axis=2).min(axis=1)
+    found = domain.boundary_distance(part.points)
+    assert (found > 0).all()
+    assert (found <= exact).all()
+    normals, anchors = domain.wall_planes(wall)
+    on_face = np.abs(((edge[::2] - anchors) * normals).sum(axis=1)) < 1e-9 * EARTH.radius
+    assert set(wall) == set(wall[on_face])  # the plane of one face of each wall
+    assert domain.wall_distance(wall, own) == pytest.approx(np.linalg.norm(beyond - own, axis=1) / 2)
+
+
 def test_the_check_accepts_parts(globe, part):
     part.check().demand()
     again = part.subset(EARTH.lonlat(part.points)[:, 0] > -100, "open")
