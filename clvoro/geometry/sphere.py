@@ -303,6 +303,8 @@ class Sphere(Domain):
         return Traits(("SPHERE",), curved=True)
 
 
+_TRIED = 12
+"""Generators that are left near a removed one: one of them has a common face with it."""
 COAST = "coast"
 """Name of the boundary unless the caller gives another one."""
 
@@ -406,12 +408,20 @@ class SphereRegion(Sphere):
     def wall_planes(self, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the plane of one face of each of `walls` (k,) int: outward unit normals and points, (k, 3) each.
 
-        It is the face towards the generator that is left and closest to the removed one.
+        The other generator of that face is the nearest one with which the middle of both is in their own cells, else
+        the one for which it is the least far outside.
         """
-        there = np.asarray(self.beyond)[walls]
-        here = np.asarray(self.within)[scipy.spatial.KDTree(self.within).query(there)[1]]
-        way = there - here
-        return way / np.linalg.norm(way, axis=1)[:, None], here + way / 2
+        within, there = np.asarray(self.within), np.asarray(self.beyond)[walls]
+        near = scipy.spatial.KDTree(within).query(there, k=np.arange(1, 1 + min(_TRIED, len(within))))[1]
+        here = within[near]
+        middle = (here + there[:, None]) / 2
+        # Below 0 where the middle between both generators is in another cell.
+        depth = self._tree.query(middle)[0] - np.linalg.norm(here - middle, axis=2)
+        rows = np.arange(len(there))
+        own = depth >= -1e-9 * self.radius
+        best = np.where(own.any(axis=1), own.argmax(axis=1), depth.argmax(axis=1))
+        way = there - here[rows, best]
+        return way / np.linalg.norm(way, axis=1)[:, None], middle[rows, best]
 
     def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return half the ways from `points` (k, 3) to the removed generators behind `walls` (k,) int, (k,)."""
