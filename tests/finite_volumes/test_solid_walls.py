@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.finite_volumes.solid_walls.mesh import outer_generators, solid_mesh
+from clvoro.finite_volumes.solid_walls.mesh import diagram_of, outer_generators, solid_mesh
 from clvoro.mesh.connectivity import following
 
 H = 0.25
@@ -107,3 +107,16 @@ def test_a_cell_has_one_polygon_on_each_patch(made):
     _, faces = made
     walls = np.stack([faces.owner, faces.neighbor], axis=1)[faces.n_inner :]
     assert len(np.unique(walls, axis=0)) == len(walls)
+
+
+def test_check_finds_what_is_wrong(made):
+    solid, faces = made
+    diagram = diagram_of(faces)
+    assert diagram.check()
+    arrays = {name: getattr(diagram, name).copy() for name in diagram._arrays}
+    wall = faces.corners[faces.starts[faces.n_inner]]
+    arrays["vertices"][np.flatnonzero((diagram.vertices == faces.points[wall]).all(axis=1))] += 1e-3
+    arrays["volumes"][0] *= 1.001
+    text = str(type(diagram)(solid, arrays).check())
+    assert "walls" in text
+    assert "volumes[0]" in text

@@ -47,9 +47,7 @@ class WallSurface:
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the closest triangle (k,), the point on it (k, 3), and the distance (k,), negative inside."""
-        feet = self.solid.feet(points)
-        inside = self.solid.surface.columns.winding(points) > 0
-        return feet.triangle, feet.point, np.where(inside, -feet.distance, feet.distance)
+        return self.solid.closest(points)
 
     def touches(self, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return for each of `points` (k, 3) whether the surface may lie within `reach` (k,)."""
