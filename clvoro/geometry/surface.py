@@ -7,20 +7,18 @@ from functools import cached_property
 from numbers import Real
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy
 
 from ..arguments import format_point
 from ..errors import InputError, InputTypeError
-from ..files import open_plain, unlogged
 from .bvh import Tree
 from .columns import Columns
 from .shapes import coordinates
+from .surface_files import joined, read_parts
 from .triangles import crossing, packed_rows, packed_weights
 
-_FORMATS = ("stl", "obj", "ply", "off")
 _BLOCK = 1 << 18  # pairs of triangles, or of a point and a triangle, per batch
 
 
@@ -107,44 +105,8 @@ class Surface:
         InputError
             If trimesh is not installed, the file cannot be read, or it holds no valid surface.
         """
-        path = Path(path)
-        kind = path.suffix.lower().lstrip(".")
-        if kind not in _FORMATS:
-            raise InputError(
-                f"{str(path)!r} ends in {path.suffix!r}, expected a surface file: "
-                + ", ".join(f".{f}" for f in _FORMATS)
-            )
-        if not path.exists():
-            raise InputError(f"there is no surface file {str(path)!r}")
-        try:
-            import trimesh
-        except ImportError as error:
-            raise InputError(
-                "reading a surface file needs trimesh; pip install 'clvoro[surfaces]' "
-                "(or pip install trimesh), or pass the arrays: Surface(vertices, triangles)"
-            ) from error
-        # Files of textures and materials are not needed.
-        extra: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
-        try:
-            # Coordinates that are not finite are refused below.
-            with open_plain(path) as file, np.errstate(all="ignore"), unlogged("trimesh"):
-                mesh: Any = trimesh.load(file, file_type=kind, force="mesh", process=False, **extra)
-            vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
-        except MemoryError:
-            raise
-        except OSError as error:
-            raise InputError(f"surface file {str(path)!r} cannot be read: {error.strerror or error}") from error
-        except ModuleNotFoundError as error:  # trimesh would need a module that guesses the encoding
-            raise InputError(
-                f"{str(path)!r} cannot be read as {kind.upper()}: it is damaged or not in UTF-8; export it again"
-            ) from error
-        except Exception as error:  # trimesh raises many kinds of errors for damaged files
-            raise InputError(
-                f"{str(path)!r} cannot be read as {kind.upper()} ({type(error).__name__}: {error}); export it again"
-            ) from error
-        if not triangles.size:
-            raise InputError(f"{str(path)!r} holds no triangles, expected a surface")
-        return cls(vertices, triangles, f"surface {str(path)!r}", join)
+        vertices, triangles, _ = joined(read_parts(path))
+        return cls(vertices, triangles, f"surface {str(Path(path))!r}", join)
 
     @cached_property
     def corners(self) -> np.ndarray:

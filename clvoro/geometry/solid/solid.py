@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -18,14 +19,17 @@ import scipy
 from ...arguments import check_rows, format_point, warn
 from ...errors import InputError, MismatchWarning
 from ..boundary_names import BoundaryNames, Walls
+from ..box import Box
 from ..bvh import Tree
 from ..columns import Columns
 from ..domain import Domain
 from ..polygon import Polygon
 from ..surface import Surface
+from ..surface_files import SOLIDS, FilePart, joined, parts_of, read_parts, word
 from ..triangles import packed_weights, pierced
 from ..wall_triangles import WallTriangles
 from .checks import repaired, require_bounding, require_no_crossings, sharp_edges
+from .combining import around, boolean, named_triangles
 from .creases import CONCAVE, CONVEX, connect, corner_normals, dihedral_turns, find_creases, triangle_normals
 from .stations import Stations, place_stations
 
@@ -260,6 +264,70 @@ class Solid(Domain):
     def from_arrays(cls, vertices: object, triangles: object, **options: Any) -> Solid:
         """Return the solid inside of a surface; `options` are those of `Solid`."""
         return cls(vertices, triangles, **options)
+
+    @classmethod
+    def read(cls, path: str | PathLike[str], units: str | float | None = None, **options: Any) -> Solid:
+        """Read a solid from an STL, OBJ, PLY, OFF or 3MF file with trimesh, or from a STEP file with Gmsh.
+
+        Solids of an STL file, groups of an OBJ file, objects of a 3MF file and named faces of a STEP file give
+        boundaries their names.
+
+        Parameters
+        ----------
+        path : str or path
+        units : str or float, optional
+            The unit of the numbers in the file: m, mm, cm, km, um, in, ft, or its length in meters. The solid is in
+            meters then; by default numbers stay as they are. STEP files say their unit: the solid is in meters.
+        **options
+            As for `Solid`.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, or its surface bounds no region.
+        MissingLibraryError
+            If the file needs a library that is not installed.
+        """
+        unit = _unit_length(units)
+        return cls(**{**_from_parts(read_parts(path, SOLIDS), unit), "name": f"solid {str(path)!r}", **options})
+
+    @classmethod
+    def from_trimesh(cls, mesh: Any, **options: Any) -> Solid:
+        """Return the solid inside of a ``trimesh.Trimesh``, or of all meshes of a ``trimesh.Scene`` and their names."""
+        return cls(**{**_from_parts(parts_of(mesh), 1.0), **options})
+
+    @classmethod
+    def outside(cls, of: Solid, box: Box | tuple[Sequence[float], Sequence[float]], **options: Any) -> Solid:
+        """Return the region of a box around a body, for external flow.
+
+        The sides of the box have the names xMin, xMax, ..., or those of a `Box`; the others are those of the body.
+        Cavities of the body are not meshed. A body that touches or crosses the box needs manifold3d.
+
+        Parameters
+        ----------
+        of : Solid
+        box : Box, or its lower and upper corner
+        **options
+            As for `Solid`.
+        """
+        lower, upper = (box.lower, box.upper) if isinstance(box, Box) else box
+        frame = cls.box(lower, upper, names=box.names if isinstance(box, Box) else None)
+        return cls(**{**around(of, frame), "angle": of.angle, **options})
+
+    def __add__(self, other: Solid) -> Solid:
+        return self._combined(other, "+")
+
+    def __sub__(self, other: Solid) -> Solid:
+        return self._combined(other, "-")
+
+    def __and__(self, other: Solid) -> Solid:
+        return self._combined(other, "^")
+
+    def _combined(self, other: Solid, operation: str) -> Solid:
+        """Return a boolean of two solids; names stay."""
+        if not isinstance(other, Solid):
+            return NotImplemented
+        return Solid(**boolean(named_triangles(self), named_triangles(other), operation), angle=self.angle)
 
     @classmethod
     def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Solid:
@@ -682,6 +750,33 @@ class Solid(Domain):
 
     def __hash__(self) -> int:
         return int(hashlib.sha256(self.surface.vertices.tobytes()).hexdigest()[:15], 16)
+
+
+_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
+
+
+def _unit_length(units: str | float | None) -> float:
+    """Return the length of a unit in meters."""
+    if units is None:
+        return 1.0
+    if isinstance(units, str) and units in _UNITS:
+        return _UNITS[units]
+    if isinstance(units, Real) and not isinstance(units, bool) and 0 < units < math.inf:
+        return float(units)
+    raise InputError(f"units is {units!r}, expected one of {', '.join(_UNITS)}, or the length of the unit in meters")
+
+
+def _from_parts(parts: list[FilePart], unit: float) -> dict[str, Any]:
+    """Return the arguments of a solid from the parts of a file; parts of one name are one group."""
+    vertices, triangles, part = joined(parts)
+    arguments: dict[str, Any] = {"vertices": unit * vertices, "triangles": triangles}
+    if len(parts) == 1:
+        known = parts[0].name.strip()
+        return arguments | ({"group_names": [word(known, 0)]} if known else {})
+    words = [word(p.name, k) for k, p in enumerate(parts)]
+    names = list(dict.fromkeys(words))
+    groups = np.array([names.index(w) for w in words])[part]
+    return arguments | {"groups": groups, "group_names": names}
 
 
 def _volume(corners: np.ndarray) -> float:

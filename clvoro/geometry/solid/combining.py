@@ -1,0 +1,111 @@
+"""Solids from others: the region around a body, several solids as one, and booleans by manifold3d."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...errors import InputError, MissingLibraryError
+
+if TYPE_CHECKING:
+    from .solid import Solid
+
+NamedTriangles = tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]
+"""Vertices (v, 3), triangles (t, 3), group of each triangle (t,), and the names of the groups."""
+
+
+def named_triangles(solid: Solid) -> NamedTriangles:
+    """Return the surface of a solid with its names as groups."""
+    names = solid.boundaries
+    return solid.surface.vertices, solid.surface.triangles, names.index[solid.patch].astype(np.int64), list(names.names)
+
+
+def merged(parts: list[NamedTriangles]) -> dict[str, Any]:
+    """Return the arguments of a solid from several surfaces. Groups of one name become one."""
+    names = list(dict.fromkeys(name for part in parts for name in part[3]))
+    starts = np.cumsum([0, *(len(part[0]) for part in parts)])
+    groups = [np.array([names.index(name) for name in part[3]])[part[2]] for part in parts]
+    return {
+        "vertices": np.concatenate([part[0] for part in parts]),
+        "triangles": np.concatenate([part[1] + start for part, start in zip(parts, starts[:-1], strict=True)]),
+        "groups": np.concatenate(groups),
+        "group_names": names,
+    }
+
+
+def outer_shells(solid: Solid) -> np.ndarray:
+    """Return which triangles (t,) belong to the outside of a solid, not to its cavities, (t,) bool."""
+    count, shell = solid.shells
+    corners = solid.surface.corners - solid.surface.corners.mean(axis=(0, 1))
+    a, b, c = np.moveaxis(corners, 1, 0)
+    return (np.bincount(shell, np.einsum("ij,ij->i", a, np.cross(b, c)), count) > 0)[shell]
+
+
+def around(body: Solid, box: Solid) -> dict[str, Any]:
+    """Return the arguments of the region of a box around a body.
+
+    Names of the body that a side of the box has get the prefix ``body-``.
+    """
+    vertices, triangles, groups, names = named_triangles(body)
+    outside = outer_shells(body)
+    sides = box.boundary_names
+    names = [f"body-{name}" if name in sides else name for name in names]
+    inside = (np.array(body.lower) > box.lower).all() and (np.array(body.upper) < box.upper).all()
+    if inside:
+        turned = triangles[outside][:, ::-1]
+        return merged([named_triangles(box), (vertices, turned, groups[outside], names)])
+    if not ((np.array(body.upper) > box.lower).all() and (np.array(body.lower) < box.upper).all()):
+        raise InputError(
+            f"Solid.outside got a body from {body.lower} to {body.upper} and a box from {box.lower} to {box.upper}, "
+            "which do not overlap; do they have the same unit? Solid.read has units="
+        )
+    return boolean(named_triangles(box), (vertices, triangles[outside], groups[outside], names), "-")
+
+
+def boolean(first: NamedTriangles, second: NamedTriangles, operation: str) -> dict[str, Any]:
+    """Return the arguments of the sum, difference or common part of two solids: `operation` is +, - or ^.
+
+    Raises
+    ------
+    MissingLibraryError
+        If manifold3d is not installed.
+    InputError
+        If nothing is left.
+    """
+    try:
+        import manifold3d
+    except ImportError as error:
+        raise MissingLibraryError(
+            "booleans of solids, and bodies that touch or cross their box, need manifold3d; pip install "
+            "'clvoro[solids]' (or pip install manifold3d)"
+        ) from error
+    names = list(dict.fromkeys([*first[3], *second[3]]))
+    start = manifold3d.Manifold.reserve_ids(len(names))
+    manifolds = []
+    for vertices, triangles, groups, own in (first, second):
+        number = np.array([names.index(name) for name in own])[groups]
+        order = np.argsort(number, kind="stable")
+        used, begin = np.unique(number[order], return_index=True)
+        mesh = manifold3d.Mesh64(
+            np.array(vertices, np.float64),
+            np.array(triangles[order], np.uint64),
+            run_index=(3 * np.append(begin, len(order))).astype(np.uint64),
+            run_original_id=(start + used).astype(np.uint32),
+        )
+        made = manifold3d.Manifold(mesh)
+        if made.status() != manifold3d.Error.NoError:
+            raise InputError(f"a boolean of solids got a surface that manifold3d refuses: {made.status().name}")
+        manifolds.append(made)
+    a, b = manifolds
+    result = (a + b if operation == "+" else a - b if operation == "-" else a ^ b).to_mesh64()
+    if not len(result.tri_verts):
+        raise InputError("a boolean of solids leaves nothing, expected a region; do the solids overlap?")
+    lengths = np.diff(np.asarray(result.run_index).astype(np.int64)) // 3
+    groups = np.repeat(np.asarray(result.run_original_id).astype(np.int64) - start, lengths)
+    return {
+        "vertices": np.asarray(result.vert_properties)[:, :3],
+        "triangles": np.asarray(result.tri_verts).astype(np.int64),
+        "groups": groups,
+        "group_names": names,
+    }

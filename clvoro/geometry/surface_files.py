@@ -1,0 +1,162 @@
+"""Triangulated surfaces in files: STL, OBJ, PLY, OFF and 3MF by trimesh, STEP by Gmsh."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import InputError, MissingLibraryError
+from ..files import open_plain, unlogged
+
+SURFACES = ("stl", "obj", "ply", "off")
+SOLIDS = (*SURFACES, "3mf", "step", "stp")
+_OPTIONS: dict[str, dict[str, Any]] = {
+    # Files of textures and materials are not needed; groups are.
+    "obj": {"skip_materials": True, "split_groups": True, "split_objects": True, "group_material": False}
+}
+_TURNS = 32  # triangles around a circle of a STEP file
+
+
+class FilePart(NamedTuple):
+    """A part of a file: its name, vertices (v, 3) float and triangles (t, 3) int."""
+
+    name: str
+    vertices: np.ndarray
+    triangles: np.ndarray
+
+
+def read_parts(path: str | PathLike[str], kinds: Iterable[str] = SURFACES) -> list[FilePart]:
+    """Return the parts of a surface file: solids of an STL file, groups of an OBJ file, objects of a 3MF file.
+
+    Raises
+    ------
+    InputError
+        If trimesh is not installed, the file cannot be read, or it holds no triangles.
+    """
+    path = Path(path)
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in kinds:
+        raise InputError(
+            f"{str(path)!r} ends in {path.suffix!r}, expected a surface file: " + ", ".join(f".{f}" for f in kinds)
+        )
+    if not path.exists():
+        raise InputError(f"there is no surface file {str(path)!r}")
+    if kind in ("step", "stp"):
+        return _read_step(path)
+    try:
+        import trimesh
+    except ImportError as error:
+        raise InputError(
+            "reading a surface file needs trimesh; pip install 'clvoro[surfaces]' "
+            "(or pip install trimesh), or pass the arrays: Surface(vertices, triangles)"
+        ) from error
+    try:
+        # Coordinates that are not finite are refused by `Surface`.
+        with open_plain(path) as file, np.errstate(all="ignore"), unlogged("trimesh"):
+            loaded: Any = trimesh.load(file, file_type=kind, process=False, **_OPTIONS.get(kind, {}))
+            parts = parts_of(loaded)
+    except MemoryError:
+        raise
+    except OSError as error:
+        raise InputError(f"surface file {str(path)!r} cannot be read: {error.strerror or error}") from error
+    except ModuleNotFoundError as error:
+        # 3MF needs more modules; for others trimesh would need one that guesses the encoding.
+        if kind == "3mf":
+            raise MissingLibraryError(f"reading {str(path)!r} needs {error.name}; pip install {error.name}") from error
+        raise InputError(
+            f"{str(path)!r} cannot be read as {kind.upper()}: it is damaged or not in UTF-8; export it again"
+        ) from error
+    except Exception as error:  # trimesh raises many kinds of errors for damaged files
+        raise InputError(
+            f"{str(path)!r} cannot be read as {kind.upper()} ({type(error).__name__}: {error}); export it again"
+        ) from error
+    if not any(len(part.triangles) for part in parts):
+        raise InputError(f"{str(path)!r} holds no triangles, expected a surface")
+    return parts
+
+
+def parts_of(loaded: Any) -> list[FilePart]:
+    """Return the parts of a mesh or scene of trimesh, in its order."""
+    if not hasattr(loaded, "graph"):
+        triangles = getattr(loaded, "faces", np.zeros((0, 3), np.int64))
+        return [FilePart("", np.asarray(loaded.vertices, float), np.asarray(triangles))]
+    parts = []
+    for node in sorted(loaded.graph.nodes_geometry, key=lambda n: list(loaded.geometry).index(loaded.graph[n][1])):
+        matrix, name = loaded.graph[node]
+        mesh = loaded.geometry[name]
+        if not hasattr(mesh, "faces"):
+            continue
+        vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+        if not np.array_equal(matrix, np.eye(4)):
+            vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            if np.linalg.det(matrix[:3, :3]) < 0:
+                triangles = triangles[:, ::-1]
+        parts.append(FilePart(str(name), vertices, triangles))
+    return parts
+
+
+def joined(parts: list[FilePart]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the vertices (v, 3) and triangles (t, 3) of all parts, and the part of each triangle, (t,) int."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    return (
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.triangles + start for part, start in zip(parts, starts[:-1], strict=True)]),
+        np.repeat(np.arange(len(parts)), [len(part.triangles) for part in parts]),
+    )
+
+
+def word(name: str, number: int) -> str:
+    """Return `name` as the name of a boundary: a word of letters, digits, _, . and -; else ``part-number``."""
+    made = re.sub(r"[^A-Za-z0-9_.-]+", "_", name.strip()).strip("_")
+    if not re.search(r"[A-Za-z]", made):
+        return f"part-{number}"
+    return made if re.match(r"[A-Za-z_]", made) else f"part-{made}"
+
+
+def _read_step(path: Path) -> list[FilePart]:
+    """Return the surface of the solids in a STEP file, in meters; faces of one name are a part."""
+    try:
+        import gmsh
+    except (ImportError, OSError) as error:
+        raise MissingLibraryError(
+            f"reading {str(path)!r} needs Gmsh, which triangulates CAD surfaces; pip install 'clvoro[step]' (or pip "
+            "install gmsh), or export the part as STL"
+        ) from error
+    started = not gmsh.isInitialized()
+    if started:
+        gmsh.initialize(interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setString("Geometry.OCCTargetUnit", "M")
+        gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", _TURNS)
+        gmsh.model.add("part")
+        gmsh.model.occ.importShapes(os.fspath(path))
+        gmsh.model.occ.synchronize()
+        gmsh.model.mesh.generate(2)
+        tags, points, _ = gmsh.model.mesh.getNodes()
+        place = np.zeros(int(tags.max()) + 1 if len(tags) else 1, np.int64)
+        place[tags] = np.arange(len(tags))
+        found: dict[str, list[np.ndarray]] = {}
+        for _, volume in gmsh.model.getEntities(3):
+            for _, face in gmsh.model.getBoundary([(3, volume)], oriented=False):
+                name = gmsh.model.getEntityName(2, abs(face)).rpartition("/")[2]
+                nodes = gmsh.model.mesh.getElementsByType(2, abs(face))[1]
+                triangles = place[nodes.astype(np.int64)].reshape(-1, 3)
+                found.setdefault(name, []).append(triangles)
+    except Exception as error:  # Gmsh raises plain exceptions
+        raise InputError(f"{str(path)!r} cannot be read as STEP ({error}); export it again, or as STL") from error
+    finally:
+        if started:
+            gmsh.finalize()
+        else:
+            gmsh.model.remove()
+    if not found:
+        raise InputError(f"{str(path)!r} holds no solid, expected one; surfaces alone bound no region")
+    vertices = np.asarray(points, float).reshape(-1, 3)
+    return [FilePart(name, vertices, np.concatenate(triangles)) for name, triangles in found.items()]

@@ -1,0 +1,181 @@
+"""Solids from files, bodies in a box, booleans; and surfaces that bound no region."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from clvoro import Box, Solid
+from clvoro.errors import InputError, MismatchWarning, MissingLibraryError
+
+CUBE = Solid.box((0, 0, 0), (1, 1, 1))
+V, T = CUBE.surface.vertices, CUBE.surface.triangles
+
+
+def ascii_stl(parts):
+    """An STL file with a solid for each name."""
+    lines = []
+    for name, triangles in parts.items():
+        lines.append(f"solid {name}")
+        for corners in V[triangles]:
+            lines += ["facet normal 0 0 0", "outer loop", *(f"vertex {x:.9g} {y:.9g} {z:.9g}" for x, y, z in corners)]
+            lines += ["endloop", "endfacet"]
+        lines.append(f"endsolid {name}")
+    return "\n".join(lines) + "\n"
+
+
+def test_solids_of_an_stl_file_become_boundaries(tmp_path):
+    (tmp_path / "part.stl").write_text(ascii_stl({"in let": T[:2], "outlet": T[2:4], "wall": T[4:]}))
+    solid = Solid.read(tmp_path / "part.stl", units="mm", names={"walls": ["wall"]})
+    assert solid.measure == pytest.approx(1e-9)
+    assert solid.boundary_names == ("walls", "in_let", "outlet")
+    assert np.bincount(solid.boundary_index).tolist() == [4, 1, 1]
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "off", "obj", "3mf"])
+def test_every_format_brings_the_same_solid(tmp_path, kind):
+    trimesh = pytest.importorskip("trimesh")
+    path = tmp_path / f"ball.{kind}"
+    ball = Solid.ball((1, 2, 3), 0.5, edge=0.2)
+    mesh = trimesh.Trimesh(ball.surface.vertices, ball.surface.triangles, process=False)
+    mesh.export(path)
+    solid = Solid.read(path)
+    assert solid.measure == pytest.approx(ball.measure, rel=1e-6)
+    assert (solid.n_patches, solid.n_pieces) == (1, 1)
+    assert Solid.from_trimesh(mesh).measure == pytest.approx(ball.measure)
+
+
+def test_a_step_file_is_read_in_meters(tmp_path):
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize(interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.occ.addCylinder(0, 0, 0, 0, 0, 20, 5)
+        gmsh.model.occ.synchronize()
+        gmsh.write(str(tmp_path / "part.step"))
+    finally:
+        gmsh.finalize()
+    solid = Solid.read(tmp_path / "part.step")
+    assert solid.measure == pytest.approx(np.pi * 0.005**2 * 0.02, rel=0.02)
+    assert solid.n_patches == 3
+
+
+def test_step_without_gmsh_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gmsh", None)
+    (tmp_path / "part.step").write_text("")
+    with pytest.raises(MissingLibraryError, match=r"clvoro\[step\]"):
+        Solid.read(tmp_path / "part.step")
+
+
+def test_the_outside_of_a_body_has_the_names_of_both():
+    body = Solid.ball((0, 0, 0), 1, edge=0.3, group_names=("ball",))
+    region = Solid.outside(body, Box((-2, -2, -2), (4, 2, 2), names={"inlet": "xMin"}))
+    assert region.boundary_names == ("inlet", "xMax", "yMin", "yMax", "zMin", "zMax", "ball")
+    assert region.measure == pytest.approx(6 * 16 - body.measure)
+    assert region.contains(np.array([(0, 0, 0), (1.5, 0, 0)])).tolist() == [False, True]
+    assert Solid.outside(CUBE, ((-1, -1, -1), (2, 2, 2))).boundary_names[6:] == tuple(
+        f"body-{axis}{end}" for axis in "xyz" for end in ("Min", "Max")
+    )
+    with pytest.raises(InputError, match="do not overlap"):
+        Solid.outside(CUBE, ((5, 5, 5), (6, 6, 6)))
+
+
+def test_a_cavity_of_the_body_is_not_outside():
+    shell = Solid.outside(CUBE, ((-1, -1, -1), (2, 2, 2)))
+    assert Solid.outside(shell, ((-5, -5, -5), (5, 5, 5))).measure == pytest.approx(1000 - 27)
+
+
+def test_booleans_keep_names():
+    pytest.importorskip("manifold3d")
+    pin = Solid.cylinder((0.5, 0.5, -1), (0.5, 0.5, 2), 0.2, group_names=("pin", "low", "high"))
+    hole = CUBE - pin
+    assert hole.boundary_names == (*CUBE.boundary_names, "pin")
+    area = CUBE.measure - hole.measure
+    assert area == pytest.approx(np.pi * 0.04, rel=0.01)
+    assert (CUBE + pin).measure == pytest.approx(1 + 2 * area)
+    assert (CUBE & pin).measure == pytest.approx(area)
+    on_floor = Solid.outside(CUBE, ((-1, -1, 0), (2, 2, 2)))
+    assert on_floor.measure == pytest.approx(17)
+    with pytest.raises(InputError, match="leaves nothing"):
+        CUBE - Solid.box((-1, -1, -1), (2, 2, 2))
+
+
+def test_several_solids_and_their_pieces():
+    far = Solid(np.vstack([V, V + 3, V + (0, 0, 5)]), np.vstack([T, T + 8, T + 16]))
+    assert (far.n_pieces, far.measure) == (3, pytest.approx(3))
+    assert far.piece_of(np.array([(0.5, 0.5, 0.5), (3.5, 3.5, 3.5), (0.5, 0.5, 5.5), (2, 2, 2)])).tolist() == [0, 1, 2, -1]
+    assert far.piece_of(far.inner_points()).tolist() == [0, 1, 2]
+
+
+def with_gap(apart):
+    """The cube as separate triangles, with some corners a little apart."""
+    corners = V[T].copy()
+    corners[5, 1] += apart
+    return corners.reshape(-1, 3), np.arange(36).reshape(-1, 3)
+
+
+FLIPPED = np.vstack([T[:3, ::-1], T[3:]])
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "says"),
+    [
+        (V, T[1:], "3 edges belong to a single triangle"),
+        (*with_gap(1e-4), r"join=0\.000\d+ closes it"),
+        (V, np.vstack([T, T[:1], T[3:4]]), "2 duplicate triangles"),
+        (V, FLIPPED, "oriented differently"),
+        (V, T[:, ::-1], "inside out"),
+        (np.vstack([V, V + 0.5]), np.vstack([T, T + 8]), "intersects itself"),
+        (np.vstack([V, 0.5 * V + 0.25]), np.vstack([T, T + 8]), "overlap or lie in each other"),
+        (np.where((V == 1).all(axis=1)[:, None], -0.2, V), T, "triangles"),
+    ],
+)
+def test_surfaces_that_bound_no_region_are_refused_with_the_place(vertices, triangles, says):
+    with pytest.raises(InputError, match=says):
+        Solid(vertices, triangles)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "says"),
+    [
+        (*with_gap(1e-4), "joined vertices"),
+        (V, np.vstack([T, T[:1], T[3:4]]), "removed 2 duplicate"),
+        (V, FLIPPED, "flipped 3 triangles"),
+        (V, T[:, ::-1], "flipped 12 triangles"),
+        (np.vstack([V, 0.5 * V + 0.25]), np.vstack([T, T + 8]), "flipped 12 triangles"),
+    ],
+)
+def test_repair_mends_what_is_certain_and_says_so(vertices, triangles, says):
+    with pytest.warns(MismatchWarning, match=says):
+        solid = Solid(vertices, triangles, repair=True)
+    assert solid.measure == pytest.approx(1 if len(vertices) != 16 else 0.875, rel=1e-3)
+
+
+def test_edges_sharper_than_ten_degrees_are_warned_of():
+    wedge = np.array([(0, 0, 0), (1, 0, 0), (1, 0.1, 0)])
+    vertices = np.vstack([wedge, wedge + (0, 0, 1)])
+    triangles = [(0, 2, 1), (3, 4, 5), (0, 1, 4), (0, 4, 3), (1, 2, 5), (1, 5, 4), (2, 0, 3), (2, 3, 5)]
+    with pytest.warns(MismatchWarning, match="1 edges sharper than 10 degrees"):
+        Solid(vertices, triangles)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"groups": [0, 1]}, "groups have shape"),
+        ({"angle": 200}, "angle is 200"),
+        ({"creases": [(0, 99)]}, "creases have vertices up to 99"),
+        ({"names": {"inlet": "nowhere"}}, "nowhere"),
+    ],
+)
+def test_wrong_options_are_refused(options, says):
+    with pytest.raises(InputError, match=says):
+        Solid(V, T, **options)
+
+
+def test_creases_can_be_drawn_on_a_flat_wall():
+    solid = Solid.box((0, 0, 0), (1, 1, 1), creases=np.array([[0, 6], [2, 4]]))
+    assert solid.n_patches == 7
+    assert np.count_nonzero(solid.creases.concave) == 1
+    with pytest.raises(InputError, match="units is 'inch'"):
+        Solid.read(__file__.replace("test_files_and_booleans.py", "none.stl"), units="inch")
