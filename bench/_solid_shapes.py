@@ -1,4 +1,4 @@
-"""Solids for benches, made by trimesh and manifold3d: the shape, and two sizes of cells."""
+"""Solids for benches, of trimesh and manifold3d: the shape, and two sizes of cells."""
 
 from __future__ import annotations
 

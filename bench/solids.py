@@ -128,7 +128,7 @@ def main() -> None:
                 with tempfile.TemporaryDirectory() as folder:
                     case = Path(folder) if options.keep is None else options.keep / label
                     try:
-                        row |= measure(adapter, solid_of(make()), h, case, **settings, **seed)
+                        row |= measure(adapter, solid_of(make(), repair=name == "dirty"), h, case, **settings, **seed)
                         if options.pictures is not None:
                             draw(row["result"], options.pictures / f"{label}.png", f"{name}, h = {h:g}")
                     except ClvoroError as error:

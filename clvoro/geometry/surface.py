@@ -19,7 +19,7 @@ from .shapes import coordinates
 from .surface_files import joined, read_parts
 from .triangles import crossing, packed_rows, packed_weights
 
-_BLOCK = 1 << 18  # pairs of triangles, or of a point and a triangle, per batch
+_BLOCK = 1 << 14  # pairs of triangles per batch: they stay in the caches
 
 
 class Surface:

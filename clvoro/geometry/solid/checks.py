@@ -20,7 +20,7 @@ _CROSSINGS = 400_000  # triangles up to which self-intersections are sought
 
 
 def closing_distance(surface: Surface) -> float | None:
-    """Return a distance of joined vertices that closes an open surface, or None."""
+    """Return a distance of joined vertices that closes an open surface up to duplicate triangles, or None."""
     edges = surface.open_edges
     places = np.unique(edges)
     if len(places) < 2:
@@ -32,7 +32,10 @@ def closing_distance(surface: Surface) -> float | None:
     for gap in (gaps[-1:], gaps[len(gaps) // 2 : len(gaps) // 2 + 1]):
         if gap.size:
             join = float(f"{1.1 * gap[0]:.2g}")
-            if Surface(surface.vertices, surface.triangles, surface.name, join).closed:
+            vertices, triangles = Surface(surface.vertices, surface.triangles, surface.name, join).welded
+            triangles = triangles[(triangles != np.roll(triangles, -1, axis=1)).all(axis=1)]
+            triangles = np.delete(triangles, repeated_triangles(triangles), axis=0)
+            if len(triangles) and Surface(vertices, triangles).closed:
                 return join
     return None
 

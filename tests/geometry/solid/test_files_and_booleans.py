@@ -103,7 +103,12 @@ def test_booleans_keep_names():
 def test_several_solids_and_their_pieces():
     far = Solid(np.vstack([V, V + 3, V + (0, 0, 5)]), np.vstack([T, T + 8, T + 16]))
     assert (far.n_pieces, far.measure) == (3, pytest.approx(3))
-    assert far.piece_of(np.array([(0.5, 0.5, 0.5), (3.5, 3.5, 3.5), (0.5, 0.5, 5.5), (2, 2, 2)])).tolist() == [0, 1, 2, -1]
+    assert far.piece_of(np.array([(0.5, 0.5, 0.5), (3.5, 3.5, 3.5), (0.5, 0.5, 5.5), (2, 2, 2)])).tolist() == [
+        0,
+        1,
+        2,
+        -1,
+    ]
     assert far.piece_of(far.inner_points()).tolist() == [0, 1, 2]
 
 
