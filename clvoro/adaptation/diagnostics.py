@@ -22,8 +22,12 @@ from ..sizing.field import Field
 
 COARSER, FINER = 2.0, 1e-3
 """Ratios of the sizes of layers and of the field beside them that indicate a mistake."""
+NARROWER = 0.8
+"""Width of layers over the size field below which a run says so."""
 SAMPLE = 64
 """Points along a layer where the sizes are compared."""
+MISSED = 0.2
+"""Mean |e| above which a run has not met its sizes."""
 MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
 """Limits of |e|. For size fields of moderate growth the mean is at most 0.02 and the largest value at most 0.3; where h
 jumps 1 : 2 between two cells, the largest value is 1."""
@@ -101,6 +105,23 @@ def narrow_parts(
     widths = np.where(domain.periodic, np.inf, domain.extent)
     strait = NarrowPart(center, float(widths.min()), float(size(center[None])[0]))
     return strait if strait.width < NARROW * strait.size else None, None
+
+
+def widths_of_layers(field: Field, domain: Domain, layers: Sequence[Layers]) -> str:
+    """Return in words where the default width of layers is smaller than the size field, or an empty text."""
+    found = []
+    for k, layer in enumerate(layers):
+        if layer.spacing is None:
+            feet, normals = columns_of(domain, layer)
+            places = (feet + layer.rows[-1] * normals)[:: -(-len(feet) // SAMPLE)]
+            places = places[domain.contains(places)]
+            h = float(np.median(field(places))) if len(places) else 0.0
+            if layer.width < NARROWER * h:
+                found.append(
+                    f"layers[{k}] have cells {layer.width:.3g} wide, the last layer's height, where the size field is "
+                    f"{h:.3g}: give spacing for others"
+                )
+    return "; ".join(found)
 
 
 def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arguments import coincident_named, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
-from ..geometry.boundary_layers import apart_from, count_rows, free_domain, place_layers
+from ..geometry.boundary_layers import apart_from, check_gaps, count_rows, free_domain, place_layers
 from ..geometry.domain import Domain
 from ..geometry.geojson import may_be_degrees
 from ..geometry.lines.pairs import place_pairs
@@ -208,6 +208,7 @@ def _place_layers(
     if not layers:
         return np.empty((0, domain.dim)), domain, field
     check_memory(stages.engine, count_rows(domain, layers), domain)
+    check_gaps(domain, layers)
     rows, free = place_layers(domain, layers), free_domain(domain, layers)
     least = len(rows) + max(free.n_pieces, n_fixed)
     if n_cells is not None and n_cells < least:

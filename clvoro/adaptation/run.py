@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -18,10 +19,11 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from ..mesh.straightening import cell_quality
 from ..opencl.primitives import Summary
+from ..sizing.field import as_field
 from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
 from .checkpoint import Checkpointer, Saved, run_fingerprint
-from .diagnostics import warn_of_errors, warn_of_obtuse_triangles
+from .diagnostics import FEW_CELLS, MISSED, warn_of_errors, warn_of_obtuse_triangles, widths_of_layers
 from .fixed_points import origins, put_back
 from .motion import Displacement, Method
 from .options import Checkpoint, Options, uses
@@ -33,6 +35,7 @@ from .stages import Stages
 from .tuning import REACHED, RENEWAL, WINDOW
 
 INTERRUPTED, STOPPED, UNDER_WAY = "interrupted", "stopped by the callback", "under way"
+MISSES = "plan ended, but the sizes are missed"
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
 SETTLED = "tolerance of the moving mesh met"
 """Reasons of converged runs."""
@@ -174,6 +177,8 @@ class Run:
             "fixed": len(self._fixed),
         }
         used = {name: value for name, value in settings.items() if uses(options.method, name)}
+        widths = widths_of_layers(as_field(self._size), self._domain, options.layers) if options.layers else ""
+        used |= {"widths": widths} if widths else {}
         return {**used, "trade": planned.trade} if options.multilevel else used
 
     def _fewer_levels(self, levels: int, error: FewCellsError) -> int:
@@ -411,6 +416,12 @@ class Run:
             self.solution = None
             self._add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
         result = self._read_result()
+        if result.converged and self._options.multilevel and len(result.points) >= FEW_CELLS:
+            mean = float(np.abs(result.size_error).mean())
+            if mean > max(MISSED, self._options.error_target or 0.0):
+                warn_of_errors(result)
+                reason = f"{MISSES}: mean |e| {mean:.2g}"
+                return dataclasses.replace(result, converged=False, stop_reason=reason)
         if result.converged:
             self._note_end_of_trade(result)
             if self.obtuse:

@@ -22,8 +22,9 @@ OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 _EPILOG = """\
 exit codes:
   0    done
-  1    the run failed, or a file could not be written; check: a mesh is wrong;
-       run --check-solver: the solver rejects the mesh
+  1    the run failed or misses its sizes (mean |e| above 0.2), or a file could
+       not be written; check: a mesh is wrong; run --check-solver: the solver
+       rejects the mesh
   2    bad usage or input, or the output folder cannot be made;
        check: a file cannot be read
   3    no usable device
@@ -335,7 +336,7 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     if job.run():
         return INTERRUPTED
-    return FAILED if job.rejected else OK
+    return FAILED if job.rejected or job.missed else OK
 
 
 def _level_count(text: str | None) -> str | int | None:

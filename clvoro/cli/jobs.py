@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, warn_of_unused
-from ..adaptation.run import INTERRUPTED
+from ..adaptation.run import INTERRUPTED, MISSES
 from ..errors import Aborted, ClvoroError, InputError, SolverWarning
 from ..finite_volumes.gate import Solver
 from ..finite_volumes.solver_mesh import WallShape
@@ -100,6 +100,7 @@ class Job:
     command: tuple[str, ...] = ()
     interrupted: bool = field(default=False, init=False)
     rejected: bool = field(default=False, init=False)
+    missed: bool = field(default=False, init=False)
 
     def run(self) -> bool:
         """Run all methods, write the files, print the summary; return whether it was interrupted.
@@ -158,6 +159,7 @@ class Job:
                 frames = run_frames(
                     self.case, adapter, last, self.out, lambda: self.interrupted, self.report, self._now_and_then()
                 )
+        self.missed = any(result.stop_reason.startswith(MISSES) for result in results.values())
         self._summarize(results, where, profiles)
         self._tell_how_to_continue(files)
         if self.solver is not None:
@@ -425,6 +427,9 @@ class Job:
         if build_seconds() > 2:
             print(f"{build_seconds():.1f} of these seconds built kernels, which the driver keeps for later runs")
         for name, result in results.items():
+            for said in (result.scaling, result.settings.get("widths")):
+                if said:
+                    print(f"{name}: {said}")
             if "trade" in result.settings:
                 print(f"{name}: {result.settings['trade']}")
             if result.diagram.domain.cell_dim == 3:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 import shapely
 
-from ..arguments import check_integer, check_number
+from ..arguments import check_integer, check_number, format_point
 from ..errors import InputError, InputTypeError
 from .boundary_names import Walls
 from .box import Box
@@ -21,6 +21,9 @@ _NEAR = 0.6  # of a cell: of two generators that are nearer to each other than t
 _SHORT = 1e-9  # of the domain: shorter edges of the region beyond the layers are dropped
 _APART = 0.3  # of a width, between the last row and the generators that move
 _NO_ROOM = "layers leave no room for other cells; make them thinner, or choose fewer edges"
+_TIGHT = 0.25  # share of the columns in gaps without room for them, above which layers are refused
+_FILLED = 0.8  # share of a gap that layers may fill
+_FACING = -0.5  # cosine between the normals of two walls that face each other
 _OWN = 0.9  # of its distance from its wall: a generator that is nearer to another wall than this is dropped
 
 
@@ -313,3 +316,56 @@ def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray
     """Return the `points` (n, 2) that lie in the `free` domain and differ from all `rows` (k, 2)."""
     apart = free.contains(points) & (scipy.spatial.KDTree(rows).query(points)[0] > 0)
     return points[apart]
+
+
+def check_gaps(domain: Domain, layers: Sequence[Layers]) -> None:
+    """Refuse layers that are thicker than the gap between two walls along much of their length.
+
+    In a narrow place, where layers of two walls overlap, each row is kept for its nearest wall. Layers that reach
+    beyond the middle of a long gap give spikes.
+
+    Raises
+    ------
+    InputError
+        With the place of the narrowest gap, and the largest thickness that fits there.
+    """
+    polygon, _ = as_polygon(domain)
+    begin, end = polygon.oriented.vertices, polygon.oriented.ends
+    thickness = np.zeros(len(begin))
+    for layer in layers:
+        chosen = _chosen(domain, layer)
+        thickness[chosen] = np.maximum(thickness[chosen], layer.rows[-1])
+    for k, layer in enumerate(layers):
+        feet, normals = columns_of(domain, layer)
+        gaps, walls = _opposite(feet, normals, begin, end)
+        needed = float(layer.rows[-1]) + np.where(walls >= 0, thickness[walls], 0.0)
+        tight = needed > gaps
+        if tight.mean() <= _TIGHT:
+            continue
+        worst = int(np.argmin(np.where(tight, gaps / needed, np.inf)))
+        fits = _FILLED * layer.thickness * gaps[worst] / needed[worst]
+        raise InputError(
+            f"layers[{k}] are {layer.thickness:.3g} thick, and the gap at {format_point(feet[worst])} is "
+            f"{gaps[worst]:.3g} wide{', with layers on both sides' if thickness[walls[worst]] else ''}, expected a "
+            f"thickness of at most {fits:.3g}; use fewer or thinner layers, or leave out these edges"
+        )
+
+
+def _opposite(
+    feet: np.ndarray, normals: np.ndarray, begin: np.ndarray, end: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each foot (c, 2) how far its normal goes to a wall that faces it, (c,), and that wall, -1 if none."""
+    along = end - begin
+    inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.maximum(np.hypot(*along.T), 1e-300)[:, None]
+    reach = float(np.ptp(begin, axis=0).max()) * 2
+    lines = shapely.linestrings(np.stack([feet, feet + reach * normals], axis=1))
+    tree = shapely.STRtree(np.asarray(shapely.linestrings(np.stack([begin, end], axis=1))))
+    column, wall = tree.query(np.asarray(lines), predicate="intersects")
+    facing = (inward[wall] * normals[column]).sum(axis=1) < _FACING
+    column, wall = column[facing], wall[facing]
+    away = ((begin[wall] - feet[column]) * inward[wall]).sum(axis=1)
+    away /= (normals[column] * inward[wall]).sum(axis=1)
+    gaps, walls = np.full(len(feet), np.inf), np.full(len(feet), -1)
+    order = np.argsort(-away, kind="stable")
+    gaps[column[order]], walls[column[order]] = away[order], wall[order]
+    return gaps, walls

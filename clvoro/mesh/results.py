@@ -99,7 +99,8 @@ class Result(Sealed, MeshOutput):
         times this common factor; else 1.
     settings : dict
         The options that the method uses, to repeat the run. ``settings["error_target"]`` is the one that the run had,
-        given or chosen by the size field, and ``settings["trade"]`` says so in words.
+        given or chosen by the size field, and ``settings["trade"]`` says so in words; ``settings["widths"]`` says where
+        the default width of layers is below the size field.
     origin : (n,) int32 or None
         Index of each generator in the points with which the run began, of a fixed one that of the point whose place it
         has taken; -1 for inserted generators, which come last.
@@ -192,11 +193,23 @@ class Result(Sealed, MeshOutput):
             raise AttributeError(f"a Result has no {name!r}{hint}", name=name, obj=self)
 
     def __repr__(self) -> str:
-        e, q = np.abs(self.size_error), self.quality
+        e, q, scaled = np.abs(self.size_error), self.quality, self.scaling
         return (
             f"Result({len(self.points)} cells, mean |e| {e.mean():.4f}, max |e| {e.max():.4f}, "
-            f"mean Q {q.mean():.4f}, min Q {q.min():.4f}; {self.stop_reason})"
+            f"mean Q {q.mean():.4f}, min Q {q.min():.4f}; {scaled + '; ' if scaled else ''}{self.stop_reason})"
         )
+
+    @property
+    def scaling(self) -> str:
+        """By which factor `n_cells` has scaled the sizes, and how many cells the field alone would give, in words.
+
+        Empty without `n_cells`, and where the factor is 1 to three digits.
+        """
+        factor = self.size_factor
+        if self.settings.get("n_cells") is None or round(factor, 3) == 1:
+            return ""
+        alone = round(len(self.points) * factor**self.diagram.domain.cell_dim)
+        return f"sizes x {factor:.3g} (the field alone: {alone:,} cells)"
 
 
 def summary(result: Result) -> dict[str, Any]:

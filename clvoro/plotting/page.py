@@ -147,8 +147,10 @@ def _page(
         "time": f"{numbers['seconds']:.2f} s",
     }
     cards = "".join(f"<div><dt>{_safe(k)}</dt><dd>{_safe(v)}</dd></div>" for k, v in head.items())
-    if main.size_factor != 1:
-        facts = {**facts, "size field scaled by": f"{main.size_factor:.4g} to fit the number of cells"}
+    if main.settings.get("widths"):
+        facts = {**facts, "layers": main.settings["widths"]}
+    if main.scaling:
+        facts = {**facts, "number of cells": main.scaling}
     if numbers["trade"]:
         facts = {**facts, "sizes and shape": numbers["trade"]}
     words = "; ".join([f"method {name}", *(f"{k} {v}" for k, v in facts.items())])

@@ -1,5 +1,6 @@
 """Boundary layers: layers of cells along walls, whose generators do not move."""
 
+import re
 from itertools import pairwise
 
 import numpy as np
@@ -387,3 +388,25 @@ def test_new_generators_keep_away_from_layers_around_corners(ctx, dtype):
         away = shapely.distance(free_domain(star, [layer]).geometry, shapely.points(others))
         assert away.max() <= 16 * np.finfo(dtype).eps
         assert (result.history["inserted"] > 0).sum() >= 2, "by refinement, and to meet the count"
+
+
+def test_layers_thicker_than_their_gap_are_refused_with_a_thickness_that_fits(ctx):
+    channel = clvoro.Polygon([(0, 0), (4, 0), (4, 1), (0, 1)], [clvoro.curves.circle((1, 0.5), 0.2, name="pipe")])
+    for edges in ("pipe", None):
+        layers = Layers(0.005, count=16, growth=1.3, edges=edges)
+        with pytest.raises(
+            InputError, match=r"layers\[0\] are 1.09 thick, and the gap at .* is ([\d.]+) wide"
+        ) as raised:
+            clvoro.Adapter(ctx).run(channel, 0.1, layers=layers)
+        fits = float(re.search("at most ([0-9.]+)", str(raised.value))[1])
+        thinner = Layers(0.005 * fits / layers.thickness, count=16, growth=1.3, spacing=0.05, edges=edges)
+        result = clvoro.Adapter(ctx).run(channel, 0.1, "fast", layers=thinner)
+        assert np.abs(result.size_error).mean() < 0.05
+
+
+def test_a_default_width_below_the_size_field_is_said(ctx):
+    box, adapter = clvoro.Box((0, 0), (1, 1)), clvoro.Adapter(ctx)
+    thin = adapter.run(box, 0.1, "fast", layers=Layers(0.02, edges="yMin"), max_steps=0)
+    assert thin.settings["widths"].startswith("layers[0] have cells 0.02 wide, the last layer's height, where the size")
+    given = adapter.run(box, 0.1, "fast", layers=Layers(0.02, spacing=0.1, edges="yMin"), max_steps=0)
+    assert "widths" not in given.settings
