@@ -207,10 +207,11 @@ ADD_RUN(add_lengths, EIGHT_LENGTHS, ONE_LENGTH, global const REAL *u, global con
 #endif
 
 /* Block-wise: partials[groups * slot + group] = summary of the group's items of an array, of the first `count` of eight
-   arrays; slots has the slot of each. */
+   arrays; slots has the slot of each. With `lengths` an array has vectors u_i, and its items are |u_i| / h_i. */
 kernel void summarize_blocks(global const REAL *a0, global const REAL *a1, global const REAL *a2, global const REAL *a3,
                              global const REAL *a4, global const REAL *a5, global const REAL *a6, global const REAL *a7,
-                             const int count, const int n, const int8 slots, global summary_t *partials)
+                             const int count, const int n, const int8 slots, global summary_t *partials,
+                             const int lengths, global const REAL *h)
 {
     const int slot_of[8] = {slots.s0, slots.s1, slots.s2, slots.s3, slots.s4, slots.s5, slots.s6, slots.s7};
     GROUP_SUMMARIES(shares);
@@ -220,34 +221,17 @@ kernel void summarize_blocks(global const REAL *a0, global const REAL *a1, globa
         global summary_t *out = partials + get_num_groups(0) * slot_of[a] + get_group_id(0);
         summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
 #if GROUP_SIZE == 1
-        add_run(&mine, block_begin(n), block_end(n), values);
+        if (lengths)
+            add_lengths(&mine, block_begin(n), block_end(n), values, h);
+        else
+            add_run(&mine, block_begin(n), block_end(n), values);
 #else
         for (BLOCK_LOOP(i, n))
-            add_value(&mine, values[i]);
+            add_value(&mine, lengths ? length_over(i, values, h) : values[i]);
 #endif
         merge_group(&mine, shares);
         if (get_local_id(0) == 0)
             *out = mine;
-    }
-}
-
-/* The same for |u_i| / h_i and |v_i| / h_i, which are not stored. */
-kernel void summarize_lengths(global const REAL *u, global const REAL *v, global const REAL *h, const int n,
-                              const int slot_of_u, const int slot_of_v, global summary_t *partials)
-{
-    GROUP_SUMMARIES(shares);
-    for (int a = 0; a < 2; ++a) {
-        global const REAL *vectors = a == 0 ? u : v;
-        summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
-#if GROUP_SIZE == 1
-        add_lengths(&mine, block_begin(n), block_end(n), vectors, h);
-#else
-        for (BLOCK_LOOP(i, n))
-            add_value(&mine, length_over(i, vectors, h));
-#endif
-        merge_group(&mine, shares);
-        if (get_local_id(0) == 0)
-            partials[get_num_groups(0) * (a == 0 ? slot_of_u : slot_of_v) + get_group_id(0)] = mine;
     }
 }
 

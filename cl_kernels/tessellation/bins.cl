@@ -160,12 +160,3 @@ kernel void number_items(const int size, global int *items)
     WORK_ITEM(p);
     items[p] = p;
 }
-
-/* Per item p: the position of its generator, and its weight. */
-kernel void gather_items(const int size, global const int *items, global const REAL *points, global REAL *binned)
-{
-    WORK_ITEM(p);
-    const int i = items[p];
-    for (int a = 0; a < STRIDE; ++a)
-        binned[STRIDE * p + a] = points[STRIDE * i + a];
-}

@@ -463,7 +463,7 @@ class MeshState:
 
     def summarize_displacements(self, lloyd: cla.Array, correction: cla.Array) -> None:
         """Summarize the lengths of both displacements (n, d) over h."""
-        self.summaries.collect_lengths(("lloyd", "correction"), lloyd, correction, self.h)
+        self.summaries.collect_all({"lloyd": lloyd, "correction": correction}, self.n, self.h)
 
     def zero_fixed(self, displacement: cla.Array) -> None:
         """Set `displacement` (n, d) to zero for fixed generators."""

@@ -94,8 +94,11 @@ class Summaries:
         """Summarize the first `n` of `array` into the slot `name`."""
         self.collect_all({name: array}, n)
 
-    def collect_all(self, arrays: Mapping[str, cla.Array], n: int) -> None:
-        """Summarize the first `n` of each array into the slot of its name; at most `AT_ONCE` arrays."""
+    def collect_all(self, arrays: Mapping[str, cla.Array], n: int, unit: cla.Array | None = None) -> None:
+        """Summarize the first `n` of each array into the slot of its name; at most `AT_ONCE` arrays.
+
+        With `unit` (n,) the arrays are vectors (n, d), of which the lengths over `unit` are summarized.
+        """
         given, names = list(arrays.values()), tuple(arrays)
         spare = given[:1] * (AT_ONCE - len(given))
         if names not in self._slots_of:
@@ -103,14 +106,10 @@ class Summaries:
             vector = np.array(slots + [0] * len(spare), np.int32)
             self._slots_of[names] = vector, sum(1 << slot for slot in slots)
         slots, which = self._slots_of[names]
-        self.engine.run_blocks(self._kernels.summarize_blocks, *given, *spare, len(given), n, slots, self._partials)
+        lengths = (0, given[0]) if unit is None else (1, unit)
+        summarize = self._kernels.summarize_blocks
+        self.engine.run_blocks(summarize, *given, *spare, len(given), n, slots, self._partials, *lengths)
         self._pending, self._known = self._pending | which, None
-
-    def collect_lengths(self, names: tuple[str, str], u: cla.Array, v: cla.Array, unit: cla.Array) -> None:
-        """Summarize the lengths of `u` and `v`, (n, d), over `unit` (n,) into the slots of two names."""
-        one, two = (self.slots[name] for name in names)
-        self.engine.run_blocks(self._kernels.summarize_lengths, u, v, unit, len(unit), one, two, self._partials)
-        self._pending, self._known = self._pending | 1 << one | 1 << two, None
 
     @property
     def values(self) -> cla.Array:
@@ -169,11 +168,11 @@ class Gather:
         self.engine = engine
         self._kernels = engine.kernels("opencl/primitives")
 
-    def rows(self, items: cla.Array, array: cla.Array) -> cla.Array:
-        """Return a new array whose row p is ``array[items[p]]``."""
-        shape = (items.shape[0], *array.shape[1:])
-        out = self.engine.empty(shape, array.dtype)
-        self.engine.run_each(self._kernels.gather_rows, shape[0], items, array, _words_of(array), out)
+    def rows(self, items: cla.Array, array: cla.Array, out: cla.Array | None = None) -> cla.Array:
+        """Return an array, `out` or a new one, whose row p is ``array[items[p]]``."""
+        size = len(items)
+        out = self.engine.empty((size, *array.shape[1:]), array.dtype) if out is None else out
+        self.engine.run_each(self._kernels.gather_rows, size, items, array, _words_of(array), out)
         return out
 
     def lists(self, lists: Lists, array: cla.Array, names: cla.Array | None = None) -> cla.Array:

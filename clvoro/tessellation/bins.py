@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike
 from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
-from ..opencl.primitives import Scan
+from ..opencl.primitives import Gather, Scan
 
 OCCUPANCY = 2
 """Mean number of generators per bin: a compromise between bins to open and generators to test."""
@@ -86,7 +86,7 @@ class Bins:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._scan = Scan(engine)
+        self._scan, self._gather = Scan(engine), Gather(engine)
         self._kernels = engine.kernels(
             "tessellation/bins",
             {
@@ -228,7 +228,7 @@ class Bins:
         engine.run_each(
             k.sort_bins, total, self._bins, self._grid_of, self._frames, self._shapes, self._items, self._reach, spacing
         )
-        engine.run_each(k.gather_items, n, self._items, points, self._points)
+        self._gather.rows(self._items[:n], points, self._points)
         return BinnedPoints(
             self._items,
             self._points,

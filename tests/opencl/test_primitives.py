@@ -134,7 +134,8 @@ def test_lengths(ctx, engine, dim, n):
     u, v = rng.normal(size=(2, n, dim)).astype(engine.real)
     h = rng.uniform(0.1, 2, n).astype(engine.real)
     summaries, expected = Summaries(engine, "abc"), Summaries(engine, "abc")
-    summaries.collect_lengths(("c", "a"), *map(engine.upload, (u, v, h)))
+    lengths = dict(zip("ca", map(engine.upload, (u, v)), strict=True))
+    summaries.collect_all(lengths, len(h), engine.upload(h))
     for name, w in (("c", u), ("a", v)):
         square = w[:, 0] * w[:, 0] + w[:, 1] * w[:, 1]
         lengths = np.sqrt(square + w[:, 2] * w[:, 2] if dim == 3 else square) / h
