@@ -13,7 +13,6 @@ from ..geometry.boundary_layers import apart_from, check_gaps, count_rows, free_
 from ..geometry.domain import Domain
 from ..geometry.geojson import may_be_degrees
 from ..geometry.lines.pairs import place_pairs
-from ..geometry.sphere import Sphere
 from ..sizing import Sizing, as_field
 from ..sizing.distance import limit_beside_layers, limit_beside_lines
 from ..sizing.feature import NARROW
@@ -33,18 +32,7 @@ from .sampling.quadrature import DensityTree
 from .sampling.start import density_tree, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-from .tuning import (
-    CELLS_ACROSS,
-    EVEN_ON_SPHERE,
-    GRADIENT_STEP,
-    LEAST_ADAPTED,
-    LEAST_ON_SPHERE,
-    LEAST_STEEP,
-    MOVES,
-    OPENINGS,
-    SIZES_ON_SPHERE,
-    STEPS,
-)
+from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, OPENINGS, SAMPLED_SIZES, STEPS
 
 
 @dataclass(frozen=True)
@@ -225,51 +213,43 @@ def _count(
     """Return the number of cells of the finest level, and the factor on the size field that gives it."""
     n_cells = options.n_cells
     target = n_cells if n_cells is not None else max(1, round(required))
-    if domain.globe is not None:
-        _check_on_sphere(domain.globe, sizing, tree, required, target, options)
+    _check_sizes(domain, sizing, tree, required, target, options)
     if n_cells is None and required < 0.5:
         _warn_of_coarse_size(domain, required)
     scaled = options.multilevel and n_cells is not None
     return target, (required / target) ** (1 / domain.cell_dim) if scaled else 1.0
 
 
-def _check_on_sphere(
-    sphere: Sphere, sizing: Sizing, tree: DensityTree | None, required: float, target: int, options: Options
+def _check_sizes(
+    domain: Domain, sizing: Sizing, tree: DensityTree | None, required: float, target: int, options: Options
 ) -> None:
     """Raise if cells are too few or too large. `required` cells have the sizes of the field itself."""
-    n_cells, places = options.n_cells, sphere.spiral_points(SIZES_ON_SPHERE)
-    if tree is not None:
+    n_cells, largest = options.n_cells, domain.largest_size
+    if tree is not None and largest < math.inf:
+        places = domain.even_points(SAMPLED_SIZES)
         scale = 1.0 if n_cells is None else (required / n_cells) ** 0.5
         h = scale * sizing(places)
         k = int(h.argmax())
         # As many equal cells as wanted have the size that they have.
-        if h[k] > sphere.radius and (n_cells is None or h[k] > 1.01 * h.min()):
+        if h[k] > largest and (n_cells is None or h[k] > 1.01 * h.min()):
             scaled = "" if n_cells is None else f" in a mesh of {n_cells} cells"
             remedy = (
                 "use smaller sizes, in the unit of the radius, or n_cells"
                 if n_cells is None
                 else "use more cells, or sizes that differ less"
             )
-            lon, lat = sphere.lonlat(places[k : k + 1])[0]
             raise SizeFieldError(
-                f"h{scaled} is {h[k]:.6g} at longitude {lon:.0f}, latitude {lat:.0f}, larger than the radius, "
-                f"{sphere.radius:g}; {remedy}"
+                f"h{scaled} is {h[k]:.6g} at {domain.place_name(places[k])}, larger than the radius, {largest:g}; "
+                f"{remedy}"
             )
-    least = _least_cells(sphere, options.multilevel)
+    least = domain.least_cells(options.multilevel) if domain.evenly_below else 1
     if target < least:
-        given = f"n_cells is {n_cells}" if n_cells else f"the size field requires {required:.2g} cells on {sphere}"
-        fewer = f"; method='lloyd' makes {LEAST_ON_SPHERE} or more" if n_cells else ""
+        given = f"n_cells is {n_cells}" if n_cells else f"the size field requires {required:.2g} cells on {domain}"
+        fewer = f"; method='lloyd' makes {domain.least_cells(False)} or more" if n_cells else ""
         raise InputError(
             f"{given}, expected at least {least} cells, on all sides of the sphere; use smaller sizes, in the unit "
             f"of the radius{fewer}"
         )
-
-
-def _least_cells(domain: Domain, adapted: bool) -> int:
-    """Return the least number of cells in `domain`, with sizes that are `adapted`."""
-    if domain.globe is not None:
-        return LEAST_ADAPTED if adapted else LEAST_ON_SPHERE
-    return domain.n_pieces if adapted else 1
 
 
 def _warn_of_coarse_size(domain: Domain, required: float) -> None:
@@ -321,8 +301,7 @@ def _count_levels(setup: Setup, points: np.ndarray | None, target: int, n_rows: 
             levels -= 1
         return levels
     count = int(levels)
-    least = 1 if domain.globe is None else LEAST_ADAPTED
-    most = int(math.log2(max(target / least, 1)) / d)
+    most = int(math.log2(max(target / domain.least_cells(True), 1)) / d)
     if points is None and count > most:
         raise InputError(
             f"levels is {levels}, expected at most {most} for {target} cells, or 'auto': each "
@@ -371,9 +350,9 @@ def _sample(prepared: Prepared) -> np.ndarray:
     setup, options, levels = prepared.setup, prepared.options, prepared.levels
     domain, real = setup.domain, setup.stages.engine.real
     cells = (prepared.target - len(prepared.rows)) / 2 ** (domain.cell_dim * levels)
-    n = max(_least_cells(setup.free, levels > 0), round(cells))
-    if domain.globe is not None and n < EVEN_ON_SPHERE:
-        return domain.globe.spiral_points(n)
+    n = max(setup.free.least_cells(levels > 0), round(cells))
+    if n < domain.evenly_below:
+        return domain.even_points(n)
     if options.start == "uniform":
         return sample_uniform(setup.free, n, options.seed, real)
     return sample_density(setup.sizing, setup.free, n, options.seed, real, prepared.tree)
@@ -409,7 +388,7 @@ def plan(prepared: Prepared, near: bool) -> Plan:
         target,
         warm=prepared.points is not None,
         near=near,
-        openings=0 if domain.globe is None else OPENINGS,  # models there have C grids
+        openings=OPENINGS if domain.for_c_grids else 0,
         narrow_parts=domain.cuts_cells,
     )
     if options.method == "transport":

@@ -17,12 +17,8 @@ STEEP, STEEPEST, LEAST_STEEP = 0.1, 0.18, 0.01
 """Slopes |grad h| between which the error target grows, and the share of steep cells from which it does."""
 SINGLE_LEVEL_ERROR_TARGET = 0.0017
 """Largest error target with one level."""
-LEAST_ON_SPHERE, LEAST_ADAPTED = 4, 20
-"""Least numbers of cells on a sphere: fewer leave a half of it free, at once or while sizes are corrected."""
-EVEN_ON_SPHERE = 200
-"""Number of cells up to which a sphere starts from an even spiral: random ones may leave a half of it free."""
-SIZES_ON_SPHERE = 2000
-"""Places on a sphere at which sizes are compared with its radius."""
+SAMPLED_SIZES = 2000
+"""Places at which sizes are compared with the largest one of the domain."""
 STEPS = 100
 """Default number of steps of a method that repeats one kind of step."""
 WINDOW = 10

@@ -121,7 +121,7 @@ class ArcGraded(Field):
         """Return the number of nodes along the equator."""
         if isinstance(self.given.resolution, int):
             return globe_columns(self.given.resolution)
-        least = min(evaluate(sphere.spiral_points(_PROBES)).min(), at_marks.min(initial=math.inf))
+        least = min(evaluate(sphere.even_points(_PROBES)).min(), at_marks.min(initial=math.inf))
         wanted = max(2 * math.pi * sphere.radius / least, _COARSEST)
         columns = globe_columns(min(wanted, math.sqrt(2 * MOST_NODES)))
         while columns * columns // 2 > MOST_NODES:

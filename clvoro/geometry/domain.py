@@ -157,6 +157,24 @@ class Domain(ABC):
         """The polygon whose edges are the boundary and cut the cells, or None."""
         return None
 
+    evenly_below: int = 0
+    """Starts of fewer generators are `even_points`, not random ones."""
+    for_c_grids: bool = False
+    """Whether models have C grids on its meshes, so that runs open obtuse triangles."""
+
+    @property
+    def largest_size(self) -> float:
+        """Largest size of cells."""
+        return math.inf
+
+    def even_points(self, n: int) -> np.ndarray:
+        """Return `n` evenly spread points (n, d), of domains with `evenly_below` or a `largest_size`."""
+        raise NotImplementedError(f"{type(self).__name__}.even_points")
+
+    def least_cells(self, adapted: bool) -> int:
+        """Return the least number of cells; `adapted`: of meshes that go from coarse to fine."""
+        return self.n_pieces if adapted else 1
+
     @property
     def uncut(self) -> Domain:
         """The domain before `subset` removed cells of its mesh: itself, unless it is what is left."""

@@ -56,7 +56,7 @@ def directions(points: np.ndarray) -> np.ndarray:
 
 def farthest_place(points: np.ndarray) -> tuple[float, float, float]:
     """Return longitude and latitude of about the place farthest from `points` on the unit sphere, and that distance."""
-    places = Sphere(1).spiral_points(4000)
+    places = Sphere(1).even_points(4000)
     chord = np.asarray(scipy.spatial.KDTree(points).query(places)[0])
     lon, lat = directions(places[chord.argmax() :][:1])[0]
     return float(lon), float(lat), float(np.degrees(2 * np.arcsin(min(chord.max() / 2, 1))))
@@ -91,6 +91,10 @@ class Sphere(Domain):
 
     radius: float = EARTH_RADIUS
 
+    # Not fields of the dataclass: random starts of so few generators leave a side of the sphere free.
+    evenly_below = 200
+    for_c_grids = True
+
     def __post_init__(self) -> None:
         check_number("Sphere radius", self.radius, above=0)
         if not 1 / LARGEST_EDGE <= self.radius <= LARGEST_EDGE:
@@ -114,6 +118,15 @@ class Sphere(Domain):
     def cell_dim(self) -> int:
         """2: cells have areas."""
         return 2
+
+    @property
+    def largest_size(self) -> float:
+        """The radius."""
+        return self.radius
+
+    def least_cells(self, adapted: bool) -> int:
+        """Return the least number of cells: fewer leave a half free, at once or while sizes are `adapted`."""
+        return 20 if adapted else 4
 
     @property
     def measure(self) -> float:
@@ -222,7 +235,7 @@ class Sphere(Domain):
 
         return Chart(Box((-np.pi * r, -r), (np.pi * r, r)), position, place)
 
-    def spiral_points(self, n: int) -> np.ndarray:
+    def even_points(self, n: int) -> np.ndarray:
         """Return `n` evenly spread positions (n, 3), on a spiral in golden angles (Fibonacci lattice)."""
         z = 1 - (2 * np.arange(n) + 1) / n
         turn, r = np.pi * (3 - np.sqrt(5)) * np.arange(n), np.sqrt(1 - z * z)

@@ -106,7 +106,7 @@ def test_edges_on_a_sphere_in_single_precision(ctx):
     """Corners are rounded to 2^-24 of the radius, and the shortest edges are 0.13 h: at 5e-3 they lose four digits."""
     sphere = clvoro.Sphere(2)
     engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(np.float32), sphere.traits(np.dtype(np.float32)))
-    points = sphere.spiral_points(200)
+    points = sphere.even_points(200)
     limit = 2 * 2**-24 / (1e-4 * 0.13)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
