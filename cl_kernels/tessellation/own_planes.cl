@@ -11,6 +11,8 @@
 #endif
 /* Least distance of a generator from its planes. */
 #define LEAST_DEPTH (16 * REAL_EPS)
+/* Round-off of the distance from the plane of a triangle. */
+#define PLANE_NOISE (8 * REAL_EPS)
 /* Share of the way to a foot that must be free. */
 #define FREE_SHARE R(0.999)
 
@@ -76,13 +78,14 @@ kernel void guess_reach(const int size, global const int *items, global const fl
     own_reach[items[p]] = factor * spacing[p];
 }
 
-/* Per generator i: its own planes, nearest first. `wall_normals`: normals at the corners of triangles, and the shift.
+/* Per generator i: its own planes, nearest first. `wall_planes`: unit normals and levels of triangles, which tell most
+   that are not the nearest of their patch. `wall_normals`: normals at the corners of triangles, and the shift.
    counters: number of planes; most patches near a generator; generators outside of their nearest patch. Planes beyond
    `room` are only counted. */
-kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS, global const REAL4 *wall_normals,
-                            global const float *own_reach, const int room, global int2 *own_rows,
-                            global int *own_labels, global REAL4 *own_planes, global float *own_found,
-                            global int *counters)
+kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS, global const REAL4 *wall_planes,
+                            global const REAL4 *wall_normals, global const float *own_reach, const int room,
+                            global int2 *own_rows, global int *own_labels, global REAL4 *own_planes,
+                            global float *own_found, global int *counters)
 {
     LONG_ITEM(i);
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
@@ -105,23 +108,26 @@ kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS
             continue;
         known[t % KNOWN] = t;
         const int2 kinds = wall_kinds[t];
-        const foot_t foot = foot_on_triangle(wall_corners[3 * t] - x, wall_corners[3 * t + 1] - x,
-                                             wall_corners[3 * t + 2] - x, kinds.s1);
-        if (!(foot.d2 < reach2))
-            continue;
         int k = 0;
         while (k < n && patches[k] != kinds.s0)
             ++k;
+        const REAL best = k < n ? feet[k].d2 : reach2;
+        const REAL4 plane = wall_planes[t];
+        const REAL off = fabs(plane.s0 * x.s0 + plane.s1 * x.s1 + plane.s2 * x.s2 - plane.s3) - PLANE_NOISE;
+        if (off > 0 && off * off >= best)
+            continue;
+        const foot_t foot = foot_on_triangle(wall_corners[3 * t] - x, wall_corners[3 * t + 1] - x,
+                                             wall_corners[3 * t + 2] - x, kinds.s1);
+        if (!(foot.d2 < best))
+            continue;
         if (k == MOST_OWN) {
             atomic_max(counters + 1, MOST_OWN + 1);
             continue;
         }
-        if (k == n || foot.d2 < feet[k].d2 || (foot.d2 == feet[k].d2 && t < triangles[k])) {
-            n = max(n, k + 1);
-            patches[k] = kinds.s0;
-            triangles[k] = t;
-            feet[k] = foot;
-        }
+        n = max(n, k + 1);
+        patches[k] = kinds.s0;
+        triangles[k] = t;
+        feet[k] = foot;
     }
     if (n == 0)
         return;

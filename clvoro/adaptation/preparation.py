@@ -142,6 +142,8 @@ def prepare(
                 f"the mesh has {target} cells, but {len(fixed)} generators are beside the lines or fixed, expected at "
                 "least as many cells; use smaller sizes, or more cells"
             )
+    if options.multilevel:
+        fixed = np.concatenate([fixed, domain.station_points(lambda x: factor * np.asarray(sizing(x)))])
     setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, pairs)
     lattice = lattice_points(domain, target) if options.method in MOVING else None
     levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0

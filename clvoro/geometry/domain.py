@@ -434,6 +434,17 @@ class Domain(ABC):
         """Return the nearest point of the box to each of `points` (n, d)."""
         return np.where(self.periodic, points, np.clip(points, self.lower, self.upper))
 
+    def station_points(self, size: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Return where generators must stand so that cells of the sizes `size` end at walls, (m, d): nowhere.
+
+        Parameters
+        ----------
+        size : callable
+            Target size at points (k, d), (k,).
+        """
+        del size
+        return np.empty((0, self.dim))
+
     def chart(self) -> Chart:
         """Return the domain in which generators are drawn and sizes are integrated: itself, unless it is curved."""
         return Chart(self, np.asarray, np.asarray)

@@ -58,7 +58,14 @@ class WallTriangles:
     def __len__(self) -> int:
         return len(self.patch)
 
-    def planes(self, scale: float, size: Callable[[np.ndarray], np.ndarray] | None) -> np.ndarray:
+    def planes(self, frame: tuple[np.ndarray, float]) -> np.ndarray:
+        """Return unit normals and levels of the triangles' planes in the coordinates of `frame`, (t, 4)."""
+        corners = (self.corners - frame[0]) / frame[1]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        return np.column_stack([normals, (normals * corners[:, 0]).sum(axis=1)])
+
+    def corner_normals(self, scale: float, size: Callable[[np.ndarray], np.ndarray] | None) -> np.ndarray:
         """Return the normals at the corners, and by how much planes are moved inwards there, (t, 3, 4).
 
         Parameters

@@ -51,7 +51,8 @@ class SolidBox:
         self.plane_count = 0
         origin, scale = domain.frame
         self._walls = walls.arguments(engine, (origin, scale))
-        self._normals = engine.upload(walls.planes(scale, size))
+        self._planes_of_walls = engine.upload(walls.planes(domain.frame))
+        self._normals = engine.upload(walls.corner_normals(scale, size))
         self._most, self._n = MOST_OWN, 0
         self._counters = engine.empty(3, np.int32)
         self._labels, self._planes = engine.empty(0, np.int32), engine.empty((0, 4))
@@ -91,6 +92,7 @@ class SolidBox:
                 n,
                 points,
                 *self._walls,
+                self._planes_of_walls,
                 self._normals,
                 self._reach,
                 np.int32(len(self._labels)),

@@ -560,6 +560,10 @@ class Solid(Domain):
         """
         return place_stations(self, size if callable(size) else lambda x: np.full(len(x), float(size)))
 
+    def station_points(self, size: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Return the generators of `stations`, (m, 3)."""
+        return self.stations(size).points
+
     def visible(self, points: np.ndarray, feet: np.ndarray) -> np.ndarray:
         """Return whether no other wall is between each point (n, 3) and its foot on the surface, (n,) bool."""
         end = points + (1 - 1e-6) * (feet - points)
