@@ -27,6 +27,7 @@ from ...geometry.curves import Curve
 from ...geometry.domain import Domain
 from ...geometry.geojson import FOREIGN
 from ...geometry.polygon import Polygon
+from ...geometry.solid.solid import Solid
 from ...geometry.sphere import Sphere
 from ...io.arrays import read_array
 from ...io.foam import PatchType
@@ -490,13 +491,43 @@ class SphereTable(Kind, tag="sphere"):
     radius: Positive | None = None
 
 
-DomainTable = BoxTable | PolygonTable | SphereTable
+class Around(Table):
+    """The box around a body: two corners, and names of its sides."""
+
+    lower: Space
+    upper: Space
+    names: Names | None = None
+
+
+class SolidTable(Kind, tag="solid"):
+    """The inside of a surface from a file, or with `outside` the region of a box around it."""
+
+    file: Text
+    units: Text | Positive | None = None
+    outside: Around | None = None
+    names: Names | None = None
+    angle: Positive | None = None
+    join: NotNegative | None = None
+    repair: bool | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Solid:
+        options = self.given("file", "units", "outside", "names")
+        path = locate(folder, self.file)
+        if self.outside is None:
+            return Solid.read(path, self.units, names=self.names, **options)
+        box = Box(**self.outside.given())
+        return Solid.outside(Solid.read(path, self.units, **options), box, names=self.names)
+
+
+DomainTable = BoxTable | PolygonTable | SphereTable | SolidTable
 
 
 def with_kind(domain: object, place: str) -> object:
-    """Return the table `domain` with its key `kind`, which boxes and polygons may leave out."""
+    """Return the table `domain` with its key `kind`, which boxes, polygons and solids may leave out."""
     if not isinstance(domain, Mapping) or "kind" in domain:
         return domain
+    if "solid" in domain and not {"lower", "upper", "polygon", "outer"} & set(domain):
+        return {"kind": "solid", **{"file" if key == "solid" else key: value for key, value in domain.items()}}
     corners = [key for key in ("lower", "upper", "periodic") if key in domain]
     rings = [key for key in ("polygon", "outer", "holes") if key in domain]
     if corners and rings:
@@ -505,8 +536,8 @@ def with_kind(domain: object, place: str) -> object:
         )
     if not corners and not rings:
         raise InputError(
-            f"{place} is neither a box nor a polygon nor a sphere, expected lower and upper, or outer, or "
-            'polygon = FILE, or kind = "sphere"'
+            f"{place} is neither a box nor a polygon, a solid or a sphere, expected lower and upper, or outer, or "
+            'polygon = FILE, or solid = FILE, or kind = "sphere"'
         )
     named = {"file" if key == "polygon" else key: value for key, value in domain.items()}
     return {"kind": "polygon" if rings else "box", **named}

@@ -101,7 +101,7 @@ def test_booleans_keep_names():
 
 
 def test_several_solids_and_their_pieces():
-    far = Solid(np.vstack([V, V + 3, V + (0, 0, 5)]), np.vstack([T, T + 8, T + 16]))
+    far = Solid(np.vstack([V, V + 3, V + np.array([0, 0, 5])]), np.vstack([T, T + 8, T + 16]))
     assert (far.n_pieces, far.measure) == (3, pytest.approx(3))
     assert far.piece_of(np.array([(0.5, 0.5, 0.5), (3.5, 3.5, 3.5), (0.5, 0.5, 5.5), (2, 2, 2)])).tolist() == [
         0,
@@ -158,7 +158,7 @@ def test_repair_mends_what_is_certain_and_says_so(vertices, triangles, says):
 
 def test_edges_sharper_than_ten_degrees_are_warned_of():
     wedge = np.array([(0, 0, 0), (1, 0, 0), (1, 0.1, 0)])
-    vertices = np.vstack([wedge, wedge + (0, 0, 1)])
+    vertices = np.vstack([wedge, wedge + np.array([0, 0, 1])])
     triangles = [(0, 2, 1), (3, 4, 5), (0, 1, 4), (0, 4, 3), (1, 2, 5), (1, 5, 4), (2, 0, 3), (2, 3, 5)]
     with pytest.warns(MismatchWarning, match="1 edges sharper than 10 degrees"):
         Solid(vertices, triangles)
