@@ -25,7 +25,7 @@ from .adaptation.options import (
 from .adaptation.preparation import prepare
 from .adaptation.run import Run, check_run
 from .adaptation.stages import Stages
-from .adaptation.transport.given import power_diagram_of, transport_to
+from .adaptation.transport import power_diagram_of, transport_to
 from .arguments import check_choice, check_points, coincident_named
 from .errors import InputError, InputTypeError, MemoryLimitError
 from .geometry.boundary_layers import Layers

@@ -27,9 +27,8 @@ from .options import Options
 from .plan.actions import Action, Prescribe
 from .plan.efforts import choose_error_target, is_near, steep_share
 from .plan.schedule import adaptive_schedule, auto_levels, repeated_schedule
-from .sampling.charts import charted
 from .sampling.quadrature import DensityTree
-from .sampling.start import density_tree, sample_density, sample_uniform
+from .sampling.start import charted, density_tree, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
 from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, OPENINGS, SAMPLED_SIZES, STEPS

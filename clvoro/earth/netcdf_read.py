@@ -15,10 +15,10 @@ from ..errors import InputError
 from ..files import open_plain
 from ..geometry.sphere import EARTH_RADIUS, Sphere, SphereRegion, triangle_areas
 from ..io.arrays import FileError
+from ..mesh.check.rebuilt import rebuild_on_sphere
 from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Result
-from ..mesh.spherical import rebuild_on_sphere
 
 OFF_SPHERE = 1e-5
 """Largest distance of a position from its sphere in units of the radius: round-off of float32, and more."""

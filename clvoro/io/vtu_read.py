@@ -22,11 +22,10 @@ import numpy as np
 
 from ..files import open_plain
 from ..geometry.domain import Domain
-from ..mesh.check.rebuilt import rebuild
+from ..mesh.check.rebuilt import rebuild, rebuild_on_sphere
 from ..mesh.connectivity import face_owners, following
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Result
-from ..mesh.spherical import rebuild_on_sphere
 from .arrays import EXPANSION, LEAST, FileError, explained
 from .contents import described
 from .vtu import KINDS, SOLVER_MESH

@@ -511,7 +511,7 @@ class Diagram(MeshOutput):
 
     @cached_property
     def _shapes(self) -> np.ndarray:
-        from .shapes import cell_shapes
+        from .lookup import cell_shapes
 
         return cell_shapes(self)
 

@@ -1,8 +1,9 @@
-"""What a diagram answers: one cell, the cells that hold points, the dual triangles."""
+"""What a diagram answers: one cell, the cells that hold points, the dual triangles, shapes of shapely."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy
@@ -10,6 +11,7 @@ import shapely
 
 from ..arguments import check_integer
 from ..errors import InputError
+from .connectivity import face_ends, next_faces
 from .diagram import Diagram
 from .read_only import Sealed
 
@@ -170,3 +172,48 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
     apex = np.repeat(first, fans)
     step = 1 + np.arange(len(apex)) - np.repeat(np.cumsum(fans) - fans, fans)
     return np.column_stack([cells[apex], cells[apex + step], cells[apex + step + 1]]).astype(np.int32)
+
+
+def cell_shapes(diagram: Diagram) -> np.ndarray:
+    """Return each cell of a diagram in 2D as a shapely geometry, (n,); see `Diagram.to_shapely`."""
+    ends, following = face_ends(diagram), next_faces(diagram)
+    owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
+    # One loop follows the other; each ends where the next face is its first one.
+    begins = np.concatenate([[True], following[:-1] != np.arange(1, len(following))])
+    loop = np.cumsum(begins) - 1
+    sizes = np.bincount(loop)
+    ring = np.repeat(np.arange(len(sizes)), sizes + 1)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    # The first corner comes again at the end.
+    place = np.arange(len(ring)) - ring
+    place = np.where(place == starts[ring + 1], starts[ring], place)
+    of = owner[starts[:-1]]
+    cells = np.empty(len(diagram), object)
+    usable = sizes >= 3
+    rings = np.full(len(sizes), None, object)
+    kept = usable[ring]
+    numbers = np.cumsum(usable) - 1
+    rings[usable] = shapely.linearrings(diagram.vertices[ends[place[kept], 0]], indices=numbers[ring[kept]])
+    lone = np.bincount(of[usable], minlength=len(diagram))[of] == 1
+    cells[of[usable & lone]] = shapely.polygons(rings[usable & lone])
+    several = np.flatnonzero(usable & ~lone)
+    for i in np.unique(of[several]):
+        cells[i] = _joined(rings[several[of[several] == i]])
+    cells[[cell is None for cell in cells]] = shapely.Polygon()
+    bad = ~shapely.is_valid(cells)  # outlines that touch or cross themselves within round-off
+    cells[bad] = [_areas(shapely.make_valid(cell)) for cell in cells[bad]]
+    return cells
+
+
+def _joined(rings: np.ndarray) -> Any:
+    """Return the region on the left of all `rings`."""
+    outer = shapely.is_ccw(rings)
+    parts = [_areas(shapely.make_valid(part)) for part in np.asarray(shapely.polygons(rings))]
+    whole = shapely.union_all([p for p, o in zip(parts, outer, strict=True) if o])
+    return shapely.difference(whole, shapely.union_all([p for p, o in zip(parts, outer, strict=True) if not o]))
+
+
+def _areas(shape: Any) -> Any:
+    """Return the parts of a shape that have an area."""
+    flat = [p for p in shapely.get_parts(shape) if p.geom_type in ("Polygon", "MultiPolygon")]
+    return shapely.union_all(flat) if flat else shapely.Polygon()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..io.fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
     from ..io.foam import PatchType
     from ..plotting.colors import Color
-    from ..plotting.views import View
+    from ..plotting.pictures import View
     from .diagram import Diagram
     from .faces import Faces
     from .results import Result

@@ -14,8 +14,8 @@ from .cells import plot_boundaries, plot_cells, plot_size
 from .curves import plot_distributions, plot_history
 from .globe import map_projection, plot_globe
 from .page import write_report
+from .pictures import plot_mesh
 from .solids import plot_cutaway, plot_slice, plot_slices
-from .views import plot_mesh
 
 __all__ = [
     "map_projection",

@@ -1,4 +1,4 @@
-"""Pictures of cells in the plane, of sizes, and of named boundaries."""
+"""Meshes of too many cells for polygons: images in which each pixel has the color of the cell at its center."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Any, cast
+from weakref import WeakKeyDictionary
 
 import numpy as np
+import scipy
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
@@ -19,13 +22,71 @@ from ..geometry.domain import Domain
 from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
-from . import pixels
 from .colors import COLORINGS, Color, Paint, paint_of, picture_of
 from .legends import add_color_bar, finished, round_numbers
 from .style import METHOD_COLORS, WIDTH, corners_of, frame_domain, interactive_figure, single_height, styled
 
 if TYPE_CHECKING:
     from ..geometry.shapes import Edges
+
+MOST_POLYGONS = 30_000
+"""With more cells in a picture, it is an image."""
+PER_INCH = 200
+"""Pixels of an image per inch of its axes."""
+_RIM = 3
+"""Pixels outside of the domain, that far from it, have the color of the nearest pixel inside."""
+
+Positions = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+_last: WeakKeyDictionary[Diagram, tuple[np.ndarray, ...]] = WeakKeyDictionary()
+"""For the last image of each diagram: which pixels show the mesh, their positions, and their cells. A report shows the
+same part in several colors, so the cells are found once."""
+
+
+def add_image(ax: Any, diagram: Diagram, paint: Paint, positions: Positions | None = None) -> Any:
+    """Add an image of the mesh that fills `ax`, whose limits are set, and return it.
+
+    `positions` returns for places (k, 2) in the picture which of them show the mesh, (k,) bool, and where those are in
+    the domain, (j, d). By default a place is its own position.
+    """
+    lower, upper = np.transpose([ax.get_xlim(), ax.get_ylim()])
+    extent = upper - lower
+    box = ax.get_position()
+    inches = ax.figure.get_size_inches() * (box.width, box.height)
+    counts = np.maximum(np.ceil(PER_INCH * min(inches / extent) * extent), 2).astype(int)
+    x, y = (lower[a] + extent[a] * (np.arange(counts[a]) + 0.5) / counts[a] for a in (0, 1))
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    inside, at = (np.ones(len(places), bool), places) if positions is None else positions(places)
+    known = _last.get(diagram)
+    if known is None or not all(map(np.array_equal, known, (inside, at))):
+        cells = np.full(len(places), -1)
+        cells[inside] = diagram.locate(at)
+        known = _last[diagram] = inside, at, _with_rim(cells.reshape(len(y), len(x)))
+    # -1 leads to the last place.
+    shown = np.append(paint.finite, np.nan)[known[2]]
+    # The method of plain axes: those of a map would look for its projection.
+    return Axes.imshow(
+        ax,
+        np.ma.masked_invalid(shown),
+        extent=(lower[0], upper[0], lower[1], upper[1]),
+        origin="lower",
+        # Colors are interpolated: between classes there are no further ones.
+        interpolation_stage="rgba",
+        cmap=paint.scheme.color_map,
+        norm=paint.norm,
+    )
+
+
+def _with_rim(cells: np.ndarray) -> np.ndarray:
+    """Return the cells of pixels, -1 where there is none, with the nearest cell at pixels just outside of the mesh."""
+    outside = cells < 0
+    if not outside.any() or outside.all():
+        return cells
+    distances, nearest = cast(
+        "tuple[np.ndarray, np.ndarray]", scipy.ndimage.distance_transform_edt(outside, return_indices=True)
+    )
+    return np.where(distances <= _RIM, cells[tuple(nearest)], -1)
+
 
 _LINE = {"edgecolor": "#1A1A1A", "linewidth": 0.8, "facecolor": "none", "joinstyle": "round"}
 _MARGIN = 0.01  # of the longer side, around a whole domain
@@ -201,18 +262,18 @@ def draw_cells(
     paint: Paint,
     edges: bool = True,
     bridged: np.ndarray | None = None,
-    positions: pixels.Positions | None = None,
+    positions: Positions | None = None,
 ) -> Any:
     """Add `polygons` (k, 2) of the rows `cells`, to `ax`, whose limits are set; return what covers the picture.
 
-    Many polygons become an image, for which `positions` is as in `pixels.add_image`. Cells with large faces are
+    Many polygons become an image, for which `positions` is as in `add_image`. Cells with large faces are
     drawn over it. `bridged` (n,) marks outlines that connect several loops.
     """
     widths = edge_widths(ax, polygons) if edges else np.zeros(len(polygons))
     bridged = np.zeros(len(cells), bool) if bridged is None else bridged
     image: Any = None
-    if len(cells) > pixels.MOST_POLYGONS:
-        image = pixels.add_image(ax, diagram, paint, positions)
+    if len(cells) > MOST_POLYGONS:
+        image = add_image(ax, diagram, paint, positions)
         shown = np.flatnonzero(widths > _LEAST).tolist()
         cells, polygons, widths, bridged = cells[shown], [polygons[k] for k in shown], widths[shown], bridged[shown]
     drawn = draw_polygons(ax, cells, polygons, paint, widths, bridged)

@@ -12,7 +12,7 @@ import shapely
 
 from ..mesh.connectivity import face_ends
 from ..mesh.diagram import Diagram
-from ..mesh.shapes import cell_shapes
+from ..mesh.lookup import cell_shapes
 
 PAIRS = 1 << 20
 """Pairs of cells that are intersected at a time."""

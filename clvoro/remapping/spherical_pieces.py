@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 
 from ..geometry.sphere import arc_excess
+from ..mesh.check.rebuilt import bisector_corners
 from ..mesh.connectivity import face_owners, following, take_rows
 from ..mesh.diagram import Diagram
-from ..mesh.spherical import bisector_corners
 
 STRAIGHT = 1e-6
 """Sine of the angle between two faces below which their corner is taken from the diagram."""

@@ -137,7 +137,10 @@ def test_fields_of_the_plane_stay():
         (lambda: clvoro.adapt(EARTH, sizing.Raster(WAVES.T, (-90, -180), (90, 180))), "longitude and latitude swapped"),
         (lambda: clvoro.adapt(EARTH, sizing.Raster(WAVES, (-np.pi, -np.pi / 2), (np.pi, np.pi / 2))), "in radians"),
         (lambda: clvoro.adapt(EARTH, sizing.Distance(sizing.Circle((3, 100), 5), 1e5, 1.1)), r"position \(3, 100\)"),
-        (lambda: clvoro.adapt(EARTH, sizing.Expression("5e6 + 3e4*lat")), r"longitude -?[\d.]+, latitude 8[\d.]+, larger"),
+        (
+            lambda: clvoro.adapt(EARTH, sizing.Expression("5e6 + 3e4*lat")),
+            r"longitude -?[\d.]+, latitude 8[\d.]+, larger",
+        ),
     ],
 )
 def test_mistakes(call, message):

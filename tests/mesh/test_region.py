@@ -267,7 +267,7 @@ def test_made_up_results_are_parts_too(part):
 def test_pictures_leave_removed_cells_out(globe, monkeypatch, most):
     """As polygons and, with many cells, as pixels; more walls than cells."""
     pyplot = pytest.importorskip("matplotlib.pyplot")
-    monkeypatch.setattr("clvoro.plotting.pixels.MOST_POLYGONS", most)
+    monkeypatch.setattr("clvoro.plotting.cells.MOST_POLYGONS", most)
     north = globe.subset(np.arange(len(globe)) % 3 == 0)
     assert len(north.domain.beyond) > len(north)
     figure = north.plot(edges=False)

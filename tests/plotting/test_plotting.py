@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.plotting import page, pictures, pixels, plot_cells, plot_history, plot_size, write_report
+from clvoro.plotting import page, pictures, plot_cells, plot_history, plot_size, write_report
 from clvoro.plotting.legends import short
 from clvoro.plotting.pictures import pictures_of, render
 from clvoro.plotting.style import nice
@@ -169,7 +169,7 @@ RING = clvoro.Polygon([(0, 0), (2, 0), (2, 1), (0, 1)], [[(0.4, 0.4), (1.6, 0.4)
 
 @pytest.mark.parametrize("domain", [BOX, RING, clvoro.Box((0, 0), (2, 1), periodic=True)], ids=str)
 def test_pixels_have_the_values_of_their_cells(adapter, domain, monkeypatch):
-    monkeypatch.setattr(pixels, "MOST_POLYGONS", 10)
+    monkeypatch.setattr("clvoro.plotting.cells.MOST_POLYGONS", 10)
     points = domain.lower + np.random.default_rng(3).random((300, 2)) * domain.extent
     diagram = adapter.diagram(domain, points[domain.contains(points)])
     own = np.arange(len(diagram))

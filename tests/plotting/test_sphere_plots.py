@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 import clvoro
 from clvoro.errors import ClvoroError, InputError, MissingPicturesWarning
-from clvoro.plotting import globe, map_projection, pixels, plot_cells, plot_globe, plot_slice, write_report
+from clvoro.plotting import globe, map_projection, plot_cells, plot_globe, plot_slice, write_report
 from clvoro.plotting.colors import kilometer_of
 from clvoro.plotting.globe import default_center, outlines, project_cells
 from clvoro.plotting.pictures import pictures_of
@@ -133,8 +133,8 @@ def test_edges_are_as_thin_as_their_cells_look(mesh):
 
 
 def test_pixels_show_the_cells_they_are_in(mesh, monkeypatch):
-    monkeypatch.setattr(pixels, "MOST_POLYGONS", 10)
-    monkeypatch.setattr(pixels, "PER_INCH", 10)
+    monkeypatch.setattr("clvoro.plotting.cells.MOST_POLYGONS", 10)
+    monkeypatch.setattr("clvoro.plotting.cells.PER_INCH", 10)
     own = np.arange(len(mesh.points))
     figure = mesh.plot(own, center=(-45, 40), edges=False)
     (image,) = figure.axes[0].images

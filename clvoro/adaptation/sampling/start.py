@@ -1,10 +1,10 @@
-"""The number of cells, and random initial generators."""
+"""Random generators with the density of a size field, in a domain or in the chart of a curved one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from numbers import Integral, Real
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -13,9 +13,45 @@ from ...errors import InputError, InputTypeError
 from ...geometry.domain import Domain
 from ...sizing import as_field
 from .box_tree import BoxTree
-from .charts import charted
 from .coverage import CutCoverage, coverage_of
 from .quadrature import DensityTree
+
+
+class Charted:
+    """A size field on a curved domain as a function of places in its chart.
+
+    Parameters
+    ----------
+    field : callable
+        h(points (n, d)) -> (n,).
+    domain : Domain
+    """
+
+    def __init__(self, field: Callable[[np.ndarray], np.ndarray], domain: Domain) -> None:
+        self._field, self._domain, self._chart = field, domain, domain.chart()
+
+    @property
+    def real(self) -> np.dtype:
+        """Precision of the field."""
+        return getattr(self._field, "real", np.dtype(float))
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Return h at places in the chart, (n,)."""
+        return self._field(self._chart.position(points))
+
+    def landmarks(self, domain: Domain) -> np.ndarray:
+        """Return the field's landmarks in the chart `domain`; see `Field.landmarks`."""
+        del domain
+        known: Any = getattr(self._field, "landmarks", None)
+        return self._chart.place(np.empty((0, self._domain.dim)) if known is None else known(self._domain))
+
+
+def charted(
+    domain: Domain, field: Callable[[np.ndarray], np.ndarray]
+) -> tuple[Domain, Callable[[np.ndarray], np.ndarray]]:
+    """Return the domain's chart, and the field there; `domain` and `field` if it is plane already."""
+    return (domain.chart().domain, Charted(field, domain)) if domain.curved else (domain, field)
+
 
 _ATTEMPTS = 40
 _ULPS = 4  # least distance of points from the boundary of a polygon

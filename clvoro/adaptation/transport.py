@@ -6,16 +6,16 @@ import numpy as np
 import pyopencl.array as cla
 import shapely
 
-from ...arguments import check_integer, check_number, check_points, coincident_named, warn
-from ...errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWarning
-from ...geometry.domain import Domain
-from ...mesh.diagram import Diagram
-from ...mesh.results import Transported
-from ...solvers.transport import TOLERANCE
-from ...tessellation.readback.diagram import fetch_diagram
-from ...tessellation.tessellator import Tessellator
-from ..estimates import check_memory
-from ..stages import Stages
+from ..arguments import check_integer, check_number, check_points, coincident_named, warn
+from ..errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWarning
+from ..geometry.domain import Domain
+from ..mesh.diagram import Diagram
+from ..mesh.results import Transported
+from ..solvers.transport import TOLERANCE
+from ..tessellation.readback.diagram import fetch_diagram
+from ..tessellation.tessellator import Tessellator
+from .estimates import check_memory
+from .stages import Stages
 
 SUM_TOLERANCE = 1e-9
 """Largest relative difference of the sum of volumes from the measure of the domain, if the round-off of the volumes is

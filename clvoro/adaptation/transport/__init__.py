@@ -1,1 +1,0 @@
-"""Power diagrams of given generators, and cells with prescribed volumes."""
