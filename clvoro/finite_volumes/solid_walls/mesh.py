@@ -269,9 +269,8 @@ class _Maker:
 
     def _wall_polygons(self, parts: TrimmedFaces, far: np.ndarray) -> Divider:
         """Close the cells at the surface."""
-        with_chord = parts.face[np.searchsorted(parts.starts, np.flatnonzero(parts.chord), "right") - 1]
-        is_open = np.zeros(self.n, bool)
-        is_open[self.owner[with_chord]] = is_open[self.neighbor[with_chord]] = True
+        is_open = np.zeros(self.n, bool)  # a thin edge of the solid may open a cell without a chord
+        is_open[self.owner[parts.face]] = is_open[self.neighbor[parts.face]] = True
         far = far[is_open[self.owner[far]] | is_open[self.neighbor[far]]]
         starts, corners = take_rows(self.starts, self.corners, far)
         faces = np.repeat(np.concatenate([parts.face, far]), np.concatenate([np.diff(parts.starts), np.diff(starts)]))
