@@ -50,7 +50,7 @@ def write_cgns(contents: Contents, path: Path) -> None:
         raise missing("h5py", "formats", "a .cgns file") from error
     mesh, patches, _ = poly_mesh(contents.diagram)
     with atomic_folder(path) as temporary, h5py.File(temporary, "w", libver=("earliest", "v110")) as file:
-        root = _Node(file["/"], h5py)
+        root = _CgnsNode(file["/"], h5py)
         root.mark("HDF5 MotherNode", "Root Node of HDF5 File", "MT")
         file.create_dataset(" format", data=_text(f"IEEE_{sys.byteorder.upper()}_32", 15))
         file.create_dataset(" hdf5version", data=_text(f"HDF5 Version {h5py.version.hdf5_version}", 33))
@@ -59,7 +59,7 @@ def write_cgns(contents: Contents, path: Path) -> None:
         _write_zone(base, mesh, patches, contents)
 
 
-def _write_zone(base: _Node, mesh: Faces, patches: list[Any], contents: Contents) -> None:
+def _write_zone(base: _CgnsNode, mesh: Faces, patches: list[Any], contents: Contents) -> None:
     f, n = len(mesh), mesh.n_cells
     index = np.int64 if len(mesh.corners) > 1 << 30 else np.int32
     zone = base.add("Zone", "Zone_t", np.array([[len(mesh.points)], [n], [0]], index))
@@ -109,7 +109,7 @@ def _text(text: str, size: int) -> np.ndarray:
     return np.frombuffer(text.encode("ascii").ljust(size, b"\0")[:size], np.int8)
 
 
-class _Node:
+class _CgnsNode:
     """A node of a CGNS tree: a group of HDF5."""
 
     def __init__(self, group: Any, h5py: Any) -> None:
@@ -125,9 +125,9 @@ class _Node:
             attribute.write(np.array(text.encode(), f"S{size}"), text_type)
         self.group.attrs.create("flags", np.array([1], np.int32))
 
-    def add(self, name: str, label: str, data: np.ndarray | str | None = None) -> _Node:
+    def add(self, name: str, label: str, data: np.ndarray | str | None = None) -> _CgnsNode:
         """Add a node below this one."""
-        node = _Node(self.group.create_group(name, track_order=True), self.h5py)
+        node = _CgnsNode(self.group.create_group(name, track_order=True), self.h5py)
         if data is None:
             node.mark(name, label, "MT")
             return node

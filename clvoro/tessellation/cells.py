@@ -59,7 +59,7 @@ class Cells:
     engine : Engine
     folded : bool
         For the folded diagrams of a periodic box, in which a neighbor is the nearest image of its generator: they are
-        updated, or made by `clip_by_rings`. The periods are built into the kernels, which compute corners from
+        updated, or clipped by `clip_by_rings`. The periods are built into the kernels, which compute corners from
         differences of positions.
 
     Attributes
