@@ -240,3 +240,69 @@ REAL size_of_caps(const REAL *x, __global const REAL *data, int count)
     return h;
 }
 #endif
+
+/* Items of closed boundaries: segments a, b in 2D, triangles a, b, c in 3D. */
+#define SIZE_CORNERS (DIM * DIM)
+
+/* Whether the line through (u, v) along u crosses the segment from a to b at more than u. Ends are taken in one order,
+   so that a segment gives the same answer in all items that have it; of a chain each end counts once. */
+int size_line_crosses(REAL u, REAL v, REAL au, REAL av, REAL bu, REAL bv)
+{
+    if ((av > v) == (bv > v))
+        return 0;
+    const int turn = av > bv;
+    const REAL pu = turn ? bu : au, pv = turn ? bv : av, qu = turn ? au : bu, qv = turn ? av : bv;
+    return u < (qu - pu) * (v - pv) / (qv - pv) + pu;
+}
+
+/* Whether the ray from x along the first axis meets an item. */
+int size_ray_meets(const REAL *x, __global const REAL *e)
+{
+#if DIM == 2
+    return size_line_crosses(x[0], x[1], e[0], e[1], e[2], e[3]);
+#else
+    int inside = 0;
+    for (int k = 0; k < 3; ++k) {
+        __global const REAL *a = e + 3 * k, *b = e + 3 * ((k + 1) % 3);
+        inside ^= size_line_crosses(x[1], x[2], a[1], a[2], b[1], b[2]);
+    }
+    if (!inside)
+        return 0;
+    REAL s[3], t[3];
+    for (int a = 0; a < 3; ++a) {
+        s[a] = e[3 + a] - e[a];
+        t[a] = e[6 + a] - e[a];
+    }
+    const REAL nx = s[1] * t[2] - s[2] * t[1], ny = s[2] * t[0] - s[0] * t[2], nz = s[0] * t[1] - s[1] * t[0];
+    return nx != 0 && x[0] < e[0] - (ny * (x[1] - e[1]) + nz * (x[2] - e[2])) / nx;
+#endif
+}
+
+/* Whether x is inside of closed boundaries: the ray meets them an odd number of times. The tree is that of
+   size_nearest_tree. */
+int size_inside(const REAL *x, __global const REAL *data, int n, int levels)
+{
+    const int first_leaf = (1 << levels) - 1;
+    __global const REAL *items = data + (2 * first_leaf + 1) * 2 * DIM;
+    int waiting[24], top = 0, inside = 0;
+    waiting[top++] = 0;
+    while (top > 0) {
+        const int node = waiting[--top];
+        __global const REAL *box = data + node * 2 * DIM;
+        int apart = x[0] > box[DIM];
+        for (int a = 1; a < DIM; ++a)
+            apart |= x[a] < box[a] || x[a] > box[DIM + a];
+        if (apart)
+            continue;
+        if (node < first_leaf) {
+            waiting[top++] = 2 * node + 1;
+            waiting[top++] = 2 * node + 2;
+            continue;
+        }
+        const long leaf = node - first_leaf;
+        const int end = (int)(((leaf + 1) * n) >> levels);
+        for (int i = (int)((leaf * n) >> levels); i < end; ++i)
+            inside ^= size_ray_meets(x, items + i * SIZE_CORNERS);
+    }
+    return inside;
+}

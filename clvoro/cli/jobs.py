@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import earth
 from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, warn_of_unused
 from ..adaptation.run import INTERRUPTED, MISSES
 from ..errors import Aborted, ClvoroError, InputError, SolverWarning
@@ -118,6 +119,7 @@ class Job:
         size = self._during("preparing the size field", self.case.size_field)
         warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
         self._refuse_formats()
+        self._land = self.case.land
         self.case = self.case.with_patches(self.types)
         patch_types(self.case.domain.boundary_names, self.case.patches)
         files = self._checkpoints()
@@ -204,6 +206,8 @@ class Job:
                 adapter.on_memory = adapter.on_build = None
         if result.stop_reason == INTERRUPTED:
             self.interrupted = True
+        if self._land is not None:
+            result = result.subset(earth.ocean(result, self._land))
         return replace(result, stop_reason=INTERRUPTED) if self.interrupted else result
 
     def _during(self, work: str, task: Callable[[], Any]) -> Any:

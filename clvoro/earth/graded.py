@@ -17,7 +17,8 @@ from ..sizing.field import Combined, Field, Scaled, on_domain
 from ..sizing.gradation import Gradation, globe_columns
 from ..sizing.graded import BATCH, MOST_NODES, Graded, default_engine
 from ..sizing.raster import Raster
-from .sizes import ArcDistance, LonLat
+from ..sizing.region import Region
+from .sizes import ArcDistance, ArcRegion, LonLat
 
 if TYPE_CHECKING:
     from ..geometry.domain import Domain
@@ -165,4 +166,6 @@ def on_sphere(domain: Sphere, field: Field) -> Field:
         return ArcGraded(field, on_sphere(domain, field.field), domain)
     if field.dim != 2 or isinstance(field, (LonLat, ArcDistance)):
         return field
+    if isinstance(field, Region):
+        return ArcRegion(field, domain)
     return ArcDistance(field, domain) if isinstance(field, Distance) else LonLat(field)

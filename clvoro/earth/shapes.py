@@ -55,6 +55,15 @@ class LonLatArea:
         found[np.setdiff1d(inside, removed) % n] = True
         return found
 
+    def whole(self) -> shapely.Geometry:
+        """Return the polygons in the plane, with their images one and two turns to both sides."""
+        turns = [np.array([360.0 * turn, 0.0]) for turn in range(-2, 3)]
+        outer, holes = (
+            shapely.union_all([shapely.transform(ring, lambda x, way=way: x + way) for way in turns for ring in rings])
+            for rings in (self.outer, self.holes)
+        )
+        return shapely.difference(outer, holes)
+
     @staticmethod
     def _keys(
         tree: shapely.STRtree, rings: np.ndarray, pieces: np.ndarray, predicate: _Predicate, n: int

@@ -7,17 +7,20 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import shapely
 
 from ..arguments import check_number, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.box import Box
 from ..geometry.domain import Domain
+from ..geometry.shapes import Circle
 from ..geometry.sphere import Sphere, directions
 from ..sizing.arguments import check_positive, check_slope
 from ..sizing.distance import Distance
 from ..sizing.field import Field, as_field
 from ..sizing.raster import Raster
-from .shapes import check_lonlat, warn_of_radians
+from ..sizing.region import Region, inside_code, ring_edges
+from .shapes import area_of, check_lonlat, warn_of_radians
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -94,14 +97,7 @@ class LonLat(Field):
         inner = writer.in_plane(Box((self.west, -90), (self.west + 360, 90)))
         result = self.field._emit(inner)
         name = writer.function(inner.statements, result)
-        way = writer.name()
-        writer.statements += [
-            f"REAL {way}[2] = {{atan2(x[1], x[0]), atan2(x[2], hypot(x[0], x[1]))}};",
-            f"{way}[0] *= (REAL)({_DEGREES!r});",
-            f"{way}[1] *= (REAL)({_DEGREES!r});",
-            f"{way}[0] += {way}[0] < (REAL)({self.west!r}) ? 360 : 0;",
-            f"{way}[0] -= {way}[0] > (REAL)({self.west + 360!r}) ? 360 : 0;",
-        ]
+        way = degrees_code(writer, self.west)
         return writer.variable(f"{name}({way}, data) * data[{writer.store(1 / writer.scale)}]")
 
     def __repr__(self) -> str:
@@ -198,6 +194,66 @@ class ArcDistance(Distance):
     def _finish(self, writer: CodeWriter, best2: str, law: int) -> str:
         arc = writer.variable(f"2 * asin(fmin(sqrt({best2}) / 2, (REAL)1))")
         return super()._finish(writer, writer.variable(f"{arc} * {arc}"), law)
+
+
+class ArcRegion(ArcDistance):
+    """A `Region` of shapes in longitude and latitude; distances are along great circles."""
+
+    def __init__(self, given: Region, sphere: Sphere) -> None:
+        super().__init__(given, sphere)
+        pairs = list(zip(given.shapes, given.areas, strict=True))
+        self.parts_in_degrees = [area_of("a shape of a Region", area) for s, area in pairs if not isinstance(s, Circle)]
+        caps = [(*sphere.positions([s.center])[0], s.radius) for s, _ in pairs if isinstance(s, Circle)]
+        self.caps = np.array(caps).reshape(-1, 4) / (sphere.radius, sphere.radius, sphere.radius, _DEGREES)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return whether each of `points` (n, 3) is in the region, (n,) bool."""
+        lonlat, unit = directions(points), points / np.linalg.norm(points, axis=1)[:, None]
+        inside = (unit @ self.caps[:, :3].T >= np.cos(self.caps[:, 3])).any(axis=1)
+        for part in self.parts_in_degrees:
+            inside |= part.contains(lonlat)
+        return inside
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of `points` (n, 3) to the region along a great circle, (n,) float64; 0 in it."""
+        return np.where(self.contains(points), 0.0, ArcDistance.distance(self, points))
+
+    def landmarks(self, domain: Domain) -> np.ndarray:
+        """Return positions on the outline and in the region."""
+        grid = Region.landmarks(self.given, DEGREES)  # type: ignore[arg-type]
+        fits = np.abs(grid[:, 1]) <= 90
+        return np.concatenate([ArcDistance.landmarks(self, domain), self.sphere.positions(grid[fits])])
+
+    def _finish(self, writer: CodeWriter, best2: str, law: int) -> str:
+        inside = []
+        for *center, radius in self.caps:
+            at = writer.store(center, math.cos(radius))
+            inside.append(f"x[0] * data[{at}] + x[1] * data[{at + 1}] + x[2] * data[{at + 2}] >= data[{at + 3}]")
+        if self.parts_in_degrees:
+            inside.append(self._in_degrees(writer))
+        near = writer.variable(f"({' || '.join(inside)}) ? 0 : {best2}")
+        return ArcDistance._finish(self, writer, near, law)
+
+    def _in_degrees(self, writer: CodeWriter) -> str:
+        """Return the text that is true in one of the polygons."""
+        inner = writer.in_plane(DEGREES)
+        edges = ring_edges(shapely.union_all([part.whole() for part in self.parts_in_degrees]))
+        name = writer.function([], f"{inside_code(inner, edges, 'x')} ? 1 : 0")
+        way = degrees_code(writer, -180.0)
+        return f"{name}({way}, data) > 0"
+
+
+def degrees_code(writer: CodeWriter, west: float) -> str:
+    """Add the longitude, from `west` on, and latitude of x in degrees; return the name of the variable."""
+    way = writer.name()
+    writer.statements += [
+        f"REAL {way}[2] = {{atan2(x[1], x[0]), atan2(x[2], hypot(x[0], x[1]))}};",
+        f"{way}[0] *= (REAL)({_DEGREES!r});",
+        f"{way}[1] *= (REAL)({_DEGREES!r});",
+        f"{way}[0] += {way}[0] < (REAL)({west!r}) ? 360 : 0;",
+        f"{way}[0] -= {way}[0] > (REAL)({west + 360!r}) ? 360 : 0;",
+    ]
+    return way
 
 
 def _degree_lines(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

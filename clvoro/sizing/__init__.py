@@ -19,6 +19,7 @@ from .feature import FeatureSize
 from .field import Constant, Field, Function, as_field, maximum, minimum
 from .graded import Graded
 from .raster import Raster, Scattered
+from .region import Region
 from .solution import gradient_size, hessian_size
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "Graded",
     "Polyline",
     "Raster",
+    "Region",
     "Scattered",
     "Segment",
     "Sizing",

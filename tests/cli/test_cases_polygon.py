@@ -213,3 +213,34 @@ def test_shapefiles_are_refused_with_a_command(tmp_path):
     (tmp_path / "case.toml").write_text('size = 1\n[domain]\npolygon = "lake.shp"\n')
     with pytest.raises(InputError, match=r"domain\.polygon names .*ogr2ogr -t_srs EPSG:NUMBER lake\.geojson lake\.shp"):
         load_case(tmp_path / "case.toml")
+
+
+def test_regions_and_rectangles(tmp_path):
+    (tmp_path / "island.wkt").write_text("POLYGON ((3 0.2, 3.5 0.2, 3.5 0.5, 3 0.2))")
+    (tmp_path / "case.toml").write_text("""
+[domain]
+outer = {kind = "rectangle", lower = [0, 0], upper = [4, 1]}
+holes = [{kind = "rectangle", lower = [1, 0.4], upper = [1.3, 0.6]}]
+[size]
+kind = "region"
+h = 0.02
+growth = 1.2
+h_max = 0.2
+shapes = [
+    {kind = "box", lower = [1.3, 0.3], upper = [2.5, 0.7]},
+    {kind = "polygon", outer = [[0.5, 0.5], [0.9, 0.3], [0.9, 0.7]]},
+    {kind = "polygon", file = "island.wkt"},
+]
+""")
+    case = load_case(tmp_path / "case.toml")
+    assert case.domain.measure == pytest.approx(4 - 0.06)
+    h = case.size_field()(np.array([(2, 0.5), (0.8, 0.5), (3.4, 0.4), (0.1, 0.1)]))
+    assert h[:3].tolist() == [0.02] * 3
+    assert h[3] > 0.05
+    for old, new, says in (
+        ("upper = [1.3, 0.6]", "upper = [0.9, 0.6]", "expected lower < upper"),
+        ("h = 0.02", "h_min = 0.02", "size"),
+    ):
+        text = (tmp_path / "case.toml").read_text().replace(old, new)
+        with pytest.raises(InputError, match=says):
+            Case.from_toml(text, "bad", tmp_path)

@@ -295,3 +295,22 @@ def test_frames(here, sizes):
     assert call("run", "small.toml", "--quiet") == cli.OK
     assert len(list((here / "out/small/frames").iterdir())) == 2
     assert (here / "out/small/pictures/frames.png").is_file()
+
+
+LAND = '{"type": "Polygon", "coordinates": [[[-60, -40], [20, -40], [20, 50], [-60, 50], [-60, -40]]]}'
+
+
+def test_land_of_a_case_is_removed(here):
+    (here / "land.geojson").write_text(LAND)
+    case = 'size = 1.5e6\n[domain]\nkind = "sphere"\nland = "land.geojson"\n[run]\neffort = "fast"\n'
+    (here / "ocean-1.toml").write_text(case)
+    assert call("run", "ocean-1.toml", "--no-report", "--quiet", "--format", "mpas", "--out", "a") == cli.OK
+    mesh = clvoro.load(here / "a/mesh.npz")
+    assert mesh.diagram.domain.boundary_names == ("coast",)
+    lon, lat = clvoro.Sphere().lonlat(mesh.points).T
+    assert not ((lon > -60) & (lon < 20) & (lat > -40) & (lat < 50)).any()
+    assert call("run", "a/case.toml", "--no-report", "--quiet", "--out", "b") == cli.OK
+    assert np.array_equal(clvoro.load(here / "b/mesh.npz").points, mesh.points)
+    (here / "ocean-1.toml").write_text(case.replace("land.geojson", "lnd.geojson"))
+    assert call("run", "ocean-1.toml", "--out", "c") == cli.BAD_INPUT
+    assert not (here / "c").exists()

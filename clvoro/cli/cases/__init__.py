@@ -17,6 +17,7 @@ from ...errors import InputError
 from ...files import open_plain, read_text
 from ...geometry.boundary_layers import Layers
 from ...geometry.domain import Domain
+from ...geometry.polygon import Polygon
 from ...io.atomic import atomic_file
 from . import schema, toml
 from .checks import file_name
@@ -80,6 +81,12 @@ class Case:
     def run(self) -> dict[str, Any]:
         """The keys of the file's `[run]` table."""
         return self.table.get("run", {})
+
+    @property
+    def land(self) -> Polygon | None:
+        """Polygons, in longitudes and latitudes, whose cells are removed from a mesh of the sphere, if any."""
+        name = self.table["domain"].get("land")
+        return None if name is None else schema.read_polygon(locate(self.folder, name), "domain.land", planar=False)
 
     @property
     def patches(self) -> dict[str, Any]:
@@ -175,7 +182,7 @@ def _files(node: Any) -> Iterator[tuple[dict[str, Any], str]]:
         if isinstance(item, (dict, list)):
             yield from _files(item)
     if isinstance(node, dict):
-        yield from ((node, key) for key in ("file", "points", "fixed") if isinstance(node.get(key), str))
+        yield from ((node, key) for key in ("file", "points", "fixed", "land") if isinstance(node.get(key), str))
 
 
 def _check_walls(table: dict[str, Any], domain: Domain, place: str) -> None:

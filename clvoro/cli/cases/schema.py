@@ -25,7 +25,7 @@ from ...files import LONGEST_GEOMETRY, read_text
 from ...geometry.box import Box
 from ...geometry.curves import Curve
 from ...geometry.domain import Domain
-from ...geometry.geojson import FOREIGN
+from ...geometry.geojson import FOREIGN, pieces_of_geojson
 from ...geometry.polygon import Polygon
 from ...geometry.solid.solid import Solid
 from ...geometry.sphere import Sphere
@@ -200,6 +200,25 @@ Shape = (
     | Spline
 )
 
+
+class PolygonShape(Kind, tag="polygon"):
+    """Polygons in a file of GeoJSON or well-known text, or a ring of points with holes."""
+
+    CHOICE = ("file", "outer")
+    file: Text | None = None
+    outer: Annotated[list[Plane], Meta(min_length=3)] | None = None
+    holes: list[Annotated[list[Plane], Meta(min_length=3)]] | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        if self.file is None:
+            return Polygon(self.outer, self.holes or [])
+        return read_polygon(locate(folder, self.file), "size.shapes.file", planar=not domain.curved)
+
+
+RegionShape = (
+    CircleShape | Ball | BoxShape | PolygonShape | SurfaceShape | ClosedPolylineShape | Ellipse | Naca | Spline
+)
+
 # Size fields.
 
 _ON_SPHERE = "caps, distance, expression, graded, raster or a combination of them"
@@ -240,6 +259,18 @@ class DistanceTable(Kind, tag="distance"):
 
     def build(self, folder: Path, domain: Any = None) -> Any:
         return sizing.Distance([shape.build(folder, domain) for shape in self.shapes], **self.given("shapes"))
+
+
+class RegionTable(Kind, tag="region"):
+    CHOICE = ("growth", "slope")
+    shapes: Annotated[list[RegionShape], Meta(min_length=1)]
+    h: Positive
+    growth: Positive | None = None
+    slope: Positive | None = None
+    h_max: Positive | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        return sizing.Region([shape.build(folder, domain) for shape in self.shapes], **self.given("shapes"))
 
 
 class ExpressionTable(Kind, tag="expression"):
@@ -366,6 +397,7 @@ Size = (
     | ConstantTable
     | CapsTable
     | DistanceTable
+    | RegionTable
     | ExpressionTable
     | RasterTable
     | Hessian
@@ -414,13 +446,27 @@ def load_array(path: Path, place: str) -> np.ndarray:
 
 # Domains.
 
+
+class Rectangle(Kind, tag="rectangle"):
+    """A rectangle as a ring of a domain."""
+
+    lower: Plane
+    upper: Plane
+
+    def build(self, folder: Path, domain: Any = None) -> list[Plane]:
+        (a, b), (c, d) = self.lower, self.upper
+        if not (a < c and b < d):
+            raise InputError(f"domain has a rectangle from {self.lower} to {self.upper}, expected lower < upper")
+        return [(a, b), (c, b), (c, d), (a, d)]
+
+
 Names = dict[str, Walls]
 RingCurve = CircleCurve | Arc | Ellipse | Naca | Spline
-Ring = RingCurve | list[Plane | RingCurve]
+Ring = RingCurve | Rectangle | list[Plane | RingCurve]
 
 
 def _ring(ring: Any) -> Any:
-    if isinstance(ring, CurveTable):
+    if isinstance(ring, Kind):
         return ring.build(Path())
     return [item.build(Path()) if isinstance(item, CurveTable) else item for item in ring]
 
@@ -471,24 +517,17 @@ class PolygonTable(Kind, tag="polygon"):
     def _whole(self, folder: Path) -> Polygon:
         if self.file is None:
             return Polygon(_ring(self.outer), [_ring(hole) for hole in self.holes or []], self.names)
-        path = locate(folder, self.file)
-        if path.suffix.lower() in FOREIGN:
-            raise InputError(
-                f"domain.polygon names {str(path)!r}, expected GeoJSON or well-known text; convert it, with GDAL: "
-                f"ogr2ogr -t_srs EPSG:NUMBER {path.stem}.geojson {path.name}, where NUMBER is a projection in meters"
-            )
-        if path.suffix.lower() not in (".wkt", ".txt"):
-            return Polygon.from_geojson(path, self.names)
-        try:
-            text = read_text(path, LONGEST_GEOMETRY)
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"cannot read {path} ({error}), expected well-known text") from error
-        return Polygon.from_wkt(text, self.names)
+        return read_polygon(locate(folder, self.file), "domain.polygon", self.names)
 
 
 class SphereTable(Kind, tag="sphere"):
-    MAKE = Sphere
+    """A sphere; `land` names polygons in longitudes and latitudes whose cells are removed after the run."""
+
     radius: Positive | None = None
+    land: Text | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Sphere:
+        return Sphere(**self.given("land"))
 
 
 class Around(Table):
@@ -541,6 +580,29 @@ def with_kind(domain: object, place: str) -> object:
         )
     named = {"file" if key == "polygon" else key: value for key, value in domain.items()}
     return {"kind": "polygon" if rings else "box", **named}
+
+
+def read_polygon(path: Path, key: str, names: Names | None = None, planar: bool = True) -> Polygon:
+    """Read polygons from a file of GeoJSON or well-known text; `key` names it in the case.
+
+    Raises
+    ------
+    InputError
+    """
+    if path.suffix.lower() in FOREIGN:
+        raise InputError(
+            f"{key} names {str(path)!r}, expected GeoJSON or well-known text; convert it, with GDAL: "
+            f"ogr2ogr -t_srs EPSG:NUMBER {path.stem}.geojson {path.name}, where NUMBER is a projection in meters"
+        )
+    if path.suffix.lower() not in (".wkt", ".txt"):
+        if planar:
+            return Polygon.from_geojson(path, names)
+        return Polygon.from_pieces(pieces_of_geojson(path, planar=False)[0])
+    try:
+        text = read_text(path, LONGEST_GEOMETRY)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {path} ({error}), expected well-known text") from error
+    return Polygon.from_wkt(text, names)
 
 
 # The case.
