@@ -132,7 +132,7 @@ def _area_of(shape: Any) -> shapely.Geometry:
         area = shapely.Polygon(shape.points)
     elif isinstance(shape, curves.Curve) and shape.closed:
         area = shapely.Polygon(shape.vertices)
-    elif isinstance(shape, shapely.Polygon | shapely.MultiPolygon):
+    elif getattr(shape, "geom_type", "") in ("Polygon", "MultiPolygon"):
         area = shape
     else:
         raise _not_closed(shape)

@@ -229,7 +229,7 @@ class ConstantTable(Kind, tag="constant"):
     value: Positive
 
 
-class Region(Table):
+class CapTable(Table):
     center: Plane
     radius: NotNegative
     size: Positive
@@ -237,7 +237,7 @@ class Region(Table):
 
 class CapsTable(Kind, tag="caps"):
     CHOICE = ("growth", "slope")
-    regions: Annotated[list[Region], Meta(min_length=1)]
+    regions: Annotated[list[CapTable], Meta(min_length=1)]
     h_max: Positive
     growth: Positive | None = None
     slope: Positive | None = None
