@@ -1,12 +1,14 @@
 """How long the first run takes: separate processes with empty kernel caches.
 
-    python bench/first_run.py [--repeat N] [--warm] [--programs] [--json]
+    python bench/first_run.py [--repeat N] [--warm] [--programs] [--small] [--json]
     python bench/first_run.py --record
 
 A box in 2D (625 cells) and one in 3D (1000 cells) are adapted with default options. Printed are the machine, the number
 of programs and kernels that are built, and the medians of the seconds that a process takes to import the package, to
 make an adapter, and to run. The processor time includes that of workers, and is disturbed less by others on the
 machine. `--warm` repeats the runs with full caches. `--programs` prints the seconds of processor time per program.
+`--small` prints only what later runs of small meshes in one process take: the least seconds, of processor time, and of
+the main thread.
 `--record` writes `clvoro/opencl/first_kernels.json`: which kernels a first run needs, in which order.
 """
 
@@ -29,6 +31,22 @@ RECORDED = {
     "3D periodic": ("clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)", 0.1),
     "sphere": ("clvoro.Sphere(1.0)", 0.08),
 }
+SMALL = {
+    "2D box, 800 cells": ("clvoro.Box((0, 0), (1, 1))", 0.03536),
+    "2D polygon, 600 cells": ("clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.4, 1), (0.4, 0.5), (0, 0.5)])", 0.03651),
+    "3D box, 600 cells": ("clvoro.Box((0, 0, 0), (1, 1, 1))", 0.1186),
+}
+AGAIN = """
+import json, time
+import clvoro
+clocks = time.perf_counter, time.process_time, time.thread_time
+domain, spent = {domain}, []
+for _ in range(8):
+    began = [clock() for clock in clocks]
+    clvoro.adapt(domain, {size})
+    spent.append([clock() - start for clock, start in zip(clocks, began)])
+print(json.dumps([min(times) for times in zip(*spent)]))
+"""
 RUN = """
 import json, resource, time
 def clocks():
@@ -162,11 +180,19 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3, help="processes for each kind (3)")
     parser.add_argument("--warm", action="store_true", help="with full caches as well")
     parser.add_argument("--programs", action="store_true", help="the processor time of each program")
+    parser.add_argument("--small", action="store_true", help="later runs of small meshes")
     parser.add_argument("--record", action="store_true", help="write the record of kernels")
     parser.add_argument("--json", action="store_true", help="print one JSON object per line instead")
     options = parser.parse_args()
     if options.record:
         write_record()
+        return
+    if options.small:
+        for kind, (domain, size) in SMALL.items():
+            wall, busy, host = in_process(AGAIN.format(domain=domain, size=size), None)  # type: ignore[misc]
+            print(
+                f"{kind:22} {wall:5.2f} s, {busy:5.2f} s of processor time, {host:5.2f} s of the thread that launches"
+            )
         return
     if not options.json:
         print(in_process(MACHINE.format(), None))

@@ -174,54 +174,12 @@ class Bins:
         engine.run_each(k.count_root, n, points, frame, shape, self._keys, self._ranks, self._counts)
         begin, size, grids = 0, root_bins, 1
         for level in range(MAX_LEVELS):
-            end, may_divide = begin + size, np.int32(level < MAX_LEVELS - 1)
-            engine.run_each(k.plan_children, size, self._counts, np.int32(begin), may_divide, self._flags, self._sizes)
-            for place, values in enumerate((self._flags, self._sizes)):
-                self._scan.exclusive(values, values, size, total=(self._found, place))
-            self._scan.exclusive(self._counts, self._starts, size, first=begin)
-            engine.run_each(
-                k.place_bins,
-                size,
-                self._starts,
-                np.int32(begin),
-                self._grid_of,
-                self._shapes,
-                self._grid_items,
-                np.int32(grids),
-                self._flags,
-                self._bins,
-            )
-            new_grids, new_bins = map(int, self._found.get())
+            new_grids, new_bins, firsts = self._place_level(begin, size, grids, level < MAX_LEVELS - 1)
             if new_grids == 0:
                 break
-            child_firsts = self._sizes  # _reserve may replace it
-            self._reserve(n, end + new_bins)
-            self._clear(self._counts, end, new_bins)
-            engine.run_each(
-                k.make_grids,
-                size,
-                self._bins,
-                self._counts,
-                np.int32(begin),
-                np.int32(end),
-                child_firsts,
-                self._grid_of,
-                self._frames,
-                self._shapes,
-                self._grid_items,
-            )
-            engine.run_each(
-                k.count_in_child_bins,
-                n,
-                points,
-                self._bins,
-                self._frames,
-                self._shapes,
-                self._keys,
-                self._ranks,
-                self._counts,
-            )
-            begin, size, grids = end, new_bins, grids + new_grids
+            self._reserve(n, begin + size + new_bins)
+            self._divide(points, n, begin, size, firsts, new_bins)
+            begin, size, grids = begin + size, new_bins, grids + new_grids
         total = begin + size
         engine.run_each(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
         spacing = self._ranks.view(np.float32)  # the ranks are no longer needed
@@ -239,6 +197,50 @@ class Bins:
             self._shapes,
             tuple(int(side) for side in sides),
         )
+
+    def _place_level(self, begin: int, size: int, grids: int, may_divide: bool) -> tuple[int, int, cla.Array]:
+        """Place the items of the `size` bins from `begin` on, and plan the division of the fullest.
+
+        Returns the numbers of new grids and new bins, and where the new bins of each divided one begin.
+        """
+        engine, k, first = self.engine, self._kernels, np.int32(begin)
+        engine.run_each(k.plan_children, size, self._counts, first, np.int32(may_divide), self._flags, self._sizes)
+        for place, values in enumerate((self._flags, self._sizes)):
+            self._scan.exclusive(values, values, size, total=(self._found, place))
+        self._scan.exclusive(self._counts, self._starts, size, first=begin)
+        engine.run_each(
+            k.place_bins,
+            size,
+            self._starts,
+            first,
+            self._grid_of,
+            self._shapes,
+            self._grid_items,
+            np.int32(grids),
+            self._flags,
+            self._bins,
+        )
+        new_grids, new_bins = map(int, self._found.get())
+        return new_grids, new_bins, self._sizes
+
+    def _divide(self, points: cla.Array, n: int, begin: int, size: int, firsts: cla.Array, new_bins: int) -> None:
+        """Make the planned grids of `new_bins` bins, and count their generators."""
+        engine, k, end = self.engine, self._kernels, begin + size
+        self._clear(self._counts, end, new_bins)
+        grids = self._frames, self._shapes
+        engine.run_each(
+            k.make_grids,
+            size,
+            self._bins,
+            self._counts,
+            np.int32(begin),
+            np.int32(end),
+            firsts,
+            self._grid_of,
+            *grids,
+            self._grid_items,
+        )
+        engine.run_each(k.count_in_child_bins, n, points, self._bins, *grids, self._keys, self._ranks, self._counts)
 
     def renumber(self, binned: BinnedPoints, n: int) -> None:
         """Update `binned` after its `n` generators have been sorted into its order: item p is now generator p.

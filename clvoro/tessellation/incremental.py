@@ -15,7 +15,7 @@ from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 from .cells import CLIPPED, FLAGS, LEFT, Cells, most_faces, verdict
 from .device_diagram import DOUBT, Follow, Tessellation, read_report
-from .face_rows import spare_slots
+from .face_rows import FaceRows, spare_slots
 from .rounds import with_room
 
 MAX_ROUNDS = 6
@@ -104,54 +104,7 @@ class IncrementalUpdate:
                 limits = size, in_all, most_wrong
                 self._scan.exclusive(marks, sums, n)
                 engine.run_each(k.list_marked, n, number, *limits, marks, sums, listed, rows.flags)
-                few = FEW if cells.lanes > 1 and number == 0 else n + 1
-                if few <= size:
-                    engine.run_each(
-                        k.wrap_marked,
-                        -(-size // cells.lanes),
-                        few,
-                        rows.flags,
-                        listed,
-                        rows.places,
-                        rows.slots,
-                        rows.counts,
-                        *old,
-                        points,
-                        *corners,
-                        group=1,
-                    )
-                this = listed, number
-                engine.run_each(
-                    k.clip_marked,
-                    size,
-                    *this,
-                    few,
-                    rows.places,
-                    rows.slots,
-                    rows.counts,
-                    *old,
-                    points,
-                    *corners,
-                    self._fits,
-                    rows.flags,
-                )
-                engine.run_each(
-                    k.place_clipped, size, *this, rows.flags, rows.slots, rows.counts, rows.places, marks, self._fits
-                )
-                engine.run_each(
-                    k.check_clipped,
-                    size,
-                    *this,
-                    rows.flags,
-                    rows.places,
-                    rows.slots,
-                    rows.counts,
-                    *old,
-                    points,
-                    *corners,
-                    marks,
-                    self._fits,
-                )
+                self._clip_listed(k, cells, number, size, listed, rows, marks, (*old, points, *corners))
             given = rows, box, points, n, *old
             cells.enqueue_match(*given, exact=False, marks=marks, fits=self._fits)
             t = cells.measure(*given, most_faces(n), 0, exact=False, ahead=True)
@@ -174,6 +127,32 @@ class IncrementalUpdate:
             if found[2] > most_wrong or sum(clipped) + left > in_all or done >= MAX_ROUNDS - 1:
                 return None
             expected = [left]
+
+    def _clip_listed(
+        self,
+        k: SimpleNamespace,
+        cells: Cells,
+        number: int,
+        size: int,
+        listed: cla.Array,
+        rows: FaceRows,
+        marks: cla.Array,
+        given: tuple[object, ...],
+    ) -> None:
+        """Round `number`: clip the `listed` cells, at most `size`, and check them and their neighbors.
+
+        `given` are the graph before, the generators and the corners of the box.
+        """
+        engine, this = self.engine, (listed, number)
+        few = FEW if cells.lanes > 1 and number == 0 else self._n + 1
+        new = rows.slots, rows.counts
+        if few <= size:
+            engine.run_each(
+                k.wrap_marked, -(-size // cells.lanes), few, rows.flags, listed, rows.places, *new, *given, group=1
+            )
+        engine.run_each(k.clip_marked, size, *this, few, rows.places, *new, *given, self._fits, rows.flags)
+        engine.run_each(k.place_clipped, size, *this, rows.flags, *new, rows.places, marks, self._fits)
+        engine.run_each(k.check_clipped, size, *this, rows.flags, rows.places, *new, *given, marks, self._fits)
 
     def _check(self, kernel: cl.Kernel, items: int, n: int, args: tuple[object, ...]) -> None:
         """Check all rows with `items` work-items, or only a sample if it shows that too many have changed."""
