@@ -198,15 +198,9 @@ class _Maker:
         v = len(self.points)
         keys, edges = np.unique(np.minimum(corners, after) * v + np.maximum(corners, after), return_inverse=True)
         a, b = keys // v, keys % v
-        on_crease = np.where(self.site >= self.surface.n_patches, self.site, -1)
         h_edge = np.minimum(h[a], h[b])
         pierced = pierce_edges(
-            self.surface,
-            self.points[a],
-            self.points[b],
-            np.stack([signed[a], signed[b]], axis=1),
-            np.stack([on_crease[a], on_crease[b]], axis=1),
-            h_edge,
+            self.surface, self.points[a], self.points[b], np.stack([signed[a], signed[b]], axis=1), h_edge
         )
         site, placed = self._sited(pierced.points, pierced.triangles, h_edge[pierced.edge])
         self.points = np.concatenate([self.points, placed])
@@ -230,12 +224,25 @@ class _Maker:
         crossings = cross_cells(self.surface, self.generators, self.tree, self.sizes)
         sites = self.surface.n_patches + crossings.edge
         middle = (self.points[parts.items[chords]] + self.points[after[chords]]) / 2
-        rank = self._match(crossings, self.owner[face] * self.n + self.neighbor[face], one, other, middle)
+        keys = self.owner[face] * self.n + self.neighbor[face]
+        rank = self._match(crossings, keys, one, other, middle)
+        left = np.flatnonzero(rank < 0)
+        pairs = self._match_twice(crossings, keys[left], one[left], other[left])
+        twice = np.array([left[k] for k in pairs], np.int64)
+        # Where vertices have been moved onto a crease, it may cross another face: take its nearest point.
+        left = np.setdiff1d(left, twice)
+        h = np.minimum(self.sizes[self.owner[face[left]]], self.sizes[self.neighbor[face[left]]])
+        edge, foot = self.surface.nearest_crease(middle[left], h, (one[left], other[left]))
+        left, edge, foot = left[edge >= 0], edge[edge >= 0], foot[edge >= 0]
+        rank[left] = len(sites) + np.arange(len(left))
         first = len(self.points)
-        self.points = np.concatenate([self.points, crossings.points])
-        self.site = np.concatenate([self.site, sites])
-        self.unmatched = int(np.count_nonzero(rank < 0))
-        rows, taken = chords[rank >= 0], rank[rank >= 0]
+        self.points = np.concatenate([self.points, crossings.points, foot])
+        self.site = np.concatenate([self.site, sites, self.surface.n_patches + edge])
+        found = np.flatnonzero(rank >= 0)
+        rows = chords[np.concatenate([found, np.repeat(twice, 2)])]
+        taken = np.concatenate([rank[found], np.array(list(pairs.values()), np.int64).ravel()])
+        order = np.argsort(rows, kind="stable")
+        rows, taken = rows[order], taken[order]
         counts = np.diff(parts.starts)
         added = np.bincount(np.searchsorted(parts.starts, rows, "right") - 1, minlength=len(counts))
         return TrimmedFaces(
@@ -265,6 +272,27 @@ class _Maker:
         order = np.lexsort((far, row))
         first = np.unique(row[order], return_index=True)[1]
         found[row[order[first]]] = which[order[first]]
+        return found
+
+    def _match_twice(
+        self, crossings: Crossings, face: np.ndarray, one: np.ndarray, other: np.ndarray
+    ) -> dict[int, tuple[int, int]]:
+        """Return two crossings for each chord between patches that have a third one between them, the nearest pair."""
+        key = crossings.cells[:, 0] * self.n + crossings.cells[:, 1]
+        found: dict[int, tuple[int, int]] = {}
+        for k, (low, high) in enumerate(
+            zip(*(np.searchsorted(key, face, side) for side in ("left", "right")), strict=True)
+        ):
+            here = [set(self.surface.patches_of(self.surface.n_patches + crossings.edge[c])) for c in range(low, high)]
+            begin, end = (set(self.surface.patches_of(site[k])) for site in (one, other))
+            pairs = [
+                (float(np.linalg.norm(crossings.points[low + i] - crossings.points[low + j])), (low + i, low + j))
+                for i, a in enumerate(here)
+                for j, b in enumerate(here)
+                if i != j and a & begin and a & b and b & end
+            ]
+            if pairs:
+                found[k] = min(pairs)[1]
         return found
 
     def _wall_polygons(self, parts: TrimmedFaces, far: np.ndarray) -> Divider:

@@ -52,7 +52,7 @@ def sides(distance: np.ndarray, h: np.ndarray) -> np.ndarray:
 
 
 def pierce_edges(
-    surface: WallSurface, a: np.ndarray, b: np.ndarray, distances: np.ndarray, sites: np.ndarray, h: np.ndarray
+    surface: WallSurface, a: np.ndarray, b: np.ndarray, distances: np.ndarray, h: np.ndarray
 ) -> PiercedEdges:
     """Find where edges cross the surface.
 
@@ -62,8 +62,6 @@ def pierce_edges(
         Ends.
     distances : (e, 2) float
         Signed distances of the ends from the surface; 0 for ends on it.
-    sites : (e, 2) int
-        Sites of ends on creases and corners, -1 for others.
     h : (e,) float
     """
     length = np.linalg.norm(b - a, axis=1)
@@ -78,7 +76,7 @@ def pierce_edges(
     low, high = signed[change], signed[change + 1]
     row, place, tri, points = _roots(surface, a, b, edge[low], t[[low, high]], d[[low, high]], h)
     starts, ends = begin == IN, end == IN
-    leaving = _leaves(surface, a, b, distances, sites, (begin, end), h, length)
+    leaving = _leaves(surface, a, b, distances, (begin, end), h, length)
     row, place = np.concatenate([row, leaving[0]]), np.concatenate([place, leaving[1]])
     tri, points = np.concatenate([tri, leaving[2]]), np.concatenate([points, leaving[3]])
     starts[leaving[0][leaving[4] == 0]] = True
@@ -154,16 +152,18 @@ def _leaves(
     a: np.ndarray,
     b: np.ndarray,
     distances: np.ndarray,
-    sites: np.ndarray,
     sides_at: tuple[np.ndarray, np.ndarray],
     h: np.ndarray,
     length: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Return edges that run along a crease from an end on it, and then leave: place, triangle, point and that end."""
+    """Return edges that run along the surface from an end on it, and leave at a crease: place, triangle, point, end."""
     none = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.int64)
     found = [none]
     for end in (0, 1):
-        k = np.flatnonzero((sites[:, end] >= 0) & (distances[:, end] == 0) & (sides_at[end] == OUT))
+        k = np.flatnonzero((distances[:, end] == 0) & (sides_at[end] == OUT) & (length > _LEAVE * h))
+        early = _LEAVE * h[k] / length[k]
+        x = a[k] + (early if end == 0 else 1 - early)[:, None] * (b[k] - a[k])
+        k = k[np.abs(surface.closest(x)[2]) <= ON * h[k]]
         if not len(k):
             continue
         low, high = np.zeros(len(k)), np.ones(len(k))

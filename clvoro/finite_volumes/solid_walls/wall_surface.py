@@ -63,12 +63,20 @@ class WallSurface:
     def _corner_tree(self) -> KDTree:
         return KDTree(self.corners)
 
-    def nearest_crease(self, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest edge of a crease within `reach` (k,), or -1, and the point on it (k, 3)."""
+    def nearest_crease(
+        self, points: np.ndarray, reach: np.ndarray, between: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nearest edge of a crease within `reach` (k,), or -1, and the point on it (k, 3).
+
+        `between` are pairs of sites, (k,) each: only creases count that have a patch of each.
+        """
         edge, foot = np.full(len(points), -1), points.copy()
         if not len(self.ends) or not len(points):
             return edge, foot
         who, item = near_items(self._crease_tree, points, reach)
+        for site in between or ():
+            fits = self.common(self.n_patches + item, site[who])[0] > 0
+            who, item = who[fits], item[fits]
         begin, along = self.ends[item, 0], self.ends[item, 1] - self.ends[item, 0]
         share = ((points[who] - begin) * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300)
         there = begin + np.clip(share, 0, 1)[:, None] * along
