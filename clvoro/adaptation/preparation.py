@@ -18,6 +18,7 @@ from ..sizing.distance import limit_beside_layers, limit_beside_lines
 from ..sizing.feature import NARROW
 from ..sizing.field import Field, on_domain
 from ..tessellation.power import require_power_domain
+from .corners import place_stations
 from .diagnostics import check_precision, narrow_parts, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import Extras, check_memory, expected_boundary_cells, expected_images, expected_surplus
 from .fixed_points import check_room, place_beside_lines
@@ -31,7 +32,7 @@ from .sampling.quadrature import DensityTree
 from .sampling.start import charted, density_tree, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, OPENINGS, SAMPLED_SIZES, STEPS
+from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOST_STATIONS, MOVES, OPENINGS, SAMPLED_SIZES, STEPS
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,13 @@ def prepare(
             )
     if options.multilevel:
         fixed = np.concatenate([fixed, domain.station_points(lambda x: factor * np.asarray(sizing(x)))])
-    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, pairs)
+    stationed = None
+    if domain.outline is not None and tree is not None and pairs is None:
+        h = factor * np.asarray(sizing(domain.outline.oriented.vertices), float)
+        stations = place_stations(domain.outline, free, np.concatenate([fixed, rows]), h)
+        if len(fixed) + len(rows) + MOST_STATIONS * len(stations.points) <= target:
+            fixed, stationed = np.concatenate([fixed, stations.points]), stations.corners
+    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, pairs, stationed)
     lattice = lattice_points(domain, target) if options.method in MOVING else None
     levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0
     if options.levels == "auto" and max_levels is not None:

@@ -96,13 +96,15 @@ class Setup:
     fixed : int
         Generators with labels below `fixed` do not move.
     points : (k, d) ndarray
-        Positions of those with the labels 0 to k - 1, on the finest level: first those of the caller, whose cells have
-        target sizes like all others, then those beside lines. The other fixed generators are those of layers. The size
-        of the cells beside lines and in layers is their target size.
+        Positions of those with the labels 0 to k - 1, on the finest level: first those of the caller, then those
+        around corners, whose cells have target sizes like all others, then those beside lines. The other fixed
+        generators are those of layers. The size of the cells beside lines and in layers is their target size.
     factor : float
         Initial factor on the size field on the finest level.
     pairs : LinePairs or None
         Generators beside lines: the last of `points`.
+    stationed : (c,) ndarray or None
+        Vertices of the domain around which fixed generators stand on the finest level.
     """
 
     stages: Stages
@@ -113,6 +115,7 @@ class Setup:
     points: np.ndarray
     factor: float = 1.0
     pairs: LinePairs | None = None
+    stationed: np.ndarray | None = None
 
     @property
     def first_sized(self) -> int:
