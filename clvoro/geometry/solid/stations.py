@@ -1,9 +1,10 @@
 """Stations: generators around concave creases and corners, placed so that faces between their cells meet there.
 
-At a station k generators stand around a crease with the interior angle alpha, k = round(alpha / 90 degrees): at one
-distance from it, in the middle of k equal sectors. So their bisectors contain the crease, and each of the outermost two
-is nearest to one wall only. Along a chain stations are equidistributed by 1 / h. At an open end the first one is half a
-step away. Where chains meet, the mirror images of their last generators in the walls there complete the corner.
+At a station k generators stand around a crease at one distance from it, in the middle of k equal sectors. With the
+mean interior angle alpha of the chain, k = round(alpha / 90 degrees). So their bisectors contain the crease, and each
+of the outermost two is nearest to one wall only. Along a chain stations are equidistributed by 1 / h. At an open end
+the first one is half a step away. Where chains meet, the mirror images of their last generators in the walls there
+complete the corner.
 """
 
 from __future__ import annotations
@@ -110,8 +111,9 @@ def place_stations(solid: Solid, size: Callable[[np.ndarray], np.ndarray]) -> St
     for chain in np.unique(solid.creases.chain[solid.creases.concave]).tolist():
         line = chain_line(solid, chain)
         at, h = _divide(line, size)
+        k = _sectors(line)
         for s, step in zip(at, h, strict=True):
-            around = _around(line, float(s), float(step))
+            around = _around(line, float(s), float(step), k)
             points.append(around)
             sizes.append(np.full(len(around), step))
             chains.append(np.full(len(around), chain))
@@ -140,14 +142,23 @@ def _divide(line: Line, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.nd
     return at, np.interp(at, s, h) * (reached[-1] / max(count, 1))
 
 
-def _around(line: Line, s: float, h: float) -> np.ndarray:
-    """Return the generators of the station at the length `s`, (k, 3)."""
+def _sectors(line: Line) -> int:
+    """Return the number of generators around a line: one for each right angle of the mean interior angle."""
+    turn = np.arctan2(
+        np.einsum("ij,ij->i", np.cross(line.left, line.right), line.tangents),
+        np.einsum("ij,ij->i", line.left, line.right),
+    )
+    mean = float(np.interp((np.arange(_FEWEST) + 0.5) / _FEWEST * line.at[-1], line.at, math.pi - turn).mean())
+    return max(2, round(mean / (math.pi / 2)))
+
+
+def _around(line: Line, s: float, h: float, k: int) -> np.ndarray:
+    """Return the `k` generators of the station at the length `s`, (k, 3)."""
     at = np.array([s])
     spot, left, right = (line.along(values, at)[0] for values in (line.points, line.left, line.right))
     along = _unit(line.along(line.tangents, at)[0])
     left, right = (_unit(n - (n @ along) * along) for n in (left, right))
     angle = math.pi - math.atan2(float(np.cross(left, right) @ along), float(left @ right))
-    k = max(2, round(angle / (math.pi / 2)))
     half = 0.5 * angle / k
     # The cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
     r = h / math.sqrt(math.tan(half)) * (math.cos(half) + 1 / math.cos(half)) / 3
