@@ -101,9 +101,8 @@ def narrow_parts(
     """
     if domain.outline is not None:
         return find_narrow_parts(domain.outline, size)
-    center = (np.array(domain.lower) + domain.upper) / 2
-    widths = np.where(domain.periodic, np.inf, domain.extent)
-    strait = NarrowPart(center, float(widths.min()), float(size(center[None])[0]))
+    place, width = domain.narrowest(size)
+    strait = NarrowPart(place, width, float(size(place[None])[0]))
     return strait if strait.width < NARROW * strait.size else None, None
 
 

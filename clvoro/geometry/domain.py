@@ -434,6 +434,12 @@ class Domain(ABC):
         """Return the nearest point of the box to each of `points` (n, d)."""
         return np.where(self.periodic, points, np.clip(points, self.lower, self.upper))
 
+    def narrowest(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
+        """Return a place (d,) where the domain is narrowest in units of the sizes `size`, and its width there."""
+        del size
+        widths = np.where(self.periodic, np.inf, self.extent)
+        return (np.array(self.lower) + self.upper) / 2, float(widths.min())
+
     def station_points(self, size: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return where generators must stand so that cells of the sizes `size` end at walls, (m, d): nowhere.
 

@@ -34,6 +34,8 @@ from .creases import CONCAVE, CONVEX, connect, corner_normals, dihedral_turns, f
 from .stations import Stations, place_stations
 
 _ON = 1e-12  # of the diagonal: points this close to the surface lie on it
+_PROBES = 4096  # places on the surface from which widths are measured
+_FACING = -0.7  # product of the normals of two walls that face each other
 _EDGE = 1e-9  # weight of a corner below which a foot lies on the opposite side
 _MARGIN = 0.05  # of the longest edge, by which the clip box is larger than the region
 
@@ -563,6 +565,35 @@ class Solid(Domain):
     def station_points(self, size: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return the generators of `stations`, (m, 3)."""
         return self.stations(size).points
+
+    def narrowest(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
+        """Return a place (3,) where the solid is narrowest in units of the sizes `size`, and its width there.
+
+        The width is that of thin parts and of gaps between bodies, measured inwards from a sample of the surface. Sharp
+        edges, where two walls meet, do not count.
+        """
+        areas = np.cumsum(self._areas)
+        k = np.arange(_PROBES)
+        item = np.minimum(np.searchsorted(areas, (k + 0.5) / _PROBES * areas[-1]), len(areas) - 1)
+        item = np.unique(np.concatenate([item, k * len(areas) // _PROBES]))
+        begin = self.surface.corners[item].mean(axis=1)
+        h = np.asarray(size(begin), float)
+        middle, width = np.add(self.lower, self.upper) / 2, np.full(len(item), float(self.extent.min()))
+        if width[0] >= h.max():
+            width[:] = math.inf
+        end = begin - h[:, None] * self.normals[item]
+        who, other = self.surface.tree.meeting(np.minimum(begin, end), np.maximum(begin, end))
+        facing = np.einsum("ij,ij->i", self.normals[item[who]], self.normals[other]) < _FACING
+        meets = np.sort(self.creases.patches, axis=1) @ (self.n_patches, 1)
+        pair = np.sort(self.patch[np.column_stack([item[who], other])], axis=1) @ (self.n_patches, 1)
+        rows = np.flatnonzero(facing & ~np.isin(pair, meets))
+        share = pierced(begin[who[rows]], end[who[rows]], self.surface.corners[other[rows]])
+        seen = share > 1e-9
+        np.minimum.at(width, who[rows[seen]], share[seen] * h[who[rows[seen]]])
+        worst = int((width / h).argmin())
+        if not width[worst] < h[worst]:
+            return middle, float(self.extent.min())
+        return begin[worst] - 0.5 * width[worst] * self.normals[item[worst]], float(width[worst])
 
     def visible(self, points: np.ndarray, feet: np.ndarray) -> np.ndarray:
         """Return whether no other wall is between each point (n, 3) and its foot on the surface, (n,) bool."""

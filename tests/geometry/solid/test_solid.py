@@ -148,3 +148,16 @@ def test_a_solid_comes_back_from_its_description():
     assert hash(again) == hash(solid)
     assert again.boundary_names == solid.boundary_names
     assert again != SOLIDS["ball"]
+
+
+def test_thin_parts_and_gaps_are_found():
+    plate = Solid.box((0, 0, 0), (1, 1, 0.02))
+    place, width = plate.narrowest(lambda x: np.full(len(x), 0.2))
+    assert width == pytest.approx(0.02)
+    assert plate.contains(place[None])[0]
+    gap = Solid.outside(Solid.box((0, 0, 0.03), (1, 1, 0.5)), ((-1, -1, 0), (2, 2, 1)))
+    place, width = gap.narrowest(lambda x: np.full(len(x), 0.2))
+    assert width == pytest.approx(0.03)
+    assert gap.contains(place[None])[0]
+    for solid in (SOLIDS["box"], SOLIDS["ball"], Solid.cone((0, 0, 0), (0, 0, 1), 0.2)):
+        assert solid.narrowest(lambda x: np.full(len(x), 0.1))[1] > 0.1
