@@ -103,8 +103,9 @@ def _sample(
         gap = (t[1] - t[0]) * length[e]
         together = np.abs(d).sum(axis=0)
         product = d[0] * d[1]
-        # An end on the surface: the edge leaves it straight, unless it runs along it.
-        straight = (product == 0) & (together > 0.3 * gap) | (product <= 0) & (seen > 0) | (gap <= ON * h[e])
+        # From an end on the surface the edge leaves at once, or runs along it for a while, or comes back.
+        at_end = (product == 0) & ((together > 0.8 * gap) | (gap <= _LEAVE * h[e]))
+        straight = at_end | (product < 0) & (seen > 0) | (gap <= ON * h[e])
         open_ = ~straight & ~((product > 0) & (together >= gap * (1 - 1e-9)))
         e, t, d, seen = e[open_], t[:, open_], d[:, open_], seen[open_]
         if not len(e):
