@@ -69,7 +69,7 @@ inline int nearest_generator(global const REAL *x, const graph_t *graph, int n, 
         j = best;
         for (int k = graph->starts[j]; k < graph->starts[j + 1]; ++k) {
             const int q = graph->neighbors[k];
-            if (q < 0)
+            if (q < 0 || q >= n)
                 continue;
             d = load_vector(graph->points, q) - here;
             const REAL d2 = dot_vectors(d, d);
@@ -116,7 +116,10 @@ inline int cut_by_cell(private piece_t *piece, REAL4 x, REAL reach, int j, const
        q_i = sum_j |V_i and V_j| (q_j + g_j . (c_ij - c_j)) / sum_j |V_i and V_j|,
 
    over the old cells j, with the centroid c_ij of the intersection of V_i and V_j. The old cells are found by flooding:
-   first the one that contains x_i, then the neighbors across each face of an intersection.
+   first the one that contains x_i, then the neighbors across each face of an intersection. Points of the old graph from
+   n_old on have no cells: they are images, or mirror images behind walls. Where the meshes do not cover the same domain
+   (`partial`), cells may overlap no old cell; their means are 0. Until one is found, the search goes on through all
+   cells whose generators are as near as that of an overlapped cell may be.
 
    means, low, high (n_new, width)   q_i, and bounds of the old data in the cell
    volumes, covered (n_new,)         volume of the cell, sum of the volumes of its intersections
@@ -124,8 +127,8 @@ inline int cut_by_cell(private piece_t *piece, REAL4 x, REAL reach, int j, const
 kernel void transfer_cell_data(const int size, const int first, global const int *todo, const int capacity,
                                global int *queues, global int *tables, GRAPH_ARGS, const int n_old, OLD_GRAPH_ARGS,
                                global const int *items, BIN_ARGS, const REAL4 box_lower, const REAL4 box_upper,
-                               CELL_DATA_ARGS, global REAL *means, global REAL *low, global REAL *high,
-                               global REAL *volumes, global REAL *covered, global int *status)
+                               const int partial, CELL_DATA_ARGS, global REAL *means, global REAL *low,
+                               global REAL *high, global REAL *volumes, global REAL *covered, global int *status)
 {
     WORK_ITEM(p);
     const int i = todo[first + p];
@@ -145,7 +148,10 @@ kernel void transfer_cell_data(const int size, const int first, global const int
     const REAL reach = sqrt(piece.reach2);
     note_piece(&whole, &piece);
     const graph_t old = {old_points, old_starts, old_neighbors};
-    visit(&seen, nearest_generator(points + (size_t)DIM * i, &old, n_old, items, bins, grid_frames, grid_shapes));
+    const int nearest = nearest_generator(points + (size_t)DIM * i, &old, n_old, items, bins, grid_frames, grid_shapes);
+    visit(&seen, nearest);
+    const REAL4 way = load_vector(old_points, nearest) - x;
+    const REAL farthest = partial ? 2 * reach + sqrt(dot_vectors(way, way)) : REAL_MAX;
     for (int c = 0; c < width; ++c) {
         means[(size_t)i * width + c] = 0;
         low[(size_t)i * width + c] = REAL_MAX;
@@ -163,8 +169,14 @@ kernel void transfer_cell_data(const int size, const int first, global const int
         bool room = true;
         if (what == PIECE_EMPTY) {
             /* Round-off may let the search for the first cell stop at a neighbor of it. */
-            for (int q = old_starts[j]; sum == 0 && q < old_starts[j + 1]; ++q)
-                room = room && (old_neighbors[q] < 0 || visit(&seen, old_neighbors[q]));
+            for (int q = old_starts[j]; sum == 0 && q < old_starts[j + 1]; ++q) {
+                const int next = old_neighbors[q];
+                if (next < 0 || next >= n_old)
+                    continue;
+                const REAL4 there = load_vector(old_points, next) - x;
+                if (sqrt(dot_vectors(there, there)) <= farthest)
+                    room = room && visit(&seen, next);
+            }
         } else {
             const REAL volume = measure_piece(&piece, &centroid);
             const REAL4 off = (x - load_vector(old_points, j)) + centroid - load_vector(centroids, j);
@@ -180,7 +192,8 @@ kernel void transfer_cell_data(const int size, const int first, global const int
                 high[to] = fmax(high[to], most[from]);
             }
             for (EACH_FACE (&piece, f))
-                room = room && (face_label(&piece, f) < 0 || visit(&seen, face_label(&piece, f)));
+                if (face_label(&piece, f) >= 0 && face_label(&piece, f) < n_old)
+                    room = room && visit(&seen, face_label(&piece, f));
         }
         if (!room) {
             status[i] = LIST_FULL;
@@ -189,8 +202,8 @@ kernel void transfer_cell_data(const int size, const int first, global const int
     }
     covered[i] = sum;
     for (int c = 0; c < width; ++c)
-        means[(size_t)i * width + c] /= sum;
-    status[i] = sum > 0 ? DONE : FAILED;
+        means[(size_t)i * width + c] /= sum > 0 ? sum : 1;
+    status[i] = sum > 0 || partial ? DONE : FAILED;
 }
 
 /* Solve M g = b for a symmetric positive semidefinite M by elimination with the largest pivot first. Overwrites M, and
@@ -283,7 +296,7 @@ kernel void fit_slopes(const int size, const int width, GRAPH_ARGS, const REAL4 
         }
         for (int k = starts[j]; k < starts[j + 1]; ++k) {
             const int q = neighbors[k];
-            if (q < 0)
+            if (q < 0 || q >= size)
                 continue;
             const REAL there = values[(size_t)q * width + c];
             const REAL4 d4 = (load_vector(points, q) - x) + (load_vector(centroids, q) - cj);

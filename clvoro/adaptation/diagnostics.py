@@ -28,6 +28,8 @@ SAMPLE = 64
 """Points along a layer where the sizes are compared."""
 MISSED = 0.2
 """Mean |e| above which a run has not met its sizes."""
+FAR_ERROR = 10.0
+"""Mean |e| from which a method that keeps the number of cells says that the sizes are others."""
 MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
 """Limits of |e|. For size fields of moderate growth the mean is at most 0.02 and the largest value at most 0.3; where h
 jumps 1 : 2 between two cells, the largest value is 1."""
@@ -147,6 +149,26 @@ def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> 
                 "field have the same unit? Otherwise give spacing, the width along the wall"
             ]
     return []
+
+
+def warn_of_other_sizes(result: Result) -> None:
+    """Warn if a method that keeps the number of cells ends with cells of a size far from that of the field.
+
+    Warns
+    -----
+    SizeErrorWarning
+    """
+    mean = float(np.abs(result.size_error).mean())
+    if mean < FAR_ERROR:
+        return
+    dim = result.diagram.domain.cell_dim
+    ratio = float(np.median(result.diagram.volumes ** (1 / dim) / result.target_size))
+    warn(
+        f"mean |e| is {mean:.3g}: the cells have {ratio:.2g} times the sizes of the size field, as method "
+        f"{result.settings['method']!r} keeps {len(result)} cells; use the field times {ratio:.2g}, or "
+        "method='adaptive', which makes as many cells as the field requires",
+        SizeErrorWarning,
+    )
 
 
 def warn_of_errors(result: Result) -> None:

@@ -32,7 +32,17 @@ from .sampling.quadrature import DensityTree
 from .sampling.start import charted, density_tree, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOST_STATIONS, MOVES, OPENINGS, SAMPLED_SIZES, STEPS
+from .tuning import (
+    CELLS_ACROSS,
+    GRADIENT_STEP,
+    LEAST_STEEP,
+    MOST_STATIONS,
+    MOVES,
+    NEAR_SIZE,
+    OPENINGS,
+    SAMPLED_SIZES,
+    STEPS,
+)
 
 
 @dataclass(frozen=True)
@@ -145,12 +155,13 @@ def prepare(
     if options.multilevel:
         fixed = np.concatenate([fixed, domain.station_points(lambda x: factor * np.asarray(sizing(x)))])
     stationed = None
+    own = _own_factor(sizing, free, tree, target) if domain.outline is not None and not options.multilevel else 1.0
     if domain.outline is not None and tree is not None and pairs is None:
-        h = factor * np.asarray(sizing(domain.outline.oriented.vertices), float)
+        h = factor * own * np.asarray(sizing(domain.outline.oriented.vertices), float)
         stations = place_stations(domain.outline, free, np.concatenate([fixed, rows]), h)
         if len(fixed) + len(rows) + MOST_STATIONS * len(stations.points) <= target:
             fixed, stationed = np.concatenate([fixed, stations.points]), stations.corners
-    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, pairs, stationed)
+    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, pairs, stationed)
     lattice = lattice_points(domain, target) if options.method in MOVING else None
     levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0
     if options.levels == "auto" and max_levels is not None:
@@ -158,6 +169,13 @@ def prepare(
     most = max(target, 0 if points is None else len(points))
     memory = _estimate_memory(setup, options, tree, required, most, levels)
     return Prepared(options, setup, points, rows, tree, required, target, lattice, levels, memory)
+
+
+def _own_factor(sizing: Sizing, free: Domain, tree: DensityTree | None, count: int) -> float:
+    """Return the size of `count` cells over the size field; 1 if it is near 1."""
+    tree = density_tree(sizing, free) if tree is None else tree
+    factor = (tree.integral / count) ** (1 / free.cell_dim)
+    return factor if not 1 / NEAR_SIZE < factor < NEAR_SIZE else 1.0
 
 
 def _check_together(domain: Domain, points: np.ndarray | None, fixed: np.ndarray, options: Options) -> None:

@@ -101,6 +101,8 @@ class Setup:
         generators are those of layers. The size of the cells beside lines and in layers is their target size.
     factor : float
         Initial factor on the size field on the finest level.
+    own_factor : float
+        Size of the cells over that of the size field, if a method keeps another number of cells than the field has.
     pairs : LinePairs or None
         Generators beside lines: the last of `points`.
     stationed : (c,) ndarray or None
@@ -114,6 +116,7 @@ class Setup:
     fixed: int
     points: np.ndarray
     factor: float = 1.0
+    own_factor: float = 1.0
     pairs: LinePairs | None = None
     stationed: np.ndarray | None = None
 

@@ -189,6 +189,9 @@ SETTLING = 3
 DEPTHS, MOST_SAMPLES = (0.1, 0.2, 0.3), 64
 """Depths behind a wall: if one is in the domain again, the wall is thin. Most places on an edge where this is asked."""
 
+NEAR_SIZE = 1.25
+"""Ratio of the cells' own size and the size field from which on corners work with the former."""
+
 # Fixed generators.
 
 CLOSE, AT_WALL, ON_WALL = 0.4, 0.2, 0.01

@@ -47,7 +47,7 @@ class Walls:
             return
         # `normalize_sizes` changes the factor by little: all of a level, also resumed, has the same corners.
         level = round(math.log2(size_factor / setup.factor))
-        h = 2.0**level * setup.factor * np.asarray(setup.sizing(domain.oriented.vertices), float)
+        h = 2.0**level * setup.factor * setup.own_factor * np.asarray(setup.sizing(domain.oriented.vertices), float)
         groups = find_corners(domain, h, setup.free.outline, None if level else setup.stationed)
         if len(groups):
             self.corners = PlacedCorners(setup.stages.engine, domain, groups)

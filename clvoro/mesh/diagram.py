@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from ..errors import InputError
+from ..arguments import warn
+from ..errors import InputError, MismatchWarning
 from ..opencl.probe import check_process
 from .output import MeshOutput
 from .read_only import read_only, seal
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
     from .lookup import Cell, Locator
     from .quality import Measures
     from .results import Result
+
+
+_COVERED = 1e-6
+"""Missing share of a cell up to which a transfer counts it as covered."""
 
 
 class Diagram(MeshOutput):
@@ -438,9 +443,13 @@ class Diagram(MeshOutput):
         order: int = 1,
         *,
         limited: bool = True,
+        covered: bool = False,
         adapter: Adapter | None = None,
-    ) -> np.ndarray:
-        """Transfer cell data to another mesh of the same domain, conservatively.
+    ) -> Any:
+        """Transfer cell data to another mesh, conservatively.
+
+        Both meshes have one domain, or domains that overlap: a globe and its ocean, a box and a lake in it. A new cell
+        that this mesh covers in part gets the mean over that part.
 
         A new cell gets the mean over its intersections with the old cells. With `order` 1 a value is constant in an old
         cell. With `order` 2 it is a linear function about the centroid. Its slope fits the values of the neighbors by
@@ -459,10 +468,12 @@ class Diagram(MeshOutput):
             Whether slopes are limited. Without limits linear functions are exact up to round-off, at walls and extrema,
             too, where a cell has d neighbors in different directions, but new values may exceed the old ones. On a
             sphere they are then exact to the second order.
+        covered : bool
+            Whether to return the covered share of each new cell, too.
         adapter : Adapter, optional
             The adapter whose device does the work; by default that of `create_context()`. In float64 where the device
-            has it. Between meshes of a polygonal domain, whose cells need not be convex, and on a sphere, the host does
-            it.
+            has it. In the plane the host does it for meshes of a polygonal domain, whose cells need not be convex, and
+            of a periodic box; also on a sphere.
 
         Returns
         -------
@@ -470,19 +481,46 @@ class Diagram(MeshOutput):
             The mass, the sum of volume times value, is kept to 1e-12 of that of the absolute values. Every new value
             lies between the least and the largest old value nearby (unless `limited` is False). A correction in
             proportion to the distance from these bounds compensates the round-off of the mass. Between float32 meshes
-            the bounds take precedence: the mass of a constant differs as the sums of the volumes do.
+            the bounds take precedence: the mass of a constant differs as the sums of the volumes do. Between different
+            domains the mass in their common part is kept. Where this mesh covers nothing, the value is NaN.
+        (n_new,) float64
+            With `covered`, the share of each new cell that this mesh covers, from 0 to 1.
 
         Raises
         ------
         InputError, InputTypeError
-            If the meshes have different domains or a periodic one in 3D, `values` has another shape or is not finite,
-            or `order` is neither 1 nor 2.
+            If the meshes are in different spaces or have different periods, one has cells that a surface cuts in 3D,
+            `values` has another shape or is not finite, or `order` is neither 1 nor 2.
         ClvoroError
             If one of the meshes is not the Voronoi diagram of its points.
+
+        Warns
+        -----
+        MismatchWarning
+            If new cells are not covered, and `covered` is not asked for; says how many.
+
+        Examples
+        --------
+        >>> box = clvoro.voronoi(clvoro.Box((0, 0), (2, 1)), [(0.5, 0.5), (1.5, 0.5)])
+        >>> shore = clvoro.Polygon([(0.5, 0.2), (2.5, 0.2), (2.5, 0.8), (0.5, 0.8)])
+        >>> lake = clvoro.voronoi(shore, [(1, 0.5), (2, 0.5)])
+        >>> values, share = box.transfer([1.0, 3.0], lake, covered=True)
+        >>> values.round(3).tolist(), share.round(3).tolist()
+        ([2.0, 3.0], [1.0, 0.5])
         """
         from ..remapping.cell_data import transfer_values
 
-        return transfer_values(self, values, onto, order, limited, adapter)
+        found, share = transfer_values(self, values, onto, order, limited, adapter)
+        if covered:
+            return found, share
+        missing = int((share < 1 - _COVERED).sum())
+        if missing:
+            warn(
+                f"{missing} of {len(share)} new cells are not covered by this mesh, or only in part, and have the "
+                "means over the covered parts, or NaN; pass covered=True for their covered shares",
+                MismatchWarning,
+            )
+        return found
 
     default_color = "quality"
 

@@ -144,10 +144,11 @@ class Result(Sealed, MeshOutput):
         order: int = 1,
         *,
         limited: bool = True,
+        covered: bool = False,
         adapter: Adapter | None = None,
-    ) -> np.ndarray:
-        """Transfer cell data (n,) or (n, k) to another mesh of the same domain; see `Diagram.transfer`."""
-        return self.diagram.transfer(values, onto, order, limited=limited, adapter=adapter)
+    ) -> Any:
+        """Transfer cell data (n,) or (n, k) to another mesh; see `Diagram.transfer`."""
+        return self.diagram.transfer(values, onto, order, limited=limited, covered=covered, adapter=adapter)
 
     def to_shapely(self) -> np.ndarray:
         """Return the cells of a mesh in 2D as polygons of shapely, (n,); see `Diagram.to_shapely`."""

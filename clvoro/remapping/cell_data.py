@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyopencl as cl
 
 from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
+from ..geometry.box import Box
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..opencl import probe
@@ -18,8 +19,9 @@ from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..tessellation.bins import Bins
 from .device_transfer import CellData, CellGraph, ConservativeTransfer, transfer_bytes
-from .host_transfer import find_defect, transfer_on_host
+from .host_transfer import TINY, find_defect, transfer_on_host
 from .sphere_transfer import transfer_on_sphere
+from .unfolded import Unfolded, farthest_neighbor, unfold
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -34,38 +36,80 @@ def transfer_values(
     order: int = 1,
     limited: bool = True,
     adapter: Adapter | None = None,
-) -> np.ndarray:
-    """Transfer `values` of the cells of `old` to the cells of `new`; see `Result.transfer`."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Transfer `values` of the cells of `old` to the cells of `new`; see `Diagram.transfer`.
+
+    Returns
+    -------
+    values : (n_new,) or (n_new, k) float64
+        NaN where old cells cover nothing.
+    covered : (n_new,) float64
+        The covered share of each new cell.
+    """
     source, target = _diagram("self", old), _diagram("onto", new)
-    if source.domain != target.domain:
-        raise InputError(
-            f"onto is a mesh of {target.domain}, the values are on {source.domain}; expected the same domain: make "
-            "both meshes with one domain"
-        )
-    on_host = not source.domain.plain
-    if on_host and source.domain.cell_dim == 3:
-        raise InputError(
-            f"the meshes are of {source.domain}; expected a domain with walls, since transfer in 3D periodic boxes is "
-            "not supported"
-        )
+    _require_one_space(source, target)
     if isinstance(order, bool) or order not in (1, 2):
         raise InputError(f"order is {order!r}, expected 1 or 2")
     given = _checked(values, len(source))
     columns = np.ascontiguousarray(given.reshape(len(source), -1), np.float64)
-    if columns.shape[1] == 0:
-        return np.zeros((len(target), 0))
+    # Without columns the shares are still asked for.
+    filled = columns if columns.shape[1] else np.zeros((len(source), 1))
     # Scale to numbers around 1 by powers of two: this is exact, and no product overflows.
-    scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(columns).max(axis=0), 1e-300))))
-    task = source, target, columns / scale, order, bool(limited)
-    if on_host:
-        means, low, high = _transfer_on_host(*task)
+    scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(filled).max(axis=0), 1e-300))))
+    same = source.domain == target.domain
+    task = source, target, filled / scale, order, bool(limited), not same
+    if _on_host(source) or _on_host(target):
+        means, low, high, covered = _transfer_on_host(*task)
     else:
         with adapter._alone() if adapter is not None else nullcontext():
             ctx = _default_context() if adapter is None else adapter.ctx
-            means, low, high = _transfer_on_device(ctx, *task)
+            means, low, high, covered = _transfer_on_device(ctx, *task)
     bounded = order == 1 or bool(limited)
-    conserved = _conserve_mass(columns / scale, source.volumes, means, target.volumes, low, high, bounded)
-    return (conserved * scale).reshape(len(target), *given.shape[1:])
+    if same:
+        means = _conserve_mass(filled / scale, source.volumes, means, target.volumes, low, high, bounded)
+    elif bounded:
+        means = np.clip(means, low, np.maximum(low, high))
+    means[covered == 0] = np.nan
+    shape = len(target), *given.shape[1:]
+    return (means * scale)[:, : columns.shape[1]].reshape(shape), np.minimum(covered, 1)
+
+
+def _on_host(diagram: Diagram) -> bool:
+    """Return whether the host intersects the cells: not convex, on a sphere, or in the plane behind seams."""
+    domain = diagram.domain
+    return not domain.plain and domain.cell_dim == 2
+
+
+def _require_one_space(source: Diagram, target: Diagram) -> None:
+    """Raise InputError if cells of the meshes cannot overlap: of different dimensions, spheres or periods."""
+    a, b = source.domain, target.domain
+    if (a.cell_dim, a.dim) != (b.cell_dim, b.dim):
+        raise InputError(
+            f"onto is a mesh of {b}, the values are on {a}; expected meshes in one space: both in the plane, in 3D, or "
+            "on a sphere"
+        )
+    if a.globe is not None and b.globe is not None and a.globe.radius != b.globe.radius:
+        raise InputError(
+            f"onto is a mesh of {b}, the values are on {a}; expected one radius: give both spheres the same unit"
+        )
+    both = np.array(a.periodic) & np.array(b.periodic)
+    apart = both & (a.extent != b.extent)
+    if apart.any():
+        axis = int(apart.argmax())
+        raise InputError(
+            f"the meshes have periods of {a.extent[axis]:g} and {b.extent[axis]:g} along axis {axis}, expected one "
+            "period; transfer onto a box with walls, or with the same period"
+        )
+    if a.cell_dim > 2 and (a.cuts_cells or b.cuts_cells):
+        raise InputError(
+            f"the meshes are of {a} and {b}; expected boxes, since cells that a surface cuts are not transferred in "
+            "3D; transfer between meshes of a box around it, and take the cells inside by subset"
+        )
+    if a.cell_dim > 2 and a.periodic != b.periodic:
+        raise InputError(
+            f"the meshes are of {a} and {b}, which are periodic in different directions, expected the same ones in 3D; "
+            "transfer between boxes with the same periodic directions"
+        )
 
 
 def _diagram(name: str, mesh: object) -> Diagram:
@@ -113,15 +157,16 @@ def _default_context() -> cl.Context:
 
 
 def _transfer_on_device(
-    ctx: cl.Context, source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return means over the new cells and bounds of the old data in them, (n, width) float64 each."""
+    ctx: cl.Context, source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool, partial: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return means over the new cells, bounds of the old data in them, and covered shares, float64."""
     queue = cl.CommandQueue(ctx)
     # Double precision where the device has it, whatever the precision of the meshes: intersections lose digits.
     real = np.dtype(np.float64 if probe.has_fp64(queue.device) else np.float32)
-    engine, box = Engine(ctx, queue, source.domain.dim, real), source.domain
-    before, after = ((len(mesh), len(mesh.neighbors)) for mesh in (source, target))
-    needed = transfer_bytes(engine, before, after, columns.shape[1], order)
+    engine = Engine(ctx, queue, source.domain.dim, real)
+    box, before, after = _graphs(source, target, partial)
+    sizes = ((len(graph), len(graph.neighbors)) for graph in (before, after))
+    needed = transfer_bytes(engine, *sizes, columns.shape[1], order)  # type: ignore[arg-type]
     device = queue.device
     if needed > available_memory(device):
         raise MemoryLimitError(
@@ -130,29 +175,53 @@ def _transfer_on_device(
             "fewer columns at a time, or use another device"
         )
     bins, stage = Bins(engine), ConservativeTransfer(engine)
-    old, new = _upload(engine, source), _upload(engine, target)
+    old, new = _upload(engine, box, before), _upload(engine, box, after)
     sequence = bins.build(box, new.points, new.n).items[: new.n].copy()
     binned = bins.build(box, old.points, old.n)
-    values = engine.upload(columns)
-    centroids = engine.upload((source.centroids - source.points) / box.frame[1])
+    values = engine.upload(columns[before.cells])
+    centroids = engine.upload(((source.centroids - source.points) / box.frame[1])[before.cells])
     if order == 2:
         data = stage.fit_slopes(box, old, values, centroids, limited)
     else:
         data = CellData(values, values, values, centroids)
-    got = stage.transfer(box, old, binned, data, new, sequence)
-    _require_cover(got.covered, got.volumes, box.dim)
-    return got.means.astype(float), got.low.astype(float), got.high.astype(float)
+    got = stage.transfer(box, old, binned, data, new, sequence, partial)
+    if not partial:
+        _require_cover(got.covered, got.volumes, box.dim)
+    covered = got.covered / np.maximum(got.volumes, TINY)
+    return got.means.astype(float), got.low.astype(float), got.high.astype(float), covered.astype(float)
+
+
+def _graphs(source: Diagram, target: Diagram, partial: bool) -> tuple[Any, Unfolded, Unfolded]:
+    """Return a box around all cells, and the cells of both meshes as the device takes them."""
+    domain = source.domain
+    if domain.plain and not partial:
+        return domain, _as_given(source), _as_given(target)
+    new = unfold(target)
+    far = farthest_neighbor(source) + farthest_neighbor(target)
+    lower, upper = target.points.min(axis=0) - 2 * far, target.points.max(axis=0) + 2 * far
+    old = unfold(source, lower, upper) if any(domain.periodic) else unfold(source)
+    every = np.concatenate([old.points, new.points])
+    margin = 0.01 * float(np.ptp(every, axis=0).max())
+    return Box(tuple(every.min(axis=0) - margin), tuple(every.max(axis=0) + margin)), old, new
+
+
+def _as_given(diagram: Diagram) -> Unfolded:
+    """Return the cells of a diagram in a box with walls, which bound them."""
+    n = len(diagram)
+    starts, neighbors = diagram.neighbor_starts, diagram.neighbors
+    return Unfolded(diagram.points, starts, neighbors, np.arange(n), np.zeros((n, diagram.domain.dim)))
 
 
 def _transfer_on_host(
-    source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool, partial: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Do what `_transfer_on_device` does, for polygons, 2D periodic boxes and spheres."""
     work = transfer_on_sphere if source.domain.curved else transfer_on_host
     means, low, high, covered = work(source, target, columns, order, limited)
-    unit = source.domain.frame[1] ** 2
-    _require_cover(covered / unit, target.volumes / unit, 2)
-    return means, low, high
+    if not partial:
+        unit = source.domain.frame[1] ** 2
+        _require_cover(covered / unit, target.volumes / unit, 2)
+    return means, low, high, covered / target.volumes
 
 
 def _require_cover(covered: np.ndarray, volumes: np.ndarray, dim: int) -> None:
@@ -165,14 +234,14 @@ def _require_cover(covered: np.ndarray, volumes: np.ndarray, dim: int) -> None:
         )
 
 
-def _upload(engine: Engine, diagram: Diagram) -> CellGraph:
-    """Copy the graph of a diagram to the device."""
-    origin, scale = diagram.domain.frame
+def _upload(engine: Engine, box: Any, graph: Unfolded) -> CellGraph:
+    """Copy the graph of cells to the device."""
+    origin, scale = box.frame
     return CellGraph(
-        len(diagram),
-        engine.upload((diagram.points - origin) / scale),
-        engine.upload(diagram.neighbor_starts, np.int32),
-        engine.upload(diagram.neighbors, np.int32),
+        len(graph),
+        engine.upload((graph.points - origin) / scale),
+        engine.upload(graph.starts, np.int32),
+        engine.upload(graph.neighbors, np.int32),
     )
 
 

@@ -35,10 +35,10 @@ class CellGraph:
     Attributes
     ----------
     n : int
-    points : (n, d) real
-        Generators, in normalized coordinates.
+    points : (k, d) real
+        Generators, in normalized coordinates; the first n have cells.
     starts, neighbors : (n + 1,), (m,) int32
-        Rows of the neighbor graph; -1 - wall for walls.
+        Rows of the neighbor graph; -1 - wall for the sides of the box.
     """
 
     n: int
@@ -195,16 +195,27 @@ class ConservativeTransfer:
             self._enlarge(int(large[0]))
 
     def transfer(
-        self, box: ClipBox, old: CellGraph, binned: BinnedPoints, data: CellData, new: CellGraph, order: cla.Array
+        self,
+        box: ClipBox,
+        old: CellGraph,
+        binned: BinnedPoints,
+        data: CellData,
+        new: CellGraph,
+        order: cla.Array,
+        partial: bool = False,
     ) -> TransferredData:
         """Return the means of `data` of the old cells over the new cells.
 
         Parameters
         ----------
+        box : ClipBox
+            A box that holds all new cells.
         binned : BinnedPoints
             The generators of `old`.
         order : (>= n,) int32
             Order in which work-items take the new cells; consecutive cells should be near each other.
+        partial : bool
+            Whether parts of new cells, or all of one, may be outside of the old cells.
 
         Raises
         ------
@@ -243,6 +254,7 @@ class ConservativeTransfer:
                     binned.grid_frames,
                     binned.grid_shapes,
                     *box.device_corners(engine.real),
+                    np.int32(partial),
                     *data.kernel_args,
                     means,
                     low,

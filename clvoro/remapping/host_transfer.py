@@ -5,6 +5,7 @@ For polygons, where cells need not be convex, and for 2D periodic boxes, where c
 
 from __future__ import annotations
 
+import math
 from itertools import product
 
 import numpy as np
@@ -47,7 +48,7 @@ def transfer_on_host(
         slopes, least, most = fit_slopes(source, columns, limited)
     sums = CellSums(len(target), columns, slopes, least, most)
     new = cell_shapes(target)
-    old, image, offsets = _images(source, cell_shapes(source), shapely.total_bounds(new))
+    old, image, offsets = _images(source, cell_shapes(source), target, shapely.total_bounds(new))
     here, there = shapely.STRtree(old).query(new, predicate="intersects")
     by = np.lexsort((there, here))
     here, there = here[by], there[by]
@@ -105,8 +106,10 @@ class CellSums:
         return (self.mass / np.maximum(self.covered, TINY)[:, None], self.low, self.high, self.covered)
 
 
-def _images(diagram: Diagram, cells: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `cells` and their periodic images that overlap `bounds`.
+def _images(
+    diagram: Diagram, cells: np.ndarray, target: Diagram, bounds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `cells` and their periodic images that overlap `bounds`; periods are those of either mesh.
 
     Returns
     -------
@@ -116,13 +119,22 @@ def _images(diagram: Diagram, cells: np.ndarray, bounds: np.ndarray) -> tuple[np
     offsets : (k, 2) float64
         From the cell to the image.
     """
-    n, periodic = len(cells), diagram.domain.periodic
-    shapes, rows, offsets = [cells], [np.arange(n)], [np.zeros((n, 2))]
     boxes = shapely.bounds(cells)
-    for step in product(*((-1, 0, 1) if p else (0,) for p in periodic)):
+    own, other = diagram.domain, target.domain
+    steps, extents = [], []
+    for axis in range(2):
+        extents.append(float((own if own.periodic[axis] else other).extent[axis]))
+        first, last = 0, 0
+        if own.periodic[axis] or other.periodic[axis]:
+            first = math.floor((bounds[axis] - boxes[:, axis + 2].max()) / extents[axis])
+            last = math.ceil((bounds[axis + 2] - boxes[:, axis].min()) / extents[axis])
+        steps.append(range(min(first, 0), max(last, 0) + 1))
+    n = len(cells)
+    shapes, rows, offsets = [cells], [np.arange(n)], [np.zeros((n, 2))]
+    for step in product(*steps):
         if not any(step):
             continue
-        shift = np.array(step) * diagram.domain.extent
+        shift = np.array(step) * extents
         low, high = boxes[:, :2] + shift, boxes[:, 2:] + shift
         near = np.flatnonzero(((high > bounds[:2]) & (low < bounds[2:])).all(axis=1))
         shapes.append(shapely.transform(cells[near], lambda xy, shift=shift: xy + shift))

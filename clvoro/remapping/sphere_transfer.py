@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 
 from ..errors import InputError
 from ..mesh.diagram import Diagram
@@ -42,7 +43,13 @@ def transfer_on_sphere(
     if order == 2:
         slopes, least, most = _fit_slopes(old, means, columns, limited)
     sums = CellSums(len(new), columns, slopes, least, most)
-    front = np.arange(len(new)) * len(old) + Locator(source).find(target.points)
+    if source.domain != target.domain:
+        keys = _near(new, old)
+        for first in range(0, len(keys), PAIRS):
+            _add_pairs(sums, new, old, means, keys[first : first + PAIRS])
+        front = keys[:0]
+    else:
+        front = np.arange(len(new)) * len(old) + Locator(source).find(target.points)
     seen = front
     while front.size:
         found = [
@@ -55,6 +62,16 @@ def transfer_on_sphere(
     unit = source.domain.frame[1] ** 2
     result, low, high, covered = sums.results()
     return result, low, high, covered * unit
+
+
+def _near(new: TangentCells, old: TangentCells) -> np.ndarray:
+    """Return the keys of all pairs of cells that may overlap, as the old cells need not cover the new ones."""
+    tree = scipy.spatial.KDTree(old.x)
+    found = tree.query_ball_point(new.x, new.reach + old.reach.max())
+    i = np.repeat(np.arange(len(new)), [len(row) for row in found])
+    j = np.concatenate([np.empty(0, int), *(np.array(row, int) for row in found)]).astype(int)
+    near = np.sqrt(((new.x[i] - old.x[j]) ** 2).sum(axis=1)) <= new.reach[i] + old.reach[j]
+    return np.sort(i[near] * len(old) + j[near])
 
 
 def _require_areas(name: str, diagram: Diagram, areas: np.ndarray) -> None:
@@ -90,11 +107,12 @@ def _fit_slopes(
     old: TangentCells, means: np.ndarray, columns: np.ndarray, limited: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return slopes (n, width, 3) in space, tangential at the generators, and the bounds of neighbors' values."""
-    i = np.repeat(np.arange(len(old)), np.diff(old.starts))
-    j = old.neighbors
+    every = np.repeat(np.arange(len(old)), np.diff(old.starts))
+    inner = old.neighbors >= 0
+    i, j = every[inner], old.neighbors[inner]
     between = old.along_tangents(old.x[j] - old.x[i] + means[j] - means[i], i)
     u = old.pieces.corners
-    corners = u / np.sqrt(1 + (u * u).sum(axis=1))[:, None] - old.along_tangents(means[i], i)
-    flat, least, most = fit_linear_functions(columns, i, j, between, i, corners, limited)
+    corners = u / np.sqrt(1 + (u * u).sum(axis=1))[:, None] - old.along_tangents(means[every], every)
+    flat, least, most = fit_linear_functions(columns, i, j, between, every, corners, limited)
     one, other = (flat[:, :, a, None] * old.tangents[a][:, None, :] for a in range(2))
     return one + other, least, most

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..geometry.sphere import arc_excess
 from ..mesh.check.rebuilt import bisector_corners
-from ..mesh.connectivity import face_owners, following, take_rows
+from ..mesh.connectivity import face_owners, following, neighbor_points, take_rows
 from ..mesh.diagram import Diagram
 
 STRAIGHT = 1e-6
@@ -144,6 +144,9 @@ class TangentCells:
     tangents : pair of (n, 3) float64
         Unit vectors of the tangent planes there.
     starts, neighbors : (n + 1,), (m,) int
+        Neighbors are -1 or less where cells have been removed.
+    there : (m, 3) float64
+        The generators behind the faces, also those of removed cells.
     pieces : Pieces
     reach : (n,) float64
         Largest distance of a projected corner from the generator.
@@ -156,7 +159,10 @@ class TangentCells:
         self.x, self.tangents = on_sphere / radius, sphere.tangents(on_sphere)
         self.starts = np.asarray(diagram.neighbor_starts, np.int64)
         self.neighbors = np.asarray(diagram.neighbors, np.int64)
-        between = self.x[self.neighbors] - self.x[owner]
+        self.there = self.x[self.neighbors]
+        walls = np.flatnonzero(self.neighbors < 0)
+        self.there[walls] = sphere.wrap(neighbor_points(diagram, walls)) / radius
+        between = self.there - self.x[owner]
         # The bisectors of two neighbors are the lines n.u = |d|^2 / 2.
         normals = self.along_tangents(between, owner)
         corners, sines = bisector_corners(self.starts, normals, dot(between, between) / 2)
@@ -201,20 +207,20 @@ class TangentCells:
             if count < len(pieces):
                 done.append(pieces.between(count, len(pieces)))
                 pieces = pieces.between(0, count)
-            behind = old.neighbors[old.starts[j[:count]] + face]
-            pieces = pieces.cut(*self._half_planes(i[:count], old, j[:count], behind), behind)
+            faces = old.starts[j[:count]] + face
+            pieces = pieces.cut(*self._half_planes(i[:count], old, j[:count], faces), old.neighbors[faces])
         return pairs, join([pieces, *reversed(done)])
 
     def _half_planes(
-        self, i: np.ndarray, old: TangentCells, j: np.ndarray, behind: np.ndarray
+        self, i: np.ndarray, old: TangentCells, j: np.ndarray, faces: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return normals, levels and depths, in the tangent planes of cells i, of what is nearer to j than to `behind`.
+        """Return normals, levels and depths, in the tangent planes of cells i, of what is nearer to j than to others.
 
         Both cells of a face get the same line with opposite signs, so that their pieces are complementary.
         """
         x = self.x[i]
-        a, b = old.x[j] - x, old.x[behind] - x
-        normal = old.x[behind] - old.x[j]
+        a, b = old.x[j] - x, old.there[faces] - x
+        normal = old.there[faces] - old.x[j]
         far = np.sqrt(np.maximum(dot(a, a), dot(b, b)))
         noise = 4 * np.finfo(float).eps * np.sqrt(dot(normal, normal))
         depths = noise * (self.reach[i] + far)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import clvoro
 from clvoro import sizing
 from clvoro.adaptation.methods import (
     PUBLISHED,
@@ -15,7 +16,7 @@ from clvoro.adaptation.methods import (
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
 from clvoro.adaptation.tuning import AT_WALLS_OF_BOXES, PENALTY_PER_ERROR
-from clvoro.errors import SizeFieldError
+from clvoro.errors import SizeErrorWarning, SizeFieldError
 from clvoro.sizing import Sizing
 from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets
@@ -242,3 +243,16 @@ def test_names():
         else:
             assert isinstance(method, PublishedMethod)
             assert (method.lloyd, method.poisson) == (name != "poisson", name != "lloyd")
+
+
+def test_lloyd_in_a_polygon_does_not_depend_on_the_size(ctx):
+    """Corners work with the size that the cells have; errors of 20 are said."""
+    domain = clvoro.Polygon([(0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
+    points = np.random.default_rng(0).uniform(0, 1, (300, 2))
+    points = points[domain.contains(points)][:120]
+    own = (domain.measure / len(points)) ** 0.5
+    run = {"points": points, "method": "lloyd", "max_steps": 40, "options": clvoro.PaperOptions(tol=0)}
+    adapter = clvoro.Adapter(ctx)
+    with pytest.warns(SizeErrorWarning, match="times the sizes of the size field"):
+        far = adapter.run(domain, 30 * own, **run)
+    assert far.points == pytest.approx(adapter.run(domain, own, **run).points, abs=1e-3 * own)

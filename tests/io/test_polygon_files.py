@@ -708,12 +708,6 @@ def test_transfer_onto_itself_changes_nothing(pair) -> None:
     assert np.abs(pair[0].transfer(values, pair[0]) - values).max() < 1e-13
 
 
-def test_transfer_between_domains_is_refused(pair, ctx) -> None:
-    other = clvoro.Adapter(ctx).diagram(Polygon(SQUARE), SQUARE * 0.5 + 0.2)
-    with pytest.raises(InputError, match="expected the same domain"):
-        pair[0].transfer(np.zeros(60), other)
-
-
 def test_slopes_are_those_of_the_device(ctx) -> None:
     from clvoro.remapping.host_transfer import fit_slopes
 

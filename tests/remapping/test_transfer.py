@@ -477,8 +477,6 @@ def test_other_bad_input(mesh, adapter):
         old.transfer(np.ones(9), new.points)
     with pytest.raises(InputError, match="order is 3, expected 1 or 2"):
         old.transfer(np.ones(9), new, 3)
-    with pytest.raises(InputError, match="expected the same domain"):
-        old.transfer(np.ones(9), adapter.diagram(Box((0, 0), (1, 1)), [[0.5, 0.5]]))
     assert old.transfer(np.ones((9, 0)), new).shape == (8, 0)
 
 

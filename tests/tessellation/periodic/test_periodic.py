@@ -497,13 +497,6 @@ def test_a_wrong_shift_is_found(double):
     assert "graph symmetric" in str(report)
 
 
-def test_operations_without_periodic_support_are_rejected(double):
-    cube = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
-    solid = double.diagram(cube, np.random.default_rng(8).random((20, 3)))
-    with pytest.raises(InputError, match="3D periodic boxes"):
-        solid.transfer(solid.volumes, solid)
-
-
 def test_pictures_are_filled_up_to_the_boundary(double):
     """Images of cells cover the window; each position lies in one polygon."""
     from matplotlib.collections import PolyCollection

@@ -1,0 +1,118 @@
+"""Transfer between meshes of different domains: values and covered shares, against exact areas and constants."""
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro.errors import InputError, MismatchWarning
+
+RNG = np.random.default_rng(5)
+LAKE = clvoro.Polygon([(0.2, 0.1), (1.8, 0.15), (1.9, 0.8), (0.9, 0.95)])
+
+
+def in_box(adapter, lower, upper, count, periodic=False):
+    domain = clvoro.Box(lower, upper, periodic=periodic)
+    return adapter.diagram(domain, RNG.uniform(lower, upper, (count, len(lower))))
+
+
+@pytest.fixture(scope="module")
+def pairs(ctx):
+    """Pairs of meshes, each with the measure of their common part."""
+    adapter = clvoro.Adapter(ctx)
+    earth = clvoro.Sphere()
+    globe, fine = (adapter.diagram(earth, earth.icosahedral_points(k)) for k in (6, 9))
+    north, east = (g.subset(g.points[:, axis] > 0) for g, axis in ((globe, 2), (fine, 1)))
+    grid = in_box(adapter, (0, 0), (2, 1), 60)
+    points = RNG.uniform(0, 2, (400, 2))
+    lake = adapter.diagram(LAKE, points[LAKE.contains(points)])
+    rough, whole = (in_box(adapter, (0, 0, 0), (1, 1, 1), n) for n in (80, 50))
+    part = in_box(adapter, (0.2, 0.3, 0.1), (1.4, 0.9, 0.8), 70)
+    ring, tile = (in_box(adapter, (0, 0), (1, 1), n, True) for n in (40, 30))
+    column, tube = (in_box(adapter, (0, 0, 0), (1, 1, 2), n, (True, True, False)) for n in (60, 50))
+    shell = whole.subset(np.linalg.norm(whole.points - 0.5, axis=1) > 0.3)
+    return {
+        "globe to its part": (globe, north, north.volumes.sum()),
+        "part of a globe to the globe": (north, globe, north.volumes.sum()),
+        "parts of a globe": (north, east, None),
+        "box to lake": (grid, lake, LAKE.measure),
+        "lake to box": (lake, grid, LAKE.measure),
+        "lake to periodic box": (lake, ring, 1.0),
+        "periodic box to box": (ring, in_box(adapter, (0.2, 0), (0.9, 1), 20), 0.7),
+        "periodic boxes": (ring, tile, 1.0),
+        "boxes in 3D": (rough, part, 0.8 * 0.6 * 0.7),
+        "part of a box in 3D": (shell, rough, shell.volumes.sum()),
+        "periodic boxes in 3D": (column, tube, 2.0),
+    }
+
+
+KINDS = (
+    "globe to its part",
+    "part of a globe to the globe",
+    "parts of a globe",
+    "box to lake",
+    "lake to box",
+    "periodic box to box",
+    "periodic boxes",
+    "boxes in 3D",
+    "part of a box in 3D",
+    "periodic boxes in 3D",
+)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_constants_stay_and_the_covered_shares_are_right(pairs, kind, order):
+    old, new, common = pairs[kind]
+    values = np.column_stack([np.full(len(old), 3.0), RNG.random(len(old))])
+    got, share = old.transfer(values, new, order, covered=True)
+    seen = share > 0
+    assert np.array_equal(np.isnan(got).any(axis=1), ~seen)
+    assert got[seen, 0] == pytest.approx(3.0, rel=1e-12)
+    assert got[seen, 1].min() >= values[:, 1].min()
+    assert got[seen, 1].max() <= values[:, 1].max()
+    assert share.max() <= 1
+    if common is not None:
+        assert (share * new.volumes).sum() == pytest.approx(common, rel=1e-9)
+    if old.volumes.sum() == pytest.approx(common, rel=1e-12):  # the new mesh covers the old one
+        mass = np.nansum(got[:, 1] * share * new.volumes)
+        assert mass == pytest.approx((values[:, 1] * old.volumes).sum(), rel=1e-9 if order == 1 else 0.02)
+
+
+def test_means_are_those_of_the_intersections(pairs):
+    old, new, _ = pairs["lake to box"]
+    values = RNG.random(len(old))
+    got, share = old.transfer(values, new, covered=True)
+    a, b = old.to_shapely(), new.to_shapely()
+    areas = np.array([shapely.area(shapely.intersection(cell, a)) for cell in b])
+    assert share == pytest.approx(areas.sum(axis=1) / new.volumes, abs=1e-12)
+    seen = share > 0
+    assert got[seen] == pytest.approx((areas @ values)[seen] / areas.sum(axis=1)[seen], rel=1e-12)
+
+
+def test_values_of_an_ocean_are_those_of_its_globe(pairs):
+    globe, north, _ = pairs["globe to its part"]
+    values = RNG.random(len(globe))
+    assert globe.transfer(values, north) == pytest.approx(values[globe.points[:, 2] > 0], rel=1e-12)
+
+
+def test_what_is_not_covered_is_said(pairs, ctx):
+    old, new, _ = pairs["lake to box"]
+    with pytest.warns(MismatchWarning, match="covered=True"):
+        old.transfer(np.ones(len(old)), new)
+    adapter = clvoro.Adapter(ctx)
+    others = {
+        "one space": in_box(adapter, (0, 0, 0), (1, 1, 1), 20),
+        "different directions": None,
+        "one period": in_box(adapter, (0, 0), (2, 1), 20, True),
+    }
+    with pytest.raises(InputError, match="one space"):
+        old.transfer(np.ones(len(old)), others["one space"])
+    with pytest.raises(InputError, match="different directions"):
+        pairs["periodic boxes in 3D"][0].transfer(np.ones(60), others["one space"])
+    with pytest.raises(InputError, match="one period"):
+        pairs["periodic boxes"][0].transfer(np.ones(40), others["one period"])
+    globe, earth = pairs["globe to its part"][0], clvoro.Sphere(2.0)
+    other = adapter.diagram(earth, earth.icosahedral_points(3))
+    with pytest.raises(InputError, match="one radius"):
+        globe.transfer(np.ones(len(globe)), other)
