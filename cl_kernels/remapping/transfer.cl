@@ -118,8 +118,8 @@ inline int cut_by_cell(private piece_t *piece, REAL4 x, REAL reach, int j, const
    over the old cells j, with the centroid c_ij of the intersection of V_i and V_j. The old cells are found by flooding:
    first the one that contains x_i, then the neighbors across each face of an intersection. Points of the old graph from
    n_old on have no cells: they are images, or mirror images behind walls. Where the meshes do not cover the same domain
-   (`partial`), cells may overlap no old cell; their means are 0. Until one is found, the search goes on through all
-   cells whose generators are as near as that of an overlapped cell may be.
+   (`partial`), cells may overlap no old cell; their means are 0. The search then goes through all cells whose
+   generators are as near as that of an overlapped cell may be.
 
    means, low, high (n_new, width)   q_i, and bounds of the old data in the cell
    volumes, covered (n_new,)         volume of the cell, sum of the volumes of its intersections
@@ -167,9 +167,10 @@ kernel void transfer_cell_data(const int size, const int first, global const int
             return;
         }
         bool room = true;
-        if (what == PIECE_EMPTY) {
-            /* Round-off may let the search for the first cell stop at a neighbor of it. */
-            for (int q = old_starts[j]; sum == 0 && q < old_starts[j + 1]; ++q) {
+        if (what == PIECE_EMPTY || partial) {
+            /* Round-off may let the search for the first cell stop at a neighbor of it. In partial covers what an old
+               cell shares with the new one may lie apart from all else. */
+            for (int q = old_starts[j]; (sum == 0 || partial) && q < old_starts[j + 1]; ++q) {
                 const int next = old_neighbors[q];
                 if (next < 0 || next >= n_old)
                     continue;
@@ -177,7 +178,8 @@ kernel void transfer_cell_data(const int size, const int first, global const int
                 if (sqrt(dot_vectors(there, there)) <= farthest)
                     room = room && visit(&seen, next);
             }
-        } else {
+        }
+        if (what != PIECE_EMPTY) {
             const REAL volume = measure_piece(&piece, &centroid);
             const REAL4 off = (x - load_vector(old_points, j)) + centroid - load_vector(centroids, j);
             sum += volume;
