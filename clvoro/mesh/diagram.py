@@ -472,8 +472,8 @@ class Diagram(MeshOutput):
             Whether to return the covered share of each new cell, too.
         adapter : Adapter, optional
             The adapter whose device does the work; by default that of `create_context()`. In float64 where the device
-            has it. In the plane the host does it for meshes of a polygonal domain, whose cells need not be convex, and
-            of a periodic box; also on a sphere.
+            has it. The host does it for meshes of a polygonal domain, whose cells need not be convex, of boxes with
+            different seams, and on a sphere.
 
         Returns
         -------

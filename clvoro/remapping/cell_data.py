@@ -11,6 +11,7 @@ import pyopencl as cl
 
 from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
 from ..geometry.box import Box
+from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..opencl import probe
@@ -58,7 +59,7 @@ def transfer_values(
     scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(filled).max(axis=0), 1e-300))))
     same = source.domain == target.domain
     task = source, target, filled / scale, order, bool(limited), not same
-    if _on_host(source) or _on_host(target):
+    if _on_host(source.domain, target.domain):
         means, low, high, covered = _transfer_on_host(*task)
     else:
         with adapter._alone() if adapter is not None else nullcontext():
@@ -74,10 +75,9 @@ def transfer_values(
     return (means * scale)[:, : columns.shape[1]].reshape(shape), np.minimum(covered, 1)
 
 
-def _on_host(diagram: Diagram) -> bool:
-    """Return whether the host intersects the cells: not convex, on a sphere, or in the plane behind seams."""
-    domain = diagram.domain
-    return not domain.plain and domain.cell_dim == 2
+def _on_host(a: Domain, b: Domain) -> bool:
+    """Return whether the host intersects the cells: not convex, on a sphere, or in boxes with different seams."""
+    return a.curved or a.outline is not None or b.outline is not None or a.periodic != b.periodic
 
 
 def _require_one_space(source: Diagram, target: Diagram) -> None:
@@ -100,12 +100,18 @@ def _require_one_space(source: Diagram, target: Diagram) -> None:
             f"the meshes have periods of {a.extent[axis]:g} and {b.extent[axis]:g} along axis {axis}, expected one "
             "period; transfer onto a box with walls, or with the same period"
         )
-    if a.cell_dim > 2 and (a.cuts_cells or b.cuts_cells):
+    if a.cell_dim > 2:
+        _require_boxes(a, b)
+
+
+def _require_boxes(a: Domain, b: Domain) -> None:
+    """Raise InputError if cells of meshes in 3D are cut by surfaces, or have different seams."""
+    if a.cuts_cells or b.cuts_cells:
         raise InputError(
             f"the meshes are of {a} and {b}; expected boxes, since cells that a surface cuts are not transferred in "
             "3D; transfer between meshes of a box around it, and take the cells inside by subset"
         )
-    if a.cell_dim > 2 and a.periodic != b.periodic:
+    if a.periodic != b.periodic:
         raise InputError(
             f"the meshes are of {a} and {b}, which are periodic in different directions, expected the same ones in 3D; "
             "transfer between boxes with the same periodic directions"
