@@ -31,6 +31,9 @@ FOLDED = {"plane": dict.fromkeys(SIZES["plane"], 0.5), "space": {"diagram": 0.5,
 """What is added per cell (not per image) in periodic boxes, as a share of `SIZES`."""
 CELLS_PER_BOUNDARY_CELL, CELLS_PER_EDGE = 1.5, 0.3
 """As many cells take as much as a cell at a boundary that cuts cells takes in addition, and as an edge of it."""
+CELLS_PER_WALL_CELL = 2.0
+"""As many cells take as much as a cell at the surface of a solid takes in addition: own planes, room for cells that are
+clipped again, and generators outside of the mesh that is read."""
 LARGEST = 0.2
 """Share of the largest array."""
 FIXED = 2**16
@@ -107,6 +110,10 @@ def estimate_memory(
             boundary = domain.boundary_measure / spacing
         edges = len(domain.outline.oriented.vertices)
         cells += CELLS_PER_BOUNDARY_CELL * min(boundary, n) + CELLS_PER_EDGE * edges
+    if domain is not None and domain.wall_triangles is not None:
+        walls = domain.boundary_measure / (domain.measure / max(n, 1.0)) ** (2 / 3)
+        cells += CELLS_PER_WALL_CELL * min(walls, n)
+        space += domain.wall_triangles.device_bytes(engine.real)
     reals, integers = SIZES[kind][work]
     return float(cells) * (reals * engine.real.itemsize + integers * 4) + space + FIXED + extras.field_bytes
 

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
 SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of edges and corners of triangles: within a patch, on a convex crease, on a concave one."""
-SAGITTA = 1 / 12
-"""Mean height of a curved surface over a wall face, times curvature over area."""
+SAGITTA = 0.105
+"""Mean height of a curved surface over wall faces, over mean curvature times h^2: half the mean square of the distance
+from the foot, which is 0.083 h^2 for squares around it. Measured in balls."""
 SIDE_PER_ROOT, LEAST_SIDE, LARGEST_SIDE = 0.4, 48, 128
 """Bins along the longest side, per square root of the number of triangles, and limits: bins are as wide as triangles,
 so that few triangles are in several of them."""
@@ -57,6 +58,10 @@ class WallTriangles:
 
     def __len__(self) -> int:
         return len(self.patch)
+
+    def device_bytes(self, real: np.dtype) -> int:
+        """Return about how many bytes the triangles, their normals and bins take on a device."""
+        return len(self) * (28 * real.itemsize + 32) + 5 * LARGEST_SIDE**3 // 8
 
     def planes(self, frame: tuple[np.ndarray, float]) -> np.ndarray:
         """Return unit normals and levels of the triangles' planes in the coordinates of `frame`, (t, 4)."""

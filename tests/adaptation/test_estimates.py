@@ -85,6 +85,7 @@ RUNS = {
     "cube": (CUBE, 0.06, {}),
     "body": (CUBE, BALL, {}),
     "periodic cube": (TORUS_3D, 0.08, {}),
+    "ball": (clvoro.Solid.ball((0, 0, 0), 1.0), 0.12, {"effort": "fast"}),
     "raster": (SQUARE, sizing.Raster(np.full((400, 400), 0.03), (0, 0), (1, 1)), {"effort": "fast"}),
 }
 """Domain, size, and what else a run is given."""

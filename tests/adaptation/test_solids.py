@@ -1,0 +1,55 @@
+"""Runs in solids: sizes at walls, stations, starts, and the same bits."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.adaptation.state import MeshState
+from tests.tessellation.test_own_planes import corner
+
+H = 0.3
+
+
+@pytest.fixture
+def volumes(monkeypatch):
+    """The volumes of the device's cells at the end of a run, in the order of labels."""
+    found, before = [], MeshState.finalize
+
+    def finalize(mesh):
+        again = before(mesh)
+        found[:] = [mesh.to_host(mesh.t.volumes, mesh.domain.frame[1] ** 3)]
+        return again
+
+    monkeypatch.setattr(MeshState, "finalize", finalize)
+    return found
+
+
+def test_cells_in_a_solid_with_a_concave_crease(ctx, volumes):
+    solid, adapter = corner(), clvoro.Adapter(ctx)
+    result = adapter.run(solid, H, "fast")
+    stations = solid.station_points(lambda x: np.full(len(x), H))
+    lengths = np.cbrt(volumes[0])
+    assert solid.contains(result.points).all()
+    assert volumes[0].sum() == pytest.approx(solid.measure, rel=1e-12)
+    assert np.abs(lengths / H - 1).mean() < 0.01
+    assert len(stations) > 3
+    assert result.points[: len(stations)] == pytest.approx(stations, abs=1e-12)
+    assert lengths[: len(stations)] == pytest.approx(H, rel=0.02)
+    again = adapter.run(solid, H, "fast")
+    assert np.array_equal(again.points, result.points)
+
+
+def test_curved_walls_have_nearly_the_volume_of_the_solid(ctx, volumes):
+    ball = clvoro.Solid.ball((0, 0, 0), 1.0, edge=0.1)
+    clvoro.Adapter(ctx, dtype="float32").run(ball, 0.3, "fast")
+    assert volumes[0].sum() == pytest.approx(ball.measure, rel=0.01)
+    assert np.abs(np.cbrt(volumes[0]) / 0.3 - 1).mean() < 0.01
+
+
+def test_exact_sizes_and_given_generators(ctx, volumes):
+    cube, adapter = clvoro.Solid.box((0, 0, 0), (1, 1, 1)), clvoro.Adapter(ctx)
+    result = adapter.run(cube, 0.2, "fast", method="exact")
+    assert np.abs(np.cbrt(volumes[0]) / (0.2 * result.size_factor) - 1).max() < 1e-3
+    near = adapter.run(cube, 0.2, "fast", points=result.points)
+    assert len(near.points) == len(result.points)
+    assert near.history["step"][-1] < result.history["step"][-1]
