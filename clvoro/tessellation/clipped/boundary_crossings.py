@@ -119,7 +119,8 @@ class Boundary:
         self.owners = engine.zeros(self.edges, np.int32)
         self.owner_sites = engine.empty((self.edges, 2))
         self._known = 0  # number of cells when `owners` was computed
-        self._flags = engine.empty(1, np.int32)
+        # Flags of kernels, and the number of chords: the host reads both at once.
+        self._flags = engine.empty(2, np.int32)
 
     def cut(self, t: Tessellation, generators: int, shift: tuple[float, float] = (0, 0)) -> Chords | np.ndarray:
         """Trace all edges, shifted by `shift` (normalized coordinates), through the cells of `t`.
@@ -148,9 +149,8 @@ class Boundary:
         none = np.int32(0), firsts, firsts, firsts, vertices
         walk = (np.int32(generators), vertices, self.next_vertex, *found, *graph)
         engine.run_each(k.walk_edges, edges, *walk, *none, intruders, self._flags)
-        self._scan.exclusive(firsts, firsts, edges)
-        count = int(firsts[edges].get())
-        flags = int(self._flags.get()[0])
+        self._scan.exclusive(firsts, firsts, edges, total=(self._flags, 1))
+        flags, count = self._flags.get().tolist()
         if flags & OUTSIDE:
             return np.flatnonzero(intruders.get())
         if flags & LOST:

@@ -72,7 +72,8 @@ class Trim:
         # Sizes change little from step to step.
         self._scan, self._room = Scan(engine), NamedArrays(engine, spare=1 / 16)
         self._kernels = engine.kernels("tessellation/clipped/trim")
-        self._flags = engine.empty(1, np.int32)
+        # Flags of kernels, and the number of segments: the host reads both at once.
+        self._flags = engine.empty(2, np.int32)
 
     def trim(self, domain: Polygon, points: cla.Array, convex: Tessellation, chords: Chords, n: int) -> Tessellation:
         """Return the diagram of `domain` for `points` (n, 2), the first `n` generators of `convex`.
@@ -127,9 +128,9 @@ class Trim:
             starts,
             self._flags,
         )
-        self._scan.exclusive(starts, starts, u)
-        count = int(starts[u].get())
-        flags = self._demand(int(self._flags.get()[0]))
+        self._scan.exclusive(starts, starts, u, total=(self._flags, 1))
+        flags, count = self._flags.get().tolist()
+        self._demand(flags)
         names = ("labels", "from", "to", "places")
         parts = [room(name, size=count, dtype=np.int32) for name in names]
         parts += [room(name, size=2 * count) for name in ("p", "q")]
@@ -154,11 +155,10 @@ class Trim:
         return self._write(points, convex, chords, found, (orphans, orphan_count), marks)
 
     @staticmethod
-    def _demand(flags: int) -> int:
-        """Return the flags; raise BoundaryError if a walk or a loop was lost."""
+    def _demand(flags: int) -> None:
+        """Raise BoundaryError if a walk or a loop was lost."""
         if flags & LOST:
             raise BoundaryError
-        return flags
 
     def _adopt(self, chords: Chords, found: _Pieces, marks: cla.Array) -> tuple[cla.Array, int]:
         """Find the owner of each piece without generator; return the pieces that change cells, and their number."""
