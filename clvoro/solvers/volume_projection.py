@@ -193,9 +193,9 @@ class VolumeProjection:
             self._unread = ref(solution)
             return solution
         Launch(engine, k.assemble_projection, *given, self._counts, *rest)()
-        direction, update = k.update_projection_direction, k.update_projection
-        launches = (Launch(engine, kernel, *given, self._counts) for kernel in (direction, update))
-        rows = self._iterate(t, v, *launches, most)
+        direction = Launch(engine, k.update_projection_direction, *given, self._counts)
+        update = Launch(engine, k.update_projection, *given, self._counts)
+        rows = self._iterate(t, v, direction, update, most)
         solution = self._solution(rows, limits.tolerance)
         if solution.iterations:
             engine.run_each(k.write_correction, n, v.u, v.y, targets.h, t.points, correction, start)
