@@ -6,7 +6,7 @@ import numpy as np
 import pyopencl.array as cla
 import shapely
 
-from ..arguments import check_integer, check_number, check_points, coincident_named, warn
+from ..arguments import check_integer, check_number, check_points, coincident_named, format_point, warn
 from ..errors import EmptyCellsWarning, InputError, InputTypeError, SizeErrorWarning
 from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
@@ -70,6 +70,7 @@ def transport_to(
     tolerance = check_number("tolerance", tolerance, above=0)
     kind = np.asarray(volumes).dtype
     rounding = float(np.finfo(kind).eps) if kind.kind == "f" else 0.0
+    _check_held(host, domain)
     _check_volumes(given, domain, rounding)
     _check_pieces(host, given, domain, rounding)
     check_memory(engine, n, domain, run=False, power=True)
@@ -143,6 +144,22 @@ def _check_volumes(volumes: np.ndarray, domain: Domain, rounding: float) -> None
         )
 
 
+def _check_held(points: np.ndarray, domain: Domain) -> None:
+    """Raise InputError if a piece of the domain has none of the generators `points`."""
+    if domain.outline is None or domain.n_pieces == 1:
+        return
+    held = np.unique(domain.piece_of(points))
+    empty = np.setdiff1d(np.arange(domain.n_pieces), held)
+    if empty.size:
+        k = int(empty[0])
+        place = domain.inner_points()[k]
+        raise InputError(
+            f"piece {k} of the domain, at {format_point(place)}, has no generator ({empty.size} of {domain.n_pieces} "
+            "pieces have none), so that its area belongs to no cell; add a generator there, or leave the piece out, as "
+            "domain.split() returns the pieces"
+        )
+
+
 def _check_pieces(points: np.ndarray, volumes: np.ndarray, domain: Domain, rounding: float) -> None:
     """Raise InputError unless `volumes` fill each piece of the domain that holds the generators `points`."""
     if domain.outline is None or domain.n_pieces == 1:
@@ -153,5 +170,6 @@ def _check_pieces(points: np.ndarray, volumes: np.ndarray, domain: Domain, round
         if not abs(total - piece.area) <= max(SUM_TOLERANCE, rounding) * domain.measure:
             raise InputError(
                 f"the sum of the volumes of the {inside.sum()} generators in piece {k} of the domain is {total:.12g}, "
-                f"expected the area of the piece, {piece.area:.12g}; scale them"
+                f"expected the area of the piece, {piece.area:.12g}; scale these by "
+                f"{piece.area / total:.6g}, so that the generators of each piece fill it"
             )

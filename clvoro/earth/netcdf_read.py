@@ -154,6 +154,20 @@ def _removed(
 _PLANE = "it is a mesh in the plane, expected one on a sphere; load a .npz or .vtu file instead"
 
 
+def _netcdf4(name: str) -> Any:
+    """Open a netCDF-4 file, without masks and scales."""
+    try:
+        import netCDF4
+    except ModuleNotFoundError as error:
+        raise FileError(
+            "it is netCDF-4, for which the package netCDF4 is missing: run `pip install netCDF4`, or convert the file "
+            "to netCDF-3 by `nccopy -k nc6 FILE NEW`"
+        ) from error
+    file = netCDF4.Dataset(name)
+    file.set_auto_maskandscale(False)
+    return file
+
+
 class Variables:
     """The variables and attributes of an open file."""
 
@@ -186,7 +200,7 @@ class Variables:
     def _array(self, name: str, kinds: str) -> np.ndarray:
         if name not in self:
             raise FileError(f"it lacks the variable {name}")
-        found = np.array(self._file.variables[name].data)
+        found = np.array(self._file.variables[name][...])
         if found.dtype.kind not in kinds:
             raise FileError(f"its variable {name} has the type {found.dtype}")
         if kinds == "f" and not np.isfinite(found).all():
@@ -225,7 +239,7 @@ def read_ugrid(file: Variables) -> MeshInFile | None:
         raise FileError(_PLANE)
     if faces is None:
         raise FileError(
-            "its faces have no longitudes and latitudes, which are the generators; pass generators to clvoro.voronoi"
+            f"its faces have no longitudes and latitudes, which are the generators: {_why_none(file, mesh)}"
         )
     radius = _radius(file)
     sphere = Sphere(radius)
@@ -291,9 +305,22 @@ def _lonlat_names(file: Variables, coordinates: object) -> tuple[str, str] | Non
             units = str(file.about(name, "units") or "").lower()
             for axis, direction in (("lon", "east"), ("lat", "north")):
                 standard = str(file.about(name, "standard_name") or "")
-                if units.startswith("degree") and (direction in units or standard.startswith(axis)):
+                named = not units and not standard and axis in name.lower()  # some programs give names only
+                if named or (units.startswith("degree") and (direction in units or standard.startswith(axis))):
                     found[axis] = name
     return (found["lon"], found["lat"]) if len(found) == 2 else None
+
+
+def _why_none(file: Variables, mesh: str) -> str:
+    """Say why the coordinates of faces are none."""
+    names = str(file.about(mesh, "face_coordinates") or "").split()
+    if not names:
+        return f"{mesh} has no attribute face_coordinates; pass generators to clvoro.voronoi"
+    lacking = [name for name in names if name not in file]
+    if lacking:
+        return f"face_coordinates of {mesh} names {lacking[0]}, which is no variable"
+    units = ", ".join(f"{name} has units {file.about(name, 'units')!r}" for name in names)
+    return f"{units}, expected 'degrees_east' and 'degrees_north'; set the attribute units"
 
 
 def _radius(file: Variables) -> float:
@@ -328,10 +355,8 @@ def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
     try:
         with open_plain(path) as file:
             head = file.read(4)
-            if head == _HDF5:
-                raise FileError("it is netCDF-4, expected netCDF-3; convert it by `nccopy -k nc6 FILE NEW`")
             file.seek(0)
-            with scipy.io.netcdf_file(file, mmap=False) as found:
+            with _netcdf4(name) if head == _HDF5 else scipy.io.netcdf_file(file, mmap=False) as found:
                 cells = _read(Variables(found))
         diagram = make_diagram(cells)
     except FileError as problem:

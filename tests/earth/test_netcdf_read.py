@@ -1,5 +1,7 @@
 """Meshes on a sphere from netCDF files: what was saved comes back, and damaged files are refused."""
 
+import sys
+
 import numpy as np
 import pytest
 from scipy.io import netcdf_file
@@ -130,7 +132,7 @@ def test_damaged_files_are_refused(tmp_path, convention, change, message):
 
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "mesh.nc"
-    for content, message in ((b"\x89HDF\r\n", "nccopy"), (b"CDF", "damaged or no netCDF-3"), (b"", "damaged")):
+    for content, message in ((b"\x89HDF\r\n", "nccopy|NetCDF"), (b"CDF", "damaged or no netCDF-3"), (b"", "damaged")):
         path.write_bytes(content)
         with pytest.raises(InputError, match=rf"cannot read .*mesh\.nc: .*{message}"):
             clvoro.load(path)
@@ -141,3 +143,45 @@ def test_other_files_are_refused(tmp_path):
             clvoro.load(path)
     with pytest.raises(InputError, match="No such file"):
         clvoro.load(tmp_path / "missing.nc")
+
+
+def test_faces_whose_coordinates_have_no_units_are_taken_by_their_names(tmp_path):
+    def rename(named, units):
+        def change(v, a):
+            old = v["mesh"][2]["face_coordinates"].decode().split()
+            for name, new in zip(old, named, strict=True):
+                v[new] = (*v.pop(name)[:2], {} if units is None else {"units": units})
+            v["mesh"][2]["face_coordinates"] = " ".join(named)
+
+        return change
+
+    good = clvoro.load(changed(tmp_path, "ugrid", rename(("face_lon", "face_lat"), None)))
+    assert len(good) > 0
+    for named, units, says in (
+        (("face_u", "face_v"), None, r"face_u has units None, .*expected 'degrees_east' and 'degrees_north'"),
+        (("face_lon", "face_lat"), "cubits", "face_lon has units 'cubits'"),
+    ):
+        with pytest.raises(InputError, match=says):
+            clvoro.load(changed(tmp_path, "ugrid", rename(named, units)))
+
+
+def test_netcdf_4_needs_one_package(ocean, tmp_path, monkeypatch):
+    netCDF4 = pytest.importorskip("netCDF4")
+    ocean.to_netcdf(tmp_path / "old.nc")
+    with netCDF4.Dataset(tmp_path / "old.nc") as old, netCDF4.Dataset(tmp_path / "new.nc", "w") as new:
+        old.set_auto_maskandscale(False)
+        new.setncatts({key: old.getncattr(key) for key in old.ncattrs()})
+        for name, dimension in old.dimensions.items():
+            new.createDimension(name, len(dimension))
+        for name, variable in old.variables.items():
+            about = {key: variable.getncattr(key) for key in variable.ncattrs()}
+            made = new.createVariable(
+                name, variable.dtype, variable.dimensions, fill_value=about.pop("_FillValue", None)
+            )
+            made.set_auto_maskandscale(False)
+            made.setncatts(about)
+            made[...] = variable[...]
+    assert np.array_equal(clvoro.load(tmp_path / "new.nc").points, clvoro.load(tmp_path / "old.nc").points)
+    monkeypatch.setitem(sys.modules, "netCDF4", None)
+    with pytest.raises(InputError, match="pip install netCDF4"):
+        clvoro.load(tmp_path / "new.nc")
