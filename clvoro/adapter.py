@@ -179,7 +179,8 @@ class Adapter:
             elif isinstance(domain, list | tuple | np.ndarray):
                 hint = "; write clvoro.Polygon(domain)"
             raise InputTypeError(
-                f"domain is a {type(domain).__name__}, expected a clvoro.Box, a clvoro.Polygon or a clvoro.Sphere{hint}"
+                f"domain is a {type(domain).__name__}, expected a clvoro.Box, clvoro.Polygon, clvoro.Sphere or "
+                f"clvoro.Solid{hint}"
             )
         return Engine(self.ctx, self.queue, domain.dim, self.dtype, domain.traits(self.dtype))
 
@@ -200,7 +201,7 @@ class Adapter:
 
         Parameters
         ----------
-        domain : Box, Polygon or Sphere
+        domain : Box, Polygon, Sphere or Solid
         points : (n, d) array of float
             Distinct generators inside the domain, walls included.
 
@@ -275,7 +276,7 @@ class Adapter:
 
         Parameters
         ----------
-        domain : Box, Polygon or Sphere
+        domain : Box, Polygon, Sphere or Solid
             "transport" needs a box or a polygon, a moving mesh a box without periodic sides.
         size : number, callable or clvoro.sizing field
             Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d. A callable

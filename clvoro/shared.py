@@ -63,7 +63,7 @@ def adapt(
 
     Parameters
     ----------
-    domain : Box, Polygon or Sphere
+    domain : Box, Polygon, Sphere or Solid
         "transport" needs a box or a polygon, a moving mesh a box without periodic sides.
     size : number, callable or clvoro.sizing field
         Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d.
@@ -217,7 +217,7 @@ def voronoi(domain: Domain, points: ArrayLike) -> Diagram:
 
     Parameters
     ----------
-    domain : Box, Polygon or Sphere
+    domain : Box, Polygon, Sphere or Solid
     points : (n, d) array of float
         Distinct generators inside the domain, walls included, in the domain's unit of length.
 

@@ -94,7 +94,7 @@ def save(
     cell_data: Mapping[str, ArrayLike] | None = None,
     **others: object,
 ) -> None:
-    """Write a mesh in a box, a polygon or on a sphere to `path`; the suffix selects the format; see `Diagram.save`."""
+    """Write a mesh in any domain to `path`; the suffix selects the format; see `Diagram.save`."""
     for name in others:
         fits = [_METHODS[kind] for kind, names in _OPTIONS.items() if name in names]
         remedy = "write " + " or ".join(f"mesh.{method}(path, {name}=...)" for method in fits)
@@ -116,7 +116,7 @@ def write(
     Parameters
     ----------
     mesh : Result or Diagram
-        In a box, a polygon or on a sphere.
+        In a box, a polygon or a solid, or on a sphere.
     path : str or path
     cell_data : mapping, optional
     kind : {".foam", ".nc", ".vtu"}, optional

@@ -50,7 +50,7 @@ class Diagram(MeshOutput):
 
     Attributes
     ----------
-    domain : Box, Polygon, Sphere, SphereRegion or Subdomain
+    domain : Box, Polygon, Sphere, Solid, SphereRegion or Subdomain
     points : (n, d) float64
         Generators, in the domain's unit of length.
     volumes : (n,) float64
@@ -324,7 +324,7 @@ class Diagram(MeshOutput):
         return make_cell(self, i)
 
     def locate(self, points: ArrayLike) -> np.ndarray:
-        """Return the cell that holds each of some points, in a box, a polygon or on a sphere.
+        """Return the cell that holds each of some points, in a box, a polygon or a solid, or on a sphere.
 
         A point on a face is in one of the cells that meet there.
 

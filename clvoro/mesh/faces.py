@@ -28,7 +28,7 @@ FLATTEST = 1e-3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Faces(Sealed):
-    """Every face of a mesh in a box, a polygon or a periodic box, in 2D or 3D, on a sphere or a part of one.
+    """Every face of a mesh in a box, also a periodic one, a polygon or a solid, on a sphere or a part of one.
 
     `Diagram.faces` are those of a diagram, each once. The faces between two cells come first, sorted by (owner,
     neighbor). The faces on walls follow, wall by wall, each in the order of the owners. Faces without measure are left
@@ -42,7 +42,7 @@ class Faces(Sealed):
 
     Attributes
     ----------
-    domain : Box, Polygon, Sphere, SphereRegion or Subdomain
+    domain : Box, Polygon, Sphere, Solid, SphereRegion or Subdomain
     generators : (n, d) float64
         Cell i is that of generator i.
     points : (v, d) float64

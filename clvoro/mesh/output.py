@@ -38,7 +38,7 @@ class MeshOutput:
         return cast("Result | Diagram", self)
 
     def subset(self: Mesh, keep: ArrayLike | Domain, boundary: str = "coast") -> Mesh:
-        """Return the mesh without some of its cells, in a box or a polygon, or on a sphere.
+        """Return the mesh without some of its cells, in a box, a polygon or a solid, or on a sphere.
 
         The cells that are left do not change. Their faces towards removed cells become faces on a boundary. So all
         faces are on bisectors, as models on C grids need it at coasts. The domain of the new mesh is a
@@ -87,7 +87,7 @@ class MeshOutput:
         return cast("Mesh", take_subset(cast("Diagram", self), keep, boundary))
 
     def boundary_cells(self, boundary: Walls | None = None) -> np.ndarray:
-        """Return the indices of the cells with a face on the boundary of a box, a polygon or a part of a sphere, (k,).
+        """Return the indices of the cells with a face on the boundary of any domain, (k,).
 
         They are ascending.
 
@@ -118,8 +118,8 @@ class MeshOutput:
     ) -> None:
         """Write the mesh to `path`; the suffix selects the format.
 
-        The file of a diagram has no sizes, errors and history. Meshes in boxes, polygons and on spheres are written in
-        all formats, except that OpenFOAM has no meshes on spheres.
+        The file of a diagram has no sizes, errors and history. Meshes in boxes, polygons and solids and on spheres are
+        written in all formats, except that OpenFOAM has no meshes on spheres.
 
         ``.npz``
             Everything; `clvoro.load` reads it.
@@ -171,7 +171,7 @@ class MeshOutput:
         walls: WallShape = "straight",
         zones: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        """Write the mesh in a box or a polygon for OpenFOAM.
+        """Write the mesh in a box, a polygon or a solid for OpenFOAM.
 
         In 2D it is one layer of prisms between patches of type `empty`. Each periodic direction is one pair of cyclic
         patches; with several of them, these are for OpenFOAM of openfoam.com.
@@ -252,7 +252,7 @@ class MeshOutput:
     def to_vtu(
         self, path: str | PathLike[str], *, walls: WallShape = "exact", cell_data: Mapping[str, ArrayLike] | None = None
     ) -> None:
-        """Write the mesh in a box, a polygon or on a sphere for ParaView and other VTK programs.
+        """Write the mesh in a box, a polygon or a solid, or on a sphere for ParaView and other VTK programs.
 
         Cells are polygons or polyhedra with size, error, quality, boundary and more as cell data; row i is cell i of
         the mesh. VTK's `vtkCellSizeFilter` (PyVista's `compute_cell_sizes`) is wrong for cells that are not convex, as
@@ -282,7 +282,7 @@ class MeshOutput:
     def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> Faces:
         """Return the mesh as a finite-volume solver sees it: points, and each face with corners, owner and neighbor.
 
-        The mesh is in a box, also a periodic one, or in a polygon, in 2D or 3D.
+        The mesh is in a box, also a periodic one, in a polygon or in a solid.
 
         Solvers reject or mistrust cells that are not convex, and faces that are much smaller than their cells. The
         diagram itself has such cells where the boundary has corners or is finer than the mesh. With `collapse` the
@@ -375,7 +375,7 @@ class MeshOutput:
         return plot_mesh(self._self, self.default_color if color is None else color, view, **options)
 
     def to_pyvista(self, cell_data: Mapping[str, ArrayLike] | None = None) -> pyvista.UnstructuredGrid:
-        """Return the cells in a box, a polygon or on a sphere as an unstructured grid of PyVista.
+        """Return the cells in a box, a polygon or a solid, or on a sphere as an unstructured grid of PyVista.
 
         Parameters
         ----------
@@ -400,7 +400,7 @@ class MeshOutput:
         return to_pyvista(self._self, cell_data)
 
     def to_meshio(self, cell_data: Mapping[str, ArrayLike] | None = None) -> meshio.Mesh:
-        """Return the cells in a box, a polygon or on a sphere as a mesh of meshio.
+        """Return the cells in a box, a polygon or a solid, or on a sphere as a mesh of meshio.
 
         Parameters
         ----------
@@ -461,7 +461,7 @@ class MeshOutput:
         return to_disv(self._self, walls)
 
     def to_fipy(self, walls: WallShape = "straight") -> VoronoiMesh2D | VoronoiMesh3D:
-        """Return the cells in a box, also a periodic one, or in a polygon as a mesh of FiPy.
+        """Return the cells in a box, also a periodic one, in a polygon or in a solid as a mesh of FiPy.
 
         The cell centers are the generators. The center of a face is where the line between two generators crosses it,
         on walls the foot of the generator's perpendicular. There FiPy's two-point flux has no error of first order.

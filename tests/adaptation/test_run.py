@@ -571,7 +571,11 @@ def test_one_cell_of_the_right_size(adapter):
         ({"size": lambda p: 0.1}, ClvoroError, "shape"),
         ({"size": 1e-6}, MemoryLimitError, r"3\.75e\+12 cells.*GiB"),
         ({"n_cells": 10**11}, MemoryLimitError, r"1e\+11 cells.*GiB"),
-        ({"domain": "box"}, InputTypeError, "domain is a str, expected .*Box, a clvoro.Polygon or a clvoro.Sphere"),
+        (
+            {"domain": "box"},
+            InputTypeError,
+            "domain is a str, expected .*Box, clvoro.Polygon, clvoro.Sphere or clvoro.Solid",
+        ),
         ({"domain": shapely.box(0, 0, 1, 1)}, InputTypeError, r"Polygon\.from_shapely\(domain\)"),
         ({"points": np.ma.masked_less(random_points(9, 1), 0.2)}, InputError, r"points has \d+ masked numbers"),
         (
