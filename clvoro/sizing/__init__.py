@@ -21,6 +21,7 @@ from .graded import Graded
 from .raster import Raster, Scattered
 from .region import Region
 from .solution import gradient_size, hessian_size
+from .surface_sizes import curvature_size, gap_size
 
 __all__ = [
     "Ball",
@@ -42,6 +43,8 @@ __all__ = [
     "Sizing",
     "Surface",
     "as_field",
+    "curvature_size",
+    "gap_size",
     "generate_code",
     "gradient_size",
     "hessian_size",

@@ -24,6 +24,7 @@ from ..bvh import Tree
 from ..columns import Columns
 from ..domain import Domain
 from ..polygon import Polygon
+from ..shapes import Edges
 from ..surface import Surface
 from ..surface_files import SOLIDS, FilePart, joined, parts_of, read_parts, word
 from ..triangles import packed_weights, pierced
@@ -578,22 +579,54 @@ class Solid(Domain):
         item = np.unique(np.concatenate([item, k * len(areas) // _PROBES]))
         begin = self.surface.corners[item].mean(axis=1)
         h = np.asarray(size(begin), float)
-        middle, width = np.add(self.lower, self.upper) / 2, np.full(len(item), float(self.extent.min()))
-        if width[0] >= h.max():
-            width[:] = math.inf
-        end = begin - h[:, None] * self.normals[item]
-        who, other = self.surface.tree.meeting(np.minimum(begin, end), np.maximum(begin, end))
-        facing = np.einsum("ij,ij->i", self.normals[item[who]], self.normals[other]) < _FACING
-        meets = np.sort(self.creases.patches, axis=1) @ (self.n_patches, 1)
-        pair = np.sort(self.patch[np.column_stack([item[who], other])], axis=1) @ (self.n_patches, 1)
-        rows = np.flatnonzero(facing & ~np.isin(pair, meets))
-        share = pierced(begin[who[rows]], end[who[rows]], self.surface.corners[other[rows]])
-        seen = share > 1e-9
-        np.minimum.at(width, who[rows[seen]], share[seen] * h[who[rows[seen]]])
+        width = np.minimum(self.widths(item, h), max(float(self.extent.min()), 0.0))
         worst = int((width / h).argmin())
         if not width[worst] < h[worst]:
-            return middle, float(self.extent.min())
+            return np.add(self.lower, self.upper) / 2, float(self.extent.min())
         return begin[worst] - 0.5 * width[worst] * self.normals[item[worst]], float(width[worst])
+
+    def widths(self, items: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return how far the wall is that faces each of the triangles `items` (k,), up to `reach` (k,); else inf.
+
+        From the middle of a triangle inwards. Walls that share a crease with the triangle's patch do not count.
+        """
+        width = np.full(len(items), math.inf)
+        meets = np.sort(self.creases.patches, axis=1) @ (self.n_patches, 1)
+        for first in range(0, len(items), _PROBES):
+            item, far = items[first : first + _PROBES], reach[first : first + _PROBES]
+            begin = self.surface.corners[item].mean(axis=1)
+            end = begin - far[:, None] * self.normals[item]
+            who, other = self.surface.tree.meeting(np.minimum(begin, end), np.maximum(begin, end))
+            facing = np.einsum("ij,ij->i", self.normals[item[who]], self.normals[other]) < _FACING
+            pair = np.sort(self.patch[np.column_stack([item[who], other])], axis=1) @ (self.n_patches, 1)
+            rows = np.flatnonzero(facing & ~np.isin(pair, meets))
+            share = pierced(begin[who[rows]], end[who[rows]], self.surface.corners[other[rows]])
+            seen = share > 1e-9
+            np.minimum.at(width, first + who[rows[seen]], share[seen] * far[who[rows[seen]]])
+        return width
+
+    @cached_property
+    def curvature(self) -> np.ndarray:
+        """Largest curvature of the surface in each triangle, in the directions of its sides; 1 / length, (t,)."""
+        sides = np.roll(self.surface.corners, -1, axis=1) - self.surface.corners
+        turn = np.roll(self.corner_normals, -1, axis=1) - self.corner_normals
+        length2 = np.einsum("tkd,tkd->tk", sides, sides)
+        along = np.abs(np.einsum("tkd,tkd->tk", turn, sides))
+        return np.divide(along, length2, out=np.zeros_like(along), where=length2 > 0).max(axis=1)
+
+    def crease_edges(self, concave: bool | None = None) -> Edges:
+        """Return creases as a shape for `clvoro.sizing.Distance`: all, or only those that are concave, or convex.
+
+        Raises
+        ------
+        InputError
+            If there are none.
+        """
+        chosen = np.ones(len(self.creases), bool) if concave is None else self.creases.concave == concave
+        if not chosen.any():
+            raise InputError(f"{self} has no {'' if concave is None else 'concave ' if concave else 'convex '}creases")
+        ends = self.surface.vertices[self.creases.edges[chosen]]
+        return Edges(ends[:, 0], ends[:, 1])
 
     def visible(self, points: np.ndarray, feet: np.ndarray) -> np.ndarray:
         """Return whether no other wall is between each point (n, 3) and its foot on the surface, (n,) bool."""
