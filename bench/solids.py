@@ -91,7 +91,7 @@ def draw(result: clvoro.Result, path: Path, title: str) -> None:
     from clvoro.plotting.solids import plot_cutaway
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    plot_cutaway(result, "quality", walls=True, title=title).savefig(path, dpi=150)
+    plot_cutaway(result, "quality", walls=True, title=title).savefig(path, dpi=150, bbox_inches="tight")
 
 
 def main() -> None:
