@@ -176,7 +176,9 @@ def _outline_path(domain: Domain) -> Path | None:
     return Path.make_compound_path(*(Path(ring, closed=True) for ring in closed))
 
 
-_INK = np.full(3, 0.1)
+_INK, _LIGHT_INK = np.full(3, 0.1), np.full(3, 0.75)
+_LUMINANCE, _DARK = np.array([0.2126, 0.7152, 0.0722]), 0.3
+"""Weights of red, green and blue in the luminance of a color, and that below which edges are light."""
 _LEAST = 0.06
 """Width in points of the thinnest edges."""
 _SEAM = 0.25
@@ -304,7 +306,8 @@ def draw_polygons(
     # The thinnest lines fade out: a sudden end of all lines would look like a feature of the mesh.
     alpha = 0.9 * np.clip((widths - _LEAST) / 0.14, 0, 1)[:, None]
     lines = colors.copy()
-    lines[:, :3] += alpha * (_INK - colors[:, :3])
+    dark = (colors[:, :3] @ _LUMINANCE < _DARK)[:, None]
+    lines[:, :3] += alpha * (np.where(dark, _LIGHT_INK, _INK) - colors[:, :3])
     widths = np.maximum(widths, _SEAM)
     drawn = PolyCollection(
         list(polygons),

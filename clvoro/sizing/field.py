@@ -84,6 +84,12 @@ class Field:
             raise InputError(
                 f"the size field {self!r} is for {self.dim} dimensions, got a domain or points "
                 f"of {dim}; build it with {dim} coordinates"
+                + (
+                    ". If these are positions on a sphere, and the field is one of longitude and latitude, write "
+                    "clvoro.earth.LonLat(field)(points)"
+                    if dim == 3
+                    else ""
+                )
             )
 
     def map_parts(self, change: Callable[[Field], Field]) -> Field:
