@@ -664,6 +664,7 @@ class MeshState:
             self.tessellation = None
             self.tessellation = tessellator.complete(self.points, sites, self.n)
         self.tessellation = tessellator.final(self.t)
+        tessellator.steps.warn_of_leaks(self.t)
         self.evaluate_metric()
         return again
 

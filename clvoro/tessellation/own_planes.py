@@ -15,6 +15,8 @@ from .bins import BinnedPoints
 
 FIRST_REACH = 1.6
 """How far the surface is searched about a new generator, in units of the local spacing of bins."""
+SIDES_OF_BOX = -(2**30)
+"""Labels of the sides of the box around a solid are less."""
 MOST_OWN = 8
 """Room for patches near a generator. It is doubled if there are more."""
 PLANES_PER_CELL = 1.0

@@ -12,12 +12,14 @@ from typing import TypeAlias
 import numpy as np
 import pyopencl.array as cla
 
+from ..arguments import format_point, warn
+from ..errors import MismatchWarning
 from ..geometry.domain import ClipBox, Domain
 from ..geometry.wall_triangles import WallTriangles
 from .bins import BinnedPoints
 from .cut_cells import CutCells
-from .device_diagram import Follow, NeighborRows, Tessellation
-from .own_planes import SolidBox
+from .device_diagram import Follow, NeighborRows, Tessellation, domain_position
+from .own_planes import SIDES_OF_BOX, SolidBox
 from .part import Part
 from .periodic.halo import Halo
 from .polyhedra import Polyhedra
@@ -93,6 +95,9 @@ class DomainSteps:
         """Return whether the latest diagram `t` has all that its vertices need."""
         return True
 
+    def warn_of_leaks(self, t: Tessellation) -> None:
+        """Warn of cells of the final diagram `t` that the walls do not bound."""
+
     def update(
         self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
     ) -> Tessellation | None:
@@ -134,6 +139,22 @@ class SolidWalls(DomainSteps):
         if previous is None:
             self.box.guess(binned, part.n_own)
         self.box.find(part.points)
+
+    def warn_of_leaks(self, t: Tessellation) -> None:
+        """Warn of cells that reach the box around the solid, and of generators outside of their nearest patch."""
+        starts = t.starts.get()
+        faces = np.flatnonzero(t.neighbors[: int(starts[t.n])].get() < SIDES_OF_BOX)
+        if not len(faces) and not self.box.outside:
+            return
+        open_cells = np.unique(np.searchsorted(starts, faces, side="right") - 1)
+        where = ""
+        if len(open_cells):
+            where = f", the first at {format_point(domain_position(self.domain, t.points[int(open_cells[0])].get()))}"
+        warn(
+            f"the walls do not bound {len(open_cells)} cells{where}, and {self.box.outside} generators are behind the "
+            "nearest wall: the solid is narrow or sharp for the size of cells there; use smaller sizes",
+            MismatchWarning,
+        )
 
     def update(
         self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow

@@ -53,3 +53,9 @@ def test_exact_sizes_and_given_generators(ctx, volumes):
     near = adapter.run(cube, 0.2, "fast", points=result.points)
     assert len(near.points) == len(result.points)
     assert near.history["step"][-1] < result.history["step"][-1]
+
+
+def test_cells_that_walls_do_not_bound_are_warned_of(ctx):
+    ball = clvoro.Solid.ball((0, 0, 0), 1.0, edge=0.2)
+    with pytest.warns(clvoro.errors.MismatchWarning, match="do not bound"), np.errstate(all="ignore"):
+        clvoro.Adapter(ctx).run(ball, 1.0, "fast")
