@@ -268,7 +268,7 @@ def _check_sizes(
                 f"h{scaled} is {h[k]:.6g} at {domain.place_name(places[k])}, larger than the radius, {largest:g}; "
                 f"{remedy}"
             )
-    least = domain.least_cells(options.multilevel) if domain.evenly_below else 1
+    least = _least_cells(domain, options.multilevel)
     if target < least:
         given = f"n_cells is {n_cells}" if n_cells else f"the size field requires {required:.2g} cells on {domain}"
         fewer = f"; method='lloyd' makes {domain.least_cells(False)} or more" if n_cells else ""
@@ -276,6 +276,11 @@ def _check_sizes(
             f"{given}, expected at least {least} cells, on all sides of the sphere; use smaller sizes, in the unit "
             f"of the radius{fewer}"
         )
+
+
+def _least_cells(domain: Domain, adapted: bool) -> int:
+    """Return the least number of cells that is not refused. Where pieces are more, starts have one in each of them."""
+    return domain.least_cells(adapted) if domain.evenly_below else 1
 
 
 def _warn_of_coarse_size(domain: Domain, required: float) -> None:
@@ -327,7 +332,7 @@ def _count_levels(setup: Setup, points: np.ndarray | None, target: int, n_rows: 
             levels -= 1
         return levels
     count = int(levels)
-    most = int(math.log2(max(target / domain.least_cells(True), 1)) / d)
+    most = int(math.log2(max(target / _least_cells(domain, True), 1)) / d)
     if points is None and count > most:
         raise InputError(
             f"levels is {levels}, expected at most {most} for {target} cells, or 'auto': each "
