@@ -243,6 +243,8 @@ class Options:
     layers: Sequence[Layers] = ()
 
     def __post_init__(self) -> None:
+        if self.method in EFFORTS:
+            raise InputError(f"method is {self.method!r}, which is an effort; write effort={self.method!r}")
         check_choice("method", self.method, METHODS)
         check_choice("points", self.start, STARTS)
         if self.effort not in EFFORTS and not isinstance(self.effort, str):

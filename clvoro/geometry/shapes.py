@@ -50,19 +50,20 @@ class Circle:
     radius: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", coordinates("Circle center", self.center, 1))
+        name = type(self).__name__
+        object.__setattr__(self, "center", coordinates(f"{name} center", self.center, 1))
         if not isinstance(self.radius, Real):
-            raise InputTypeError(f"Circle radius is {self.radius!r}, expected a number")
+            raise InputTypeError(f"{name} radius is {self.radius!r}, expected a number")
         if not (math.isfinite(self.radius) and self.radius >= 0):
-            raise InputError(f"Circle radius is {self.radius!r}, expected finite and not negative")
+            raise InputError(f"{name} radius is {self.radius!r}, expected finite and not negative")
 
     def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the ends (m, d), (m, d) and radii (m,) of the segments that the curve consists of."""
         return self.center[None], self.center[None], np.array([float(self.radius)])
 
 
-Ball = Circle
-"""The name of `Circle` in 3D."""
+class Ball(Circle):
+    """A sphere in 3D, which has the parameters of a `Circle`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NoReturn, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -188,10 +188,12 @@ class Result(Sealed, MeshOutput):
 
     if not TYPE_CHECKING:
 
-        def __getattr__(self, name: str) -> NoReturn:
+        def __getattr__(self, name: str) -> Any:
+            """Return an attribute of the diagram, such as `volumes`, `neighbors` or `domain`."""
             there = name == "domain" or name in Diagram._NAMES or hasattr(Diagram, name)
-            hint = f"; write mesh.diagram.{name}" if there and not name.startswith("_") else ""
-            raise AttributeError(f"a Result has no {name!r}{hint}", name=name, obj=self)
+            if there and not name.startswith("_"):
+                return getattr(self.diagram, name)
+            raise AttributeError(f"a Result has no {name!r}", name=name, obj=self)
 
     def __repr__(self) -> str:
         e, q, scaled = np.abs(self.size_error), self.quality, self.scaling

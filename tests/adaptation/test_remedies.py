@@ -10,6 +10,7 @@ import shapely
 import clvoro
 from clvoro import sizing
 from clvoro.arguments import format_point
+from clvoro.cli.cases import Case
 from clvoro.errors import ClvoroError, SizeErrorWarning
 from clvoro.geometry.surface import Surface
 
@@ -66,9 +67,9 @@ def test_shapefiles(tmp_path) -> None:
 
 def test_arrays_of_the_diagram(mesh) -> None:
     assert len(mesh) == len(mesh.diagram) == 30
-    for name in ("volumes", "domain", "locate", "faces"):
-        with pytest.raises(AttributeError, match=rf"write mesh\.diagram\.{name}$"):
-            getattr(mesh, name)
+    for name in ("volumes", "domain", "faces", "neighbors"):
+        assert getattr(mesh, name) is getattr(mesh.diagram, name)
+    assert mesh.locate([(0.5, 0.5)]) == mesh.diagram.locate([(0.5, 0.5)])
     with pytest.raises(AttributeError, match=r"a Result has no 'areas'$"):
         _ = mesh.areas
 
@@ -123,3 +124,12 @@ def test_a_ring_with_a_spike_is_made_valid_as_the_message_says():
         clvoro.Polygon(ring)
     remedy = re.search(r"as (Polygon\.from_shapely\(.*\)) does", str(raised.value))[1]
     assert eval(remedy, {"Polygon": clvoro.Polygon, "shapely": shapely, "ring": ring}).measure == 16
+
+
+def test_an_effort_for_a_method_is_recognized(ctx):
+    with pytest.raises(ClvoroError, match="method is 'fast', which is an effort; write effort='fast'"):
+        clvoro.Adapter(ctx).run(BOX, 0.1, method="fast")
+    with pytest.raises(ClvoroError, match=r"run\.method is 'best' \(it is an effort: write effort = 'best'\)"):
+        Case.from_toml("size = 1\n[domain]\nlower = [0, 0]\nupper = [1, 1]\n[run]\nmethod = 'best'\n", "a")
+    with pytest.raises(ClvoroError, match="Ball radius is -1"):
+        sizing.Ball((0, 0, 0), -1)

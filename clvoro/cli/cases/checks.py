@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
+from ...adaptation.options import EFFORTS
 from ...errors import InputError
 
 T = TypeVar("T")
@@ -121,7 +122,8 @@ def _explain(message: str, kind: Any, content: object, place: str, homes: Mappin
             if isinstance(got, Mapping):
                 key = next(key for key, word in got.items() if word not in known)
                 where, got = _below(where, key), got[key]
-        return f"{where} is {got!r:.60}{_nearest(got, known)}; expected one of {', '.join(known)}"
+        hint = f" (it is an effort: write effort = {got!r})" if got in EFFORTS and keys[-1] != "effort" else ""
+        return f"{where} is {got!r:.60}{hint or _nearest(got, known)}; expected one of {', '.join(known)}"
     if not text.startswith("Expected"):  # an error of a table as a whole
         return f"{where} {text}"
     expected = text.partition(", got")[0].removeprefix("Expected ").replace(" | null", "").replace(" | ", "` or `")

@@ -131,8 +131,8 @@ class CircleShape(Kind, tag="circle"):
     radius: NotNegative
 
 
-class Ball(Kind, tag="sphere"):
-    MAKE = sizing.Circle
+class BallShape(Kind, tag="sphere"):
+    MAKE = sizing.Ball
     center: Space
     radius: NotNegative
 
@@ -187,7 +187,7 @@ class ClosedPolylineShape(Kind, tag="closed_polyline"):
 
 Shape = (
     CircleShape
-    | Ball
+    | BallShape
     | BoxShape
     | BoundaryShape
     | SurfaceShape
@@ -216,7 +216,7 @@ class PolygonShape(Kind, tag="polygon"):
 
 
 RegionShape = (
-    CircleShape | Ball | BoxShape | PolygonShape | SurfaceShape | ClosedPolylineShape | Ellipse | Naca | Spline
+    CircleShape | BallShape | BoxShape | PolygonShape | SurfaceShape | ClosedPolylineShape | Ellipse | Naca | Spline
 )
 
 # Size fields.
