@@ -25,8 +25,8 @@ from .adaptation.options import (
 from .adaptation.preparation import prepare
 from .adaptation.run import Run, check_run
 from .adaptation.stages import Stages
-from .adaptation.transport import power_diagram_of, transport_to
-from .arguments import check_choice, check_points, coincident_named
+from .adaptation.transport import RELAXED, power_diagram_of, transport_to
+from .arguments import check_choice, check_integer, check_points, coincident_named
 from .errors import InputError, InputTypeError, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.domain import Domain
@@ -246,13 +246,20 @@ class Adapter:
         *,
         tolerance: float | None = None,
         max_steps: int = 100,
+        relax: int = 0,
     ) -> Transported:
         """Return the power diagram of `points` whose cells have `volumes`, in a box or a polygon.
 
         See `clvoro.transport`.
         """
+        check_integer("relax", relax, 0, 10**6)
         with self._alone():
-            return transport_to(self._stages_for(domain), domain, points, volumes, tolerance, max_steps)
+            stages = self._stages_for(domain)
+            for _ in range(relax):
+                near = max(tolerance or 0.0, RELAXED)
+                found = transport_to(stages, domain, points, volumes, near, max_steps).diagram
+                points = domain.wrap(domain.nearest(found.centroids))
+            return transport_to(stages, domain, points, volumes, tolerance, max_steps)
 
     def run(
         self,

@@ -166,7 +166,13 @@ def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diag
 
 
 def transport(
-    domain: Domain, points: ArrayLike, volumes: ArrayLike, *, tolerance: float | None = None, max_steps: int = 100
+    domain: Domain,
+    points: ArrayLike,
+    volumes: ArrayLike,
+    *,
+    tolerance: float | None = None,
+    max_steps: int = 100,
+    relax: int = 0,
 ) -> Transported:
     """Find the weights with which the cells of a power diagram have prescribed `volumes`, on the best device.
 
@@ -178,13 +184,16 @@ def transport(
     ----------
     domain : Box or Polygon
     points : (n, d) array of float
-        Distinct generators inside the domain. They stay where they are.
+        Distinct generators inside the domain. They stay where they are, without `relax`.
     volumes : (n,) array of float
         Volumes > 0 of the cells (areas in 2D). Their sum is that of the domain, in each of its pieces.
     tolerance : float, optional
         Largest relative error of a volume; by default 1e-10, in float32 1e-3.
     max_steps : int
         Largest number of Newton steps.
+    relax : int
+        How often generators move to the centroids of their cells, which have `volumes` to 1 % then, before the last
+        transport. Cells become round, as the grains of a polycrystal. ``diagram.points`` are the generators at the end.
 
     Returns
     -------
@@ -209,7 +218,7 @@ def transport(
     >>> found.diagram.volumes.round(9).tolist(), found.converged
     ([0.2, 0.3, 0.5], True)
     """
-    return shared_adapter().transport(domain, points, volumes, tolerance=tolerance, max_steps=max_steps)
+    return shared_adapter().transport(domain, points, volumes, tolerance=tolerance, max_steps=max_steps, relax=relax)
 
 
 def voronoi(domain: Domain, points: ArrayLike) -> Diagram:

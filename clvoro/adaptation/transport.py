@@ -17,6 +17,8 @@ from ..tessellation.tessellator import Tessellator
 from .estimates import check_memory
 from .stages import Stages
 
+RELAXED = 1e-2
+"""Largest relative error of volumes before generators move to the centroids of their cells."""
 SUM_TOLERANCE = 1e-9
 """Largest relative difference of the sum of volumes from the measure of the domain, if the round-off of the volumes is
 not larger."""

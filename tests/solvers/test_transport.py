@@ -127,3 +127,18 @@ def test_bad_input(ctx):
         found = adapter.transport(box, points, volumes, max_steps=1)
     assert not found.converged
     assert clvoro.Adapter(ctx).transport(box, points[:1], [box.measure]).diagram.volumes == [4.5]
+
+
+def test_relaxed_cells_are_round_and_have_their_volumes(ctx):
+    """Lloyd's moves between transports, one by one with the public interface, give the same generators."""
+    adapter, rng = clvoro.Adapter(ctx), np.random.default_rng(4)
+    box = clvoro.Box((0, 0), (1, 1), periodic=True)
+    points, volumes = rng.random((40, 2)), rng.uniform(0.5, 1.5, 40)
+    volumes /= volumes.sum()
+    relaxed = adapter.transport(box, points, volumes, relax=2)
+    assert relaxed.diagram.volumes == pytest.approx(volumes, rel=1e-9)
+    for _ in range(2):
+        points = box.wrap(adapter.transport(box, points, volumes, tolerance=1e-2).diagram.centroids)
+    assert relaxed.diagram.points == pytest.approx(points, abs=1e-12)
+    off = np.linalg.norm(relaxed.diagram.centroids - relaxed.diagram.points, axis=1)
+    assert off.mean() < 0.05 * 40**-0.5 * 4
