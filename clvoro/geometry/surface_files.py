@@ -139,14 +139,14 @@ def _read_step(path: Path) -> list[FilePart]:
         gmsh.model.occ.importShapes(os.fspath(path))
         gmsh.model.occ.synchronize()
         gmsh.model.mesh.generate(2)
-        tags, points, _ = gmsh.model.mesh.getNodes()
+        tags, points = (np.asarray(part) for part in gmsh.model.mesh.getNodes()[:2])
         place = np.zeros(int(tags.max()) + 1 if len(tags) else 1, np.int64)
         place[tags] = np.arange(len(tags))
         found: dict[str, list[np.ndarray]] = {}
         for _, volume in gmsh.model.getEntities(3):
             for _, face in gmsh.model.getBoundary([(3, volume)], oriented=False):
                 name = gmsh.model.getEntityName(2, abs(face)).rpartition("/")[2]
-                nodes = gmsh.model.mesh.getElementsByType(2, abs(face))[1]
+                nodes = np.asarray(gmsh.model.mesh.getElementsByType(2, abs(face))[1])
                 triangles = place[nodes.astype(np.int64)].reshape(-1, 3)
                 found.setdefault(name, []).append(triangles)
     except Exception as error:  # Gmsh raises plain exceptions

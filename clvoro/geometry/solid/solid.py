@@ -247,6 +247,7 @@ class Solid(Domain):
     def _drawn(self, creases: object) -> np.ndarray:
         """Return the sides of triangles (3 t,) that are among the edges `creases`, given as places of vertices."""
         triangles = self.surface.triangles
+        self._drawn_edges = np.zeros((0, 2), np.int64)
         if creases is None:
             return np.zeros(3 * len(triangles), bool)
         edges = np.asarray(creases)
@@ -259,7 +260,7 @@ class Solid(Domain):
             raise InputError(
                 f"{self.surface.name} creases have vertices up to {edges.max()}, expected those of the surface"
             )
-        edges = np.sort(self._places[edges], axis=1)
+        edges = self._drawn_edges = np.sort(self._places[edges], axis=1)
         ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
         return np.isin(ends @ (n, 1), edges @ (n, 1))
 
@@ -802,6 +803,7 @@ class Solid(Domain):
             "groups": _packed(self._group, "<i8"),
             "group_names": list(self._group_names),
             "angle": self.angle,
+            **({"creases": self._drawn_edges.tolist()} if len(self._drawn_edges) else {}),
             **({"names": dict(self.names)} if self.names else {}),
         }
 
@@ -816,8 +818,15 @@ class Solid(Domain):
     def __repr__(self) -> str:
         return f"Solid({len(self.patch)} triangles, {self.n_patches} patches, volume {self.measure:.6g})"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _described, (self.describe(),)
+
     def __hash__(self) -> int:
         return int(hashlib.sha256(self.surface.vertices.tobytes()).hexdigest()[:15], 16)
+
+
+def _described(values: dict[str, Any]) -> Solid:
+    return Solid.described(**values)
 
 
 _UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
@@ -827,10 +836,12 @@ def _unit_length(units: str | float | None) -> float:
     """Return the length of a unit in meters."""
     if units is None:
         return 1.0
-    if isinstance(units, str) and units in _UNITS:
-        return _UNITS[units]
-    if isinstance(units, Real) and not isinstance(units, bool) and 0 < units < math.inf:
-        return float(units)
+    if isinstance(units, str):
+        length = _UNITS.get(units, 0.0)
+    else:
+        length = float(units) if isinstance(units, Real) and not isinstance(units, bool) else 0.0
+    if 0 < length < math.inf:
+        return length
     raise InputError(f"units is {units!r}, expected one of {', '.join(_UNITS)}, or the length of the unit in meters")
 
 

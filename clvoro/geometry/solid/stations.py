@@ -98,7 +98,7 @@ def chain_line(solid: Solid, chain: int) -> Line:
         first = solid.corner_normals[item, (corner == vertices[:-1, None]).argmax(axis=1)]
         last = solid.corner_normals[item[-1], (corner[-1] == vertices[-1]).argmax()]
         normals.append(np.vstack([first, last]))
-    return Line(points, _unit(ahead + behind), *normals, np.append(0, np.cumsum(lengths)), closed)
+    return Line(points, _unit(ahead + behind), normals[0], normals[1], np.append(0, np.cumsum(lengths)), closed)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

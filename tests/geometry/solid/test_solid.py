@@ -1,5 +1,7 @@
 """Solids: where points are, patches and creases, the planes that cut cells; against formulas and slow references."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -147,6 +149,9 @@ def test_a_solid_comes_back_from_its_description():
     assert again == solid
     assert hash(again) == hash(solid)
     assert again.boundary_names == solid.boundary_names
+    assert pickle.loads(pickle.dumps(solid)) == solid
+    drawn = Solid.box((0, 0, 0), (1, 1, 1), creases=np.array([[0, 6], [2, 4]]))
+    assert Solid.described(**drawn.describe()).n_patches == drawn.n_patches == 7
     assert again != SOLIDS["ball"]
 
 
