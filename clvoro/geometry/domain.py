@@ -31,15 +31,12 @@ LARGEST_EDGE = 1e50
 
 
 class ClipBox(Protocol):
-    """The box that clips cells: a `Domain`, or a box that a stage makes. Stages use nothing else of a domain.
+    """The box that clips cells: a `Domain`, or a box that a stage makes. Stages use nothing else of a domain."""
 
-    Attributes
-    ----------
-    plane_count : int
-        Number of planes of walls that cut single cells, in a solid.
-    """
-
-    plane_count: int
+    @property
+    def plane_count(self) -> int:
+        """Number of planes of walls that cut single cells, in a solid."""
+        ...
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners in the device's coordinates, padded to four numbers as kernels take them."""
@@ -523,8 +520,10 @@ class Domain(ABC):
         """The triangles whose planes cut the cells near them, in a solid; else None."""
         return None
 
-    plane_count: ClassVar[int] = 0
-    """There are no walls but the box; see `ClipBox`."""
+    @property
+    def plane_count(self) -> int:
+        """0: there are no walls but the box."""
+        return 0
 
     def clip_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the CLIP_BOX_ARGS of kernels in 3D for cells that nothing but the box bounds."""

@@ -94,7 +94,7 @@ class PolyhedraUpdate:
             flags, used, left, marked, kept = found[:REPORT_LISTED]
             if flags & UNKNOWN and box.look_farther(points):
                 flags &= ~UNKNOWN
-                self._report[0].set(np.int32(flags))
+                self._report[0].set(np.array(flags, np.int32))
             if flags & ~HARMLESS or max(left, marked) > most:
                 return None
             if marked or left:

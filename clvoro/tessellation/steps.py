@@ -118,8 +118,6 @@ class SolidWalls(DomainSteps):
         See `SolidBox`.
     """
 
-    box: SolidBox
-
     def __init__(
         self,
         stages: TessellationStages,
@@ -128,7 +126,7 @@ class SolidWalls(DomainSteps):
         size: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
         super().__init__(stages, domain)
-        self.box = SolidBox(stages.engine, domain, walls, size)
+        self.box = self.walls = SolidBox(stages.engine, domain, walls, size)
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the part of the first `n` of `sites`."""
@@ -137,22 +135,22 @@ class SolidWalls(DomainSteps):
     def find_walls(self, part: Part, binned: BinnedPoints, previous: Tessellation | None) -> None:
         """Find the planes that cut the cells of `part`."""
         if previous is None:
-            self.box.guess(binned, part.n_own)
-        self.box.find(part.points)
+            self.walls.guess(binned, part.n_own)
+        self.walls.find(part.points)
 
     def warn_of_leaks(self, t: Tessellation) -> None:
         """Warn of cells that reach the box around the solid, and of generators outside of their nearest patch."""
         starts = t.starts.get()
         faces = np.flatnonzero(t.neighbors[: int(starts[t.n])].get() < SIDES_OF_BOX)
-        if not len(faces) and not self.box.outside:
+        if not len(faces) and not self.walls.outside:
             return
         open_cells = np.unique(np.searchsorted(starts, faces, side="right") - 1)
         where = ""
         if len(open_cells):
             where = f", the first at {format_point(domain_position(self.domain, t.points[int(open_cells[0])].get()))}"
         warn(
-            f"the walls do not bound {len(open_cells)} cells{where}, and {self.box.outside} generators are behind the "
-            "nearest wall: the solid is narrow or sharp for the size of cells there; use smaller sizes",
+            f"the walls do not bound {len(open_cells)} cells{where}, and {self.walls.outside} generators are behind "
+            "the nearest wall: the solid is narrow or sharp for the size of cells there; use smaller sizes",
             MismatchWarning,
         )
 
@@ -164,5 +162,5 @@ class SolidWalls(DomainSteps):
         def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
             cells.clip_rest(cut, report, self.box, sites, sort(), previous)
 
-        self.box.find(sites)
+        self.walls.find(sites)
         return self.stages.update.update(self.stages.cells, self.box, sites, previous, follow=follow, clip=clip)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import pyopencl.array as cla
@@ -41,7 +40,6 @@ class ExtendedBox:
 
     lower: np.ndarray
     upper: np.ndarray
-    plane_count: ClassVar[int] = 0
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners, padded to four numbers."""
@@ -52,6 +50,11 @@ class ExtendedBox:
     def clip_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the CLIP_BOX_ARGS of kernels."""
         return self.device_corners(engine.real)
+
+    @property
+    def plane_count(self) -> int:
+        """0: there are no walls."""
+        return 0
 
     def look_farther(self, points: cla.Array) -> bool:
         """Return False: there are no walls."""
