@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clvoro import Solid, sizing
-from clvoro.adaptation.sampling.start import count_cells, sample_density, sample_uniform
+from clvoro.adaptation.sampling.start import count_cells, density_tree, sample_density, sample_uniform
 
 BALL = Solid.ball((0, 0, 0), 1, edge=0.2)
 
@@ -12,8 +12,9 @@ BALL = Solid.ball((0, 0, 0), 1, edge=0.2)
 @pytest.mark.parametrize("solid", [BALL, Solid.box((0, 0, 0), (1, 1, 0.01))])
 def test_uniform_sizes_need_cells_in_proportion_to_the_volume(solid):
     h = (solid.measure / 300) ** (1 / 3)
-    assert count_cells(h, solid) == pytest.approx(300)
-    for x in (sample_density(h, solid, 300, seed=1), sample_uniform(solid, 300, seed=1)):
+    tree = density_tree(h, solid)
+    assert tree.integral == pytest.approx(300)
+    for x in (sample_density(h, solid, 300, seed=1, tree=tree), sample_uniform(solid, 300, seed=1)):
         assert len(x) == 300
         assert (solid.signed_distance(x) < 0).all()
         assert np.abs(x.mean(axis=0) - np.add(solid.lower, solid.upper) / 2).max() < 0.1 * solid.extent.max()

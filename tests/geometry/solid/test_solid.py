@@ -58,7 +58,7 @@ SOLIDS = {
 @pytest.mark.parametrize("name", SOLIDS)
 def test_points_inside_are_those_with_winding_number_one(name):
     solid = SOLIDS[name]
-    x = around(solid, 2000)
+    x = around(solid, 400)
     wound = winding(solid.surface.corners, x)
     assert np.array_equal(solid.surface.columns.winding(x), np.rint(wound))
     assert np.array_equal(solid.contains(x), np.rint(wound) > 0)
