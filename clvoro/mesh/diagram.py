@@ -497,7 +497,7 @@ class Diagram(MeshOutput):
         Warns
         -----
         MismatchWarning
-            If new cells are not covered, and `covered` is not asked for; says how many.
+            If new cells are not covered, and `covered` is False; says how many.
 
         Examples
         --------

@@ -53,7 +53,7 @@ def transfer_values(
         raise InputError(f"order is {order!r}, expected 1 or 2")
     given = _checked(values, len(source))
     columns = np.ascontiguousarray(given.reshape(len(source), -1), np.float64)
-    # Without columns the shares are still asked for.
+    # Without columns there are shares, too.
     filled = columns if columns.shape[1] else np.zeros((len(source), 1))
     # Scale to numbers around 1 by powers of two: this is exact, and no product overflows.
     scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(filled).max(axis=0), 1e-300))))
@@ -100,22 +100,14 @@ def _require_one_space(source: Diagram, target: Diagram) -> None:
             f"the meshes have periods of {a.extent[axis]:g} and {b.extent[axis]:g} along axis {axis}, expected one "
             "period; transfer onto a box with walls, or with the same period"
         )
-    if a.cell_dim > 2:
-        _require_boxes(a, b)
-
-
-def _require_boxes(a: Domain, b: Domain) -> None:
-    """Raise InputError if cells of meshes in 3D are cut by surfaces, or have different seams."""
-    if a.cuts_cells or b.cuts_cells:
+    if (a.cuts_cells and a.outline is None) or (b.cuts_cells and b.outline is None):
         raise InputError(
             f"the meshes are of {a} and {b}; expected boxes, since cells that a surface cuts are not transferred in "
             "3D; transfer between meshes of a box around it, and take the cells inside by subset"
         )
-    if a.periodic != b.periodic:
-        raise InputError(
-            f"the meshes are of {a} and {b}, which are periodic in different directions, expected the same ones in 3D; "
-            "transfer between boxes with the same periodic directions"
-        )
+    if a.periodic != b.periodic and not a.curved:
+        remedy = "transfer between boxes with the same periodic directions"
+        a.require_plane("the meshes are periodic in different directions, which goes in the plane only", remedy)
 
 
 def _diagram(name: str, mesh: object) -> Diagram:
