@@ -26,7 +26,7 @@ from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
 from .options import Options
 from .plan.actions import Action, Prescribe
-from .plan.efforts import choose_error_target, is_near, steep_share
+from .plan.efforts import NEAR_COUNT, NEAR_ERROR, choose_error_target, is_near, steep_share
 from .plan.schedule import adaptive_schedule, auto_levels, repeated_schedule
 from .sampling.quadrature import DensityTree
 from .sampling.start import charted, density_tree, sample_density, sample_uniform
@@ -389,15 +389,26 @@ def _sample(prepared: Prepared) -> np.ndarray:
     return sample_density(setup.sizing, setup.free, n, options.seed, real, prepared.tree)
 
 
-def only_needs_correction(prepared: Prepared, mesh: MeshState) -> bool:
-    """Return whether the points of the caller are a mesh that only needs a correction; `mesh` is theirs."""
+def only_needs_correction(prepared: Prepared, mesh: MeshState) -> tuple[bool, str]:
+    """Return whether the points of the caller are a mesh that only needs a correction, and why; `mesh` is theirs."""
     options, n = prepared.options, mesh.n
-    if prepared.points is None or not options.multilevel or prepared.levels:
-        return False
+    if prepared.points is None or not options.multilevel:
+        return False, ""
+    if prepared.levels:
+        return False, f"the given points are too few to be corrected: {prepared.levels} refinements led to the sizes"
     missing = mesh.missing_cells() if options.n_cells is None else float(options.n_cells - n)
     s = mesh.summaries.read()
     dim = prepared.setup.domain.cell_dim
-    return is_near(dim, options.effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n)
+    mean, quality = s["error"].magnitude / n, s["quality"].sum / n
+    near = is_near(dim, options.effort, n, missing, mean, quality)
+    off = f"{abs(missing) / n:.1%} of the cells too {'few' if missing > 0 else 'many'}"
+    found = f"mean |e| {mean:.2g}, {off}, mean Q {quality:.3f}"
+    if near:
+        return True, f"the given mesh is near and only corrected ({found})"
+    return False, (
+        f"the given mesh is not near, and all steps were taken ({found}; near means at most {NEAR_ERROR:g}, "
+        f"{NEAR_COUNT:.0%}, and regular cells)"
+    )
 
 
 def plan(prepared: Prepared, near: bool) -> Plan:

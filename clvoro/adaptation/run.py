@@ -132,9 +132,9 @@ class Run:
             except FewCellsError as error:
                 self._begin(size, points, self._fewer_levels(prepared.levels, error))
                 return
-            self.near = only_needs_correction(prepared, self.state)
+            self.near, self._path = only_needs_correction(prepared, self.state)
         else:
-            self.near = saved.near
+            self.near, self._path = saved.near, ""
         self._size, self._points = size, points
         planned = plan(prepared, self.near)
         self._writer = None
@@ -186,6 +186,7 @@ class Run:
         used = {name: value for name, value in settings.items() if uses(options.method, name)}
         widths = widths_of_layers(as_field(self._size), self._domain, options.layers) if options.layers else ""
         used |= {"widths": widths} if widths else {}
+        used |= {"path": self._path} if self._path else {}
         return {**used, "trade": planned.trade} if options.multilevel else used
 
     def _fewer_levels(self, levels: int, error: FewCellsError) -> int:

@@ -99,7 +99,8 @@ class Result(Sealed, MeshOutput):
         times this common factor; else 1.
     settings : dict
         The options that the method uses, to repeat the run. ``settings["error_target"]`` is the one that the run had,
-        given or chosen by the size field, and ``settings["trade"]`` says so in words; ``settings["widths"]`` says where
+        given or chosen by the size field, and ``settings["trade"]`` says so in words; ``settings["path"]`` says whether
+        the mesh of given points was only corrected, and why; ``settings["widths"]`` says where
         the default width of layers is below the size field.
     origin : (n,) int32 or None
         Index of each generator in the points with which the run began, of a fixed one that of the point whose place it
@@ -230,6 +231,7 @@ def summary(result: Result) -> dict[str, Any]:
         "size_factor": float(result.size_factor),
         "error_target": result.settings.get("error_target"),
         "trade": result.settings.get("trade"),
+        "path": result.settings.get("path"),
         "ever_changed": float(history["ever_changed"][-1]) if len(history) else 0.0,
         "converged": bool(result.converged),
         "stop_reason": result.stop_reason,

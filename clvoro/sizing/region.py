@@ -60,8 +60,8 @@ class Region(Distance):
         super().__init__(shapes, h, growth, h_max, slope)
         given = list(shapes) if isinstance(shapes, Iterable) and not isinstance(shapes, Surface | Domain) else [shapes]
         self.shapes = tuple(given)
-        self.areas = [_area_of(shape) for shape in given] if self.dim == 2 else []
-        self.solids = [_solid_of(shape) for shape in given] if self.dim == 3 else []
+        made: list[Any] = [{2: _area_of, 3: _solid_of}[self.dim](shape) for shape in given]
+        self.areas, self.solids = {2: (made, []), 3: ([], made)}[self.dim]
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return whether each of `points` (n, d) is in the region, (n,) bool."""

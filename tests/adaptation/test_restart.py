@@ -121,3 +121,13 @@ def test_near_by_every_measure():
     assert is_near(2, "fast", **{**near, "mean_quality": 0.98})
     assert not is_near(2, "best", **{**near, "mean_quality": 0.98})
     assert set(EFFORTS) == {"fast", "default", "best"}
+
+
+def test_the_result_says_whether_it_was_corrected_and_why(ctx):
+    box, adapter = clvoro.Box((0, 0), (1, 1)), clvoro.Adapter(ctx)
+    mesh = adapter.run(box, 0.1, "fast")
+    assert mesh.summary()["path"] is None
+    near, far = (adapter.run(box, h, "fast", points=mesh.points) for h in (0.1, 0.085))
+    assert near.settings["path"].startswith("the given mesh is near and only corrected (mean |e| 0.0")
+    assert far.summary()["path"].startswith("the given mesh is not near, and all steps were taken (mean |e| 0.")
+    assert near.summary()["steps"] < far.summary()["steps"]

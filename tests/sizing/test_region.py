@@ -53,7 +53,7 @@ def test_regions_in_space():
 
 def test_regions_on_the_sphere():
     earth = clvoro.Sphere()
-    points = earth.spiral_points(1500)
+    points = earth.icosahedral_points(4)
     lon, lat = earth.lonlat(points).T
     inside = ((lat > -40) & (lat < 50) & ((lon > 160) | (lon < -160))) | (lat > 75)
     field = sizing.Region([shapely.box(160, -40, 200, 50), sizing.Circle((0, 90), 15)], 2e5, 1.2, 8e5)
