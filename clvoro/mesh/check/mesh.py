@@ -38,7 +38,8 @@ def check_corners(check: Check) -> None:
         return
     inner = np.flatnonzero((d.neighbors >= 0) & ~d.shifts.any(axis=1))
     here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
-    if d.domain.cell_dim == 2:
+    flat = d.domain.cell_dim == 2
+    if flat:
         ends = face_ends(d)
         wrong = (ends[here] != ends[there][:, ::-1]).any(axis=1)
     else:
@@ -57,7 +58,7 @@ def check_corners(check: Check) -> None:
         wrong,
         lambda k: f"the face of cells {owner[here[k]]} and {owner[there[k]]} has other vertices from either side",
     )
-    if d.domain.cell_dim == 2 and not any(d.domain.periodic):
+    if flat and not any(d.domain.periodic):
         # Across seams a vertex has several numbers.
         expected = _euler_characteristic(d)
         v, e = len(d.vertices), len(d.neighbors) - len(inner) // 2
