@@ -102,7 +102,7 @@ def names_in(path):
 
 
 def kernels_in(path):
-    return set(re.findall(r"^(?:kernel|inline) \w+ (\w+)\(", path.read_text(), re.MULTILINE))
+    return set(re.findall(r"^(?:(?:kernel|inline) )?\w+ (\w+)\(", path.read_text(), re.MULTILINE))
 
 
 def unknown(cell, folder):
