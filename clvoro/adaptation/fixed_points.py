@@ -16,6 +16,7 @@ import shapely
 from ..arguments import FIRST_ROWS, check_points, coincident_pair, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
+from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.lines.pairs import LinePairs, place_pairs
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
@@ -232,14 +233,16 @@ def take_places(
 
 
 def clear_balls(
-    points: np.ndarray, labels: np.ndarray, pairs: LinePairs, domain: Domain, n_fixed: int
+    points: np.ndarray, labels: np.ndarray, around: FixedGenerators, domain: Domain, n_fixed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return generators and labels without those in the balls beside lines: they move out, or are left out.
+    """Return generators and labels without those in the balls of `around`: they move out, or are left out.
 
     Parameters and returned arrays are as those of `take_places`.
     """
+    if not len(around.centers):
+        return points, labels
     origin, scale = domain.frame
-    centers, radii = (pairs.centers - origin) / scale, pairs.radii / scale
+    centers, radii = (around.centers - origin) / scale, around.radii / scale
     period = domain.periods(np.dtype(np.float64)) if any(domain.periodic) else np.zeros(domain.dim)
     tree = scipy.spatial.KDTree(np.mod(centers, np.where(period > 0, period, np.inf)), boxsize=period)
     moving = np.flatnonzero(labels >= n_fixed)

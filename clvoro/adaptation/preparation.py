@@ -143,25 +143,26 @@ def prepare(
         warn_of_narrow_parts(domain, lambda x: factor * sizing(x))
     if len(fixed):
         check_room(fixed, domain, free, rows, factor * sizing(fixed))
-    pairs = None
+    around = None
     if domain.lines is not None:
-        pairs = place_beside_lines(domain, free, fixed, lambda x: factor * np.asarray(sizing(x)))
-        fixed = np.concatenate([fixed, pairs.points])
+        around = place_beside_lines(domain, free, fixed, lambda x: factor * np.asarray(sizing(x)))
+        fixed = np.concatenate([fixed, around.points])
         if len(fixed) > target:
             raise InputError(
                 f"the mesh has {target} cells, but {len(fixed)} generators are beside the lines or fixed, expected at "
                 "least as many cells; use smaller sizes, or more cells"
             )
-    if options.multilevel:
-        fixed = np.concatenate([fixed, domain.station_points(lambda x: factor * np.asarray(sizing(x)))])
+    elif options.multilevel:
+        around = domain.stations(lambda x: factor * np.asarray(sizing(x)))
+        fixed = fixed if around is None else np.concatenate([fixed, around.points])
     stationed = None
     own = _own_factor(sizing, free, tree, target) if domain.outline is not None and not options.multilevel else 1.0
-    if domain.outline is not None and tree is not None and pairs is None:
+    if domain.outline is not None and tree is not None and around is None:
         h = factor * own * np.asarray(sizing(domain.outline.oriented.vertices), float)
         stations = place_stations(domain.outline, free, np.concatenate([fixed, rows]), h)
         if len(fixed) + len(rows) + MOST_STATIONS * len(stations.points) <= target:
             fixed, stationed = np.concatenate([fixed, stations.points]), stations.corners
-    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, pairs, stationed)
+    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, around, stationed)
     lattice = lattice_points(domain, target) if options.method in MOVING else None
     levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0
     if options.levels == "auto" and max_levels is not None:

@@ -13,7 +13,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..geometry.domain import Domain
-from ..geometry.lines.pairs import LinePairs
+from ..geometry.fixed_generators import FixedGenerators
 from ..mesh.diagram import Diagram
 from ..mesh.results import Displacements
 from ..opencl.device_array import buffer_of
@@ -97,14 +97,14 @@ class Setup:
         Generators with labels below `fixed` do not move.
     points : (k, d) ndarray
         Positions of those with the labels 0 to k - 1, on the finest level: first those of the caller, then those
-        around corners, whose cells have target sizes like all others, then those beside lines. The other fixed
-        generators are those of layers. The size of the cells beside lines and in layers is their target size.
+        around corners and creases, whose cells have target sizes like all others, then those beside lines. The other
+        fixed generators are those of layers. The size of the cells beside lines and in layers is their target size.
     factor : float
         Initial factor on the size field on the finest level.
     own_factor : float
         Size of the cells over that of the size field, if a method keeps another number of cells than the field has.
-    pairs : LinePairs or None
-        Generators beside lines: the last of `points`.
+    around : FixedGenerators or None
+        Generators beside lines or around creases: the last of `points`.
     stationed : (c,) ndarray or None
         Vertices of the domain around which fixed generators stand on the finest level.
     """
@@ -117,13 +117,14 @@ class Setup:
     points: np.ndarray
     factor: float = 1.0
     own_factor: float = 1.0
-    pairs: LinePairs | None = None
+    around: FixedGenerators | None = None
     stationed: np.ndarray | None = None
 
     @property
     def first_sized(self) -> int:
         """Label of the first generator beside lines or of layers."""
-        return len(self.points) - (0 if self.pairs is None else len(self.pairs.points))
+        sized = 0 if self.around is None or not self.around.own_sizes else len(self.around)
+        return len(self.points) - sized
 
     @property
     def first_row(self) -> int:
@@ -133,8 +134,8 @@ class Setup:
     def place_fixed(self, points: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return generators and labels with the fixed ones, and whose places these have taken; see `take_places`."""
         points, labels, taken = take_places(points, labels, self.points, self.domain, self.fixed)
-        if self.pairs is not None:
-            points, labels = clear_balls(points, labels, self.pairs, self.domain, self.fixed)
+        if self.around is not None:
+            points, labels = clear_balls(points, labels, self.around, self.domain, self.fixed)
         return points, labels, taken
 
     def on(self, engine: Engine) -> Setup:
@@ -329,14 +330,14 @@ class MeshState:
 
     @cached_property
     def balls(self) -> Balls | None:
-        """Balls beside lines, which have generators on the finest level only."""
-        pairs = self.setup.pairs
-        if pairs is None or round(math.log2(self.size_factor / self.setup.factor)):
+        """Balls beside lines and around creases, which have generators on the finest level only."""
+        around = self.setup.around
+        if around is None or not len(around) or round(math.log2(self.size_factor / self.setup.factor)):
             return None
         origin, scale = self.domain.frame
-        spheres = np.column_stack([(pairs.centers - origin) / scale, pairs.radii / scale])[pairs.balls]
-        engine, count = self.engine, len(pairs.points)
-        starts = engine.upload(pairs.ball_starts, np.int32)
+        spheres = np.column_stack([(around.centers - origin) / scale, around.radii / scale])[around.balls]
+        engine, count = self.engine, len(around)
+        starts = engine.upload(around.ball_starts, np.int32)
         return Balls(self.setup.first_row - count, count, starts, engine.upload(spheres))
 
     def _target_sizes(self, points: np.ndarray) -> np.ndarray:
@@ -567,7 +568,7 @@ class MeshState:
         return self._replace(rows, counts)
 
     def delete_squeezed(self) -> None:
-        """Delete small cells beside lines: generators that are squeezed between balls cannot move away."""
+        """Delete small cells between balls: generators that are squeezed between balls cannot move away."""
         if self.balls is None:
             return
         stages, engine = self.stages, self.engine

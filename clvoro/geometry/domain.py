@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pyopencl.array as cla
 
     from ..opencl.engine import Engine
+    from .fixed_generators import FixedGenerators
     from .lines.lines import Lines
     from .polygon import Polygon
     from .sphere import Sphere
@@ -437,8 +438,8 @@ class Domain(ABC):
         widths = np.where(self.periodic, np.inf, self.extent)
         return (np.array(self.lower) + self.upper) / 2, float(widths.min())
 
-    def station_points(self, size: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return where generators must stand so that cells of the sizes `size` end at walls, (m, d): nowhere.
+    def stations(self, size: Callable[[np.ndarray], np.ndarray]) -> FixedGenerators | None:
+        """Return the generators that must be fixed so that cells of the sizes `size` end at walls: none here.
 
         Parameters
         ----------
@@ -446,7 +447,7 @@ class Domain(ABC):
             Target size at points (k, d), (k,).
         """
         del size
-        return np.empty((0, self.dim))
+        return None
 
     def chart(self) -> Chart:
         """Return the domain in which generators are drawn and sizes are integrated: itself, unless it is curved."""

@@ -61,7 +61,7 @@ def test_generators_leave_the_balls(ctx, mesh):
         "density", clvoro.MultilevelOptions(levels=0), method="adaptive", n_cells=None, layers=()
     )
     state = start(prepare(Stages(engine), domain, 0.08, None, options))
-    pairs, balls = state.setup.pairs, state.balls
+    pairs, balls = state.setup.around, state.balls
     points, labels = state.points.get(), state.labels.get()
     scale = domain.frame[1]
     centers, radii = pairs.centers / scale, pairs.radii / scale

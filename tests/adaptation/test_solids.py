@@ -27,7 +27,8 @@ def volumes(monkeypatch):
 def test_cells_in_a_solid_with_a_concave_crease(ctx, volumes):
     solid, adapter = corner(), clvoro.Adapter(ctx)
     result = adapter.run(solid, H, "fast")
-    stations = solid.station_points(lambda x: np.full(len(x), H))
+    around = solid.stations(H)
+    stations = around.points
     lengths = np.cbrt(volumes[0])
     assert solid.contains(result.points).all()
     assert volumes[0].sum() == pytest.approx(solid.measure, rel=1e-12)
@@ -35,6 +36,9 @@ def test_cells_in_a_solid_with_a_concave_crease(ctx, volumes):
     assert len(stations) > 3
     assert result.points[: len(stations)] == pytest.approx(stations, abs=1e-12)
     assert lengths[: len(stations)] == pytest.approx(H, rel=0.02)
+    others = result.points[len(stations) :]
+    gaps = np.linalg.norm(others[:, None] - around.centers, axis=2) / around.radii
+    assert 0.99 < gaps.min() < 1.3
     again = adapter.run(solid, H, "fast")
     assert np.array_equal(again.points, result.points)
 

@@ -19,6 +19,7 @@ import scipy
 import shapely
 
 from ..domain import Domain
+from ..fixed_generators import FixedGenerators
 from .lines import Network, wall_lines
 
 _RADIUS = math.sqrt(0.5)  # of a circle, over the mean of its chords: square cells
@@ -45,31 +46,22 @@ _CLEAR = 1.06  # radius in which no other generators are, over that of the circl
 
 
 @dataclass(frozen=True)
-class LinePairs:
-    """The generators beside lines, and what keeps the others away.
+class LinePairs(FixedGenerators):
+    """The generators beside lines. Balls are around the stations.
 
     Attributes
     ----------
-    points : (n, 2) float64
-        Generators that do not move.
-    centers, radii : (b, 2) and (b,) float64
-        Balls without other generators.
-    ball_starts, balls : (n + 1,) and (k,) int32
-        The balls of generator i are ``balls[ball_starts[i]:ball_starts[i + 1]]``.
     chords, sizes : (c, 2, 2) and (c,) float64
         Where faces are to lie, and sizes of the cells beside them.
     dropped : (d, 2) float64
         Places at which a line is left out, because there is no room beside it.
     """
 
-    points: np.ndarray
-    centers: np.ndarray
-    radii: np.ndarray
-    ball_starts: np.ndarray
-    balls: np.ndarray
     chords: np.ndarray
     sizes: np.ndarray
     dropped: np.ndarray
+
+    own_sizes = True
 
 
 class _Piece(NamedTuple):

@@ -564,10 +564,6 @@ class Solid(Domain):
         """
         return place_stations(self, size if callable(size) else lambda x: np.full(len(x), float(size)))
 
-    def station_points(self, size: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return the generators of `stations`, (m, 3)."""
-        return self.stations(size).points
-
     def narrowest(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
         """Return a place (3,) where the solid is narrowest in units of the sizes `size`, and its width there.
 

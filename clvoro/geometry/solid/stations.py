@@ -1,10 +1,11 @@
 """Stations: generators around concave creases and corners, placed so that faces between their cells meet there.
 
-At a station k generators stand around a crease at one distance from it, in the middle of k equal sectors. With the
-mean interior angle alpha of the chain, k = round(alpha / 90 degrees). So their bisectors contain the crease, and each
-of the outermost two is nearest to one wall only. Along a chain stations are equidistributed by 1 / h. At an open end
-the first one is half a step away. Where chains meet, the mirror images of their last generators in the walls there
-complete the corner.
+Nodes divide a chain of creases into chords, equidistributed by 1 / h. Around each node is a ball without other
+generators. Beside a chord k generators stand where the spheres around its two ends intersect, in the middle of k equal
+sectors. With the interior angle alpha there, k = round(alpha / 90 degrees). So all their bisectors contain the chord,
+and each of the outermost two is nearest to one wall only. Where chains meet, the node in the corner is one of all of
+them. Generators of two chains that are near each other become one, on the spheres of both. Mirror images of the
+generators in the walls there complete the corner.
 """
 
 from __future__ import annotations
@@ -17,41 +18,39 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from ..fixed_generators import FixedGenerators
+
 if TYPE_CHECKING:
     from .solid import Solid
 
-_SAME = 0.02  # of h: generators this close are the same one
+_CLEAR = 1.06  # radius in which no other generators are, over that of the sphere
 _ROOM = 0.5  # of h: least distance of generators that are not the same
 _WALL = 0.3  # of h: least distance of generators from walls
 _SAMPLES = 8  # of 1 / h per step, at least
 _FEWEST = 64  # samples per chain, at least
 _MOST = 1 << 16
 _ROUNDS = 3  # of reflections at a corner
+_CROWD = 16  # generators at a corner, about
+_ITERATIONS = 8  # of Newton's method
 
 
 @dataclass(frozen=True)
-class Stations:
+class Stations(FixedGenerators):
     """Generators around concave creases.
 
     Attributes
     ----------
-    points : (m, 3) float
-        Generators.
-    size : (m,) float
+    size : (n,) float
         The size h of their cells.
-    chain : (m,) int
+    chain : (n,) int
         The chain that each one belongs to; -1 for those that complete a corner.
     left_out : (k, 3) float
         Places on creases where there is no room for a station.
     """
 
-    points: np.ndarray
     size: np.ndarray
     chain: np.ndarray
     left_out: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.points)
 
 
 @dataclass(frozen=True)
@@ -107,23 +106,70 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def place_stations(solid: Solid, size: Callable[[np.ndarray], np.ndarray]) -> Stations:
     """Return the stations of a solid for the sizes h = size(points (n, 3))."""
-    points, sizes, chains, spots = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, np.int64)], [np.zeros((0, 3))]
-    for chain in np.unique(solid.creases.chain[solid.creases.concave]).tolist():
-        line = chain_line(solid, chain)
-        at, h = _divide(line, size)
-        k = _sectors(line)
-        for s, step in zip(at, h, strict=True):
-            around = _around(line, float(s), float(step), k)
-            points.append(around)
-            sizes.append(np.full(len(around), step))
-            chains.append(np.full(len(around), chain))
-            spots.append(np.broadcast_to(line.along(line.points, np.array([s])), around.shape))
-    found = Stations(*(np.concatenate(part) for part in (points, sizes, chains, spots)))
-    return _complete(solid, _with_room(solid, found))
+    chains = [_Chain(solid, c, size) for c in np.unique(solid.creases.chain[solid.creases.concave]).tolist()]
+    chains = [chain for chain in chains if len(chain.h)]
+    _share_corners(chains)
+    placing = _AroundCreases(solid)
+    for chain in chains:
+        placing.add(chain)
+    placing.join()
+    placing.leave_out()
+    placing.complete()
+    return placing.stations()
 
 
-def _divide(line: Line, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lengths along a line at which stations are, and the sizes there."""
+class _Chain:
+    """A chain that is divided into chords.
+
+    Attributes
+    ----------
+    number : int
+    vertices : (2,) int
+        Those at its ends.
+    h, middle, angle : (n,) float
+        Of each chord: size, length along the chain, interior angle.
+    count : (n,) int
+        Number of generators.
+    nodes, radii : (n + 1, 3) and (n + 1,) float
+        The ends of the chords, and the distances of the generators from them.
+    """
+
+    def __init__(self, solid: Solid, number: int, size: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.number, self.line = number, chain_line(solid, number)
+        self.vertices = solid.creases.vertices(number)[[0, -1]]
+        at, self.middle, self.h = _divide(self.line, size)
+        self.nodes = self.line.along(self.line.points, at)
+        chords = np.diff(self.nodes, axis=0)
+        self.lengths = np.linalg.norm(chords, axis=1)
+        self.ways = chords / self.lengths[:, None]
+        left, right = (self.line.along(n, self.middle) for n in (self.line.left, self.line.right))
+        self.left, right = (_unit(n - (n * self.ways).sum(axis=1)[:, None] * self.ways) for n in (left, right))
+        sine, cosine = (np.cross(self.left, right) * self.ways).sum(axis=1), (self.left * right).sum(axis=1)
+        self.angle = math.pi - np.arctan2(sine, cosine)
+        self.count = np.maximum(2, np.rint(self.angle / (math.pi / 2))).astype(int)
+        half = 0.5 * self.angle / self.count
+        # A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
+        reach = self.h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3
+        radii = np.hypot(reach, 0.5 * self.lengths)
+        before, after = (radii[-1:], radii[:1]) if self.line.closed else (radii[:1], radii[-1:])
+        self.radii = 0.5 * (np.append(before, radii) + np.append(radii, after))
+
+    def around(self, i: int) -> np.ndarray:
+        """Return the generators beside chord `i`, (k, 3)."""
+        (r, q), length, way = self.radii[i : i + 2], self.lengths[i], self.ways[i]
+        foot = 0.5 * (length + (r * r - q * q) / length)
+        height = math.sqrt(max(r * r - foot * foot, 0.0))
+        turn = (np.arange(self.count[i]) + 0.5) * (self.angle[i] / self.count[i])
+        across = np.cross(self.left[i], way)
+        return (
+            self.nodes[i]
+            + foot * way
+            + height * (np.cos(turn)[:, None] * across - np.sin(turn)[:, None] * self.left[i])
+        )
+
+
+def _divide(line: Line, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the lengths along a line at the ends of chords, (n + 1,), in their middle, and the sizes there, (n,)."""
     total = float(line.at[-1])
     n = _FEWEST
     while True:
@@ -136,89 +182,144 @@ def _divide(line: Line, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.nd
     count = round(float(reached[-1]))
     if line.closed:
         count = max(count, 3)
-    marks = (np.arange(count) + 0.5) / max(count, 1) * reached[-1]
+    marks = np.arange(2 * count + 1) / max(2 * count, 1) * reached[-1]
     at = np.interp(marks, reached, s)
     # Cells are as long along the line as across it.
-    return at, np.interp(at, s, h) * (reached[-1] / max(count, 1))
+    return at[::2], at[1::2], np.interp(at[1::2], s, h) * (reached[-1] / max(count, 1))
 
 
-def _sectors(line: Line) -> int:
-    """Return the number of generators around a line: one for each right angle of the mean interior angle."""
-    turn = np.arctan2(
-        np.einsum("ij,ij->i", np.cross(line.left, line.right), line.tangents),
-        np.einsum("ij,ij->i", line.left, line.right),
-    )
-    mean = float(np.interp((np.arange(_FEWEST) + 0.5) / _FEWEST * line.at[-1], line.at, math.pi - turn).mean())
-    return max(2, round(mean / (math.pi / 2)))
+def _share_corners(chains: list[_Chain]) -> None:
+    """Give the chains that meet in a corner one radius there."""
+    ends: dict[int, list[tuple[_Chain, int]]] = {}
+    for chain in chains:
+        for end in (0, -1):
+            ends.setdefault(int(chain.vertices[end]), []).append((chain, end))
+    for meeting in ends.values():
+        radius = float(np.mean([chain.radii[end] for chain, end in meeting]))
+        for chain, end in meeting:
+            chain.radii[end] = radius
 
 
-def _around(line: Line, s: float, h: float, k: int) -> np.ndarray:
-    """Return the `k` generators of the station at the length `s`, (k, 3)."""
-    at = np.array([s])
-    spot, left, right = (line.along(values, at)[0] for values in (line.points, line.left, line.right))
-    along = _unit(line.along(line.tangents, at)[0])
-    left, right = (_unit(n - (n @ along) * along) for n in (left, right))
-    angle = math.pi - math.atan2(float(np.cross(left, right) @ along), float(left @ right))
-    half = 0.5 * angle / k
-    # The cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
-    r = h / math.sqrt(math.tan(half)) * (math.cos(half) + 1 / math.cos(half)) / 3
-    turn = (2 * np.arange(k) + 1) * half
-    return spot + r * (np.cos(turn)[:, None] * np.cross(left, along) - np.sin(turn)[:, None] * left)
+class _AroundCreases:
+    """Collects generators and balls."""
 
+    def __init__(self, solid: Solid) -> None:
+        self.solid = solid
+        self.points, self.sizes, self.chains = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
+        self.spots = np.zeros((0, 3))  # the middle of the chord of each generator
+        self.balls: list[list[int]] = []  # of each generator
+        self.centers: list[np.ndarray] = []
+        self.radii: list[float] = []
+        self.lost = [np.zeros((0, 3))]
 
-def _with_room(solid: Solid, found: Stations) -> Stations:
-    """Merge generators at the same place; leave out those near others, near walls, or outside of the solid.
+    def add(self, chain: _Chain) -> None:
+        """Add the generators and balls of a chain."""
+        first, n = len(self.centers), len(chain.h)
+        self.centers += list(chain.nodes)
+        self.radii += chain.radii.tolist()
+        for i in range(n):
+            around = chain.around(i)
+            self.points = np.vstack([self.points, around])
+            self.sizes = np.append(self.sizes, np.full(len(around), chain.h[i]))
+            self.chains = np.append(self.chains, np.full(len(around), chain.number))
+            spot = chain.line.along(chain.line.points, chain.middle[i : i + 1])
+            self.spots = np.vstack([self.spots, np.broadcast_to(spot, around.shape)])
+            self.balls += [[first + i, first + i + 1] for _ in around]
 
-    The attribute `left_out` has the place on the crease of each generator before, and those of the rejected ones after.
-    """
-    if not len(found):
-        return found
-    points, h, spot = found.points, found.size, found.left_out
-    keep = -solid.signed_distance(points) > _WALL * h
-    near = scipy.spatial.KDTree(points).query_pairs(_ROOM * h.max(), output_type="ndarray")
-    distance = np.linalg.norm(points[near[:, 0]] - points[near[:, 1]], axis=1)
-    lost = ~keep
-    for (i, j), d in sorted(zip(map(tuple, near.tolist()), distance.tolist(), strict=True)):
-        if keep[i] and keep[j] and d < _ROOM * min(h[i], h[j]):
-            keep[j] = False
-            lost[j] = d > _SAME * h[j]
-    return Stations(points[keep], h[keep], found.chain[keep], np.unique(spot[lost], axis=0))
+    def keep(self, kept: np.ndarray) -> None:
+        self.points, self.sizes, self.chains = self.points[kept], self.sizes[kept], self.chains[kept]
+        self.spots = self.spots[kept]
+        self.balls = [balls for balls, k in zip(self.balls, kept.tolist(), strict=True) if k]
 
+    def join(self) -> None:
+        """Make one of two generators of different chains that are near each other, on the spheres of both."""
+        if not len(self.points):
+            return
+        kept = np.ones(len(self.points), bool)
+        for i, j in self.near_pairs():
+            if not kept[i] or not kept[j] or self.chains[i] == self.chains[j]:
+                continue
+            balls = self.balls[i] + self.balls[j]
+            point = self.common_point(0.5 * (self.points[i] + self.points[j]), balls)
+            if np.linalg.norm(point - self.points[[i, j]], axis=1).max() < _ROOM * self.sizes[i]:
+                self.points[i], self.balls[i] = point, balls
+                kept[j] = False
+        self.keep(kept)
 
-def _complete(solid: Solid, found: Stations) -> Stations:
-    """Add the mirror images of generators at corners in the walls there."""
-    creases = solid.creases
-    ends, count = np.unique(creases.edges[creases.concave].ravel(), return_counts=True)
-    corners = np.intersect1d(ends[count > 1], solid.corners)
-    if not len(found) or not corners.size:
-        return found
-    points, sizes, chains = found.points, found.size, found.chain
-    for corner in corners.tolist():
-        x = solid.surface.vertices[corner]
-        touching = (solid.surface.triangles == corner).any(axis=1)
-        walls = _distinct(solid.normals[touching])
-        away = np.linalg.norm(points - x, axis=1)
-        mine = points[away < 1.1 * sizes]
-        if len(mine) < 2:
-            continue
-        h = float(np.median(sizes[away < 1.1 * sizes]))
-        distance = np.linalg.norm(mine - x, axis=1)
-        for _ in range(_ROUNDS):
-            images = (mine[:, None] - 2 * ((mine - x) @ walls.T)[:, :, None] * walls).reshape(-1, 3)
-            images = images[solid.signed_distance(images) < -_WALL * h]
-            new = 0
-            for image in images:
-                others = np.vstack([points, mine])
-                if np.linalg.norm(others - image, axis=1).min() > _ROOM * h:
-                    mine = np.vstack([mine, image])
-                    new += 1
-            if not new or len(mine) > 16:
-                break
-        added = mine[len(distance) :]
-        points = np.vstack([points, added])
-        sizes = np.append(sizes, np.full(len(added), h))
-        chains = np.append(chains, np.full(len(added), -1))
-    return Stations(points, sizes, chains, found.left_out)
+    def near_pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of generators without room for both, the closest first."""
+        near = scipy.spatial.KDTree(self.points).query_pairs(_ROOM * self.sizes.max(), output_type="ndarray")
+        distance = np.linalg.norm(self.points[near[:, 0]] - self.points[near[:, 1]], axis=1)
+        near, distance = (a[distance < _ROOM * self.sizes[near].min(axis=1)] for a in (near, distance))
+        order = np.lexsort((near[:, 1], near[:, 0], np.round(distance, 9)))
+        return [(i, j) for i, j in near[order].tolist()]
+
+    def common_point(self, point: np.ndarray, balls: list[int]) -> np.ndarray:
+        """Return the point near `point` on the spheres of all `balls`, or the best one: least squares."""
+        centers, radii = np.array(self.centers)[balls], np.array(self.radii)[balls]
+        for _ in range(_ITERATIONS):
+            way = point - centers
+            distance = np.linalg.norm(way, axis=1)
+            point = point - np.linalg.lstsq(way / distance[:, None], distance - radii, rcond=1e-6)[0]
+        return point
+
+    def leave_out(self) -> None:
+        """Leave out generators near others, near walls, or outside of the solid; note their places on the creases."""
+        if not len(self.points):
+            return
+        keep = -self.solid.signed_distance(self.points) > _WALL * self.sizes
+        for i, j in self.near_pairs():
+            if keep[i] and keep[j]:
+                keep[j] = False
+        self.lost.append(self.spots[~keep])
+        self.keep(keep)
+
+    def complete(self) -> None:
+        """Add the mirror images of generators at corners in the walls there."""
+        solid, creases = self.solid, self.solid.creases
+        ends, count = np.unique(creases.edges[creases.concave].ravel(), return_counts=True)
+        corners = np.intersect1d(ends[count > 1], solid.corners)
+        if not len(self.points):
+            return
+        for corner in corners.tolist():
+            x = solid.surface.vertices[corner]
+            walls = _distinct(solid.normals[(solid.surface.triangles == corner).any(axis=1)])
+            near = np.linalg.norm(self.points - x, axis=1) < 1.1 * self.sizes
+            mine = self.points[near]
+            if len(mine) < 2:
+                continue
+            h = float(np.median(self.sizes[near]))
+            added: list[np.ndarray] = []
+            for _ in range(_ROUNDS):
+                images = (mine[:, None] - 2 * ((mine - x) @ walls.T)[:, :, None] * walls).reshape(-1, 3)
+                images = images[solid.signed_distance(images) < -_WALL * h]
+                new = 0
+                for image in images:
+                    others = np.vstack([self.points, *added])
+                    if np.linalg.norm(others - image, axis=1).min() > _ROOM * h:
+                        added.append(image)
+                        new += 1
+                mine = np.vstack([mine, *added[len(added) - new :]])
+                if not new or len(mine) > _CROWD:
+                    break
+            self.points = np.vstack([self.points, *added])
+            self.sizes = np.append(self.sizes, np.full(len(added), h))
+            self.chains = np.append(self.chains, np.full(len(added), -1))
+            self.balls += [[] for _ in added]
+
+    def stations(self) -> Stations:
+        """Return what has been placed."""
+        radii = _CLEAR * np.array(self.radii)
+        return Stations(
+            self.points,
+            np.reshape(self.centers, (-1, 3)),
+            radii,
+            np.cumsum([0, *map(len, self.balls)]).astype(np.int32),
+            np.array([ball for balls in self.balls for ball in balls], np.int32),
+            self.sizes,
+            self.chains,
+            np.unique(np.concatenate(self.lost), axis=0),
+        )
 
 
 def _distinct(normals: np.ndarray) -> np.ndarray:
