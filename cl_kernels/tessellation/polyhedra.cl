@@ -281,8 +281,9 @@ inline bool touches_walls(global const int *labels, int begin, int count, int ot
    symmetric. The cell is flagged as collapsed if the face is wider than round-off explains, or if the areas of its
    faces and those of its neighbors differ by more than a share of the cell. In a power diagram cells may be so small
    that they are uncertain, as long as that is no more than the round-off of a neighbor. Faces of a neighbor without a
-   row are not compared, nor are those of two certain cells, nor those at walls of a solid. In a diagram with ghost
-   images the periods are 0. While cells are missing or wrong, this and the next two kernels do nothing. */
+   row are not compared, nor are those of two certain cells, nor those at walls of a solid, where cells at a sharp tip
+   may share three faces or fewer. In a diagram with ghost images the periods are 0. While cells are missing or wrong,
+   this and the next two kernels do nothing. */
 kernel void match_polyhedron_faces(const int size, global const int *row_places, global const int *row_counts,
                                    global const int *labels, global const REAL *measures, global const REAL *volumes,
                                    global const REAL *points, const REAL share, global uchar *kept, global int *counts,
@@ -329,7 +330,7 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
 #endif
     }
     counts[i] = count;
-    if (TOO_FEW(count) || !(apart <= most))
+    if ((TOO_FEW(count) && !touches_walls(labels, row_places[i], n, 0, 0)) || !(apart <= most))
         atomic_or(report, FLAG_COLLAPSED);
     else if (apart > EVEN_SHARE * volumes[i])
         atomic_or(report, FLAG_UNEVEN);

@@ -63,3 +63,10 @@ def test_cells_that_walls_do_not_bound_are_warned_of(ctx):
     ball = clvoro.Solid.ball((0, 0, 0), 1.0, edge=0.2)
     with pytest.warns(clvoro.errors.MismatchWarning, match="do not bound"), np.errstate(all="ignore"):
         clvoro.Adapter(ctx).run(ball, 1.0, "fast")
+
+
+@pytest.mark.filterwarnings("ignore::clvoro.errors.SizeErrorWarning", "ignore::clvoro.errors.MismatchWarning")
+def test_cells_at_a_sharp_tip_may_have_few_faces(ctx):
+    cone = clvoro.Solid.cone((0, 0, 0), (0, 0, 2), 1.0, edge=0.13)
+    result = clvoro.Adapter(ctx).run(cone, 0.25, "fast")
+    assert result.diagram.volumes.sum() == pytest.approx(cone.measure, rel=0.06)

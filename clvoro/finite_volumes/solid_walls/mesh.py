@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 OUTSIDE = 1.6
 """Distance of outer generators from the surface, over h."""
+_CERTAIN = 0.3
+"""Vertices are not examined if the depths of their generators show that they are deeper than this share of h."""
 _CLEAR = 1.4
 """Least distance of outer generators from the whole surface, over h: no cell is that wide at a wall."""
 
@@ -167,6 +169,22 @@ class _Maker:
         polygons = self._wall_polygons(parts, far)
         return self._assemble(far, parts, polygons)
 
+    def _certified(self, starts: np.ndarray, corners: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Return a lower bound of the depth in the solid of each vertex of the faces `near`, (v,); -inf for others.
+
+        A vertex is as deep as each of its generators, up to its distance from it.
+        """
+        cells = distinct(np.concatenate([self.owner[near], self.neighbor[near]]))
+        depth = np.full(self.n, -np.inf)
+        depth[cells] = -self.surface.closest(self.generators[cells])[2]
+        face = np.repeat(near, np.diff(starts))
+        bound = np.full(len(self.points), -np.inf)
+        for side in (self.owner, self.neighbor):
+            i = side[face]
+            away = np.linalg.norm(self.points[corners] - self.generators[i], axis=1)
+            np.maximum.at(bound, corners, depth[i] - away)
+        return bound
+
     def _near_faces(self) -> np.ndarray:
         """Return the faces both of whose cells may reach the surface."""
         face = np.repeat(np.arange(len(self.owner)), np.diff(self.starts))
@@ -184,17 +202,24 @@ class _Maker:
         used = distinct(corners)
         h = np.full(len(self.points), np.inf)
         np.minimum.at(h, corners, np.repeat(h_face, np.diff(starts)))
-        triangle, foot, distance = self.surface.closest(self.points[used])
-        side = np.full(len(self.points), IN, np.int8)
-        side[used] = sides(distance, h[used])
-        on = side[used] == WALL
-        self.site = np.full(len(self.points), -1)
-        at = used[on]
-        self.site[at], self.points[at] = self._sited(foot[on], triangle[on], h[at])
-        signed = np.zeros(len(self.points))
-        signed[used] = np.where(on, 0, distance)
-        # Edges, each once.
         after = corners[following(starts)]
+        signed = -self._certified(starts, corners, near)
+        side = np.full(len(self.points), IN, np.int8)
+        self.site = np.full(len(self.points), -1)
+        at_wall = used[signed[used] > -_CERTAIN * h[used]]
+        for _ in range(2):
+            triangle, foot, signed[at_wall] = self.surface.closest(self.points[at_wall])
+            side[at_wall] = sides(signed[at_wall], h[at_wall])
+            on = side[at_wall] == WALL
+            at = at_wall[on]
+            self.site[at], self.points[at] = self._sited(foot[on], triangle[on], h[at])
+            signed[at] = 0
+            # Edges that may leave the solid need true distances of both ends.
+            known = np.zeros(len(self.points), bool)
+            known[at_wall] = True
+            leave = known[corners] & (side[corners] != IN) | known[after] & (side[after] != IN)
+            at_wall = distinct(np.concatenate([corners[leave & ~known[corners]], after[leave & ~known[after]]]))
+        # Edges, each once.
         v = len(self.points)
         keys, edges = np.unique(np.minimum(corners, after) * v + np.maximum(corners, after), return_inverse=True)
         a, b = keys // v, keys % v

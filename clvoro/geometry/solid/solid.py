@@ -38,6 +38,8 @@ _ON = 1e-12  # of the diagonal: points this close to the surface lie on it
 _PROBES = 4096  # places on the surface from which widths are measured
 _FACING = -0.7  # product of the normals of two walls that face each other
 _EDGE = 1e-9  # weight of a corner below which a foot lies on the opposite side
+_SAMPLES = 2048  # places on the surface from which the search for nearest points begins, besides vertices
+_MOST_STEPS = 64  # along a side of a triangle
 _MARGIN = 0.05  # of the longest edge, by which the clip box is larger than the region
 
 
@@ -76,7 +78,8 @@ class NearestTriangles:
         self.items = items
         self.corners, self._rows = surface.corners[items], surface.rows[items]
         self._tree = Tree(self.corners.min(axis=1), self.corners.max(axis=1))
-        self._vertices = scipy.spatial.KDTree(surface.vertices[np.unique(surface.triangles[items])])
+        points, self._sampled = _samples(surface.triangles[items], self.corners)
+        self._samples = scipy.spatial.KDTree(points)
         self._tie = _ON * float(np.ptp(surface.vertices, axis=0).max())
 
     def near(self, x: np.ndarray, reach: np.ndarray) -> np.ndarray:
@@ -89,8 +92,10 @@ class NearestTriangles:
         bound2 = np.full(len(x), reach * reach)
         close = np.flatnonzero(np.isfinite(x).all(axis=1))
         if reach > self._tie:
-            vertex = self._vertices.query(x[close], distance_upper_bound=reach)[0]
-            bound2[close] = np.minimum(bound2[close], (vertex + self._tie) ** 2)
+            away, sample = self._samples.query(x[close], distance_upper_bound=reach)
+            close, sample = close[np.isfinite(away)], sample[np.isfinite(away)]
+            there2 = packed_weights(x[close], self._rows[self._sampled[sample]])[2]
+            bound2[close] = np.minimum(bound2[close], (np.sqrt(there2) + self._tie) ** 2)
         best2, item = self._tree.nearest(x, bound2, lambda y, k: packed_weights(y, self._rows[k])[2])
         found = item >= 0
         weights = np.zeros((len(x), 3))
@@ -98,6 +103,28 @@ class NearestTriangles:
         weights[found] = np.column_stack([1 - s - t, s, t])
         point = np.einsum("nk,nkd->nd", weights, self.corners[item])
         return Feet(np.where(found, self.items[item], -1), weights, point, np.where(found, np.sqrt(best2), math.inf))
+
+
+def _samples(triangles: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (k, 3) on a surface, and their triangles (k,): the vertices, and a grid in each large triangle.
+
+    Parameters
+    ----------
+    triangles : (t, 3) int
+    corners : (t, 3, 3) float
+    """
+    _, first = np.unique(triangles, return_index=True)
+    points, item = [corners.reshape(-1, 3)[first]], [first // 3]
+    longest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
+    spacing = math.sqrt(float(_areas(corners).sum()) / _SAMPLES)
+    steps = np.minimum(np.ceil(longest / spacing), _MOST_STEPS).astype(int) if spacing > 0 else np.ones(len(corners))
+    for k in np.unique(steps[steps > 1]).tolist():
+        rows = np.flatnonzero(steps == k)
+        i, j = np.nonzero(np.add.outer(np.arange(k + 1), np.arange(k + 1)) <= k)
+        weights = np.column_stack([k - i - j, i, j]) / k
+        points.append(np.einsum("sk,tkd->tsd", weights, corners[rows]).reshape(-1, 3))
+        item.append(np.repeat(rows, len(weights)))
+    return np.concatenate(points), np.concatenate(item)
 
 
 @dataclass(frozen=True)
