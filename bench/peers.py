@@ -195,8 +195,6 @@ def with_jigsaw(points: Array, options: argparse.Namespace) -> Made:
     """Return a call that meshes the unit square or cube with about as many vertices, without volumes."""
     if not (program := shutil.which("jigsaw")):
         raise ImportError("jigsaw is not on the PATH")
-    if options.set != "uniform":
-        raise ImportError("JIGSAW makes points of its own")
     n, dim = points.shape
     corners = list(itertools.product((0, 1), repeat=dim))
     parts = [(0, 1), (1, 3), (3, 2), (2, 0)]
@@ -353,7 +351,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
         truths: dict[bool, Truth] = {}
         for name in options.peers:
             peer = PEERS[name]
-            if dim not in peer.dims or (peer.periodic and dim == 2):
+            if dim not in peer.dims or (peer.periodic and dim == 2) or (which != "uniform" and not peer.volumes):
                 continue
             record: dict[str, Any] = {"peer": name, "dim": dim, "cells": n, "set": which}
             with tempfile.TemporaryDirectory() as made:

@@ -35,6 +35,8 @@ VIEW = (-60.0, 26.0)
 """Azimuth and elevation of the viewer, degrees: x-max, y-min and z-max walls are in front."""
 _AXES = {"x": 0, "y": 1, "z": 2}
 _VTK_POLYHEDRON = 42
+_IN_CUT = 0.7
+"""Brightness of faces in the cut against those on walls and sides of the box."""
 
 
 def plot_slice(
@@ -190,7 +192,7 @@ def plot_cutaway(
     cut : "octant", "x", "y", "z", 3 floats, (n,) bool or None
         The removed part: the cells with generators between the point and the viewer, in all three directions;
         those in front of a plane with this normal, on the viewer's side for "x", "y" and "z"; those that are not
-        marked as kept; or nothing.
+        marked as kept; or nothing. Faces in the cut are darker than those on walls and sides of the box.
     through : 3 floats, optional
         The point; by default among the smallest cells.
     angles : (azimuth, elevation), degrees
@@ -409,12 +411,25 @@ def visible_faces(
 
 def _walls_of(diagram: Diagram, polygons: list[np.ndarray]) -> np.ndarray:
     """Return the wall of each polygon, (f,) int; -1 for others."""
-    starts, corners = take_rows(*face_corners(diagram), np.flatnonzero(diagram.neighbors < 0))
+    rows = np.flatnonzero(diagram.neighbors < 0)
+    if not len(rows):
+        return np.full(len(polygons), -1)
+    starts, corners = take_rows(*face_corners(diagram), rows)
     counts = np.maximum(np.diff(starts), 1)
     middles = np.add.reduceat(diagram.vertices[corners], starts[:-1]) / counts[:, None]
     far, row = KDTree(middles).query([polygon.mean(axis=0) for polygon in polygons])
     walls = -1 - diagram.neighbors[diagram.neighbors < 0]
     return np.where(np.asarray(far) < 1e-6 * diagram.domain.extent.max(), walls[row], -1)
+
+
+def _outside(diagram: Diagram, polygons: list[np.ndarray]) -> np.ndarray:
+    """Return which polygons lie on a wall or a side of the box, (f,) bool: not in the cut."""
+    domain = diagram.domain
+    starts = np.cumsum([0, *map(len, polygons)])[:-1]
+    gaps = np.stack([np.concatenate(polygons) - side for side in (domain.lower, domain.upper)], axis=1)
+    farthest = np.maximum.reduceat(np.abs(gaps), starts, axis=0)
+    on_side = (farthest < 1e-5 * domain.extent.max()).any(axis=(1, 2))
+    return on_side | (_walls_of(diagram, polygons) >= 0)
 
 
 def _draw_cutaway(
@@ -443,6 +458,8 @@ def _draw_cutaway(
     # The light comes from above, a little from the left.
     light = 0.5 * towards + 0.62 * up - 0.3 * right
     shade = 0.72 + 0.28 * np.clip(normals @ light / np.linalg.norm(light), 0, 1)
+    if polygons:
+        shade[~_outside(diagram, polygons)] *= _IN_CUT
     widths, colors = edge_widths(ax, flat) if edges else np.zeros(len(flat)), paint.rgba(cells)
     if walls and polygons:
         wall = _walls_of(diagram, polygons)
@@ -457,6 +474,8 @@ def _label_axes(ax: Any, diagram: Diagram, right: np.ndarray, up: np.ndarray, to
     center, screen = box.mean(axis=0), np.stack([right, up], axis=1)
     front = (towards > 0).astype(int)
     for axis, name in enumerate("xyz"):
+        if np.linalg.norm(screen[axis]) < 1e-9:  # seen end-on
+            continue
         # An edge of the outline lies between a visible and a hidden wall. Take the lowest, for z the leftmost.
         places = []
         for flip in {0, 1, 2} - {axis}:

@@ -295,6 +295,18 @@ def test_cutaway_of_a_periodic_box_has_its_flat_sides(periodic):
     assert 0.5 * areas[0] < areas[1] < 0.9 * areas[0]
 
 
+@pytest.mark.parametrize("periodic", [False, True])
+def test_faces_in_a_cut_are_darker(ctx, periodic):
+    box = Box((0, 0, 0), (1, 1, 1), periodic=periodic)
+    d = Adapter(ctx).diagram(box, np.random.default_rng(3).random((60, 3)))
+    brightest = []
+    for cut in (None, "x"):  # seen along x: one side of the box, then the cut alone
+        ax = plot_cutaway(d, np.ones(60), cut=cut, angles=(0, 0)).axes[0]
+        (faces,) = (c for c in ax.collections if isinstance(c, PolyCollection))
+        brightest.append(faces.get_facecolor()[:, 1].max())
+    assert brightest[1] < 0.8 * brightest[0]
+
+
 def test_without_pyvista(result, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     for view in ("slices", "slice", "cutaway"):
