@@ -159,8 +159,8 @@ def place_beside_lines(
                 "of the walls that the lines reach, if faces have to lie on them there",
                 MismatchWarning,
             )
-    if len(pairs.dropped):
-        x = pairs.dropped[0]
+    if len(pairs.left_out):
+        x = pairs.left_out[0]
         warn(
             f"lines have no room at {format_point(x)}: they are too near to each other or meet at too small an angle "
             f"for the size there, {float(np.asarray(size(x[None]))[0]):.3g}. A part of a line without faces on it "
@@ -177,6 +177,46 @@ def place_beside_lines(
                 "or use smaller sizes"
             )
     return pairs
+
+
+def place_around_creases(
+    domain: Domain, wells: np.ndarray, size: Callable[[np.ndarray], np.ndarray]
+) -> FixedGenerators | None:
+    """Return the generators around concave creases of `domain`, if there are any.
+
+    Parameters
+    ----------
+    wells : (k, d) array
+        Fixed generators of the caller.
+    size : callable
+        Sizes (n,) at points (n, d).
+
+    Warns
+    -----
+    MismatchWarning
+        If there is no room for them, or a generator of the caller is among them; says where.
+    """
+    around = domain.stations(size)
+    if around is None:
+        return None
+    if len(around.left_out):
+        x = around.left_out[0]
+        warn(
+            f"cells have no room at {len(around.left_out)} places on concave creases, the first at {format_point(x)}: "
+            "another crease or wall is near or meets it at a small angle, for the size there, "
+            f"{float(np.asarray(size(x[None]))[0]):.3g}. Cells may be concave; use smaller sizes around it",
+            MismatchWarning,
+        )
+    if len(wells) and len(around):
+        gaps = np.linalg.norm(wells[:, None] - around.centers, axis=2) / around.radii
+        i, b = np.unravel_index(gaps.argmin(), gaps.shape)
+        if gaps[i, b] < 1:
+            warn(
+                f"fixed[{i}] is at {format_point(wells[i])}, {gaps[i, b] * around.radii[b]:.3g} from a concave crease, "
+                f"expected at least {around.radii[b]:.3g}: cells there may be concave. Move it, or use smaller sizes",
+                MismatchWarning,
+            )
+    return around
 
 
 def in_frame(points: np.ndarray, domain: Domain) -> tuple[np.ndarray, np.ndarray | None]:

@@ -21,7 +21,7 @@ from ..tessellation.power import require_power_domain
 from .corners import place_stations
 from .diagnostics import check_precision, narrow_parts, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import Extras, check_memory, expected_boundary_cells, expected_images, expected_surplus
-from .fixed_points import check_room, place_beside_lines
+from .fixed_points import check_room, place_around_creases, place_beside_lines
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
 from .options import Options
@@ -153,7 +153,7 @@ def prepare(
                 "least as many cells; use smaller sizes, or more cells"
             )
     elif options.multilevel:
-        around = domain.stations(lambda x: factor * np.asarray(sizing(x)))
+        around = place_around_creases(domain, fixed, lambda x: factor * np.asarray(sizing(x)))
         fixed = fixed if around is None else np.concatenate([fixed, around.points])
     stationed = None
     own = _own_factor(sizing, free, tree, target) if domain.outline is not None and not options.multilevel else 1.0

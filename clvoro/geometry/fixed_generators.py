@@ -21,6 +21,8 @@ class FixedGenerators:
         Balls without other generators.
     ball_starts, balls : (n + 1,) and (k,) int32
         The balls of generator i are ``balls[ball_starts[i]:ball_starts[i + 1]]``.
+    left_out : (k, d) float64
+        Places on lines or creases without room for generators.
     """
 
     points: np.ndarray
@@ -28,6 +30,7 @@ class FixedGenerators:
     radii: np.ndarray
     ball_starts: np.ndarray
     balls: np.ndarray
+    left_out: np.ndarray
 
     own_sizes = False
     """The target size of these cells is the size that they have."""

@@ -96,7 +96,7 @@ def test_pairs_make_faces_on_the_lines_wherever_other_generators_are(kind):
     domain = domain.with_lines(lines)
     size = 0.08
     pairs = place_pairs(domain, domain.lines.network(domain), lambda x: np.full(len(x), size))
-    assert not len(pairs.dropped)
+    assert not len(pairs.left_out)
     assert domain.contains(pairs.points).all()
     period = np.where(domain.periodic, domain.extent, 0.0)
     others = np.random.default_rng(0).uniform(domain.lower, domain.upper, (4000, 2))

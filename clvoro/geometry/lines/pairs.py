@@ -53,13 +53,10 @@ class LinePairs(FixedGenerators):
     ----------
     chords, sizes : (c, 2, 2) and (c,) float64
         Where faces are to lie, and sizes of the cells beside them.
-    dropped : (d, 2) float64
-        Places at which a line is left out, because there is no room beside it.
     """
 
     chords: np.ndarray
     sizes: np.ndarray
-    dropped: np.ndarray
 
     own_sizes = True
 
@@ -167,9 +164,9 @@ def place_pairs(domain: Domain, network: Network, size: Callable[[np.ndarray], n
         _CLEAR * np.array(layout.radii),
         np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
         np.array([b for _, b in members], np.int32),
+        np.reshape(placing.dropped, (-1, 2)),
         np.reshape(layout.chords, (-1, 2, 2)),
         np.array(layout.sizes),
-        np.reshape(placing.dropped, (-1, 2)),
     )
 
 

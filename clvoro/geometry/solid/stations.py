@@ -30,6 +30,7 @@ _SAMPLES = 8  # of 1 / h per step, at least
 _FEWEST = 64  # samples per chain, at least
 _MOST = 1 << 16
 _ROUNDS = 3  # of reflections at a corner
+_EXACT = 0.02  # of a radius: generators this near to a sphere are on it
 _CROWD = 16  # generators at a corner, about
 _ITERATIONS = 8  # of Newton's method
 
@@ -44,13 +45,10 @@ class Stations(FixedGenerators):
         The size h of their cells.
     chain : (n,) int
         The chain that each one belongs to; -1 for those that complete a corner.
-    left_out : (k, 3) float
-        Places on creases where there is no room for a station.
     """
 
     size: np.ndarray
     chain: np.ndarray
-    left_out: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -210,7 +208,7 @@ class _AroundCreases:
         self.balls: list[list[int]] = []  # of each generator
         self.centers: list[np.ndarray] = []
         self.radii: list[float] = []
-        self.lost = [np.zeros((0, 3))]
+        self.lost = np.zeros((0, 3))
 
     def add(self, chain: _Chain) -> None:
         """Add the generators and balls of a chain."""
@@ -232,7 +230,7 @@ class _AroundCreases:
         self.balls = [balls for balls, k in zip(self.balls, kept.tolist(), strict=True) if k]
 
     def join(self) -> None:
-        """Make one of two generators of different chains that are near each other, on the spheres of both."""
+        """Make one of two near generators of different chains, if there is a place on the spheres of both."""
         if not len(self.points):
             return
         kept = np.ones(len(self.points), bool)
@@ -241,7 +239,9 @@ class _AroundCreases:
                 continue
             balls = self.balls[i] + self.balls[j]
             point = self.common_point(0.5 * (self.points[i] + self.points[j]), balls)
-            if np.linalg.norm(point - self.points[[i, j]], axis=1).max() < _ROOM * self.sizes[i]:
+            near = np.linalg.norm(point - self.points[[i, j]], axis=1).max() < _ROOM * self.sizes[i]
+            off = np.linalg.norm(point - np.array(self.centers)[balls], axis=1) / np.array(self.radii)[balls] - 1
+            if near and np.abs(off).max() < _EXACT:
                 self.points[i], self.balls[i] = point, balls
                 kept[j] = False
         self.keep(kept)
@@ -264,14 +264,14 @@ class _AroundCreases:
         return point
 
     def leave_out(self) -> None:
-        """Leave out generators near others, near walls, or outside of the solid; note their places on the creases."""
+        """Leave out generators near others, near walls, or outside; note their places on creases."""
         if not len(self.points):
             return
         keep = -self.solid.signed_distance(self.points) > _WALL * self.sizes
         for i, j in self.near_pairs():
             if keep[i] and keep[j]:
                 keep[j] = False
-        self.lost.append(self.spots[~keep])
+        self.lost = np.unique(self.spots[~keep], axis=0)
         self.keep(keep)
 
     def complete(self) -> None:
@@ -316,9 +316,9 @@ class _AroundCreases:
             radii,
             np.cumsum([0, *map(len, self.balls)]).astype(np.int32),
             np.array([ball for balls in self.balls for ball in balls], np.int32),
+            self.lost,
             self.sizes,
             self.chains,
-            np.unique(np.concatenate(self.lost), axis=0),
         )
 
 

@@ -5,6 +5,8 @@ import pytest
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree
 
 from clvoro import Polygon, Solid
+from clvoro.adaptation.fixed_points import place_around_creases
+from clvoro.errors import MismatchWarning
 from clvoro.geometry.solid.stations import chain_line
 
 L = Solid.extruded(Polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]), 0, 1)
@@ -85,6 +87,21 @@ def test_stations_follow_the_sizes_along_a_crease():
     middle = (z[1:] + z[:-1]) / 2
     assert np.diff(z) == pytest.approx(0.05 + 0.05 * middle, rel=0.03)
     assert len(stations) == 3 * len(z)
+
+
+def test_places_without_room_are_reported():
+    """Above a ledge that is narrower than the cells, and in a run."""
+    ledge = Polygon([(0, 0), (1.05, 0), (1.05, 1), (1, 1), (1, 2), (0, 2)])
+    solid = Solid.extruded(ledge, 0, 0.6)
+    left = solid.stations(0.2).left_out
+    assert left[:, :2] == pytest.approx(np.tile([1.0, 1.0], (3, 1)))
+    with pytest.warns(MismatchWarning, match="no room at 3 places on concave creases, the first at \\(1, 1, 0.1\\)"):
+        place_around_creases(solid, np.empty((0, 3)), lambda x: np.full(len(x), 0.2))
+
+
+def test_given_generators_in_balls_are_reported():
+    with pytest.warns(MismatchWarning, match="fixed\\[0\\] .* from a concave crease"):
+        place_around_creases(L, np.array([[0.9, 0.9, 0.5]]), lambda x: np.full(len(x), 0.2))
 
 
 def test_solids_without_concave_creases_have_no_stations():
