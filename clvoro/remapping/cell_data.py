@@ -58,7 +58,9 @@ def transfer_values(
     # Scale to numbers around 1 by powers of two: this is exact, and no product overflows.
     scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(filled).max(axis=0), 1e-300))))
     same = source.domain == target.domain
-    task = source, target, filled / scale, order, bool(limited), not same
+    # Cells at the walls of a solid do not end at the same chords.
+    partial = not same or source.domain.wall_triangles is not None
+    task = source, target, filled / scale, order, bool(limited), partial
     if _on_host(source.domain, target.domain):
         means, low, high, covered = _transfer_on_host(*task)
     else:
@@ -68,6 +70,7 @@ def transfer_values(
     bounded = order == 1 or bool(limited)
     if same:
         means = _conserve_mass(filled / scale, source.volumes, means, target.volumes, low, high, bounded)
+        covered = np.where(covered > 0, 1.0, 0.0)
     elif bounded:
         means = np.clip(means, low, np.maximum(low, high))
     means[covered == 0] = np.nan

@@ -359,11 +359,9 @@ def rebuild(diagram: Diagram) -> dict[str, np.ndarray]:
     """Return the arrays of a diagram that follow from its corners: measures and centroids of faces, centroids."""
     with np.errstate(all="ignore"):  # the check reports numbers that are not finite
         g = Rebuilt(diagram)
-    return {
-        "face_measures": g.measures,
-        "face_centroids": g.middles + diagram.points[g.owner],
-        "centroids": g.centroids + diagram.points,
-    }
+        warped = diagram.domain.wall_triangles is not None  # faces at the walls of a solid are not plane
+        centroids = diagram.faces.measures.geometry.centroids if warped else g.centroids + diagram.points
+    return {"face_measures": g.measures, "face_centroids": g.middles + diagram.points[g.owner], "centroids": centroids}
 
 
 RADIUS_ROUNDINGS = 16
