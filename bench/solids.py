@@ -1,7 +1,8 @@
 """Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
 
     python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
-                           [--keep FOLDER] [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
+                           [--beside-box N] [--keep FOLDER] [--pictures FOLDER] [--device NAME]
+                           [--dtype float32] [--json]
 
 The solids are in `bench/_solid_shapes.py`; they need trimesh, manifold3d, shapely, networkx and, for the gyroid,
 scikit-image. Each is meshed at two uniform sizes with default settings, and written as polyMesh. A row has the number
@@ -9,7 +10,8 @@ of cells, mean |e| of the sizes and mean isoperimetric quotient, the largest and
 skewness, the number of concave cells, the volume of all cells over that of the solid, and the verdict.
 
 --runs is a list of efforts and "exact". With `--booleans N` the solids are N random booleans of boxes, balls and
-cylinders. Pictures show each mesh cut open, with the patches in colors.
+cylinders. `--beside-box N` compares processor times of whole runs in a cube of N cells: as a box, and as a solid.
+Pictures show each mesh cut open, with the patches in colors.
 """
 
 from __future__ import annotations
@@ -94,6 +96,19 @@ def draw(result: clvoro.Result, path: Path, title: str) -> None:
     plot_cutaway(result, "quality", walls=True, title=title).savefig(path, dpi=150, bbox_inches="tight")
 
 
+def beside_box(adapter: clvoro.Adapter, n: int) -> None:
+    """Print the processor times of a run in a unit cube of `n` cells as a box and as a solid, and their ratio."""
+    seconds: dict[str, float] = {}
+    for domain in (clvoro.Box((0, 0, 0), (1, 1, 1)), clvoro.Solid.box((0, 0, 0), (1, 1, 1))):
+        adapter.run(domain, 0.25, "fast")  # builds the programs
+        begin = time.process_time()
+        result = adapter.run(domain, n ** (-1 / 3))
+        name = type(domain).__name__
+        seconds[name] = time.process_time() - begin
+        print(f"{name}: {len(result.points)} cells, {seconds[name]:.2f} s of processor time", flush=True)
+    print(f"Solid / Box: {seconds['Solid'] / seconds['Box']:.2f}")
+
+
 def main() -> None:
     """Run the bench."""
     options_of = parser(__doc__)
@@ -103,9 +118,12 @@ def main() -> None:
     options_of.add_argument("--resolutions", default="0,1", metavar="NUMBERS", help="0: coarse, 1: fine")
     options_of.add_argument("--booleans", type=int, default=0, metavar="N", help="random solids in place of those")
     options_of.add_argument("--size", type=float, default=0.12, help="of the cells of random solids")
+    options_of.add_argument("--beside-box", type=int, metavar="N", help="compare times of N cells in a cube")
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = options_of.parse_args()
+    if options.beside_box:
+        return beside_box(make_adapter(options), options.beside_box)
     if shutil.which("checkMesh") is None:
         raise SystemExit("checkMesh is not installed; Debian has it in the package openfoam")
     adapter = make_adapter(options)
