@@ -14,6 +14,7 @@ from ..geometry.polygon import Polygon
 from ..opencl import memory_limits
 from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
+from ..opencl.workspace import KEPT
 from ..tessellation.cut_cells import clipping_space
 from .sampling.quadrature import DensityTree
 
@@ -36,8 +37,9 @@ CELLS_PER_WALL_CELL = 2.0
 clipped again, and generators outside of the mesh that is read."""
 LARGEST = 0.2
 """Share of the largest array."""
-FIXED = 2**16
-"""Bytes for any number of cells: the record of a solver's iterations, sums and scans, small arrays."""
+FIXED = 2**16 + KEPT
+"""Bytes for any number of cells: the record of a solver's iterations, sums and scans, small arrays, and memory that is
+kept for later steps."""
 IMAGE_REACH = {2: 1.55, 3: 1.75}
 """Depth of the halo of equal cells over their size."""
 STEEP_FROM, STEEP_TO = 1.4, 2.4

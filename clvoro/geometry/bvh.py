@@ -66,16 +66,24 @@ class Tree:
         return order
 
     def nearest2(
-        self, points: np.ndarray, bound2: np.ndarray, distance2: Callable[[np.ndarray, np.ndarray], np.ndarray]
+        self,
+        points: np.ndarray,
+        bound2: np.ndarray,
+        distance2: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        in_boxes: bool = True,
     ) -> np.ndarray:
         """Return the smallest squared distance of each of `points` (n, d) to the items, but at most `bound2`, (n,).
 
         See `nearest`.
         """
-        return self.nearest(points, bound2, distance2)[0]
+        return self.nearest(points, bound2, distance2, in_boxes)[0]
 
     def nearest(
-        self, points: np.ndarray, bound2: np.ndarray, distance2: Callable[[np.ndarray, np.ndarray], np.ndarray]
+        self,
+        points: np.ndarray,
+        bound2: np.ndarray,
+        distance2: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        in_boxes: bool = True,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the squared distance of each of `points` to the nearest item, at most `bound2`, and that item.
 
@@ -86,6 +94,8 @@ class Tree:
             Items beyond this squared distance are skipped; a tighter bound is faster.
         distance2 : callable
             Returns the squared distances of points (m, d) to items (m,), given by index.
+        in_boxes : bool
+            Whether distances are those to places in the items' boxes. They may also be larger.
 
         Returns
         -------
@@ -96,16 +106,15 @@ class Tree:
         d = points.shape[1]
         for first in range(0, len(points), _BLOCK):
             who = np.arange(first, min(first + _BLOCK, len(points)))
-            reach2 = (
-                best2.copy()
-            )  # an upper bound: each box holds an item, which is no farther than its farthest corner
+            reach2 = best2.copy()
             node = np.zeros(len(who), np.int64)
             for level in range(self.levels + 1):
                 box = self.boxes[node + (1 << level) - 1]
                 low, high = box[:, :d] - points[who], points[who] - box[:, d:]
                 away2 = (np.maximum(np.maximum(low, high), 0) ** 2).sum(axis=1)
-                farthest2 = (np.minimum(low, high) ** 2).sum(axis=1) * (1 + 1e-12)
-                np.minimum.at(reach2, who, farthest2)
+                if in_boxes:  # each box holds an item, which is no farther than the farthest corner
+                    farthest2 = (np.minimum(low, high) ** 2).sum(axis=1) * (1 + 1e-12)
+                    np.minimum.at(reach2, who, farthest2)
                 near = away2 <= reach2[who]
                 who, node = who[near], node[near]
                 if level < self.levels:

@@ -34,7 +34,7 @@ SLACK = 1.05
 for that, the factor grows by itself: otherwise two needs that alternate would free and allocate in every step."""
 LOOSEST, SMALL = 4, 4096
 """A buffer may have so many times the bytes of its array, or so many bytes in any case."""
-KEPT = 1 << 23
+KEPT = 1 << 19
 """Bytes up to which memory is kept that is not needed for a while. To allocate it again takes as long as a step of a
 small mesh."""
 SPARE = 32

@@ -194,7 +194,7 @@ class Distance(Field):
         for item in np.unique(np.linspace(0, len(self._begin) - 1, 16).astype(int)):
             best2 = np.minimum(best2, away2(points, np.full(len(points), item)))
         tree = Tree(*_item_boxes(self._begin, self._end, self._radius))
-        return np.sqrt(tree.nearest2(points, best2, away2))
+        return np.sqrt(tree.nearest2(points, best2, away2, in_boxes=bool((self._radius >= 0).all())))
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return np.minimum(self.h_min + self.slope * self.distance(points), self.h_max)

@@ -541,7 +541,7 @@ def test_one_cell_of_the_right_size(adapter):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"method": "best"}, InputError, "method is 'best', expected one of adaptive, exact, transport, lloyd"),
+        ({"method": "best"}, InputError, "method is 'best', which is an effort; write effort='best'"),
         ({"method": None}, InputError, "method is None"),
         ({"points": "random"}, InputError, "points is 'random', expected one of density, uniform"),
         ({"effort": "most"}, InputError, "effort is 'most', expected one of fast"),

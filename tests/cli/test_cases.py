@@ -160,7 +160,7 @@ def test_sizes_from_a_solution(tmp_path):
         ("size = 0.1\n[run]\nspacing = 0.1", ["run", "'spacing'", "it belongs to [[layers]]"]),
         (
             "[size]\nkind = 'constant'\nvalue = 0.1\nslope = 0.2",
-            ["size", "'slope'", "it is for kind = 'caps' or 'distance' or 'graded'"],
+            ["size", "'slope'", "it is for kind = 'caps' or 'distance' or 'region' or 'graded'"],
         ),
         ("", ["lacks size"]),
         ("[size]\nkind = 'distnce'", ["size.kind", "did you mean 'distance'"]),

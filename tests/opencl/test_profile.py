@@ -141,7 +141,7 @@ def test_calls_and_bytes_of_known_launches(engine):
 def test_times_are_those_of_the_events(engine):
     x = engine.zeros(200_000)
     kernel = engine.kernels("opencl/primitives").summarize_blocks
-    args = (*[x] * 8, np.int32(1), np.int32(len(x)), np.zeros(8, np.int32), engine.empty(6 * engine.groups))
+    args = (*[x] * 8, np.int32(1), np.int32(len(x)), np.zeros(8, np.int32), engine.empty(6 * engine.groups), 0, x)
     with Profile(engine.queue) as taken:
         events = [engine.run_blocks(kernel, *args) for _ in range(9)]
     seconds = sum(1e-9 * (e.profile.end - e.profile.start) for e in events)
@@ -152,7 +152,7 @@ def test_times_are_those_of_the_events(engine):
 def test_few_events_are_kept(engine, monkeypatch):
     monkeypatch.setattr(profile, "PENDING", 10)
     x, kernel = engine.zeros(64), engine.kernels("opencl/primitives").summarize_blocks
-    args = (*[x] * 8, np.int32(1), np.int32(64), np.zeros(8, np.int32), engine.empty(6 * engine.groups))
+    args = (*[x] * 8, np.int32(1), np.int32(64), np.zeros(8, np.int32), engine.empty(6 * engine.groups), 0, x)
     most = 0
     with Profile(engine.queue) as taken:
         for _ in range(57):

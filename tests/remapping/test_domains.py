@@ -21,7 +21,7 @@ def pairs(ctx):
     """Pairs of meshes, each with the measure of their common part."""
     adapter = clvoro.Adapter(ctx)
     earth = clvoro.Sphere()
-    globe, fine = (adapter.diagram(earth, earth.icosahedral_points(k)) for k in (6, 9))
+    globe, fine = (adapter.diagram(earth, earth.icosahedral_points(k)) for k in (2, 3))
     north, east = (g.subset(g.points[:, axis] > 0) for g, axis in ((globe, 2), (fine, 1)))
     grid = in_box(adapter, (0, 0), (2, 1), 60)
     points = RNG.uniform(0, 2, (400, 2))
