@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -547,3 +548,22 @@ class Domain(ABC):
         """Return the arguments of kernels with DOMAIN_ARGS; see geometry/domain.h."""
         walls = () if self.wall_triangles is None else self.wall_triangles.arguments(engine, self.frame)
         return *self.device_corners(engine.real), *walls, *engine.period_args
+
+
+def images_in(domain: Domain, lower: np.ndarray, upper: np.ndarray, within: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the cells, or of a periodic domain also their images, that reach into a box.
+
+    `lower` and `upper` (n, d) are the corners of the cells' bounding boxes, `within` those of the box.
+
+    Returns
+    -------
+    list of (rows (k,), offset (d,))
+    """
+    found = []
+    for step in product(*((0, -1, 1) if p else (0,) for p in domain.periodic)):
+        by = step * domain.extent
+        # An image must reach in by more than round-off.
+        slack = 1e-9 * domain.extent * any(step)
+        seen = ((upper + by >= within[0] + slack) & (lower + by <= within[1] - slack)).all(axis=1)
+        found.append((np.flatnonzero(seen), by))
+    return found

@@ -216,10 +216,12 @@ def to_meshio(mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None 
     return to_meshio(contents)
 
 
-def to_pyvista(mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None) -> pyvista.UnstructuredGrid:
+def to_pyvista(
+    mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None, cut: bool = False
+) -> pyvista.UnstructuredGrid:
     """Return an unstructured grid of PyVista; see `Diagram.to_pyvista`."""
     from .convert import to_pyvista
 
     contents = Contents.of(mesh, cell_data)
     contents.diagram.demand_cells("to_pyvista")
-    return to_pyvista(contents)
+    return to_pyvista(contents, cut)

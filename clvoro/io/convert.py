@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import ClvoroError, InputError, MissingLibraryError
+from ..geometry.domain import Domain, images_in
 from ..mesh.results import Result
 from .atomic import atomic_file, atomic_folder
 from .contents import Contents
@@ -43,8 +44,8 @@ def to_meshio(contents: Contents, with_data: bool = True) -> meshio.Mesh:
     )
 
 
-def to_pyvista(contents: Contents) -> pyvista.UnstructuredGrid:
-    """Return an unstructured grid of PyVista; see `Diagram.to_pyvista`."""
+def to_pyvista(contents: Contents, cut: bool = False) -> pyvista.UnstructuredGrid:
+    """Return an unstructured grid of PyVista, perhaps `cut` at the box; see `Diagram.to_pyvista`."""
     try:
         import pyvista
     except ModuleNotFoundError as error:
@@ -58,7 +59,25 @@ def to_pyvista(contents: Contents) -> pyvista.UnstructuredGrid:
     grid = pyvista.UnstructuredGrid(cells, np.full(len(diagram), kind.number, np.uint8), in_space(diagram.vertices))
     for name, values in cell_data(contents).items():
         grid.cell_data[name] = np.array(values)
-    return grid
+    return _cut(grid, diagram.domain) if cut and any(diagram.domain.periodic) else grid
+
+
+def _cut(grid: pyvista.UnstructuredGrid, domain: Domain) -> pyvista.UnstructuredGrid:
+    """Return the cells cut at the periodic sides of the box, with their images, which fill it."""
+    import pyvista
+
+    box = np.array([domain.lower, domain.upper])
+    corners = np.asarray(grid.points)[grid.cell_connectivity, : domain.dim]
+    low, high = (bound.reduceat(corners, grid.offset[:-1], axis=0) for bound in (np.minimum, np.maximum))
+    parts = []
+    for rows, by in images_in(domain, low, high, box):
+        if len(rows):
+            parts.append(grid.extract_cells(rows).translate(in_space(by[None])[0], inplace=False))
+    whole = pyvista.merge(parts, merge_points=False) if len(parts) > 1 else parts[0]
+    for axis in np.flatnonzero(domain.periodic):
+        sides = in_space(box)
+        whole = whole.clip("xyz"[axis], origin=sides[0], invert=False).clip("xyz"[axis], origin=sides[1])
+    return whole
 
 
 def _polygons(diagram: Diagram) -> tuple[list[Any], list[np.ndarray]]:

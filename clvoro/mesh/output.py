@@ -374,13 +374,18 @@ class MeshOutput:
 
         return plot_mesh(self._self, self.default_color if color is None else color, view, **options)
 
-    def to_pyvista(self, cell_data: Mapping[str, ArrayLike] | None = None) -> pyvista.UnstructuredGrid:
+    def to_pyvista(
+        self, cell_data: Mapping[str, ArrayLike] | None = None, cut: bool = False
+    ) -> pyvista.UnstructuredGrid:
         """Return the cells in a box, a polygon or a solid, or on a sphere as an unstructured grid of PyVista.
 
         Parameters
         ----------
         cell_data : mapping, optional
             As for `save`.
+        cut : bool
+            Cut cells at the sides of a periodic box, for viewing: their images fill it, and "label" says of which
+            cell each part is. By default cells lie whole around their generators, partly outside of the box.
 
         Returns
         -------
@@ -397,7 +402,7 @@ class MeshOutput:
         """
         from ..io import to_pyvista
 
-        return to_pyvista(self._self, cell_data)
+        return to_pyvista(self._self, cell_data, cut)
 
     def to_meshio(self, cell_data: Mapping[str, ArrayLike] | None = None) -> meshio.Mesh:
         """Return the cells in a box, a polygon or a solid, or on a sphere as a mesh of meshio.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import TYPE_CHECKING, Any, cast
 from weakref import WeakKeyDictionary
 
@@ -18,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..arguments import format_point
 from ..errors import InputError
-from ..geometry.domain import Domain
+from ..geometry.domain import Domain, images_in
 from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
@@ -403,25 +402,6 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
         clip_to_domain(ax, domain, image)
         add_color_bar(ax, paint)
     return ax.figure
-
-
-def images_in(domain: Domain, lower: np.ndarray, upper: np.ndarray, within: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the cells, or of a periodic domain also their images, that reach into a box.
-
-    `lower` and `upper` (n, d) are the corners of the cells' bounding boxes, `within` those of the box.
-
-    Returns
-    -------
-    list of (rows (k,), offset (d,))
-    """
-    found = []
-    for step in product(*((0, -1, 1) if p else (0,) for p in domain.periodic)):
-        by = step * domain.extent
-        # An image must reach in by more than round-off.
-        slack = 1e-9 * domain.extent * any(step)
-        seen = ((upper + by >= within[0] + slack) & (lower + by <= within[1] - slack)).all(axis=1)
-        found.append((np.flatnonzero(seen), by))
-    return found
 
 
 def _cells_in(diagram: Diagram, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,11 +19,12 @@ from scipy.spatial import KDTree
 
 from ..arguments import format_point
 from ..errors import InputError
+from ..geometry.domain import images_in
 from ..io.convert import missing
 from ..mesh.connectivity import face_corners, following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
-from .cells import draw_polygons, edge_widths, images_in
+from .cells import draw_polygons, edge_widths
 from .colors import Color, Paint, paint_of, picture_of
 from .legends import add_key, finished
 from .style import METHOD_COLORS, WIDTH, corners_of, frame_domain, interactive_figure, nice, styled

@@ -182,6 +182,21 @@ def test_to_pyvista(diagram):
         np.testing.assert_array_equal(corners, np.unique(diagram.cell(i).vertices, axis=0))
 
 
+@pytest.mark.parametrize("periodic", [(True, True), (False, True), (True, True, False), (True, True, True)])
+def test_cells_cut_at_the_box_fill_it(ctx, periodic):
+    pytest.importorskip("pyvista")
+    dim = len(periodic)
+    box = clvoro.Box((1,) * dim, (3,) * dim, periodic=periodic)
+    diagram = clvoro.Adapter(ctx).diagram(box, 1 + 2 * np.random.default_rng(5).random((30, dim)))
+    grid = diagram.to_pyvista(cut=True)
+    bounds = np.reshape(grid.bounds, (3, 2))[:dim]
+    assert bounds == pytest.approx(np.tile([1.0, 3.0], (dim, 1)), abs=1e-6)
+    sizes = grid.compute_cell_sizes()["Volume" if dim == 3 else "Area"]
+    parts = np.bincount(grid.cell_data["label"], sizes, minlength=30)
+    assert parts == pytest.approx(diagram.volumes, rel=1e-4)
+    assert grid.n_cells > 30
+
+
 @pytest.mark.parametrize("library", ["meshio", "pyvista"])
 def test_missing_libraries_are_named(result, monkeypatch, library):
     monkeypatch.setitem(__import__("sys").modules, library, None)
