@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.finite_volumes.solid_walls.mesh import diagram_of, outer_generators, solid_mesh
+from clvoro.finite_volumes.solid_walls.mesh import diagram_of, outer_generators, solid_diagram, solid_mesh
 from clvoro.mesh.connectivity import following
 
 H = 0.25
@@ -39,14 +39,18 @@ def generators(solid):
     return x[solid.signed_distance(x) < -0.2 * H]
 
 
+def whole_diagram(ctx, solid, x, h):
+    """Return the diagram of generators and outer generators in a box around the solid."""
+    box = clvoro.Box(np.subtract(solid.lower, 4 * H), np.add(solid.upper, 4 * H))
+    return clvoro.Adapter(ctx).diagram(box, np.concatenate([x, outer_generators(solid, x, h)]))
+
+
 @pytest.fixture(scope="module", params=SOLIDS)
 def made(request, ctx):
     solid = SOLIDS[request.param]()
     x = generators(solid)
     h = np.full(len(x), H)
-    outer = outer_generators(solid, x, h)
-    box = clvoro.Box(np.subtract(solid.lower, 4 * H), np.add(solid.upper, 4 * H))
-    mesh = solid_mesh(solid, x, h, clvoro.Adapter(ctx).diagram(box, np.concatenate([x, outer])))
+    mesh = solid_mesh(solid, x, h, whole_diagram(ctx, solid, x, h))
     assert not len(mesh.odd)
     assert not len(mesh.lost)
     return solid, mesh.faces
@@ -120,3 +124,13 @@ def test_check_finds_what_is_wrong(made):
     text = str(type(diagram)(solid, arrays).check())
     assert "walls" in text
     assert "volumes[" in text
+
+
+def test_concave_cells_are_warned_of(ctx):
+    """Where a generator beside the crease is missing, another cell contains the crease."""
+    solid = el()
+    x = generators(solid)
+    x = np.delete(x, np.linalg.norm(x - (1 + H / 2, 1 - H / 2, 0.5), axis=1).argmin(), axis=0)
+    h = np.full(len(x), H)
+    with pytest.warns(clvoro.errors.MismatchWarning, match="cells at walls are concave, the first at"):
+        solid_diagram(solid, x, h, whole_diagram(ctx, solid, x, h))

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import KDTree
 
-from ...arguments import format_point
-from ...errors import InputError
+from ...arguments import format_point, warn
+from ...errors import InputError, MismatchWarning
 from ...mesh.connectivity import distinct, following, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
 from .chains import Crossings, cross_cells
-from .mend import narrow_faces
+from .mend import find_concave, narrow_faces
 from .pierce import IN, WALL, pierce_edges, sides
 from .polygons import Divider, chain_loops, open_sides
 from .trimmed_faces import TrimmedFaces, trim_faces
@@ -104,6 +104,11 @@ def solid_diagram(solid: Solid, points: np.ndarray, sizes: np.ndarray, whole: Di
     ------
     InputError
         If generators have no cell, as the solid is too thin there.
+
+    Warns
+    -----
+    MismatchWarning
+        If cells are concave.
     """
     made = solid_mesh(solid, points, sizes, whole)
     if len(made.lost):
@@ -113,7 +118,15 @@ def solid_diagram(solid: Solid, points: np.ndarray, sizes: np.ndarray, whole: Di
             f"{place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
         )
     diagram = diagram_of(made.faces)
-    return diagram_of(collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes)))
+    diagram = diagram_of(collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes)))
+    concave = np.unique(find_concave(diagram.faces)[1])
+    if len(concave):
+        warn(
+            f"{len(concave)} cells at walls are concave, the first at {format_point(points[concave[0]])}: the walls "
+            "bend or meet within a cell there, and OpenFOAM does not accept it; use smaller sizes there",
+            MismatchWarning,
+        )
+    return diagram
 
 
 def diagram_of(faces: Faces) -> Diagram:
