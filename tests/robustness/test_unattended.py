@@ -119,7 +119,7 @@ def test_characters_that_a_stream_does_not_know(here, monkeypatch):
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", stream)
     assert call("--out", "über") == cli.OK
-    assert b"\\xfcber/mesh.vtu" in stream.buffer.getvalue()
+    assert b"\\xfcber: mesh.vtu" in stream.buffer.getvalue()
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
