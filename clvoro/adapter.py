@@ -228,6 +228,7 @@ class Adapter:
 
     def _diagram(self, domain: Domain, points: ArrayLike) -> Diagram:
         stages = self._stages_for(domain)
+        domain.require_no_holes("points of a diagram are given")
         host = check_points(points, domain)
         check_memory(stages.engine, len(host), domain, run=False)
         with coincident_named(host, domain, self.dtype):

@@ -161,6 +161,12 @@ def place_beside_lines(
             )
     if len(pairs.left_out):
         x = pairs.left_out[0]
+        if domain.holes is not None:
+            raise InputError(
+                f"outlines of holes have no room at {format_point(x)}: they are too near to each other for the size "
+                f"there, {float(np.asarray(size(x[None]))[0]):.3g}, or a corner has less than about 20 degrees; use "
+                "smaller sizes around it, move the holes apart, or make the corner blunt"
+            )
         warn(
             f"lines have no room at {format_point(x)}: they are too near to each other or meet at too small an angle "
             f"for the size there, {float(np.asarray(size(x[None]))[0]):.3g}. A part of a line without faces on it "

@@ -182,6 +182,8 @@ def _own_factor(sizing: Sizing, free: Domain, tree: DensityTree | None, count: i
 def _check_together(domain: Domain, points: np.ndarray | None, fixed: np.ndarray, options: Options) -> None:
     """Raise if the arguments of a run do not fit together."""
     n_cells, method = options.n_cells, options.method
+    if n_cells is not None:
+        domain.require_no_holes("n_cells is given")
     if method == "transport":
         require_power_domain(domain)
     if (len(fixed) or domain.lines) and method in ("transport", *MOVING):

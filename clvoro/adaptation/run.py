@@ -18,6 +18,7 @@ from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from ..mesh.straightening import cell_quality
+from ..mesh.subset import without_holes
 from ..opencl.primitives import Summary
 from ..sizing.field import as_field
 from ..solvers.linear_system import Solution
@@ -459,7 +460,7 @@ class Run:
         put_back(diagram, mesh.setup.points)
         if mesh.domain.wall_triangles is not None:
             error, quality = self._measured_again(diagram, size)
-        return Result(
+        result = Result(
             points=diagram.points,
             diagram=diagram,
             target_size=size,
@@ -474,6 +475,7 @@ class Run:
             settings=dict(self._settings),
             origin=origins(labels, self.started, mesh.taken),
         )
+        return without_holes(result)
 
     def _measured_again(self, diagram: Diagram, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return error and quality of the cells of a solid's mesh, which differ a little from those of the run."""

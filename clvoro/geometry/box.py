@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,6 +87,48 @@ class Box(Domain):
         object.__setattr__(self, "upper", tuple(upper.tolist()))
         object.__setattr__(self, "periodic", _directions(self.periodic, lower.size))
         object.__setattr__(self, "names", self._checked_names())
+
+    def without(self, holes: Sequence[object], names: Mapping[str, Walls] | None = None) -> Box:
+        """Return this box in 2D with holes, for runs; one direction or both are periodic.
+
+        Such holes are tubes of a bank, wings of a cascade, pores of a representative volume. Generators stand on both
+        sides of their outlines in pairs that are mirror images, so that faces lie on them; the cells inside are removed
+        when a run ends. Holes may cross periodic sides. The domain of the mesh is a
+        `clvoro.geometry.subdomain.Subdomain`.
+
+        Parameters
+        ----------
+        holes : sequence of rings
+            Each like the outer ring of a `Polygon`: vertices (k, 2), a closed curve, or a list of points and curves.
+        names : mapping, optional
+            Names of boundaries, each with its holes: numbers, default names, or a sequence of them. The default names
+            are ``hole-1``, ``hole-2``, ..., or that of the curve that a hole is.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If no direction is periodic, a hole is no ring, holes touch each other, their images or a wall, or names
+            are wrong.
+
+        Examples
+        --------
+        >>> tube = clvoro.curves.circle((0, 0.5), 0.2)
+        >>> bank = clvoro.Box((0, 0), (1, 1), periodic=True).without([tube], names={"tube": 0})
+        >>> mesh = clvoro.adapt(bank, clvoro.sizing.Distance(bank.holes, 0.03, growth=1.2, h_max=0.1), "fast")
+        >>> mesh.diagram.domain.boundary_names, round(mesh.diagram.domain.measure, 2)
+        (('tube',), 0.87)
+        """
+        from .lines.obstacles import Obstacles
+
+        self.require_plane("holes are in the plane", "use a clvoro.Solid")
+        if not any(self.periodic):
+            raise InputError(f"{self} has no periodic direction; write clvoro.Polygon(outline, holes)")
+        if self.lines is not None:
+            raise InputError("the box has lines or holes already, expected one of them; give all holes at once")
+        made = Box(**self.describe())
+        found = Obstacles(made, holes, names)
+        vars(made).update(lines=found, holes=found)
+        return made
 
     def __repr__(self) -> str:
         periodic = f", periodic={self.periodic}" if any(self.periodic) else ""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ..opencl.engine import Engine
     from .fixed_generators import FixedGenerators
     from .lines.lines import Lines
+    from .lines.obstacles import Obstacles
     from .polygon import Polygon
     from .sphere import Sphere
     from .wall_triangles import WallTriangles
@@ -74,12 +75,15 @@ class Domain(ABC):
         The caller's names of boundaries.
     lines : Lines or None
         Lines inside, on which faces of cells lie; see `with_lines`.
+    holes : Obstacles or None
+        The same lines if their insides are removed from meshes; see `Box.without`.
     """
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     names: Mapping[str, Walls] | None = None
     lines: Lines | None = None
+    holes: Obstacles | None = None
 
     def with_lines(self, lines: object) -> Domain:
         """Return the same domain in 2D with lines inside, on which faces of the cells of a run lie.
@@ -110,6 +114,7 @@ class Domain(ABC):
         from .lines.lines import Lines
 
         self.require_plane("lines are in the plane", "leave them out")
+        self.require_no_holes("lines are given")
         made = type(self).described(**self.describe())
         found = Lines(lines)
         if not len(found.network(made).chains):
@@ -412,6 +417,11 @@ class Domain(ABC):
         """Raise InputError, which begins with `what` and ends with `remedy`, unless the domain is part of a plane."""
         if self.dim > 2:
             raise InputError(f"{what}, and {self} is in 3D or on a sphere; {remedy}")
+
+    def require_no_holes(self, what: str) -> None:
+        """Raise InputError, which begins with `what`, if holes are removed from meshes of the domain."""
+        if self.holes is not None:
+            raise InputError(f"{what}, which does not go with the holes of {self}; use it in the box without holes")
 
     def place_name(self, x: np.ndarray) -> str:
         """Return a position (d,) in words, for messages."""

@@ -85,7 +85,8 @@ class Result(Sealed, MeshOutput):
         most 30 degrees in sum, and holes within a cell are not sides.
     history : structured array of `HISTORY_DTYPE`
         One row per step: ``history["mean_error"]``, ... The last row describes this mesh. It is an additional one if
-        the run was stopped on a coarser level, before sizes were scaled to `n_cells`, or within a step.
+        the run was stopped on a coarser level, before sizes were scaled to `n_cells`, or within a step. Cells in the
+        holes of a periodic box are deleted in it.
     converged : bool
         Whether the run ended by itself: at its tolerance, or at the end of its plan.
     stop_reason : str

@@ -8,7 +8,8 @@ from typing import TypeVar, cast
 
 import numpy as np
 
-from ..errors import InputError, InputTypeError
+from ..arguments import format_point, warn
+from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
 from ..geometry.sphere import COAST, Sphere, SphereRegion
 from ..geometry.subdomain import Subdomain
@@ -35,19 +36,44 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     part = make(diagram, kept, boundary)
     if not isinstance(mesh, Result):
         return cast("Mesh", part)
+    made = _result_of(mesh, part, kept)
+    reason = f"{len(part)} of {len(kept)} cells; {mesh.stop_reason}"
+    return cast("Mesh", dataclasses.replace(made, history=np.zeros(0, HISTORY_DTYPE), stop_reason=reason))
+
+
+def _result_of(mesh: Result, part: Diagram, kept: np.ndarray) -> Result:
+    """Return `mesh` with the diagram `part`, which has the cells `kept` (n,) bool."""
     taken = {name: getattr(mesh, name)[kept] for name in ("target_size", "size_error", "quality")}
-    made = dataclasses.replace(
-        mesh,
-        points=part.points,
-        diagram=part,
-        **taken,
-        history=np.zeros(0, HISTORY_DTYPE),
-        stop_reason=f"{len(part)} of {len(kept)} cells; {mesh.stop_reason}",
-        initial=None,
-        final=None,
-        origin=None if mesh.origin is None else mesh.origin[kept],
-    )
-    return cast("Mesh", made)
+    origin = None if mesh.origin is None else mesh.origin[kept]
+    return dataclasses.replace(mesh, points=part.points, diagram=part, **taken, initial=None, final=None, origin=origin)
+
+
+def without_holes(mesh: Result) -> Result:
+    """Return `mesh` without the cells in the holes of its domain; faces on a hole have its name."""
+    holes = mesh.diagram.domain.holes
+    if holes is None:
+        return mesh
+    inside = holes.hole_of(mesh.points)
+    made = _result_of(mesh, _in_space(mesh.diagram, inside < 0, holes.names_of(inside)), inside < 0)
+    history, error = mesh.history.copy(), np.abs(made.size_error)
+    last = {"cells": len(error), "deleted": history["deleted"][-1] + np.count_nonzero(inside >= 0)}
+    last |= {"mean_error": error.mean(), "max_error": error.max()}
+    last |= {"mean_quality": made.quality.mean(), "min_quality": made.quality.min()}
+    for name, value in last.items():
+        history[name][-1] = value
+    made = dataclasses.replace(made, history=history)
+    faces, domain = made.diagram.faces, made.diagram.domain
+    cut = np.flatnonzero(faces.neighbor < 0)
+    cut = cut[domain.removed_behind(-1 - faces.neighbor[cut])]
+    ends = faces.points[faces.corners.reshape(-1, 2)[cut]]
+    off = cut[~holes.covers(domain.uncut, ends)]
+    if len(off):
+        warn(
+            f"{len(off)} faces around holes do not lie on their outlines, the first at "
+            f"{format_point(faces.center[off[0]])}; use smaller sizes there",
+            MismatchWarning,
+        )
+    return made
 
 
 def check_mask(name: str, mask: object, n: int) -> np.ndarray:
@@ -70,8 +96,11 @@ def check_mask(name: str, mask: object, n: int) -> np.ndarray:
     return array
 
 
-def _in_space(d: Diagram, kept: np.ndarray, boundary: str) -> Diagram:
-    """Return the kept cells in a box or polygon; faces towards removed cells become walls of a `Subdomain`."""
+def _in_space(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray) -> Diagram:
+    """Return the kept cells in a box or polygon; faces towards removed cells become walls of a `Subdomain`.
+
+    `boundary` is the name of these walls, or one for each cell that is removed, (n,) object.
+    """
     number, owner = np.cumsum(kept) - 1, face_owners(d)
     faces = np.flatnonzero(kept[owner])
     behind = d.neighbors[faces]
@@ -83,7 +112,7 @@ def _in_space(d: Diagram, kept: np.ndarray, boundary: str) -> Diagram:
     neighbors = np.where(behind < 0, behind, number[np.maximum(behind, 0)])
     neighbors[cut] = -1 - w - np.arange(cut.sum())
     within, beyond = d.points[owner[faces[cut]]], neighbor_points(d, faces[cut])
-    labels = np.full(len(behind), boundary, object)
+    labels = np.broadcast_to(np.asarray(boundary, object), len(d))[np.maximum(behind, 0)]
     old = cut & (behind < 0)
     labels[old] = [d.domain.boundary_names[k] for k in d.domain.boundary_index[-1 - behind[old]]]
     domain = Subdomain(whole, within, beyond, float(d.volumes[kept].sum()), _names(labels[cut].tolist(), w))

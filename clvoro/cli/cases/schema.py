@@ -490,9 +490,12 @@ class BoxTable(Kind, tag="box"):
     periodic: bool | list[bool] | None = None
     names: Names | None = None
     lines: Text | list[Line] | None = None
+    holes: list[Ring] | None = None
+    hole_names: Names | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
-        return _with_lines(Box(**self.given("lines")), self.lines, folder)
+        made = _with_lines(Box(**self.given("lines", "holes", "hole_names")), self.lines, folder)
+        return made if self.holes is None else made.without([_ring(hole) for hole in self.holes], self.hole_names)
 
 
 class PolygonTable(Kind, tag="polygon"):
@@ -568,7 +571,7 @@ def with_kind(domain: object, place: str) -> object:
     if "solid" in domain and not {"lower", "upper", "polygon", "outer"} & set(domain):
         return {"kind": "solid", **{"file" if key == "solid" else key: value for key, value in domain.items()}}
     corners = [key for key in ("lower", "upper", "periodic") if key in domain]
-    rings = [key for key in ("polygon", "outer", "holes") if key in domain]
+    rings = [key for key in ("polygon", "outer") if key in domain]
     if corners and rings:
         raise InputError(
             f"{place} has both {corners[0]}, of a box, and {rings[0]}, of a polygon; leave one of them out"

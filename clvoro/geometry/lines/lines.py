@@ -113,7 +113,7 @@ class Lines:
         within = 10 * _SNAP * float(domain.extent.max())  # in float32, too
         middles = segments.mean(axis=1)
         ends = segments + (domain.wrap(middles) - middles)[:, None]
-        lines = shapely.union_all([self.inside(domain), *self._at_seams(domain)])
+        lines = self._with_images(domain)
         shapely.prepare(lines)
         on = shapely.dwithin(shapely.points(ends), lines, within).all(axis=1)
         lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
@@ -123,10 +123,11 @@ class Lines:
         )
         return on
 
-    def _at_seams(self, domain: Domain) -> list[Any]:
-        """Return the images of the lines beyond the periodic sides."""
+    def _with_images(self, domain: Domain) -> Any:
+        """Return the lines in `domain` and their images beyond the periodic sides, as shapely lines."""
         inside, axes = self.inside(domain), np.flatnonzero(domain.periodic).tolist()
-        return [_moved(inside, axis, sign * domain.extent[axis]) for axis in axes for sign in (-1, 1)]
+        images = [_moved(inside, axis, sign * domain.extent[axis]) for axis in axes for sign in (-1, 1)]
+        return shapely.union_all([inside, *images])
 
     def regions(self, domain: Domain) -> list[Any]:
         """Return the parts into which the lines divide `domain`, as shapely polygons, the largest first.

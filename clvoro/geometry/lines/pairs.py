@@ -174,8 +174,8 @@ class _Placing:
     """Places pairs; lengths of chords shrink where they have no room, until all have it."""
 
     def __init__(self, domain: Domain, network: Network, size: Callable[[np.ndarray], np.ndarray]) -> None:
-        self.domain, self.size = domain, size
-        nodes, self.pieces = _divide(network, size)
+        self.domain, self.size = domain, lambda x: size(domain.wrap(x))
+        nodes, self.pieces = _divide(network, self.size)
         self.uses: list[list[_Use]] = [[] for _ in nodes]
         for k, piece in enumerate(self.pieces):
             for end in (0, 1):
