@@ -24,7 +24,7 @@ PROGRESS = 0.95
 def require_power_domain(domain: Domain) -> None:
     """Raise InputError if there are no power diagrams in such a domain."""
     domain.require_no_holes("weights or volumes are given")
-    if domain.curved:
+    if domain.curved or domain.wall_triangles is not None:
         raise InputError(
             f"the domain is {domain}, expected a polygon or a box: there are no power diagrams in other domains"
         )

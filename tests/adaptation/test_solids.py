@@ -5,6 +5,7 @@ import pytest
 
 import clvoro
 from clvoro.adaptation.state import MeshState
+from clvoro.errors import InputError
 from tests.tessellation.test_own_planes import corner
 
 H = 0.3
@@ -81,3 +82,13 @@ def test_cells_at_a_sharp_tip_may_have_few_faces(ctx):
     cone = clvoro.Solid.cone((0, 0, 0), (0, 0, 2), 1.0, edge=0.13)
     result = clvoro.Adapter(ctx).run(cone, 0.25, "fast")
     assert result.diagram.volumes.sum() == pytest.approx(cone.measure, rel=0.06)
+
+
+def test_what_solids_do_not_have_is_refused(ctx):
+    adapter, cube = clvoro.Adapter(ctx), clvoro.Solid.box((0, 0, 0), (1, 1, 1))
+    with pytest.raises(InputError, match="no power diagrams"):
+        adapter.run(cube, 0.4, method="transport")
+    with pytest.raises(InputError, match="no power diagrams"):
+        adapter.transport(cube, [(0.3, 0.5, 0.5), (0.7, 0.5, 0.5)], [0.5, 0.5])
+    with pytest.raises(InputError, match="leave out `periodic`"):
+        clvoro.Solid.outside(cube, clvoro.Box((-1, -1, -1), (2, 2, 2), periodic=True))

@@ -340,7 +340,14 @@ class Solid(Domain):
         box : Box, or its lower and upper corner
         **options
             As for `Solid`.
+
+        Raises
+        ------
+        InputError
+            If the box is periodic.
         """
+        if isinstance(box, Box) and any(box.periodic):
+            raise InputError(f"Solid.outside box is {box}, expected a box with walls; leave out `periodic`")
         lower, upper = (box.lower, box.upper) if isinstance(box, Box) else box
         frame = cls.box(lower, upper, names=box.names if isinstance(box, Box) else None)
         return cls(**{**around(of, frame), "angle": of.angle, **options})
