@@ -491,7 +491,7 @@ class Adapter:
         --------
         >>> adapter = clvoro.Adapter()
         >>> bytes_ = adapter.memory_needed(clvoro.Box((0, 0), (1, 1)), 0.01)
-        >>> 5e6 < bytes_ < 6e6
+        >>> 5e6 < bytes_ < 7e6
         True
         """
         merged, own = merged_options(points, options, method=method, n_cells=n_cells, layers=layers)

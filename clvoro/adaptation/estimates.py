@@ -146,7 +146,7 @@ def check_memory(
             f"{in_bytes(needed)}, and the device has {in_bytes(available)}). Do h and the domain have the same unit "
             "of length? If so, use a larger size or a smaller n_cells"
         )
-    largest, most = LARGEST * needed, memory_limits.largest_allocation(device)
+    largest, most = LARGEST * (needed - FIXED), memory_limits.largest_allocation(device)
     remedy = (
         "Do h and the domain have the same unit of length? If so, use a larger size, n_cells, dtype='float32' or "
         "another device"
