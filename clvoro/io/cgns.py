@@ -87,7 +87,7 @@ def _write_zone(base: _CgnsNode, mesh: Faces, patches: list[Any], contents: Cont
     for patch in patches:
         if patch.size:
             condition = conditions.add(_name(patch.name), "BC_t", _CONDITIONS.get(patch.kind, "BCTypeUserDefined"))
-            condition.add("PointRange", "IndexRange_t", np.array([[first + 1], [first + patch.size]], index).T)
+            condition.add("PointRange", "IndexRange_t", np.array([[first + 1], [first + patch.size]], index))
             condition.add("GridLocation", "GridLocation_t", "FaceCenter")
         first += patch.size
     solution = zone.add("CellData", "FlowSolution_t")
