@@ -115,21 +115,29 @@ class Tree:
                 if in_boxes:  # each box holds an item, which is no farther than the farthest corner
                     farthest2 = (np.minimum(low, high) ** 2).sum(axis=1) * (1 + 1e-12)
                     np.minimum.at(reach2, who, farthest2)
-                near = away2 <= reach2[who]
-                who, node = who[near], node[near]
-                if level < self.levels:
-                    who, node = np.repeat(who, 2), np.repeat(2 * node, 2)
-                    node[1::2] += 1
-            starts = self.starts(self.levels)
-            place = starts[node][:, None] + np.arange(_LEAF)
-            inside = place < starts[node + 1][:, None]
-            who, item = np.repeat(who, inside.sum(axis=1)), self.order[place[inside]]
+                who, node = self._below(level, who, node, away2 <= reach2[who])
+            who, item = self._items(who, node)
             found = distance2(points[who], item)
             order = np.lexsort((item, found, who))
             order = order[np.diff(who[order], prepend=-1) > 0]
             order = order[found[order] <= best2[who[order]]]
             best2[who[order]], best[who[order]] = found[order], item[order]
         return best2, best
+
+    def _below(self, level: int, who: np.ndarray, node: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the `kept` pairs of a query and a node of a level, with the node's children unless it is a leaf."""
+        who, node = who[kept], node[kept]
+        if level < self.levels:
+            who, node = np.repeat(who, 2), np.repeat(2 * node, 2)
+            node[1::2] += 1
+        return who, node
+
+    def _items(self, who: np.ndarray, leaf: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pairs of a query and each item of its leaf."""
+        starts = self.starts(self.levels)
+        place = starts[leaf][:, None] + np.arange(_LEAF)
+        inside = place < starts[leaf + 1][:, None]
+        return np.repeat(who, inside.sum(axis=1)), self.order[place[inside]]
 
     def meeting(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return all pairs of a box with the corners `low`, `high` (n, d) and an item whose leaf it meets.
@@ -141,14 +149,8 @@ class Tree:
         for level in range(self.levels + 1):
             box = self.boxes[node + (1 << level) - 1]
             meet = ((box[:, :d] <= high[who]) & (low[who] <= box[:, d:])).all(axis=1)
-            who, node = who[meet], node[meet]
-            if level < self.levels:
-                who, node = np.repeat(who, 2), np.repeat(2 * node, 2)
-                node[1::2] += 1
-        starts = self.starts(self.levels)
-        place = starts[node][:, None] + np.arange(_LEAF)
-        inside = place < starts[node + 1][:, None]
-        who, item = np.repeat(who, inside.sum(axis=1)), self.order[place[inside]]
+            who, node = self._below(level, who, node, meet)
+        who, item = self._items(who, node)
         order = np.lexsort((item, who))
         return who[order], item[order]
 
