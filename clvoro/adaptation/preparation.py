@@ -17,7 +17,6 @@ from ..sizing import Sizing, as_field
 from ..sizing.distance import limit_beside_layers, limit_beside_lines
 from ..sizing.feature import NARROW
 from ..sizing.field import Field, on_domain
-from ..tessellation.power import require_power_domain
 from .corners import place_stations
 from .diagnostics import check_precision, narrow_parts, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import Extras, check_memory, expected_boundary_cells, expected_images, expected_surplus
@@ -185,7 +184,7 @@ def _check_together(domain: Domain, points: np.ndarray | None, fixed: np.ndarray
     if n_cells is not None:
         domain.require_no_holes("n_cells is given")
     if method == "transport":
-        require_power_domain(domain)
+        domain.require_power_diagrams()
     if (len(fixed) or domain.lines) and method in ("transport", *MOVING):
         given = "fixed generators are given" if len(fixed) else "the domain has lines"
         raise InputError(f"{given}, but method {method!r} moves all generators; use method='adaptive' or 'exact'")

@@ -458,7 +458,7 @@ class Run:
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
         diagram = mesh.fetch_diagram()
         put_back(diagram, mesh.setup.points)
-        if mesh.domain.wall_triangles is not None:
+        if mesh.domain.curved_walls:
             error, quality = self._measured_again(diagram, size)
         result = Result(
             points=diagram.points,

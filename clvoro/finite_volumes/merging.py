@@ -175,7 +175,7 @@ class MergingCells:
         self.now_code = np.zeros(v, np.int64)
         self.touched = np.zeros(self.n, bool)
         self.changed, self.edited = np.zeros((2, len(self.owner)), bool)
-        self.edited[:] = diagram.domain.wall_triangles is not None  # there faces are not quite plane
+        self.edited[:] = diagram.domain.curved_walls  # there faces are not quite plane
         self.unwanted = np.zeros(len(self.owner), bool)
         self._places = [np.full(k, -1, np.int32) for k in (v, self.n, len(self.owner))]
 

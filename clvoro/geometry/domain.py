@@ -146,6 +146,9 @@ class Domain(ABC):
     """Whether the boundary cuts cells anywhere. Cells at walls then need not be convex, they may have several loops,
     and each face stores both of its ends."""
 
+    curved_walls: bool = False
+    """Whether walls may be curved. The faces on them need not be plane, and cells there are not quite Voronoi cells."""
+
     @property
     def plain(self) -> bool:
         """Whether the domain is its bounding box, with walls on all sides."""
@@ -422,6 +425,14 @@ class Domain(ABC):
         """Raise InputError, which begins with `what`, if holes are removed from meshes of the domain."""
         if self.holes is not None:
             raise InputError(f"{what}, which does not go with the holes of {self}; use it in the box without holes")
+
+    def require_power_diagrams(self) -> None:
+        """Raise InputError if there are no power diagrams in the domain."""
+        self.require_no_holes("weights or volumes are given")
+        if self.curved or self.curved_walls:
+            raise InputError(
+                f"the domain is {self}, expected a polygon or a box: there are no power diagrams in other domains"
+            )
 
     def place_name(self, x: np.ndarray) -> str:
         """Return a position (d,) in words, for messages."""

@@ -346,7 +346,7 @@ def make_faces(diagram: Diagram) -> Faces:
         twin=np.full(len(rows), -1),
         shift=np.where(flipped[:, None], -shift, shift) if flipped.any() else shift,
         half_face=rows,
-        diagram=diagram if diagram.domain.wall_triangles is None else None,
+        diagram=None if diagram.domain.curved_walls else diagram,
     )
 
 

@@ -59,7 +59,7 @@ def transfer_values(
     scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(filled).max(axis=0), 1e-300))))
     same = source.domain == target.domain
     # Cells at the walls of a solid do not end at the same chords.
-    partial = not same or source.domain.wall_triangles is not None
+    partial = not same or source.domain.curved_walls
     task = source, target, filled / scale, order, bool(limited), partial
     if _on_host(source.domain, target.domain):
         means, low, high, covered = _transfer_on_host(*task)

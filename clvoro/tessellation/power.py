@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 import pyopencl.array as cla
 
-from ..errors import InputError
 from ..geometry.domain import ClipBox, Domain
 from ..opencl.primitives import Summaries
 from .device_diagram import NeighborRows, Tessellation
@@ -19,15 +18,6 @@ CLOSED = 1e-12
 """Largest relative difference of the sum of volumes from that of the domain, where no part of a cell is missing."""
 PROGRESS = 0.95
 """Ratio of the excess of two rounds above which the search begins anew."""
-
-
-def require_power_domain(domain: Domain) -> None:
-    """Raise InputError if there are no power diagrams in such a domain."""
-    domain.require_no_holes("weights or volumes are given")
-    if domain.curved or domain.wall_triangles is not None:
-        raise InputError(
-            f"the domain is {domain}, expected a polygon or a box: there are no power diagrams in other domains"
-        )
 
 
 class Rings:

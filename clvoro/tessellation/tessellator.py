@@ -16,7 +16,7 @@ from .clipped.cut import Cut
 from .device_diagram import CloseError, Follow, NeighborRows, Tessellation, read_report
 from .part import Part
 from .periodic.images import Images
-from .power import Rings, require_power_domain
+from .power import Rings
 from .stages import TessellationStages
 from .steps import DomainSteps, SolidWalls, Sort
 
@@ -57,7 +57,7 @@ class Tessellator:
         weighted: bool = False,
     ) -> None:
         if weighted:
-            require_power_domain(domain)
+            domain.require_power_diagrams()
         self.domain, self.weighted = domain, weighted
         self.stages = stages.weighted if weighted else stages
         if any(domain.periodic):

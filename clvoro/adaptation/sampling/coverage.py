@@ -313,6 +313,6 @@ class PolygonCoverage(CutCoverage):
 
 def coverage_of(boxes: BoxTree, domain: Domain) -> FullCoverage:
     """Return the coverage of `domain` by `boxes`."""
-    if domain.wall_triangles is not None:
+    if domain.curved_walls:
         return SolidCoverage(boxes, domain)
     return FullCoverage(boxes) if domain.outline is None else PolygonCoverage(boxes, domain.outline)

@@ -290,10 +290,7 @@ def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) ->
     `working` are the points in the domain's frame.
     """
     origin, scale = domain.frame
-    if domain.outline is not None:
-        margin = _ULPS * float(np.finfo(working.dtype).eps) * scale
-        return domain.outline.contains_well(points, margin)
-    if domain.wall_triangles is not None:
+    if domain.outline is not None or domain.curved_walls:
         return domain.contains_well(points, _ULPS * float(np.finfo(working.dtype).eps) * scale)
     lower, upper = (((np.array(c) - origin) / scale).astype(working.dtype) for c in (domain.lower, domain.upper))
     bad = ((working <= lower) | (working >= upper)).any(axis=1)

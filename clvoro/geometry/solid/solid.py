@@ -213,6 +213,8 @@ class Solid(Domain):
     (1.0, 12, 8)
     """
 
+    curved_walls = True
+
     def __init__(
         self,
         vertices: object,

@@ -185,10 +185,10 @@ def _finish(check: Check, dtype: object = None, more: Callable[[Rebuilt], None] 
         with np.errstate(all="ignore"):
             _check_structure(check)
             geometry = rebuild_cells(diagram, dtype)
-            if diagram.domain.wall_triangles is None:
-                _check_geometry(check, geometry)
-            else:
+            if diagram.domain.curved_walls:
                 check_solid(check, geometry)
+            else:
+                _check_geometry(check, geometry)
             if more is not None:
                 more(geometry)
     except StopError:

@@ -43,7 +43,7 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
     InputError
         If round-off has made cells wrong.
     """
-    if domain.wall_triangles is not None:
+    if domain.curved_walls:
         from .solid import fetch_mesh
 
         return fetch_mesh(engine, cast("Solid", domain), t, labels)
