@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.ndimage import distance_transform_cdt
+import scipy
 
 from .edge_bins import ranges
 
@@ -166,6 +166,7 @@ def bin_triangles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
     bins, listed = pairs[order].T
     starts = np.searchsorted(bins, np.arange(counts.prod() + 1))
     empty = (np.diff(starts) == 0).reshape(counts[::-1])
-    clear = np.minimum(np.asarray(distance_transform_cdt(empty, "chessboard"), int), 255).astype(np.uint8)
+    steps = scipy.ndimage.distance_transform_cdt(empty, "chessboard")
+    clear = np.minimum(np.asarray(steps, int), 255).astype(np.uint8)
     frame = np.array([*lower, 1 / width])
     return frame, np.array([*counts, 0], np.int32), starts.astype(np.int32), listed, clear.ravel()

@@ -58,8 +58,6 @@ def connected_components(t: Tessellation) -> np.ndarray:
     The positions of the generators are not sufficient for that: a generator in a corner that several pieces share lies
     in all of them, and a piece without a generator consists of parts of cells and connects them.
     """
-    # This import takes 0.2 s, and most runs do without it.
-
     starts = t.starts.get()
     other = t.neighbors[: starts[-1]].get()
     walls = other < 0

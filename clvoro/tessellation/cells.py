@@ -190,8 +190,7 @@ class Cells:
                     continue
                 t = None
                 if not flags & ~DOUBT:
-                    old = rows.places, rows.places
-                    t = self.measure(rows, box, points, n, *old, m, flags, exact)
+                    t = self.measure(rows, box, points, m, flags, exact)
                 if t is not None:
                     return t
                 if flags & OPEN:
@@ -244,8 +243,7 @@ class Cells:
                 rows.flags,
                 *bounds,
             )
-            # Every row is new.
-            found = self._match(rows, box, points, n, rows.places, rows.places, exact)
+            found = self._match(rows, box, points, exact)
             if not found[0] & FULL or found[0] & CROWDED:
                 return found
             self._enlarge(n)
@@ -262,7 +260,7 @@ class Cells:
         The result is right if the sum of its volumes is that of the domain. None if a cell has too many faces, or
         is open in a folded graph.
         """
-        n, old = previous.n, (previous.starts, previous.neighbors)
+        n = previous.n
         self.reserve(n)
         rows = self.take_rows(n, spare=spare_slots(n))
         self.engine.run_each(
@@ -270,17 +268,17 @@ class Cells:
             n,
             points,
             *box.device_corners(self.engine.real),
-            *old,
+            previous.starts,
+            previous.neighbors,
             rows.slots,
             rows.counts,
             rows.places,
             rows.flags,
         )
-        same = rows.places, rows.places
-        flags, m = self._match(rows, box, points, n, *same, exact)
+        flags, m = self._match(rows, box, points, exact)
         if flags & ~DOUBT:
             return None
-        return self.measure(rows, box, points, n, *same, m, flags, exact)
+        return self.measure(rows, box, points, m, flags, exact)
 
     def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
         """Return `t`, a diagram of `box`, with face measures and centroids in full precision, in new arrays."""
@@ -304,18 +302,9 @@ class Cells:
         """Return the flags and the number of half-faces. `CROWDED`: there were too few spare slots."""
         return verdict(self._flags.get().tolist())
 
-    def _match(
-        self,
-        rows: FaceRows,
-        box: ClipBox,
-        points: cla.Array,
-        n: int,
-        old_starts: cla.Array,
-        old_neighbors: cla.Array,
-        exact: bool,
-    ) -> tuple[int, int]:
+    def _match(self, rows: FaceRows, box: ClipBox, points: cla.Array, exact: bool) -> tuple[int, int]:
         """Make the rows symmetric; return the flags and the number of half-faces."""
-        self.enqueue_match(rows, box, points, n, old_starts, old_neighbors, exact)
+        self.enqueue_match(rows, box, points, exact)
         return self._read_flags()
 
     def enqueue_match(
@@ -323,9 +312,6 @@ class Cells:
         rows: FaceRows,
         box: ClipBox,
         points: cla.Array,
-        n: int,
-        old_starts: cla.Array,
-        old_neighbors: cla.Array,
         exact: bool,
         marks: cla.Array | None = None,
         fits: cla.Array | None = None,
@@ -339,12 +325,11 @@ class Cells:
         engine, starts = self.engine, rows.starts
         engine.run_each(
             self._kernels.match_polygon_faces,
-            n,
+            rows.n,
             rows.places,
             rows.slots,
             rows.counts,
-            old_starts,
-            old_neighbors,
+            *rows.old,
             points,
             *box.device_corners(engine.real),
             int(fits is not None),
@@ -355,49 +340,64 @@ class Cells:
             starts,
             rows.flags,
         )
-        self._count(rows, starts, n)
+        self._count(rows, starts)
 
-    def _count(self, rows: FaceRows, counts: cla.Array, n: int) -> None:
-        """Set `rows.starts` and the number of half-faces from the lengths of `n` rows."""
-        self._scan.exclusive(counts, rows.starts, n, total=(rows.flags, FACES))
+    def _count(self, rows: FaceRows, counts: cla.Array) -> None:
+        """Set `rows.starts` and the number of half-faces from the lengths of rows."""
+        self._scan.exclusive(counts, rows.starts, rows.n, total=(rows.flags, FACES))
 
     def measure(
-        self,
-        rows: FaceRows,
-        box: ClipBox,
-        points: cla.Array,
-        n: int,
-        old_starts: cla.Array,
-        old_neighbors: cla.Array,
-        m: int,
-        flags: int,
-        exact: bool,
-        ahead: bool = False,
+        self, rows: FaceRows, box: ClipBox, points: cla.Array, m: int, flags: int, exact: bool, ahead: bool = False
     ) -> Tessellation | None:
         """Write graph and measures of the rows; return None if doubtful cells are inconsistent.
 
         With `ahead` the flags are not known. Nothing is written unless they are 0, and there are at most `m` faces.
         """
-        engine, corners, starts = self.engine, box.device_corners(self.engine.real), rows.starts
+        engine, n = self.engine, rows.n
         self._reserve_faces(n, m)
         new, faces = self._views, self._of_faces
         # The new graph may overwrite the previous one directly only if no row is read from there and no check follows.
-        direct = old_starts is rows.places and not flags & DOUBT
+        direct = rows.all_new and not flags & DOUBT
         neighbors = faces["neighbors"] if direct else engine.scratch(m, np.int32)
         unless = int(ahead), m, rows.flags
-        engine.run(
-            self._kernels.measure_cells,
-            -(-n // self.lanes),
+        self._measure_rows(rows, box, points, unless, neighbors)
+        if flags & DOUBT:
+            wrong = self._check_doubtful(rows, box, points, neighbors, exact)
+            if wrong & LOOPED and rows.all_new:
+                return self._measure_without_loops(rows, box, points, neighbors, exact)
+            if wrong:
+                return None
+        copy = int(not direct), *unless, rows.starts, neighbors, new["starts"], faces["neighbors"]
+        engine.run_blocks(self._kernels.copy_graph, n, *copy)
+        return Tessellation(
             n,
+            points,
+            new["starts"],
+            faces["neighbors"],
+            faces["face_measures"],
+            faces["face_centroids"],
+            new["volumes"],
+            new["offsets"],
+            new["covariances"],
+        )
+
+    def _measure_rows(
+        self, rows: FaceRows, box: ClipBox, points: cla.Array, unless: tuple[object, ...], neighbors: cla.Array
+    ) -> None:
+        """Write the graph of the rows to `neighbors`, and their measures, `unless` as `measure` says."""
+        new, faces = self._views, self._of_faces
+        self.engine.run(
+            self._kernels.measure_cells,
+            -(-rows.n // self.lanes),
+            rows.n,
             rows.places,
             rows.slots,
             rows.counts,
-            old_starts,
-            old_neighbors,
+            *rows.old,
             rows.keep,
-            starts,
+            rows.starts,
             points,
-            *corners,
+            *box.device_corners(self.engine.real),
             *unless,
             neighbors,
             faces["face_measures"],
@@ -406,65 +406,57 @@ class Cells:
             new["offsets"],
             new["covariances"],
         )
-        if flags & DOUBT:
-            engine.run_each(
-                self._kernels.check_doubtful,
-                n,
-                rows.places,
-                rows.counts,
-                starts,
-                neighbors,
-                new["volumes"],
-                points,
-                *corners,
-                self._share(exact),
-                rows.flags,
-            )
-            wrong = self._read_flags()[0] & ~DOUBT
-            if wrong & LOOPED and old_starts is rows.places:
-                return self._measure_without_loops(rows, box, points, n, neighbors, exact)
-            if wrong:
-                return None
-        whole = int(not direct)
-        engine.run_blocks(
-            self._kernels.copy_graph, n, whole, *unless, starts, neighbors, new["starts"], faces["neighbors"]
+
+    def _check_doubtful(
+        self, rows: FaceRows, box: ClipBox, points: cla.Array, neighbors: cla.Array, exact: bool
+    ) -> int:
+        """Return the error bits of doubtful cells in the graph (`rows.starts`, `neighbors`)."""
+        self.engine.run_each(
+            self._kernels.check_doubtful,
+            rows.n,
+            rows.places,
+            rows.counts,
+            rows.starts,
+            neighbors,
+            self._views["volumes"],
+            points,
+            *box.device_corners(self.engine.real),
+            self._share(exact),
+            rows.flags,
         )
-        return Tessellation(
-            n=n,
-            points=points,
-            starts=new["starts"],
-            neighbors=faces["neighbors"],
-            face_measures=faces["face_measures"],
-            face_centroids=faces["face_centroids"],
-            volumes=new["volumes"],
-            offsets=new["offsets"],
-            covariances=new["covariances"],
-        )
+        return self._read_flags()[0] & ~DOUBT
 
     def _measure_without_loops(
-        self, rows: FaceRows, box: ClipBox, points: cla.Array, n: int, neighbors: cla.Array, exact: bool
+        self, rows: FaceRows, box: ClipBox, points: cla.Array, neighbors: cla.Array, exact: bool
     ) -> Tessellation | None:
         """Measure again without the crossing faces of the graph (`rows.starts`, `neighbors`)."""
+        n, drop_loops = rows.n, self._kernels.drop_loops
         counts = self.engine.scratch(n + 1, np.int32)
         self._reset_flags(n, len(rows.counts), byte_count=4)
-        self.engine.run_each(
-            self._kernels.drop_loops, n, rows.places, rows.counts, rows.starts, neighbors, rows.keep, counts, rows.flags
-        )
-        self._count(rows, counts, n)
+        graph = rows.starts, neighbors
+        self.engine.run_each(drop_loops, n, rows.places, rows.counts, *graph, rows.keep, counts, rows.flags)
+        self._count(rows, counts)
         flags, m = self._read_flags()
         if flags & ~DOUBT:
             return None
-        return self.measure(rows, box, points, n, rows.places, rows.places, m, flags, exact)
+        return self.measure(rows, box, points, m, flags, exact)
 
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
 
     def take_rows(
-        self, n: int, slots: int | None = None, spare: int = 0, whole: bool = False, reset: bool = True
+        self,
+        n: int,
+        slots: int | None = None,
+        spare: int = 0,
+        whole: bool = False,
+        reset: bool = True,
+        previous: Tessellation | None = None,
     ) -> FaceRows:
         """Return `n` empty rows of faces, of which `slots` (by default all) may be new; `reset` the flags.
 
-        `spare` slots follow, for rows longer than one slot. With `whole`, faces no longer than round-off stay.
+        Others are those of `previous`. `spare` slots follow, for rows longer than one slot. With `whole`, faces no
+        longer than round-off stay.
         """
         engine, slots = self.engine, n if slots is None else slots
         first, slots = slots, slots + spare
@@ -475,14 +467,10 @@ class Cells:
             )
         if reset:
             self._reset_flags(first, slots, whole)
-        return FaceRows(
-            engine.scratch(slots * SLOT, np.int32),
-            engine.scratch(slots, np.int32),
-            engine.scratch(slots, np.uint32),
-            engine.scratch(n, np.int32),
-            engine.scratch(n + 1, np.int32),
-            self._flags,
-        )
+        faces, counts = engine.scratch(slots * SLOT, np.int32), engine.scratch(slots, np.int32)
+        keep, places = engine.scratch(slots, np.uint32), engine.scratch(n, np.int32)
+        old = (places, places) if previous is None else (previous.starts, previous.neighbors)
+        return FaceRows(faces, counts, keep, places, engine.scratch(n + 1, np.int32), self._flags, old)
 
     def _reset_flags(self, first: int, slots: int, whole: bool = False, **part: Any) -> None:
         """Reset the flags, or a part of them; `first` and `slots` are the range of the spare slots."""

@@ -32,6 +32,8 @@ class FaceRows:
     flags : (6,) int32
         Error bits, whether any cell is doubtful, number of faces, next spare slot, number of slots, and whether faces
         below round-off are kept.
+    old : tuple of (n + 1,) int32 and int32
+        Starts and neighbors of the previous graph; `places` twice if all rows are new.
     """
 
     slots: cla.Array
@@ -40,6 +42,17 @@ class FaceRows:
     places: cla.Array
     starts: cla.Array
     flags: cla.Array
+    old: tuple[cla.Array, cla.Array]
+
+    @property
+    def n(self) -> int:
+        """Number of rows."""
+        return len(self.places)
+
+    @property
+    def all_new(self) -> bool:
+        """Whether no row is one of the previous graph."""
+        return self.old[0] is self.places
 
 
 def spare_slots(n: int) -> int:

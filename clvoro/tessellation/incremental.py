@@ -88,14 +88,14 @@ class IncrementalUpdate:
             self._fits.fill(0)
         first_most, most = int(MAX_SHARE * n), int((MAX_SHARE + AGAIN_SHARE) * n)
         spare = spare_slots(n)
-        rows = cells.take_rows(n, most, spare, reset=False)
+        rows = cells.take_rows(n, most, spare, reset=False, previous=previous)
         marks, listed = engine.scratch(n, np.int32), engine.scratch(most, np.int32)
         sums = engine.scratch(n + 1, np.int32)
         corners = box.device_corners(engine.real)
-        old = (previous.starts, previous.neighbors)
         most_wrong = int(WRONG_SHARE * n / SAMPLE) if n >= SAMPLED_FROM else n
         engine.run_each(k.begin_update, n, marks, rows.places, rows.flags, FLAGS, most, most + spare)
-        check = most_wrong, *old, points, *corners, self._fits, marks, rows.flags
+        given = *rows.old, points, *corners
+        check = most_wrong, *given, self._fits, marks, rows.flags
         self._check(k.check_rows, -(-n // cells.lanes), n, check)
         done, expected = 0, [first_most] if self._expected is None else self._expected
         while True:
@@ -104,10 +104,9 @@ class IncrementalUpdate:
                 limits = size, in_all, most_wrong
                 self._scan.exclusive(marks, sums, n)
                 engine.run_each(k.list_marked, n, number, *limits, marks, sums, listed, rows.flags)
-                self._clip_listed(k, cells, number, size, listed, rows, marks, (*old, points, *corners))
-            given = rows, box, points, n, *old
-            cells.enqueue_match(*given, exact=False, marks=marks, fits=self._fits)
-            t = cells.measure(*given, most_faces(n), 0, exact=False, ahead=True)
+                self._clip_listed(k, cells, number, size, listed, rows, marks, given)
+            cells.enqueue_match(rows, box, points, exact=False, marks=marks, fits=self._fits)
+            t = cells.measure(rows, box, points, most_faces(n), 0, exact=False, ahead=True)
             assert t is not None
             found = follow(t, rows.flags)
             sums_of_rounds = found[CLIPPED : CLIPPED + done + len(expected) + 1]
@@ -119,7 +118,7 @@ class IncrementalUpdate:
                 if flags & ~DOUBT:
                     return None
                 if flags or m > most_faces(n):
-                    t = cells.measure(*given, m, flags, exact=False)
+                    t = cells.measure(rows, box, points, m, flags, exact=False)
                     if t is not None:
                         follow(t, None)
                 return t

@@ -324,8 +324,7 @@ def test_cells_with_two_faces_are_rejected(ctx, doubtful):
         sign = -1 if doubtful else 1
         rows.counts.set(np.array([sign * len(labels) for labels in lists], np.int32))
         rows.flags.set(np.array([0, doubtful, 0, n, n] + [0] * (FLAGS - 5), np.int32))
-        old = rows.places, rows.places
-        flags, m = cells._match(rows, BOX, points, n, *old, exact=True)
+        flags, m = cells._match(rows, BOX, points, exact=True)
         assert m == 9 - two
         assert flags == (COLLAPSED if two else 0) | (DOUBT if doubtful else 0)
 
