@@ -7,13 +7,14 @@ the generators that share a corner move to their mean distance from it, and near
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 import scipy
 
 from ..geometry.domain import Domain
+from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.polygon import Polygon
 from ..geometry.rings import OrientedRings
 from ..geometry.tips import WIDEST, find_tips
@@ -87,21 +88,16 @@ class CornerGroups:
 
 
 @dataclass(frozen=True)
-class FixedAround:
+class CornerStations(FixedGenerators):
     """Fixed generators around re-entrant corners with long sides, at one distance, so that their faces end there.
 
-    Attributes
-    ----------
-    points : (s, 2) float64
-    corners : (c,) int
-        Vertices in `Polygon.oriented`.
+    There are no balls around these corners.
     """
 
-    points: np.ndarray
-    corners: np.ndarray
+    corners: np.ndarray = field()
 
 
-def place_stations(domain: Polygon, free: Domain, fixed: np.ndarray, h: np.ndarray) -> FixedAround:
+def place_stations(domain: Polygon, free: Domain, fixed: np.ndarray, h: np.ndarray) -> CornerStations:
     """Return generators around the re-entrant corners of `domain` that have room for cells of size `h` (k,).
 
     Around a corner of 270 degrees three stand in the middle of three equal sectors, around others as many as it has
@@ -134,7 +130,9 @@ def place_stations(domain: Polygon, free: Domain, fixed: np.ndarray, h: np.ndarr
     for a, b in zip(one[near].tolist(), two[near].tolist(), strict=True):
         if left[a] and left[b]:
             left[max(a, b)] = False
-    return FixedAround(points[left[corner]], corners[left])
+    points = points[left[corner]]
+    no_balls = np.empty((0, 2)), np.empty(0), np.zeros(len(points) + 1, np.int32), np.empty(0, np.int32)
+    return CornerStations(points, *no_balls, left_out=np.empty((0, 2)), corners=corners[left])
 
 
 def find_corners(

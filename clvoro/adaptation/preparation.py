@@ -154,14 +154,13 @@ def prepare(
     elif options.multilevel:
         around = place_around_creases(domain, fixed, lambda x: factor * np.asarray(sizing(x)))
         fixed = fixed if around is None else np.concatenate([fixed, around.points])
-    stationed = None
     own = _own_factor(sizing, free, tree, target) if domain.outline is not None and not options.multilevel else 1.0
     if domain.outline is not None and tree is not None and around is None:
         h = factor * own * np.asarray(sizing(domain.outline.oriented.vertices), float)
         stations = place_stations(domain.outline, free, np.concatenate([fixed, rows]), h)
         if len(fixed) + len(rows) + MOST_STATIONS * len(stations.points) <= target:
-            fixed, stationed = np.concatenate([fixed, stations.points]), stations.corners
-    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, around, stationed)
+            fixed, around = np.concatenate([fixed, stations.points]), stations
+    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, around)
     lattice = lattice_points(domain, target) if options.method in MOVING else None
     levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0
     if options.levels == "auto" and max_levels is not None:

@@ -104,9 +104,7 @@ class Setup:
     own_factor : float
         Size of the cells over that of the size field, if a method keeps another number of cells than the field has.
     around : FixedGenerators or None
-        Generators beside lines or around creases: the last of `points`.
-    stationed : (c,) ndarray or None
-        Vertices of the domain around which fixed generators stand on the finest level.
+        Generators beside lines, or around corners or creases: the last of `points`.
     """
 
     stages: Stages
@@ -118,7 +116,6 @@ class Setup:
     factor: float = 1.0
     own_factor: float = 1.0
     around: FixedGenerators | None = None
-    stationed: np.ndarray | None = None
 
     @property
     def first_sized(self) -> int:
@@ -332,7 +329,7 @@ class MeshState:
     def balls(self) -> Balls | None:
         """Balls beside lines and around creases, which have generators on the finest level only."""
         around = self.setup.around
-        if around is None or not len(around) or round(math.log2(self.size_factor / self.setup.factor)):
+        if around is None or not len(around.balls) or round(math.log2(self.size_factor / self.setup.factor)):
             return None
         origin, scale = self.domain.frame
         spheres = np.column_stack([(around.centers - origin) / scale, around.radii / scale])[around.balls]

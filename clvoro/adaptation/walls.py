@@ -48,7 +48,8 @@ class Walls:
         # `normalize_sizes` changes the factor by little: all of a level, also resumed, has the same corners.
         level = round(math.log2(size_factor / setup.factor))
         h = 2.0**level * setup.factor * setup.own_factor * np.asarray(setup.sizing(domain.oriented.vertices), float)
-        groups = find_corners(domain, h, setup.free.outline, None if level else setup.stationed)
+        around = None if level or setup.around is None else setup.around.corners
+        groups = find_corners(domain, h, setup.free.outline, around)
         if len(groups):
             self.corners = PlacedCorners(setup.stages.engine, domain, groups)
         self.thin = self.corners is not None and has_thin_walls(domain, h)

@@ -33,7 +33,9 @@ class FixedGenerators:
     left_out: np.ndarray
 
     own_sizes = False
-    """The target size of these cells is the size that they have."""
+    """Whether the target size of these cells is the size that they have."""
+    corners = np.empty(0, int)
+    """Vertices of `Polygon.oriented` around which they stand, (c,)."""
 
     def __len__(self) -> int:
         return len(self.points)
