@@ -1,6 +1,7 @@
 """The documentation: code on its pages and its examples run, and what it names exists."""
 
 import ast
+import pydoc
 import re
 import subprocess
 import sys
@@ -174,3 +175,14 @@ def test_public_names_are_in_the_reference():
     names = set(re.findall(r"^   (?:clvoro\.)?(?:\w+\.)*(\w+)$", listed, re.MULTILINE))
     assert set(clvoro.__all__) - {"curves", "profile", "earth", "sizing", "ClvoroError", "Interrupted"} <= names
     assert {n for n in clvoro.sizing.__all__ if n not in ("Sizing", "generate_code")} <= names
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "api").glob("*.rst")), ids=lambda p: p.stem)
+def test_what_api_pages_list_exists(page):
+    module = ""
+    for line in page.read_text().splitlines():
+        name = line.strip()
+        if line.startswith(".. currentmodule:: "):
+            module = line.split()[-1] + "."
+        elif re.fullmatch(r"   [\w.]+", line) and not (page.parent / f"{name}.rst").is_file():
+            assert pydoc.locate(module + name), name
