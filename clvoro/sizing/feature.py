@@ -78,7 +78,7 @@ def find_gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, n
         again = finer > 1.5 * counts[rows]
         done = np.isin(row, rows[~again]) & np.isfinite(radius)
         found.append((begin[done], end[done]))
-        # In steps, because a gap may be narrow at a short part of an edge only.
+        # One pass takes at most four times the samples of the pass before.
         counts[rows[again]] = np.minimum(finer[again], 4 * counts[rows[again]])
         rows = rows[again]
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))  # type: ignore[return-value]

@@ -425,7 +425,7 @@ def _between(a: float, b: float) -> float:
 
 
 def _divide(network: Network, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, list[_Piece]]:
-    """Return nodes and pieces: chains, divided at corners and between segments that are long beside h."""
+    """Divide chains at their corners; return the nodes (n, 2), at which pieces end, and the pieces."""
     nodes, pieces = list(network.nodes), []
     for chain, (begin, end) in zip(network.chains, network.ends.tolist(), strict=True):
         along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(chain, axis=0).T))])
@@ -443,7 +443,7 @@ def _divide(network: Network, size: Callable[[np.ndarray], np.ndarray]) -> tuple
 
 
 def _corners_of(chain: np.ndarray, along: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return the inner vertices of a chain that are stations in any case."""
+    """Return the inner vertices that divide a chain: between segments longer than h / 2, and at sharp bends."""
     if len(chain) < 3:
         return np.empty(0, int)
     s, reach = along[1:-1], _REACH * h[1:-1]
