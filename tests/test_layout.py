@@ -230,6 +230,12 @@ def test_domains_are_asked_not_told_apart():
     assert len(dimensions) <= MOST_DIMENSIONS, dimensions
 
 
+def test_packages_of_scipy_are_imported_when_they_are_used():
+    """`import scipy` alone imports none of them, so that `import clvoro` need not wait for them."""
+    found = [path for path in PACKAGE.rglob("*.py") if re.search(r"^(from|import) scipy[. ]", path.read_text(), re.M)]
+    assert not found
+
+
 def test_classes_have_names_of_their_own():
     found = collections.defaultdict(list)
     for module, tree in modules().items():

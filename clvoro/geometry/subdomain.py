@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ..arguments import check_number, check_rows
 from ..errors import InputError
@@ -139,7 +139,7 @@ class Subdomain(Domain):
         """Return for each of `points` (n, d) on the boundary the closest wall, (n,) int."""
         found = self.whole.closest_walls(points)
         middles = (self.within + self.beyond) / 2
-        away, pair = KDTree(middles).query(points)
+        away, pair = scipy.spatial.KDTree(middles).query(points)
         at_cut = away < self.whole.boundary_distance(points)
         return np.where(at_cut, self.n_whole + np.asarray(pair), found)
 
@@ -149,11 +149,11 @@ class Subdomain(Domain):
         return (here - there) / 2 - _ROUNDINGS * here
 
     @cached_property
-    def _trees(self) -> tuple[KDTree, KDTree]:
+    def _trees(self) -> tuple[scipy.spatial.KDTree, scipy.spatial.KDTree]:
         images = [self.extent * shift for shift in np.ndindex(*(3 if p else 1 for p in self.periodic))]
         back = np.where(self.periodic, self.extent, 0.0)
         near = [np.concatenate([x + move - back for move in images]) for x in (self.within, self.beyond)]
-        return KDTree(near[0]), KDTree(near[1])
+        return scipy.spatial.KDTree(near[0]), scipy.spatial.KDTree(near[1])
 
     def boundary(self, walls: Walls | None = None) -> NoReturn:
         """Raise an error, because the boundary changes with the mesh."""

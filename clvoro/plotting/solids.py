@@ -12,10 +12,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike
-from scipy.spatial import KDTree
 
 from ..arguments import format_point
 from ..errors import InputError
@@ -418,7 +418,7 @@ def _walls_of(diagram: Diagram, polygons: list[np.ndarray]) -> np.ndarray:
     starts, corners = take_rows(*face_corners(diagram), rows)
     counts = np.maximum(np.diff(starts), 1)
     middles = np.add.reduceat(diagram.vertices[corners], starts[:-1]) / counts[:, None]
-    far, row = KDTree(middles).query([polygon.mean(axis=0) for polygon in polygons])
+    far, row = scipy.spatial.KDTree(middles).query([polygon.mean(axis=0) for polygon in polygons])
     walls = -1 - diagram.neighbors[diagram.neighbors < 0]
     return np.where(np.asarray(far) < 1e-6 * diagram.domain.extent.max(), walls[row], -1)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from .wall_surface import WallSurface, nearest
 
@@ -30,7 +30,9 @@ class Crossings:
     edge: np.ndarray
 
 
-def cross_cells(surface: WallSurface, generators: np.ndarray, tree: KDTree, sizes: np.ndarray) -> Crossings:
+def cross_cells(
+    surface: WallSurface, generators: np.ndarray, tree: scipy.spatial.KDTree, sizes: np.ndarray
+) -> Crossings:
     """Return where the creases cross the faces of the Voronoi diagram of `generators` (n, 3)."""
     ends = surface.ends
     if not len(ends):

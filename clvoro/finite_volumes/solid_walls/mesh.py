@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ...arguments import format_point, warn
 from ...errors import InputError, MismatchWarning
@@ -171,7 +171,7 @@ class _Maker:
         self.owner, self.neighbor = f.owner[rows].astype(np.int64), f.neighbor[rows].astype(np.int64)
         self.starts, self.corners = take_rows(f.starts, f.corners.astype(np.int64), rows)
         self.points = np.array(f.points, float)
-        self.tree = KDTree(generators)
+        self.tree = scipy.spatial.KDTree(generators)
 
     def mesh(self) -> SolidMesh:
         """Return the mesh."""

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ...geometry.bvh import Tree
 from ...mesh.connectivity import take_rows
@@ -60,8 +60,8 @@ class WallSurface:
         return Tree(self.ends.min(axis=1), self.ends.max(axis=1))
 
     @cached_property
-    def _corner_tree(self) -> KDTree:
-        return KDTree(self.corners)
+    def _corner_tree(self) -> scipy.spatial.KDTree:
+        return scipy.spatial.KDTree(self.corners)
 
     def nearest_crease(
         self, points: np.ndarray, reach: np.ndarray, between: tuple[np.ndarray, np.ndarray] | None = None
@@ -143,7 +143,7 @@ class WallSurface:
         return number[place], least[place]
 
 
-def nearest(tree: KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest(tree: scipy.spatial.KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance to the nearest point of `tree` and its row, (k,) each; none if there are no `points`."""
     if not len(points):
         return np.zeros(0), np.zeros(0, np.int64)

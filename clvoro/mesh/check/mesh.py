@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
-from scipy.spatial import KDTree
 
 from ..connectivity import face_ends, face_keys, plane_shares, take_rows
 from ..lookup import lifted, power_tree
@@ -442,7 +441,7 @@ def check_solid(check: Check, g: Rebuilt) -> None:
     inner[corners] = False
     kept = np.flatnonzero(inner[g.corners])
     x, own = d.vertices[g.corners[kept]], g.cells[kept]
-    near = KDTree(d.points).query(x)[0]
+    near = scipy.spatial.KDTree(d.points).query(x)[0]
     size = np.cbrt(np.maximum(d.volumes, 0))
     beyond = np.linalg.norm(x - d.points[own], axis=1) - near - MOVED * size[own]
     check.note(
