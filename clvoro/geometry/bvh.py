@@ -154,6 +154,22 @@ class Tree:
         order = np.lexsort((item, who))
         return who[order], item[order]
 
+    def within(self, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return pairs of one of `points` (n, d) and an item whose leaf is not farther from it than `reach` (n,)."""
+        d, block = points.shape[1], 32 * _BLOCK  # only boxes are compared here: larger batches are faster
+        found = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
+        for first in range(0, len(points), block):
+            who = np.arange(first, min(first + block, len(points)))
+            node = np.zeros(len(who), np.int64)
+            for level in range(self.levels + 1):
+                box, x = self.boxes[node + (1 << level) - 1], points[who]
+                away = np.maximum(np.maximum(box[:, :d] - x, x - box[:, d:]), 0)
+                near = (away**2).sum(axis=1) <= reach[who] ** 2
+                who, node = self._below(level, who, node, near)
+            found.append(self._items(who, node))
+        who, item = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return who, item
+
     def overlaps(self) -> tuple[np.ndarray, np.ndarray]:
         """Return all pairs of items i < j whose leaves are the same or have overlapping boxes, two arrays (m,) int.
 

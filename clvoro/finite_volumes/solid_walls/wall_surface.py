@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ import numpy as np
 import scipy
 
 from ...geometry.bvh import Tree
-from ...mesh.connectivity import take_rows
+from ...mesh.connectivity import distinct, take_rows
 
 if TYPE_CHECKING:
     from ...geometry.solid.solid import Solid
@@ -52,7 +51,7 @@ class WallSurface:
     def touches(self, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return for each of `points` (k, 3) whether the surface may lie within `reach` (k,)."""
         found = np.zeros(len(points), bool)
-        found[near_items(self.solid.surface.tree, points, reach)[0]] = True
+        found[self.solid.surface.tree.within(points, reach)[0]] = True
         return found
 
     @cached_property
@@ -73,7 +72,7 @@ class WallSurface:
         edge, foot = np.full(len(points), -1), points.copy()
         if not len(self.ends) or not len(points):
             return edge, foot
-        who, item = near_items(self._crease_tree, points, reach)
+        who, item = self._crease_tree.within(points, reach)
         for site in between or ():
             fits = self.common(self.n_patches + item, site[who])[0] > 0
             who, item = who[fits], item[fits]
@@ -106,18 +105,12 @@ class WallSurface:
     @cached_property
     def _site_patches(self) -> tuple[np.ndarray, np.ndarray]:
         """Patches of each site, ascending, as ragged rows."""
-        size = len(self.vertices)
-        place = np.full(size, -1)
+        place = np.full(len(self.vertices), -1)
         place[self.solid.corners] = np.arange(len(self.corners))
         at, patch = place[self.triangles].ravel(), np.repeat(self.patch, 3)
         pairs = np.unique(np.stack([at[at >= 0], patch[at >= 0]]), axis=1)
-        counts = np.concatenate(
-            [
-                np.ones(self.n_patches, int),
-                np.full(len(self.ends), 2),
-                np.bincount(pairs[0], minlength=len(self.corners)),
-            ]
-        )
+        at_corners = np.bincount(pairs[0], minlength=len(self.corners))
+        counts = np.concatenate([np.ones(self.n_patches, int), np.full(len(self.ends), 2), at_corners])
         items = [np.arange(self.n_patches), np.sort(self.solid.creases.patches, axis=1).ravel(), pairs[1]]
         return np.concatenate([[0], np.cumsum(counts)]), np.concatenate(items).astype(np.int64)
 
@@ -131,13 +124,11 @@ class WallSurface:
         size = self.first_corner + len(self.corners)
         keys, place = np.unique(one * size + other, return_inverse=True)
         starts, items = self._site_patches
-        counts_a, a = take_rows(starts, items, keys // size)
-        counts_b, b = take_rows(starts, items, keys % size)
-        rows = np.concatenate([np.repeat(np.arange(len(keys)), np.diff(c)) for c in (counts_a, counts_b)])
-        pairs = rows * self.n_patches + np.concatenate([a, b])
-        pairs.sort()
-        shared = pairs[:-1][pairs[1:] == pairs[:-1]]
-        shared = np.unique(shared)
+        starts_a, a = take_rows(starts, items, keys // size)
+        starts_b, b = take_rows(starts, items, keys % size)
+        rows = np.concatenate([np.repeat(np.arange(len(keys)), np.diff(s)) for s in (starts_a, starts_b)])
+        pairs = np.sort(rows * self.n_patches + np.concatenate([a, b]))
+        shared = distinct(pairs[:-1][pairs[1:] == pairs[:-1]])
         number, least = np.bincount(shared // self.n_patches, minlength=len(keys)), np.full(len(keys), -1)
         least[(shared // self.n_patches)[::-1]] = (shared % self.n_patches)[::-1]
         return number[place], least[place]
@@ -149,29 +140,3 @@ def nearest(tree: scipy.spatial.KDTree, points: np.ndarray) -> tuple[np.ndarray,
         return np.zeros(0), np.zeros(0, np.int64)
     far, row = tree.query(points)
     return np.asarray(far), np.asarray(row)
-
-
-def near_items(
-    tree: Tree, points: np.ndarray, reach: np.ndarray, block: int = 1 << 16
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of a point and an item of `tree` whose leaf is not farther from it than `reach` (k,)."""
-    found: list[Sequence[np.ndarray]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
-    leaf = tree.starts(tree.levels)
-    for first in range(0, len(points), block):
-        who = np.arange(first, min(first + block, len(points)))
-        node = np.zeros(len(who), np.int64)
-        for level in range(tree.levels + 1):
-            box = tree.boxes[node + (1 << level) - 1]
-            x = points[who]
-            away = np.maximum(np.maximum(box[:, :3] - x, x - box[:, 3:]), 0)
-            near = np.einsum("ij,ij->i", away, away) <= reach[who] ** 2
-            who, node = who[near], node[near]
-            if level < tree.levels:
-                who, node = np.repeat(who, 2), np.repeat(2 * node, 2)
-                node[1::2] += 1
-        counts = leaf[node + 1] - leaf[node]
-        row = np.repeat(np.arange(len(node)), counts)
-        place = leaf[node][row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
-        found.append((who[row], tree.order[place]))
-    who, item = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return who, item
