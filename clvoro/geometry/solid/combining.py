@@ -34,21 +34,13 @@ def merged(parts: list[NamedTriangles]) -> dict[str, Any]:
     }
 
 
-def outer_shells(solid: Solid) -> np.ndarray:
-    """Return which triangles (t,) belong to the outside of a solid, not to its cavities, (t,) bool."""
-    count, shell = solid.shells
-    corners = solid.surface.corners - solid.surface.corners.mean(axis=(0, 1))
-    a, b, c = np.moveaxis(corners, 1, 0)
-    return (np.bincount(shell, np.einsum("ij,ij->i", a, np.cross(b, c)), count) > 0)[shell]
-
-
 def around(body: Solid, box: Solid) -> dict[str, Any]:
     """Return the arguments of the region of a box around a body.
 
     Names of the body that a side of the box has get the prefix ``body-``.
     """
     vertices, triangles, groups, names = named_triangles(body)
-    outside = outer_shells(body)
+    outside = (body.shell_volumes > 0)[body.shells[1]]
     sides = box.boundary_names
     names = [f"body-{name}" if name in sides else name for name in names]
     inside = (np.array(body.lower) > box.lower).all() and (np.array(body.upper) < box.upper).all()

@@ -737,13 +737,16 @@ class Solid(Domain):
         return connect(len(self.patch), np.column_stack([side, self.twin]) // 3)
 
     @cached_property
+    def shell_volumes(self) -> np.ndarray:
+        """Volume inside of each connected part of the surface, negative for cavities, (s,) float."""
+        count, shell = self.shells
+        a, b, c = np.moveaxis(self.surface.corners - np.add(self.lower, self.upper) / 2, 1, 0)
+        return np.bincount(shell, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, count)
+
+    @cached_property
     def _pieces(self) -> list[np.ndarray]:
         """The triangles of each separate piece of the region: an outer shell, and those of its cavities."""
-        count, shell = self.shells
-        corners = self.surface.corners
-        center = np.add(self.lower, self.upper) / 2
-        a, b, c = np.moveaxis(corners - center, 1, 0)
-        volume = np.bincount(shell, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, count)
+        shell, volume, corners = self.shells[1], self.shell_volumes, self.surface.corners
         outer = [s for s in np.argsort(volume) if volume[s] > 0]  # the smallest first
         parts = {s: [np.flatnonzero(shell == s)] for s in outer}
         around = {s: Columns(corners[parts[s][0]]) for s in outer} if len(outer) > 1 else {}
