@@ -25,7 +25,7 @@ _ROUNDINGS = 64 * float(np.finfo(np.float32).eps)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Subdomain(Domain):
-    """Part of a `Box` or `Polygon`: the domain of a mesh after `Diagram.subset` has removed cells from it.
+    """Part of a `Box`, `Polygon` or `Solid`: the domain of a mesh after `Diagram.subset` has removed cells from it.
 
     Its walls are those of the whole domain, then one for each face towards a removed cell, which lies on the bisector
     of two generators: that of its cell, and that of the removed cell.
@@ -54,7 +54,7 @@ class Subdomain(Domain):
     names: Mapping[str, Walls] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("lower", "upper", "periodic", "cuts_cells"):
+        for name in ("lower", "upper", "periodic", "cuts_cells", "curved_walls"):
             object.__setattr__(self, name, getattr(self.whole, name))
         for name in ("within", "beyond"):
             what = f"Subdomain {name}"

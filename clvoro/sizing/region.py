@@ -35,8 +35,8 @@ class Region(Distance):
     ----------
     shapes : shape or iterable of shapes
         In 2D a `clvoro.Polygon` or `clvoro.Box`, a `Circle`, a `ClosedPolyline`, a closed curve of `clvoro.curves`, or
-        a polygon of shapely; in 3D a `clvoro.Box`, a `Ball`, or a closed `Surface`. On a sphere those of 2D in
-        longitudes and latitudes in degrees. Several shapes are one region.
+        a polygon of shapely; in 3D a `clvoro.Box`, a `clvoro.Solid`, a `Ball`, or a closed `Surface`. On a sphere
+        those of 2D in longitudes and latitudes in degrees. Several shapes are one region.
     h : float
         Size in the region.
     growth, slope, h_max : float
@@ -149,6 +149,8 @@ def _solid_of(shape: Any) -> Circle | Surface:
         shape.require_closed()
         return shape
     if isinstance(shape, Domain) and not shape.curved:
+        if shape.curved_walls:
+            return shape.boundary()
         return box_surface(np.array(shape.lower), np.array(shape.upper))
     raise _not_closed(shape)
 
@@ -156,5 +158,5 @@ def _solid_of(shape: Any) -> Circle | Surface:
 def _not_closed(shape: Any) -> InputTypeError:
     return InputTypeError(
         f"Region got {shape!r:.60} of type {type(shape).__name__}, which has no inside; expected a Polygon, Box, "
-        "Circle, Ball, ClosedPolyline, closed curve, closed Surface or shapely Polygon; for a line write Distance"
+        "Solid, Circle, Ball, closed curve, ClosedPolyline, closed Surface, shapely Polygon; for a line write Distance"
     )

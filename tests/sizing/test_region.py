@@ -51,6 +51,17 @@ def test_regions_in_space():
         assert on_device(field, SPACE, points, "float64") == pytest.approx(expected, rel=1e-12)
 
 
+def test_the_region_of_a_solid_is_its_inside():
+    signs = np.array(list(np.ndindex(2, 2, 2))) * 2 - 1
+    octahedron = clvoro.Solid.polyhedron(signs, signs.sum(axis=1) + 0.8)  # around (1, 1, 1)
+    points = np.random.default_rng(3).random((500, 3)) * 2
+    inside = np.abs(points - 1).sum(axis=1) < 0.8
+    field = sizing.Region(octahedron, 0.05, slope=0.2)
+    assert 30 < inside.sum() < 100
+    assert ((field(points) == 0.05) == inside).all()
+    assert on_device(field, SPACE, points, "float64") == pytest.approx(field(points), rel=1e-12)
+
+
 def test_regions_on_the_sphere():
     earth = clvoro.Sphere()
     points = earth.icosahedral_points(4)
