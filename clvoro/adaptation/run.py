@@ -16,7 +16,7 @@ from ..arguments import check_callable, check_points
 from ..errors import InputTypeError, Interrupted
 from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
-from ..mesh.results import HISTORY_DTYPE, Displacements, Result
+from ..mesh.results import HISTORY_DTYPE, Displacements, Result, figures
 from ..mesh.straightening import cell_quality
 from ..mesh.subset import without_holes
 from ..opencl.primitives import Summary
@@ -478,12 +478,14 @@ class Run:
         return without_holes(result)
 
     def _measured_again(self, diagram: Diagram, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return error and quality of the cells of a solid's mesh, which differ a little from those of the run."""
+        """Return error and quality of the cells of `diagram`, in a solid, and put their figures into the history.
+
+        The device's cells at curved walls are a little different from those of the diagram.
+        """
         length = np.cbrt(diagram.volumes)
         error = (length - size) / np.minimum(length, size)
         quality = cell_quality(diagram, np.add.reduceat(diagram.face_measures, diagram.neighbor_starts[:-1]))
-        last = {"mean_error": np.abs(error).mean(), "max_error": np.abs(error).max()}
-        for name, value in {**last, "mean_quality": quality.mean(), "min_quality": quality.min()}.items():
+        for name, value in figures(error, quality).items():
             self.rows[-1][name] = value
         return error, quality
 

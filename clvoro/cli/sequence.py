@@ -13,7 +13,7 @@ from ..adaptation.options import Options, arguments_of_run, uses
 from ..errors import MissingLibraryError, MissingPicturesWarning
 from ..io import save
 from ..io.atomic import atomic_file, writing
-from ..mesh.results import Result
+from ..mesh.results import Result, figures
 
 if TYPE_CHECKING:
     from .cases import Case
@@ -84,16 +84,13 @@ def _write_rows(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
-    error, history = np.abs(result.size_error), result.history
+    history = result.history
     return {
         "frame": frame,
         "time": time,
-        "cells": len(error),
+        "cells": len(result.points),
         "steps": int(history["step"][-1]),
-        "mean_error": error.mean(),
-        "max_error": error.max(),
-        "mean_quality": result.quality.mean(),
-        "min_quality": result.quality.min(),
+        **figures(result.size_error, result.quality),
         "seconds": float(history["seconds"][-1]),
     }
 

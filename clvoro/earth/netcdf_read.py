@@ -18,7 +18,7 @@ from ..io.arrays import FileError
 from ..mesh.check.rebuilt import rebuild_on_sphere
 from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
-from ..mesh.results import HISTORY_DTYPE, Result
+from ..mesh.results import Result, result_of_file
 
 OFF_SPHERE = 1e-5
 """Largest distance of a position from its sphere in units of the radius: round-off of float32, and more."""
@@ -56,7 +56,7 @@ class MeshInFile:
 
 
 def make_diagram(cells: MeshInFile) -> Diagram:
-    """Return the diagram of `cells`; without the whole sphere it is that of a `SphereRegion`.
+    """Return the diagram of `cells`. If they do not cover the whole sphere, its domain is a `SphereRegion`.
 
     Raises
     ------
@@ -178,7 +178,7 @@ class Variables:
         return name in self._file.variables
 
     def names(self) -> list[str]:
-        """Return the names of all variables."""
+        """Return the names of all variables of the file."""
         return list(self._file.variables)
 
     def about(self, name: str, key: str) -> Any:
@@ -367,17 +367,7 @@ def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
         raise InputError(f"cannot read {name}: it is damaged or no netCDF-3 ({error})") from error
     if cells.of_run is None:
         return diagram
-    size, error, quality = cells.of_run
-    return Result(
-        points=diagram.points,
-        diagram=diagram,
-        target_size=size,
-        size_error=error,
-        quality=quality,
-        history=np.zeros(0, HISTORY_DTYPE),
-        converged=False,
-        stop_reason="read from a .nc file",
-    )
+    return result_of_file(diagram, *cells.of_run, kind=".nc")
 
 
 def _read(file: Variables) -> MeshInFile:

@@ -25,7 +25,7 @@ from ..geometry.domain import Domain
 from ..mesh.check.rebuilt import rebuild, rebuild_on_sphere
 from ..mesh.connectivity import face_owners, following
 from ..mesh.diagram import Diagram
-from ..mesh.results import HISTORY_DTYPE, Result
+from ..mesh.results import Result, result_of_file
 from .arrays import EXPANSION, LEAST, FileError, explained
 from .contents import described
 from .vtu import KINDS, SOLVER_MESH
@@ -229,17 +229,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
     of_run = [f"CellData.{name}" for name in ("size", "error", "quality")]
     if not set(of_run) & set(arrays):
         return diagram
-    size, error, quality = (arrays[name].astype(float) for name in of_run)
-    return Result(
-        points=points,
-        diagram=diagram,
-        target_size=size,
-        size_error=error,
-        quality=quality,
-        history=np.zeros(0, HISTORY_DTYPE),
-        converged=False,
-        stop_reason="read from a .vtu file",
-    )
+    return result_of_file(diagram, *(arrays[name].astype(float) for name in of_run), kind=".vtu")
 
 
 def _cell_polygons(arrays: Mapping[str, np.ndarray], v: int, domain: Domain) -> dict[str, np.ndarray]:

@@ -217,18 +217,42 @@ class Result(Sealed, MeshOutput):
         return f"sizes x {factor:.3g} (the field alone: {alone:,} cells)"
 
 
+def result_of_file(
+    diagram: Diagram, target_size: np.ndarray, size_error: np.ndarray, quality: np.ndarray, kind: str
+) -> Result:
+    """Return the result that a file of `kind`, such as ".vtu", holds: it has no history."""
+    return Result(
+        points=diagram.points,
+        diagram=diagram,
+        target_size=target_size,
+        size_error=size_error,
+        quality=quality,
+        history=np.zeros(0, HISTORY_DTYPE),
+        converged=False,
+        stop_reason=f"read from a {kind} file",
+    )
+
+
+def figures(size_error: np.ndarray, quality: np.ndarray) -> dict[str, float]:
+    """Return mean and largest |e|, and mean and least Q, by their names in the history."""
+    error = np.abs(size_error)
+    return {
+        "mean_error": float(error.mean()),
+        "max_error": float(error.max()),
+        "mean_quality": float(quality.mean()),
+        "min_quality": float(quality.min()),
+    }
+
+
 def summary(result: Result) -> dict[str, Any]:
     """Return the figures of a run; see `Result.summary`."""
-    error, history = np.abs(result.size_error), result.history
+    history = result.history
     parts = beside_boundary(result) if result.diagram.domain.outline is not None else {}
     apart = {f"{part}_{name}": value for part, some in parts.items() for name, value in some.items()}
     return {
         "cells": len(result.points),
         "steps": int(history["step"][-1]) if len(history) else 0,
-        "mean_error": float(error.mean()),
-        "max_error": float(error.max()),
-        "mean_quality": float(result.quality.mean()),
-        "min_quality": float(result.quality.min()),
+        **figures(result.size_error, result.quality),
         "size_factor": float(result.size_factor),
         "error_target": result.settings.get("error_target"),
         "trade": result.settings.get("trade"),

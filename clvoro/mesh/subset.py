@@ -15,7 +15,7 @@ from ..geometry.sphere import COAST, Sphere, SphereRegion
 from ..geometry.subdomain import Subdomain
 from .connectivity import face_owners, neighbor_points, take_rows
 from .diagram import Diagram
-from .results import HISTORY_DTYPE, Result
+from .results import HISTORY_DTYPE, Result, figures
 
 Mesh = TypeVar("Mesh", Result, Diagram)
 
@@ -55,11 +55,9 @@ def without_holes(mesh: Result) -> Result:
         return mesh
     inside = holes.hole_of(mesh.points)
     made = _result_of(mesh, _in_space(mesh.diagram, inside < 0, holes.names_of(inside)), inside < 0)
-    history, error = mesh.history.copy(), np.abs(made.size_error)
-    last = {"cells": len(error), "deleted": history["deleted"][-1] + np.count_nonzero(inside >= 0)}
-    last |= {"mean_error": error.mean(), "max_error": error.max()}
-    last |= {"mean_quality": made.quality.mean(), "min_quality": made.quality.min()}
-    for name, value in last.items():
+    history = mesh.history.copy()
+    last = {"cells": len(made.points), "deleted": history["deleted"][-1] + np.count_nonzero(inside >= 0)}
+    for name, value in (last | figures(made.size_error, made.quality)).items():
         history[name][-1] = value
     made = dataclasses.replace(made, history=history)
     faces, domain = made.diagram.faces, made.diagram.domain
@@ -116,9 +114,14 @@ def _in_space(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray) -> Diagr
     old = cut & (behind < 0)
     labels[old] = [d.domain.boundary_names[k] for k in d.domain.boundary_index[-1 - behind[old]]]
     domain = Subdomain(whole, within, beyond, float(d.volumes[kept].sum()), _names(labels[cut].tolist(), w))
+    shifts = np.where(cut[:, None], 0, d.shifts[faces]).astype(np.int8)
+    return Diagram(domain, {**_arrays(d, kept, faces, neighbors), "shifts": shifts})
+
+
+def _arrays(d: Diagram, kept: np.ndarray, faces: np.ndarray, neighbors: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the arrays of the cells that are `kept`, (n,) bool, with the rows `faces` and new `neighbors`, (m,)."""
     arrays = {name: getattr(d, name)[kept] for name in ("points", "volumes", "centroids")}
-    arrays |= {name: getattr(d, name)[faces] for name in ("shifts", "face_measures", "face_centroids")}
-    arrays["shifts"] = np.where(cut[:, None], 0, arrays["shifts"]).astype(np.int8)
+    arrays |= {name: getattr(d, name)[faces] for name in ("face_measures", "face_centroids")}
     arrays["neighbor_starts"] = np.concatenate([[0], np.cumsum(np.diff(d.neighbor_starts)[kept])]).astype(np.int32)
     arrays["neighbors"] = neighbors.astype(np.int32)
     rows = {"cell_vertex": np.flatnonzero(kept), "face_vertex": faces}
@@ -131,7 +134,7 @@ def _in_space(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray) -> Diagr
     used, renumbered = np.unique(np.concatenate([*corners.values()]), return_inverse=True)
     parts = np.split(renumbered.ravel().astype(np.int32), np.cumsum([len(c) for c in corners.values()])[:-1])
     arrays |= {_CORNERS[name]: part for name, part in zip(corners, parts, strict=True)}
-    return Diagram(domain, {**arrays, "vertices": d.vertices[used]})
+    return {**arrays, "vertices": d.vertices[used]}
 
 
 _CORNERS = {"cell_vertex": "cell_vertices", "face_vertex": "face_vertices"}
@@ -162,19 +165,7 @@ def _on_sphere(d: Diagram, kept: np.ndarray, boundary: str, sphere: Sphere) -> D
         area=min(float(d.volumes[kept].sum()), Sphere(sphere.radius).measure),
         names=_names(labels),
     )
-    corners = d.cell_vertices[faces]
-    used, renumbered = np.unique(corners, return_inverse=True)
-    starts = np.concatenate([[0], np.cumsum(np.diff(d.neighbor_starts)[kept])]).astype(np.int32)
-    arrays = {
-        **{name: getattr(d, name)[kept] for name in ("points", "volumes", "centroids")},
-        "neighbor_starts": starts,
-        "neighbors": neighbors.astype(np.int32),
-        **{name: getattr(d, name)[faces] for name in ("face_measures", "face_centroids")},
-        "vertices": d.vertices[used],
-        "cell_vertex_starts": starts,
-        "cell_vertices": renumbered.ravel().astype(np.int32),
-    }
-    return Diagram(region, arrays)
+    return Diagram(region, _arrays(d, kept, faces, neighbors))
 
 
 def _names(labels: list[str], first: int = 0) -> dict[str, list[int]] | None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..results import figures
 from ..straightening import cell_quality
 from .findings import ROUNDINGS
 
@@ -64,14 +65,7 @@ def check_history(check: Check, result: Result, rounding: float) -> None:
     check.note(
         "history", [rows["level"][-1] != 0], lambda _: f"the history ends on level {rows['level'][-1]}, expected 0"
     )
-    error = np.abs(result.size_error)
-    expected = {
-        "mean_error": error.mean(),
-        "max_error": error.max(),
-        "mean_quality": result.quality.mean(),
-        "min_quality": result.quality.min(),
-    }
-    for name, value in expected.items():
+    for name, value in figures(result.size_error, result.quality).items():
         last = rows[name][-1]
         check.note(
             "history",
