@@ -389,7 +389,8 @@ def _check(arguments: argparse.Namespace) -> int:
 def _verdict(name: str, arguments: argparse.Namespace) -> Any:
     """Return the report on one mesh file."""
     from ..io import load
-    from ..io.foam_read import check_polymesh, polymesh_folder
+    from ..io.foam import polymesh_folder
+    from ..io.foam_read import check_polymesh
 
     folder = polymesh_folder(name)
     if folder is None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..errors import ClvoroError, InputError
 from ..io import check_writable, make_folder
+from ..io.foam import polymesh_folder
 from .cases import WRITTEN
 
 
@@ -49,8 +50,7 @@ def check_folder(folder: Path) -> None:
 
 def written_names(path: Path) -> str:
     """Return the name of a written file, for a file ``.foam`` with that of its mesh."""
-    mesh = path.parent / "constant" / "polyMesh"
-    return f"{path} (with {mesh})" if path.suffix.lower() == ".foam" else str(path)
+    return f"{path} (with {polymesh_folder(path)})" if path.suffix.lower() == ".foam" else str(path)
 
 
 def do_all(tasks: Iterable[Callable[[], object]]) -> None:

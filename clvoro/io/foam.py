@@ -16,6 +16,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -204,6 +205,15 @@ _BYTE_ORDER = {"little": "LSB", "big": "MSB"}[sys.byteorder]
 _CHUNK = 1 << 14
 
 
+def polymesh_folder(path: str | PathLike[str]) -> Path | None:
+    """Return the folder ``polyMesh`` that `path` means: itself, its case, or a file ``.foam`` in it; else None."""
+    path = Path(path)
+    case = path.parent if path.suffix.lower() == ".foam" else path
+    if path.name == "polyMesh":
+        return path
+    return case / "constant" / "polyMesh" if path.suffix.lower() == ".foam" or path.is_dir() else None
+
+
 def write_foam(
     contents: Contents,
     path: Path,
@@ -244,11 +254,10 @@ def write_foam(
         raise InputTypeError(f"binary is {binary!r:.60} of type {type(binary).__name__}, expected True or False")
     mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls)
     inner = mesh.n_inner
-    marker = path if path.suffix.lower() == ".foam" else None
-    folder = path if marker is None else path.parent / "constant" / "polyMesh"
-    if marker is not None:
-        make_folder(marker.parent)
-        with atomic_file(marker):  # first, because it fails if the folder is not writable
+    folder = polymesh_folder(path) or path
+    if folder != path:
+        make_folder(path.parent)
+        with atomic_file(path):  # first, because it fails if the folder is not writable
             pass
     make_folder(folder)
     note = f"nPoints:{len(mesh.points)} nCells:{mesh.n_cells} nFaces:{len(mesh)} nInternalFaces:{inner}"

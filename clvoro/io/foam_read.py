@@ -20,20 +20,12 @@ from ..mesh.connectivity import following, take_rows
 from ..mesh.faces import Faces
 from ..mesh.geometry import face_vectors
 from .arrays import FileError, explained
+from .foam import polymesh_folder
 
 _HEAD = re.compile(rb"FoamFile\s*\{(.*?)\}", re.DOTALL)
 _COMMENTS = re.compile(rb"/\*.*?\*/|//[^\n]*", re.DOTALL)
 _LIST = re.compile(rb"\s*(\d+)\s*\(?")
 _PATCH = re.compile(r'"?([^\s"{}()]+)"?\s*\{([^{}]*)\}')
-
-
-def polymesh_folder(path: str | PathLike[str]) -> Path | None:
-    """Return the folder ``polyMesh`` that `path` means: itself, its case, or a file ``.foam`` in it; else None."""
-    path = Path(path)
-    case = path.parent if path.suffix.lower() == ".foam" else path
-    if path.name == "polyMesh":
-        return path
-    return case / "constant" / "polyMesh" if path.suffix.lower() == ".foam" or path.is_dir() else None
 
 
 def check_polymesh(folder: Path) -> SolverReport:
