@@ -64,8 +64,6 @@ def to_pyvista(contents: Contents, cut: bool = False) -> pyvista.UnstructuredGri
 
 def _cut(grid: pyvista.UnstructuredGrid, domain: Domain) -> pyvista.UnstructuredGrid:
     """Return the cells cut at the periodic sides of the box, with their images, which fill it."""
-    import pyvista
-
     box = np.array([domain.lower, domain.upper])
     corners = np.asarray(grid.points)[grid.cell_connectivity, : domain.dim]
     low, high = (bound.reduceat(corners, grid.offset[:-1], axis=0) for bound in (np.minimum, np.maximum))
@@ -73,9 +71,17 @@ def _cut(grid: pyvista.UnstructuredGrid, domain: Domain) -> pyvista.Unstructured
     for rows, by in images_in(domain, low, high, box):
         if len(rows):
             parts.append(grid.extract_cells(rows).translate(in_space(by[None])[0], inplace=False))
-    whole = pyvista.merge(parts, merge_points=False) if len(parts) > 1 else parts[0]
+    return cut_at_sides(parts, domain)
+
+
+def cut_at_sides(parts: list[Any], domain: Domain) -> pyvista.UnstructuredGrid:
+    """Return the cells of all `parts`, cut at the periodic sides of the box."""
+    import pyvista
+
+    alone = (*parts, pyvista.UnstructuredGrid())[0]
+    whole: Any = pyvista.merge(parts, merge_points=False) if len(parts) > 1 else alone
+    sides = in_space(np.array([domain.lower, domain.upper]))
     for axis in np.flatnonzero(domain.periodic):
-        sides = in_space(box)
         whole = whole.clip("xyz"[axis], origin=sides[0], invert=False).clip("xyz"[axis], origin=sides[1])
     return whole
 

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 
 from ..arguments import format_point
 from ..errors import InputError
-from ..geometry.domain import images_in
-from ..io.convert import missing
+from ..geometry.domain import Domain, images_in
+from ..io.convert import cut_at_sides, missing
 from ..mesh.connectivity import face_corners, following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
@@ -349,10 +349,7 @@ def _polyhedra(diagram: Diagram, chosen: Callable[[np.ndarray, np.ndarray], np.n
         grid = pyvista.UnstructuredGrid(cells, np.full(len(rows), _VTK_POLYHEDRON, np.uint8), diagram.vertices + by)
         grid.cell_data.update({"cell": rows, "generator": diagram.points[rows] + by})
         parts.append(grid)
-    whole = pyvista.merge(parts, merge_points=False) if len(parts) > 1 else (*parts, pyvista.UnstructuredGrid())[0]
-    for axis in np.flatnonzero(domain.periodic):
-        whole = whole.clip("xyz"[axis], origin=box[0], invert=False).clip("xyz"[axis], origin=box[1])
-    return whole
+    return cut_at_sides(parts, domain)
 
 
 def _polygons(surface: pyvista.PolyData) -> list[np.ndarray]:
@@ -423,14 +420,12 @@ def _walls_of(diagram: Diagram, polygons: list[np.ndarray]) -> np.ndarray:
     return np.where(np.asarray(far) < 1e-6 * diagram.domain.extent.max(), walls[row], -1)
 
 
-def _outside(diagram: Diagram, polygons: list[np.ndarray]) -> np.ndarray:
-    """Return which polygons lie on a wall or a side of the box, (f,) bool: not in the cut."""
-    domain = diagram.domain
+def _on_sides(domain: Domain, polygons: list[np.ndarray]) -> np.ndarray:
+    """Return which polygons lie on a side of the box, (f,) bool."""
     starts = np.cumsum([0, *map(len, polygons)])[:-1]
     gaps = np.stack([np.concatenate(polygons) - side for side in (domain.lower, domain.upper)], axis=1)
     farthest = np.maximum.reduceat(np.abs(gaps), starts, axis=0)
-    on_side = (farthest < 1e-5 * domain.extent.max()).any(axis=(1, 2))
-    return on_side | (_walls_of(diagram, polygons) >= 0)
+    return (farthest < 1e-5 * domain.extent.max()).any(axis=(1, 2))
 
 
 def _draw_cutaway(
@@ -459,11 +454,11 @@ def _draw_cutaway(
     # The light comes from above, a little from the left.
     light = 0.5 * towards + 0.62 * up - 0.3 * right
     shade = 0.72 + 0.28 * np.clip(normals @ light / np.linalg.norm(light), 0, 1)
-    if polygons:
-        shade[~_outside(diagram, polygons)] *= _IN_CUT
     widths, colors = edge_widths(ax, flat) if edges else np.zeros(len(flat)), paint.rgba(cells)
-    if walls and polygons:
-        wall = _walls_of(diagram, polygons)
+    wall = _walls_of(diagram, polygons) if polygons else np.zeros(0, int)
+    if polygons:
+        shade[(wall < 0) & ~_on_sides(diagram.domain, polygons)] *= _IN_CUT
+    if walls:
         hues = np.array([to_rgba(color) for color in METHOD_COLORS])
         colors[wall >= 0] = 0.5 + 0.5 * hues[wall[wall >= 0] % len(hues)]
     draw_polygons(ax, cells, flat, paint, widths, light=shade, colors=colors)
