@@ -11,7 +11,7 @@ from ..finite_volumes.solver_mesh import WallShape
 from ..mesh.connectivity import face_ends, face_keys, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.faces import OFF_BISECTOR
-from .c_grid import RIGHT_ANGLE, measure_c_grid
+from .c_grid import RIGHT_ANGLE, CGridMeasures, measure_c_grid
 
 _SHORTEST_EDGE = 1e-6
 """Least ratio of the length of an edge to the distance of its generators: C-grid schemes divide by the length."""
@@ -41,6 +41,13 @@ def check_for_mpas(diagram: Diagram, walls: WallShape | None) -> SolverReport:
     return SolverReport("mpas", tuple(made), len(diagram), faces, 0.0)
 
 
+def _edges_once(diagram: Diagram, m: CGridMeasures) -> tuple[np.ndarray, Rows]:
+    """Return one half-face of each edge between two cells, (k,) int, and the edges as rows of criteria."""
+    inner = np.flatnonzero(m.inner)
+    inner = inner[np.less(*face_keys(diagram, inner))]
+    return inner, Rows(diagram.face_centroids[inner], face_owners(diagram)[inner], diagram.domain.dim)
+
+
 def _at_walls(diagram: Diagram, edges: Rows, off_bisector: np.ndarray) -> list[Criterion]:
     """Return what walls that cut cells may break: edges on bisectors, three at each vertex."""
     if not diagram.domain.cuts_cells:
@@ -58,19 +65,19 @@ def _at_walls(diagram: Diagram, edges: Rows, off_bisector: np.ndarray) -> list[C
 
 def coast_faults(diagram: Diagram) -> list[Criterion]:
     """Return the criteria that the walls of a polygon break, so that no model on a C grid can use the mesh."""
-    names = ("edge off its bisector", "edges at a vertex")
-    found = [c for c in _criteria(diagram) if c.name in names] if diagram.domain.cuts_cells else []
-    return [c for c in found if not c.ok]
+    if not diagram.domain.cuts_cells:
+        return []
+    m = measure_c_grid(diagram)
+    inner, edges = _edges_once(diagram, m)
+    return [c for c in _at_walls(diagram, edges, m.off_bisector[inner]) if not c.ok]
 
 
 def _criteria(diagram: Diagram) -> list[Criterion]:
     """Return the criteria for meshes of MPAS."""
     d, m = diagram, measure_c_grid(diagram)
     dim, owner = d.domain.dim, face_owners(diagram)
-    inner = np.flatnonzero(m.inner)
-    inner = inner[np.less(*face_keys(d, inner))]  # each edge once
+    inner, edges = _edges_once(d, m)
     cells = Rows(d.points, None, dim)
-    edges = Rows(d.face_centroids[inner], owner[inner], dim)
     places, cell = d.vertices[face_ends(d)[m.corners, 0]], owner[m.corners]
     corners, vertices = Rows(places, cell, dim), Rows(places[m.first], cell[m.first], dim)
     return [

@@ -216,13 +216,13 @@ class ArcRegion(ArcDistance):
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of `points` (n, 3) to the region along a great circle, (n,) float64; 0 in it."""
-        return np.where(self.contains(points), 0.0, ArcDistance.distance(self, points))
+        return np.where(self.contains(points), 0.0, super().distance(points))
 
     def landmarks(self, domain: Domain) -> np.ndarray:
         """Return positions on the outline and in the region."""
-        grid = Region.landmarks(self.given, DEGREES)  # type: ignore[arg-type]
+        grid = self.given.landmarks(DEGREES)
         fits = np.abs(grid[:, 1]) <= 90
-        return np.concatenate([ArcDistance.landmarks(self, domain), self.sphere.positions(grid[fits])])
+        return np.concatenate([super().landmarks(domain), self.sphere.positions(grid[fits])])
 
     def _finish(self, writer: CodeWriter, best2: str, law: int) -> str:
         inside = []
@@ -232,7 +232,7 @@ class ArcRegion(ArcDistance):
         if self.parts_in_degrees:
             inside.append(self._in_degrees(writer))
         near = writer.variable(f"({' || '.join(inside)}) ? 0 : {best2}")
-        return ArcDistance._finish(self, writer, near, law)
+        return super()._finish(writer, near, law)
 
     def _in_degrees(self, writer: CodeWriter) -> str:
         """Return the text that is true in one of the polygons."""
