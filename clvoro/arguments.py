@@ -194,7 +194,7 @@ def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
 
 
 FIRST_ROWS = "numpy.sort(numpy.unique({}, axis=0, return_index=True)[1])"
-"""Rows of an array without those that are equal to an earlier one, in their order."""
+"""NumPy expression for the first row of each set of equal rows, in ascending order; `{}` is the array."""
 
 
 @contextmanager

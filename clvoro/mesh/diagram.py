@@ -484,7 +484,9 @@ class Diagram(MeshOutput):
             the bounds take precedence: the mass of a constant differs as the sums of the volumes do. Between different
             domains the mass in their common part is kept. Where this mesh covers nothing, the value is NaN.
         (n_new,) float64
-            With `covered`, the share of each new cell that this mesh covers, from 0 to 1.
+            With `covered`, the share of each new cell that this mesh covers, from 0 to 1. Between meshes of one domain
+            it is 1 for every cell that overlaps an old one. In a solid that is an approximation: cells at curved walls
+            are bounded by planes there, and two meshes of one solid differ a little at its surface.
 
         Raises
         ------

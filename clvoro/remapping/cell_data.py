@@ -45,7 +45,7 @@ def transfer_values(
     values : (n_new,) or (n_new, k) float64
         NaN where old cells cover nothing.
     covered : (n_new,) float64
-        The covered share of each new cell.
+        The covered share of each new cell; see `Diagram.transfer`.
     """
     source, target = _diagram("self", old), _diagram("onto", new)
     _require_one_space(source, target)
@@ -207,7 +207,7 @@ def _graphs(source: Diagram, target: Diagram, partial: bool) -> tuple[Any, Unfol
 
 
 def _as_given(diagram: Diagram) -> Unfolded:
-    """Return the cells of a diagram in a box with walls, which bound them."""
+    """Return the cells of a diagram in a box without periodic sides. The device cuts them at the walls of the box."""
     n = len(diagram)
     starts, neighbors = diagram.neighbor_starts, diagram.neighbors
     return Unfolded(diagram.points, starts, neighbors, np.arange(n), np.zeros((n, diagram.domain.dim)))
