@@ -227,6 +227,15 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join([line(header), "|" + "---|" * len(header), *(line(row) for row in rows)])
 
 
+SHAPE_COLUMNS: dict[str, Callable[[dict[str, Any]], object]] = {
+    "mean |e|": lambda r: f"{r['mean_error']:.4f}",
+    "max |e|": lambda r: f"{r['max_error']:.3f}",
+    "mean Q": lambda r: f"{r['mean_quality']:.4f}",
+    "min Q": lambda r: f"{r['min_quality']:.3f}",
+}
+"""Columns for the errors of the sizes and the quality of the shapes of a mesh."""
+
+
 class Report:
     """Print rows as they come with --json, else gather them into one Markdown table.
 

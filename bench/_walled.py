@@ -218,6 +218,28 @@ def periodic_channel_3d() -> Setup:
     return Setup(domain, sizing.Expression("0.06 + 0.1 * (z < 0.5 ? z : 1 - z)"), {})
 
 
+def periodic_tubes() -> Setup:
+    """Return a bank of four tubes in a box that is periodic along both axes: on its corner, two seams, and inside."""
+    tubes = [clvoro.curves.circle(center, 0.2) for center in ((0, 0), (1, 0), (0, 0.5), (1, 0.5))]
+    domain = clvoro.Box((0, 0), (2, 1), periodic=True).without(tubes, names={"tubes": range(4)})
+    return Setup(domain, sizing.Distance(domain.holes, h_min=0.02, growth=1.2, h_max=0.06), {})
+
+
+def periodic_cascade() -> Setup:
+    """Return two blunt NACA 4424 sections in a channel that is periodic along y; one is on the seam."""
+    sections = [clvoro.curves.naca("4424", 1, (0.5, y), 20, "blunt") for y in (0.1, 0.7)]
+    names = {"inlet": "xMin", "outlet": "xMax"}
+    domain = clvoro.Box((0, -0.6), (2.5, 0.6), (False, True), names).without(sections, names={"wings": range(2)})
+    return Setup(domain, sizing.Distance(domain.holes, h_min=0.005, growth=1.2, h_max=0.06), {})
+
+
+def periodic_pores() -> Setup:
+    """Return the space between five grains in a square that is periodic along both axes."""
+    grains = [((0.1, 0.1), 0.16), ((0.55, 0.05), 0.18), ((0.3, 0.5), 0.2), ((0.8, 0.45), 0.15), ((0.75, 0.78), 0.13)]
+    domain = clvoro.Box((0, 0), (1, 1), periodic=True).without([clvoro.curves.circle(*grain) for grain in grains])
+    return Setup(domain, sizing.Distance(domain.holes, h_min=0.012, growth=1.2, h_max=0.03), {})
+
+
 def sphere(name: str) -> Callable[[], Setup]:
     """Return a cube with the field S1, S2 or S3."""
     return lambda: Setup(CUBE, test_field(name), {})
@@ -246,6 +268,9 @@ WALLED: dict[str, Callable[[], Setup]] = {
     "city": city,
     "ponds": ponds,
     "periodic channel": periodic_channel,
+    "periodic tubes": periodic_tubes,
+    "periodic cascade": periodic_cascade,
+    "periodic pores": periodic_pores,
     "periodic channel 3D": periodic_channel_3d,
     "S1": sphere("S1"),
     "S2": sphere("S2"),

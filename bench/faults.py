@@ -13,10 +13,11 @@ from __future__ import annotations
 import sys
 import time
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import Report, heading, make_adapter, names, parser
+from _common import SHAPE_COLUMNS, Report, heading, make_adapter, names, parser
 
 import clvoro
 
@@ -52,17 +53,23 @@ KINDS: dict[str, tuple[clvoro.Box | clvoro.Polygon, Any, Any]] = {
         1.0,
     ),
 }
+
+
+def with_and_without(show: Callable[[dict[str, Any]], object]) -> Callable[[dict[str, Any]], str]:
+    """Return a column that shows a figure with lines and, in brackets, without."""
+    return lambda r: f"{show(r)} ({show(r['without'])})"
+
+
 COLUMNS = {
     "lines": lambda r: r["kind"],
     "cells": lambda r: f"{r['cells']:,}",
     "covered": lambda r: f"{r['covered']:.6f}",
     "left out": lambda r: r["left_out"],
     "h beside": lambda r: ", ".join(f"{x:.2f}" for x in r["beside"]),
-    "mean \\|e\\|": lambda r: f"{r['mean_error']:.4f} ({r['without']['mean_error']:.4f})",
-    "max \\|e\\|": lambda r: f"{r['max_error']:.2f} ({r['without']['max_error']:.2f})",
-    "mean Q": lambda r: f"{r['mean_quality']:.3f} ({r['without']['mean_quality']:.3f})",
-    "min Q": lambda r: f"{r['min_quality']:.2f} ({r['without']['min_quality']:.2f})",
-    "time [s]": lambda r: f"{r['seconds']:.2f} ({r['without']['seconds']:.2f})",
+    **{
+        name: with_and_without(show)
+        for name, show in {**SHAPE_COLUMNS, "time [s]": lambda r: f"{r['seconds']:.2f}"}.items()
+    },
 }
 
 

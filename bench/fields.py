@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import FIRST_SEED, PICTURES, Report, figures, heading, make_adapter, parser
+from _common import FIRST_SEED, PICTURES, SHAPE_COLUMNS, Report, figures, heading, make_adapter, parser
 
 import clvoro
 from clvoro import sizing
@@ -148,10 +148,7 @@ COLUMNS = {
     "cells": lambda r: f"{r['cells']:,}",
     "least h": lambda r: f"{r['least']:.4f}",
     "largest h": lambda r: f"{r['most']:.4f}",
-    "mean |e|": lambda r: f"{r['mean_error']:.4f}",
-    "max |e|": lambda r: f"{r['max_error']:.3f}",
-    "mean Q": lambda r: f"{r['mean_quality']:.4f}",
-    "min Q": lambda r: f"{r['min_quality']:.3f}",
+    **SHAPE_COLUMNS,
 }
 
 

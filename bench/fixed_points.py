@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from _common import FIRST_SEED, Report, heading, make_adapter, names, parser
+from _common import FIRST_SEED, SHAPE_COLUMNS, Report, heading, make_adapter, names, parser
 
 import clvoro
 from clvoro import sizing
@@ -45,10 +45,7 @@ COLUMNS = {
     "case": lambda r: r["case"],
     "cells": lambda r: f"{r['cells']:,}",
     "of them": lambda r: r["part"],
-    "mean |e|": lambda r: f"{r['mean_error']:.4f}",
-    "max |e|": lambda r: f"{r['max_error']:.3f}",
-    "mean Q": lambda r: f"{r['mean_quality']:.3f}",
-    "min Q": lambda r: f"{r['min_quality']:.2f}",
+    **SHAPE_COLUMNS,
     "off": lambda r: f"{r['mean_off']:.3f} ({r['max_off']:.2f})",
 }
 

@@ -18,7 +18,7 @@ import time
 from typing import Any
 
 import numpy as np
-from _common import CUBE, FIRST_SEED, Report, figures, heading, make_adapter, names, parser
+from _common import CUBE, FIRST_SEED, SHAPE_COLUMNS, Report, figures, heading, make_adapter, names, parser
 from scipy.spatial import ConvexHull, KDTree, Voronoi
 from scipy.spatial.transform import Rotation
 
@@ -134,10 +134,7 @@ COLUMNS = {
     "start": lambda r: r["start"],
     "effort": lambda r: r["effort"],
     "cells": lambda r: r.get("cells", ""),
-    "mean |e|": lambda r: f"{r['mean_error']:.4f}",
-    "max |e|": lambda r: f"{r['max_error']:.3f}",
-    "mean Q": lambda r: f"{r['mean_quality']:.4f}",
-    "min Q": lambda r: f"{r['min_quality']:.3f}",
+    **SHAPE_COLUMNS,
     "all Q": lambda r: f"{r['mean_quality_all']:.4f} / {r['min_quality_all']:.3f}" if "mean_quality_all" in r else "",
     "seconds": lambda r: f"{r['seconds']:.1f}" if "seconds" in r else "",
 }

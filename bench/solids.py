@@ -16,7 +16,6 @@ Pictures show each mesh cut open, with the patches in colors.
 
 from __future__ import annotations
 
-import re
 import shutil
 import tempfile
 import time
@@ -27,39 +26,27 @@ from typing import Any
 import numpy as np
 from _common import Report, heading, make_adapter, names, parser
 from _solid_shapes import SHAPES, random_part, solid_of
+from solver_ready import COLUMNS as PLANE_COLUMNS
+from solver_ready import figures_of
 
 import clvoro
 from clvoro.errors import ClvoroError
-from clvoro.io.check_mesh import CheckMeshResult, check_case
+from clvoro.io.check_mesh import check_case
 
-NUMBER = r"([-+.\deE]*\d)"
-FIGURES = {
-    "non_orthogonality": rf"non-orthogonality Max: {NUMBER}",
-    "mean_non_orthogonality": rf"non-orthogonality Max: {NUMBER} average: {NUMBER}",
-    "skewness": rf"Max skewness = {NUMBER}",
-    "concave": r"Concave cells .*number of cells: (\d+)",
-}
 COLUMNS = {
     "solid": lambda r: r["solid"],
     "run": lambda r: r["run"],
     "h": lambda r: f"{r['h']:g}",
     "cells": lambda r: r["cells"],
-    "s": lambda r: f"{r['seconds']:.1f}",
+    "s": PLANE_COLUMNS["s"],
     "mean e": lambda r: f"{r['error']:.4f}",
     "quotient": lambda r: f"{r['quotient']:.3f}",
     "non-orth. max, mean": lambda r: f"{r['non_orthogonality']:.1f}, {r['mean_non_orthogonality']:.2f}",
-    "skewness": lambda r: f"{r['skewness']:.2f}",
+    "skewness": PLANE_COLUMNS["skewness"],
     "concave": lambda r: f"{r['concave']:.0f}",
     "volume": lambda r: f"{r['volume']:.5f}",
-    "checkMesh": lambda r: "Mesh OK" if r["ok"] else f"fails: {r['complaints'][:120]}",
+    "checkMesh": PLANE_COLUMNS["checkMesh"],
 }
-
-
-def figures_of(verdict: CheckMeshResult) -> dict[str, Any]:
-    """Return the figures in the output of checkMesh, and what it says of the mesh."""
-    matches = {name: re.search(pattern, verdict.text) for name, pattern in FIGURES.items()}
-    found = {k: float(m.group(m.lastindex or 1)) if m else 0.0 for k, m in matches.items()}
-    return {**found, "ok": verdict.ok, "complaints": "; ".join(line[:60] for line in verdict.complaints)}
 
 
 def quotient(diagram: clvoro.Diagram) -> float:

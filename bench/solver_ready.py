@@ -38,6 +38,7 @@ from clvoro.io.check_mesh import CheckMeshResult, check_case
 NUMBER = r"([-+.\deE]*\d)"
 FIGURES = {
     "non_orthogonality": rf"non-orthogonality Max: {NUMBER}",
+    "mean_non_orthogonality": rf"non-orthogonality Max: {NUMBER} average: {NUMBER}",
     "skewness": rf"Max skewness = {NUMBER}",
     "concave": r"Concave cells .*number of cells: (\d+)",
 }
@@ -52,7 +53,7 @@ DOMAINS: dict[str, Callable[[], tuple[Any, Any, dict[str, Any]]]] = {
 def figures_of(verdict: CheckMeshResult) -> dict[str, Any]:
     """Return the figures in the output of checkMesh, and what it says of the mesh."""
     matches = {name: re.search(pattern, verdict.text) for name, pattern in FIGURES.items()}
-    found: dict[str, Any] = {k: float(m.group(1)) if m else 0.0 for k, m in matches.items()}
+    found: dict[str, Any] = {k: float(m.group(m.lastindex or 1)) if m else 0.0 for k, m in matches.items()}
     complaints = "; ".join(line[:70] for line in verdict.complaints)
     return {**found, "ok": verdict.ok, "complaints": complaints}
 
