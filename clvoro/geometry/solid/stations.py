@@ -212,17 +212,14 @@ class _AroundCreases:
 
     def add(self, chain: _Chain) -> None:
         """Add the generators and balls of a chain."""
-        first, n = len(self.centers), len(chain.h)
+        first, chord = len(self.centers), np.repeat(np.arange(len(chain.h)), chain.count)
         self.centers += list(chain.nodes)
         self.radii += chain.radii.tolist()
-        for i in range(n):
-            around = chain.around(i)
-            self.points = np.vstack([self.points, around])
-            self.sizes = np.append(self.sizes, np.full(len(around), chain.h[i]))
-            self.chains = np.append(self.chains, np.full(len(around), chain.number))
-            spot = chain.line.along(chain.line.points, chain.middle[i : i + 1])
-            self.spots = np.vstack([self.spots, np.broadcast_to(spot, around.shape)])
-            self.balls += [[first + i, first + i + 1] for _ in around]
+        self.points = np.vstack([self.points, *(chain.around(i) for i in range(len(chain.h)))])
+        self.sizes = np.append(self.sizes, chain.h[chord])
+        self.chains = np.append(self.chains, np.full(len(chord), chain.number))
+        self.spots = np.vstack([self.spots, chain.line.along(chain.line.points, chain.middle)[chord]])
+        self.balls += [[first + i, first + i + 1] for i in chord.tolist()]
 
     def keep(self, kept: np.ndarray) -> None:
         self.points, self.sizes, self.chains = self.points[kept], self.sizes[kept], self.chains[kept]
