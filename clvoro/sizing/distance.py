@@ -43,9 +43,9 @@ class Distance(Field):
     ----------
     shapes : shape or iterable of shapes
         `Circle`, `Segment`, `Polyline`, `ClosedPolyline`; in 3D `Ball`, `Segment`, `Polyline`, `ClosedPolyline`,
-        `Surface`; in both a `clvoro.Box`, which stands for its walls, and a `clvoro.Polygon`, which stands for its
-        edges (``domain.boundary("island")`` for some of them); in 2D a curve of `clvoro.curves`, or a geometry of
-        shapely, which stands for its points, lines and rings. The distance is to the curve or surface, from both sides.
+        `Surface`; a `clvoro.Box`, `clvoro.Polygon` or `clvoro.Solid`, which stands for its walls
+        (``domain.boundary("island")`` for some of them); in 2D a curve of `clvoro.curves`, or a geometry of shapely,
+        which stands for its points, lines and rings. The distance is to the curve or surface, from both sides.
     h_min : float
         Size on the shapes.
     growth : float, optional
@@ -93,8 +93,8 @@ class Distance(Field):
                 hint = "; write Circle(p, radius=0) for a point p, Polyline(points) for a line"
                 raise InputTypeError(
                     f"Distance got a shape of type {type(shape).__name__}, expected Circle, "
-                    "Ball, Segment, Polyline, ClosedPolyline, Edges, Surface, Box, clvoro.Polygon, a curve of "
-                    f"clvoro.curves or a geometry of shapely{hint if bare else ''}"
+                    "Ball, Segment, Polyline, ClosedPolyline, Edges, Surface, Box, clvoro.Polygon, clvoro.Solid, a "
+                    f"curve of clvoro.curves or a geometry of shapely{hint if bare else ''}"
                 )
         if not self.shapes:
             raise InputError("Distance got no shapes, expected at least one")
