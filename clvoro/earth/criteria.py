@@ -49,7 +49,7 @@ def _edges_once(diagram: Diagram, m: CGridMeasures) -> tuple[np.ndarray, Rows]:
 
 
 def _at_walls(diagram: Diagram, edges: Rows, off_bisector: np.ndarray) -> list[Criterion]:
-    """Return what walls that cut cells may break: edges on bisectors, three at each vertex."""
+    """Return the criteria that cut cells at walls may break: edges lie on bisectors, and three meet at a vertex."""
     if not diagram.domain.cuts_cells:
         return []
     f = diagram.faces

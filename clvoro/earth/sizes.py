@@ -235,7 +235,7 @@ class ArcRegion(ArcDistance):
         return super()._finish(writer, near, law)
 
     def _in_degrees(self, writer: CodeWriter) -> str:
-        """Return the text that is true in one of the polygons."""
+        """Return the kernel's expression that is true inside one of the polygons."""
         inner = writer.in_plane(DEGREES)
         edges = ring_edges(shapely.union_all([part.whole() for part in self.parts_in_degrees]))
         name = writer.function([], f"{inside_code(inner, edges, 'x')} ? 1 : 0")
@@ -244,7 +244,7 @@ class ArcRegion(ArcDistance):
 
 
 def degrees_code(writer: CodeWriter, west: float) -> str:
-    """Add the longitude, from `west` on, and latitude of x in degrees; return the name of the variable."""
+    """Add code for the longitude (from `west` on) and latitude of x in degrees; return the name of its variable."""
     way = writer.name()
     writer.statements += [
         f"REAL {way}[2] = {{atan2(x[1], x[0]), atan2(x[2], hypot(x[0], x[1]))}};",

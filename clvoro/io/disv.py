@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 _EMPTY = 1e-13
 """Length of faces that are left out, over the extent of the domain."""
 _OBLIQUE = 1.0
-"""Angle in degrees between a face's normal and the line between its centers, above which the mesh is warned of: fluxes
-then need MODFLOW's option XT3D."""
+"""Angle in degrees between a face's normal and the line between its centers, above which the check warns: fluxes then
+need MODFLOW's option XT3D."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +139,7 @@ def _disv_mesh(diagram: Diagram, walls: WallShape) -> Faces:
 
 
 def check_for_modflow(diagram: Diagram, walls: WallShape | None) -> SolverReport:
-    """Check `diagram` by what MODFLOW 6 demands of a DISV grid, and control-volume finite differences of its cells.
+    """Check `diagram` by the demands of MODFLOW 6 on DISV grids, and of its control-volume differences on cells.
 
     Raises
     ------

@@ -307,7 +307,7 @@ def _header(name: str, note: str, binary: bool) -> str:
 
 
 def _zones(diagram: Diagram, given: Mapping[str, ArrayLike] | None) -> dict[str, np.ndarray]:
-    """Return the cells of each zone: parts between the lines of the domain, and those that the caller gives."""
+    """Return the cells of each zone by name: of the regions between the domain's lines, and of the caller's zones."""
     found = {}
     if diagram.domain.lines is not None:
         regions = diagram.cell_region
@@ -334,7 +334,7 @@ def _zones(diagram: Diagram, given: Mapping[str, ArrayLike] | None) -> dict[str,
 
 
 def _faces_on_lines(diagram: Diagram, mesh: Faces) -> np.ndarray:
-    """Return the inner faces of a mesh for OpenFOAM that lie on the lines of the domain: those of two cells there."""
+    """Return the inner faces of a mesh for OpenFOAM that lie on the lines of the domain, (k,) int."""
     rows, n = diagram.line_faces, len(diagram)
     of_lines = diagram.faces.owner[rows].astype(np.int64) * n + diagram.faces.neighbor[rows]
     inner = slice(mesh.n_inner)

@@ -71,7 +71,7 @@ def _read_faces(folder: Path) -> Faces:
 
 
 def _coupled(mesh: Faces, patches: list[_Patch]) -> tuple[Faces, np.ndarray]:
-    """Return the mesh with the faces of cyclic patches as those of seams, and the former rows of its faces."""
+    """Join the faces of cyclic patches as seams; return the mesh, and the row that each face had before, (f,)."""
     by_name = {patch.name: patch for patch in patches}
     pairs = [
         (patch.faces, by_name[patch.across].faces)

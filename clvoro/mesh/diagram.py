@@ -277,7 +277,7 @@ class Diagram(MeshOutput):
 
     @cached_property
     def cell_region(self) -> np.ndarray:
-        """The part of the domain between its lines that each generator is in, (n,) int32; 0 is the largest part.
+        """Region of each generator, (n,) int32: the lines of the domain divide it into regions, and 0 is the largest.
 
         All formats of files hold it, if the domain has lines: as cell data, or as zones of cells for OpenFOAM.
         """
@@ -287,7 +287,7 @@ class Diagram(MeshOutput):
 
     @cached_property
     def line_faces(self) -> np.ndarray:
-        """Rows of `faces` on the lines of the domain, (k,) int, such as those with the leakage of a fault."""
+        """Rows of the `faces` that lie on the lines of the domain, (k,) int, such as the faces of a fault."""
         lines, f = self.domain.lines, self.faces
         if lines is None:
             return np.empty(0, np.int64)

@@ -1,4 +1,4 @@
-"""What a diagram answers: one cell, the cells that hold points, the dual triangles, shapes of shapely."""
+"""Queries of a diagram: one cell, the cells that hold points, the dual triangles, shapes of shapely."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def _on_sphere(d: Diagram, kept: np.ndarray, boundary: str, sphere: Sphere) -> D
 
 
 def _names(labels: list[str], first: int = 0) -> dict[str, list[int]] | None:
-    """Return the numbers of walls by name, from `first` on, without those of the default name."""
+    """Return the walls of each name, numbered from `first` on; those with the default name are left out."""
     names: dict[str, list[int]] = {}
     for k, label in enumerate(labels):
         if label != COAST:

@@ -177,7 +177,7 @@ def _outline_path(domain: Domain) -> Path | None:
 
 _INK, _LIGHT_INK = np.full(3, 0.1), np.full(3, 0.75)
 _LUMINANCE, _DARK = np.array([0.2126, 0.7152, 0.0722]), 0.3
-"""Weights of red, green and blue in the luminance of a color, and that below which edges are light."""
+"""Weights of red, green and blue in the luminance of a color, and the luminance below which a cell has light edges."""
 _LEAST = 0.06
 """Width in points of the thinnest edges."""
 _SEAM = 0.25

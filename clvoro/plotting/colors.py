@@ -34,7 +34,7 @@ _FAR = 3.0
 """Values of the caller are cut from the color scale if the scale would be that many times as long with them."""
 
 _BEYOND_BEST = 3.0
-"""End of a scale of errors for several meshes, in units of the end for the best of them."""
+"""Largest end of the error scale that several meshes share, over the end of the best mesh's own scale."""
 
 # Without their darkest parts, in which faces cannot be seen.
 _DARKLESS = ListedColormap(colormaps["viridis"](np.linspace(0.14, 1, 256)), "viridis without its darkest part")
@@ -286,9 +286,10 @@ def paint_of(
 
 
 def shared_paint(results: Sequence[Result], color: str) -> Paint:
-    """Return one scale for the cells of all `results`, and the values of all.
+    """Return one color scale for the cells of all `results`, with their values.
 
-    That of errors ends at the largest of the mesh that has the smallest, or a few times as far: others would be hidden.
+    A scale of errors ends at most at `_BEYOND_BEST` times the end of the best mesh's own scale. Otherwise one bad mesh
+    would hide the differences between the others.
     """
     scheme = coloring(color, results[0].diagram.domain)
     values = [scheme.values(r) for r in results]

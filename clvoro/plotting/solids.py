@@ -37,7 +37,7 @@ VIEW = (-60.0, 26.0)
 _AXES = {"x": 0, "y": 1, "z": 2}
 _VTK_POLYHEDRON = 42
 _IN_CUT = 0.7
-"""Brightness of faces in the cut against those on walls and sides of the box."""
+"""Brightness of faces in the cut, over that of faces on walls and sides of the box."""
 
 
 def plot_slice(

@@ -53,12 +53,12 @@ def transfer_values(
         raise InputError(f"order is {order!r}, expected 1 or 2")
     given = _checked(values, len(source))
     columns = np.ascontiguousarray(given.reshape(len(source), -1), np.float64)
-    # Without columns there are shares, too.
+    # If `values` has no columns, one of zeros is transferred for the shares.
     filled = columns if columns.shape[1] else np.zeros((len(source), 1))
     # Scale to numbers around 1 by powers of two: this is exact, and no product overflows.
     scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(filled).max(axis=0), 1e-300))))
     same = source.domain == target.domain
-    # Cells at the walls of a solid do not end at the same chords.
+    # At the curved walls of a solid the cells of two meshes end at different planes.
     partial = not same or source.domain.curved_walls
     task = source, target, filled / scale, order, bool(limited), partial
     if _on_host(source.domain, target.domain):
@@ -79,7 +79,7 @@ def transfer_values(
 
 
 def _on_host(a: Domain, b: Domain) -> bool:
-    """Return whether the host intersects the cells: not convex, on a sphere, or in boxes with different seams."""
+    """Return whether the host intersects the cells: in polygons, on spheres, and in boxes with different seams."""
     return a.curved or a.outline is not None or b.outline is not None or a.periodic != b.periodic
 
 

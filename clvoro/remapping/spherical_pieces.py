@@ -214,7 +214,7 @@ class TangentCells:
     def _half_planes(
         self, i: np.ndarray, old: TangentCells, j: np.ndarray, faces: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return normals, levels and depths, in the tangent planes of cells i, of what is nearer to j than to others.
+        """Return normals, levels and depths, in the tangent planes of cells i, of half-planes that `faces` of j bound.
 
         Both cells of a face get the same line with opposite signs, so that their pieces are complementary.
         """

@@ -1,4 +1,4 @@
-"""Meshes whose cells lie between bisectors alone: walls, seams and removed cells become points behind the faces."""
+"""Cells that bisectors alone bound: walls, seams and removed cells are replaced by points behind the faces."""
 
 from __future__ import annotations
 

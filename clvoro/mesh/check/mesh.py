@@ -161,7 +161,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
 
 
 MOVED = 0.4
-"""Largest difference of the distances of a vertex inside a solid from its generators, over the size of the cell.
+"""Largest difference between the distances from an inner vertex of a solid to its generators, over the cell's size.
 
 Vertices move by at most 0.15 of it when short edges are merged, and by 0.03 where they are put on the surface."""
 
@@ -385,7 +385,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
 
 
 def check_solid(check: Check, g: Rebuilt) -> None:
-    """Check the mesh of a solid: measures follow from corners, corners at walls lie on the surface.
+    """Check the mesh of a solid: measures are those of its corners, and corners of faces on walls lie on the surface.
 
     Wall polygons are chords of a curved surface: what the cells lack of the solid, or have beyond it, lies between the
     polygons and the surface. Inside, vertices are equidistant from the generators around them up to what merging and
