@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -33,25 +33,27 @@ LARGEST_EDGE = 1e50
 """Longest edge of a domain, and the inverse of the shortest: fifth powers of lengths must not overflow float64."""
 
 
-class ClipBox(Protocol):
-    """The box that clips cells: a `Domain`, or a box that a stage makes. Stages use nothing else of a domain."""
+class ClipBox(ABC):
+    """The box that clips cells: a `Domain`, or a box that a stage makes. Stages use nothing else of a domain.
 
-    @property
-    def plane_count(self) -> int:
-        """Number of planes of walls that cut single cells, in a solid."""
-        ...
+    Attributes
+    ----------
+    plane_count : int
+        Number of planes of walls that cut single cells, in a solid.
+    """
 
+    plane_count: int = 0
+
+    @abstractmethod
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners in the device's coordinates, padded to four numbers as kernels take them."""
-        ...
 
     def clip_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the CLIP_BOX_ARGS of kernels in 3D (tessellation/own_planes.h)."""
-        ...
+        return self.device_corners(engine.real)
 
-    def look_farther(self, points: cla.Array) -> bool:
-        """Find walls of a solid as far as cells of `points` (n, 3) reach; kernels have noted that. True in a solid."""
-        ...
+    def look_farther(self, points: cla.Array) -> None:  # noqa: B027
+        """Find walls of a solid as far as cells of `points` (n, 3) reach; kernels have noted that."""
 
 
 class Chart(NamedTuple):
@@ -62,7 +64,7 @@ class Chart(NamedTuple):
     place: Callable[[np.ndarray], np.ndarray]
 
 
-class Domain(ABC):
+class Domain(ClipBox):
     """The region to mesh: a box between two corners in all that a class does not say otherwise.
 
     Attributes
@@ -542,19 +544,6 @@ class Domain(ABC):
     def wall_triangles(self) -> WallTriangles | None:
         """The triangles whose planes cut the cells near them, in a solid; else None."""
         return None
-
-    @property
-    def plane_count(self) -> int:
-        """0: there are no walls but the box."""
-        return 0
-
-    def clip_args(self, engine: Engine) -> tuple[object, ...]:
-        """Return the CLIP_BOX_ARGS of kernels in 3D for cells that nothing but the box bounds."""
-        return self.device_corners(engine.real)
-
-    def look_farther(self, points: cla.Array) -> bool:
-        """Return False: there are no walls but the box."""
-        return False
 
     def traits(self, real: np.dtype) -> Traits:
         """Return for what kernels are built, with the periods in the device's coordinates."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl.array as cla
 
-from ..geometry.domain import Domain
+from ..geometry.domain import ClipBox, Domain
 from ..geometry.wall_triangles import WallTriangles
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
@@ -23,8 +23,8 @@ PLANES_PER_CELL = 1.0
 """First guess of own planes per generator."""
 
 
-class SolidBox:
-    """The box around a solid, and the planes of walls that cut the cells of generators in it: a `ClipBox`.
+class SolidBox(ClipBox):
+    """The box around a solid, and the planes of walls that cut the cells of generators in it.
 
     Parameters
     ----------
@@ -50,11 +50,9 @@ class SolidBox:
         size: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
         self.engine, self.domain, self.outside = engine, domain, 0
-        self.plane_count = 0
-        origin, scale = domain.frame
-        self._walls = walls.arguments(engine, (origin, scale))
+        self._walls = walls.arguments(engine, domain.frame)
         self._planes_of_walls = engine.upload(walls.planes(domain.frame))
-        self._normals = engine.upload(walls.corner_normals(scale, size))
+        self._normals = engine.upload(walls.corner_normals(domain.frame[1], size))
         self._most, self._n = MOST_OWN, 0
         self._counters = engine.empty(3, np.int32)
         self._labels, self._planes = engine.empty(0, np.int32), engine.empty((0, 4))
@@ -116,7 +114,6 @@ class SolidBox:
     def _reserve(self, room: int) -> None:
         self._labels, self._planes = self.engine.empty(room, np.int32), self.engine.empty((room, 4))
 
-    def look_farther(self, points: cla.Array) -> bool:
-        """Find the planes again, since cells reach farther than the surface was known. Returns True."""
+    def look_farther(self, points: cla.Array) -> None:
+        """Find the planes again, since cells reach farther than the surface was known."""
         self.find(points)
-        return True

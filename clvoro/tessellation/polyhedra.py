@@ -284,7 +284,8 @@ class Polyhedra:
                 capacity, again = FACE_CAPACITY, False
                 self._begin_report()
             elif flags & UNKNOWN:
-                again = box.look_farther(points)
+                box.look_farther(points)
+                again = True
                 self._begin_report(flags & HARMLESS, m)
             elif flags & FULL:
                 # Clip only the cells with too many faces, with a larger capacity.

@@ -92,7 +92,8 @@ class PolyhedraUpdate:
             else:
                 found = self._report.get().tolist()
             flags, used, left, marked, kept = found[:REPORT_LISTED]
-            if flags & UNKNOWN and box.look_farther(points):
+            if flags & UNKNOWN:
+                box.look_farther(points)
                 flags &= ~UNKNOWN
                 self._report[0].set(np.array(flags, np.int32))
             if flags & ~HARMLESS or max(left, marked) > most:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
-from ...geometry.domain import Domain
+from ...geometry.domain import ClipBox, Domain
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
 from ..bins import BinnedPoints
@@ -30,7 +30,7 @@ OTHER_CELLS = 0.1
 
 
 @dataclass(frozen=True)
-class ExtendedBox:
+class ExtendedBox(ClipBox):
     """A periodic box with its halo, in the device's coordinates.
 
     Attributes
@@ -46,19 +46,6 @@ class ExtendedBox:
         corners = np.zeros((2, 4), real)
         corners[:, : len(self.lower)] = self.lower, self.upper
         return corners[0], corners[1]
-
-    def clip_args(self, engine: Engine) -> tuple[object, ...]:
-        """Return the CLIP_BOX_ARGS of kernels."""
-        return self.device_corners(engine.real)
-
-    @property
-    def plane_count(self) -> int:
-        """0: there are no walls."""
-        return 0
-
-    def look_farther(self, points: cla.Array) -> bool:
-        """Return False: there are no walls."""
-        return False
 
 
 @dataclass(frozen=True)
