@@ -41,10 +41,11 @@ def open_dead_ends(mesh: Faces, parts: np.ndarray) -> Faces:
         Index of the named part of the boundary for each wall.
     """
     for _ in range(ROUNDS):
-        bad = np.flatnonzero(PlaneMeasures(mesh).determinant < LEAST_DETERMINANT)
+        measures = PlaneMeasures(mesh)
+        bad = np.flatnonzero(measures.determinant < LEAST_DETERMINANT)
         if not bad.size or mesh.n_cells < 3:
             return mesh
-        edit = _Edit(mesh, parts)
+        edit = _Edit(measures, parts)
         for cell in bad.tolist():
             edit.change(cell)
         if not edit.touched:
@@ -56,11 +57,12 @@ def open_dead_ends(mesh: Faces, parts: np.ndarray) -> Faces:
 class _Edit:
     """Changes of single cells of a mesh. Each cell is changed once."""
 
-    def __init__(self, mesh: Faces, parts: np.ndarray) -> None:
-        self.old, self.points = mesh, list(mesh.points)
+    def __init__(self, measures: PlaneMeasures, parts: np.ndarray) -> None:
+        self.old = mesh = measures.mesh
+        self.points = list(mesh.points)
         self.ends = mesh.corners.reshape(-1, 2).tolist()
         self.owner, self.neighbor = mesh.owner.tolist(), mesh.neighbor.tolist()
-        self.centroids = PlaneMeasures(mesh).centroids
+        self.centroids = measures.centroids
         self.slides = point_kinds(mesh, parts) == WALL
         self.starts, sides = mesh.cell_faces()
         self.faces = mesh.sides()[1][sides]

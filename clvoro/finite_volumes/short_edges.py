@@ -104,13 +104,13 @@ class _Round:
         self.cell = np.repeat(np.arange(mesh.n_cells), np.diff(self.starts))
         self.images = mesh.images if any(mesh.domain.periodic) else np.arange(v)
         self.kind = point_kinds(mesh, parts, self.images)
-        ratio = _lengths_over_limits(mesh, broken)
+        ratio, longer = _lengths_over_limits(mesh, broken)
         ends = mesh.corners.reshape(-1, 2)
         if not broken.size:
             bent = np.zeros(v, bool)
             bent[self.loop[turns(mesh.points[self.loop], following(self.starts)) < STRAIGHT]] = True
             bad = bent[ends].any(axis=1) | (PlaneMeasures(mesh).skewness > SKEW)
-            ratio[bad] = _lengths_over_limits(mesh, broken, LONGEST)[bad]
+            ratio[bad] = longer[bad]
         first, second = self.images[ends].T
         # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
         tried = (ratio < 1) & (mesh.twin < np.arange(len(ends))) & (first != second)
@@ -227,8 +227,8 @@ class _Round:
         return made.take_faces(ends[:, 0] != ends[:, 1]).compact()
 
 
-def _lengths_over_limits(mesh: Faces, broken: np.ndarray, short: float = SHORT) -> np.ndarray:
-    """Return the length of each face over that below which it is short, (f,).
+def _lengths_over_limits(mesh: Faces, broken: np.ndarray) -> list[np.ndarray]:
+    """Return the length of each face over that below which it is short, (f,), for `SHORT` and for `LONGEST`.
 
     The width of a cell is 4 times its area over its perimeter; `broken` are cells that are no simple polygons.
     """
@@ -236,10 +236,12 @@ def _lengths_over_limits(mesh: Faces, broken: np.ndarray, short: float = SHORT) 
     lengths = np.linalg.norm(b - a, axis=1)
     both = np.concatenate([mesh.owner, mesh.neighbor[: mesh.n_inner]])
     perimeter = np.bincount(both, np.concatenate([lengths, lengths[: mesh.n_inner]]), mesh.n_cells)
-    area = np.maximum(polygon_areas(mesh), 0)
-    limit = np.minimum(short * np.sqrt(area), THIN * 4 * area / np.maximum(perimeter, 1e-300))
-    limit[broken] = 0
-    return lengths / np.maximum(smaller_size(mesh.owner, mesh.neighbor, limit), 1e-300)
+    area, found = np.maximum(polygon_areas(mesh), 0), []
+    for short in (SHORT, LONGEST):
+        limit = np.minimum(short * np.sqrt(area), THIN * 4 * area / np.maximum(perimeter, 1e-300))
+        limit[broken] = 0
+        found.append(lengths / np.maximum(smaller_size(mesh.owner, mesh.neighbor, limit), 1e-300))
+    return found
 
 
 def point_kinds(mesh: Faces, parts: np.ndarray, images: np.ndarray | None = None) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Mend cells at curved walls that checkMesh takes for concave."""
+"""Find cells at curved walls that checkMesh takes for concave, and the faces whose collapse mends them."""
 
 from __future__ import annotations
 

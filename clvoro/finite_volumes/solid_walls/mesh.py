@@ -10,7 +10,7 @@ import scipy
 
 from ...arguments import format_point, warn
 from ...errors import InputError, MismatchWarning
-from ...mesh.connectivity import distinct, following, take_rows
+from ...mesh.connectivity import distinct, following, take_ranges, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
@@ -66,7 +66,8 @@ def outer_generators(solid: Solid, points: np.ndarray, sizes: np.ndarray) -> np.
     surface = WallSurface(solid)
     near = np.flatnonzero(surface.touches(points, 1.5 * sizes))
     _, foot, distance = surface.closest(points[near])
-    near, foot, distance = near[np.abs(distance) < 1.5 * sizes[near]], *_where(foot, distance, sizes[near])
+    close = np.abs(distance) < 1.5 * sizes[near]
+    near, foot, distance = near[close], foot[close], distance[close]
     h = sizes[near]
     normal = foot - points[near]
     normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
@@ -74,11 +75,6 @@ def outer_generators(solid: Solid, points: np.ndarray, sizes: np.ndarray) -> np.
     placed = foot + OUTSIDE * h[:, None] * normal
     clear = surface.closest(placed)[2] > _CLEAR * h
     return placed[clear]
-
-
-def _where(foot: np.ndarray, distance: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    kept = np.abs(distance) < 1.5 * h
-    return foot[kept], distance[kept]
 
 
 def solid_mesh(solid: Solid, points: np.ndarray, sizes: np.ndarray, diagram: Diagram) -> SolidMesh:
@@ -225,7 +221,7 @@ class _Maker:
             side[at_wall] = sides(signed[at_wall], h[at_wall])
             on = side[at_wall] == WALL
             at = at_wall[on]
-            self.site[at], self.points[at] = self._sited(foot[on], triangle[on], h[at])
+            self.site[at], self.points[at] = self.surface.sites(foot[on], triangle[on], h[at])
             signed[at] = 0
             # Edges that may leave the solid need true distances of both ends.
             known = np.zeros(len(self.points), bool)
@@ -240,16 +236,13 @@ class _Maker:
         pierced = pierce_edges(
             self.surface, self.points[a], self.points[b], np.stack([signed[a], signed[b]], axis=1), h_edge
         )
-        site, placed = self._sited(pierced.points, pierced.triangles, h_edge[pierced.edge])
+        site, placed = self.surface.sites(pierced.points, pierced.triangles, h_edge[pierced.edge])
         self.points = np.concatenate([self.points, placed])
         self.site = np.concatenate([self.site, site])
         parts = trim_faces(
             self.surface, starts, corners, edges, corners == a[edges], side, pierced, self.points, h_face
         )
         return TrimmedFaces(near[parts.face], parts.starts, parts.items, parts.chord)
-
-    def _sited(self, foot: np.ndarray, triangle: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self.surface.sites(foot, triangle, h)
 
     def _to_creases(self, parts: TrimmedFaces) -> TrimmedFaces:
         """Put a vertex on the crease between the two ends of a chord that lie on different patches."""
@@ -300,9 +293,8 @@ class _Maker:
         found = np.full(len(face), -1)
         key = crossings.cells[:, 0] * self.n + crossings.cells[:, 1]
         low, high = np.searchsorted(key, face, "left"), np.searchsorted(key, face, "right")
-        counts = high - low
-        row = np.repeat(np.arange(len(face)), counts)
-        which = low[row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+        row = np.repeat(np.arange(len(face)), high - low)
+        which = take_ranges(low, high - low, np.arange(len(key)))[1]
         site = self.surface.n_patches + crossings.edge[which]
         fits = (self.surface.common(site, one[row])[0] > 0) & (self.surface.common(site, other[row])[0] > 0)
         row, which = row[fits], which[fits]
@@ -366,11 +358,9 @@ class _Maker:
             return corner_vertex[c]
 
         divider = Divider(self.surface, corners_of, vertex_of)
-        counts = np.diff(starts)
         uniform = np.minimum.reduceat(label, starts[:-1]) == np.maximum.reduceat(label, starts[:-1])
         self.plain = take_rows(starts, begin, np.flatnonzero(uniform))
         self.plain_cell, self.plain_patch = cell[starts[:-1][uniform]], label[starts[:-1][uniform]]
-        del counts
         for k in np.flatnonzero(~uniform).tolist():
             s = slice(starts[k], starts[k + 1])
             divider.divide(int(cell[starts[k]]), begin[s].tolist(), label[s].tolist())
