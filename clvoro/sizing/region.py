@@ -149,9 +149,9 @@ def _solid_of(shape: Any) -> Circle | Surface:
         shape.require_closed()
         return shape
     if isinstance(shape, Domain) and not shape.curved:
-        if shape.curved_walls:
-            return shape.boundary()
-        return box_surface(np.array(shape.lower), np.array(shape.upper))
+        box = np.array(shape.lower), np.array(shape.upper)
+        walls: Any = shape.boundary() if shape.curved_walls else box_surface(*box)
+        return walls
     raise _not_closed(shape)
 
 
