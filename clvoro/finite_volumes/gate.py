@@ -12,7 +12,7 @@ from ..errors import InputError, MismatchWarning
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .criteria import Criterion, Rows, SolverReport
-from .measures import SolverMeasures
+from .measures import PlaneMeasures, SolverMeasures
 from .prisms import simple_loops
 from .solver_mesh import WallShape, make_solver_mesh
 
@@ -55,33 +55,63 @@ SOLVERS: dict[str, Callable[[Diagram, WallShape | None], SolverReport]] = {"open
 """The check of a diagram for each solver; `io` adds MODFLOW, `earth` models on C grids."""
 
 
-def warn_of_rejection(mesh: Faces) -> None:
-    """Warn if OpenFOAM rejects a mesh in 2D for a cell at a wall.
+_LIMITS = {"aspect_ratio": 1000, "skewness": 4, "determinant": 1e-3, "weight": 0.05, "volume_ratio": 0.01}
+"""OpenFOAM's limits of the measures that convex cells, too, may miss: those below 1 are the least, others the most."""
+_MEASURES = {2: PlaneMeasures, 3: SolverMeasures}
 
-    Only these cells are checked, since the boundary deforms few others: that costs little.
+
+def warn_of_rejection(mesh: Faces, walls: WallShape = "straight") -> None:
+    """Warn if OpenFOAM rejects a mesh that was made with `walls`.
+
+    All criteria are computed for the cells that walls cut, and for those beyond one of `_LIMITS`. Others are convex.
 
     Warns
     -----
     MismatchWarning
         Names the criteria, and the worst place of the first one.
     """
-    at_wall, k = np.zeros(mesh.n_cells, bool), mesh.n_inner
-    at_wall[mesh.owner[k:]] = True
-    kept, (a, b) = at_wall.copy(), (mesh.owner[:k], mesh.neighbor[:k])
-    kept[a[at_wall[b]]] = kept[b[at_wall[a]]] = True
+    at_walls = mesh.domain.cuts_cells or mesh.domain.curved_walls
+    judged = _suspects(mesh, at_walls)
+    if not judged.any():
+        return
+    kept, k = judged.copy(), np.flatnonzero(mesh.neighbor >= 0)
+    a, b = mesh.owner[k], mesh.neighbor[k]
+    kept[a[judged[b]]] = kept[b[judged[a]]] = True
     part, _ = mesh.part(kept)
-    failed = [c for c in _openfoam(part, at_wall[kept]) if c.demanded and not c.ok]
+    failed = [c for c in _openfoam(part, judged[kept]) if c.demanded and not c.ok]
     if not failed:
         return
     first = failed[0]
     at = "" if first.place is None else f" at {format_point(first.place)}"
     also = f", and {', '.join(c.name for c in failed[1:])}" if failed[1:] else ""
+    remedy = "Use smaller cells there" if at_walls else "Let a run move the generators, as clvoro.adapt does"
+    if walls == "exact":
+        remedy = "Write it with walls='straight'"
+    elif mesh.domain.outline is not None:
+        remedy += ", or drop what is smaller than a cell first, as domain.simplified(size) does"
     warn(
         f"OpenFOAM's checkMesh rejects this mesh: {first.name} is {first.value:.3g}, expected "
         f"{'at most' if first.above else 'at least'} {first.limit:.3g}{at}{also}; check(solver='openfoam') lists all. "
-        "Use smaller cells there, or drop what is smaller than a cell first, as domain.simplified(size) does",
+        f"{remedy}",
         MismatchWarning,
     )
+
+
+def _suspects(mesh: Faces, at_walls: bool) -> np.ndarray:
+    """Return the cells beyond one of `_LIMITS`, and those on walls if `at_walls`, (n,) bool."""
+    measures = _MEASURES[mesh.dim](mesh)
+    found = np.zeros(mesh.n_cells, bool)
+    if at_walls:
+        found[mesh.owner[mesh.neighbor < 0]] = True
+    for name, limit in _LIMITS.items():
+        values = getattr(measures, name)
+        bad = values > limit if limit > 1 else values < limit
+        if name in ("aspect_ratio", "determinant"):
+            found |= bad
+        else:
+            found[mesh.owner[bad]] = True
+            found[mesh.neighbor[bad & (mesh.neighbor >= 0)]] = True
+    return found
 
 
 def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
@@ -109,22 +139,22 @@ def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
         Criterion("boundary openness", float(openness), 1e-6, True, True, int(openness > 1e-6)),
         cells("faces of a cell", sides, 4, above=False),
         cells("cell openness", m.openness, 1e-6),
-        cells("aspect ratio", m.aspect_ratio, 1000),
+        cells("aspect ratio", m.aspect_ratio, _LIMITS["aspect_ratio"]),
         faces("face area", np.linalg.norm(g.areas, axis=1), LEAST_MEASURE, above=False),
         cells("cell volume", g.volumes, LEAST_MEASURE, above=False),
         faces("non-orthogonality", angle, 90 - np.degrees(1e-15), strict=False),
         faces("non-orthogonality, severe", angle, 70, demanded=False),
         faces("face pyramids", m.pyramids, -1e-15, above=False),
-        faces("skewness", m.skewness, 4),
+        faces("skewness", m.skewness, _LIMITS["skewness"]),
         faces("face tetrahedra", m.bad_tetrahedra, 0),
         Rows(ends, _cells_of_edges(m), mesh.dim)(
             "edge length over size", m.edge_spans / span, 1e-6, above=False, demanded=False
         ),
         faces("flatness", m.flatness, 0.8, above=False, demanded=False),
-        cells("determinant", m.determinant, 1e-3, above=False),
+        cells("determinant", m.determinant, _LIMITS["determinant"], above=False),
         cells("concavity", concave, 0, failing=m.concave),
-        between("interpolation weight", m.weight[coupled], 0.05, above=False),
-        between("volume ratio", m.volume_ratio[coupled], 0.01, above=False),
+        between("interpolation weight", m.weight[coupled], _LIMITS["weight"], above=False),
+        between("volume ratio", m.volume_ratio[coupled], _LIMITS["volume_ratio"], above=False),
     ]
     return [*made, regions(mesh)]
 

