@@ -49,8 +49,8 @@ class DomainSteps:
         self.stages, self.domain, self.box = stages, domain, domain
         self.most = stages.engine.empty(1, np.int32)
 
-    def begin(self, n: int) -> None:
-        """Prepare for a new diagram of `n` generators."""
+    def begin(self, n: int, last: bool = False) -> None:
+        """Prepare for a new diagram of `n` generators, the `last` one of a run."""
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the part of the first `n` of `sites` and the ghosts that their cells need, as far as known."""

@@ -20,6 +20,9 @@ from .power import Rings
 from .stages import TessellationStages
 from .steps import DomainSteps, SolidWalls, Sort
 
+LATER_FROM = 10_000
+"""Cells from which those of periodic images, if they are the larger part, are built once the halo is known."""
+
 
 class Tessellator:
     """Tessellate one domain repeatedly, by generators without or with weights.
@@ -183,14 +186,15 @@ class Tessellator:
         steps = self.steps
         rows = None if previous is None or not self.stages.cells.from_previous else steps.rows(previous)
         nearest = not (exact or self.weighted)
-        steps.begin(n)
+        steps.begin(n, last=complete)
+        enough = False
         while True:
             part = steps.extend(sites, n)
             binned = sort() if part.points is sites else self._sorted(part)
             steps.find_walls(part, binned, previous)
             try:
-                # Ghosts without values need cells, since something cuts these.
-                whole = complete or part.home is None
+                # Ghosts without values need cells, since something cuts these. Many images wait until they are enough.
+                whole = part.home is None or (complete and (enough or part.count < max(2 * n, LATER_FROM)))
                 start = None if rows is None else steps.unfold(part, rows)
                 t = self._cells(part, binned, exact, part.count if whole else n, start)
             except CloseError:
@@ -198,7 +202,8 @@ class Tessellator:
                     raise
                 continue
             found = steps.finish(part, binned, t, points, exact, nearest)
-            if found is not None:
+            enough = found is not None
+            if found is not None and (whole or not complete):
                 return replace(found, points=points, sites=sites)
             # Memory for the new diagram.
             del part, binned, t

@@ -83,7 +83,9 @@ class GhostImages:
         self._report = engine.empty(3, np.int32)
         self._turn = 0
 
-    def extend(self, domain: Domain, points: cla.Array, n: int, halo: Halo, factor: float, grow: bool) -> Part:
+    def extend(
+        self, domain: Domain, points: cla.Array, n: int, halo: Halo, factor: float, grow: bool, room: float = 1.0
+    ) -> Part:
         """Return the first `n` of `points` (n, d) with their images in the halo.
 
         In a power diagram rows of `points` end with weights.
@@ -94,6 +96,8 @@ class GhostImages:
             Its depths are set to those required, times `factor`.
         grow : bool
             Let no depth become smaller.
+        room : float
+            Share of `SIDEWAYS` and `OUTWARDS`: 0 in the last diagram of a run.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         periods = domain.periods(engine.real)
@@ -150,8 +154,8 @@ class GhostImages:
             np.int32(n),
             np.append(periods, np.zeros(4 - d)).astype(engine.real),
             *blocks,
-            engine.real.type(SIDEWAYS),
-            engine.real.type(OUTWARDS),
+            engine.real.type(room * SIDEWAYS),
+            engine.real.type(room * OUTWARDS),
             halo.kept,
             halo.depths,
             halo.extremes,

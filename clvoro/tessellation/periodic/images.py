@@ -23,6 +23,9 @@ from .halo import Halo
 FIRST_DEPTH = 2.7
 """Estimated depth of the halo for the first diagram, in mean spacings."""
 
+LAST_FACTOR = 1.05
+"""Factor to a required depth in the last diagram of a run. It saves attempts that add a few images."""
+
 
 class FewCellsError(InputError):
     """A periodic box has too few cells: a neighbor is not the nearest image of its generator."""
@@ -53,19 +56,21 @@ class Images(DomainSteps):
         self._sums = Summaries(stages.engine, ("volumes",))
         self.halo = self._halo = Halo(stages.engine) if halo is None else halo
         self.most = self._halo.most
-        self._factor, self._grow = 1.0, False
+        self._factor, self._grow, self._room = 1.0, False, 1.0
 
-    def begin(self, n: int) -> None:
+    def begin(self, n: int, last: bool = False) -> None:
         """Take the depth of the halo from the latest diagram, or estimate it, for `n` generators."""
         halo, dim = self._halo, self.domain.dim
         if halo.cells == 0:
             volume = self.domain.measure / self.domain.frame[1] ** dim
             halo.fill(FIRST_DEPTH * (volume / n) ** (1 / dim), n)
-        self._factor, self._grow = (halo.cells / n) ** (1 / dim), False
+        # Room for motion costs many images where cells differ much in size.
+        self._factor, self._grow, self._room = (halo.cells / n) ** (1 / dim), False, 0.0 if last else 1.0
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the first `n` of `sites` with their images in the halo."""
-        return self.stages.ghost_images.extend(self.domain, sites, n, self._halo, self._factor, self._grow)
+        images = self.stages.ghost_images
+        return images.extend(self.domain, sites, n, self._halo, self._factor, self._grow, self._room)
 
     def rows(self, previous: Tessellation) -> NeighborRows:
         """Return a copy of the graph of `previous`: the first of several attempts overwrites an updated diagram."""
@@ -92,7 +97,7 @@ class Images(DomainSteps):
             part, self._halo, binned, t, points, share, nearest
         )
         if not enough:
-            self._factor, self._grow = 1.0, True
+            self._factor, self._grow = 1.0 if self._room > 0 else LAST_FACTOR, True
             return None
         if flags & COLLAPSED:
             raise CloseError(points, part.n_own)

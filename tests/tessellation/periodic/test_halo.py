@@ -150,6 +150,19 @@ def check_depths(adapter, box, points, walks):
     assert requests > 30
 
 
+def test_single_diagrams_of_graded_points_take_few_images(ctx):
+    """Large cells in the corners need no images of the small ones in the middle, which have no room to move there."""
+    adapter, box = clvoro.Adapter(ctx, "float64"), clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
+    rng = np.random.default_rng(2208)
+    ways = rng.normal(size=(600, 3))
+    points = 0.5 + ways * (0.5 * rng.random(600) ** 3 / np.linalg.norm(ways, axis=1))[:, None]
+    stages = adapter._stages_for(box)
+    x = stages.engine.upload(box.place(points, adapter.dtype))
+    t = Tessellator(stages, box).tessellate(x, 600, exact=True, complete=True)
+    assert t.folded.part.count < 4 * 600
+    stages.release()
+
+
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("short", [0.6, 0.9])
 def test_too_shallow_blocks_are_detected(adapter, short):

@@ -589,9 +589,9 @@ def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch):
     rows = previous.starts.get(), previous.neighbors.get()[: previous.starts.get()[-1]]
     extend, unfold = GhostImages.extend, GhostImages.unfold
 
-    def narrow(ghost_images, domain, points, n, halo, factor, grow):
+    def narrow(ghost_images, domain, points, n, halo, factor, grow, room):
         short = len(begun) < 3
-        return extend(ghost_images, domain, points, n, halo, 0.4 if short else factor, grow and not short)
+        return extend(ghost_images, domain, points, n, halo, 0.4 if short else factor, grow and not short, room)
 
     def seen(ghost_images, images, graph):
         begun.append((graph.starts.get(), graph.neighbors.get()[: len(rows[1])]))
