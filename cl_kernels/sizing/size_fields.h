@@ -306,3 +306,56 @@ int size_inside(const REAL *x, __global const REAL *data, int n, int levels)
     }
     return inside;
 }
+
+/* A field from the data of cells (clvoro/sizing/cells.py). data: axis and coordinate of each inner node of a k-d tree
+   whose leaves are all `levels` deep; then for each cell its centroid (DIM), value, least and largest value, and slope
+   (DIM), leaf by leaf.
+
+   The linear functions of all cells with r_j^2 < 2 r^2, r the distance of the nearest centroid, are blended with the
+   weights (1 - 3 (r_j^2 - r^2) / (r_j^2 + r^2))^2: the first pass finds r, the second one sums. */
+#define SIZE_CELL (2 * DIM + 3)
+#define SIZE_MOST_LEVELS 32
+REAL size_on_cells(const REAL *x, __global const REAL *data, int n, int levels)
+{
+    const int leaves = 1 << levels;
+    __global const REAL *cells = data + 2 * (leaves - 1);
+    REAL nearest = SIZE_LARGEST, sum = 0, total = 0;
+    for (int pass = 0; pass < 2; ++pass) {
+        int pending[SIZE_MOST_LEVELS], count = 1;
+        REAL gaps[SIZE_MOST_LEVELS];
+        pending[0] = 1;
+        gaps[0] = 0;
+        while (count > 0) {
+            int node = pending[--count];
+            REAL gap = gaps[count];
+            if (gap > (pass ? 2 * nearest : nearest))
+                continue;
+            while (node < leaves) {
+                const REAL beyond = x[(int)data[2 * (node - 1)]] - data[2 * (node - 1) + 1];
+                const int right = beyond > 0;
+                pending[count] = 2 * node + 1 - right;
+                gaps[count++] = fmax(gap, beyond * beyond);
+                node = 2 * node + right;
+            }
+            const long leaf = node - leaves;
+            for (int c = (int)((leaf * n) >> levels); c < (int)(((leaf + 1) * n) >> levels); ++c) {
+                __global const REAL *cell = cells + c * SIZE_CELL;
+                REAL apart2 = 0, value = cell[DIM];
+                for (int a = 0; a < DIM; ++a) {
+                    const REAL v = x[a] - cell[a];
+                    apart2 += v * v;
+                    value += cell[DIM + 3 + a] * v;
+                }
+                if (!pass) {
+                    nearest = fmin(nearest, apart2);
+                } else if (apart2 <= 2 * nearest) {
+                    const REAL far = apart2 > nearest ? 3 * (apart2 - nearest) / (apart2 + nearest) : 0;
+                    const REAL weight = far < 1 ? (1 - far) * (1 - far) : 0;
+                    sum += weight * fmin(fmax(value, cell[DIM + 1]), cell[DIM + 2]);
+                    total += weight;
+                }
+            }
+        }
+    }
+    return sum / total;
+}

@@ -151,6 +151,18 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     raise DeviceError(_complaint(subject, found, failures, broken, chosen, fp64))
 
 
+@cache
+def shared_context() -> cl.Context:
+    """Return one context on the default device for all that runs without an adapter, so that programs are built once.
+
+    Raises
+    ------
+    DeviceError
+        If no device works.
+    """
+    return create_context()
+
+
 def list_devices() -> list[DeviceInfo]:
     """Test every OpenCL device and return one entry for each, in the order of the platforms.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..opencl import probe
-from ..opencl.devices import create_context
+from ..opencl.devices import shared_context
 from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..tessellation.bins import Bins
@@ -65,7 +64,7 @@ def transfer_values(
         means, low, high, covered = _transfer_on_host(*task)
     else:
         with adapter._alone() if adapter is not None else nullcontext():
-            ctx = _default_context() if adapter is None else adapter.ctx
+            ctx = shared_context() if adapter is None else adapter.ctx
             means, low, high, covered = _transfer_on_device(ctx, *task)
     bounded = order == 1 or bool(limited)
     if same:
@@ -149,12 +148,6 @@ def _checked(values: ArrayLike, n: int) -> np.ndarray:
             "replace them first"
         )
     return array
-
-
-@lru_cache(maxsize=1)
-def _default_context() -> cl.Context:
-    """Return one context for all calls, so that programs are built once."""
-    return create_context()
 
 
 def _transfer_on_device(

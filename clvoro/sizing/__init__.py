@@ -11,8 +11,20 @@ How to add a size field:
 
 from ..geometry.shapes import Ball, Circle, ClosedPolyline, Edges, Polyline, Segment
 from ..geometry.surface import Surface
+from .cells import OnCells
 from .codegen import generate_code
+from .derivatives import derivatives
 from .distance import Distance
+from .estimates import (
+    Estimate,
+    combine,
+    interface_distance,
+    normalize,
+    q_criterion,
+    sensor_size,
+    shock_sensor,
+    vorticity,
+)
 from .evaluation import Sizing
 from .expression import Expression
 from .feature import FeatureSize
@@ -30,11 +42,13 @@ __all__ = [
     "Constant",
     "Distance",
     "Edges",
+    "Estimate",
     "Expression",
     "FeatureSize",
     "Field",
     "Function",
     "Graded",
+    "OnCells",
     "Polyline",
     "Raster",
     "Region",
@@ -43,11 +57,19 @@ __all__ = [
     "Sizing",
     "Surface",
     "as_field",
+    "combine",
     "curvature_size",
+    "derivatives",
     "gap_size",
     "generate_code",
     "gradient_size",
     "hessian_size",
+    "interface_distance",
     "maximum",
     "minimum",
+    "normalize",
+    "q_criterion",
+    "sensor_size",
+    "shock_sensor",
+    "vorticity",
 ]

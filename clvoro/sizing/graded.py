@@ -282,10 +282,11 @@ def _check_resolution(resolution: int | Sequence[int], dim: int | None) -> int |
 
 
 def default_engine(dim: int, traits: Traits = PLAIN) -> Engine:
-    """Return an engine in float64 on the default device."""
+    """Return an engine on the default device, in float64 where it has that."""
     import pyopencl as cl
 
-    from ..opencl.devices import create_context
+    from ..opencl.devices import has_fp64, shared_context
 
-    ctx = create_context()
-    return Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64), traits)
+    ctx = shared_context()
+    queue = cl.CommandQueue(ctx)
+    return Engine(ctx, queue, dim, np.dtype(np.float64 if has_fp64(queue.device) else np.float32), traits)

@@ -1,24 +1,28 @@
-"""Sizes from a solution on a raster, by its second derivatives (Hessian) or its gradient."""
+"""Sizes from a solution on a raster or on the cells of a mesh, by its second derivatives (Hessian) or its gradient."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from numbers import Real
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
-from ..errors import InputError, InputTypeError
-from .arguments import check_positive
+from ..errors import InputError
+from .estimates import Estimate, curvature_of, estimate, slope_of
+from .profiles import FLAT, check_bounds, check_one_of, check_p, scale_profile
 from .raster import Raster, check_box, fill_missing
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-_FLAT = 1e-12  # share of the largest curvature below which curvature counts as 0
+    from ..mesh.diagram import Diagram
+    from ..mesh.results import Result
+
+_GROWTH = 1.2
 
 
+@overload
 def hessian_size(
     values: ArrayLike,
     lower: Sequence[float],
@@ -31,7 +35,40 @@ def hessian_size(
     h_max: float = math.inf,
     at: str = "nodes",
     missing: str = "error",
-) -> Raster:
+) -> Raster: ...
+
+
+@overload
+def hessian_size(
+    values: ArrayLike | Sequence[ArrayLike],
+    *,
+    on: Result | Diagram,
+    n_cells: float | None = None,
+    eps: float | None = None,
+    p: float = 2.0,
+    h_min: float = 0.0,
+    h_max: float = math.inf,
+    growth: float = _GROWTH,
+    weight: ArrayLike | None = None,
+) -> Estimate: ...
+
+
+def hessian_size(
+    values: ArrayLike | Sequence[ArrayLike],
+    lower: Sequence[float] | None = None,
+    upper: Sequence[float] | None = None,
+    *,
+    on: Result | Diagram | None = None,
+    n_cells: float | None = None,
+    eps: float | None = None,
+    p: float = 2.0,
+    h_min: float = 0.0,
+    h_max: float = math.inf,
+    at: str = "nodes",
+    missing: str = "error",
+    growth: float = _GROWTH,
+    weight: ArrayLike | None = None,
+) -> Raster | Estimate:
     r"""Return the size that interpolates a solution best in the L^p norm.
 
     Loseille and Alauzet (Continuous mesh framework, I and II, SIAM J. Numer. Anal. 49, 2011) minimize
@@ -51,9 +88,13 @@ def hessian_size(
     Parameters
     ----------
     values : (ny, nx) or (nz, ny, nx) array of real numbers
-        The solution, arranged as in `Raster`.
+        The solution, arranged as in `Raster`. On a mesh (n,), or (n, c) for a vector with c components, or a list of
+        such arrays: several fields. Each is scaled so that it alone would give as many cells as the others; the
+        largest curvature counts.
     lower, upper : sequences of 2 or 3 floats
         The box that the array covers.
+    on : Result or Diagram, optional
+        In place of the box: the mesh on whose cells the values are, in any domain.
     n_cells : float, optional
         Number of cells N in the box, bounds included.
     eps : float, optional
@@ -64,17 +105,25 @@ def hessian_size(
     h_min, h_max : float
         Bounds. Where the Hessian is 0, h is `h_max`, by default the longest side of the box.
     at, missing
-        As for `Raster`.
+        As for `Raster`, of rasters only.
+    growth : float
+        On a mesh only: ratio of the sizes of neighboring cells at most. `n_cells` and `eps` hold after it. Around a
+        raster write `Graded`.
+    weight : (n,) array of float, optional
+        On a mesh only: factor of the curvature in each cell. For a goal such as drag it is the size of the adjoint
+        solution, or of its gradient, in that cell (Loseille, Dervieux and Alauzet 2010, J. Comput. Phys. 229, 2866).
 
     Returns
     -------
-    Raster
+    Raster or Estimate
+        On a mesh an `Estimate`: sizes with the error that they lead to.
 
     Raises
     ------
     InputError, InputTypeError
         If the array has fewer than 3 values along an axis or an argument is out of range; if no
-        common factor meets `n_cells` within the bounds.
+        common factor meets `n_cells` within the bounds; on a mesh, if there is not a row of finite numbers for each
+        cell.
 
     Notes
     -----
@@ -95,10 +144,24 @@ def hessian_size(
         u = np.tanh(50 * (x + y - 1))
         size = Graded(hessian_size(u, (0, 0), (1, 1), n_cells=5000, h_max=0.1), growth=1.2)
         clvoro.Adapter().run(clvoro.Box((0, 0), (1, 1)), size, n_cells=5000).plot("size")
+
+    From the solution on a mesh to the next mesh:
+
+    >>> box = clvoro.Box((0, 0), (1, 1))
+    >>> mesh = clvoro.adapt(box, 0.04, "fast")
+    >>> u = np.tanh(20 * (mesh.centroids.sum(axis=1) - 1))
+    >>> size = clvoro.sizing.hessian_size(u, on=mesh, n_cells=800)
+    >>> after = clvoro.adapt(box, size, "fast", n_cells=800)
+    >>> len(after), bool(size.values.max() > 5 * size.values.min())
+    (800, True)
     """
-    u, corners, spacing = _check_solution("hessian_size", values, lower, upper, at, missing, least=3)
-    if not (isinstance(p, Real) and p >= 1):
-        raise InputError(f"hessian_size p is {p!r}, expected at least 1; math.inf is allowed")
+    if on is not None:
+        _refuse_raster("hessian_size", lower, upper, at, missing)
+        bounds = h_min, h_max, growth
+        return estimate("hessian_size", on, curvature_of(values, on, p, weight), 2, p, 1 / 8, n_cells, eps, *bounds)
+    low, high = _corners("hessian_size", lower, upper, growth, weight)
+    u, corners, spacing = _check_solution("hessian_size", values, low, high, at, missing, least=3)
+    check_p("hessian_size", p)
     d = u.ndim
     curvature = _curvature(u, spacing)
     largest = curvature.max()
@@ -106,11 +169,11 @@ def hessian_size(
         shape = np.zeros(u.shape)
     else:
         shape = curvature / largest  # l in units that neither overflow nor underflow
-        shape[shape < _FLAT] = 0
+        shape[shape < FLAT] = 0
     power = 0.5 if math.isinf(p) else p / (2 * p + d)
     with np.errstate(divide="ignore"):
         profile = shape**-power
-    wanted = _check_one_of("hessian_size", n_cells, eps)
+    wanted = check_one_of("hessian_size", n_cells, eps)
     if eps is not None:
         # e = c^2 l^(1 - 2 power) / 8 with c for l / largest: divided by `largest`.
         norm = 1.0
@@ -122,6 +185,7 @@ def hessian_size(
     return _sizes_from_profile("hessian_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at)
 
 
+@overload
 def gradient_size(
     values: ArrayLike,
     lower: Sequence[float],
@@ -133,15 +197,44 @@ def gradient_size(
     h_max: float = math.inf,
     at: str = "nodes",
     missing: str = "error",
-) -> Raster:
+) -> Raster: ...
+
+
+@overload
+def gradient_size(
+    values: ArrayLike | Sequence[ArrayLike],
+    *,
+    on: Result | Diagram,
+    eps: float | None = None,
+    n_cells: float | None = None,
+    h_min: float = 0.0,
+    h_max: float = math.inf,
+    growth: float = _GROWTH,
+) -> Estimate: ...
+
+
+def gradient_size(
+    values: ArrayLike | Sequence[ArrayLike],
+    lower: Sequence[float] | None = None,
+    upper: Sequence[float] | None = None,
+    *,
+    on: Result | Diagram | None = None,
+    eps: float | None = None,
+    n_cells: float | None = None,
+    h_min: float = 0.0,
+    h_max: float = math.inf,
+    at: str = "nodes",
+    missing: str = "error",
+    growth: float = _GROWTH,
+) -> Raster | Estimate:
     """Return the size over which a solution changes by a constant amount.
 
     ``h = eps / |grad u|``, within the bounds.
 
     Parameters
     ----------
-    values, lower, upper, at, missing
-        As for `hessian_size`; at least 2 values along each axis.
+    values, lower, upper, on, at, missing, growth
+        As for `hessian_size`; on a raster at least 2 values along each axis.
     eps : float, optional
         Change of u over a cell, in the unit of u.
     n_cells : float, optional
@@ -151,7 +244,7 @@ def gradient_size(
 
     Returns
     -------
-    Raster
+    Raster or Estimate
 
     Raises
     ------
@@ -163,14 +256,23 @@ def gradient_size(
     Cells over which the temperature changes by two degrees, none longer than 0.1::
 
         size = gradient_size(temperature, (0, 0), (2, 1), eps=2.0, h_max=0.1)
+
+    Eight cells across a flame, whose progress variable goes from 0 to 1 (or any other field, whatever its range)::
+
+        size = gradient_size(progress, on=mesh, eps=np.ptp(progress) / 8, h_max=0.1)
     """
-    u, corners, spacing = _check_solution("gradient_size", values, lower, upper, at, missing, least=2)
+    if on is not None:
+        _refuse_raster("gradient_size", lower, upper, at, missing)
+        steep = slope_of(values, on)
+        return estimate("gradient_size", on, steep, 1, math.inf, 1.0, n_cells, eps, h_min, h_max, growth)
+    low, high = _corners("gradient_size", lower, upper, growth, None)
+    u, corners, spacing = _check_solution("gradient_size", values, low, high, at, missing, least=2)
     slopes = np.gradient(u, *spacing[::-1])
     steep = np.sqrt(sum(s**2 for s in slopes))
     largest = float(steep.max())
     with np.errstate(divide="ignore"):
-        profile = 1 / np.where(steep < _FLAT * largest, 0, steep / (largest or 1))
-    wanted = _check_one_of("gradient_size", n_cells, eps)
+        profile = 1 / np.where(steep < FLAT * largest, 0, steep / (largest or 1))
+    wanted = check_one_of("gradient_size", n_cells, eps)
     factor = None
     if eps is not None:
         factor = wanted / largest if largest > 0 else math.inf
@@ -178,10 +280,10 @@ def gradient_size(
 
 
 def _check_solution(
-    what: str, values: ArrayLike, lower: ArrayLike, upper: ArrayLike, at: str, missing: str, least: int
+    what: str, values: object, lower: ArrayLike, upper: ArrayLike, at: str, missing: str, least: int
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Return the checked values, the corners and the spacing of the values along x, y (, z)."""
-    shape = np.shape(values)
+    shape = np.shape(values)  # type: ignore[arg-type]
     low, high = check_box(what, shape, lower, upper, at)
     counts = np.array(shape[::-1])
     if counts.min(initial=least) < least:
@@ -218,13 +320,6 @@ def _weights(shape: tuple[int, ...], spacing: np.ndarray, at: str) -> np.ndarray
     return total
 
 
-def _check_one_of(what: str, n_cells: object, eps: object) -> float:
-    if (n_cells is None) == (eps is None):
-        raise InputError(f"{what} got n_cells={n_cells} and eps={eps}, expected exactly one of them")
-    name = "eps" if n_cells is None else "n_cells"
-    return check_positive(f"{what} {name}", eps if n_cells is None else n_cells)
-
-
 def _sizes_from_profile(
     what: str,
     profile: np.ndarray,
@@ -237,39 +332,26 @@ def _sizes_from_profile(
     at: str,
 ) -> Raster:
     """Return factor * profile within the bounds. Without a factor, find the one that gives `n_cells`."""
-    for name, bound in (("h_min", h_min), ("h_max", h_max)):
-        if not isinstance(bound, Real) or isinstance(bound, bool):
-            raise InputTypeError(f"{what} {name} is {bound!r}, expected a number")
-    if not (0 <= h_min <= h_max and h_min < math.inf and h_max > 0):
-        raise InputError(f"{what} got h_min={h_min} and h_max={h_max}, expected 0 <= h_min <= h_max")
-    if n_cells is not None and not np.isfinite(profile).any():
-        raise InputError(
-            f"{what} values have no derivatives other than 0, so n_cells={n_cells:g} cannot be "
-            "distributed; use a number as size"
-        )
     low, high = corners
-    top = float(min(h_max, (high - low).max()) if math.isinf(h_max) else h_max)
+    top = check_bounds(what, h_min, h_max, float((high - low).max()))
+    weights = None if factor is not None else _weights(profile.shape, spacing, at)
+    return Raster(scale_profile(what, profile, factor, n_cells, weights, profile.ndim, h_min, top), low, high, at=at)
 
-    def sizes(factor: float) -> np.ndarray:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.clip(np.where(np.isinf(profile), math.inf, factor * profile), h_min, top)
 
-    if factor is None:
-        weights = _weights(profile.shape, spacing, at)
+def _refuse_raster(what: str, lower: object, upper: object, at: str, missing: str) -> None:
+    if lower is not None or upper is not None or at != "nodes" or missing != "error":
+        raise InputError(f"{what} got on= and lower, upper, at or missing, which are for rasters; leave these out")
 
-        def count(log_factor: float) -> float:
-            with np.errstate(over="ignore", divide="ignore"):
-                return float(np.sum(weights * sizes(math.exp(log_factor)) ** -profile.ndim))
 
-        begin, end = math.log(top) - 600.0, math.log(top) + 1.0
-        most, least = count(begin), count(end)
-        if not least * (1 - 1e-9) <= n_cells <= most * (1 + 1e-9):  # type: ignore[operator]
-            raise InputError(
-                f"{what} n_cells is {n_cells:g}, but sizes from {h_min:g} to {top:g} give "
-                f"{least:.6g} to {most:.6g} cells; change h_min, h_max or n_cells"
-            )
-        for _ in range(100):  # bisection: the number decreases with the factor
-            middle = 0.5 * (begin + end)
-            begin, end = (middle, end) if count(middle) > n_cells else (begin, middle)  # type: ignore[operator]
-        factor = math.exp(0.5 * (begin + end))
-    return Raster(sizes(factor), low, high, at=at)
+def _corners(
+    what: str, lower: Sequence[float] | None, upper: Sequence[float] | None, growth: float, weight: object
+) -> tuple[Sequence[float], Sequence[float]]:
+    """Return the corners of a raster; raise InputError if there are none, or there are arguments of meshes."""
+    if lower is None or upper is None:
+        raise InputError(
+            f"{what} got lower={lower} and upper={upper}, expected the corners of the box that the array covers, or "
+            "on= with the mesh on whose cells the values are"
+        )
+    if growth != _GROWTH or weight is not None:
+        raise InputError(f"{what} got growth or weight for a raster; write Graded(...) around it, or give on= a mesh")
+    return lower, upper

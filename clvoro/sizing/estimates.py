@@ -1,0 +1,394 @@
+"""Estimates: sizes on the cells of a mesh, with the error that they lead to; how they are combined and normalized."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from ..errors import InputError
+from .arguments import check_positive, check_slope
+from .cells import OnCells
+from .derivatives import CellStencils, check_cell_values, derivatives
+from .profiles import FLAT, check_bounds, check_one_of, check_p, scale_profile
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from ..mesh.diagram import Diagram
+    from ..mesh.results import Result
+
+_SMOOTHED = 1  # passes: second derivatives of computed fields are noisy from cell to cell
+
+
+class Estimate(OnCells):
+    """Sizes on the cells of a mesh, a size field, with the error that they lead to.
+
+    Attributes
+    ----------
+    mesh : Diagram
+        The mesh of the solution.
+    values : (n,) float64
+        Size h in each of its cells, in the unit of the coordinates.
+    error : (n,) float64
+        Error that a cell of this size has there; for its unit see the function that made the estimate.
+    order : float
+        The error is proportional to h^order.
+    p : float
+        Exponent of the norm that is small for a number of cells.
+    """
+
+    def __init__(self, mesh: Result | Diagram, values: ArrayLike, error: ArrayLike, order: float = 2.0, p: float = 2.0):
+        super().__init__(mesh, values)
+        self.error = check_cell_values("Estimate error", error, len(self.values))
+        self.order, self.p = order, p
+
+    @property
+    def norm(self) -> float:
+        """The L^p norm of the error over the domain; the largest error for p = inf."""
+        most = float(self.error.max(initial=0.0))
+        if math.isinf(self.p) or most == 0:
+            return most
+        return most * float(np.sum(self.mesh.volumes * (self.error / most) ** self.p)) ** (1 / self.p)
+
+    @property
+    def n_cells(self) -> float:
+        """Number of cells of these sizes, the integral of h^-d."""
+        return float(np.sum(self.mesh.volumes * self.values**-self.mesh.domain.cell_dim))
+
+    def with_sizes(self, values: np.ndarray) -> Estimate:
+        """Return the estimate for other sizes (n,)."""
+        return Estimate(self.mesh, values, self.error * (values / self.values) ** self.order, self.order, self.p)
+
+    def __repr__(self) -> str:
+        low, high = self.values.min(), self.values.max()
+        return (
+            f"Estimate({self.n_cells:,.0f} cells, h {low:.3g} to {high:.3g}, error {self.norm:.3g}; "
+            f"from {len(self.values)} cells in {self.mesh.domain})"
+        )
+
+
+def curvature_of(values: object, on: Result | Diagram, p: float, weight: ArrayLike | None) -> np.ndarray:
+    """Return the largest absolute eigenvalue of the Hessian in each cell, (n,), of one or several fields.
+
+    Several are scaled so that for each the integral of l^(p d / (2 p + d)) is 1.
+    """
+    check_p("hessian_size", p)
+    stencils = CellStencils.of(on)
+    d = stencils.mesh.domain.cell_dim
+    power = d / 2 if math.isinf(p) else p * d / (2 * p + d)
+    fields, found = _fields(values, len(stencils)), []
+    for field in fields:
+        hessians = derivatives(field, stencils.mesh)[1]
+        spectral = np.abs(np.linalg.eigvalsh(hessians)).max(axis=-1)
+        spectral = _free_of_rounding(np.sqrt((spectral.reshape(len(field), -1) ** 2).sum(axis=1)), field, stencils, 2)
+        found.append(stencils.smooth(spectral, _SMOOTHED))
+    if len(fields) > 1:
+        found = [_scaled(curvature, stencils.mesh.volumes, power) for curvature in found]
+    most = np.maximum.reduce(found)
+    if weight is None:
+        return most
+    factor = check_cell_values("hessian_size weight", weight, len(stencils))
+    if factor.ndim != 1 or factor.min() < 0:
+        raise InputError(
+            f"hessian_size weight has shape {factor.shape} and values down to {factor.min():g}, expected "
+            f"({len(stencils)},) numbers >= 0; take the absolute value"
+        )
+    return most * factor
+
+
+def slope_of(values: object, on: Result | Diagram) -> np.ndarray:
+    """Return the length of the gradient in each cell, (n,), of one or several fields.
+
+    Several are scaled to the same mean.
+    """
+    stencils = CellStencils.of(on)
+    found = []
+    for field in _fields(values, len(stencils)):
+        gradients = derivatives(field, stencils.mesh)[0]
+        steep = np.sqrt((gradients.reshape(len(field), -1) ** 2).sum(axis=1))
+        found.append(_free_of_rounding(steep, field, stencils, 1))
+    if len(found) > 1:
+        found = [_scaled(steep, stencils.mesh.volumes, 1.0) for steep in found]
+    return np.maximum.reduce(found)
+
+
+def _fields(values: object, n: int) -> list[np.ndarray]:
+    """Return the fields in `values`: an array is one, a list or tuple of arrays are several."""
+    several = isinstance(values, list | tuple) and len(values) > 0 and all(np.ndim(v) > 0 for v in values)
+    given: Sequence[object] = values if several else [values]  # type: ignore[assignment]
+    names = [f"values[{k}]" for k in range(len(given))] if several else ["values"]
+    return [check_cell_values(name, field, n) for name, field in zip(names, given, strict=True)]
+
+
+def _free_of_rounding(found: np.ndarray, field: np.ndarray, stencils: CellStencils, order: int) -> np.ndarray:
+    """Return derivatives, 0 where they are round-off of the field's values."""
+    n = len(field)
+    lengths = np.full(n, np.inf)
+    np.minimum.at(lengths, stencils.owners, stencils.lengths)
+    noise = 64 * np.finfo(float).eps * np.abs(field).max()
+    return np.where(found * lengths**order > noise, found, 0.0)
+
+
+def _scaled(found: np.ndarray, volumes: np.ndarray, power: float) -> np.ndarray:
+    """Return `found` over its mean of this power; as it is if it is 0."""
+    most = float(found.max())
+    if most == 0:
+        return found
+    mean = float(np.sum(volumes * (found / most) ** power)) / float(volumes.sum())
+    return found / (most * mean ** (1 / power))
+
+
+def estimate(
+    what: str,
+    on: Result | Diagram,
+    indicator: np.ndarray,
+    order: float,
+    p: float,
+    constant: float,
+    n_cells: float | None,
+    eps: float | None,
+    h_min: float,
+    h_max: float,
+    growth: float,
+) -> Estimate:
+    """Return the sizes that make the L^p norm of the error e = constant * indicator * h^order least.
+
+    With l the indicator, h = c l^(-p / (order p + d)), and c^d = (1 / N) integral l^(p d / (order p + d)) for N cells;
+    h is then bounded, its growth limited, and c chosen again.
+    """
+    stencils = CellStencils.of(on)
+    mesh = stencils.mesh
+    d, volumes = mesh.domain.cell_dim, mesh.volumes
+    slope = check_slope(what, growth, None)
+    top = check_bounds(what, h_min, h_max, float(mesh.domain.extent.max()))
+    wanted = check_one_of(what, n_cells, eps)
+    largest = float(indicator.max())
+    shape = indicator / largest if largest > 0 else np.zeros(len(indicator))
+    shape[shape < FLAT] = 0
+    power = 1 / order if math.isinf(p) else p / (order * p + d)
+    with np.errstate(divide="ignore"):
+        profile = shape**-power
+    factor = None
+    if eps is not None:
+        norm = 1.0 if math.isinf(p) else float(np.sum(volumes * shape ** (power * d))) ** (1 / p)
+        factor = (wanted / (constant * largest * norm)) ** (1 / order) if largest > 0 else math.inf
+    limit = partial(stencils.limit_growth, slope=slope)
+    sizes = scale_profile(what, profile, factor, n_cells, volumes, d, h_min, top, limit)
+    return Estimate(mesh, sizes, constant * indicator * sizes**order, order, p)
+
+
+def sensor_size(
+    sensor: ArrayLike,
+    *,
+    on: Result | Diagram,
+    eps: float | None = None,
+    n_cells: float | None = None,
+    order: float = 1.0,
+    h_min: float = 0.0,
+    h_max: float = math.inf,
+    growth: float = 1.2,
+) -> Estimate:
+    """Return the size by which ``sensor * h**order`` is the same in all cells: any feature of a flow, or a model's own.
+
+    Parameters
+    ----------
+    sensor : (n,) array of float
+        At least 0 in each cell: `vorticity`, `q_criterion`, `shock_sensor`, or an indicator of your own.
+    on, n_cells, h_min, h_max, growth
+        As for `hessian_size`.
+    eps : float, optional
+        In place of `n_cells`: the value of ``sensor * h**order``, the error of the estimate.
+    order : float
+        Power of h.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    InputError, InputTypeError
+        As for `hessian_size`; if the sensor is negative.
+
+    Examples
+    --------
+    Of the kinetic energy of turbulence, k_model is modeled with cells of size h0, and proportional to h^(2/3) in the
+    inertial range. At least 80 % shall be resolved::
+
+        share = k_model / (k_model + k_resolved)
+        size = sensor_size(share / h0 ** (2 / 3), on=mesh, order=2 / 3, eps=0.2)
+    """
+    stencils = CellStencils.of(on)
+    given = check_cell_values("sensor", sensor, len(stencils))
+    if given.ndim != 1 or given.min() < 0:
+        raise InputError(
+            f"sensor has shape {given.shape} and values down to {given.min():g}, expected ({len(stencils)},) numbers "
+            ">= 0; take the absolute value, or numpy.maximum(sensor, 0)"
+        )
+    check_positive("sensor_size order", order)
+    return estimate("sensor_size", on, given, order, math.inf, 1.0, n_cells, eps, h_min, h_max, growth)
+
+
+def combine(*estimates: Estimate, by: Literal["max", "mean"] = "max") -> Estimate:
+    """Return one estimate of several: of different features, or of several times.
+
+    The running maximum over a window of time, ``combine(window, latest)``, keeps vortex streets and moving shocks
+    inside of fine cells until the mesh is adapted again.
+
+    Parameters
+    ----------
+    *estimates : Estimate
+        Also of different meshes: all are evaluated on the mesh of the last one.
+    by : "max" or "mean"
+        Whether the smallest size counts in each cell, or the mean density of cells, h^-d.
+
+    Returns
+    -------
+    Estimate
+        The error is the largest, or the mean, of those predicted. It has a meaning if they have one unit.
+
+    Raises
+    ------
+    InputError
+        If there is no estimate, or `by` is something else.
+    """
+    if not estimates or not all(isinstance(e, Estimate) for e in estimates):
+        raise InputError(f"combine got {estimates!r:.60}, expected estimates; combine other fields by sizing.minimum")
+    if by not in ("max", "mean"):
+        raise InputError(f"combine got by={by!r}, expected 'max' or 'mean'")
+    last = estimates[-1]
+    d, x = last.mesh.domain.cell_dim, last.mesh.centroids
+    sizes = [e.values if e.mesh is last.mesh else e(x) for e in estimates]
+    errors = [e.error if e.mesh is last.mesh else OnCells(e.mesh, e.error)(x) for e in estimates]
+    h = np.minimum.reduce(sizes) if by == "max" else np.mean([s**-d for s in sizes], axis=0) ** (-1 / d)
+    scaled = [error * (h / s) ** e.order for e, s, error in zip(estimates, sizes, errors, strict=True)]
+    error = np.maximum.reduce(scaled) if by == "max" else np.mean(scaled, axis=0)
+    return Estimate(last.mesh, h, error, last.order, last.p)
+
+
+def normalize(
+    estimate: Estimate,
+    *,
+    n_cells: float | None = None,
+    eps: float | None = None,
+    h_min: float = 0.0,
+    h_max: float = math.inf,
+    growth: float = 1.2,
+) -> Estimate:
+    """Return an estimate times the factor for which it has a number of cells or an error.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    n_cells : float, optional
+        Number of cells, bounds and growth included.
+    eps : float, optional
+        In place of `n_cells`: the norm of the error (`Estimate.norm`), before bounds and growth.
+    h_min, h_max, growth
+        As for `hessian_size`.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    InputError, InputTypeError
+        As for `hessian_size`.
+    """
+    wanted = check_one_of("normalize", n_cells, eps)
+    slope = check_slope("normalize", growth, None)
+    mesh = estimate.mesh
+    top = check_bounds("normalize", h_min, h_max, float(mesh.domain.extent.max()))
+    factor = None
+    if eps is not None:
+        if estimate.norm == 0:
+            raise InputError(f"normalize got eps={eps} for an estimate that is 0 everywhere; give n_cells")
+        factor = (wanted / estimate.norm) ** (1 / estimate.order)
+    limit = partial(CellStencils.of(mesh).limit_growth, slope=slope)
+    d = mesh.domain.cell_dim
+    unit = 1.0 if factor is not None else float(estimate.values.min())
+    profile = estimate.values / unit
+    sizes = scale_profile("normalize", profile, factor, n_cells, mesh.volumes, d, h_min, top, limit)
+    return estimate.with_sizes(sizes)
+
+
+# Sensors: features of a flow.
+
+
+def vorticity(velocity: ArrayLike, on: Result | Diagram) -> np.ndarray:
+    """Return the size of the curl of `velocity` (n, d) in each cell, (n,) float64."""
+    skew = _skew(_velocity_gradients("vorticity", velocity, on))
+    return np.sqrt(2 * (skew**2).sum(axis=(1, 2)))
+
+
+def q_criterion(velocity: ArrayLike, on: Result | Diagram) -> np.ndarray:
+    """Return where rotation exceeds strain, max(0, (|W|^2 - |S|^2) / 2) of `velocity` (n, d), (n,) float64.
+
+    S and W are the symmetric and the skew part of its gradient (Hunt, Wray and Moin 1988).
+    """
+    gradients = _velocity_gradients("q_criterion", velocity, on)
+    skew = _skew(gradients)
+    strain = gradients - skew
+    return np.maximum(0, ((skew**2).sum(axis=(1, 2)) - (strain**2).sum(axis=(1, 2))) / 2)
+
+
+def shock_sensor(velocity: ArrayLike, pressure: ArrayLike, on: Result | Diagram) -> np.ndarray:
+    """Return |grad p| / p times the share of compression, s^2 / (s^2 + w^2), in each cell, (n,) float64.
+
+    s = max(0, -div u) is the rate of compression, w the vorticity (Ducros et al. 1999, J. Comput. Phys. 152, 517). It
+    is large in shocks and small in vortices and in expansions. With `sensor_size`, `eps` is the relative jump of the
+    pressure over a cell.
+    """
+    gradients = _velocity_gradients("shock_sensor", velocity, on)
+    p = check_cell_values("shock_sensor pressure", pressure, len(gradients))
+    if p.ndim != 1 or p.min() <= 0:
+        raise InputError(f"shock_sensor pressure has shape {p.shape}, expected ({len(p)},) positive numbers")
+    pressing = np.maximum(0, -np.trace(gradients, axis1=1, axis2=2)) ** 2
+    turning = 2 * (_skew(gradients) ** 2).sum(axis=(1, 2))
+    share = pressing / np.maximum(pressing + turning, 1e-300)
+    return share * np.linalg.norm(derivatives(p, on)[0], axis=1) / p
+
+
+def interface_distance(level: ArrayLike, on: Result | Diagram) -> np.ndarray:
+    """Return the distance of each cell from the interface where `level` (n,) changes its sign, (n,) float64.
+
+    Along the graph of the cells, which is up to 15 % longer than the straight line. ``OnCells(mesh, h_min + slope *
+    distance)`` is a size field around it; subtract .5 from a fraction of volume.
+
+    Raises
+    ------
+    InputError
+        If the sign is the same everywhere.
+    """
+    stencils = CellStencils.of(on)
+    u = check_cell_values("level", level, len(stencils))
+    if u.ndim != 1 or not (u.min() <= 0 <= u.max()):
+        raise InputError(
+            f"level has shape {u.shape} and values from {u.min():g} to {u.max():g}, expected ({len(u)},) numbers of "
+            "both signs; subtract the value at the interface"
+        )
+    own, other = stencils.owners, stencils.neighbors
+    crossed = (u[own] <= 0) != (u[other] <= 0)
+    share = np.abs(u[own]) / np.maximum(np.abs(u[own]) + np.abs(u[other]), 1e-300)
+    begin = np.full(len(u), 1e3 * (stencils.lengths.sum() + 1))
+    np.minimum.at(begin, own[crossed], (share * stencils.lengths)[crossed])
+    return stencils.limit_growth(np.maximum(begin, 1e-300), 1.0)
+
+
+def _velocity_gradients(what: str, velocity: ArrayLike, on: Result | Diagram) -> np.ndarray:
+    """Return the gradients (n, component, axis) of a velocity (n, d)."""
+    stencils = CellStencils.of(on)
+    u = check_cell_values(f"{what} velocity", velocity, len(stencils))
+    d = stencils.mesh.domain.dim
+    if u.shape != (len(u), d):
+        raise InputError(f"{what} velocity has shape {u.shape}, expected ({len(u)}, {d}): a component for each axis")
+    return derivatives(u, on)[0]
+
+
+def _skew(gradients: np.ndarray) -> np.ndarray:
+    return (gradients - gradients.transpose(0, 2, 1)) / 2

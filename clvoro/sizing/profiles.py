@@ -1,0 +1,121 @@
+"""Sizes c l^(-q) from a profile: the common factor c for a number of cells, within bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from numbers import Real
+
+import numpy as np
+
+from ..errors import InputError, InputTypeError
+from .arguments import check_positive
+
+FLAT = 1e-12
+"""Share of the largest derivative below which a derivative counts as 0."""
+_FIRST_STEP, _CLOSE = 0.1, 1e-7  # of the logarithm of a factor
+
+
+def check_p(what: str, p: object) -> None:
+    """Raise InputError unless `p` is the exponent of a norm."""
+    if not (isinstance(p, Real) and float(p) >= 1):
+        raise InputError(f"{what} p is {p!r}, expected at least 1; math.inf is allowed")
+
+
+def check_one_of(what: str, n_cells: object, eps: object) -> float:
+    """Return the one that is given.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If both or none are, or it is not positive.
+    """
+    if (n_cells is None) == (eps is None):
+        raise InputError(f"{what} got n_cells={n_cells} and eps={eps}, expected exactly one of them")
+    name = "eps" if n_cells is None else "n_cells"
+    return check_positive(f"{what} {name}", eps if n_cells is None else n_cells)
+
+
+def check_bounds(what: str, h_min: object, h_max: object, longest: float) -> float:
+    """Return the largest size: `h_max`, or `longest` if that is infinite.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If the bounds are not numbers in order.
+    """
+    for name, bound in (("h_min", h_min), ("h_max", h_max)):
+        if not isinstance(bound, Real) or isinstance(bound, bool):
+            raise InputTypeError(f"{what} {name} is {bound!r}, expected a number")
+    if not (0 <= h_min <= h_max and h_min < math.inf and h_max > 0):  # type: ignore[operator]
+        raise InputError(f"{what} got h_min={h_min} and h_max={h_max}, expected 0 <= h_min <= h_max")
+    return longest if math.isinf(h_max) else float(h_max)  # type: ignore[arg-type]
+
+
+def scale_profile(
+    what: str,
+    profile: np.ndarray,
+    factor: float | None,
+    n_cells: float | None,
+    volumes: np.ndarray | None,
+    dim: int,
+    h_min: float,
+    top: float,
+    limit: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> np.ndarray:
+    """Return factor * profile within the bounds. Without a factor, find the one that gives `n_cells`.
+
+    Parameters
+    ----------
+    profile : array
+        Infinite where sizes are largest.
+    volumes : array, optional
+        Volume that each value represents, to count cells; needed without a factor.
+    limit : callable, optional
+        What is done with sizes within the bounds, such as limiting their growth. It makes none larger.
+
+    Raises
+    ------
+    InputError
+        If no factor gives `n_cells`.
+    """
+    if n_cells is not None and not np.isfinite(profile).any():
+        raise InputError(
+            f"{what} values have no derivatives other than 0, so n_cells={n_cells:g} cannot be "
+            "distributed; use a number as size"
+        )
+
+    def sizes(factor: float) -> np.ndarray:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.clip(np.where(np.isinf(profile), math.inf, factor * profile), h_min, top)
+
+    def limited(factor: float) -> np.ndarray:
+        return sizes(factor) if limit is None else limit(sizes(factor))
+
+    if factor is not None:
+        return limited(factor)
+
+    def count(log_factor: float, of: Callable[[float], np.ndarray] = sizes) -> float:
+        with np.errstate(over="ignore", divide="ignore"):
+            return float(np.sum(volumes * of(math.exp(log_factor)) ** -dim))
+
+    begin, end = math.log(top) - 600.0, math.log(top) + 1.0
+    most, least = count(begin), count(end)
+    if not least * (1 - 1e-9) <= n_cells <= most * (1 + 1e-9):  # type: ignore[operator]
+        raise InputError(
+            f"{what} n_cells is {n_cells:g}, but sizes from {h_min:g} to {top:g} give "
+            f"{least:.6g} to {most:.6g} cells; change h_min, h_max or n_cells"
+        )
+    for _ in range(100):  # bisection: the number decreases with the factor
+        middle = 0.5 * (begin + end)
+        begin, end = (middle, end) if count(middle) > n_cells else (begin, middle)  # type: ignore[operator]
+    if limit is None:
+        return sizes(math.exp(0.5 * (begin + end)))
+    # Limited sizes are smaller, so that the factor is larger.
+    step = _FIRST_STEP
+    while count(end, limited) > n_cells and end < math.log(top) + 1e3:  # type: ignore[operator]
+        begin, end, step = end, end + step, 2 * step
+    while end - begin > _CLOSE:
+        middle = 0.5 * (begin + end)
+        begin, end = (middle, end) if count(middle, limited) > n_cells else (begin, middle)  # type: ignore[operator]
+    return limited(math.exp(end))
