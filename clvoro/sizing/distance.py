@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -193,8 +194,11 @@ class Distance(Field):
         # A few items give a first bound.
         for item in np.unique(np.linspace(0, len(self._begin) - 1, 16).astype(int)):
             best2 = np.minimum(best2, away2(points, np.full(len(points), item)))
-        tree = Tree(*_item_boxes(self._begin, self._end, self._radius))
-        return np.sqrt(tree.nearest2(points, best2, away2, in_boxes=bool((self._radius >= 0).all())))
+        return np.sqrt(self._tree.nearest2(points, best2, away2, in_boxes=bool((self._radius >= 0).all())))
+
+    @cached_property
+    def _tree(self) -> Tree:
+        return Tree(*_item_boxes(self._begin, self._end, self._radius))
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return np.minimum(self.h_min + self.slope * self.distance(points), self.h_max)

@@ -210,25 +210,34 @@ class _Placing:
         if len(self.pieces) < 2:
             return
         tree = shapely.STRtree([shapely.LineString(piece.path) for piece in self.pieces])
-        found = [np.empty((0, 3))]
-        for piece in self.pieces:
-            h = self.size(piece.at(np.linspace(0, piece.length, 9)))
-            x = piece.at(np.linspace(0, piece.length, 2 + math.ceil(2 * piece.length / float(np.min(h)))))
-            sizes = np.asarray(self.size(x), float)
-            rows, others = tree.query(shapely.points(x), predicate="dwithin", distance=sizes / _OF_GAP)
-            apart = np.array([not {*piece.ends} & {*self.pieces[j].ends} for j in others.tolist()], bool)
-            gaps = shapely.distance(shapely.points(x[rows]), tree.geometries[others])
-            lengths = np.maximum(_OF_GAP * gaps, 2 * _SMALLEST * sizes[rows])
-            near = apart & (lengths < sizes[rows])
-            found.append(np.column_stack([x[rows], lengths])[near])
-        self.limit(np.concatenate(found))
+        least = [np.min(h) for h in self.along_pieces(self.size, [9] * len(self.pieces))[1]]
+        counts = [2 + math.ceil(2 * p.length / float(h)) for p, h in zip(self.pieces, least, strict=True)]
+        x, h = (np.concatenate(of) for of in self.along_pieces(self.size, counts))
+        rows, others = tree.query(shapely.points(x), predicate="dwithin", distance=h / _OF_GAP)
+        ends = np.array([piece.ends for piece in self.pieces])
+        own = np.repeat(ends, counts, axis=0)[rows]
+        apart = (own[:, :, None] != ends[others][:, None]).all(axis=(1, 2))
+        gaps = shapely.distance(shapely.points(x[rows]), tree.geometries[others])
+        lengths = np.maximum(_OF_GAP * gaps, 2 * _SMALLEST * h[rows])
+        near = apart & (lengths < h[rows])
+        self.limit(np.column_stack([x[rows], lengths])[near])
+
+    def along_pieces(
+        self, size: Callable[[np.ndarray], np.ndarray], counts: list[int]
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return `counts` equidistant points (n, 2) of each piece, and the `size` there, evaluated at once."""
+        x = [piece.at(np.linspace(0, piece.length, n)) for piece, n in zip(self.pieces, counts, strict=True)]
+        return x, np.split(np.asarray(size(np.concatenate(x)), float), np.cumsum(counts)[:-1])
 
     def lay_out(self) -> _Layout:
         """Place stations and generators within the present limits."""
         layout = _Layout()
         h = self.longest(self.nodes).tolist() if len(self.nodes) else []
         self.corners = [self.corner(node, h[node]) for node in range(len(self.nodes))]
-        places = {k: self.stations(k, layout) for k in sorted({k for uses in self.uses for k, _ in uses})}
+        least = [h.min() for h in self.along_pieces(self.longest, [17] * len(self.pieces))[1]] if self.pieces else []
+        counts = [max(17, 3 * math.ceil(p.length / float(h))) for p, h in zip(self.pieces, least, strict=True)]
+        sizes = self.along_pieces(self.longest, counts)[1] if self.pieces else []
+        places = {k: self.stations(k, h, layout) for k, h in enumerate(sizes)}
         steps: list[list[float]] = [[] for _ in self.nodes]
         for k, s in places.items():
             chords = np.hypot(*np.diff(self.pieces[k].at(s), axis=0).T)
@@ -290,16 +299,14 @@ class _Placing:
         way = piece.at(np.array([piece.length - s if end else s]))[0] - piece.path[-end]
         return math.atan2(way[1], way[0])
 
-    def stations(self, k: int, layout: _Layout) -> np.ndarray:
-        """Return the lengths along piece `k` at which its chords end."""
+    def stations(self, k: int, h: np.ndarray, layout: _Layout) -> np.ndarray:
+        """Return the lengths along piece `k` at which its chords end; `h` are the longest at equidistant points."""
         piece = self.pieces[k]
         length = piece.length
         first, last = (self.corners[node] for node in piece.ends)
         begin = 0.0 if first is None else first.lengths[k, 0]
         end = length - (0.0 if last is None else last.lengths[k, 1])
-        ends = self.longest(piece.at(np.linspace(0, length, 17)))
-        fine = np.linspace(0, length, max(17, 3 * math.ceil(length / float(ends.min()))))
-        h = self.longest(piece.at(fine))
+        fine = np.linspace(0, length, len(h))
         count = np.concatenate([[0], np.cumsum(np.diff(fine) * (1 / h[1:] + 1 / h[:-1]) / 2)])
         a, b = np.interp([begin, end], fine, count)
         free = first is None and last is None
