@@ -80,8 +80,8 @@ kernel void guess_reach(const int size, global const int *items, global const fl
 
 /* Per generator i: its own planes, nearest first. `wall_planes`: unit normals and levels of triangles, which tell most
    that are not the nearest of their patch. `wall_normals`: normals at the corners of triangles, and the shift.
-   counters: number of planes; most patches near a generator; generators outside of their nearest patch. Planes beyond
-   `room` are only counted. */
+   counters: number of planes; most patches near a generator; generators outside of their nearest patch. Where there is
+   no room, own_found is -1: nothing is known. */
 kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS, global const REAL4 *wall_planes,
                             global const REAL4 *wall_normals, global const float *own_reach, const int room,
                             global int2 *own_rows, global int *own_labels, global REAL4 *own_planes,
@@ -122,6 +122,7 @@ kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS
             continue;
         if (k == MOST_OWN) {
             atomic_max(counters + 1, MOST_OWN + 1);
+            own_found[i] = -1;
             continue;
         }
         n = max(n, k + 1);
@@ -165,8 +166,12 @@ kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS
         ++count;
     }
     const int place = atomic_add(counters, count);
+    if (place + count > room) {
+        own_found[i] = -1;
+        return;
+    }
     own_rows[i] = (int2)(place, count);
-    for (int k = 0; k < count && place + count <= room; ++k) {
+    for (int k = 0; k < count; ++k) {
         own_labels[place + k] = patches[order[k]];
         own_planes[place + k] = planes[k];
     }

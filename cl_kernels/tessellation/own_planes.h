@@ -7,6 +7,8 @@
    own_reach[i]   up to where the cell reaches, and somewhat more: what should be known of the surface next time
 
    CLIP_BOX_ARGS: what cells start from. The box lies around the solid, so that it never bounds a finished cell. */
+#include "opencl/real.h"
+
 #ifdef SOLID
 #define OWN_ARGS                                                                                                       \
     , global const int2 *own_rows, global const int *own_labels, global const REAL4 *own_planes,                       \
@@ -33,3 +35,19 @@ inline bool knows_walls(int i, REAL reach2, global const float *own_found, globa
     return reach <= own_found[i];
 }
 #endif
+
+/* The outward unit normal of the wall at a face of the cell of generator i, by the label of the face. */
+inline REAL4 wall_normal(int i, int label, CLIP_BOX_ARGS)
+{
+    REAL4 normal = 0;
+#ifdef SOLID
+    for (int k = own_rows[i].s0; k < own_rows[i].s0 + own_rows[i].s1; ++k)
+        normal = own_labels[k] == label ? own_planes[k] : normal;
+    normal.s3 = 0;
+#else
+    const int wall = -1 - label;
+    const REAL sign = wall % 2 ? 1 : -1;
+    normal = (REAL4)(wall < 2 ? sign : 0, wall / 2 == 1 ? sign : 0, wall > 3 ? sign : 0, 0);
+#endif
+    return normal;
+}

@@ -177,7 +177,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         const REAL reach_length = sqrt(cell->reach2), near2 = sqrt(REAL_EPS) * cell->reach2;
         const REAL slim = 512 * noise_length(reach_length);
         int count = 0;
-        bool doubtful = cell->torn || has_own_planes(cell), narrow = false;
+        bool doubtful = cell->torn, narrow = false;
         REAL volume = 0, lost = 0;
         REAL4 first = 0; /* moments x, y, z */
         for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1)) {
@@ -237,6 +237,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
                 write_corners(cell, corners + 2 * place);
             corners[2 * place].s3 = clear ? NEW_CORNERS : NO_CORNERS;
         }
+        doubtful |= has_own_planes(cell);
         if (doubtful || narrow)
             atomic_or(report, (doubtful ? FLAG_DOUBT : 0) | (narrow ? FLAG_NARROW : 0));
         flag_lost_faces(count, volume, lost, share, report);

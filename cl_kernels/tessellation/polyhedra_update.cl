@@ -43,7 +43,7 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
     if (n > MOST_FACES)
         return -1;
     for (int k = 0; k < n; ++k) {
-        if (HAD_WALLS(in->neighbors[start + k]))
+        if (LACKS_WALL(in->neighbors[start + k], in))
             return -1;
         add_plane(cell, in->neighbors[start + k], x, in);
     }
@@ -55,7 +55,7 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
         }
         if (next == INT_MAX)
             break;
-        if (cell->faces == MOST_FACES)
+        if (cell->faces == MOST_FACES || LACKS_WALL(next, in))
             return -1;
         add_plane(cell, next, x, in);
         last = next;
@@ -64,20 +64,17 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
     return n;
 }
 
-/* Keep the cell of generator i at x within the walls: those that it does not have become further neighbors. True if
-   there is none. In a solid nothing is done. */
-inline bool keep_in_box(const corners_t *cell, int i, REAL4 x, const rows_t *in, global int *marks)
+/* The set of the walls that the cell of a generator at x crosses, one bit each. */
+inline uint crossed_walls(const corners_t *cell, REAL4 x, const rows_t *in)
 {
+    const REAL reach = sqrt(cell->reach2), noise = WALL_NOISE(reach);
+    uint crossed = 0;
 #ifdef SOLID
-    bool cut = MAY_MEET_WALLS(i, cell->reach2, in);
-    for (int v = 0; v < cell->corners && !cut; ++v)
-        cut = is_behind_walls(corner_place(cell, v), in);
-    return !cut;
-#endif
-    const REAL reach = sqrt(cell->reach2), noise = 64 * REAL_EPS * (1 + reach);
+    for (int v = 0; in->own_row.s1 > 0 && v < cell->corners; ++v)
+        crossed |= own_planes_before(corner_place(cell, v), noise, in);
+#else
     const REAL4 low = x - in->box_lower, high = in->box_upper - x;
     const REAL rooms[6] = {low.s0, high.s0, low.s1, high.s1, low.s2, high.s2};
-    bool inside = true;
     for (int wall = 0; wall < 6; ++wall) {
         if (reach <= rooms[wall] + noise)
             continue;
@@ -85,12 +82,22 @@ inline bool keep_in_box(const corners_t *cell, int i, REAL4 x, const rows_t *in,
         REAL farthest = 0;
         for (int v = 0; v < cell->corners; ++v)
             farthest = fmax(farthest, wall & 1 ? places[v] : -places[v]);
-        if (farthest <= rooms[wall] + noise)
-            continue;
-        inside = false;
-        add_neighbor(i, -1 - wall, in, marks);
+        crossed |= (uint) !(farthest <= rooms[wall] + noise) << wall;
     }
-    return inside;
+#endif
+    return crossed;
+}
+
+/* Keep the cell of generator i at x within the walls: those that it does not have become further neighbors. True if
+   there is none, and all walls near the cell are known. */
+inline bool keep_in_walls(const corners_t *cell, int i, REAL4 x, const rows_t *in, global int *marks)
+{
+    if (!KNOWS_WALLS(i, cell->reach2, in))
+        return false;
+    const uint crossed = crossed_walls(cell, x, in);
+    for (uint rest = crossed; rest; rest &= rest - 1)
+        add_neighbor(i, WALL_LABEL(popcount(~rest & (rest - 1)), in), in, marks);
+    return crossed == 0;
 }
 
 /* Remove all links, and link the vertices. */
@@ -270,7 +277,7 @@ kernel void update_cells(const int size, const int which, global const int *list
     }
     kept = kept && state == KNOWN_CORNERS;
     changed[i] = done && kept ? 0 : ALL_FACES;
-    if (done && has_nearest_images(cell.reach2, &in) && keep_in_box(&cell, i, x, &in, marks)) {
+    if (done && has_nearest_images(cell.reach2, &in) && keep_in_walls(&cell, i, x, &in, marks)) {
         const bool longer = cell.faces > old_starts[i + 1] - start;
         const int place = longer ? take_places(report, cell.faces) : start;
         const measured_t out = {labels, measures, centroids, volumes, offsets, covariances};
@@ -299,13 +306,35 @@ inline void mark_counted(int i, int mark, global int *marks, global int *report)
         atomic_inc(report + REPORT_MARKED);
 }
 
+/* The key of face f of a cell with `n` faces, from its triples; see write_keys. */
+inline uint key_of_face(int f, int place, int n, global const int *labels, global const uchar4 *corners)
+{
+    uint sum = 0;
+    for (int v = 2 * place; v < 2 * place + 2 * n - 4; ++v) {
+        const int at[3] = {corners[v].s0, corners[v].s1, corners[v].s2};
+        for (int a = 0; a < 3; ++a)
+            if (at[a] == f)
+                sum += hash_of_label(labels[place + at[(a + 1) % 3]]) * hash_of_label(labels[place + at[(a + 2) % 3]]);
+    }
+    return sum;
+}
+
+/* Whether face f of a cell and face g of another one have the same vertices. At walls of a solid their areas differ. */
+inline bool have_same_corners(int f, int place, int n, int g, int other_place, int m, global const int *labels,
+                              global const uchar4 *corners)
+{
+    return corners[2 * place].s3 != NO_CORNERS && corners[2 * other_place].s3 != NO_CORNERS &&
+           key_of_face(f, place, n, labels, corners) == key_of_face(g, other_place, m, labels, corners);
+}
+
 /* Per generator i with a changed cell: compare its faces with those of its neighbors. Cells that differ are marked.
    Faces with the keys of the previous diagram agree with neighbors that have these, too; others compare them. Two cells
    that compare all faces do it once. Unfinished cells are compared when they are known; none are if the faces of some
    cells are missing, as there is only room for `room`: FLAG_FULL. Marked and unfinished cells are counted. */
 kernel void check_cells(const int size, const int room, global int *report, global const int *row_places,
                         global const int *row_counts, global const int *labels, global const REAL *measures,
-                        global const uint *keys, global const int *changed, global int *marks)
+                        global const uchar4 *corners, global const uint *keys, global const int *changed,
+                        global int *marks)
 {
     LONG_ITEM(i);
     const bool full = report[REPORT_FACES] > room;
@@ -339,7 +368,8 @@ kernel void check_cells(const int size, const int room, global int *report, glob
             for (int q = begin; q < begin + n; ++q)
                 area += measures[q];
             for (int q = place; q < place + m; ++q)
-                same |= labels[q] == i && fabs(measures[q] - measures[k]) <= AREA_NOISE * area;
+                same |= labels[q] == i && (fabs(measures[q] - measures[k]) <= AREA_NOISE * area ||
+                                           have_same_corners(f, begin, n, q - place, place, m, labels, corners));
         }
         /* A cell that will be updated again is compared then. Other work-items change other bits of its mark now. */
         if (same || ((atomic_or(marks + i, 0) | atomic_or(marks + j, 0)) & UPDATE_AGAIN))

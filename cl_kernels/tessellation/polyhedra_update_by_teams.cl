@@ -30,21 +30,17 @@ typedef struct {
     uint walls;
 } placed_t;
 
-/* Walls of a solid may cut the cell. */
-#define CUT_BY_WALLS (~(uint)0)
-
 /* Whether a cell with vertices as far as `reach` crosses a wall at the distance `room`, toward which its vertices
    extend by `extent`. */
 inline bool crosses(REAL room, REAL reach, REAL extent)
 {
-    const REAL noise = 64 * REAL_EPS * (1 + reach);
+    const REAL noise = WALL_NOISE(reach);
     return !(reach <= room + noise || extent <= room + noise);
 }
 
 /* Find the vertices, TEAM at once, and sum them up; see place_corners. `fits` becomes whether no vertex lies beyond
    another face. The sums are incomplete if one does. */
-inline bool team_place(local team_cell_t *at, team_t *team, int i, REAL4 x, const rows_t *in, placed_t *placed,
-                       bool *fits)
+inline bool team_place(local team_cell_t *at, team_t *team, REAL4 x, const rows_t *in, placed_t *placed, bool *fits)
 {
     local corners_t *cell = &at->cell;
     const int lane = team->lane, corner_count = cell->corners, faces = cell->faces;
@@ -103,7 +99,6 @@ inline bool team_place(local team_cell_t *at, team_t *team, int i, REAL4 x, cons
 
     REAL far2 = 0;
     REAL4 below = 0, above = 0;
-    bool behind = false;
     for (int v = lane; v < corner_count; v += TEAM) {
         const REAL4 place = corner_place(cell, v);
         const places_t y = {place.s0, place.s1, place.s2};
@@ -119,19 +114,20 @@ inline bool team_place(local team_cell_t *at, team_t *team, int i, REAL4 x, cons
         far2 = y2 > far2 ? y2 : far2;
         below = fmax(below, -place);
         above = fmax(above, place);
-        behind |= is_behind_walls(place, in);
     }
     const REAL reach2 = team_largest(team, far2), reach = sqrt(reach2);
+#ifdef SOLID
+    uint walls = 0;
+    for (int v = lane; in->own_row.s1 > 0 && v < corner_count; v += TEAM)
+        walls |= own_planes_before(corner_place(cell, v), WALL_NOISE(reach), in);
+#else
     const REAL4 low = x - in->box_lower, high = in->box_upper - x;
     const uint walls = (uint)crosses(low.s0, reach, below.s0) | (uint)crosses(high.s0, reach, above.s0) << 1 |
                        (uint)crosses(low.s1, reach, below.s1) << 2 | (uint)crosses(high.s1, reach, above.s1) << 3 |
                        (uint)crosses(low.s2, reach, below.s2) << 4 | (uint)crosses(high.s2, reach, above.s2) << 5;
+#endif
     placed->reach2 = reach2;
     placed->walls = team_or(team, walls);
-#ifdef SOLID
-    if (team_ballot(team, behind) != 0 || MAY_MEET_WALLS(i, reach2, in))
-        placed->walls = CUT_BY_WALLS;
-#endif
     *fits = team_ballot(team, !fit) == 0;
     return team_ballot(team, !good || (has_face && !(cell->planes[lane].s3 > LEAST_NEAREST2 * reach2))) == 0;
 }
@@ -296,13 +292,11 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
     }
     if (what < 0 || before < 4 || faces > MOST_FACES)
         return;
-#ifdef SOLID
-    if (team_ballot(&team, lane < before && HAD_WALLS(old_neighbors[start + lane])) != 0)
-        return;
-#endif
     if (lane < before)
         cell->labels[lane] = old_neighbors[start + lane];
     TEAM_SYNC();
+    if (team_ballot(&team, lane < faces && LACKS_WALL(cell->labels[lane], &in)) != 0)
+        return;
     cell->planes[lane] = lane < faces ? plane_of_face(cell->labels[lane], x, &in) : 0;
     at->origins[lane] = lane;
     const int state = known ? old_corners[2 * start].s3 : NO_CORNERS;
@@ -321,15 +315,15 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
         if (turn == 1 && !team_repair(at, &team, faces, good ? before : 0, x, &in, marks))
             return;
         bool fits;
-        good = team_place(at, &team, i, x, &in, &placed, &fits);
+        good = team_place(at, &team, x, &in, &placed, &fits);
         kept = turn == 0 && faces == before;
         done = good && fits && (turn == 1 || kept);
     }
-    if (!done || !has_nearest_images(placed.reach2, &in))
+    if (!done || !has_nearest_images(placed.reach2, &in) || !KNOWS_WALLS(i, placed.reach2, &in))
         return;
     if (placed.walls != 0) {
-        if (placed.walls != CUT_BY_WALLS && (placed.walls >> lane) & 1)
-            add_neighbor(i, -1 - lane, &in, marks);
+        if ((placed.walls >> lane) & 1)
+            add_neighbor(i, WALL_LABEL(lane, &in), &in, marks);
         return;
     }
     int place = start;

@@ -52,6 +52,20 @@ typedef struct {
         old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS OWN_ROW(i)                               \
     }
 
+#ifdef SOLID
+/* Number of the plane of its own that a cell has with this label; -1 if it has none. */
+inline int own_plane_of(int label, const rows_t *in)
+{
+    int found = -1;
+    for (int k = in->own_row.s0; k < in->own_row.s0 + in->own_row.s1; ++k)
+        found = in->own_labels[k] == label ? k : found;
+    return found;
+}
+#define LACKS_WALL(label, in) ((label) < 0 && own_plane_of(label, in) < 0)
+#else
+#define LACKS_WALL(label, in) false
+#endif
+
 /* The plane (p, d^2) between a generator at x and a neighbor or wall. */
 inline REAL4 plane_of_face(int label, REAL4 x, const rows_t *in)
 {
@@ -61,9 +75,14 @@ inline REAL4 plane_of_face(int label, REAL4 x, const rows_t *in)
         d = (REAL4)(nearest_image(d.s0, in->periods.s0), nearest_image(d.s1, in->periods.s1),
                     nearest_image(d.s2, in->periods.s2), 0);
     } else {
+#ifdef SOLID
+        const REAL4 own = in->own_planes[own_plane_of(label, in)];
+        d = (REAL4)(own.s0, own.s1, own.s2, 0) * (2 * own.s3);
+#else
         const int wall = -1 - label;
         const REAL4 across = 2 * ((wall & 1 ? in->box_upper : in->box_lower) - x);
         d = (REAL4)(wall < 2 ? across.s0 : 0, wall >> 1 == 1 ? across.s1 : 0, wall > 3 ? across.s2 : 0, 0);
+#endif
     }
     const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2, inverse = 1 / d2;
     return (REAL4)(d.s0 * inverse, d.s1 * inverse, d.s2 * inverse, d2);
@@ -90,24 +109,26 @@ inline bool names_neighbor(int label, int i, const rows_t *in)
     return found;
 }
 
-/* In a solid cells that had a face on a wall, or cross a plane of their own, are clipped. Whether vertex y of a cell is
-   beyond such a plane; and whether walls may cut the cell of generator i otherwise. */
+/* Round-off of the distance from a wall, of a vertex as far as `reach`. */
+#define WALL_NOISE(reach) (64 * REAL_EPS * (1 + (reach)))
+
 #ifdef SOLID
-inline bool is_behind_walls(REAL4 y, const rows_t *in)
+/* The set of the planes of its own that vertex y of a cell is beyond: one bit each. */
+inline uint own_planes_before(REAL4 y, REAL noise, const rows_t *in)
 {
-    bool behind = false;
-    for (int k = in->own_row.s0; k < in->own_row.s0 + in->own_row.s1; ++k) {
-        const REAL4 plane = in->own_planes[k];
-        behind |= fma(plane.s0, y.s0, fma(plane.s1, y.s1, plane.s2 * y.s2)) > plane.s3;
+    uint set = 0;
+    for (int k = 0; k < in->own_row.s1; ++k) {
+        const REAL4 plane = in->own_planes[in->own_row.s0 + k];
+        const REAL along = fma(plane.s0, y.s0, fma(plane.s1, y.s1, plane.s2 * y.s2));
+        set |= (uint)(along > plane.s3 + noise) << k;
     }
-    return behind;
+    return set;
 }
-#define HAD_WALLS(label) ((label) < 0)
-#define MAY_MEET_WALLS(i, reach2, in) (!knows_walls(i, reach2, (in)->own_found, (in)->own_reach))
+#define KNOWS_WALLS(i, reach2, in) knows_walls(i, reach2, (in)->own_found, (in)->own_reach)
+#define WALL_LABEL(wall, in) (in)->own_labels[(in)->own_row.s0 + (wall)]
 #else
-#define is_behind_walls(y, in) false
-#define HAD_WALLS(label) false
-#define MAY_MEET_WALLS(i, reach2, in) false
+#define KNOWS_WALLS(i, reach2, in) true
+#define WALL_LABEL(wall, in) (-1 - (wall))
 #endif
 
 /* Make `label` a further neighbor of i, unless it was one; i is clipped if there is no room. */

@@ -52,8 +52,12 @@ class ClipBox(ABC):
         """Return the CLIP_BOX_ARGS of kernels in 3D (tessellation/own_planes.h)."""
         return self.device_corners(engine.real)
 
-    def look_farther(self, points: cla.Array) -> None:  # noqa: B027
-        """Find walls of a solid as far as cells of `points` (n, 3) reach; kernels have noted that."""
+    def look_farther(self, points: cla.Array) -> bool:
+        """Find walls of a solid as far as cells of `points` (n, 3) reach; kernels have noted that.
+
+        Returns whether planes of walls have been lost for want of room.
+        """
+        return False
 
 
 class Chart(NamedTuple):

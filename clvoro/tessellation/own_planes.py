@@ -37,9 +37,7 @@ class SolidBox(ClipBox):
     Attributes
     ----------
     plane_count : int
-        Number of planes in the latest diagram.
-    outside : int
-        Number of generators outside of the patch that is nearest to them, in the latest diagram.
+        Number of planes when they were last counted.
     """
 
     def __init__(
@@ -49,12 +47,13 @@ class SolidBox(ClipBox):
         walls: WallTriangles,
         size: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
-        self.engine, self.domain, self.outside = engine, domain, 0
+        self.engine, self.domain = engine, domain
         self._walls = walls.arguments(engine, domain.frame)
         self._planes_of_walls = engine.upload(walls.planes(domain.frame))
         self._normals = engine.upload(walls.corner_normals(domain.frame[1], size))
         self._most, self._n = MOST_OWN, 0
-        self._counters = engine.empty(3, np.int32)
+        self._counters = engine.zeros(3, np.int32)
+        self._rows, self._reach = engine.empty((0, 2), np.int32), engine.empty(0, np.float32)
         self._labels, self._planes = engine.empty(0, np.int32), engine.empty((0, 4))
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
@@ -68,11 +67,11 @@ class SolidBox(ClipBox):
 
     def guess(self, binned: BinnedPoints, n: int) -> None:
         """Guess how far the surface must be known about each of `n` new generators."""
-        engine = self.engine
-        if n != self._n:
-            self._rows = engine.empty((n, 2), np.int32)
-            self._found, self._reach = engine.empty(n, np.float32), engine.empty(n, np.float32)
-            self._n = n
+        engine, self._n = self.engine, n
+        if n > len(self._reach):
+            room = n + n // 8
+            self._rows = engine.empty((room, 2), np.int32)
+            self._found, self._reach = engine.empty(room, np.float32), engine.empty(room, np.float32)
         kernel = self._kernels.guess_reach
         engine.run_each(kernel, n, binned.items, binned.spacing, np.float32(FIRST_REACH), self._reach)
 
@@ -81,39 +80,57 @@ class SolidBox(ClipBox):
         return self.engine.kernels("tessellation/own_planes", {"MOST_OWN": self._most})
 
     def find(self, points: cla.Array) -> None:
-        """Find the planes for the positions `points` (n, 3), as far as cells have reached."""
-        engine, n = self.engine, self._n
+        """Find the planes for the positions `points` (n, 3), as far as cells have reached, and have room for them."""
         if not len(self._labels):
-            self._reserve(int(PLANES_PER_CELL * n) + 64)
-        while True:
-            self._counters.fill(0)
-            engine.run_each(
-                self._kernels.find_own_planes,
-                n,
-                points,
-                *self._walls,
-                self._planes_of_walls,
-                self._normals,
-                self._reach,
-                np.int32(len(self._labels)),
-                self._rows,
-                self._labels,
-                self._planes,
-                self._found,
-                self._counters,
-            )
-            count, most, self.outside = self._counters.get().tolist()
-            if most > self._most:
-                self._most *= 2
-            elif count > len(self._labels):
-                self._reserve(count + count // 4)
-            else:
-                self.plane_count = count
-                return
+            self._reserve(int(PLANES_PER_CELL * self._n) + 64)
+        self.follow(points)
+        while self._grow():
+            self.follow(points)
+
+    def follow(self, points: cla.Array) -> None:
+        """Find the planes for the positions `points` (n, 3), if there is room; otherwise `look_farther` makes it.
+
+        Nothing is read. Where there is no room, cells are flagged as those of which the surface is not known.
+        """
+        self._counters.fill(0)
+        self.engine.run_each(
+            self._kernels.find_own_planes,
+            self._n,
+            points,
+            *self._walls,
+            self._planes_of_walls,
+            self._normals,
+            self._reach,
+            np.int32(len(self._labels)),
+            self._rows,
+            self._labels,
+            self._planes,
+            self._found,
+            self._counters,
+        )
+
+    def _grow(self) -> bool:
+        """Make room for all planes that were found; return whether there was too little."""
+        count, most, _ = self._counters.get().tolist()
+        self.plane_count = count
+        if most > self._most:
+            self._most *= 2
+        elif count > len(self._labels):
+            self._reserve(count + count // 4)
+        else:
+            return False
+        return True
 
     def _reserve(self, room: int) -> None:
         self._labels, self._planes = self.engine.empty(room, np.int32), self.engine.empty((room, 4))
 
-    def look_farther(self, points: cla.Array) -> None:
-        """Find the planes again, since cells reach farther than the surface was known."""
+    @property
+    def outside(self) -> int:
+        """Number of generators outside of the patch that is nearest to them, in the latest diagram."""
+        return int(self._counters.get()[2])
+
+    def look_farther(self, points: cla.Array) -> bool:
+        """Find the planes again, since cells reach farther than the surface was known; return if there was no room."""
+        lost = self._grow()
         self.find(points)
+        return lost

@@ -93,7 +93,8 @@ class PolyhedraUpdate:
                 found = self._report.get().tolist()
             flags, used, left, marked, kept = found[:REPORT_LISTED]
             if flags & UNKNOWN:
-                box.look_farther(points)
+                if box.look_farther(points):
+                    return None
                 flags &= ~UNKNOWN
                 self._report[0].set(np.array(flags, np.int32))
             if flags & ~HARMLESS or max(left, marked) > most:
@@ -192,6 +193,7 @@ class _Rounds:
             cut.counts,
             cut.labels,
             cut.measures,
+            cut.corners,
             cut.keys,
             self._changed,
             self._marks,

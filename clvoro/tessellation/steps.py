@@ -142,14 +142,15 @@ class SolidWalls(DomainSteps):
         """Warn of cells that reach the box around the solid, and of generators outside of their nearest patch."""
         starts = t.starts.get()
         faces = np.flatnonzero(t.neighbors[: int(starts[t.n])].get() < SIDES_OF_BOX)
-        if not len(faces) and not self.walls.outside:
+        outside = self.walls.outside
+        if not len(faces) and not outside:
             return
         open_cells = np.unique(np.searchsorted(starts, faces, side="right") - 1)
         where = ""
         if len(open_cells):
             where = f", the first at {format_point(domain_position(self.domain, t.points[int(open_cells[0])].get()))}"
         warn(
-            f"the walls do not bound {len(open_cells)} cells{where}, and {self.walls.outside} generators are behind "
+            f"the walls do not bound {len(open_cells)} cells{where}, and {outside} generators are behind "
             "the nearest wall: the solid is narrow or sharp for the size of cells there; use smaller sizes",
             MismatchWarning,
         )
@@ -157,10 +158,10 @@ class SolidWalls(DomainSteps):
     def update(
         self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
     ) -> Tessellation | None:
-        """Update `previous` incrementally; cells at walls are clipped anew."""
+        """Update `previous` incrementally."""
 
         def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
             cells.clip_rest(cut, report, self.box, sites, sort(), previous)
 
-        self.walls.find(sites)
+        self.walls.follow(sites)
         return self.stages.update.update(self.stages.cells, self.box, sites, previous, follow=follow, clip=clip)

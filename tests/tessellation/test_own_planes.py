@@ -99,9 +99,9 @@ def test_planes_are_those_of_the_reference(ctx, name, real):
     box.guess(binned, n)
     box.find(device.points)
     x = device.points.get().astype(float) * scale + solid.frame[0]
-    reach = box._reach.get().astype(float) * scale
+    reach = box._reach.get()[:n].astype(float) * scale
     expected = solid.own_planes(x, reach)
-    rows, labels, planes = (a.get() for a in (box._rows, box._labels, box._planes))
+    rows, labels, planes = box._rows.get()[:n], box._labels.get(), box._planes.get()
     found = np.concatenate([np.arange(first, first + count) for first, count in rows])
     owner = np.repeat(np.arange(n), rows[:, 1])
     order = np.lexsort((-labels[found], owner))
@@ -114,7 +114,7 @@ def test_planes_are_those_of_the_reference(ctx, name, real):
 
 
 @pytest.mark.parametrize("real", REALS, ids=str)
-@pytest.mark.parametrize("name", ["box", "Fichera"])
+@pytest.mark.parametrize("name", ["box", "Fichera", "ball"])
 def test_updates_are_new_diagrams(ctx, name, real):
     solid = SOLIDS[name]()
     device = Device(ctx, solid, real, inner_points(solid, 1500))
@@ -135,7 +135,7 @@ def test_updates_are_new_diagrams(ctx, name, real):
     assert rows == rows_of(fresh)
     assert all(i in rows[j] for i, row in enumerate(rows) for j in row if j >= 0)
     total = volumes.sum(dtype=float) * solid.frame[1] ** 3 / solid.measure
-    assert total == pytest.approx(1, abs=1e3 * float(np.finfo(real).eps) if name == "box" else 0.02)
+    assert total == pytest.approx(1, abs=1e3 * float(np.finfo(real).eps) if name == "box" else 0.03)
 
 
 @pytest.mark.parametrize("real", REALS, ids=str)

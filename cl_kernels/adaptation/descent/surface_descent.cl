@@ -11,6 +11,7 @@
 
      dE/dx_i = sum over edges of K integral (p - x_i) dl + sum over faces of A / |d| (P_j - P_i) (m - x_i). */
 #include "geometry/domain.h"
+#include "tessellation/own_planes.h"
 #include "tessellation/row_counts.h"
 #include "tessellation/wide_vectors.h"
 
@@ -115,9 +116,9 @@ inline REAL4 pull_of_edges(const sides_t *sides, global const uchar4 *corners, i
    keeps the displacement to its centroid. */
 kernel void descend_surface(const int size, global const int *starts, global const int *neighbors,
                             global const FACE *face_measures, global const FACE *face_centroids,
-                            global const uchar4 *corners, global const REAL *points, global const REAL *h,
-                            global const REAL2 *forces, const REAL rate, const REAL max_displacement,
-                            global REAL *lloyd PERIOD_ARGS)
+                            global const uchar4 *corners, global const REAL *points, CLIP_BOX_ARGS,
+                            global const REAL *h, global const REAL2 *forces, const REAL rate,
+                            const REAL max_displacement, global REAL *lloyd PERIOD_ARGS)
 {
     LONG_ITEM(i);
     const int begin = starts[i], faces = starts[i + 1] - begin;
@@ -140,9 +141,7 @@ kernel void descend_surface(const int size, global const int *starts, global con
             sides.tension[f] = forces[j].s0;
             g += face_measures[k] * sides.inverse[f] * (forces[j].s1 - own.s1) * m;
         } else {
-            const int wall = -1 - j;
-            const REAL sign = wall % 2 ? 1 : -1;
-            away = (REAL4)(wall < 2 ? sign : 0, wall / 2 == 1 ? sign : 0, wall > 3 ? sign : 0, 0);
+            away = wall_normal(i, j, CLIP_BOX);
             sides.level[f] = dot(away, m);
             away.s3 = 1;
             sides.inverse[f] = sides.tension[f] = 0;

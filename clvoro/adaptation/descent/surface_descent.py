@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pyopencl.array as cla
 
+from ...geometry.domain import ClipBox
 from ...opencl.engine import Engine
 from ...tessellation.device_diagram import Tessellation
 
@@ -17,6 +18,7 @@ class SurfaceDescent:
 
     def descend(
         self,
+        box: ClipBox,
         t: Tessellation,
         h: cla.Array,
         quality: cla.Array,
@@ -30,6 +32,8 @@ class SurfaceDescent:
 
         Parameters
         ----------
+        box : ClipBox
+            That of the tessellator: it knows the walls.
         t : Tessellation
             With vertices.
         h, quality : (n,) real
@@ -63,6 +67,7 @@ class SurfaceDescent:
                 t.face_centroids,
                 t.vertices[0],
                 t.points,
+                *box.clip_args(engine),
                 h,
                 forces,
                 real(rate),
