@@ -24,14 +24,7 @@ from ..sizing.field import as_field
 from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
 from .checkpoint import Checkpointer, Saved, run_fingerprint
-from .diagnostics import (
-    FEW_CELLS,
-    MISSED,
-    warn_of_errors,
-    warn_of_obtuse_triangles,
-    warn_of_other_sizes,
-    widths_of_layers,
-)
+from .diagnostics import MISSED, warn_of_errors, warn_of_obtuse_triangles, warn_of_other_sizes, widths_of_layers
 from .fixed_points import origins, put_back
 from .motion import Displacement, Method
 from .options import Checkpoint, Options, uses
@@ -427,7 +420,7 @@ class Run:
         result = self._read_result()
         if not self._options.multilevel:
             warn_of_other_sizes(result)
-        if result.converged and self._options.multilevel and len(result.points) >= FEW_CELLS:
+        if result.converged and self._options.multilevel:
             mean = float(np.abs(result.size_error).mean())
             if mean > max(MISSED, self._options.error_target or 0.0):
                 warn_of_errors(result)

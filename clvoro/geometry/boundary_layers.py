@@ -327,7 +327,7 @@ def check_gaps(domain: Domain, layers: Sequence[Layers]) -> None:
     Raises
     ------
     InputError
-        With the place of the narrowest gap, and the largest thickness that fits there.
+        With the place of a narrow gap, and the largest thickness that fits there.
     """
     polygon, _ = as_polygon(domain)
     begin, end = polygon.oriented.vertices, polygon.oriented.ends
@@ -342,7 +342,8 @@ def check_gaps(domain: Domain, layers: Sequence[Layers]) -> None:
         tight = needed > gaps
         if tight.mean() <= _TIGHT:
             continue
-        worst = int(np.argmin(np.where(tight, gaps / needed, np.inf)))
+        # In sharp corners columns are in ever narrower gaps: a few of the narrowest are passed over.
+        worst = int(np.argsort(gaps / needed, kind="stable")[int(_TIGHT / 2 * len(gaps))])
         fits = _FILLED * layer.thickness * gaps[worst] / needed[worst]
         raise InputError(
             f"layers[{k}] are {layer.thickness:.3g} thick, and the gap at {format_point(feet[worst])} is "

@@ -652,3 +652,5 @@ def test_a_mesh_that_misses_its_sizes_is_not_completed(ctx):
     assert np.abs(result.size_error).mean() > 0.2
     assert not result.converged
     assert result.stop_reason.startswith("plan ended, but the sizes are missed: mean |e| ")
+    with pytest.warns(CoarseSizeWarning):
+        assert not clvoro.Adapter(ctx).run(clvoro.Box((0, 0), (1, 1)), 2.0).converged

@@ -12,6 +12,7 @@ from clvoro.errors import InputError, InputTypeError, MemoryLimitError
 from clvoro.finite_volumes.prisms import cell_loops
 from clvoro.geometry.boundary_layers import (
     Layers,
+    check_gaps,
     chosen_segments,
     columns_of,
     count_rows,
@@ -402,6 +403,13 @@ def test_layers_thicker_than_their_gap_are_refused_with_a_thickness_that_fits(ct
         thinner = Layers(0.005 * fits / layers.thickness, count=16, growth=1.3, spacing=0.05, edges=edges)
         result = clvoro.Adapter(ctx).run(channel, 0.1, "fast", layers=thinner)
         assert np.abs(result.size_error).mean() < 0.05
+    # The place is in the throat, not in a sharp corner, where gaps are ever narrower.
+    throat = clvoro.Polygon([(0, 0), (2, 0), (2, 1), (1.2, 0.1), (0.8, 0.1), (0, 1)])
+    with pytest.raises(
+        InputError, match=r"the gap at \(1\.\d*, 0\.1\) is 0\.1 wide, with layers on both sides"
+    ) as raised:
+        check_gaps(throat, [Layers(0.01, count=6)])
+    check_gaps(throat, [Layers(float(re.search("at most ([0-9.]+)", str(raised.value))[1]) / 6, count=6, spacing=0.01)])
 
 
 def test_a_default_width_below_the_size_field_is_said(ctx):
