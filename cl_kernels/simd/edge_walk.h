@@ -117,10 +117,7 @@ inline void next_edge(walk_t *walk, int lane)
 /* Trace the cells of the chosen lanes. */
 inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 chosen)
 {
-    cells->reach2 = cells->square_x = cells->square_y = cells->square_z = 0;
-    cells->mixed_x = cells->mixed_y = cells->mixed_z = 0;
-    for (int k = 0; k < HULL_CAPACITY * LANES; ++k)
-        cells->sums[k] = 0;
+    cells->reach2 = 0;
     cells->planes[HULL_CAPACITY].d2 = 0;
     for (int lane = 0; lane < LANES; ++lane) {
         lane_walk_t *own = &walk->lanes[lane];
@@ -175,9 +172,7 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
         const long8 none = stop.at < 0;
         vstore8(vload8(0, cells->lost) | (active & none), 0, cells->lost);
         vstore8(active & ~none, 0, now);
-        long at_a[LANES], at_b[LANES], at_c[LANES];
         for (int lane = 0; lane < LANES; ++lane) {
-            at_a[lane] = at_b[lane] = at_c[lane] = HULL_CAPACITY;
             walk->active[lane] = 0;
             if (!now[lane])
                 continue;
@@ -191,9 +186,6 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
                 cells->doubt[lane] = -1;
                 now[lane] = 0;
             } else {
-                at_a[lane] = fa;
-                at_b[lane] = fb;
-                at_c[lane] = f;
                 ++cells->corners[lane];
                 if (corner == 0)
                     own->edges[own->open++] = (uchar4)(fa, fb, corner, 0);
@@ -202,7 +194,6 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
         }
         const long8 some = vload8(0, now);
         cells->reach2 = some ? fmax(cells->reach2, dot8(y, y)) : cells->reach2;
-        add_corner(cells, some, at_a, at_b, at_c, y, a, b, c, ab, bc, ca, a2, b2, c2);
         active = vload8(0, walk->active);
         y = planes_at(walk->corners, walk->from);
         a = planes_at(cells->planes, walk->a);

@@ -196,7 +196,8 @@ inline long8 list_near(list_t *list, near_t *near, global const double *binned, 
     list->nearest = 0;
     for (int k = 0; k < list->ends[SHELLS - 1]; ++k) {
         planes_t *plane = &list->planes[k];
-        const double8 d2 = fma(plane->x, plane->x, fma(plane->y, plane->y, plane->z * plane->z)), scale = 1 / d2;
+        /* As in plane_of_face (tessellation/update_rows.h): an update then has the same bits. */
+        const double8 d2 = plane->x * plane->x + plane->y * plane->y + plane->z * plane->z, scale = 1 / d2;
         const long8 there = plane->x < INFINITY;
         plane->x = there ? plane->x * scale : 0;
         plane->y = there ? plane->y * scale : 0;

@@ -30,7 +30,7 @@ inline int add_cutters(list_t *list, int k, int slot, global const double *binne
               binned[3 * places[3] + axis], binned[3 * places[4] + axis], binned[3 * places[5] + axis],                \
               binned[3 * places[6] + axis], binned[3 * places[7] + axis])
     const double8 dx = COORDINATES(0) - x.s0, dy = COORDINATES(1) - x.s1, dz = COORDINATES(2) - x.s2;
-    const double8 d2 = fma(dx, dx, fma(dy, dy, dz * dz));
+    const double8 d2 = dx * dx + dy * dy + dz * dz;
     const long8 number = {0, 1, 2, 3, 4, 5, 6, 7}, inside = (d2 < to2) & (d2 >= from2) & (number < (long)(end - first));
     if (!any(inside))
         return k;
@@ -191,9 +191,7 @@ inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const o
     }
     walk_cells(cells, &later->walk, list, some);
     const long8 closed = some & ~vload8(0, cells->lost) & ~vload8(0, cells->doubt);
-    const moments_t m = finish_cells(cells, &later->walk, closed);
     const double8 need = 2 * sqrt(cells->reach2) * (1 + 8 * DBL_EPSILON), seen = vload8(0, later->seen);
-    const long8 certain = certain_cells(cells, &m, list);
     int places[LANES];
     double needs[LANES], froms[LANES];
     long whole[LANES];
@@ -207,5 +205,5 @@ inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const o
         if (whole[lane] && !(needs[lane] <= froms[lane]) &&
             find_more(later, runs, cells, &later->walk, lane, places[lane], froms[lane], needs[lane], in) != 0)
             whole[lane] = 0;
-    write_cells(cells, &later->walk, &m, vload8(0, whole) & certain, places, need, binned, out);
+    write_cells(cells, &later->walk, vload8(0, whole), places, need, binned, out);
 }

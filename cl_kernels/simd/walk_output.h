@@ -4,19 +4,18 @@
 #include "tessellation/periodic/halo.h"
 #include "simd/edge_walk.h"
 
-/* Limits of certainty: least squared ratio of the distance of the nearest generator to that of the farthest vertex;
-   least ratio of the area of a face to the squared distance of its farthest vertex, which is the same for both cells.
- */
-#define CERTAIN_NEAREST2 1e-7
-#define CERTAIN_AREA 1e-8
+/* Thickness of a face, as a share of the distance of its farthest vertex, from which on it is certain: both of its
+   cells have it. */
+#define LEAST_AREA 1e-8
+#include "tessellation/corner_sums.h"
 
 /* The output arrays, in the layout of `clip_polyhedra` (polyhedra.cl). */
 typedef struct {
     int room;
     global const int *items;
     global float *reach;
-    global int *row_places, *row_counts, *labels, *report;
-    global double *measures, *centroids, *volumes, *offsets, *covariances;
+    global int *row_places, *row_counts, *report;
+    measured_t measures;
     int with_corners;
     global uchar4 *corners;
 #ifdef HALO
@@ -88,72 +87,68 @@ inline void check_walked_balls(const cells_t *cells, const walk_t *walk, long8 s
 }
 #endif
 
-/* Write the cells of some lanes, of items `places`; return their number. `reach` is twice the distance of the farthest
-   vertex. */
-inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t *m, long8 done, const int *places,
-                       double8 reach, global const double *binned, const output_t *out)
+/* Measure and write the cell of a lane, of generator i. False if round-off may decide about its faces, or if they are
+   many: then it is not written. */
+inline bool write_cell(const cells_t *cells, const walk_t *walk, int lane, int i, const output_t *out)
+{
+    corners_t cell;
+    sums_t sums;
+    cell.faces = cells->faces[lane];
+    cell.corners = cells->corners[lane];
+    if (cell.faces > MOST_FACES)
+        return false;
+    for (int f = 0; f < cell.faces; ++f) {
+        const int other = LANE(cells->places, f, lane);
+        cell.labels[f] = other < 0 ? other : out->items[other];
+        cell.planes[f] = (double4)(PLANE_LANE(cells->planes, f, 0, lane), PLANE_LANE(cells->planes, f, 1, lane),
+                                   PLANE_LANE(cells->planes, f, 2, lane), PLANE_LANE(cells->planes, f, 3, lane));
+    }
+    pad_planes(&cell);
+    for (int v = 0; v < cell.corners; ++v)
+        cell.at[v] = walk->lanes[lane].corner_faces[v];
+    if (!place_corners(&cell, &sums, true) || !fits_corners(&cell))
+        return false;
+    const int place = take_places(out->report, cell.faces);
+    out->row_places[i] = place;
+    if (place + cell.faces > out->room) {
+        out->row_counts[i] = cell.faces | CERTAIN; /* all is repeated */
+        return true;
+    }
+    if (!write_measures(&cell, &sums, i, place, &out->measures))
+        return false;
+    out->row_counts[i] = cell.faces | CERTAIN;
+    if (out->with_corners)
+        write_triples(&cell, out->corners + 2 * place, NEW_CORNERS);
+    return true;
+}
+
+/* Write the cells of some lanes, of items `places`, those that are certain; return their number. `reach` is twice the
+   distance of the farthest vertex. */
+inline int write_cells(const cells_t *cells, const walk_t *walk, long8 done, const int *places, double8 reach,
+                       global const double *binned, const output_t *out)
 {
     long lanes[LANES];
     double reaches[LANES];
     vstore8(done, 0, lanes);
     vstore8(reach, 0, reaches);
-    int total = 0, made = 0;
-#ifdef SOLID
-    for (int lane = 0; lane < LANES; ++lane)
-        if (lanes[lane]) {
-            const double radius2 = reaches[lane] * reaches[lane] / 4;
-            lanes[lane] = knows_walls(out->items[places[lane]], radius2, out->own_found, out->own_reach);
-        }
-    done = vload8(0, lanes) != 0;
-#endif
-    for (int lane = 0; lane < LANES; ++lane) {
-        total += lanes[lane] ? cells->faces[lane] : 0;
-        made += lanes[lane] != 0;
-    }
-    if (made == 0)
-        return 0;
-#ifdef HALO
-    check_walked_balls(cells, walk, done, places, binned, out);
-#endif
-    int place = take_places(out->report, total);
-    const bool fits = place + total <= out->room;
+    int made = 0;
     for (int lane = 0; lane < LANES; ++lane) {
         if (!lanes[lane])
             continue;
-        const int i = out->items[places[lane]], count = cells->faces[lane];
-        out->reach[places[lane]] = (float)reaches[lane];
-        out->row_places[i] = place;
-        out->row_counts[i] = count | CERTAIN;
-        if (fits && out->with_corners) {
-            for (int v = 0; v < cells->corners[lane]; ++v)
-                out->corners[2 * place + v] = walk->lanes[lane].corner_faces[v];
-            out->corners[2 * place].s3 = count <= MOST_FACES ? NEW_CORNERS : NO_CORNERS;
+        const int i = out->items[places[lane]];
+#ifdef SOLID
+        lanes[lane] = knows_walls(i, reaches[lane] * reaches[lane] / 4, out->own_found, out->own_reach);
+#endif
+        if (lanes[lane] && write_cell(cells, walk, lane, i, out)) {
+            out->reach[places[lane]] = (float)reaches[lane];
+            ++made;
+        } else {
+            lanes[lane] = 0;
         }
-        for (int f = 0; f < count && fits; ++f, ++place) {
-            const int other = LANE(cells->places, f, lane);
-            out->labels[place] = other < 0 ? other : out->items[other];
-            const double4 face = LANE(cells->sums, f, lane);
-            out->measures[place] = face.s0;
-            out->centroids[3 * place] = face.s1;
-            out->centroids[3 * place + 1] = face.s2;
-            out->centroids[3 * place + 2] = face.s3;
-        }
-        out->volumes[i] = LANE((const double *)&m->volume, 0, lane);
-        out->offsets[3 * i] = LANE((const double *)&m->x, 0, lane);
-        out->offsets[3 * i + 1] = LANE((const double *)&m->y, 0, lane);
-        out->offsets[3 * i + 2] = LANE((const double *)&m->z, 0, lane);
-        out->covariances[6 * i] = LANE((const double *)&m->xx, 0, lane);
-        out->covariances[6 * i + 1] = LANE((const double *)&m->xy, 0, lane);
-        out->covariances[6 * i + 2] = LANE((const double *)&m->zx, 0, lane);
-        out->covariances[6 * i + 3] = LANE((const double *)&m->yy, 0, lane);
-        out->covariances[6 * i + 4] = LANE((const double *)&m->yz, 0, lane);
-        out->covariances[6 * i + 5] = LANE((const double *)&m->zz, 0, lane);
     }
+#ifdef HALO
+    if (made > 0)
+        check_walked_balls(cells, walk, vload8(0, lanes) != 0, places, binned, out);
+#endif
     return made;
-}
-
-/* Lanes whose cell, traced among all generators nearer than `reach`, is certain. */
-inline long8 certain_cells(const cells_t *cells, const moments_t *m, const list_t *list)
-{
-    return (list->nearest2 > CERTAIN_NEAREST2 * cells->reach2) & (m->least > CERTAIN_AREA);
 }

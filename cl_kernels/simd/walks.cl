@@ -88,8 +88,15 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
                            CLIP_BOX_ARGS, const double first_reach, const int room, CELL_OUTPUT_ARGS HALO_ARGS)
 {
     LONG_ITEM(stretch);
-    output_t out = {room,     items,     reach,   row_places, row_counts,  labels,       report,
-                    measures, centroids, volumes, offsets,    covariances, with_corners, corners};
+    output_t out = {room,
+                    items,
+                    reach,
+                    row_places,
+                    row_counts,
+                    report,
+                    {labels, measures, centroids, volumes, offsets, covariances},
+                    with_corners,
+                    corners};
 #ifdef HALO
     MAKE_HALO;
     out.halo = halo;
@@ -163,7 +170,6 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
             continue;
         walk_cells(&cells, &walk, &list, chosen);
         const long8 lost = chosen & vload8(0, cells.lost), closed = chosen & ~lost & ~vload8(0, cells.doubt);
-        const moments_t m = finish_cells(&cells, &walk, closed);
         const double8 need = 2 * sqrt(cells.reach2) * (1 + 8 * DBL_EPSILON);
         long far[LANES], whole[LANES];
         double needs[LANES];
@@ -178,8 +184,7 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
                 while (later.n == LANES)
                     walk_later(&later, &runs, &in, &out);
             }
-        made += write_cells(&cells, &walk, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need,
-                            binned, &out);
+        made += write_cells(&cells, &walk, vload8(0, whole), places, need, binned, &out);
         vstore8(vload8(0, wanted) | (lost & ~vload8(0, open)), 0, wanted);
         vstore8(vload8(0, open) | lost, 0, open);
         vstore8(fresh & ~chosen, 0, guessed);

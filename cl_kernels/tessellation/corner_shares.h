@@ -17,13 +17,14 @@
 #define LEAST_SINE2 R(1e-10)
 #define LEAST_ANGLE2 R(1e-12)
 #define LEAST_NEAREST2 R(1e-7)
-#define LEAST_AREA R(1e-12)
 #else
 #define BEYOND_NOISE R(1e-5)
 #define LEAST_SINE2 R(1e-6)
 #define LEAST_ANGLE2 R(1e-4)
 #define LEAST_NEAREST2 R(1e-3)
-#define LEAST_AREA R(1e-6)
+#endif
+#ifndef LEAST_AREA
+#define LEAST_AREA (IS_DOUBLE ? R(1e-12) : R(1e-6))
 #endif
 /* Areas below this share of the squared distance of the farthest vertex are computed again in a more accurate way: sums
    over points far from a face lose digits. */
@@ -67,7 +68,8 @@ inline void find_corner(corner_t *at, const places_t *a, const places_t *b, cons
     at->ca2 = ca2;
 }
 
-/* Contributions of a vertex at the end of the common edge of faces p and q; see `share_edge` in simd/walk_state.h. */
+/* Contributions of a vertex at the end of the common edge of faces p and q, along w = p x q: the foot of x on the edge
+   is at -g w from the vertex; parts of the areas, and of the second moments weighted by volume. */
 typedef struct {
     WIDE g, part_p, part_q, both;
 } part_t;
@@ -89,8 +91,13 @@ inline void first_moments(places_t *first, WIDE part_in, const places_t *in, WID
     first->z = fma(part_out, out->z, part_in * in->z);
 }
 
-/* The shares of a vertex: of the areas and first moments of its faces, and of the second moments of the cell; see
-   `add_corner` in simd/walk_state.h. */
+/* The shares of a vertex: of the areas and first moments of its faces, and of the second moments of the cell.
+
+   x, the foot of x on a face, the foot f of x on an edge of the face, and a vertex v of the edge form a tetrahedron,
+   with a negative volume if a foot lies outside: six at every vertex. For a face at p, the triangle of the feet and the
+   vertex has the area g (p^2 - p.q) / (4 |p|), and the tetrahedron the volume g (p^2 - p.q) / (24 p^2). First moments
+   follow from f + v. Second moments: here the terms without the foot on the face, v v + f f + (v + f) (v + f). With
+   u = g w their sum is 6 y y - 3 (y u + u y) + 2 u u. */
 typedef struct {
     WIDE a, b, c;
     places_t first_a, first_b, first_c;

@@ -96,6 +96,23 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
     return largest_lane(-good) < 0 && nearest2 > LEAST_NEAREST2 * cell->reach2; /* a NaN is not good */
 }
 
+/* Whether all vertices lie in the cell up to round-off. */
+inline bool fits_corners(const corners_t *cell)
+{
+    WIDE beyond = cell->beyond[0];
+    for (int block = 1; WIDTH * block < cell->corners; ++block)
+        beyond = cell->beyond[block] > beyond ? cell->beyond[block] : beyond;
+    return !(largest_lane(beyond) > BEYOND_NOISE);
+}
+
+/* Write the vertices as triples, with their state. */
+inline void write_triples(const corners_t *cell, global uchar4 *corners, uchar state)
+{
+    for (int v = 0; v < cell->corners; ++v)
+        corners[v] = cell->at[v];
+    corners[0].s3 = state;
+}
+
 /* Write the faces from `place` on, and the moments of the cell of generator i, from its sums. False if a face has no
    more area than round-off. */
 inline bool write_measures(const CORNERS *cell, const sums_t *sums, int i, int place, const measured_t *out)

@@ -196,14 +196,6 @@ typedef union {
     sums_t sums;
 } links_or_sums_t;
 
-inline bool fits_corners(const corners_t *cell)
-{
-    WIDE beyond = cell->beyond[0];
-    for (int block = 1; WIDTH * block < cell->corners; ++block)
-        beyond = cell->beyond[block] > beyond ? cell->beyond[block] : beyond;
-    return !(largest_lane(beyond) > BEYOND_NOISE);
-}
-
 /* Per generator i: no marks, no further neighbors. `used` are the faces of the previous diagram. */
 kernel void begin_cell_updates(const int size, const int used, const int report_size, global int *report,
                                global int *marks, global int *more)
@@ -284,9 +276,7 @@ kernel void update_cells(const int size, const int which, global const int *list
         if (place + cell.faces <= room && write_measures(&cell, &work.sums, i, place, &out)) {
             row_places[i] = place;
             row_counts[i] = cell.faces | CERTAIN;
-            for (int v = 0; v < cell.corners; ++v)
-                corners[2 * place + v] = cell.at[v];
-            corners[2 * place].s3 = KNOWN_CORNERS;
+            write_triples(&cell, corners + 2 * place, KNOWN_CORNERS);
             for (int f = 0; kept && f < cell.faces; ++f)
                 keys[place + f] = old_keys[start + f];
             if (!kept) {

@@ -8,6 +8,7 @@ from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import CUBE as CUBE_SIDE
 from clvoro.tessellation.polyhedra import FIRST_REACH, STRETCH, Polyhedra
+from clvoro.tessellation.polyhedra_update import PolyhedraUpdate
 from tests.reference import diagrams3d as reference3d
 
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -278,6 +279,17 @@ def test_face_arrays_grow(engine, monkeypatch):
     found = tessellations(engine, points)[0][0]
     for array in vars(found):
         assert np.array_equal(getattr(found, array), getattr(expected, array)), array
+
+
+def test_an_update_without_motion_keeps_the_bits(engine):
+    """Cells are measured from their vertices by the same function, whoever has found these."""
+    n, x = 800, engine.upload(POINTS["random"][:800])
+    cells, binned = Polyhedra(engine), Bins(engine).build(CUBE, x, n)
+    t = cells.tessellate(CUBE, x, n, binned, exact=False)
+    new = Rows(t)
+    updated = Rows(PolyhedraUpdate(engine).update(cells, CUBE, x, t, None))
+    for name, array in vars(new).items():
+        assert np.array_equal(array, getattr(updated, name)), name
 
 
 def test_same_bits_twice(engine):
