@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ..finite_volumes.solver_mesh import WallShape
     from ..geometry.boundary_names import Walls
     from ..geometry.domain import Domain
+    from ..geometry.surface import Surface
     from ..io.disv import Disv
     from ..io.fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
     from ..io.foam import PatchType
@@ -37,7 +38,7 @@ class MeshOutput:
     def _self(self) -> Result | Diagram:
         return cast("Result | Diagram", self)
 
-    def subset(self: Mesh, keep: ArrayLike | Domain, boundary: str = "coast") -> Mesh:
+    def subset(self: Mesh, keep: ArrayLike | Domain | Surface, boundary: str = "coast") -> Mesh:
         """Return the mesh without some of its cells, in a box, a polygon or a solid, or on a sphere.
 
         The cells that are left do not change. Their faces towards removed cells become faces on a boundary. So all
@@ -48,9 +49,9 @@ class MeshOutput:
 
         Parameters
         ----------
-        keep : (n,) array of bool, or domain
-            Which cells are left; they keep their order. A domain, such as a `clvoro.Polygon`, keeps the cells that have
-            their generators in it.
+        keep : (n,) array of bool, domain or `clvoro.sizing.Surface`
+            Which cells are left; they keep their order. A domain, such as a `clvoro.Polygon`, and a closed surface keep
+            the cells that have their generators in it.
         boundary : str
             Name of the new boundary. A mesh that has a boundary already keeps the name of that one.
 

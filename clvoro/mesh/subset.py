@@ -13,6 +13,7 @@ from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
 from ..geometry.sphere import COAST, Sphere, SphereRegion
 from ..geometry.subdomain import Subdomain
+from ..geometry.surface import Surface
 from .connectivity import face_owners, neighbor_points, take_rows
 from .diagram import Diagram
 from .results import HISTORY_DTYPE, Result, figures
@@ -24,7 +25,9 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     """Return `mesh` without the cells where `keep` is False; see `MeshOutput.subset`."""
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     diagram.demand_voronoi("subset")
-    kept = keep.contains(diagram.points) if isinstance(keep, Domain) else check_mask("keep", keep, len(diagram))
+    kept = (
+        keep.contains(diagram.points) if isinstance(keep, Domain | Surface) else check_mask("keep", keep, len(diagram))
+    )
     if not kept.any():
         raise InputError(
             f"keep selects none of the {len(kept)} cells, expected at least one that is True; is it the opposite mask?"
@@ -84,7 +87,8 @@ def check_mask(name: str, mask: object, n: int) -> np.ndarray:
     """
     array = np.asarray(mask)
     if array.dtype != bool:
-        remedy = f"; write {name} == 1, or use np.isin" if array.dtype.kind in "iuf" else ""
+        remedy = "; for the cells in a shape pass clvoro.Polygon.from_shapely(shape).contains(mesh.points)"
+        remedy = f"; write {name} == 1, or use np.isin" if array.dtype.kind in "iuf" else remedy
         raise InputTypeError(f"{name} has dtype {array.dtype}, expected an array of {n} bool, one per cell{remedy}")
     if array.shape != (n,):
         grid = "; for a mask on a grid pass a function of longitude and latitude that looks it up"

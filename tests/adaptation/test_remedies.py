@@ -129,7 +129,9 @@ def test_a_ring_with_a_spike_is_made_valid_as_the_message_says():
 def test_an_effort_for_a_method_is_recognized(ctx):
     with pytest.raises(ClvoroError, match="method is 'fast', which is an effort; write effort='fast'"):
         clvoro.Adapter(ctx).run(BOX, 0.1, method="fast")
-    with pytest.raises(ClvoroError, match=r"run\.method is 'best' \(it is an effort: write effort = 'best'\)"):
+    with pytest.raises(
+        ClvoroError, match=r"run\.method is 'best' \(it is an effort: write effort = 'best', or --effort best\)"
+    ):
         Case.from_toml("size = 1\n[domain]\nlower = [0, 0]\nupper = [1, 1]\n[run]\nmethod = 'best'\n", "a")
     with pytest.raises(ClvoroError, match="Ball radius is -1"):
         sizing.Ball((0, 0, 0), -1)

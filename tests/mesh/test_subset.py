@@ -89,9 +89,17 @@ def test_a_result_and_a_domain_select_cells(ctx):
     assert result.subset(np.ones(200, bool)) is result
 
 
+def test_a_closed_surface_selects_cells(ctx):
+    diagram = clvoro.Adapter(ctx).diagram(DOMAINS["solid"], np.random.default_rng(3).random((150, 3)) * 2)
+    ball = clvoro.Solid.ball((1, 1, 1), 0.7).surface
+    assert np.array_equal(diagram.subset(ball).points, diagram.points[ball.contains(diagram.points)])
+
+
 def test_wrong_parts_are_refused(ctx, part, whole):
     with pytest.raises(InputTypeError, match="keep has dtype int64"):
         whole.subset(np.arange(len(whole)))
+    with pytest.raises(InputTypeError, match=r"pass clvoro\.Polygon\.from_shapely\(shape\)\.contains\(mesh\.points\)"):
+        whole.subset(L_SHAPE.geometry)
     with pytest.raises(InputError, match="keep selects none"):
         whole.subset(np.zeros(len(whole), bool))
     with pytest.raises(InputError, match="make the mesh in the whole domain, then remove cells"):

@@ -122,7 +122,11 @@ def _explain(message: str, kind: Any, content: object, place: str, homes: Mappin
             if isinstance(got, Mapping):
                 key = next(key for key, word in got.items() if word not in known)
                 where, got = _below(where, key), got[key]
-        hint = f" (it is an effort: write effort = {got!r})" if got in EFFORTS and keys[-1] != "effort" else ""
+        hint = (
+            f" (it is an effort: write effort = {got!r}, or --effort {got})"
+            if got in EFFORTS and keys[-1] != "effort"
+            else ""
+        )
         return f"{where} is {got!r:.60}{hint or _nearest(got, known)}; expected one of {', '.join(known)}"
     if not text.startswith("Expected"):  # an error of a table as a whole
         return f"{where} {text}"
