@@ -176,3 +176,37 @@ kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS
         own_planes[place + k] = planes[k];
     }
 }
+
+/* Per point: the triangle nearest to it, the first one of several; -1 if all are farther than `most`. */
+kernel void find_nearest_triangles(const int size, global const REAL *points, global const REAL *most, WALL_ARGS,
+                                   global int *nearest)
+{
+    LONG_ITEM(i);
+    const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
+    const int4 bin = wall_bin(x, wall_frame, wall_shape);
+    const REAL width = 1 / wall_frame.s3;
+    const int clear = wall_clear[(bin.s2 * wall_shape.s1 + bin.s1) * wall_shape.s0 + bin.s0];
+    nearest[i] = -1;
+    if ((clear - 1) * width > most[i])
+        return;
+    /* Balls of growing radius, until the nearest triangle in the bins of one lies in it. */
+    for (REAL reach = (clear + R(0.5)) * width;; reach *= 2) {
+        const REAL least = fmin(reach, most[i]), least2 = least * least;
+        REAL best2 = REAL_MAX;
+        int best = INT_MAX;
+        EACH_TRIANGLE (t, x - least, x + least) {
+            const foot_t foot =
+                foot_on_triangle(wall_corners[3 * t] - x, wall_corners[3 * t + 1] - x, wall_corners[3 * t + 2] - x, 0);
+            if (foot.d2 < best2 || (foot.d2 == best2 && t < best)) {
+                best2 = foot.d2;
+                best = t;
+            }
+        }
+        if (best2 <= least2)
+            nearest[i] = best;
+        if (best2 <= least2 || !(reach < most[i]) || !(reach < 1 / REAL_EPS))
+            return;
+        if (best2 < 4 * reach * reach)
+            reach = sqrt(best2) / 2 * (1 + 8 * REAL_EPS);
+    }
+}

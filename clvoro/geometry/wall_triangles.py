@@ -44,6 +44,11 @@ class WallTriangles:
         `SMOOTH`, `CONVEX` or `CONCAVE` for the edge from corner s to corner s + 1.
     ends : (t, 3) int
         The same for corner s: `CONCAVE` where a concave crease of the patch passes or ends.
+
+    Attributes
+    ----------
+    items : (k,) int
+        The triangles that have an area; only these are kept.
     """
 
     def __init__(
@@ -51,6 +56,7 @@ class WallTriangles:
     ) -> None:
         sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         kept = np.linalg.norm(sides, axis=1) > 0
+        self.items = np.flatnonzero(kept)
         self.corners, self.patch = np.asarray(corners, float)[kept], np.asarray(patch)[kept]
         self.normals = np.asarray(normals, float)[kept]
         self.edges, self.ends = np.asarray(edges)[kept], np.asarray(ends)[kept]

@@ -134,3 +134,36 @@ class SolidBox(ClipBox):
         lost = self._grow()
         self.find(points)
         return lost
+
+
+class SurfaceSearch:
+    """Finds the nearest triangles of the surface of a solid.
+
+    Parameters
+    ----------
+    engine : Engine
+        Of the domain.
+    """
+
+    def __init__(self, engine: Engine, domain: Domain, walls: WallTriangles) -> None:
+        self._engine, self._frame, self._walls = engine, domain.frame, walls
+
+    def nearest(self, points: np.ndarray, reach: np.ndarray | float) -> np.ndarray:
+        """Return the triangle nearest to each of `points` (k, 3) within `reach`, (k,) or a number; else -1; (k,) int.
+
+        Among triangles as near as one another to round-off of the device it may be any.
+        """
+        engine, (origin, scale) = self._engine, self._frame
+        found = engine.empty(len(points), np.int32)
+        if not len(points):
+            return np.zeros(0, np.int64)
+        engine.run_each(
+            engine.kernels("tessellation/own_planes", {"MOST_OWN": MOST_OWN}).find_nearest_triangles,
+            len(points),
+            engine.upload((points - origin) / scale),
+            engine.upload(np.broadcast_to(np.minimum(reach, np.finfo(np.float32).max / 4) / scale, len(points))),
+            *self._walls.arguments(engine, self._frame),
+            found,
+        )
+        item = found.get().astype(np.int64)
+        return np.where(item < 0, -1, self._walls.items[item])

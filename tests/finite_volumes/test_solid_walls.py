@@ -5,6 +5,7 @@ import pytest
 
 import clvoro
 from clvoro.finite_volumes.solid_walls.mesh import diagram_of, outer_generators, solid_diagram, solid_mesh
+from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
 from clvoro.mesh.connectivity import following
 
 H = 0.25
@@ -42,7 +43,7 @@ def generators(solid):
 def whole_diagram(ctx, solid, x, h):
     """Return the diagram of generators and outer generators in a box around the solid."""
     box = clvoro.Box(np.subtract(solid.lower, 4 * H), np.add(solid.upper, 4 * H))
-    return clvoro.Adapter(ctx).diagram(box, np.concatenate([x, outer_generators(solid, x, h)]))
+    return clvoro.Adapter(ctx).diagram(box, np.concatenate([x, outer_generators(WallSurface(solid), x, h)]))
 
 
 @pytest.fixture(scope="module", params=SOLIDS)
@@ -50,7 +51,7 @@ def made(request, ctx):
     solid = SOLIDS[request.param]()
     x = generators(solid)
     h = np.full(len(x), H)
-    mesh = solid_mesh(solid, x, h, whole_diagram(ctx, solid, x, h))
+    mesh = solid_mesh(WallSurface(solid), x, h, whole_diagram(ctx, solid, x, h))
     assert not len(mesh.odd)
     assert not len(mesh.lost)
     return solid, mesh.faces
@@ -133,4 +134,4 @@ def test_concave_cells_are_warned_of(ctx):
     x = np.delete(x, np.linalg.norm(x - (1 + H / 2, 1 - H / 2, 0.5), axis=1).argmin(), axis=0)
     h = np.full(len(x), H)
     with pytest.warns(clvoro.errors.MismatchWarning, match="cells at walls are concave, the first at"):
-        solid_diagram(solid, x, h, whole_diagram(ctx, solid, x, h))
+        solid_diagram(WallSurface(solid), x, h, whole_diagram(ctx, solid, x, h))

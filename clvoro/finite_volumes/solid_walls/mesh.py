@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import scipy
@@ -20,9 +20,6 @@ from .pierce import IN, WALL, pierce_edges, sides
 from .polygons import Divider, chain_loops, open_sides
 from .trimmed_faces import TrimmedFaces, trim_faces
 from .wall_surface import WallSurface, nearest
-
-if TYPE_CHECKING:
-    from ...geometry.solid.solid import Solid
 
 OUTSIDE = 1.6
 """Distance of outer generators from the surface, over h."""
@@ -50,8 +47,8 @@ class SolidMesh:
     lost: np.ndarray
 
 
-def outer_generators(solid: Solid, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return points (m, 3) outside of `solid` that bound the cells of generators at its surface.
+def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return points (m, 3) outside of a solid that bound the cells of generators at its surface.
 
     They are farther from each point of the solid than its nearest generator is. So they do not change the diagram
     inside.
@@ -63,7 +60,6 @@ def outer_generators(solid: Solid, points: np.ndarray, sizes: np.ndarray) -> np.
     sizes : (n,) float
         h at the generators.
     """
-    surface = WallSurface(solid)
     near = np.flatnonzero(surface.touches(points, 1.5 * sizes))
     _, foot, distance = surface.closest(points[near])
     close = np.abs(distance) < 1.5 * sizes[near]
@@ -77,12 +73,12 @@ def outer_generators(solid: Solid, points: np.ndarray, sizes: np.ndarray) -> np.
     return placed[clear]
 
 
-def solid_mesh(solid: Solid, points: np.ndarray, sizes: np.ndarray, diagram: Diagram) -> SolidMesh:
+def solid_mesh(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, diagram: Diagram) -> SolidMesh:
     """Return the mesh of a solid.
 
     Parameters
     ----------
-    solid : Solid
+    surface : WallSurface
     points : (n, 3) float
         Generators inside.
     sizes : (n,) float
@@ -90,10 +86,10 @@ def solid_mesh(solid: Solid, points: np.ndarray, sizes: np.ndarray, diagram: Dia
     diagram : Diagram
         Of the generators, and of `outer_generators` after them, in a box around the solid.
     """
-    return _Maker(solid, points, sizes, diagram).mesh()
+    return _Maker(surface, points, sizes, diagram).mesh()
 
 
-def solid_diagram(solid: Solid, points: np.ndarray, sizes: np.ndarray, whole: Diagram) -> Diagram:
+def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Diagram) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges; see `solid_mesh`.
 
     Raises
@@ -106,12 +102,12 @@ def solid_diagram(solid: Solid, points: np.ndarray, sizes: np.ndarray, whole: Di
     MismatchWarning
         If cells are concave.
     """
-    made = solid_mesh(solid, points, sizes, whole)
+    made = solid_mesh(surface, points, sizes, whole)
     if len(made.lost):
         place = format_point(points[made.lost[0]])
         raise InputError(
-            f"{solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first at "
-            f"{place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
+            f"{surface.solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first "
+            f"at {place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
         )
     diagram = diagram_of(made.faces)
     diagram = diagram_of(collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes)))
@@ -126,27 +122,38 @@ def solid_diagram(solid: Solid, points: np.ndarray, sizes: np.ndarray, whole: Di
 
 
 def diagram_of(faces: Faces) -> Diagram:
-    """Return the mesh `faces` in 3D as a diagram; all measures follow from the corners."""
+    """Return the mesh `faces` in 3D as a diagram; all measures follow from the corners.
+
+    `faces` come in the order of `Diagram.faces`.
+    """
     starts, places = faces.cell_faces()
     face = faces.sides()[1][places]
     back = places >= len(faces)
-    corner_starts, corners = take_rows(faces.starts, faces.corners, face, back)
-    geometry = faces.measures.geometry
-    return Diagram(
+    half_face = np.empty(len(faces), np.int64)
+    half_face[places[~back]] = np.flatnonzero(~back)
+    faces = replace(faces, half_face=half_face)
+
+    @cache
+    def loops() -> tuple[np.ndarray, np.ndarray]:
+        return take_rows(faces.starts, faces.corners, face, back)
+
+    diagram = Diagram(
         faces.domain,
         {
             "points": faces.generators,
-            "volumes": geometry.volumes,
-            "centroids": geometry.centroids,
+            "volumes": faces.measures.geometry.volumes,
+            "centroids": faces.measures.geometry.centroids,
             "neighbor_starts": starts.astype(np.int32),
             "neighbors": np.where(back, faces.owner[face], faces.neighbor[face]).astype(np.int32),
             "face_measures": faces.area[face],
-            "face_centroids": faces.center[face],
+            "face_centroids": lambda: faces.center[face],
             "vertices": faces.points,
-            "face_vertex_starts": corner_starts.astype(np.int32),
-            "face_vertices": corners.astype(np.int32),
+            "face_vertex_starts": lambda: loops()[0].astype(np.int32),
+            "face_vertices": lambda: loops()[1].astype(np.int32),
         },
     )
+    diagram.faces = faces
+    return diagram
 
 
 class _Maker:
@@ -159,8 +166,8 @@ class _Maker:
         See `WallSurface`; -1 for vertices inside.
     """
 
-    def __init__(self, solid: Solid, generators: np.ndarray, sizes: np.ndarray, diagram: Diagram) -> None:
-        self.solid, self.surface = solid, WallSurface(solid)
+    def __init__(self, surface: WallSurface, generators: np.ndarray, sizes: np.ndarray, diagram: Diagram) -> None:
+        self.surface = surface
         self.generators, self.sizes, self.n = generators, sizes, len(generators)
         f = diagram.faces
         rows = np.flatnonzero((f.owner < self.n) & (f.neighbor >= 0) & (f.neighbor < self.n))
@@ -196,11 +203,12 @@ class _Maker:
 
     def _near_faces(self) -> np.ndarray:
         """Return the faces both of whose cells may reach the surface."""
-        face = np.repeat(np.arange(len(self.owner)), np.diff(self.starts))
+        # Both generators of a face are equally far from its vertices.
+        away = self.points[self.corners] - np.repeat(self.generators[self.owner], np.diff(self.starts), axis=0)
+        farthest = np.maximum.reduceat(np.einsum("vd,vd->v", away, away), self.starts[:-1])
         reach = np.zeros(self.n)
         for cells in (self.owner, self.neighbor):
-            away = self.points[self.corners] - self.generators[cells[face]]
-            np.maximum.at(reach, cells[face], (away**2).sum(axis=1))
+            np.maximum.at(reach, cells, farthest)
         near = self.surface.touches(self.generators, np.sqrt(reach) + 0.1 * self.sizes)
         return np.flatnonzero(near[self.owner] & near[self.neighbor])
 
@@ -401,7 +409,7 @@ class _Maker:
         owner = np.concatenate([owner[inner], wall_owner[walls]])
         neighbor = np.concatenate([neighbor[inner], -1 - wall_patch[walls]])
         faces = Faces(
-            domain=self.solid,
+            domain=self.surface.solid,
             generators=self.generators,
             points=self.points,
             starts=np.concatenate([one[0], one[0][-1] + two[0][1:]]),

@@ -39,13 +39,14 @@ class WallPolygons:
 
 def open_sides(cell: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the sides of faces, given as seen from cells, that no other face of the cell has, turned around."""
-    size = int(max(begin.max(initial=0), end.max(initial=0))) + 1
     low, high = np.minimum(begin, end), np.maximum(begin, end)
     forward = begin < end
-    order = np.lexsort((high, low, cell))
-    key_cell, key_edge = cell[order], low[order] * size + high[order]
-    new = np.ones(len(order), bool)
-    new[1:] = (key_cell[1:] != key_cell[:-1]) | (key_edge[1:] != key_edge[:-1])
+    # Cells and vertices are numbered anew, so that a side is one number, which is sorted faster than three.
+    (place, vertices), (row, cells) = _ranks(low, high), _ranks(cell)
+    assert cells * vertices**2 < 2**63
+    key = (row[cell] * vertices + place[low]) * vertices + place[high]
+    order = np.argsort(key, kind="stable")
+    new = np.diff(key[order], prepend=-1) != 0
     first = np.flatnonzero(new)
     if not len(first):
         return cell[:0], begin[:0], end[:0]
@@ -53,6 +54,15 @@ def open_sides(cell: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np
     rows = order[first[balance != 0]]
     up = balance[balance != 0] < 0  # the missing side runs the other way
     return cell[rows], np.where(up, low[rows], high[rows]), np.where(up, high[rows], low[rows])
+
+
+def _ranks(*numbers: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the rank of each number that occurs among all that do, as an array by number, and how many do."""
+    used = np.zeros(max(int(given.max(initial=0)) for given in numbers) + 1, bool)
+    for given in numbers:
+        used[given] = True
+    ranks = np.cumsum(used) - 1
+    return ranks, int(ranks[-1]) + 1
 
 
 def chain_loops(

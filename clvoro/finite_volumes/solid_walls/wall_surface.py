@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -29,10 +30,15 @@ class WallSurface:
     Parameters
     ----------
     solid : Solid
+    nearest : callable, optional
+        Returns the triangle nearest to each of the points (k, 3) within a reach, (k,) or a number; -1 where there is
+        none; (k,) int. By default the solid's own search does.
     """
 
-    def __init__(self, solid: Solid) -> None:
-        self.solid = solid
+    def __init__(
+        self, solid: Solid, nearest: Callable[[np.ndarray, np.ndarray | float], np.ndarray] | None = None
+    ) -> None:
+        self.solid, self._nearest = solid, nearest
         self.vertices, self.triangles = solid.surface.vertices, solid.surface.triangles
         self.patch = solid.patch
         self.n_patches = solid.n_patches
@@ -46,10 +52,12 @@ class WallSurface:
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the closest triangle (k,), the point on it (k, 3), and the distance (k,), negative inside."""
-        return self.solid.closest(points)
+        return self.solid.closest(points, None if self._nearest is None else self._nearest(points, np.inf))
 
     def touches(self, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return for each of `points` (k, 3) whether the surface may lie within `reach` (k,)."""
+        if self._nearest is not None:
+            return self._nearest(points, reach) >= 0
         found = np.zeros(len(points), bool)
         found[self.solid.surface.tree.within(points, reach)[0]] = True
         return found

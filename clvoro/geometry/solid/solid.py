@@ -96,13 +96,17 @@ class NearestTriangles:
             close, sample = close[np.isfinite(away)], sample[np.isfinite(away)]
             there2 = packed_weights(x[close], self._rows[self._sampled[sample]])[2]
             bound2[close] = np.minimum(bound2[close], (np.sqrt(there2) + self._tie) ** 2)
-        best2, item = self._tree.nearest(x, bound2, lambda y, k: packed_weights(y, self._rows[k])[2])
+        _, item = self._tree.nearest(x, bound2, lambda y, k: packed_weights(y, self._rows[k])[2])
+        return self.feet_on(x, item)
+
+    def feet_on(self, x: np.ndarray, item: np.ndarray) -> Feet:
+        """Return the points of triangles `item` (n,) nearest to the points x (n, 3); nothing for the item -1."""
         found = item >= 0
-        weights = np.zeros((len(x), 3))
-        s, t, _ = packed_weights(x[found], self._rows[item[found]])
+        weights, away2 = np.zeros((len(x), 3)), np.full(len(x), math.inf)
+        s, t, away2[found] = packed_weights(x[found], self._rows[item[found]])
         weights[found] = np.column_stack([1 - s - t, s, t])
         point = np.einsum("nk,nkd->nd", weights, self.corners[item])
-        return Feet(np.where(found, self.items[item], -1), weights, point, np.where(found, np.sqrt(best2), math.inf))
+        return Feet(np.where(found, self.items[item], -1), weights, point, np.sqrt(away2))
 
 
 def _samples(triangles: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -464,9 +468,14 @@ class Solid(Domain):
         """Return the nearest point of the surface to each of `points` (n, 3), within `reach`."""
         return self._whole.feet(np.asarray(points, float), reach)
 
-    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return triangle (n,) int, foot (n, 3) and distance (n,), negative inside, of `points` (n, 3)."""
-        feet = self.feet(points)
+    def closest(
+        self, points: np.ndarray, triangles: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return triangle (n,) int, foot (n, 3) and distance (n,), negative inside, of `points` (n, 3).
+
+        `triangles` (n,) are the nearest ones, if they are known.
+        """
+        feet = self.feet(points) if triangles is None else self._whole.feet_on(points, triangles)
         return feet.triangle, feet.point, np.where(self.covers(points), -1, 1) * feet.distance
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:

@@ -6,11 +6,13 @@ import numpy as np
 import pyopencl.array as cla
 
 from ...finite_volumes.solid_walls.mesh import outer_generators, solid_diagram
+from ...finite_volumes.solid_walls.wall_surface import WallSurface
 from ...geometry.box import Box
 from ...geometry.solid.solid import Solid
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ..device_diagram import Tessellation
+from ..own_planes import SurfaceSearch
 from ..stages import TessellationStages
 from .diagram import make_diagram, order_of
 
@@ -33,9 +35,10 @@ def fetch_mesh(engine: Engine, domain: Solid, t: Tessellation, labels: cla.Array
     order = order_of(labels.get()[: t.n])
     points = origin + scale * t.points.get()[: t.n, :3][order].astype(float)
     sizes = scale * np.cbrt(t.volumes.get()[: t.n][order].astype(float))
-    outer = outer_generators(domain, points, sizes)
+    surface = WallSurface(domain, SurfaceSearch(engine, domain, domain.wall_triangles).nearest)
+    outer = outer_generators(surface, points, sizes)
     reach = _MARGIN * sizes.max()
     box = Box(tuple(np.subtract(domain.lower, reach).tolist()), tuple(np.add(domain.upper, reach).tolist()))
     stages = TessellationStages(engine.replaced(traits=box.traits(engine.real)))
     whole = make_diagram(stages, box, np.concatenate([points, outer]))
-    return solid_diagram(domain, points, sizes, whole)
+    return solid_diagram(surface, points, sizes, whole)
