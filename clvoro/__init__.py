@@ -24,7 +24,7 @@ pictures in `clvoro.plotting`, times of kernels in `clvoro.profile`. The command
 ``clvoro``; begin with ``clvoro --help``.
 """
 
-from . import curves, earth, sizing
+from . import curves, earth, foam, sizing
 from .adaptation.options import Checkpoint, MultilevelOptions, PaperOptions
 from .adaptation.run import Run
 from .adapter import Adapter
@@ -64,6 +64,7 @@ __all__ = [
     "create_context",
     "curves",
     "earth",
+    "foam",
     "list_devices",
     "load",
     "power_diagram",

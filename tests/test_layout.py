@@ -39,6 +39,7 @@ ORDER = (
     "earth",
     "adapter",
     "shared",
+    "foam",
     "__init__",
     "cli",
     "__main__",

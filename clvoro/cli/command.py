@@ -6,6 +6,7 @@ Each command imports what it needs when it starts, so that `clvoro --help` answe
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -43,6 +44,7 @@ examples:
   clvoro check --for openfoam result/mesh.vtu
   clvoro run ocean --format mpas        a mesh of the Earth for ocean models
   clvoro check --for mpas out/ocean/mesh.vtu
+  clvoro foam adapt CASE --cells 6000 --cycles 3 --solver simpleFoam
 """
 
 
@@ -59,6 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_run(commands)
     _add_convert(commands)
     _add_check(commands)
+    _add_foam(commands)
     devices = commands.add_parser("devices", help="list the OpenCL devices and whether they work")
     devices.set_defaults(work=_devices)
     cases = commands.add_parser("cases", help="list the built-in cases, or print one")
@@ -205,6 +208,42 @@ def _add_check(commands: Any) -> None:
     )
     _add_walls(check)
     check.add_argument("--json", action="store_true", help="print one JSON object per file")
+
+
+def _add_foam(commands: Any) -> None:
+    foam = commands.add_parser("foam", help="cases of OpenFOAM: adapt the mesh to the solution")
+    adapt = foam.add_subparsers(dest="foam_command", metavar="COMMAND", required=True).add_parser(
+        "adapt",
+        help="adapt the mesh of a case to its latest time, once or in a loop with its solver",
+        description="Estimate sizes from the latest time of a case, adapt its mesh, and transfer all fields in cells.\n"
+        "The new mesh and its fields take the place of the latest time in one step. With --solver the case is\n"
+        "solved before each cycle, and at the end; a call that was killed goes on if it is repeated. The report is\n"
+        "CASE/clvoro/report.csv.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    adapt.set_defaults(work=_foam_adapt)
+    adapt.add_argument("case", metavar="CASE", type=_path, help="the folder with system, constant and times")
+    adapt.add_argument("--cells", metavar="N", type=int, required=True, help="number of cells of the new mesh")
+    adapt.add_argument("--fields", metavar="LIST", default="U,p", help="fields that the mesh follows (default: U,p)")
+    adapt.add_argument("--cycles", metavar="N", type=int, default=1, help="number of meshes (default: 1)")
+    adapt.add_argument("--solver", metavar="PROGRAM", help="program that solves the case, such as simpleFoam")
+    adapt.add_argument(
+        "--interval",
+        metavar="T",
+        type=float,
+        help="time or iterations that the solver advances in each cycle (default: those of system/controlDict)",
+    )
+    adapt.add_argument(
+        "--mesh", metavar="FILE", type=_path, help="the present mesh as clvoro saved it (default: from the boundary)"
+    )
+    adapt.add_argument("--p", type=float, default=2.0, metavar="P", help="norm of the error that is small (default: 2)")
+    adapt.add_argument("--h-min", type=float, default=0.0, metavar="H", help="smallest size")
+    adapt.add_argument("--h-max", type=float, default=math.inf, metavar="H", help="largest size")
+    adapt.add_argument("--growth", type=float, default=1.2, metavar="G", help="ratio of neighboring sizes at most")
+    adapt.add_argument("--effort", choices=("fast", "default", "best"), default="default", help="work against quality")
+    adapt.add_argument("--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices")
+    adapt.add_argument("--no-pictures", action="store_true", help="no pictures")
+    adapt.add_argument("--json", action="store_true", help="print one JSON object per cycle")
 
 
 def _mesh_formats(text: str) -> tuple[str, ...]:
@@ -401,6 +440,45 @@ def _verdict(name: str, arguments: argparse.Namespace) -> Any:
             f"{name} is a mesh for OpenFOAM, and {given} is for mesh.npz and mesh.vtu of the same run; check those"
         )
     return check_polymesh(folder)
+
+
+def _foam_adapt(arguments: argparse.Namespace) -> int:
+    import dataclasses
+    import json
+
+    from ..adapter import Adapter
+    from ..foam import FoamCycle, adapt_case
+    from ..opencl.devices import create_context
+
+    def show(row: FoamCycle) -> None:
+        if arguments.json:
+            print(json.dumps(dataclasses.asdict(row)), flush=True)
+            return
+        text = f"cycle {row.cycle}: {row.cells:,} cells at {row.time:g}"
+        text += "".join(f", {name} {value:.6g}" for name, value in row.monitors.items())
+        if row.next_cells is not None:
+            text += f"; next {row.next_cells:,} cells, predicted error {row.predicted_error:.3g}"
+        seconds = (row.solver_seconds, row.mesh_seconds or 0, row.transfer_seconds or 0)
+        print(f"{text}; {seconds[0]:.1f} s solver, {seconds[1]:.1f} s mesh, {seconds[2]:.1f} s transfer", flush=True)
+
+    adapt_case(
+        arguments.case,
+        n_cells=arguments.cells,
+        fields=[name.strip() for name in arguments.fields.split(",")],
+        cycles=arguments.cycles,
+        solver=arguments.solver,
+        interval=arguments.interval,
+        mesh=arguments.mesh,
+        p=arguments.p,
+        h_min=arguments.h_min,
+        h_max=arguments.h_max,
+        growth=arguments.growth,
+        effort=arguments.effort,
+        pictures=not arguments.no_pictures,
+        adapter=None if arguments.device is None else Adapter(create_context(arguments.device)),
+        on_cycle=show,
+    )
+    return OK
 
 
 def _devices(_: argparse.Namespace) -> int:

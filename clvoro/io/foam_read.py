@@ -42,11 +42,11 @@ def check_polymesh(folder: Path) -> SolverReport:
 
 def _read_faces(folder: Path) -> Faces:
     """Return the mesh in `folder`; one layer of prisms between empty patches as a mesh in 2D."""
-    points = _File.read(folder, "points").vectors()
-    starts, corners = _File.read(folder, "faces").rows()
-    owner = _File.read(folder, "owner").labels()
-    inside = _File.read(folder, "neighbour").labels()
-    patches = _File.read(folder, "boundary").patches()
+    points = FoamFile.read(folder, "points").vectors()
+    starts, corners = FoamFile.read(folder, "faces").rows()
+    owner = FoamFile.read(folder, "owner").labels()
+    inside = FoamFile.read(folder, "neighbour").labels()
+    patches = FoamFile.read(folder, "boundary").patches()
     f, inner = len(starts) - 1, len(inside)
     n = int(max(owner.max(initial=-1), inside.max(initial=-1))) + 1
     fits = len(owner) == f and inner <= f and n > 0 and min(owner.min(), inside.min(initial=0)) >= 0
@@ -70,7 +70,7 @@ def _read_faces(folder: Path) -> Faces:
     return _in_plane(mesh, empty) if empty.sum() == 2 * n else mesh
 
 
-def _coupled(mesh: Faces, patches: list[_Patch]) -> tuple[Faces, np.ndarray]:
+def _coupled(mesh: Faces, patches: list[FoamPatchFaces]) -> tuple[Faces, np.ndarray]:
     """Join the faces of cyclic patches as seams; return the mesh, and the row that each face had before, (f,)."""
     by_name = {patch.name: patch for patch in patches}
     pairs = [
@@ -134,7 +134,7 @@ def _box(lower: np.ndarray, upper: np.ndarray, periodic: np.ndarray | None = Non
 
 
 @dataclass(frozen=True)
-class _Patch:
+class FoamPatchFaces:
     """A part of the boundary: name, type, the patch across a seam, and its faces, (k,)."""
 
     name: str
@@ -144,14 +144,15 @@ class _Patch:
 
 
 @dataclass(frozen=True)
-class _File:
+class FoamFile:
     """One file of a polyMesh: the entries of its head, and what follows."""
 
     head: dict[str, str]
     body: bytes
 
     @classmethod
-    def read(cls, folder: Path, name: str) -> _File:
+    def read(cls, folder: Path, name: str) -> FoamFile:
+        """Read the file `name`, or its compressed form, of a folder."""
         path = folder / name
         packed = not path.exists() and path.with_name(f"{name}.gz").exists()
         try:
@@ -228,14 +229,14 @@ class _File:
             raise FileError(f"faces has {len(counts)} faces, expected as many as it says")
         return starts, np.delete(numbers, starts[:-1] + np.arange(len(counts)))
 
-    def patches(self) -> list[_Patch]:
+    def patches(self) -> list[FoamPatchFaces]:
         """Return the parts of the boundary."""
         made = []
         for name, body in _PATCH.findall(self.body.decode("utf-8", "replace")):
             entries = dict(re.findall(r"(\w+)\s+([^;]+);", body))
             first, count = int(entries["startFace"]), int(entries["nFaces"])
             across = entries.get("neighbourPatch", "").strip()
-            made.append(_Patch(name, entries["type"].strip(), across, np.arange(first, first + count)))
+            made.append(FoamPatchFaces(name, entries["type"].strip(), across, np.arange(first, first + count)))
         return made
 
 

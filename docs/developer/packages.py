@@ -5,7 +5,7 @@ from pathlib import Path
 WIDTH, ROW, GAP = 760, 62, 14
 ROWS = [
     [("cli", "the command, cases"), ("adapter.py", "the entry: adapt, voronoi, Adapter")],
-    [("earth", "longitudes and latitudes, oceans, C grids")],
+    [("foam", "cases of OpenFOAM follow a solution"), ("earth", "spheres, oceans, C grids")],
     [
         ("plotting", "pictures, report"),
         ("remapping", "transfer between meshes"),

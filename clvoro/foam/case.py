@@ -1,0 +1,236 @@
+"""A case of OpenFOAM as a folder: its times, its meshes, its settings, and its solver."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import ClvoroError, InputError
+from ..io.atomic import atomic_file
+from .fields import FoamField, read_field
+
+_EXCHANGE, _HERE = 2, -100  # RENAME_EXCHANGE and AT_FDCWD of Linux
+_HOME = "/usr/share/openfoam"  # of Debian's package, whose programs need the variable
+_TAIL = 1500
+
+
+class Time(NamedTuple):
+    """A time that has been written: its folder's name, and its value."""
+
+    name: str
+    value: float
+
+
+class FoamCase:
+    """A folder with ``system`` and ``constant``, and a folder for each time.
+
+    Parameters
+    ----------
+    folder : path
+
+    Raises
+    ------
+    InputError
+        If it is no case.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        if not (self.folder / "system" / "controlDict").is_file():
+            raise InputError(
+                f"{self.folder} has no system/controlDict, expected the folder of a case of OpenFOAM: the one that has "
+                "system, constant and 0"
+            )
+        if (self.folder / "processor0").exists():
+            raise InputError(
+                f"{self.folder} is decomposed (processor0, ...), expected a whole case; run reconstructPar "
+                "-latestTime, and remove the folders processor*"
+            )
+        self.own = self.folder / "clvoro"
+
+    def times(self) -> list[Time]:
+        """Return the times with fields, in ascending order."""
+        found = []
+        for path in self.folder.iterdir():
+            if re.fullmatch(r"[-+]?[\d.]+(?:[eE][-+]?\d+)?", path.name) and path.is_dir() and any(path.iterdir()):
+                found.append(Time(path.name, float(path.name)))
+        return sorted(found, key=lambda time: time.value)
+
+    def latest(self) -> Time:
+        """Return the latest time.
+
+        Raises
+        ------
+        InputError
+            If none has been written.
+        """
+        times = self.times()
+        if not times:
+            raise InputError(
+                f"{self.folder} has no time with fields, expected folders such as 0 or 500; run the solver first"
+            )
+        return times[-1]
+
+    def mesh_folder(self, time: Time) -> Path:
+        """Return the folder ``polyMesh`` that holds at a time: that of the latest time before it that has one.
+
+        Raises
+        ------
+        InputError
+            If there is no mesh.
+        """
+        for earlier in reversed(self.times()):
+            folder = self.folder / earlier.name / "polyMesh"
+            if earlier.value <= time.value and _has(folder, "faces"):
+                return folder
+        folder = self.folder / "constant" / "polyMesh"
+        if not _has(folder, "faces"):
+            raise InputError(f"{self.folder} has no mesh, expected constant/polyMesh; write it by mesh.to_openfoam")
+        return folder
+
+    def fields(self, time: Time) -> list[FoamField]:
+        """Return all fields of a time."""
+        found = []
+        for path in sorted((self.folder / time.name).iterdir()):
+            if path.is_file() and path.name[0] != "." and path.suffix in ("", ".gz"):
+                field = read_field(path)
+                if field.type:
+                    found.append(field)
+        return found
+
+    def put_time(self, name: str, made: Path) -> None:
+        """Put the folder `made` in place of that of a time, in one step.
+
+        Without a system call that exchanges folders it takes two steps. In between the time before is the latest one,
+        whose fields fit its mesh, too; `mend` ends an exchange that was interrupted.
+        """
+        target = self.folder / name
+        if not target.exists():
+            os.rename(made, target)
+        elif _exchange(made, target):
+            shutil.rmtree(made)
+        else:
+            old = self.own / "old"
+            shutil.rmtree(old, ignore_errors=True)
+            (made / ".complete").touch()
+            os.rename(target, old)
+            os.rename(made, target)
+            (target / ".complete").unlink()
+            shutil.rmtree(old)
+
+    def mend(self) -> None:
+        """End an exchange of folders that was interrupted, and remove what is incomplete."""
+        if not self.own.is_dir():
+            return
+        for made in self.own.glob("next-*"):
+            target = self.folder / made.name.removeprefix("next-")
+            if (made / ".complete").exists() and not target.exists():
+                os.rename(made, target)
+                (target / ".complete").unlink()
+            else:
+                shutil.rmtree(made)
+        shutil.rmtree(self.own / "old", ignore_errors=True)
+
+    # Settings and the solver.
+
+    @property
+    def control(self) -> Path:
+        """The file of the times of a run."""
+        return self.folder / "system" / "controlDict"
+
+    def control_number(self, name: str) -> float | None:
+        """Return the number of an entry of ``system/controlDict``; None if it is missing, or not a number."""
+        found = re.search(rf"^\s*{name}\s+([^;\s]+)\s*;", self.control.read_text(), re.MULTILINE)
+        try:
+            return float(found[1]) if found else None
+        except ValueError:
+            return None
+
+    def set_control(self, **entries: object) -> None:
+        """Change entries of ``system/controlDict``; the first time a copy is kept beside the reports."""
+        text = self.control.read_text()
+        kept = self.own / "controlDict.before"
+        if not kept.exists():
+            shutil.copy2(self.control, kept)
+        for name, value in entries.items():
+            line = re.compile(rf"^(\s*){name}\s+[^;]*;", re.MULTILINE)
+            written = f"{name} {value};"
+            text = line.sub(rf"\g<1>{written}", text, count=1) if line.search(text) else f"{text.rstrip()}\n{written}\n"
+        with atomic_file(self.control) as file:
+            file.write(text.encode())
+
+    def run(self, solver: str, log: Path) -> None:
+        """Run a program of OpenFOAM in the case; what it prints goes into `log`.
+
+        Raises
+        ------
+        InputError
+            If it is not installed.
+        ClvoroError
+            If it fails; with the end of the log.
+        """
+        words = solver.split()
+        if not words or shutil.which(words[0]) is None:
+            raise InputError(f"solver is {solver!r}, which is not on the PATH; load OpenFOAM's environment first")
+        environment = {"WM_PROJECT_DIR": _HOME, **os.environ}
+        with open(log, "wb") as file:
+            code = subprocess.run(words, cwd=self.folder, env=environment, stdout=file, stderr=file, check=False)
+        if code.returncode:
+            raise ClvoroError(
+                f"{solver} failed with code {code.returncode}: {log.read_text(errors='replace')[-_TAIL:]}\nsee {log}"
+            )
+
+    def monitors(self) -> dict[str, float]:
+        """Return the last values of the tables in ``postProcessing``, by function object and column."""
+        found: dict[str, float] = {}
+        for function in sorted((self.folder / "postProcessing").glob("*")):
+            starts = [path for path in function.glob("*") if re.fullmatch(r"[\d.eE+-]+", path.name)]
+            for path in sorted(max(starts, key=lambda p: float(p.name)).glob("*.dat")) if starts else []:
+                found |= {f"{function.name}.{column}": value for column, value in _last_row(path).items()}
+        return found
+
+
+def _has(folder: Path, name: str) -> bool:
+    return (folder / name).exists() or (folder / f"{name}.gz").exists()
+
+
+def _last_row(path: Path) -> dict[str, float]:
+    """Return the last row of a table by column, without the time; nothing if it is not a plain table."""
+    lines = path.read_text(errors="replace").splitlines()
+    heads = [line.strip("# \t").split() for line in lines if line.startswith("#")]
+    rows = [line.split() for line in lines if line and not line.startswith("#")]
+    if not heads or not rows or len(heads[-1]) != len(rows[-1]):
+        return {}
+    try:
+        values = np.array(rows[-1], float)
+    except ValueError:
+        return {}
+    return dict(zip(heads[-1][1:], values[1:].tolist(), strict=True))
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """Exchange two folders in one step; return whether the system can do that."""
+    try:
+        call = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    return call(_HERE, os.fsencode(a), _HERE, os.fsencode(b), _EXCHANGE) == 0
+
+
+def patch_entry(patches: Iterable[str], name: str) -> str | None:
+    """Return the key of a patch in a field: its name, else the last pattern in quotes that fits it."""
+    known = list(patches)
+    if name in known:
+        return name
+    for key in reversed(known):
+        if key.startswith('"') and re.fullmatch(key.strip('"'), name):
+            return key
+    return None

@@ -1,0 +1,447 @@
+"""Adapt a case of OpenFOAM to its solution: once, or in a loop with its solver."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from dataclasses import fields as fields_of
+from os import PathLike
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from ..adaptation.options import EffortName
+from ..adapter import Adapter
+from ..arguments import check_integer
+from ..errors import InputError, InputTypeError
+from ..geometry.boundary_layers import Layers
+from ..io import load
+from ..io.arrays import explained
+from ..io.atomic import atomic_file, check_writable, make_folder
+from ..io.foam import PatchType
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
+from ..shared import shared_adapter
+from ..sizing import Estimate, hessian_size
+from .case import FoamCase, Time
+from .fields import FoamField
+from .mesh import FoamMesh
+from .transfer import MeshOfCase, transfer_fields
+
+_MESH, _NOTE = "clvoro.npz", "clvoro.json"
+"""Files beside those of a polyMesh: the generators, and what is known of the cycle."""
+Estimator = Callable[[Mapping[str, np.ndarray], Diagram], Estimate]
+
+
+@dataclass(frozen=True)
+class FoamCycle:
+    """One row of the report: a solution, and the mesh that was made from it.
+
+    Attributes
+    ----------
+    cycle : int
+        0 for the first mesh.
+    time : float
+        Time, or iteration, at which the solution was read.
+    cells : int
+        Number of cells on which it was computed.
+    monitors : dict of str to float
+        Last values of the tables of the case's function objects, such as forces, as ``forces.Cd``.
+    solver_seconds : float
+        0 if the solver was run by hand.
+    predicted_error : float or None
+        The norm of the error that the next mesh has by the estimate; None if no mesh was made, after the last cycle.
+    next_cells : int or None
+    mesh_seconds, transfer_seconds : float or None
+    """
+
+    cycle: int
+    time: float
+    cells: int
+    monitors: dict[str, float] = field(default_factory=dict)
+    solver_seconds: float = 0.0
+    predicted_error: float | None = None
+    next_cells: int | None = None
+    mesh_seconds: float | None = None
+    transfer_seconds: float | None = None
+
+
+def adapt_case(
+    case: str | PathLike[str],
+    *,
+    n_cells: int,
+    fields: Sequence[str] = ("U", "p"),
+    cycles: int = 1,
+    solver: str | Callable[[Path], object] | None = None,
+    interval: float | None = None,
+    mesh: Result | Diagram | str | PathLike[str] | None = None,
+    layers: Layers | Sequence[Layers] | None = None,
+    estimate: Estimator | None = None,
+    p: float = 2.0,
+    h_min: float = 0.0,
+    h_max: float = math.inf,
+    growth: float = 1.2,
+    effort: EffortName = "default",
+    pictures: bool = True,
+    adapter: Adapter | None = None,
+    on_cycle: Callable[[FoamCycle], object] | None = None,
+) -> list[FoamCycle]:
+    """Adapt the mesh of a case of OpenFOAM to its latest solution, `cycles` times.
+
+    A cycle reads the latest time, estimates the sizes that interpolate `fields` best, adapts the present generators to
+    them, and transfers all fields in cells. The new mesh and its fields become the latest time, in place of the old
+    one, in one step: at any moment the case has a mesh that fits its fields. Fluxes `phi` are projected so that they
+    are free of divergence. Names and types of patches and boundary conditions stay; their lists of values are
+    interpolated.
+
+    With `solver` the case is solved first, between the cycles, and at the end. A call that was killed goes on where it
+    was, if it is repeated.
+
+    Parameters
+    ----------
+    case : path
+        The folder, not decomposed. In 2D one layer of cells normal to z between empty patches.
+    n_cells : int
+        Number of cells of the new mesh.
+    fields : sequence of str
+        Fields from which sizes are estimated; each has the same weight.
+    cycles : int
+        Number of meshes that are made, those of earlier calls included if there is a `solver`.
+    solver : str or callable, optional
+        A program of OpenFOAM, such as "simpleFoam", or a function of the folder that writes a later time. Without it
+        there is one cycle.
+    interval : float, optional
+        Time, or number of iterations, that the solver advances in each cycle. By default the time from the start to the
+        end of ``system/controlDict``. Its entries `startFrom` and `endTime` change.
+    mesh : Result, Diagram or path, optional
+        The present mesh as clvoro made it; by default ``polyMesh/clvoro.npz``, else the boundary of the case becomes a
+        polygon or a solid, and the centroids of its cells the generators.
+    layers : Layers or sequence of Layers, optional
+        Boundary layers of the new meshes; by default those of the last call.
+    estimate : callable, optional
+        In place of the Hessian of `fields`: takes the fields by name, (n,) or (n, d), and the diagram, and returns an
+        estimate. It is scaled to `n_cells`.
+    p, h_min, h_max, growth
+        As for `hessian_size`.
+    effort : "fast", "default" or "best"
+        As for `Adapter.run`.
+    pictures : bool
+        Draw the mesh of each cycle, colored by the size of the first of `fields`, into ``clvoro/cycle-K.png`` (2D).
+    adapter : Adapter, optional
+        By default the shared one, on the best device.
+    on_cycle : callable, optional
+        Called with each row of the report.
+
+    Returns
+    -------
+    list of FoamCycle
+        Also as ``clvoro/report.csv`` in the case.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        Before anything is written: if there is no time or mesh, a field is missing, has another length or is not
+        finite; the estimate is zero everywhere; the patches are not those of `mesh`; or an argument is wrong.
+    ClvoroError
+        If the solver fails.
+
+    Examples
+    --------
+    Three cycles, unattended::
+
+        rows = clvoro.foam.adapt_case("cylinder", n_cells=6000, cycles=3, solver="simpleFoam")
+        print(rows[-1].monitors["forces.Cd"])
+    """
+    check_integer("n_cells", n_cells, 1)
+    check_integer("cycles", cycles, 1)
+    if solver is None and cycles > 1:
+        raise InputError(f"cycles is {cycles} without a solver, expected 1; give solver=, such as 'simpleFoam'")
+    if isinstance(fields, str) or not fields or not all(isinstance(name, str) for name in fields):
+        raise InputTypeError(f"fields is {fields!r:.60}, expected names, such as ('U', 'p')")
+    loop = _Loop(
+        FoamCase(case),
+        n_cells,
+        tuple(fields),
+        estimate or (lambda found, on: hessian_size([found[f] for f in fields], on=on, n_cells=n_cells, **bounds)),
+        None if layers is None else (layers,) if isinstance(layers, Layers) else tuple(layers),
+        effort,
+        pictures,
+        adapter or shared_adapter(),
+    )
+    bounds: dict[str, Any] = {"p": p, "h_min": h_min, "h_max": h_max, "growth": growth}
+    return loop.run(mesh, cycles, solver, interval, on_cycle)
+
+
+@dataclass
+class _Loop:
+    case: FoamCase
+    n_cells: int
+    names: tuple[str, ...]
+    estimate: Estimator
+    layers: tuple[Layers, ...] | None
+    effort: EffortName
+    pictures: bool
+    adapter: Adapter
+    rows: list[FoamCycle] = field(default_factory=list)
+
+    def run(
+        self,
+        mesh: object,
+        cycles: int,
+        solver: str | Callable[[Path], object] | None,
+        interval: float | None,
+        on_cycle: Callable[[FoamCycle], object] | None,
+    ) -> list[FoamCycle]:
+        case = self.case
+        case.mend()
+        note = self._note(case.latest())
+        self.rows = _read_report(case.own / "report.csv")[: note["cycle"] + 1]
+        if note["cycle"]:
+            # The report is written after the mesh: a call may have been killed in between.
+            self.rows[note["cycle"] - 1 : note["cycle"]] = [FoamCycle(**note["row"])]
+        if solver is None:
+            # Before anything is written.
+            known = self.rows[note["cycle"]] if len(self.rows) > note["cycle"] else self._solved(note, 0.0)
+            done = self._adapt(known, note, mesh)
+            if on_cycle is not None:
+                on_cycle(done)
+            return self.rows
+        length = self._interval(interval)
+        check_writable(case.folder)
+        make_folder(case.own)
+        while True:
+            note = self._note(case.latest())
+            known = self.rows[note["cycle"]] if len(self.rows) > note["cycle"] else None
+            if known is None:
+                known = self._solve(solver, note, length)
+            if note["cycle"] >= cycles:
+                if on_cycle is not None:
+                    on_cycle(known)
+                return self.rows
+            known = self._adapt(known, note, mesh)
+            if on_cycle is not None:
+                on_cycle(known)
+
+    def _note(self, time: Time) -> dict[str, Any]:
+        """Return what is known of the mesh at a time: cycle, time of the transfer, layers."""
+        path = self.case.mesh_folder(time) / _NOTE
+        if not path.exists():
+            return {"cycle": 0, "time": None, "layers": []}
+        with explained(path, "the note of a cycle"):
+            return json.loads(path.read_text())
+
+    def _interval(self, given: float | None) -> float:
+        if given is None:
+            case = self.case
+            end, begin = case.control_number("endTime"), case.control_number("startTime")
+            kept = case.own / "interval"
+            if kept.exists():
+                return float(kept.read_text())
+            if end is None or end <= (begin or 0.0):
+                raise InputError(
+                    f"{case.control} has no endTime after its startTime, expected both; write them, or pass interval="
+                )
+            make_folder(case.own)
+            given = end - (begin or 0.0)
+            kept.write_text(repr(given))
+        if not (math.isfinite(given) and given > 0):
+            raise InputError(f"interval is {given!r}, expected a positive number")
+        return given
+
+    def _solve(self, solver: str | Callable[[Path], object], note: dict[str, Any], length: float) -> FoamCycle:
+        """Run the solver on the present mesh; return the row of its solution."""
+        case = self.case
+        before = case.latest()
+        begin = before.value if note["time"] is None else note["time"]
+        case.set_control(startFrom="latestTime", endTime=f"{begin + length:.12g}")
+        start = time.perf_counter()
+        if callable(solver):
+            solver(case.folder)
+        else:
+            case.run(solver, case.own / f"log.cycle-{note['cycle']}")
+        after = case.latest()
+        if after.value <= begin:
+            raise InputError(
+                f"{solver} has written no time after {before.name}; let writeInterval in {case.control} divide the "
+                f"interval of {length:g}"
+            )
+        return self._solved(note, time.perf_counter() - start)
+
+    def _solved(self, note: dict[str, Any], seconds: float) -> FoamCycle:
+        """Return the row of the latest solution, and add it to the report."""
+        case = self.case
+        latest = case.latest()
+        cells = FoamMesh.read(case.mesh_folder(latest)).n_cells
+        row = FoamCycle(note["cycle"], latest.value, cells, case.monitors(), seconds)
+        if seconds:
+            self._keep(row)
+        return row
+
+    def _keep(self, row: FoamCycle) -> None:
+        self.rows[row.cycle :] = [row]
+        _write_report(self.case.own / "report.csv", self.rows)
+
+    def _adapt(self, row: FoamCycle, note: dict[str, Any], mesh: object) -> FoamCycle:
+        """Make the next mesh, transfer the fields, and put them in place; return the row with figures of the mesh."""
+        case, latest = self.case, self.case.latest()
+        start = time.perf_counter()
+        folder = case.mesh_folder(latest)
+        foam = FoamMesh.read(folder)
+        old = MeshOfCase.of(foam, self._diagram(folder, foam, mesh if note["cycle"] == 0 else None))
+        fields = case.fields(latest)
+        _check_lengths(fields, foam)
+        size = self._sizes(fields, old)
+        layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
+        domain = old.diagram.domain
+        made = self.adapter.run(
+            domain, size, self.effort, points=old.diagram.points, n_cells=self.n_cells, layers=layers
+        )
+        mesh_seconds = time.perf_counter() - start
+        make_folder(case.own)
+        target = case.own / f"next-{latest.name}"
+        shutil.rmtree(target, ignore_errors=True)
+        types = cast(dict[str, PatchType], {name: foam.types[name] for name in domain.boundary_names})
+        shutil.copytree(case.folder / latest.name, target, ignore=_only_uniform)
+        made.to_openfoam(target / "polyMesh", types=types, thickness=foam.thickness)
+        made.save(target / "polyMesh" / _MESH)
+        new = MeshOfCase.of(FoamMesh.read(target / "polyMesh"), made.diagram)
+        start = time.perf_counter()
+        for moved in transfer_fields(fields, old, new, self.adapter):
+            moved.write(target / moved.name, latest.name)
+        transfer_seconds = time.perf_counter() - start
+        if self.pictures and old.diagram.domain.dim == 2:
+            self._draw(old, fields, row.cycle)
+        done = FoamCycle(
+            row.cycle,
+            row.time,
+            row.cells,
+            row.monitors,
+            row.solver_seconds,
+            size.norm,
+            new.foam.n_cells,
+            mesh_seconds,
+            transfer_seconds,
+        )
+        described = [asdict(layer) for layer in layers]
+        known = {"cycle": row.cycle + 1, "time": latest.value, "layers": described, "row": asdict(done)}
+        (target / "polyMesh" / _NOTE).write_text(json.dumps(known))
+        case.put_time(latest.name, target)
+        self._keep(done)
+        return done
+
+    def _diagram(self, folder: Path, foam: FoamMesh, given: object) -> Diagram:
+        """Return the diagram of the present mesh: given, kept beside it, or of the boundary and the centroids."""
+        if given is None and (folder / _MESH).exists():
+            given = folder / _MESH
+        if isinstance(given, str | PathLike):
+            given = load(given)
+        if isinstance(given, Result):
+            given = given.diagram
+        if given is None:
+            domain = foam.domain()
+            return self.adapter.diagram(domain, foam.centroids[:, : domain.dim])
+        if not isinstance(given, Diagram):
+            raise InputTypeError(f"mesh is a {type(given).__name__}, expected a clvoro.Result, a Diagram or a path")
+        own, there = set(given.domain.boundary_names), set(foam.types)
+        if own != there:
+            raise InputError(
+                f"mesh has the boundaries {', '.join(sorted(own))}, the case the patches {', '.join(sorted(there))}; "
+                "expected the same names: give them to the domain, and write the case from it"
+            )
+        if foam.n_cells != len(given) and not given.domain.curved_walls:
+            raise InputError(f"mesh has {len(given)} cells, the case {foam.n_cells}; expected the mesh of the case")
+        return given
+
+    def _sizes(self, fields: Sequence[FoamField], old: MeshOfCase) -> Estimate:
+        found: dict[str, np.ndarray] = {}
+        for one in fields:
+            if one.in_cells:
+                columns = old.to_diagram(one.internal.rows(old.foam.n_cells))
+                if one.type == "vector":
+                    columns = columns[:, : old.diagram.domain.dim]
+                found[one.name] = columns[:, 0] if one.type == "scalar" else columns
+        missing = [name for name in self.names if name not in found]
+        if missing:
+            raise InputError(
+                f"the latest time of {self.case.folder} has no field {missing[0]}, expected one of {', '.join(found)}"
+            )
+        for name in self.names:
+            bad = ~np.isfinite(found[name].reshape(len(found[name]), -1)).all(axis=1)
+            if bad.any():
+                raise InputError(
+                    f"{name} is not finite in {int(bad.sum())} cells, the first is {int(bad.argmax())}; the solver has "
+                    "diverged: go back to an earlier time"
+                )
+        made = self.estimate(found, old.diagram)
+        if not isinstance(made, Estimate):
+            raise InputTypeError(f"estimate returned a {type(made).__name__}, expected a clvoro.sizing.Estimate")
+        return made
+
+    def _draw(self, old: MeshOfCase, fields: Sequence[FoamField], cycle: int) -> None:
+        """Draw the mesh and the solution of a cycle."""
+        import importlib.util
+
+        if importlib.util.find_spec("matplotlib") is None:
+            return
+        by_name = {one.name: one for one in fields}
+        values = old.to_diagram(by_name[self.names[0]].internal.rows(old.foam.n_cells))
+        figure = old.diagram.plot(np.linalg.norm(values, axis=1), label=self.names[0])
+        figure.axes[0].set_title(f"cycle {cycle}: {old.foam.n_cells:,} cells", loc="left")
+        figure.savefig(self.case.own / f"cycle-{cycle}.png", dpi=150)
+
+
+def _only_uniform(folder: str, names: list[str]) -> list[str]:
+    """Return what is not copied to the next mesh: all but the folder ``uniform``."""
+    return [] if Path(folder).name == "uniform" or "time" in names else [name for name in names if name != "uniform"]
+
+
+def _check_lengths(fields: Sequence[FoamField], foam: FoamMesh) -> None:
+    """Raise InputError if a field has not a value for each cell."""
+    for one in fields:
+        if one.in_cells:
+            values = one.internal
+            if not values.uniform and len(values.numbers) != foam.n_cells:
+                raise InputError(
+                    f"the field {one.name} has {len(values.numbers)} values, the mesh {foam.n_cells} cells; expected a "
+                    "time and its own mesh"
+                )
+
+
+def _layers_of(described: Sequence[Mapping[str, Any]]) -> list[Layers]:
+    return [Layers(**{**one, "edges": None if one["edges"] is None else tuple(one["edges"])}) for one in described]
+
+
+_COLUMNS = tuple(one.name for one in fields_of(FoamCycle) if one.name != "monitors")
+
+
+def _write_report(path: Path, rows: Sequence[FoamCycle]) -> None:
+    monitors = list(dict.fromkeys(name for row in rows for name in row.monitors))
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([*_COLUMNS, *monitors])
+    for row in rows:
+        own = [getattr(row, name) for name in _COLUMNS]
+        table.writerow(["" if v is None else v for v in (*own, *(row.monitors.get(m) for m in monitors))])
+    with atomic_file(path) as file:
+        file.write(text.getvalue().encode())
+
+
+def _read_report(path: Path) -> list[FoamCycle]:
+    if not path.exists():
+        return []
+    found = []
+    with open(path, newline="") as file:
+        for given in csv.DictReader(file):
+            numbers = {key: float(value) for key, value in given.items() if value}
+            own: dict[str, Any] = {key: numbers.pop(key, None) for key in _COLUMNS}
+            for key in ("cycle", "cells", "next_cells"):
+                own[key] = None if own[key] is None else int(own[key])
+            found.append(FoamCycle(**own, monitors=numbers))
+    return found

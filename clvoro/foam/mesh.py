@@ -1,0 +1,215 @@
+"""The mesh of a case: its cells and patches as OpenFOAM sees them, and its boundary as a domain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.domain import Domain
+from ..geometry.polygon import Polygon
+from ..geometry.rings import signed_area
+from ..geometry.solid.solid import Solid
+from ..io.arrays import FileError, explained
+from ..io.foam_read import FoamFile, FoamPatchFaces
+from ..mesh.geometry import face_geometry
+
+
+@dataclass(frozen=True)
+class FoamMesh:
+    """A polyMesh.
+
+    Attributes
+    ----------
+    points : (v, 3) float64
+    starts, corners : (f + 1,), (k,) int64
+        Corners of the faces.
+    owner, neighbor : (f,), (i,) int64
+        Cells of each face; inner faces come first.
+    patches : list
+        Name, kind, and faces of each part of the boundary.
+    """
+
+    points: np.ndarray
+    starts: np.ndarray
+    corners: np.ndarray
+    owner: np.ndarray
+    neighbor: np.ndarray
+    patches: list[FoamPatchFaces]
+
+    @classmethod
+    def read(cls, folder: Path) -> FoamMesh:
+        """Read a folder ``polyMesh``.
+
+        Raises
+        ------
+        InputError
+            If a file is missing or damaged, or there is no boundary.
+        """
+        with explained(folder, "the files points, faces, owner, neighbour and boundary"):
+            points = FoamFile.read(folder, "points").vectors()
+            starts, corners = FoamFile.read(folder, "faces").rows()
+            owner = FoamFile.read(folder, "owner").labels()
+            neighbor = FoamFile.read(folder, "neighbour").labels()
+            patches = FoamFile.read(folder, "boundary").patches()
+            if not any(len(patch.faces) for patch in patches if patch.kind != "empty"):
+                raise FileError("its boundary has no patch with faces, expected walls, inlets, ...")
+            return cls(points, starts, corners, owner, neighbor, patches)
+
+    @cached_property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return int(max(self.owner.max(initial=-1), self.neighbor.max(initial=-1))) + 1
+
+    @cached_property
+    def faces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centers and area vectors of the faces, (f, 3) each; these point out of the owner."""
+        return face_geometry(self.points, self.starts, self.corners)
+
+    @cached_property
+    def _cells(self) -> tuple[np.ndarray, np.ndarray]:
+        """Volumes and centroids, by pyramids over the faces."""
+        centers, areas = self.faces
+        n, inner = self.n_cells, len(self.neighbor)
+        count = np.bincount(self.owner, minlength=n) + np.bincount(self.neighbor, minlength=n)
+        middle = _sum(self.owner, centers, n) + _sum(self.neighbor, centers[:inner], n)
+        middle /= count[:, None]
+        volumes, moments = np.zeros(n), np.zeros((n, 3))
+        for cells, sign in ((self.owner, 1.0), (self.neighbor, -1.0)):
+            to = centers[: len(cells)] - middle[cells]
+            pyramids = sign * (to * areas[: len(cells)]).sum(axis=1) / 3
+            volumes += np.bincount(cells, pyramids, n)
+            moments += _sum(cells, pyramids[:, None] * 0.75 * to, n)
+        return volumes, middle + moments / volumes[:, None]
+
+    @property
+    def volumes(self) -> np.ndarray:
+        """Volumes of the cells, (n,)."""
+        return self._cells[0]
+
+    @property
+    def centroids(self) -> np.ndarray:
+        """Centroids of the cells, (n, 3)."""
+        return self._cells[1]
+
+    @cached_property
+    def is_plane(self) -> bool:
+        """Whether it is one layer of cells between empty patches, normal to z."""
+        flat = [patch.faces for patch in self.patches if patch.kind == "empty" and len(patch.faces)]
+        return (
+            bool(flat)
+            and len(np.concatenate(flat)) == 2 * self.n_cells
+            and bool(np.abs(self.faces[1][np.concatenate(flat), :2]).max() < 1e-6 * np.abs(self.faces[1]).max())
+        )
+
+    @property
+    def thickness(self) -> float | None:
+        """Height of the layer of cells; None in space."""
+        return float(np.ptp(self.points[:, 2])) if self.is_plane else None
+
+    @property
+    def types(self) -> dict[str, str]:
+        """Types of the patches with faces, without those of the layer."""
+        return {patch.name: patch.kind for patch in self.patches if patch.kind != "empty"}
+
+    def domain(self) -> Domain:
+        """Return the inside of the boundary: a polygon, or a solid. Boundaries have the names of the patches.
+
+        Raises
+        ------
+        InputError
+            If patches are of a kind that no domain has, such as cyclic or wedge ones; or the boundary is not closed.
+        """
+        known = ("wall", "patch", "symmetry", "symmetryPlane")
+        other = [f"{p.name} ({p.kind})" for p in self.patches if p.kind not in (*known, "empty") and len(p.faces)]
+        if other:
+            raise InputError(
+                f"the case has patches {', '.join(other)}, expected types {', '.join(known)}, or one layer of cells "
+                "between empty patches; mesh it with clvoro, and pass mesh="
+            )
+        return self._polygon() if self.is_plane else self._solid()
+
+    def _polygon(self) -> Polygon:
+        ends, names = [], []
+        low = self.points[:, 2] < self.points[:, 2].mean()
+        for patch in self.patches:
+            if patch.kind == "empty":
+                continue
+            for face in patch.faces.tolist():
+                corners = self.corners[self.starts[face] : self.starts[face + 1]]
+                below = corners[low[corners]]
+                if len(below) != 2:
+                    raise InputError(f"face {face} of patch {patch.name} is not one edge high; pass mesh=")
+                ends.append(below)
+                names.append(patch.name)
+        return polygon_of_edges(self.points[:, :2], np.array(ends), names)
+
+    def _solid(self) -> Solid:
+        triangles, groups = [], []
+        for k, patch in enumerate(self.patches):
+            for face in patch.faces.tolist():
+                corners = self.corners[self.starts[face] : self.starts[face + 1]]
+                fan = np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
+                triangles.append(fan)
+                groups += [k] * len(fan)
+        used, rows = np.unique(np.concatenate(triangles), return_inverse=True)
+        return Solid(self.points[used], rows.reshape(-1, 3), groups, [patch.name for patch in self.patches])
+
+
+def polygon_of_edges(points: np.ndarray, ends: np.ndarray, names: list[str]) -> Polygon:
+    """Return the polygon whose boundary is made of edges; straight runs of edges with one name become one edge.
+
+    Parameters
+    ----------
+    points : (v, 2) float
+    ends : (k, 2) int
+    names : list of k str
+
+    Raises
+    ------
+    InputError
+        If they do not close.
+    """
+    at: dict[int, list[int]] = {}
+    for k, pair in enumerate(ends.tolist()):
+        for v in pair:
+            at.setdefault(v, []).append(k)
+    open_ends = [v for v, edges in at.items() if len(edges) != 2]
+    if open_ends:
+        x, y = points[open_ends[0]]
+        raise InputError(f"the boundary is not closed, or touches itself, at ({x:g}, {y:g}); pass mesh=")
+    left, rings = set(range(len(ends))), []
+    while left:
+        edge = min(left)
+        begin, v = ends[edge].tolist()
+        ring = [(begin, names[edge])]
+        left.discard(edge)
+        while v != begin:
+            edge = next(k for k in at[v] if k != edge)
+            left.discard(edge)
+            ring.append((v, names[edge]))
+            a, b = ends[edge].tolist()
+            v = b if a == v else a
+        rings.append(_without_straight_corners(points, ring))
+    rings.sort(key=lambda ring: -abs(signed_area(points[[v for v, _ in ring]])))
+    every = [name for ring in rings for _, name in ring]
+    edges = {name: [k for k, other in enumerate(every) if other == name] for name in dict.fromkeys(names)}
+    made = [points[[v for v, _ in ring]] for ring in rings]
+    return Polygon(made[0], made[1:], names=edges)
+
+
+def _without_straight_corners(points: np.ndarray, ring: list[tuple[int, str]]) -> list[tuple[int, str]]:
+    """Return the ring without the corners between two edges of one name on one line."""
+    x = points[[v for v, _ in ring]]
+    before, after = x - np.roll(x, 1, axis=0), np.roll(x, -1, axis=0) - x
+    turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    size = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    kept = [k for k, (_, name) in enumerate(ring) if abs(turn[k]) > 1e-7 * size[k] or name != ring[k - 1][1]]
+    return [ring[k] for k in kept] if len(kept) > 2 else ring
+
+
+def _sum(rows: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+    return np.stack([np.bincount(rows, column, n) for column in values.T], axis=1)

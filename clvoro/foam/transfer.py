@@ -1,0 +1,205 @@
+"""Fields from the mesh of a case to the next one: cells conservatively, patches, and fluxes free of divergence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+
+from ..geometry.box import Box
+from ..mesh.diagram import Diagram
+from .case import patch_entry
+from .fields import WIDTHS, Entries, FoamField, Values
+from .fluxes import project_fluxes
+from .mesh import FoamMesh
+
+if TYPE_CHECKING:
+    from ..adapter import Adapter
+
+_OPEN = ("zeroGradient", "inletOutlet", "outletInlet", "pressureInlet", "freestream", "advective", "waveTransmissive")
+"""Beginnings of the types of a velocity at patches through which the flux is free."""
+_CLOSED = ("noSlip", "slip", "symmetry", "symmetryPlane", "empty", "cyclic", "wedge")
+_VOLUME_FLUX = (0.0, 3.0, -1.0)
+
+
+@dataclass(frozen=True)
+class MeshOfCase:
+    """The mesh of a case, as OpenFOAM's and as a diagram.
+
+    Attributes
+    ----------
+    foam : FoamMesh
+    diagram : Diagram
+    row : (c,) int
+        The cell of the diagram to which each cell of OpenFOAM belongs: where cells are merged or divided at walls, not
+        all have one of their own.
+    """
+
+    foam: FoamMesh
+    diagram: Diagram
+    row: np.ndarray
+
+    @classmethod
+    def of(cls, foam: FoamMesh, diagram: Diagram) -> MeshOfCase:
+        """Join both meshes."""
+        if foam.n_cells == len(diagram):
+            return cls(foam, diagram, np.arange(len(diagram)))
+        centroids = foam.centroids[:, : diagram.domain.dim]
+        return cls(foam, diagram, scipy.spatial.KDTree(diagram.points).query(centroids)[1])
+
+    def to_diagram(self, values: np.ndarray) -> np.ndarray:
+        """Return the means of values (c, k) over the cells of the diagram, (n, k); of the nearest one if there is none.
+
+        They are numbers that a solver has for its cells.
+        """
+        n = len(self.diagram)
+        if len(self.row) == n:
+            return values
+        volume = np.bincount(self.row, self.foam.volumes, n)
+        sums = np.stack([np.bincount(self.row, self.foam.volumes * v, n) for v in values.T], axis=1)
+        empty = volume == 0
+        means = sums / np.where(empty, 1, volume)[:, None]
+        if empty.any():
+            nearest = scipy.spatial.KDTree(self.foam.centroids[:, : self.diagram.domain.dim]).query(
+                self.diagram.points[empty]
+            )[1]
+            means[empty] = values[nearest]
+        return means
+
+
+def transfer_fields(fields: Sequence[FoamField], old: MeshOfCase, new: MeshOfCase, adapter: Adapter) -> list[FoamField]:
+    """Return all fields in cells on the new mesh, and the flux `phi` of the velocity `U`.
+
+    In cells the sum of volume times value is that on the old mesh, with the volumes of the solver, and there are no new
+    extrema. Other fields on faces are left out: solvers make them.
+    """
+    in_cells = [field for field in fields if field.in_cells]
+    widths = [WIDTHS[field.type] for field in in_cells]
+    columns = np.concatenate([f.internal.rows(old.foam.n_cells) for f in in_cells], axis=1)
+    # Columns without differences are not transferred: the third component in the plane, for one.
+    moving = np.ptp(columns, axis=0) > 0
+    values = np.repeat(columns[:1], new.foam.n_cells, axis=0)
+    if moving.any():
+        given = old.to_diagram(columns[:, moving])
+        carried = _carry(given, old.diagram, new.diagram, adapter)[new.row]
+        values[:, moving] = conserve(columns[:, moving], old.foam.volumes, carried, new.foam.volumes)
+    made = []
+    for field, part in zip(in_cells, np.split(values, np.cumsum(widths)[:-1], axis=1), strict=True):
+        given = field.internal
+        internal = given if given.uniform else Values(given.kind, part, False)
+        made.append(replace(field, entries=_with_boundary(field, internal, old.foam, new.foam)))
+    by_name = {field.name: field for field in made}
+    velocity = by_name.get("U")
+    for field in fields:
+        if field.name == "phi" and field.dimensions[:3] == _VOLUME_FLUX and velocity is not None:
+            made.append(_flux(field, velocity, new.foam))
+    return made
+
+
+def _carry(values: np.ndarray, old: Diagram, new: Diagram, adapter: Adapter) -> np.ndarray:
+    """Return cell data on the new diagram. In a solid the cells of the box around it take its place."""
+    if old.domain.curved_walls:
+        every = np.concatenate([old.points, new.points])
+        margin = 0.01 * np.ptp(every, axis=0).max()
+        box = Box(tuple((every.min(axis=0) - margin).tolist()), tuple((every.max(axis=0) + margin).tolist()))
+        old, new = adapter.diagram(box, old.points), adapter.diagram(box, new.points)
+    return old.transfer(values, onto=new, order=2, adapter=adapter)
+
+
+def conserve(old: np.ndarray, old_volumes: np.ndarray, new: np.ndarray, volumes: np.ndarray) -> np.ndarray:
+    """Return `new` (n, k) with the sums of volume times value that `old` (m, k) has, and within its extrema.
+
+    Each value moves towards an extremum by one share of its distance from it.
+    """
+    low, high = old.min(axis=0), old.max(axis=0)
+    made = np.clip(new, low, high)
+    ratio = np.sum(old_volumes, dtype=np.longdouble) / np.sum(volumes, dtype=np.longdouble)
+    for _ in range(2):  # the second time corrects the round-off of the first
+        for c in range(made.shape[1]):
+            # Volumes of two meshes of one domain differ where walls are curved: means are kept then.
+            wanted = np.sum(np.multiply(old_volumes, old[:, c], dtype=np.longdouble)) / ratio
+            missing = wanted - np.sum(np.multiply(volumes, made[:, c], dtype=np.longdouble))
+            room = (high[c] if missing > 0 else low[c]) - made[:, c]
+            capacity = np.sum(np.multiply(volumes, room, dtype=np.longdouble))
+            if missing != 0 and capacity != 0:
+                made[:, c] += min(float(missing / capacity), 1.0) * room
+    return np.clip(made, low, high)
+
+
+def _with_boundary(field: FoamField, internal: Values, old: FoamMesh, new: FoamMesh) -> Entries:
+    """Return the entries of a field on the new mesh: lists of values at patches are interpolated."""
+    boundary: Entries = {}
+    before = {patch.name: patch.faces for patch in old.patches}
+    for patch in new.patches:
+        key = patch_entry(field.patches, patch.name)
+        if patch.kind == "empty" or key is None:
+            boundary[patch.name] = {"type": b"empty" if patch.kind == "empty" else b"zeroGradient"}
+            continue
+        faces = before.get(patch.name, np.zeros(0, int))
+        boundary[patch.name] = _on_patch(field.patches[key], faces, patch.faces, old, new)
+    return {**field.entries, "internalField": internal, "boundaryField": boundary}
+
+
+def _on_patch(entries: Entries, before: np.ndarray, faces: np.ndarray, old: FoamMesh, new: FoamMesh) -> Entries:
+    made: Entries = {}
+    for name, value in entries.items():
+        if isinstance(value, dict):
+            made[name] = _on_patch(value, before, faces, old, new)
+        elif isinstance(value, Values) and not value.uniform and len(value.numbers) == len(before) > 0:
+            made[name] = replace(value, numbers=_interpolate(value.numbers, before, faces, old, new))
+        elif isinstance(value, Values) and not value.uniform and len(value.numbers) != len(faces):
+            continue  # of faces that are not there: the solver evaluates the condition
+        else:
+            made[name] = value
+    return made
+
+
+def _interpolate(values: np.ndarray, before: np.ndarray, faces: np.ndarray, old: FoamMesh, new: FoamMesh) -> np.ndarray:
+    """Return values (k, w) at the new faces of a patch: linear between the two nearest old ones, with the same mean."""
+    centers, areas = old.faces[0][before], np.linalg.norm(old.faces[1][before], axis=1)
+    at, sizes = new.faces[0][faces], np.linalg.norm(new.faces[1][faces], axis=1)
+    if len(centers) == 1 or len(at) == 0:
+        return np.repeat(values[:1], len(at), axis=0)
+    if old.is_plane:
+        _, near = scipy.spatial.KDTree(centers[:, :2]).query(at[:, :2], 2)
+        a, b = centers[near[:, 0]], centers[near[:, 1]]
+        along = ((at - a) * (b - a))[:, :2].sum(axis=1) / np.maximum(((b - a)[:, :2] ** 2).sum(axis=1), 1e-300)
+        # Beyond the last face the line goes on.
+        share = np.clip(along, -1, 1)[:, None]
+        made = (1 - share) * values[near[:, 0]] + share * values[near[:, 1]]
+    else:
+        apart, near = (a.reshape(len(at), -1) for a in scipy.spatial.KDTree(centers).query(at, min(4, len(centers))))
+        weight = 1 / np.maximum(apart, 1e-9 * apart.max()) ** 2
+        made = (weight[..., None] * values[near]).sum(axis=1) / weight.sum(axis=1)[:, None]
+    return made + (areas @ values / areas.sum() - sizes @ made / sizes.sum())
+
+
+def _flux(field: FoamField, velocity: FoamField, mesh: FoamMesh) -> FoamField:
+    """Return the field `phi` of a velocity, free of divergence."""
+    inner, n = len(mesh.neighbor), mesh.n_cells
+    at_boundary, is_open = np.zeros(len(mesh.owner) - inner), np.zeros(len(mesh.owner) - inner, bool)
+    areas = mesh.faces[1]
+    for patch in mesh.patches:
+        rows = patch.faces - inner
+        entries = velocity.patches.get(patch.name, {})
+        kind = entries.get("type", b"")
+        name = kind.decode() if isinstance(kind, bytes) else ""
+        value = entries.get("value")
+        if name.startswith(_CLOSED) or patch.kind == "empty":
+            continue
+        if name.startswith(_OPEN) or not isinstance(value, Values):
+            is_open[rows] = True
+        else:
+            at_boundary[rows] = (value.rows(len(rows)) * areas[patch.faces]).sum(axis=1)
+    flux = project_fluxes(mesh, velocity.internal.rows(n), at_boundary, is_open)
+    boundary: Entries = {}
+    for patch in mesh.patches:
+        if patch.kind == "empty":
+            boundary[patch.name] = {"type": b"empty", "value": Values("scalar", np.zeros((0, 1)), False)}
+        else:
+            boundary[patch.name] = {"type": b"calculated", "value": Values("scalar", flux[patch.faces, None], False)}
+    internal = Values("scalar", flux[:inner, None], False)
+    return replace(field, entries={**field.entries, "internalField": internal, "boundaryField": boundary})

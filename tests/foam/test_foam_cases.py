@@ -1,0 +1,330 @@
+"""Cases of OpenFOAM that follow a solution: their fields, one cycle, and loops that are interrupted."""
+
+import gzip
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro import foam, sizing
+from clvoro.errors import ClvoroError, InputError, InputTypeError
+from clvoro.foam import case as cases
+from clvoro.foam.case import FoamCase
+from clvoro.foam.fluxes import MOST_DIVERGENCE, divergence
+from clvoro.foam.mesh import FoamMesh, polygon_of_edges
+
+HOLE = [(0.9, 0.4), (1.1, 0.4), (1.1, 0.6), (0.9, 0.6)]
+DOMAIN = clvoro.Polygon(
+    [(0, 0), (3, 0), (3, 1), (0, 1)], [HOLE], names={"walls": [0, 2], "outlet": 1, "inlet": 3, "body": range(4, 8)}
+)
+TEXT = b"""FoamFile { version 2.0; format ascii; class volVectorField; object U; }
+// a comment; with { signs
+dimensions [0 1 -1 0 0 0 0];
+internalField nonuniform List<vector> 2((1 2 3) (4 -5e-3 6));
+boundaryField
+{
+    inlet { type fixedValue; value uniform (1 0 0); table { file "a b"; coeffs (1 2); } }
+    "wall.*" { type noSlip; }
+    back { type empty; value nonuniform 0(); }
+    out { type calculated; value nonuniform List<vector> 3{(1 1 1)}; }
+}
+"""
+
+
+def test_fields_are_read_and_written(tmp_path):
+    path = tmp_path / "U"
+    path.write_bytes(TEXT)
+    field = foam.read_field(path)
+    assert (field.name, field.type, field.in_cells, field.dimensions[:3]) == ("U", "vector", True, (0, 1, -1))
+    assert field.internal.numbers.tolist() == [[1, 2, 3], [4, -5e-3, 6]]
+    assert field.patches["inlet"]["value"].rows(3).tolist() == [[1, 0, 0]] * 3
+    assert field.patches["inlet"]["table"] == {"file": b'"a b"', "coeffs": b"(1 2)"}
+    assert field.patches["out"]["value"].numbers.tolist() == [[1, 1, 1]] * 3
+    for binary in (False, True):
+        made = foam.FoamField(field.name, field.kind, binary, field.entries)
+        made.write(tmp_path / "again", "5")
+        (tmp_path / "packed.gz").write_bytes(gzip.compress((tmp_path / "again").read_bytes()))
+        for name in ("again", "packed.gz"):
+            again = foam.read_field(tmp_path / name)
+            assert again.binary is binary
+            assert again.internal.numbers.tolist() == field.internal.numbers.tolist()
+            assert list(again.patches) == list(field.patches)
+            assert again.patches["back"]["value"].numbers.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        (b"FoamFile", b"File", "no head"),
+        (b"(4 -5e-3 6));", b"(4 -5e-3));", "has 5 numbers, expected 6"),
+        (b"3{(1 1 1)};", b"3{(1 1 1)}", "no"),
+        (b"dimensions [", b'#include "other"\ndimensions [', "only OpenFOAM reads"),
+        (b"List<vector> 2(", b"List<label> 2(", "type label"),
+    ],
+)
+def test_damaged_fields_are_refused(tmp_path, old, new, text):
+    path = tmp_path / "U"
+    path.write_bytes(TEXT.replace(old, new))
+    with pytest.raises(InputError, match=text):
+        foam.read_field(path)
+
+
+def velocity(x):
+    """Return a flow from left to right that is not free of divergence, with a layer."""
+    u = 4 * x[:, 1] * (1 - x[:, 1])
+    return np.column_stack([u, 0.3 * np.tanh(20 * (x[:, 0] - 1.5)) * u, 0 * u])
+
+
+def put_fields(folder, name, binary=False):
+    """Write U, p and phi at a time on the present mesh of a case."""
+    mesh = FoamMesh.read(FoamCase(folder).mesh_folder(cases.Time(name, float(name))))
+    time = folder / name
+    (time / "uniform").mkdir(parents=True, exist_ok=True)
+    (time / "uniform" / "time").write_text("deltaT 1;")
+    (time / "notes").write_text("FoamFile { version 2.0; class dictionary; object notes; }\nno field;\n")
+    centers = {patch.name: mesh.faces[0][patch.faces] for patch in mesh.patches}
+    at_inlet = foam.Values("vector", velocity(centers["inlet"]), False)
+    boundary = {
+        "inlet": {"type": b"fixedValue", "value": at_inlet},
+        "outlet": {"type": b"zeroGradient"},
+        '"(walls|body)"': {"type": b"noSlip"},
+        **{patch.name: {"type": b"empty"} for patch in mesh.patches if patch.kind == "empty"},
+    }
+    pressure = {key: {"type": b"zeroGradient" if v["type"] != b"empty" else b"empty"} for key, v in boundary.items()}
+    u = velocity(mesh.centroids)
+    for kind, field_name, dimensions, values, patches in (
+        ("volVectorField", "U", b"[0 1 -1 0 0 0 0]", foam.Values("vector", u, False), boundary),
+        ("volScalarField", "p", b"[0 2 -2 0 0 0 0]", foam.Values("scalar", u[:, :1] ** 2, False), pressure),
+        ("volScalarField", "k", b"[0 2 -2 0 0 0 0]", foam.Values("scalar", np.full((1, 1), 2.5), True), pressure),
+        (
+            "surfaceScalarField",
+            "phi",
+            b"[0 3 -1 0 0 0 0]",
+            foam.Values("scalar", np.zeros((len(mesh.neighbor), 1)), False),
+            {},
+        ),
+    ):
+        entries = {"dimensions": dimensions, "internalField": values, "boundaryField": patches}
+        foam.FoamField(field_name, kind, binary, entries).write(time / field_name, name)
+    return mesh
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("foam") / "case"
+    (folder / "system").mkdir(parents=True)
+    (folder / "system" / "controlDict").write_text(
+        "startFrom startTime;\nstartTime 0;\nendTime 10;\nwriteInterval 1;\n"
+    )
+    mesh = clvoro.adapt(DOMAIN, 0.1, "fast")
+    mesh.to_openfoam(folder / "constant" / "polyMesh", types={"body": "symmetry"}, thickness=0.25)
+    mesh.save(folder / "constant" / "polyMesh" / "clvoro.npz")
+    put_fields(folder, "5", binary=True)
+    return folder
+
+
+@pytest.fixture
+def case(template, tmp_path):
+    return shutil.copytree(template, tmp_path / "case")
+
+
+def content(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_one_cycle(case, known):
+    """Of a mesh of clvoro, and of one of which nothing but OpenFOAM's files is known."""
+    if not known:
+        (case / "constant" / "polyMesh" / "clvoro.npz").unlink()
+    before = FoamMesh.read(case / "constant" / "polyMesh")
+    u = foam.read_field(case / "5" / "U").internal.rows(before.n_cells)
+    (row,) = foam.adapt_case(case, n_cells=500, effort="fast")
+    assert (row.cycle, row.time, row.cells, row.next_cells) == (0, 5, before.n_cells, 500)
+    folder = case / "5" / "polyMesh"
+    assert FoamCase(case).mesh_folder(FoamCase(case).latest()) == folder
+    mesh = FoamMesh.read(folder)
+    assert mesh.types == before.types == {"walls": "wall", "outlet": "patch", "inlet": "patch", "body": "symmetry"}
+    assert mesh.thickness == pytest.approx(0.25)
+    assert mesh.volumes.sum() == pytest.approx(0.25 * DOMAIN.measure)
+    after = foam.read_field(case / "5" / "U")
+    assert after.binary
+    w = after.internal.rows(500)
+    assert np.abs(mesh.volumes @ w - before.volumes @ u).max() < 1e-13 * (before.volumes @ np.abs(u)).max()
+    assert (w.min(axis=0) >= u.min(axis=0)).all()
+    assert (w.max(axis=0) <= u.max(axis=0)).all()
+    assert np.abs(w - velocity(mesh.centroids)).mean() < 0.01
+    assert foam.read_field(case / "5" / "k").internal.uniform
+    assert sorted(path.name for path in (case / "5").iterdir()) == ["U", "k", "p", "phi", "polyMesh", "uniform"]
+    assert (case / "5" / "uniform" / "time").exists()
+    # The parabola at the inlet, and the flux that it brings.
+    (inlet,) = (patch.faces for patch in mesh.patches if patch.name == "inlet")
+    given = after.patches["inlet"]["value"].rows(len(inlet))
+    assert given[:, 0] == pytest.approx(velocity(mesh.faces[0][inlet])[:, 0], abs=0.02)
+    flux = foam.read_field(case / "5" / "phi")
+    every = [flux.internal.numbers[:, 0]]
+    every += [flux.patches[patch.name]["value"].numbers[:, 0] for patch in mesh.patches if patch.kind != "empty"]
+    phi = np.concatenate([*every, np.zeros(2 * mesh.n_cells)])
+    assert divergence(mesh, phi) < MOST_DIVERGENCE
+    assert phi[inlet].sum() == pytest.approx((given * mesh.faces[1][inlet]).sum(), rel=1e-12)
+    sizes = np.sqrt(clvoro.load(folder / "clvoro.npz").volumes)
+    x = mesh.centroids
+    assert sizes[np.abs(x[:, 0] - 1.5) < 0.1].mean() < 0.9 * sizes[x[:, 0] > 2.5].mean()
+    assert (case / "clvoro" / "cycle-0.png").exists()
+    assert not list((case / "clvoro").glob("next-*"))
+
+
+def test_loops_go_on_where_they_were_killed(case, monkeypatch):
+    """At the solver, before and after the folders are exchanged."""
+    calls = []
+
+    def solver(folder):
+        now = FoamCase(folder)
+        assert "startFrom latestTime;" in now.control.read_text()
+        calls.append(now.control_number("endTime"))
+        if len(calls) == 2:
+            raise RuntimeError("killed")
+        put_fields(folder, f"{calls[-1]:g}")
+        table = folder / "postProcessing" / "forces" / "0" / "coefficient.dat"
+        table.parent.mkdir(parents=True, exist_ok=True)
+        table.write_text(f"# Time Cd Cl\n{calls[-1]} {len(calls)} 0.5\n")
+
+    def go_on():
+        return foam.adapt_case(
+            case, n_cells=300, cycles=2, solver=solver, interval=2, effort="fast", layers=LAYERS, pictures=False
+        )
+
+    with pytest.raises(RuntimeError, match="killed"):
+        go_on()
+    assert FoamCase(case).latest().name == "7"
+    real = FoamCase.put_time
+
+    def dies(self, name, made):
+        monkeypatch.setattr(FoamCase, "put_time", real)
+        if name == "9":
+            (made / ".complete").touch()
+            shutil.move(self.folder / name, self.own / "old")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FoamCase, "put_time", dies)
+    with pytest.raises(KeyboardInterrupt):
+        go_on()
+    # Not even then is there a time without its mesh.
+    assert FoamMesh.read(FoamCase(case).mesh_folder(FoamCase(case).latest())).n_cells == 300
+    rows = go_on()
+    assert [row.cycle for row in rows] == [0, 1, 2]
+    assert calls == [7, 9, 9, 11]
+    assert [row.next_cells for row in rows] == [300, 300, None]
+    assert [row.monitors["forces.Cd"] for row in rows] == [1, 3, 4]
+    assert go_on() == rows
+    note = json.loads((case / "9" / "polyMesh" / "clvoro.json").read_text())
+    assert note["layers"][0]["height"] == LAYERS.height
+    y = clvoro.load(case / "9" / "polyMesh" / "clvoro.npz").points[:, 1]
+    assert (np.abs(y - LAYERS.rows[0]) < 1e-9).sum() > 20
+
+
+LAYERS = clvoro.Layers(0.02, 2, 1.2, spacing=0.08, edges="walls")
+
+
+def test_exchanges_without_the_system_call(case, monkeypatch):
+    monkeypatch.setattr(cases, "_exchange", lambda a, b: False)
+    foam.adapt_case(case, n_cells=300, effort="fast", pictures=False, estimate=by_hand)
+    assert FoamMesh.read(case / "5" / "polyMesh").n_cells == 300
+    assert not (case / "clvoro" / "old").exists()
+    assert not (case / "5" / ".complete").exists()
+
+
+def by_hand(fields, mesh):
+    assert sorted(fields) == ["U", "k", "p"]
+    assert fields["U"].shape == (len(mesh), 2)
+    return sizing.sensor_size(sizing.vorticity(fields["U"], mesh), on=mesh, n_cells=300)
+
+
+def spoil(case, name="5/p", old=b"", new=b""):
+    path = case / name
+    path.write_bytes(path.read_bytes().replace(old, new, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "kind", "text"),
+    [
+        (lambda c: shutil.rmtree(c / "system"), {}, InputError, "no system/controlDict"),
+        (lambda c: shutil.rmtree(c / "5"), {}, InputError, "run the solver first"),
+        (lambda c: (c / "processor0").mkdir(), {}, InputError, "reconstructPar"),
+        (lambda c: shutil.rmtree(c / "constant"), {}, InputError, "no mesh"),
+        (lambda c: None, {"fields": ("T",)}, InputError, "no field T"),
+        (lambda c: None, {"fields": "U"}, InputTypeError, "expected names"),
+        (lambda c: None, {"fields": ("k",)}, InputError, "no derivatives other than 0"),
+        (lambda c: None, {"cycles": 3}, InputError, "without a solver"),
+        (lambda c: None, {"n_cells": 0}, InputError, "n_cells"),
+        (lambda c: None, {"solver": "noSuchFoam"}, InputError, "not on the PATH"),
+        (lambda c: None, {"solver": "false"}, ClvoroError, "failed with code 1"),
+        (lambda c: None, {"solver": lambda folder: None}, InputError, "no time after 5"),
+        (lambda c: None, {"solver": "true", "interval": -1}, InputError, "interval"),
+        (lambda c: None, {"mesh": clvoro.voronoi(DOMAIN, [(1, 0.1), (2, 0.5)])}, InputError, "the mesh of the case"),
+        (lambda c: None, {"mesh": clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), [(0.5, 0.5)])}, InputError, "same names"),
+        (lambda c: None, {"estimate": lambda fields, mesh: 0.1}, InputTypeError, "Estimate"),
+        (lambda c: None, {"layers": LAYERS, "n_cells": 20}, ClvoroError, "."),
+        (lambda c: put_nan(c), {}, InputError, "p is not finite in 1 cells, the first is 3"),
+        (lambda c: put_short(c), {}, InputError, "values, the mesh"),
+    ],
+)
+def test_bad_input_changes_nothing(case, change, options, kind, text):
+    change(case)
+    before = content(case)
+    with pytest.raises(kind, match=text):
+        foam.adapt_case(case, **{"n_cells": 300, "effort": "fast"} | options)
+    after = content(case)
+    if "solver" not in options:
+        assert after == before
+    assert all(after[path] == data for path, data in before.items() if path.name != "controlDict")
+
+
+def put_nan(case):
+    field = foam.read_field(case / "5" / "p")
+    field.internal.numbers.base[3] = np.nan if field.internal.numbers.base.ndim == 1 else [np.nan]
+    field.write(case / "5" / "p", "5")
+
+
+def put_short(case):
+    field = foam.read_field(case / "5" / "p")
+    values = foam.Values("scalar", field.internal.numbers[:-1], False)
+    foam.FoamField("p", field.kind, False, {**field.entries, "internalField": values}).write(case / "5" / "p", "5")
+
+
+def test_polygons_of_edges():
+    """Straight runs of a name become one edge, holes stay, and open boundaries are refused."""
+    points = np.array([(0, 0), (1, 0), (2, 0), (2, 2), (0, 2), (0.5, 0.5), (1, 1), (0.5, 1)])
+    ends = np.array([(0, 1), (2, 1), (2, 3), (3, 4), (4, 0), (5, 6), (6, 7), (7, 5)])
+    polygon = polygon_of_edges(points, ends, ["low", "low", "right", "top", "top", *["hole"] * 3])
+    assert polygon.measure == pytest.approx(4 - 0.125)
+    assert len(polygon.vertices) == 7
+    assert set(polygon.boundary_names) == {"low", "right", "top", "hole"}
+    with pytest.raises(InputError, match="not closed"):
+        polygon_of_edges(points, ends[1:], ["a"] * 7)
+
+
+@pytest.mark.slow
+def test_a_box_in_space_is_taken_over(tmp_path):
+    folder = tmp_path / "case"
+    (folder / "system").mkdir(parents=True)
+    (folder / "system" / "controlDict").write_text("endTime 1;\n")
+    box = clvoro.Box((0, 0, 0), (1, 1, 1))
+    mesh = clvoro.adapt(box, 0.2, "fast")
+    mesh.to_openfoam(folder / "constant" / "polyMesh")
+    values = np.tanh(10 * (mesh.centroids[:, 0] - 0.5))
+    internal = foam.Values("scalar", values[:, None], False)
+    patches = {'".*"': {"type": b"zeroGradient"}}
+    entries = {"dimensions": b"[0 0 0 1 0 0 0]", "internalField": internal, "boundaryField": patches}
+    (folder / "1").mkdir()
+    foam.FoamField("T", "volScalarField", False, entries).write(folder / "1" / "T", "1")
+    before = FoamMesh.read(folder / "constant" / "polyMesh")
+    foam.adapt_case(folder, n_cells=300, fields=["T"], effort="fast")
+    made = FoamMesh.read(folder / "1" / "polyMesh")
+    assert set(made.types) == set(box.boundary_names)
+    assert made.volumes.sum() == pytest.approx(1)
+    after = foam.read_field(folder / "1" / "T").internal.rows(made.n_cells)[:, 0]
+    assert made.volumes @ after == pytest.approx(before.volumes @ values, abs=1e-12)
+    assert after == pytest.approx(np.tanh(10 * (made.centroids[:, 0] - 0.5)), abs=0.35)
