@@ -235,7 +235,7 @@ class Adapter:
             return make_diagram(stages, domain, host)
 
     def power_diagram(self, domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
-        """Return the power diagram of `points` with `weights` in a box or a polygon; see `clvoro.power_diagram`."""
+        """Return the power diagram of `points` with `weights`; see `clvoro.power_diagram`."""
         with self._alone():
             return power_diagram_of(self._stages_for(domain), domain, points, weights)
 
@@ -249,10 +249,7 @@ class Adapter:
         max_steps: int = 100,
         relax: int = 0,
     ) -> Transported:
-        """Return the power diagram of `points` whose cells have `volumes`, in a box or a polygon.
-
-        See `clvoro.transport`.
-        """
+        """Return the power diagram of `points` whose cells have `volumes`; see `clvoro.transport`."""
         check_integer("relax", relax, 0, 10**6)
         with self._alone():
             stages = self._stages_for(domain)
@@ -285,7 +282,7 @@ class Adapter:
         Parameters
         ----------
         domain : Box, Polygon, Sphere or Solid
-            "transport" needs a box or a polygon, a moving mesh a box without periodic sides.
+            "transport" needs a box, a polygon or a sphere, a moving mesh a box without periodic sides.
         size : number, callable or clvoro.sizing field
             Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d. A callable
             takes points (n, d), returns (n,), and is evaluated on the host: each step then moves all points there and
@@ -300,7 +297,7 @@ class Adapter:
         method : str
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
             size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a
-            power diagram, in polygons and boxes. The others repeat one kind of step: "lloyd", "poisson" and
+            power diagram, not in solids. The others repeat one kind of step: "lloyd", "poisson" and
             "coupled" as published, "weighted-lloyd" and "weighted" with the density h^-d, and the moving meshes "mmpde"
             and "monge-ampere", which map a lattice in a box (see `clvoro.adaptation.methods`).
         n_cells : int, optional

@@ -64,7 +64,7 @@ def adapt(
     Parameters
     ----------
     domain : Box, Polygon, Sphere or Solid
-        "transport" needs a box or a polygon, a moving mesh a box without periodic sides.
+        "transport" needs a box, a polygon or a sphere, a moving mesh a box without periodic sides.
     size : number, callable or clvoro.sizing field
         Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d.
     effort : "fast", "default" or "best"
@@ -125,11 +125,13 @@ def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diag
     SIAM J. Comput. 16, 78). Its faces are at right angles to the lines between generators, and a larger weight makes
     the cell larger. It need not contain its generator, and may be empty. Equal weights give the Voronoi diagram. In a
     polygon a cell is the whole part of the domain that the definition gives it: on both sides of a wall thinner than a
-    cell, if need be, where `voronoi` gives the part without the generator to a neighbor.
+    cell, if need be, where `voronoi` gives the part without the generator to a neighbor. On a sphere of radius R it is
+    the set of y with ``exp(w_i / 2R^2) x_i.y >= exp(w_j / 2R^2) x_j.y`` for all j, which is the same for cells that are
+    small; faces are arcs of great circles (Sugihara 2002, J. Geom. Graph. 6, 69).
 
     Parameters
     ----------
-    domain : Box or Polygon
+    domain : Box, Polygon or Sphere
     points : (n, d) array of float
         Distinct generators inside the domain.
     weights : (n,) array of float
@@ -145,8 +147,8 @@ def power_diagram(domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diag
     DeviceError
         If no device works.
     InputError, InputTypeError
-        If an argument is not as expected, the domain is a sphere, or points are too close together for the
-        precision.
+        If an argument is not as expected, the domain is a solid or has holes, or points are too close together for
+        the precision.
     MemoryLimitError
         If the device has not enough memory.
 
@@ -178,11 +180,13 @@ def transport(
 
     These cells transport the volume of the domain to the generators at the least cost, the integral of the squared
     distance. Damped steps of Newton's method find them for any volumes that sum to that of the domain (Kitagawa,
-    Merigot and Thibert 2019, J. Eur. Math. Soc. 21, 2603).
+    Merigot and Thibert 2019, J. Eur. Math. Soc. 21, 2603). On a sphere the cost is -log of the cosine of the angle: a
+    cell lies within 90 degrees of its generator, so that areas that are very different from those of the Voronoi cells
+    may have no solution.
 
     Parameters
     ----------
-    domain : Box or Polygon
+    domain : Box, Polygon or Sphere
     points : (n, d) array of float
         Distinct generators inside the domain. They stay where they are, without `relax`.
     volumes : (n,) array of float

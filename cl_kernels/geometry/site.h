@@ -4,8 +4,14 @@
 #ifdef SPHERE
 /* A generator on the unit sphere as the origin of a plane: its tangent plane, onto which the sphere is projected from
    its center. Great circles become straight lines, so cells become convex polygons. A site holds the position of the
-   generator and two tangent unit vectors; seen from outside, the second is counter-clockwise from the first. */
+   generator and two tangent unit vectors; seen from outside, the second is counter-clockwise from the first; in a power
+   diagram also the weight. */
+#ifdef WEIGHTED
+#define SITE_SIZE 10
+#define SITE_WEIGHT(x) (x)[9]
+#else
 #define SITE_SIZE 9
+#endif
 #define SITE(x, i, points)                                                                                             \
     REAL x[SITE_SIZE];                                                                                                 \
     place_site(x, i, points)
@@ -19,7 +25,7 @@
 inline void place_site(REAL *x, int i, global const REAL *points)
 {
     EACH_AXIS (a)
-        x[a] = points[3 * i + a];
+        x[a] = points[STRIDE * i + a];
     /* Without a branch and without cancellation (Duff et al. 2017, Building an orthonormal basis, revisited). */
     const REAL sign = x[2] < 0 ? -1 : 1, s = -1 / (sign + x[2]), t = x[0] * x[1] * s;
     x[3] = 1 + sign * x[0] * x[0] * s;
@@ -28,6 +34,9 @@ inline void place_site(REAL *x, int i, global const REAL *points)
     x[6] = t;
     x[7] = sign + x[1] * x[1] * s;
     x[8] = -x[1];
+#ifdef WEIGHTED
+    SITE_WEIGHT(x) = WEIGHT(points, i);
+#endif
 }
 
 /* The tangents of `place_site` in single precision, for one or several positions. */
@@ -64,10 +73,26 @@ inline void in_space(const REAL *x, REAL2 p, REAL *d)
 #define direction_of direction_on_sphere
 inline REAL2 direction_on_sphere(const REAL *x, int j, global const REAL *points)
 {
-    const REAL d[3] = {points[3 * j] - x[0], points[3 * j + 1] - x[1], points[3 * j + 2] - x[2]};
+    global const REAL *y = points + STRIDE * j;
+    const REAL d[3] = {y[0] - x[0], y[1] - x[1], y[2] - x[2]};
     const REAL d2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
     return d2 < OPPOSITE ? along_tangents(x, d) * (1 / (1 - d2 / 4)) : (REAL2)(1 / REAL_EPS, 0);
 }
+
+#ifdef WEIGHTED
+/* In a power diagram on the sphere a cell holds the points y with the largest (1 + w_i / 2) x_i.y (Sugihara 2002,
+   J. Geom. Graph. 6, 69). With the difference D of both positions, (1 + w_i / 2) x.y >= (1 + w_j / 2) (x + D).y is
+   p.D <= D.D / 2 + (w_i - w_j) / (2 + w_j). */
+inline REAL lift(const REAL *x, int j, global const REAL *points)
+{
+    return (SITE_WEIGHT(x) - WEIGHT(points, j)) / (2 + WEIGHT(points, j));
+}
+
+/* By how much the weight of generator j, at the square d2 of the distance in the projection, exceeds that of the site:
+   the bisector is { p : p.d = (d.d - excess) / 2 }. */
+#define WEIGHT_EXCESS(x, j, d2, points) (-2 * lift(x, j, points) * (1 + (d2) / 4))
+#define EXCESS_BETWEEN(a, b, to_a, to_b, points) ((to_b) - (to_a))
+#endif
 
 /* A point of the tangent plane of `from` in that of `to`. */
 inline REAL2 seen_from(const REAL *to, const REAL *from, REAL2 p)
@@ -103,4 +128,9 @@ inline void on_sphere(const REAL *x, REAL2 p, REAL *d)
 #endif
 #ifndef SITE_WEIGHT
 #define SITE_WEIGHT(x) R(0)
+#endif
+#ifndef WEIGHT_EXCESS
+#define WEIGHT_EXCESS(x, j, d2, points) (WEIGHT(points, j) - SITE_WEIGHT(x))
+/* By how much that of b exceeds that of a, from those over the site. */
+#define EXCESS_BETWEEN(a, b, to_a, to_b, points) (WEIGHT(points, b) - WEIGHT(points, a))
 #endif

@@ -1,6 +1,7 @@
 /* Weights of generators, for power diagrams: with -DWEIGHTED each row of generators ends with the weight w. The plane
    between the cells of i and j is { x_i + y : y.d = level } with d = x_j - x_i and level = (d.d - (w_j - w_i)) / 2,
-   the bisector for equal weights. Otherwise weights are the constant 0, and compilers leave them out. */
+   the bisector for equal weights; for the sphere see site.h. Otherwise weights are the constant 0, and compilers leave
+   them out. */
 #include "opencl/real.h"
 
 #ifdef WEIGHTED

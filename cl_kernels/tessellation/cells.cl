@@ -54,13 +54,13 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
     int flag = 0;
     REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* a radius of 0 would never widen */
     while (flag == 0) {
+#ifdef WEIGHTED
+        /* The outermost bins extend beyond the square. */
+        cell.most = most_excess(weight_within(x, w + 1 / FRAME_INVERSE(grid_frames[0]) BOUNDS), SITE_WEIGHT(x));
+#endif
 #ifdef SPHERE
         flag = clip_cell_by_bins(&cell, (REAL4)(x[0], x[1], x[2], 0), p, w, inner, false, &in);
 #else
-#ifdef WEIGHTED
-        /* The outermost bins extend beyond the square. */
-        cell.most = weight_within(x, w + 1 / FRAME_INVERSE(grid_frames[0]) BOUNDS) - SITE_WEIGHT(x);
-#endif
         flag = clip_polygon_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
 #endif
 #ifdef WEIGHTED

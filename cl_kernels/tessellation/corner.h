@@ -57,7 +57,8 @@ inline REAL2 corner_at_square(const REAL *x, int a, int b, global const REAL *po
         other = (-1 - max(a, b)) % 2 ? SQUARE : -SQUARE;
     } else {
         const REAL2 d = direction_of(x, max(a, b), points);
-        other = (dot(d, d) / 2 - level * (axis == 0 ? d.s0 : d.s1)) / (axis == 0 ? d.s1 : d.s0);
+        const REAL d2 = dot(d, d), there = (d2 - WEIGHT_EXCESS(x, max(a, b), d2, points)) / 2;
+        other = (there - level * (axis == 0 ? d.s0 : d.s1)) / (axis == 0 ? d.s1 : d.s0);
     }
     return axis == 0 ? (REAL2)(level, other) : (REAL2)(other, level);
 }
@@ -72,12 +73,12 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
         const REAL2 w = (REAL2)(APART(0, u.s0, v.s0, points[STRIDE * a], points[STRIDE * b]),
                                 APART(1, u.s1, v.s1, points[STRIDE * a + 1], points[STRIDE * b + 1]));
         const REAL u2 = dot(u, u), v2 = dot(v, v), w2 = dot(w, w);
-        const REAL to_a = WEIGHT(points, a) - SITE_WEIGHT(x), to_b = WEIGHT(points, b) - SITE_WEIGHT(x);
+        const REAL to_a = WEIGHT_EXCESS(x, a, u2, points), to_b = WEIGHT_EXCESS(x, b, v2, points);
         /* The circumcenter of the triangle, relative to x_i. If the other two generators are near each other, the
            squares cancel, and it is computed relative to one of them. */
         if (w2 > R(1e-3) * u2)
             return circumcenter(u, v, u2 - to_a, v2 - to_b);
-        return circumcenter(w, -u, w2 - (WEIGHT(points, b) - WEIGHT(points, a)), u2 + to_a) + u;
+        return circumcenter(w, -u, w2 - EXCESS_BETWEEN(a, b, to_a, to_b, points), u2 + to_a) + u;
     }
 #ifdef SPHERE
     return corner_at_square(x, a, b, points);

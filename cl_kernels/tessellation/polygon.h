@@ -29,7 +29,7 @@ typedef struct {
     int generator;
     REAL position[SITE_SIZE], lower[2], upper[2];
 #ifdef WEIGHTED
-    REAL most; /* largest difference of the weight of a generator that is searched from that of this one */
+    REAL most; /* largest excess of the weight of a generator that is searched over that of this one */
 #endif
 } cell_t;
 
@@ -132,7 +132,7 @@ inline bool clip_polygon(cell_t *cell, const REAL *d, REAL d2, int neighbor, boo
                          global const REAL *points)
 {
     const int n = cell->n;
-    const REAL level = (d2 - (WEIGHT(points, neighbor) - SITE_WEIGHT(cell->position))) / 2;
+    const REAL level = (d2 - WEIGHT_EXCESS(cell->position, neighbor, d2, points)) / 2;
 #ifdef WEIGHTED
     if (level > 0 && level * level > R(1.01) * d2 * cell->reach2)
         return true;

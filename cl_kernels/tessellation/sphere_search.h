@@ -10,5 +10,8 @@ inline int clip_sphere_cell(cell_t *cell, int j, bool seen_before, global const 
 }
 
 #define CELL cell_t
+#ifdef WEIGHTED
+#define CUTTING_SQUARE(cell) cutting_distance2(cell)
+#endif
 #define CLIP_BY_ITEM(cell, d, j, warm, points) clip_sphere_cell(cell, j, warm, points)
 #include "tessellation/search.h"

@@ -35,11 +35,29 @@ inline int tile_index(int3 tile, int side)
     return (tile.s2 * side + tile.s1) * side + tile.s0;
 }
 
+/* By how much a weight with the upper bound `bound` may exceed w. On the sphere see WEIGHT_EXCESS: as there, but
+   without the factor 1 + d^2 / 4. All weights are above -2. */
+inline REAL most_excess(REAL bound, REAL w)
+{
+#ifdef SPHERE
+    return 2 * (fmax(bound, R(-2)) - w) / (2 + fmax(bound, R(-2)));
+#else
+    return bound - w;
+#endif
+}
+
 /* The distance from which on no generator j cuts a cell: those with d^2 - (w_j - w) >= 2 d r, for the largest
-   difference of weights `most` and the distance r of the farthest corner. */
+   excess of weights `most` and the distance r of the farthest corner. On the sphere d = 2 t, with the tangent t of half
+   the angle, the excess is most (1 + t^2), and the chord is 2 sin(atan(t)). */
 inline REAL cutting_radius(REAL r2, REAL most)
 {
+#ifdef SPHERE
+    const REAL m = most / 2, rest = r2 + m * (2 - m);
+    const REAL t = rest > 0 ? (sqrt(r2) + sqrt(rest)) / (2 - m) : 0;
+    return 2 * t / sqrt(1 + t * t);
+#else
     return r2 + most > 0 ? sqrt(r2) + sqrt(r2 + most) : 0;
+#endif
 }
 
 /* The least radius around x beyond which no generator cuts a cell with the weight w and the square r2 of the distance
@@ -52,7 +70,7 @@ inline REAL search_radius(const REAL *x, REAL w, REAL r2 BOUND_ARGS)
         first += tile_count(side >> shift++);
     for (REAL beyond = REAL_MAX;; --shift) {
         const int here = side >> shift;
-        const REAL need = cutting_radius(r2, bounds[first + tile_index(tile >> shift, here)] - w);
+        const REAL need = cutting_radius(r2, most_excess(bounds[first + tile_index(tile >> shift, here)], w));
         const REAL within = shift == 0 ? 0 : (1 << (shift - 1)) / tiles_from.s3;
         if (need > within || shift == 0)
             return fmin(need, beyond);

@@ -23,7 +23,7 @@ MAX_CELLS = 100_000_000
 SIZES = {
     "plane": {"run": (26, 86), "diagram": (65, 45), "power run": (74, 119), "power diagram": (75, 92)},
     "cut": {"run": (68, 79), "diagram": (94, 90), "power run": (171, 134), "power diagram": (125, 130)},
-    "curved": {"run": (33, 90), "diagram": (70, 82)},
+    "curved": {"run": (33, 90), "diagram": (70, 82), "power run": (88, 138), "power diagram": (70, 82)},
     "space": {"run": (187, 525), "diagram": (325, 525), "power run": (187, 525), "power diagram": (300, 575)},
 }
 """Reals and 32-bit integers per cell at the peak of a run, or of one diagram of random generators, and while all arrays

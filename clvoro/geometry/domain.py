@@ -435,10 +435,43 @@ class Domain(ClipBox):
     def require_power_diagrams(self) -> None:
         """Raise InputError if there are no power diagrams in the domain."""
         self.require_no_holes("weights or volumes are given")
-        if self.curved or self.curved_walls:
+        if self.curved_walls:
             raise InputError(
-                f"the domain is {self}, expected a polygon or a box: there are no power diagrams in other domains"
+                f"the domain is {self}, expected a polygon, a box or a sphere: there are no power diagrams in solids"
             )
+
+    def given_weights(self, weights: np.ndarray) -> np.ndarray:
+        """Return the given weights (n,) of those that generators have on the device, in the unit there."""
+        return weights
+
+    def lift(self, points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what adds a coordinate to generators, so that cells of a power diagram are those of the nearest one.
+
+        Parameters
+        ----------
+        points, weights : (n, d), (n,) float
+
+        Returns
+        -------
+        moved : (n, d) or () float
+            To be added to the positions.
+        heights : (n,) float
+            The further coordinate, which is 0 for other points: sqrt(max w - w_i) (Aurenhammer 1987).
+        """
+        del points
+        return np.zeros(()), np.sqrt(weights.max() - weights)
+
+    def plane_shares(self, squares: np.ndarray, excess: np.ndarray) -> np.ndarray:
+        """Return where the planes between two cells cross the lines of their generators, as shares of these, (k,).
+
+        Parameters
+        ----------
+        squares : (k,) float
+            Of the distances of the generators.
+        excess : (k,) float
+            By how much the weight of the second generator exceeds that of the first.
+        """
+        return (1 - excess / squares) / 2
 
     def place_name(self, x: np.ndarray) -> str:
         """Return a position (d,) in words, for messages."""

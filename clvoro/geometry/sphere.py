@@ -310,6 +310,23 @@ class Sphere(Domain):
         """Origin and scale of the device's coordinates: unit vectors."""
         return np.zeros(3), self.radius
 
+    def given_weights(self, weights: np.ndarray) -> np.ndarray:
+        """Return the given weights (n,) of those w that generators have on the device: 2 log(1 + w / 2)."""
+        return 2 * np.log1p(weights / 2)
+
+    def lift(self, points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return as for other domains: with s_i = exp((w_i - max w) / (2 R^2)), s_i x_i and R sqrt(1 - s_i^2).
+
+        From there the square of the distance to y is 2 R^2 - 2 s_i x_i.y.
+        """
+        less = np.expm1((weights - weights.max()) / (2 * self.radius**2))
+        return less[:, None] * points, self.radius * np.sqrt(-less * (2 + less))
+
+    def plane_shares(self, squares: np.ndarray, excess: np.ndarray) -> np.ndarray:
+        """Return as for other domains; the planes contain the center of the sphere."""
+        lift, rise = np.expm1(-excess / (2 * self.radius**2)), squares / (2 * self.radius**2)
+        return (lift + rise) / ((2 + lift) * rise)
+
     def traits(self, real: np.dtype) -> Traits:
         """Return for what kernels are built."""
         del real

@@ -42,13 +42,13 @@ def neighbor_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
 def plane_shares(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
     """Return where the planes of half-faces cross the lines between their generators, as shares of these lines, (k,).
 
-    1/2 in a Voronoi diagram; in a power diagram (1 - (w_j - w_i) / |x_j - x_i|^2) / 2. `faces` (k,) are between cells.
+    1/2 in a Voronoi diagram; for a power diagram see `Domain.plane_shares`. `faces` (k,) are between cells.
     """
     if not diagram.is_power:
         return np.full(len(faces), 0.5)
     i, j = face_owners(diagram)[faces], diagram.neighbors[faces]
     between = neighbor_points(diagram, faces) - diagram.points[i]
-    return (1 - (diagram.weights[j] - diagram.weights[i]) / (between**2).sum(axis=1)) / 2
+    return diagram.domain.plane_shares((between**2).sum(axis=1), diagram.weights[j] - diagram.weights[i])
 
 
 def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

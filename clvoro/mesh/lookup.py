@@ -82,13 +82,12 @@ def make_cell(diagram: Diagram, i: int) -> Cell:
 def power_tree(diagram: Diagram, places: np.ndarray, periods: np.ndarray) -> scipy.spatial.KDTree:
     """Return a search tree of the generators at `places` (n, d); 0 in `periods` stands for walls.
 
-    In a power diagram a further coordinate is sqrt(max w - w_i): the square of the distance from a point with 0 there
-    is |y - x_i|^2 - w_i + max w (Aurenhammer 1987). `lifted` adds the coordinate to points.
+    In a power diagram there is a further coordinate; see `Domain.lift`. `lifted` adds it to points.
     """
     if not diagram.is_power:
         return scipy.spatial.KDTree(places, boxsize=periods)
-    heights = np.sqrt(diagram.weights.max() - diagram.weights)
-    return scipy.spatial.KDTree(np.column_stack([places, heights]), boxsize=np.append(periods, 0.0))
+    moved, heights = diagram.domain.lift(diagram.points, diagram.weights)
+    return scipy.spatial.KDTree(np.column_stack([places + moved, heights]), boxsize=np.append(periods, 0.0))
 
 
 def lifted(diagram: Diagram, places: np.ndarray) -> np.ndarray:
@@ -157,7 +156,7 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
     if diagram.is_power:
         # The generators need not lie around the vertex, but around their own middle.
         number = np.bincount(vertices, minlength=len(centers))
-        sums = [np.bincount(vertices, diagram.points[cells, a], len(centers)) for a in range(2)]
+        sums = [np.bincount(vertices, diagram.points[cells, a], len(centers)) for a in range(centers.shape[1])]
         centers = np.column_stack(sums) / number[:, None]
     arms = diagram.points[cells] - centers[vertices]
     axes = diagram.domain.tangents(diagram.vertices)

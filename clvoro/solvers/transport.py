@@ -14,7 +14,7 @@ import pyopencl.array as cla
 
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
-from ..tessellation.device_diagram import NeighborRows, Tessellation
+from ..tessellation.device_diagram import NeighborRows, OpenCellError, Tessellation
 from ..tessellation.tessellator import Tessellator
 from .components import balance_components, fit_components
 from .linear_system import Solution
@@ -178,7 +178,12 @@ class Transport:
     ) -> _State | None:
         """Return the state with these weights; None if a cell is known to be smaller than `least`."""
         engine, n = self.engine, len(prescribed)
-        t = power.tessellate_weighted(points, weights, n, exact, self._rows, least)
+        try:
+            t = power.tessellate_weighted(points, weights, n, exact, self._rows, least)
+        except OpenCellError:
+            if least <= 0:  # the generators alone leave a half of the sphere free
+                raise
+            return None
         if t is None:
             return None
         rhs, square, relative = (engine.empty(n) for _ in range(3))

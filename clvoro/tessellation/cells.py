@@ -194,7 +194,7 @@ class Cells:
                 if t is not None:
                     return t
                 if flags & OPEN:
-                    raise OpenCellError(points[:total].get())
+                    raise OpenCellError(points[:total].get()[:, : engine.dim])
                 if whole or flags & COINCIDE:
                     raise CloseError(points, total)
                 # Too many short faces may have been dropped: keep all.

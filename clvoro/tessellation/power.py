@@ -1,7 +1,9 @@
 """Power diagrams (Laguerre diagrams): Voronoi diagrams of generators with weights, the paper's (2.5).
 
-V_i = { y : |y - x_i|^2 - w_i <= |y - x_j|^2 - w_j for all j } (Aurenhammer 1987, SIAM J. Comput. 16, 78). The kernels
-are those of Voronoi diagrams, built with WEIGHTED (see geometry/weights.h).
+V_i = { y : |y - x_i|^2 - w_i <= |y - x_j|^2 - w_j for all j } (Aurenhammer 1987, SIAM J. Comput. 16, 78). On the unit
+sphere V_i = { y : exp(w_i / 2) x_i.y >= exp(w_j / 2) x_j.y for all j }, which is the same for small cells; faces are
+arcs of great circles (Sugihara 2002, J. Geom. Graph. 6, 69). The kernels are those of Voronoi diagrams, built with
+WEIGHTED (see geometry/weights.h, geometry/site.h).
 """
 
 from __future__ import annotations
@@ -33,10 +35,13 @@ class Rings:
         self.stages = stages
         engine = stages.engine
         self._kernels = engine.kernels("tessellation/power")
+        self._arcs: cla.Array | None = None
         self._summaries = Summaries(engine, ("volume",))
         lower, upper = domain.device_corners(engine.real)
-        self._volume = float(np.prod((upper - lower)[: engine.dim].astype(float)))
-        self.volume = domain.measure / domain.frame[1] ** engine.dim if domain.cuts_cells else self._volume
+        given = domain.measure / domain.frame[1] ** engine.cell_dim
+        of_box = float(np.prod((upper - lower)[: engine.dim].astype(float)))
+        self._volume = given if domain.curved else of_box
+        self.volume = given if domain.cuts_cells else self._volume
 
     def attach(self, points: cla.Array, weights: cla.Array, n: int, most: cla.Array) -> cla.Array:
         """Return `points` (n, d) with `weights` (n,) in rows (n, d + 1); `most` becomes the key of the largest."""
@@ -45,6 +50,17 @@ class Rings:
         most.fill(np.iinfo(np.int32).min)
         engine.run_each(self._kernels.attach_weights, n, points, weights, sites, most)
         return sites
+
+    def slopes(self, t: Tessellation) -> cla.Array:
+        """Return what the matrix of -2 dV/dw takes for the measures of faces: on a sphere with `weigh_arcs`."""
+        engine = self.stages.engine
+        if not engine.traits.curved:
+            return t.face_measures
+        if self._arcs is None or len(self._arcs) < len(t.face_measures):
+            self._arcs = engine.empty(len(t.face_measures), engine.face)
+        faces = t.starts, t.neighbors, t.sites, t.face_measures, t.face_centroids
+        engine.run_each(self._kernels.weigh_arcs, t.n, *faces, self._arcs)
+        return self._arcs
 
     def search(
         self, box: ClipBox, sites: cla.Array, previous: NeighborRows, exact: bool, least: float

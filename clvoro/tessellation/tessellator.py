@@ -248,8 +248,14 @@ class Tessellator:
         return replace(t, face_measures=faces[0], face_centroids=faces[1])
 
     def laplacian_measures(self, t: Tessellation) -> cla.Array:
-        """Return the face measures of `t` for a Poisson matrix (see `GhostImages.scale_far_measures`)."""
-        return t.face_measures if t.folded is None else self.stages.ghost_images.scale_far_measures(t, t.folded.codes)
+        """Return the face measures of the power diagram `t` for the matrix of Newton's method.
+
+        See `GhostImages.scale_far_measures` and `Rings.slopes`.
+        """
+        assert self.rings is not None
+        if t.folded is not None:
+            return self.stages.ghost_images.scale_far_measures(t, t.folded.codes)
+        return self.rings.slopes(t)
 
     @contextmanager
     def _in_units(self, points: cla.Array, n: int) -> Iterator[None]:

@@ -83,6 +83,7 @@ RUNS = {
     "periodic waves": (TORUS, 0.03 * sizing.Expression("1 + 0.9 * sin(6.2831853 * x)"), {}),
     "periodic transport": (TORUS, 0.018, {"method": "transport"}),
     "sphere": (clvoro.Sphere(1.0), 0.06, {}),
+    "transport on a sphere": (clvoro.Sphere(1.0), 0.06, {"method": "transport"}),
     "cube": (CUBE, 0.06, {}),
     "body": (CUBE, BALL, {}),
     "periodic cube": (TORUS_3D, 0.08, {}),

@@ -25,6 +25,7 @@ def size(points):
         pytest.param(clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), 0.16, "float64", marks=pytest.mark.slow),
         pytest.param(clvoro.Box((0, 0), (2, 1), periodic=(False, True)), size, "float32", marks=pytest.mark.slow),
         pytest.param(LAKE, size, "float64", marks=pytest.mark.slow),
+        (clvoro.Sphere(1.0), lambda points: 0.25 + 0.1 * points[:, 2], "float64"),
     ],
 )
 def test_all_cells_have_their_size(ctx, domain, h, real):
@@ -56,6 +57,6 @@ def test_a_run_that_is_stopped_between_its_power_diagrams_has_weights(ctx):
 def test_what_is_refused(ctx):
     adapter = clvoro.Adapter(ctx)
     with pytest.raises(InputError, match="power diagrams"):
-        adapter.run(clvoro.Sphere(), 0.2, method="transport")
+        adapter.run(clvoro.Solid.box((0, 0, 0), (1, 1, 1)), 0.4, method="transport")
     with pytest.raises(InputError, match="layers"):
         adapter.run(BOX, 0.1, method="transport", layers=clvoro.Layers(0.01))

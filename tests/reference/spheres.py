@@ -31,6 +31,9 @@ def grid_of_rings():
 class SphericalDiagram:
     """The diagram of points (n, 3) in general position, from their convex hull.
 
+    With weights (n,) it is the power diagram: the hull is that of exp(w / 2) x, and points inside of it have no cells
+    (Sugihara 2002, J. Geom. Graph. 6, 69).
+
     Attributes
     ----------
     neighbors : list of lists
@@ -42,13 +45,15 @@ class SphericalDiagram:
         Lengths of the faces, and their middles on the sphere.
     """
 
-    def __init__(self, x):
-        hull = ConvexHull(x)
+    def __init__(self, x, weights=None):
+        factors = np.ones(len(x)) if weights is None else np.exp(weights / 2)
+        y = factors[:, None] * x
+        hull = ConvexHull(y)
         triangles = hull.simplices.copy()
-        a, b, c = x[triangles].swapaxes(0, 1)
+        a, b, c = y[triangles].swapaxes(0, 1)
         inwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0
         triangles[inwards] = triangles[inwards][:, ::-1]
-        a, b, c = x[triangles].swapaxes(0, 1)
+        a, b, c = y[triangles].swapaxes(0, 1)
         normals = np.cross(b - a, c - a)
         self.vertices = normals / np.linalg.norm(normals, axis=1)[:, None]
         follows = [{} for _ in x]  # neighbor -> (next neighbor, vertex between them)
@@ -58,7 +63,7 @@ class SphericalDiagram:
         self.neighbors, self.arcs, self.middles = [], [], []
         self.areas, self.offsets, self.moments = (np.zeros(len(x)), np.zeros((len(x), 3)), np.zeros((len(x), 3, 3)))
         for i, around in enumerate(follows):
-            j, row, corners = next(iter(around)), [], []
+            j, row, corners = next(iter(around), None), [], []
             for _ in around:
                 row.append(j)
                 j, v = around[j]
@@ -67,7 +72,8 @@ class SphericalDiagram:
             after = self.vertices[corners]
             before = np.roll(after, 1, axis=0)
             self.neighbors.append(row)
-            self._measure(x[i], i, before, after)
+            if row:
+                self._measure(x[i], i, before, after)
 
     def _measure(self, x, i, before, after):
         cross = np.cross(before, after)

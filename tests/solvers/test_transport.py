@@ -1,12 +1,17 @@
 """Prescribed volumes: Newton's steps, the volumes that they reach, and what is refused."""
 
 import numpy as np
+import pyopencl as cl
 import pytest
 import shapely
 
 import clvoro
+from clvoro.adaptation.stages import Stages
 from clvoro.errors import InputError, InputTypeError, SizeErrorWarning
+from clvoro.opencl.engine import Engine
+from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.power_diagrams import polygon_power_cells, power_cells
+from tests.reference.spheres import SphericalDiagram, random_points
 
 BOXES = {2: clvoro.Box((-1, 0), (2, 1.5)), 3: clvoro.Box((0, 0, 5), (1, 2, 6))}
 
@@ -53,6 +58,42 @@ def test_newton_with_far_neighbors(ctx):
     assert found.converged
     # With the distances of nearest images the error falls by a constant factor, in 16 steps or more.
     assert len(found.shares) < 9
+
+
+@pytest.mark.sparse(1)
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_cells_on_a_sphere_get_any_areas(ctx, real):
+    """Areas that grow sixfold to the north move cells far from their generators."""
+    sphere, x = clvoro.Sphere(3.0), random_points(80, 5)
+    areas = np.exp(0.9 * x[:, 2])
+    areas *= sphere.measure / areas.sum()
+    found = clvoro.Adapter(ctx, real).transport(sphere, 3 * x, areas)
+    tolerance = 1e-10 if real == "float64" else 1e-3
+    assert found.converged
+    assert len(found.shares) < 12
+    np.testing.assert_allclose(found.diagram.volumes, areas, rtol=2 * tolerance)
+    reference = SphericalDiagram(x, found.diagram.weights / 9)
+    np.testing.assert_allclose(9 * reference.areas, areas, rtol=1e-9 if real == "float64" else 3e-3)
+    assert found.diagram.check(), found.diagram.check()
+
+
+def test_newton_on_a_sphere_of_few_cells(ctx):
+    """Its matrix has the derivatives of areas by weights, by differences of those of the reference."""
+    x, step = random_points(16, 6), 1e-6
+    weights = 0.2 * np.random.default_rng(3).random(16)
+    sphere = clvoro.Sphere(1.0)
+    engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(np.float64), sphere.traits(np.dtype(np.float64)))
+    power = Tessellator(Stages(engine), sphere, weighted=True)
+    t = power.tessellate_weighted(engine.upload(x), engine.upload(weights), 16, exact=True)
+    starts, neighbors, measures = (a.get() for a in (t.starts, t.neighbors, power.laplacian_measures(t)))
+    matrix, owner = np.zeros((16, 16)), np.repeat(np.arange(16), np.diff(starts))
+    np.add.at(matrix, (owner, neighbors[: len(owner)]), -measures[: len(owner)])
+    matrix /= 2 * np.maximum(np.linalg.norm(x[:, None] - x, axis=2), 1e-9)
+    for j in range(0, 16, 5):
+        more, less = (SphericalDiagram(x, weights + s * step * (np.arange(16) == j)).areas for s in (1, -1))
+        slope = (more - less) / (2 * step)
+        others = np.arange(16) != j
+        np.testing.assert_allclose(matrix[others, j], slope[others], atol=1e-6)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import shapely
 import clvoro
 from clvoro.errors import EmptyCellsWarning, InputError, InputTypeError
 from tests.reference.power_diagrams import polygon_power_cells, power_cells
+from tests.reference.spheres import SphericalDiagram, random_points
 
 BOXES = {2: clvoro.Box((-1, 0), (2, 1.5)), 3: clvoro.Box((0, 0, 5), (1, 2, 6))}
 SQUARE = clvoro.Box((0, 0), (1, 1))
@@ -108,6 +109,28 @@ def test_images_carry_the_weights_of_their_generators(ctx, dim):
         np.testing.assert_allclose(d.volumes, power_cells(box, points, weights)[0], atol=1e-12)
         assert d.volumes.sum() == pytest.approx(box.measure, rel=1e-13)
         assert d.check(), d.check()
+
+
+@pytest.mark.sparse(1)
+@pytest.mark.filterwarnings("ignore::clvoro.errors.EmptyCellsWarning")
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_cells_on_a_sphere_are_those_of_the_definition(ctx, real):
+    """Weights of random size leave cells empty; those that grow to the north move cells by a third of a radian."""
+    sphere, x, rng = clvoro.Sphere(2.0), random_points(120, 3), np.random.default_rng(14)
+    noise = 2e3 * np.finfo(real).eps
+    for weights, least in ((0.1 * rng.random(120) + 5, 5), (0.5 * x[:, 2], 0)):
+        d = clvoro.Adapter(ctx, real).power_diagram(sphere, 2 * x, 4 * weights)
+        reference = SphericalDiagram(x, weights)
+        np.testing.assert_allclose(d.volumes, 4 * reference.areas, atol=noise)
+        assert d.empty_cells.tolist() == np.flatnonzero(reference.areas == 0).tolist()
+        assert len(d.empty_cells) >= least
+        assert [sorted(d.cell(i).neighbors) for i in range(9)] == [sorted(row) for row in reference.neighbors[:9]]
+        filled = reference.areas > 1e-2
+        np.testing.assert_allclose((d.centroids / 2 - x)[filled], reference.offsets[filled], atol=10 * noise)
+        assert d.check(), d.check()
+        places = random_points(300, 4)
+        assert d.locate(places).tolist() == (places @ x.T * np.exp(weights / 2)).argmax(axis=1).tolist()
+    assert np.linalg.norm(d.centroids / 2 - x, axis=1).max() > 0.3
 
 
 def test_weights_of_a_moved_periodic_diagram(ctx):
@@ -245,7 +268,7 @@ def test_bad_input(ctx):
         adapter.power_diagram(SQUARE, points[[0, 0, 1]], [0, 1, 2])
     with pytest.raises(InputError, match="finite differences"):
         adapter.power_diagram(SQUARE, points, [1e308, -1e308, 0])
-    with pytest.raises(InputError, match="no power diagrams"):
+    with pytest.raises(InputError, match="leave a half of it free"):
         adapter.power_diagram(clvoro.Sphere(), [(0, 0, 1)], [0])
     with pytest.warns(EmptyCellsWarning, match="2 of 3"):
         d = adapter.power_diagram(SQUARE, points, [0, 1e300, 0])

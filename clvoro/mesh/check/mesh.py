@@ -85,7 +85,8 @@ def _euler_characteristic(d: Diagram) -> int | None:
     ends = face_ends(d)[walls]
     if len(np.unique(ends[:, 0])) < len(ends):
         return None
-    parts = _count_components(len(d), owner[~walls], d.neighbors[~walls])
+    empty = np.count_nonzero(np.diff(d.neighbor_starts) == 0)
+    parts = _count_components(len(d), owner[~walls], d.neighbors[~walls]) - empty
     # All other vertices are parts of their own.
     others = len(d.vertices) - len(np.unique(ends))
     return 2 * parts - (_count_components(len(d.vertices), *ends.T) - others)
@@ -587,10 +588,13 @@ def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
     # The tree takes a period of 0 for an axis that is not periodic.
     tree = power_tree(d, np.minimum(d.points - lower, last), periods)
     lengths = d.domain.lengths
-    own = lengths(np.linalg.norm(corners - d.points[g.cells], axis=1))
+    own, nearest = corners - d.points[g.cells], tree.query(lifted(d, d.vertices - lower))[0][g.corners]
     if d.is_power:
-        own = np.hypot(own, tree.data[g.cells, -1])
-    nearest = lengths(tree.query(lifted(d, d.vertices - lower))[0][g.corners])
+        moved, heights = d.domain.lift(d.points, d.weights)
+        own = np.column_stack([own - np.broadcast_to(moved, d.points.shape)[g.cells], heights[g.cells]])
+    own, nearest = np.linalg.norm(own, axis=1), nearest
+    if not d.is_power:
+        own, nearest = lengths(own), lengths(nearest)
     excess = np.maximum(own - nearest - slack, 0)
     if d.domain.outline is not None and not d.is_power:
         excess[hidden(d, d.domain.outline, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0

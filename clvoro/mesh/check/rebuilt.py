@@ -22,7 +22,8 @@ def rebuild_on_sphere(diagram: Diagram) -> dict[str, np.ndarray]:
     """Return the arrays of a diagram on a sphere that follow from its corners: arcs, their middles, and centroids.
 
     The integral of the position over a cell of the unit sphere is half the sum over its edges, from v to w, of
-    arc n, with n the unit vector along v x w (Gauss). The centroid has its direction.
+    arc n, with n the unit vector along v x w (Gauss). The centroid has its direction; that of an empty cell is the
+    generator.
     """
     sphere = diagram.domain
     radius, owner = sphere.frame[1], face_owners(diagram)
@@ -34,6 +35,8 @@ def rebuild_on_sphere(diagram: Diagram) -> dict[str, np.ndarray]:
     sines, cosines = np.linalg.norm(cross, axis=1), (v * w).sum(axis=1)
     terms = np.cross(a, b) + arc_excess(sines, cosines)[:, None] * cross
     integrals = np.column_stack([np.bincount(owner, t, len(diagram)) for t in terms.T])
+    empty = np.diff(diagram.neighbor_starts) == 0
+    integrals[empty] = points[empty]
     return {
         "face_measures": radius * np.arctan2(sines, cosines),
         "face_centroids": sphere.wrap(v + w),
@@ -416,10 +419,12 @@ class SphereCells(Rebuilt):
         between = sphere.wrap(behind) / sphere.radius - unit[self.owner]
         normal = self._along_tangents(between)
         level = (between**2).sum(axis=1) / 2
+        if d.is_power:
+            level += np.expm1((d.weights[self.owner] - d.weights[d.neighbors]) / (2 * sphere.radius**2))
         length = np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
         self.directions = normal / length[:, None]
         self.spacings = sphere.radius * np.maximum(np.linalg.norm(between, axis=1), 1e-300)
-        # The bisectors of two neighbors are the lines n.p = |d|^2 / 2 in the tangent plane.
+        # The bisectors of two neighbors are the lines n.p = |d|^2 / 2 in the tangent plane; see `Rings` for weights.
         corners, _ = bisector_corners(d.neighbor_starts, normal, level)
         with np.errstate(all="ignore"):
             corner = unit[self.owner] + sum(p[:, None] * t for p, t in zip(corners.T, self._tangents, strict=True))
@@ -438,6 +443,7 @@ class SphereCells(Rebuilt):
             "cell_vertex_starts": d.neighbor_starts,
             "cell_vertices": np.arange(len(self.owner)),
         }
+        arrays |= {"weights": d.weights} if d.is_power else {}
         return SphereCells(Diagram(d.domain, arrays), real=self.real)
 
 

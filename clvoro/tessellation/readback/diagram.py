@@ -401,7 +401,7 @@ class _DiagramReader:
 
     def weights(self) -> np.ndarray:
         rows = self.t.sites.get()[self.order, self.engine.dim]
-        return rows.astype(np.float64) * self.scale**2
+        return self.domain.given_weights(rows.astype(np.float64)) * self.scale**2
 
     def volumes(self) -> np.ndarray:
         return self._read(self.t.volumes, self.engine.cell_dim)
