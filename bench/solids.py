@@ -1,7 +1,7 @@
 """Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
 
     python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
-                           [--beside-box N] [--keep FOLDER] [--pictures FOLDER] [--device NAME]
+                           [--speed NUMBERS] [--keep FOLDER] [--pictures FOLDER] [--device NAME]
                            [--dtype float32] [--json]
 
 The solids are in `bench/_solid_shapes.py`; they need trimesh, manifold3d, shapely, networkx and, for the gyroid,
@@ -10,12 +10,15 @@ of cells, mean |e| of the sizes and mean isoperimetric quotient, the largest and
 skewness, the number of concave cells, the volume of all cells over that of the solid, and the verdict.
 
 --runs is a list of efforts and "exact". With `--booleans N` the solids are N random booleans of boxes, balls and
-cylinders. `--beside-box N` compares processor times of whole runs in a cube of N cells: as a box, and as a solid.
+cylinders. `--speed NUMBERS` compares processor times for so many cells in a cube as a box, as a solid, and around a
+ball in it, with the default effort: those of the run, and of the mesh on the host with its faces. Memory is the most
+up to then of the whole process.
 Pictures show each mesh cut open, with the patches in colors.
 """
 
 from __future__ import annotations
 
+import resource
 import shutil
 import tempfile
 import time
@@ -47,6 +50,10 @@ COLUMNS = {
     "volume": lambda r: f"{r['volume']:.5f}",
     "checkMesh": PLANE_COLUMNS["checkMesh"],
 }
+
+
+BALL_EDGE = 0.05
+"""Length of triangles of the ball, over its radius."""
 
 
 def quotient(diagram: clvoro.Diagram) -> float:
@@ -83,17 +90,48 @@ def draw(result: clvoro.Result, path: Path, title: str) -> None:
     plot_cutaway(result, "quality", walls=True, title=title).savefig(path, dpi=150, bbox_inches="tight")
 
 
-def beside_box(adapter: clvoro.Adapter, n: int) -> None:
-    """Print the processor times of a run in a unit cube of `n` cells as a box and as a solid, and their ratio."""
-    seconds: dict[str, float] = {}
-    for domain in (clvoro.Box((0, 0, 0), (1, 1, 1)), clvoro.Solid.box((0, 0, 0), (1, 1, 1))):
-        adapter.run(domain, 0.25, "fast")  # builds the programs
-        begin = time.process_time()
-        result = adapter.run(domain, n ** (-1 / 3))
-        name = type(domain).__name__
-        seconds[name] = time.process_time() - begin
-        print(f"{name}: {len(result.points)} cells, {seconds[name]:.2f} s of processor time", flush=True)
-    print(f"Solid / Box: {seconds['Solid'] / seconds['Box']:.2f}")
+SPEED_COLUMNS = {
+    "domain": lambda r: r["domain"],
+    "triangles": lambda r: r["triangles"],
+    "cells": lambda r: r["cells"],
+    "run, s": lambda r: f"{r['run']:.1f}",
+    "mesh, s": lambda r: f"{r['mesh']:.1f}",
+    "sum / box": lambda r: f"{r['ratio']:.2f}",
+    "peak memory, GB": lambda r: f"{r['memory']:.2f}",
+}
+
+
+def measure_speed(adapter: clvoro.Adapter, n: int, report: Report) -> None:
+    """Add rows of processor times with `n` cells in a box, in the same cube as a solid, and around a ball in it."""
+    begun: list[float] = []
+
+    def steps(status: Any) -> None:
+        begun[1:] = [time.process_time()]
+
+    cube, base = clvoro.Box((0, 0, 0), (1, 1, 1)), 0.0
+    ball = clvoro.Solid.ball((0.5, 0.5, 0.5), 0.25, edge=0.25 * BALL_EDGE)
+    for name, domain in (
+        ("box", cube),
+        ("cube as a solid", clvoro.Solid.box((0, 0, 0), (1, 1, 1))),
+        ("outside of a ball", clvoro.Solid.outside(ball, cube)),
+    ):
+        adapter.run(domain, 0.2, "fast").diagram.faces.area.sum()  # builds the programs
+        begun[:] = [time.process_time()]
+        result = adapter.run(domain, (domain.measure / n) ** (1 / 3), callback=steps)
+        result.diagram.faces.area.sum()
+        end = time.process_time()
+        base = base or end - begun[0]
+        row = {
+            "domain": name,
+            "triangles": len(getattr(domain, "patch", ())),
+            "cells": len(result.points),
+            "run": begun[1] - begun[0],
+            "mesh": end - begun[1],
+            "ratio": (end - begun[0]) / base,
+            "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        }
+        del result
+        report.add(row, f"{name}, {n}: {row['ratio']:.2f}")
 
 
 def main() -> None:
@@ -105,12 +143,15 @@ def main() -> None:
     options_of.add_argument("--resolutions", default="0,1", metavar="NUMBERS", help="0: coarse, 1: fine")
     options_of.add_argument("--booleans", type=int, default=0, metavar="N", help="random solids in place of those")
     options_of.add_argument("--size", type=float, default=0.12, help="of the cells of random solids")
-    options_of.add_argument("--beside-box", type=int, metavar="N", help="compare times of N cells in a cube")
+    options_of.add_argument("--speed", default="", metavar="NUMBERS", help="processor times of so many cells")
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = options_of.parse_args()
-    if options.beside_box:
-        return beside_box(make_adapter(options), options.beside_box)
+    if options.speed:
+        adapter, report = make_adapter(options), Report(options.json, SPEED_COLUMNS)
+        for n in names(options.speed):
+            measure_speed(adapter, round(float(n)), report)
+        return report.finish(heading(adapter, "processor time of runs, and of meshes that are read with their faces"))
     if shutil.which("checkMesh") is None:
         raise SystemExit("checkMesh is not installed; Debian has it in the package openfoam")
     adapter = make_adapter(options)
