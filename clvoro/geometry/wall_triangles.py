@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 
 SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of edges and corners of triangles: within a patch, on a convex crease, on a concave one."""
-SAGITTA = 0.105
-"""Mean height of a curved surface over wall faces, over mean curvature times h^2: half the mean square of the distance
-from the foot, which is 0.083 h^2 for squares around it. Measured in balls."""
+SAGITTA, SAGITTA_SLOPE = 0.245, 0.7
+"""Depth of wall polygons, whose vertices lie on the surface, below a surface of mean curvature H, over H h^2: half the
+mean square of the vertices' distance from the foot, which is 0.19 of the area of hexagons. Wall faces are larger than
+h^2, and the more so the more convex the wall is: the factor is 1 + SAGITTA_SLOPE H h. Measured in and around balls."""
 SIDE_PER_ROOT, LEAST_SIDE, LARGEST_SIDE = 0.4, 48, 128
 """Bins along the longest side, per square root of the number of triangles, and limits: bins are as wide as triangles,
 so that few triangles are in several of them."""
@@ -89,7 +90,8 @@ class WallTriangles:
         shift = np.zeros(self.edges.shape)
         if size is not None:
             h = np.asarray(size(self.corners.reshape(-1, 3)), float).reshape(shift.shape)
-            shift = SAGITTA * mean_curvature(self.corners, self.normals)[:, None] * h**2 / scale
+            bend = mean_curvature(self.corners, self.normals)[:, None] * h
+            shift = SAGITTA * bend * np.clip(1 + SAGITTA_SLOPE * bend, 0.5, 1.5) * h / scale
         return np.concatenate([self.normals, shift[..., None]], axis=2)
 
     def arguments(self, engine: Engine, frame: tuple[np.ndarray, float]) -> tuple[object, ...]:
