@@ -7,18 +7,17 @@ the generators that share a corner move to their mean distance from it, and near
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import scipy
 
 from ..geometry.domain import Domain
-from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.polygon import Polygon
 from ..geometry.rings import OrientedRings
 from ..geometry.tips import WIDEST, find_tips
-from ..mesh.straightening import WALL_CORNER, cross
+from ..mesh.straightening import cross
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 from .motion import Moving
@@ -31,16 +30,12 @@ from .tuning import (
     JOINED,
     LEAST_SPACING,
     LEAST_TURN,
-    LONG_SIDE,
     POCKET_SPACING,
     POCKETS,
     SHARP_REACH,
     SHARP_TURN,
     SPACING,
-    STATION_DEPTH,
-    STATION_SPACING,
     WALL_REACH,
-    WIDEST_STATION,
 )
 
 GROUP = 4
@@ -85,54 +80,6 @@ class CornerGroups:
 
     def __len__(self) -> int:
         return len(self.starts) - 1
-
-
-@dataclass(frozen=True)
-class CornerStations(FixedGenerators):
-    """Fixed generators around re-entrant corners with long sides, at one distance, so that their faces end there.
-
-    There are no balls around these corners.
-    """
-
-    corners: np.ndarray = field()
-
-
-def place_stations(domain: Polygon, free: Domain, fixed: np.ndarray, h: np.ndarray) -> CornerStations:
-    """Return generators around the re-entrant corners of `domain` that have room for cells of size `h` (k,).
-
-    Around a corner of 270 degrees three stand in the middle of three equal sectors, around others as many as it has
-    right angles. The outer ones see one wall each; all have the size h. Corners between sides shorter than
-    `LONG_SIDE`, near layers, other stations, other walls or `fixed` generators (m, 2) have none.
-    """
-    rings = domain.oriented
-    angle = np.pi - rings.turns
-    sharp = (rings.turns < -WALL_CORNER) & (angle < WIDEST_STATION)
-    sharp &= np.minimum(rings.lengths, rings.lengths[rings.before]) >= LONG_SIDE * h
-    corners = np.flatnonzero(sharp)
-    count = np.maximum(np.rint(angle[corners] / (np.pi / 2)).astype(int), 2)
-    sector = angle[corners] / count
-    corner = np.repeat(np.arange(len(corners)), count)
-    place = np.arange(len(corner)) - np.repeat(np.cumsum(count) - count, count)
-    way = np.arctan2(*rings.along[corners].T[::-1])[corner] + sector[corner] * (place + 0.5)
-    size = h[corners][corner]
-    reach = size / (2 * np.sin(sector / 2))[corner]
-    points = rings.vertices[corners][corner] + reach[:, None] * np.column_stack([np.cos(way), np.sin(way)])
-    good = domain.contains(points) & free.contains(points)
-    good[good] = domain.boundary_distance(points[good]) >= STATION_DEPTH * size[good]
-    good[good] = free.boundary_distance(points[good]) >= STATION_DEPTH * size[good]
-    if len(fixed) and len(points):
-        good &= scipy.spatial.KDTree(fixed).query(points)[0] >= size
-    left = np.bincount(corner, ~good, len(corners)) == 0
-    pairs = scipy.spatial.KDTree(points).query_pairs(float(size.max(initial=0)), output_type="ndarray")
-    one, two = corner[pairs].T
-    gap = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
-    near = (one != two) & (gap < STATION_SPACING * size[pairs].max(axis=1))
-    for a, b in zip(one[near].tolist(), two[near].tolist(), strict=True):
-        if left[a] and left[b]:
-            left[max(a, b)] = False
-    points = points[left[corner]]
-    no_balls = np.empty((0, 2)), np.empty(0), np.zeros(len(points) + 1, np.int32), np.empty(0, np.int32)
-    return CornerStations(points, *no_balls, left_out=np.empty((0, 2)), corners=corners[left])
 
 
 def find_corners(

@@ -6,18 +6,15 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import shapely
 
 from ..arguments import format_point, warn
 from ..errors import InputError, MismatchWarning, ObtuseTrianglesWarning, PrecisionWarning, SizeErrorWarning
 from ..geometry.boundary_layers import Layers, columns_of
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
 from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..sizing import Sizing
-from ..sizing.feature import NARROW, NarrowPart, find_narrow_parts
 from ..sizing.field import Field
 
 COARSER, FINER = 2.0, 1e-3
@@ -35,8 +32,6 @@ MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
 jumps 1 : 2 between two cells, the largest value is 1."""
 STEEP = 1.25
 """Ratio of the sizes of adjacent cells above which a size error is attributed to the growth of h."""
-FEW_CELLS = 30
-"""Pieces of a polygon that fewer cells would fill do not meet their sizes."""
 ROUND_OFF_ERROR = 0.1
 """Mean |e| because of round-off, over the ratio of the spacing of positions to h. Random changes of up to half a
 spacing cost 0.095 (0.07 in 3D) times this ratio (`bench/precision.py --noise`)."""
@@ -81,7 +76,7 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
     -----
     MismatchWarning
     """
-    strait, dead_end = narrow_parts(domain, size)
+    strait, dead_end = domain.narrow_parts(size)
     found = strait or dead_end
     if found is None:
         return
@@ -90,22 +85,7 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
         text = f"the domain is narrower than half a cell: {here}cells there are long and reach from wall to wall"
     else:
         text = f"the domain has a dead end that is narrower than a cell: {here}cells there have poor shapes"
-    remedy = ", or fill it: domain.simplified(size) does" if domain.outline is not None else ""
-    warn(f"{text}. Use smaller sizes there, as sizing.FeatureSize does{remedy}", MismatchWarning)
-
-
-def narrow_parts(
-    domain: Domain, size: Callable[[np.ndarray], np.ndarray]
-) -> tuple[NarrowPart | None, NarrowPart | None]:
-    """Return where `domain` is narrower than half a cell of `size`, and in a polygon a dead end, or None for each.
-
-    See `find_narrow_parts`.
-    """
-    if domain.outline is not None:
-        return find_narrow_parts(domain.outline, size)
-    place, width = domain.narrowest(size)
-    strait = NarrowPart(place, width, float(size(place[None])[0]))
-    return strait if strait.width < NARROW * strait.size else None, None
+    warn(f"{text}. {domain.remedy_for_narrow_parts}", MismatchWarning)
 
 
 def widths_of_layers(field: Field, domain: Domain, layers: Sequence[Layers]) -> str:
@@ -203,32 +183,12 @@ def warn_of_errors(result: Result) -> None:
             "sizes change there by more than cells can follow from one to the next: bound their growth, as by "
             "sizing.Graded(size, growth=1.2), or use more cells"
         )
-    elif diagram.domain.outline is not None and len(diagram) > FEW_CELLS:
-        why = _why_in_polygon(diagram.domain.outline, result.points[worst], wanted)
     else:
-        why = (
-            f"the domain has a measure of {diagram.domain.measure:.6g}, which cells of this size do not fill evenly: "
-            "use smaller sizes, or n_cells, which scales the sizes to a number of cells"
-        )
+        why = diagram.domain.why_sizes_are_missed(result.points[worst], wanted, len(diagram))
     warn(
         f"the mesh does not meet its size field: mean |e| is {mean:.2g}, and a cell at {place} has the size "
         f"{made:.3g} where the size field is {wanted:.3g}; {why}",
         SizeErrorWarning,
-    )
-
-
-def _why_in_polygon(domain: Polygon, x: np.ndarray, h: float) -> str:
-    """Return why the cell at `x` has not the size `h` where sizes vary little, and the remedy."""
-    point = shapely.Point(x)
-    piece = min(domain.pieces, key=lambda shape: shape.distance(point))
-    if domain.n_pieces > 1 and piece.area < FEW_CELLS * h**2:
-        return (
-            f"it is in a piece of the domain that {piece.area / h**2:.2g} cells would fill: use smaller sizes there, "
-            "or keep the largest piece, domain.split()[0]"
-        )
-    return (
-        "narrow parts of the domain do not hold a whole number of cells of this size: use smaller sizes there, as "
-        "sizing.FeatureSize does, or fill them: domain.simplified(size) does"
     )
 
 

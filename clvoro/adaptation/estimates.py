@@ -10,7 +10,6 @@ import numpy as np
 
 from ..errors import MemoryLimitError
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
 from ..opencl import memory_limits
 from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
@@ -69,7 +68,7 @@ class Extras:
     field_bytes : float
         Memory of the size field.
     boundary : float, optional
-        Cells at a boundary that cuts cells (`expected_boundary_cells`); by default those of equal cells.
+        Cells at a boundary that cuts cells; by default those of equal cells.
     """
 
     images: float | None = None
@@ -105,13 +104,12 @@ def estimate_memory(
             depth = IMAGE_REACH[domain.dim] * (domain.measure / max(n, 1.0)) ** (1 / domain.dim)
             images = np.prod(1 + 2 * np.minimum(depth / domain.extent[list(domain.periodic)], 1.0)) - 1
         cells += n * (images + FOLDED.get(kind, {}).get(work, 0.0))
-    if domain is not None and domain.outline is not None:
+    if domain is not None and domain.cutting_edges:
         boundary = extras.boundary
         if boundary is None:
             spacing = (domain.measure / max(n, 1.0)) ** 0.5
             boundary = domain.boundary_measure / spacing
-        edges = len(domain.outline.oriented.vertices)
-        cells += CELLS_PER_BOUNDARY_CELL * min(boundary, n) + CELLS_PER_EDGE * edges
+        cells += CELLS_PER_BOUNDARY_CELL * min(boundary, n) + CELLS_PER_EDGE * domain.cutting_edges
     if domain is not None and domain.wall_triangles is not None:
         walls = domain.boundary_measure / (domain.measure / max(n, 1.0)) ** (2 / 3)
         cells += CELLS_PER_WALL_CELL * min(walls, n)
@@ -230,19 +228,3 @@ def expected_surplus(
     ratios = sizes.reshape(-1, 2 * d).max(axis=1) / h
     steep = (ratios.clip(STEEP_FROM, STEEP_TO) - STEEP_FROM).mean()
     return float(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * steep)))
-
-
-def expected_boundary_cells(domain: Polygon, size: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Return the expected number of cells at the boundary of a polygon: the integral of 1 / h along it.
-
-    Parameters
-    ----------
-    size : callable
-        h(points (k, 2)) -> (k,).
-    """
-    edges = domain.oriented
-    parts = np.maximum(1, np.ceil(SAMPLE * edges.lengths / edges.lengths.sum())).astype(int)
-    edge = np.repeat(np.arange(len(parts)), parts)
-    part = np.arange(len(edge)) - np.repeat(np.cumsum(parts) - parts, parts)
-    places = edges.vertices[edge] + ((part + 0.5) / parts[edge])[:, None] * edges.along[edge]
-    return float((edges.lengths[edge] / parts[edge] / size(places)).sum())

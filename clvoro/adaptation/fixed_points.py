@@ -18,7 +18,6 @@ from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.lines.pairs import LinePairs, place_pairs
-from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import read_only
 from .tuning import AT_WALL, BEHIND_WALL, CANDIDATES, CLEARINGS, CLOSE, ON_WALL
@@ -185,25 +184,30 @@ def place_beside_lines(
     return pairs
 
 
-def place_around_creases(
-    domain: Domain, wells: np.ndarray, size: Callable[[np.ndarray], np.ndarray]
+def place_in_corners(
+    domain: Domain, free: Domain, wells: np.ndarray, rows: np.ndarray, size: Callable[[np.ndarray], np.ndarray], n: int
 ) -> FixedGenerators | None:
-    """Return the generators around concave creases of `domain`, if there are any.
+    """Return the generators around re-entrant corners and concave creases of `domain`, if there are any.
 
     Parameters
     ----------
-    wells : (k, d) array
-        Fixed generators of the caller.
+    free : Domain
+        The domain without layers.
+    wells, rows : (k, d) and (m, d) array
+        Fixed generators of the caller, and those of layers.
     size : callable
         Sizes (n,) at points (n, d).
+    n : int
+        Number of cells: where they are too few, there are none.
 
     Warns
     -----
     MismatchWarning
         If there is no room for them, or a generator of the caller is among them; says where.
     """
-    around = domain.stations(size)
-    if around is None:
+    others = np.concatenate([wells, rows])
+    around = domain.stations(size, free, others)
+    if around is None or (around.least_cells and len(others) + around.least_cells * len(around) > n):
         return None
     if len(around.left_out):
         x = around.left_out[0]
@@ -213,7 +217,7 @@ def place_around_creases(
             f"{float(np.asarray(size(x[None]))[0]):.3g}. Cells may be concave; use smaller sizes around it",
             MismatchWarning,
         )
-    if len(wells) and len(around):
+    if len(wells) and len(around.centers):
         gaps = np.linalg.norm(wells[:, None] - around.centers, axis=2) / around.radii
         i, b = np.unravel_index(gaps.argmin(), gaps.shape)
         if gaps[i, b] < 1:
@@ -261,9 +265,9 @@ def take_places(
         tree = scipy.spatial.KDTree(points[others].astype(np.float64), boxsize=periods, balanced_tree=False)
         near = tree.query(x[waiting], k=count)
         distance, index = (np.reshape(found, (-1, count)) for found in near)
-        if domain.outline is not None:
-            hidden = ~_sees(domain.outline, fixed[waiting, None], points[others[index]])
-            distance = np.where(hidden, BEHIND_WALL * distance, distance)
+        origin, scale = domain.frame
+        seen = domain.sees(fixed[waiting, None], points[others[index]] * scale + origin)
+        distance = np.where(seen, distance, BEHIND_WALL * distance)
         used = np.zeros(len(others), bool)
         for k in np.argsort(distance, axis=None, kind="stable").tolist():
             row, candidate = waiting[k // count], index.flat[k]
@@ -317,14 +321,6 @@ def clear_balls(
     kept = np.ones(len(points), bool)
     kept[moving[~inside]] = False
     return points[kept], labels[kept]
-
-
-def _sees(domain: Polygon, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return which segments from `a` (k, 1, 2) to `b` (k, m, 2), in device coordinates, lie in the domain, (k, m)."""
-    origin, scale = domain.frame
-    ends = np.stack(np.broadcast_arrays(a, b * scale + origin), axis=2)
-    shapely.prepare(domain.geometry)
-    return np.asarray(shapely.covers(domain.geometry, shapely.linestrings(ends)))
 
 
 def put_back(diagram: Diagram, fixed: np.ndarray) -> None:

@@ -11,16 +11,14 @@ from ..arguments import coincident_named, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
 from ..geometry.boundary_layers import apart_from, check_gaps, count_rows, free_domain, place_layers
 from ..geometry.domain import Domain
-from ..geometry.geojson import may_be_degrees
+from ..geometry.gaps import NARROW
 from ..geometry.lines.pairs import place_pairs
 from ..sizing import Sizing, as_field
 from ..sizing.distance import limit_beside_layers, limit_beside_lines
-from ..sizing.feature import NARROW
 from ..sizing.field import Field, on_domain
-from .corners import place_stations
-from .diagnostics import check_precision, narrow_parts, warn_of_mismatches, warn_of_narrow_parts
-from .estimates import Extras, check_memory, expected_boundary_cells, expected_images, expected_surplus
-from .fixed_points import check_room, place_around_creases, place_beside_lines
+from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
+from .estimates import SAMPLE, Extras, check_memory, expected_images, expected_surplus
+from .fixed_points import check_room, place_beside_lines, place_in_corners
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
 from .options import Options
@@ -31,17 +29,7 @@ from .sampling.quadrature import DensityTree
 from .sampling.start import charted, density_tree, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-from .tuning import (
-    CELLS_ACROSS,
-    GRADIENT_STEP,
-    LEAST_STEEP,
-    MOST_STATIONS,
-    MOVES,
-    NEAR_SIZE,
-    OPENINGS,
-    SAMPLED_SIZES,
-    STEPS,
-)
+from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
 
 
 @dataclass(frozen=True)
@@ -142,24 +130,21 @@ def prepare(
         warn_of_narrow_parts(domain, lambda x: factor * sizing(x))
     if len(fixed):
         check_room(fixed, domain, free, rows, factor * sizing(fixed))
-    around = None
+    own, around = 1.0, None
+    if not options.multilevel and (tree is not None or domain.cutting_edges):
+        own = _own_factor(sizing, free, tree, target)
     if domain.lines is not None:
         around = place_beside_lines(domain, free, fixed, lambda x: factor * np.asarray(sizing(x)))
-        fixed = np.concatenate([fixed, around.points])
-        if len(fixed) > target:
+        if (count := len(fixed) + len(around)) > target:
             raise InputError(
-                f"the mesh has {target} cells, but {len(fixed)} generators are beside the lines or fixed, expected at "
-                "least as many cells; use smaller sizes, or more cells"
+                f"the mesh has {target} cells, but {count} generators are beside the lines or fixed, expected at least "
+                "as many cells; use smaller sizes, or more cells"
             )
-    elif options.multilevel:
-        around = place_around_creases(domain, fixed, lambda x: factor * np.asarray(sizing(x)))
-        fixed = fixed if around is None else np.concatenate([fixed, around.points])
-    own = _own_factor(sizing, free, tree, target) if domain.outline is not None and not options.multilevel else 1.0
-    if domain.outline is not None and tree is not None and around is None:
-        h = factor * own * np.asarray(sizing(domain.outline.oriented.vertices), float)
-        stations = place_stations(domain.outline, free, np.concatenate([fixed, rows]), h)
-        if len(fixed) + len(rows) + MOST_STATIONS * len(stations.points) <= target:
-            fixed, around = np.concatenate([fixed, stations.points]), stations
+    elif tree is not None:
+        own_size = factor * own
+        around = place_in_corners(domain, free, fixed, rows, lambda x: own_size * np.asarray(sizing(x)), target)
+    if around is not None:
+        fixed = np.concatenate([fixed, around.points])
     setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, around)
     lattice = lattice_points(domain, target) if options.method in MOVING else None
     levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0
@@ -290,9 +275,7 @@ def _warn_of_coarse_size(domain: Domain, required: float) -> None:
         f"the measure {domain.measure:.6g}, and the mesh has a single cell; do "
         "h and the domain have the same unit of length?"
     )
-    if domain.outline is not None and may_be_degrees(domain.lower, domain.upper):
-        message += " (Coordinates that are longitudes and latitudes must be projected first.)"
-    warn(message, CoarseSizeWarning)
+    warn(message + domain.unit_hint, CoarseSizeWarning)
 
 
 def _estimate_memory(
@@ -314,8 +297,8 @@ def _estimate_memory(
     if any(domain.periodic) and tree is not None:
         images = expected_images(domain, sizing, most * tree.integral / required, tree)
     field_bytes = sizing.device_bytes + sizing.bytes_for(most)
-    if domain.outline is not None and tree is not None:
-        boundary = expected_boundary_cells(domain.outline, lambda p: (required / most) ** 0.5 * sizing(p))
+    if tree is not None:
+        boundary = domain.along_cutting_edges(lambda p: 1 / ((required / most) ** 0.5 * sizing(p)), SAMPLE)
     needed = check_memory(engine, most, domain, Extras(images, surplus, field_bytes, boundary), power=power)
     # For few cells, the preparation may have taken more than the run.
     return max(needed, float(sizing.peak_bytes))
@@ -347,7 +330,7 @@ def _count_levels(setup: Setup, points: np.ndarray | None, target: int, n_rows: 
 def _is_narrow(setup: Setup, coarseness: float) -> bool:
     """Return whether a gap between layers is narrower than `CELLS_ACROSS` cells of size ``coarseness * h``."""
     scale = CELLS_ACROSS / NARROW * coarseness * setup.factor
-    return narrow_parts(setup.free, lambda x: scale * setup.sizing(x))[0] is not None
+    return setup.free.narrow_parts(lambda x: scale * setup.sizing(x))[0] is not None
 
 
 def start(prepared: Prepared) -> MeshState:

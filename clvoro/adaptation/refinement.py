@@ -7,16 +7,16 @@ import pyopencl.array as cla
 import scipy
 
 from ..geometry.domain import Domain
-from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 from ..tessellation.device_diagram import Tessellation
 from .tuning import CHECKED, CHECKED_PER_EDGE, COINCIDENT, SHORT_FACE
 
 
-def most_checked(domain: Polygon) -> int:
+def most_checked(domain: Domain) -> int:
     """Return the number of new and old generators up to which coincident ones are looked for."""
-    return max(CHECKED, CHECKED_PER_EDGE * len(domain.oriented.vertices))
+    edges = domain.cutting_edges
+    return max(CHECKED, CHECKED_PER_EDGE * edges) if edges else 0
 
 
 class Refinement:
@@ -62,7 +62,7 @@ class Refinement:
             *t.outlines,
         )
         # Several cells that are much larger than the edges of the boundary can bring one at the same corner.
-        if domain.outline is not None and len(finer) <= most_checked(domain.outline):
+        if len(finer) <= most_checked(domain):
             return self._without_coincident(finer, n)
         return finer
 

@@ -148,7 +148,7 @@ def _check_volumes(volumes: np.ndarray, domain: Domain, rounding: float) -> None
 
 def _check_held(points: np.ndarray, domain: Domain) -> None:
     """Raise InputError if a piece of the domain has none of the generators `points`."""
-    if domain.outline is None or domain.n_pieces == 1:
+    if domain.n_pieces == 1:
         return
     held = np.unique(domain.piece_of(points))
     empty = np.setdiff1d(np.arange(domain.n_pieces), held)
@@ -164,9 +164,9 @@ def _check_held(points: np.ndarray, domain: Domain) -> None:
 
 def _check_pieces(points: np.ndarray, volumes: np.ndarray, domain: Domain, rounding: float) -> None:
     """Raise InputError unless `volumes` fill each piece of the domain that holds the generators `points`."""
-    if domain.outline is None or domain.n_pieces == 1:
+    if domain.n_pieces == 1:
         return
-    for k, piece in enumerate(shapely.get_parts(domain.outline.geometry)):
+    for k, piece in enumerate(shapely.get_parts(domain.region)):
         inside = shapely.dwithin(piece, shapely.points(points), 0)
         total = float(volumes[inside].sum())
         if not abs(total - piece.area) <= max(SUM_TOLERANCE, rounding) * domain.measure:

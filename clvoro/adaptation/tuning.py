@@ -162,12 +162,6 @@ MOVES = 1
 SHARP_REACH, BEND_REACH = 0.05, 0.35
 """Distances along the boundary from a corner: over the first its turns are added, over the second the boundary is a
 straight line."""
-LONG_SIDE, WIDEST_STATION = 1.5, np.radians(300)
-"""Least length over h of both walls of a corner around which generators are fixed, and its largest interior angle."""
-STATION_DEPTH, STATION_SPACING = 0.4, 0.8
-"""Least distances over h of these generators from walls, and from those of another corner."""
-MOST_STATIONS = 3
-"""Least number of cells for each of them."""
 SHARP_TURN, LEAST_TURN = np.radians(20), np.radians(30)
 """Least turns of a corner over both distances."""
 SPACING, LEAST_SPACING, FAN = 1.1, 0.15, 0.5

@@ -235,15 +235,14 @@ class Job:
             )
         if self.types and "openfoam" not in self.mesh_formats:
             raise InputError("types are given, and no mesh is written for OpenFOAM; add --format openfoam")
-        if self.case.domain.curved and (self.solver is not None or "openfoam" in self.mesh_formats):
+        name, domain = self.case.name, self.case.domain
+        if self.solver is not None or "openfoam" in self.mesh_formats:
             what = "format openfoam" if self.solver is None else f"check-solver {self.solver}"
-            raise InputError(
-                f"{self.case.name}: {what} is for meshes in boxes and polygons, and the domain is a sphere; expected "
-                "--format mpas or nc, and clvoro check --for mpas"
-            )
-        if "scrip" in self.mesh_formats and not self.case.domain.curved:
-            raise InputError(
-                f"{self.case.name}: format scrip is for meshes on a sphere; expected nc, mpas or another format"
+            remedy = "expected --format mpas or nc, and clvoro check --for mpas"
+            domain.require_flat(f"{name}: {what} is for meshes in boxes, polygons and solids", remedy)
+        if "scrip" in self.mesh_formats:
+            domain.require_globe(
+                f"{name}: format scrip is for meshes on a sphere", "expected nc, mpas or another format"
             )
         for kind in self.mesh_formats:
             if kind in PLANE and self.case.domain.cell_dim != 2:
@@ -438,8 +437,8 @@ class Job:
                 print(f"{name}: {result.settings['trade']}")
             if result.diagram.domain.cell_dim == 3:
                 print(f"{name}: {result.measures.line()}")
-            if result.diagram.domain.cuts_cells:
-                print(f"{name}: {boundary_line(result)}")
+            if line := boundary_line(result):
+                print(f"{name}: {line}")
         print(f"written into {self.out}: {', '.join(self._written(results))}")
         for name, profile in profiles.items():
             print(f"\nwhere the time of {name} went:\n{profile.table()}")

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.sphere import triangle_areas
 from ..mesh.connectivity import face_ends, face_keys, face_owners, neighbor_points, next_faces
 from ..mesh.diagram import Diagram
 
@@ -135,14 +134,10 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
     distance = np.maximum(np.linalg.norm(line, axis=1), 1e-300)
     normal, middle = line / distance[:, None], own + line / 2
     angles = _angles(begin[corners], middle[corners], normal[corners], distance[corners])
-    if domain.globe:
-        middle = domain.wrap(middle)
-        offset = domain.lengths(np.linalg.norm(d.face_centroids - middle, axis=1))
-        distance = domain.lengths(distance)
-        away = domain.lengths(np.linalg.norm(d.centroids - d.points, axis=1))
-    else:
-        offset = np.linalg.norm(d.face_centroids - middle, axis=1)
-        away = np.linalg.norm(d.centroids - d.points, axis=1)
+    middle = domain.onto(middle)
+    offset = domain.lengths(np.linalg.norm(d.face_centroids - middle, axis=1))
+    distance = domain.lengths(distance)
+    away = domain.lengths(np.linalg.norm(d.centroids - d.points, axis=1))
     relative = np.full(len(offset), np.inf)
     np.divide(offset, d.face_measures, out=relative, where=d.face_measures > 0)
     sides = [middle[before[corners]], begin[corners], middle[corners]]
@@ -210,8 +205,5 @@ def _cells_around(d: Diagram, corners: np.ndarray, after: np.ndarray) -> tuple[n
 
 def _kites(d: Diagram, own: np.ndarray, before: np.ndarray, vertex: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the signed areas of quadrilaterals own, before, vertex, after, counter-clockwise, (k,)."""
-    if globe := d.domain.globe:
-        a, p, v, q = (globe.wrap(x) / globe.radius for x in (own, before, vertex, after))
-        return globe.radius**2 * (triangle_areas(a, p, v) + triangle_areas(a, v, q))
-    p, v, q = (x - own for x in (before, vertex, after))
-    return (p[:, 0] * v[:, 1] - p[:, 1] * v[:, 0] + v[:, 0] * q[:, 1] - v[:, 1] * q[:, 0]) / 2
+    areas = d.domain.triangle_areas
+    return areas(own, before, vertex) + areas(own, vertex, after)

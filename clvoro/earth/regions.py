@@ -253,9 +253,7 @@ def _diagram_of(mesh: object) -> tuple[Diagram, Sphere]:
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     if not isinstance(diagram, Diagram):
         raise InputTypeError(f"mesh is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram")
-    globe = diagram.domain.globe
-    if globe is None:
-        raise InputError(f"mesh is in {diagram.domain}, expected a mesh on a clvoro.Sphere")
+    globe = diagram.domain.require_globe("regions are for meshes on a clvoro.Sphere", "in the plane, use subset")
     return diagram, globe
 
 

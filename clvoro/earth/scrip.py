@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
 from ..io.contents import Contents
 from ..io.netcdf import NetCDF
 from ..mesh.connectivity import cell_corners
@@ -27,12 +26,8 @@ def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
     """
     del unit
     diagram, domain = contents.diagram, contents.diagram.domain
-    globe = domain.globe
-    if globe is None:
-        raise InputError(
-            f"cannot write {path}: SCRIP files are for meshes on a Sphere, not for {domain}; leave out "
-            "convention='scrip'"
-        )
+    what = f"cannot write {path}: SCRIP files are for meshes on a Sphere"
+    globe = domain.require_globe(what, "leave out convention='scrip'")
     starts, corners = cell_corners(diagram)
     counts, n = np.diff(starts), len(diagram)
     most = int(counts.max())

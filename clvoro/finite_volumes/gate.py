@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ..arguments import check_choice, format_point, warn
-from ..errors import InputError, MismatchWarning
+from ..errors import MismatchWarning
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .criteria import Criterion, Rows, SolverReport
@@ -36,11 +36,8 @@ def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallS
 
 
 def _check_for_openfoam(diagram: Diagram, walls: WallShape | None) -> SolverReport:
-    if diagram.domain.curved:
-        raise InputError(
-            f"solver is 'openfoam', whose meshes are polyhedra, and the mesh is on {diagram.domain}; use "
-            "solver='mpas' for meshes on a sphere"
-        )
+    remedy = "use solver='mpas' for meshes on a sphere"
+    diagram.domain.require_flat("solver is 'openfoam', whose meshes are polyhedra", remedy)
     walls = "straight" if walls is None else walls
     mesh = make_solver_mesh(diagram, walls, walls == "straight")
     return openfoam_report(mesh, mesh.area_change)

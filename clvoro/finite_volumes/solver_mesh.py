@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ..arguments import check_choice, warn
-from ..errors import InputError, MismatchWarning
+from ..errors import MismatchWarning
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .seams import faces_with_seams
@@ -30,8 +30,7 @@ def make_solver_mesh(
     """
     check_choice("walls", walls, ("straight", "exact"))
     diagram.demand_cells("solver_mesh")
-    check_not_sphere(
-        diagram,
+    diagram.domain.require_flat(
         "meshes for solvers have cells in the plane or polyhedra",
         "use the diagram itself, as diagram.faces, or a file with walls='exact'",
     )
@@ -89,15 +88,3 @@ def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, colla
 
 
 _COLLAPSED = {2: _collapsed_polygons, 3: _collapsed_polyhedra}
-
-
-def check_not_sphere(diagram: Diagram, why: str, instead: str) -> None:
-    """Refuse a diagram on a sphere.
-
-    Raises
-    ------
-    InputError
-        Says `why`, and what to do `instead`.
-    """
-    if diagram.domain.curved:
-        raise InputError(f"{why}, and the cells on {diagram.domain} are pieces of a curved surface; {instead}")

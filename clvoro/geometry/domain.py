@@ -10,11 +10,13 @@ from itertools import product
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
+import shapely
 
 from ..arguments import check_rows, format_point
 from ..errors import InputError
 from ..opencl.engine import PLAIN, Traits
 from .boundary_names import BoundaryNames, Walls
+from .gaps import NARROW, NarrowPart
 from .shapes import Edges
 from .surface import Surface, box_surface
 
@@ -174,6 +176,18 @@ class Domain(ClipBox):
     """Starts of fewer generators are `even_points`, not random ones."""
     for_c_grids: bool = False
     """Whether models have C grids on its meshes, so that runs open obtuse triangles."""
+
+    @cached_property
+    def region(self) -> Any:
+        """The domain as a closed shape: of shapely in the plane, a `Surface` in 3D; None on spheres."""
+        if self.dim == 2:
+            return shapely.box(*self.lower, *self.upper)
+        return box_surface(np.array(self.lower), np.array(self.upper))
+
+    def same_surface(self, other: Domain) -> bool:
+        """Return whether cells of both domains can overlap: on spheres, whether their radii are equal."""
+        del other
+        return True
 
     @property
     def largest_size(self) -> float:
@@ -376,6 +390,13 @@ class Domain(ClipBox):
         inside = (points >= self.lower) & (points <= self.upper)
         return np.all(inside | (np.array(self.periodic) & np.isfinite(points)), axis=1)
 
+    def sees(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return for segments from `a` (k, 1, d) to `b` (k, m, d) whether they lie in the domain, (k, m).
+
+        By default, where no wall can be in between, all of them.
+        """
+        return np.ones(np.broadcast_shapes(a.shape, b.shape)[:-1], bool)
+
     def covers(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, d) whether it lies in the domain; on a wall it may or may not. Fast."""
         return self.contains(points)
@@ -414,6 +435,20 @@ class Domain(ClipBox):
         """Return the lengths in the domain of straight segments of the lengths `chords`; arcs on a sphere."""
         return np.asarray(chords)
 
+    def onto(self, points: np.ndarray) -> np.ndarray:
+        """Return the positions of the curved surface that are nearest to `points` (n, d); in flat domains `points`."""
+        return points
+
+    def along_surface(self, vectors: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the parts of `vectors` (n, d) that are tangential to the domain at `points` (n, d)."""
+        del points
+        return vectors
+
+    def triangle_areas(self, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Return the areas of triangles with the corners `a`, `b`, `c` (n, d), counter-clockwise; in 2D, (n,)."""
+        p, q = b - a, c - a
+        return (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]) / 2
+
     def tangents(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return `cell_dim` orthogonal unit vectors tangential to the domain at `points` (n, d), each (n, d)."""
         return tuple(np.broadcast_to(axis, np.shape(points)) for axis in np.eye(self.dim))
@@ -426,6 +461,23 @@ class Domain(ClipBox):
         """Raise InputError, which begins with `what` and ends with `remedy`, unless the domain is part of a plane."""
         if self.dim > 2:
             raise InputError(f"{what}, and {self} is in 3D or on a sphere; {remedy}")
+
+    def require_flat(self, what: str, remedy: str) -> None:
+        """Raise InputError, which begins with `what` and ends with `remedy`, if cells lie on a curved surface."""
+        if self.curved:
+            raise InputError(f"{what}, and the cells on {self} are pieces of a curved surface; {remedy}")
+
+    def require_globe(self, what: str, remedy: str) -> Sphere:
+        """Return the sphere whose longitudes and latitudes positions have.
+
+        Raises
+        ------
+        InputError
+            If there is none; begins with `what`, and ends with `remedy`.
+        """
+        if self.globe is None:
+            raise InputError(f"{what}, not for {self}; {remedy}")
+        return self.globe
 
     def require_no_holes(self, what: str) -> None:
         """Raise InputError, which begins with `what`, if holes are removed from meshes of the domain."""
@@ -499,15 +551,52 @@ class Domain(ClipBox):
         widths = np.where(self.periodic, np.inf, self.extent)
         return (np.array(self.lower) + self.upper) / 2, float(widths.min())
 
-    def stations(self, size: Callable[[np.ndarray], np.ndarray]) -> FixedGenerators | None:
-        """Return the generators that must be fixed so that cells of the sizes `size` end at walls: none here.
+    def narrow_parts(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[NarrowPart | None, NarrowPart | None]:
+        """Return where the domain is narrower than half a cell of `size`, and a dead end narrower than a cell, or None.
+
+        By default there are no dead ends.
+        """
+        place, width = self.narrowest(size)
+        strait = NarrowPart(place, width, float(size(place[None])[0]))
+        return strait if strait.width < NARROW * strait.size else None, None
+
+    remedy_for_narrow_parts = "Use smaller sizes there"
+    """What a warning of narrow parts advises."""
+
+    def why_sizes_are_missed(self, x: np.ndarray, h: float, cells: int) -> str:
+        """Return why the cell at `x` (d,) of a mesh of `cells` has not the size `h`, where sizes vary little."""
+        del x, h, cells
+        return (
+            f"the domain has a measure of {self.measure:.6g}, which cells of this size do not fill evenly: use smaller "
+            "sizes, or n_cells, which scales the sizes to a number of cells"
+        )
+
+    cutting_edges: int = 0
+    """Number of edges of the boundary that cut cells in the plane."""
+
+    def along_cutting_edges(self, function: Callable[[np.ndarray], np.ndarray], samples: int) -> float:
+        """Return the integral of `function` of places (k, d) along those edges, from about `samples` places."""
+        del function, samples
+        return 0.0
+
+    unit_hint: str = ""
+    """What a user of coarse sizes should know of the unit of the coordinates."""
+
+    def stations(
+        self, size: Callable[[np.ndarray], np.ndarray], free: Domain, fixed: np.ndarray
+    ) -> FixedGenerators | None:
+        """Return generators that must stay so that faces end in re-entrant corners and creases: none here.
 
         Parameters
         ----------
         size : callable
             Target size at points (k, d), (k,).
+        free : Domain
+            The domain without layers.
+        fixed : (m, d) array
+            Other generators that stay.
         """
-        del size
+        del size, free, fixed
         return None
 
     def chart(self) -> Chart:

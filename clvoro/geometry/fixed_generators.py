@@ -1,10 +1,27 @@
-"""Generators that do not move, so that faces lie on lines or end in creases, and balls that keep the others away."""
+"""Generators that do not move, so that faces lie on lines or end in corners and creases.
+
+Balls around lines and creases keep the others away.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
+
+from .rings import WALL_CORNER
+
+if TYPE_CHECKING:
+    from .domain import Domain
+    from .polygon import Polygon
+
+_LONG_SIDE, _WIDEST = 1.5, np.radians(300)
+"""Least length over h of both walls of a corner around which generators are fixed, and its largest interior angle."""
+_DEPTH, _SPACING = 0.4, 0.8
+"""Least distances over h of these generators from walls, and from those of another corner."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +53,59 @@ class FixedGenerators:
     """Whether the target size of these cells is the size that they have."""
     corners = np.empty(0, int)
     """Vertices of `Polygon.oriented` around which they stand, (c,)."""
+    least_cells = 0
+    """Least number of cells of a mesh for each of them."""
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+@dataclass(frozen=True)
+class CornerStations(FixedGenerators):
+    """Fixed generators around re-entrant corners with long sides, at one distance, so that their faces end there.
+
+    There are no balls around these corners.
+    """
+
+    corners: np.ndarray = field()
+    least_cells = 3
+
+
+def place_around_corners(
+    domain: Polygon, size: Callable[[np.ndarray], np.ndarray], free: Domain, fixed: np.ndarray
+) -> CornerStations:
+    """Return generators around the re-entrant corners of `domain` that have room for cells of the sizes `size`.
+
+    Around a corner of 270 degrees three stand in the middle of three equal sectors, around others as many as it has
+    right angles. The outer ones see one wall each; all have the size h. Corners between sides shorter than
+    `_LONG_SIDE`, near layers, other stations, other walls or `fixed` generators (m, 2) have none.
+    """
+    rings = domain.oriented
+    h, angle = np.asarray(size(rings.vertices), float), np.pi - rings.turns
+    sharp = (rings.turns < -WALL_CORNER) & (angle < _WIDEST)
+    sharp &= np.minimum(rings.lengths, rings.lengths[rings.before]) >= _LONG_SIDE * h
+    corners = np.flatnonzero(sharp)
+    count = np.maximum(np.rint(angle[corners] / (np.pi / 2)).astype(int), 2)
+    sector = angle[corners] / count
+    corner = np.repeat(np.arange(len(corners)), count)
+    place = np.arange(len(corner)) - np.repeat(np.cumsum(count) - count, count)
+    way = np.arctan2(*rings.along[corners].T[::-1])[corner] + sector[corner] * (place + 0.5)
+    size_at = h[corners][corner]
+    reach = size_at / (2 * np.sin(sector / 2))[corner]
+    points = rings.vertices[corners][corner] + reach[:, None] * np.column_stack([np.cos(way), np.sin(way)])
+    good = domain.contains(points) & free.contains(points)
+    good[good] = domain.boundary_distance(points[good]) >= _DEPTH * size_at[good]
+    good[good] = free.boundary_distance(points[good]) >= _DEPTH * size_at[good]
+    if len(fixed) and len(points):
+        good &= scipy.spatial.KDTree(fixed).query(points)[0] >= size_at
+    left = np.bincount(corner, ~good, len(corners)) == 0
+    pairs = scipy.spatial.KDTree(points).query_pairs(float(size_at.max(initial=0)), output_type="ndarray")
+    one, two = corner[pairs].T
+    gap = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
+    near = (one != two) & (gap < _SPACING * size_at[pairs].max(axis=1))
+    for a, b in zip(one[near].tolist(), two[near].tolist(), strict=True):
+        if left[a] and left[b]:
+            left[max(a, b)] = False
+    points = points[left[corner]]
+    no_balls = np.empty((0, 2)), np.empty(0), np.zeros(len(points) + 1, np.int32), np.empty(0, np.int32)
+    return CornerStations(points, *no_balls, left_out=np.empty((0, 2)), corners=corners[left])

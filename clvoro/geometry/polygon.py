@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from os import PathLike
@@ -22,7 +22,9 @@ from .curved_edges import CurvedEdges
 from .curves import Curve
 from .domain import Domain
 from .edge_bins import EdgeBins
-from .geojson import pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt, squeezed
+from .fixed_generators import FixedGenerators, place_around_corners
+from .gaps import NarrowPart, find_narrow_parts
+from .geojson import may_be_degrees, pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt, squeezed
 from .rings import OrientedRings, make_rings, project, signed_area
 from .shapes import Edges
 from .simplification import pieces_of, simplify
@@ -35,6 +37,8 @@ _MARGIN = 1 / 64
 _ROUNDINGS = 8
 """Tolerance for points on the boundary, in units of round-off of the largest coordinate."""
 
+FEW_CELLS = 30
+"""Pieces that fewer cells would fill do not meet their sizes."""
 BOUNDARY_SHIFTS = (8, 16, 32, 64, 64, 64, 64, 64)
 """Shifts of the boundary in units of round-off, each in another direction. They are tried one after the other if the
 boundary cannot be traced through the diagram. They are within the tolerance of vertices."""
@@ -495,6 +499,11 @@ class Polygon(Domain):
         return whole
 
     @property
+    def region(self) -> Any:  # type: ignore[override]
+        """The domain as a shape of shapely."""
+        return self.geometry
+
+    @property
     def _rounding(self) -> float:
         far = max(map(abs, (*self.lower, *self.upper)))
         return _ROUNDINGS * float(np.finfo(float).eps) * far
@@ -598,6 +607,61 @@ class Polygon(Domain):
         on = np.hypot(*(self.oriented.vertices[after] - points[rows]).T) <= within
         on &= np.isin(rows * count + after, rows * count + edges)
         return np.bincount(rows, minlength=len(points)) > 1 + np.bincount(rows[on], minlength=len(points))
+
+    def narrow_parts(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[NarrowPart | None, NarrowPart | None]:
+        """Return where the polygon is narrower than half a cell, and a dead end; see `find_narrow_parts`."""
+        return find_narrow_parts(self, size)
+
+    remedy_for_narrow_parts = (
+        "Use smaller sizes there, as sizing.FeatureSize does, or fill it: domain.simplified(size) does"
+    )
+
+    def why_sizes_are_missed(self, x: np.ndarray, h: float, cells: int) -> str:
+        """Return why the cell at `x` (2,) of a mesh of `cells` has not the size `h`, where sizes vary little."""
+        if cells <= FEW_CELLS:
+            return super().why_sizes_are_missed(x, h, cells)
+        point = shapely.Point(x)
+        piece = min(self.pieces, key=lambda shape: shape.distance(point))
+        if self.n_pieces > 1 and piece.area < FEW_CELLS * h**2:
+            return (
+                f"it is in a piece of the domain that {piece.area / h**2:.2g} cells would fill: use smaller sizes "
+                "there, or keep the largest piece, domain.split()[0]"
+            )
+        return (
+            "narrow parts of the domain do not hold a whole number of cells of this size: use smaller sizes there, as "
+            "sizing.FeatureSize does, or fill them: domain.simplified(size) does"
+        )
+
+    @property
+    def cutting_edges(self) -> int:  # type: ignore[override]
+        """Number of edges."""
+        return len(self.oriented.vertices)
+
+    def along_cutting_edges(self, function: Callable[[np.ndarray], np.ndarray], samples: int) -> float:
+        """Return the integral of `function` of places (k, 2) along the boundary, from about `samples` places."""
+        edges = self.oriented
+        parts = np.maximum(1, np.ceil(samples * edges.lengths / edges.lengths.sum())).astype(int)
+        edge = np.repeat(np.arange(len(parts)), parts)
+        part = np.arange(len(edge)) - np.repeat(np.cumsum(parts) - parts, parts)
+        places = edges.vertices[edge] + ((part + 0.5) / parts[edge])[:, None] * edges.along[edge]
+        return float((edges.lengths[edge] / parts[edge] * function(places)).sum())
+
+    @property
+    def unit_hint(self) -> str:  # type: ignore[override]
+        """What to do with longitudes and latitudes, if coordinates may be that."""
+        if not may_be_degrees(self.lower, self.upper):
+            return ""
+        return " (Coordinates that are longitudes and latitudes must be projected first.)"
+
+    def sees(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return which segments from `a` (k, 1, 2) to `b` (k, m, 2) lie in the polygon, (k, m)."""
+        shapely.prepare(self.geometry)
+        ends = np.stack(np.broadcast_arrays(a, b), axis=2)
+        return np.asarray(shapely.covers(self.geometry, shapely.linestrings(ends)))
+
+    def stations(self, size: Callable[[np.ndarray], np.ndarray], free: Domain, fixed: np.ndarray) -> FixedGenerators:
+        """Return generators around re-entrant corners; see `place_around_corners`."""
+        return place_around_corners(self, size, free, fixed)
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Return the nearest point of the domain to each of `points` (n, 2): the point itself if it is inside."""

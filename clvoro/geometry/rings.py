@@ -26,6 +26,8 @@ SHORTEST_EDGE = 1e-12
 """Shortest edge, as a share of the bounding box's longest edge."""
 _RESOLUTION = 2.0**-40
 """Smallest extent, as a share of the largest coordinate: 12 bits are left of float64's 52."""
+WALL_CORNER = np.pi / 6
+"""Turn of a boundary, 30 degrees, beyond which it has a corner."""
 _SPLIT = 2.0**27 + 1
 _NAMED = 4  # rings at one place that an error lists
 

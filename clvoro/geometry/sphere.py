@@ -119,6 +119,12 @@ class Sphere(Domain):
         """2: cells have areas."""
         return 2
 
+    region = None
+
+    def same_surface(self, other: Domain) -> bool:
+        """Return whether `other` is on the same sphere."""
+        return other.globe is not None and other.globe.radius == self.radius
+
     @property
     def largest_size(self) -> float:
         """The radius."""
@@ -304,6 +310,19 @@ class Sphere(Domain):
         """Return the positions on the sphere, (n, 3), in the direction of `points`."""
         x = np.asarray(points, float)
         return self.radius * (x / np.linalg.norm(x, axis=1, keepdims=True))
+
+    def onto(self, points: np.ndarray) -> np.ndarray:
+        """Return the positions on the sphere, (n, 3), in the direction of `points`."""
+        return self.wrap(points)
+
+    def along_surface(self, vectors: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the parts of `vectors` (n, 3) in the planes that touch the sphere at `points` (n, 3)."""
+        up = points / self.radius
+        return vectors - (vectors * up).sum(axis=1)[:, None] * up
+
+    def triangle_areas(self, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Return the areas of triangles of great circles with the corners `a`, `b`, `c` (n, 3): (n,)."""
+        return self.radius**2 * triangle_areas(*(self.wrap(x) / self.radius for x in (a, b, c)))
 
     @property
     def frame(self) -> tuple[np.ndarray, float]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..arguments import check_path
 from ..errors import InputError, InputTypeError
-from ..finite_volumes.solver_mesh import WallShape, check_not_sphere
+from ..finite_volumes.solver_mesh import WallShape
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .atomic import check_writable, make_folder
@@ -191,8 +191,7 @@ def to_fipy(mesh: Result | Diagram, walls: WallShape = "straight") -> VoronoiMes
     """Return a mesh of FiPy; see `Diagram.to_fipy`."""
     diagram = Contents.of(mesh).diagram
     diagram.demand_voronoi("to_fipy")
-    check_not_sphere(
-        diagram,
+    diagram.domain.require_flat(
         "FiPy has cells in the plane and polyhedra",
         "save as .nc, or use diagram.faces, which has arcs of great circles",
     )

@@ -26,7 +26,7 @@ import orjson
 from ..errors import InputError, InputTypeError
 from ..finite_volumes.gate import warn_of_rejection
 from ..finite_volumes.prisms import polyhedra
-from ..finite_volumes.solver_mesh import WallShape, check_not_sphere, make_solver_mesh
+from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.boundary_names import WORD, Walls
 from ..mesh.connectivity import slices
 from ..mesh.diagram import Diagram
@@ -238,10 +238,8 @@ def write_foam(
         Zones of cells by name, one bool per cell each; see `MeshOutput.to_openfoam`. Without zones the files of those
         of an earlier mesh are removed.
     """
-    check_not_sphere(
-        contents.diagram,
-        f"cannot write {path}: OpenFOAM's cells are polyhedra",
-        "save as .nc with convention='mpas', or as .vtu",
+    contents.diagram.domain.require_flat(
+        f"cannot write {path}: OpenFOAM's cells are polyhedra", "save as .nc with convention='mpas', or as .vtu"
     )
     if contents.extra:
         raise InputError(

@@ -114,7 +114,7 @@ class Measures:
         follow.
         """
         domain = None if self.diagram is None else self.diagram.domain
-        of_c_grid = self.c_grid.summary() if domain is not None and domain.curved else {}
+        of_c_grid = self.c_grid.summary() if domain is not None and domain.for_c_grids else {}
         angle, ratio = (
             values[self.inner] if self.inner.any() else values for values in (self.centroid_angle, self.volume_ratio)
         )
@@ -158,19 +158,14 @@ def measure_mesh(diagram: Diagram) -> Measures:
     share = np.full(len(line), 0.5)
     share[inner] = plane_shares(diagram, np.flatnonzero(inner))
     crossing = points[owner] + share[:, None] * line
-    if domain.curved:
-        crossing = domain.wrap(crossing)
+    crossing = domain.onto(crossing)
     offset, distance = domain.lengths(np.linalg.norm(middles - crossing, axis=1)), domain.lengths(distance)
     skewness = np.where(offset > 0, np.inf, 0.0)  # remains where the distance is 0
     np.divide(offset, distance, out=skewness, where=distance > 0)
 
     angle = np.zeros(len(line))
     between = centroids[other] + diagram.shifts * diagram.domain.extent - centroids[owner]
-    if domain.curved:
-        # The part in the plane that touches the sphere where the arcs cross.
-        up = crossing / domain.frame[1]
-        between -= (between * up).sum(axis=1)[:, None] * up
-    angle[inner] = _angles(line[inner], between[inner])
+    angle[inner] = _angles(line[inner], domain.along_surface(between, crossing)[inner])
 
     counts = np.diff(starts)
     some = counts > 0  # in a power diagram cells may be empty

@@ -247,8 +247,8 @@ def figures(size_error: np.ndarray, quality: np.ndarray) -> dict[str, float]:
 def summary(result: Result) -> dict[str, Any]:
     """Return the figures of a run; see `Result.summary`."""
     history = result.history
-    parts = beside_boundary(result) if result.diagram.domain.outline is not None else {}
-    apart = {f"{part}_{name}": value for part, some in parts.items() for name, value in some.items()}
+    parts = beside_boundary(result).items()
+    apart = {f"{part}_{name}": value for part, some in parts for name, value in some.items()}
     return {
         "cells": len(result.points),
         "steps": int(history["step"][-1]) if len(history) else 0,
@@ -269,9 +269,11 @@ def beside_boundary(result: Result) -> dict[str, dict[str, Any]]:
     """Return number, mean |e|, mean and least Q of `boundary` cells, those of them at a `corner`, and `inner` cells.
 
     A corner is a turn of the boundary by more than 30 degrees; see `have_corners`. The values are None if there is no
-    such cell.
+    such cell. Where no edges cut cells, there are no such parts.
     """
     d = result.diagram
+    if not d.domain.cutting_edges:
+        return {}
     owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
     on_boundary = np.bincount(owner, d.neighbors < 0, len(d)) > 0
     found = {}

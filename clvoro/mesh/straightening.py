@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..geometry.rings import WALL_CORNER
 from .connectivity import face_ends
 
 if TYPE_CHECKING:
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from ..geometry.polygon import Polygon
     from .diagram import Diagram
 
-WALL_CORNER = np.pi / 6
-"""Turn of the boundary, 30 degrees, beyond which it has a corner."""
 SIDE_TURN = WALL_CORNER * (1 + 2.0**-10)
 """Largest turn of a side on the boundary: `WALL_CORNER` and a little more.
 

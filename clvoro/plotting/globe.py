@@ -89,11 +89,7 @@ def plot_globe(
     """
     result = picture_of(mesh)
     diagram = result.diagram
-    sphere = diagram.domain.globe
-    if sphere is None:
-        raise InputError(
-            f"plot_globe draws meshes on a sphere, and this one is in {diagram.domain}; call result.plot()"
-        )
+    sphere = diagram.domain.require_globe("plot_globe draws meshes on a sphere", "call result.plot()")
     paint = paint_of(result, color, label, limits)
     with styled():
         if ax is None:

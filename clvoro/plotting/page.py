@@ -157,7 +157,7 @@ def _page(
     parts = [
         f"<h1>{_safe(title)}</h1><p class=what>{_safe(words)}</p><dl>{cards}</dl>",
         f"<h2>Runs</h2>{_runs(results, name)}" if len(results) > 1 else f"<p>Stopped: {_safe(main.stop_reason)}.</p>",
-        f"<h2>Cells on the boundary</h2>{_apart(results, name)}" if main.diagram.domain.cuts_cells else "",
+        f"<h2>Cells on the boundary</h2>{apart}" if (apart := _apart(results, name)) else "",
         f"<h2>Measures for finite volumes</h2>{_measures(name, main)}",
         f"<h2>Pictures</h2><p>{_safe(missing)}</p>" if missing else "<h2>Pictures</h2>",
     ]
@@ -198,13 +198,13 @@ def _measures(name: str, result: Result) -> str:
 
 
 def _apart(results: Mapping[str, Result], main: str) -> str:
-    """Return the table of boundary cells, those of them at corners, and inner cells."""
+    """Return the table of boundary cells, those of them at corners, and inner cells; "" where no edges cut cells."""
     rows = []
     for method, result in results.items():
         for part, s in beside_boundary(result).items():
             numbers = (f"{s['mean_error']:.4f}", f"{s['mean_quality']:.4f}", f"{s['min_quality']:.3f}")
             rows.append((method, f"{part} cells", str(s["cells"]), *(numbers if s["cells"] else ("–",) * 3)))
-    return _table(("method", "", "number", "mean |e|", "mean Q", "min Q"), rows, main)
+    return _table(("method", "", "number", "mean |e|", "mean Q", "min Q"), rows, main) if rows else ""
 
 
 def _runs(results: Mapping[str, Result], main: str) -> str:

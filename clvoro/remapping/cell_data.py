@@ -79,7 +79,7 @@ def transfer_values(
 
 def _on_host(a: Domain, b: Domain) -> bool:
     """Return whether the host intersects the cells: in polygons, on spheres, and in boxes with different seams."""
-    return a.curved or a.outline is not None or b.outline is not None or a.periodic != b.periodic
+    return a.curved or a.cuts_cells or b.cuts_cells or a.periodic != b.periodic
 
 
 def _require_one_space(source: Diagram, target: Diagram) -> None:
@@ -90,7 +90,7 @@ def _require_one_space(source: Diagram, target: Diagram) -> None:
             f"onto is a mesh of {b}, the values are on {a}; expected meshes in one space: both in the plane, in 3D, or "
             "on a sphere"
         )
-    if a.globe is not None and b.globe is not None and a.globe.radius != b.globe.radius:
+    if not a.same_surface(b):
         raise InputError(
             f"onto is a mesh of {b}, the values are on {a}; expected one radius: give both spheres the same unit"
         )
@@ -101,11 +101,6 @@ def _require_one_space(source: Diagram, target: Diagram) -> None:
         raise InputError(
             f"the meshes have periods of {a.extent[axis]:g} and {b.extent[axis]:g} along axis {axis}, expected one "
             "period; transfer onto a box with walls, or with the same period"
-        )
-    if (a.cuts_cells and a.outline is None) or (b.cuts_cells and b.outline is None):
-        raise InputError(
-            f"the meshes are of {a} and {b}; expected boxes, since cells that a surface cuts are not transferred in "
-            "3D; transfer between meshes of a box around it, and take the cells inside by subset"
         )
     if a.periodic != b.periodic and not a.curved:
         remedy = "transfer between boxes with the same periodic directions"

@@ -14,7 +14,7 @@ from ..geometry import curves
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
 from ..geometry.shapes import Circle, ClosedPolyline
-from ..geometry.surface import Surface, box_surface
+from ..geometry.surface import Surface
 from .distance import Distance
 
 if TYPE_CHECKING:
@@ -120,11 +120,8 @@ def ring_edges(area: shapely.Geometry) -> np.ndarray:
 
 def _area_of(shape: Any) -> shapely.Geometry:
     """Return a closed shape in 2D as a polygon of shapely."""
-    if isinstance(shape, Domain) and shape.outline is not None:
-        area = shape.outline.geometry
-    elif isinstance(shape, Domain) and not shape.curved:
-        (a, b), (c, d) = shape.lower, shape.upper
-        area = shapely.box(a, b, c, d)
+    if isinstance(shape, Domain) and shape.region is not None:
+        area = shape.region
     elif isinstance(shape, Circle) and shape.radius > 0:
         turn = 2 * np.pi * np.arange(_SIDES) / _SIDES
         area = shapely.Polygon(shape.center + shape.radius * np.column_stack([np.cos(turn), np.sin(turn)]))
@@ -148,10 +145,8 @@ def _solid_of(shape: Any) -> Circle | Surface:
     if isinstance(shape, Surface):
         shape.require_closed()
         return shape
-    if isinstance(shape, Domain) and not shape.curved:
-        box = np.array(shape.lower), np.array(shape.upper)
-        walls: Any = shape.boundary() if shape.curved_walls else box_surface(*box)
-        return walls
+    if isinstance(shape, Domain) and shape.region is not None:
+        return shape.region
     raise _not_closed(shape)
 
 

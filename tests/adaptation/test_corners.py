@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 import clvoro
 from clvoro.adaptation import corners, tuning
-from clvoro.adaptation.corners import find_corners, place_stations
+from clvoro.adaptation.corners import find_corners
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
 from clvoro.mesh.connectivity import face_ends
@@ -430,21 +430,21 @@ def test_faces_end_in_corners(method, real, domain, more, adapter, adapter32):
 def test_stations_stand_around_corners_with_room():
     """Three around a corner of 270 degrees, at one distance, each in a sector of 90; none where there is no room."""
     corner = int(np.flatnonzero(L.oriented.turns < 0)[0])
-    h, none = np.full(len(L.oriented.vertices), 0.05), np.empty((0, 2))
-    stations = place_stations(L, L, none, h)
+    none = np.empty((0, 2))
+    stations = L.stations(lambda x: np.full(len(x), 0.05), L, none)
     assert stations.corners.tolist() == [corner]
     away = stations.points - L.oriented.vertices[corner]
     assert np.allclose(np.hypot(*away.T), 0.05 / np.sqrt(2))
     assert np.allclose(np.degrees(np.arctan2(*away.T[::-1])) % 90, 45)
     assert np.allclose(L.boundary_distance(stations.points)[[0, 2]], 0.025)
-    for given, size in ((stations.points[1:2] + 0.01, h), (none, 10 * h)):
-        assert len(place_stations(L, L, given, size).points) == 0
+    for given, h in ((stations.points[1:2] + 0.01, 0.05), (none, 0.5)):
+        assert len(L.stations(lambda x, h=h: np.full(len(x), h), L, given)) == 0
 
 
 @pytest.mark.parametrize(("h", "count"), [(0.1, 2), (0.35, 0)])
 def test_corners_with_short_sides_have_no_stations(h, count):
     stairs = clvoro.Polygon([(0, 0), (4, 0), (4, 1), (2.5, 1), (2.5, 1.5), (2, 1.5), (2, 2.5), (0, 2.5)])
-    stations = place_stations(stairs, stairs, np.empty((0, 2)), np.full(8, h))
+    stations = stairs.stations(lambda x: np.full(len(x), h), stairs, np.empty((0, 2)))
     assert len(stations.corners) == count
 
 

@@ -304,10 +304,10 @@ def test_size_errors_in_polygons_have_a_remedy():
     """A small piece shall be left out, and a narrow part be filled."""
     pond, lake = [(2, 0), (2.12, 0), (2.12, 0.12), (2, 0.12)], [(0, 0), (1, 0), (1, 1), (0, 1)]
     both = clvoro.Polygon.from_pieces([[pond], [lake]])
-    why = diagnostics._why_in_polygon(both, np.array([2.05, 0.05]), 0.1)
+    why = both.why_sizes_are_missed(np.array([2.05, 0.05]), 0.1, 100)
     assert "a piece of the domain that 1.4 cells would fill" in why
     assert "domain.split()[0]" in why
-    assert "domain.simplified(size)" in diagnostics._why_in_polygon(both, np.array([0.5, 0.5]), 0.1)
+    assert "domain.simplified(size)" in both.why_sizes_are_missed(np.array([0.5, 0.5]), 0.1, 100)
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ def volumes(monkeypatch):
 def test_cells_in_a_solid_with_a_concave_crease(ctx, volumes):
     solid, adapter = corner(), clvoro.Adapter(ctx)
     result = adapter.run(solid, H, "fast")
-    around = solid.stations(H)
+    around = solid.stations(lambda x: np.full(len(x), H))
     stations = around.points
     lengths = np.cbrt(volumes[0])
     assert solid.contains(result.points).all()

@@ -11,8 +11,8 @@ import clvoro
 from clvoro import sizing
 from clvoro.adaptation.sampling.start import sample_uniform
 from clvoro.errors import InputError, InputTypeError
+from clvoro.geometry.gaps import FACING
 from clvoro.opencl.engine import Engine
-from clvoro.sizing.feature import FACING
 from tests.reference.polygons import HOLE, SQUARE, ragged
 
 CIRCLE = np.column_stack([f(np.arange(200) * math.pi / 100) for f in (np.cos, np.sin)])

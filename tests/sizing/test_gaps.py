@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.sizing.feature import FACING, _balls
+from clvoro.geometry.gaps import FACING, _balls
 
 from ..reference.gaps import largest_radius
 

@@ -50,7 +50,8 @@ def charted(
     domain: Domain, field: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[Domain, Callable[[np.ndarray], np.ndarray]]:
     """Return the domain's chart, and the field there; `domain` and `field` if it is plane already."""
-    return (domain.chart().domain, Charted(field, domain)) if domain.curved else (domain, field)
+    chart = domain.chart().domain
+    return (domain, field) if chart is domain else (chart, Charted(field, domain))
 
 
 _ATTEMPTS = 40
@@ -143,7 +144,7 @@ def sample_density(
     field = _evaluator(field)
     tree = density_tree(field, domain) if tree is None else tree
     chart = domain.chart()
-    if domain.curved:
+    if chart.domain is not domain:
         _, field = charted(domain, field)
         return chart.position(sample_density(field, chart.domain, n, seed, real, tree))
     boxes, coverage, slopes = tree.boxes, tree.coverage, tree.slopes
@@ -188,8 +189,8 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
         If the precision has not `n` distinct points.
     """
     n, seed = _check_arguments(n, seed)
-    if domain.curved:
-        chart = domain.chart()
+    chart = domain.chart()
+    if chart.domain is not domain:
         return chart.position(sample_uniform(chart.domain, n, seed, real))
     rng = np.random.Generator(np.random.PCG64(seed))
     place = _uniform_in(domain, rng)

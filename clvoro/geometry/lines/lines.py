@@ -80,8 +80,7 @@ class Lines:
     def inside(self, domain: Domain) -> Any:
         """Return the part of the lines in `domain` but not on its walls, divided where lines meet, as shapely lines."""
         extent = domain.extent
-        outline = domain.outline
-        region = _box(domain) if outline is None else outline.geometry
+        region = domain.region
         snap = _SNAP * float(extent.max())
         copies = [self.geometry]
         for axis in np.flatnonzero(domain.periodic).tolist():
@@ -134,8 +133,7 @@ class Lines:
 
         Parts that are joined by a periodic seam are one multipolygon.
         """
-        outline = domain.outline
-        region = _box(domain) if outline is None else outline.geometry
+        region = domain.region
         # Lines of an end that misses a wall by round-off reach it.
         boundary = region.boundary
         lines = shapely.snap(self.inside(domain), boundary, _SNAP * float(domain.extent.max()))
@@ -230,11 +228,6 @@ def _moved(shape: Any, axis: int, distance: float) -> Any:
     """Return a shape of shapely, moved along an axis."""
     way = np.where(np.arange(2) == axis, distance, 0.0)
     return shapely.transform(shape, lambda x: x + way)
-
-
-def _box(domain: Domain) -> Any:
-    (a, b), (c, d) = domain.lower, domain.upper
-    return shapely.box(a, b, c, d)
 
 
 def wall_lines(domain: Domain) -> Any:

@@ -602,12 +602,15 @@ class Solid(Domain):
         sound[doubtful] = self.visible(x[row[doubtful]], foot[doubtful])
         return OwnPlanes(row[sound], patch[sound], foot[sound], normal[sound], depth[sound], behind)
 
-    def stations(self, size: Callable[[np.ndarray], np.ndarray] | float) -> Stations:
-        """Return generators around concave creases and corners, for sizes h: a number, or a function of points (n, 3).
+    def stations(
+        self, size: Callable[[np.ndarray], np.ndarray], free: Domain | None = None, fixed: np.ndarray | None = None
+    ) -> Stations:
+        """Return generators around concave creases and corners, for sizes h = size(points (n, 3)).
 
         Faces between their cells meet in the creases, so that no cell is concave there.
         """
-        return place_stations(self, size if callable(size) else lambda x: np.full(len(x), float(size)))
+        del free, fixed
+        return place_stations(self, size)
 
     def narrowest(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
         """Return a place (3,) where the solid is narrowest in units of the sizes `size`, and its width there.
@@ -738,6 +741,11 @@ class Solid(Domain):
         """
         chosen = self.boundaries.select("boundary", walls)
         return Surface(self.surface.vertices, self.surface.triangles[np.isin(self.patch, chosen)], "boundary")
+
+    @property
+    def region(self) -> Surface:  # type: ignore[override]
+        """The whole surface."""
+        return self.boundary()
 
     @cached_property
     def shells(self) -> tuple[int, np.ndarray]:

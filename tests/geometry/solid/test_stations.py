@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree
 
 from clvoro import Polygon, Solid
-from clvoro.adaptation.fixed_points import place_around_creases
+from clvoro.adaptation.fixed_points import place_in_corners
 from clvoro.errors import MismatchWarning
 from clvoro.geometry.solid.stations import chain_line
 
@@ -42,7 +42,7 @@ def ties(stations, points, k):
 @pytest.mark.parametrize(("solid", "count"), [(L, 3 * 5), (FICHERA, 3 * 15 - 3 + 1), (BOSS, None), (STEPPED, None)])
 def test_creases_are_equidistant_from_the_generators_around_them(solid, count):
     h = 0.2
-    stations = solid.stations(h)
+    stations = solid.stations(lambda x: np.full(len(x), h))
     assert len(stations.left_out) == 0
     assert count is None or len(stations) == count
     assert (solid.signed_distance(stations.points) < -0.3 * h).all()
@@ -62,7 +62,7 @@ def test_creases_are_equidistant_from_the_generators_around_them(solid, count):
 def test_cells_of_stations_have_the_size_that_is_asked_for(solid):
     """With a lattice around them; cells are cut by the planes of the walls near them."""
     h = 0.2
-    points = solid.stations(h).points
+    points = solid.stations(lambda x: np.full(len(x), h)).points
     n = len(points)
     axis = np.arange(0.1, 2, 0.2)
     lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -93,16 +93,16 @@ def test_places_without_room_are_reported():
     """Above a ledge that is narrower than the cells, and in a run."""
     ledge = Polygon([(0, 0), (1.05, 0), (1.05, 1), (1, 1), (1, 2), (0, 2)])
     solid = Solid.extruded(ledge, 0, 0.6)
-    left = solid.stations(0.2).left_out
+    left = solid.stations(lambda x: np.full(len(x), 0.2)).left_out
     assert left[:, :2] == pytest.approx(np.tile([1.0, 1.0], (3, 1)))
     with pytest.warns(MismatchWarning, match="no room at 3 places on concave creases, the first at \\(1, 1, 0.1\\)"):
-        place_around_creases(solid, np.empty((0, 3)), lambda x: np.full(len(x), 0.2))
+        place_in_corners(solid, solid, *np.empty((2, 0, 3)), lambda x: np.full(len(x), 0.2), 1000)
 
 
 def test_given_generators_in_balls_are_reported():
     with pytest.warns(MismatchWarning, match="fixed\\[0\\] .* from a concave crease"):
-        place_around_creases(L, np.array([[0.9, 0.9, 0.5]]), lambda x: np.full(len(x), 0.2))
+        place_in_corners(L, L, np.array([[0.9, 0.9, 0.5]]), np.empty((0, 3)), lambda x: np.full(len(x), 0.2), 1000)
 
 
 def test_solids_without_concave_creases_have_no_stations():
-    assert len(Solid.box((0, 0, 0), (1, 1, 1)).stations(0.1)) == 0
+    assert len(Solid.box((0, 0, 0), (1, 1, 1)).stations(lambda x: np.full(len(x), 0.1))) == 0
