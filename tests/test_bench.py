@@ -181,15 +181,6 @@ def test_cylinder():
 
 
 @pytest.mark.slow
-def test_sharp_corners():
-    rows = records("sharp_corners.py", "--angles", "30")
-    assert [r["run"] for r in rows] == ["default", "best", "exact"]
-    # An isosceles triangle with this tip has Q = 0.820.
-    assert rows[0]["bound"] == pytest.approx([0.820, 0.686, 0.637], abs=1e-3)
-    assert all(0.6 < r["quality"] < 0.69 and r["accepted"] for r in rows)
-
-
-@pytest.mark.slow
 def test_masks():
     """Sizes are met on staircases, too: mean |e| at walls was 0.14 where a face ended in each of their corners."""
     given, simplified = records("masks.py", "--sizes", "3", "--masks", "2")

@@ -58,8 +58,10 @@ UPWARD = {
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
 """Files directly in `clvoro/`, and in each of its folders."""
 DOMAINS = {"Box", "Polygon", "Sphere", "SphereRegion"}
-MOST_TYPE_TESTS, MOST_DIMENSIONS = 3, 40
-"""Tests of a domain's type outside of `geometry`, and comparisons of a dimension: both ask what a domain should say."""
+KINDS = {"outline", "curved", "cuts_cells", "globe", "curved_walls", "plain", "wall_triangles"}
+MOST_TYPE_TESTS, MOST_DIMENSIONS, MOST_KINDS = 3, 40, 108
+"""Tests of a domain's type outside of `geometry`, comparisons of a dimension, and uses of the attributes by which
+domains differ: all ask what a domain should say."""
 OF_DOMAINS = re.compile("polygon|sphere|periodic|weight", re.I)
 """Words that the lowest package does not know."""
 OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")
@@ -216,9 +218,11 @@ def words_in(node):
 
 def test_domains_are_asked_not_told_apart():
     """Whoever adds a domain writes one class: others ask it, and neither test its type nor compare its dimension."""
-    types, dimensions = [], []
+    types, dimensions, kinds = [], [], []
     for module, tree in modules().items():
         for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and node.attr in KINDS and not module.startswith("geometry."):
+                kinds.append(f"{module}: {ast.unparse(node)}")
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
                 if words_in(node.args[1]) & DOMAINS and not module.startswith("geometry."):
                     types.append(f"{module}: {ast.unparse(node)}")
@@ -229,6 +233,7 @@ def test_domains_are_asked_not_told_apart():
                     dimensions.append(f"{module}: {ast.unparse(node)}")
     assert len(types) <= MOST_TYPE_TESTS, types
     assert len(dimensions) <= MOST_DIMENSIONS, dimensions
+    assert len(kinds) <= MOST_KINDS, collections.Counter(kinds)
 
 
 def test_packages_of_scipy_are_imported_when_they_are_used():

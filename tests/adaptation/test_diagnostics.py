@@ -11,7 +11,6 @@ import shapely
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation import diagnostics
 from clvoro.adaptation.diagnostics import layer_mismatches, warn_of_narrow_parts
 from clvoro.cli import command as cli
 from clvoro.errors import CoarseSizeWarning, InputError, MismatchWarning, SizeErrorWarning

@@ -286,7 +286,7 @@ def test_graph_for_metis_in_parts(ctx, tmp_path, monkeypatch):
         (lambda d, to: d.save(to / "constant" / "polyMesh"), "OpenFOAM.*Sphere"),
         (lambda d, to: d.to_vtu(to / "mesh.vtu", walls="straight"), "solvers .*Sphere.*walls='exact'"),
         (lambda d, _: d.solver_mesh(), "solvers .*Sphere"),
-        (lambda d, _: d.check(solver="openfoam"), "polyhedra, and the mesh is on Sphere"),
+        (lambda d, _: d.check(solver="openfoam"), "polyhedra, and the cells on Sphere"),
         (lambda d, _: d.to_disv(), "DISV .*Sphere.*Polygon"),
         (lambda d, _: d.to_fipy(), "FiPy .*Sphere.*faces"),
         (lambda d, _: d.to_shapely(), "shapely .*Sphere.*to_pyvista"),
