@@ -393,7 +393,7 @@ def test_other_wrong_arguments_are_refused(ctx, globe):
     with pytest.raises(InputTypeError, match="mesh is a Sphere"):
         earth.inside(EARTH, RING)
     plane = clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0), (1, 1)), [(0.5, 0.5)])
-    with pytest.raises(InputError, match="regions are for meshes on a clvoro.Sphere"):
+    with pytest.raises(InputError, match=r"regions are for meshes on a clvoro\.Sphere"):
         earth.inside(plane, RING)
     with pytest.raises(InputError, match="keep selects no cell"):
         earth.rings(globe, np.zeros(3000, bool))
