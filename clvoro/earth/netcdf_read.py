@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import scipy
 
-from ..errors import InputError
 from ..files import open_plain
 from ..geometry.sphere import EARTH_RADIUS, Sphere, SphereRegion, triangle_areas
-from ..io.arrays import FileError
+from ..io.arrays import FileError, explained
 from ..mesh.check.rebuilt import rebuild_on_sphere
 from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
@@ -352,19 +351,12 @@ def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
         file and the fault.
     """
     name = os.fspath(path)
-    try:
-        with open_plain(path) as file:
-            head = file.read(4)
-            file.seek(0)
-            with _netcdf4(name) if head == _HDF5 else scipy.io.netcdf_file(file, mmap=False) as found:
-                cells = _read(Variables(found))
+    with explained(path, "a netCDF file"), open_plain(path) as file:
+        head = file.read(4)
+        file.seek(0)
+        with _netcdf4(name) if head == _HDF5 else scipy.io.netcdf_file(file, mmap=False) as found:
+            cells = _read(Variables(found))
         diagram = make_diagram(cells)
-    except FileError as problem:
-        raise InputError(f"cannot read {name}: {problem}") from problem
-    except OSError as error:
-        raise InputError(f"cannot read {name}: {error.strerror or error}") from error
-    except Exception as error:  # of SciPy's reader, on damaged files
-        raise InputError(f"cannot read {name}: it is damaged or no netCDF-3 ({error})") from error
     if cells.of_run is None:
         return diagram
     return result_of_file(diagram, *cells.of_run, kind=".nc")

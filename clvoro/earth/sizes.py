@@ -14,7 +14,7 @@ from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.box import Box
 from ..geometry.domain import Domain
 from ..geometry.shapes import Circle
-from ..geometry.sphere import Sphere, directions
+from ..geometry.sphere import DEGREES, Sphere, directions
 from ..sizing.arguments import check_positive, check_slope
 from ..sizing.distance import Distance
 from ..sizing.field import Field, as_field
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from ..sizing.codegen import CodeWriter
 
-DEGREES = Box((-180, -90), (180, 90))
-"""The whole sphere in longitude and latitude."""
 SAGITTA = 1e-3
 """Largest distance over h_min of an arc from the chords that stand for it."""
 MOST_CHORDS, LONGEST_CHORD = 1 << 18, np.radians(1)

@@ -203,6 +203,11 @@ class Domain(ClipBox):
         return self.n_pieces if adapted else 1
 
     @property
+    def map_domain(self) -> Domain:
+        """The domain of coordinates in which rasters and outlines are given: longitudes and latitudes on a sphere."""
+        return self
+
+    @property
     def uncut(self) -> Domain:
         """The domain before `subset` removed cells of its mesh: itself, unless it is what is left."""
         return self

@@ -20,6 +20,8 @@ from .domain import LARGEST_EDGE, Chart, Domain
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+DEGREES = Box((-180, -90), (180, 90))
+"""All longitudes and latitudes."""
 _SHORT = 1e-4
 """Square of the sine of an arc below which a series replaces a difference."""
 
@@ -120,6 +122,11 @@ class Sphere(Domain):
         return 2
 
     region = None
+
+    @property
+    def map_domain(self) -> Domain:
+        """Longitudes and latitudes in degrees."""
+        return DEGREES
 
     def same_surface(self, other: Domain) -> bool:
         """Return whether `other` is on the same sphere."""

@@ -126,15 +126,15 @@ def put(name, at, value):
 )
 def test_damaged_files_are_refused(tmp_path, convention, change, message):
     path = changed(tmp_path, convention, change)
-    with pytest.raises(InputError, match=rf"cannot read .*bad\.nc: .*({message})"):
+    with pytest.raises(InputError, match=rf"cannot load .*bad\.nc: .*({message})"):
         clvoro.load(path)
 
 
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "mesh.nc"
-    for content, message in ((b"\x89HDF\r\n", "nccopy|NetCDF"), (b"CDF", "damaged or no netCDF-3"), (b"", "damaged")):
+    for content, message in ((b"\x89HDF\r\n", "nccopy|NetCDF"), (b"CDF", "damaged or not a netCDF"), (b"", "damaged")):
         path.write_bytes(content)
-        with pytest.raises(InputError, match=rf"cannot read .*mesh\.nc: .*{message}"):
+        with pytest.raises(InputError, match=rf"cannot load .*mesh\.nc: .*{message}"):
             clvoro.load(path)
     plane = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.8), (0.6, 0.1)])
     for convention in ("mpas", "ugrid"):

@@ -19,7 +19,6 @@ from msgspec import Meta
 
 from ... import earth, sizing
 from ...adaptation.options import EffortName, MethodName, Start
-from ...earth.sizes import DEGREES
 from ...errors import InputError
 from ...files import LONGEST_GEOMETRY, read_text
 from ...geometry.box import Box
@@ -142,7 +141,7 @@ class BoxShape(Kind, tag="box"):
     upper: Point | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
-        if domain.curved and None in (self.lower, self.upper):
+        if domain.map_domain is not domain and None in (self.lower, self.upper):
             raise InputError(f"size.shapes has a box without corners, expected lower and upper in degrees on {domain}")
         return Box(self.lower or domain.lower, self.upper or domain.upper)
 
@@ -212,7 +211,7 @@ class PolygonShape(Kind, tag="polygon"):
     def build(self, folder: Path, domain: Any = None) -> Any:
         if self.file is None:
             return Polygon(self.outer, self.holes or [])
-        return read_polygon(locate(folder, self.file), "size.shapes.file", planar=not domain.curved)
+        return read_polygon(locate(folder, self.file), "size.shapes.file", planar=domain.map_domain is domain)
 
 
 RegionShape = (
@@ -311,7 +310,7 @@ class RasterTable(ArrayTable, tag="raster"):
             raise InputError(
                 f"size.variable is {self.variable!r}, and {path} is neither a netCDF nor a .npz file; leave it out"
             )
-        return self.over(DEGREES if domain.curved else domain, load_array(path, "size.file"))
+        return self.over(domain.map_domain, load_array(path, "size.file"))
 
 
 class Gradient(ArrayTable, tag="gradient"):
@@ -323,7 +322,7 @@ class Gradient(ArrayTable, tag="gradient"):
     h_max: Positive | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
-        _require(not domain.curved, self, _ON_SPHERE, domain)
+        _require(domain.map_domain is domain, self, _ON_SPHERE, domain)
         return self.over(domain, load_array(folder / self.file, "size.file"))
 
 
