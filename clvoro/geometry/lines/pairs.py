@@ -237,7 +237,8 @@ class _Placing:
         least = [h.min() for h in self.along_pieces(self.longest, [17] * len(self.pieces))[1]] if self.pieces else []
         counts = [max(17, 3 * math.ceil(p.length / float(h))) for p, h in zip(self.pieces, least, strict=True)]
         sizes = self.along_pieces(self.longest, counts)[1] if self.pieces else []
-        places = {k: self.stations(k, h, layout) for k, h in enumerate(sizes)}
+        left = {k for uses in self.uses for k, _ in uses}
+        places = {k: self.stations(k, h, layout) for k, h in enumerate(sizes) if k in left}
         steps: list[list[float]] = [[] for _ in self.nodes]
         for k, s in places.items():
             chords = np.hypot(*np.diff(self.pieces[k].at(s), axis=0).T)
