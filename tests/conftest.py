@@ -34,13 +34,12 @@ for number, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signa
 @pytest.fixture(scope="session", autouse=True)
 def lanes_for_small_meshes():
     """Let the small meshes of tests exercise the cells in vector lanes, too."""
-    from clvoro.tessellation.cells import Cells
-    from clvoro.tessellation.polyhedra import Polyhedra
+    from clvoro.tessellation.back_ends import LANES_FROM
 
-    before = Cells.hulls_from, Polyhedra.walks_from
-    Cells.hulls_from = Polyhedra.walks_from = 0
+    before = dict(LANES_FROM)
+    LANES_FROM.update(dict.fromkeys(LANES_FROM, 0))
     yield
-    Cells.hulls_from, Polyhedra.walks_from = before
+    LANES_FROM.update(before)
 
 
 class Invokers(dict):

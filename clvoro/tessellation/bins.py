@@ -80,6 +80,11 @@ class BinnedPoints:
     grid_shapes: cla.Array
     sides: tuple[int, ...]
 
+    @property
+    def search(self) -> tuple[cla.Array, ...]:
+        """The search radii, and the BIN_ARGS of kernels (tessellation/bins.h)."""
+        return self.reach, self.bins, self.grid_frames, self.grid_shapes
+
 
 class Bins:
     """Sort generators into bins. Buffers stay between calls and grow when needed."""

@@ -16,6 +16,7 @@ from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
+from .back_ends import LANES, LANES_FROM, has_lanes
 from .bins import MAX_LEVELS, BinnedPoints
 from .device_diagram import (
     COINCIDE,
@@ -42,8 +43,8 @@ LARGEST_ROW, LARGEST_ELSEWHERE = 4096, 512
 polygon, clipping such a cell by as many edges takes minutes."""
 FLAGS, FACES, CLIPPED, LEFT = 16, 6, 8, 15
 """Number of flags, and those that `face_rows.h` calls half-faces, clipped cells, and cells that are still marked."""
-LANES, EIGHTS = 8, 16
-"""Cells that one work-item of a CPU builds at once in vector lanes, and number of such batches in `hulls.cl`."""
+EIGHTS = 16
+"""Batches of `LANES` cells that one work-item of a CPU builds in `hulls.cl`."""
 FIRST_REACH = 1.9
 """Largest first search radius of `hulls.cl`, in units of the local spacing of the bins."""
 
@@ -68,8 +69,6 @@ class Cells:
         Cells that one work-item measures or checks.
     """
 
-    hulls_from = 1000
-    """Number of generators from which CPUs use `hulls.cl`. For fewer, its build takes longer than it saves."""
     from_previous = False
     """Whether new cells may start from the neighbors in an earlier diagram, and updates need bins."""
 
@@ -86,11 +85,10 @@ class Cells:
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
         self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
         engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
-        in_lanes = engine.group_size == 1 and engine.real == np.float64 and self._bounds is None
-        self.lanes = LANES if in_lanes else 1
+        self.lanes = LANES if has_lanes(engine) else 1
         self._kernels = engine.kernels("tessellation/cells", {**defines, "IN_LANES": int(self.lanes > 1)})
         self._hulls = None
-        if in_lanes and not self._folds:
+        if self.lanes > 1 and not self._folds:
             hulls = {"SLOT": SLOT, "MAX_DEPTH": MAX_LEVELS, "EIGHTS": EIGHTS}
             self._hulls = engine.kernels("simd/hulls", hulls)
 
@@ -205,8 +203,7 @@ class Cells:
     ) -> tuple[int, int]:
         """Build and match the rows of the first `n` of `total` generators; return as `_match` does."""
         engine, corners = self.engine, box.device_corners(self.engine.real)
-        search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
-        hulls = self._hulls if total >= self.hulls_from else None
+        hulls = self._hulls if n >= LANES_FROM[2] else None
         some = hulls is not None
         bounds = () if self._bounds is None else self._bounds.build(box, points, total)
         if hulls is not None:
@@ -218,7 +215,7 @@ class Cells:
                 binned.points,
                 binned.items,
                 binned.spacing,
-                *search,
+                *binned.search,
                 *corners,
                 engine.real.type(FIRST_REACH),
                 rows.slots,
@@ -233,7 +230,7 @@ class Cells:
                 np.int32(n),
                 binned.points,
                 binned.items,
-                *search,
+                *binned.search,
                 points,
                 *corners,
                 np.int32(some),

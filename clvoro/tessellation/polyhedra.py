@@ -17,6 +17,7 @@ from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
+from .back_ends import LANES_FROM, TEAM, TeamKernel, has_lanes, has_teams_for_new_cells, has_warps, team_defines
 from .bins import MAX_LEVELS, BinnedPoints
 from .cut_cells import (
     FACE_CAPACITY,
@@ -33,7 +34,6 @@ from .cut_cells import (
 )
 from .device_diagram import EXACT_SHARE, FULL, ROUGH_SHARE, UNKNOWN, CloseError, NeighborRows, Tessellation
 from .periodic.halo import halo_defines
-from .teams import TEAM, TeamKernel, are_for_new_cells, has_warps, team_defines
 from .weight_bounds import WeightBounds
 
 FACES_PER_CELL = 16.5
@@ -46,6 +46,16 @@ FIRST_REACH = 2.0
 """First search radius of `walks.cl`, in units of the local spacing of the bins."""
 
 
+def _larger(capacity: int) -> int:
+    """Return the capacity for cells with more faces than `capacity`."""
+    if GROWTH * capacity > MOST_FACES:
+        raise ClvoroError(
+            f"a cell has more than {MOST_FACES} faces, expected fewer; remove or perturb generators "
+            "that lie on a common sphere"
+        )
+    return GROWTH * capacity
+
+
 class Polyhedra:
     """Tessellate a box in 3D; with an engine for power diagrams by points with weights (n, 4).
 
@@ -55,8 +65,6 @@ class Polyhedra:
 
     from_previous = True
     """Whether new cells may start from the neighbors in an earlier diagram, and updates need bins."""
-    walks_from = 15_000
-    """Number of cells from which CPUs use `walks.cl`. For fewer, its build takes longer than it saves."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -64,14 +72,14 @@ class Polyhedra:
         self._programs: dict[int, SimpleNamespace] = {}
         self._kernels(FACE_CAPACITY)
         self._team: TeamKernel | None = None
-        if are_for_new_cells(engine):
+        if has_teams_for_new_cells(engine):
             by_teams = engine.kernels(
                 "tessellation/polyhedra_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
             )
             self._team = TeamKernel(engine.queue.device, by_teams, "clip_polyhedra_by_teams")
         self._walks: Kernels | None = None
         self._bounds = WeightBounds(engine) if engine.traits.site_values else None
-        if self._bounds is None and engine.group_size == 1 and engine.real == np.float64:
+        if has_lanes(engine):
             defines = {"STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine)}
             self._walks = engine.kernels("simd/walks", defines)
         self._report = engine.empty(REPORT_SIZE, np.int32)
@@ -224,55 +232,15 @@ class Polyhedra:
         warm = previous is not None and previous.n == rows
         old = (previous.starts, previous.neighbors) if previous is not None and warm else (counts, counts)
         capacity, again = FACE_CAPACITY, False
-        walk = None if self._walks is None or rows < self.walks_from else self._walks.walk_all_cells
-        first_reach = engine.real.type(FIRST_REACH)
-        self._begin_report()
-        search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
+        in_lanes = self._walks is not None and rows >= LANES_FROM[3]
         corners = engine.scratch(2 * self._room, np.uint32) if keep else None
+        self._begin_report()
         while True:
             cut = CutCells(places, counts, *faces, cells, self._room, corners, faces[0])
-            clip_args = box.clip_args(engine)
-            room, written = np.int32(self._room), cut.output(self._report)
-            if walk is not None and not again:
-                with engine.workspace.frame():
-                    order = self._ordered(binned, rows)
-                    engine.run_each(
-                        walk,
-                        -(-rows // STRETCH),
-                        np.int32(rows),
-                        order,
-                        binned.points,
-                        binned.items,
-                        binned.spacing,
-                        *search,
-                        *clip_args,
-                        first_reach,
-                        room,
-                        *written,
-                        *halo_args,
-                        group=1,
-                    )
-            some = np.int32(again or walk is not None)
-            cell_args = (
-                np.int32(rows),
-                binned.points,
-                binned.items,
-                *search,
-                points,
-                *clip_args,
-                np.int32(warm),
-                *old,
-                some,
-                room,
-                share,
-                *written,
-            )
-            by_team = None if some or self._team is None else self._team.get()
-            if by_team is not None:
-                engine.run(by_team, TEAM * n, np.int32(n), *cell_args, group=TEAM)
-            else:
-                clip = self._kernels(capacity).clip_polyhedra
-                clip_each(engine, clip, capacity, n, cell_args, halo_args)
+            if in_lanes and not again:
+                self._walk(box, binned, cut, halo_args)
+            some = again or in_lanes
+            self._clip(box, points, n, binned, cut, (warm, *old), some, capacity, share, halo_args)
             flags, m = (int(v) for v in self._report.get()[:2])
             if flags & ~(FULL | UNKNOWN | HARMLESS):
                 return None
@@ -283,21 +251,78 @@ class Polyhedra:
                 corners = engine.scratch(2 * self._room, np.uint32) if keep else None
                 capacity, again = FACE_CAPACITY, False
                 self._begin_report()
-            elif flags & UNKNOWN:
+                continue
+            if flags & UNKNOWN:
                 box.look_farther(points)
-                again = True
-                self._begin_report(flags & HARMLESS, m)
             elif flags & FULL:
-                # Clip only the cells with too many faces, with a larger capacity.
-                capacity, again = GROWTH * capacity, True
-                if capacity > MOST_FACES:
-                    raise ClvoroError(
-                        f"a cell has more than {MOST_FACES} faces, expected fewer; remove or perturb generators "
-                        "that lie on a common sphere"
-                    )
-                self._begin_report(flags & HARMLESS, m)
+                capacity = _larger(capacity)
             else:
                 return replace(cut, m=m)
+            # Clip only the cells that are not finished.
+            again = True
+            self._begin_report(flags & HARMLESS, m)
+
+    def _walk(self, box: ClipBox, binned: BinnedPoints, cut: CutCells, halo_args: tuple[object, ...]) -> None:
+        """Build cells in lanes; those that remain to be clipped are unfinished."""
+        engine, rows = self.engine, len(cut.counts)
+        assert self._walks is not None
+        with engine.workspace.frame():
+            engine.run_each(
+                self._walks.walk_all_cells,
+                -(-rows // STRETCH),
+                np.int32(rows),
+                self._ordered(binned, rows),
+                binned.points,
+                binned.items,
+                binned.spacing,
+                *binned.search,
+                *box.clip_args(engine),
+                engine.real.type(FIRST_REACH),
+                np.int32(len(cut.labels)),
+                *cut.output(self._report),
+                *halo_args,
+                group=1,
+            )
+
+    def _clip(
+        self,
+        box: ClipBox,
+        points: cla.Array,
+        size: int,
+        binned: BinnedPoints,
+        cut: CutCells,
+        start: tuple[bool, cla.Array, cla.Array],
+        some: bool,
+        capacity: int,
+        share: np.floating,
+        halo_args: tuple[object, ...],
+        report: cla.Array | None = None,
+    ) -> None:
+        """Clip all cells, or with `some` the unfinished ones, by the first `size` of `points`.
+
+        By teams if the engine has these, else one work-item for each. `start`: whether cells start from the neighbors
+        of an earlier diagram, and its graph.
+        """
+        engine = self.engine
+        args = (
+            np.int32(len(cut.counts)),
+            binned.points,
+            binned.items,
+            *binned.search,
+            points,
+            *box.clip_args(engine),
+            np.int32(start[0]),
+            *start[1:],
+            np.int32(some),
+            np.int32(len(cut.labels)),
+            share,
+            *cut.output(self._report if report is None else report),
+        )
+        by_team = None if some or self._team is None else self._team.get()
+        if by_team is not None:
+            engine.run(by_team, TEAM * size, np.int32(size), *args, group=TEAM)
+        else:
+            clip_each(engine, self._kernels(capacity).clip_polyhedra, capacity, size, args, halo_args)
 
     def _begin_report(self, flags: int = 0, used: int = 0) -> None:
         """Set the report to `flags` and the number of `used` faces."""
@@ -325,27 +350,9 @@ class Polyhedra:
         halo_args: tuple[object, ...] = (),
     ) -> None:
         """Clip the unfinished cells of `cut` by all of the `size` generators and ghost images near them."""
-        engine, rows = self.engine, len(cut.counts)
-        size = rows if size is None else size
-        search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
-        share, old = engine.real.type(ROUGH_SHARE), (previous.starts, previous.neighbors)
-        engine.run_each(
-            self._kernels(FACE_CAPACITY).clip_polyhedra,
-            size,
-            np.int32(rows),
-            binned.points,
-            binned.items,
-            *search,
-            points,
-            *box.clip_args(engine),
-            np.int32(1),
-            *old,
-            np.int32(1),
-            np.int32(len(cut.labels)),
-            share,
-            *cut.output(report),
-            *halo_args,
-        )
+        size, start = len(cut.counts) if size is None else size, (True, previous.starts, previous.neighbors)
+        share = self.engine.real.type(ROUGH_SHARE)
+        self._clip(box, points, size, binned, cut, start, True, FACE_CAPACITY, share, halo_args, report)
 
     def match(
         self, cut: CutCells, report: cla.Array, points: cla.Array, share: np.floating, m: int, folded: bool = False

@@ -12,11 +12,11 @@ from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.workspace import framed
+from .back_ends import TEAM, TeamKernel, has_teams, has_warps, team_defines
 from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_SIZE, CutCells
 from .device_diagram import ROUGH_SHARE, UNKNOWN, Follow, Tessellation, read_report
 from .polyhedra import Polyhedra
 from .rounds import with_room
-from .teams import TEAM, TeamKernel, are_for, has_warps, team_defines
 
 MORE = 8
 """Room for further neighbors of a cell, as in `tessellation/polyhedra_update.cl`."""
@@ -42,7 +42,7 @@ class PolyhedraUpdate:
         self.engine = engine
         self._kernels = engine.kernels("tessellation/polyhedra_update")
         self._team: TeamKernel | None = None
-        if are_for(engine):
+        if has_teams(engine):
             by_teams = engine.kernels(
                 "tessellation/polyhedra_update_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
             )

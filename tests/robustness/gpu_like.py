@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 from clvoro.opencl import engine, launch, ranges
 from clvoro.solvers import poisson
-from clvoro.tessellation import teams
+from clvoro.tessellation import back_ends
 
 LONGEST = 2e-3
 """Seconds after which a launch is divided in tests, so that those of small meshes are, too."""
@@ -43,8 +43,8 @@ def groups(size: int, count: int = 16) -> Iterator[None]:
 @contextmanager
 def by_teams(wanted: bool) -> Iterator[None]:
     """Let teams build the cells in 3D of engines made inside the ``with`` block, or not, on any device."""
-    before, teams.are_faster = teams.are_faster, lambda _: wanted
+    before, back_ends.teams_are_faster = back_ends.teams_are_faster, lambda _: wanted
     try:
         yield
     finally:
-        teams.are_faster = before
+        back_ends.teams_are_faster = before

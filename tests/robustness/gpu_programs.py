@@ -21,9 +21,9 @@ import clvoro
 from clvoro.opencl import prebuild
 from clvoro.opencl import program as _program
 from clvoro.opencl.engine import Engine
+from clvoro.tessellation.back_ends import TEAM, team_defines
 from clvoro.tessellation.cells import CELL_CAPACITY
 from clvoro.tessellation.cut_cells import FACE_CAPACITY
-from clvoro.tessellation.teams import TEAM, team_defines
 from tests.robustness import oclgrind_work
 from tests.robustness.gpu_like import groups
 

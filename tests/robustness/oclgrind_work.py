@@ -28,17 +28,15 @@ from clvoro.opencl.engine import Engine
 from clvoro.opencl.kernels import Kernels
 from clvoro.opencl.primitives import Scan
 from clvoro.sizing import Ball, Circle, ClosedPolyline, Distance, Expression, Graded, Raster, Sizing, Surface, minimum
-from clvoro.tessellation import teams
-from clvoro.tessellation.cells import Cells
+from clvoro.tessellation import back_ends
 from clvoro.tessellation.face_rows import SLOT
-from clvoro.tessellation.polyhedra import Polyhedra
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.patch import BOX as PATCH
 from tests.reference.patch import hexagons, tessellate
 from tests.robustness.gpu_like import use_groups
 from tests.robustness.oclgrind_runs import COMB, RUNS, large
 
-Cells.hulls_from = Polyhedra.walks_from = 0  # lanes for small meshes, too
+back_ends.LANES_FROM.update({2: 0, 3: 0})  # lanes for small meshes, too
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 GRADED = "0.12 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)"
@@ -571,7 +569,7 @@ def main(name: str, *options: str) -> None:
     if "groups" in options:
         use_groups(16, 3)
     if "teams" in options:
-        teams.are_faster = lambda _: True
+        back_ends.teams_are_faster = lambda _: True
     name_domains()
     build_for_simulator()
     buffers_of_their_own()

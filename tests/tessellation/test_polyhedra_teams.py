@@ -16,7 +16,7 @@ from clvoro.opencl import engine as engine_module
 from clvoro.opencl import program, ranges
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.hooks import Tally, watching
-from clvoro.tessellation import teams
+from clvoro.tessellation import back_ends
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.robustness.gpu_like import by_teams, groups
@@ -53,7 +53,7 @@ def ctx():
             found = clvoro.create_context(name)
         except clvoro.ClvoroError:
             continue
-        if teams.has_warps(found.devices[0]) or not program.on_nvidia(found.devices[0]):
+        if back_ends.has_warps(found.devices[0]) or not program.on_nvidia(found.devices[0]):
             return found
     pytest.skip("needs an NVIDIA GPU of compute capability 8, or Intel's runtime: pip install '.[cpu]'")
 
@@ -93,7 +93,7 @@ def test_same_bits_as_by_single_items(ctx, name, dtype):
     for key, array in plain.items():
         assert np.array_equal(array, by_team[key]), key
     counts = np.diff(plain["new", "starts"])
-    assert (counts.max() > teams.TEAM) == (name == "many faces")
+    assert (counts.max() > back_ends.TEAM) == (name == "many faces")
 
 
 def test_same_bits_in_ranges(ctx, monkeypatch):
@@ -107,7 +107,7 @@ def test_same_bits_in_ranges(ctx, monkeypatch):
         return plain(queue, kernel, size, group, offset)
 
     def in_parts(queue, kernel, items, group, limit):
-        limit.items, limit.known = 7 * teams.TEAM + 5, True
+        limit.items, limit.known = 7 * back_ends.TEAM + 5, True
         return ranges.enqueue_ranges(queue, kernel, items, group, limit)
 
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", noted)
@@ -116,7 +116,7 @@ def test_same_bits_in_ranges(ctx, monkeypatch):
     monkeypatch.setattr(engine_module, "enqueue_ranges", in_parts)
     found = diagrams(ctx, "float64", SETS["random"], True)
     assert len(begins) > 50
-    assert not any(number % teams.TEAM for pair in begins for number in pair)
+    assert not any(number % back_ends.TEAM for pair in begins for number in pair)
     assert all(np.array_equal(found[key], array) for key, array in expected.items())
 
 
@@ -231,7 +231,7 @@ def test_devices_with_teams(platform, capability, expected):
             name = ""
 
     Device.platform.name = platform
-    assert teams.are_faster(Device) == expected
+    assert back_ends.teams_are_faster(Device) == expected
 
 
 def test_domains_with_teams():
@@ -240,5 +240,5 @@ def test_domains_with_teams():
     with by_teams(True):
         for traits in (traits_of(), traits_of(("PERIODIC",), (1.0, 1.0, 1.0)), traits_of(("WEIGHTED",), site_values=1)):
             made = Engine(context, cl.CommandQueue(context), 3, np.dtype(np.float32), traits)
-            assert teams.are_for(made) == (not traits.site_values)
-            assert teams.are_for_new_cells(made) == (traits == engine_module.PLAIN)
+            assert back_ends.has_teams(made) == (not traits.site_values)
+            assert back_ends.has_teams_for_new_cells(made) == (traits == engine_module.PLAIN)

@@ -10,7 +10,7 @@ import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.errors import InputError
 from clvoro.opencl.engine import Engine
-from clvoro.tessellation.cells import Cells
+from clvoro.tessellation.back_ends import LANES_FROM
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.spheres import UNIT, SphericalDiagram, clustered_points, grid_of_rings, random_points
 
@@ -181,7 +181,7 @@ def test_lanes_and_single_cells(ctx, monkeypatch):
     """Cells that are wrapped eight at a time are those that are clipped one by one."""
     points = np.concatenate([SETS["random"], SETS["clustered"]])
     wrapped = clvoro.Adapter(ctx).diagram(UNIT, points)
-    monkeypatch.setattr(Cells, "hulls_from", 10**9)
+    monkeypatch.setitem(LANES_FROM, 2, 10**9)
     clipped = clvoro.Adapter(ctx).diagram(UNIT, points)
     assert np.array_equal(wrapped.neighbors, clipped.neighbors)
     assert np.array_equal(wrapped.volumes, clipped.volumes)

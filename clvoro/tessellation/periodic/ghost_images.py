@@ -253,31 +253,10 @@ class GhostImages:
             `FAR`, `COLLAPSED` or both, and the first generator with such a face.
         """
         engine, k, n, home = self.engine, self._kernels, part.n_own, _home(part)
-        if engine.dim == 2:  # in 3D the kernels that clip cells do this
-            engine.run_each(
-                k.measure_required_depths,
-                part.count,
-                binned.items,
-                binned.reach,
-                part.points,
-                t.starts,
-                t.neighbors,
-                *part.box.device_corners(engine.real),
-                *part.halo_args,
-            )
-        engine.run_each(
-            k.store_required_depths,
-            block_count(engine.dim),
-            halo.depths,
-            halo.kept,
-            halo.requests,
-            halo.required,
-            *engine.period_args,
-        )
-        halo.cells, halo.estimated = n, False
+        self._store_depths(part, halo, binned, t)
         m = int(t.starts[n].get())
         self._turn = 1 - self._turn
-        graph = [self._room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbors", "codes")]
+        neighbors, codes = (self._room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbors", "codes"))
         kept = self._room("kept", size=m, dtype=np.uint8)
         starts = self._room("starts", self._turn, size=n + 1, dtype=np.int32)
         engine.run_each(
@@ -293,45 +272,70 @@ class GhostImages:
             home.codes,
             engine.real.type(share),
             np.int32(nearest),
-            *graph,
+            neighbors,
+            codes,
             kept,
             starts,
             self._report,
             *engine.period_args,
         )
         words = self._report.get()
-        flags, places = int(words[1]), None
-        measures = t.face_measures[:m], t.face_centroids[:m]
-        vertices = tuple(array[: m * len(array) // len(t.neighbors)] for array in t.vertices)
         self._scan.exclusive(starts, starts, n)
-        if flags & DROPPED:
-            left = int(starts[n].get())
-            places = engine.empty(left, np.int32)
-            closed = (
-                engine.empty(left, np.int32),
-                engine.empty(left, np.int32),
-                engine.empty(left, engine.face),
-                engine.empty((left, engine.dim), engine.face),
-            )
-            engine.run_each(k.close_rows, n, t.starts, kept, starts, *graph, *measures, *closed, places)
-            graph, measures, vertices = list(closed[:2]), closed[2:], ()
+        faces = neighbors, codes, t.face_measures[:m], t.face_centroids[:m]
+        vertices = tuple(array[: m * len(array) // len(t.neighbors)] for array in t.vertices)
+        places = None
+        if words[1] & DROPPED:
+            *faces, places = self._close(n, t, kept, starts, faces)
+            vertices = ()
         folded = Tessellation(
             n,
             points,
             starts,
-            graph[0],
-            *measures,
+            faces[0],
+            faces[2],
+            faces[3],
             t.volumes[:n],
             t.offsets[:n],
             t.covariances[:n],
             vertices=vertices,
-            folded=Folded(part, graph[1], places, t if t.n == part.count else None),
+            folded=Folded(part, faces[1], places, t if t.n == part.count else None),
         )
         enough = not words[0]
         if not enough:
             # The next attempt writes to the same buffers, since it starts from the previous graph as well.
             self._turn = 1 - self._turn
-        return folded, enough, flags & ~DROPPED, int(words[2])
+        return folded, enough, int(words[1]) & ~DROPPED, int(words[2])
+
+    def _store_depths(self, part: Part, halo: Halo, binned: BinnedPoints, t: Tessellation) -> None:
+        """Set the required depths of `halo` to those that `t`, the diagram of `part`, has requested."""
+        engine, k = self.engine, self._kernels
+        if engine.dim == 2:  # in 3D the kernels that clip cells do this
+            engine.run_each(
+                k.measure_required_depths,
+                part.count,
+                binned.items,
+                binned.reach,
+                part.points,
+                t.starts,
+                t.neighbors,
+                *part.box.device_corners(engine.real),
+                *part.halo_args,
+            )
+        blocks = block_count(engine.dim)
+        stored = halo.depths, halo.kept, halo.requests, halo.required
+        engine.run_each(k.store_required_depths, blocks, *stored, *engine.period_args)
+        halo.cells, halo.estimated = part.n_own, False
+
+    def _close(
+        self, n: int, t: Tessellation, kept: cla.Array, starts: cla.Array, faces: tuple[cla.Array, ...]
+    ) -> list[cla.Array]:
+        """Return `faces` without those that are not `kept`, and their places in `t`. `starts` begin the new rows."""
+        engine = self.engine
+        left = int(starts[n].get())
+        closed = [engine.empty(left, dtype) for dtype in (np.int32, np.int32, engine.face)]
+        closed += [engine.empty((left, engine.dim), engine.face), engine.empty(left, np.int32)]
+        engine.run_each(self._kernels.close_rows, n, t.starts, kept, starts, *faces, *closed)
+        return closed
 
 
 def _home(part: Part) -> Home:

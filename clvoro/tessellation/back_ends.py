@@ -1,7 +1,18 @@
-"""Kernels in which a team of work-items builds or updates one cell in 3D, and which devices and domains use them."""
+"""The back ends that build and update cells, and the rules by which an engine takes one.
+
+=======  ==========================================================================================================
+scalar   One work-item for each cell. It works everywhere, and makes the cells that the others leave.
+lanes    Eight cells at a time in the lanes of a CPU's vectors (`cl_kernels/simd/`): in float64, without weights.
+         New cells from a number of them on; before, the build of the kernels takes longer than it saves.
+teams    In 3D a team of work-items for each cell: on NVIDIA's GPUs, without weights.
+=======  ==========================================================================================================
+
+In 2D all give the same bits. In 3D teams have those of scalar; lanes differ by round-off.
+"""
 
 from __future__ import annotations
 
+import numpy as np
 import pyopencl as cl
 
 from ..errors import BuildError
@@ -11,11 +22,20 @@ from ..opencl.program import on_nvidia
 from .bins import MAX_LEVELS
 from .cut_cells import FACE_CAPACITY
 
+LANES = 8
+"""Cells in the lanes of a vector."""
+LANES_FROM = {2: 1000, 3: 15_000}
+"""Number of cells from which new ones are built in lanes, by their dimension."""
 TEAM = 32
 """Number of work-items of a team. A cell has at most as many faces (MOST_FACES in `tessellation/row_counts.h`)."""
 
 
-def are_faster(device: cl.Device) -> bool:
+def has_lanes(engine: Engine) -> bool:
+    """Return whether eight cells at a time are built, measured and checked."""
+    return engine.group_size == 1 and engine.real == np.float64 and not engine.traits.site_values
+
+
+def teams_are_faster(device: cl.Device) -> bool:
     """Return whether teams build cells faster than single work-items on `device`: on NVIDIA's GPUs.
 
     By the platform, not by a measurement: the same choice in every run. The kernel for 1e6 random generators in float64
@@ -29,14 +49,14 @@ def has_warps(device: cl.Device) -> bool:
     return on_nvidia(device) and device.compute_capability_major_nv >= 8
 
 
-def are_for(engine: Engine) -> bool:
+def has_teams(engine: Engine) -> bool:
     """Return whether teams update cells in 3D: without weights, on devices where they are faster."""
-    return not engine.traits.site_values and are_faster(engine.queue.device)
+    return not engine.traits.site_values and teams_are_faster(engine.queue.device)
 
 
-def are_for_new_cells(engine: Engine) -> bool:
+def has_teams_for_new_cells(engine: Engine) -> bool:
     """Return whether teams also build cells from scratch: then the box must have walls on all sides."""
-    return engine.traits == PLAIN and FACE_CAPACITY == TEAM and are_for(engine)
+    return engine.traits == PLAIN and FACE_CAPACITY == TEAM and has_teams(engine)
 
 
 def team_defines(warps: bool) -> dict[str, object]:
