@@ -90,12 +90,16 @@ class CellStencils:
         return low, high
 
     def smooth(self, values: np.ndarray, passes: int) -> np.ndarray:
-        """Return the mean of each of `values` (n,) and the mean of its neighbors, `passes` times."""
-        count = np.diff(self.starts)
+        """Return the mean of each of `values` (n, ...) and the mean of its neighbors, `passes` times."""
+        n, count = len(self), np.diff(self.starts)
+        mean = scipy.sparse.csr_array(
+            (np.repeat(0.5 / np.maximum(count, 1), count), self.neighbors, self.starts), (n, n)
+        )
+        mean += scipy.sparse.diags_array(np.where(count > 0, 0.5, 1.0))
+        flat = values.reshape(n, -1)
         for _ in range(passes):
-            around = np.bincount(self.owners, values[self.neighbors], len(self))
-            values = np.where(count > 0, (values + around / np.maximum(count, 1)) / 2, values)
-        return values
+            flat = mean @ flat
+        return flat.reshape(values.shape)
 
     @cached_property
     def _graph(self) -> scipy.sparse.csr_array:

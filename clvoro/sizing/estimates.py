@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..mesh.diagram import Diagram
     from ..mesh.results import Result
 
-_SMOOTHED = 1  # passes: second derivatives of computed fields are noisy from cell to cell
+_SMOOTHED = 2  # passes: second derivatives of computed fields are noisy from cell to cell
 
 
 class Estimate(OnCells):
@@ -82,10 +82,10 @@ def curvature_of(values: object, on: Result | Diagram, p: float, weight: ArrayLi
     power = d / 2 if math.isinf(p) else p * d / (2 * p + d)
     fields, found = _fields(values, len(stencils)), []
     for field in fields:
-        hessians = derivatives(field, stencils.mesh)[1]
+        hessians = stencils.smooth(derivatives(field, stencils.mesh)[1], _SMOOTHED)
         spectral = np.abs(np.linalg.eigvalsh(hessians)).max(axis=-1)
-        spectral = _free_of_rounding(np.sqrt((spectral.reshape(len(field), -1) ** 2).sum(axis=1)), field, stencils, 2)
-        found.append(stencils.smooth(spectral, _SMOOTHED))
+        spectral = np.sqrt((spectral.reshape(len(field), -1) ** 2).sum(axis=1))
+        found.append(_free_of_rounding(spectral, field, stencils, 2))
     if len(fields) > 1:
         found = [_scaled(curvature, stencils.mesh.volumes, power) for curvature in found]
     most = np.maximum.reduce(found)

@@ -169,7 +169,7 @@ def test_the_predicted_error_is_that_of_the_next_mesh(fine):
     u = np.tanh(20 * (fine.centroids.sum(axis=1) - 1))
     coarse, finer = (sizing.hessian_size(u, on=fine, n_cells=n, growth=3) for n in (1000, 4000))
     assert coarse.norm / finer.norm == pytest.approx(4, rel=0.1)
-    after = clvoro.adapt(SQUARE, coarse, "fast", n_cells=1000)
+    after = clvoro.adapt(SQUARE, sizing.hessian_size(u, on=fine, n_cells=1000), "fast", n_cells=1000)
     assert np.abs(after.size_error).mean() < 0.03
 
 
