@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from ..arguments import coincident_named, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
 from ..geometry.boundary_layers import apart_from, check_gaps, count_rows, free_domain, place_layers
 from ..geometry.domain import Domain
+from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.gaps import NARROW
 from ..geometry.lines.pairs import place_pairs
 from ..sizing import Sizing, as_field
@@ -130,19 +132,11 @@ def prepare(
         warn_of_narrow_parts(domain, lambda x: factor * sizing(x))
     if len(fixed):
         check_room(fixed, domain, free, rows, factor * sizing(fixed))
-    own, around = 1.0, None
+    own = 1.0
     if not options.multilevel and (tree is not None or domain.cutting_edges):
         own = _own_factor(sizing, free, tree, target)
-    if domain.lines is not None:
-        around = place_beside_lines(domain, free, fixed, lambda x: factor * np.asarray(sizing(x)))
-        if (count := len(fixed) + len(around)) > target:
-            raise InputError(
-                f"the mesh has {target} cells, but {count} generators are beside the lines or fixed, expected at least "
-                "as many cells; use smaller sizes, or more cells"
-            )
-    elif tree is not None:
-        own_size = factor * own
-        around = place_in_corners(domain, free, fixed, rows, lambda x: own_size * np.asarray(sizing(x)), target)
+    scale = factor if domain.lines is not None else factor * own
+    around = _place_around(domain, free, fixed, rows, lambda x: scale * np.asarray(sizing(x)), target, tree is not None)
     if around is not None:
         fixed = np.concatenate([fixed, around.points])
     setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, around)
@@ -153,6 +147,27 @@ def prepare(
     most = max(target, 0 if points is None else len(points))
     memory = _estimate_memory(setup, options, tree, required, most, levels)
     return Prepared(options, setup, points, rows, tree, required, target, lattice, levels, memory)
+
+
+def _place_around(
+    domain: Domain,
+    free: Domain,
+    fixed: np.ndarray,
+    rows: np.ndarray,
+    size: Callable[[np.ndarray], np.ndarray],
+    target: int,
+    drawn: bool,
+) -> FixedGenerators | None:
+    """Return generators beside lines, or, where the others are `drawn` at random, in corners and creases, if any."""
+    if domain.lines is None:
+        return place_in_corners(domain, free, fixed, rows, size, target) if drawn else None
+    around = place_beside_lines(domain, free, fixed, size)
+    if (count := len(fixed) + len(around)) > target:
+        raise InputError(
+            f"the mesh has {target} cells, but {count} generators are beside the lines or fixed, expected at least as "
+            "many cells; use smaller sizes, or more cells"
+        )
+    return around
 
 
 def _own_factor(sizing: Sizing, free: Domain, tree: DensityTree | None, count: int) -> float:

@@ -15,7 +15,6 @@ import numpy as np
 from ..arguments import check_callable, check_points
 from ..errors import InputTypeError, Interrupted
 from ..geometry.domain import Domain
-from ..geometry.polygon import FEW_CELLS
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result, figures
 from ..mesh.straightening import cell_quality

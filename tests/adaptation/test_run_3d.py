@@ -113,45 +113,6 @@ def test_row_i_is_the_callers_generator(adapter):
     assert result.history["energy"][0] == pytest.approx(sum(map(second_moment, cells, points)), rel=1e-9)
 
 
-@pytest.mark.sparse(2)
-@pytest.mark.parametrize("method", runs.FROM_POINTS)
-def test_no_steps(adapter, method):
-    points = random_points(200, 6)
-    result = adapter.run(
-        BOX, SMALL, points=points, method=method, max_steps=0, options=clvoro.MultilevelOptions(levels=0)
-    )
-    assert np.array_equal(result.points, points)
-    assert len(result.history) == 1
-    check(result, SMALL)
-
-
-@pytest.mark.sparse(1)
-@pytest.mark.parametrize("method", ["lloyd", "weighted-lloyd"])
-def test_warm_start(adapter, method):
-    """Four steps, and four more from their result, are the same as eight."""
-    options = {"method": method, "options": clvoro.PaperOptions(tol=0)}
-    points = random_points(300, 7)
-    eight = adapter.run(BOX, SMALL, points=points, max_steps=8, **options)
-    four = adapter.run(BOX, SMALL, points=points, max_steps=4, **options)
-    again = adapter.run(BOX, SMALL, points=four.points, max_steps=4, **options)
-    assert again.points == pytest.approx(eight.points, abs=1e-10)
-    assert again.settings["start"] == "points"
-
-
-def test_origin_names_the_callers_generators(adapter):
-    """Kept generators come first, in their order and near their positions; inserted ones have -1."""
-    first = adapter.run(BOX, SMALL, seed=31, effort="fast")
-    result = adapter.run(BOX, SMALL, points=first.points, effort="fast", n_cells=len(first.points) + 9)
-    origin = result.origin
-    kept = origin >= 0
-    assert 0 < (~kept).sum() <= result.history["inserted"].sum()
-    assert kept[: kept.sum()].all()
-    assert (np.diff(origin[kept]) > 0).all()
-    moved = np.linalg.norm(result.points[kept] - first.points[origin[kept]], axis=1)
-    assert np.median(moved / result.target_size[kept]) < 0.5
-    check(result, SMALL)
-
-
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize(
     ("dtype", "options"),
@@ -189,36 +150,7 @@ def test_units_do_not_matter(adapter):
     assert b.history["energy"] == pytest.approx(a.history["energy"] * 1e-15, rel=1e-5)
 
 
-# How a run ends; counts and levels.
-
-
-@pytest.mark.sparse(1)
-@pytest.mark.parametrize(
-    ("options", "rows"), [({"method": "coupled"}, 4), ({"options": clvoro.MultilevelOptions(levels=1)}, 6)]
-)
-@pytest.mark.parametrize("how", ["returns True", "is interrupted", "max_steps"])
-def test_stopped(adapter, options, rows, how):
-    """On any level the mesh has the target size."""
-    seen = []
-
-    def callback(row):
-        seen.append(row.copy())
-        if how == "is interrupted" and len(seen) == rows:
-            raise KeyboardInterrupt
-        return how == "returns True" and len(seen) == rows
-
-    most = {"max_steps": rows - 1} if how == "max_steps" else {}
-    result = adapter.run(BOX, S1, callback=callback, seed=12, effort="fast", on_interrupt="return", **options, **most)
-    assert len(seen) == rows
-    assert not result.converged
-    reasons = {
-        "returns True": "stopped by the callback",
-        "is interrupted": "interrupted",
-        "max_steps": "max_steps reached",
-    }
-    assert result.stop_reason == reasons[how]
-    assert len(result.points) == pytest.approx(1778, rel=0.12)
-    check(result, S1)
+# Counts and levels.
 
 
 @pytest.mark.sparse(3)
@@ -227,20 +159,6 @@ def test_stopped(adapter, options, rows, how):
 def test_n_cells_is_held(adapter, method, n):
     result = adapter.run(BOX, SMALL, n_cells=n, method=method, effort="fast", max_steps=20)
     assert len(result.points) == n
-    check(result, SMALL)
-
-
-@pytest.mark.sparse(1)
-@pytest.mark.parametrize("n_cells", [210, 260])
-def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
-    result = adapter.run(BOX, SMALL, n_cells=n_cells, method="exact", seed=15)
-    assert len(result.points) == n_cells
-    # Sizes are evaluated at generators. With 210 cells, eight starts and four sizes of groups the factor is 1.027 to
-    # 1.058 times that.
-    assert result.size_factor == pytest.approx(np.cbrt(291 / n_cells), rel=0.08)
-    length = np.cbrt(result.diagram.volumes)
-    # Three steps; at so few cells h changes by a third from one to the next.
-    assert np.abs(np.log(length / result.target_size)).mean() < 2e-3
     check(result, SMALL)
 
 
@@ -253,15 +171,6 @@ def test_levels(adapter, levels):
     assert h["cells"][0] == round(1778 / 8**levels)
     assert len(result.points) == pytest.approx(1900, rel=0.06)
     check(result, S1)
-
-
-@pytest.mark.slow
-def test_levels_from_the_callers_points(adapter):
-    for n, level in ((250, 1), (1900, 0)):
-        result = adapter.run(BOX, S1, points=random_points(n, 17), effort="fast")
-        assert result.history["level"][0] == level
-        assert len(result.points) == pytest.approx(1900, rel=0.1)
-        check(result, S1)
 
 
 def test_refinement_gives_the_number_of_the_next_level(adapter):
@@ -337,13 +246,6 @@ def test_fields(adapter, name):
         assert result.quality.mean() > 0.55
     else:
         assert result.quality.mean() > 0.35
-
-
-def test_callable_and_device_field_agree(adapter):
-    options = {"method": "coupled", "max_steps": 5, "seed": 3, "options": clvoro.PaperOptions(tol=0)}
-    device = adapter.run(BOX, SMALL, **options)
-    host = adapter.run(BOX, lambda points: SMALL(points), points=device.initial.points, **options)
-    assert host.points == pytest.approx(device.points, abs=1e-6)
 
 
 @pytest.mark.slow

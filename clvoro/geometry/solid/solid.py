@@ -82,11 +82,6 @@ class NearestTriangles:
         self._samples = scipy.spatial.KDTree(points)
         self._tie = _ON * float(np.ptp(surface.vertices, axis=0).max())
 
-    def near(self, x: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Return which of the points x (n, 3) are within `reach` (n,) of the bounding box, (n,) bool."""
-        low, high = self._tree.boxes[0, :3], self._tree.boxes[0, 3:]
-        return (np.maximum(np.maximum(low - x, x - high), 0) ** 2).sum(axis=1) <= reach**2
-
     def feet(self, x: np.ndarray, reach: float) -> Feet:
         """Return the nearest point of the triangles to each of the points x (n, 3), within `reach`."""
         bound2 = np.full(len(x), reach * reach)
@@ -129,33 +124,6 @@ def _samples(triangles: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np
         points.append(np.einsum("sk,tkd->tsd", weights, corners[rows]).reshape(-1, 3))
         item.append(np.repeat(rows, len(weights)))
     return np.concatenate(points), np.concatenate(item)
-
-
-@dataclass(frozen=True)
-class OwnPlanes:
-    """The planes that cut the cells of generators near walls.
-
-    Attributes
-    ----------
-    row : (k,) int
-        The generator, ascending; for each one by patch.
-    patch : (k,) int32
-    foot : (k, 3) float
-        A point of the plane: the nearest point of the patch.
-    normal : (k, 3) float
-        Unit normal, out of the region.
-    depth : (k,) float
-        Distance of the generator from the plane, positive.
-    behind : (b,) int
-        Generators that are behind the plane of their nearest patch, so that it cannot cut their cell.
-    """
-
-    row: np.ndarray
-    patch: np.ndarray
-    foot: np.ndarray
-    normal: np.ndarray
-    depth: np.ndarray
-    behind: np.ndarray
 
 
 class Solid(Domain):
@@ -535,72 +503,12 @@ class Solid(Domain):
         """The surface as kernels take it."""
         return WallTriangles(self.surface.corners, self.patch, self.corner_normals, self.side_kinds, self.corner_kinds)
 
-    def foot_kinds(self, feet: Feet) -> np.ndarray:
-        """Return the kinds (n,) of feet: `CONCAVE` on concave creases, where a patch does not go on; else smaller."""
-        zero = feet.weights <= _EDGE
-        kinds = np.zeros(len(zero), np.int8)
-        for k in range(3):
-            side = zero[:, (k + 2) % 3] & ~zero[:, k] & ~zero[:, (k + 1) % 3]
-            kinds[side] = self.side_kinds[feet.triangle[side], k]
-            corner = zero[:, (k + 1) % 3] & zero[:, (k + 2) % 3]
-            kinds[corner] = self.corner_kinds[feet.triangle[corner], k]
-        return kinds
-
     @cached_property
     def _patches(self) -> list[NearestTriangles]:
         """The triangles of each patch, for nearest points."""
         order = np.argsort(self.patch, kind="stable")
         parts = np.split(order, np.searchsorted(self.patch[order], np.arange(1, self.n_patches)))
         return [NearestTriangles(self.surface, part) for part in parts]
-
-    def own_planes(self, points: np.ndarray, reach: float | np.ndarray, normals: np.ndarray | None = None) -> OwnPlanes:
-        """Return the planes that cut the cells of generators: those of all patches near them.
-
-        The plane of a patch touches it at the foot, its point nearest to the generator. A patch whose foot lies on a
-        concave crease gives none, since it does not go on there; nor does one that other walls hide, or that is seen
-        from behind.
-
-        Parameters
-        ----------
-        points : (n, 3) float
-            Generators in the solid.
-        reach : float or (n,) float
-            Patches within this distance count.
-        normals : (t, 3, 3) float, optional
-            Normals at the triangles' corners; by default `corner_normals`.
-        """
-        x = check_rows("points", points, 3)
-        reach = np.broadcast_to(np.asarray(reach, float), len(x))
-        normals = self.corner_normals if normals is None else normals
-        found: list[tuple[np.ndarray, ...]] = []
-        for k, part in enumerate(self._patches):
-            rows = np.flatnonzero(part.near(x, reach))
-            if not rows.size:
-                continue
-            feet = part.feet(x[rows], float(reach[rows].max()))
-            near = np.flatnonzero(feet.distance <= reach[rows])
-            feet = Feet(*(array[near] for array in (feet.triangle, feet.weights, feet.point, feet.distance)))
-            normal = np.einsum("nk,nkd->nd", feet.weights, normals[feet.triangle])
-            normal /= np.linalg.norm(normal, axis=1)[:, None]
-            kind = self.foot_kinds(feet)
-            found.append((rows[near], np.full(len(near), k, np.int32), feet.point, normal, feet.distance, kind))
-        if not found:
-            none = np.zeros(0, np.int64)
-            return OwnPlanes(none, none.astype(np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), none)
-        row, patch, foot, normal, distance, kind = (np.concatenate(part) for part in zip(*found, strict=True))
-        order = np.lexsort((patch, row))
-        row, patch, foot, normal, distance, kind = (
-            array[order] for array in (row, patch, foot, normal, distance, kind)
-        )
-        depth = np.einsum("ij,ij->i", foot - x[row], normal)
-        first = np.full(len(x), math.inf)
-        np.minimum.at(first, row, distance)
-        nearest = distance == first[row]
-        behind = np.unique(row[nearest & (depth <= 0) & (kind < CONCAVE)])
-        sound = (depth > 0) & (kind < CONCAVE)
-        doubtful = np.flatnonzero(sound & ~nearest)
-        sound[doubtful] = self.visible(x[row[doubtful]], foot[doubtful])
-        return OwnPlanes(row[sound], patch[sound], foot[sound], normal[sound], depth[sound], behind)
 
     def stations(
         self, size: Callable[[np.ndarray], np.ndarray], free: Domain | None = None, fixed: np.ndarray | None = None
@@ -672,16 +580,6 @@ class Solid(Domain):
             raise InputError(f"{self} has no {'' if concave is None else 'concave ' if concave else 'convex '}creases")
         ends = self.surface.vertices[self.creases.edges[chosen]]
         return Edges(ends[:, 0], ends[:, 1])
-
-    def visible(self, points: np.ndarray, feet: np.ndarray) -> np.ndarray:
-        """Return whether no other wall is between each point (n, 3) and its foot on the surface, (n,) bool."""
-        end = points + (1 - 1e-6) * (feet - points)
-        who, item = self.surface.tree.meeting(np.minimum(points, end), np.maximum(points, end))
-        seen = np.ones(len(points), bool)
-        for first in range(0, len(who), 1 << 18):
-            w, k = who[first : first + (1 << 18)], item[first : first + (1 << 18)]
-            seen[w[np.isfinite(pierced(points[w], end[w], self.surface.corners[k]))]] = False
-        return seen
 
     # The protocol of domains.
 

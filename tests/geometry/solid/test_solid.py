@@ -84,20 +84,6 @@ def test_rays_through_edges_and_vertices_count_once():
     assert np.array_equal(solid.contains(x), ((x >= 0) & (x <= 1)).all(axis=1))
 
 
-@pytest.mark.parametrize("name", ["box", "ball", "cylinder"])
-def test_own_planes_are_tangential_and_keep_their_generators(name):
-    solid = SOLIDS[name]
-    x = around(solid, 3000, 1)
-    x = x[solid.contains(x)]
-    planes = solid.own_planes(x, 0.5)
-    assert not planes.behind.size
-    assert np.abs(np.linalg.norm(planes.normal, axis=1) - 1).max() < 1e-12
-    assert planes.depth == pytest.approx(((planes.foot - x[planes.row]) * planes.normal).sum(axis=1))
-    for k in range(solid.n_patches):
-        mine = planes.row[planes.patch == k]
-        assert np.array_equal(mine, np.flatnonzero(solid.wall_distance(np.full(len(x), k), x) <= 0.5))
-
-
 @pytest.mark.parametrize("kind", ["any", "two corners at one place", "corners on a line", "a point"])
 def test_distances_to_triangles(kind):
     rng = np.random.default_rng(7)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree
+from scipy.spatial import KDTree
 
 from clvoro import Polygon, Solid
 from clvoro.adaptation.fixed_points import place_in_corners
@@ -56,28 +56,6 @@ def test_creases_are_equidistant_from_the_generators_around_them(solid, count):
         )
     if solid is FICHERA:
         assert ties(stations, np.array([[1.0, 1, 1]]), 7) == pytest.approx(1, abs=1e-12)
-
-
-@pytest.mark.parametrize("solid", [L, FICHERA])
-def test_cells_of_stations_have_the_size_that_is_asked_for(solid):
-    """With a lattice around them; cells are cut by the planes of the walls near them."""
-    h = 0.2
-    points = solid.stations(lambda x: np.full(len(x), h)).points
-    n = len(points)
-    axis = np.arange(0.1, 2, 0.2)
-    lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    lattice = lattice[(solid.signed_distance(lattice) < -0.05) & (KDTree(points).query(lattice)[0] > 0.05)]
-    x = np.vstack([points, lattice])
-    planes = solid.own_planes(points, 1.4 * h)
-    tree = KDTree(x)
-    for i in range(n):
-        j = np.array([q for q in tree.query_ball_point(x[i], 3 * h) if q != i])
-        d = x[j] - x[i]
-        mine = planes.row == i
-        cut = np.column_stack([d, -np.einsum("ij,ij->i", d, (x[j] + x[i]) / 2)])
-        own = np.column_stack([planes.normal[mine], -(planes.normal[mine] * planes.foot[mine]).sum(axis=1)])
-        volume = ConvexHull(HalfspaceIntersection(np.vstack([cut, own]), x[i]).intersections).volume
-        assert volume ** (1 / 3) == pytest.approx(h, rel=0.02)
 
 
 def test_stations_follow_the_sizes_along_a_crease():
