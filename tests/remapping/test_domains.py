@@ -116,3 +116,11 @@ def test_what_is_not_covered_is_said(pairs, ctx):
     other = adapter.diagram(earth, earth.icosahedral_points(3))
     with pytest.raises(InputError, match="one radius"):
         globe.transfer(np.ones(len(globe)), other)
+
+
+def test_parts_of_a_polygon():
+    """The second part lies in the first one."""
+    rng, bay = np.random.default_rng(5), clvoro.Polygon([(0, 0), (2, 0), (2, 1), (1, 0.7), (0, 1)])
+    whole, other = (clvoro.voronoi(bay, bay.nearest(rng.random((150, 2)) * (1.9, 0.6) + 0.05)) for _ in range(2))
+    old, new = whole.subset(whole.points[:, 0] > 0.9), other.subset(other.points[:, 0] > 1.3)
+    assert old.transfer(np.full(len(old), 3.0), new) == pytest.approx(3)
