@@ -3,7 +3,8 @@
     python bench/first_run.py [--repeat N] [--warm] [--programs] [--small] [--json]
     python bench/first_run.py --record
 
-A box in 2D (625 cells) and one in 3D (1000 cells) are adapted with default options. Printed are the machine, the number
+A box in 2D (625 cells) and one in 3D (1000 cells) are adapted with default options, and 1000 generators get cells of
+prescribed volumes (`transport`). Printed are the machine, the number
 of programs and kernels that are built, and the medians of the seconds that a process takes to import the package, to
 make an adapter, and to run. The processor time includes that of workers, and is disturbed less by others on the
 machine. `--warm` repeats the runs with full caches. `--programs` prints the seconds of processor time per program.
@@ -23,14 +24,31 @@ import sys
 import tempfile
 from pathlib import Path
 
-KINDS = {"2D box": ("clvoro.Box((0, 0), (1, 1))", 0.04), "3D box": ("clvoro.Box((0, 0, 0), (1, 1, 1))", 0.1)}
-RECORDED = {
-    **KINDS,
+RUNS = {
+    "2D box": ("clvoro.Box((0, 0), (1, 1))", 0.04),
+    "3D box": ("clvoro.Box((0, 0, 0), (1, 1, 1))", 0.1),
     "2D polygon": ("clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.4, 1), (0.4, 0.5), (0, 0.5)])", 0.04),
     "2D periodic": ("clvoro.Box((0, 0), (1, 1), periodic=True)", 0.04),
     "3D periodic": ("clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)", 0.1),
     "sphere": ("clvoro.Sphere(1.0)", 0.08),
 }
+TRANSPORT = "transport({domain}, *given({domain}, {n}))"
+GIVEN = """
+import numpy as np
+def given(domain, n):
+    points = np.random.default_rng(1).uniform(domain.lower, domain.upper, (n, domain.dim))
+    points = domain.nearest(points)
+    return points, np.full(len(points), domain.measure / len(points))
+"""
+RECORDED = {
+    **{name: (domain, "", f"run({domain}, {size})") for name, (domain, size) in RUNS.items()},
+    **{
+        f"{name}, transport": (RUNS[name][0], "transport", TRANSPORT.format(domain=RUNS[name][0], n=1000))
+        for name in ("2D box", "3D box", "sphere")
+    },
+}
+"""Domain, job if it is not a run, and what an adapter does."""
+KINDS = {name: RECORDED[name] for name in ("2D box", "3D box", "2D box, transport", "3D box, transport")}
 SMALL = {
     "2D box, 800 cells": ("clvoro.Box((0, 0), (1, 1))", 0.03536),
     "2D polygon, 600 cells": ("clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.4, 1), (0.4, 0.5), (0, 0.5)])", 0.03651),
@@ -49,6 +67,7 @@ print(json.dumps([min(times) for times in zip(*spent)]))
 """
 RUN = """
 import json, resource, time
+{given}
 def clocks():
     own, ended = (resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return time.perf_counter(), own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime
@@ -57,7 +76,7 @@ import clvoro
 marks.append(clocks())
 adapter = clvoro.Adapter()
 marks.append(clocks())
-adapter.run({domain}, {size})
+adapter.{call}
 marks.append(clocks())
 from clvoro.opencl import prebuild
 prebuild._stop_workers()
@@ -76,7 +95,7 @@ def clock():
     return own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime
 ctx = clvoro.create_context()
 engine = clvoro.Adapter(ctx)._stages_for({domain}).engine
-recorded = prebuild._record()[prebuild.kind_of(engine)]
+recorded = prebuild._record()[prebuild.kind_of(engine, "{job}")]
 work = prebuild._work(engine, recorded)
 zeros = cl.Buffer(ctx, cl.mem_flags.COPY_HOST_PTR, hostbuf=np.zeros(1 << 20, np.uint8))
 rows, began = [], clock()
@@ -104,13 +123,15 @@ import json, sys
 import numpy as np, pyopencl as cl
 import clvoro
 from clvoro.opencl import engine as engines, kernels as kernel_objects, prebuild
-made, launches, programs, kinds = {{}}, {{}}, [], []
+made, launches, programs = {{}}, {{}}, []
+{given}
 plain = engines.Engine.kernels, kernel_objects.set_changed, cl.enqueue_nd_range_kernel
 def kernels(engine, stage, defines=None, prelude="", **options):
     taken = plain[0](engine, stage, defines, prelude, **options)
-    kinds.append(prebuild.kind_of(engine))
-    single = {{"REAL": "float"}} if engine.real == np.float32 else {{}}
-    made[id(taken)] = taken, (stage, single | {{k: str(v) for k, v in (defines or {{}}).items()}}), prelude
+    more = {{"REAL": "float"}} if engine.real == np.float32 else {{}}
+    if "WEIGHTED" in engine.all_defines(stage, {{}}):
+        more["WEIGHTED"] = "1"
+    made[id(taken)] = taken, (stage, more | {{k: str(v) for k, v in (defines or {{}}).items()}}), prelude
     return taken
 def getattribute(taken, name):
     kernel = old(taken, name)
@@ -134,9 +155,11 @@ def enqueue(queue, kernel, size, group, *args, **options):
 engines.Engine.kernels, kernel_objects.Kernels.__getattr__ = kernels, getattribute
 kernel_objects.set_changed, cl.enqueue_nd_range_kernel = set_changed, enqueue
 prebuild._is_new = lambda *_: False
-clvoro.Adapter().run({domain}, {size})
+adapter = clvoro.Adapter()
+adapter.{call}
+kind = prebuild.kind_of(adapter._engine_for({domain}), "{job}")
 rows = [[*key, sizes] for key, sizes in launches.items()]
-print(json.dumps([kinds[-1], {{"programs": programs, "launches": rows}}]))
+print(json.dumps([kind, {{"programs": programs, "launches": rows}}]))
 """
 ROOT = Path(__file__).parent.parent
 PLACE = ROOT / "clvoro" / "opencl" / "first_kernels.json"
@@ -157,8 +180,8 @@ def in_process(code: str, cache: str | None) -> object:
 
 def record_kind(kind: str) -> tuple[str, dict[str, list]]:
     """Return the name of a kind of run, and its programs and launches in the order of their first use."""
-    domain, size = RECORDED[kind]
-    name, found = in_process(RECORDER.format(domain=domain, size=size), None)  # type: ignore[misc]
+    domain, job, call = RECORDED[kind]
+    name, found = in_process(RECORDER.format(domain=domain, job=job, call=call, given=GIVEN), None)  # type: ignore[misc]
     return name, found
 
 
@@ -196,12 +219,13 @@ def main() -> None:
         return
     if not options.json:
         print(in_process(MACHINE.format(), None))
-        print("kind     cache  programs  kernels  import  adapter    run   adapter + run: seconds, of processor time")
-    for kind, (domain, size) in KINDS.items():
+        columns = "cache  programs  kernels  import  adapter    run   adapter + run: seconds, of processor time"
+        print(f"kind                {columns}")
+    for kind, (domain, job, call) in KINDS.items():
         found: dict[str, list] = {"empty": [], "full": []}
         for _ in range(options.repeat):
             with tempfile.TemporaryDirectory() as cache:
-                code = RUN.format(domain=domain, size=size)
+                code = RUN.format(call=call, given=GIVEN)
                 found["empty"].append(in_process(code, cache))
                 if options.warm:
                     found["full"].append(in_process(code, cache))
@@ -215,12 +239,12 @@ def main() -> None:
                 print(json.dumps({"kind": kind, "cache": state, **wall, "processor": used, "kernels": kernels}))
             else:
                 print(
-                    f"{kind}   {state:5}  {programs:8}  {kernels:7}  {wall['import']:6.2f}  {wall['adapter']:7.2f}  "
+                    f"{kind:17}   {state:5}  {programs:8}  {kernels:7}  {wall['import']:6.2f}  {wall['adapter']:7.2f}  "
                     f"{wall['run']:5.2f}   {total:20.2f}  {used:17.2f}"
                 )
         if options.programs:
             with tempfile.TemporaryDirectory() as cache:
-                for stage, count, of_program, of_kernels in in_process(PROGRAMS.format(domain=domain), cache):
+                for stage, count, of_program, of_kernels in in_process(PROGRAMS.format(domain=domain, job=job), cache):
                     print(f"  {stage:36} {of_program:5.2f} s, {count:2} kernels {of_kernels:5.2f} s")
 
 

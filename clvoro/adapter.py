@@ -253,11 +253,12 @@ class Adapter:
         check_integer("relax", relax, 0, 10**6)
         with self._alone():
             stages = self._stages_for(domain)
-            for _ in range(relax):
-                near = max(tolerance or 0.0, RELAXED)
-                found = transport_to(stages, domain, points, volumes, near, max_steps).diagram
-                points = domain.wrap(domain.nearest(found.centroids))
-            return transport_to(stages, domain, points, volumes, tolerance, max_steps)
+            with report_builds(stages.engine, self.on_build, "transport"):
+                for _ in range(relax):
+                    near = max(tolerance or 0.0, RELAXED)
+                    found = transport_to(stages, domain, points, volumes, near, max_steps).diagram
+                    points = domain.wrap(domain.nearest(found.centroids))
+                return transport_to(stages, domain, points, volumes, tolerance, max_steps)
 
     def run(
         self,

@@ -87,7 +87,7 @@ kernel void clip_by_rings(const int size, global const REAL *points, const REAL4
                           global const int *old_starts, global const int *old_neighbors, global int *rows,
                           global int *row_counts, global int *places, global int *flags)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     SITE(x, i, points);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
@@ -154,7 +154,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
                                 const REAL4 box_upper, const int repaired, const REAL share, global const int *marks,
                                 global int *fits, global uint *keep, global int *counts, global int *flags)
 {
-    WORK_ITEM(i);
+    LONG_ITEM(i);
     counts[i] = 0;
     if (flags[FLAG_MARKED]) {
         if (marks[i])

@@ -41,7 +41,7 @@ def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: ob
     near = np.maximum(given - given.max(), -WITHIN_REACH * float((domain.extent**2).sum()))
     scaled = (near - near.mean()) / domain.frame[1] ** 2
     with coincident_named(host, domain, stages.engine.real):
-        labels, sorted_points = _sorted(stages, domain, host)
+        labels, sorted_points = _sorted(power, host)
         device_weights = stages.engine.upload(scaled[labels.get()])
         t = power.tessellate_weighted(sorted_points, device_weights, n, exact=True, complete=True)
         assert t is not None
@@ -77,7 +77,7 @@ def transport_to(
     _check_pieces(host, given, domain, rounding)
     check_memory(engine, n, domain, run=False, power=True)
     with coincident_named(host, domain, engine.real):
-        labels, sorted_points = _sorted(stages, domain, host)
+        labels, sorted_points = _sorted(power, host)
         prescribed = given[labels.get()] / domain.frame[1] ** domain.cell_dim
         t, _, newton = stages.transport.solve(
             power, sorted_points, engine.upload(prescribed), None, tolerance, most, exact=True
@@ -101,11 +101,14 @@ def _remedy(real: np.dtype, used_up: bool) -> str:
     return "a larger tolerance" if real == np.float64 else "a larger tolerance or dtype='float64'"
 
 
-def _sorted(stages: Stages, domain: Domain, host: np.ndarray) -> tuple[cla.Array, cla.Array]:
+def _sorted(power: Tessellator, host: np.ndarray) -> tuple[cla.Array, cla.Array]:
     """Return the rows of the generators in the order of the bins, and their positions on the device."""
-    n = len(host)
-    binned = stages.bins.build(domain, stages.engine.upload(domain.place(host, stages.engine.real)), n)
-    return binned.items[:n].copy(), binned.points[:n].copy()
+    engine, domain, n = power.stages.engine, power.domain, len(host)
+    places = np.asarray(domain.place(host, engine.real), engine.real)
+    # The bins of generators with weights: others would be a further program.
+    sites = engine.upload(np.pad(places, ((0, 0), (0, 1))))
+    labels = power.stages.bins.build(domain, sites, n).items[:n].copy()
+    return labels, engine.upload(places[labels.get()])
 
 
 def _check_numbers(name: str, value: object, n: int) -> np.ndarray:

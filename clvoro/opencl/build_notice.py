@@ -55,7 +55,9 @@ class BuildNotice:
 
 
 @contextmanager
-def report_builds(engine: Engine, on_build: Callable[[int, int], object] | None) -> Iterator[BuildNotice | None]:
+def report_builds(
+    engine: Engine, on_build: Callable[[int, int], object] | None, job: str = ""
+) -> Iterator[BuildNotice | None]:
     """Let workers build kernels of a first run, and report the progress inside the ``with`` block.
 
     Parameters
@@ -64,13 +66,15 @@ def report_builds(engine: Engine, on_build: Callable[[int, int], object] | None)
     on_build : callable or None
         Called with the number of kernels built and of all. With None, the standard error shows a line if it is a
         terminal.
+    job : str
+        What is done in place of a run: "transport".
 
     Yields
     ------
     BuildNotice or None
         The line, if there is one.
     """
-    total, notice = build_ahead(engine), None
+    total, notice = build_ahead(engine, job), None
     if total and on_build is None and sys.stderr is not None and sys.stderr.isatty():
         notice = BuildNotice(total)
         on_build = lambda built, _: notice.show(built)  # noqa: E731

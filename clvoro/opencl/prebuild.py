@@ -67,15 +67,15 @@ def start_workers(device: cl.Device) -> None:
         _start(device)
 
 
-def build_ahead(engine: Engine) -> int:
-    """Let workers build the kernels of a run on `engine`, if this is the first run of its kind.
+def build_ahead(engine: Engine, job: str = "") -> int:
+    """Let workers build the kernels of a run on `engine`, or of another `job`, if this is the first one of its kind.
 
     Returns
     -------
     int
         Number of recorded kernels of such a run; 0 if it is not the first, or nothing is recorded.
     """
-    kind, device = kind_of(engine), engine.queue.device
+    kind, device = kind_of(engine, job), engine.queue.device
     in_processes = on_pocl(device)
     recorded = _record().get(kind if in_processes else kind.replace("float32", "float64"))
     if recorded is None or (kind, device.int_ptr) in _known:
@@ -99,9 +99,9 @@ def build_ahead(engine: Engine) -> int:
     return len(work.launches)
 
 
-def kind_of(engine: Engine) -> str:
-    """Return the kind of a run: dimension, precision and kind of domain."""
-    return " ".join([f"{engine.dim}D", engine.real.name, *engine.traits.macros])
+def kind_of(engine: Engine, job: str = "") -> str:
+    """Return the kind of a run: dimension, precision and kind of domain, and the `job`, if it is not a run."""
+    return " ".join([f"{engine.dim}D", engine.real.name, *engine.traits.macros, *job.split()])
 
 
 @cache

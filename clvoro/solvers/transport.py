@@ -30,6 +30,8 @@ FORCING, ROUGHEST = 0.1, 1e-3
 """The linear residual is this share of the largest relative error, or `ROUGHEST` if that is less."""
 FINEST = {"float64": 1e-9, "float32": 1e-5}
 """Smallest linear residual."""
+FEW = 20_000
+"""Up to so many cells all linear solves have the precision of the last ones: kernels for another one are not built."""
 
 
 @dataclass
@@ -200,7 +202,8 @@ class Transport:
         step = engine.empty(len(points))
         with engine.workspace.frame():
             measures = power.laplacian_measures(t)
-            laplacian = self._poisson.assemble(t.starts, t.neighbors, measures, points, tolerance=tolerance)
+            finest = FINEST[engine.real.name] if t.n <= FEW else tolerance
+            laplacian = self._poisson.assemble(t.starts, t.neighbors, measures, points, tolerance=finest)
             solution = self._poisson.solve(
                 laplacian, now.rhs, step, tolerance=tolerance, ordering=ordering, from_zero=True
             )

@@ -18,6 +18,8 @@ from .stages import TessellationStages
 
 CLOSED = 1e-12
 """Largest relative difference of the sum of volumes from that of the domain, where no part of a cell is missing."""
+RINGS_FROM = 2000
+"""Number of generators from which cells are searched in rings. For fewer, the build of its kernel takes longer."""
 PROGRESS = 0.95
 """Ratio of the excess of two rounds above which the search begins anew."""
 
@@ -71,7 +73,8 @@ class Rings:
         too large, never too small. In a periodic box an image cuts off only what belongs to other cells. If one is
         missing, the volumes add up to more than that of the box.
         """
-        cells, rows, before = self.stages.ring_cells, previous, np.inf
+        cells = self.stages.ring_cells if previous.n >= RINGS_FROM else None
+        rows, before = previous, np.inf
         while cells is not None:
             t = cells.clip_by_rings(box, sites, rows, exact)
             if t is None:
