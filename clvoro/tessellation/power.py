@@ -42,7 +42,8 @@ class Rings:
         lower, upper = domain.device_corners(engine.real)
         given = domain.measure / domain.frame[1] ** engine.cell_dim
         of_box = float(np.prod((upper - lower)[: engine.dim].astype(float)))
-        self._volume = given if domain.curved else of_box
+        self._curved = domain.curved
+        self._volume = given if self._curved else of_box
         self.volume = given if domain.cuts_cells else self._volume
 
     def attach(self, points: cla.Array, weights: cla.Array, n: int, most: cla.Array) -> cla.Array:
@@ -56,7 +57,7 @@ class Rings:
     def slopes(self, t: Tessellation) -> cla.Array:
         """Return what the matrix of -2 dV/dw takes for the measures of faces: on a sphere with `weigh_arcs`."""
         engine = self.stages.engine
-        if not engine.traits.curved:
+        if not self._curved:
             return t.face_measures
         if self._arcs is None or len(self._arcs) < len(t.face_measures):
             self._arcs = engine.empty(len(t.face_measures), engine.face)

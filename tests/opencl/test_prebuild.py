@@ -125,7 +125,7 @@ def test_line_appears_after_a_while_and_is_cleared(monkeypatch):
 
 @pytest.mark.parametrize(("new", "terminal", "lines"), [(5, True, 1), (5, False, 0), (0, True, 0)])
 def test_only_first_runs_on_terminals_show_a_line(engine, monkeypatch, new, terminal, lines):
-    monkeypatch.setattr(build_notice, "build_ahead", lambda _: new)
+    monkeypatch.setattr(build_notice, "build_ahead", lambda *_: new)
     monkeypatch.setattr(build_notice, "PATIENCE", 0)
     monkeypatch.setattr(sys, "stderr", Terminal() if terminal else io.StringIO())
     with report_builds(engine, None):
@@ -135,7 +135,7 @@ def test_only_first_runs_on_terminals_show_a_line(engine, monkeypatch, new, term
 
 
 def test_callback_replaces_the_line(engine, monkeypatch):
-    monkeypatch.setattr(build_notice, "build_ahead", lambda _: 2)
+    monkeypatch.setattr(build_notice, "build_ahead", lambda *_: 2)
     monkeypatch.setattr(sys, "stderr", Terminal())
     told = []
     with report_builds(engine, lambda built, total: told.append((built, total))):
