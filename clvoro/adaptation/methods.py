@@ -205,7 +205,7 @@ class ProjectedMethod(Method):
         """Evaluate the descent, with momentum, and its projection."""
         stages, t, engine = mesh.stages, mesh.t, mesh.engine
         relaxation, momentum, bad_cell_weight = self.relaxation, self.momentum, self.bad_cell_weight
-        if mesh.walls.thin:
+        if mesh.has_thin_walls:
             relaxation, momentum = (min(relaxation, self.calm_relaxation), min(momentum, CALM_MOMENTUM))
             bad_cell_weight = min(bad_cell_weight, CALM_BAD_CELL_WEIGHT)
         lloyd, correction = engine.scratch(mesh.points.shape), engine.scratch(mesh.points.shape)
@@ -253,8 +253,6 @@ class ProjectedMethod(Method):
             else:
                 stages.motion.add_momentum(relaxation, lloyd, mesh.velocity, momentum)
             mesh.zero_fixed(lloyd)
-            if self.descent == "quality":
-                mesh.walls.constrain(mesh, lloyd)
             sums = None if self.correct_mean else stages.density.sum_log_ratio(w)
         warm = mesh.multipliers is not None
         if not warm:

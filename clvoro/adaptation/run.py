@@ -413,8 +413,6 @@ class Run:
             Refine().apply(self)
         CorrectCount().apply(self)
         if not self._is_recorded():
-            if self.steps:
-                self.state.walls.settle(self.state)
             self.solution = None
             self._add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
         result = self._read_result()

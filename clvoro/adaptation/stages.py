@@ -6,7 +6,6 @@ from ..solvers.poisson import Poisson
 from ..solvers.transport import Transport
 from ..solvers.volume_projection import VolumeProjection
 from ..tessellation.stages import TessellationStages, made_by
-from .corners import Corners
 from .density import Density
 from .descent.quality_descent import QualityDescent
 from .descent.surface_descent import SurfaceDescent
@@ -30,7 +29,6 @@ class Stages(TessellationStages):
     quality_descent = made_by(QualityDescent)
     motion = made_by(Motion)
     mmpde = made_by(Mmpde)
-    corners = made_by(Corners)
     thin_walls = made_by(ThinWalls)
     refinement = made_by(Refinement)
     surface_descent = made_by(SurfaceDescent)

@@ -31,8 +31,8 @@ from .insertion_deletion import CellSizes, Change, Generators, Outcome
 from .metric import Neighborhoods
 from .motion import Balls, Displacement, Moving
 from .stages import Stages
+from .thin_walls import has_thin_walls
 from .tuning import CLIMB_STRAIN, MOST_OBTUSE, SQUEEZED
-from .walls import Walls
 
 SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio", "weight")
 
@@ -207,7 +207,7 @@ class MeshState:
         self.engine = self.stages.engine
         self.summaries = Summaries(self.engine, SUMMARIES)
         self._ordered: cla.Array | None = None
-        self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser)
+        self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser, straight=True)
         self.power: Tessellator | None = None
         self.follows_log_ratio = self._knows_log_ratio = False
         self.taken = np.full(setup.first_row, -1, np.int32) if taken is None else taken
@@ -321,9 +321,20 @@ class MeshState:
         return Displacements(x, self.to_host(d.lloyd, scale), self.to_host(d.correction, scale))
 
     @cached_property
-    def walls(self) -> Walls:
-        """Corners and thin walls of the domain, for the cells of this level."""
-        return Walls(self.setup, self.size_factor)
+    def has_thin_walls(self) -> bool:
+        """Whether walls of the domain are thinner than the cells of this level."""
+        setup, domain = self.setup, self.domain.outline
+        if domain is None:
+            return False
+        # `normalize_sizes` changes the factor by little: all of a level, also resumed, has the same walls.
+        level = round(math.log2(self.size_factor / setup.factor))
+        factor = 2.0**level * setup.factor * setup.own_factor
+        return has_thin_walls(domain, factor * np.asarray(self.sizing(domain.oriented.vertices), float))
+
+    def pair_generators(self) -> None:
+        """Move generators beside thin walls to be mirror images of each other. The diagram is then out of date."""
+        if self.has_thin_walls:
+            self.stages.thin_walls.pair(self.free, self.t, self.h, self.moving)
 
     @cached_property
     def balls(self) -> Balls | None:
@@ -673,9 +684,10 @@ class MeshState:
 
     def fetch_diagram(self) -> Diagram:
         """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards."""
-        engine = self._latest_tessellator.stages.engine
+        tessellator = self._latest_tessellator
+        t, engine = tessellator.steps.measure_exactly(self.t), tessellator.stages.engine
         self.stages.release()
-        return fetch_diagram(engine, self.domain, self.t, self.labels, copy=False)
+        return fetch_diagram(engine, self.domain, t, self.labels, copy=False)
 
 
 def _take_apart(new: Outcome | None) -> tuple[dict[str, cla.Array], tuple[int, int]]:

@@ -3,7 +3,6 @@
 Lengths are over h, the target size, unless they say otherwise. e is the error of a size, Q the quality of a cell.
 """
 
-import numpy as np
 
 # The start of a run.
 
@@ -159,27 +158,6 @@ MOVES = 1
 
 # Corners and thin walls.
 
-SHARP_REACH, BEND_REACH = 0.05, 0.35
-"""Distances along the boundary from a corner: over the first its turns are added, over the second the boundary is a
-straight line."""
-SHARP_TURN, LEAST_TURN = np.radians(20), np.radians(30)
-"""Least turns of a corner over both distances."""
-SPACING, LEAST_SPACING, FAN = 1.1, 0.15, 0.5
-"""Spacing of corners: ``SPACING - FAN * turn``, for the mean turn of two corners, but at least `LEAST_SPACING`. Cells
-fan out around a corner, so sharp corners may be close to each other."""
-POCKETS, POCKET_SPACING = (0.01, 0.35), 0.75
-"""Areas over h^2, inside the domain, between the boundary and the segment from one corner to another. No cell fits in
-such a pocket, as on a staircase: its corners are at least `POCKET_SPACING` apart."""
-JOINED = 1.6
-"""Distance, over the larger h of both, up to which two corners may share a generator. They are in one group then."""
-CANDIDATE_REACH, FARTHEST_REACH = 2.2, 3.0
-"""Largest distance of a generator from a corner that it may share; the same where no generator is near."""
-GROUP_REACH = 2 * FARTHEST_REACH
-"""Distance up to which a group knows the corners of others, so that no two groups move the same generator."""
-WALL_REACH = 0.5
-"""Distance along the boundary from a corner up to which cells at the wall are candidates."""
-SETTLING = 3
-"""Projections at corners if a run does not end with a step: each turns generators by a small angle only."""
 DEPTHS, MOST_SAMPLES = (0.1, 0.2, 0.3), 64
 """Depths behind a wall: if one is in the domain again, the wall is thin. Most places on an edge where this is asked."""
 

@@ -25,10 +25,10 @@ from ..arguments import format_point, warn
 from ..errors import MismatchWarning
 from ..geometry.polygon import Polygon
 from ..geometry.ring_coordinate import RingCoordinate
-from ..geometry.rings import OrientedRings
+from ..geometry.rings import WALL_CORNER, OrientedRings
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
-from ..mesh.straightening import WALL_CORNER, cross
+from ..mesh.straightening import chain_areas, choose_corners, cross
 
 FAR = 20.0
 """Distance of four additional generators, which close all cells, over the extent of the domain."""
@@ -36,12 +36,9 @@ ON_WALL = 0.1
 """Vertices that are nearer to the boundary than this lie on it, over the width of the thinnest cell there."""
 BEHIND_WALL = 2.0
 """Length over that distance from which on a face that leads outward from a vertex on the boundary is kept."""
-SNAP_RE_ENTRANT, SNAP_CONVEX = 0.25, 0.12
-"""A face ends in a corner of the domain that is nearer than this along the boundary, over the width of its cells."""
-LEAST_BULGE = 0.1
-"""Distance from a straight face over the size of the cell at which a vertex of the domain becomes a corner of it."""
-FILLED = 0.5
-"""Share of the triangle of a corner and the ends of the face that must lie in the domain, or it is cut off."""
+SNAP = 0.12
+"""A face ends in a convex corner of the domain, or at the end of a named part of it, that is nearer than this along the
+boundary, over the width of its cells."""
 AROUND = 4.0
 """Largest area between a wall face and the boundary behind it, over that of the cell."""
 LEFT_OUT = 0.5
@@ -320,14 +317,13 @@ class _WallMaker:
         return self.along.position(edge[order], share[order])
 
     def move_into_corners(self) -> None:
-        """Move the nearest face end on the boundary into each corner of the domain and each end of a named part."""
+        """Move the nearest face end on the boundary into each convex corner and each end of a named part."""
         width = np.full(len(self.points), np.inf)
         for end in self.ends[self.kept].T:
             np.minimum.at(width, end, self.width[self.kept])
         on = np.flatnonzero(~np.isnan(self.position))
         turns, begins = self.rings.turns, self.along.begins
-        corners = np.flatnonzero((np.abs(turns) > WALL_CORNER) | self.changes_part)
-        reach = np.where(turns[corners] < -WALL_CORNER, SNAP_RE_ENTRANT, SNAP_CONVEX)
+        corners = np.flatnonzero((turns > WALL_CORNER) | self.changes_part)
         s, ring, near = self.position[on], self.along.ring_of(self.position[on]), []
         ring_of_corner = self.along.ring_of(begins[corners])
         for r in np.intersect1d(ring, ring_of_corner).tolist():
@@ -336,7 +332,7 @@ class _WallMaker:
             for k in (mine[place % len(mine)], mine[place - 1]):
                 gap = np.abs(begins[corners[k]] - s[here])
                 gap = np.minimum(gap, self.along.span(r)[1] - gap)
-                near += [(g, c, p) for g, c, p in zip(gap, k, on[here], strict=True) if g <= reach[c] * width[p]]
+                near += [(g, c, p) for g, c, p in zip(gap, k, on[here], strict=True) if g <= SNAP * width[p]]
         taken: set[int] = set()
         moved: set[int] = set()
         for _, corner, point in sorted(near):
@@ -411,7 +407,7 @@ class _WallMaker:
         joined = (ring == along.ring_of(t)) & ~np.isnan(s + t)
         every, cell, gap, s, t, ring = (values[joined] for values in (every, cell, gap, s, t, ring))
         chain, path, starts = self._chains(along, ring, s, t, gap)
-        joined = _areas(chain, starts[:-1], starts[1:] - 1) <= AROUND * self.size[cell] ** 2
+        joined = chain_areas(chain, starts[:-1], starts[1:] - 1) <= AROUND * self.size[cell] ** 2
         left = np.setdiff1d(np.arange(len(positions)), every[joined])
         cell, gap, s, t, ring = (values[joined] for values in (cell, gap, s, t, ring))
         chain, path, starts = self._chains(along, ring, s, t, gap)
@@ -419,7 +415,7 @@ class _WallMaker:
         total = along.begins[along.ring_starts[1:]][ring] - begin
         row = np.repeat(np.arange(len(cell)), np.diff(starts))
         chosen = (path < 0) | changes[path]
-        self._choose_corners(chain, chosen, self.size[cell][row])
+        choose_corners(chain, chosen, self.size[cell][row])
         kept = np.flatnonzero(chosen)
         added = path[kept] >= 0
         names = np.empty(len(kept), np.int64)
@@ -435,7 +431,9 @@ class _WallMaker:
         edges = along.edges(begin[row[side]] + middles % total[row[side]])
         self._add_walls(cell[row[side]], rings.edge_numbers[edges], np.column_stack([names[side], names[side + 1]]))
         # What lies between the boundary and the walls.
-        off = _areas(chain, starts[:-1], starts[1:] - 1) - _areas(chain[kept], kept_starts[:-1], kept_starts[1:] - 1)
+        off = chain_areas(chain, starts[:-1], starts[1:] - 1) - chain_areas(
+            chain[kept], kept_starts[:-1], kept_starts[1:] - 1
+        )
         large = np.flatnonzero(np.abs(off) > LEFT_OUT * self.size[cell] ** 2)
         places = chain[(starts[:-1] + starts[1:])[large] // 2]
         self.left_out += list(zip(np.abs(off[large]).tolist(), places, strict=True))
@@ -482,32 +480,6 @@ class _WallMaker:
         for place, points in ((starts[:-1], gap[:, 0]), (starts[1:] - 1, gap[:, 1])):
             chain[place], path[place] = self.points[points], -1
         return chain, path, starts
-
-    def _choose_corners(self, chain: np.ndarray, chosen: np.ndarray, size: np.ndarray) -> None:
-        """Choose among the points of chains those that become corners of convex cells, between the `chosen` ones.
-
-        As in the algorithm of Douglas and Peucker the point farthest from a straight face divides it, if it is far
-        enough outside, and the domain fills the triangle; then both halves are treated alike.
-        """
-        ends = np.flatnonzero(chosen)
-        low, high = ends[:-1], ends[1:]
-        low, high = low[high - low > 1], high[high - low > 1]
-        while low.size:
-            starts = np.concatenate([[0], np.cumsum(high - low - 1)])
-            row = np.repeat(np.arange(len(low)), np.diff(starts))
-            place = low[row] + 1 + np.arange(starts[-1]) - starts[row]
-            side = chain[high] - chain[low]
-            length = np.hypot(*side.T)
-            off = cross(chain[place] - chain[low][row], side[row]) / np.maximum(length, 1e-300)[row]
-            farthest = np.maximum.reduceat(off, starts[:-1])
-            hit = np.flatnonzero(off == farthest[row])
-            middle = place[hit[np.searchsorted(row[hit], np.arange(len(low)))]]
-            filled = _areas(chain, low, high) >= FILLED * farthest * length / 2
-            divided = (length > 0) & (farthest >= LEAST_BULGE * size[low]) & filled
-            low, middle, high = low[divided], middle[divided], high[divided]
-            chosen[middle] = True
-            low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
-            low, high = low[high - low > 1], high[high - low > 1]
 
     def warn_of_left_out(self) -> None:
         """Warn of parts of the domain that are left out, and of islands that no cell has a wall on."""
@@ -573,13 +545,4 @@ def _changes(rings: OrientedRings, parts: np.ndarray) -> np.ndarray:
 
 def _area(loop: np.ndarray) -> float:
     """Return the area within points (k, 2), positive if they run counter-clockwise."""
-    return float(_areas(loop, np.array([0]), np.array([len(loop) - 1]))[0])
-
-
-def _areas(points: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return the area within the `points` (k, 2) from each `first` to each `last` (g,), negative if clockwise."""
-    starts = np.concatenate([[0], np.cumsum(last - first)])
-    row = np.repeat(np.arange(len(first)), last - first)
-    place = first[row] + np.arange(starts[-1]) - starts[row]
-    base = points[first][row]
-    return np.bincount(row, cross(points[place] - base, points[place + 1] - base), len(first)) / 2
+    return float(chain_areas(loop, np.array([0]), np.array([len(loop) - 1]))[0])

@@ -6,20 +6,20 @@ Balls around lines and creases keep the others away.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
-from .rings import WALL_CORNER
+from .rings import WALL_CORNER, OrientedRings
 
 if TYPE_CHECKING:
     from .domain import Domain
     from .polygon import Polygon
 
-_LONG_SIDE, _WIDEST = 1.5, np.radians(300)
-"""Least length over h of both walls of a corner around which generators are fixed, and its largest interior angle."""
+_LONG_SIDE, _MOST_BEND = 1.5, np.radians(20)
+"""Length over h of both walls of a corner around which generators are fixed, and how much they may turn there."""
 _DEPTH, _SPACING = 0.4, 0.8
 """Least distances over h of these generators from walls, and from those of another corner."""
 
@@ -51,8 +51,6 @@ class FixedGenerators:
 
     own_sizes = False
     """Whether the target size of these cells is the size that they have."""
-    corners = np.empty(0, int)
-    """Vertices of `Polygon.oriented` around which they stand, (c,)."""
     least_cells = 0
     """Least number of cells of a mesh for each of them."""
 
@@ -67,7 +65,6 @@ class CornerStations(FixedGenerators):
     There are no balls around these corners.
     """
 
-    corners: np.ndarray = field()
     least_cells = 3
 
 
@@ -77,13 +74,13 @@ def place_around_corners(
     """Return generators around the re-entrant corners of `domain` that have room for cells of the sizes `size`.
 
     Around a corner of 270 degrees three stand in the middle of three equal sectors, around others as many as it has
-    right angles. The outer ones see one wall each; all have the size h. Corners between sides shorter than
-    `_LONG_SIDE`, near layers, other stations, other walls or `fixed` generators (m, 2) have none.
+    right angles. The outer ones see one wall each; all have the size h. Corners between walls that are straight over
+    less than `_LONG_SIDE`, near layers, other stations, other walls or `fixed` generators (m, 2) have none.
     """
     rings = domain.oriented
     h, angle = np.asarray(size(rings.vertices), float), np.pi - rings.turns
-    sharp = (rings.turns < -WALL_CORNER) & (angle < _WIDEST)
-    sharp &= np.minimum(rings.lengths, rings.lengths[rings.before]) >= _LONG_SIDE * h
+    sharp = rings.turns < -WALL_CORNER
+    sharp[sharp] = _have_straight_sides(rings, np.flatnonzero(sharp), _LONG_SIDE * h[sharp])
     corners = np.flatnonzero(sharp)
     count = np.maximum(np.rint(angle[corners] / (np.pi / 2)).astype(int), 2)
     sector = angle[corners] / count
@@ -108,4 +105,20 @@ def place_around_corners(
             left[max(a, b)] = False
     points = points[left[corner]]
     no_balls = np.empty((0, 2)), np.empty(0), np.zeros(len(points) + 1, np.int32), np.empty(0, np.int32)
-    return CornerStations(points, *no_balls, left_out=np.empty((0, 2)), corners=corners[left])
+    return CornerStations(points, *no_balls, left_out=np.empty((0, 2)))
+
+
+def _have_straight_sides(rings: OrientedRings, corners: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Return whether both walls of `corners` (c,) turn by at most `_MOST_BEND` in sum up to `length` (c,), (c,) bool."""
+    straight = np.ones(len(corners), bool)
+    before = rings.before
+    walls = (before, rings.lengths[before]), (rings.next_vertex, rings.lengths)
+    for row, corner in enumerate(corners.tolist()):
+        for step, lengths in walls:
+            vertex, passed, bend = corner, float(lengths[corner]), 0.0
+            while straight[row] and passed < length[row]:
+                vertex = step[vertex]
+                passed += lengths[vertex]
+                bend += abs(rings.turns[vertex])
+                straight[row] = bend <= _MOST_BEND
+    return straight

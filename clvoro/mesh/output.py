@@ -193,10 +193,9 @@ class MeshOutput:
         binary : bool
             Write numbers as bytes (labels of 32 bits, scalars of 64), which is faster and takes less space.
         walls : {"straight", "exact"}
-            With "straight" the cells are those of `solver_mesh`: the faces of a cell on the boundary become one
-            straight face where they turn by at most 30 degrees in sum, face ends near a corner of the domain move into
-            it, and short edges are collapsed. Solvers reject cells that are not convex. With "exact" all faces are
-            those of the diagram.
+            With "straight" the cells are those of `solver_mesh`: convex, with straight faces on the boundary and
+            without short edges. Solvers reject cells that are not convex. With "exact" all faces are those of the
+            diagram.
         zones : mapping, optional
             Zones of cells by name, each with one bool per cell, as ``{"pipe": surface.contains(mesh.points)}``:
             sources, porous media, parts that rotate. If the domain has lines, the parts between them are the zones
@@ -293,9 +292,9 @@ class MeshOutput:
         ----------
         walls : {"straight", "exact"}
             With "straight", in a polygon: each cell is convex. It has one straight face where it meets the boundary, or
-            several with the convex corners of the domain and the ends of its named parts between them. A face ends in
-            a corner of the domain that is near. What is smaller than a cell is left out. The change of area is the
-            mesh's `area_change`.
+            several with the convex corners of the domain and the ends of its named parts between them. Re-entrant
+            corners within a cell are cut off. What is smaller than a cell is left out. The change of area is the mesh's
+            `area_change`.
         collapse : bool
             Whether the ends of short faces become one point: in 2D of faces shorter than 0.055 times the size of
             the smaller cell and 0.2 times the width of the thinner one, while cells remain convex. Corners and ends

@@ -78,11 +78,12 @@ class Result(Sealed, MeshOutput):
     target_size : (n,) float64
         Target size h at the generators, in the domain's unit of length.
     size_error : (n,) float64
-        Signed metric error e, the paper's (3.1): positive where a cell is too large.
+        Signed metric error e, the paper's (3.1): positive where a cell is too large. In a polygonal domain sizes and
+        quality are those of cells with straight walls, as the mesh for solvers has them: along the boundary a cell has
+        one straight side, or several with the convex corners of the domain between. Areas in `diagram` are exact.
     quality : (n,) float64
         Cell quality: in 2D the paper's (4.1), 1 for a regular polygon; in 3D the isoperimetric quotient
-        36 pi V^2 / S^3. In a polygonal domain faces on the boundary count as one straight side while they turn by at
-        most 30 degrees in sum, and holes within a cell are not sides.
+        36 pi V^2 / S^3.
     history : structured array of `HISTORY_DTYPE`
         One row per step: ``history["mean_error"]``, ... The last row describes this mesh. It is an additional one if
         the run was stopped on a coarser level, before sizes were scaled to `n_cells`, or within a step. Cells in the

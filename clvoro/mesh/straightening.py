@@ -11,17 +11,13 @@ from ..geometry.rings import WALL_CORNER
 from .connectivity import face_ends
 
 if TYPE_CHECKING:
-    from numpy.typing import DTypeLike
-
     from ..geometry.polygon import Polygon
     from .diagram import Diagram
 
-SIDE_TURN = WALL_CORNER * (1 + 2.0**-10)
-"""Largest turn of a side on the boundary: `WALL_CORNER` and a little more.
-
-Sums of turns have round-off, but an arc of 2 x 15 degrees is one side in any precision. The margin is smaller than the
-difference to the next possible sum in regular rings, whose turns are 360 degrees over their number of edges.
-"""
+LEAST_BULGE = 0.1
+"""Distance from a straight side over the size of the cell at which a vertex of the domain becomes a corner of it."""
+FILLED = 0.5
+"""Share of the triangle of a corner and the ends of the side that must lie in the domain, or it is cut off."""
 
 
 def count_sides(diagram: Diagram) -> np.ndarray:
@@ -49,20 +45,13 @@ class Straightened:
         return 4 * np.maximum(self.areas, 0) * n * np.tan(np.pi / n) / self.perimeters**2
 
 
-def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
-    """Return sides, areas and perimeters of cells in 2D with a straightened boundary.
+def straighten(diagram: Diagram) -> Straightened:
+    """Return sides, areas and perimeters of cells in 2D as the mesh for solvers has them.
 
-    Each face between cells is a side. A stretch of the boundary that turns by at most 30 degrees (`SIDE_TURN`) in sum
-    is one side, a straight line from its first to its last end; where it turns farther a new side begins. Stretches
-    follow the rings of the domain, from the beginning to the end of the cell's part of a ring. If a cell has a whole
-    ring, the first stretch begins in its sharpest corner. Holes within a cell are not sides. Cells with fewer than
-    three sides remain as they are. In a box the sides are the faces.
-
-    Parameters
-    ----------
-    diagram : Diagram
-    real : dtype
-        Precision of the sums of turns, as on the device.
+    Each face between cells is a side. Along the boundary a cell has one straight side from its first to its last point
+    on a ring, with the convex corners of the domain between that `choose_corners` finds; re-entrant corners are cut
+    off. A ring that is a whole cell stays as it is, and holes within a cell are not sides. Cells with fewer than three
+    sides remain as they are. In a box the sides are the faces.
     """
     starts = diagram.neighbor_starts
     counts, n = np.diff(starts), len(diagram)
@@ -71,46 +60,48 @@ def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
     domain = diagram.domain.outline
     if domain is None:
         return Straightened(counts, diagram.volumes, perimeters)
-    of, first, final = _stretches(diagram, domain, owner, np.dtype(real))
-    rows, cells, last = np.flatnonzero(of >= 0), owner[first], len(first)
-    # Positions are relative to the generator. A side of a single face changes nothing.
-    ends = face_ends(diagram)
-    p, q = (diagram.vertices[v] - diagram.points[owner] for v in ends.T)
-    length, area = (np.bincount(of[rows], x[rows], last) for x in (measures, cross(p, q) / 2))
-    begin, end = p[first], q[final]
-    several = np.bincount(of[rows], minlength=last) > 1
-    longer = np.where(several, length - np.hypot(*(end - begin).T), 0.0)
-    beyond = np.where(several, area - cross(begin, end) / 2, 0.0)
-    sides = np.bincount(owner[diagram.neighbors >= 0], minlength=n)
-    sides += np.bincount(cells, minlength=n)
-    polygons = sides >= 3
-    return Straightened(
-        sides,
-        diagram.volumes - polygons * np.bincount(cells, beyond, n),
-        perimeters - polygons * np.bincount(cells, longer, n),
-    )
+    sides = _straight_sides(diagram, domain, owner)
+    inner = np.flatnonzero(diagram.neighbors >= 0)
+    # Positions are relative to the generator.
+    ends = (diagram.vertices[v] - diagram.points[owner[inner]] for v in face_ends(diagram)[inner].T)
+    p, q = (np.concatenate(pair) for pair in zip(ends, (sides.begin, sides.end), strict=True))
+    cell = np.concatenate([owner[inner], sides.cell])
+    number = np.bincount(cell, minlength=n)
+    areas = np.bincount(cell, cross(p, q) / 2, n)
+    made = (number >= 3) & (areas > 0)
+    length = np.bincount(cell, np.hypot(*(q - p).T), n)
+    return Straightened(number, np.where(made, areas, diagram.volumes), np.where(made, length, perimeters))
 
 
-def cell_quality(diagram: Diagram, surfaces: np.ndarray, real: DTypeLike = np.float64) -> np.ndarray:
+def cell_quality(diagram: Diagram, surfaces: np.ndarray) -> np.ndarray:
     """Return the quality of each cell, (n,): the paper's (4.1) in 2D and on a sphere, the isoperimetric quotient in 3D.
 
-    `surfaces` (n,) are the sums of the measures of the cells' faces; `real` as for `straighten`.
+    `surfaces` (n,) are the sums of the measures of the cells' faces.
     """
     if diagram.domain.cell_dim == 2:
-        return straighten(diagram, real).quality()
+        return straighten(diagram).quality()
     return 36 * np.pi * diagram.volumes**2 / surfaces**3
+
+
+def cell_sizes(diagram: Diagram) -> np.ndarray:
+    """Return the size of each cell as runs count it, (n,): its volume to the power 1 / d, in 2D as `straighten` has it.
+
+    Cells of power diagrams, whose volumes are prescribed, count as they are.
+    """
+    plane = diagram.domain.dim == 2 and not diagram.is_power
+    volumes = straighten(diagram).areas if plane else diagram.volumes
+    return np.maximum(volumes, 0) ** (1 / diagram.domain.cell_dim)
 
 
 def have_corners(diagram: Diagram) -> np.ndarray:
     """Return which cells in a polygonal domain have a corner of the boundary, (n,) bool.
 
-    That is a turn by more than 30 degrees (`SIDE_TURN`): at the end of a wall face of the cell, or in sum within it, so
-    that the cell has several sides on one stretch of the boundary.
+    The boundary turns there by more than 30 degrees: at the end of a wall face of the cell, or between two such faces
+    or the straight sides of the cell.
     """
     domain = diagram.domain.outline
     assert domain is not None
     owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
-    of, _, _ = _stretches(diagram, domain, owner, np.dtype(np.float64))
     following, edges = along_rings(diagram, domain), _places(diagram, domain)
     here = np.flatnonzero(following >= 0)
     there = following[here]
@@ -121,10 +112,11 @@ def have_corners(diagram: Diagram) -> np.ndarray:
     whole = np.add.reduceat(oriented.turns, oriented.ring_starts[:-1])
     turned = sums[edges[there]] - sums[edges[here]]
     turned += np.where(edges[there] < edges[here], whole[rings - 1], 0)
-    within = owner[here] == owner[there]
-    cornered = (np.abs(turned) > SIDE_TURN) | (within & (of[here] != of[there]))
+    cornered = np.abs(turned) > WALL_CORNER
     found = np.zeros(len(diagram), bool)
     found[owner[here[cornered]]] = found[owner[there[cornered]]] = True
+    sides = _straight_sides(diagram, domain, owner)
+    found[sides.cell[1:][np.diff(sides.run) == 0]] = True
     return found
 
 
@@ -133,36 +125,104 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-def _stretches(
-    diagram: Diagram, domain: Polygon, owner: np.ndarray, real: np.dtype
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the stretch of each half-face, (m,), or -1; and the first and the last half-face of each stretch, (s,)."""
+def chain_areas(points: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Return the area within the `points` (k, 2) from each `first` to each `last` (g,), negative if clockwise."""
+    starts = np.concatenate([[0], np.cumsum(last - first)])
+    row = np.repeat(np.arange(len(first)), last - first)
+    place = first[row] + np.arange(starts[-1]) - starts[row]
+    base = points[first][row]
+    return np.bincount(row, cross(points[place] - base, points[place + 1] - base), len(first)) / 2
+
+
+def choose_corners(chain: np.ndarray, chosen: np.ndarray, size: np.ndarray) -> None:
+    """Choose among the points of chains those that become corners of convex cells, between the `chosen` ones.
+
+    As in the algorithm of Douglas and Peucker the point farthest from a straight side divides it, if it is far enough
+    outside, and the domain fills the triangle; then both halves are treated alike.
+
+    Parameters
+    ----------
+    chain : (k, 2) float64
+        Points along the boundary, the domain on the left, one chain after the other.
+    chosen : (k,) bool
+        Changed in place. The first and the last point of each chain are chosen.
+    size : (k,) float64
+        Size of the cell of each point.
+    """
+    ends = np.flatnonzero(chosen)
+    low, high = ends[:-1], ends[1:]
+    low, high = low[high - low > 1], high[high - low > 1]
+    while low.size:
+        starts = np.concatenate([[0], np.cumsum(high - low - 1)])
+        row = np.repeat(np.arange(len(low)), np.diff(starts))
+        place = low[row] + 1 + np.arange(starts[-1]) - starts[row]
+        side = chain[high] - chain[low]
+        length = np.hypot(*side.T)
+        off = cross(chain[place] - chain[low][row], side[row]) / np.maximum(length, 1e-300)[row]
+        farthest = np.maximum.reduceat(off, starts[:-1])
+        hit = np.flatnonzero(off == farthest[row])
+        middle = place[hit[np.searchsorted(row[hit], np.arange(len(low)))]]
+        filled = chain_areas(chain, low, high) >= FILLED * farthest * length / 2
+        divided = (length > 0) & (farthest >= LEAST_BULGE * size[low]) & filled
+        low, middle, high = low[divided], middle[divided], high[divided]
+        chosen[middle] = True
+        low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
+        low, high = low[high - low > 1], high[high - low > 1]
+
+
+@dataclass(frozen=True)
+class _Sides:
+    """Straight sides along the boundary.
+
+    Attributes
+    ----------
+    cell, run : (s,) int
+        Cell, and number of its part of a ring.
+    begin, end : (s, 2) float64
+        Relative to the generator.
+    """
+
+    cell: np.ndarray
+    run: np.ndarray
+    begin: np.ndarray
+    end: np.ndarray
+
+
+def _straight_sides(diagram: Diagram, domain: Polygon, owner: np.ndarray) -> _Sides:
+    """Return the straight sides of all cells along the boundary."""
     following = along_rings(diagram, domain)
-    edges = _places(diagram, domain)
-    begins = _beginnings(domain, following, edges, owner)
-    onward, of_face, cells = following.tolist(), edges.tolist(), owner.tolist()
-    next_edge, turns = (domain.oriented.next_vertex.tolist(), list(domain.oriented.turns.astype(real)))
-    stretch = np.full(len(edges), -1)
-    first: list[int] = []
-    final: list[int] = []
-    for begin in begins:
-        face, turned = begin, real.type(0)
-        first.append(face)
+    begins, rings = _beginnings(domain, following, _places(diagram, domain), owner)
+    onward, cells = following.tolist(), owner.tolist()
+    faces: list[int] = []
+    firsts: list[int] = []
+    for begin in begins.tolist():
+        firsts.append(len(faces))
+        face = begin
         while True:
-            stretch[face] = len(first) - 1
-            next_, edge = onward[face], of_face[face]
-            if next_ < 0 or next_ == begin or cells[next_] != cells[begin] or stretch[next_] >= 0:
+            faces.append(face)
+            face = onward[face]
+            if face < 0 or face == begin or cells[face] != cells[begin]:
                 break
-            while edge != of_face[next_]:
-                edge = next_edge[edge]
-                turned += turns[edge]
-            if abs(turned) > real.type(SIDE_TURN):
-                final.append(face)
-                first.append(next_)
-                turned = real.type(0)
-            face = next_
-        final.append(face)
-    return stretch, np.array(first, int), np.array(final, int)
+    # Each run has one point more than faces.
+    face, starts = np.array(faces, int), np.array([*firsts, len(faces)], int)
+    run = np.repeat(np.arange(len(begins)), np.diff(starts))
+    run_of_point = np.repeat(np.arange(len(begins)), np.diff(starts) + 1)
+    first = np.flatnonzero(np.diff(run_of_point, prepend=-1))
+    last = np.append(first[1:], len(run_of_point)) - 1
+    chain = np.empty((len(run_of_point), 2))
+    ends = face_ends(diagram)[face]
+    chain[np.arange(len(face)) + run] = diagram.vertices[ends[:, 0]]
+    chain[last] = diagram.vertices[ends[starts[1:] - 1, 1]]
+    cell = owner[begins][run_of_point]
+    chain -= diagram.points[cell]
+    chosen = np.isin(run_of_point, np.flatnonzero(rings))
+    chosen[first] = chosen[last] = True
+    choose_corners(chain, chosen, np.sqrt(np.maximum(diagram.volumes, 0))[cell])
+    kept = np.flatnonzero(chosen)
+    kept, after = kept[:-1], kept[1:]
+    within = run_of_point[kept] == run_of_point[after]
+    kept, after = kept[within], after[within]
+    return _Sides(cell[kept], run_of_point[kept], chain[kept], chain[after])
 
 
 def _places(diagram: Diagram, domain: Polygon) -> np.ndarray:
@@ -195,8 +255,13 @@ def along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
     return following
 
 
-def _beginnings(domain: Polygon, following: np.ndarray, edges: np.ndarray, owner: np.ndarray) -> list[int]:
-    """Return the half-faces on the boundary with which a cell's part of a ring begins; none for a whole hole."""
+def _beginnings(
+    domain: Polygon, following: np.ndarray, edges: np.ndarray, owner: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the half-faces on the boundary with which a cell's part of a ring begins, (r,), and if it is all of it.
+
+    There is none for a whole hole.
+    """
     rows = np.flatnonzero(edges >= 0)
     goes_on = rows[following[rows] >= 0]
     before = np.full(len(edges), -1)
@@ -207,10 +272,6 @@ def _beginnings(domain: Polygon, following: np.ndarray, edges: np.ndarray, owner
     divided = np.zeros(len(oriented.sharpest), bool)
     divided[ring[begins]] = True
     is_outer = np.diff(domain.piece_of_ring, prepend=-1) > 0
-    # A ring that belongs to one cell begins with the first face after its sharpest corner.
-    firsts = rows[(edges[before[rows]] != edges[rows]) & (is_outer & ~divided)[ring[rows]]]
-    size = np.diff(oriented.ring_starts)[ring[firsts]]
-    away = (edges[firsts] - oriented.sharpest[ring[firsts]]) % size
-    order = np.lexsort((away, ring[firsts]))
-    nearest = np.diff(ring[firsts[order]], prepend=-1) > 0
-    return [*begins.tolist(), *firsts[order][nearest].tolist()]
+    firsts = rows[(is_outer & ~divided)[ring[rows]]]
+    firsts = firsts[np.unique(ring[firsts], return_index=True)[1]]
+    return np.append(begins, firsts), np.repeat([False, True], [len(begins), len(firsts)])

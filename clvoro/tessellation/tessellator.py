@@ -37,6 +37,8 @@ class Tessellator:
         The tessellator of a coarser level of the same domain. Its halo is the first guess in a periodic box.
     weighted : bool
         Make power diagrams.
+    straight : bool
+        Where a boundary cuts cells: measure cells as the mesh for solvers has them; see `Cut`.
 
     Attributes
     ----------
@@ -58,6 +60,7 @@ class Tessellator:
         spacing: Callable[[np.ndarray], np.ndarray] | None = None,
         coarser: Tessellator | None = None,
         weighted: bool = False,
+        straight: bool = False,
     ) -> None:
         if weighted:
             domain.require_power_diagrams()
@@ -67,7 +70,7 @@ class Tessellator:
             halo = None if coarser is None else coarser.steps.halo
             self.steps: DomainSteps = Images(self.stages, domain, halo)
         elif domain.outline is not None:
-            self.steps = Cut(self.stages, domain.outline, spacing)
+            self.steps = Cut(self.stages, domain.outline, spacing, straight)
         elif domain.wall_triangles is not None:
             self.steps = SolidWalls(self.stages, domain, domain.wall_triangles, spacing)
         else:

@@ -96,24 +96,6 @@ def test_cells_do_not_overlap(ring):
         assert cells[i].intersection(cells[j]).area < 1e-14
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_face_ends_in_a_corner_that_is_near(ctx, seed):
-    """Two generators, nearly at the same distance from the corner, put the face's end beside it."""
-    rng = np.random.default_rng(seed)
-    corner = np.array([0.5, 0.5])
-    near = corner + 0.1 * np.array([(1, -0.4), (-0.4, 1)]) + rng.uniform(-0.01, 0.01, (2, 2))
-    far = np.array([(x, y) for x in (0.1, 0.3, 0.5, 0.7, 0.9) for y in (0.1, 0.3)])
-    far = np.concatenate([far, far[[0, 1, 2, 3]] + (0, 0.4), far[[0, 2]] + (0, 0.8)])
-    points = np.concatenate([near, far + rng.uniform(-0.02, 0.02, far.shape)])
-    diagram = clvoro.Adapter(ctx).diagram(Polygon(ELL), points)
-    assert max(map(concave_by, polygons(diagram.solver_mesh("exact", collapse=False)))) > 80
-    mesh = diagram.solver_mesh()
-    cells = polygons(mesh)
-    assert max(map(concave_by, cells)) < 1e-9
-    assert sum(p.touches(shapely.Point(corner)) for p in cells) == 2
-    assert mesh.area_change == 0
-
-
 def test_a_single_cell_is_the_domain(ctx):
     mesh = clvoro.Adapter(ctx).diagram(Polygon(ELL), np.array([(0.4, 0.4)])).solver_mesh()
     assert [p.equals(shapely.Polygon(ELL)) for p in polygons(mesh)] == [True]

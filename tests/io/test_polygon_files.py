@@ -250,87 +250,13 @@ def test_faces_are_the_outlines_of_cells(result) -> None:
     assert sorted(following.tolist()) == list(range(len(following)))
 
 
-def corners_by_hand(diagram, i: int) -> tuple[np.ndarray, bool]:
-    """Walk around a cell, face by face; return where its sides begin, and whether nothing else belongs to it.
-
-    The boundary is one side as long as it turns by no more than 30 degrees.
-    """
-    rows = range(diagram.neighbor_starts[i], diagram.neighbor_starts[i + 1])
-    ends, x = face_ends(diagram), diagram.vertices
-    after = {f: g for f in rows for g in rows if ends[f, 1] == ends[g, 0]}
-    first = f = next(f for f in rows if diagram.neighbors[f] >= 0)
-    corners, walked, turned, before = [], 0, 0.0, None
-    while walked == 0 or f != first:
-        e = complex(*(x[ends[f, 1]] - x[ends[f, 0]]))
-        if diagram.neighbors[f] >= 0:
-            corners.append(ends[f, 0])
-            before = None
-        else:
-            turned += np.angle(e / before) if before is not None else 0.0
-            if before is None or abs(turned) > np.pi / 6:
-                corners.append(ends[f, 0])
-                turned = 0.0
-            before = e
-        f, walked = after[f], walked + 1
-    return x[corners], walked == len(rows)
-
-
-@pytest.mark.sparse(1)
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_quality_is_that_of_the_cell_with_straight_sides(ctx, dtype: str) -> None:
-    eps, straightened, joined = float(np.finfo(dtype).eps), 0, 0
-    for domain in (comb(), Polygon(ring().rings[0])):
-        result = mesh(ctx, domain, 150, dtype)
-        diagram = result.diagram
-        counts, faces = count_sides(diagram), np.diff(diagram.neighbor_starts)
-        for i in range(150):
-            corners, whole = corners_by_hand(diagram, i)
-            if not whole:  # islands
-                continue
-            n = len(corners)
-            assert counts[i] == n
-            straightened += n < faces[i]
-            x, y = (corners - diagram.points[i]).T
-            area = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
-            perimeter = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
-            expected = 4 * max(area, 0) * n * np.tan(np.pi / n) / perimeter**2
-            # Round-off of corners is eps of the domain, which is up to 4 wide and 10 cells across.
-            assert result.quality[i] == pytest.approx(expected, abs=4096 * eps)
-            edges = diagram.neighbors[diagram.neighbor_starts[i] : diagram.neighbor_starts[i + 1]]
-            joined += len(set(edges[edges < 0].tolist())) < (edges < 0).sum()
-    assert straightened > 30
-    assert joined > 10
-
-
-def test_a_bent_side_counts_as_one_straight_side(ctx) -> None:
-    """A regular pentagon with one corner in a bend of a wall. Counted as four sides it would have Q = 1.10."""
-    angle = np.arange(5) * 2 * np.pi / 5
-    pentagon = np.column_stack([np.cos(angle), np.sin(angle)])
-    # The corner on the wall is as flat as a side may be; the other corners stay.
-    a, b = pentagon[1], pentagon[4]
-    flat = (a + b) / 2 + (0.5 * np.linalg.norm(a - b) * np.tan(np.radians(14.9)), 0)
-    domain = Polygon([flat, a, pentagon[2], pentagon[3], b])
-    result = clvoro.Adapter(ctx).run(domain, 1.0, points=np.array([(0.0, 0.0)]), method="lloyd", max_steps=0)
-    corners = domain.oriented.vertices[(domain.oriented.vertices != flat).any(axis=1)]
-    x, y = corners.T
-    area = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
-    perimeter = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
-    assert len(corners) == 4
-    assert result.quality[0] == pytest.approx(16 * area / perimeter**2, rel=1e-14)
-    assert result.check()
-
-
 def test_a_cell_without_neighbors_has_the_sides_of_its_piece(ctx) -> None:
     square_and_hole = Polygon(SQUARE, [SQUARE * 0.2 + 0.4])
     diagram = clvoro.Adapter(ctx).diagram(square_and_hole, np.array([(0.3, 0.3)]))
     assert count_sides(diagram).tolist() == [4]
     circle = Polygon([(np.cos(t), np.sin(t)) for t in np.arange(100) * np.pi / 50])
     diagram = clvoro.Adapter(ctx).diagram(circle, np.array([(0.0, 0.0)]))
-    # 100 turns of 3.6 degrees: a new side after each 9, and a last side of one edge.
-    assert count_sides(diagram).tolist() == [12]
-    begun_amid = Polygon(np.vstack([(0.5, 0), SQUARE[1:], SQUARE[:1]]))
-    diagram = clvoro.Adapter(ctx).diagram(begun_amid, np.array([(0.5, 0.5)]))
-    assert count_sides(diagram).tolist() == [4]
+    assert count_sides(diagram).tolist() == [100]
 
 
 def test_measures(result) -> None:

@@ -46,7 +46,6 @@ LIMITS = {
     "descend_surface": (176, 2112),
     "count_corners": (288, 4608),
     "list_corners": (288, 4608),
-    "share_corners": (144, 4000),
     "find_loops": (176, 256),
     "walk_edges": (176, 64),
     "fit_slopes": (224, 4608),

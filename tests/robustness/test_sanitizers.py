@@ -99,7 +99,6 @@ FUNCTIONS = {
     "volume_projection.assemble_projection",
     "quality_descent.compute_cell_forces",
     "surface_descent.compute_surface_forces",
-    "corners.share_corners",
     "size_field.evaluate_size",
     "size_field.evaluate_size_gradient",
 }

@@ -1,8 +1,8 @@
 /* The boundary of cells in a clipped diagram. OUTLINE_ARGS come last in the signature of a kernel and are empty in
    boxes.
 
-   outlines[i]  .s0: quality of cell i by the paper's (4.1); a stretch of the boundary that turns by at most 30 degrees
-                counts as one straight side, see wall_sides.h. .s1: number of neighbors of a hexagonal lattice there
+   outlines[i]  .s0: quality of cell i by the paper's (4.1) with straight sides along the boundary, see wall_sides.h.
+                .s1: number of neighbors of a hexagonal lattice there
    tangents[e]  unit vector along edge e of the boundary, the domain on its left: the face with label -1 - e */
 #include "opencl/real.h"
 

@@ -367,8 +367,10 @@ kernel void copy_whole(const int size, global const int *starts, global const in
 /* Per crossed cell u: row and measures of all pieces of its generator. orphans lists the pieces that changed cells, in
    order; place_cells[place] is the crossed cell that they lie in.
 
+   With `straight` the measures are those of cells with straight sides along the boundary (wall_sides.h).
+
    outlines[i] = (quality, number of neighbors of a hexagonal lattice here) */
-kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const REAL2 *points,
+kernel void write_trimmed(const int size, const int straight, SEGMENT_ARGS, SHORE_ARGS, global const REAL2 *points,
                           global const int *touched, global const int *slots, global const int *roots,
                           global const int *orphans, const int orphan_count, global const int *place_cells,
                           global const int *new_starts, global int *new_neighbors, global REAL *new_measures,
@@ -400,9 +402,7 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const
             if (!is_face(&s, k, home, i, slots, roots, &other))
                 continue;
             if (other >= 0)
-                add_wall_face(&o, p, q);
-            else if (begins_run(&shore, s.from[k], i))
-                add_wall_sides(&o, &shore, s.from[k], i, points[i]);
+                add_side(&o, p, q);
             perimeter += sqrt(dot(e, e));
             new_neighbors[at] = other;
             new_measures[at] = sqrt(dot(e, e));
@@ -411,10 +411,17 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const
             ++at;
         }
     }
-    write_moments(&m, i, volumes, offsets, covariances);
+    const REAL cell_size = sqrt(m.area / 2);
+    for (int face = new_starts[i]; face < at; ++face) {
+        const int chord = s.from[face_segments[face]];
+        if (new_neighbors[face] < 0 && begins_run(&shore, chord, i))
+            add_wall_sides(&o, &shore, chord, i, points[i], cell_size);
+    }
     /* Two sides do not form a polygon, even if one is bent. */
+    const bool is_polygon = o.sides > 2 && o.m.area > 0;
+    write_moments(straight && is_polygon ? &o.m : &m, i, volumes, offsets, covariances);
     const REAL quality =
-        o.sides < 3 ? polygon_quality(3, m.area / 2, perimeter) : polygon_quality(o.sides, o.area / 2, o.perimeter);
+        is_polygon ? polygon_quality(o.sides, o.m.area / 2, o.perimeter) : polygon_quality(3, m.area / 2, perimeter);
     outlines[i] = (REAL2)(fmax(quality, R(0)), 6 - o.missing);
 }
 

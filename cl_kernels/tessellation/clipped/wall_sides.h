@@ -1,20 +1,25 @@
 #include "tessellation/clipped/boundary.h"
 #include "tessellation/clipped/outline.h"
 
-/* The sides of a cell: its faces with other cells, and each stretch of the boundary that turns by at most 30 degrees. A
-   stretch counts as one straight side, from its first to its last point; area and quality follow.
+/* The sides of a cell as the mesh for solvers has it: its faces with other cells, and straight sides along the
+   boundary.
 
-   A run is a contiguous part of a ring that bounds one cell, chord by chord. Its first stretch begins at its start or,
-   for a ring around a whole cell, at the sharpest corner. A hole inside a cell is not a side. The number of neighbors
-   of a hexagonal lattice at the boundary is 6 - the sum of 2 + turning / 60 degrees over the runs. */
+   A run is a contiguous part of a ring that bounds one cell, chord by chord. It becomes one side from its first to its
+   last point, with convex corners of the domain between: as in the algorithm of Douglas and Peucker the farthest point
+   outside divides a side, if it is far enough, and the domain fills the triangle. A re-entrant corner is cut off. A
+   ring around a whole cell stays as it is, and a hole inside a cell is no side. The host does the same
+   (straightening.py), and so does the mesh for solvers (walls.py).
+
+   The number of neighbors of a hexagonal lattice at the boundary is 6 - the sum of 2 + turning / 60 degrees over the
+   runs. */
 typedef struct {
-    REAL sides, missing;
-    REAL perimeter, area; /* twice the area */
+    REAL sides, missing, perimeter;
+    moments_t m;
 } outline_t;
 
-/* Slightly more than 30 degrees, so that an arc of 2 x 15 degrees is one side despite round-off. The host adds the same
-   numbers in the same order (straightening.py). */
-#define SIDE_TURN R(0.524110102527594)
+#define LEAST_BULGE R(0.1) /* distance of a corner from the side, over the size of the cell */
+#define FILLED R(0.5)      /* share of its triangle that lies in the domain */
+#define MOST_PARTS 16      /* parts of a run that wait to be divided */
 
 /* The boundary of the cells of a clipped diagram.
 
@@ -35,22 +40,16 @@ typedef struct {
 
 inline outline_t no_outline(void)
 {
-    outline_t o = {0, 0, 0, 0};
+    outline_t o = {0, 0, 0, {0, 0, 0, 0, 0, 0}};
     return o;
 }
 
-inline void add_straight(outline_t *o, REAL2 p, REAL2 q)
+inline void add_side(outline_t *o, REAL2 p, REAL2 q)
 {
     const REAL2 e = q - p;
-    o->perimeter += sqrt(dot(e, e));
-    o->area += difference_of_products(p.s0, q.s1, p.s1, q.s0);
-}
-
-/* A face between cells. */
-inline void add_wall_face(outline_t *o, REAL2 p, REAL2 q)
-{
     o->sides += 1;
-    add_straight(o, p, q);
+    o->perimeter += sqrt(dot(e, e));
+    add_triangle(&o->m, p, q);
 }
 
 /* The next chord of nonzero length, and the turning angle up to it. */
@@ -91,30 +90,62 @@ inline bool begins_run(const shore_t *s, int chord, int i)
     return s->owners[other] != i || (sharpest && is_ring(s, chord, i));
 }
 
-/* Add the run of generator i, at x, that begins with chord `first`. */
-inline void add_wall_sides(outline_t *o, const shore_t *s, int first, int i, REAL2 x)
+/* The first chord of the part of a run from chord `first` to chord `last` that begins in a convex corner between
+   straight sides, and the chord before; -1 if there is none. Positions are relative to x. */
+inline int2 corner_between(const shore_t *s, int first, int last, REAL2 x, REAL size)
 {
-    const bool is_hole = s->c.shells[s->c.edges[first]] >= 0 && is_ring(s, first, i);
-    REAL2 begin = chord_begin(&s->c, first) - x;
-    REAL turned = 0;
-    bool goes_on = true;
-    o->sides += !is_hole;
-    o->missing += is_hole ? 0 : 2;
-    for (int chord = first; goes_on;) {
-        REAL sum = turned;
-        const int next = chord_past(s, chord, &sum);
-        const REAL2 end = chord_end(&s->c, chord) - x;
-        const bool turns = fabs(sum) > SIDE_TURN;
-        goes_on = next != first && s->owners[next] == i;
-        if (!goes_on || turns || is_hole) {
-            add_straight(o, begin, end);
-            begin = end;
+    const REAL2 p = chord_begin(&s->c, first) - x, side = chord_end(&s->c, last) - x - p;
+    const REAL length = sqrt(dot(side, side));
+    REAL farthest = 0, area = 0, turned = 0;
+    int2 found = -1;
+    for (int chord = first; chord != last;) {
+        const int next = chord_past(s, chord, &turned);
+        const REAL2 u = chord_begin(&s->c, chord) - x - p, v = chord_end(&s->c, chord) - x - p;
+        const REAL off = v.s0 * side.s1 - v.s1 * side.s0;
+        area += difference_of_products(u.s0, v.s1, u.s1, v.s0);
+        if (off > farthest) {
+            farthest = off;
+            found = (int2)(next, chord);
         }
-        if (goes_on && !is_hole) {
-            o->sides += turns;
-            o->missing += (sum - turned) / R(1.0471975511965976);
-        }
-        turned = turns ? 0 : sum;
         chord = next;
+    }
+    const REAL2 u = chord_begin(&s->c, last) - x - p;
+    area += difference_of_products(u.s0, side.s1, u.s1, side.s0);
+    const bool is_corner = length > 0 && farthest >= LEAST_BULGE * size * length && area >= FILLED * farthest;
+    return is_corner ? found : (int2)(-1);
+}
+
+/* Add the run of generator i, at x, that begins with chord `first`. The cell has the size `size`. */
+inline void add_wall_sides(outline_t *o, const shore_t *s, int first, int i, REAL2 x, REAL size)
+{
+    const bool goes_round = is_ring(s, first, i);
+    if (goes_round && s->c.shells[s->c.edges[first]] >= 0)
+        return; /* a hole */
+    REAL turned = 0;
+    int last = first;
+    for (;;) {
+        if (goes_round)
+            add_side(o, chord_begin(&s->c, last) - x, chord_end(&s->c, last) - x);
+        REAL sum = turned;
+        const int next = chord_past(s, last, &sum);
+        if (next == first || s->owners[next] != i)
+            break;
+        turned = sum;
+        last = next;
+    }
+    o->missing += 2 + turned / R(1.0471975511965976);
+    if (goes_round)
+        return;
+    int2 parts[MOST_PARTS];
+    parts[0] = (int2)(first, last);
+    for (int count = 1; count > 0;) {
+        const int2 part = parts[--count];
+        const int2 corner = count + 2 <= MOST_PARTS ? corner_between(s, part.s0, part.s1, x, size) : (int2)(-1);
+        if (corner.s0 < 0) {
+            add_side(o, chord_begin(&s->c, part.s0) - x, chord_end(&s->c, part.s1) - x);
+        } else {
+            parts[count++] = (int2)(corner.s0, part.s1);
+            parts[count++] = (int2)(part.s0, corner.s1);
+        }
     }
 }

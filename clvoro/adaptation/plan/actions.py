@@ -41,7 +41,7 @@ class Step:
             displacement = self.method.step(run.state)
             run.note(displacement)
             run.state.move(displacement)
-            run.state.walls.adjust(run.state)
+            run.state.pair_generators()
         run.state.update()
         for _ in range(self.openings):
             run.obtuse, opened = run.state.open_triangles()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..results import figures
-from ..straightening import cell_quality
+from ..straightening import cell_quality, cell_sizes
 from .findings import ROUNDINGS
 
 if TYPE_CHECKING:
@@ -89,12 +89,12 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
     )
     check.note("target_size", ~(h > 0), lambda i: f"target_size[{i}] is {h[i]}, expected > 0", stop=True)
     eps = float(np.finfo(g.real).eps)
-    length = np.maximum(d.volumes, 0) ** (1 / dim)
+    length = cell_sizes(d)
     with np.errstate(all="ignore"):
         error = (length - h) / np.minimum(length, h)
         counts = np.diff(d.neighbor_starts)
         perimeter = np.bincount(np.repeat(np.arange(n), counts), d.face_measures, minlength=n)
-        quality = cell_quality(d, perimeter, g.real)
+        quality = cell_quality(d, perimeter)
     check.note(
         "size_error",
         np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),

@@ -32,14 +32,20 @@ class Cut(DomainSteps):
     spacing : callable or None
         Distance of generators near points (k, 2) of the boundary, (k,); see `place_ghost_generators`. None: no ghost
         generators. The diagram is the same, but slow to make where many generators surround a wide hole.
+    straight : bool
+        Measure cells with straight sides along the boundary, until `measure_exactly`; see `Trim.trim`.
     """
 
     def __init__(
-        self, stages: TessellationStages, domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray] | None
+        self,
+        stages: TessellationStages,
+        domain: Polygon,
+        spacing: Callable[[np.ndarray], np.ndarray] | None,
+        straight: bool = False,
     ) -> None:
         super().__init__(stages, domain)
         engine = stages.engine
-        self._boundary, self._polygon = Boundary(engine, domain), domain
+        self._boundary, self._polygon, self._straight = Boundary(engine, domain), domain, straight
         origin, scale = domain.frame
         self._spacing = spacing
         found = np.empty((0, 2)) if spacing is None else place_ghost_generators(domain, spacing)
@@ -81,7 +87,7 @@ class Cut(DomainSteps):
                 # The search for the vertices starts from the cells of the previous call.
                 chords = self._boundary.cut(t, n, shift)
                 if isinstance(chords, Chords):
-                    return self.stages.trim.trim(self._polygon, points, t, chords, n)
+                    return self.stages.trim.trim(self._polygon, points, t, chords, n, self._straight)
             except BoundaryError as error:
                 lost = error
                 continue
@@ -91,6 +97,13 @@ class Cut(DomainSteps):
             self._ghosts = self._ghosts[keep & (self._removals < PATIENCE)]
             return None
         raise lost
+
+    def measure_exactly(self, t: Tessellation) -> Tessellation:
+        """Return `t` with the measures of cells up to the boundary."""
+        if not self._straight:
+            return t
+        assert t.trimmed is not None
+        return self.stages.trim.trim(self._polygon, t.points, t.trimmed.convex, t.trimmed.chords, t.n)
 
     def update(
         self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow

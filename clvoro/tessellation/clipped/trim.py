@@ -75,12 +75,15 @@ class Trim:
         # Flags of kernels, and the number of segments: the host reads both at once.
         self._flags = engine.empty(2, np.int32)
 
-    def trim(self, domain: Polygon, points: cla.Array, convex: Tessellation, chords: Chords, n: int) -> Tessellation:
+    def trim(
+        self, domain: Polygon, points: cla.Array, convex: Tessellation, chords: Chords, n: int, straight: bool = False
+    ) -> Tessellation:
         """Return the diagram of `domain` for `points` (n, 2), the first `n` generators of `convex`.
 
         A cell is the piece of its convex cell within the domain that contains the generator. Any other piece goes to
         the neighboring cell with which it shares the longest face. In a power diagram a
-        cell has all its pieces.
+        cell has all its pieces. With `straight` volumes, offsets and covariances are those of cells with straight sides
+        along the boundary, as the mesh for solvers has them.
 
         Raises
         ------
@@ -152,7 +155,7 @@ class Trim:
         marks = room.zeros("marks", size=n, dtype=np.int32)
         found = _Pieces(segments, count, pieces, roots)
         orphans, orphan_count = self._adopt(chords, found, marks) if flags & ORPHANS else (pieces, 0)
-        return self._write(points, convex, chords, found, (orphans, orphan_count), marks)
+        return self._write(points, convex, chords, found, (orphans, orphan_count), marks, straight)
 
     @staticmethod
     def _demand(flags: int) -> None:
@@ -185,6 +188,7 @@ class Trim:
         found: _Pieces,
         orphans: tuple[cla.Array, int],
         marks: cla.Array,
+        straight: bool,
     ) -> Tessellation:
         """Write the rows and measures of the diagram."""
         n, segments, roots = len(marks), found.segments, found.roots
@@ -226,6 +230,7 @@ class Trim:
         engine.run_each(
             k.write_trimmed,
             u,
+            int(straight),
             *segments,
             *chords.arrays,
             chord_owners,
