@@ -109,7 +109,7 @@ def place_around_corners(
 
 
 def _have_straight_sides(rings: OrientedRings, corners: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return whether both walls of `corners` (c,) turn by at most `_MOST_BEND` in sum up to `length` (c,), (c,) bool."""
+    """Return whether both walls of `corners` (c,) turn by at most `_MOST_BEND` up to `length` (c,), (c,) bool."""
     straight = np.ones(len(corners), bool)
     before = rings.before
     walls = (before, rings.lengths[before]), (rings.next_vertex, rings.lengths)
