@@ -84,12 +84,12 @@ def cell_quality(diagram: Diagram, surfaces: np.ndarray) -> np.ndarray:
 
 
 def cell_sizes(diagram: Diagram) -> np.ndarray:
-    """Return the size of each cell as runs count it, (n,): its volume to the power 1 / d, in 2D as `straighten` has it.
+    """Return the size of each cell as runs count it, (n,): its volume to the power 1 / d, in polygons as `straighten` has it.
 
     Cells of power diagrams, whose volumes are prescribed, count as they are.
     """
-    plane = diagram.domain.dim == 2 and not diagram.is_power
-    volumes = straighten(diagram).areas if plane else diagram.volumes
+    cut = diagram.domain.outline is not None and not diagram.is_power
+    volumes = straighten(diagram).areas if cut else diagram.volumes
     return np.maximum(volumes, 0) ** (1 / diagram.domain.cell_dim)
 
 
