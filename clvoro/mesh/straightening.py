@@ -86,7 +86,7 @@ def cell_quality(diagram: Diagram, surfaces: np.ndarray) -> np.ndarray:
 def cell_sizes(diagram: Diagram) -> np.ndarray:
     """Return the size of each cell as runs count it, (n,): its volume to the power 1 / d.
 
-    In polygons areas are those of `straighten`. Cells of power diagrams, whose volumes are prescribed, count as they are.
+    In polygons areas are those of `straighten`. Cells of power diagrams have prescribed volumes and count as they are.
     """
     cut = diagram.domain.outline is not None and not diagram.is_power
     volumes = straighten(diagram).areas if cut else diagram.volumes
