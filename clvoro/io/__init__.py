@@ -84,6 +84,10 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
         fault.
     """
     path = check_path("path", path)
+    if Path(path).suffix.lower() == ".foam":
+        from .foam_read import refuse_polymesh
+
+        refuse_polymesh(path)
     return READERS.get(Path(path).suffix.lower(), load_npz)(path)
 
 

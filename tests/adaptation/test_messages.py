@@ -5,7 +5,6 @@ import warnings
 
 import numpy as np
 import pytest
-import shapely
 
 import clvoro
 from clvoro import sizing
@@ -99,31 +98,6 @@ def test_shapes_at_a_seam_are_to_be_repeated(ctx) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", SizeErrorWarning)
         adapter.run(torus, sizing.Distance(spots, h_min=0.03, growth=1.2), effort="fast")
-
-
-def test_a_piece_without_a_generator_is_named_and_the_remedies_work():
-    boxes = shapely.MultiPolygon([shapely.box(0, 0, 2, 2), shapely.box(3, 0, 3.5, 0.5)])
-    domain = clvoro.Polygon.from_shapely(boxes)
-    points = np.random.default_rng(0).random((8, 2)) * 2
-    for total in (domain.measure, 4.0):
-        with pytest.raises(
-            ClvoroError, match=r"piece 1 of the domain, at \(3\.25, 0\.25\), has no generator"
-        ) as raised:
-            clvoro.transport(domain, points, np.full(8, total / 8))
-    x, y = re.search(r"at \(([\d.]+), ([\d.]+)\)", str(raised.value)).groups()
-    more = np.vstack([points, [(float(x), float(y))]])
-    with pytest.raises(ClvoroError, match=r"scale these by ([\d.]+)") as raised:
-        clvoro.transport(domain, more, np.full(9, domain.measure / 9))
-    assert clvoro.transport(domain, more, [0.5] * 8 + [0.25]).converged
-    assert clvoro.transport(domain.split()[0], points, np.full(8, 0.5)).converged
-
-
-def test_a_ring_with_a_spike_is_made_valid_as_the_message_says():
-    ring = [(0, 0), (4, 0), (4, 2), (6, 2), (4, 2), (4, 4), (0, 4)]
-    with pytest.raises(ClvoroError, match="Self-intersection") as raised:
-        clvoro.Polygon(ring)
-    remedy = re.search(r"as (Polygon\.from_shapely\(.*\)) does", str(raised.value))[1]
-    assert eval(remedy, {"Polygon": clvoro.Polygon, "shapely": shapely, "ring": ring}).measure == 16
 
 
 def test_an_effort_for_a_method_is_recognized(ctx):

@@ -1,0 +1,795 @@
+"""Errors say what to do: each is raised here, and what it says is done. A new error with a remedy needs a row, too."""
+
+import ast
+import json
+import traceback
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro import curves, earth, plotting, sizing
+from clvoro.adaptation.sampling.quadrature import DensityTree
+from clvoro.cli.cases import Case
+from clvoro.cli.jobs import Job
+from clvoro.errors import ClvoroError
+
+PACKAGE = Path(clvoro.__file__).parent
+BOX, CUBE = clvoro.Box((0, 0), (1, 1)), clvoro.Box((0, 0, 0), (1, 1, 1))
+TORUS = clvoro.Box((0, 0), (1, 1), periodic=True)
+CHANNEL = clvoro.Box((0, 0), (1, 1), periodic=(True, False))
+SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
+HOLE = [(0.4, 0.4), (0.6, 0.4), (0.6, 0.6), (0.4, 0.6)]
+GLOBE = clvoro.Sphere(1)
+LINED = BOX.with_lines([[(0.1, 0.5), (0.9, 0.5)]])
+WELLS = np.column_stack([np.linspace(0.1, 0.9, 9), np.full(9, 0.1)])
+TRIANGLES = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
+CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
+POINTS = np.random.default_rng(5).random((30, 2))
+TWICE = np.concatenate([POINTS, POINTS[:1]])
+DISTANCE = sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), h_min=0.1, growth=1.2)
+CASE = "size = 0.3\n[domain]\nlower = [0, 0]\nupper = [1, 1]\n[run]\neffort = 'fast'\n"
+RASTER = "{{ kind = 'raster', file = '{}', lower = [0, 0], upper = [1, 1] }}\n"
+CAPS = "{ kind = 'caps', h_max = 0.7, growth = 1.2, regions = [{ center = [0, 0], radius = 0.1, size = 0.5 }] }\n"
+SPHERE_CASE = "size = 0.7\n[domain]\nkind = 'sphere'\nradius = 1\n[run]\neffort = 'fast'\n"
+
+
+def first_rows(name, array):
+    return eval(clvoro.arguments.FIRST_ROWS.format(name), {"numpy": np, name: array})
+
+
+def raster(lower, upper, shape=(5, 9), **options):
+    return sizing.Raster(np.full(shape, 0.5), lower, upper, **options)
+
+
+def lonlat(lon, lat, names=("lat", "lon"), /, **units):
+    """Return what `earth.from_xarray` takes: an array with longitudes and latitudes, some in other units."""
+    along = {}
+    for name, values in zip(names, (lat, lon), strict=True):
+        attrs = {"units": units[name]} if name in units else {}
+        values = np.asarray(values, float)
+        dims = (name,) if values.ndim == 1 else ("j", "i")
+        along[name] = SimpleNamespace(values=values, dims=dims, attrs=attrs)
+    values = np.full((len(lat), len(lon)), 0.5)
+    return SimpleNamespace(values=values, dims=names, coords=along, attrs={})
+
+
+def north(points):
+    return points[:, -1] > 0
+
+
+def two(scale, away=0.1, turned=False):
+    """Return vertices and triangles of a tetrahedron, and of another one in it or across it."""
+    more = np.array(TRIANGLES) + 4
+    return np.concatenate([CORNERS, away + scale * CORNERS]), [*TRIANGLES, *(more[:, ::-1] if turned else more)]
+
+
+POINT = sizing.Distance(sizing.Circle((0.5, 0.5), 0), h_min=1e-9, growth=3, h_max=0.3)
+LON, LAT = np.linspace(-180, 180, 9), np.linspace(-90, 90, 5)
+
+# What was wrong, and what the error says to write instead. `t` has files and small meshes.
+ROWS = [
+    # Runs.
+    (lambda t: t.run(0.3, BOX), lambda t: t.run(BOX, 0.3)),
+    (lambda t: t.run(BOX, 0.3, method="fast"), lambda t: t.run(BOX, 0.3, effort="fast")),
+    (lambda t: t.run(BOX, 0.3, 200), lambda t: t.run(BOX, 0.3, "default")),
+    (lambda t: clvoro.Adapter("cpu"), lambda t: clvoro.Adapter(clvoro.create_context("cpu"))),
+    (lambda t: t.copied(), lambda t: clvoro.Adapter(t.adapter.ctx, t.adapter.dtype)),
+    (lambda t: t.reentrant(t.adapter), lambda t: t.reentrant(clvoro.Adapter(t.adapter.ctx))),
+    (lambda t: t.run(BOX, 0.2, callback=lambda a, b: None), lambda t: t.run(BOX, 0.2, callback=lambda row: None)),
+    (lambda t: t.run(BOX, lambda p: 0 * p[:, 0]), lambda t: t.run(BOX, sizing.maximum(lambda p: 0 * p[:, 0], 0.2))),
+    (lambda t: t.run(BOX, lambda p: 1e-200 + 0 * p[:, 0]), lambda t: t.run(BOX, sizing.maximum(0.2, 0.1))),
+    (
+        lambda t: t.run(BOX, 0.3, layers=clvoro.Layers(0.05), method="transport"),
+        lambda t: t.run(BOX, 0.3, layers=clvoro.Layers(0.05), method="exact"),
+    ),
+    (
+        lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.02), n_cells=20),
+        lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.02)),
+    ),
+    (
+        lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.1, count=6)),
+        lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.02, count=6)),
+    ),
+    (lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.6)), lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.06))),
+    (
+        lambda t: t.run(BOX, 0.2, fixed=[(0.5, 0.5)], method="transport"),
+        lambda t: t.run(BOX, 0.2, fixed=[(0.5, 0.5)], method="exact"),
+    ),
+    (
+        lambda t: t.run(BOX, 0.2, points=POINTS, n_cells=40, method="lloyd"),
+        lambda t: t.run(BOX, 0.2, points=POINTS, method="lloyd"),
+    ),
+    (
+        lambda t: t.run(BOX, 0.2, n_cells=1, fixed=[(0.2, 0.5), (0.7, 0.5)]),
+        lambda t: t.run(BOX, 0.2, fixed=[(0.2, 0.5), (0.7, 0.5)]),
+    ),
+    (lambda t: t.run(TORUS, 0.2, method="mmpde"), lambda t: t.run(TORUS, 0.2, method="adaptive")),
+    (lambda t: t.run(BOX, 0.2, points=POINTS, method="mmpde"), lambda t: t.run(BOX, 0.2, method="mmpde")),
+    (lambda t: t.run(BOX, 0.6, method="mmpde"), lambda t: t.run(BOX, 0.1, method="mmpde")),
+    (lambda t: t.run(GLOBE, 3.0), lambda t: t.run(GLOBE, 0.8)),
+    (lambda t: t.run(GLOBE, 1.0, n_cells=2), lambda t: t.run(GLOBE, 0.8)),
+    (lambda t: t.run(LINED, 0.3, n_cells=10, fixed=WELLS), lambda t: t.run(LINED, 0.1, fixed=WELLS)),
+    (
+        lambda t: t.run(BOX, 0.2, fixed=[(0.5, 0.5)] * 2),
+        lambda t: t.run(BOX, 0.2, fixed=np.array([(0.5, 0.5)] * 2)[first_rows("fixed", np.array([(0.5, 0.5)] * 2))]),
+    ),
+    (
+        lambda t: t.run(BOX, 0.2, fixed=[(0.5, 0.02)], layers=clvoro.Layers(0.05)),
+        lambda t: t.run(BOX, 0.2, fixed=[(0.5, 0.5)], layers=clvoro.Layers(0.05)),
+    ),
+    (lambda t: t.run(BOX, 0.2, fixed=[(0.5, 0)]), lambda t: t.run(BOX, 0.2, fixed=[(0.5, 0.2)])),
+    (lambda t: t.run(LINED, 0.2, fixed=[(0.5, 0.52)]), lambda t: t.run(LINED, 0.2, fixed=[(0.5, 0.8)])),
+    (
+        lambda t: t.run(TORUS.without([[(0.3, 0.5), (0.7, 0.49), (0.7, 0.51)]]), 0.1),
+        lambda t: t.run(TORUS.without([[(0.3, 0.45), (0.7, 0.4), (0.7, 0.6), (0.3, 0.55)]]), 0.05),
+    ),
+    (lambda t: t.run(TORUS.without([HOLE]), 0.1, n_cells=90), lambda t: t.run(TORUS.without([HOLE]), 0.1)),
+    (lambda t: t.run(t.part.domain, 0.2), lambda t: t.run(BOX, 0.2).subset(clvoro.Box((0.3, 0), (1, 1)))),
+    # Checkpoints.
+    (
+        lambda t: t.run(BOX, 0.3, checkpoint=t.write("notes.txt", "x")),
+        lambda t: t.run(BOX, 0.3, checkpoint=t.path("other")),
+    ),
+    (lambda t: t.run(BOX, 0.3, seed=2, checkpoint=t.resume()), lambda t: t.run(BOX, 0.3, checkpoint=t.resume())),
+    (lambda t: t.run(BOX, 0.25, checkpoint=t.resume()), lambda t: t.run(BOX, 0.3, checkpoint=t.resume())),
+    # Points, weights and volumes.
+    (lambda t: t.voronoi(BOX, [*POINTS, (np.nan, 0)]), lambda t: t.voronoi(BOX, POINTS)),
+    (lambda t: t.voronoi(BOX, [*POINTS, (2, 0)]), lambda t: t.voronoi(clvoro.Box((0, 0), (2, 1)), [*POINTS, (2, 0)])),
+    (
+        lambda t: t.voronoi(BOX, np.ma.masked_greater(POINTS, 0.9)),
+        lambda t: t.voronoi(BOX, np.ma.compress_rows(np.ma.masked_greater(POINTS, 0.9))),
+    ),
+    (
+        lambda t: t.voronoi(BOX, POINTS @ (1, 1j)),
+        lambda t: t.voronoi(BOX, np.column_stack([(POINTS @ (1, 1j)).real, (POINTS @ (1, 1j)).imag])),
+    ),
+    (lambda t: t.voronoi(BOX, POINTS.T), lambda t: t.voronoi(BOX, POINTS)),
+    (lambda t: t.voronoi(BOX, TWICE), lambda t: t.voronoi(BOX, TWICE[first_rows("points", TWICE)])),
+    (
+        lambda t: t.adapter.power_diagram(BOX, POINTS, np.where(np.arange(30) < 1, 1.7e308, -1.7e308)),
+        lambda t: t.adapter.power_diagram(BOX, POINTS, 0.001 * np.arange(30)),
+    ),
+    (
+        lambda t: clvoro.transport(BOX, POINTS, np.ma.masked_less(np.full(30, 1 / 30), 1)),
+        lambda t: clvoro.transport(BOX, POINTS, np.full(30, 1 / 30)),
+    ),
+    (
+        lambda t: clvoro.transport(BOX, POINTS, np.arange(30) / 435),
+        lambda t: clvoro.transport(BOX, POINTS[1:], np.arange(1, 30) / 435),
+    ),
+    (
+        lambda t: clvoro.transport(BOX, POINTS, np.ones(30)),
+        lambda t: clvoro.transport(BOX, POINTS, np.ones(30) * (BOX.measure / 30)),
+    ),
+    (
+        lambda t: clvoro.transport(t.pieces, POINTS, np.full(30, 1.25 / 30)),
+        lambda t: clvoro.transport(t.pieces.split()[0], POINTS, np.full(30, 1 / 30)),
+    ),
+    (
+        lambda t: clvoro.transport(t.pieces, [*POINTS, (2.25, 0.25)], np.full(31, 1.25 / 31)),
+        lambda t: clvoro.transport(t.pieces, [*POINTS, (2.25, 0.25)], [*np.full(30, 1 / 30), 0.25]),
+    ),
+    (lambda t: t.power.subset(t.power.volumes > 0.02), lambda t: t.mesh.subset(t.mesh.volumes > 0.02)),
+    (
+        lambda t: t.empty.solver_mesh(),
+        lambda t: t.adapter.power_diagram(
+            BOX, POINTS[t.empty.volumes > 0], t.empty.weights[t.empty.volumes > 0]
+        ).solver_mesh(),
+    ),
+    # Parts of meshes and their figures.
+    (lambda t: t.mesh.subset(np.zeros(30, bool)), lambda t: t.mesh.subset(~np.zeros(30, bool))),
+    (lambda t: t.mesh.subset(np.arange(30) % 2), lambda t: t.mesh.subset(np.arange(30) % 2 == 1)),
+    (lambda t: t.torus.triangles(), lambda t: (t.torus.neighbors, t.torus.shifts)),
+    (lambda t: t.mesh.check(walls="exact"), lambda t: t.mesh.check(solver="openfoam", walls="exact")),
+    (lambda t: t.mesh.check(solver="mpas", walls="exact"), lambda t: t.mesh.check(solver="mpas")),
+    (lambda t: t.globe.check(solver="openfoam"), lambda t: t.globe.check(solver="mpas")),
+    (lambda t: t.globe.solver_mesh(), lambda t: t.globe.faces),
+    (lambda t: t.cube.measures.c_grid, lambda t: t.cube.measures.exact),
+    (lambda t: t.cube.to_shapely(), lambda t: t.cube.to_pyvista()),
+    (lambda t: t.torus.to_disv(), lambda t: t.mesh.to_disv()),
+    (lambda t: t.single.to_fipy(), lambda t: t.torus.to_fipy()),
+    # Transfer.
+    (lambda t: t.mesh.transfer(np.ones(30), onto=t.cube), lambda t: t.mesh.transfer(np.ones(30), onto=t.torus)),
+    (
+        lambda t: t.globe.transfer(np.ones(len(t.globe)), onto=t.large_globe),
+        lambda t: t.globe.transfer(np.ones(len(t.globe)), onto=t.globe),
+    ),
+    (lambda t: t.torus.transfer(np.ones(30), onto=t.wide_torus), lambda t: t.torus.transfer(np.ones(30), onto=t.mesh)),
+    (
+        lambda t: t.mesh.transfer(np.ones(30) * 1j, onto=t.torus),
+        lambda t: t.mesh.transfer(np.column_stack([np.zeros(30), np.ones(30)]), onto=t.torus),
+    ),
+    (
+        lambda t: t.mesh.transfer(np.ones((2, 30)), onto=t.torus),
+        lambda t: t.mesh.transfer(np.ones((2, 30)).T, onto=t.torus),
+    ),
+    # Files.
+    (
+        lambda t: t.mesh.save(t.path("a.vtu"), walls="straight"),
+        lambda t: t.mesh.to_vtu(t.path("a.vtu"), walls="straight"),
+    ),
+    (lambda t: t.mesh.to_vtu(t.path("a.foam")), lambda t: t.mesh.save(t.path("a.foam"))),
+    (
+        lambda t: t.mesh.save(t.path("none/a.vtu")),
+        lambda t: (t.path("made").mkdir(), t.mesh.save(t.path("made/a.vtu"))),
+    ),
+    (
+        lambda t: (t.path("folder.vtu").mkdir(), t.mesh.save(t.path("folder.vtu"))),
+        lambda t: t.mesh.save(t.path("file.vtu")),
+    ),
+    (lambda t: t.mesh.save(t.write("file") / "polyMesh"), lambda t: t.mesh.save(t.path("polyMesh"))),
+    (
+        lambda t: t.mesh.save(t.path("a.vtu"), cell_data={"volume": np.ones(30)}),
+        lambda t: t.mesh.save(t.path("a.vtu"), cell_data={"own": np.ones(30)}),
+    ),
+    (
+        lambda t: t.mesh.save(t.path("a.vtu"), cell_data={"own": np.ma.masked_less(np.arange(30.0), 3)}),
+        lambda t: t.mesh.save(t.path("a.vtu"), cell_data={"own": np.arange(30.0)}),
+    ),
+    (
+        lambda t: t.mesh.save(t.path("a.obj"), cell_data={"own": np.ones(30)}),
+        lambda t: t.mesh.save(t.path("a.vtk"), cell_data={"own": np.ones(30)}),
+    ),
+    (
+        lambda t: t.mesh.save(t.path("graph.info"), cell_data={"own": np.ones(30)}),
+        lambda t: t.mesh.save(t.path("a.nc"), cell_data={"own": np.ones(30)}),
+    ),
+    (
+        lambda t: t.mesh.save(t.path("a.foam"), cell_data={"own": np.ones(30)}),
+        lambda t: t.mesh.to_openfoam(t.path("a.foam"), zones={"own": np.arange(30) < 9}),
+    ),
+    (
+        lambda t: t.mesh.save(t.path("a.nc"), cell_data={"mesh": np.ones(30)}),
+        lambda t: t.mesh.save(t.path("a.nc"), cell_data={"own": np.ones(30)}),
+    ),
+    (lambda t: t.cube.save(t.path("a.obj")), lambda t: t.cube.save(t.path("a.vtu"))),
+    (lambda t: t.cube.to_openfoam(t.path("a.foam"), thickness=1), lambda t: t.cube.to_openfoam(t.path("a.foam"))),
+    (
+        lambda t: t.voronoi(clvoro.Box((0, 0), (1, 1), names={"front": "xMin"}), POINTS).save(t.path("a.foam")),
+        lambda t: t.voronoi(clvoro.Box((0, 0), (1, 1), names={"forward": "xMin"}), POINTS).save(t.path("a.foam")),
+    ),
+    (
+        lambda t: t.mesh.to_openfoam(t.path("a.foam"), zones={"a b": np.ones(30, bool)}),
+        lambda t: t.mesh.to_openfoam(t.path("a.foam"), zones={"ab": np.ones(30, bool)}),
+    ),
+    (
+        lambda t: t.mesh.to_openfoam(t.path("a.foam"), zones={"own": t.mesh.points[:, 0]}),
+        lambda t: t.mesh.to_openfoam(t.path("a.foam"), zones={"own": t.mesh.points[:, 0] > 0}),
+    ),
+    (
+        lambda t: (t.mesh.save(t.path("a.foam")), clvoro.load(t.path("a.foam"))),
+        lambda t: (t.mesh.save(t.path("a.npz")), clvoro.load(t.path("a.npz"))),
+    ),
+    (
+        lambda t: t.globe.to_netcdf(t.path("a.nc"), units="degrees"),
+        lambda t: t.globe.to_netcdf(t.path("a.nc"), units="km"),
+    ),
+    (lambda t: t.mesh.to_netcdf(t.path("a.nc"), convention="scrip"), lambda t: t.mesh.to_netcdf(t.path("a.nc"))),
+    (
+        lambda t: t.holed.to_netcdf(t.path("a.nc"), convention="mpas"),
+        lambda t: t.mesh.subset(np.abs(POINTS - 0.5).max(axis=1) < 0.4).to_netcdf(t.path("a.nc"), convention="mpas"),
+    ),
+    (lambda t: t.around.to_netcdf(t.path("a.nc"), convention="mpas"), lambda t: t.around.to_netcdf(t.path("a.nc"))),
+    (
+        lambda t: (
+            t.around.check(solver="openfoam", walls="exact").demand()
+            or t.around.to_openfoam(t.path("a.foam"), walls="exact")
+        ),
+        lambda t: t.around.save(t.path("a.vtu")),
+    ),
+    (
+        lambda t: t.single.to_netcdf(t.path("a.nc"), convention="mpas"),
+        lambda t: t.torus.to_netcdf(t.path("a.nc"), convention="mpas"),
+    ),
+    # Pictures.
+    (lambda t: plotting.plot_globe(t.mesh), lambda t: t.result.plot()),
+    (lambda t: plotting.plot_slices(t.result), lambda t: t.result.plot()),
+    (
+        lambda t: plotting.plot_slice(t.cube_result, through=(0, 0, 9)),
+        lambda t: plotting.plot_slice(t.cube_result, through=(0, 0, 0.5)),
+    ),
+    (lambda t: t.result.plot(cut="x"), lambda t: t.result.plot()),
+    # Size fields.
+    (lambda t: sizing.Distance(BOX, 0.1, growth=50), lambda t: sizing.Distance(BOX, 0.1, slope=0.5)),
+    (lambda t: sizing.Expression("x" + "+x" * 60_000), lambda t: raster((0, 0), (1, 1))),
+    (lambda t: DISTANCE - 0.1, lambda t: t.run(BOX, lambda p: DISTANCE(p) - 0.01 * p[:, 0])),
+    (lambda t: DISTANCE**0.5, lambda t: t.run(BOX, lambda p: DISTANCE(p) ** 0.9)),
+    (lambda t: min(DISTANCE, 0.1), lambda t: t.run(BOX, sizing.minimum(DISTANCE, 0.15))),
+    (lambda t: np.sqrt(DISTANCE), lambda t: t.run(BOX, lambda p: np.sqrt(DISTANCE(p)))),
+    (
+        lambda t: t.run(BOX, sizing.minimum(*[sizing.Expression(f"0.3 + {k}") for k in range(300)])),
+        lambda t: t.run(BOX, sizing.Distance([sizing.Circle((0, 1 + k), 0) for k in range(300)], 0.3, 1.2)),
+    ),
+    (
+        lambda t: t.run(CUBE, DISTANCE),
+        lambda t: t.run(CUBE, sizing.Distance(sizing.Ball((0.5, 0.5, 0.5), 0.2), h_min=0.3, growth=1.2)),
+    ),
+    (
+        lambda t: t.run(BOX, lambda p: np.ma.masked_less(p[:, 0], 0.5)),
+        lambda t: t.run(BOX, lambda p: np.ma.filled(np.ma.masked_less(p[:, 0], 0.5), 0.3)),
+    ),
+    (lambda t: t.run(BOX, lambda p: 0.3), lambda t: t.run(BOX, 0.3)),
+    (
+        lambda t: sizing.Graded(lambda p: 0.3 + 0 * p[:, 0], 1.2)(POINTS),
+        lambda t: sizing.Graded(lambda p: 0.3 + 0 * p[:, 0], 1.2, box=BOX)(POINTS),
+    ),
+    (
+        lambda t: t.run(BOX, sizing.Graded(lambda p: 0.3 + 0 * p[:, 0], 1.2, resolution=2**20)),
+        lambda t: t.run(BOX, sizing.Graded(lambda p: 0.3 + 0 * p[:, 0], 1.2)),
+    ),
+    (
+        lambda t: t.run(BOX, sizing.Graded(lambda p: 0.3 + 0 * p[:, 0], 1.2, resolution=46000)),
+        lambda t: t.run(BOX, sizing.Graded(lambda p: 0.3 + 0 * p[:, 0], 1.2, resolution=50)),
+    ),
+    (
+        lambda t: raster((0, 0), (1, 1)) and sizing.Raster([[1, np.nan]], (0, 0), (1, 1)),
+        lambda t: sizing.Raster([[1, np.nan]], (0, 0), (1, 1), missing="nearest"),
+    ),
+    (lambda t: sizing.Raster([[np.nan] * 2] * 2, (0, 0), (1, 1)), lambda t: raster((0, 0), (1, 1))),
+    (lambda t: raster((0, 1), (1, 0)), lambda t: sizing.Raster(np.full((5, 9), 0.5)[::-1], (0, 0), (1, 1))),
+    (
+        lambda t: t.run(BOX, raster((0, 0), (0.5, 1), outside="error")),
+        lambda t: t.run(BOX, raster((0, 0), (0.5, 1), outside="nearest")),
+    ),
+    (lambda t: t.run(BOX, raster((5, 5), (6, 6))), lambda t: t.run(BOX, raster((0, 0), (1, 1)))),
+    (
+        lambda t: sizing.Scattered(POINTS, np.full(30, np.nan), (0, 0), (1, 1)),
+        lambda t: sizing.Scattered(POINTS, np.full(30, 0.5), (0, 0), (1, 1)),
+    ),
+    (
+        lambda t: sizing.Scattered(POINTS * (1, 0), np.ones(30)),
+        lambda t: sizing.Scattered(POINTS, np.ones(30), (0, 0), (1, 1)),
+    ),
+    (
+        lambda t: sizing.Scattered(POINTS, np.ones(30), (5, 5), (6, 6)),
+        lambda t: sizing.Scattered(POINTS, np.ones(30), (0, 0), (1, 1)),
+    ),
+    (
+        lambda t: sizing.Scattered(TWICE, np.arange(31.0) + 1, (0, 0), (1, 1)),
+        lambda t: sizing.Scattered(TWICE, np.arange(31.0) + 1, (0, 0), (1, 1), method="nearest"),
+    ),
+    (
+        lambda t: sizing.Scattered(POINTS[:2], np.ones(2), (0, 0), (1, 1)),
+        lambda t: sizing.Scattered(POINTS[:2], np.ones(2), (0, 0), (1, 1), method="nearest"),
+    ),
+    (
+        lambda t: sizing.Region(shapely.Polygon([SQUARE[k] for k in (0, 2, 1, 3)]), 0.1, 1.2),
+        lambda t: sizing.Region(shapely.Polygon(SQUARE), 0.1, 1.2),
+    ),
+    (
+        lambda t: sizing.hessian_size(np.ones((2, 2)), (0, 0), (1, 1), n_cells=9),
+        lambda t: sizing.hessian_size(np.random.default_rng(0).random((9, 9)), (0, 0), (1, 1), n_cells=9),
+    ),
+    (
+        lambda t: sizing.hessian_size(np.random.default_rng(0).random((9, 9)), (0, 0), (1, 1), n_cells=9, p=0),
+        lambda t: sizing.hessian_size(np.random.default_rng(0).random((9, 9)), (0, 0), (1, 1), n_cells=9, p=np.inf),
+    ),
+    (lambda t: sizing.hessian_size(np.ones((9, 9)), (0, 0), (1, 1), n_cells=9), lambda t: t.run(BOX, 0.3)),
+    (
+        lambda t: sizing.hessian_size(np.random.default_rng(0).random((9, 9)), (0, 0), (1, 1), n_cells=9, h_max=1e-3),
+        lambda t: sizing.hessian_size(np.random.default_rng(0).random((9, 9)), (0, 0), (1, 1), n_cells=9),
+    ),
+    # Boxes, polygons and curves.
+    (lambda t: clvoro.Box(0, 2.5), lambda t: clvoro.Box((0, 0), (2.5, 1.5))),
+    (lambda t: clvoro.Box((0,), (2.5,)), lambda t: clvoro.Box((0, 0), (2.5, 1.5))),
+    (lambda t: clvoro.Box((0, 2.5), (0, 1.5)), lambda t: clvoro.Box((0, 0), (2.5, 1.5))),
+    (lambda t: clvoro.Box((0, 0), (1e200, 1)), lambda t: clvoro.Box((0, 0), (1, 1))),
+    (lambda t: BOX.without([HOLE]), lambda t: clvoro.Polygon(SQUARE, [HOLE])),
+    (
+        lambda t: TORUS.without([HOLE]).without([HOLE]),
+        lambda t: TORUS.without([HOLE, [(0.1, 0.1), (0.2, 0.1), (0.2, 0.2)]]),
+    ),
+    (
+        lambda t: TORUS.without([HOLE, [(x + 0.1, y) for x, y in HOLE]]),
+        lambda t: TORUS.without([HOLE, [(x + 0.35, y) for x, y in HOLE]]),
+    ),
+    (
+        lambda t: CHANNEL.without([[(x, y - 0.5) for x, y in HOLE]]),
+        lambda t: TORUS.without([[(x, y - 0.5) for x, y in HOLE]]),
+    ),
+    (lambda t: CHANNEL.without([HOLE], names={"yMin": [0]}), lambda t: CHANNEL.without([HOLE], names={"pore": [0]})),
+    (lambda t: CUBE.with_lines([[(0, 0), (1, 1)]]), lambda t: BOX.with_lines([[(0, 0), (1, 1)]])),
+    (lambda t: BOX.with_lines([[(7, 7), (8, 8)]]), lambda t: BOX.with_lines([[(0.7, 0.7), (0.8, 0.8)]])),
+    (
+        lambda t: t.adapter.diagram(
+            clvoro.Box((0, 0, 0), (1, 1, 1e-16), periodic=(False, False, True)), [(0.5, 0.5, 0)]
+        ),
+        lambda t: t.adapter.diagram(
+            clvoro.Box((0, 0, 0), (1, 1, 1e-2), periodic=(False, False, True)), [(0.5, 0.5, 0)]
+        ),
+    ),
+    (
+        lambda t: clvoro.Polygon([SQUARE[k] for k in (0, 2, 1, 3)]),
+        lambda t: clvoro.Polygon.from_shapely(shapely.make_valid(shapely.Polygon([SQUARE[k] for k in (0, 2, 1, 3)]))),
+    ),
+    (lambda t: clvoro.Polygon("lake.geojson"), lambda t: clvoro.Polygon.from_geojson(t.lake)),
+    (lambda t: clvoro.Polygon(np.multiply(SQUARE, 1e200)), lambda t: clvoro.Polygon(SQUARE)),
+    (lambda t: clvoro.Polygon(np.add(SQUARE, 1e16)), lambda t: clvoro.Polygon(SQUARE)),
+    (
+        lambda t: clvoro.Polygon([*SQUARE, (1e-15, 1)]),
+        lambda t: clvoro.Polygon.from_shapely(
+            shapely.remove_repeated_points(shapely.Polygon([*SQUARE, (1e-15, 1)]), 1e-9)
+        ),
+    ),
+    (lambda t: clvoro.Polygon(SQUARE, [HOLE, HOLE]), lambda t: clvoro.Polygon(SQUARE, [HOLE])),
+    (
+        lambda t: (
+            clvoro.Polygon(SQUARE, names={"a": [0], "outer": [1]})
+            and clvoro.Polygon(SQUARE, [HOLE], names={"hole-1": [0]})
+        ),
+        lambda t: clvoro.Polygon(SQUARE, [HOLE], names={"pore": [0]}),
+    ),
+    (
+        lambda t: clvoro.Polygon(curves.arc((0, 0), 1, 0, 180)),
+        lambda t: clvoro.Polygon([curves.arc((0, 0), 1, 0, 180)]),
+    ),
+    (
+        lambda t: clvoro.Polygon([curves.arc((0, 0), 1, 0, 180), (-1, -1e-7), (0, -1)]),
+        lambda t: clvoro.Polygon([curves.arc((0, 0), 1, 0, 180), (-1, 0), (0, -1)]),
+    ),
+    (
+        lambda t: clvoro.Polygon([*SQUARE, curves.circle((0.5, 0.5), 0.1)]),
+        lambda t: clvoro.Polygon(SQUARE, [curves.circle((0.5, 0.5), 0.1)]),
+    ),
+    (
+        lambda t: clvoro.Polygon(SQUARE, [curves.circle((0.5, 0.5), 0.1, name="outer")]),
+        lambda t: clvoro.Polygon(SQUARE, [curves.circle((0.5, 0.5), 0.1, name="pipe")]),
+    ),
+    (
+        lambda t: clvoro.Polygon([curves.circle((0, 0), 1, tolerance=1e-14)]),
+        lambda t: clvoro.Polygon([curves.circle((0, 0), 1, tolerance=1e-6)]),
+    ),
+    (lambda t: curves.circle((1e9, 0), 1e-9), lambda t: curves.circle((0, 0), 1e-9)),
+    (lambda t: curves.arc((0, 0), 1, 0, 360), lambda t: curves.circle((0, 0), 1)),
+    (lambda t: curves.naca("24"), lambda t: curves.naca("2412")),
+    (lambda t: curves.spline([(0, 0), (1, 1), (1, 1), (2, 0)]), lambda t: curves.spline([(0, 0), (1, 1), (2, 0)])),
+    (lambda t: clvoro.Polygon(SQUARE).simplified(5), lambda t: clvoro.Polygon(SQUARE).simplified(0.1)),
+    (
+        lambda t: clvoro.Polygon.from_geojson(
+            {"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": None}]}
+        ),
+        lambda t: clvoro.Polygon.from_geojson(t.lake),
+    ),
+    (
+        lambda t: clvoro.Polygon.from_geojson({"type": "Point", "coordinates": [0, 0]}),
+        lambda t: clvoro.Polygon.from_geojson(t.lake),
+    ),
+    # Spheres.
+    (lambda t: clvoro.Sphere(1e300), lambda t: clvoro.Sphere(6371)),
+    (lambda t: GLOBE.boundary(), lambda t: BOX.boundary()),
+    (lambda t: t.run(t.ocean.domain, 0.7), lambda t: t.run(GLOBE, 0.7).subset),
+    (lambda t: t.ocean.domain.boundary(), lambda t: t.run(GLOBE, 0.7)),
+    (lambda t: t.part.domain.boundary(), lambda t: BOX.boundary()),
+    (
+        lambda t: t.run(GLOBE, sizing.Graded(lambda lon, lat: 0.5 + 0 * lon, 1.2, box=BOX)),
+        lambda t: t.run(GLOBE, sizing.Graded(sizing.Expression("0.8 + 0 * lat"), 1.2)),
+    ),
+    (lambda t: t.run(GLOBE, raster((-90, -180), (90, 180))), lambda t: t.run(GLOBE, raster((-180, -90), (180, 90)))),
+    (
+        lambda t: earth.ocean(t.globe, np.ones(len(t.globe), bool)),
+        lambda t: earth.ocean(t.globe, ~np.ones(len(t.globe), bool)),
+    ),
+    (lambda t: earth.ocean(t.globe, north, least_cells=10**6), lambda t: earth.ocean(t.globe, north, least_cells=3)),
+    (
+        lambda t: earth.ocean(t.globe, shapely.Polygon([(-180, -60), (0, 10), (180, -60)])),
+        lambda t: earth.ocean(t.globe, shapely.Polygon([(-180, -60), (0, 10), (180, -60), (180, -90), (-180, -90)])),
+    ),
+    (lambda t: earth.from_xarray(np.ones((2, 2))), lambda t: sizing.Raster(np.ones((2, 2)), (0, 0), (1, 1))),
+    (
+        lambda t: earth.from_xarray(lonlat(LON, LAT, ("y", "x"))),
+        lambda t: earth.from_xarray(lonlat(LON, LAT, ("lat", "lon"))),
+    ),
+    (
+        lambda t: earth.from_xarray(lonlat(np.radians(LON), np.radians(LAT), lon="radians")),
+        lambda t: earth.from_xarray(lonlat(LON, LAT)),
+    ),
+    (
+        lambda t: earth.from_xarray(lonlat(np.radians(LON), np.radians(LAT))),
+        lambda t: earth.from_xarray(lonlat(LON, LAT)),
+    ),
+    (lambda t: earth.from_xarray(lonlat(LON[[1, 0, 2, 3]], LAT)), lambda t: earth.from_xarray(lonlat(LON[:4], LAT))),
+    (lambda t: earth.from_xarray(lonlat(LON, LAT * 2)), lambda t: earth.from_xarray(lonlat(LON, LAT))),
+    (lambda t: earth.from_xarray(lonlat(LON * 9, LAT)), lambda t: earth.from_xarray(lonlat(LON, LAT))),
+    (
+        lambda t: earth.from_xarray(lonlat([0, 1e-5, 90], [0, 1e-5, 80])),
+        lambda t: earth.from_xarray(lonlat([0, 45, 90], [0, 40, 80])),
+    ),
+    (lambda t: earth.from_xarray(lonlat(LON + np.zeros((5, 1)), LAT)), lambda t: earth.from_xarray(lonlat(LON, LAT))),
+    # Surfaces and solids.
+    (
+        lambda t: sizing.Surface([(0, 0), (1, 0), (1, 1)], [(0, 1, 2)]),
+        lambda t: sizing.ClosedPolyline([(0, 0), (1, 0), (1, 1)]),
+    ),
+    (lambda t: sizing.Surface(CORNERS, [(0, 1, 2, 3)]), lambda t: sizing.Surface(CORNERS, TRIANGLES)),
+    (lambda t: sizing.Surface(CORNERS * (1, 0, 0), TRIANGLES), lambda t: sizing.Surface(CORNERS, TRIANGLES)),
+    (
+        lambda t: sizing.Surface(CORNERS, TRIANGLES[:3]).contains(CORNERS),
+        lambda t: sizing.Surface(CORNERS, TRIANGLES).contains(CORNERS),
+    ),
+    (
+        lambda t: sizing.Surface(CORNERS, [*TRIANGLES, TRIANGLES[0]]).contains(CORNERS),
+        lambda t: sizing.Surface(CORNERS, TRIANGLES).contains(CORNERS),
+    ),
+    (
+        lambda t: clvoro.Solid(CORNERS, [*TRIANGLES, TRIANGLES[0]]),
+        lambda t: clvoro.Solid(CORNERS, [*TRIANGLES, TRIANGLES[0]], repair=True),
+    ),
+    (
+        lambda t: clvoro.Solid(CORNERS, [*TRIANGLES[:3], TRIANGLES[3][::-1]]),
+        lambda t: clvoro.Solid(CORNERS, [*TRIANGLES[:3], TRIANGLES[3][::-1]], repair=True),
+    ),
+    (
+        lambda t: clvoro.Solid(CORNERS, np.array(TRIANGLES)[:, ::-1]),
+        lambda t: clvoro.Solid(CORNERS, np.array(TRIANGLES)),
+    ),
+    (lambda t: clvoro.Solid(*two(0.2)), lambda t: clvoro.Solid(*two(0.2, turned=True))),
+    (
+        lambda t: clvoro.Solid(*two(1, away=0.3)),
+        lambda t: clvoro.Solid(CORNERS, TRIANGLES) + clvoro.Solid(CORNERS + 0.3, TRIANGLES),
+    ),
+    (
+        lambda t: clvoro.Solid.outside(clvoro.Solid(CORNERS, TRIANGLES), clvoro.Box((5, 5, 5), (6, 6, 6))),
+        lambda t: clvoro.Solid.outside(clvoro.Solid(CORNERS, TRIANGLES), clvoro.Box((-1, -1, -1), (2, 2, 2))),
+    ),
+    (
+        lambda t: clvoro.Solid.outside(
+            clvoro.Solid(CORNERS, TRIANGLES), clvoro.Box((-1, -1, -1), (2, 2, 2), periodic=True)
+        ),
+        lambda t: clvoro.Solid.outside(clvoro.Solid(CORNERS, TRIANGLES), clvoro.Box((-1, -1, -1), (2, 2, 2))),
+    ),
+    (
+        lambda t: clvoro.Solid(CORNERS, TRIANGLES) & clvoro.Solid(CORNERS + 5, TRIANGLES),
+        lambda t: clvoro.Solid(CORNERS, TRIANGLES) & clvoro.Solid(CORNERS + 0.1, TRIANGLES),
+    ),
+    (
+        lambda t: clvoro.Solid.polyhedron([(1, 0, 0)], [1]),
+        lambda t: clvoro.Solid.polyhedron(np.concatenate([np.eye(3), -np.eye(3)]), np.ones(6)),
+    ),
+    (
+        lambda t: sizing.Surface.read(t.write("a.stl", "solid x\nfacet")),
+        lambda t: clvoro.Solid.ball((0, 0, 0), 1).surface,
+    ),
+    (
+        lambda t: t.run(clvoro.Solid.box((0, 0, 0), (1, 1, 1e-3)), 0.5),
+        lambda t: t.run(clvoro.Solid.box((0, 0, 0), (1, 1, 1)), 0.5),
+    ),
+    # Case files and the command.
+    (lambda t: t.job(CASE, walls="exact"), lambda t: t.job(CASE, walls="exact", mesh_formats=("openfoam",))),
+    (
+        lambda t: t.job(CASE, types={"xMin": "patch"}),
+        lambda t: t.job(CASE, types={"xMin": "patch"}, mesh_formats=("openfoam",)),
+    ),
+    (lambda t: t.job(SPHERE_CASE, mesh_formats=("openfoam",)), lambda t: t.job(SPHERE_CASE, mesh_formats=("nc",))),
+    (lambda t: t.job(CASE, mesh_formats=("scrip",)), lambda t: t.job(CASE, mesh_formats=("nc",))),
+    (
+        lambda t: t.job(CASE.replace("[0, 0]", "[0, 0, 0]").replace("[1, 1]", "[1, 1, 1]"), mesh_formats=("nc",)),
+        lambda t: t.job(CASE.replace("[0, 0]", "[0, 0, 0]").replace("[1, 1]", "[1, 1, 1]"), mesh_formats=("openfoam",)),
+    ),
+    (lambda t: t.job(CASE, checkpoint_every=5), lambda t: t.job(CASE, checkpoint_every=5, checkpoint=t.path("c"))),
+    (
+        lambda t: t.job(CASE + "method = ['lloyd', 'coupled']", checkpoint=t.path("c")),
+        lambda t: t.job(CASE + "method = 'adaptive'", checkpoint=t.path("c")),
+    ),
+    (lambda t: t.job(CASE, checkpoint=t.path("out/mesh.npz")), lambda t: t.job(CASE, checkpoint=t.path("c"))),
+    (lambda t: (t.path("out/mesh.vtu").mkdir(parents=True), t.job(CASE)), lambda t: t.job(CASE, out=t.path("out2"))),
+    (lambda t: t.case(CASE.replace("lower", "outer = [[0, 0], [1, 0], [1, 1]]\nlower")), lambda t: t.case(CASE)),
+    (
+        lambda t: t.case(CASE.replace("size = 0.3", "name = 'a/b'\nsize = 0.3")),
+        lambda t: t.case(CASE.replace("size = 0.3", "name = 'ab'\nsize = 0.3")),
+    ),
+    (
+        lambda t: t.case(f"size = 1\n[domain]\npolygon = '{t.write('a.shp', 'x')}'\n"),
+        lambda t: t.case(f"size = 1\n[domain]\npolygon = '{t.lake}'\n"),
+    ),
+    (
+        lambda t: t.case(CASE.replace("0.3\n", RASTER.format(t.write("a.npy", "x")))),
+        lambda t: t.case(CASE.replace("0.3\n", RASTER.format(t.grid))),
+    ),
+    (
+        lambda t: t.case(CASE.replace("0.3\n", RASTER.replace("raster", "raster', variable = 'h").format(t.grid))),
+        lambda t: t.case(CASE.replace("0.3\n", RASTER.format(t.grid))),
+    ),
+    (lambda t: clvoro.create_context(3), lambda t: clvoro.create_context("cpu")),
+    (lambda t: clvoro.Box("ab", "cd"), lambda t: clvoro.Box((0, 0), (2.5, 1.5))),
+    (lambda t: t.run(BOX, POINT, dtype="float32"), lambda t: t.run(BOX, POINT)),
+    (
+        lambda t: t.run(BOX, 1e-9, points=POINTS, method="lloyd", dtype="float32"),
+        lambda t: t.run(BOX, 0.2, points=POINTS, method="lloyd"),
+    ),
+    (
+        lambda t: DensityTree(sizing.as_field(lambda p: np.nan * p[:, 0]), BOX),
+        lambda t: DensityTree(sizing.as_field(lambda p: np.nan_to_num(np.nan * p[:, 0], nan=0.3)), BOX),
+    ),
+    (lambda t: t.case(CASE.replace("0.3\n", CAPS)), lambda t: t.case(SPHERE_CASE.replace("0.7\n", CAPS))),
+    (
+        lambda t: t.case(SPHERE_CASE.replace("0.7\n", RASTER.format(t.lonlat))),
+        lambda t: t.case(
+            SPHERE_CASE.replace("0.7\n", RASTER.format(t.lonlat).replace(", lower = [0, 0], upper = [1, 1]", ""))
+        ),
+    ),
+    (
+        lambda t: t.job(CASE.replace("effort = 'fast'", "methods = ['lloyd', 'coupled']"), checkpoint=t.path("c")),
+        lambda t: t.job(CASE.replace("effort = 'fast'", "method = 'coupled'"), checkpoint=t.path("c")),
+    ),
+    (
+        lambda t: t.run(GLOBE, sizing.Graded(sizing.Expression("0.7 + 0 * lat"), 1.2, box=BOX)),
+        lambda t: t.run(GLOBE, sizing.Graded(sizing.Expression("0.7 + 0 * lat"), 1.2)),
+    ),
+    (
+        lambda t: earth.from_xarray(
+            SimpleNamespace(**vars(lonlat(LON, LAT)) | {"values": np.ones((2, 5, 9)), "dims": ("time", "lat", "lon")})
+        ),
+        lambda t: earth.from_xarray(lonlat(LON, LAT)),
+    ),
+    (lambda t: t.around.to_openfoam(t.path("a.foam"), walls="exact"), lambda t: t.around.save(t.path("a.vtu"))),
+    (lambda t: clvoro.Polygon(np.multiply(SQUARE, 1e-3) + 1e12), lambda t: clvoro.Polygon(np.multiply(SQUARE, 1e-3))),
+    (lambda t: sizing.Raster([[np.nan] * 2] * 2, (0, 0), (1, 1), missing="nearest"), lambda t: raster((0, 0), (1, 1))),
+    (
+        lambda t: (t.mesh.save(t.path("a.foam")), clvoro.load(t.path("polyMesh"))),
+        lambda t: (t.mesh.save(t.path("a.npz")), clvoro.load(t.path("a.npz"))),
+    ),
+    (lambda t: t.mesh.to_vtu(t.path("a.nc")), lambda t: t.mesh.save(t.path("a.nc"))),
+]
+
+
+ELSEWHERE = (
+    *("foam/", "opencl/", "sizing/cells.py", "sizing/derivatives.py", "sizing/estimates.py"),
+    *("pip install", "needs Matplotlib", "needs meshio", "xarray says", "which needs xarray"),  # libraries
+    *("export it again", "holds no solid", "earlier version of clvoro", "of version", "version of clvoro"),  # files
+    *("a place that is writable", "has  bytes", "is for mesh.npz and mesh.vtu", "leave it out; projection"),
+    *("which need  on the device", "whose largest array", "is out of memory", "expected fewer", "32-bit indices"),
+    *("not as many distinct points", "as short as round-off", "cells meet at a vertex", "not the Voronoi diagram of"),
+    *("is folded within a cell", "without the inside on one side", "intersects itself", "has no device form"),
+    *(
+        "is for projection=",
+        "do not fit between the walls",
+        "which is for ; save as",
+        "which are for rasters",
+        "weight for a raster",
+    ),
+)
+"""Parts of paths and texts of errors that other tests raise: of devices, disks, libraries, damaged files, limits beyond
+the memory and round-off, and those of loops around a solver."""
+
+
+class Workplace(SimpleNamespace):
+    """Files and small meshes for `ROWS`; each call has a folder of its own."""
+
+    def path(self, name):
+        return self.folder / name
+
+    def write(self, name, text=""):
+        self.path(name).write_text(text)
+        return self.path(name)
+
+    def run(self, *args, **options):
+        options = (
+            {"max_steps": None if "checkpoint" in options else 0}
+            | ({} if len(args) > 2 or "effort" in options else {"effort": "fast"})
+            | options
+        )
+        if options.get("method") not in (None, "adaptive", "exact", "transport"):
+            options.pop("effort", None)
+        adapter = clvoro.Adapter(self.adapter.ctx, options.pop("dtype", "float64"))
+        return adapter.run(*args, **options)
+
+    def voronoi(self, domain, points):
+        return self.adapter.diagram(domain, points)
+
+    def copied(self):
+        import copy
+
+        return copy.copy(self.adapter)
+
+    def reentrant(self, other):
+        self.adapter.run(BOX, 0.3, "fast", callback=lambda row: other.diagram(BOX, POINTS) is None)
+
+    def resume(self):
+        saved = self.path("saved")
+        self.adapter.run(BOX, 0.3, "fast", checkpoint=saved, callback=lambda row: row["step"] == 2)
+        return clvoro.Checkpoint(resume=saved)
+
+    def case(self, text):
+        return Case.from_toml(text, "a.toml").size_field()
+
+    def job(self, text, out=None, **options):
+        Job(Case.from_toml(text, "a"), out or self.path("out"), report=False, quiet=True, **options).run()
+
+
+@pytest.fixture(scope="module")
+def meshes(ctx, tmp_path_factory):
+    adapter, folder = clvoro.Adapter(ctx), tmp_path_factory.mktemp("files")
+    lake, grid = folder / "lake.geojson", folder / "grid.npy"
+    lake.write_text(json.dumps({"type": "Polygon", "coordinates": [[*SQUARE, SQUARE[0]]]}))
+    np.save(grid, np.full((3, 3), 0.3))
+    np.savez(folder / "lonlat.npz", lon=LON, lat=LAT, h=np.full((5, 9), 0.7))
+    solid = np.random.default_rng(1).random((20, 3))
+    mesh, globe = adapter.diagram(BOX, POINTS), adapter.diagram(GLOBE, GLOBE.icosahedral_points(1))
+    small = clvoro.Polygon(SQUARE, [[(0.45, 0.45), (0.55, 0.45), (0.55, 0.55)]])
+    apart = np.where(np.arange(30) < 1, -5.0, 0)
+    return {
+        "adapter": adapter,
+        "lake": lake,
+        "grid": grid,
+        "lonlat": folder / "lonlat.npz",
+        "mesh": mesh,
+        "part": mesh.subset(POINTS[:, 0] > 0.3),
+        "torus": adapter.diagram(TORUS, POINTS),
+        "wide_torus": adapter.diagram(clvoro.Box((0, 0), (2, 1), periodic=True), POINTS),
+        "single": adapter.diagram(TORUS, POINTS[:1]),
+        "cube": adapter.diagram(CUBE, solid),
+        "globe": globe,
+        "large_globe": adapter.diagram(clvoro.Sphere(2), 2 * globe.points),
+        "ocean": globe.subset(globe.points[:, 2] > 0),
+        "holed": adapter.diagram(clvoro.Polygon(SQUARE, [HOLE]), POINTS[~clvoro.Polygon(HOLE).covers(POINTS)]),
+        "around": adapter.diagram(small, [(0.3, 0.5), (0.05, 0.5), (0.95, 0.5)]),
+        "power": adapter.power_diagram(BOX, POINTS, 0.001 * np.arange(30)),
+        "empty": adapter.power_diagram(BOX, POINTS, apart),
+        "result": adapter.run(BOX, 0.2, points=POINTS, method="lloyd", max_steps=0),
+        "cube_result": adapter.run(CUBE, 0.4, points=solid, method="lloyd", max_steps=0),
+        "pieces": clvoro.Polygon.from_pieces([[SQUARE], [[(2, 0), (2.5, 0), (2.5, 0.5), (2, 0.5)]]]),
+    }
+
+
+def raised_at(error):
+    """Return where in the package `error` and the errors that it follows were raised: file and line."""
+    places = set()
+    while error is not None:
+        frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(str(PACKAGE))]
+        places |= {(str(Path(f.filename).relative_to(PACKAGE)), f.lineno) for f in frames}
+        error = error.__cause__ or error.__context__
+    return places
+
+
+@pytest.mark.parametrize("row", range(len(ROWS)))
+def test_what_an_error_says_to_do_works(meshes, tmp_path, row):
+    wrong, right = ROWS[row]
+    (tmp_path / "wrong").mkdir()
+    (tmp_path / "right").mkdir()
+    with pytest.raises(ClvoroError) as caught:
+        wrong(Workplace(folder=tmp_path / "wrong", **meshes))
+    print(caught.value)
+    right(Workplace(folder=tmp_path / "right", **meshes))
+
+
+def text_of(node):
+    """Return the text of a message that is written in the source, without what is filled in."""
+    if isinstance(node, ast.Constant):
+        return str(node.value)
+    if isinstance(node, ast.JoinedStr):
+        return "".join(text_of(v) for v in node.values)
+    if isinstance(node, ast.BinOp):
+        return text_of(node.left) + text_of(node.right)
+    return "; " if isinstance(node, ast.FormattedValue) and ast.unparse(node.value) == "remedy" else ""
+
+
+def errors_with_remedies():
+    """Yield file, first and last line, and text of each error that says what to do."""
+    names = {n for n, kind in vars(clvoro.errors).items() if isinstance(kind, type) and issubclass(kind, ClvoroError)}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not (isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args):
+                continue
+            if ast.unparse(node.exc.func) in names and "; " in (text := text_of(node.exc.args[0])):
+                yield str(path.relative_to(PACKAGE)), node.lineno, node.end_lineno, text
+
+
+def test_every_error_that_says_what_to_do_has_a_row(meshes, tmp_path):
+    seen = set()
+    for k, (wrong, _) in enumerate(ROWS):
+        (tmp_path / str(k)).mkdir()
+        try:
+            wrong(Workplace(folder=tmp_path / str(k), **meshes))
+        except ClvoroError as error:
+            seen |= raised_at(error)
+    missing = [
+        f"{path}:{first} {text}"
+        for path, first, last, text in errors_with_remedies()
+        if not any(part in path + text for part in ELSEWHERE)
+        and not any((path, line) in seen for line in range(first, last + 1))
+    ]
+    assert not missing, "\n".join(["add rows for these errors to ROWS, or name them in ELSEWHERE", *missing])
