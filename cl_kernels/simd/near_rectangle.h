@@ -23,8 +23,7 @@ inline bool add_near_run(near_t *near, int first, int end)
     return true;
 }
 
-#if DIM == 3
-/* Collect the generators in a box, and some near it. False if there are too many. */
+/* Collect the generators in a rectangle or box, and some near it. False if there are too many. */
 inline bool collect_near(near_t *near, double4 lower, double4 upper, BIN_ARGS)
 {
     descent_t way; /* position: layer, row and bin */
@@ -40,10 +39,10 @@ inline bool collect_near(near_t *near, double4 lower, double4 upper, BIN_ARGS)
         const int right = axis_bin(upper.s0, frame.s0, inverse, shape.s1);
         const int bottom = axis_bin(lower.s1, frame.s1, inverse, shape.s2);
         const int top = axis_bin(upper.s1, frame.s1, inverse, shape.s2);
-        const int last = axis_bin(upper.s2, frame.s2, inverse, shape.s3);
+        const int last = DIM == 2 ? 0 : axis_bin(upper.s2, frame.s2, inverse, shape.s3);
         int layer = place.s0, row = place.s1, next = place.s2, child = -1;
         if (layer < 0) {
-            layer = axis_bin(lower.s2, frame.s2, inverse, shape.s3);
+            layer = DIM == 2 ? 0 : axis_bin(lower.s2, frame.s2, inverse, shape.s3);
             row = bottom;
             next = left;
         }
@@ -64,41 +63,3 @@ inline bool collect_near(near_t *near, double4 lower, double4 upper, BIN_ARGS)
     }
     return true;
 }
-#else
-/* Collect the generators in a rectangle, and some near it. False if there are too many. */
-inline bool collect_near(near_t *near, double4 lower, double4 upper, BIN_ARGS)
-{
-    descent_t way; /* position: row and bin */
-    near->count = 0;
-    begin_descent(&way, (int4)(-1));
-    while (way.depth >= 0) {
-        const int grid = way.grids[way.depth];
-        const int4 place = way.places[way.depth];
-        const FRAME frame = grid_frames[grid];
-        const int4 shape = grid_shapes[grid];
-        const double inverse = FRAME_INVERSE(frame);
-        const int left = axis_bin(lower.s0, frame.s0, inverse, shape.s1);
-        const int right = axis_bin(upper.s0, frame.s0, inverse, shape.s1);
-        const int top = axis_bin(upper.s1, frame.s1, inverse, shape.s2);
-        int row = place.s0, next = place.s1, child = -1;
-        if (row < 0) {
-            row = axis_bin(lower.s1, frame.s1, inverse, shape.s2);
-            next = left;
-        }
-        while (row <= top && child < 0) {
-            global const int2 *row_bins = bins + shape.s0 + row * shape.s1;
-            while (next <= right && child < 0) {
-                const int2 run = next_run(row_bins, &next, right, WHOLE, &child);
-                if (child < 0 && !add_near_run(near, run.s0, run.s1))
-                    return false;
-            }
-            if (next > right && child < 0) {
-                ++row;
-                next = left;
-            }
-        }
-        leave_grid(&way, child, (int4)(row, next, 0, 0), (int4)(-1));
-    }
-    return true;
-}
-#endif

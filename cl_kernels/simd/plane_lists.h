@@ -1,10 +1,7 @@
 /* Per vector lane a list of half-spaces: the points nearer to the generator x of the lane than to another at x + d,
    y.p <= 1/2 with p = d / |d|^2. A wall is the bisector with the mirror image. */
 #include "simd/bin_runs.h"
-
-#define LANES 8
-/* One lane of vector k of an array. */
-#define LANE(vectors, k, lane) ((vectors)[(k)*LANES + (lane)])
+#include "simd/lanes.h"
 
 typedef struct {
     double8 x, y, z, d2;
