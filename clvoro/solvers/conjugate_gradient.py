@@ -74,7 +74,7 @@ class ConjugateGradient:
         ----------
         operator : Operator
         rhs : (n,) real, device
-        x : (n or ``operator.columns``,) real, device
+        x : (n,) real, device
         precondition : (n,) store or callable (r, u, work)
             Inverse of a diagonal, or a function that enqueues u = M^-1 r, M symmetric positive definite, all in
             `store`. It may overwrite `work`.
@@ -287,7 +287,7 @@ class _Iteration:
         self._kernels = k = solver.kernels_in(store)
         scratch = self._engine.scratch
         self._r, self._u, self._q = (scratch(n, store) for _ in range(3))
-        self._p = scratch(operator.columns or n, store)
+        self._p = scratch(n, store)
         # On CPUs it costs more to evaluate directions of neighbors again than to store them.
         self._merged = operator.rows is not None and self._engine.group_size > 1
         directions = (self._p, scratch(n, store)) if self._merged else (self._p, self._p)

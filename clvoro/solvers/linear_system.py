@@ -101,15 +101,12 @@ class Operator:
     rows : tuple of device arrays, optional
         Starts, columns and weights of A, if it is a matrix (see solvers/sparse_rows.h). One work-group then solves
         systems of few unknowns, if the preconditioner is diagonal. On GPUs an iteration takes a launch less.
-    columns : int, optional
-        Number of rows of x, if `apply` needs more than those of y: it fills these itself, as for ghosts.
     """
 
     apply: Apply
     writes_curvature: bool = False
     singular: bool = False
     rows: tuple[cla.Array, ...] | None = None
-    columns: int | None = None
 
 
 @dataclass(frozen=True)

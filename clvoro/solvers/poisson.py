@@ -70,17 +70,14 @@ class Laplacian:
     ----------
     starts : (n + 1,) int32
     neighbors : (m,) int32
-        Neighbors of the diagram: walls are negative.
+        Neighbors of the diagram, owners in place of ghosts: walls are negative.
     weights : (m,) real or float32
         w_ij = rho_ij l_ij / d_ij; 0 at walls.
-    part : Part, optional
-        The part whose rows `neighbors` names, if it has ghosts.
     """
 
     starts: cla.Array
     neighbors: cla.Array
     weights: cla.Array
-    part: Part | None = None
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -163,12 +160,13 @@ class Poisson:
         tolerance : float
             Tolerance of the solves to come. From `SINGLE_PRECISION_TOLERANCE` on weights and vectors are in float32.
         part : Part, optional
-            The part whose rows `neighbors` names, if it has ghosts.
+            The part whose rows `neighbors` names, if it has ghosts. Those with an owner in it are replaced by this one.
+            If others have owners elsewhere, `apply` takes x with their values, and `solve` is not for such a matrix.
 
         Returns
         -------
         Laplacian
-            Its weights are in the workspace and valid to the end of the present frame.
+            Its weights, and columns of a part, are in the workspace and valid to the end of the present frame.
 
         Raises
         ------
@@ -197,7 +195,8 @@ class Poisson:
             weights,
             *self.engine.period_args,
         )
-        return Laplacian(starts, neighbors, weights, part)
+        columns = neighbors if part is None else part.name_owners(engine, starts, neighbors)
+        return Laplacian(starts, columns, weights)
 
     def inverse_diagonal(self, laplacian: Laplacian) -> cla.Array:
         """Return the inverse row sums of the weights (n,), 0 for a sum of 0, in the workspace."""
@@ -226,10 +225,7 @@ class Poisson:
         return rhs
 
     def apply(self, laplacian: Laplacian, x: cla.Array, y: cla.Array) -> None:
-        """Enqueue y = A x, both in the precision of the weights; x may also be in that of the engine.
-
-        If the Laplacian has a part, x has rows of ghosts, which are filled.
-        """
+        """Enqueue y = A x, both in the precision of the weights; x may also be in that of the engine."""
         self._apply_of(laplacian)(x, y)
 
     def set_up_multigrid(self, laplacian: Laplacian, ordering: object = None) -> Multigrid:
@@ -307,22 +303,14 @@ class Poisson:
         SolverError
             If a number is not finite, or the iteration breaks down with Jacobi's preconditioner.
         """
-        n, part = len(laplacian), laplacian.part
+        n = len(laplacian)
         _check("rhs", rhs, (n,))
-        _check("potential", potential, (n if part is None else part.count,))
+        _check("potential", potential, (n,))
         if preconditioner not in _PRECONDITIONERS:
             raise InputError(f"preconditioner got {preconditioner!r}, expected one of {_PRECONDITIONERS}")
         if not tolerance > 0:
             raise InputError(f"tolerance got {tolerance!r}, expected a number > 0, such as 1e-8")
-        operator = Operator(
-            self._apply_of(laplacian),
-            writes_curvature=True,
-            singular=True,
-            rows=laplacian.rows if part is None else None,
-            columns=None if part is None else part.count,
-        )
-        if part is not None:
-            preconditioner = "jacobi"  # multigrid knows no ghosts
+        operator = Operator(self._apply_of(laplacian), writes_curvature=True, singular=True, rows=laplacian.rows)
         system = _Equation(laplacian, operator, rhs, potential, tolerance)
         if preconditioner == "auto":
             one_group = n <= one_group_limit(self.engine)
@@ -406,8 +394,6 @@ class Poisson:
         last: list = [None, None, None]
 
         def apply(x: cla.Array, y: cla.Array) -> None:
-            if laplacian.part is not None:
-                laplacian.part.forward(self.engine, x)
             if last[0] is not x or last[1] is not y:
                 last[:] = x, y, Launch(self.engine, *self._launch(laplacian, x, y))
             last[2]()

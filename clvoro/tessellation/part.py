@@ -70,6 +70,18 @@ class Part:
     home: Home | None = None
     halo_args: tuple[object, ...] = ()
 
+    def name_owners(self, engine: Engine, starts: cla.Array, neighbors: cla.Array) -> cla.Array:
+        """Return `neighbors` (m,) with owners in place of the ghosts that have one in this part.
+
+        They are in the workspace. Rows begin at `starts` (n_own + 1,).
+        """
+        if self.home is None or self.home.parts is not None:
+            return neighbors
+        named = engine.scratch(len(neighbors), np.int32)
+        kernel = engine.kernels("tessellation/part").name_owners
+        engine.run_each(kernel, self.n_own, np.int32(self.n_own), self.home.rows, starts, neighbors, named)
+        return named
+
     def forward(self, engine: Engine, values: cla.Array, others: Sequence[cla.Array] = ()) -> None:
         """Fill the rows of ghosts in `values` (count, ...), of any type, with the values of their owners.
 

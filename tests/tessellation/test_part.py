@@ -1,13 +1,15 @@
 """Parts with ghosts: two halves of a box with each other's generators as halos; a periodic box that is not folded."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from clvoro.adaptation.stages import Stages
 from clvoro.geometry.box import Box
-from clvoro.solvers.linear_system import Limits
+from clvoro.solvers.conjugate_gradient import ConjugateGradient
+from clvoro.solvers.linear_system import Limits, Operator
 from clvoro.solvers.volume_projection import Penalty, Targets
 from clvoro.tessellation.part import Home, Part
 from clvoro.tessellation.tessellator import Tessellator
@@ -159,6 +161,43 @@ def test_the_laplacian_of_two_halves(ctx, dim, real):
 
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", REALS)
+def test_the_poisson_equation_in_two_halves(ctx, dim, real):
+    """Each half applies its rows to its own values and those that `Part.forward` brings from the other."""
+    halves = Halves(ctx, dim, real)
+    engine, poisson, n = halves.engine, Stages(halves.engine).poisson, len(halves.places)
+    source = np.random.default_rng(60105).standard_normal(n)
+    source, limits = halves.upload(source - source.mean()), Limits(1e-9 if real == np.float64 else 1e-4, 1000)
+    diagrams = [halves.tessellate(part) for part in halves.parts]
+    diagrams = [replace(t, **{name: getattr(t, name).copy() for name in ("starts", "neighbors")}) for t in diagrams]
+    bounds = np.cumsum([0, *halves.n_own])
+    with engine.workspace.frame():
+        t = halves.whole
+        expected = engine.zeros(n)
+        matrix = poisson.assemble(t.starts, t.neighbors, t.face_measures, t.points)
+        assert poisson.solve(matrix, source, expected, tolerance=limits.tolerance).converged
+        matrices, inverses = [], []
+        for part, t in zip(halves.parts, diagrams, strict=True):
+            matrices.append(poisson.assemble(t.starts, t.neighbors, t.face_measures, part.points, part=part))
+            inverses.append(poisson.inverse_diagonal(matrices[-1]).get())
+
+        def apply(x, y):
+            owned = [x[a:b].copy() for a, b in pairwise(bounds)]
+            for part, rows, values, (a, b) in zip(halves.parts, matrices, owned, pairwise(bounds), strict=True):
+                both, product = engine.zeros(part.count), engine.empty(b - a)
+                both[: b - a] = values
+                part.forward(engine, both, owned)
+                poisson.apply(rows, both, product)
+                y[a:b] = product
+
+        found, inverse = engine.zeros(n), engine.upload(np.concatenate(inverses))
+        given = Operator(apply, singular=True), source, found, inverse, limits
+        assert ConjugateGradient(engine).solve(*given, from_zero=True).converged
+        one, other = found.get(), expected.get()
+        assert np.abs(one - other).max() < 1e3 * limits.tolerance * np.abs(other).max()
+
+
+@pytest.mark.sparse(2)
+@pytest.mark.parametrize("real", REALS)
 def test_a_periodic_box_that_is_not_folded(ctx, dim, real):
     """Images are ghosts of a part in a larger box without periods; stages read values of neighbors."""
     box = Box((0,) * dim, (1,) * dim, periodic=True)
@@ -203,9 +242,12 @@ def test_a_periodic_box_that_is_not_folded(ctx, dim, real):
         assert np.abs(one - other).max() < 1e-4 * np.abs(other).max(), "derivatives are in single precision"
         source, potentials = rng.standard_normal(n) / n, []
         for part, made, poisson in ((alone.part, alone, unfolded.poisson), (None, t, stages.poisson)):
-            phi = poisson.engine.zeros(made.rows)
+            phi = poisson.engine.zeros(n)
             matrix = poisson.assemble(made.starts, made.neighbors, made.face_measures, made.points, part=part)
             tolerance = 1e-9 if real == np.float64 else 1e-4
-            assert poisson.solve(matrix, poisson.engine.upload(source), phi, tolerance=tolerance).converged
-            potentials.append(phi.get()[:n])
-        assert np.abs(potentials[0] - potentials[1]).max() < 1e3 * tolerance * np.abs(potentials[1]).max()
+            for kind in ("jacobi", "multigrid"):
+                given = {"tolerance": tolerance, "preconditioner": kind, "from_zero": True}
+                assert poisson.solve(matrix, poisson.engine.upload(source), phi, **given).converged
+                potentials.append(phi.get())
+        for potential in potentials[1:]:
+            assert np.abs(potentials[0] - potential).max() < 1e3 * tolerance * np.abs(potential).max()
