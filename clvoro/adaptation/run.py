@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 
 from ..arguments import check_callable, check_points
 from ..errors import InputTypeError, Interrupted
@@ -447,10 +448,20 @@ class Run:
         labels = mesh.ordered(mesh.labels)
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
-        diagram = mesh.fetch_diagram()
-        put_back(diagram, mesh.setup.points)
+        origin, fixed = origins(labels, self.started, mesh.taken), mesh.setup.points
         if mesh.domain.curved_walls:
+            frame = mesh.domain.frame
+            generators = frame[0] + frame[1] * mesh.to_host(mesh.points)[:, :3]
+            diagram = mesh.fetch_diagram()
+            # Cells may have been cut along creases, and generators in thin places may have none.
+            home = np.asarray(scipy.spatial.KDTree(generators).query(diagram.points)[1])
+            own = np.zeros(len(home), bool)
+            own[np.unique(home, return_index=True)[1]] = True
+            size, origin, fixed = size[home], np.where(own, origin[home], -1), fixed[home[own & (home < len(fixed))]]
             error, quality = self._measured_again(diagram, size)
+        else:
+            diagram = mesh.fetch_diagram()
+        put_back(diagram, fixed)
         result = Result(
             points=diagram.points,
             diagram=diagram,
@@ -464,7 +475,7 @@ class Run:
             final=final,
             size_factor=mesh.size_factor,
             settings=dict(self._settings),
-            origin=origins(labels, self.started, mesh.taken),
+            origin=origin,
         )
         return without_holes(result)
 

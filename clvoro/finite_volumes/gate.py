@@ -156,6 +156,20 @@ def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
     return [*made, regions(mesh)]
 
 
+def rejected_cells(mesh: Faces) -> np.ndarray:
+    """Return which cells in 3D OpenFOAM rejects, or one of whose faces, (n,) bool."""
+    m = mesh.measures
+    g, k = m.geometry, mesh.n_inner
+    bad = m.concave | (g.volumes < LEAST_MEASURE) | (m.determinant < 1e-3) | (m.aspect_ratio > 1000)
+    faces = (m.pyramids < -1e-15) | (m.bad_tetrahedra > 0) | (m.skewness > 4)
+    faces |= np.linalg.norm(g.areas, axis=1) < LEAST_MEASURE
+    faces[m.coupled] |= (m.weight[m.coupled] < 0.05) | (m.volume_ratio[m.coupled] < 0.01)
+    faces |= m.non_orthogonality >= 90
+    bad[mesh.owner[faces]] = True
+    bad[mesh.neighbor[:k][faces[:k]]] = True
+    return bad
+
+
 def around_islands(mesh: Faces) -> Criterion | None:
     """Return the cells in 2D around islands as a criterion that fails, or None if there are none."""
     broken = simple_loops(mesh)[2]

@@ -29,6 +29,10 @@ class Crossings:
     points: np.ndarray
     edge: np.ndarray
 
+    def take(self, rows: np.ndarray) -> Crossings:
+        """Return some of the crossings."""
+        return Crossings(self.cells[rows], self.points[rows], self.edge[rows])
+
 
 def cross_cells(
     surface: WallSurface, generators: np.ndarray, tree: scipy.spatial.KDTree, sizes: np.ndarray
@@ -69,7 +73,14 @@ def cross_cells(
         edge, low, high, i, j, t, k = (values[~done] for values in (edge, low, high, i, j, t, k))
         edge, low, high = np.concatenate([edge, edge]), np.concatenate([low, t]), np.concatenate([t, high])
         i, j = np.concatenate([i, k]), np.concatenate([k, j])
-    cells, points, edge = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return joined([Crossings(*part) for part in found])
+
+
+def joined(parts: list[Crossings]) -> Crossings:
+    """Return all crossings, sorted."""
+    cells, points, edge = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("cells", "points", "edge")
+    )
     cells = np.sort(cells, axis=1)
     order = np.lexsort((edge, cells[:, 1], cells[:, 0]))
     return Crossings(cells[order], points[order], edge[order])

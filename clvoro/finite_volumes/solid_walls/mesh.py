@@ -14,9 +14,10 @@ from ...mesh.connectivity import distinct, following, take_ranges, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
-from .chains import Crossings, cross_cells
-from .mend import find_concave, narrow_faces
-from .pierce import IN, WALL, pierce_edges, sides
+from .chains import Crossings, cross_cells, joined
+from .cutting import CellFaces, cross_cuts, cut_at_creases
+from .mend import narrow_faces, rejected_at_walls, split_walls
+from .pierce import IN, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
 from .trimmed_faces import TrimmedFaces, trim_faces
 from .wall_surface import WallSurface, nearest
@@ -27,6 +28,15 @@ _CERTAIN = 0.3
 """Vertices are not examined if the depths of their generators show that they are deeper than this share of h."""
 _CLEAR = 1.4
 """Least distance of outer generators from the whole surface, over h: no cell is that wide at a wall."""
+EXACT, CUT, FILLED, ROUNDED = range(4)
+"""How the walls of a cell are made: with all creases; with cuts along concave creases; without concave creases; without
+creases. Each next one makes more cells convex, and leaves out more of the surface."""
+_FEW = 0.03
+"""Largest share of generators without a cell; a solid with more of them is refused."""
+_PATIENCE = 3
+"""How often a mesh is made again without fewer rejected cells than before."""
+_MISSED = 0.1
+"""A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +46,9 @@ class SolidMesh:
     Attributes
     ----------
     faces : Faces
+    home : (m,) int
+        The generator of each cell, first those of generators that have a cell, ascending; then follow further parts of
+        cells that have been cut along concave creases.
     odd : (k,) int
         Cells whose wall could not be divided by creases.
     lost : (k,) int
@@ -43,6 +56,7 @@ class SolidMesh:
     """
 
     faces: Faces
+    home: np.ndarray
     odd: np.ndarray
     lost: np.ndarray
 
@@ -86,7 +100,7 @@ def solid_mesh(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, diag
     diagram : Diagram
         Of the generators, and of `outer_generators` after them, in a box around the solid.
     """
-    return _Maker(surface, points, sizes, diagram).mesh()
+    return _Maker(surface, points, sizes, diagram, np.full(len(points), CUT, np.int8)).mesh()
 
 
 def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Diagram) -> Diagram:
@@ -102,23 +116,82 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
     MismatchWarning
         If cells are concave.
     """
-    made = solid_mesh(surface, points, sizes, whole)
+    walls = np.full(len(points), EXACT, np.int8)
+    best: tuple[int, SolidMesh, Faces, np.ndarray] | None = None
+    since = 0
+    while since < _PATIENCE:
+        made = _Maker(surface, points, sizes, whole, walls).mesh()
+        if len(made.lost) > _FEW * len(points):
+            place = format_point(points[made.lost[0]])
+            raise InputError(
+                f"{surface.solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first "
+                f"at {place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
+            )
+        diagram = diagram_of(made.faces)
+        faces = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes[made.home]))
+        rejected = rejected_at_walls(faces)
+        if len(rejected):
+            faces = split_walls(faces, rejected)
+            rejected = rejected_at_walls(faces)
+        since += 1
+        if best is None or len(rejected) < best[0]:
+            best, since = (len(rejected), made, faces, rejected), 0
+        if not len(rejected):
+            break
+        _simplify(walls, whole.faces, np.unique(made.home[rejected]))
+    assert best is not None
+    _, made, faces, rejected = best
+    n = len(points) - len(made.lost)
+    if len(made.home) > n:
+        faces = _with_centroids(faces, n)
+    diagram = diagram_of(faces)
     if len(made.lost):
-        place = format_point(points[made.lost[0]])
-        raise InputError(
-            f"{surface.solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first "
-            f"at {place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
-        )
-    diagram = diagram_of(made.faces)
-    diagram = diagram_of(collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes)))
-    concave = np.unique(find_concave(diagram.faces)[1])
-    if len(concave):
         warn(
-            f"{len(concave)} cells at walls are concave, the first at {format_point(points[concave[0]])}: the walls "
-            "bend or meet within a cell there, and OpenFOAM does not accept it; use smaller sizes there",
+            f"{len(made.lost)} generators have no cell, the first at {format_point(points[made.lost[0]])}: the solid "
+            "is thinner than a cell there, and this part of it is left out; use smaller sizes there",
+            MismatchWarning,
+        )
+    if len(rejected):
+        warn(
+            f"{len(rejected)} cells at walls are concave or inverted, the first at "
+            f"{format_point(faces.generators[rejected[0]])}: the walls bend or meet within a cell there, and OpenFOAM "
+            "does not accept it; use smaller sizes there",
             MismatchWarning,
         )
     return diagram
+
+
+def _simplify(walls: np.ndarray, faces: Faces, rejected: np.ndarray) -> None:
+    """Change how the walls of `rejected` cells are made, or of their neighbors.
+
+    Parameters
+    ----------
+    walls : (n,) int8
+        EXACT, CUT, FILLED or ROUNDED.
+    faces : Faces
+        Of the diagram; cells beyond n are outside.
+    rejected : (k,) int
+    """
+    n = len(walls)
+    between = (faces.owner < n) & (faces.neighbor >= 0) & (faces.neighbor < n)
+    one, other = faces.owner[between], faces.neighbor[between]
+    one, other = np.concatenate([one, other]), np.concatenate([other, one])
+    mine = np.zeros(n, bool)
+    mine[rejected] = True
+    # A cut may spoil a neighbor of the cell.
+    blamed = other[mine[one] & (walls[one] == EXACT) & (walls[other] == CUT)]
+    spared = one[mine[one] & (walls[one] == EXACT) & (walls[other] == CUT)]
+    beside = other[mine[one] & (walls[one] == ROUNDED)]
+    mine[spared] = False
+    mine[blamed] = mine[beside] = True
+    walls[mine] = np.minimum(walls[mine] + 1, ROUNDED)
+
+
+def _with_centroids(faces: Faces, n: int) -> Faces:
+    """Return a mesh with the centroids of all cells but the first `n` as generators."""
+    generators = faces.generators.copy()
+    generators[n:] = faces.measures.geometry.centroids[n:]
+    return replace(faces, generators=generators)
 
 
 def diagram_of(faces: Faces) -> Diagram:
@@ -166,15 +239,26 @@ class _Maker:
         See `WallSurface`; -1 for vertices inside.
     """
 
-    def __init__(self, surface: WallSurface, generators: np.ndarray, sizes: np.ndarray, diagram: Diagram) -> None:
+    def __init__(
+        self, surface: WallSurface, generators: np.ndarray, sizes: np.ndarray, diagram: Diagram, walls: np.ndarray
+    ) -> None:
         self.surface = surface
-        self.generators, self.sizes, self.n = generators, sizes, len(generators)
+        self.tree, self.h = scipy.spatial.KDTree(generators), sizes
         f = diagram.faces
-        rows = np.flatnonzero((f.owner < self.n) & (f.neighbor >= 0) & (f.neighbor < self.n))
-        self.owner, self.neighbor = f.owner[rows].astype(np.int64), f.neighbor[rows].astype(np.int64)
-        self.starts, self.corners = take_rows(f.starts, f.corners.astype(np.int64), rows)
-        self.points = np.array(f.points, float)
-        self.tree = scipy.spatial.KDTree(generators)
+        of_diagram = CellFaces(
+            f.owner.astype(np.int64),
+            f.neighbor.astype(np.int64),
+            f.starts,
+            f.corners.astype(np.int64),
+            np.array(f.points, float),
+            np.arange(len(diagram)),
+        )
+        self.cells = cut_at_creases(self.surface, self.tree, sizes, of_diagram, walls == CUT).within(len(generators))
+        self.owner, self.neighbor = self.cells.owner, self.cells.neighbor
+        self.starts, self.corners, self.points = self.cells.starts, self.cells.corners, self.cells.points
+        self.n, home = len(self.cells.home), self.cells.home
+        self.filled, self.rounded = walls[home] >= FILLED, walls[home] == ROUNDED
+        self.generators, self.sizes = generators[home], sizes[home]
 
     def mesh(self) -> SolidMesh:
         """Return the mesh."""
@@ -223,13 +307,17 @@ class _Maker:
         signed = -self._certified(starts, corners, near)
         side = np.full(len(self.points), IN, np.int8)
         self.site = np.full(len(self.points), -1)
+        face = np.repeat(near, np.diff(starts))
+        at_filled = self.filled[self.owner[face]] | self.filled[self.neighbor[face]]
+        free = np.zeros(len(self.points), bool)
+        free[corners[at_filled]] = True
         at_wall = used[signed[used] > -_CERTAIN * h[used]]
         for _ in range(2):
             triangle, foot, signed[at_wall] = self.surface.closest(self.points[at_wall])
             side[at_wall] = sides(signed[at_wall], h[at_wall])
             on = side[at_wall] == WALL
             at = at_wall[on]
-            self.site[at], self.points[at] = self.surface.sites(foot[on], triangle[on], h[at])
+            self.site[at], self.points[at] = self.surface.sites(foot[on], triangle[on], h[at], free[at])
             signed[at] = 0
             # Edges that may leave the solid need true distances of both ends.
             known = np.zeros(len(self.points), bool)
@@ -244,7 +332,12 @@ class _Maker:
         pierced = pierce_edges(
             self.surface, self.points[a], self.points[b], np.stack([signed[a], signed[b]], axis=1), h_edge
         )
-        site, placed = self.surface.sites(pierced.points, pierced.triangles, h_edge[pierced.edge])
+        simple = np.zeros(len(a), bool)
+        simple[edges[at_filled]] = True
+        if simple.any():
+            pierced = simplified(pierced, side[a], side[b], simple)
+        edge = pierced.edge
+        site, placed = self.surface.sites(pierced.points, pierced.triangles, h_edge[edge], simple[edge])
         self.points = np.concatenate([self.points, placed])
         self.site = np.concatenate([self.site, site])
         parts = trim_faces(
@@ -255,12 +348,17 @@ class _Maker:
     def _to_creases(self, parts: TrimmedFaces) -> TrimmedFaces:
         """Put a vertex on the crease between the two ends of a chord that lie on different patches."""
         after = parts.items[following(parts.starts)]
-        chords = np.flatnonzero(parts.chord)
+        face = parts.face[np.repeat(np.arange(len(parts.face)), np.diff(parts.starts))]
+        creased = parts.chord & ~self.rounded[self.owner[face]] & ~self.rounded[self.neighbor[face]]
+        chords = np.flatnonzero(creased)
         one, other = self.site[parts.items[chords]], self.site[after[chords]]
         apart = self.surface.common(one, other)[0] == 0
         chords, one, other = chords[apart], one[apart], other[apart]
         face = parts.face[np.searchsorted(parts.starts, chords, "right") - 1]
-        crossings = cross_cells(self.surface, self.generators, self.tree, self.sizes)
+        crossings = self._crossings()
+        filled = self.filled[crossings.cells].any(axis=1)
+        edge = np.minimum(crossings.edge, len(self.surface.ends) - 1)
+        crossings = crossings.take(~filled | ~self.surface.solid.creases.concave[edge])
         sites = self.surface.n_patches + crossings.edge
         middle = (self.points[parts.items[chords]] + self.points[after[chords]]) / 2
         keys = self.owner[face] * self.n + self.neighbor[face]
@@ -272,6 +370,8 @@ class _Maker:
         left = np.setdiff1d(left, twice)
         h = np.minimum(self.sizes[self.owner[face[left]]], self.sizes[self.neighbor[face[left]]])
         edge, foot = self.surface.nearest_crease(middle[left], h, (one[left], other[left]))
+        filled = self.filled[self.owner[face[left]]] | self.filled[self.neighbor[face[left]]]
+        edge[filled & (edge >= 0) & self.surface.solid.creases.concave[edge]] = -1
         left, edge, foot = left[edge >= 0], edge[edge >= 0], foot[edge >= 0]
         rank[left] = len(sites) + np.arange(len(left))
         first = len(self.points)
@@ -280,6 +380,8 @@ class _Maker:
         found = np.flatnonzero(rank >= 0)
         rows = chords[np.concatenate([found, np.repeat(twice, 2)])]
         taken = np.concatenate([rank[found], np.array(list(pairs.values()), np.int64).ravel()])
+        beside = self._bypassed(parts, crossings, np.setdiff1d(np.flatnonzero(creased), rows), taken)
+        rows, taken = np.concatenate([rows, beside[0]]), np.concatenate([taken, beside[1]])
         order = np.argsort(rows, kind="stable")
         rows, taken = rows[order], taken[order]
         counts = np.diff(parts.starts)
@@ -290,6 +392,15 @@ class _Maker:
             np.insert(parts.items, rows + 1, first + taken),
             np.insert(parts.chord, rows + 1, True),
         )
+
+    def _crossings(self) -> Crossings:
+        """Return where creases cross faces."""
+        found = cross_cells(self.surface, np.asarray(self.tree.data), self.tree, self.h)
+        if not self.cells.cuts:
+            return found
+        chain = self.surface.solid.creases.chain[found.edge]
+        cells = np.stack([self.cells.locate(found.points, column, chain) for column in found.cells.T], axis=1)
+        return joined([replace(found, cells=cells), cross_cuts(self.surface, self.tree, self.h, self.cells)])
 
     def _match(
         self, crossings: Crossings, face: np.ndarray, one: np.ndarray, other: np.ndarray, middle: np.ndarray
@@ -311,6 +422,34 @@ class _Maker:
         first = np.unique(row[order], return_index=True)[1]
         found[row[order[first]]] = which[order[first]]
         return found
+
+    def _bypassed(
+        self, parts: TrimmedFaces, crossings: Crossings, chords: np.ndarray, taken: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return chords that miss a crossing on their face, and the crossing, (k,) each.
+
+        Both ends of such a chord lie on one patch, but between them the face ends on others.
+        """
+        free = np.setdiff1d(np.arange(len(crossings.edge)), taken)
+        face = parts.face[np.searchsorted(parts.starts, chords, "right") - 1]
+        key = self.owner[face] * self.n + self.neighbor[face]
+        order = np.argsort(key, kind="stable")
+        of_crossing = crossings.cells[free, 0] * self.n + crossings.cells[free, 1]
+        low, high = (np.searchsorted(key[order], of_crossing, side) for side in ("left", "right"))
+        which = np.repeat(free, high - low)
+        chord = chords[order[take_ranges(low, high - low, np.arange(len(order)))[1]]]
+        begin, end = parts.items[chord], parts.items[following(parts.starts)[chord]]
+        site = self.surface.n_patches + crossings.edge[which]
+        fits = (self.surface.common(site, self.site[begin])[0] > 0) & (self.surface.common(site, self.site[end])[0] > 0)
+        a, b, x = self.points[begin], self.points[end], crossings.points[which]
+        along = b - a
+        share = ((x - a) * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300)
+        away = np.linalg.norm(x - a - np.clip(share, 0, 1)[:, None] * along, axis=1)
+        far = away > _MISSED * self.sizes[crossings.cells[which, 0]]
+        rows = np.flatnonzero(fits & far)
+        order = rows[np.lexsort((-away[rows], chord[rows]))]
+        first = np.unique(chord[order], return_index=True)[1]
+        return chord[order[first]], which[order[first]]
 
     def _match_twice(
         self, crossings: Crossings, face: np.ndarray, one: np.ndarray, other: np.ndarray
@@ -344,18 +483,27 @@ class _Maker:
         after = np.concatenate([parts.items[following(parts.starts)], corners[following(starts)]])
         cell = np.concatenate([self.owner[faces], self.neighbor[faces]])
         begin, end = np.concatenate([here, after]), np.concatenate([after, here])
+        if self.cells.cuts:  # generators lie in one part of a cell only
+            parts_of = np.unique([c for cut in self.cells.cuts for c in (cut.below, cut.above)])
+            rows = np.flatnonzero(np.isin(cell, parts_of))
+            total = np.zeros((self.n, 3))
+            np.add.at(total, cell[rows], self.points[begin[rows]])
+            parts_of = parts_of[total[parts_of].any(axis=1)]
+            self.generators[parts_of] = total[parts_of] / np.bincount(cell[rows], minlength=self.n)[parts_of, None]
         mine = is_open[cell]
         cell, begin, end = open_sides(cell[mine], begin[mine], end[mine])
         label = self._labels(cell, begin, end)
         order, starts = chain_loops(cell, begin, end, label)
         cell, begin, label = cell[order], begin[order], label[order]
+        label = self._joined_runs(cell, begin, end[order], label, starts)
         corner_vertex: dict[int, int] = {}
         taken = self.site[begin] - self.surface.first_corner
         for vertex, c in zip(begin[taken >= 0].tolist(), taken[taken >= 0].tolist(), strict=True):
             corner_vertex[c] = vertex
         corners_of: dict[int, list[int]] = {}
-        for c, i in enumerate(nearest(self.tree, self.surface.corners)[1].tolist()):
-            if c not in corner_vertex:
+        cells = self.cells.locate(self.surface.corners, nearest(self.tree, self.surface.corners)[1])
+        for c, i in enumerate(cells.tolist()):
+            if c not in corner_vertex and not self.filled[i]:
                 corners_of.setdefault(i, []).append(c)
         new_points: list[np.ndarray] = []
 
@@ -367,14 +515,44 @@ class _Maker:
 
         divider = Divider(self.surface, corners_of, vertex_of)
         uniform = np.minimum.reduceat(label, starts[:-1]) == np.maximum.reduceat(label, starts[:-1])
-        self.plain = take_rows(starts, begin, np.flatnonzero(uniform))
-        self.plain_cell, self.plain_patch = cell[starts[:-1][uniform]], label[starts[:-1][uniform]]
+        self.whole = take_rows(starts, begin, np.flatnonzero(uniform))
+        self.whole_cell, self.whole_patch = cell[starts[:-1][uniform]], label[starts[:-1][uniform]]
         for k in np.flatnonzero(~uniform).tolist():
             s = slice(starts[k], starts[k + 1])
             divider.divide(int(cell[starts[k]]), begin[s].tolist(), label[s].tolist())
         if new_points:
             self.points = np.concatenate([self.points, new_points])
         return divider
+
+    def _joined_runs(
+        self, cell: np.ndarray, begin: np.ndarray, end: np.ndarray, label: np.ndarray, starts: np.ndarray
+    ) -> np.ndarray:
+        """Return the labels of the sides of loops; in filled and rounded cells runs are joined without a crease between.
+
+        A run is joined with the longest neighbor that no convex crease parts from it.
+        """
+        label = label.copy()
+        convex = np.zeros(self.surface.first_corner + len(self.surface.corners), bool)
+        convex[self.surface.n_patches : self.surface.first_corner] = ~self.surface.solid.creases.concave
+        convex[self.surface.first_corner :] = True
+        for k in np.flatnonzero(self.filled[cell[starts[:-1]]]).tolist():
+            s = slice(starts[k], starts[k + 1])
+            sides = label[s]
+            length = np.linalg.norm(self.points[end[s]] - self.points[begin[s]], axis=1)
+            real = convex[self.site[begin[s]]] & ~self.rounded[cell[starts[k]]]
+            while True:
+                cuts = np.flatnonzero(sides != np.roll(sides, 1))
+                open_ = cuts[~real[cuts]]
+                if not len(open_):
+                    break
+                run = np.cumsum(sides != np.roll(sides, 1)) % max(len(cuts), 1)
+                total = np.bincount(run, length, minlength=max(len(cuts), 1))
+                pair = [(total[run[c - 1]], total[run[c]], c) for c in open_.tolist()]
+                before, after, c = min(pair, key=lambda p: min(p[:2]))
+                small, large = (c - 1, c) if before < after else (c, c - 1)
+                sides[run == run[small]] = sides[large]
+            label[s] = sides
+        return label
 
     def _labels(self, cell: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Return the patch of each side at a wall: that of both ends, or the nearest to its middle."""
@@ -397,10 +575,10 @@ class _Maker:
         counts = np.concatenate([np.diff(starts), np.diff(parts.starts)])
         items = np.concatenate([corners, parts.items])
         p = divider.polygons
-        wall_counts = np.concatenate([np.diff(self.plain[0]), [len(loop) for loop in p.loops]]).astype(np.int64)
-        wall_items = np.concatenate([self.plain[1], np.array([v for loop in p.loops for v in loop], np.int64)])
-        wall_owner = np.concatenate([self.plain_cell, np.array(p.cell, np.int64)])
-        wall_patch = np.concatenate([self.plain_patch, np.array(p.patch, np.int64)])
+        wall_counts = np.concatenate([np.diff(self.whole[0]), [len(loop) for loop in p.loops]]).astype(np.int64)
+        wall_items = np.concatenate([self.whole[1], np.array([v for loop in p.loops for v in loop], np.int64)])
+        wall_owner = np.concatenate([self.whole_cell, np.array(p.cell, np.int64)])
+        wall_patch = np.concatenate([self.whole_patch, np.array(p.patch, np.int64)])
         inner = np.lexsort((neighbor, owner))
         walls = np.lexsort((wall_owner, wall_patch))
         one = take_rows(np.concatenate([[0], np.cumsum(counts)]), items, inner)
@@ -408,9 +586,14 @@ class _Maker:
         f = len(inner) + len(walls)
         owner = np.concatenate([owner[inner], wall_owner[walls]])
         neighbor = np.concatenate([neighbor[inner], -1 - wall_patch[walls]])
+        seen = np.bincount(owner, minlength=self.n) + np.bincount(neighbor[neighbor >= 0], minlength=self.n) > 0
+        number = np.cumsum(seen) - 1
+        owner, neighbor = number[owner], np.where(neighbor >= 0, number[np.maximum(neighbor, 0)], neighbor)
+        home, own = self.cells.home[seen], np.flatnonzero(seen) < len(self.h)
+        generators = np.where(own[:, None], np.asarray(self.tree.data)[home], self.generators[seen])
         faces = Faces(
             domain=self.surface.solid,
-            generators=self.generators,
+            generators=generators,
             points=self.points,
             starts=np.concatenate([one[0], one[0][-1] + two[0][1:]]),
             corners=np.concatenate([one[1], two[1]]).astype(np.int32),
@@ -420,5 +603,5 @@ class _Maker:
             shift=np.zeros((f, 3), np.int8),
             half_face=np.full(f, -1),
         ).compact()
-        seen = np.bincount(owner, minlength=self.n) + np.bincount(neighbor[neighbor >= 0], minlength=self.n)
-        return SolidMesh(faces, np.unique(np.array(p.odd, np.int64)), np.flatnonzero(seen == 0))
+        odd = number[np.unique(np.array(p.odd, np.int64))]
+        return SolidMesh(faces, home, odd, np.flatnonzero(~seen[: len(self.h)]))

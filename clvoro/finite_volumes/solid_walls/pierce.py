@@ -86,6 +86,40 @@ def pierce_edges(
     return PiercedEdges(starts, ends, first, row[order], points[order], tri[order])
 
 
+def simplified(pierced: PiercedEdges, a: np.ndarray, b: np.ndarray, simple: np.ndarray) -> PiercedEdges:
+    """Return the parts of edges with at most one piercing of each edge that is `simple` (e,).
+
+    Of an edge between the sides IN and OUT, `a` and `b` (e,), the part beside its end inside is kept. What the surface
+    cuts out of an edge with both ends inside is ignored, as is what is inside between two ends outside.
+    """
+    first, count = pierced.first[:-1], np.diff(pierced.first)
+    leaves, enters = simple & (a == IN) & (b == OUT), simple & (a == OUT) & (b == IN)
+    number = np.arange(len(pierced.edge)) - first[pierced.edge]
+    kept = ~simple[pierced.edge] | leaves[pierced.edge] & (number == 0)
+    kept |= enters[pierced.edge] & (number == count[pierced.edge] - 1)
+    starts, ends = pierced.starts_inside.copy(), pierced.ends_inside.copy()
+    starts[simple & (a != WALL)], ends[simple & (b != WALL)] = (
+        (a == IN)[simple & (a != WALL)],
+        (b == IN)[simple & (b != WALL)],
+    )
+    along = simple & ~leaves & ~enters
+    one = along & (a == WALL) & (b != WALL)
+    starts[one] = ends[one]
+    one = along & (b == WALL) & (a != WALL)
+    ends[one] = starts[one]
+    both = along & (a == WALL) & (b == WALL)
+    starts[both] = ends[both] = (starts & ends)[both]
+    edge = pierced.edge[kept]
+    return PiercedEdges(
+        starts,
+        ends,
+        np.concatenate([[0], np.cumsum(np.bincount(edge, minlength=len(a)))]),
+        edge,
+        pierced.points[kept],
+        pierced.triangles[kept],
+    )
+
+
 def _sample(
     surface: WallSurface, a: np.ndarray, b: np.ndarray, distances: np.ndarray, h: np.ndarray, length: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

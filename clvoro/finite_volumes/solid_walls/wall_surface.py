@@ -94,17 +94,22 @@ class WallSurface:
         edge[who[order[first]]], foot[who[order[first]]] = item[order[first]], there[order[first]]
         return edge, foot
 
-    def sites(self, points: np.ndarray, triangles: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def sites(
+        self, points: np.ndarray, triangles: np.ndarray, h: np.ndarray, free: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the sites (k,) of wall vertices at `points` (k, 3) on `triangles`, and where they lie there (k, 3).
 
-        A corner is the site of one vertex only: the nearest.
+        A corner is the site of one vertex only: the nearest. The vertices `free` (k,) are not moved to concave creases
+        and to corners.
         """
         site = self.patch[triangles].astype(np.int64)
         edge, foot = self.nearest_crease(points, SNAP_CREASE * h)
+        loose = free & (edge >= 0) & self.solid.creases.concave[edge] if len(self.ends) else free
+        foot[loose], edge[loose] = points[loose], -1
         site[edge >= 0] = self.n_patches + edge[edge >= 0]
         if len(self.corners) and len(points):
             far, corner = nearest(self._corner_tree, points)
-            rows = np.flatnonzero(far <= SNAP_CORNER * h)
+            rows = np.flatnonzero((far <= SNAP_CORNER * h) & ~free)
             rows = rows[np.argsort(far[rows], kind="stable")]
             rows = rows[np.unique(corner[rows], return_index=True)[1]]
             site[rows], foot[rows] = self.first_corner + corner[rows], self.corners[corner[rows]]

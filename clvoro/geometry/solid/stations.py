@@ -268,7 +268,9 @@ class _AroundCreases:
         for i, j in self.near_pairs():
             if keep[i] and keep[j]:
                 keep[j] = False
-        self.lost = np.unique(self.spots[~keep], axis=0)
+        # Without one of them, faces between the others may lie in a wall beyond the crease: all leave together.
+        self.lost, spot = np.unique(self.spots[~keep], axis=0), np.unique(self.spots, axis=0, return_inverse=True)[1]
+        keep &= ~np.isin(spot, spot[~keep])
         self.keep(keep)
 
     def complete(self) -> None:
@@ -306,13 +308,13 @@ class _AroundCreases:
 
     def stations(self) -> Stations:
         """Return what has been placed."""
-        radii = _CLEAR * np.array(self.radii)
+        used, balls = np.unique([ball for balls in self.balls for ball in balls], return_inverse=True)
         return Stations(
             self.points,
-            np.reshape(self.centers, (-1, 3)),
-            radii,
+            np.reshape(self.centers, (-1, 3))[used.astype(int)],
+            _CLEAR * np.array(self.radii)[used.astype(int)],
             np.cumsum([0, *map(len, self.balls)]).astype(np.int32),
-            np.array([ball for balls in self.balls for ball in balls], np.int32),
+            balls.astype(np.int32),
             self.lost,
             self.sizes,
             self.chains,
