@@ -453,10 +453,9 @@ class Run:
             frame = mesh.domain.frame
             generators = frame[0] + frame[1] * mesh.to_host(mesh.points)[:, :3]
             diagram = mesh.fetch_diagram()
-            # Cells may have been cut along creases, and generators in thin places may have none.
-            home = np.asarray(scipy.spatial.KDTree(generators).query(diagram.points)[1])
-            own = np.zeros(len(home), bool)
-            own[np.unique(home, return_index=True)[1]] = True
+            # Cells may have been cut along creases: further parts come last. Generators in thin places may have none.
+            away, home = scipy.spatial.KDTree(generators).query(diagram.points)
+            own = away < 1e-9 * frame[1]
             size, origin, fixed = size[home], np.where(own, origin[home], -1), fixed[home[own & (home < len(fixed))]]
             error, quality = self._measured_again(diagram, size)
         else:
@@ -487,7 +486,7 @@ class Run:
         length = np.cbrt(diagram.volumes)
         error = (length - size) / np.minimum(length, size)
         quality = cell_quality(diagram, np.add.reduceat(diagram.face_measures, diagram.neighbor_starts[:-1]))
-        for name, value in figures(error, quality).items():
+        for name, value in {"cells": len(diagram), **figures(error, quality)}.items():
             self.rows[-1][name] = value
         return error, quality
 

@@ -227,7 +227,7 @@ def concave_pairs(
         One face of a pair is changed.
     """
     found = [np.zeros((2, 0), np.int64)]
-    normals = areas / lengths(areas)
+    normals = areas / np.maximum(lengths(areas), 1e-300)
     counts = np.diff(starts)
     wide = -(counts // -4) * 4  # cells are compared together that have about as many faces
     for k in distinct(wide).tolist():

@@ -7,6 +7,7 @@ walls. The vertices of the diagram decide: all cells that a crease cuts see the 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -77,7 +78,7 @@ class Bisecting:
 
 
 @dataclass(frozen=True)
-class Cut:
+class CreaseCut:
     """A cell that is cut by a surface into a part below and one above; one of them keeps the number of the cell."""
 
     cell: int
@@ -98,7 +99,7 @@ class CellFaces:
     points : (v, 3) float
     home : (n,) int
         Of each cell the cell of the diagram that it is a part of.
-    cuts : list of Cut
+    cuts : list of CreaseCut
     """
 
     owner: np.ndarray
@@ -107,7 +108,7 @@ class CellFaces:
     corners: np.ndarray
     points: np.ndarray
     home: np.ndarray
-    cuts: tuple[Cut, ...] = ()
+    cuts: tuple[CreaseCut, ...] = ()
 
     def locate(self, points: np.ndarray, cell: np.ndarray, chain: np.ndarray | None = None) -> np.ndarray:
         """Return the part of the cell of the diagram `cell` (k,) in which each of `points` (k, 3) lies, (k,).
@@ -137,7 +138,10 @@ class CellFaces:
             starts=starts,
             corners=corners,
             home=self.home[inner[:-1]],
-            cuts=tuple(Cut(*(int(number[c]) for c in (cut.cell, cut.below, cut.above)), cut.by) for cut in self.cuts),
+            cuts=tuple(
+                replace(cut, **{name: int(number[getattr(cut, name)]) for name in ("cell", "below", "above")})
+                for cut in self.cuts
+            ),
         )
 
 
@@ -223,7 +227,7 @@ class _Cutter:
         while cells:
             try:
                 return self._cut(cells, by)
-            except _NotTwoParts as odd:
+            except _UncutError as odd:
                 cells = [c for c in cells if c not in odd.cells]
         return self.faces
 
@@ -270,7 +274,7 @@ class _Cutter:
             m = len(full)
             ends = [k for k in range(m) if side[k] == 0 and side[k - 1] * side[(k + 1) % m] < 0]
             if len(ends) != 2 or any(side[k] * side[k - 1] < 0 for k in range(m)):
-                raise _NotTwoParts({i, j} & above.keys())
+                raise _UncutError({i, j} & above.keys())
             p, q = ends
             one, other = full[p : q + 1], full[q:] + full[: p + 1]  # both from end to end
             if side[(p + 1) % m] < 0:
@@ -296,11 +300,11 @@ class _Cutter:
             line = [one[-1], *middle, one[0]]
             for c, way in ((i, line), (j, line[::-1])):
                 if c in above:
-                    borders[c] += list(zip(way[:-1], way[1:], strict=True))
+                    borders[c] += itertools.pairwise(way)
         for c in cells:
             loop = _closed(borders[c])
             if loop is None:
-                raise _NotTwoParts({c})
+                raise _UncutError({c})
             owner.append(below[c])
             neighbor.append(above[c])
             made.append(loop)
@@ -323,7 +327,7 @@ class _Cutter:
             corners=np.concatenate([corners, [a for loop in made for a in loop]]).astype(np.int64),
             points=np.concatenate([position, np.reshape(extra, (-1, 3))]),
             home=np.append(f.home, f.home[cells]),
-            cuts=(*f.cuts, *(Cut(c, below[c], above[c], by) for c in cells)),
+            cuts=(*f.cuts, *(CreaseCut(c, below[c], above[c], by) for c in cells)),
         )
 
     def _sides(self, rows: np.ndarray, loops: list[list[int]], by: Bisecting) -> dict[int, tuple[int, float]]:
@@ -373,7 +377,7 @@ class _Cutter:
         return owner, neighbor, loops
 
 
-class _NotTwoParts(Exception):
+class _UncutError(Exception):
     """A surface does not cut these cells into two parts."""
 
     def __init__(self, cells: set[int]) -> None:

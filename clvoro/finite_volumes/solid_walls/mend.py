@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...mesh.connectivity import take_rows
 from ...mesh.faces import Faces
 from ...mesh.geometry import loop_geometry
 from ..defects import DefectLimits, concave_pairs
@@ -127,3 +128,32 @@ def _best_halves(x: np.ndarray, centers: np.ndarray, normals: np.ndarray, middle
             if cosine.max() < best:
                 best, found = float(cosine.max()), (a, b)
     return found
+
+
+def without_cells(faces: Faces, cells: np.ndarray) -> Faces:
+    """Return the mesh without some small cells (k,) at walls: their faces to others become walls in their place."""
+    k = faces.n_inner
+    gone = np.zeros(faces.n_cells, bool)
+    gone[cells] = True
+    wall = np.full(faces.n_cells, -1)
+    by_area = k + np.argsort(faces.area[k:], kind="stable")
+    wall[faces.owner[by_area]] = faces.neighbor[by_area]
+    one, other = gone[faces.owner], gone[np.maximum(faces.neighbor, 0)] & (faces.neighbor >= 0)
+    rows = np.flatnonzero(~(one & (other | (faces.neighbor < 0))))
+    turned = one[rows]
+    own, there = faces.owner[rows], faces.neighbor[rows]
+    owner = np.where(turned, there, own)
+    neighbor = np.where(turned | other[rows], wall[np.where(turned, own, there)], there)
+    number = np.cumsum(~gone) - 1
+    owner, inner = number[owner], neighbor >= 0
+    neighbor = np.where(inner, number[np.maximum(neighbor, 0)], neighbor)
+    order = np.lexsort((np.where(inner, neighbor, owner), np.where(inner, owner, -neighbor), ~inner))
+    starts, corners = take_rows(faces.starts, faces.corners, rows[order], turned[order])
+    return faces.take_faces(
+        rows[order],
+        generators=faces.generators[~gone],
+        owner=owner[order].astype(np.int32),
+        neighbor=neighbor[order].astype(np.int32),
+        starts=starts,
+        corners=corners,
+    ).compact()

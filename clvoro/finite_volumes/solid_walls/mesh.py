@@ -16,7 +16,7 @@ from ...mesh.faces import Faces
 from ..collapse import collapse_short
 from .chains import Crossings, cross_cells, joined
 from .cutting import CellFaces, cross_cuts, cut_at_creases
-from .mend import narrow_faces, rejected_at_walls, split_walls
+from .mend import narrow_faces, rejected_at_walls, split_walls, without_cells
 from .pierce import IN, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
 from .trimmed_faces import TrimmedFaces, trim_faces
@@ -31,6 +31,8 @@ _CLEAR = 1.4
 EXACT, CUT, FILLED, ROUNDED = range(4)
 """How the walls of a cell are made: with all creases; with cuts along concave creases; without concave creases; without
 creases. Each next one makes more cells convex, and leaves out more of the surface."""
+_SLIVER = 0.05
+"""Rejected cells at walls with a smaller volume over h^3 are left out."""
 _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE = 3
@@ -114,51 +116,60 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
     Warns
     -----
     MismatchWarning
-        If cells are concave.
+        If generators have no cell, cells are cut, leave out creases, or are concave: how many, and the first place.
     """
     walls = np.full(len(points), EXACT, np.int8)
-    best: tuple[int, SolidMesh, Faces, np.ndarray] | None = None
+    best: tuple[int, Faces, np.ndarray, np.ndarray, np.ndarray] | None = None
     since = 0
     while since < _PATIENCE:
-        made = _Maker(surface, points, sizes, whole, walls).mesh()
-        if len(made.lost) > _FEW * len(points):
-            place = format_point(points[made.lost[0]])
-            raise InputError(
-                f"{surface.solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first "
-                f"at {place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
-            )
-        diagram = diagram_of(made.faces)
-        faces = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes[made.home]))
+        faces, home = _made(surface, points, sizes, whole, walls)
         rejected = rejected_at_walls(faces)
-        if len(rejected):
-            faces = split_walls(faces, rejected)
-            rejected = rejected_at_walls(faces)
         since += 1
         if best is None or len(rejected) < best[0]:
-            best, since = (len(rejected), made, faces, rejected), 0
+            best, since = (len(rejected), faces, home, rejected, walls.copy()), 0
         if not len(rejected):
             break
-        _simplify(walls, whole.faces, np.unique(made.home[rejected]))
+        _simplify(walls, whole.faces, np.unique(home[rejected]))
     assert best is not None
-    _, made, faces, rejected = best
-    n = len(points) - len(made.lost)
-    if len(made.home) > n:
-        faces = _with_centroids(faces, n)
-    diagram = diagram_of(faces)
-    if len(made.lost):
-        warn(
-            f"{len(made.lost)} generators have no cell, the first at {format_point(points[made.lost[0]])}: the solid "
-            "is thinner than a cell there, and this part of it is left out; use smaller sizes there",
-            MismatchWarning,
+    _, faces, home, rejected, walls = best
+    lost = np.setdiff1d(np.arange(len(points)), home)
+    own = len(points) - len(lost)
+    if len(home) > own:
+        generators = faces.generators.copy()
+        generators[own:] = faces.measures.geometry.centroids[own:]
+        faces = replace(faces, generators=generators)
+    left_out = np.flatnonzero(walls >= FILLED)
+    for rows, text in (
+        (points[lost], "generators at {} have no cell: the solid is thinner than a cell, which is left out"),
+        (points[home[own:]], "cells at {} are parts of others, cut where a concave crease passes through them"),
+        (points[left_out], "cells at {} leave out creases or corners, of which several meet within a cell"),
+        (faces.generators[rejected], "cells at {} are concave or inverted, and OpenFOAM does not accept them"),
+    ):
+        if len(rows):
+            place = format_point(rows[0]) + (" and elsewhere" if len(rows) > 1 else "")
+            warn(f"{len(rows)} {text.format(place)}; use smaller sizes there", MismatchWarning)
+    return diagram_of(faces)
+
+
+def _made(
+    surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Diagram, walls: np.ndarray
+) -> tuple[Faces, np.ndarray]:
+    """Return the mesh without short edges and slivers, and the generator of each cell; see `SolidMesh.home`."""
+    made = _Maker(surface, points, sizes, whole, walls).mesh()
+    if len(made.lost) > _FEW * len(points):
+        place = format_point(points[made.lost[0]])
+        raise InputError(
+            f"{surface.solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first "
+            f"at {place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
         )
-    if len(rejected):
-        warn(
-            f"{len(rejected)} cells at walls are concave or inverted, the first at "
-            f"{format_point(faces.generators[rejected[0]])}: the walls bend or meet within a cell there, and OpenFOAM "
-            "does not accept it; use smaller sizes there",
-            MismatchWarning,
-        )
-    return diagram
+    home, diagram = made.home, diagram_of(made.faces)
+    faces = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes[home]))
+    rejected = rejected_at_walls(faces)
+    slivers = rejected[faces.volumes[rejected] < _SLIVER * sizes[home[rejected]] ** 3]
+    if len(slivers):
+        faces, home = without_cells(faces, slivers), np.delete(home, slivers)
+        rejected = rejected_at_walls(faces)
+    return split_walls(faces, rejected) if len(rejected) else faces, home
 
 
 def _simplify(walls: np.ndarray, faces: Faces, rejected: np.ndarray) -> None:
@@ -185,13 +196,6 @@ def _simplify(walls: np.ndarray, faces: Faces, rejected: np.ndarray) -> None:
     mine[spared] = False
     mine[blamed] = mine[beside] = True
     walls[mine] = np.minimum(walls[mine] + 1, ROUNDED)
-
-
-def _with_centroids(faces: Faces, n: int) -> Faces:
-    """Return a mesh with the centroids of all cells but the first `n` as generators."""
-    generators = faces.generators.copy()
-    generators[n:] = faces.measures.geometry.centroids[n:]
-    return replace(faces, generators=generators)
 
 
 def diagram_of(faces: Faces) -> Diagram:
@@ -527,7 +531,7 @@ class _Maker:
     def _joined_runs(
         self, cell: np.ndarray, begin: np.ndarray, end: np.ndarray, label: np.ndarray, starts: np.ndarray
     ) -> np.ndarray:
-        """Return the labels of the sides of loops; in filled and rounded cells runs are joined without a crease between.
+        """Return the labels of the sides of loops; in cells without creases runs of sides are joined.
 
         A run is joined with the longest neighbor that no convex crease parts from it.
         """

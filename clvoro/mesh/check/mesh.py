@@ -445,9 +445,13 @@ def check_solid(check: Check, g: Rebuilt) -> None:
     inner[corners] = False
     kept = np.flatnonzero(inner[g.corners])
     x, own = d.vertices[g.corners[kept]], g.cells[kept]
-    near = scipy.spatial.KDTree(d.points).query(x)[0]
+    # Parts of cells that have been cut come last, with their centroids as generators.
+    whole = np.flatnonzero(np.linalg.norm(d.points - d.centroids, axis=1) > slack)
+    n = int(whole[-1]) + 1 if whole.size else len(d)
+    tree, home = scipy.spatial.KDTree(d.points[:n]), np.arange(len(d))
+    home[n:] = tree.query(d.points[n:])[1]
     size = np.cbrt(np.maximum(d.volumes, 0))
-    beyond = np.linalg.norm(x - d.points[own], axis=1) - near - MOVED * size[own]
+    beyond = np.linalg.norm(x - d.points[home[own]], axis=1) - tree.query(x)[0] - MOVED * size[home[own]]
     check.note(
         "nearest generators",
         np.maximum(beyond, 0),
