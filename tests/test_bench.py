@@ -68,6 +68,11 @@ def test_peers():
 
 
 @pytest.mark.slow
+def test_faults():
+    assert all(r["right"] for r in records("faults.py", "--only", "dangle,pieces,units,tile"))
+
+
+@pytest.mark.slow
 def test_restart():
     cold, *moved = records("restart.py", "--moves", "2")
     assert cold["steps"] > 100
