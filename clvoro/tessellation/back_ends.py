@@ -7,7 +7,8 @@ lanes    Eight cells at a time in the lanes of a CPU's vectors (`cl_kernels/simd
 teams    In 3D a team of work-items for each cell: on NVIDIA's GPUs, without weights.
 =======  ==========================================================================================================
 
-In 2D all give the same bits. In 3D teams have those of scalar; lanes differ by round-off.
+In 2D all give the same bits. In 3D teams have those of scalar. Lanes have the same graph, but sum over the vertices of
+a cell in the order in which they trace them, as updates do, not that in which scalar clips.
 """
 
 from __future__ import annotations
