@@ -428,7 +428,7 @@ class Job:
                 f"{s['seconds']:9.2f}  {s['stop_reason']}"
             )
         if build_seconds() > 2:
-            print(f"{build_seconds():.1f} of these seconds built kernels, which the driver keeps for later runs")
+            print(f"building kernels took {build_seconds():.1f} s; the driver keeps them for later runs")
         for name, result in results.items():
             for said in (result.scaling, result.settings.get("widths")):
                 if said:
