@@ -48,6 +48,9 @@ class Diagram(MeshOutput):
     holes, and then has several loops of faces. It may share several faces with one neighbor, which its row then lists
     several times.
 
+    In a solid the rows are those of the generators that have a cell, in their order. Then follow further parts of cells
+    that are cut along concave creases, each with its centroid in place of a generator.
+
     Attributes
     ----------
     domain : Box, Polygon, Sphere, Solid, SphereRegion or Subdomain

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import clvoro
+from clvoro.finite_volumes.solid_walls.mend import _best_halves, without_cells
 from clvoro.finite_volumes.solid_walls.mesh import diagram_of, outer_generators, solid_diagram, solid_mesh
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
 from clvoro.mesh.connectivity import following
@@ -140,3 +141,33 @@ def test_a_cell_with_a_concave_crease_is_cut(ctx):
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=1e-9)
     assert np.array_equal(d.points[: len(x)], x)
     assert len(d) > len(x)
+
+
+def test_a_crease_that_cannot_be_followed_is_left_out(ctx):
+    """Where one generator beside the crease is missing, faces of the others lie in a wall."""
+    solid = el()
+    x = generators(solid)
+    x = np.delete(x, np.linalg.norm(x - (1 + H / 2, 1 - H / 2, 0.5), axis=1).argmin(), axis=0)
+    h = np.full(len(x), H)
+    with pytest.warns(clvoro.errors.MismatchWarning, match="leave out creases"):
+        d = solid_diagram(WallSurface(solid), x, h, whole_diagram(ctx, solid, x, h))
+    assert d.check("openfoam")
+    assert d.volumes.sum() == pytest.approx(solid.measure, rel=0.01)
+
+
+def test_cells_that_are_left_out_become_walls(made):
+    """All other cells stay closed, and lose no face."""
+    _, faces = made
+    cell = int(faces.owner[faces.n_inner])
+    left = without_cells(faces, np.array([cell]))
+    cells, begin, end = sides_of_cells(left)
+    there, back = (np.stack([cells, *ends], axis=1) for ends in ((begin, end), (end, begin)))
+    assert np.array_equal(np.unique(there, axis=0), np.unique(back, axis=0))
+    assert np.allclose(left.volumes, np.delete(faces.volumes, cell), rtol=1e-9)
+    assert left.n_inner == faces.n_inner - (faces.owner[: faces.n_inner] == cell).sum() - (faces.neighbor == cell).sum()
+
+
+def test_a_bent_wall_polygon_is_split_along_its_bend():
+    bent = np.array([(0, 0, 0), (1, 0, 0), (2, 0, -0.5), (2, 1, -0.5), (1, 1, 0), (0, 1, 0)], float)
+    floor = np.array([(1, 0.5, -2)], float)
+    assert _best_halves(bent, floor, np.array([(0, 0, -1.0)]), np.array([1, 0.5, -1.0])) == (1, 4)
