@@ -1,4 +1,4 @@
-"""Cases of OpenFOAM in plane domains: write them, run them, and read their results."""
+"""Cases of OpenFOAM: write them, run them, and read their results."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from clvoro.io.foam_read import FoamFile
+from clvoro.mesh.geometry import cell_geometry, face_geometry
 
 HOME = "/usr/share/openfoam"  # of Debian's package
 NUMBER = r"[-+.e\d]+"
@@ -38,10 +41,11 @@ def header(kind: str, name: str) -> str:
 
 
 def nonuniform(values: np.ndarray) -> str:
-    """Write a field of scalars (n,), or of vectors from their components x and y, (n, 2)."""
+    """Write a field of scalars (n,), or of vectors (n, 3), or from their components x and y, (n, 2)."""
     if values.ndim == 1:
         return f"nonuniform List<scalar> {len(values)}({' '.join(map(repr, values.tolist()))})"
-    rows = " ".join(f"({x!r} {y!r} 0)" for x, y in values.tolist())
+    values = np.pad(values, ((0, 0), (0, 3 - values.shape[1])))
+    rows = " ".join(f"({x!r} {y!r} {z!r})" for x, y, z in values.tolist())
     return f"nonuniform List<vector> {len(values)}({rows})"
 
 
@@ -84,6 +88,41 @@ class PlaneMesh:
         """Return the ends of each face of `patch` in the plane, (n, 2, 2)."""
         faces = (self._points[face] for face in self._faces[self.patches[patch]])
         return np.array([face[face[:, 2] < face[:, 2].mean(), :2] for face in faces])
+
+
+class SpaceMesh:
+    """A polyMesh in space, as OpenFOAM measures it.
+
+    Attributes
+    ----------
+    centroids, volumes : (n, 3), (n,) float
+    centers, areas : (f, 3) float
+    owner, inside : (f,), (k,) int
+        Cells of each face, and behind the first faces.
+    patches : dict of str to (k,) int
+        The faces of each patch.
+    """
+
+    def __init__(self, case: Path) -> None:
+        folder = case / "constant" / "polyMesh"
+        points, (starts, corners) = FoamFile.read(folder, "points").vectors(), FoamFile.read(folder, "faces").rows()
+        self.owner, inside = FoamFile.read(folder, "owner").labels(), FoamFile.read(folder, "neighbour").labels()
+        self.patches = {patch.name: patch.faces for patch in FoamFile.read(folder, "boundary").patches()}
+        self.centers, self.areas = face_geometry(points, starts, corners)
+        self.inside, n = inside, int(self.owner.max()) + 1
+        self.centroids, self.volumes = cell_geometry(self.centers, self.areas, self.owner, inside, n)
+
+    def velocity(self, flux: np.ndarray) -> np.ndarray:
+        """Return the velocity (n, 3) that fits the `flux` (f,) through the faces of each cell best.
+
+        That is the sum of S S / |S|, inverted, times the sum of S / |S| times the flux.
+        """
+        unit = self.areas / np.linalg.norm(self.areas, axis=1)[:, None]
+        cell, face = np.concatenate([self.owner, self.inside]), np.r_[: len(self.owner), : len(self.inside)]
+        matrix, right = np.zeros((len(self.volumes), 3, 3)), np.zeros((len(self.volumes), 3, 1))
+        np.add.at(matrix, cell, (self.areas[:, :, None] * unit[:, None])[face])
+        np.add.at(right, cell, (unit * flux[:, None])[face][:, :, None])
+        return np.linalg.solve(matrix, right)[:, :, 0]
 
 
 def _centroid(polygon: np.ndarray) -> np.ndarray:
@@ -166,7 +205,7 @@ class Case:
         """Write the dictionary or field `name`, such as "system/controlDict" or "0/U"."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        kinds = {"0/U": "volVectorField", "0/p": "volScalarField"}
+        kinds = {"0/U": "volVectorField", "0/p": "volScalarField", "0/Phi": "volScalarField"}
         path.write_text(header(kinds.get(name, "dictionary"), path.name) + text_of(entries))
 
     def run(self, program: str, *options: str) -> str:
@@ -193,10 +232,10 @@ class Case:
         rows = np.array([line.split() for line in lines if not line.startswith("#")], float)
         return dict(zip(heads[-1], rows.T, strict=True))
 
-    def field(self, name: str) -> np.ndarray:
-        """Return the values of a field in cells at the last time, (n,), or (n, 2) of a vector."""
+    def field(self, name: str, dim: int = 2) -> np.ndarray:
+        """Return the values of a field in cells at the last time, (n,), or the first `dim` components of a vector."""
         times = [p for p in self.folder.iterdir() if re.fullmatch(r"[\d.]+", p.name)]
         text = (max(times, key=lambda p: float(p.name)) / name).read_text()
         text = text[text.index("internalField") : text.index("boundaryField")]
         values = np.array(re.sub(r"[()]", " ", text[text.index("(") : text.rindex(")")]).split())
-        return values.astype(float) if "<scalar>" in text else values.astype(float).reshape(-1, 3)[:, :2]
+        return values.astype(float) if "<scalar>" in text else values.astype(float).reshape(-1, 3)[:, :dim]
