@@ -331,7 +331,7 @@ class Caps(Field):
         for k, region in enumerate(regions):
             if not isinstance(region, (tuple, list)) or len(region) != 3:
                 raise InputTypeError(f"Caps regions[{k}] is {region!r}, expected ((longitude, latitude), radius, size)")
-            center = self.sphere.positions([region[0]])[0] / self.sphere.radius
+            center = self.sphere.positions([region[0]])[0] / self.sphere.radius  # type: ignore[list-item]
             radius = check_number(f"Caps regions[{k}] radius", region[1], least=0)
             rows.append([*center, radius, check_positive(f"Caps regions[{k}] size", region[2])])
         if not rows:

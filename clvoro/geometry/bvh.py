@@ -148,7 +148,7 @@ class Tree:
         who, node = np.arange(len(low)), np.zeros(len(low), np.int64)
         for level in range(self.levels + 1):
             box = self.boxes[node + (1 << level) - 1]
-            meet: np.ndarray = ((box[:, :d] <= high[who]) & (low[who] <= box[:, d:])).all(axis=1)
+            meet = np.asarray(((box[:, :d] <= high[who]) & (low[who] <= box[:, d:])).all(axis=1))
             who, node = self._below(level, who, node, meet)
         who, item = self._items(who, node)
         order = np.lexsort((item, who))

@@ -181,7 +181,8 @@ class Domain(ClipBox):
     def region(self) -> Any:
         """The domain as a closed shape: of shapely in the plane, a `Surface` in 3D; None on spheres."""
         if self.dim == 2:
-            return shapely.box(*self.lower, *self.upper)
+            (a, b), (c, d) = self.lower, self.upper
+            return shapely.box(a, b, c, d)
         return box_surface(np.array(self.lower), np.array(self.upper))
 
     def same_surface(self, other: Domain) -> bool:

@@ -121,7 +121,7 @@ class Sphere(Domain):
         """2: cells have areas."""
         return 2
 
-    region = None
+    region = None  # type: ignore[assignment]
 
     @property
     def map_domain(self) -> Domain:

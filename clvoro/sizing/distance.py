@@ -85,7 +85,7 @@ class Distance(Field):
                 f"Distance got shapes {shapes!r} of type {type(shapes).__name__}, expected a shape or a list of them, "
                 "such as Distance(Circle((0.5, 0.5), 0.1), h_min=0.01, growth=1.2)"
             )
-        given: Iterable[Any] = [shapes] if isinstance(shapes, (Shape, shapely.Geometry)) else shapes
+        given: Any = [shapes] if isinstance(shapes, (Shape, shapely.Geometry)) else shapes
         parts = [shapes_of(s) if isinstance(s, shapely.Geometry) else [s] for s in given]
         self.shapes: tuple[Any, ...] = tuple(shape for some in parts for shape in some)
         for shape in self.shapes:

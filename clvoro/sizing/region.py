@@ -60,8 +60,9 @@ class Region(Distance):
         super().__init__(shapes, h, growth, h_max, slope)
         given = list(shapes) if isinstance(shapes, Iterable) and not isinstance(shapes, Surface | Domain) else [shapes]
         self.shapes = tuple(given)
-        made: list[Any] = [{2: _area_of, 3: _solid_of}[self.dim](shape) for shape in given]
-        self.areas, self.solids = {2: (made, []), 3: ([], made)}[self.dim]
+        dim = int(self.dim or 0)
+        made: list[Any] = [{2: _area_of, 3: _solid_of}[dim](shape) for shape in given]
+        self.areas, self.solids = {2: (made, []), 3: ([], made)}[dim]
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return whether each of `points` (n, d) is in the region, (n,) bool."""
@@ -120,6 +121,7 @@ def ring_edges(area: shapely.Geometry) -> np.ndarray:
 
 def _area_of(shape: Any) -> shapely.Geometry:
     """Return a closed shape in 2D as a polygon of shapely."""
+    area: Any
     if isinstance(shape, Domain) and shape.region is not None:
         area = shape.region
     elif isinstance(shape, Circle) and shape.radius > 0:

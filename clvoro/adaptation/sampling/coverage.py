@@ -150,7 +150,7 @@ class SolidCoverage(CutCoverage):
         """Split the boxes where `chosen` (m,) is true; see `BoxTree.split`."""
         parent, child = self.boxes.split(chosen)
         before, one = self.share, np.ones(len(parent))
-        self.share, self.inner, self._cut = (a[parent] for a in (self.share, self.inner, self._cut))
+        self.share, self.inner, self._cut = self.share[parent], self.inner[parent], self._cut[parent]
         rows = np.flatnonzero((child >= 0) & self._cut & (self.share > 0))
         if rows.size:
             self._examine(rows)

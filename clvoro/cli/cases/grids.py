@@ -135,7 +135,7 @@ def _by_xarray(path: Path, variable: str | None) -> Any:
     """Read netCDF-4, which is HDF5."""
     remedy = "pip install xarray netCDF4, or convert the file to netCDF-3, as by nccopy -k nc6 IN OUT"
     try:
-        import xarray
+        import xarray  # type: ignore[import-not-found]
     except ModuleNotFoundError as error:
         raise InputError(
             f"{path} is a netCDF-4 file, which needs xarray, and that is not installed; {remedy}"

@@ -41,7 +41,7 @@ class Obstacles(Lines):
         super().__init__([np.concatenate([ring, ring[:1]]) for ring in rings])
         # The name of a curve that is the whole hole, or that of the hole.
         own = [polygon.boundary_names for polygon in made]
-        labels = [f"hole-{k + 1}" if len(name) > 1 or name[0] == _RING else name[0] for k, name in enumerate(own)]
+        labels = [name[0] if len(name) == 1 and name[0] != _RING else f"hole-{k + 1}" for k, name in enumerate(own)]
         default = tuple(dict.fromkeys(labels))
         parts = BoundaryNames(default, np.array([default.index(name) for name in labels], np.int32), "hole")
         self.parts = parts.renamed("holes names", names) if names else parts

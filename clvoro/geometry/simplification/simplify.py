@@ -110,6 +110,8 @@ def thinned(
     """Return the rings of pieces of `water` with fewer vertices, and the edges of each name."""
     rings = [_Ring(domain, *ring, tolerance) for piece in water for ring in piece]
     first = np.cumsum([0] + [len(piece) for piece in water])
+    rows: list[np.ndarray] = []
+    pieces: list[list[np.ndarray]] = []
     for k in range(_TRIES):
         rows = [ring.kept() for ring in rings]
         thin = [ring.x[row] for ring, row in zip(rings, rows, strict=True)]
@@ -139,7 +141,7 @@ def _crossing(rings: list[np.ndarray]) -> np.ndarray:
     after = np.arange(1, len(ends) + 1)
     last = np.flatnonzero(np.diff(ring, append=-1))
     after[last] = np.append(0, last[:-1] + 1)
-    lines = shapely.linestrings(ends)
+    lines = np.asarray(shapely.linestrings(ends))
     a, b = shapely.STRtree(lines).query(lines, predicate="intersects")
     found = np.zeros(len(ends), bool)
     found[a[(a != b) & (after[a] != b) & (after[b] != a)]] = True

@@ -46,7 +46,7 @@ def divided_boundary(
         size = h[edges[again]].mean(axis=1)
         length = np.hypot(*(end - begin).T)
         long = np.flatnonzero(length > _LONGEST_FACING * size)
-        found = shapely.linestrings(np.stack([begin, end], axis=1)[long])
+        found = np.asarray(shapely.linestrings(np.stack([begin, end], axis=1)[long]))
         at, other = tree.query(found, predicate="dwithin", distance=size[long])
         row = long[at]
         facing = ((end - begin)[row] * way[other]).sum(axis=1) < -0.9 * length[row]
@@ -83,8 +83,8 @@ def _split(x: np.ndarray, edges: np.ndarray, n: int, share: np.ndarray | None = 
     a, b = edges.T
     if share is None:
         length = np.hypot(*(x[b] - x[a]).T)
-        share = np.exp2(np.floor(np.log2(length / 1.5))) / length
-        share = np.where((a < n) == (b < n), 0.5, np.where(a < n, share, 1 - share))
+        power = np.exp2(np.floor(np.log2(length / 1.5))) / length
+        share = np.where((a < n) == (b < n), 0.5, np.where(a < n, power, 1 - power))
     middle = len(x) + np.arange(len(edges))
     halves = np.concatenate([np.column_stack([a, middle]), np.column_stack([middle, b])])
     return halves, np.concatenate([x, x[a] + share[:, None] * (x[b] - x[a])])

@@ -499,7 +499,7 @@ class Solid(Domain):
         return most[place.reshape(-1)].reshape(-1, 3)
 
     @cached_property
-    def wall_triangles(self) -> WallTriangles:
+    def wall_triangles(self) -> WallTriangles:  # type: ignore[override]
         """The surface as kernels take it."""
         return WallTriangles(self.surface.corners, self.patch, self.corner_normals, self.side_kinds, self.corner_kinds)
 

@@ -85,7 +85,7 @@ def _euler_characteristic(d: Diagram) -> int | None:
     ends = face_ends(d)[walls]
     if len(np.unique(ends[:, 0])) < len(ends):
         return None
-    empty = np.count_nonzero(np.diff(d.neighbor_starts) == 0)
+    empty = int(np.count_nonzero(np.diff(d.neighbor_starts) == 0))
     parts = _count_components(len(d), owner[~walls], d.neighbors[~walls]) - empty
     # All other vertices are parts of their own.
     others = len(d.vertices) - len(np.unique(ends))

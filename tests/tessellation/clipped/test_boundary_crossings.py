@@ -33,7 +33,7 @@ def convex(stages, domain, points, n):
     return stages.cells.tessellate(domain, points, n, stages.bins.build(domain, points, n), exact=False)
 
 
-@pytest.mark.sparse(4)
+@pytest.mark.sparse(3)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", ["star", "holes", "pieces", "comb", "slit"])
 def test_chords(ctx, name, real):
