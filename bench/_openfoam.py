@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from clvoro.foam.case import FoamCase
 from clvoro.io.foam_read import FoamFile
 from clvoro.mesh.geometry import cell_geometry, face_geometry
 
@@ -64,8 +65,8 @@ class PlaneMesh:
         Corners of the cells.
     """
 
-    def __init__(self, case: Path) -> None:
-        folder = case / "constant" / "polyMesh"
+    def __init__(self, case: Path, folder: Path | None = None) -> None:
+        folder = folder or case / "constant" / "polyMesh"
         triple = rf"\(({NUMBER}) ({NUMBER}) ({NUMBER})\)"
         self._points = np.array(re.findall(triple, _body(folder / "points")), float)
         rows = re.findall(r"\d+\s*\(([\d\s]+)\)", _body(folder / "faces"))
@@ -231,6 +232,11 @@ class Case:
         heads = [line.split()[1:] for line in lines if line.startswith("#")]
         rows = np.array([line.split() for line in lines if not line.startswith("#")], float)
         return dict(zip(heads[-1], rows.T, strict=True))
+
+    def latest_mesh(self) -> PlaneMesh:
+        """Return the mesh of the latest time."""
+        known = FoamCase(self.folder)
+        return PlaneMesh(self.folder, known.mesh_folder(known.latest()))
 
     def field(self, name: str, dim: int = 2) -> np.ndarray:
         """Return the values of a field in cells at the last time, (n,), or the first `dim` components of a vector."""

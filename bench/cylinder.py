@@ -1,7 +1,8 @@
 """Flow around a cylinder with OpenFOAM on meshes of clvoro, Gmsh and blockMesh, against reference values.
 
     python bench/cylinder.py [--reynolds 20|100] [--cells 3000,6000,13000] [--meshers NAMES] [--samples 3]
-                             [--convection linear|linearUpwind] [--pictures FOLDER] [--device NAME] [--json]
+                             [--convection linear|linearUpwind] [--cycles 3] [--p 2] [--pictures FOLDER]
+                             [--device NAME] [--json]
 
 The benchmark of Schaefer and Turek (1996): a channel of 2.2 x 0.41, a cylinder of diameter 0.1 at (0.2, 0.2), a
 parabolic inlet. At Re 20 the flow is steady (`simpleFoam`), at Re 100 it sheds vortices (`pimpleFoam`). All meshes
@@ -13,6 +14,10 @@ Strouhal number.
 
 Lift is small, and random errors of the cells above and below the cylinder do not cancel. "Mirrored" is a mesh of the
 channel below the axis of the cylinder, with the mirror images of its generators above it, or of its cells with Gmsh.
+
+"Uniform" is a mesh of one size. "Newcomer" is a polygon of 360 edges with sizes that grow from it, and no layers.
+"Followed" begins as that mesh, with as many cells as the row says, and follows the solution: `clvoro.foam.adapt_case`
+makes a new mesh --cycles times from U and p, with an error that is small in the L^p norm. No place is named.
 
 With --samples several meshes are made for each row, with counts that differ by one percent and with other seeds:
 shown are the median and the range. Without OpenFOAM the script ends with a message. Without Gmsh (pip install gmsh)
@@ -119,6 +124,45 @@ def mesh_clvoro(layers: bool, effort: str, mirrored: bool = False) -> Callable[.
         made.to_openfoam(case.folder / "constant" / "polyMesh", types=types, thickness=THICKNESS)
 
     return mesh
+
+
+def _newcomer() -> clvoro.Polygon:
+    """Return the channel with a cylinder of 360 straight edges."""
+    angle = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    ring = np.column_stack([np.cos(angle), np.sin(angle)]) * RADIUS + CENTER
+    names = {"walls": [0, 2], "outlet": 1, "inlet": 3, "cylinder": range(4, 364)}
+    return clvoro.Polygon([(0, 0), (LENGTH, 0), (LENGTH, HEIGHT), (0, HEIGHT)], [ring], names=names)
+
+
+def mesh_newcomer(uniform: bool) -> Callable[..., None]:
+    def mesh(case: Case, adapter: clvoro.Adapter, size: Size, n_cells: int, seed: int) -> None:
+        domain = _newcomer()
+        field: object = math.sqrt(domain.measure / n_cells)
+        if not uniform:
+            ring = clvoro.sizing.ClosedPolyline(domain.vertices[4:])
+            field = clvoro.sizing.Distance(ring, h_min=0.002, slope=0.06, h_max=0.02)
+        made = adapter.run(domain, field, n_cells=n_cells, seed=seed)
+        folder = case.folder / "constant" / "polyMesh"
+        made.to_openfoam(folder, types={"inlet": "patch", "outlet": "patch"}, thickness=THICKNESS)
+        made.save(folder / "clvoro.npz")
+
+    return mesh
+
+
+def follow(case: Case, adapter: clvoro.Adapter, n_cells: int, cycles: int, p: float) -> dict[str, float]:
+    """Adapt the case to its solution; return drag and lift on the last mesh, the cells, and seconds by kind."""
+    rows = clvoro.foam.adapt_case(
+        case.folder, n_cells=n_cells, cycles=cycles, solver="simpleFoam", interval=3000, p=p, adapter=adapter
+    )
+    last = rows[-1]
+    return {
+        "drag": last.monitors["forces.Cd"],
+        "lift": last.monitors["forces.Cl"],
+        "steps": last.time,
+        "solver_seconds": sum(row.solver_seconds for row in rows),
+        "mesh_seconds": sum(row.mesh_seconds or 0 for row in rows),
+        "transfer_seconds": sum(row.transfer_seconds or 0 for row in rows),
+    }
 
 
 def _lower_part() -> clvoro.Polygon:
@@ -274,6 +318,9 @@ MESHERS: dict[str, Callable[..., None]] = {
     "Gmsh quadrangles": mesh_gmsh(True),
     "Gmsh quadrangles, mirrored": mesh_gmsh(True, mirrored=True),
     "blockMesh": mesh_blocks,
+    "uniform": mesh_newcomer(True),
+    "newcomer": mesh_newcomer(False),
+    "followed": mesh_newcomer(False),
 }
 
 
@@ -415,14 +462,20 @@ def steady_flow(case: Case, mesh: PlaneMesh, convection: str) -> dict[str, float
     """Solve at Re 20; return drag, lift, pressure difference and the number of iterations."""
     write_case(case, mesh, 20, convection)
     case.run("simpleFoam")
-    forces, pressure = case.table("forces", "coefficient.dat"), case.field("p")
-    front, rear = (value_at((x, 0.2), mesh.centroids, pressure) for x in (0.2 - RADIUS, 0.2 + RADIUS))
+    forces = case.table("forces", "coefficient.dat")
     return {
         "drag": float(forces["Cd"][-1]),
         "lift": float(forces["Cl"][-1]),
-        "pressure": front - rear,
         "steps": float(forces["Time"][-1]),
+        **pressure_difference(case, mesh),
     }
+
+
+def pressure_difference(case: Case, mesh: PlaneMesh) -> dict[str, float]:
+    """Return the difference of the pressures before and behind the cylinder."""
+    pressure = case.field("p")
+    front, rear = (value_at((x, 0.2), mesh.centroids, pressure) for x in (0.2 - RADIUS, 0.2 + RADIUS))
+    return {"pressure": front - rear}
 
 
 class Shedding:
@@ -511,6 +564,8 @@ def main() -> None:
     options_of.add_argument("--meshers", default=";".join(MESHERS), metavar="NAMES", help="separated by semicolons")
     options_of.add_argument("--samples", type=int, default=1)
     options_of.add_argument("--convection", choices=("linear", "linearUpwind"), default="linearUpwind")
+    options_of.add_argument("--cycles", type=int, default=3)
+    options_of.add_argument("--p", type=float, default=2.0)
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = options_of.parse_args()
     re_ = options.reynolds
@@ -543,7 +598,15 @@ def main() -> None:
                         break
                     mesh = PlaneMesh(case.folder)
                     start = time.perf_counter()
-                    flow = steady_flow(case, mesh, convection) if re_ == 20 else shedding.flow(case, mesh, convection)
+                    if re_ != 20:
+                        flow = shedding.flow(case, mesh, convection)
+                    elif mesher == "followed":
+                        write_case(case, mesh, 20, convection)
+                        flow = follow(case, adapter, n, options.cycles, options.p)
+                        mesh = case.latest_mesh()
+                        flow |= pressure_difference(case, mesh)
+                    else:
+                        flow = steady_flow(case, mesh, convection)
                     found = {**flow, **(errors(flow) if re_ == 20 else {}), "cells": len(mesh)}
                     found["seconds"] = time.perf_counter() - start
                     for key, value in found.items():

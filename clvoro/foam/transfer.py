@@ -100,8 +100,9 @@ def transfer_fields(fields: Sequence[FoamField], old: MeshOfCase, new: MeshOfCas
 
 
 def _carry(values: np.ndarray, old: Diagram, new: Diagram, adapter: Adapter) -> np.ndarray:
-    """Return cell data on the new diagram. In a solid the cells of the box around it take its place."""
-    if old.domain.curved_walls:
+    """Return cell data on the new diagram. In a solid those of the cells of a box around it."""
+    extent = np.array(old.domain.extent)
+    if len(extent) > 2 and old.domain.measure < (1 - 1e-9) * extent.prod():
         every = np.concatenate([old.points, new.points])
         margin = 0.01 * np.ptp(every, axis=0).max()
         box = Box(tuple((every.min(axis=0) - margin).tolist()), tuple((every.max(axis=0) + margin).tolist()))

@@ -112,7 +112,8 @@ class OnCells(Field):
                 f"{type(self).__name__} values have shape {self.values.shape}, expected ({len(self.values)},): one "
                 "for each cell; make a field of each column"
             )
-        self.dim, self.on_sphere = self.mesh.domain.dim, self.mesh.domain.curved
+        domain = self.mesh.domain
+        self.dim, self.on_sphere = domain.dim, domain.cell_dim < domain.dim
 
     @cached_property
     def _cells(self) -> tuple[np.ndarray, np.ndarray]:

@@ -191,7 +191,7 @@ def derivatives(values: ArrayLike, on: Result | Diagram) -> tuple[np.ndarray, np
     # Numbers around 1 neither overflow nor underflow in any precision.
     unit = domain.frame[1]
     scale = np.maximum(np.ptp(columns, axis=0), 1e-300)
-    gradients, hessians = Derivatives(engine, domain.curved).fit_quadratics(
+    gradients, hessians = Derivatives(engine, domain.cell_dim < domain.dim).fit_quadratics(
         stencils, (columns - columns.mean(axis=0)) / scale, unit
     )
     d, shape = domain.dim, given.shape
@@ -203,10 +203,10 @@ def derivatives(values: ArrayLike, on: Result | Diagram) -> tuple[np.ndarray, np
 class Derivatives:
     """Fits polynomials to cell data, for cells in flat space or on a sphere."""
 
-    def __init__(self, engine: Engine, curved: bool) -> None:
+    def __init__(self, engine: Engine, on_sphere: bool) -> None:
         self.engine = engine
         defines: dict[str, object] = {"SMALLEST_PIVOT": repr(_SMALLEST_PIVOT[engine.real])}
-        self._kernels = engine.kernels("sizing/derivatives", defines | ({"SPHERE": 1} if curved else {}))
+        self._kernels = engine.kernels("sizing/derivatives", defines | ({"SPHERE": 1} if on_sphere else {}))
 
     def fit_quadratics(self, stencils: CellStencils, values: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray]:
         """Return gradients (n, k, d) and Hessians (n, k, d, d) of `values` (n, k), with lengths in `unit`."""

@@ -130,7 +130,7 @@ def hessian_size(
     Second derivatives are central differences of neighboring values; on the sides, those of the next row inside. They
     magnify noise by 1 / spacing^2: smooth noisy data first.
 
-    On a layer (bench/interpolation.py) the default p within `Graded`, with growth 1.2 to 1.4 and an `h_max` of a tenth
+    On a layer the default p within `Graded`, with growth 1.2 to 1.4 and an `h_max` of a tenth
     of the box or more, interpolates best. p = 1 is as good in L^1. A larger p decreases the largest error and increases
     the mean.
 

@@ -1,0 +1,286 @@
+"""Meshes that follow a function: interpolation error against the isotropic optimum, beside Gmsh and MMG.
+
+    python bench/adaptive.py [--spaces plane,space,sphere] [--functions smooth,layer,kink,shock] [--cells 4000]
+                             [--cycles 4] [--growth 1.4] [--effort fast] [--pictures FOLDER] [--device NAME] [--json]
+
+Each mesh begins uniform. A cycle evaluates the function at the centroids of the cells, takes sizes from
+`hessian_size(u, on=mesh, n_cells=N, p)`, and adapts the generators to them. Gmsh and MMG (pip install gmsh mmgpy) get
+the sizes of the last cycle, scaled to as many unknowns. Unknowns are the generators, and in a box the points on the
+walls that close their triangulation; of the others they are the vertices.
+
+The error is that of linear interpolation in the Delaunay triangulation of the unknowns. "optimum" is the least error of
+isotropic meshes: with e(x) the L^p mean of the error on a simplex of volume 1, and V the volume of a simplex,
+
+    |e V^(2/d)|_p is least for V = c e^(-d p / (2 p + d)),
+
+over all orientations of equilateral triangles, or of the tetrahedra of a body-centered lattice, whose number is that
+of the mesh. The columns "L1" and "L2" are the error over this optimum, each for a mesh of its own p; "uniform" is the
+error of the uniform mesh over it. Targets: 1.15 in the plane and on the sphere, 1.25 in space.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _common import FIRST_SEED, Report, heading, make_adapter, names, parser, shown
+from _remeshers import MESHERS, MissingPeerError, remesh
+from scipy.spatial import ConvexHull, Delaunay
+from scipy.stats import qmc
+
+import clvoro
+from clvoro import sizing
+from clvoro.sizing.graded import default_engine
+
+Function = Callable[[np.ndarray], np.ndarray]
+TARGET = {2: 1.15, 3: 1.25}
+BATCH = 4_000_000
+SAMPLES = 1 << 16
+
+
+def distance(x: np.ndarray) -> np.ndarray:
+    """Return the distance of points (..., d) from a circle or ball of radius 0.6 around a point near a corner."""
+    center = np.array([0.2, 0.1, 0.15])[: x.shape[-1]]
+    return np.linalg.norm(x - center, axis=-1) - 0.6
+
+
+FUNCTIONS: dict[str, Function] = {
+    "smooth": lambda x: np.sin(4 * x[..., 0]) * np.exp(1.5 * x[..., 1]),
+    "layer": lambda x: np.tanh(20 * distance(x)),
+    "kink": lambda x: np.sqrt(distance(x) ** 2 + 0.02**2),
+    "shock": lambda x: np.tanh(60 * distance(x)) + 0.3 * np.sin(3 * x[..., 0]),
+}
+
+
+@dataclass(frozen=True)
+class Space:
+    """A domain to mesh, and how its points are triangulated."""
+
+    domain: clvoro.Box | clvoro.Sphere
+    dim: int
+
+    @property
+    def is_sphere(self) -> bool:
+        """Whether cells lie on a surface."""
+        return self.dim < len(self.domain.lower)
+
+    def unknowns(self, mesh: clvoro.Diagram) -> np.ndarray:
+        """Return the generators, with the points on walls that close their triangulation."""
+        if self.is_sphere:
+            return mesh.points
+        walls = mesh.neighbors < 0
+        lower, upper = np.array(self.domain.lower), np.array(self.domain.upper)
+        corners = lower + (upper - lower) * np.stack(np.meshgrid(*[[0, 1]] * self.dim), axis=-1).reshape(-1, self.dim)
+        on = [mesh.points, mesh.face_centroids[walls], corners]
+        if self.dim == 3:
+            # Cells at two walls: the middle of their edge.
+            owner = np.repeat(np.arange(len(mesh)), np.diff(mesh.neighbor_starts))[walls]
+            wall = -1 - mesh.neighbors[walls]
+            for a in range(6):
+                for b in range(a + 1, 6):
+                    if a // 2 != b // 2:
+                        x = mesh.points[np.intersect1d(owner[wall == a], owner[wall == b])].copy()
+                        for side in (a, b):
+                            x[:, side // 2] = (lower, upper)[side % 2][side // 2]
+                        on.append(x)
+        return np.concatenate(on)
+
+    def simplices(self, points: np.ndarray) -> np.ndarray:
+        """Return the Delaunay triangulation of points, (m, d + 1)."""
+        return ConvexHull(points).simplices if self.is_sphere else Delaunay(points).simplices
+
+    def onto(self, x: np.ndarray) -> np.ndarray:
+        """Return points on the domain: on the sphere those of its flat triangles are moved outwards."""
+        return x / np.linalg.norm(x, axis=-1, keepdims=True) if self.is_sphere else x
+
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return points that fill the domain evenly, (n, D), and the directions along it at each, (n, d, D)."""
+        t = qmc.Sobol(self.dim, seed=1).random(SAMPLES)
+        if not self.is_sphere:
+            return t, np.broadcast_to(np.eye(self.dim), (len(t), self.dim, self.dim))
+        z, angle = 2 * t[:, 0] - 1, 2 * np.pi * t[:, 1]
+        s = np.sqrt(1 - z**2)
+        x = np.column_stack([s * np.cos(angle), s * np.sin(angle), z])
+        east = np.column_stack([-np.sin(angle), np.cos(angle), 0 * z])
+        return x, np.stack([east, np.cross(x, east)], axis=1)
+
+
+SPACES = {
+    "plane": Space(clvoro.Box((0, 0), (1, 1)), 2),
+    "space": Space(clvoro.Box((0, 0, 0), (1, 1, 1)), 3),
+    "sphere": Space(clvoro.Sphere(1.0), 2),
+}
+
+
+def volumes_of(corners: np.ndarray) -> np.ndarray:
+    """Return the volumes of simplices (n, d + 1, D)."""
+    sides = corners[:, 1:] - corners[:, :1]
+    gram = np.einsum("nad,nbd->nab", sides, sides)
+    return np.sqrt(np.maximum(np.linalg.det(gram), 0)) / math.factorial(sides.shape[1])
+
+
+def inner_points(dim: int, count: int) -> np.ndarray:
+    """Return barycentric coordinates (count, d + 1) that fill a simplex evenly."""
+    t = np.sort(qmc.Sobol(dim, seed=2).random(count), axis=1)
+    return np.diff(t, axis=1, prepend=0, append=1)
+
+
+def interpolation_errors(space: Space, points: np.ndarray, u: Function) -> tuple[dict[int, float], int]:
+    """Return the L1 and the L2 error of linear interpolation between `points`, and the number of simplices."""
+    x = points[space.simplices(points)]
+    volume = volumes_of(x)
+    x, volume = x[volume > 1e-14], volume[volume > 1e-14]
+    weights = inner_points(space.dim, 64)
+    sums = np.zeros(2)
+    for some in np.array_split(np.arange(len(x)), len(x) * len(weights) // BATCH + 1):
+        at = np.einsum("qb,nbd->nqd", weights, x[some])
+        error = np.abs(u(x[some]) @ weights.T - u(space.onto(at)))
+        sums += volume[some] @ error.mean(axis=1), volume[some] @ (error**2).mean(axis=1)
+    return {1: float(sums[0]), 2: math.sqrt(sums[1])}, len(x)
+
+
+def reference_simplices(dim: int) -> np.ndarray:
+    """Return simplices of volume 1 in all orientations, (n, d + 1, d)."""
+    if dim == 2:
+        base = np.array([(0, 0), (1, 0), (0.5, math.sqrt(0.75))])
+        turned = []
+        for angle in np.linspace(0, 2 * np.pi / 3, 12, endpoint=False):
+            c, s = math.cos(angle), math.sin(angle)
+            turned.append(base @ np.array([(c, s), (-s, c)]))
+        corners = np.array(turned)
+    else:
+        from scipy.spatial.transform import Rotation
+
+        base = np.array([(0.0, 0, 0), (1, 0, 0), (0.5, 0.5, 0.5), (0.5, 0.5, -0.5)])
+        corners = np.array([base @ r.as_matrix() for r in Rotation.random(24, random_state=3)])
+    return corners / volumes_of(corners)[:, None, None] ** (1 / dim)
+
+
+def optimum(space: Space, u: Function, p: int, simplices: int) -> float:
+    """Return the least L^p error of isotropic meshes with a number of simplices."""
+    d, step = space.dim, 1e-4
+    x, along = space.samples()
+    hessian = np.empty((len(x), d, d))
+    for a in range(d):
+        for b in range(a + 1):
+            total = np.zeros(len(x))
+            for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                v = step * (i * along[:, a] + j * along[:, b])
+                if a == b:
+                    v = 2 * step * i * along[:, a] if i == j else 0 * v
+                length = np.linalg.norm(v, axis=1, keepdims=True)
+                there = x * np.cos(length) + v * np.sinc(length / np.pi) if space.is_sphere else x + v
+                total += i * j * u(there)
+            hessian[:, a, b] = hessian[:, b, a] = total / (4 * step**2)
+    eigen = np.linalg.eigvalsh(hessian)
+    corners, weights = reference_simplices(d), inner_points(d, 32)
+    inside = np.einsum("qb,nbd->nqd", weights, corners)
+    # The error of x^2 / 2 along each axis; that of a quadratic function is their sum, with the eigenvalues.
+    squares = 0.5 * (np.einsum("qb,nbd->nqd", weights, corners**2) - inside**2).reshape(-1, d)
+    local = np.empty(len(x))
+    for some in np.array_split(np.arange(len(x)), len(x) * len(squares) // BATCH + 1):
+        local[some] = (np.abs(eigen[some] @ squares.T) ** p).mean(axis=1) ** (1 / p)
+    measure = space.domain.measure
+    power = d * p / (2 * p + d)
+    mean = float((local**power).mean()) * measure
+    # V = c local^-power with the integral of 1 / V the number of simplices.
+    return mean ** (1 / power) * simplices ** (-2 / d)
+
+
+def adapt(
+    space: Space, adapter: clvoro.Adapter, u: Function, n: int, options: Any, p: int
+) -> tuple[clvoro.Result, sizing.Estimate, clvoro.Result]:
+    """Return the mesh that follows a function, its sizes, and the uniform mesh."""
+    size = (space.domain.measure / n) ** (1 / space.dim)
+    uniform = adapter.run(space.domain, size, options.effort, n_cells=n, seed=FIRST_SEED)
+    mesh = uniform
+    for _ in range(options.cycles):
+        estimate = sizing.hessian_size(u(mesh.centroids), on=mesh, n_cells=n, p=p, growth=options.growth)
+        mesh = adapter.run(space.domain, estimate, options.effort, n_cells=n, points=mesh.points, seed=FIRST_SEED)
+    return mesh, estimate, uniform
+
+
+def picture(found: list[tuple[str, clvoro.Result]], path: Path) -> None:
+    """Draw the meshes in the plane side by side."""
+    from clvoro.plotting import plot_cells
+    from clvoro.plotting.style import new_figure, styled
+
+    with styled():
+        figure = new_figure(3.2 * len(found), 3.5)
+        for ax, (name, mesh) in zip(np.atleast_1d(figure.subplots(1, len(found))), found, strict=True):
+            plot_cells(mesh, "size", ax, key=False)
+            ax.set_title(f"{name}: {len(mesh):,} cells", loc="left", fontsize=9)
+            ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        figure.savefig(path, dpi=150)
+
+
+COLUMNS = {
+    "space": lambda r: r["space"],
+    "function": lambda r: r["function"],
+    "mesh": lambda r: r["mesh"],
+    "unknowns": shown("unknowns", ",d"),
+    "L1": shown("L1", ".3f"),
+    "uniform": shown("uniform1", ".2f"),
+    "L2": shown("L2", ".3f"),
+    "uniform ": shown("uniform2", ".2f"),
+    "seconds": shown("seconds", ".1f"),
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    made = parser(__doc__)
+    made.add_argument("--spaces", default=",".join(SPACES))
+    made.add_argument("--functions", default=",".join(FUNCTIONS))
+    made.add_argument("--cells", type=int, default=4000)
+    made.add_argument("--cycles", type=int, default=4)
+    made.add_argument("--growth", type=float, default=1.4)
+    made.add_argument("--effort", default="fast", choices=("fast", "default", "best"))
+    made.add_argument("--pictures", type=Path, metavar="FOLDER")
+    options = made.parse_args(arguments)
+    adapter, report, missed = make_adapter(options), Report(options.json, COLUMNS), False
+    drawn: list[tuple[str, clvoro.Result]] = []
+    for name in names(options.spaces):
+        space = SPACES[name]
+        for function in names(options.functions):
+            u = FUNCTIONS[function]
+            rows: dict[str, dict[str, Any]] = {}
+            for p in (1, 2):
+                start = time.perf_counter()
+                mesh, estimate, uniform = adapt(space, adapter, u, options.cells, options, p)
+                seconds = time.perf_counter() - start
+                points = {"clvoro": space.unknowns(mesh.diagram)}
+                if not space.is_sphere:
+                    # On the device, because Gmsh takes millions of values.
+                    sizes = sizing.Sizing(default_engine(space.dim), space.domain, estimate)
+                    for peer, mesher in MESHERS.items():
+                        try:
+                            points[peer] = remesh(mesher, space.domain, sizes, len(points["clvoro"]))[0]
+                        except MissingPeerError as error:
+                            print(f"left out: {error}")
+                for mesher, x in points.items():
+                    errors, count = interpolation_errors(space, x, u)
+                    least = optimum(space, u, p, count)
+                    row = rows.setdefault(mesher, {"space": name, "function": function, "mesh": mesher})
+                    row |= {"unknowns": len(x), f"L{p}": errors[p] / least}
+                    if mesher == "clvoro":
+                        plain, count = interpolation_errors(space, space.unknowns(uniform.diagram), u)
+                        row |= {f"uniform{p}": plain[p] / optimum(space, u, p, count), "seconds": seconds}
+                        missed |= errors[p] / least > TARGET[space.dim]
+            if name == "plane":
+                drawn.append((function, mesh))
+            for row in rows.values():
+                report.add(row, f"{name}, {function}, {row['mesh']}")
+    if options.pictures and drawn:
+        options.pictures.mkdir(parents=True, exist_ok=True)
+        picture(drawn, options.pictures / "adaptive.png")
+    report.finish(heading(adapter, f"Interpolation error over the isotropic optimum, {options.cells:,} cells"))
+    return int(missed)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
