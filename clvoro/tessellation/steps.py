@@ -54,7 +54,7 @@ class DomainSteps:
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the part of the first `n` of `sites` and the ghosts that their cells need, as far as known."""
-        return Part(n, n, sites, self.domain)
+        return Part(n, n, sites, self.box)
 
     def drop_ghosts(self) -> bool:
         """Make ghosts fewer, because generators appear too close; return whether that is possible."""
@@ -132,10 +132,6 @@ class SolidWalls(DomainSteps):
         super().__init__(stages, domain)
         self.box = self.walls = SolidBox(stages.engine, domain, walls, size)
 
-    def extend(self, sites: cla.Array, n: int) -> Part:
-        """Return the part of the first `n` of `sites`."""
-        return Part(n, n, sites, self.box)
-
     def find_walls(self, part: Part, binned: BinnedPoints, previous: Tessellation | None) -> None:
         """Find the planes that cut the cells of `part`."""
         if previous is None:
@@ -163,9 +159,5 @@ class SolidWalls(DomainSteps):
         self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
     ) -> Tessellation | None:
         """Update `previous` incrementally."""
-
-        def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
-            cells.clip_rest(cut, report, self.box, sites, sort(), previous)
-
         self.walls.follow(sites)
-        return self.stages.update.update(self.stages.cells, self.box, sites, previous, follow=follow, clip=clip)
+        return super().update(sites, n, previous, sort, follow)
