@@ -12,6 +12,7 @@ from clvoro.tessellation.device_diagram import read_report
 from clvoro.tessellation.own_planes import SolidBox
 from clvoro.tessellation.stages import TessellationStages
 from clvoro.tessellation.tessellator import Tessellator
+from tests.reference.own_planes import own_planes
 
 REALS = [np.dtype(np.float64), np.dtype(np.float32)]
 
@@ -100,7 +101,7 @@ def test_planes_are_those_of_the_reference(ctx, name, real):
     box.find(device.points)
     x = device.points.get().astype(float) * scale + solid.frame[0]
     reach = box._reach.get()[:n].astype(float) * scale
-    expected = solid.own_planes(x, reach)
+    expected = own_planes(solid, x, reach)
     rows, labels, planes = box._rows.get()[:n], box._labels.get(), box._planes.get()
     found = np.concatenate([np.arange(first, first + count) for first, count in rows])
     owner = np.repeat(np.arange(n), rows[:, 1])
