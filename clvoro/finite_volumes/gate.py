@@ -20,6 +20,8 @@ Solver = Literal["openfoam", "mpas", "modflow"]
 """Solvers whose criteria are known."""
 LEAST_MEASURE = 1e-300
 """OpenFOAM's VSMALL: least area of a face and volume of a cell."""
+LEAST_DETERMINANT = 1e-3
+"""The least one of a cell; cells with neighbors on one side only have less."""
 
 
 def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallShape | None = None) -> SolverReport:
@@ -52,7 +54,7 @@ SOLVERS: dict[str, Callable[[Diagram, WallShape | None], SolverReport]] = {"open
 """The check of a diagram for each solver; `io` adds MODFLOW, `earth` models on C grids."""
 
 
-_LIMITS = {"aspect_ratio": 1000, "skewness": 4, "determinant": 1e-3, "weight": 0.05, "volume_ratio": 0.01}
+_LIMITS = {"aspect_ratio": 1000, "skewness": 4, "determinant": LEAST_DETERMINANT, "weight": 0.05, "volume_ratio": 0.01}
 """OpenFOAM's limits of the measures that convex cells, too, may miss: those below 1 are the least, others the most."""
 _MEASURES = {2: PlaneMeasures, 3: SolverMeasures}
 
@@ -158,15 +160,15 @@ def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
 
 def rejected_cells(mesh: Faces) -> np.ndarray:
     """Return which cells in 3D OpenFOAM rejects, or one of whose faces, (n,) bool."""
-    m = mesh.measures
-    g, k = m.geometry, mesh.n_inner
-    bad = m.concave | (g.volumes < LEAST_MEASURE) | (m.determinant < 1e-3) | (m.aspect_ratio > 1000)
-    faces = (m.pyramids < -1e-15) | (m.bad_tetrahedra > 0) | (m.skewness > 4)
-    faces |= np.linalg.norm(g.areas, axis=1) < LEAST_MEASURE
-    faces[m.coupled] |= (m.weight[m.coupled] < 0.05) | (m.volume_ratio[m.coupled] < 0.01)
-    faces |= m.non_orthogonality >= 90
+    m, g = mesh.measures, mesh.measures.geometry
+    bad = m.concave | (g.volumes < LEAST_MEASURE) | (m.determinant < LEAST_DETERMINANT)
+    bad |= m.aspect_ratio > _LIMITS["aspect_ratio"]
+    faces = (m.pyramids < -1e-15) | (m.bad_tetrahedra > 0) | (m.skewness > _LIMITS["skewness"])
+    faces |= (np.linalg.norm(g.areas, axis=1) < LEAST_MEASURE) | (m.non_orthogonality >= 90)
+    faces[m.coupled] |= m.weight[m.coupled] < _LIMITS["weight"]
+    faces[m.coupled] |= m.volume_ratio[m.coupled] < _LIMITS["volume_ratio"]
     bad[mesh.owner[faces]] = True
-    bad[mesh.neighbor[:k][faces[:k]]] = True
+    bad[mesh.neighbor[faces & (mesh.neighbor >= 0)]] = True
     return bad
 
 

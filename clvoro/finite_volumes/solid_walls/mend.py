@@ -8,7 +8,7 @@ from ...mesh.connectivity import take_rows
 from ...mesh.faces import Faces
 from ...mesh.geometry import loop_geometry
 from ..defects import DefectLimits, concave_pairs
-from ..gate import rejected_cells
+from ..gate import LEAST_DETERMINANT, rejected_cells
 
 _NARROW = 0.08
 """Faces between two cells smaller than this share of h^2 are collapsed if their cells are concave there."""
@@ -47,8 +47,11 @@ def narrow_faces(faces: Faces, sizes: np.ndarray) -> np.ndarray:
     return chosen & (faces.area < _NARROW * h**2)
 
 
-def rejected_at_walls(faces: Faces) -> np.ndarray:
-    """Return the cells at walls, or beside these, that OpenFOAM rejects, ascending."""
+def rejected_at_walls(faces: Faces) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cells at walls, or beside these, that OpenFOAM rejects, and whether they are tips, (k,) each.
+
+    A tip has neighbors on one side only.
+    """
     k = faces.n_inner
     a, b = faces.owner[:k], faces.neighbor[:k]
     rings = [np.zeros(faces.n_cells, bool)]
@@ -57,8 +60,9 @@ def rejected_at_walls(faces: Faces) -> np.ndarray:
         ring = rings[-1].copy()
         ring[a[rings[-1][b]]] = ring[b[rings[-1][a]]] = True
         rings.append(ring)
-    cells = np.flatnonzero(rings[2])
-    return cells[rejected_cells(faces.part(rings[2])[0]) & rings[1][cells]]
+    cells, part = np.flatnonzero(rings[2]), faces.part(rings[2])[0]
+    rows = np.flatnonzero(rejected_cells(part) & rings[1][cells])
+    return cells[rows], part.measures.determinant[rows] < LEAST_DETERMINANT
 
 
 def split_walls(faces: Faces, cells: np.ndarray) -> Faces:

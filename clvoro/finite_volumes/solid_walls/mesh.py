@@ -31,8 +31,8 @@ _CLEAR = 1.4
 EXACT, CUT, FILLED, ROUNDED = range(4)
 """How the walls of a cell are made: with all creases; with cuts along concave creases; without concave creases; without
 creases. Each next one makes more cells convex, and leaves out more of the surface."""
-_SLIVER = 0.05
-"""Rejected cells at walls with a smaller volume over h^3 are left out."""
+_SLIVER, _TIP = 0.05, 0.4
+"""Rejected cells at walls, and those with neighbors on one side only, with a smaller volume over h^3 are left out."""
 _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE = 3
@@ -123,7 +123,7 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
     since = 0
     while since < _PATIENCE:
         faces, home = _made(surface, points, sizes, whole, walls)
-        rejected = rejected_at_walls(faces)
+        rejected = rejected_at_walls(faces)[0]
         since += 1
         if best is None or len(rejected) < best[0]:
             best, since = (len(rejected), faces, home, rejected, walls.copy()), 0
@@ -164,11 +164,12 @@ def _made(
         )
     home, diagram = made.home, diagram_of(made.faces)
     faces = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes[home]))
-    rejected = rejected_at_walls(faces)
-    slivers = rejected[faces.volumes[rejected] < _SLIVER * sizes[home[rejected]] ** 3]
+    rejected, tips = rejected_at_walls(faces)
+    share = faces.volumes[rejected] / sizes[home[rejected]] ** 3
+    slivers = rejected[share < np.where(tips, _TIP, _SLIVER)]
     if len(slivers):
         faces, home = without_cells(faces, slivers), np.delete(home, slivers)
-        rejected = rejected_at_walls(faces)
+        rejected = rejected_at_walls(faces)[0]
     return split_walls(faces, rejected) if len(rejected) else faces, home
 
 
