@@ -15,7 +15,7 @@ from ..geometry.rings import signed_area
 from ..geometry.solid.solid import Solid
 from ..io.arrays import FileError, explained
 from ..io.foam_read import FoamFile, FoamPatchFaces
-from ..mesh.geometry import face_geometry
+from ..mesh.geometry import cell_geometry, face_geometry
 
 
 @dataclass(frozen=True)
@@ -71,29 +71,18 @@ class FoamMesh:
 
     @cached_property
     def _cells(self) -> tuple[np.ndarray, np.ndarray]:
-        """Volumes and centroids, by pyramids over the faces."""
-        centers, areas = self.faces
-        n, inner = self.n_cells, len(self.neighbor)
-        count = np.bincount(self.owner, minlength=n) + np.bincount(self.neighbor, minlength=n)
-        middle = _sum(self.owner, centers, n) + _sum(self.neighbor, centers[:inner], n)
-        middle /= count[:, None]
-        volumes, moments = np.zeros(n), np.zeros((n, 3))
-        for cells, sign in ((self.owner, 1.0), (self.neighbor, -1.0)):
-            to = centers[: len(cells)] - middle[cells]
-            pyramids = sign * (to * areas[: len(cells)]).sum(axis=1) / 3
-            volumes += np.bincount(cells, pyramids, n)
-            moments += _sum(cells, pyramids[:, None] * 0.75 * to, n)
-        return volumes, middle + moments / volumes[:, None]
+        """Centroids and volumes."""
+        return cell_geometry(*self.faces, self.owner, self.neighbor, self.n_cells)
 
     @property
     def volumes(self) -> np.ndarray:
         """Volumes of the cells, (n,)."""
-        return self._cells[0]
+        return self._cells[1]
 
     @property
     def centroids(self) -> np.ndarray:
         """Centroids of the cells, (n, 3)."""
-        return self._cells[1]
+        return self._cells[0]
 
     @cached_property
     def is_plane(self) -> bool:
@@ -209,7 +198,3 @@ def _without_straight_corners(points: np.ndarray, ring: list[tuple[int, str]]) -
     size = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
     kept = [k for k, (_, name) in enumerate(ring) if abs(turn[k]) > 1e-7 * size[k] or name != ring[k - 1][1]]
     return [ring[k] for k in kept] if len(kept) > 2 else ring
-
-
-def _sum(rows: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
-    return np.stack([np.bincount(rows, column, n) for column in values.T], axis=1)
