@@ -10,6 +10,7 @@ import numpy as np
 from ..mesh.connectivity import following, take_rows
 from ..mesh.geometry import Geometry, cell_geometry, face_geometry, face_vectors, polygon_sides, smaller_size, sum_rows
 from ..mesh.straightening import cross
+from .defects import concave_pairs
 from .prisms import polyhedra
 
 if TYPE_CHECKING:
@@ -19,8 +20,8 @@ PLANAR_COSINE = 1e-6
 """Two faces of a cell are concave if a center is nearer to the other's plane than this, over the distance of both."""
 _TINY = 1e-150
 _ROOTS = {2: np.sqrt, 3: np.cbrt}
-_PAIRS = 1 << 22
-"""Pairs of faces that are compared at a time."""
+_LEAST_QUALITY = 1e-30 * (8 / 27 * 3**0.5)
+"""Of a tetrahedron: its volume over the cube of the radius of its circumsphere."""
 
 
 class SolverMeasures:
@@ -191,27 +192,17 @@ class SolverMeasures:
         """Whether OpenFOAM counts the cell as concave: a face's center is beyond the plane of another one, (n,)."""
         _, face, sign = self.face_cells
         starts, order = self.cells.cell_faces()
-        counts = np.diff(starts)
         areas = self.geometry.areas[face[order]] * sign[order][:, None]
-        normals = areas / np.maximum(np.linalg.norm(areas, axis=1), _TINY)[:, None]
         centers = self.geometry.centers[face[order]]
+        first, _ = concave_pairs(
+            np.ascontiguousarray(centers.T),
+            np.ascontiguousarray(areas.T),
+            starts,
+            -PLANAR_COSINE,
+            np.ones(len(order), bool),
+        )
         concave = np.zeros(self.mesh.n_cells, bool)
-        ends = np.cumsum(counts.astype(np.int64) ** 2)
-        first = 0
-        while first < len(counts):
-            before = ends[first - 1] if first else 0
-            last = max(int(np.searchsorted(ends, before + _PAIRS)), first + 1)
-            rows = np.arange(first, last)
-            a = np.repeat(np.arange(starts[first], starts[last]), np.repeat(counts[rows], counts[rows]))
-            squares = counts[rows] ** 2
-            base = np.repeat(np.cumsum(squares) - squares, squares)
-            size = np.repeat(counts[rows], squares)
-            b = np.repeat(starts[rows], squares) + (np.arange(len(a)) - base) % size
-            apart = centers[b] - centers[a]
-            apart /= np.maximum(np.linalg.norm(apart, axis=1), _TINY)[:, None]
-            wrong = (np.einsum("ij,ij->i", apart, normals[a]) > -PLANAR_COSINE) & (a != b)
-            concave[np.repeat(rows, squares)[wrong]] = True
-            first = last
+        concave[np.searchsorted(starts, first, "right") - 1] = True
         return concave
 
     @cached_property
@@ -453,8 +444,13 @@ def _positive(a: np.ndarray, b: np.ndarray, c: np.ndarray, tip: np.ndarray, side
     """
     u, v, w = b - a, c - a, tip - a
     six = np.einsum("ij,ij->i", np.cross(u, v), w)
-    signed = six if side else -six
-    lengths = [np.einsum("ij,ij->i", x, x)[:, None] for x in (u, v, w)]
+    signed, squares = six if side else -six, [np.einsum("ij,ij->i", x, x) for x in (u, v, w)]
+    longest = np.maximum.reduce(squares)
+    # An upper bound of the radius settles nearly all.
+    fine = signed / 6 > _LEAST_QUALITY * np.minimum(1.5 * longest**2 / np.maximum(np.abs(six), _TINY), 1e15) ** 3
+    rest = np.flatnonzero(~fine & (signed > 0))
+    u, v, w, six, lengths = u[rest], v[rest], w[rest], six[rest], [x[rest, None] for x in squares]
     top = lengths[0] * np.cross(v, w) + lengths[1] * np.cross(w, u) + lengths[2] * np.cross(u, v)
     radius = np.linalg.norm(top, axis=1) / np.maximum(2 * np.abs(six), _TINY)
-    return signed / 6 > 1e-30 * (8 / 27 * np.sqrt(3)) * np.minimum(radius, 1e15) ** 3
+    fine[rest] = signed[rest] / 6 > _LEAST_QUALITY * np.minimum(radius, 1e15) ** 3
+    return fine

@@ -122,8 +122,7 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
     best: tuple[int, Faces, np.ndarray, np.ndarray, np.ndarray] | None = None
     since = 0
     while since < _PATIENCE:
-        faces, home = _made(surface, points, sizes, whole, walls)
-        rejected = rejected_at_walls(faces)[0]
+        faces, home, rejected = _made(surface, points, sizes, whole, walls)
         since += 1
         if best is None or len(rejected) < best[0]:
             best, since = (len(rejected), faces, home, rejected, walls.copy()), 0
@@ -153,8 +152,11 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
 
 def _made(
     surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Diagram, walls: np.ndarray
-) -> tuple[Faces, np.ndarray]:
-    """Return the mesh without short edges and slivers, and the generator of each cell; see `SolidMesh.home`."""
+) -> tuple[Faces, np.ndarray, np.ndarray]:
+    """Return the mesh without short edges and slivers, the generator of each cell, and rejected cells (k,).
+
+    See `SolidMesh.home` and `rejected_at_walls`.
+    """
     made = _Maker(surface, points, sizes, whole, walls).mesh()
     if len(made.lost) > _FEW * len(points):
         place = format_point(points[made.lost[0]])
@@ -170,7 +172,10 @@ def _made(
     if len(slivers):
         faces, home = without_cells(faces, slivers), np.delete(home, slivers)
         rejected = rejected_at_walls(faces)[0]
-    return split_walls(faces, rejected) if len(rejected) else faces, home
+    if len(rejected):
+        faces = split_walls(faces, rejected)
+        rejected = rejected_at_walls(faces)[0]
+    return faces, home, rejected
 
 
 def _simplify(walls: np.ndarray, faces: Faces, rejected: np.ndarray) -> None:
