@@ -52,7 +52,7 @@ def read_grid(path: Path, variable: str | None) -> Any:
     return None
 
 
-def _choose(variable: str | None, found: Mapping[str, Any], shape: Callable[[Any], Iterable[int]]) -> str:
+def _choose(variable: str | None, found: Mapping[Any, Any], shape: Callable[[Any], Iterable[int]]) -> str:
     """Return the name of the variable: the given one, or the only one with two dimensions.
 
     `shape` returns the lengths of the dimensions that have coordinates.
