@@ -6,7 +6,7 @@ OpenFOAM refuses them: their determinant vanishes, as differences across such fa
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import takewhile
+from itertools import product, takewhile
 
 import numpy as np
 
@@ -19,8 +19,9 @@ LEAST_DETERMINANT = 2e-3
 """Cells with a smaller determinant are changed; OpenFOAM's limit is 1e-3."""
 TILT, MOST_TILT = 0.12, 0.4
 """How far the ends of a face move, over its length, and at most over that of a face on the wall."""
-STRIP, BESIDE = 0.4, 0.1
-"""Where cells at dead ends meet the second neighbor: share of the face between them, and of the way to a centroid."""
+STRIPS, BESIDE = (0.4, 0.2), 0.1
+"""Where cells at dead ends meet the second neighbor: share of the face between them, the second if the first would make
+a cell concave, and of the way to a centroid."""
 ROUNDS = 4
 
 Side = tuple[int, int, int]
@@ -94,14 +95,14 @@ class _Edit:
         inner = [side for side in loop if self.other(side[0], cell) >= 0]
         if len(inner) == 1:
             before = self.other(inner[0][0], cell)
-            ways = [(how, forward) for how in (self._share, self._reach) for forward in (True, False)]
-            any(how(cell, before, inner[0][0], forward) for how, forward in ways)
+            ways = [(how, *way) for how in (self._share, self._reach) for way in product(STRIPS, (True, False))]
+            any(how(cell, before, inner[0][0], strip, forward) for how, strip, forward in ways)
             return
         for face, a, b in inner:
             if self._tilt(cell, face, a, b):
                 return
 
-    def _share(self, cell: int, before: int, face: int, forward: bool) -> bool:
+    def _share(self, cell: int, before: int, face: int, strip: float, forward: bool) -> bool:
         """Give `cell` the part of cell `before` beside one wall, so that it borders on the cell beyond."""
         loop = self.loop(before)
         k = next((i for i, side in enumerate(loop) if side[0] == face), None)
@@ -119,15 +120,15 @@ class _Edit:
             return False
         ends = self.ends[beyond]
         x, y = self.points[q], self.points[ends[0] if ends[1] == q else ends[1]]
-        place = x + STRIP * (y - x)
+        place = x + strip * (y - x)
         self.points.append(place + BESIDE * (self.centroids[before] - place))
         loops = [[side[1] for side in self.loop(c)] for c in (before, far, cell)]
         taken = along[1:] if self.slides[p] else along  # without a point on a straight wall
-        strip = [*taken, r] if forward else [r, *taken[::-1]]
+        gained = [*taken, r] if forward else [r, *taken[::-1]]
         after = [
             [r if x == p else x for x in loops[0] if x not in along[1:]],
             [y for x in loops[1] for y in (([r, q] if forward else [q, r]) if x == q else [x])],
-            [y for x in loops[2] for y in (strip if x == p else [x])],
+            [y for x in loops[2] for y in (gained if x == p else [x])],
         ]
         if not all(map(self._is_convex, after)):
             self.points.pop()
@@ -146,7 +147,7 @@ class _Edit:
         self.touched |= {cell, before, far}
         return True
 
-    def _reach(self, cell: int, before: int, face: int, forward: bool) -> bool:
+    def _reach(self, cell: int, before: int, face: int, strip: float, forward: bool) -> bool:
         """Let the cell beyond cell `before` reach to `cell` at one end of `face`, as at the mouth of a pocket."""
         loop = self.loop(before)
         k = next((i for i, side in enumerate(loop) if side[0] == face), None)
@@ -163,7 +164,7 @@ class _Edit:
             return False
         x, y = self.points[p], self.points[q]
         ahead = np.array([y[1] - x[1], x[0] - y[0]]) if forward else np.array([x[1] - y[1], y[0] - x[0]])
-        self.points.append(x + STRIP * (y - x) + TILT * ahead)
+        self.points.append(x + strip * (y - x) + TILT * strip / STRIPS[0] * ahead)
         loops = [[side[1] for side in self.loop(c)] for c in (before, far, cell)]
         after = [
             [r if v == w else v for v in loops[0] if v == w or v != p],
