@@ -426,8 +426,8 @@ kernel void write_trimmed(const int size, const int straight, SEGMENT_ARGS, SHOR
 }
 
 /* Per crossed cell: write its number for its loops, and the owner of the bounded piece for its chords. */
-kernel void name_owners(const int size, SEGMENT_ARGS, global const int *list_starts, global const int *listed,
-                        global const int *roots, global int *place_cells, global int *chord_owners)
+kernel void name_chord_owners(const int size, SEGMENT_ARGS, global const int *list_starts, global const int *listed,
+                              global const int *roots, global int *place_cells, global int *chord_owners)
 {
     WORK_ITEM(u);
     const segments_t s = SEGMENTS;

@@ -225,7 +225,7 @@ class Trim:
         place_cells = room("place_cells", size=chords.count + u, dtype=np.int32)
         chord_owners = room("chord_owners", size=chords.count, dtype=np.int32)
         engine.run_each(
-            k.name_owners, u, *segments, chords.list_starts, chords.listed, roots, place_cells, chord_owners
+            k.name_chord_owners, u, *segments, chords.list_starts, chords.listed, roots, place_cells, chord_owners
         )
         engine.run_each(
             k.write_trimmed,
