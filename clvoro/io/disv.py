@@ -14,14 +14,15 @@ from ..finite_volumes.gate import LEAST_MEASURE, SOLVERS, around_islands, region
 from ..finite_volumes.prisms import cell_loops
 from ..mesh.connectivity import take_rows
 from ..mesh.faces import Faces
+from ..mesh.geometry import smaller_size
 from ..mesh.read_only import Sealed
 
 if TYPE_CHECKING:
     from ..finite_volumes.solver_mesh import WallShape
     from ..mesh.diagram import Diagram
 
-_EMPTY = 1e-13
-"""Length of faces that are left out, over the extent of the domain."""
+_EMPTY = 1e-5
+"""Length of faces that are left out, over the width of the smaller of their cells."""
 _OBLIQUE = 1.0
 """Angle in degrees between a face's normal and the line between its centers, above which the check warns: fluxes then
 need MODFLOW's option XT3D."""
@@ -110,10 +111,13 @@ class Disv(Sealed):
 
 
 def _without_empty_faces(mesh: Faces) -> Faces:
-    """Return `mesh` without faces between cells that are as short as round-off: MODFLOW divides by their length."""
+    """Return `mesh` without faces between cells of nearly no length, as round-off and curved walls leave them.
+
+    MODFLOW divides by their length, and their normals may point anywhere.
+    """
     ends = mesh.corners.reshape(-1, 2)
     a, b = mesh.points[ends].swapaxes(0, 1)
-    short = np.hypot(*(b - a).T) <= _EMPTY * float(np.max(mesh.domain.extent))
+    short = np.hypot(*(b - a).T) <= _EMPTY * smaller_size(mesh.owner, mesh.neighbor, np.sqrt(np.abs(mesh.volumes)))
     short[mesh.n_inner :] = False
     if not short.any():
         return mesh

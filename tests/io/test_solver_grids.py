@@ -125,6 +125,16 @@ def test_faces_in_a_row_as_short_as_round_off_are_left_out():
     assert min(lengths) > 0
 
 
+@pytest.mark.slow
+def test_faces_of_no_length_at_curved_walls_are_left_out(ctx):
+    """Corners of layers that move onto the curve can pass each other by a millionth of a cell."""
+    pipe = clvoro.curves.circle((0.2, 0.2), 0.05, name="pipe")
+    domain = clvoro.Polygon([(0, 0), (2.2, 0), (2.2, 0.41), (0, 0.41)], [pipe])
+    layers = clvoro.Layers(0.001, count=5, growth=1.2, spacing=0.003, edges="pipe")
+    mesh = clvoro.Adapter(ctx).run(domain, 0.05, "fast", layers=layers)
+    assert mesh.check(solver="modflow")["angle to the normal"].ok
+
+
 def test_boundaries_have_names_cells_and_lengths(lake):
     disv, d = lake.to_disv(), lake.diagram
     assert tuple(disv.boundaries) == d.domain.boundary_names
