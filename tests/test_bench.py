@@ -187,6 +187,14 @@ def test_cylinder():
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="needs OpenFOAM")
+def test_cavity():
+    """A mesh of blockMesh, in bytes and compressed, is taken over."""
+    followed, uniform = records("cavity.py", "--cells", "800", "--uniform", "800", "--cycles", "2")
+    assert followed["error"] < 0.7 * uniform["error"]
+
+
+@pytest.mark.slow
 def test_masks():
     """Sizes are met on staircases, too: mean |e| at walls was 0.14 where a face ended in each of their corners."""
     given, simplified = records("masks.py", "--sizes", "3", "--masks", "2")

@@ -1,0 +1,156 @@
+"""A lid-driven cavity at Re 1000 with OpenFOAM: uniform meshes, and one of blockMesh that follows its solution.
+
+    python bench/cavity.py [--cells 1000,2000] [--uniform 1000,4000,16000] [--cycles 3] [--device NAME] [--json]
+
+"Followed" begins with 24 x 24 squares of blockMesh, in bytes and compressed, of which nothing else is known:
+`clvoro.foam.adapt_case` takes their boundary over and makes a new mesh of U and p in each cycle. The error is the mean
+difference of the horizontal velocity on the vertical line through the middle from the values of Ghia, Ghia and Shin
+(1982, J. Comput. Phys. 48, 387), in percent of the lid's velocity.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from _common import FIRST_SEED, Report, counts, heading, make_adapter, parser, shown
+from _openfoam import Case, header, missing
+
+import clvoro
+from clvoro import foam, sizing
+from clvoro.foam.case import FoamCase
+
+HEIGHT = (0.0547, 0.0625, 0.0703, 0.1016, 0.1719, 0.2813, 0.4531, 0.5, 0.6172, 0.7344, 0.8516, 0.9531, 0.9609, 0.9688)
+HEIGHT = np.array([*HEIGHT, 0.9766])
+GHIA = (-0.18109, -0.20196, -0.2222, -0.2973, -0.38289, -0.27805, -0.10648, -0.0608, 0.05702, 0.18719, 0.33304)
+GHIA = np.array([*GHIA, 0.46604, 0.51117, 0.57492, 0.65928])
+BLOCKS = """convertToMeters 1;
+vertices ((0 0 0) (1 0 0) (1 1 0) (0 1 0) (0 0 0.1) (1 0 0.1) (1 1 0.1) (0 1 0.1));
+blocks (hex (0 1 2 3 4 5 6 7) (24 24 1) simpleGrading (1 1 1));
+edges ();
+boundary
+(
+    lid { type wall; faces ((3 7 6 2)); }
+    fixed { type wall; faces ((0 4 7 3) (2 6 5 1) (1 5 4 0)); }
+    frontAndBack { type empty; faces ((0 3 2 1) (4 5 6 7)); }
+);
+"""
+
+
+def write_case(case: Case, flat: tuple[str, ...]) -> None:
+    """Write fields and dictionaries; `flat` are the empty patches."""
+    empty = {name: {"type": "empty"} for name in flat}
+    closed = {"type": "zeroGradient"}
+    u = {"lid": {"type": "fixedValue", "value": "uniform (1 0 0)"}, "fixed": {"type": "noSlip"}, **empty}
+    p = {"lid": closed, "fixed": closed, **empty}
+    for name, dimensions, value, patches in (
+        ("U", "[0 1 -1 0 0 0 0]", "uniform (0 0 0)", u),
+        ("p", "[0 2 -2 0 0 0 0]", "uniform 0", p),
+    ):
+        case.write(f"0/{name}", {"dimensions": dimensions, "internalField": value, "boundaryField": patches})
+    case.write("constant/transportProperties", {"transportModel": "Newtonian", "nu": 0.001})
+    case.write("constant/turbulenceProperties", {"simulationType": "laminar"})
+    case.write(
+        "system/controlDict",
+        {
+            "startFrom": "startTime",
+            "startTime": 0,
+            "stopAt": "endTime",
+            "endTime": 2000,
+            "deltaT": 1,
+            "writeControl": "runTime",
+            "writeInterval": 2000,
+            "writeFormat": "binary",
+            "writeCompression": "on",
+        },
+    )
+    case.write(
+        "system/fvSchemes",
+        {
+            "ddtSchemes": {"default": "steadyState"},
+            "gradSchemes": {"default": "leastSquares", "grad(p)": "Gauss linear"},
+            "divSchemes": {
+                "div(phi,U)": "bounded Gauss linearUpwind grad(U)",
+                "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
+            },
+            "laplacianSchemes": {"default": "Gauss linear corrected"},
+            "interpolationSchemes": {"default": "linear"},
+            "snGradSchemes": {"default": "corrected"},
+        },
+    )
+    case.write(
+        "system/fvSolution",
+        {
+            "solvers": {
+                "p": {"solver": "GAMG", "smoother": "GaussSeidel", "tolerance": 1e-9, "relTol": 0.05},
+                "U": {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": 1e-10, "relTol": 0.05},
+            },
+            "SIMPLE": {"consistent": "yes", "pRefCell": 0, "pRefValue": 0, "residualControl": {"p": 1e-5, "U": 1e-6}},
+            "relaxationFactors": {"equations": {"U": 0.9}},
+        },
+    )
+
+
+def error(case: Case, mesh: clvoro.Diagram) -> float:
+    """Return the error of the velocity in percent."""
+    known = FoamCase(case.folder)
+    folder = known.folder / known.latest().name
+    u = foam.read_field(next(path for path in (folder / "U", folder / "U.gz") if path.exists())).internal.rows(
+        len(mesh)
+    )
+    found = sizing.OnCells(mesh, u[:, 0])(np.column_stack([np.full(len(HEIGHT), 0.5), HEIGHT]))
+    return 100 * float(np.abs(found - GHIA).mean())
+
+
+COLUMNS = {
+    "mesh": lambda r: r["mesh"],
+    "cells": shown("cells", ",d"),
+    "error %": shown("error", ".2f"),
+    "seconds": shown("seconds", ".0f"),
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    made = parser(__doc__)
+    made.add_argument("--cells", type=counts, default=counts("1000,2000"))
+    made.add_argument("--uniform", type=counts, default=counts("1000,4000,16000"))
+    made.add_argument("--cycles", type=int, default=3)
+    options = made.parse_args(arguments)
+    absent = missing("simpleFoam", "blockMesh")
+    if absent:
+        raise SystemExit(f"{absent[0]} is not installed; Debian has it in the package openfoam")
+    adapter, report = make_adapter(options), Report(options.json, COLUMNS)
+    for n in options.cells:
+        with tempfile.TemporaryDirectory() as folder:
+            case = Case(Path(folder))
+            write_case(case, ("frontAndBack",))
+            (case.folder / "system" / "blockMeshDict").write_text(header("dictionary", "blockMeshDict") + BLOCKS)
+            case.run("blockMesh")
+            start = time.perf_counter()
+            foam.adapt_case(
+                case.folder, n_cells=n, cycles=options.cycles, solver="simpleFoam", pictures=False, adapter=adapter
+            )
+            seconds, known = time.perf_counter() - start, FoamCase(case.folder)
+            mesh = clvoro.load(known.mesh_folder(known.latest()) / "clvoro.npz")
+            record = {"mesh": "followed", "cells": n, "error": error(case, mesh.diagram), "seconds": seconds}
+            report.add(record, f"followed, {n}")
+    domain = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1)], names={"lid": 2, "fixed": [0, 1, 3]})
+    for n in options.uniform:
+        with tempfile.TemporaryDirectory() as folder:
+            case, start = Case(Path(folder)), time.perf_counter()
+            write_case(case, ("back", "front"))
+            mesh = adapter.run(domain, 1 / math.sqrt(n), n_cells=n, seed=FIRST_SEED)
+            mesh.to_openfoam(case.folder / "constant" / "polyMesh", thickness=0.1)
+            case.run("simpleFoam")
+            seconds = time.perf_counter() - start
+            record = {"mesh": "uniform", "cells": n, "error": error(case, mesh.diagram), "seconds": seconds}
+            report.add(record, f"uniform, {n}")
+    report.finish(heading(adapter, "Lid-driven cavity at Re 1000"))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
