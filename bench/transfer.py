@@ -1,14 +1,16 @@
 """Transfer of cell data between meshes: speed, errors of mass and bounds, order.
 
-    python bench/transfer.py [--sizes 1e3,1e4,1e5] [--dims 2,3] [--sphere] [--random] [--repeat 3]
+    python bench/transfer.py [--sizes 1e3,1e4,1e5] [--dims 2,3] [--on sphere|lake|ball] [--random] [--repeat 3]
                              [--device NAME] [--dtype float32] [--json]
 
 Two uniform meshes of about as many cells ("fast" effort from two seeds; --random: random generators) in the unit box,
-or on the unit sphere. The values of f = sin(3 x + 1) cos(2 y) (1 + z^2) at the centroids of one mesh are transferred
-to the other and compared there. "L1 error" is the mean of |error|, "order" its rate in the mesh width from one row to
+on the unit sphere, in a lake (see bench/solver_ready.py), or in a ball. The values of f = sin(3 x + 1) cos(2 y)
+(1 + z^2) at the centroids of one mesh are transferred to the other and compared there.
+"L1 error" is the mean of |error|, "order" its rate in the mesh width from one row to
 the next. "1" is the first order, "2" the second with the limiter, "2 free" without it. "mass" is the error of the sum
 of V f over the sum of V |f|, "beyond" the distance of new values from the bounds of the old ones. "new cells/s" is
-the median of whole calls, with copies to and from the device.
+the median of whole calls, with copies to and from the device. "overlap" is the least share of a new cell that old cells
+overlap; in a ball two meshes have different planes at its surface.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from _common import FIRST_SEED, Report, counts, heading, make_adapter, parser, shown
+from _walled import lake
 
 import clvoro
 
@@ -32,18 +35,22 @@ def smooth(x: np.ndarray) -> np.ndarray:
     return np.sin(3 * x[:, 0] + 1) * np.cos(2 * x[:, 1]) * last
 
 
-def make_mesh(
-    adapter: clvoro.Adapter, dim: int, n: int, seed: int, random: bool, sphere: bool = False
-) -> clvoro.Diagram:
-    """Return a mesh of the unit box or sphere, its arrays fetched."""
-    box = clvoro.Box((0,) * dim, (1,) * dim)
-    rng, globe = np.random.default_rng(seed), clvoro.Sphere(1.0)
+DOMAINS = {
+    "sphere": lambda: clvoro.Sphere(1.0),
+    "lake": lambda: lake().domain,
+    "ball": lambda: clvoro.Solid.ball((0, 0, 0), 1.0),
+}
+
+
+def make_mesh(adapter: clvoro.Adapter, domain: Any, n: int, seed: int, random: bool) -> clvoro.Diagram:
+    """Return a mesh of a domain, its arrays fetched."""
+    rng = np.random.default_rng(seed)
     if random:
-        made = adapter.diagram(globe, rng.normal(size=(n, 3))) if sphere else adapter.diagram(box, rng.random((n, dim)))
-    elif sphere:
-        made = adapter.run(globe, 1.0, n_cells=n, effort="fast", seed=seed).diagram
+        points = domain.nearest(rng.uniform(domain.lower, domain.upper, (n, domain.dim)))
+        made = adapter.diagram(domain, points)
     else:
-        made = adapter.run(box, n ** (-1 / dim), effort="fast", seed=seed).diagram
+        h = (domain.measure / n) ** (1 / domain.cell_dim)
+        made = adapter.run(domain, h, effort="fast", seed=seed).diagram
     for name in ("volumes", "centroids", "neighbors"):
         getattr(made, name)
     return made
@@ -59,6 +66,9 @@ def measure(
         start = time.perf_counter()
         carried = old.transfer(values, new, adapter=adapter, **way)
         seconds.append(time.perf_counter() - start)
+    # A part has a domain of its own, so that shares are those of the overlaps.
+    part = new.subset(np.arange(len(new)) > 0)
+    overlap = old.transfer(values, part, adapter=adapter, covered=True)[1]
     error = np.abs(carried - smooth(new.centroids))
     mass = float(new.volumes @ carried - old.volumes @ values)
     return {
@@ -67,6 +77,7 @@ def measure(
         "error": float(new.volumes @ error / new.volumes.sum()),
         "max_error": float(error.max()),
         "mass": abs(mass) / float(old.volumes @ np.abs(values)),
+        "overlap": float(overlap.min()),
         "beyond": max(carried.max() - values.max(), values.min() - carried.min(), 0.0),
     }
 
@@ -81,6 +92,7 @@ COLUMNS = {
     "largest error": shown("max_error", ".2e"),
     "mass": shown("mass", ".0e"),
     "beyond": shown("beyond", ".0e"),
+    "overlap": shown("overlap", ".6f"),
 }
 
 
@@ -88,16 +100,18 @@ def main(arguments: list[str] | None = None) -> int:
     made = parser(__doc__)
     made.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5"), help="cells")
     made.add_argument("--dims", type=counts, default=[2, 3])
-    made.add_argument("--sphere", action="store_true", help="on the unit sphere, not in the box")
+    made.add_argument("--on", choices=DOMAINS, help="another domain than the box")
     made.add_argument("--random", action="store_true", help="random generators")
     made.add_argument("--repeat", type=int, default=3)
     options = made.parse_args(arguments)
     adapter = make_adapter(options)
     report = Report(options.json, COLUMNS)
-    for dim in [2] if options.sphere else options.dims:
+    for dim in [0] if options.on else options.dims:
+        domain = DOMAINS[options.on]() if options.on else clvoro.Box((0,) * dim, (1,) * dim)
+        dim = domain.cell_dim
         before: dict[str, tuple[int, float]] = {}
         for n in options.sizes:
-            old, new = (make_mesh(adapter, dim, n, FIRST_SEED + k, options.random, options.sphere) for k in range(2))
+            old, new = (make_mesh(adapter, domain, n, FIRST_SEED + k, options.random) for k in range(2))
             for name, way in WAYS.items():
                 record: dict[str, Any] = {"dim": dim, "way": name, "rate": None}
                 record |= measure(old, new, adapter, options.repeat, way)
@@ -108,7 +122,7 @@ def main(arguments: list[str] | None = None) -> int:
                 before[name] = (len(new), record["error"])
                 report.add(record, f"{dim}D, {n} cells, order {name}")
     kind = "random" if options.random else "uniform"
-    where = " on a sphere" if options.sphere else ""
+    where = f": {options.on}" if options.on else ""
     report.finish(heading(adapter, f"Transfer between {kind} meshes{where}"))
     worst = max(record["mass"] for record in report.records)
     return 0 if worst <= 1e-12 else 1

@@ -118,6 +118,13 @@ class Subdomain(Domain):
         anchors[cut] = self.within[pairs] + way / 2
         return normals, anchors
 
+    def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the normals (k, d) of `walls` (k,), curved ones near `points` (k, d), and the distances (k,) to them."""
+        normals, gaps = super().toward_walls(walls, points)
+        own = ~self.removed_behind(walls)
+        normals[own], gaps[own] = self.whole.toward_walls(walls[own], points[own])
+        return normals, gaps
+
     def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return the distance of each of `points` (k, d) to its wall of `walls` (k,)."""
         cut = self.removed_behind(walls)

@@ -124,3 +124,13 @@ def test_parts_of_a_polygon():
     whole, other = (clvoro.voronoi(bay, bay.nearest(rng.random((150, 2)) * (1.9, 0.6) + 0.05)) for _ in range(2))
     old, new = whole.subset(whole.points[:, 0] > 0.9), other.subset(other.points[:, 0] > 1.3)
     assert old.transfer(np.full(len(old), 3.0), new) == pytest.approx(3)
+
+
+def test_a_part_of_a_solid_overlaps_its_other_meshes(ctx):
+    """Its cells at walls are bounded by planes there, as those of the whole solid."""
+    adapter, ball = clvoro.Adapter(ctx), clvoro.Solid.ball((0, 0, 0), 1.0)
+    old, new = (adapter.run(ball, h, "fast").diagram for h in (0.45, 0.4))
+    part = new.subset(np.arange(len(new)) > 0)
+    values, shares = old.transfer(np.ones(len(old)), part, covered=True)
+    assert shares.min() > 0.9
+    np.testing.assert_allclose(values, 1, rtol=1e-12)
