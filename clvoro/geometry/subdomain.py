@@ -119,7 +119,7 @@ class Subdomain(Domain):
         return normals, anchors
 
     def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the normals (k, d) of `walls` (k,), curved ones near `points` (k, d), and the distances (k,) to them."""
+        """Return the normals (k, d) of `walls` (k,) near `points` (k, d), and the distances (k,) to them."""
         normals, gaps = super().toward_walls(walls, points)
         own = ~self.removed_behind(walls)
         normals[own], gaps[own] = self.whole.toward_walls(walls[own], points[own])
