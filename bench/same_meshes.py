@@ -299,6 +299,10 @@ def sequel_cases() -> Iterator[Case]:
     yield Case("resumed, 2D", resumed(BOX, circle(0.05), rows=30, effort="fast"))
     yield Case("resumed, 2D, coupled", resumed(BOX, circle(0.05), rows=4, method="coupled", max_steps=9))
     yield Case("resumed, 3D", resumed(CUBE, sphere(0.12), rows=20, effort="fast"))
+    pipe = clvoro.Solid.cylinder((0, 0, 0), (0, 0, 1), 0.5, edge=0.1)
+    yield Case("solid, cylinder", adapted(pipe, 0.2, effort="fast"))
+    angle = clvoro.Solid.extruded(clvoro.Polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]), 0, 1)
+    yield Case("solid, resumed in a re-entrant corner", resumed(angle, 0.35, rows=20, effort="fast"))
 
 
 # Diagrams alone.
