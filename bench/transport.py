@@ -1,12 +1,12 @@
 """Prescribed volumes in power diagrams: steps of Newton's method, and time.
 
     python bench/transport.py [--sizes 1e3,1e4,1e5] [--sizes-3d 1e3,1e4] [--sizes-lake 1e3,1e4]
-                              [--sizes-periodic 1e3,1e4] [--repeat N] [--processor-time] [--picture] [--out DIR]
-                              [--device NAME] [--dtype float32] [--json]
+                              [--sizes-periodic 1e3,1e4] [--sizes-sphere 1e3,1e4] [--repeat N] [--processor-time]
+                              [--picture] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
-Uniform random generators in a unit box with walls, in periodic ones ("torus", in 3D with a tenth of the cells), and in
-a lake of 400 edges with an island (see bench/solver_ready.py), get cells of equal volume, and of volumes in proportion
-to 0.02 + |x - c|^2, c = (0.5, 0.5) (in the box in 2D 1 : 26).
+Uniform random generators in a unit box with walls, in periodic ones ("torus", in 3D with a tenth of the cells), in a
+lake of 400 edges with an island (see bench/solver_ready.py), and random ones on a sphere of radius 0.5 around 0, get
+cells of equal volume, and of volumes in proportion to 0.02 + |x - c|^2, c = (0.5, 0.5) (in the box in 2D 1 : 26).
 "outside" is the share of the cells that do not contain their generator, "shares" the shares of the damped Newton
 steps. Seconds are the least of the repeated solves, with generators
 sorted and arrays read back. `--processor-time` measures the processor time of all threads over the number of compute
@@ -34,13 +34,13 @@ def graded(points: np.ndarray) -> np.ndarray:
     return 0.02 + ((points - 0.5) ** 2).sum(axis=1)
 
 
-def random_points(domain: clvoro.Box | clvoro.Polygon, n: int) -> np.ndarray:
+def random_points(domain: clvoro.Box | clvoro.Polygon | clvoro.Sphere, n: int) -> np.ndarray:
     """Return n uniform random points in `domain`."""
     rng, points = np.random.default_rng(SEED), np.empty((0, domain.dim))
     while len(points) < n:
         more = rng.uniform(domain.lower, domain.upper, (n, domain.dim))
         points = np.concatenate([points, more[domain.contains(more)]])
-    return points[:n]
+    return domain.nearest(points[:n])
 
 
 def equal(points: np.ndarray) -> np.ndarray:
@@ -66,6 +66,7 @@ def make_options() -> argparse.ArgumentParser:
     made.add_argument("--sizes-3d", type=counts, default=counts("1e3,1e4"), metavar="N,...")
     made.add_argument("--sizes-lake", type=counts, default=counts("1e3,1e4"), metavar="N,...")
     made.add_argument("--sizes-periodic", type=counts, default=counts("1e3,1e4"), metavar="N,...")
+    made.add_argument("--sizes-sphere", type=counts, default=counts("1e3,1e4"), metavar="N,...")
     made.add_argument("--repeat", type=int, default=3, metavar="N")
     made.add_argument("--picture", action="store_true", help="draw a picture instead")
     made.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
@@ -105,6 +106,7 @@ def main(arguments: list[str] | None = None) -> None:
         "lake": (lake().domain, options.sizes_lake),
         "torus": (clvoro.Box((0, 0), (1, 1), periodic=True), options.sizes_periodic),
         "torus in 3D": (clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), [n // 10 for n in options.sizes_periodic]),
+        "sphere": (clvoro.Sphere(0.5), options.sizes_sphere),
     }
     for name, (domain, sizes) in domains.items():
         for n in sizes:
