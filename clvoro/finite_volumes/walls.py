@@ -239,6 +239,10 @@ class _WallMaker:
                 hidden = self.domain.crossings(x[cells[loose]], places)[0]
                 seen |= np.bincount(hidden, minlength=len(loose)) == 0
             self.kept[loose[~seen]] = False
+        # But a cell that would have no face keeps them, as in a lagoon that one cell fills.
+        kept = np.flatnonzero(self.kept)
+        alone = np.bincount(np.concatenate([f.left[kept], f.right[kept]]), minlength=len(x)) == 0
+        self.kept[loose[alone[f.left[loose]] | alone[f.right[loose]]]] = True
 
     def _parts_inside(self, a: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the parts of segments from `a` (k, 2) to `a + way` that lie inside: segments (p,) and parts (p, 4).
