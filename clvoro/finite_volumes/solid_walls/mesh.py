@@ -164,9 +164,12 @@ def _made(
             f"{surface.solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first "
             f"at {place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
         )
-    home, diagram = made.home, diagram_of(made.faces)
-    faces = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes[home]))
+    home = made.home
+    faces = _collapsed(made.faces, sizes[home])
     rejected, tips = rejected_at_walls(faces)
+    if len(rejected):  # where a face has been collapsed, another small one may bulge out
+        faces = _collapsed(faces, sizes[home])
+        rejected, tips = rejected_at_walls(faces)
     share = faces.volumes[rejected] / sizes[home[rejected]] ** 3
     slivers = rejected[share < np.where(tips, _TIP, _SLIVER)]
     if len(slivers):
@@ -176,6 +179,12 @@ def _made(
         faces = split_walls(faces, rejected)
         rejected = rejected_at_walls(faces)[0]
     return faces, home, rejected
+
+
+def _collapsed(faces: Faces, sizes: np.ndarray) -> Faces:
+    """Return a mesh without short edges and small faces, and without faces that bulge out."""
+    diagram = diagram_of(faces)
+    return collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes))
 
 
 def _simplify(walls: np.ndarray, faces: Faces, rejected: np.ndarray) -> None:
