@@ -89,15 +89,17 @@ def transport_to(
         warn(
             f"the volumes of {newton.far} of {n} cells differ from the prescribed ones by more than {tolerance:.3g}, "
             f"the largest relative error is {newton.errors[-1]:.3g} after {len(newton.shares)} steps; use "
-            f"{_remedy(engine.real, len(newton.shares) >= most)}",
+            f"{_remedy(engine.real, len(newton.shares) >= most, newton.errors[-1])}",
             SizeErrorWarning,
         )
     return result
 
 
-def _remedy(real: np.dtype, used_up: bool) -> str:
+def _remedy(real: np.dtype, used_up: bool, error: float) -> str:
     if used_up:
         return "more max_steps"
+    if error > RELAXED:
+        return "volumes that are nearer to those of the Voronoi cells"
     return "a larger tolerance" if real == np.float64 else "a larger tolerance or dtype='float64'"
 
 

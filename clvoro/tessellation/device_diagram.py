@@ -29,10 +29,12 @@ LEAST_SEPARATION = {"float64": 1e-6, "float32": 3e-3}
 # Bits of the flags in tessellation/face_rows.h and tessellation/search.h.
 FULL, COINCIDE, DOUBT, NARROW, LOOPED, UNEVEN, UNKNOWN = 1, 2, 8, 16, 32, 64, 128
 OPEN = 64  # in 2D
+HALF = 85.0
+"""Degrees to the nearest generator from which on generators may leave a half of a sphere free."""
 
 
 class OpenCellError(InputError):
-    """Generators on a sphere leave a half of it free.
+    """Generators on a sphere leave a half of it free, or weights are so different that a cell reaches so far.
 
     Parameters
     ----------
@@ -42,6 +44,12 @@ class OpenCellError(InputError):
 
     def __init__(self, points: np.ndarray) -> None:
         lon, lat, away = farthest_place(points.astype(float))
+        if away < HALF:
+            super().__init__(
+                "the weights on the sphere are so different that a cell reaches 89 degrees from its generator, "
+                "expected less; use weights that differ less, such as weights / 10"
+            )
+            return
         there = np.abs(directions(points)).max(axis=0)
         hint = ""
         if len(points) > 1 and (there <= (2 * np.pi + 1e-6, np.pi / 2 + 1e-6)).all():

@@ -168,6 +168,11 @@ def test_bad_input(ctx):
         found = adapter.transport(box, points, volumes, max_steps=1)
     assert not found.converged
     assert clvoro.Adapter(ctx).transport(box, points[:1], [box.measure]).diagram.volumes == [4.5]
+    # On a sphere no cell can be larger than a half.
+    globe = clvoro.Sphere(1.0)
+    areas = np.where(np.arange(40) == 0, globe.measure - 0.039, 1e-3)
+    with pytest.warns(SizeErrorWarning, match="nearer to those of the Voronoi cells"):
+        assert not adapter.transport(globe, globe.even_points(40), areas).converged
 
 
 def test_relaxed_cells_are_round_and_have_their_volumes(ctx):

@@ -270,6 +270,9 @@ def test_bad_input(ctx):
         adapter.power_diagram(SQUARE, points, [1e308, -1e308, 0])
     with pytest.raises(InputError, match="leave a half of it free"):
         adapter.power_diagram(clvoro.Sphere(), [(0, 0, 1)], [0])
+    globe = clvoro.Sphere(1.0)
+    with pytest.raises(InputError, match="weights that differ less"):
+        adapter.power_diagram(globe, globe.even_points(40), np.where(np.arange(40) == 3, 1e300, 0))
     with pytest.warns(EmptyCellsWarning, match="2 of 3"):
         d = adapter.power_diagram(SQUARE, points, [0, 1e300, 0])
     assert d.volumes.tolist() == [0, 1, 0]
