@@ -20,6 +20,9 @@ from .fields import FoamField, read_field
 _EXCHANGE, _HERE = 2, -100  # RENAME_EXCHANGE and AT_FDCWD of Linux
 _HOME = "/usr/share/openfoam"  # of Debian's package, whose programs need the variable
 _TAIL = 1500
+_APART = re.compile(r'//[^\n]*|/\*.*?\*/|"[^"]*"', re.DOTALL)
+_BACKUP = re.compile(r"^\.|(~|\.bak|\.old|\.orig|\.save)(\.gz)?$")  # names that OpenFOAM ignores, too
+_BLOCK = re.compile(r"\{[^{}]*\}")
 
 
 class Time(NamedTuple):
@@ -100,7 +103,8 @@ class FoamCase:
         """Return all fields of a time."""
         found = []
         for path in sorted((self.folder / time.name).iterdir()):
-            if path.is_file() and path.name[0] != "." and path.suffix in ("", ".gz"):
+            left_out = _BACKUP.search(path.name) or (path.suffix == ".gz" and path.with_suffix("").exists())
+            if path.is_file() and not left_out:
                 field = read_field(path)
                 if field.type:
                     found.append(field)
@@ -148,9 +152,10 @@ class FoamCase:
 
     def control_number(self, name: str) -> float | None:
         """Return the number of an entry of ``system/controlDict``; None if it is missing, or not a number."""
-        found = re.search(rf"^\s*{name}\s+([^;\s]+)\s*;", self.control.read_text(), re.MULTILINE)
+        text = self.control.read_text()
+        place = _entry(text, name)
         try:
-            return float(found[1]) if found else None
+            return float(text[place]) if place else None
         except ValueError:
             return None
 
@@ -161,9 +166,11 @@ class FoamCase:
         if not kept.exists():
             shutil.copy2(self.control, kept)
         for name, value in entries.items():
-            line = re.compile(rf"^(\s*){name}\s+[^;]*;", re.MULTILINE)
-            written = f"{name} {value};"
-            text = line.sub(rf"\g<1>{written}", text, count=1) if line.search(text) else f"{text.rstrip()}\n{written}\n"
+            place = _entry(text, name)
+            if place is None:
+                text = f"{text.rstrip()}\n{name} {value};\n"
+            else:
+                text = f"{text[: place.start]}{value}{text[place.stop :]}"
         with atomic_file(self.control) as file:
             file.write(text.encode())
 
@@ -200,6 +207,15 @@ class FoamCase:
 
 def _has(folder: Path, name: str) -> bool:
     return (folder / name).exists() or (folder / f"{name}.gz").exists()
+
+
+def _entry(text: str, name: str) -> slice | None:
+    """Return where a dictionary has the value of an entry, the last one of that name: not in dictionaries inside it."""
+    text = _APART.sub(lambda found: " " * len(found[0]), text)
+    while (outside := _BLOCK.sub(lambda found: ";" * len(found[0]), text)) != text:
+        text = outside
+    places = [slice(*found.span(1)) for found in re.finditer(rf"(?:^|[;\n])\s*{name}\s+([^;\s][^;]*?)\s*;", text)]
+    return places[-1] if places else None
 
 
 def _last_row(path: Path) -> dict[str, float]:

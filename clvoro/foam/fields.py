@@ -23,6 +23,7 @@ _BLANK = re.compile(rb"(?:\s+|//[^\n]*|/\*.*?\*/)*", re.DOTALL)
 _NAME = re.compile(rb'"[^"]*"|[^\s{};"]+')
 _LIST = re.compile(rb"nonuniform\s+(?:List<(\w+)>\s*)?(\d+)\s*")
 _UNIFORM = re.compile(rb"uniform\s+([^;]*)")
+_FOR_OPENFOAM = "which only OpenFOAM reads; run the solver first, which writes numbers"
 _BYTE_ORDER = {"little": "LSB", "big": "MSB"}[sys.byteorder]
 
 
@@ -84,7 +85,7 @@ class FoamField:
     Attributes
     ----------
     name, kind : str
-        As in the file's head: ``object`` and ``class``.
+        Name of the file, and ``class`` in its head.
     binary : bool
     entries : dict
         Everything else in its order: text as it is, `Values` and dictionaries. ``entries["internalField"]`` are the
@@ -153,15 +154,18 @@ def read_field(path: Path) -> FoamField:
             text = gzip.decompress(file.read()) if packed else file.read()
         found = _HEAD.search(text)
         if found is None:
-            raise FileError("it has no head FoamFile, expected a field of OpenFOAM")
+            raise FileError("it has no head FoamFile, expected a field of OpenFOAM; move other files to another folder")
         pairs = re.findall(rb'(\w+)\s+"?([^;"]*?)"?\s*;', found[1])
         head = {key.decode(): value.decode("utf-8", "replace") for key, value in pairs}
         scalar = "<f4" if "scalar=32" in head.get("arch", "") else "<f8"
         binary = head.get("format") == "binary"
         kind = head.get("class", "")
-        made = FoamField(head.get("object", path.stem if packed else path.name), kind, binary, {})
-        entries, _ = _Reader(text, scalar if binary else "", made.type).entries(found.end())
-        return replace(made, entries=entries)
+        made = FoamField(path.stem if packed else path.name, kind, binary, {})
+        if made.type:
+            made = replace(made, entries=_Reader(text, scalar if binary else "", made.type).entries(found.end())[0])
+        if made.in_cells:
+            _ = made.internal  # before anything is made of it
+        return made
 
 
 class _Reader:
@@ -183,7 +187,7 @@ class _Reader:
                 at = self.skip(at + 1)
                 continue
             if self.text[at : at + 1] == b"#":
-                raise FileError("it has an entry that begins with #, which only OpenFOAM reads; let a solver write it")
+                raise FileError(f"it has an entry that begins with #, {_FOR_OPENFOAM}")
             found = _NAME.match(self.text, at)
             if found is None:
                 raise FileError(f"it cannot be read at byte {at}")
@@ -208,6 +212,8 @@ class _Reader:
             raise FileError("an entry has no ; at its end")
         whole = self.text[at:end].strip()
         uniform = _UNIFORM.fullmatch(whole)
+        if uniform is not None and b"$" in whole:
+            raise FileError(f"it has a value that begins with $, {_FOR_OPENFOAM}")
         if uniform is not None and self.type in WIDTHS:
             numbers = uniform[1].replace(b"(", b" ").replace(b")", b" ").split()
             if len(numbers) == WIDTHS[self.type]:

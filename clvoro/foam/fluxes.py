@@ -56,7 +56,7 @@ def project_fluxes(mesh: FoamMesh, velocity: np.ndarray, at_boundary: np.ndarray
         np.bincount(owner, conductance, n) + np.bincount(neighbor, conductance, n) + np.bincount(outer, beyond, n)
     )
     if not is_open.any():
-        diagonal[0] *= 2  # the potential is known up to a constant
+        diagonal[0] = 2 * diagonal[0] or 1.0  # the potential is known up to a constant
     rows, columns = np.concatenate([owner, neighbor, np.arange(n)]), np.concatenate([neighbor, owner, np.arange(n)])
     entries = np.concatenate([-conductance, -conductance, diagonal])
     matrix = scipy.sparse.csc_array((entries, (rows, columns)), shape=(n, n))

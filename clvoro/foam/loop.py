@@ -31,7 +31,7 @@ from ..mesh.results import Result
 from ..shared import shared_adapter
 from ..sizing import Estimate, hessian_size
 from .case import FoamCase, Time
-from .fields import FoamField
+from .fields import FoamField, Values
 from .mesh import FoamMesh
 from .transfer import MeshOfCase, transfer_fields
 
@@ -296,7 +296,7 @@ class _Loop:
         foam = FoamMesh.read(folder)
         old = MeshOfCase.of(foam, self._diagram(folder, foam, mesh if note["cycle"] == 0 else None))
         fields = case.fields(latest)
-        _check_lengths(fields, foam)
+        _check_values(fields, foam)
         size = self._sizes(fields, old)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
         domain = old.diagram.domain
@@ -308,7 +308,9 @@ class _Loop:
         target = case.own / f"next-{latest.name}"
         shutil.rmtree(target, ignore_errors=True)
         types = cast(dict[str, PatchType], {name: foam.types[name] for name in domain.boundary_names})
-        shutil.copytree(case.folder / latest.name, target, ignore=_only_uniform)
+        target.mkdir()
+        if (case.folder / latest.name / "uniform").is_dir():
+            shutil.copytree(case.folder / latest.name / "uniform", target / "uniform")
         made.to_openfoam(target / "polyMesh", types=types, thickness=foam.thickness)
         made.save(target / "polyMesh" / _MESH)
         new = MeshOfCase.of(FoamMesh.read(target / "polyMesh"), made.diagram)
@@ -373,13 +375,6 @@ class _Loop:
             raise InputError(
                 f"the latest time of {self.case.folder} has no field {missing[0]}, expected one of {', '.join(found)}"
             )
-        for name in self.names:
-            bad = ~np.isfinite(found[name].reshape(len(found[name]), -1)).all(axis=1)
-            if bad.any():
-                raise InputError(
-                    f"{name} is not finite in {int(bad.sum())} cells, the first is {int(bad.argmax())}; the solver has "
-                    "diverged: go back to an earlier time"
-                )
         made = self.estimate(found, old.diagram)
         if not isinstance(made, Estimate):
             raise InputTypeError(f"estimate returned a {type(made).__name__}, expected a clvoro.sizing.Estimate")
@@ -398,21 +393,30 @@ class _Loop:
         figure.savefig(self.case.own / f"cycle-{cycle}.png", dpi=150)
 
 
-def _only_uniform(folder: str, names: list[str]) -> list[str]:
-    """Return what is not copied to the next mesh: all but the folder ``uniform``."""
-    return [] if Path(folder).name == "uniform" or "time" in names else [name for name in names if name != "uniform"]
-
-
-def _check_lengths(fields: Sequence[FoamField], foam: FoamMesh) -> None:
-    """Raise InputError if a field has not a value for each cell."""
+def _check_values(fields: Sequence[FoamField], foam: FoamMesh) -> None:
+    """Raise InputError if a field has not a finite value for each cell, or others at a patch."""
     for one in fields:
-        if one.in_cells:
-            values = one.internal
-            if not values.uniform and len(values.numbers) != foam.n_cells:
-                raise InputError(
-                    f"the field {one.name} has {len(values.numbers)} values, the mesh {foam.n_cells} cells; expected a "
-                    "time and its own mesh"
-                )
+        if not one.in_cells:
+            continue
+        values = one.internal
+        if not values.uniform and len(values.numbers) != foam.n_cells:
+            raise InputError(
+                f"the field {one.name} has {len(values.numbers)} values, the mesh {foam.n_cells} cells; expected a "
+                "time and its own mesh"
+            )
+        bad = ~np.isfinite(values.numbers).all(axis=1)
+        if bad.any():
+            raise InputError(
+                f"{one.name} is not finite in {int(bad.sum())} cells, the first is {int(bad.argmax())}; the solver has "
+                "diverged: go back to an earlier time"
+            )
+        for name, entries in one.patches.items():
+            for key, given in entries.items():
+                if isinstance(given, Values) and not np.isfinite(given.numbers).all():
+                    raise InputError(
+                        f"{one.name} has a {key} at {name} that is not finite, expected numbers; go back to an earlier "
+                        "time, or correct the condition"
+                    )
 
 
 def _layers_of(described: Sequence[Mapping[str, Any]]) -> list[Layers]:

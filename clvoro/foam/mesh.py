@@ -14,7 +14,7 @@ from ..geometry.polygon import Polygon
 from ..geometry.rings import signed_area
 from ..geometry.solid.solid import Solid
 from ..io.arrays import FileError, explained
-from ..io.foam_read import FoamFile, FoamPatchFaces
+from ..io.foam_read import FoamFile, FoamPatchFaces, count_cells
 from ..mesh.geometry import cell_geometry, face_geometry
 
 
@@ -31,6 +31,8 @@ class FoamMesh:
         Cells of each face; inner faces come first.
     patches : list
         Name, kind, and faces of each part of the boundary.
+    n_cells : int
+        Number of cells.
     """
 
     points: np.ndarray
@@ -39,6 +41,7 @@ class FoamMesh:
     owner: np.ndarray
     neighbor: np.ndarray
     patches: list[FoamPatchFaces]
+    n_cells: int
 
     @classmethod
     def read(cls, folder: Path) -> FoamMesh:
@@ -57,12 +60,10 @@ class FoamMesh:
             patches = FoamFile.read(folder, "boundary").patches()
             if not any(len(patch.faces) for patch in patches if patch.kind != "empty"):
                 raise FileError("its boundary has no patch with faces, expected walls, inlets, ...")
-            return cls(points, starts, corners, owner, neighbor, patches)
-
-    @cached_property
-    def n_cells(self) -> int:
-        """Number of cells."""
-        return int(max(self.owner.max(initial=-1), self.neighbor.max(initial=-1))) + 1
+            n_cells = count_cells(points, starts, corners, owner, neighbor)
+            if any(len(patch.faces) and patch.faces[-1] >= len(owner) for patch in patches):
+                raise FileError("its boundary has faces that are not there, expected those of the mesh")
+            return cls(points, starts, corners, owner, neighbor, patches, n_cells)
 
     @cached_property
     def faces(self) -> tuple[np.ndarray, np.ndarray]:
@@ -101,8 +102,8 @@ class FoamMesh:
 
     @property
     def types(self) -> dict[str, str]:
-        """Types of the patches with faces, without those of the layer."""
-        return {patch.name: patch.kind for patch in self.patches if patch.kind != "empty"}
+        """Types of the patches with faces, without those of the layer and of seams."""
+        return {patch.name: patch.kind for patch in self.patches if patch.kind not in ("empty", "cyclic")}
 
     def domain(self) -> Domain:
         """Return the inside of the boundary: a polygon, or a solid. Boundaries have the names of the patches.
@@ -110,14 +111,14 @@ class FoamMesh:
         Raises
         ------
         InputError
-            If patches are of a kind that no domain has, such as cyclic or wedge ones; or the boundary is not closed.
+            If patches are of a kind that these domains lack, such as cyclic or wedge; or the boundary is not closed.
         """
         known = ("wall", "patch", "symmetry", "symmetryPlane")
         other = [f"{p.name} ({p.kind})" for p in self.patches if p.kind not in (*known, "empty") and len(p.faces)]
         if other:
             raise InputError(
                 f"the case has patches {', '.join(other)}, expected types {', '.join(known)}, or one layer of cells "
-                "between empty patches; mesh it with clvoro, and pass mesh="
+                "between empty patches; cyclic patches are known if the mesh is one of clvoro that is passed as mesh="
             )
         return self._polygon() if self.is_plane else self._solid()
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _OPEN = ("zeroGradient", "inletOutlet", "outletInlet", "pressureInlet", "freestream", "advective", "waveTransmissive")
 """Beginnings of the types of a velocity at patches through which the flux is free."""
-_CLOSED = ("noSlip", "slip", "symmetry", "symmetryPlane", "empty", "cyclic", "wedge")
+_CLOSED = ("noSlip", "slip", "symmetry", "symmetryPlane", "empty")
 _VOLUME_FLUX = (0.0, 3.0, -1.0)
 
 
@@ -74,7 +74,7 @@ def transfer_fields(fields: Sequence[FoamField], old: MeshOfCase, new: MeshOfCas
     """Return all fields in cells on the new mesh, and the flux `phi` of the velocity `U`.
 
     In cells the sum of volume times value is that on the old mesh, with the volumes of the solver, and there are no new
-    extrema. Other fields on faces are left out: solvers make them.
+    extrema. Other fields on faces are left out, and so is `phi` where patches are cyclic: solvers make them.
     """
     in_cells = [field for field in fields if field.in_cells]
     widths = [WIDTHS[field.type] for field in in_cells]
@@ -92,7 +92,7 @@ def transfer_fields(fields: Sequence[FoamField], old: MeshOfCase, new: MeshOfCas
         internal = given if given.uniform else Values(given.kind, part, False)
         made.append(replace(field, entries=_with_boundary(field, internal, old.foam, new.foam)))
     by_name = {field.name: field for field in made}
-    velocity = by_name.get("U")
+    velocity = None if any(patch.kind == "cyclic" for patch in new.foam.patches) else by_name.get("U")
     for field in fields:
         if field.name == "phi" and field.dimensions[:3] == _VOLUME_FLUX and velocity is not None:
             made.append(_flux(field, velocity, new.foam))

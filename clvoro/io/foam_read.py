@@ -48,10 +48,7 @@ def _read_faces(folder: Path) -> Faces:
     inside = FoamFile.read(folder, "neighbour").labels()
     patches = FoamFile.read(folder, "boundary").patches()
     f, inner = len(starts) - 1, len(inside)
-    n = int(max(owner.max(initial=-1), inside.max(initial=-1))) + 1
-    fits = len(owner) == f and inner <= f and n > 0 and min(owner.min(), inside.min(initial=0)) >= 0
-    if not fits or not ((corners >= 0) & (corners < len(points))).all() or (np.diff(starts) < 3).any():
-        raise FileError("its lists do not fit each other, expected those of one mesh")
+    n = count_cells(points, starts, corners, owner, inside)
     mesh = Faces(
         domain=_box(points.min(axis=0), points.max(axis=0)),
         generators=np.zeros((n, 3)),
@@ -68,6 +65,24 @@ def _read_faces(folder: Path) -> Faces:
     mesh, seams = _coupled(mesh, patches)
     empty = np.isin(seams, np.concatenate(flat)) if flat else np.zeros(f, bool)
     return _in_plane(mesh, empty) if empty.sum() == 2 * n else mesh
+
+
+def count_cells(
+    points: np.ndarray, starts: np.ndarray, corners: np.ndarray, owner: np.ndarray, neighbor: np.ndarray
+) -> int:
+    """Return the number of cells of a mesh.
+
+    Raises
+    ------
+    FileError
+        If its lists do not fit each other.
+    """
+    f, inner = len(starts) - 1, len(neighbor)
+    n = int(max(owner.max(initial=-1), neighbor.max(initial=-1))) + 1
+    fits = len(owner) == f and inner <= f and n > 0 and min(owner.min(), neighbor.min(initial=0)) >= 0
+    if not fits or not ((corners >= 0) & (corners < len(points))).all() or (np.diff(starts) < 3).any():
+        raise FileError("its lists do not fit each other, expected those of one mesh")
+    return n
 
 
 def _coupled(mesh: Faces, patches: list[FoamPatchFaces]) -> tuple[Faces, np.ndarray]:

@@ -3,6 +3,7 @@
 import gzip
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from clvoro.foam import case as cases
 from clvoro.foam.case import FoamCase
 from clvoro.foam.fluxes import MOST_DIVERGENCE, divergence
 from clvoro.foam.mesh import FoamMesh, polygon_of_edges
+from clvoro.io import foam_read
 
 HOLE = [(0.9, 0.4), (1.1, 0.4), (1.1, 0.6), (0.9, 0.6)]
 DOMAIN = clvoro.Polygon(
@@ -62,6 +64,7 @@ def test_fields_are_read_and_written(tmp_path):
         (b"3{(1 1 1)};", b"3{(1 1 1)}", "no"),
         (b"dimensions [", b'#include "other"\ndimensions [', "only OpenFOAM reads"),
         (b"List<vector> 2(", b"List<label> 2(", "type label"),
+        (b"uniform (1 0 0)", b"uniform $inflow", "begins with [$], which only OpenFOAM reads"),
     ],
 )
 def test_damaged_fields_are_refused(tmp_path, old, new, text):
@@ -69,6 +72,34 @@ def test_damaged_fields_are_refused(tmp_path, old, new, text):
     path.write_bytes(TEXT.replace(old, new))
     with pytest.raises(InputError, match=text):
         foam.read_field(path)
+
+
+def test_fields_of_a_time_have_the_names_of_their_files(case):
+    """Also names with dots; files that OpenFOAM ignores are left out."""
+    time = case / "5"
+    text = (time / "p").read_bytes()
+    for name in ("alpha.water", "U~", "U.orig", ".U", "k.bak"):
+        (time / name).write_bytes(text)
+    for name in ("U.gz", "T.air.gz"):
+        (time / name).write_bytes(gzip.compress(text))
+    fields = FoamCase(case).fields(FoamCase(case).latest())
+    assert [field.name for field in fields] == ["T.air", "U", "alpha.water", "k", "p", "phi"]
+    assert fields[1].type == "vector"
+
+
+def test_settings_of_a_run(case):
+    """Entries on one line, after a dictionary that has the same names, and with comments."""
+    control = FoamCase(case)
+    text = (
+        "functions { a { b { endTime 7; } } } // endTime 6;\nstopAt endTime; endTime 5;deltaT $step; /* startTime 9; */"
+    )
+    control.control.write_text(text)
+    assert control.control_number("endTime") == 5
+    assert control.control_number("startTime") is None
+    assert control.control_number("deltaT") is None
+    control.own.mkdir()
+    control.set_control(endTime="12", startFrom="latestTime")
+    assert control.control.read_text() == text.replace("endTime 5", "endTime 12") + "\nstartFrom latestTime;\n"
 
 
 def velocity(x):
@@ -242,9 +273,29 @@ def by_hand(fields, mesh):
     return sizing.sensor_size(sizing.vorticity(fields["U"], mesh), on=mesh, n_cells=300)
 
 
-def spoil(case, name="5/p", old=b"", new=b""):
+def spoil(case, name, old, new):
     path = case / name
     path.write_bytes(path.read_bytes().replace(old, new, 1))
+
+
+def change_field(case, name, change, key="internalField", patch=None):
+    """Write a field of the latest time with other numbers in cells, or at a patch."""
+    field = foam.read_field(case / "5" / name)
+    entries = {**field.entries}
+    place = entries if patch is None else entries["boundaryField"][patch]
+    place[key] = foam.Values(field.type, change(place[key].numbers), False)
+    replace(field, entries=entries).write(case / "5" / name, "5")
+
+
+def change_owner(case, n_less):
+    path = case / "constant" / "polyMesh" / "owner"
+    file = foam_read.FoamFile.read(path.parent, "owner")
+    rows = file.labels()[:-n_less].astype(np.int64)
+    path.write_text(f"FoamFile {{ format ascii; class labelList; }}\n{len(rows)}\n(\n{' '.join(map(str, rows))}\n)\n")
+
+
+def nan_in_row_3(values):
+    return np.where(np.arange(len(values))[:, None] == 3, np.nan, values)
 
 
 @pytest.mark.parametrize(
@@ -267,8 +318,23 @@ def spoil(case, name="5/p", old=b"", new=b""):
         (lambda c: None, {"mesh": clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), [(0.5, 0.5)])}, InputError, "same names"),
         (lambda c: None, {"estimate": lambda fields, mesh: 0.1}, InputTypeError, "Estimate"),
         (lambda c: None, {"layers": LAYERS, "n_cells": 20}, ClvoroError, "."),
-        (lambda c: put_nan(c), {}, InputError, "p is not finite in 1 cells, the first is 3"),
-        (lambda c: put_short(c), {}, InputError, "values, the mesh"),
+        (lambda c: change_field(c, "p", nan_in_row_3), {}, InputError, "p is not finite in 1 cells, the first is 3"),
+        (
+            lambda c: change_field(c, "U", lambda v: v * [1, 1, np.nan]),
+            {"fields": ["p"]},
+            InputError,
+            "U is not finite",
+        ),
+        (
+            lambda c: change_field(c, "U", nan_in_row_3, "value", "inlet"),
+            {},
+            InputError,
+            "a value at inlet that is not",
+        ),
+        (lambda c: change_field(c, "p", lambda v: v[:-1]), {}, InputError, "values, the mesh"),
+        (lambda c: spoil(c, "5/p", b"internalField", b"otherField"), {}, InputError, "p has no internalField"),
+        (lambda c: (c / "5" / "log").write_text("no field"), {}, InputError, "move other files"),
+        (lambda c: change_owner(c, 5), {}, InputError, "its lists do not fit each other"),
     ],
 )
 def test_bad_input_changes_nothing(case, change, options, kind, text):
@@ -280,18 +346,6 @@ def test_bad_input_changes_nothing(case, change, options, kind, text):
     if "solver" not in options:
         assert after == before
     assert all(after[path] == data for path, data in before.items() if path.name != "controlDict")
-
-
-def put_nan(case):
-    field = foam.read_field(case / "5" / "p")
-    field.internal.numbers.base[3] = np.nan if field.internal.numbers.base.ndim == 1 else [np.nan]
-    field.write(case / "5" / "p", "5")
-
-
-def put_short(case):
-    field = foam.read_field(case / "5" / "p")
-    values = foam.Values("scalar", field.internal.numbers[:-1], False)
-    foam.FoamField("p", field.kind, False, {**field.entries, "internalField": values}).write(case / "5" / "p", "5")
 
 
 def test_polygons_of_edges():
@@ -306,15 +360,21 @@ def test_polygons_of_edges():
         polygon_of_edges(points, ends[1:], ["a"] * 7)
 
 
-@pytest.mark.slow
-def test_a_box_in_space_is_taken_over(tmp_path):
+PERIODIC = clvoro.Box((0, 0), (1, 1), (True, False))
+SPACE = clvoro.Box((0, 0, 0), (1, 1, 1))
+
+
+@pytest.mark.parametrize(("box", "known"), [(PERIODIC, True), pytest.param(SPACE, False, marks=pytest.mark.slow)])
+def test_boxes_follow(tmp_path, box, known):
+    """One with a seam, and one in space of which only OpenFOAM's files are known."""
     folder = tmp_path / "case"
     (folder / "system").mkdir(parents=True)
     (folder / "system" / "controlDict").write_text("endTime 1;\n")
-    box = clvoro.Box((0, 0, 0), (1, 1, 1))
     mesh = clvoro.adapt(box, 0.2, "fast")
-    mesh.to_openfoam(folder / "constant" / "polyMesh")
-    values = np.tanh(10 * (mesh.centroids[:, 0] - 0.5))
+    mesh.to_openfoam(folder / "constant" / "polyMesh", thickness=1.0 if box is PERIODIC else None)
+    if known:
+        mesh.save(folder / "constant" / "polyMesh" / "clvoro.npz")
+    values = np.tanh(10 * (mesh.centroids[:, 1] - 0.5))
     internal = foam.Values("scalar", values[:, None], False)
     patches = {'".*"': {"type": b"zeroGradient"}}
     entries = {"dimensions": b"[0 0 0 1 0 0 0]", "internalField": internal, "boundaryField": patches}
@@ -327,4 +387,5 @@ def test_a_box_in_space_is_taken_over(tmp_path):
     assert made.volumes.sum() == pytest.approx(1)
     after = foam.read_field(folder / "1" / "T").internal.rows(made.n_cells)[:, 0]
     assert made.volumes @ after == pytest.approx(before.volumes @ values, abs=1e-12)
-    assert after == pytest.approx(np.tanh(10 * (made.centroids[:, 0] - 0.5)), abs=0.35)
+    assert after == pytest.approx(np.tanh(10 * (made.centroids[:, 1] - 0.5)), abs=0.35)
+    assert [patch.kind for patch in made.patches] == [patch.kind for patch in before.patches]
