@@ -14,10 +14,12 @@
     , global const int2 *own_rows, global const int *own_labels, global const REAL4 *own_planes,                       \
         global const float *own_found, global float *own_reach
 #define OWN , own_rows, own_labels, own_planes, own_found, own_reach
+#define WALLS_MOVE 1 /* with the generators */
 #define BOX_LABEL(side) (INT_MIN + 1 + (side))
 #else
 #define OWN_ARGS
 #define OWN
+#define WALLS_MOVE 0
 #define BOX_LABEL(side) (-1 - (side))
 #endif
 #define CLIP_BOX_ARGS const REAL4 box_lower, const REAL4 box_upper OWN_ARGS
@@ -35,19 +37,3 @@ inline bool knows_walls(int i, REAL reach2, global const float *own_found, globa
     return reach <= own_found[i];
 }
 #endif
-
-/* The outward unit normal of the wall at a face of the cell of generator i, by the label of the face. */
-inline REAL4 wall_normal(int i, int label, CLIP_BOX_ARGS)
-{
-    REAL4 normal = 0;
-#ifdef SOLID
-    for (int k = own_rows[i].s0; k < own_rows[i].s0 + own_rows[i].s1; ++k)
-        normal = own_labels[k] == label ? own_planes[k] : normal;
-    normal.s3 = 0;
-#else
-    const int wall = -1 - label;
-    const REAL sign = wall % 2 ? 1 : -1;
-    normal = (REAL4)(wall < 2 ? sign : 0, wall / 2 == 1 ? sign : 0, wall > 3 ? sign : 0, 0);
-#endif
-    return normal;
-}

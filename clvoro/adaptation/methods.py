@@ -230,13 +230,7 @@ class ProjectedMethod(Method):
                 mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
             if self.descent == "surface" and t.vertices:
                 stages.surface_descent.descend(
-                    mesh.tessellator.steps.box,
-                    t,
-                    mesh.local_length,
-                    mesh.quality,
-                    lloyd,
-                    bad_cell_weight=self.bad_cell_weight,
-                    rate=self.rate,
+                    t, mesh.local_length, mesh.quality, lloyd, bad_cell_weight=self.bad_cell_weight, rate=self.rate
                 )
             elif self.descent in ("quality", "edges"):
                 stages.quality_descent.descend(

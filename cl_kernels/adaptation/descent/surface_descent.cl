@@ -113,12 +113,12 @@ inline REAL4 pull_of_edges(const sides_t *sides, global const uchar4 *corners, i
 }
 
 /* lloyd = -rate h^2 dE/dx_i, at most max_displacement h. One work-item per generator. A cell without known vertices
-   keeps the displacement to its centroid. */
+   keeps the displacement to its centroid; so does one at a wall whose plane moves with its generator. */
 kernel void descend_surface(const int size, global const int *starts, global const int *neighbors,
                             global const FACE *face_measures, global const FACE *face_centroids,
-                            global const uchar4 *corners, global const REAL *points, CLIP_BOX_ARGS,
-                            global const REAL *h, global const REAL2 *forces, const REAL rate,
-                            const REAL max_displacement, global REAL *lloyd PERIOD_ARGS)
+                            global const uchar4 *corners, global const REAL *points, global const REAL *h,
+                            global const REAL2 *forces, const REAL rate, const REAL max_displacement,
+                            global REAL *lloyd PERIOD_ARGS)
 {
     LONG_ITEM(i);
     const int begin = starts[i], faces = starts[i + 1] - begin;
@@ -140,8 +140,12 @@ kernel void descend_surface(const int size, global const int *starts, global con
             sides.inverse[f] = 1 / sqrt(away.s3);
             sides.tension[f] = forces[j].s0;
             g += face_measures[k] * sides.inverse[f] * (forces[j].s1 - own.s1) * m;
+        } else if (WALLS_MOVE) {
+            return;
         } else {
-            away = wall_normal(i, j, CLIP_BOX);
+            const int wall = -1 - j;
+            const REAL sign = wall % 2 ? 1 : -1;
+            away = (REAL4)(wall < 2 ? sign : 0, wall / 2 == 1 ? sign : 0, wall > 3 ? sign : 0, 0);
             sides.level[f] = dot(away, m);
             away.s3 = 1;
             sides.inverse[f] = sides.tension[f] = 0;

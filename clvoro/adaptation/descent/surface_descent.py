@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pyopencl.array as cla
 
-from ...geometry.domain import ClipBox
 from ...opencl.engine import Engine
 from ...tessellation.device_diagram import Tessellation
 
@@ -18,7 +17,6 @@ class SurfaceDescent:
 
     def descend(
         self,
-        box: ClipBox,
         t: Tessellation,
         h: cla.Array,
         quality: cla.Array,
@@ -32,8 +30,6 @@ class SurfaceDescent:
 
         Parameters
         ----------
-        box : ClipBox
-            That of the tessellator: it knows the walls.
         t : Tessellation
             With vertices.
         h, quality : (n,) real
@@ -67,7 +63,6 @@ class SurfaceDescent:
                 t.face_centroids,
                 t.vertices[0],
                 t.points,
-                *box.clip_args(engine),
                 h,
                 forces,
                 real(rate),

@@ -63,7 +63,6 @@ def test_descent_follows_the_gradient(ctx, dtype):
     def descend(most):
         out = engine.empty((N, 3)).fill(KEPT)
         SurfaceDescent(engine).descend(
-            BOX,
             t,
             engine.upload(np.full(N, H)),
             engine.upload(quality),
