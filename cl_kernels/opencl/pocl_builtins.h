@@ -25,6 +25,7 @@
     T CONST_FUNCTION floor(T);                                                                                         \
     T CONST_FUNCTION ceil(T);                                                                                          \
     T CONST_FUNCTION exp(T);                                                                                           \
+    T CONST_FUNCTION expm1(T);                                                                                         \
     T CONST_FUNCTION log(T);                                                                                           \
     T CONST_FUNCTION sin(T);                                                                                           \
     T CONST_FUNCTION cos(T);                                                                                           \

@@ -91,7 +91,7 @@ def noting_programs() -> Iterator[list[Source]]:
 
 def on_sphere(adapter: clvoro.Adapter) -> None:
     """Make meshes on a sphere: its kernels are variants of those of the plane."""
-    for effort, method in (("default", "adaptive"), ("fast", "exact"), ("fast", "coupled")):
+    for effort, method in (("default", "adaptive"), ("fast", "exact"), ("fast", "coupled"), ("fast", "transport")):
         steps = 3 if method == "coupled" else None
         adapter.run(clvoro.Sphere(1.0), 0.45, seed=5, method=method, effort=effort, max_steps=steps)
 
