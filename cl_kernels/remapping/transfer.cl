@@ -8,6 +8,8 @@
 #define PIECE_LARGE 2 /* a piece has more faces than its arrays hold */
 #define FAILED 3      /* the graph is not that of a Voronoi diagram */
 
+#define WAITING 64 /* grids of bins that wait in a search */
+
 /* A neighbor graph. Row i lists the neighbors of generator i; -1 - wall stands for a wall. */
 typedef struct {
     global const REAL *points;
@@ -82,6 +84,43 @@ inline int nearest_generator(global const REAL *x, const graph_t *graph, int n, 
     return j;
 }
 
+/* Add the generators of `graph` within `farthest` of x, by the bins there. Grids of divided bins wait on a stack; those
+   for which there is no room are not entered. Returns false if the queue is full. */
+inline bool visit_near(visited_t *seen, REAL4 x, REAL farthest, const graph_t *graph, global const int *items, BIN_ARGS)
+{
+    int waiting[WAITING], n = 1;
+    waiting[0] = 0;
+    while (n > 0) {
+        const int grid = waiting[--n];
+        const FRAME frame = grid_frames[grid];
+        const int4 shape = grid_shapes[grid];
+        int low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
+        for (int a = 0; a < DIM; ++a) {
+            const REAL at = a == 0 ? x.s0 : (a == 1 ? x.s1 : x.s2);
+            const REAL origin = a == 0 ? frame.s0 : (a == 1 ? frame.s1 : frame.s2);
+            const int side = a == 0 ? shape.s1 : (a == 1 ? shape.s2 : shape.s3);
+            const REAL wide = farthest + bin_noise(fabs(at) + farthest, origin);
+            low[a] = axis_bin(at - wide, origin, FRAME_INVERSE(frame), side);
+            high[a] = axis_bin(at + wide, origin, FRAME_INVERSE(frame), side);
+        }
+        for (int iz = low[2]; iz <= high[2]; ++iz)
+            for (int iy = low[1]; iy <= high[1]; ++iy)
+                for (int ix = low[0]; ix <= high[0]; ++ix) {
+                    const int bin = shape.s0 + (DIM == 2 ? iy : iz * shape.s2 + iy) * shape.s1 + ix;
+                    if (bins[bin].s1 != bins[bin + 1].s1 && n < WAITING) {
+                        waiting[n++] = bins[bin].s1;
+                        continue;
+                    }
+                    for (int k = bins[bin].s0; k < bins[bin + 1].s0; ++k) {
+                        const REAL4 there = load_vector(graph->points, items[k]) - x;
+                        if (sqrt(dot_vectors(there, there)) <= farthest && !visit(seen, items[k]))
+                            return false;
+                    }
+                }
+    }
+    return true;
+}
+
 /* Intersect a piece, relative to x, with old cell j: { y : |y - x_j| <= |y - x_k| for all neighbors k }. Both cells of
    a face compute its plane by the same operations, so that their pieces are complementary. Returns PIECE_*. */
 inline int cut_by_cell(private piece_t *piece, REAL4 x, REAL reach, int j, const graph_t *graph)
@@ -118,8 +157,8 @@ inline int cut_by_cell(private piece_t *piece, REAL4 x, REAL reach, int j, const
    over the old cells j, with the centroid c_ij of the intersection of V_i and V_j. The old cells are found by flooding:
    first the one that contains x_i, then the neighbors across each face of an intersection. Points of the old graph from
    n_old on have no cells: they are images, or mirror images behind walls. Where the meshes do not cover the same domain
-   (`partial`), cells may overlap no old cell; their means are 0. The search then goes through all cells whose
-   generators are as near as that of an overlapped cell may be.
+   (`partial`), cells may overlap no old cell; their means are 0. What old cells share with a new one may then lie
+   apart: all whose generators are as near as that of an overlapped cell may be are tried.
 
    means, low, high (n_new, width)   q_i, and bounds of the old data in the cell
    volumes, covered (n_new,)         volume of the cell, sum of the volumes of its intersections
@@ -151,7 +190,13 @@ kernel void transfer_cell_data(const int size, const int first, global const int
     const int nearest = nearest_generator(points + (size_t)DIM * i, &old, n_old, items, bins, grid_frames, grid_shapes);
     visit(&seen, nearest);
     const REAL4 way = load_vector(old_points, nearest) - x;
-    const REAL farthest = partial ? 2 * reach + sqrt(dot_vectors(way, way)) : REAL_MAX;
+    if (partial) {
+        const REAL farthest = (2 * reach + sqrt(dot_vectors(way, way))) * (1 + 16 * REAL_EPS);
+        if (!visit_near(&seen, x, farthest, &old, items, BINS)) {
+            status[i] = LIST_FULL;
+            return;
+        }
+    }
     for (int c = 0; c < width; ++c) {
         means[(size_t)i * width + c] = 0;
         low[(size_t)i * width + c] = REAL_MAX;
@@ -167,15 +212,11 @@ kernel void transfer_cell_data(const int size, const int first, global const int
             return;
         }
         bool room = true;
-        if (what == PIECE_EMPTY || partial) {
-            /* Round-off may let the search for the first cell stop at a neighbor of it. In partial covers what an old
-               cell shares with the new one may lie apart from all else. */
-            for (int q = old_starts[j]; (sum == 0 || partial) && q < old_starts[j + 1]; ++q) {
+        if (what == PIECE_EMPTY && !partial) {
+            /* Round-off may let the search for the first cell stop at a neighbor of it. */
+            for (int q = old_starts[j]; sum == 0 && q < old_starts[j + 1]; ++q) {
                 const int next = old_neighbors[q];
-                if (next < 0 || next >= n_old)
-                    continue;
-                const REAL4 there = load_vector(old_points, next) - x;
-                if (sqrt(dot_vectors(there, there)) <= farthest)
+                if (next >= 0 && next < n_old)
                     room = room && visit(&seen, next);
             }
         }

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import nullcontext
+from dataclasses import replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +21,7 @@ from ..opencl.devices import shared_context
 from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..tessellation.bins import Bins
-from .device_transfer import CellData, CellGraph, ConservativeTransfer, transfer_bytes
+from .device_transfer import CellData, CellGraph, ConservativeTransfer, joined, transfer_bytes
 from .host_transfer import TINY, find_defect, transfer_on_host
 from .sphere_transfer import transfer_on_sphere
 from .unfolded import Unfolded, farthest_neighbor, unfold
@@ -78,8 +81,8 @@ def transfer_values(
 
 
 def _on_host(a: Domain, b: Domain) -> bool:
-    """Return whether the host intersects the cells: in polygons, on spheres, and in boxes with different seams."""
-    return a.curved or a.cuts_cells or b.cuts_cells or a.periodic != b.periodic
+    """Return whether the host intersects the cells: in polygons and on spheres."""
+    return a.curved or a.cuts_cells or b.cuts_cells
 
 
 def _require_one_space(source: Diagram, target: Diagram) -> None:
@@ -102,9 +105,6 @@ def _require_one_space(source: Diagram, target: Diagram) -> None:
             f"the meshes have periods of {a.extent[axis]:g} and {b.extent[axis]:g} along axis {axis}, expected one "
             "period; transfer onto a box with walls, or with the same period"
         )
-    if a.periodic != b.periodic and not a.curved:
-        remedy = "transfer between boxes with the same periodic directions"
-        a.require_plane("the meshes are periodic in different directions, which goes in the plane only", remedy)
 
 
 def _diagram(name: str, mesh: object) -> Diagram:
@@ -153,7 +153,8 @@ def _transfer_on_device(
     # Double precision where the device has it, whatever the precision of the meshes: intersections lose digits.
     real = np.dtype(np.float64 if probe.has_fp64(queue.device) else np.float32)
     engine = Engine(ctx, queue, source.domain.dim, real)
-    box, before, after = _graphs(source, target, partial)
+    box, images, after = _graphs(source, target, partial)
+    before = max(images, key=len)
     sizes = ((len(graph), len(graph.neighbors)) for graph in (before, after))
     needed = transfer_bytes(engine, *sizes, columns.shape[1], order)  # type: ignore[arg-type]
     device = queue.device
@@ -164,34 +165,55 @@ def _transfer_on_device(
             "fewer columns at a time, or use another device"
         )
     bins, stage = Bins(engine), ConservativeTransfer(engine)
-    old, new = _upload(engine, box, before), _upload(engine, box, after)
+    new = _upload(engine, box, after)
     sequence = bins.build(box, new.points, new.n).items[: new.n].copy()
-    binned = bins.build(box, old.points, old.n)
-    values = engine.upload(columns[before.cells])
-    centroids = engine.upload(((source.centroids - source.points) / box.frame[1])[before.cells])
-    if order == 2:
-        data = stage.fit_slopes(box, old, values, centroids, limited)
-    else:
-        data = CellData(values, values, values, centroids)
-    got = stage.transfer(box, old, binned, data, new, sequence, partial)
+    offsets = (source.centroids - source.points) / box.frame[1]
+    parts = []
+    for image in images:
+        old = _upload(engine, box, image)
+        binned = bins.build(box, old.points, old.n)
+        values, centroids = engine.upload(columns[image.cells]), engine.upload(offsets[image.cells])
+        if order == 2:
+            data = stage.fit_slopes(box, old, values, centroids, limited)
+        else:
+            data = CellData(values, values, values, centroids)
+        parts.append(stage.transfer(box, old, binned, data, new, sequence, partial))
+    got = joined(parts)
     if not partial:
         _require_cover(got.covered, got.volumes, box.dim)
     covered = got.covered / np.maximum(got.volumes, TINY)
     return got.means.astype(float), got.low.astype(float), got.high.astype(float), covered.astype(float)
 
 
-def _graphs(source: Diagram, target: Diagram, partial: bool) -> tuple[Any, Unfolded, Unfolded]:
-    """Return a box around all cells, and the cells of both meshes as the device takes them."""
+def _graphs(source: Diagram, target: Diagram, partial: bool) -> tuple[Any, list[Unfolded], Unfolded]:
+    """Return a box around all cells, and the cells of both meshes as the device takes them.
+
+    Those of the old mesh are several sets: where the new mesh alone is periodic, one for each image of the old one.
+    """
     domain = source.domain
     if domain.plain and not partial:
-        return domain, _as_given(source), _as_given(target)
+        return domain, [_as_given(source)], _as_given(target)
     new = unfold(target)
     far = farthest_neighbor(source) + farthest_neighbor(target)
     lower, upper = target.points.min(axis=0) - 2 * far, target.points.max(axis=0) + 2 * far
     old = unfold(source, lower, upper) if any(domain.periodic) else unfold(source)
-    every = np.concatenate([old.points, new.points])
+    alone = np.array(target.domain.periodic) & ~np.array(domain.periodic)
+    images = _images(old, target.domain.extent * alone, lower, upper)
+    every = np.concatenate([*(image.points for image in images), new.points])
     margin = 0.01 * float(np.ptp(every, axis=0).max())
-    return Box(tuple(every.min(axis=0) - margin), tuple(every.max(axis=0) + margin)), old, new
+    return Box(tuple(every.min(axis=0) - margin), tuple(every.max(axis=0) + margin)), images, new
+
+
+def _images(old: Unfolded, periods: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[Unfolded]:
+    """Return the images of cells by `periods` (d,), 0 where there are none, with generators between two corners."""
+    generators = old.points[: len(old)]
+    bottom, top = generators.min(axis=0), generators.max(axis=0)
+    steps = [
+        range(math.ceil((a - t) / p), math.floor((b - s) / p) + 1) if p else (0,)
+        for a, b, s, t, p in zip(lower, upper, bottom, top, periods, strict=True)
+    ]
+    offsets = [np.array(step) * periods for step in product(*steps)]
+    return [replace(old, points=old.points + x, offsets=old.offsets + x) for x in offsets] or [old]
 
 
 def _as_given(diagram: Diagram) -> Unfolded:
@@ -204,7 +226,7 @@ def _as_given(diagram: Diagram) -> Unfolded:
 def _transfer_on_host(
     source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool, partial: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Do what `_transfer_on_device` does, for polygons, 2D periodic boxes and spheres."""
+    """Do what `_transfer_on_device` does, for polygons and spheres."""
     work = transfer_on_sphere if source.domain.curved else transfer_on_host
     means, low, high, covered = work(source, target, columns, order, limited)
     if not partial:

@@ -102,6 +102,16 @@ class TransferredData:
     covered: np.ndarray
 
 
+def joined(parts: list[TransferredData]) -> TransferredData:
+    """Return the data of new cells from several sets of old cells, which overlap them one beside another."""
+    if len(parts) == 1:
+        return parts[0]
+    covered = np.sum([part.covered for part in parts], axis=0)
+    mass = sum(part.means * part.covered[:, None] for part in parts)
+    low, high = np.min([part.low for part in parts], axis=0), np.max([part.high for part in parts], axis=0)
+    return TransferredData(mass / np.where(covered > 0, covered, 1)[:, None], low, high, parts[0].volumes, covered)
+
+
 def transfer_bytes(engine: Engine, old: tuple[int, int], new: tuple[int, int], width: int, order: int) -> float:
     """Estimate the device memory in bytes that a transfer of `width` columns needs.
 
@@ -129,7 +139,7 @@ def transfer_bytes(engine: Engine, old: tuple[int, int], new: tuple[int, int], w
 
 
 class ConservativeTransfer:
-    """Average data over the intersections of the cells of two diagrams of one box."""
+    """Average data over the intersections of the cells of two diagrams in one box."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine

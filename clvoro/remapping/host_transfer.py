@@ -1,6 +1,6 @@
 """Conservative transfer of cell data on the host, with Shapely.
 
-For polygons, where cells need not be convex, and for 2D periodic boxes, where cells overlap images of others.
+For polygons, where cells need not be convex.
 """
 
 from __future__ import annotations

@@ -31,6 +31,11 @@ def pairs(ctx):
     ring, tile = (in_box(adapter, (0, 0), (1, 1), n, True) for n in (40, 30))
     column, tube = (in_box(adapter, (0, 0, 0), (1, 1, 2), n, (True, True, False)) for n in (60, 50))
     shell = whole.subset(np.linalg.norm(whole.points - 0.5, axis=1) > 0.3)
+    slabs = in_box(adapter, (0, 0, 0), (1, 1, 1), 800)
+    slabs = slabs.subset(np.abs(slabs.points[:, 2] - 0.5) > 0.2)
+    drop = in_box(adapter, (0.6, 0.7, 0.1), (1.4, 1.2, 0.8), 30)
+    strips = in_box(adapter, (0, 0), (1, 1), 400)
+    strips = strips.subset(np.abs(strips.points[:, 1] - 0.5) > 0.1)
     return {
         "globe to its part": (globe, north, north.volumes.sum()),
         "part of a globe to the globe": (north, globe, north.volumes.sum()),
@@ -43,6 +48,10 @@ def pairs(ctx):
         "boxes in 3D": (rough, part, 0.8 * 0.6 * 0.7),
         "part of a box in 3D": (shell, rough, shell.volumes.sum()),
         "periodic boxes in 3D": (column, tube, 2.0),
+        "periodic box to box in 3D": (column, drop, 0.8 * 0.5 * 0.7),
+        "box to periodic box in 3D": (drop, column, 0.8 * 0.5 * 0.7),
+        "parts that lie apart in 3D": (slabs, in_box(adapter, (0, 0, 0), (1, 1, 1), 9), slabs.volumes.sum()),
+        "parts that lie apart": (strips, in_box(adapter, (0, 0), (1, 1), 7), strips.volumes.sum()),
     }
 
 
@@ -57,6 +66,10 @@ KINDS = (
     "boxes in 3D",
     "part of a box in 3D",
     "periodic boxes in 3D",
+    "periodic box to box in 3D",
+    "box to periodic box in 3D",
+    "parts that lie apart in 3D",
+    "parts that lie apart",
 )
 
 
@@ -103,13 +116,10 @@ def test_what_is_not_covered_is_said(pairs, ctx):
     adapter = clvoro.Adapter(ctx)
     others = {
         "one space": in_box(adapter, (0, 0, 0), (1, 1, 1), 20),
-        "different directions": None,
         "one period": in_box(adapter, (0, 0), (2, 1), 20, True),
     }
     with pytest.raises(InputError, match="one space"):
         old.transfer(np.ones(len(old)), others["one space"])
-    with pytest.raises(InputError, match="different directions"):
-        pairs["periodic boxes in 3D"][0].transfer(np.ones(60), others["one space"])
     with pytest.raises(InputError, match="one period"):
         pairs["periodic boxes"][0].transfer(np.ones(40), others["one period"])
     globe, earth = pairs["globe to its part"][0], clvoro.Sphere(2.0)
