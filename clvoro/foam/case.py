@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,11 @@ import numpy as np
 from ..errors import ClvoroError, InputError
 from ..io.atomic import atomic_file
 from .fields import FoamField, read_field
+
+try:
+    import fcntl
+except ImportError:  # of Unix only
+    fcntl = None
 
 _EXCHANGE, _HERE = 2, -100  # RENAME_EXCHANGE and AT_FDCWD of Linux
 _HOME = "/usr/share/openfoam"  # of Debian's package, whose programs need the variable
@@ -58,6 +64,37 @@ class FoamCase:
                 "-latestTime, and remove the folders processor*"
             )
         self.own = self.folder / "clvoro"
+        self._lock: tuple[int, ...] = ()
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the case: no other call changes it, nor the solver of a call that was killed, which holds it, too.
+
+        Raises
+        ------
+        InputError
+            If one of them does.
+        """
+        if fcntl is None:
+            yield
+            return
+        file = os.open(self.folder, os.O_RDONLY)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(file)
+            raise InputError(
+                f"{self.folder} is in use by another call, or by the solver of one that was killed, expected one at a "
+                "time; wait until it ends, or end it"
+            ) from error
+        except OSError:  # some file systems of networks have no locks
+            pass
+        self._lock = (file,)
+        try:
+            yield
+        finally:
+            self._lock = ()
+            os.close(file)
 
     def times(self) -> list[Time]:
         """Return the times with fields, in ascending order."""
@@ -150,6 +187,11 @@ class FoamCase:
         """The file of the times of a run."""
         return self.folder / "system" / "controlDict"
 
+    @property
+    def control_before(self) -> Path:
+        """The copy of it from before the first call changed it."""
+        return self.own / "controlDict.before"
+
     def control_number(self, name: str) -> float | None:
         """Return the number of an entry of ``system/controlDict``; None if it is missing, or not a number."""
         text = self.control.read_text()
@@ -162,9 +204,8 @@ class FoamCase:
     def set_control(self, **entries: object) -> None:
         """Change entries of ``system/controlDict``; the first time a copy is kept beside the reports."""
         text = self.control.read_text()
-        kept = self.own / "controlDict.before"
-        if not kept.exists():
-            shutil.copy2(self.control, kept)
+        if not self.control_before.exists():
+            shutil.copy2(self.control, self.control_before)
         for name, value in entries.items():
             place = _entry(text, name)
             if place is None:
@@ -189,7 +230,9 @@ class FoamCase:
             raise InputError(f"solver is {solver!r}, which is not on the PATH; load OpenFOAM's environment first")
         environment = {"WM_PROJECT_DIR": _HOME, **os.environ}
         with open(log, "wb") as file:
-            code = subprocess.run(words, cwd=self.folder, env=environment, stdout=file, stderr=file, check=False)
+            code = subprocess.run(
+                words, cwd=self.folder, env=environment, stdout=file, stderr=file, pass_fds=self._lock, check=False
+            )
         if code.returncode:
             raise ClvoroError(
                 f"{solver} failed with code {code.returncode}: {log.read_text(errors='replace')[-_TAIL:]}\nsee {log}"

@@ -148,7 +148,8 @@ def adapt_case(
     ------
     InputError, InputTypeError
         Before anything is written: if there is no time or mesh, a field is missing, has another length or is not
-        finite; the estimate is zero everywhere; the patches are not those of `mesh`; or an argument is wrong.
+        finite; the estimate is zero everywhere; the patches are not those of `mesh`; another call, or its solver, uses
+        the case; or an argument is wrong.
     ClvoroError
         If the solver fails.
 
@@ -176,7 +177,8 @@ def adapt_case(
         adapter or shared_adapter(),
     )
     bounds: dict[str, Any] = {"p": p, "h_min": h_min, "h_max": h_max, "growth": growth}
-    return loop.run(mesh, cycles, solver, interval, on_cycle)
+    with loop.case.held():
+        return loop.run(mesh, cycles, solver, interval, on_cycle)
 
 
 @dataclass
@@ -208,8 +210,7 @@ class _Loop:
             self.rows[note["cycle"] - 1 : note["cycle"]] = [FoamCycle(**note["row"])]
         if solver is None:
             # Before anything is written.
-            known = self.rows[note["cycle"]] if len(self.rows) > note["cycle"] else self._solved(note, 0.0)
-            done = self._adapt(known, note, mesh)
+            done = self._adapt(self._known(note) or self._solved(note, 0.0), note, mesh)
             if on_cycle is not None:
                 on_cycle(done)
             return self.rows
@@ -218,9 +219,7 @@ class _Loop:
         make_folder(case.own)
         while True:
             note = self._note(case.latest())
-            known = self.rows[note["cycle"]] if len(self.rows) > note["cycle"] else None
-            if known is None:
-                known = self._solve(solver, note, length)
+            known = self._known(note) or self._solve(solver, note, length)
             if note["cycle"] >= cycles:
                 if on_cycle is not None:
                     on_cycle(known)
@@ -228,6 +227,11 @@ class _Loop:
             known = self._adapt(known, note, mesh)
             if on_cycle is not None:
                 on_cycle(known)
+
+    def _known(self, note: dict[str, Any]) -> FoamCycle | None:
+        """Return the row of the latest solution; None if it is not in the report."""
+        row = self.rows[note["cycle"]] if len(self.rows) > note["cycle"] else None
+        return row if row is not None and row.time == self.case.latest().value else None
 
     def _note(self, time: Time) -> dict[str, Any]:
         """Return what is known of the mesh at a time: cycle, time of the transfer, layers."""
@@ -250,7 +254,8 @@ class _Loop:
                 )
             make_folder(case.own)
             given = end - (begin or 0.0)
-            kept.write_text(repr(given))
+            with atomic_file(kept) as file:
+                file.write(repr(given).encode())
         if not (math.isfinite(given) and given > 0):
             raise InputError(f"interval is {given!r}, expected a positive number")
         return given
@@ -260,6 +265,9 @@ class _Loop:
         case = self.case
         before = case.latest()
         begin = before.value if note["time"] is None else note["time"]
+        end = case.control_number("endTime")
+        if note["time"] is None and case.control_before.exists() and end is not None:
+            begin = min(begin, end - length)  # a call was killed while the first solution was computed
         case.set_control(startFrom="latestTime", endTime=f"{begin + length:.12g}")
         start = time.perf_counter()
         if callable(solver):
