@@ -14,6 +14,7 @@ import clvoro
 from clvoro import foam, sizing
 from clvoro.errors import ClvoroError, InputError, InputTypeError
 from clvoro.foam import case as cases
+from clvoro.foam import fluxes
 from clvoro.foam.case import FoamCase
 from clvoro.foam.fluxes import MOST_DIVERGENCE, divergence
 from clvoro.foam.mesh import FoamMesh, polygon_of_edges
@@ -367,6 +368,20 @@ def test_bad_input_changes_nothing(case, change, options, kind, text):
     if "solver" not in options:
         assert after == before
     assert all(after[path] == data for path, data in before.items() if path.name != "controlDict")
+
+
+@pytest.mark.parametrize("is_open", [False, True])
+def test_iterations_project_fluxes_as_a_factorization_does(template, monkeypatch, is_open):
+    """Those of a large mesh."""
+    mesh = FoamMesh.read(template / "constant" / "polyMesh")
+    at_boundary = np.zeros(len(mesh.owner) - len(mesh.neighbor))
+    free = np.isin(np.arange(len(mesh.neighbor), len(mesh.owner)), mesh.patches[1].faces) & is_open
+    made = []
+    for most in (fluxes._DIRECT, 0):
+        monkeypatch.setattr(fluxes, "_DIRECT", most)
+        made.append(fluxes.project_fluxes(mesh, velocity(mesh.centroids), at_boundary, free))
+        assert divergence(mesh, made[-1]) < MOST_DIVERGENCE
+    assert made[1] == pytest.approx(made[0], abs=1e-9 * np.abs(made[0]).max())
 
 
 def test_polygons_of_edges():
