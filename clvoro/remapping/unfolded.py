@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from ..mesh.connectivity import face_owners, neighbor_points
+from ..mesh.connectivity import face_owners, following, neighbor_points
 from ..mesh.diagram import Diagram
 
 
@@ -71,9 +71,32 @@ def unfold(diagram: Diagram, lower: np.ndarray | None = None, upper: np.ndarray 
     neighbors[behind < 0] = -1
     alone = np.flatnonzero(neighbors < 0)
     neighbors[alone] = len(cells) + np.arange(len(alone))
-    beyond = neighbor_points(diagram, faces[alone]) + moved[alone] * extent
+    beyond = _behind(diagram, faces[alone]) + moved[alone] * extent
     offsets = shift * extent
     return Unfolded(np.concatenate([diagram.points[cells] + offsets, beyond]), starts, neighbors, cells, offsets)
+
+
+def _behind(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
+    """Return the points behind half-faces (k,), so that bisectors are where the faces of the diagram are.
+
+    Faces at curved walls have corners there and are not plane. The bisector passes through the centroid, normal to the
+    vector area; where that leads away from the wall, it touches the wall.
+    """
+    found = neighbor_points(diagram, faces)
+    curved = diagram.domain.curved_walls & (diagram.neighbors[faces] < 0)
+    if not curved.any():
+        return found
+    own, wall = diagram.points[face_owners(diagram)[faces[curved]]], faces[curved]
+    outward = found[curved] - own
+    corners, starts = diagram.face_vertices, diagram.face_vertex_starts
+    areas = np.cross(diagram.vertices[corners], diagram.vertices[corners[following(starts)]])
+    areas = np.add.reduceat(areas, starts[:-1])[wall]
+    normals = areas / np.maximum(np.linalg.norm(areas, axis=1), 1e-300)[:, None]
+    normals *= np.sign((normals * outward).sum(axis=1))[:, None]
+    gaps = ((diagram.face_centroids[wall] - own) * normals).sum(axis=1)
+    usable = ((normals * outward).sum(axis=1) > 0.5 * np.linalg.norm(outward, axis=1)) & (gaps > 0)
+    found[np.flatnonzero(curved)[usable]] = (own + 2 * gaps[:, None] * normals)[usable]
+    return found
 
 
 def farthest_neighbor(diagram: Diagram) -> float:
