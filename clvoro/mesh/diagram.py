@@ -489,7 +489,7 @@ class Diagram(MeshOutput):
         (n_new,) float64
             With `covered`, the share of each new cell that this mesh covers, from 0 to 1. Between meshes of one domain
             it is 1 for every cell that overlaps an old one. In a solid that is an approximation: cells at curved walls
-            are bounded by planes there, and overlap the cells of another mesh of it to 96 to 100 % (a ball, 500 to 8000
+            are bounded by planes there, and overlap the cells of another mesh of it to 97 to 100 % (a ball, 500 to 8000
             cells, ``bench/transfer.py --on ball``). Onto a part, `subset`, the share is that of the overlap.
 
         Raises
