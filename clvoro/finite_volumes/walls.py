@@ -43,6 +43,8 @@ AROUND = 4.0
 """Largest area between a wall face and the boundary behind it, over that of the cell."""
 LEFT_OUT = 0.5
 """Share of a cell from which on a part of the domain that is left out, or land that is added, is reported."""
+BULGE = 1e-4
+"""Turn, in radians, of a wall at the end of a named part where the boundary is re-entrant between two face ends."""
 NO_LENGTH = 1e-9
 """Length of a face over the size of its cell at which its ends are one point."""
 CLOSED = 1e-3
@@ -437,7 +439,8 @@ class _WallMaker:
         added = path[kept] >= 0
         names = np.empty(len(kept), np.int64)
         names[added] = len(self.points) + np.arange(np.count_nonzero(added))
-        self.points = np.concatenate([self.points, chain[kept[added]]])
+        corners = _without_dents(chain[kept], added)
+        self.points = np.concatenate([self.points, corners[added]])
         row = row[kept]
         kept_starts = np.searchsorted(row, np.arange(len(cell) + 1))
         names[kept_starts[:-1]], names[kept_starts[1:] - 1] = gap.T
@@ -449,7 +452,7 @@ class _WallMaker:
         self._add_walls(cell[row[side]], rings.edge_numbers[edges], np.column_stack([names[side], names[side + 1]]))
         # What lies between the boundary and the walls.
         off = chain_areas(chain, starts[:-1], starts[1:] - 1) - chain_areas(
-            chain[kept], kept_starts[:-1], kept_starts[1:] - 1
+            corners, kept_starts[:-1], kept_starts[1:] - 1
         )
         large = np.flatnonzero(np.abs(off) > LEFT_OUT * self.size[cell] ** 2)
         places = chain[(starts[:-1] + starts[1:])[large] // 2]
@@ -558,6 +561,24 @@ def _changes(rings: OrientedRings, parts: np.ndarray) -> np.ndarray:
     part, found = parts[rings.edge_numbers], np.empty(len(rings.vertices), bool)
     found[rings.next_vertex] = part != part[rings.next_vertex]
     return found
+
+
+def _without_dents(chains: np.ndarray, movable: np.ndarray) -> np.ndarray:
+    """Return points of chains (k, 2), those `movable` (k,) that are re-entrant moved just beyond a straight wall.
+
+    So a cell in whose wall a named part ends is convex.
+    """
+    x, inner = chains.copy(), np.flatnonzero(movable)
+    before, after = x[inner - 1], x[inner + 1]
+    way = after - before
+    length = np.maximum(np.hypot(*way.T), 1e-300)
+    share = ((x[inner] - before) * way).sum(axis=1) / length**2
+    off = cross(x[inner] - before, way) / length
+    least = BULGE * np.minimum(share, 1 - share) * length
+    dents = (off < least) & (share > 0) & (share < 1)
+    outward = np.column_stack([way[:, 1], -way[:, 0]]) / length[:, None]
+    x[inner[dents]] += ((least - off)[:, None] * outward)[dents]
+    return x
 
 
 def _area(loop: np.ndarray) -> float:

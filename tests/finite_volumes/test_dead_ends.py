@@ -46,3 +46,16 @@ def test_a_channel_of_cells_is_accepted(ctx):
     mesh = diagram.solver_mesh()
     assert mesh.measures.determinant.min() > 1e-3
     assert sum(p.area for p in polygons(mesh)) == pytest.approx(6, rel=1e-12)
+
+
+def test_a_cell_in_a_lagoon_reaches_through_its_throat(ctx):
+    """The cell in the throat lies on both sides of it, and a corner of its wall stands between lagoon and sea."""
+    sea = [(-2.4, 3.3), (-4.6, 1.3), (-4.6, -4), (3.5, -4), (3.5, -0.32), (0.29, 1.5)]
+    lagoon = [(3.6, -0.05), (4.14, 2.07), (1.68, 4.21), (0.3, 1.59)]
+    near = [(2.42, 1.64), (0.41, 1.42), (1.41, -0.32), (-0.96, -0.43), (-3.49, 1.91)]
+    away = [(-0.4, -2.6), (2.2, -2.5), (-3.3, -0.6), (-3.0, -2.8)]
+    diagram = clvoro.Adapter(ctx).diagram(clvoro.Polygon(sea + lagoon), near + away)
+    mesh = diagram.solver_mesh()
+    assert mesh.measures.determinant[0] > 1e-2
+    assert max(map(concave_by, polygons(mesh))) < 0
+    assert diagram.check(solver="openfoam")

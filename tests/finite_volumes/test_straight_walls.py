@@ -109,6 +109,21 @@ def test_a_corner_without_a_face_end_is_filled(ctx):
     assert mesh.area_change > 0
 
 
+@pytest.mark.parametrize("rise", [0, 0.01, 0.05])
+def test_a_cell_in_whose_wall_a_name_ends_is_convex(ctx, rise):
+    """OpenFOAM counts a cell as concave if two of its faces are in one plane."""
+    domain = Polygon([(0, 0), (1.4, rise), (3, 0), (3, 3), (0, 3)], names={"west": [0]})
+    x, y = np.meshgrid([0.5, 1.5, 2.5], [0.5, 1.5, 2.5])
+    points = np.column_stack([x.ravel(), y.ravel()]) + np.random.default_rng(3).uniform(-0.05, 0.05, (9, 2))
+    diagram = clvoro.Adapter(ctx).diagram(domain, points)
+    mesh = diagram.solver_mesh()
+    west = mesh.points[mesh.corners.reshape(-1, 2)[mesh.neighbor == -1]]
+    assert west[:, :, 0].max() == pytest.approx(1.4, abs=0.1 * rise + 1e-9)
+    assert max(map(concave_by, polygons(mesh))) < -1e-3
+    assert mesh.area_change == pytest.approx(0, abs=1e-5 + rise / 50)
+    assert diagram.check(solver="openfoam")
+
+
 def test_faces_do_not_cross_from_one_name_to_another(ctx):
     domain = Polygon(circle(64, 0.4), names={"in": range(20), "out": range(30, 64)})
     mesh = adapt(ctx, domain).solver_mesh()
