@@ -249,7 +249,8 @@ def combine(*estimates: Estimate, by: Literal["max", "mean"] = "max") -> Estimat
     Returns
     -------
     Estimate
-        The error is the largest, or the mean, of those predicted. It has a meaning if they have one unit.
+        The error is the largest, or the mean, of those predicted. It has a meaning if they have one unit. Its order is
+        the least of theirs, its `p` the largest.
 
     Raises
     ------
@@ -267,7 +268,7 @@ def combine(*estimates: Estimate, by: Literal["max", "mean"] = "max") -> Estimat
     h = np.minimum.reduce(sizes) if by == "max" else np.mean([s**-d for s in sizes], axis=0) ** (-1 / d)
     scaled = [error * (h / s) ** e.order for e, s, error in zip(estimates, sizes, errors, strict=True)]
     error = np.maximum.reduce(scaled) if by == "max" else np.mean(scaled, axis=0)
-    return Estimate(last.mesh, h, error, last.order, last.p)
+    return Estimate(last.mesh, h, error, min(e.order for e in estimates), max(e.p for e in estimates))
 
 
 def normalize(

@@ -232,6 +232,10 @@ def test_combinations_and_numbers(fine):
     assert again.n_cells == pytest.approx(1500, rel=1e-5)
     assert again.values.max() <= 0.1
     assert sizing.normalize(both, eps=both.norm / 4, growth=10).values == pytest.approx(both.values / 2, rel=1e-6)
+    # Estimates of other orders, in any sequence.
+    steep = sizing.gradient_size(x**2, on=fine, eps=0.05, h_max=0.2)
+    made = [sizing.combine(*pair) for pair in ((left, steep), (steep, left))]
+    assert [(e.order, e.p) for e in made] == [(1, math.inf)] * 2
     # A window in time, over meshes that differ.
     other = clvoro.adapt(SQUARE, 0.05, "fast")
     later = sizing.hessian_size(np.tanh(30 * (other.centroids[:, 0] - 0.6)), on=other, n_cells=1500)
