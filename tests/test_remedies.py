@@ -191,7 +191,6 @@ ROWS = [
     (lambda t: t.cube.measures.c_grid, lambda t: t.cube.measures.exact),
     (lambda t: t.cube.to_shapely(), lambda t: t.cube.to_pyvista()),
     (lambda t: t.torus.to_disv(), lambda t: t.mesh.to_disv()),
-    (lambda t: t.single.to_fipy(), lambda t: t.torus.to_fipy()),
     # Transfer.
     (lambda t: t.mesh.transfer(np.ones(30), onto=t.cube), lambda t: t.mesh.transfer(np.ones(30), onto=t.torus)),
     (
@@ -638,7 +637,14 @@ ROWS = [
 
 ELSEWHERE = (
     *("foam/", "opencl/", "sizing/cells.py", "sizing/derivatives.py", "sizing/estimates.py"),
-    *("pip install", "needs Matplotlib", "needs meshio", "xarray says", "which needs xarray"),  # libraries
+    *(
+        "pip install",
+        "FiPy's faces lie",
+        "needs Matplotlib",
+        "needs meshio",
+        "xarray says",
+        "which needs xarray",
+    ),  # libraries
     *("export it again", "holds no solid", "earlier version of clvoro", "of version", "version of clvoro"),  # files
     *("a place that is writable", "has  bytes", "is for mesh.npz and mesh.vtu", "leave it out; projection"),
     *("which need  on the device", "whose largest array", "is out of memory", "expected fewer", "32-bit indices"),
