@@ -219,7 +219,7 @@ def test_a_periodic_box_that_is_not_folded(ctx, dim, real):
             quality, ways = engine.upload(rng.uniform(0.5, 1, n)), []
             for made, own in ((alone, unfolded), (t, stages)):
                 ways.append(own.engine.zeros((n, dim)))
-                own.surface_descent.descend(box, made, h, quality, ways[-1], bad_cell_weight=5.0, rate=0.05)
+                own.surface_descent.descend(made, h, quality, ways[-1], bad_cell_weight=5.0, rate=0.05)
             one, other = (way.get() for way in ways)
             assert np.abs(one - other).max() < noise * np.abs(other).max() < 1
         quality, ratio, move = rng.uniform(0.5, 1, n), rng.normal(0, 0.3, n), 0.01 * rng.normal(size=(n, dim))
