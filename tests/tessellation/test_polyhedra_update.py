@@ -252,7 +252,7 @@ def test_same_bits_with_four_and_eight_lanes(ctx, monkeypatch):
         t = carried.t
         quality, h = engine.upload(np.full(N, 0.7)), engine.upload(np.full(N, 0.1))
         way = engine.zeros((N, 3))
-        SurfaceDescent(engine).descend(BOX, t, h, quality, way, bad_cell_weight=5.0, rate=0.05)
+        SurfaceDescent(engine).descend(t, h, quality, way, bad_cell_weight=5.0, rate=0.05)
         assert np.abs(way.get()).max() > 1e-4
         arrays = t.volumes, t.offsets, t.covariances, t.face_measures, t.face_centroids, way
         m = t.starts.get()[-1]
