@@ -262,7 +262,10 @@ def _entry(text: str, name: str) -> slice | None:
 
 
 def _last_row(path: Path) -> dict[str, float]:
-    """Return the last row of a table by column, without the time; nothing if it is not a plain table."""
+    """Return the values in the last row of a table by the names of their columns, without the first, the time.
+
+    There are none if the names do not fit the row, or it has anything but numbers.
+    """
     lines = path.read_text(errors="replace").splitlines()
     heads = [line.strip("# \t").split() for line in lines if line.startswith("#")]
     rows = [line.split() for line in lines if line and not line.startswith("#")]

@@ -16,8 +16,9 @@ N, PARTS = 1500, 24
 turn = 2 * np.pi / PARTS
 
 # %%
-# The solver: the velocity is (-y, x). A face takes its value from the cell upwind, by the gradient there, but no value beyond
-# those of its two cells. No flux crosses the walls. Heun's method advances in time.
+# The solver, of finite volumes. The velocity is (-y, x). The value at a face is extrapolated from the upwind cell by its
+# gradient, and limited to the range of the values in the two cells of the face. No flux crosses the walls. Heun's method
+# advances in time.
 
 
 def advance(mesh, u, length):
