@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import re
 import sys
 from collections.abc import Iterator
@@ -12,13 +11,12 @@ from pathlib import Path
 import numpy as np
 import orjson
 
-from ..files import open_plain
 from ..io.arrays import FileError, explained
 from ..io.atomic import atomic_file
+from ..io.foam_read import read_with_head
 
 WIDTHS = {"scalar": 1, "vector": 3, "sphericalTensor": 1, "symmTensor": 6, "tensor": 9}
 """Numbers of the components of a value, by its type."""
-_HEAD = re.compile(rb"FoamFile\s*\{(.*?)\}", re.DOTALL)
 _BLANK = re.compile(rb"(?:\s+|//[^\n]*|/\*.*?\*/)*", re.DOTALL)
 _NAME = re.compile(rb'"[^"]*"|[^\s{};"]+')
 _LIST = re.compile(rb"nonuniform\s+(?:List<(\w+)>\s*)?(\d+)\s*")
@@ -148,21 +146,16 @@ def read_field(path: Path) -> FoamField:
     InputError
         If it cannot be read.
     """
-    packed = path.suffix == ".gz"
     with explained(path, "a field of OpenFOAM"):
-        with open_plain(path) as file:
-            text = gzip.decompress(file.read()) if packed else file.read()
-        found = _HEAD.search(text)
-        if found is None:
+        head, text, begin = read_with_head(path)
+        if not begin:
             raise FileError("it has no head FoamFile, expected a field of OpenFOAM; move other files to another folder")
-        pairs = re.findall(rb'(\w+)\s+"?([^;"]*?)"?\s*;', found[1])
-        head = {key.decode(): value.decode("utf-8", "replace") for key, value in pairs}
         scalar = "<f4" if "scalar=32" in head.get("arch", "") else "<f8"
         binary = head.get("format") == "binary"
         kind = head.get("class", "")
-        made = FoamField(path.stem if packed else path.name, kind, binary, {})
+        made = FoamField(path.name.removesuffix(".gz"), kind, binary, {})
         if made.type:
-            made = replace(made, entries=_Reader(text, scalar if binary else "", made.type).entries(found.end())[0])
+            made = replace(made, entries=_Reader(text, scalar if binary else "", made.type).entries(begin)[0])
         if made.in_cells:
             _ = made.internal  # before anything is made of it
         return made

@@ -148,6 +148,27 @@ def _box(lower: np.ndarray, upper: np.ndarray, periodic: np.ndarray | None = Non
     return Box(tuple(lower.tolist()), tuple(upper.tolist()), tuple(sides.tolist()))
 
 
+def read_with_head(path: Path) -> tuple[dict[str, str], bytes, int]:
+    """Read a file of OpenFOAM, compressed if it ends in ``.gz``.
+
+    Returns
+    -------
+    head : dict
+        The entries of its head FoamFile.
+    text : bytes
+        The whole file.
+    begin : int
+        Where the head ends in it; 0 if it has none.
+    """
+    with open_plain(path) as file:
+        text = gzip.decompress(file.read()) if path.suffix == ".gz" else file.read()
+    found = _HEAD.search(text)
+    if found is None:
+        return {}, text, 0
+    entries = re.findall(rb'(\w+)\s+"?([^;"]*?)"?\s*;', found[1])
+    return {key.decode(): value.decode("utf-8", "replace") for key, value in entries}, text, found.end()
+
+
 @dataclass(frozen=True)
 class FoamPatchFaces:
     """A part of the boundary: name, type, the patch across a seam, and its faces, (k,)."""
@@ -171,16 +192,12 @@ class FoamFile:
         path = folder / name
         packed = not path.exists() and path.with_name(f"{name}.gz").exists()
         try:
-            with open_plain(path.with_name(f"{name}.gz") if packed else path) as file:
-                text = gzip.decompress(file.read()) if packed else file.read()
+            head, text, begin = read_with_head(path.with_name(f"{name}.gz") if packed else path)
         except OSError as error:
             raise FileError(f"its file {name} cannot be read ({error.strerror or error})") from error
-        found = _HEAD.search(text)
-        if found is None:
+        if not begin:
             raise FileError(f"its file {name} has no head FoamFile, expected a file of OpenFOAM")
-        entries = re.findall(rb'(\w+)\s+"?([^;"]*)"?\s*;', found[1])
-        head = {key.decode(): value.decode("utf-8", "replace") for key, value in entries}
-        body = text[found.end() :]
+        body = text[begin:]
         binary = head.get("format") == "binary" and name != "boundary"
         return cls(head, body if binary else _COMMENTS.sub(b" ", body))
 
