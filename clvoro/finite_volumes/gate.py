@@ -21,7 +21,7 @@ Solver = Literal["openfoam", "mpas", "modflow"]
 LEAST_MEASURE = 1e-300
 """OpenFOAM's VSMALL: least area of a face and volume of a cell."""
 LEAST_DETERMINANT = 1e-3
-"""The least one of a cell; cells with neighbors on one side only have less."""
+"""Least determinant of a cell; that of a cell with neighbors on one side only is smaller."""
 
 
 def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallShape | None = None) -> SolverReport:

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from ...geometry.solid.solid import Solid
 
 _SPACING = 0.05
-"""Distance of the places on creases that are looked up, over h."""
+"""Distance over h between the points of a crease around which cells are looked up."""
 _AROUND = 24
 """Directions around a crease in which cells are looked up."""
 _RADIUS = 0.15
-"""How far from the crease, over h."""
+"""Distance over h from the crease at which cells are looked up around it."""
 _HALF = np.radians(140)
 """A cell is cut if it takes more of the angle around the crease."""
 _LONG = 0.1
