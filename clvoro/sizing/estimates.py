@@ -91,13 +91,7 @@ def curvature_of(values: object, on: Result | Diagram, p: float, weight: ArrayLi
     most = np.maximum.reduce(found)
     if weight is None:
         return most
-    factor = check_cell_values("hessian_size weight", weight, len(stencils))
-    if factor.ndim != 1 or factor.min() < 0:
-        raise InputError(
-            f"hessian_size weight has shape {factor.shape} and values down to {factor.min():g}, expected "
-            f"({len(stencils)},) numbers >= 0; take the absolute value"
-        )
-    return most * factor
+    return most * _not_negative("hessian_size weight", weight, len(stencils))
 
 
 def slope_of(values: object, on: Result | Diagram) -> np.ndarray:
@@ -124,6 +118,17 @@ def _fields(values: object, n: int) -> list[np.ndarray]:
     return [check_cell_values(name, field, n) for name, field in zip(names, given, strict=True)]
 
 
+def _not_negative(what: str, values: object, n: int) -> np.ndarray:
+    """Return `values` as an array (n,) of numbers >= 0; raise InputError if it has others."""
+    array = check_cell_values(what, values, n)
+    if array.ndim != 1 or array.min() < 0:
+        raise InputError(
+            f"{what} has shape {array.shape} and values down to {array.min():g}, expected ({n},) numbers >= 0; take "
+            "the absolute value, or numpy.maximum(values, 0)"
+        )
+    return array
+
+
 def _free_of_rounding(found: np.ndarray, field: np.ndarray, stencils: CellStencils, order: int) -> np.ndarray:
     """Return derivatives, 0 where they are round-off of the field's values."""
     n = len(field)
@@ -146,9 +151,10 @@ def estimate(
     what: str,
     on: Result | Diagram,
     indicator: np.ndarray,
+    *,
     order: float,
-    p: float,
-    constant: float,
+    p: float = math.inf,
+    constant: float = 1.0,
     n_cells: float | None,
     eps: float | None,
     h_min: float,
@@ -223,14 +229,10 @@ def sensor_size(
         size = sensor_size(share / h0 ** (2 / 3), on=mesh, order=2 / 3, eps=0.2)
     """
     stencils = CellStencils.of(on)
-    given = check_cell_values("sensor", sensor, len(stencils))
-    if given.ndim != 1 or given.min() < 0:
-        raise InputError(
-            f"sensor has shape {given.shape} and values down to {given.min():g}, expected ({len(stencils)},) numbers "
-            ">= 0; take the absolute value, or numpy.maximum(sensor, 0)"
-        )
+    given = _not_negative("sensor", sensor, len(stencils))
     check_positive("sensor_size order", order)
-    return estimate("sensor_size", on, given, order, math.inf, 1.0, n_cells, eps, h_min, h_max, growth)
+    bounds = {"h_min": h_min, "h_max": h_max, "growth": growth}
+    return estimate("sensor_size", on, given, order=order, n_cells=n_cells, eps=eps, **bounds)
 
 
 def combine(*estimates: Estimate, by: Literal["max", "mean"] = "max") -> Estimate:

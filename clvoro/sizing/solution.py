@@ -157,8 +157,9 @@ def hessian_size(
     """
     if on is not None:
         _refuse_raster("hessian_size", lower, upper, at, missing)
-        bounds = h_min, h_max, growth
-        return estimate("hessian_size", on, curvature_of(values, on, p, weight), 2, p, 1 / 8, n_cells, eps, *bounds)
+        bounds = {"h_min": h_min, "h_max": h_max, "growth": growth}
+        bent = curvature_of(values, on, p, weight)
+        return estimate("hessian_size", on, bent, order=2, p=p, constant=1 / 8, n_cells=n_cells, eps=eps, **bounds)
     low, high = _corners("hessian_size", lower, upper, growth, weight)
     u, corners, spacing = _check_solution("hessian_size", values, low, high, at, missing, least=3)
     check_p("hessian_size", p)
@@ -263,8 +264,8 @@ def gradient_size(
     """
     if on is not None:
         _refuse_raster("gradient_size", lower, upper, at, missing)
-        steep = slope_of(values, on)
-        return estimate("gradient_size", on, steep, 1, math.inf, 1.0, n_cells, eps, h_min, h_max, growth)
+        bounds = {"h_min": h_min, "h_max": h_max, "growth": growth}
+        return estimate("gradient_size", on, slope_of(values, on), order=1, n_cells=n_cells, eps=eps, **bounds)
     low, high = _corners("gradient_size", lower, upper, growth, None)
     u, corners, spacing = _check_solution("gradient_size", values, low, high, at, missing, least=2)
     slopes = np.gradient(u, *spacing[::-1])
