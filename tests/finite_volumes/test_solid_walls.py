@@ -128,6 +128,19 @@ def test_check_finds_what_is_wrong(made):
     assert "volumes[" in text
 
 
+@pytest.mark.parametrize("seed", [4, 21])
+def test_an_edge_across_a_crease_with_both_ends_outside_closes_a_face(ctx, seed):
+    """The face between two of its cells has no corner inside: the edge and a vertex on the crease are its corners."""
+    solid, k = clvoro.Solid.box((0, 0, 0), (1, 1, 1)), np.arange(H / 2, 1, H)
+    x = np.stack(np.meshgrid(k, k, k, indexing="ij"), axis=-1).reshape(-1, 3)
+    x += np.random.default_rng(seed).uniform(-0.35, 0.35, x.shape) * H
+    h = np.full(len(x), H)
+    faces = solid_mesh(WallSurface(solid), x, h, whole_diagram(ctx, solid, x, h)).faces
+    walls = np.bincount(-1 - faces.neighbor[faces.n_inner :], faces.area[faces.n_inner :])
+    assert np.abs(walls - 1).max() < 1e-12
+    assert abs(faces.volumes.sum() - 1) < 1e-12
+
+
 def test_a_cell_with_a_concave_crease_is_cut(ctx):
     """Where generators beside the crease are off their places, it passes through a cell."""
     solid = el()

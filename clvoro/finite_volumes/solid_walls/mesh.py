@@ -365,7 +365,10 @@ class _Maker:
         return TrimmedFaces(near[parts.face], parts.starts, parts.items, parts.chord)
 
     def _to_creases(self, parts: TrimmedFaces) -> TrimmedFaces:
-        """Put a vertex on the crease between the two ends of a chord that lie on different patches."""
+        """Put a vertex on the crease between the two ends of a chord that lie on different patches.
+
+        Parts that still have two corners are left out.
+        """
         after = parts.items[following(parts.starts)]
         face = parts.face[np.repeat(np.arange(len(parts.face)), np.diff(parts.starts))]
         creased = parts.chord & ~self.rounded[self.owner[face]] & ~self.rounded[self.neighbor[face]]
@@ -405,12 +408,14 @@ class _Maker:
         rows, taken = rows[order], taken[order]
         counts = np.diff(parts.starts)
         added = np.bincount(np.searchsorted(parts.starts, rows, "right") - 1, minlength=len(counts))
-        return TrimmedFaces(
+        counts += added
+        made = TrimmedFaces(
             parts.face,
-            np.concatenate([[0], np.cumsum(counts + added)]),
+            np.concatenate([[0], np.cumsum(counts)]),
             np.insert(parts.items, rows + 1, first + taken),
             np.insert(parts.chord, rows + 1, True),
         )
+        return made.take(np.flatnonzero(counts >= 3))
 
     def _crossings(self) -> Crossings:
         """Return where creases cross faces."""

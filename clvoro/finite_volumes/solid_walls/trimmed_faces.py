@@ -51,6 +51,9 @@ def trim_faces(
 ) -> TrimmedFaces:
     """Keep the parts of faces that are inside of the solid.
 
+    A part of two corners is an edge with both ends outside, of a face without a corner inside. It has an area once a
+    vertex on a crease follows on its chord.
+
     Parameters
     ----------
     starts, corners : (f + 1,), (k,) int
@@ -89,7 +92,7 @@ def trim_faces(
     gaps = np.bincount(of, gap, minlength=len(starts) - 1)
     whole = TrimmedFaces(np.arange(len(starts) - 1), np.concatenate([[0], np.cumsum(counts)]), items, gap)
     several = np.flatnonzero(gaps > 1)
-    simple = whole.take(np.flatnonzero((counts >= 3) & (gaps <= 1)))
+    simple = whole.take(np.flatnonzero((counts >= 2) & (gaps <= 1)))
     made = [simple]
     if several.size:
         made.append(_divide(surface, whole, several, points, h))
@@ -140,7 +143,7 @@ def _divide(
                 k = following_run[k]
                 if k == start:
                     break
-            if len(loop) >= 3:
+            if len(loop) >= 2:
                 faces.append(int(whole.face[row]))
                 lists.append(loop)
                 chords.append(marks)
