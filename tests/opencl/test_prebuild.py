@@ -212,7 +212,7 @@ def test_threads_know_the_programs_of_gpus(ctx, monkeypatch, real, kind):
         return text
 
     monkeypatch.setattr(program, "program_text", noted)
-    domain, size = first_run.RECORDED[kind]
+    domain, size = first_run.RUNS[kind]
     adapter, counts = clvoro.Adapter(ctx, real), []
     adapter.on_build = lambda *count: counts.append(count)
     adapter.run(eval(domain), 2 * size)
