@@ -37,7 +37,6 @@ from .stations import Stations, place_stations
 _ON = 1e-12  # of the diagonal: points this close to the surface lie on it
 _PROBES = 4096  # places on the surface from which widths are measured
 _FACING = -0.7  # product of the normals of two walls that face each other
-_EDGE = 1e-9  # weight of a corner below which a foot lies on the opposite side
 _SAMPLES = 2048  # places on the surface from which the search for nearest points begins, besides vertices
 _MOST_STEPS = 64  # along a side of a triangle
 _MARGIN = 0.05  # of the longest edge, by which the clip box is larger than the region
