@@ -42,7 +42,7 @@ def check_for_mpas(diagram: Diagram, walls: WallShape | None) -> SolverReport:
 
 
 def _edges_once(diagram: Diagram, m: CGridMeasures) -> tuple[np.ndarray, Rows]:
-    """Return one half-face of each edge between two cells, (k,) int, and the edges as rows of criteria."""
+    """Return a half-face for each edge between two cells, (k,) int, and these edges as `Rows`, which make criteria."""
     inner = np.flatnonzero(m.inner)
     inner = inner[np.less(*face_keys(diagram, inner))]
     return inner, Rows(diagram.face_centroids[inner], face_owners(diagram)[inner], diagram.domain.dim)

@@ -1,4 +1,4 @@
-"""Cells that bisectors alone bound: walls, seams and removed cells are replaced by points behind the faces."""
+"""Cells bounded by bisectors alone: points behind faces take the place of walls, seams and removed cells."""
 
 from __future__ import annotations
 

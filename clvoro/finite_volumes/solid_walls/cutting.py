@@ -385,7 +385,7 @@ class _UncutError(Exception):
 
 
 def _closed(sides: list[tuple[int, int]]) -> list[int] | None:
-    """Return the only loop of directed sides, or None."""
+    """Return the vertices of the loop that directed sides form; None if they do not form exactly one."""
     after = dict(sides)
     if len(after) != len(sides) or len(sides) < 3:
         return None

@@ -64,7 +64,7 @@ class Images(DomainSteps):
         if halo.cells == 0:
             volume = self.domain.measure / self.domain.frame[1] ** dim
             halo.fill(FIRST_DEPTH * (volume / n) ** (1 / dim), n)
-        # Room for motion costs many images where cells differ much in size.
+        # Nothing moves after the last diagram. Room for motion costs many images where sizes of cells differ much.
         self._factor, self._grow, self._room = (halo.cells / n) ** (1 / dim), False, 0.0 if last else 1.0
 
     def extend(self, sites: cla.Array, n: int) -> Part:
