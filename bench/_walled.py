@@ -245,6 +245,12 @@ def sphere(name: str) -> Callable[[], Setup]:
     return lambda: Setup(CUBE, test_field(name), {})
 
 
+def spheres() -> Setup:
+    """Return a cube with sizes by the distance to the nearer of two spheres, with a kink."""
+    both = [sizing.Distance(sizing.Ball(c, 0.2), h_min=0.04, slope=0.3) for c in ((0.3, 0.3, 0.5), (0.7, 0.6, 0.5))]
+    return Setup(CUBE, sizing.minimum(*both), {})
+
+
 WALLED: dict[str, Callable[[], Setup]] = {
     "box": box,
     "lake": lake,
@@ -275,4 +281,5 @@ WALLED: dict[str, Callable[[], Setup]] = {
     "S1": sphere("S1"),
     "S2": sphere("S2"),
     "S3": sphere("S3"),
+    "spheres": spheres,
 }

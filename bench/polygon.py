@@ -9,7 +9,7 @@ processor times over the number of cores, medians of several runs by turns.
 
 The second table runs size fields of `bench/convergence.py` on such a polygon, medians of `--seeds` starts. F2 and F3
 stand against one and a half times the error targets of the box, and its mean quality less .01. Fields with kinks, where
-a run trades sizes for shape, stand against the goals of `bench/front.py`. Cells on the boundary stand against a mean
+a run trades sizes for shape, stand against those of `bench/convergence.py`. Cells on the boundary stand against a mean
 |e| of .006.
 Quality is that of cells without a face on the boundary; the others have separate columns.
 """

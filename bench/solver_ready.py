@@ -11,8 +11,8 @@ script ends with a message. Debian's package `openfoam` is enough.
 With --seeds there is one row per domain and run, for all seeds: how many meshes are accepted, and the worst figures.
 `--seeds 6` is short for `--seeds 1,2,3,4,5,6`. Processor times are those of the run, and of making the solver mesh.
 
-The domains are in `bench/_walled.py` and `bench/_sites.py`; `spheres` is that of `bench/short_edges.py`. S3 has 1e5
-cells; S2 and S3 run with their default effort only, unless they are named in --only.
+The domains are in `bench/_walled.py` and `bench/_sites.py`. S3 has 1e5 cells; S2 and S3 run with their default effort
+only, unless they are named in --only.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ import numpy as np
 from _common import Report, counts, heading, make_adapter, names, off_walls, parser
 from _sites import SITES
 from _walled import WALLED
-from short_edges import setup
 
 import clvoro
 from clvoro.errors import InputError
@@ -43,11 +42,7 @@ FIGURES = {
     "concave": r"Concave cells .*number of cells: (\d+)",
 }
 LARGE = ("S2", "S3")
-DOMAINS: dict[str, Callable[[], tuple[Any, Any, dict[str, Any]]]] = {
-    **WALLED,
-    **SITES,
-    "spheres": lambda: (*setup("spheres"), {}),
-}
+DOMAINS: dict[str, Callable[[], tuple[Any, Any, dict[str, Any]]]] = {**WALLED, **SITES}
 
 
 def figures_of(verdict: CheckMeshResult) -> dict[str, Any]:

@@ -132,8 +132,8 @@ def test_shallow_water():
 
 
 @pytest.mark.slow
-def test_fields(tmp_path):
-    rows = records("fields.py", "--effort", "fast", "--out", str(tmp_path))
+def test_sheets(tmp_path):
+    rows = records("sheets.py", "--only", "fields", "--effort", "fast", "--out", str(tmp_path))
     assert len(rows) == 6
     assert (tmp_path / "fields.png").read_bytes()[:4] == b"\x89PNG"
 
