@@ -1,14 +1,13 @@
 """The tessellation alone: time of each stage, cold and warm-started, uniform and graded.
 
     python bench/diagram.py [--dim 3] [--sizes 1e4,1e5,1e6,4e6] [--sets uniform,cubed,radial,hexagonal]
-                            [--scipy] [--repeat 5] [--processor-time] [--device NAME]
+                            [--move 0.1] [--scipy] [--repeat 5] [--processor-time] [--device NAME]
                             [--dtype float32] [--json]
 
 With `--dim 3` the unit cube: "uniform", "radial" with sizes 1 : 1000 around an empty
 ball, "core", the same with the ball filled, and "bcc", the body-centered cubic lattice, jittered
 likewise. Cells at the empty ball are cones to its center, each near hundreds of others; "core" has the
-cost of grading alone. Areas and moments are then part of "clip". A warm row bins the moved generators and clips by the
-neighbors of the diagram before first.
+cost of grading alone. Areas and moments are then part of "clip".
 
 Point sets in the unit square, random with a fixed seed: "uniform"; "cubed", uniform with x -> x^3
 in both coordinates; "radial", spacing in proportion to the distance from the center, sizes
@@ -20,12 +19,11 @@ milliseconds:
   bins     the binning of ordered generators, where they have moved
   diagram  clipping, matching, scan, areas, centroids, faces, graph
 "clip", "match" and "measure" are the device's own times of the kernels in "diagram", by its
-events. Warm rows: the generators move by up to a tenth of the distance to the nearest other, and
-the diagram is updated ("clip": check which cells keep their neighbors, clip the others);
-there is no binning. Rates are millions of cells per second: of clipping alone; from binning to
-graph; and from "order" to graph, which is a diagram of points in any order: these need no further
-binning. With `--scipy`
-SciPy's Voronoi of the same points runs too (vertices and regions, no areas), up to
+events. Warm rows: the generators move by up to `--move` times the distance to the nearest other, and
+the diagram is updated ("clip": check which cells keep their neighbors, clip the others), without
+binning. Rates are millions of cells per second: of clipping alone; from binning to graph; and from
+"order" to graph, which is a diagram of points in any order: these need no further binning. With
+`--scipy` SciPy's Voronoi of the same points runs too (vertices and regions, no areas), up to
 `--scipy-up-to` cells; "x SciPy" compares it with the last of the rates.
 
 With `--processor-time`, seconds are the processor time of this process over the device's compute units (SciPy: over
@@ -48,10 +46,8 @@ import clvoro
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.hooks import watching
 from clvoro.opencl.profile import Profile, profiled_queue
-from clvoro.tessellation.bins import Bins
-from clvoro.tessellation.cells import Cells
-from clvoro.tessellation.incremental import IncrementalUpdate
-from clvoro.tessellation.polyhedra import Polyhedra
+from clvoro.tessellation.stages import TessellationStages
+from clvoro.tessellation.tessellator import Tessellator
 
 BOX = clvoro.Box((0.0, 0.0), (1.0, 1.0))
 CUBE = clvoro.Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
@@ -59,7 +55,6 @@ SEED = 7919
 RATIO = 1e4
 RATIO_3D = 1e3
 JITTER = 0.1
-WARM_MOVE = 0.1
 
 
 def uniform(n: int, rng: np.random.Generator) -> np.ndarray:
@@ -130,7 +125,7 @@ SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
 SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, radial_3d, core_3d, bcc_3d)}
 
 
-KERNELS = {"clip": ("walk", "wrap", "clip", "check", "list", "place"), "match": ("match",), "measure": ("measure",)}
+KERNELS = {"clip": ("walk", "wrap", "clip", "check", "list", "place", "update"), "match": ("match",), "measure": ("measure",)}
 """Columns, each with the beginnings of the names of its kernels."""
 
 
@@ -150,31 +145,30 @@ def median_time(queue: Any, repeat: int, function: Callable[[], object], clock: 
     return statistics.median(times)
 
 
-class Tessellator:
-    """The stages of a diagram on one queue, over generators in the order of their bins."""
+class Diagrams:
+    """Diagrams on one queue, over generators in the order of their bins."""
 
     def __init__(self, engine: Engine, points: np.ndarray) -> None:
-        self.engine, self.n = engine, len(points)
-        self.bins = Bins(engine)
-        self.box = BOX if engine.dim == 2 else CUBE
-        self.cells = Cells(engine) if engine.dim == 2 else Polyhedra(engine)
-        self.incremental = IncrementalUpdate(engine) if engine.dim == 2 else None
+        self.n, self.box = len(points), BOX if engine.dim == 2 else CUBE
+        self.stages = TessellationStages(engine)
+        self.tessellator = Tessellator(self.stages, self.box)
         self.given = engine.upload(points)
         self.points = self.order()
         self.turn = 0
 
     def order(self) -> Any:
         """Bin the generators as given; return them in the order of the bins, as `Adapter.diagram` does."""
-        self.binned = self.bins.build(self.box, self.given, self.n)
+        bins = self.stages.bins
+        self.binned = bins.build(self.box, self.given, self.n)
         self.labels = self.binned.items[: self.n].copy()
         points = self.binned.points[: self.n].copy()
-        self.bins.renumber(self.binned, self.n)
+        bins.renumber(self.binned, self.n)
         self.reach = None
         return points
 
     def bin(self) -> None:
         """Bin the ordered generators."""
-        self.binned = self.bins.build(self.box, self.points, self.n)
+        self.binned = self.stages.bins.build(self.box, self.points, self.n)
         self.reach = None
 
     def diagram(self) -> Any:
@@ -183,11 +177,11 @@ class Tessellator:
             self.reach = self.binned.reach.copy()
         else:
             self.binned.reach[:] = self.reach
-        self.t = self.cells.tessellate(self.box, self.points, self.n, self.binned)
+        self.t = self.tessellator.tessellate(self.points, self.n, binned=self.binned)
         return self.t
 
-    def prepare_warm(self, rng: np.random.Generator) -> None:
-        """Move the generators to and fro by a share of the distance to the nearest other."""
+    def prepare_warm(self, rng: np.random.Generator, move: float) -> None:
+        """Move the generators to and fro by `move` times the distance to the nearest other."""
         self.bin()
         t, host = self.diagram(), self.points.get()
         starts = t.starts.get()
@@ -195,26 +189,16 @@ class Tessellator:
         d = host[neighbors] - np.repeat(host, np.diff(starts), axis=0)
         d = np.where(neighbors >= 0, np.linalg.norm(d, axis=1), np.inf)
         nearest = np.minimum.reduceat(d, starts[:-1])
-        moved = host + WARM_MOVE * nearest[:, None] * (rng.random(host.shape) - 0.5) * math.sqrt(2)
-        moved = np.clip(moved, 0, 1)
-        self.places = [self.points, self.engine.upload(moved)]
+        moved = host + move * nearest[:, None] * (rng.random(host.shape) - 0.5) * math.sqrt(2)
+        self.places = [self.points, self.stages.engine.upload(np.clip(moved, 0, 1))]
         # Capacities grow in a new diagram, not in an update.
-        self.cells.tessellate(self.box, self.places[1], self.n, self.bins.build(self.box, self.places[1], self.n))
-        self.t = self.cells.tessellate(self.box, self.points, self.n, self.bins.build(self.box, self.points, self.n))
+        self.tessellator.tessellate(self.places[1], self.n)
+        self.t = self.tessellator.tessellate(self.points, self.n)
 
     def diagram_warm(self) -> None:
         """Update the diagram to the moved generators, back, and so on."""
         self.turn = 1 - self.turn
-        if isinstance(self.cells, Polyhedra) or self.incremental is None:
-            points = self.places[self.turn]
-            binned = self.bins.build(self.box, points, self.n)
-            self.t = self.cells.tessellate(self.box, points, self.n, binned, self.t)
-            return
-        t = self.incremental.update(self.cells, self.box, self.places[self.turn], self.t)
-        if t is None:  # as a run does if too much has changed
-            binned = self.bins.build(self.box, self.places[self.turn], self.n)
-            t = self.cells.tessellate(self.box, self.places[self.turn], self.n, binned)
-        self.t = t
+        self.t = self.tessellator.tessellate(self.places[self.turn], self.n, self.t)
 
 
 def kernel_times(queue: Any, repeat: int, function: Callable[[], object], clock: Clock | None) -> dict[str, float]:
@@ -260,20 +244,20 @@ def measure(adapter: clvoro.Adapter, name: str, n: int, options: argparse.Namesp
     points = sets_of(options)[name](n, rng).astype(adapter.dtype)
     repeat, clock = options.repeat, clock_of(options, adapter)
     kernel_clock = clock if options.processor_time else None
-    plain = Tessellator(Engine(adapter.ctx, adapter.queue, options.dim, adapter.dtype), points)
-    queue = plain.engine.queue
+    plain = Diagrams(Engine(adapter.ctx, adapter.queue, options.dim, adapter.dtype), points)
+    queue = adapter.queue
     order = median_time(queue, repeat, plain.order, clock)
     bins = median_time(queue, repeat, plain.bin, clock)
     cold = median_time(queue, repeat, plain.diagram, clock)
-    plain.prepare_warm(rng)
+    plain.prepare_warm(rng, options.move)
     warm = median_time(queue, repeat, plain.diagram_warm, clock)
     del plain
 
     queue = profiled_queue(adapter.ctx)
-    timed = Tessellator(Engine(adapter.ctx, queue, options.dim, adapter.dtype), points)
+    timed = Diagrams(Engine(adapter.ctx, queue, options.dim, adapter.dtype), points)
     timed.bin()
     cold_kernels = kernel_times(queue, repeat, timed.diagram, kernel_clock)
-    timed.prepare_warm(rng)
+    timed.prepare_warm(rng, options.move)
     warm_kernels = kernel_times(queue, repeat, timed.diagram_warm, kernel_clock)
     del timed
 
@@ -328,6 +312,7 @@ def main() -> None:
     options_of.add_argument("--sizes", type=counts, default=[10**4, 10**5, 10**6, 4 * 10**6])
     options_of.add_argument("--dim", type=int, choices=(2, 3), default=2)
     options_of.add_argument("--sets", type=names, help=f"{', '.join(SETS)}; in 3D {', '.join(SETS_3D)}")
+    options_of.add_argument("--move", type=float, default=0.1)
     options_of.add_argument("--repeat", type=int, default=5)
     options_of.add_argument("--scipy", action="store_true")
     options_of.add_argument("--processor-time", action="store_true")
