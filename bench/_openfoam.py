@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import re
 import shutil
-import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,11 +10,8 @@ from typing import Any
 import numpy as np
 
 from clvoro.foam.case import FoamCase
-from clvoro.io.foam_read import FoamFile
-from clvoro.mesh.geometry import cell_geometry, face_geometry
-
-HOME = "/usr/share/openfoam"  # of Debian's package
-NUMBER = r"[-+.e\d]+"
+from clvoro.foam.fields import read_field
+from clvoro.foam.mesh import FoamMesh
 
 
 def missing(*programs: str) -> list[str]:
@@ -50,94 +44,42 @@ def nonuniform(values: np.ndarray) -> str:
     return f"nonuniform List<vector> {len(values)}({rows})"
 
 
-class PlaneMesh:
-    """A polyMesh of one layer of prisms between the patches `back` and `front`, as OpenFOAM reads it.
+class Mesh(FoamMesh):
+    """The polyMesh of a case, as OpenFOAM measures it."""
 
-    Attributes
-    ----------
-    owner : (f,) int
-        Owner of each face.
-    patches : dict of str to slice
-        The faces of each patch.
-    centroids : (n, 2) float
-        Centroids of the cells in the plane.
-    polygons : list of (k, 2) float
-        Corners of the cells.
-    """
-
-    def __init__(self, case: Path, folder: Path | None = None) -> None:
-        folder = folder or case / "constant" / "polyMesh"
-        triple = rf"\(({NUMBER}) ({NUMBER}) ({NUMBER})\)"
-        self._points = np.array(re.findall(triple, _body(folder / "points")), float)
-        rows = re.findall(r"\d+\s*\(([\d\s]+)\)", _body(folder / "faces"))
-        self._faces = [np.array(row.split(), int) for row in rows]
-        self.owner = np.array(_body(folder / "owner").split(), int)
-        patch = r"(\w+)\s*\{[^}]*?nFaces\s+(\d+);\s*startFace\s+(\d+);"
-        self.patches = {
-            name: slice(int(start), int(start) + int(count))
-            for name, count, start in re.findall(patch, _body(folder / "boundary"))
-        }
-        back = self.patches["back"]
-        order = np.argsort(self.owner[back]) + back.start
-        self.polygons = [self._points[self._faces[k]][:, :2] for k in order]
-        self.centroids = np.array([_centroid(polygon) for polygon in self.polygons])
+    @classmethod
+    def of(cls, case: Path, folder: Path | None = None) -> Mesh:
+        """Return the mesh of a case, or in another folder."""
+        return cls.read(folder or case / "constant" / "polyMesh")
 
     def __len__(self) -> int:
-        return len(self.polygons)
+        return self.n_cells
+
+    def patch(self, name: str) -> np.ndarray:
+        """Return the faces of a patch, (k,)."""
+        return next(patch.faces for patch in self.patches if patch.name == name)
+
+    def polygons(self, faces: np.ndarray) -> list[np.ndarray]:
+        """Return the corners of faces in the plane, each (k, 2)."""
+        return [self.points[self.corners[self.starts[f] : self.starts[f + 1]], :2] for f in faces]
 
     def edges(self, patch: str) -> np.ndarray:
-        """Return the ends of each face of `patch` in the plane, (n, 2, 2)."""
-        faces = (self._points[face] for face in self._faces[self.patches[patch]])
+        """Return the ends of each face of `patch` of a layer of prisms in the plane, (n, 2, 2)."""
+        faces = (self.points[self.corners[self.starts[f] : self.starts[f + 1]]] for f in self.patch(patch))
         return np.array([face[face[:, 2] < face[:, 2].mean(), :2] for face in faces])
-
-
-class SpaceMesh:
-    """A polyMesh in space, as OpenFOAM measures it.
-
-    Attributes
-    ----------
-    centroids, volumes : (n, 3), (n,) float
-    centers, areas : (f, 3) float
-    owner, inside : (f,), (k,) int
-        Cells of each face, and behind the first faces.
-    patches : dict of str to (k,) int
-        The faces of each patch.
-    """
-
-    def __init__(self, case: Path) -> None:
-        folder = case / "constant" / "polyMesh"
-        points, (starts, corners) = FoamFile.read(folder, "points").vectors(), FoamFile.read(folder, "faces").rows()
-        self.owner, inside = FoamFile.read(folder, "owner").labels(), FoamFile.read(folder, "neighbour").labels()
-        self.patches = {patch.name: patch.faces for patch in FoamFile.read(folder, "boundary").patches()}
-        self.centers, self.areas = face_geometry(points, starts, corners)
-        self.inside, n = inside, int(self.owner.max()) + 1
-        self.centroids, self.volumes = cell_geometry(self.centers, self.areas, self.owner, inside, n)
 
     def velocity(self, flux: np.ndarray) -> np.ndarray:
         """Return the velocity (n, 3) that fits the `flux` (f,) through the faces of each cell best.
 
         That is the sum of S S / |S|, inverted, times the sum of S / |S| times the flux.
         """
-        unit = self.areas / np.linalg.norm(self.areas, axis=1)[:, None]
-        cell, face = np.concatenate([self.owner, self.inside]), np.r_[: len(self.owner), : len(self.inside)]
-        matrix, right = np.zeros((len(self.volumes), 3, 3)), np.zeros((len(self.volumes), 3, 1))
-        np.add.at(matrix, cell, (self.areas[:, :, None] * unit[:, None])[face])
+        areas = self.faces[1]
+        unit = areas / np.linalg.norm(areas, axis=1)[:, None]
+        cell, face = np.concatenate([self.owner, self.neighbor]), np.r_[: len(self.owner), : len(self.neighbor)]
+        matrix, right = np.zeros((len(self), 3, 3)), np.zeros((len(self), 3, 1))
+        np.add.at(matrix, cell, (areas[:, :, None] * unit[:, None])[face])
         np.add.at(right, cell, (unit * flux[:, None])[face][:, :, None])
         return np.linalg.solve(matrix, right)[:, :, 0]
-
-
-def _centroid(polygon: np.ndarray) -> np.ndarray:
-    first = polygon - polygon[0]
-    after = np.roll(first, -1, axis=0)
-    weight = first[:, 0] * after[:, 1] - after[:, 0] * first[:, 1]
-    return polygon[0] + weight @ (first + after) / (3 * weight.sum())
-
-
-def _body(path: Path) -> str:
-    """Return the text between the outer parentheses of a list."""
-    text = path.read_text()
-    text = text[text.index("}") + 1 :]
-    return text[text.index("(") + 1 : text.rindex(")")]
 
 
 def write_prisms(
@@ -209,21 +151,58 @@ class Case:
         kinds = {"0/U": "volVectorField", "0/p": "volScalarField", "0/Phi": "volScalarField"}
         path.write_text(header(kinds.get(name, "dictionary"), path.name) + text_of(entries))
 
-    def run(self, program: str, *options: str) -> str:
-        """Run a program of OpenFOAM; return what it prints.
+    def write_start(
+        self,
+        velocity: Mapping[str, Any],
+        pressure: Mapping[str, Any],
+        values: tuple[str, str] = ("uniform (0 0 0)", "uniform 0"),
+    ) -> None:
+        """Write U and p: the entries of their patches, and their values in cells."""
+        for name, dimensions, inside, patches in (
+            ("U", "[0 1 -1 0 0 0 0]", values[0], velocity),
+            ("p", "[0 2 -2 0 0 0 0]", values[1], pressure),
+        ):
+            self.write(f"0/{name}", {"dimensions": dimensions, "internalField": inside, "boundaryField": patches})
+
+    def write_system(
+        self,
+        viscosity: float,
+        convection: str = "bounded Gauss linearUpwind grad(U)",
+        schemes: Mapping[str, Any] | None = None,
+        *,
+        solution: Mapping[str, Any],
+        control: Mapping[str, Any],
+    ) -> None:
+        """Write the dictionaries of a laminar flow, which is steady unless `schemes` say else."""
+        self.write("constant/transportProperties", {"transportModel": "Newtonian", "nu": viscosity})
+        self.write("constant/turbulenceProperties", {"simulationType": "laminar"})
+        common = {
+            "ddtSchemes": {"default": "steadyState"},
+            # Forces on a body are exact only if the pressure's gradient conserves momentum.
+            "gradSchemes": {"default": "leastSquares", "grad(p)": "Gauss linear"},
+            "divSchemes": {
+                "default": "Gauss linear",
+                "div(phi,U)": convection,
+                "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
+            },
+            "laplacianSchemes": {"default": "Gauss linear corrected"},
+            "interpolationSchemes": {"default": "linear"},
+            "snGradSchemes": {"default": "corrected"},
+        }
+        self.write("system/fvSchemes", {**common, **(schemes or {})})
+        self.write("system/fvSolution", {"relaxationFactors": {"equations": {"U": 0.9}}, **solution})
+        times = {"startFrom": "startTime", "startTime": 0, "stopAt": "endTime", "deltaT": 1, "writeControl": "runTime"}
+        self.write("system/controlDict", {**times, "writeInterval": control["endTime"], **control})
+
+    def run(self, *program: str) -> None:
+        """Run a program of OpenFOAM.
 
         Raises
         ------
-        RuntimeError
-            If the program fails.
+        InputError, ClvoroError
+            If it is not installed, or fails.
         """
-        environment = {"WM_PROJECT_DIR": HOME, **os.environ}
-        done = subprocess.run(
-            [program, *options], cwd=self.folder, env=environment, capture_output=True, text=True, check=False
-        )
-        if done.returncode:
-            raise RuntimeError(f"{program} failed: {(done.stdout + done.stderr)[-2000:]}")
-        return done.stdout
+        FoamCase(self.folder).run(" ".join(program), self.folder / f"log.{program[0]}")
 
     def table(self, function: str, file: str) -> dict[str, np.ndarray]:
         """Return the columns of the table that a function object wrote, by name."""
@@ -233,15 +212,14 @@ class Case:
         rows = np.array([line.split() for line in lines if not line.startswith("#")], float)
         return dict(zip(heads[-1], rows.T, strict=True))
 
-    def latest_mesh(self) -> PlaneMesh:
+    def latest_mesh(self) -> Mesh:
         """Return the mesh of the latest time."""
         known = FoamCase(self.folder)
-        return PlaneMesh(self.folder, known.mesh_folder(known.latest()))
+        return Mesh.read(known.mesh_folder(known.latest()))
 
-    def field(self, name: str, dim: int = 2) -> np.ndarray:
-        """Return the values of a field in cells at the last time, (n,), or the first `dim` components of a vector."""
-        times = [p for p in self.folder.iterdir() if re.fullmatch(r"[\d.]+", p.name)]
-        text = (max(times, key=lambda p: float(p.name)) / name).read_text()
-        text = text[text.index("internalField") : text.index("boundaryField")]
-        values = np.array(re.sub(r"[()]", " ", text[text.index("(") : text.rindex(")")]).split())
-        return values.astype(float) if "<scalar>" in text else values.astype(float).reshape(-1, 3)[:, :dim]
+    def field(self, name: str, n: int) -> np.ndarray:
+        """Return the `n` values of a field at the last time, (n, k)."""
+        folder = self.folder / FoamCase(self.folder).latest().name
+        return read_field(next(path for path in (folder / name, folder / f"{name}.gz") if path.exists())).internal.rows(
+            n
+        )

@@ -46,61 +46,19 @@ def write_case(case: Case, flat: tuple[str, ...]) -> None:
     closed = {"type": "zeroGradient"}
     u = {"lid": {"type": "fixedValue", "value": "uniform (1 0 0)"}, "fixed": {"type": "noSlip"}, **empty}
     p = {"lid": closed, "fixed": closed, **empty}
-    for name, dimensions, value, patches in (
-        ("U", "[0 1 -1 0 0 0 0]", "uniform (0 0 0)", u),
-        ("p", "[0 2 -2 0 0 0 0]", "uniform 0", p),
-    ):
-        case.write(f"0/{name}", {"dimensions": dimensions, "internalField": value, "boundaryField": patches})
-    case.write("constant/transportProperties", {"transportModel": "Newtonian", "nu": 0.001})
-    case.write("constant/turbulenceProperties", {"simulationType": "laminar"})
-    case.write(
-        "system/controlDict",
-        {
-            "startFrom": "startTime",
-            "startTime": 0,
-            "stopAt": "endTime",
-            "endTime": 2000,
-            "deltaT": 1,
-            "writeControl": "runTime",
-            "writeInterval": 2000,
-            "writeFormat": "binary",
-            "writeCompression": "on",
-        },
-    )
-    case.write(
-        "system/fvSchemes",
-        {
-            "ddtSchemes": {"default": "steadyState"},
-            "gradSchemes": {"default": "leastSquares", "grad(p)": "Gauss linear"},
-            "divSchemes": {
-                "div(phi,U)": "bounded Gauss linearUpwind grad(U)",
-                "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
-            },
-            "laplacianSchemes": {"default": "Gauss linear corrected"},
-            "interpolationSchemes": {"default": "linear"},
-            "snGradSchemes": {"default": "corrected"},
-        },
-    )
-    case.write(
-        "system/fvSolution",
-        {
-            "solvers": {
-                "p": {"solver": "GAMG", "smoother": "GaussSeidel", "tolerance": 1e-9, "relTol": 0.05},
-                "U": {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": 1e-10, "relTol": 0.05},
-            },
-            "SIMPLE": {"consistent": "yes", "pRefCell": 0, "pRefValue": 0, "residualControl": {"p": 1e-5, "U": 1e-6}},
-            "relaxationFactors": {"equations": {"U": 0.9}},
-        },
-    )
+    solvers = {
+        "p": {"solver": "GAMG", "smoother": "GaussSeidel", "tolerance": 1e-9, "relTol": 0.05},
+        "U": {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": 1e-10, "relTol": 0.05},
+    }
+    simple = {"consistent": "yes", "pRefCell": 0, "pRefValue": 0, "residualControl": {"p": 1e-5, "U": 1e-6}}
+    control = {"endTime": 2000, "writeFormat": "binary", "writeCompression": "on"}
+    case.write_start(u, p)
+    case.write_system(0.001, solution={"solvers": solvers, "SIMPLE": simple}, control=control)
 
 
 def error(case: Case, mesh: clvoro.Diagram) -> float:
     """Return the error of the velocity in percent."""
-    known = FoamCase(case.folder)
-    folder = known.folder / known.latest().name
-    u = foam.read_field(next(path for path in (folder / "U", folder / "U.gz") if path.exists())).internal.rows(
-        len(mesh)
-    )
+    u = case.field("U", len(mesh))
     found = sizing.OnCells(mesh, u[:, 0])(np.column_stack([np.full(len(HEIGHT), 0.5), HEIGHT]))
     return 100 * float(np.abs(found - GHIA).mean())
 

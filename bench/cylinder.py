@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 from _common import Report, counts, heading, make_adapter, parser, spread
-from _openfoam import Case, PlaneMesh, header, missing, nonuniform, text_of, write_prisms
+from _openfoam import Case, Mesh, header, missing, nonuniform, text_of, write_prisms
 
 import clvoro
 
@@ -329,7 +329,7 @@ MESHERS: dict[str, Callable[..., None]] = {
 
 def write_case(
     case: Case,
-    mesh: PlaneMesh,
+    mesh: Mesh,
     reynolds: int,
     convection: str,
     start: tuple[np.ndarray, np.ndarray] | None = None,
@@ -343,107 +343,46 @@ def write_case(
     primitive = y**2 * HEIGHT / 2 - y**3 / 3
     inlet = np.zeros((y.shape[1], 2))
     inlet[:, 0] = 6 * mean / HEIGHT**2 * (primitive[1] - primitive[0]) / (y[1] - y[0])
-    flat, closed = {"type": "empty"}, {"type": "zeroGradient"}
-    fields = {
-        "U": (
-            "[0 1 -1 0 0 0 0]",
-            f"uniform ({mean} 0 0)",
-            {
-                "inlet": {"type": "fixedValue", "value": nonuniform(inlet)},
-                "outlet": closed,
-                "walls": {"type": "noSlip"},
-                "cylinder": {"type": "noSlip"},
-            },
-        ),
-        "p": (
-            "[0 2 -2 0 0 0 0]",
-            "uniform 0",
-            {
-                "inlet": closed,
-                "outlet": {"type": "fixedValue", "value": "uniform 0"},
-                "walls": closed,
-                "cylinder": closed,
-            },
-        ),
-    }
-    for k, (name, (dimensions, value, patches)) in enumerate(fields.items()):
-        values = value if start is None else nonuniform(start[k])
-        case.write(
-            f"0/{name}",
-            {
-                "dimensions": dimensions,
-                "internalField": values,
-                "boundaryField": {**patches, "back": flat, "front": flat},
-            },
-        )
-    case.write("constant/transportProperties", {"transportModel": "Newtonian", "nu": VISCOSITY})
-    case.write("constant/turbulenceProperties", {"simulationType": "laminar"})
+    closed, flat = {"type": "zeroGradient"}, {name: {"type": "empty"} for name in ("back", "front")}
+    still = {name: {"type": "noSlip"} for name in ("walls", "cylinder")}
+    velocity = {"inlet": {"type": "fixedValue", "value": nonuniform(inlet)}, "outlet": closed, **still, **flat}
+    pressure = dict.fromkeys(("inlet", "walls", "cylinder"), closed)
+    pressure |= {"outlet": {"type": "fixedValue", "value": "uniform 0"}, **flat}
     scheme = {"linear": "Gauss linear", "linearUpwind": "Gauss linearUpwind grad(U)"}[convection]
-    case.write(
-        "system/fvSchemes",
-        {
-            "ddtSchemes": {"default": "steadyState" if steady else "backward"},
-            # Forces on the body are exact only if the pressure's gradient conserves momentum.
-            "gradSchemes": {"default": "leastSquares", "grad(p)": "Gauss linear"},
-            "divSchemes": {
-                "default": "none",
-                "div(phi,U)": f"bounded {scheme}" if steady else scheme,
-                "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
-            },
-            "laplacianSchemes": {"default": "Gauss linear corrected"},
-            "interpolationSchemes": {"default": "linear"},
-            "snGradSchemes": {"default": "corrected"},
-        },
-    )
     tolerance = 1e-12 if steady else 1e-7
     multigrid = {"solver": "GAMG", "smoother": "GaussSeidel"}
     gradients = {"solver": "PCG", "preconditioner": "DIC"}
-    pressure = {**(multigrid if steady else gradients), "tolerance": tolerance, "relTol": 0.05}
-    velocity = {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": tolerance, "relTol": 0.05}
-    case.write(
-        "system/fvSolution",
-        {
-            "solvers": {
-                "p": pressure,
-                "pFinal": {**pressure, "relTol": 0},
-                "U": velocity,
-                "UFinal": {**velocity, "relTol": 0},
-            },
-            "SIMPLE": {"consistent": "yes", "residualControl": {"p": 1e-7, "U": 1e-7}},
-            "PIMPLE": {"nOuterCorrectors": 2, "nCorrectors": 2, "nNonOrthogonalCorrectors": 0},
-            "relaxationFactors": {"equations": {"U": 0.9}} if steady else {"equations": {'".*"': 1}},
-        },
-    )
-    end, step = times
-    case.write(
-        "system/controlDict",
-        {
-            "startFrom": "startTime",
-            "startTime": 0,
-            "stopAt": "endTime",
-            "endTime": end,
-            "deltaT": step,
-            "writeControl": "runTime",
-            "writeInterval": end,
-            "writeFormat": "ascii",
-            "writePrecision": 12,
-            "functions": {
-                "forces": {
-                    "type": "forceCoeffs",
-                    "libs": '("libforces.so")',
-                    "patches": "(cylinder)",
-                    "rho": "rhoInf",
-                    "rhoInf": 1,
-                    "liftDir": "(0 1 0)",
-                    "dragDir": "(1 0 0)",
-                    "pitchAxis": "(0 0 1)",
-                    "CofR": "(0.2 0.2 0)",
-                    "magUInf": mean,
-                    "lRef": 2 * RADIUS,
-                    "Aref": 2 * RADIUS * THICKNESS,
-                }
-            },
-        },
+    p = {**(multigrid if steady else gradients), "tolerance": tolerance, "relTol": 0.05}
+    u = {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": tolerance, "relTol": 0.05}
+    solution = {
+        "solvers": {"p": p, "pFinal": {**p, "relTol": 0}, "U": u, "UFinal": {**u, "relTol": 0}},
+        "SIMPLE": {"consistent": "yes", "residualControl": {"p": 1e-7, "U": 1e-7}},
+        "PIMPLE": {"nOuterCorrectors": 2, "nCorrectors": 2, "nNonOrthogonalCorrectors": 0},
+    }
+    if not steady:
+        solution["relaxationFactors"] = {"equations": {'".*"': 1}}
+    forces = {
+        "type": "forceCoeffs",
+        "libs": '("libforces.so")',
+        "patches": "(cylinder)",
+        "rho": "rhoInf",
+        "rhoInf": 1,
+        "liftDir": "(0 1 0)",
+        "dragDir": "(1 0 0)",
+        "pitchAxis": "(0 0 1)",
+        "CofR": "(0.2 0.2 0)",
+        "magUInf": mean,
+        "lRef": 2 * RADIUS,
+        "Aref": 2 * RADIUS * THICKNESS,
+    }
+    values = (f"uniform ({mean} 0 0)", "uniform 0") if start is None else (nonuniform(start[0]), nonuniform(start[1]))
+    case.write_start(velocity, pressure, values)
+    case.write_system(
+        VISCOSITY,
+        f"bounded {scheme}" if steady else scheme,
+        {} if steady else {"ddtSchemes": {"default": "backward"}},
+        solution=solution,
+        control={"endTime": times[0], "deltaT": times[1], "writePrecision": 12, "functions": {"forces": forces}},
     )
 
 
@@ -458,7 +397,7 @@ def value_at(point: tuple[float, float], centroids: np.ndarray, values: np.ndarr
     return float(np.linalg.lstsq(terms * weight[:, None], values[near] * weight, rcond=None)[0][0])
 
 
-def steady_flow(case: Case, mesh: PlaneMesh, convection: str) -> dict[str, float]:
+def steady_flow(case: Case, mesh: Mesh, convection: str) -> dict[str, float]:
     """Solve at Re 20; return drag, lift, pressure difference and the number of iterations."""
     write_case(case, mesh, 20, convection)
     case.run("simpleFoam")
@@ -471,10 +410,10 @@ def steady_flow(case: Case, mesh: PlaneMesh, convection: str) -> dict[str, float
     }
 
 
-def pressure_difference(case: Case, mesh: PlaneMesh) -> dict[str, float]:
+def pressure_difference(case: Case, mesh: Mesh) -> dict[str, float]:
     """Return the difference of the pressures before and behind the cylinder."""
-    pressure = case.field("p")
-    front, rear = (value_at((x, 0.2), mesh.centroids, pressure) for x in (0.2 - RADIUS, 0.2 + RADIUS))
+    pressure = case.field("p", len(mesh))[:, 0]
+    front, rear = (value_at((x, 0.2), mesh.centroids[:, :2], pressure) for x in (0.2 - RADIUS, 0.2 + RADIUS))
     return {"pressure": front - rear}
 
 
@@ -484,17 +423,18 @@ class Shedding:
     def __init__(self) -> None:
         self.before: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def flow(self, case: Case, mesh: PlaneMesh, convection: str) -> dict[str, float]:
+    def flow(self, case: Case, mesh: Mesh, convection: str) -> dict[str, float]:
         """Solve until the flow is periodic; return largest drag and lift, and the Strouhal number."""
         start, end = None, 6.0
         if self.before is not None:
             points, u, p = self.before
-            near = np.array([np.argmin(((points - c) ** 2).sum(axis=1)) for c in mesh.centroids])
+            near = np.array([np.argmin(((points - c) ** 2).sum(axis=1)) for c in mesh.centroids[:, :2]])
             start, end = (u[near], p[near]), 2.5
         step = 0.0015 * math.sqrt(3000 / len(mesh))
         write_case(case, mesh, 100, convection, start, (end, step))
         case.run("pimpleFoam")
-        self.before = mesh.centroids, case.field("U"), case.field("p")
+        u, p = case.field("U", len(mesh))[:, :2], case.field("p", len(mesh))[:, 0]
+        self.before = mesh.centroids[:, :2], u, p
         forces = case.table("forces", "coefficient.dat")
         time_, lift = forces["Time"], forces["Cl"]
         late = time_ > end - 1.05  # three periods
@@ -510,7 +450,7 @@ class Shedding:
         }
 
 
-def picture(case: Case, mesh: PlaneMesh, path: Path, title: str) -> None:
+def picture(case: Case, mesh: Mesh, path: Path, title: str) -> None:
     """Draw the mesh near the cylinder, colored by speed."""
     import matplotlib as mpl
 
@@ -518,11 +458,13 @@ def picture(case: Case, mesh: PlaneMesh, path: Path, title: str) -> None:
     from matplotlib import pyplot as plt
     from matplotlib.collections import PolyCollection
 
-    speed = np.hypot(*case.field("U").T)
+    speed = np.linalg.norm(case.field("U", len(mesh)), axis=1)
+    back = mesh.patch("back")
+    polygons = mesh.polygons(back[np.argsort(mesh.owner[back])])
     figure, (whole, near) = plt.subplots(2, 1, figsize=(9, 7), height_ratios=(2, 5))
     for axes in (whole, near):
         edge = "none" if axes is whole else "0.25"
-        drawn = PolyCollection(mesh.polygons, array=speed, edgecolor=edge, linewidth=0.3, cmap="viridis")
+        drawn = PolyCollection(polygons, array=speed, edgecolor=edge, linewidth=0.3, cmap="viridis")
         if axes is whole:
             drawn.set_edgecolor("face")
         axes.add_collection(drawn)
@@ -596,7 +538,7 @@ def main() -> None:
                     except MissingPeerError as error:
                         print(f"left out: {mesher}, needs {error}", file=sys.stderr)
                         break
-                    mesh = PlaneMesh(case.folder)
+                    mesh = Mesh.of(case.folder)
                     start = time.perf_counter()
                     if re_ != 20:
                         flow = shedding.flow(case, mesh, convection)

@@ -125,7 +125,11 @@ SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
 SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, radial_3d, core_3d, bcc_3d)}
 
 
-KERNELS = {"clip": ("walk", "wrap", "clip", "check", "list", "place", "update"), "match": ("match",), "measure": ("measure",)}
+KERNELS = {
+    "clip": ("walk", "wrap", "clip", "check", "list", "place", "update"),
+    "match": ("match",),
+    "measure": ("measure",),
+}
 """Columns, each with the beginnings of the names of its kernels."""
 
 

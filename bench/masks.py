@@ -11,11 +11,8 @@ OpenFOAM (Debian's package `openfoam`) its criteria.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import time
 import warnings
-from pathlib import Path
 
 import numpy as np
 import shapely
@@ -23,7 +20,7 @@ from _common import Report, heading, make_adapter, parser
 from _sites import mask
 
 import clvoro
-from clvoro.io.check_mesh import check_case
+from clvoro.io.check_mesh import run_check_mesh
 
 SIMPLIFIED = 1.5  # tolerance over the size
 
@@ -54,11 +51,8 @@ KINDS = {"masks": lambda seed: mask(seed).domain, "digitized": digitized}
 
 def is_accepted(result: clvoro.Result) -> bool:
     """Return whether OpenFOAM accepts the mesh, or without it whether its criteria are met."""
-    if shutil.which("checkMesh") is None:
-        return bool(result.check(solver="openfoam"))
-    with tempfile.TemporaryDirectory() as folder:
-        result.save(Path(folder) / "constant" / "polyMesh")
-        return check_case(Path(folder)).ok
+    verdict = run_check_mesh(result)
+    return bool(result.check(solver="openfoam")) if verdict is None else verdict.ok
 
 
 COLUMNS = {

@@ -123,26 +123,6 @@ COLUMNS = {
 }
 
 
-def scaling(records: list[dict[str, Any]]) -> list[list[str]]:
-    """Return per kind of run the slope of log time against log cells, and the cost's growth."""
-    rows = []
-    for kind in dict.fromkeys((r["method"], r["effort"]) for r in records):
-        mine = [r for r in records if (r["method"], r["effort"]) == kind]
-        if len(mine) < 2:
-            continue
-        n, t = np.log([r["cells"] for r in mine]), np.log([r["seconds"] for r in mine])
-        costs = [r["per_cell"] for r in mine]
-        rows.append(
-            [
-                *kind,
-                f"{np.polyfit(n, t, 1)[0]:.3f}",
-                f"{costs[-1] / costs[-2]:.2f}",
-                f"{mine[-2]['cells']:,} to {mine[-1]['cells']:,}",
-            ]
-        )
-    return rows
-
-
 def programs(records: list[dict[str, Any]]) -> list[list[str]]:
     """Return the share of every program in the largest profiled run of each kind."""
     rows = []
@@ -178,11 +158,8 @@ def main() -> None:
                     continue
                 report.add(record, f"{method} {effort} {n:,}: {record['seconds']:.1f} s")
     report.finish(heading(adapter, "Whole runs"))
-    if not options.json:
-        header = ["method", "effort", "slope of time against cells", "time per cell: last / last but one", "cells"]
-        print(markdown(header, scaling(report.records)) + "\n")
-        if options.profile:
-            print(markdown(["method", "effort", "cells", "share of device time"], programs(report.records)) + "\n")
+    if options.profile and not options.json:
+        print(markdown(["method", "effort", "cells", "share of device time"], programs(report.records)) + "\n")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import math
 import resource
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import scipy
 from _common import Report, counts, heading, make_adapter, names, parser
-from _openfoam import Case, SpaceMesh, missing, nonuniform
+from _openfoam import Case, Mesh, missing, nonuniform
 from solver_ready import figures_of
 
 import clvoro
@@ -178,24 +178,24 @@ def around(points: np.ndarray) -> np.ndarray:
     return (1 + cube) * stream - 3 * cube * points[:, :1] * points / r**2
 
 
-def flow_around_sphere(case: Case, mesh: SpaceMesh, _: Any) -> dict[str, float]:
+def flow_around_sphere(case: Case, mesh: Mesh, _: Any) -> dict[str, float]:
     """Solve for the potential; return errors of the velocity."""
-    far, closed = mesh.patches["far"], {"type": "zeroGradient"}
-    u, area = around(mesh.centers[far]), mesh.areas[far]
+    far, closed, (centers, areas) = mesh.patch("far"), {"type": "zeroGradient"}, mesh.faces
+    u, area = around(centers[far]), areas[far]
     # As much flows out as in.
     u -= (u * area).sum() / np.linalg.norm(area, axis=1).sum() * area / np.linalg.norm(area, axis=1)[:, None]
     still = {"type": "fixedValue", "value": "uniform (0 0 0)"}
     given = {"type": "fixedValue", "value": nonuniform(u)}
     # The pressure is not used: it keeps potentialFoam from changing fluxes that are given.
     free = {"type": "fixedValue", "value": "uniform 0"}
-    write_fields(case, {"far": given, "body": still}, {"far": free, "body": closed})
+    case.write_start({"far": given, "body": still}, {"far": free, "body": closed})
     sides = {"far": closed, "body": closed}
     case.write("0/Phi", {"dimensions": "[0 2 -1 0 0 0 0]", "internalField": "uniform 0", "boundaryField": sides})
     case.run("potentialFoam", "-writephi")
-    flux = np.zeros(len(mesh.areas))
-    flux[: len(mesh.inside)], flux[far] = case.field("phi"), (u * area).sum(axis=1)
+    flux, inner = np.zeros(len(areas)), len(mesh.neighbor)
+    flux[:inner], flux[far] = case.field("phi", inner)[:, 0], (u * area).sum(axis=1)
     off = np.linalg.norm(mesh.velocity(flux) - around(mesh.centroids), axis=1) ** 2
-    at_wall = np.unique(mesh.owner[mesh.patches["body"]])
+    at_wall = np.unique(mesh.owner[mesh.patch("body")])
 
     def mean(part: Any) -> float:
         return float(np.sqrt((mesh.volumes[part] * off[part]).sum() / mesh.volumes[part].sum()))
@@ -203,24 +203,22 @@ def flow_around_sphere(case: Case, mesh: SpaceMesh, _: Any) -> dict[str, float]:
     return {"error": mean(slice(None)), "at wall": mean(at_wall)}
 
 
-def flow_through_bend(case: Case, mesh: SpaceMesh, reference: dict[str, Any]) -> dict[str, float]:
+def flow_through_bend(case: Case, mesh: Mesh, reference: dict[str, Any]) -> dict[str, float]:
     """Solve; return errors of the loss of pressure and of the velocity, or fill `reference` if it is empty."""
-    inlet, outlet = mesh.patches["inlet"], mesh.patches["outlet"]
-    y, z = mesh.centers[inlet, 1], mesh.centers[inlet, 2]
+    inlet, (centers, areas) = mesh.patch("inlet"), mesh.faces
+    y, z = centers[inlet, 1], centers[inlet, 2]
     u = np.zeros((len(inlet), 3))
     u[:, 0] = 2 * (1 - (y**2 + z**2) / RADIUS**2)
-    area = np.linalg.norm(mesh.areas, axis=1)
+    area = np.linalg.norm(areas, axis=1)
     u *= math.pi * RADIUS**2 / (u[:, 0] * area[inlet]).sum()  # the same flux on all meshes
     closed = {"type": "zeroGradient"}
-    write_fields(
-        case,
+    case.write_start(
         {"inlet": {"type": "fixedValue", "value": nonuniform(u)}, "outlet": closed, "wall": {"type": "noSlip"}},
         {"inlet": closed, "outlet": {"type": "fixedValue", "value": "uniform 0"}, "wall": closed},
     )
     case.run("simpleFoam")
-    p, u = case.field("p"), case.field("U", 3)
+    p, u = case.field("p", len(mesh))[:, 0], case.field("U", len(mesh))
     loss = float((p[mesh.owner[inlet]] * area[inlet]).sum() / area[inlet].sum())
-    del outlet
     made = {"loss": loss, "points": mesh.centroids, "velocity": u}
     if not reference:
         reference.update(made)
@@ -235,47 +233,25 @@ def flow_through_bend(case: Case, mesh: SpaceMesh, reference: dict[str, Any]) ->
     }
 
 
-def write_fields(case: Case, velocity: Mapping[str, Any], pressure: Mapping[str, Any]) -> None:
-    """Write the fields with these patches."""
-    case.write(
-        "0/U", {"dimensions": "[0 1 -1 0 0 0 0]", "internalField": "uniform (0 0 0)", "boundaryField": dict(velocity)}
-    )
-    case.write("0/p", {"dimensions": "[0 2 -2 0 0 0 0]", "internalField": "uniform 0", "boundaryField": dict(pressure)})
-
-
 def write_system(case: Case) -> None:
     """Write the dictionaries that all programs read."""
-    case.write("constant/transportProperties", {"transportModel": "Newtonian", "nu": 2 * RADIUS / REYNOLDS})
-    case.write("constant/turbulenceProperties", {"simulationType": "laminar"})
-    schemes = {
-        "ddtSchemes": {"default": "steadyState"},
-        "gradSchemes": {"default": "leastSquares"},
-        "divSchemes": {
-            "default": "Gauss linear",
-            "div(phi,U)": "bounded Gauss linear",
-            "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
-        },
-        "laplacianSchemes": {"default": "Gauss linear corrected"},
-        "interpolationSchemes": {"default": "linear"},
-        "snGradSchemes": {"default": "corrected"},
-    }
-    case.write("system/fvSchemes", schemes)
     exact = {"solver": "GAMG", "smoother": "GaussSeidel", "tolerance": 1e-11, "relTol": 1e-3}
-    case.write(
-        "system/fvSolution",
-        {
-            "solvers": {
-                "Phi": {**exact, "relTol": 0},
-                "p": {**exact, "relTol": 0.05},
-                "U": {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": 1e-11, "relTol": 0.05},
-            },
-            "potentialFlow": {"nNonOrthogonalCorrectors": 20, "PhiRefCell": 0, "PhiRefValue": 0},
-            "SIMPLE": {"consistent": "yes", "nNonOrthogonalCorrectors": 1, "residualControl": {"p": 1e-5, "U": 1e-6}},
-            "relaxationFactors": {"equations": {"U": 0.9}},
-        },
-    )
-    case.write(
-        "system/controlDict", {"startTime": 0, "endTime": 400, "deltaT": 1, "writeInterval": 400, "writePrecision": 10}
+    solvers = {
+        "Phi": {**exact, "relTol": 0},
+        "p": {**exact, "relTol": 0.05},
+        "U": {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": 1e-11, "relTol": 0.05},
+    }
+    solution = {
+        "solvers": solvers,
+        "potentialFlow": {"nNonOrthogonalCorrectors": 20, "PhiRefCell": 0, "PhiRefValue": 0},
+        "SIMPLE": {"consistent": "yes", "nNonOrthogonalCorrectors": 1, "residualControl": {"p": 1e-5, "U": 1e-6}},
+    }
+    case.write_system(
+        2 * RADIUS / REYNOLDS,
+        "bounded Gauss linear",
+        {"gradSchemes": {"default": "leastSquares"}},
+        solution=solution,
+        control={"endTime": 400, "writePrecision": 10},
     )
 
 
@@ -319,7 +295,7 @@ def measure(case: Case, adapter: clvoro.Adapter, flow: Flow, mesher: str, n: int
     begin = processor_time()
     MESHERS[mesher](case, adapter, solid, n)
     seconds = processor_time() - begin
-    mesh = SpaceMesh(case.folder)
+    mesh = Mesh.of(case.folder)
     row = {"cells": len(mesh.volumes), "seconds": seconds, **flow.solve(case, mesh, reference)}
     return {**row, **figures_of(check_case(case.folder))}
 
