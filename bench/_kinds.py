@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from _common import domain_of, test_field
 
 import clvoro
 from clvoro import earth, sizing
@@ -93,8 +94,19 @@ STRIPS = {
 }
 """Narrow strips of fine cells in a unit square, along walls or seams, and across them."""
 SLAB = "x < 0.1 ? 1.0 : 6.7"
+STEEP = {
+    "jump": (SQUARE, "x < 0.5 ? 1.0 : 19.0"),
+    "stripes": (SQUARE, "sin(25 * x) < 0 ? 1.0 : 10.0"),
+    "disc": (SQUARE, "hypot(x - 0.5, y - 0.5) < 0.25 ? 1.0 : 12.0"),
+    "kink": (SQUARE, "0.001 + fabs(x - 0.5)"),
+    "chequers": (SQUARE, "sin(20 * x) * sin(20 * y) < 0 ? 1.0 : 8.0"),
+    "wall": (CUBE, "x < 0.5 ? 1.0 : 8.0"),
+}
+"""Fields that are hard to estimate from sizes at generators, by name: domain and formula."""
 
 KINDS: dict[str, Callable[[int], Kind]] = {
+    **{name: of(domain_of(name), test_field(name)) for name in ("F2", "S1")},
+    **{f"steep, {name}": of(*given) for name, given in STEEP.items()},
     "square": even(SQUARE),
     "square, exact": even(SQUARE, method="exact"),
     "square, best": even(SQUARE, effort="best"),

@@ -1,17 +1,14 @@
 """Device memory of a whole run at its peak, by stage.
 
-    python bench/memory.py [--sizes 1e5] [--fields F2,S1] [--methods exact] [--efforts default]
-                           [--device NAME] [--dtype float32] [--json]
-    python bench/memory.py --sizes 1e4 --fields jump,stripes,disc,kink,chequers,wall
+    python bench/memory.py [--sizes 1e5] [--kinds F2,S1] [--stages] [--device NAME] [--dtype float32] [--json]
+    python bench/memory.py --sizes 1e4 --kinds steep
     python bench/memory.py --sizes 300,6000 --kinds all
 
-Each buffer is counted from its allocation until it is freed, by the module of clvoro that allocated it. Each field is
-scaled to the number of cells. The figures are bytes per cell of the finished mesh. "output" is the peak while all
-arrays of the diagram are read, after the run; "estimate" is that of `Adapter.memory_needed`, and "held" the
-larger of the two over it. In the fields of the second line sizes change several-fold from one cell to the next.
-The third line has all kinds of runs (`_kinds.py`, or some of them by their first word), one that is
-resumed and a transfer: shares of the estimate that are in use while the run is prepared, in the run,
-and while its diagram is read.
+Each buffer is counted from its allocation until it is freed. With `--stages` also by the module of clvoro that
+allocated it. Kinds of runs are those of `_kinds.py`, by their first word, one that is resumed, and a transfer; each is
+scaled to the number of cells. In those that are "steep" sizes change several-fold from one cell to the next. The
+figures are bytes per cell of the finished mesh: the estimate that a run tells, and the peaks while it is prepared, in
+the run, and while all arrays of its diagram are read ("output"). "held" is the largest of the three over the estimate.
 `clvoro.adaptation.estimates.SIZES` holds the estimates, in reals and 32-bit integers.
 """
 
@@ -22,34 +19,23 @@ import tempfile
 import traceback
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from _common import FIRST_SEED, Report, counts, domain_of, heading, make_adapter, names, parser, test_field
-from _kinds import CUBE, KINDS, SQUARE, Kind
+from _common import FIRST_SEED, Report, counts, heading, make_adapter, names, parser
+from _kinds import KINDS, SQUARE, Kind
 
 import clvoro
-from clvoro import sizing
-from clvoro.adaptation.sampling.start import count_cells
 from clvoro.opencl.engine import Engine
 from clvoro.remapping.cell_data import transfer_values
 from clvoro.remapping.device_transfer import transfer_bytes
 
-STEEP = {
-    "jump": (SQUARE, "x < 0.5 ? 1.0 : 19.0"),
-    "stripes": (SQUARE, "sin(25 * x) < 0 ? 1.0 : 10.0"),
-    "disc": (SQUARE, "hypot(x - 0.5, y - 0.5) < 0.25 ? 1.0 : 12.0"),
-    "kink": (SQUARE, "0.001 + fabs(x - 0.5)"),
-    "chequers": (SQUARE, "sin(20 * x) * sin(20 * y) < 0 ? 1.0 : 8.0"),
-    "wall": (CUBE, "x < 0.5 ? 1.0 : 8.0"),
-}
-"""Fields that are hard to estimate from sizes at generators, by name: domain and formula."""
 PACKAGE = Path(clvoro.__file__).parent
-PLUMBING = {"_program", "_arrays", "_device_array", "_primitives"}
+PLUMBING = {"device_array", "engine", "primitives", "program"}
 """Modules that allocate buffers for others."""
 
 
@@ -104,53 +90,14 @@ def counted_buffers(ledger: Ledger) -> Iterator[None]:
         cl.Buffer = plain  # type: ignore[misc]
 
 
-def peaks(options: Any, work: Callable[[clvoro.Adapter], clvoro.Diagram]) -> tuple[clvoro.Diagram, dict[str, int], int]:
-    """Do `work` with a new adapter; return its diagram and two peaks in bytes.
-
-    The first is that of `work`, by stage, the second that of reading all arrays.
-    """
-    ledger = Ledger()
-    with counted_buffers(ledger):
-        diagram = work(make_adapter(options))
-        run = {stage: size for stage, size in ledger.at_peak.items() if size}
-        ledger.begin()
-        for array in diagram._NAMES:
-            getattr(diagram, array, None)
-    return diagram, run, ledger.peak
+def read_all(diagram: clvoro.Diagram) -> None:
+    """Read all arrays."""
+    for array in diagram._NAMES:
+        getattr(diagram, array, None)
 
 
-def case_of(name: str, n: int) -> tuple[clvoro.Box, sizing.Field]:
-    """Return domain and size field for `n` cells."""
-    if name in STEEP:
-        domain, field = STEEP[name][0], sizing.Expression(STEEP[name][1])
-    else:
-        domain, field = domain_of(name), test_field(name)
-    return domain, field * (count_cells(field, domain) / n) ** (1 / domain.dim)
-
-
-def measure(options: Any, name: str, n: int, method: str, effort: str) -> dict[str, Any]:
-    """Run once by a new adapter and return the peaks, bytes per cell."""
-    domain, field = case_of(name, n)
-    given = {"method": method, "effort": effort, "seed": FIRST_SEED}
-    diagram, run, output = peaks(options, lambda a: a.run(domain, field, **given).diagram)
-    cells, run_peak = len(diagram), sum(run.values())
-    told = make_adapter(options).memory_needed(domain, field, method=method)
-    return {
-        "field": name,
-        "dim": domain.dim,
-        "cells": cells,
-        "method": method,
-        "effort": effort,
-        "run": run_peak / cells,
-        "output": output / cells,
-        "estimate": told / cells,
-        "held": max(run_peak, output) / told,
-        "stages": {stage: size / cells for stage, size in Counter(run).most_common()},
-    }
-
-
-def measure_kind(options: Any, kind: Kind) -> dict[str, Any]:
-    """Run once; return the estimate in bytes per cell, and the shares of it that were in use."""
+def measure(options: Any, kind: Kind) -> dict[str, Any]:
+    """Run once by a new adapter; return peaks and the estimate in bytes per cell, and the shares of it in use."""
     domain, size, given = kind
     ledger, told, before = Ledger(), [], []
     with counted_buffers(ledger):
@@ -163,14 +110,17 @@ def measure_kind(options: Any, kind: Kind) -> dict[str, Any]:
 
         adapter.on_memory = begin
         diagram = adapter.run(domain, size, seed=FIRST_SEED, **given).diagram
-        run = ledger.peak
+        run, stages = ledger.peak, ledger.at_peak
         ledger.begin()
-        for array in diagram._NAMES:
-            getattr(diagram, array, None)
-    parts = {"preparation": before[0], "run": run, "output": ledger.peak}
-    shares = {name: part / told[0] for name, part in parts.items()}
-    cells = len(diagram)
-    return {"cells": cells, "estimate": told[0] / cells, **shares, "held": max(shares.values())}
+        read_all(diagram)
+    parts, cells = {"preparation": before[0], "run": run, "output": ledger.peak}, len(diagram)
+    return {
+        "cells": cells,
+        "estimate": told[0] / cells,
+        **{name: part / cells for name, part in parts.items()},
+        "held": max(parts.values()) / told[0],
+        "stages": {stage: size / cells for stage, size in stages.most_common() if size},
+    }
 
 
 def resumed(options: Any, n: int) -> dict[str, Any]:
@@ -184,7 +134,7 @@ def resumed(options: Any, n: int) -> dict[str, Any]:
             checkpoint=clvoro.Checkpoint(file, every=1e9),
             callback=lambda row: row["level"] == 0 and row["progress"] > 0.5,
         )
-        return measure_kind(options, (SQUARE, size, {"checkpoint": clvoro.Checkpoint(resume=file)}))
+        return measure(options, (SQUARE, size, {"checkpoint": clvoro.Checkpoint(resume=file)}))
 
 
 def transferred(options: Any, n: int) -> dict[str, Any]:
@@ -198,22 +148,29 @@ def transferred(options: Any, n: int) -> dict[str, Any]:
     double = adapter.queue.device.double_fp_config
     engine = Engine(adapter.ctx, adapter.queue, 2, np.dtype("float64" if double else "float32"))
     told = transfer_bytes(engine, *sizes, 1, 2)
-    held = ledger.peak / told
-    return {"cells": n, "estimate": told / n, "preparation": 0.0, "run": held, "output": 0.0, "held": held}
+    none = {"preparation": 0.0, "output": 0.0, "stages": {}}
+    return {"cells": n, "estimate": told / n, "run": ledger.peak / n, "held": ledger.peak / told, **none}
 
 
 OTHERS = {"resumed": resumed, "transfer": transferred}
 
 
-def show_kinds(options: Any) -> None:
-    """Show every kind of run."""
+def main() -> None:
+    """Run the bench."""
+    options_of = parser(__doc__)
+    options_of.add_argument("--sizes", type=counts, default=[100_000], help="cells (1e5)")
+    options_of.add_argument("--kinds", type=names, default=["F2", "S1"], help="first words of kinds of runs, or 'all'")
+    options_of.add_argument("--stages", action="store_true", help="the peak of the run by stage, too")
+    options = options_of.parse_args()
     words = tuple(options.kinds)
     columns = {
         "kind": lambda r: r["kind"],
         "cells": lambda r: r["cells"],
-        "estimate": lambda r: f"{r['estimate']:.0f}",
-        **{name: lambda r, name=name: f"{r[name]:.2f}" for name in ("preparation", "run", "output", "held")},
+        **{name: lambda r, name=name: f"{r[name]:.0f}" for name in ("estimate", "preparation", "run", "output")},
+        "held": lambda r: f"{r['held']:.2f}",
     }
+    if options.stages:
+        columns["stages"] = lambda r: ", ".join(f"{stage} {size:.0f}" for stage, size in r["stages"].items())
     report = Report(options.json, columns)
     for name in (*KINDS, *OTHERS):
         if "all" not in words and not name.startswith(words):
@@ -221,49 +178,14 @@ def show_kinds(options: Any) -> None:
         for n in options.sizes:
             try:
                 other = OTHERS.get(name)
-                found = other(options, n) if other else measure_kind(options, KINDS[name](n))
+                found = other(options, n) if other else measure(options, KINDS[name](n))
             except clvoro.ClvoroError as error:  # too few cells, say, across a period
                 print(f"{name}, {n} cells: {error}", file=sys.stderr)
                 continue
             report.add({"kind": name, **found}, name)
-    report.finish(heading(make_adapter(options), "Estimate of the device memory, bytes per cell, and its share in use"))
-
-
-def main() -> int:
-    options_of = parser(__doc__)
-    options_of.add_argument("--sizes", type=counts, default=[100_000], help="cells (1e5)")
-    options_of.add_argument("--fields", type=names, default=["F2", "S1"])
-    options_of.add_argument("--methods", type=names, default=["exact"])
-    options_of.add_argument("--efforts", type=names, default=["default"])
-    options_of.add_argument("--kinds", type=names, help="kinds of runs, or 'all'")
-    options = options_of.parse_args()
-    if options.kinds:
-        show_kinds(options)
-        return 0
-    records = [
-        measure(options, name, n, method, effort)
-        for name in options.fields
-        for n in options.sizes
-        for method in options.methods
-        for effort in options.efforts
-    ]
-    stages = list(dict.fromkeys(stage for r in records for stage in r["stages"]))
-    columns = {
-        "field": lambda r: r["field"],
-        "cells": lambda r: r["cells"],
-        "method": lambda r: f"{r['method']}, {r['effort']}",
-        "run": lambda r: f"{r['run']:.0f}",
-        "output": lambda r: f"{r['output']:.0f}",
-        "estimate": lambda r: f"{r['estimate']:.0f}",
-        "held": lambda r: f"{r['held']:.2f}",
-        **{f"`{s}`": lambda r, s=s: f"{r['stages'].get(s, 0):.0f}" for s in stages},
-    }
-    report = Report(options.json, columns)
-    for record in records:
-        report.add(record)
-    report.finish(heading(make_adapter(options), "Device memory at the peak, bytes per cell"))
-    return 0
+    title = "Device memory at the peak and its estimate, bytes per cell, and the share of the estimate in use"
+    report.finish(heading(make_adapter(options), title))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
