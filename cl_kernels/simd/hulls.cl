@@ -80,7 +80,7 @@ inline long8 choose_lanes(long8 todo, const eight_t *sites, double8 r, double8 f
 
 /* Write the rows of some lanes, from item `own` on; see `clip_polygons`. */
 inline void write_rows(const hull_t *hull, long8 lanes, double8 need, int own, global const int *items,
-                       global float *reach, global int *rows, global int *row_counts)
+                       global float *reach, global int *slots, global int *slot_counts)
 {
     long written[LANES], sizes[LANES];
     double radii[LANES];
@@ -96,8 +96,8 @@ inline void write_rows(const hull_t *hull, long8 lanes, double8 need, int own, g
             const int place = LANE((const int *)hull->places, k, lane);
             labels[k] = place < 0 ? place : items[place];
         }
-        write_labels(labels, count, rows + i * SLOT);
-        row_counts[i] = count;
+        write_labels(labels, count, slots + i * SLOT);
+        slot_counts[i] = count;
         reach[own + lane] = (float)radii[lane];
     }
 }
@@ -128,13 +128,13 @@ inline double first_look(needs_t *needs, double most)
     return min(mean + WIDTH * sqrt(variance), most);
 }
 
-/* Per EIGHTS batches of eight items in bin order: the rows of their generators (see `clip_polygons`), or row_counts[i]
+/* Per EIGHTS batches of eight items in bin order: the rows of their generators (see `clip_polygons`), or slot_counts[i]
    = 0 for a cell that remains to be clipped. `first_reach` bounds the first search radius, in units of the spacing.
-   Only the first `rows_wanted` generators get rows. */
-kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, global const double *binned,
+   Only the first `rows` generators get rows. */
+kernel void wrap_all_hulls(const int size, const int n, const int rows, global const double *binned,
                            global const int *items, global const float *spacing, global float *reach, BIN_ARGS,
-                           const double4 box_lower, const double4 box_upper, const double first_reach, global int *rows,
-                           global int *row_counts, global int *places)
+                           const double4 box_lower, const double4 box_upper, const double first_reach,
+                           global int *slots, global int *slot_counts, global int *places)
 {
     WORK_ITEM(group);
     needs_t needs = {0, 0, 0};
@@ -143,11 +143,11 @@ kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, g
         long wanted[LANES];
         for (int lane = 0; lane < LANES; ++lane) {
             const int p = min(own + lane, n - 1), i = items[p];
-            const bool is_wanted = own + lane < n && i < rows_wanted;
+            const bool is_wanted = own + lane < n && i < rows;
             wanted[lane] = is_wanted ? -1 : 0;
             spacings[lane] = spacing[p];
             if (is_wanted) {
-                row_counts[i] = 0;
+                slot_counts[i] = 0;
                 places[i] = i;
             }
         }
@@ -191,7 +191,7 @@ kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, g
             doubt |= is_uncertain(&hull, &list, reach2, least);
             const double8 need = 2 * sqrt(reach2) * (1 + 8 * DBL_EPSILON);
             const long8 again = lanes & ~doubt & (hull.lost | (need > r));
-            write_rows(&hull, lanes & ~doubt & ~again, need, own, items, reach, rows, row_counts);
+            write_rows(&hull, lanes & ~doubt & ~again, need, own, items, reach, slots, slot_counts);
             note_needs(&needs, lanes & ~doubt & ~again, need / unit);
             todo = (todo & ~lanes) | again;
             if (!any_lane(todo))

@@ -28,20 +28,20 @@
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest corner cannot cut, so the search widens until the
    searched square of bins covers that circle. In a power diagram (the paper's 2.5) see `search_radius`. reach[p] is the
-   first guess of the radius, and then the radius. Only the first `rows_wanted` generators get cells.
+   first guess of the radius, and then the radius. Only the first `rows` generators get cells.
 
    With s = places[i], which is i for all but the longest rows:
-   rows[s * SLOT ...]  neighbors j, or -1 - wall; |row_counts[s]| of them, negative if round-off leaves a doubt
+   slots[s * SLOT ...]  neighbors j, or -1 - wall; |slot_counts[s]| of them, negative if round-off leaves a doubt
 
    If `some`, rows that have faces are there already (`hulls.cl`, or where others had too many). */
-kernel void clip_polygons(const int size, const int rows_wanted, global const REAL *binned, global const int *items,
+kernel void clip_polygons(const int size, const int rows, global const REAL *binned, global const int *items,
                           global float *reach, BIN_ARGS, global const REAL *points, const REAL4 box_lower,
-                          const REAL4 box_upper, const int some, global int *rows, global int *row_counts,
-                          global int *places, global int *flags CLIP_BOUND_ARGS)
+                          const REAL4 box_upper, const int some, global int *slots, global int *slot_counts,
+                          global int *places, global int *report CLIP_BOUND_ARGS)
 {
     LONG_ITEM(p);
     const int i = items[p];
-    if (i >= rows_wanted || (some && row_counts[i]))
+    if (i >= rows || (some && slot_counts[i]))
         return;
     SITE(x, p, binned);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
@@ -75,7 +75,7 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
     }
     if (flag == 0)
         reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
-    places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
+    places[i] = store_cell(&cell, flag, x, points, i, slots, slot_counts, report);
 }
 
 #ifdef WEIGHTED
@@ -84,8 +84,8 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
    not, the next round starts from these. A cell without neighbors is empty and stays so. In a folded graph neighbors
    are nearest images; images farther away are missing. */
 kernel void clip_by_rings(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
-                          global const int *old_starts, global const int *old_neighbors, global int *rows,
-                          global int *row_counts, global int *places, global int *flags)
+                          global const int *old_starts, global const int *old_neighbors, global int *slots,
+                          global int *slot_counts, global int *places, global int *report)
 {
     LONG_ITEM(i);
     SITE(x, i, points);
@@ -115,9 +115,9 @@ kernel void clip_by_rings(const int size, global const REAL *points, const REAL4
     /* Along a period no cell reaches a side of the box that contains all. There is no corner on it, either. */
     for (int f = 0; f < cell.n; ++f)
         if (cell.faces[f] < 0 && FOLD((-1 - cell.faces[f]) / 2) > 0)
-            atomic_or(flags, FLAG_OPEN);
+            atomic_or(report, FLAG_OPEN);
 #endif
-    places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
+    places[i] = store_cell(&cell, flag, x, points, i, slots, slot_counts, report);
 }
 #endif
 
@@ -152,13 +152,13 @@ kernel void match_polygon_faces(const int size, global const int *places, global
                                 global const int *slot_counts, global const int *old_starts,
                                 global const int *old_neighbors, global const REAL *points, const REAL4 box_lower,
                                 const REAL4 box_upper, const int repaired, const REAL share, global const int *marks,
-                                global int *fits, global uint *keep, global int *counts, global int *flags)
+                                global int *fits, global uint *keep, global int *counts, global int *report)
 {
     LONG_ITEM(i);
     counts[i] = 0;
-    if (flags[FLAG_MARKED]) {
+    if (report[REPORT_MARKED]) {
         if (marks[i])
-            atomic_inc(flags + FLAG_LEFT);
+            atomic_inc(report + REPORT_UNFINISHED);
         return;
     }
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
@@ -169,14 +169,15 @@ kernel void match_polygon_faces(const int size, global const int *places, global
         counts[i] = n;
         return;
     }
-    const bool some = flags[1]; /* written by earlier kernels: no race */
+    /* FLAG_COLLAPSED may be set meanwhile. */
+    const bool some = (report[REPORT_FLAGS] & FLAG_DOUBT) != 0;
     if (repaired ? fits[i] : !some) {
         /* All its faces have two sides: the row is consistent, or every new row is certain. */
         for (int left = n, k = 0; left > 0; left -= 32, ++k)
             keep[place + k] = left < 32 ? (1u << left) - 1 : ~0u;
         counts[i] = n;
         if (TOO_FEW(n))
-            atomic_or(flags, FLAG_COLLAPSED);
+            atomic_or(report, FLAG_COLLAPSED);
         return;
     }
     uint word = 0;
@@ -195,7 +196,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
             word |= 1u << (k % 32);
             ++count;
         } else if (!doubtful) {
-            atomic_or(flags, FLAG_COLLAPSED);
+            atomic_or(report, FLAG_COLLAPSED);
         } else {
             SITE(x, i, points);
             const REAL lower[2] = {box_lower.s0, box_lower.s1};
@@ -208,7 +209,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
             const REAL cut = fabs(u.s0 * v.s1 - u.s1 * v.s0);
             if (!(cut < 512 * REAL_EPS && cut <= share * listed_area(&rows, i, points, lower, upper) &&
                   cut <= share * listed_area(&rows, j, points, lower, upper)))
-                atomic_or(flags, FLAG_COLLAPSED);
+                atomic_or(report, FLAG_COLLAPSED);
             if (repaired) {
                 /* `before` and `after` are now adjacent. */
                 atomic_and(fits + i, 0);
@@ -225,7 +226,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
     }
     counts[i] = count;
     if (TOO_FEW(count))
-        atomic_or(flags, FLAG_COLLAPSED);
+        atomic_or(report, FLAG_COLLAPSED);
 }
 
 /* Per generator i: its faces as row i of the graph, and its cell's measures. All vectors are relative to x_i.
@@ -237,17 +238,17 @@ kernel void match_polygon_faces(const int size, global const int *places, global
    offsets (n, 2)            centroid - x_i, the Lloyd displacement (the paper's 2.2)
    covariances (n, 3)        xx, xy, yy of the second moments about the centroid, per unit area
 
-   With IN_LANES, each work-item takes LANES generators. With `ahead` this and `copy_graph` do nothing unless the flags
-   say that the rows are right, and that there is room for their faces. */
+   With IN_LANES, each work-item takes LANES generators. With `ahead` this and `copy_graph` do nothing unless the report
+   says that the rows are right, and that there is room for their faces. */
 kernel void measure_cells(const int size, global const int *places, global const int *slots,
                           global const int *slot_counts, global const int *old_starts, global const int *old_neighbors,
                           global const uint *keep, global const int *starts, global const REAL *points,
                           const REAL4 box_lower, const REAL4 box_upper, const int ahead, const int room,
-                          global const int *flags, global int *neighbors, global FACE *face_measures,
+                          global const int *report, global int *neighbors, global FACE *face_measures,
                           global FACE *face_centroids, global REAL *volumes, global REAL *offsets,
                           global REAL *covariances)
 {
-    if (ahead && !are_right(flags, room))
+    if (ahead && !are_right(report, room))
         return;
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
@@ -330,7 +331,7 @@ inline bool is_spread(const int size, global const int *starts, global const int
 kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts,
                            global const int *starts, global const int *neighbors, global const REAL *volumes,
                            global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const REAL share,
-                           global int *flags)
+                           global int *report)
 {
     WORK_ITEM(i);
     if (places[i] < 0)
@@ -343,7 +344,7 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     if (n == 0)
         return;
     const REAL least = fmin(512 * REAL_EPS, share * volumes[i]);
-    const REAL noise2 = flags[5] ? 16 * REAL_EPS * REAL_EPS : 0;
+    const REAL noise2 = report[REPORT_WHOLE] ? 16 * REAL_EPS * REAL_EPS : 0;
     bool right = volumes[i] > 0;
     const bool doubtful = slot_counts[places[i]] < 0;
     bool any = doubtful;
@@ -366,11 +367,12 @@ kernel void check_doubtful(const int size, global const int *places, global cons
         if (j >= size)
             continue;
         /* Corner k. If no face was dropped, there is nothing to check. */
-        if (doubtful && !flags[5] && is_spread(size, starts, neighbors, i, starts[i] + k, u, x, points, lower, upper))
+        if (doubtful && !report[REPORT_WHOLE] &&
+            is_spread(size, starts, neighbors, i, starts[i] + k, u, x, points, lower, upper))
             right = false;
         const REAL2 e = v - u;
         if (dot(e, e) < R(1e-4) * fmax(dot(u, u), dot(v, v)) && is_loop(size, starts, neighbors, i, starts[i] + k))
-            atomic_or(flags, FLAG_LOOPED);
+            atomic_or(report, FLAG_LOOPED);
         global const int *other = neighbors + starts[j];
         const int m = starts[j + 1] - starts[j];
         const int q = place_in_row(other, m, i);
@@ -394,14 +396,14 @@ kernel void check_doubtful(const int size, global const int *places, global cons
         }
     }
     if (!right)
-        atomic_or(flags, FLAG_COLLAPSED);
+        atomic_or(report, FLAG_COLLAPSED);
 }
 
 /* Per generator i, for a new graph: remove crossing faces from keep[its first slot ...]. Of two that cross both go, and
    the four cells share a vertex. counts[i] is the number of remaining faces. */
 kernel void drop_loops(const int size, global const int *places, global const int *slot_counts,
                        global const int *starts, global const int *neighbors, global uint *keep, global int *counts,
-                       global int *flags)
+                       global int *report)
 {
     WORK_ITEM(i);
     const int place = places[i], listed = abs(slot_counts[place]);
@@ -418,15 +420,15 @@ kernel void drop_loops(const int size, global const int *places, global const in
     }
     counts[i] = count;
     if (TOO_FEW(count))
-        atomic_or(flags, FLAG_COLLAPSED);
+        atomic_or(report, FLAG_COLLAPSED);
 }
 
 /* The starts of n rows, and their neighbors if `whole`, to their place, once nothing is read from there any more. */
-kernel void copy_graph(const int n, const int whole, const int ahead, const int room, global const int *flags,
+kernel void copy_graph(const int n, const int whole, const int ahead, const int room, global const int *report,
                        global const int *starts, global const int *neighbors, global int *starts_to,
                        global int *neighbors_to)
 {
-    const bool right = !ahead || are_right(flags, room);
+    const bool right = !ahead || are_right(report, room);
     const int rows = right ? n + 1 : 0, faces = right && whole ? starts[n] : 0;
     for (BLOCK_LOOP(i, rows))
         starts_to[i] = starts[i];

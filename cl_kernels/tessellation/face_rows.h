@@ -1,5 +1,6 @@
 /* Rows of faces while a diagram is made. Unchanged rows stay in the previous graph, new ones lie in slots of SLOT
    entries. A longer row takes several consecutive spare slots. */
+#include "tessellation/report.h"
 #include "tessellation/short_faces.h"
 
 #ifndef ROW_CAPACITY
@@ -9,25 +10,11 @@
 #error "build with -DSLOT=faces that have room in a slot, whose bits in a word"
 #endif
 
-/* flags[0]: error bits, below. flags[1]: not 0 if there are doubtful cells. flags[2]: wrong rows of a sample. flags[3]:
-   next spare slot. flags[4]: number of slots. flags[5]: faces no longer than round-off stay. flags[6]: number of
-   half-faces. flags[7]: whether cells are marked; while they are, rows are not matched. flags[8 + r]: number of
-   cells clipped before round r of an update. flags[15]: number of cells that are still marked. */
-#define FLAG_FACES 6
-#define FLAG_MARKED 7
-#define FLAG_CLIPPED 8
-#define FLAG_LEFT 15
-#define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than the spare slots hold */
-#define FLAG_COINCIDE 2  /* two generators at the same place */
-#define FLAG_COLLAPSED 4 /* generators too close for the precision */
-#define FLAG_LOOPED 32   /* faces cross */
-#define FLAG_OPEN 64     /* a cell on the sphere is not enclosed by generators */
-
 /* Whether matched rows are those of a diagram with room for `room` half-faces, without a doubt. */
-inline bool are_right(global const int *flags, int room)
+inline bool are_right(global const int *report, int room)
 {
-    return flags[0] == 0 && flags[1] == 0 && flags[3] <= flags[4] && flags[FLAG_MARKED] == 0 &&
-           flags[FLAG_FACES] <= room;
+    return report[REPORT_FLAGS] == 0 && report[REPORT_SPARE] <= report[REPORT_SLOTS] && report[REPORT_MARKED] == 0 &&
+           report[REPORT_KEPT] <= room;
 }
 
 #define ELSEWHERE INT_MAX
@@ -70,7 +57,7 @@ inline bool is_doubtful_row(const face_rows_t *rows, int i)
    depend on the order of clipping. The count is negative if round-off might give a neighbor other faces. Returns the
    first slot. */
 inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *points, int place, global int *slots,
-                      global int *counts, global int *flags)
+                      global int *counts, global int *report)
 {
     bool doubtful = false;
     int to = place;
@@ -81,7 +68,7 @@ inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *
 #endif
     if (flag == 0) {
         doubtful = is_doubtful(cell, x, points);
-        if (doubtful && !flags[5])
+        if (doubtful && !report[REPORT_WHOLE])
             drop_short_faces(cell, points);
 #ifdef WEIGHTED
         if (cell->n < 3)
@@ -93,14 +80,14 @@ inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *
     if (flag == 0 && cell->n > SLOT) {
         /* The slot depends on the order of work-items, its content does not. */
         const int taken = (cell->n + SLOT - 1) / SLOT;
-        to = atomic_add(flags + 3, taken);
-        if (to + taken > flags[4]) {
+        to = atomic_add(report + REPORT_SPARE, taken);
+        if (to + taken > report[REPORT_SLOTS]) {
             flag = FLAG_FULL;
             to = place;
         }
     }
     if (flag) {
-        atomic_or(flags, flag);
+        atomic_or(report, flag);
         cell->n = 0;
     }
     const int n = cell->n;
@@ -115,6 +102,6 @@ inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *
     }
     counts[to] = doubtful ? -n : n;
     if (doubtful)
-        atomic_or(flags + 1, 1);
+        atomic_or(report, FLAG_DOUBT);
     return to;
 }

@@ -143,14 +143,14 @@ inline bool check_row(int i, global const int *starts, global const int *neighbo
    looked up.
 
    With LANES a work-item checks LANES generators. Only one work-item in `stride` runs and counts wrong rows in
-   flags[2]; with `rest`, the others run unless these were more than `most_wrong`. */
+   report[REPORT_WRONG]; with `rest`, the others run unless these were more than `most_wrong`. */
 kernel void check_rows(const int size, const int stride, const int rest, const int most_wrong, global const int *starts,
                        global const int *neighbors, global const REAL *points, const REAL4 box_lower,
-                       const REAL4 box_upper, global int *fits, global int *marks, global int *flags)
+                       const REAL4 box_upper, global int *fits, global int *marks, global int *report)
 {
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
-    if (rest && flags[2] > most_wrong)
+    if (rest && report[REPORT_WRONG] > most_wrong)
         return;
     const int id = get_global_id(0);
     const int item = rest ? id + id / (stride - 1) + 1 : id * stride;
@@ -164,44 +164,44 @@ kernel void check_rows(const int size, const int stride, const int rest, const i
     const int found = check_row(item, starts, neighbors, points, lower, upper, fits, marks);
 #endif
     if (found)
-        atomic_or(flags + FLAG_MARKED, 1);
+        atomic_or(report + REPORT_MARKED, 1);
     if (found && stride > 1 && !rest)
-        atomic_add(flags + 2, found);
+        atomic_add(report + REPORT_WRONG, found);
 }
 
-/* Per generator i: an empty mark, and no new row. The flags are reset, with the spare slots from `first_spare` on. */
-kernel void begin_update(const int size, global int *marks, global int *places, global int *flags, const int flag_count,
-                         const int first_spare, const int slot_count)
+/* Per generator i: an empty mark, and no new row. The report is reset, with the spare slots from `first_spare` on. */
+kernel void begin_update(const int size, global int *marks, global int *places, global int *report,
+                         const int report_size, const int first_spare, const int slot_count)
 {
     WORK_ITEM(i);
     SHORT_LOOP
-    for (int f = 0; i == 0 && f < flag_count; ++f)
-        flags[f] = f == 3 ? first_spare : f == 4 ? slot_count : 0;
+    for (int f = 0; i == 0 && f < report_size; ++f)
+        report[f] = f == REPORT_SPARE ? first_spare : f == REPORT_SLOTS ? slot_count : 0;
     marks[i] = 0;
     places[i] = -1;
 }
 
 /* Rounds are enqueued before the host knows how many cells are marked. The number of cells clipped in a round is 0 if
    no cell is marked, or if more are than have been launched or may be clipped. */
-inline int count_of_round(int round, global const int *flags)
+inline int count_of_round(int round, global const int *report)
 {
-    return flags[FLAG_CLIPPED + round + 1] - flags[FLAG_CLIPPED + round];
+    return report[REPORT_LISTED + round + 1] - report[REPORT_LISTED + round];
 }
 
 /* Per generator i: list it if it is marked; sums are the exclusive prefix sums of the marks. `most` is the largest
    number of cells to clip in this round, `most_in_all` in all rounds; nothing is done if a sample has more than
    `most_wrong` wrong rows. */
 kernel void list_marked(const int size, const int round, const int most, const int most_in_all, const int most_wrong,
-                        global const int *marks, global const int *sums, global int *listed, global int *flags)
+                        global const int *marks, global const int *sums, global int *listed, global int *report)
 {
     WORK_ITEM(i);
     if (i > 0 && !marks[i])
         return;
-    const int base = flags[FLAG_CLIPPED + round], count = sums[size];
-    const bool over = count > most || base + count > most_in_all || flags[2] > most_wrong;
+    const int base = report[REPORT_LISTED + round], count = sums[size];
+    const bool over = count > most || base + count > most_in_all || report[REPORT_WRONG] > most_wrong;
     if (i == 0) {
-        flags[FLAG_CLIPPED + round + 1] = over ? base : base + count;
-        flags[FLAG_LEFT] = 0;
+        report[REPORT_LISTED + round + 1] = over ? base : base + count;
+        report[REPORT_UNFINISHED] = 0;
     }
     if (!over && marks[i])
         listed[sums[i]] = i;
@@ -230,13 +230,13 @@ inline int clip_polygon_by_row(cell_t *cell, const REAL *x, global const int *ro
 #if IN_LANES
 /* Per LANES listed generators of the first round, if there are at least `few`: their cells from a few candidates, in
    slots from 0 on; slot_counts[w] = 0 where a cell remains to be clipped. */
-kernel void wrap_marked(const int size, const int few, global const int *flags, global const int *listed,
+kernel void wrap_marked(const int size, const int few, global const int *report, global const int *listed,
                         global const int *places, global int *slots, global int *slot_counts,
                         global const int *old_starts, global const int *old_neighbors, global const REAL *points,
                         const REAL4 box_lower, const REAL4 box_upper)
 {
     WORK_ITEM(group);
-    const int count = count_of_round(0, flags);
+    const int count = count_of_round(0, report);
     if (count < few || group * LANES >= count)
         return;
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
@@ -249,13 +249,13 @@ kernel void wrap_marked(const int size, const int few, global const int *flags, 
 kernel void clip_marked(const int size, global const int *listed, const int round, const int wrapped_from,
                         global const int *places, global int *slots, global int *slot_counts,
                         global const int *old_starts, global const int *old_neighbors, global const REAL *points,
-                        const REAL4 box_lower, const REAL4 box_upper, global int *fits, global int *flags)
+                        const REAL4 box_lower, const REAL4 box_upper, global int *fits, global int *report)
 {
     LONG_ITEM(w);
-    const int count = count_of_round(round, flags);
+    const int count = count_of_round(round, report);
     if (w >= count)
         return;
-    const int i = listed[w], base = flags[FLAG_CLIPPED + round];
+    const int i = listed[w], base = report[REPORT_LISTED + round];
     if (count >= wrapped_from && slot_counts[base + w] > 0)
         return;
     SITE(x, i, points);
@@ -278,7 +278,7 @@ kernel void clip_marked(const int size, global const int *listed, const int roun
         if (cell.faces[k] < 0 && FOLD((-1 - cell.faces[k]) / 2) > 0)
             flag = FLAG_FULL;
 #endif
-    const int to = store_cell(&cell, flag, x, points, base + w, slots, slot_counts, flags),
+    const int to = store_cell(&cell, flag, x, points, base + w, slots, slot_counts, report),
               faces = abs(slot_counts[to]);
     if (places[i] < 0)
         return;
@@ -290,37 +290,37 @@ kernel void clip_marked(const int size, global const int *listed, const int roun
 
 /* Per listed generator: replace its old row by the new one, which is consistent until a neighbor finds otherwise. No
    cell is marked any more. */
-kernel void place_clipped(const int size, global const int *listed, const int round, global int *flags,
+kernel void place_clipped(const int size, global const int *listed, const int round, global int *report,
                           global const int *slots, global const int *slot_counts, global int *places, global int *marks,
                           global int *fits)
 {
     WORK_ITEM(w);
-    if (w >= count_of_round(round, flags))
+    if (w >= count_of_round(round, report))
         return;
     if (w == 0)
-        flags[FLAG_MARKED] = 0;
-    const int place = flags[FLAG_CLIPPED + round] + w;
+        report[REPORT_MARKED] = 0;
+    const int place = report[REPORT_LISTED + round] + w;
     places[listed[w]] = slot_counts[place] == ELSEWHERE ? slots[place * SLOT] : place;
     marks[listed[w]] = 0;
     fits[listed[w]] = 1;
 }
 
-inline void mark_both(int i, int j, global int *marks, global int *flags)
+inline void mark_both(int i, int j, global int *marks, global int *report)
 {
     atomic_or(marks + i, 1);
     atomic_or(marks + j, 1);
-    atomic_or(flags + FLAG_MARKED, 1);
+    atomic_or(report + REPORT_MARKED, 1);
 }
 
 /* Per listed generator: mark it and its neighbors where they are inconsistent. Cells that were not clipped have been
    checked against each other before. */
-kernel void check_clipped(const int size, global const int *listed, const int round, global int *flags,
+kernel void check_clipped(const int size, global const int *listed, const int round, global int *report,
                           global const int *places, global const int *slots, global const int *slot_counts,
                           global const int *old_starts, global const int *old_neighbors, global const REAL *points,
                           const REAL4 box_lower, const REAL4 box_upper, global int *marks, global int *fits)
 {
     LONG_ITEM(w);
-    if (w >= count_of_round(round, flags))
+    if (w >= count_of_round(round, report))
         return;
     const int i = listed[w];
     SITE(x, i, points);
@@ -341,7 +341,7 @@ kernel void check_clipped(const int size, global const int *listed, const int ro
         const REAL2 u = corner(i, x, a, j, points, lower, upper), v = corner(i, x, j, b, points, lower, upper);
         const REAL2 d = face_direction(j, x, points);
         if (!fits_neighbor(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper))
-            mark_both(i, j, marks, flags);
+            mark_both(i, j, marks, report);
     }
     /* Neighbors of the previous row are marked, too: they may still list i. */
     const int end = old_starts[i + 1];
@@ -356,6 +356,6 @@ kernel void check_clipped(const int size, global const int *listed, const int ro
             continue;
         atomic_and(fits + j, 0);
         if (!is_doubtful_row(&rows, j)) /* else its faces are matched with those of its neighbors */
-            mark_both(i, j, marks, flags);
+            mark_both(i, j, marks, report);
     }
 }

@@ -1,4 +1,6 @@
 /* Numbers of faces of cells in 3D, while a diagram is made. */
+#include "tessellation/report.h"
+
 #define UNFINISHED INT_MIN /* a cell that must be clipped, or clipped again with more room */
 #define CERTAIN (1 << 30)  /* added if no face is near round-off: other certain cells have the same faces */
 #define COUNT_OF(n) ((n) & (CERTAIN - 1))
@@ -9,8 +11,7 @@
                                  any order, later kernels sort them
    labels, measures, centroids   of the faces
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl
-   report (5,)                   error bits; number of faces; number of cells that are UNFINISHED, and of those that an
-                                 update must repeat; number of faces that are kept
+   report                        see report.h
    corners                       if `with_corners`: the vertices of a cell from twice its first entry on, as triples of
                                  its faces, counter-clockwise seen from outside. The fourth number of the first one is
                                  one of those below */
@@ -25,24 +26,6 @@
 #define NEW_CORNERS 1   /* they are those of a new cell */
 #define KNOWN_CORNERS 2 /* they agree with those of the neighbors, and have keys; see polyhedra_update.cl */
 #define MOST_FACES 32   /* most faces of a cell with triples: one bit each */
-
-/* The numbers of `report`. */
-#define REPORT_FLAGS 0
-#define REPORT_FACES 1
-#define REPORT_UNFINISHED 2
-#define REPORT_MARKED 3
-#define REPORT_KEPT 4
-#define REPORT_LISTED 5  /* number of cells that each round of an update repeats, from here on */
-#define REPORT_PLACED 13 /* number of listed cells */
-
-/* Bits of the error word. */
-#define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */
-#define FLAG_COINCIDE 2  /* two generators at the same place */
-#define FLAG_COLLAPSED 4 /* generators too close for the precision */
-#define FLAG_DOUBT 8     /* no error: there are doubtful cells, whose faces must be matched */
-#define FLAG_NARROW 16   /* no error: some faces may be no wider than round-off; see consistency.cl */
-#define FLAG_UNKNOWN 128 /* the surface of a solid is not known as far as a cell reaches */
-#define FLAG_UNEVEN 64   /* no error: two cells differ about their common face by more than a small share of one */
 
 /* Reserve a range in the arrays of faces. Its position depends on the order of work-items, its content does not. */
 inline int take_places(global int *report, int count)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -18,20 +17,9 @@ from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
 from .back_ends import LANES, LANES_FROM, has_lanes
 from .bins import MAX_LEVELS, BinnedPoints
-from .device_diagram import (
-    COINCIDE,
-    DOUBT,
-    EXACT_SHARE,
-    FULL,
-    LOOPED,
-    OPEN,
-    ROUGH_SHARE,
-    CloseError,
-    NeighborRows,
-    OpenCellError,
-    Tessellation,
-)
+from .device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, NeighborRows, OpenCellError, Tessellation
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
+from .report import COINCIDE, DOUBT, FULL, KEPT, LOOPED, OPEN, SIZE, SLOTS, SPARE, WHOLE
 from .weight_bounds import WeightBounds
 
 CELL_CAPACITY = 24
@@ -41,8 +29,6 @@ ROW_CAPACITY = SLOT
 LARGEST_ROW, LARGEST_ELSEWHERE = 4096, 512
 """Largest row capacity: on CPUs in boxes, and elsewhere. On a GPU every work-item has private memory of that size; in a
 polygon, clipping such a cell by as many edges takes minutes."""
-FLAGS, FACES, CLIPPED, LEFT = 16, 6, 8, 15
-"""Number of flags, and those that `face_rows.h` calls half-faces, clipped cells, and cells that are still marked."""
 EIGHTS = 16
 """Batches of `LANES` cells that one work-item of a CPU builds in `hulls.cl`."""
 FIRST_REACH = 1.9
@@ -78,8 +64,8 @@ class Cells:
         self._folds = {f"FOLD_{a}": engine.traits.periods[a].hex() for a in range(2)} if folded else {}
         self._scan = Scan(engine)
         self._capacity = self._room = self._n = self._enlarged_for = 0
-        self._flags = engine.empty(FLAGS, np.int32)
-        self._no_flags: dict[tuple[int, int, bool], cla.Array] = {}
+        self._report = engine.empty(SIZE, np.int32)
+        self._first_reports: dict[tuple[int, int, bool], cla.Array] = {}
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
@@ -184,7 +170,7 @@ class Cells:
                 flags, m = self._clip(rows, box, points, total, n, binned, exact)
                 if flags & CROWDED:
                     # Repeat with twice the slots that were requested so far.
-                    spare = 2 * (int(rows.flags.get()[3]) - n)
+                    spare = 2 * (int(rows.report.get()[SPARE]) - n)
                     continue
                 t = None
                 if not flags & ~DOUBT:
@@ -237,7 +223,7 @@ class Cells:
                 rows.slots,
                 rows.counts,
                 rows.places,
-                rows.flags,
+                rows.report,
                 *bounds,
             )
             found = self._match(rows, box, points, exact)
@@ -246,7 +232,7 @@ class Cells:
             self._enlarge(n)
             # Clip only the cells that had too many faces: their rows are empty. Doubts about others stay.
             some = True
-            self._reset_flags(n, len(rows.counts), byte_count=4)
+            self._report[:1].fill(found[0] & DOUBT)
 
     @framed
     def clip_by_rings(
@@ -270,7 +256,7 @@ class Cells:
             rows.slots,
             rows.counts,
             rows.places,
-            rows.flags,
+            rows.report,
         )
         flags, m = self._match(rows, box, points, exact)
         if flags & ~DOUBT:
@@ -295,14 +281,14 @@ class Cells:
         )
         return replace(t, face_measures=measures, face_centroids=centroids)
 
-    def _read_flags(self) -> tuple[int, int]:
+    def _read_report(self) -> tuple[int, int]:
         """Return the flags and the number of half-faces. `CROWDED`: there were too few spare slots."""
-        return verdict(self._flags.get().tolist())
+        return verdict(self._report.get().tolist())
 
     def _match(self, rows: FaceRows, box: ClipBox, points: cla.Array, exact: bool) -> tuple[int, int]:
         """Make the rows symmetric; return the flags and the number of half-faces."""
         self.enqueue_match(rows, box, points, exact)
-        return self._read_flags()
+        return self._read_report()
 
     def enqueue_match(
         self,
@@ -335,20 +321,20 @@ class Cells:
             rows.places if fits is None else fits,
             rows.keep,
             starts,
-            rows.flags,
+            rows.report,
         )
         self._count(rows, starts)
 
     def _count(self, rows: FaceRows, counts: cla.Array) -> None:
         """Set `rows.starts` and the number of half-faces from the lengths of rows."""
-        self._scan.exclusive(counts, rows.starts, rows.n, total=(rows.flags, FACES))
+        self._scan.exclusive(counts, rows.starts, rows.n, total=(rows.report, KEPT))
 
     def measure(
         self, rows: FaceRows, box: ClipBox, points: cla.Array, m: int, flags: int, exact: bool, ahead: bool = False
     ) -> Tessellation | None:
         """Write graph and measures of the rows; return None if doubtful cells are inconsistent.
 
-        With `ahead` the flags are not known. Nothing is written unless they are 0, and there are at most `m` faces.
+        With `ahead` the report is not known. Nothing is written unless its flags are 0 and there are at most `m` faces.
         """
         engine, n = self.engine, rows.n
         self._reserve_faces(n, m)
@@ -356,7 +342,7 @@ class Cells:
         # The new graph may overwrite the previous one directly only if no row is read from there and no check follows.
         direct = rows.all_new and not flags & DOUBT
         neighbors = faces["neighbors"] if direct else engine.scratch(m, np.int32)
-        unless = int(ahead), m, rows.flags
+        unless = int(ahead), m, rows.report
         self._measure_rows(rows, box, points, unless, neighbors)
         if flags & DOUBT:
             wrong = self._check_doubtful(rows, box, points, neighbors, exact)
@@ -419,9 +405,9 @@ class Cells:
             points,
             *box.device_corners(self.engine.real),
             self._share(exact),
-            rows.flags,
+            rows.report,
         )
-        return self._read_flags()[0] & ~DOUBT
+        return self._read_report()[0] & ~DOUBT
 
     def _measure_without_loops(
         self, rows: FaceRows, box: ClipBox, points: cla.Array, neighbors: cla.Array, exact: bool
@@ -429,11 +415,11 @@ class Cells:
         """Measure again without the crossing faces of the graph (`rows.starts`, `neighbors`)."""
         n, drop_loops = rows.n, self._kernels.drop_loops
         counts = self.engine.scratch(n + 1, np.int32)
-        self._reset_flags(n, len(rows.counts), byte_count=4)
+        self._report[:1].fill(DOUBT)
         graph = rows.starts, neighbors
-        self.engine.run_each(drop_loops, n, rows.places, rows.counts, *graph, rows.keep, counts, rows.flags)
+        self.engine.run_each(drop_loops, n, rows.places, rows.counts, *graph, rows.keep, counts, rows.report)
         self._count(rows, counts)
-        flags, m = self._read_flags()
+        flags, m = self._read_report()
         if flags & ~DOUBT:
             return None
         return self.measure(rows, box, points, m, flags, exact)
@@ -450,7 +436,7 @@ class Cells:
         reset: bool = True,
         previous: Tessellation | None = None,
     ) -> FaceRows:
-        """Return `n` empty rows of faces, of which `slots` (by default all) may be new; `reset` the flags.
+        """Return `n` empty rows of faces, of which `slots` (by default all) may be new; `reset` the report.
 
         Others are those of `previous`. `spare` slots follow, for rows longer than one slot. With `whole`, faces no
         longer than round-off stay.
@@ -463,24 +449,23 @@ class Cells:
                 "32-bit indices can tell apart; use fewer cells, or perturb generators that lie on a common circle"
             )
         if reset:
-            self._reset_flags(first, slots, whole)
+            self._reset_report(first, slots, whole)
         faces, counts = engine.scratch(slots * SLOT, np.int32), engine.scratch(slots, np.int32)
         keep, places = engine.scratch(slots, np.uint32), engine.scratch(n, np.int32)
         old = (places, places) if previous is None else (previous.starts, previous.neighbors)
-        return FaceRows(faces, counts, keep, places, engine.scratch(n + 1, np.int32), self._flags, old)
+        return FaceRows(faces, counts, keep, places, engine.scratch(n + 1, np.int32), self._report, old)
 
-    def _reset_flags(self, first: int, slots: int, whole: bool = False, **part: Any) -> None:
-        """Reset the flags, or a part of them; `first` and `slots` are the range of the spare slots."""
-        if (first, slots, whole) not in self._no_flags:
-            if len(self._no_flags) >= 4:
-                self._no_flags.clear()
+    def _reset_report(self, first: int, slots: int, whole: bool) -> None:
+        """Reset the report; `first` and `slots` are the range of the spare slots."""
+        given = first, slots, whole
+        if given not in self._first_reports:
+            if len(self._first_reports) >= 4:
+                self._first_reports.clear()
             # A copy on the device avoids a blocking transfer.
-            flags = np.zeros(FLAGS, np.int32)
-            flags[3:6] = first, slots, whole
-            start = self.engine.upload(flags, np.int32)
-            self._no_flags[first, slots, whole] = start
-        start = self._no_flags[first, slots, whole]
-        cl.enqueue_copy(self.engine.queue, buffer_of(self._flags), buffer_of(start), **part)
+            report = np.zeros(SIZE, np.int32)
+            report[[SPARE, SLOTS, WHOLE]] = given
+            self._first_reports[given] = self.engine.upload(report, np.int32)
+        cl.enqueue_copy(self.engine.queue, buffer_of(self._report), buffer_of(self._first_reports[given]))
 
     def _enlarge(self, n: int) -> None:
         """Double the capacities, for a mesh of `n` cells."""
@@ -503,8 +488,6 @@ def most_faces(n: int) -> int:
     return 6 * n + 12
 
 
-def verdict(flags: Sequence[int]) -> tuple[int, int]:
-    """Return the error bits and the number of half-faces."""
-    wrong, doubtful, _, spare, slots = flags[:5]
-    wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)
-    return wrong, flags[FACES]
+def verdict(report: Sequence[int]) -> tuple[int, int]:
+    """Return the flags of a report, and the number of half-faces. `CROWDED`: there were too few spare slots."""
+    return report[0] | (CROWDED if report[SPARE] > report[SLOTS] else 0), report[KEPT]

@@ -10,19 +10,15 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..opencl.engine import Engine
-from .device_diagram import DOUBT, NARROW, UNEVEN, Tessellation
+from .device_diagram import Tessellation
+from .report import NARROW, UNEVEN
 
-HARMLESS = DOUBT | NARROW | UNEVEN
-"""Flags of a diagram that is not rejected."""
 FACE_CAPACITY = 32
 """Most faces of a cell while it is clipped in private memory."""
 GROWTH, MOST_FACES = 4, 512
 """Factor to the next capacity for cells with more, and the largest one."""
 LEAST_SPACE, SPACE_PER_CELL, MOST_SPACE = 2**20, 64, 2**26
 """Bytes of global memory for cells with more than `FACE_CAPACITY` faces while they are clipped, a few at a time."""
-REPORT_SIZE = 16
-"""Numbers of the report of kernels; see tessellation/row_counts.h."""
-REPORT_FACES, REPORT_KEPT, REPORT_LISTED = 1, 4, 5
 
 
 def clipping_space(n: float) -> float:

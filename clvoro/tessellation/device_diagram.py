@@ -26,9 +26,6 @@ EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Largest share of a cell that round-off may make uncertain: in a final diagram, and in the steps of a run."""
 LEAST_SEPARATION = {"float64": 1e-6, "float32": 3e-3}
 """Of generators in 3D, as a share of the longest edge of the domain. Nearer ones may be rejected."""
-# Bits of the flags in tessellation/face_rows.h and tessellation/search.h.
-FULL, COINCIDE, DOUBT, NARROW, LOOPED, UNEVEN, UNKNOWN = 1, 2, 8, 16, 32, 64, 128
-OPEN = 64  # in 2D
 HALF = 85.0
 """Degrees to the nearest generator from which on generators may leave a half of a sphere free."""
 

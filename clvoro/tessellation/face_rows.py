@@ -29,9 +29,8 @@ class FaceRows:
         First slot of each row; -1 for a row of the previous graph.
     starts : (n + 1,) int32
         Beginning of each row in the new graph.
-    flags : (6,) int32
-        Error bits, whether any cell is doubtful, number of faces, next spare slot, number of slots, and whether faces
-        below round-off are kept.
+    report : int32
+        See `tessellation/report.h`.
     old : tuple of (n + 1,) int32 and int32
         Starts and neighbors of the previous graph; `places` twice if all rows are new.
     """
@@ -41,7 +40,7 @@ class FaceRows:
     keep: cla.Array
     places: cla.Array
     starts: cla.Array
-    flags: cla.Array
+    report: cla.Array
     old: tuple[cla.Array, cla.Array]
 
     @property

@@ -13,10 +13,10 @@ import pyopencl.array as cla
 from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from .cells import CLIPPED, FLAGS, LEFT, Cells, most_faces, verdict
-from .device_diagram import DOUBT, Follow, Tessellation, read_report
+from .cells import Cells, most_faces, verdict
+from .device_diagram import Follow, Tessellation, read_report
 from .face_rows import FaceRows, spare_slots
-from .rounds import with_room
+from .report import DOUBT, LISTED, SIZE, UNFINISHED, WRONG, with_room
 
 MAX_ROUNDS = 6
 """Most rounds of clipping and checking; after that the diagram is built from scratch."""
@@ -58,8 +58,8 @@ class IncrementalUpdate:
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, d), the new positions of the generators of `previous`.
 
-        The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the flags. See
-        `Follow` for what is called with the diagram. `clip` is not used: in 2D the update finishes all cells.
+        The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the report.
+        See `Follow` for what is called with the diagram. `clip` is not used: in 2D the update finishes all cells.
 
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
         """
@@ -93,9 +93,9 @@ class IncrementalUpdate:
         sums = engine.scratch(n + 1, np.int32)
         corners = box.device_corners(engine.real)
         most_wrong = int(WRONG_SHARE * n / SAMPLE) if n >= SAMPLED_FROM else n
-        engine.run_each(k.begin_update, n, marks, rows.places, rows.flags, FLAGS, most, most + spare)
+        engine.run_each(k.begin_update, n, marks, rows.places, rows.report, SIZE, most, most + spare)
         given = *rows.old, points, *corners
-        check = most_wrong, *given, self._fits, marks, rows.flags
+        check = most_wrong, *given, self._fits, marks, rows.report
         self._check(k.check_rows, -(-n // cells.lanes), n, check)
         done, expected = 0, [first_most] if self._expected is None else self._expected
         while True:
@@ -103,15 +103,15 @@ class IncrementalUpdate:
                 in_all = most if number else first_most
                 limits = size, in_all, most_wrong
                 self._scan.exclusive(marks, sums, n)
-                engine.run_each(k.list_marked, n, number, *limits, marks, sums, listed, rows.flags)
+                engine.run_each(k.list_marked, n, number, *limits, marks, sums, listed, rows.report)
                 self._clip_listed(k, cells, number, size, listed, rows, marks, given)
             cells.enqueue_match(rows, box, points, exact=False, marks=marks, fits=self._fits)
             t = cells.measure(rows, box, points, most_faces(n), 0, exact=False, ahead=True)
             assert t is not None
-            found = follow(t, rows.flags)
-            sums_of_rounds = found[CLIPPED : CLIPPED + done + len(expected) + 1]
+            found = follow(t, rows.report)
+            sums_of_rounds = found[LISTED : LISTED + done + len(expected) + 1]
             clipped = [after - before for before, after in pairwise(sums_of_rounds)]
-            done, left = sum(count > 0 for count in clipped), found[LEFT]
+            done, left = sum(count > 0 for count in clipped), found[UNFINISHED]
             if left == 0:
                 self._expected = with_room(clipped[:done], first_most)
                 flags, m = verdict(found)
@@ -123,7 +123,7 @@ class IncrementalUpdate:
                         follow(t, None)
                 return t
             in_all = most if done else first_most
-            if found[2] > most_wrong or sum(clipped) + left > in_all or done >= MAX_ROUNDS - 1:
+            if found[WRONG] > most_wrong or sum(clipped) + left > in_all or done >= MAX_ROUNDS - 1:
                 return None
             expected = [left]
 
@@ -147,11 +147,11 @@ class IncrementalUpdate:
         new = rows.slots, rows.counts
         if few <= size:
             engine.run_each(
-                k.wrap_marked, -(-size // cells.lanes), few, rows.flags, listed, rows.places, *new, *given, group=1
+                k.wrap_marked, -(-size // cells.lanes), few, rows.report, listed, rows.places, *new, *given, group=1
             )
-        engine.run_each(k.clip_marked, size, *this, few, rows.places, *new, *given, self._fits, rows.flags)
-        engine.run_each(k.place_clipped, size, *this, rows.flags, *new, rows.places, marks, self._fits)
-        engine.run_each(k.check_clipped, size, *this, rows.flags, rows.places, *new, *given, marks, self._fits)
+        engine.run_each(k.clip_marked, size, *this, few, rows.places, *new, *given, self._fits, rows.report)
+        engine.run_each(k.place_clipped, size, *this, rows.report, *new, rows.places, marks, self._fits)
+        engine.run_each(k.check_clipped, size, *this, rows.report, rows.places, *new, *given, marks, self._fits)
 
     def _check(self, kernel: cl.Kernel, items: int, n: int, args: tuple[object, ...]) -> None:
         """Check all rows with `items` work-items, or only a sample if it shows that too many have changed."""

@@ -19,21 +19,10 @@ from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
 from .back_ends import LANES_FROM, TEAM, TeamKernel, has_lanes, has_teams_for_new_cells, has_warps, team_defines
 from .bins import MAX_LEVELS, BinnedPoints
-from .cut_cells import (
-    FACE_CAPACITY,
-    GROWTH,
-    HARMLESS,
-    MOST_FACES,
-    REPORT_FACES,
-    REPORT_KEPT,
-    REPORT_SIZE,
-    CutCells,
-    Matching,
-    capacity_defines,
-    clip_each,
-)
-from .device_diagram import EXACT_SHARE, FULL, ROUGH_SHARE, UNKNOWN, CloseError, NeighborRows, Tessellation
+from .cut_cells import FACE_CAPACITY, GROWTH, MOST_FACES, CutCells, Matching, capacity_defines, clip_each
+from .device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, NeighborRows, Tessellation
 from .periodic.halo import halo_defines
+from .report import FACES, FULL, HARMLESS, KEPT, SIZE, UNKNOWN
 from .weight_bounds import WeightBounds
 
 FACES_PER_CELL = 16.5
@@ -82,7 +71,7 @@ class Polyhedra:
         if has_lanes(engine):
             defines = {"STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine)}
             self._walks = engine.kernels("simd/walks", defines)
-        self._report = engine.empty(REPORT_SIZE, np.int32)
+        self._report = engine.empty(SIZE, np.int32)
         self._capacity = self._room = self._n = 0
         self._of_vertices: tuple[cla.Array, cla.Array] | None = None
 
@@ -326,8 +315,8 @@ class Polyhedra:
 
     def _begin_report(self, flags: int = 0, used: int = 0) -> None:
         """Set the report to `flags` and the number of `used` faces."""
-        report = np.zeros(REPORT_SIZE, np.int32)
-        report[0], report[REPORT_FACES] = flags, used
+        report = np.zeros(SIZE, np.int32)
+        report[0], report[FACES] = flags, used
         self._report.set(report)
 
     def take_cells(self, n: int, m: int) -> CutCells:
@@ -383,7 +372,7 @@ class Polyhedra:
             report,
             *(args if folded else tuple(0 * arg for arg in args)),
         )
-        self._scan.exclusive(starts, starts, rows, total=(report, REPORT_KEPT))
+        self._scan.exclusive(starts, starts, rows, total=(report, KEPT))
         matching = Matching(cut, points, kept, starts, report)
         self.place(matching, m)
         return matching

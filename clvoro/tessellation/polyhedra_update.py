@@ -13,10 +13,10 @@ from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.workspace import framed
 from .back_ends import TEAM, TeamKernel, has_teams, has_warps, team_defines
-from .cut_cells import HARMLESS, REPORT_LISTED, REPORT_SIZE, CutCells
-from .device_diagram import ROUGH_SHARE, UNKNOWN, Follow, Tessellation, read_report
+from .cut_cells import CutCells
+from .device_diagram import ROUGH_SHARE, Follow, Tessellation, read_report
 from .polyhedra import Polyhedra
-from .rounds import with_room
+from .report import HARMLESS, LISTED, SIZE, UNKNOWN, with_room
 
 MORE = 8
 """Room for further neighbors of a cell, as in `tessellation/polyhedra_update.cl`."""
@@ -47,7 +47,7 @@ class PolyhedraUpdate:
                 "tessellation/polyhedra_update_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
             )
             self._team = TeamKernel(engine.queue.device, by_teams, "update_cells_by_teams")
-        self._report = engine.empty(REPORT_SIZE, np.int32)
+        self._report = engine.empty(SIZE, np.int32)
         self._share = engine.real.type(ROUGH_SHARE)
         self._n, self._expected, self._clips = 0, [0], False
 
@@ -91,7 +91,7 @@ class PolyhedraUpdate:
                 found = follow(matching.tessellation(), self._report)
             else:
                 found = self._report.get().tolist()
-            flags, used, left, marked, kept = found[:REPORT_LISTED]
+            flags, used, left, marked, kept = found[:LISTED]
             if flags & UNKNOWN:
                 if box.look_farther(points):
                     return None
@@ -110,7 +110,7 @@ class PolyhedraUpdate:
                     rounds.check()
                 continue
             self._clips = clipped
-            counts = found[REPORT_LISTED : REPORT_LISTED + done]
+            counts = found[LISTED : LISTED + done]
             self._expected = with_room((count for count in counts if count > 0), most)
             if matching is None:
                 sizes, final = [], True
@@ -157,7 +157,7 @@ class _Rounds:
         self._before = (previous.starts, previous.neighbors, np.int32(bool(previous.vertices)), *old, points)
         self._output = (np.int32(self.room), *self.cut.output(report), self.cut.keys, self._changed)
         engine.run_each(
-            kernels.begin_cell_updates, n, np.int32(before), np.int32(REPORT_SIZE), report, self._marks, self._more
+            kernels.begin_cell_updates, n, np.int32(before), np.int32(SIZE), report, self._marks, self._more
         )
 
     def update(self, size: int, which: int) -> None:

@@ -8,15 +8,15 @@ from hypothesis import strategies as st
 
 import clvoro
 from clvoro.opencl.engine import Engine
+from clvoro.tessellation import report
 from clvoro.tessellation.bins import Bins
-from clvoro.tessellation.cells import FLAGS, ROW_CAPACITY, Cells
-from clvoro.tessellation.device_diagram import DOUBT
+from clvoro.tessellation.cells import ROW_CAPACITY, Cells
 from clvoro.tessellation.face_rows import SLOT
 from clvoro.tessellation.readback.diagram import order_of, used_indices
 from tests.reference import diagrams as reference
 
 BOX = clvoro.Box((0.0, 0.0), (2.5, 1.5))
-COLLAPSED = 4  # FLAG_COLLAPSED of tessellation/face_rows.h
+COLLAPSED = 4  # FLAG_COLLAPSED of tessellation/report.h
 
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
@@ -323,10 +323,10 @@ def test_cells_with_two_faces_are_rejected(ctx, doubtful):
         # A doubtful cell has all rows compared, and all agree.
         sign = -1 if doubtful else 1
         rows.counts.set(np.array([sign * len(labels) for labels in lists], np.int32))
-        rows.flags.set(np.array([0, doubtful, 0, n, n] + [0] * (FLAGS - 5), np.int32))
+        rows.report.set(np.array([report.DOUBT * doubtful] + [0] * (report.SIZE - 1), np.int32))
         flags, m = cells._match(rows, BOX, points, exact=True)
         assert m == 9 - two
-        assert flags == (COLLAPSED if two else 0) | (DOUBT if doubtful else 0)
+        assert flags == (COLLAPSED if two else 0) | (report.DOUBT if doubtful else 0)
 
 
 @pytest.mark.parametrize("labels", [[], [0], [3], [2, 0, 1], [7, 1, 4], [10**9, 5, 0], [0, 4, 2, 9]])

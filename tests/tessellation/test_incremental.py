@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation import incremental as repair
 from clvoro.tessellation.bins import Bins
-from clvoro.tessellation.cells import CLIPPED, Cells
+from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT
 from clvoro.tessellation.incremental import IncrementalUpdate
+from clvoro.tessellation.report import LISTED
 from tests.reference import patch
 
 N = 700
@@ -226,9 +227,9 @@ def test_most_cells_are_made_in_lanes(ctx, monkeypatch):
     assert np.mean(np.array(right)[counts > 0]) > 0.97
 
 
-def clipped_in(flags, number):
+def clipped_in(report, number):
     """Return how many cells are clipped in a round."""
-    before, after = flags.get()[CLIPPED + number : CLIPPED + number + 2]
+    before, after = report.get()[LISTED + number : LISTED + number + 2]
     return int(after - before)
 
 

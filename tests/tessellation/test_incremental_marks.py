@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from clvoro.tessellation import report
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT
@@ -41,7 +42,8 @@ def test_a_former_neighbor_of_a_clipped_cell_loses_its_mark(ctx, again):
     slots = engine.upload(slots, np.int32)
     counts = engine.upload([len(wrong), 0], np.int32)
     # In the second round, after one clipped cell.
-    flags = engine.upload([0, 0, 0, 2, 2, 0, 0, 1, 0, 1, 2], np.int32)
+    given = np.zeros(report.SIZE)
+    given[[3, report.LISTED + 1, report.LISTED + 2]], given[[report.SPARE, report.SLOTS]] = (1, 1, 2), 2
     engine.run_each(
         kernels.clip_marked,
         1,
@@ -55,7 +57,7 @@ def test_a_former_neighbor_of_a_clipped_cell_loses_its_mark(ctx, again):
         x,
         *patch.BOX.device_corners(engine.real),
         fits,
-        flags,
+        engine.upload(given, np.int32),
     )
     assert np.array_equal(slots.get()[SLOT:][: len(rows[i])], rows[i])
     assert counts.get()[1] == len(rows[i])

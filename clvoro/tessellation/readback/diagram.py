@@ -14,7 +14,8 @@ from ...geometry.domain import ClipBox, Domain
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ...opencl.primitives import Gather, Lists
-from ..device_diagram import UNEVEN, CloseError, Tessellation
+from ..device_diagram import CloseError, Tessellation
+from ..report import UNEVEN
 from ..stages import TessellationStages
 from ..tessellator import Tessellator
 from ..topology3d.consistency import SharedFaces, share_faces
