@@ -11,7 +11,6 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal
 
 import numpy as np
-import scipy
 
 from ..arguments import check_callable, check_points
 from ..errors import InputTypeError, Interrupted
@@ -449,17 +448,12 @@ class Run:
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
         origin, fixed = origins(labels, self.started, mesh.taken), mesh.setup.points
-        if mesh.domain.curved_walls:
-            frame = mesh.domain.frame
-            generators = frame[0] + frame[1] * mesh.to_host(mesh.points)[:, :3]
-            diagram = mesh.fetch_diagram()
+        diagram = mesh.fetch_diagram()
+        if (home := diagram.home) is not None:
             # Cells may have been cut along creases: further parts come last. Generators in thin places may have none.
-            away, home = scipy.spatial.KDTree(generators).query(diagram.points)
-            own = away < 1e-9 * frame[1]
+            own, home = home >= 0, np.where(home < 0, -1 - home, home)
             size, origin, fixed = size[home], np.where(own, origin[home], -1), fixed[home[own & (home < len(fixed))]]
             error, quality = self._measured_again(diagram, size)
-        else:
-            diagram = mesh.fetch_diagram()
         put_back(diagram, fixed)
         result = Result(
             points=diagram.points,

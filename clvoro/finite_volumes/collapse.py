@@ -33,7 +33,9 @@ _SURE = 1.05
 """Margin of the suspects: areas of the diagram differ a little from those of the mesh."""
 
 
-def collapse_short(mesh: Faces, diagram: Diagram, unwanted: np.ndarray | None = None) -> Faces:
+def collapse_short(
+    mesh: Faces, diagram: Diagram, unwanted: np.ndarray | None = None, chosen: np.ndarray | None = None
+) -> Faces:
     """Return `mesh` without edges shorter than 0.02 h and faces smaller than 0.001 h^2, where its cells stay valid.
 
     Faces smaller than 0.02 h^2 whose skewness exceeds 1.8 are collapsed, too.
@@ -50,8 +52,12 @@ def collapse_short(mesh: Faces, diagram: Diagram, unwanted: np.ndarray | None = 
     diagram : Diagram
     unwanted : (f,) bool, optional
         Faces that are collapsed whatever their size.
+    chosen : (f,) bool, optional
+        Faces whose corners may move; all by default.
     """
     suspects = _suspects(mesh, diagram)
+    if chosen is not None:
+        suspects &= chosen
     if unwanted is not None:
         suspects |= unwanted
     if not suspects.any():

@@ -90,6 +90,9 @@ class Diagram(MeshOutput):
         with the cell on the left of the way from the first to the second. In 3D the order is counter-clockwise as seen
         from outside of the cell; the opposite half-face has the opposite order. Empty where a face is as narrow as
         round-off.
+    home : (n,) int or None
+        In a solid the row i of each cell's generator among those that the mesh was made of; -1 - i for further parts
+        of its cell. None elsewhere: cell i is that of generator i.
     weights : (n,) float64
         Weights w of the generators in a power diagram, in the square of the domain's unit of length. Zeros in a Voronoi
         diagram.
@@ -147,6 +150,7 @@ class Diagram(MeshOutput):
         self.domain = domain
         self._arrays = {n: a if callable(a) else read_only(a) for n, a in arrays.items()}
         self._derived: dict[str, np.ndarray] = {}
+        self.home: np.ndarray | None = None
 
     def __getattr__(self, name: str) -> np.ndarray:
         if name not in self._NAMES:

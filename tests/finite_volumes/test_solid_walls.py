@@ -5,7 +5,7 @@ import pytest
 
 import clvoro
 from clvoro.finite_volumes.solid_walls.mend import _best_halves, without_cells
-from clvoro.finite_volumes.solid_walls.mesh import diagram_of, outer_generators, solid_diagram, solid_mesh
+from clvoro.finite_volumes.solid_walls.mesh import diagram_of, outer_generators, solid_diagram
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
 from clvoro.mesh.connectivity import following
 
@@ -41,10 +41,10 @@ def generators(solid):
     return x[solid.signed_distance(x) < -0.2 * H]
 
 
-def whole_diagram(ctx, solid, x, h):
-    """Return the diagram of generators and outer generators in a box around the solid."""
+def whole_faces(ctx, solid, x, h):
+    """Return the faces of the diagram of generators and outer generators in a box around the solid."""
     box = clvoro.Box(np.subtract(solid.lower, 4 * H), np.add(solid.upper, 4 * H))
-    return clvoro.Adapter(ctx).diagram(box, np.concatenate([x, outer_generators(WallSurface(solid), x, h)]))
+    return clvoro.Adapter(ctx).diagram(box, np.concatenate([x, outer_generators(WallSurface(solid), x, h)])).faces
 
 
 @pytest.fixture(scope="module", params=SOLIDS)
@@ -52,10 +52,9 @@ def made(request, ctx):
     solid = SOLIDS[request.param]()
     x = generators(solid)
     h = np.full(len(x), H)
-    mesh = solid_mesh(WallSurface(solid), x, h, whole_diagram(ctx, solid, x, h))
-    assert not len(mesh.odd)
-    assert not len(mesh.lost)
-    return solid, mesh.faces
+    diagram = solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h))
+    assert np.array_equal(diagram.home, np.arange(len(x)))
+    return solid, diagram.faces
 
 
 def sides_of_cells(faces):
@@ -135,7 +134,7 @@ def test_an_edge_across_a_crease_with_both_ends_outside_closes_a_face(ctx, seed)
     x = np.stack(np.meshgrid(k, k, k, indexing="ij"), axis=-1).reshape(-1, 3)
     x += np.random.default_rng(seed).uniform(-0.35, 0.35, x.shape) * H
     h = np.full(len(x), H)
-    faces = solid_mesh(WallSurface(solid), x, h, whole_diagram(ctx, solid, x, h)).faces
+    faces = solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h)).faces
     walls = np.bincount(-1 - faces.neighbor[faces.n_inner :], faces.area[faces.n_inner :])
     assert np.abs(walls - 1).max() < 1e-12
     assert abs(faces.volumes.sum() - 1) < 1e-12
@@ -148,7 +147,7 @@ def test_a_cell_with_a_concave_crease_is_cut(ctx):
     x[np.linalg.norm(x - (1, 1, 0.5), axis=1) < H] += 0.25 * H * np.array([1, -0.6, 0.1])
     h = np.full(len(x), H)
     with pytest.warns(clvoro.errors.MismatchWarning, match="cells at .* are parts of others"):
-        d = solid_diagram(WallSurface(solid), x, h, whole_diagram(ctx, solid, x, h))
+        d = solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h))
     assert d.check("openfoam")
     assert d.check()
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=1e-9)
@@ -163,7 +162,7 @@ def test_a_crease_that_cannot_be_followed_is_left_out(ctx):
     x = np.delete(x, np.linalg.norm(x - (1 + H / 2, 1 - H / 2, 0.5), axis=1).argmin(), axis=0)
     h = np.full(len(x), H)
     with pytest.warns(clvoro.errors.MismatchWarning, match="leave out creases"):
-        d = solid_diagram(WallSurface(solid), x, h, whole_diagram(ctx, solid, x, h))
+        d = solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h))
     assert d.check("openfoam")
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=0.01)
 

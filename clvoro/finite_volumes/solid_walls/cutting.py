@@ -99,6 +99,8 @@ class CellFaces:
     points : (v, 3) float
     home : (n,) int
         Of each cell the cell of the diagram that it is a part of.
+    row : (f,) int
+        The face of the diagram that each is; -1 for new ones.
     cuts : list of CreaseCut
     """
 
@@ -108,6 +110,7 @@ class CellFaces:
     corners: np.ndarray
     points: np.ndarray
     home: np.ndarray
+    row: np.ndarray
     cuts: tuple[CreaseCut, ...] = ()
 
     def locate(self, points: np.ndarray, cell: np.ndarray, chain: np.ndarray | None = None) -> np.ndarray:
@@ -138,6 +141,7 @@ class CellFaces:
             starts=starts,
             corners=corners,
             home=self.home[inner[:-1]],
+            row=self.row[rows],
             cuts=tuple(
                 replace(cut, **{name: int(number[getattr(cut, name)]) for name in ("cell", "below", "above")})
                 for cut in self.cuts
@@ -327,6 +331,7 @@ class _Cutter:
             corners=np.concatenate([corners, [a for loop in made for a in loop]]).astype(np.int64),
             points=np.concatenate([position, np.reshape(extra, (-1, 3))]),
             home=np.append(f.home, f.home[cells]),
+            row=np.concatenate([f.row[left], np.full(len(made), -1)]),
             cuts=(*f.cuts, *(CreaseCut(c, below[c], above[c], by) for c in cells)),
         )
 

@@ -15,8 +15,9 @@ from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
 from .chains import Crossings, cross_cells, joined
-from .cutting import CellFaces, cross_cuts, cut_at_creases
+from .cutting import cross_cuts, cut_at_creases
 from .mend import narrow_faces, rejected_at_walls, split_walls, without_cells
+from .near_walls import NearWalls
 from .pierce import IN, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
 from .trimmed_faces import TrimmedFaces, trim_faces
@@ -42,25 +43,25 @@ _MISSED = 0.1
 
 
 @dataclass(frozen=True)
-class SolidMesh:
-    """The mesh of a solid.
+class _Made:
+    """Cells near the surface that end there.
 
     Attributes
     ----------
     faces : Faces
     home : (m,) int
-        The generator of each cell, first those of generators that have a cell, ascending; then follow further parts of
-        cells that have been cut along concave creases.
-    odd : (k,) int
-        Cells whose wall could not be divided by creases.
-    lost : (k,) int
-        Generators without a cell.
+        The cell of `NearWalls` that each one was.
+    own : (m,) bool
+        Whether it holds the generator. Those that do come first, ascending; then follow further parts of cells that
+        have been cut along concave creases.
+    rejected : (k,) int
+        See `rejected_at_walls`.
     """
 
     faces: Faces
     home: np.ndarray
-    odd: np.ndarray
-    lost: np.ndarray
+    own: np.ndarray
+    rejected: np.ndarray
 
 
 def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -89,8 +90,8 @@ def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray
     return placed[clear]
 
 
-def solid_mesh(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, diagram: Diagram) -> SolidMesh:
-    """Return the mesh of a solid.
+def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Faces) -> Diagram:
+    """Return the mesh of a solid as a diagram, without short edges at walls.
 
     Parameters
     ----------
@@ -99,14 +100,8 @@ def solid_mesh(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, diag
         Generators inside.
     sizes : (n,) float
         h at the generators.
-    diagram : Diagram
-        Of the generators, and of `outer_generators` after them, in a box around the solid.
-    """
-    return _Maker(surface, points, sizes, diagram, np.full(len(points), CUT, np.int8)).mesh()
-
-
-def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Diagram) -> Diagram:
-    """Return the mesh of a solid as a diagram, without short edges; see `solid_mesh`.
+    whole : Faces
+        Of the diagram of the generators, and of `outer_generators` after them, in a box around the solid.
 
     Raises
     ------
@@ -118,91 +113,100 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
     MismatchWarning
         If generators have no cell, cells are cut, leave out creases, or are concave: how many, and the first place.
     """
-    walls = np.full(len(points), EXACT, np.int8)
-    best: tuple[int, Faces, np.ndarray, np.ndarray, np.ndarray] | None = None
+    near = NearWalls.of(surface, points, sizes, whole)
+    del whole
+    walls = np.full(len(near.sizes), CUT, np.int8)
+    best, kept = None, walls
     since = 0
     while since < _PATIENCE:
-        faces, home, rejected = _made(surface, points, sizes, whole, walls)
+        made = _made(surface, near, walls)
         since += 1
-        if best is None or len(rejected) < best[0]:
-            best, since = (len(rejected), faces, home, rejected, walls.copy()), 0
-        if not len(rejected):
+        if best is None or len(made.rejected) < len(best.rejected):
+            best, kept, since = made, walls.copy(), 0
+        if not len(made.rejected):
             break
-        _simplify(walls, whole.faces, np.unique(home[rejected]))
+        _simplify(walls, near, np.unique(made.home[made.rejected]))
     assert best is not None
-    _, faces, home, rejected, walls = best
+    rejected = best.faces.generators[best.rejected]
+    faces, home = near.put_back(best.faces, best.home, best.own)
     lost = np.setdiff1d(np.arange(len(points)), home)
-    own = len(points) - len(lost)
-    if len(home) > own:
-        generators = faces.generators.copy()
-        generators[own:] = faces.measures.geometry.centroids[own:]
-        faces = replace(faces, generators=generators)
-    left_out = np.flatnonzero(walls >= FILLED)
     for rows, text in (
         (points[lost], "generators at {} have no cell: the solid is thinner than a cell, which is left out"),
-        (points[home[own:]], "cells at {} are parts of others, cut where a concave crease passes through them"),
-        (points[left_out], "cells at {} leave out creases or corners, of which several meet within a cell"),
-        (faces.generators[rejected], "cells at {} are concave or inverted, and OpenFOAM does not accept them"),
+        (
+            points[-1 - home[home < 0]],
+            "cells at {} are parts of others, cut where a concave crease passes through them",
+        ),
+        (
+            near.generators[kept >= FILLED],
+            "cells at {} leave out creases or corners, of which several meet within a cell",
+        ),
+        (rejected, "cells at {} are concave or inverted, and OpenFOAM does not accept them"),
     ):
         if len(rows):
             place = format_point(rows[0]) + (" and elsewhere" if len(rows) > 1 else "")
             warn(f"{len(rows)} {text.format(place)}; use smaller sizes there", MismatchWarning)
-    return diagram_of(faces)
+    diagram = diagram_of(faces)
+    diagram.home = home
+    return diagram
 
 
-def _made(
-    surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Diagram, walls: np.ndarray
-) -> tuple[Faces, np.ndarray, np.ndarray]:
-    """Return the mesh without short edges and slivers, the generator of each cell, and rejected cells (k,).
-
-    See `SolidMesh.home` and `rejected_at_walls`.
-    """
-    made = _Maker(surface, points, sizes, whole, walls).mesh()
-    if len(made.lost) > _FEW * len(points):
-        place = format_point(points[made.lost[0]])
+def _made(surface: WallSurface, near: NearWalls, walls: np.ndarray) -> _Made:
+    """Return the cells near the surface without short edges and slivers; `walls` (p + 1,) says how they are made."""
+    raw = _Maker(surface, near, walls).mesh()
+    home, own = raw.home, raw.own
+    lost = np.setdiff1d(np.arange(len(near.rows)), home)
+    if len(lost) > _FEW * len(near.points):
+        place = format_point(near.generators[lost[0]])
         raise InputError(
-            f"{surface.solid} is too thin for cells of this size: {len(made.lost)} generators have no cell, the first "
-            f"at {place}, where h is {sizes[made.lost[0]]:.3g}; use smaller cells there"
+            f"{surface.solid} is too thin for cells of this size: {len(lost)} generators have no cell, the first at "
+            f"{place}, where h is {near.sizes[lost[0]]:.3g}; use smaller cells there"
         )
-    home = made.home
-    faces = _collapsed(made.faces, sizes[home])
+    faces = _collapsed(raw.faces, near.sizes[home])
     rejected, tips = rejected_at_walls(faces)
     if len(rejected):  # where a face has been collapsed, another small one may bulge out
-        faces = _collapsed(faces, sizes[home])
+        faces = _collapsed(faces, near.sizes[home])
         rejected, tips = rejected_at_walls(faces)
-    share = faces.volumes[rejected] / sizes[home[rejected]] ** 3
-    slivers = rejected[share < np.where(tips, _TIP, _SLIVER)]
-    if len(slivers):
-        faces, home = without_cells(faces, slivers), np.delete(home, slivers)
-        rejected = rejected_at_walls(faces)[0]
+    if len(rejected):
+        share = faces.volumes[rejected] / near.sizes[home[rejected]] ** 3
+        slivers = rejected[share < np.where(tips, _TIP, _SLIVER)]
+        if len(slivers):
+            faces, home, own = without_cells(faces, slivers), np.delete(home, slivers), np.delete(own, slivers)
+            rejected = rejected_at_walls(faces)[0]
     if len(rejected):
         faces = split_walls(faces, rejected)
         rejected = rejected_at_walls(faces)[0]
-    return faces, home, rejected
+    if not own.all():
+        centroids = faces.measures.geometry.centroids
+        faces = replace(faces, generators=np.where(own[:, None], faces.generators, centroids))
+    return _Made(faces, home, own, rejected)
 
 
 def _collapsed(faces: Faces, sizes: np.ndarray) -> Faces:
-    """Return a mesh without short edges and small faces, and without faces that bulge out."""
+    """Return a mesh without short edges and small faces of cells at walls, and without faces that bulge out."""
     diagram = diagram_of(faces)
-    return collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes))
+    at_wall = np.zeros(faces.n_cells, bool)
+    at_wall[faces.owner[faces.n_inner :]] = True
+    chosen = at_wall[faces.owner] | at_wall[np.maximum(faces.neighbor, 0)]
+    made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes), chosen)
+    row = np.full(len(diagram.neighbors), -1)
+    row[diagram.faces.half_face] = faces.half_face
+    return replace(made, half_face=row[made.half_face])
 
 
-def _simplify(walls: np.ndarray, faces: Faces, rejected: np.ndarray) -> None:
+def _simplify(walls: np.ndarray, near: NearWalls, rejected: np.ndarray) -> None:
     """Change how the walls of `rejected` cells are made, or of their neighbors.
 
     Parameters
     ----------
-    walls : (n,) int8
+    walls : (p + 1,) int8
         EXACT, CUT, FILLED or ROUNDED.
-    faces : Faces
-        Of the diagram; cells beyond n are outside.
     rejected : (k,) int
     """
-    n = len(walls)
-    between = (faces.owner < n) & (faces.neighbor >= 0) & (faces.neighbor < n)
-    one, other = faces.owner[between], faces.neighbor[between]
+    cells, p = near.cells, len(near.rows)
+    between = (cells.owner < p) & (cells.neighbor >= 0) & (cells.neighbor < p)
+    one, other = cells.owner[between], cells.neighbor[between]
     one, other = np.concatenate([one, other]), np.concatenate([other, one])
-    mine = np.zeros(n, bool)
+    mine = np.zeros(p + 1, bool)
     mine[rejected] = True
     # A cut may spoil a neighbor of the cell.
     blamed = other[mine[one] & (walls[one] == EXACT) & (walls[other] == CUT)]
@@ -233,11 +237,11 @@ def diagram_of(faces: Faces) -> Diagram:
         faces.domain,
         {
             "points": faces.generators,
-            "volumes": faces.measures.geometry.volumes,
-            "centroids": faces.measures.geometry.centroids,
+            "volumes": lambda: faces.measures.geometry.volumes,
+            "centroids": lambda: faces.measures.geometry.centroids,
             "neighbor_starts": starts.astype(np.int32),
             "neighbors": np.where(back, faces.owner[face], faces.neighbor[face]).astype(np.int32),
-            "face_measures": faces.area[face],
+            "face_measures": lambda: faces.area[face],
             "face_centroids": lambda: faces.center[face],
             "vertices": faces.points,
             "face_vertex_starts": lambda: loops()[0].astype(np.int32),
@@ -258,35 +262,24 @@ class _Maker:
         See `WallSurface`; -1 for vertices inside.
     """
 
-    def __init__(
-        self, surface: WallSurface, generators: np.ndarray, sizes: np.ndarray, diagram: Diagram, walls: np.ndarray
-    ) -> None:
+    def __init__(self, surface: WallSurface, near: NearWalls, walls: np.ndarray) -> None:
         self.surface = surface
-        self.tree, self.h = scipy.spatial.KDTree(generators), sizes
-        f = diagram.faces
-        of_diagram = CellFaces(
-            f.owner.astype(np.int64),
-            f.neighbor.astype(np.int64),
-            f.starts,
-            f.corners.astype(np.int64),
-            np.array(f.points, float),
-            np.arange(len(diagram)),
-        )
-        self.cells = cut_at_creases(self.surface, self.tree, sizes, of_diagram, walls == CUT).within(len(generators))
+        self.tree, self.h = scipy.spatial.KDTree(near.generators), near.sizes
+        cells = cut_at_creases(self.surface, self.tree, self.h, near.cells, walls == CUT)
+        self.cells = cells.within(len(self.h))
         self.owner, self.neighbor = self.cells.owner, self.cells.neighbor
         self.starts, self.corners, self.points = self.cells.starts, self.cells.corners, self.cells.points
         self.n, home = len(self.cells.home), self.cells.home
+        self.at_wall = near.at_wall[home]
         self.filled, self.rounded = walls[home] >= FILLED, walls[home] == ROUNDED
-        self.generators, self.sizes = generators[home], sizes[home]
+        self.generators, self.sizes = near.generators[home], near.sizes[home]
 
-    def mesh(self) -> SolidMesh:
-        """Return the mesh."""
-        near = self._near_faces()
-        parts = self._trim(near)
-        parts = self._to_creases(parts)
-        far = np.setdiff1d(np.arange(len(self.owner)), near, assume_unique=True)
-        polygons = self._wall_polygons(parts, far)
-        return self._assemble(far, parts, polygons)
+    def mesh(self) -> _Made:
+        """Return the mesh; no cell is checked."""
+        touches = self.at_wall[self.owner] & self.at_wall[self.neighbor]
+        near, far = np.flatnonzero(touches), np.flatnonzero(~touches)
+        parts = self._to_creases(self._trim(near))
+        return self._assemble(far, parts, self._wall_polygons(parts, far))
 
     def _certified(self, starts: np.ndarray, corners: np.ndarray, near: np.ndarray) -> np.ndarray:
         """Return a lower bound of the depth in the solid of each vertex of the faces `near`, (v,); -inf for others.
@@ -303,17 +296,6 @@ class _Maker:
             away = np.linalg.norm(self.points[corners] - self.generators[i], axis=1)
             np.maximum.at(bound, corners, depth[i] - away)
         return bound
-
-    def _near_faces(self) -> np.ndarray:
-        """Return the faces both of whose cells may reach the surface."""
-        # Both generators of a face are equally far from its vertices.
-        away = self.points[self.corners] - np.repeat(self.generators[self.owner], np.diff(self.starts), axis=0)
-        farthest = np.maximum.reduceat(np.einsum("vd,vd->v", away, away), self.starts[:-1])
-        reach = np.zeros(self.n)
-        for cells in (self.owner, self.neighbor):
-            np.maximum.at(reach, cells, farthest)
-        near = self.surface.touches(self.generators, np.sqrt(reach) + 0.1 * self.sizes)
-        return np.flatnonzero(near[self.owner] & near[self.neighbor])
 
     def _trim(self, near: np.ndarray) -> TrimmedFaces:
         """Decide about the vertices and edges of the faces `near`, and return their parts inside."""
@@ -591,7 +573,7 @@ class _Maker:
         label[rows] = near
         return label
 
-    def _assemble(self, far: np.ndarray, parts: TrimmedFaces, divider: Divider) -> SolidMesh:
+    def _assemble(self, far: np.ndarray, parts: TrimmedFaces, divider: Divider) -> _Made:
         """Put all faces together."""
         starts, corners = take_rows(self.starts, self.corners, far)
         owner = np.concatenate([self.owner[far], self.owner[parts.face]])
@@ -603,6 +585,7 @@ class _Maker:
         wall_items = np.concatenate([self.whole[1], np.array([v for loop in p.loops for v in loop], np.int64)])
         wall_owner = np.concatenate([self.whole_cell, np.array(p.cell, np.int64)])
         wall_patch = np.concatenate([self.whole_patch, np.array(p.patch, np.int64)])
+        row = np.concatenate([self.cells.row[far], np.full(len(parts.face), -1)])
         inner = np.lexsort((neighbor, owner))
         walls = np.lexsort((wall_owner, wall_patch))
         one = take_rows(np.concatenate([[0], np.cumsum(counts)]), items, inner)
@@ -625,7 +608,6 @@ class _Maker:
             neighbor=neighbor.astype(np.int32),
             twin=np.full(f, -1),
             shift=np.zeros((f, 3), np.int8),
-            half_face=np.full(f, -1),
+            half_face=np.concatenate([row[inner], np.full(len(walls), -1)]),
         ).compact()
-        odd = number[np.unique(np.array(p.odd, np.int64))]
-        return SolidMesh(faces, home, odd, np.flatnonzero(~seen[: len(self.h)]))
+        return _Made(faces, home, own, np.zeros(0, np.int64))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pyopencl.array as cla
 
@@ -40,5 +42,5 @@ def fetch_mesh(engine: Engine, domain: Solid, t: Tessellation, labels: cla.Array
     reach = _MARGIN * sizes.max()
     box = Box(tuple(np.subtract(domain.lower, reach).tolist()), tuple(np.add(domain.upper, reach).tolist()))
     stages = TessellationStages(engine.replaced(traits=box.traits(engine.real)))
-    whole = make_diagram(stages, box, np.concatenate([points, outer]))
+    whole = replace(make_diagram(stages, box, np.concatenate([points, outer])).faces, diagram=None)
     return solid_diagram(surface, points, sizes, whole)
