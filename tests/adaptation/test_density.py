@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from clvoro.adaptation.density import Density
-from clvoro.tessellation.device_diagram import Tessellation
 from tests.reference import diagrams as reference
-from tests.reference import graphs, patch
+from tests.reference import patch
 
 N = 250
 
@@ -48,48 +47,6 @@ def test_gradient_of_an_exponential(engine):
     # log h, about 5, has a round-off of a few eps, over distances of at least 0.003.
     assert np.abs(gradient[told] - slope).max() < 8000 * np.finfo(engine.real).eps
     assert not gradient[~told].any()
-
-
-def test_gradient_is_that_of_least_squares(engine):
-    """The fit weights each neighbor by 1 / distance^2 and ignores walls, for any values."""
-    points = patch.random_points(N, 114)
-    h = np.random.default_rng(7).uniform(0.02, 0.2, N)
-    t = patch.tessellate(engine, points)
-    gradient = Density(engine).lloyd_weights(t, engine.upload(h)).gradient.get()
-    host, eps = patch.fetch(t), float(np.finfo(engine.real).eps)
-    for i in range(N):
-        row = host.neighbors[host.starts[i] : host.starts[i + 1]]
-        j = row[row >= 0]
-        d = points[j] - points[i]
-        m = (d.T / (d**2).sum(axis=1)) @ d
-        expected = np.linalg.solve(m, (d.T / (d**2).sum(axis=1)) @ np.log(h[j] / h[i]))
-        # Positions round by eps of the domain: that over the distance of the nearest is what it is off by, in parts of
-        # its rise over that distance; the matrix enlarges it.
-        nearest = np.sqrt((d**2).sum(axis=1).min())
-        rounding = 4 * eps * np.linalg.cond(m) / nearest**2
-        assert gradient[i] == pytest.approx(expected, rel=0, abs=rounding)
-
-
-def test_gradient_in_three_dimensions(ctx):
-    engine = patch.make_engine(ctx, dim=3)
-    points, starts, neighbors, measures, volumes = graphs.random_graph(150, 3, seed=23)
-    slope = np.array([0.4, -1.7, 0.9])
-    zeros = engine.zeros((150, 6))
-    t = Tessellation(
-        n=150,
-        points=engine.upload(points),
-        starts=engine.upload(starts, np.int32),
-        neighbors=engine.upload(neighbors, np.int32),
-        face_measures=engine.upload(measures),
-        face_centroids=zeros,
-        volumes=engine.upload(volumes),
-        offsets=engine.zeros((150, 3)),
-        covariances=zeros,
-    )
-    h = 0.1 * np.exp(points @ slope)
-    w = Density(engine).lloyd_weights(t, engine.upload(h))
-    assert np.abs(w.gradient.get() - slope).max() < 1e-9
-    assert w.log_ratio.get() == pytest.approx(np.log(volumes / h**3), rel=1e-12)
 
 
 @pytest.mark.parametrize(

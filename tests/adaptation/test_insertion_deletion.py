@@ -21,25 +21,40 @@ from tests.reference import patch
 QUIET = CLIMB_STRAIN + 0.001  # above CLIMB_STRAIN pairs at walls are left alone
 
 
+BOX_OF = {2: patch.BOX, 3: patch.BOXES["space"]}
+ANY = {"plane": (2, "float64"), "space": (3, "float64"), "space, float32": (3, "float32")}
+
+
 @pytest.fixture(scope="module")
 def engine(ctx):
     return patch.make_engine(ctx)
+
+
+@pytest.fixture(scope="module", params=ANY)
+def any_engine(ctx, request):
+    dim, real = ANY[request.param]
+    return patch.make_engine(ctx, real, dim)
+
+
+def random_points(n, seed, engine):
+    return patch.random_points(n, seed, BOX_OF[engine.dim]).astype(engine.real).astype(float)
 
 
 class Sweep:
     """One call of `insert_delete`, or of `repair_cells` if the quality is given, and its changes by labels."""
 
     def __init__(self, engine, points, h, total, control=None, **options):
-        n, rng = len(points), np.random.default_rng(808)
+        (n, dim), rng = points.shape, np.random.default_rng(808)
+        self.box = BOX_OF[dim]
         self.n, self.points, self.h = n, points, np.broadcast_to(h, n)
         self.labels = rng.permutation(3 * n)[:n].astype(np.int32)
-        self.velocity = rng.normal(size=(n, 2)).astype(engine.real)
+        self.velocity = rng.normal(size=(n, dim)).astype(engine.real)
         self.ever_changed = (rng.random(n) < 0.5).astype(engine.real)
         self.signatures = rng.integers(1, 2**63, n).astype(np.uint64)
-        self.t = patch.tessellate(engine, points)
+        self.t = patch.tessellate(engine, points, self.box)
         self.host = patch.fetch(self.t)
-        local_length = np.minimum(self.h, np.sqrt(self.host.volumes))
-        self.log_ratio = np.log(self.host.volumes / self.h**2)
+        local_length = np.minimum(self.h, self.host.volumes ** (1 / dim))
+        self.log_ratio = np.log(self.host.volumes / self.h**dim)
         rows = Generators(
             self.t.points,
             engine.upload(self.labels, np.int32),
@@ -51,12 +66,12 @@ class Sweep:
         control = control or InsertionDeletion(engine)
         if "quality" in options:
             quality = engine.upload(options.pop("quality"))
-            self.new = control.repair_cells(patch.BOX, self.t, quality, rows, self.first_new, **options)
+            self.new = control.repair_cells(self.box, self.t, quality, rows, self.first_new, **options)
         else:
             sizes = CellSizes(*map(engine.upload, (self.h, local_length, self.log_ratio)))
             fixed = options.pop("fixed", 0)
             self.new = control.insert_delete(
-                patch.BOX, self.t, sizes, rows, self.first_new, Change(total, **options), fixed
+                self.box, self.t, sizes, rows, self.first_new, Change(total, **options), fixed
             )
         if self.new is not None:
             self.account()
@@ -71,12 +86,12 @@ class Sweep:
         assert (~old).sum() == self.new.inserted
         born = np.sort(labels[~old])
         assert np.array_equal(born, self.first_new + np.arange(self.new.inserted))
-        assert patch.BOX.contains(self.new_points).all()
+        assert self.box.contains(self.new_points).all()
         row = {label: i for i, label in enumerate(self.labels)}
         self.rows = np.array([row[label] for label in labels[old]], int)  # the row of each old generator before
         self.deleted = np.setdiff1d(np.arange(self.n), self.rows)
         assert len(self.deleted) == self.new.deleted
-        moved = (self.new_points[old] != self.points[self.rows]).any(axis=1)
+        moved = (self.new_points[old] != self.points.astype(self.new_points.dtype)[self.rows]).any(axis=1)
         self.moved, self.moved_to = self.rows[moved], self.new_points[old][moved]
         assert np.array_equal(new.velocity.get()[old][~moved], self.velocity[self.rows[~moved]])
         assert not new.velocity.get()[old][moved].any()
@@ -239,28 +254,49 @@ def test_number_is_corrected_exactly(engine, total):
     assert score.argmax() in sites
 
 
-def test_cells_are_split_along_their_longest_axis(engine):
-    points = patch.relaxed_points(300, 67, steps=1)
-    sweep = Sweep(engine, points, 0.04, 5.0, climb=False)
-    assert len(sweep.moved) == 5
+@pytest.mark.sparse(4)
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("total", [-7.0, -1.0, 1.0, 7.0, 500.0, -500.0])
+def test_number_is_corrected_in_space(ctx, real, total):
+    n, engine = 600, patch.make_engine(ctx, real, 3)
+    sweep = Sweep(engine, random_points(n, 61, engine), np.cbrt(0.675 / n), total, climb=False)
+    change = sweep.new.inserted - sweep.new.deleted
+    assert min(sweep.new.inserted, sweep.new.deleted) == 0
+    assert change * total > 0
+    assert change == total if abs(total) < 3 else abs(change) <= min(abs(total), int(MAX_CHANGE * n))
+    sites = sweep.moved if total > 0 else sweep.deleted
+    assert len(sites) == abs(change)
+    # Among the largest, or smallest, over h; a cell near a more extreme one is left for later.
+    rank = np.argsort(np.argsort(-np.sign(total) * sweep.log_ratio))
+    assert np.median(rank[sites]) < n / 10
+
+
+@pytest.mark.parametrize(("dim", "h", "steps"), [(2, 0.04, 1), (3, 0.13, 0)])
+def test_cells_are_split_along_their_longest_axis(ctx, dim, h, steps):
+    points = patch.relaxed_points(300, 67, steps, BOX_OF[dim])
+    sweep = Sweep(patch.make_engine(ctx, dim=dim), points, h, 5.0, climb=False)
+    assert len(sweep.moved) == sweep.new.inserted >= 2
     for i, there in zip(sweep.moved, sweep.moved_to, strict=True):
-        xx, xy, yy = sweep.host.covariances[i]
-        axis = np.linalg.eigh([[xx, xy], [xy, yy]])[1][:, 1]
+        moments = np.zeros((dim, dim))
+        moments[np.triu_indices(dim)] = sweep.host.covariances[i]
+        values, axes = np.linalg.eigh(moments, "U")
         centroid = points[i] + sweep.host.offsets[i]
-        part = np.sqrt(sweep.host.volumes[i]) / 4
-        assert abs((there - centroid) @ axis) == pytest.approx(part, rel=1e-6)
-        assert np.linalg.norm(there - centroid) == pytest.approx(part, rel=1e-6)
-        other = 2 * centroid - there
-        assert np.abs(sweep.born - other).max(axis=1).min() < 1e-12
+        way, part = there - centroid, sweep.host.volumes[i] ** (1 / dim) / 4
+        assert np.linalg.norm(way) == pytest.approx(part, rel=1e-6)
+        # In space twelve powers of the moments: the rest of the others has shrunk by their ratio each time.
+        left = 1e-6 if dim == 2 else 4 * (values[1] / values[2]) ** 12
+        assert abs(way @ axes[:, -1]) / part > 1 - left
+        assert np.abs(sweep.born - (2 * centroid - there)).max(axis=1).min() < 1e-12
 
 
 @pytest.mark.sparse(6)
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 @pytest.mark.parametrize("total", [-50.0, 50.0])
 @pytest.mark.parametrize("climb", [True, False])
-def test_few_cells(engine, n, total, climb):
+def test_few_cells(any_engine, n, total, climb):
     """The last generator stays."""
-    sweep = Sweep(engine, patch.random_points(n, n), 0.3, total, climb=climb)
+    climb &= any_engine.dim == 2
+    sweep = Sweep(any_engine, random_points(n, n, any_engine), 0.3, total, climb=climb)
     if n == 1 and total < 0:
         assert sweep.new is None
     else:

@@ -5,7 +5,6 @@ import pytest
 
 from clvoro.adaptation.metric import Metric, Neighborhoods
 from clvoro.tessellation.cells import Cells
-from clvoro.tessellation.device_diagram import Tessellation
 from tests.reference import diagrams as reference
 from tests.reference import patch
 
@@ -71,37 +70,6 @@ def test_squares(engine):
     assert np.abs(error).max() < 16 * eps
     assert np.abs(quality - 1).max() < 16 * eps
     assert energy == pytest.approx(np.full(48, a**4 / 6), rel=64 * eps)
-
-
-def test_three_dimensions(ctx):
-    """A few cuboids: kernels of one code base serve both dimensions."""
-    engine = patch.make_engine(ctx, dim=3)
-    rng = np.random.default_rng(12)
-    sides = rng.uniform(0.1, 0.4, (5, 3))
-    offsets = rng.uniform(-0.05, 0.05, (5, 3))
-    volumes = sides.prod(axis=1)
-    covariances = np.zeros((5, 6))  # xx, xy, xz, yy, yz, zz
-    covariances[:, [0, 3, 5]] = sides**2 / 12
-    faces = np.repeat(volumes[:, None] / sides, 2, axis=1)
-    h = np.array([0.1, 0.2, 0.3, 0.2, 0.5])
-    empty = engine.zeros(1)
-    t = Tessellation(
-        n=5,
-        points=empty,
-        starts=engine.upload(np.arange(6) * 6, np.int32),
-        neighbors=empty,
-        face_measures=engine.upload(faces.ravel()),
-        face_centroids=empty,
-        volumes=engine.upload(volumes),
-        offsets=engine.upload(offsets),
-        covariances=engine.upload(covariances),
-    )
-    error, quality, energy, _ = evaluate(engine, t, h)
-    length = np.cbrt(volumes)
-    assert error == pytest.approx((length - h) / np.minimum(length, h), rel=1e-13)
-    assert quality == pytest.approx(36 * np.pi * volumes**2 / faces.sum(axis=1) ** 3, rel=1e-13)
-    square = (offsets**2).sum(axis=1) + (sides**2).sum(axis=1) / 12
-    assert energy == pytest.approx(volumes * square, rel=1e-13)
 
 
 def neighbor_sets(t, labels):

@@ -18,11 +18,17 @@ from clvoro.errors import (
     SizeFieldError,
 )
 from tests.reference import diagrams as reference
+from tests.reference import diagrams3d as reference3d
 from tests.reference import runs
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 F1 = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.02, slope=0.3)
 """The test field: 588 cells."""
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
+SMALL = sizing.Distance(sizing.Circle((0.5, 0.5, 0.4), 0.25), 0.08, slope=0.6)
+"""222 cells by the integral of h^-3."""
+FIELD_IN = {2: (BOX, F1), 3: (CUBE, SMALL)}
+ONE_LEVEL = clvoro.MultilevelOptions(levels=1)
 REPEATING = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")
 
 
@@ -37,11 +43,13 @@ def check(result, field, box=BOX, real="float64"):
 # What the rows mean.
 
 
-def test_row_i_is_the_callers_generator(adapter):
+@pytest.mark.parametrize(("dim", "n", "size"), [(2, 400, 0.1), (3, 250, 0.2)])
+def test_row_i_is_the_callers_generator(adapter, dim, n, size):
     """One step of Lloyd's takes every generator to the centroid of its own cell."""
-    points = random_points(400, 5)
-    result = adapter.run(BOX, 0.1, points=points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0))
-    cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
+    box, _ = FIELD_IN[dim]
+    points = random_points(n, 5, box)
+    result = adapter.run(box, size, points=points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0))
+    cells = (reference if dim == 2 else reference3d).box_voronoi(box.lower, box.upper, points)
     assert result.points == pytest.approx(np.array([c.centroid for c in cells]), abs=1e-12)
     assert np.array_equal(result.initial.points, points)
     assert result.initial.points + result.initial.lloyd == pytest.approx(result.points, abs=1e-12)
@@ -120,21 +128,25 @@ def test_threads_take_turns(adapter):
             assert np.array_equal(points, alone)
 
 
-@pytest.mark.sparse(1)
+@pytest.mark.sparse(2)
 @pytest.mark.parametrize(
-    "options",
+    ("dim", "dtype", "options"),
     [
-        {"method": "coupled", "max_steps": 12},
-        {"method": "weighted", "points": "uniform", "max_steps": 12},
-        {"effort": "fast"},
-        {"method": "exact", "effort": "fast", "n_cells": 1400},
+        (2, "float64", {"method": "coupled", "max_steps": 12}),
+        (2, "float64", {"method": "weighted", "points": "uniform", "max_steps": 12}),
+        (2, "float64", {"effort": "fast"}),
+        (2, "float64", {"method": "exact", "effort": "fast", "n_cells": 1400}),
+        (3, "float32", {"method": "coupled", "max_steps": 6}),
+        (3, "float64", {"effort": "fast"}),
+        (3, "float32", {"method": "exact", "effort": "fast", "n_cells": 333, "options": ONE_LEVEL}),
     ],
 )
-def test_repeated_runs_give_the_same_bits(adapter, options):
+def test_repeated_runs_give_the_same_bits(adapter, adapter32, dim, dtype, options):
     """By the same adapter after other work, and by a new one."""
-    first = adapter.run(BOX, F1, seed=2718, **options)
-    for other in (adapter, clvoro.Adapter()):
-        again = other.run(BOX, F1, seed=2718, **options)
+    used, given = (adapter if dtype == "float64" else adapter32), FIELD_IN[dim]
+    first = used.run(*given, seed=2718, **options)
+    for other in (used, clvoro.Adapter(dtype=dtype)):
+        again = other.run(*given, seed=2718, **options)
         assert np.array_equal(again.points, first.points)
         for name in set(first.history.dtype.names) - {"seconds"}:
             assert np.array_equal(again.history[name], first.history[name]), name
@@ -147,21 +159,26 @@ def test_seed(adapter, start):
     assert (a.points != b.points).all()
 
 
-@pytest.mark.sparse(1)
-@pytest.mark.parametrize(("method", "steps", "off"), [("coupled", 5, 1e-7), ("weighted", 3, 5e-6)])
-def test_units_do_not_matter(adapter, method, steps, off):
+@pytest.mark.sparse(2)
+@pytest.mark.parametrize(
+    ("dim", "method", "steps", "off"), [(2, "coupled", 5, 1e-7), (2, "weighted", 3, 5e-6), (3, "weighted", 5, 1e-6)]
+)
+def test_units_do_not_matter(adapter, dim, method, steps, off):
     """A mesh in millimeters far from the origin is the same mesh."""
-    points = random_points(300, 8)
-    box = clvoro.Box((40, -7), (40 + 2.5e-3, -7 + 1.5e-3))
-    small = sizing.Distance(sizing.Circle((40 + 0.9e-3, -7 + 0.75e-3), 0.3e-3), 0.02e-3, slope=0.3)
+    box, field = FIELD_IN[dim]
+    points, corner = random_points(300, 8, box), np.array((40.0, -7.0, 3.0)[:dim])
+    far = clvoro.Box(corner, corner + 1e-3 * box.extent)
+    center, radius = ((0.9, 0.75), 0.3) if dim == 2 else ((0.5, 0.5, 0.4), 0.25)
+    least, slope = (0.02, 0.3) if dim == 2 else (0.08, 0.6)
+    small = sizing.Distance(sizing.Circle(corner + 1e-3 * np.array(center), 1e-3 * radius), 1e-3 * least, slope=slope)
     options = {"method": method, "max_steps": steps, "options": clvoro.PaperOptions(tol=0)}
-    a = adapter.run(BOX, F1, points=points, **options)
-    b = adapter.run(box, small, points=points * 1e-3 + box.lower, **options)
+    a = adapter.run(box, field, points=points, **options)
+    b = adapter.run(far, small, points=points * 1e-3 + corner, **options)
     # 40 rounds to 7e-15, 1e-10 of a cell, faces and rough solves to 6e-8; steps let differences grow, until one of the
     # solves takes an iteration more than the other.
-    assert (b.points - box.lower) * 1e3 == pytest.approx(a.points, abs=off)
+    assert (b.points - corner) * 1e3 == pytest.approx(a.points, abs=off)
     assert b.history["mean_error"] == pytest.approx(a.history["mean_error"], rel=1e-5)
-    assert b.history["energy"] == pytest.approx(a.history["energy"] * 1e-12, rel=1e-5)
+    assert b.history["energy"] == pytest.approx(a.history["energy"] * 1e-3 ** (dim + 2), rel=1e-5)
 
 
 def test_callable_and_device_field_agree(adapter):
@@ -230,7 +247,7 @@ def test_adaptive_runs_end_with_the_schedule(adapter):
     assert result.history["progress"][-1] == 1
 
 
-LEVELS = {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
+LEVELS = {"effort": "fast", "options": ONE_LEVEL}
 
 
 @pytest.mark.sparse(2)
@@ -309,17 +326,19 @@ def test_max_steps_of_adaptive_runs(adapter):
 # Counts and levels.
 
 
-@pytest.mark.sparse(4)
+@pytest.mark.sparse(6)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
-@pytest.mark.parametrize("n", [1, 2, 3, 5, 250])
-def test_n_cells_is_held(adapter, method, n):
-    result = adapter.run(BOX, F1, n_cells=n, method=method, effort="fast", max_steps=None if n > 5 else 60)
+@pytest.mark.parametrize(("dim", "n"), [(2, 1), (2, 2), (2, 3), (2, 5), (2, 250), (3, 1), (3, 2), (3, 3)])
+def test_n_cells_is_held(adapter, method, dim, n):
+    box, field = FIELD_IN[dim]
+    result = adapter.run(box, field, n_cells=n, method=method, effort="fast", max_steps=None if n > 5 else 60)
     assert len(result.points) == n
-    check(result, F1)
+    check(result, field, box)
     if method in REPEATING:
         assert result.size_factor == 1
     else:
-        assert np.log(np.sqrt(result.diagram.volumes) / result.target_size).mean() == pytest.approx(0, abs=1e-9)
+        length = result.diagram.volumes ** (1 / dim)
+        assert np.log(length / result.target_size).mean() == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.sparse(1)
@@ -363,15 +382,16 @@ def test_number_of_cells_is_that_of_the_size_field(adapter):
 
 
 @pytest.mark.sparse(2)
-@pytest.mark.parametrize("levels", [0, 1, 2])
-def test_levels(adapter, levels):
-    result = adapter.run(BOX, F1, options=clvoro.MultilevelOptions(levels=levels), effort="fast", seed=16)
+@pytest.mark.parametrize(("dim", "levels"), [(2, 0), (2, 1), (2, 2), (3, 0), (3, 1)])
+def test_levels(adapter, dim, levels):
+    (box, field), (least, cells, share) = FIELD_IN[dim], {2: (588, 600, 0.05), 3: (222, 270, 0.1)}[dim]
+    result = adapter.run(box, field, options=clvoro.MultilevelOptions(levels=levels), effort="fast", seed=16)
     h = result.history
     assert h["level"][0] == levels
-    assert h["cells"][0] == round(588 / 4**levels)
-    assert len(result.points) == pytest.approx(600, rel=0.05)
+    assert h["cells"][0] == round(least / 2 ** (dim * levels))
+    assert len(result.points) == pytest.approx(cells, rel=share)
     assert np.abs(result.size_error).mean() < 0.03
-    check(result, F1)
+    check(result, field, box)
 
 
 def test_levels_from_the_callers_points(adapter):
@@ -391,11 +411,6 @@ def test_far_too_many_points(adapter):
 
 
 # Figures on the test field.
-
-
-def figures(result):
-    e, q = np.abs(result.size_error), result.quality
-    return e.mean(), e.max(), q.mean(), q.min()
 
 
 @pytest.mark.slow
@@ -418,16 +433,16 @@ def test_figures_of_repeated_steps(adapter, options, error, quality):
     results = [adapter.run(BOX, F1, seed=seed, **options) for seed in (11, 13)]
     for result in results:
         check(result, F1)
-    assert min(figures(r)[0] for r in results) <= error
-    assert max(figures(r)[2] for r in results) >= quality
+    assert min(runs.figures(r)[0] for r in results) <= error
+    assert max(runs.figures(r)[2] for r in results) >= quality
 
 
 @pytest.mark.slow
 def test_published_ordering(adapter):
     """Lloyd's alone never meets the sizes, Poisson's alone meets them with poor cells, coupled does both."""
-    start = random_points(588, 18)
+    start, options = random_points(588, 18), clvoro.PaperOptions(tol=0)
     lloyd, poisson, coupled = (
-        figures(adapter.run(BOX, F1, points=start, method=method, max_steps=100, options=clvoro.PaperOptions(tol=0)))
+        runs.figures(adapter.run(BOX, F1, points=start, method=method, max_steps=100, options=options))
         for method in ("lloyd", "poisson", "coupled")
     )
     assert lloyd[0] > 1
@@ -453,7 +468,7 @@ def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, larg
     results = [run(BOX, F1, seed=seed, **options) for seed in range(1, 4)]
     for result in results:
         check(result, F1, real=dtype)
-    e_mean, e_max, q_mean, q_min = np.median([figures(r) for r in results], axis=0)
+    e_mean, e_max, q_mean, q_min = np.median([runs.figures(r) for r in results], axis=0)
     assert e_mean <= mean
     assert e_max <= largest
     assert q_mean >= quality
@@ -478,7 +493,7 @@ def test_final_displacements_are_those_of_the_last_step(adapter):
 def test_error_target_trades_sizes_for_quality(adapter):
     """A larger error target gives better cells."""
     tight, loose = (
-        figures(adapter.run(BOX, F1, seed=19, options=clvoro.MultilevelOptions(error_target=target), n_cells=588))
+        runs.figures(adapter.run(BOX, F1, seed=19, options=clvoro.MultilevelOptions(error_target=target), n_cells=588))
         for target in (0.001, 0.01)
     )
     assert tight[0] < 0.5 * loose[0]

@@ -10,7 +10,6 @@ from clvoro import sizing
 from clvoro.adaptation.plan.actions import count_changed
 from clvoro.adaptation.plan.efforts import EFFORTS_3D
 from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
-from tests.reference import diagrams3d as reference3d
 from tests.reference import runs
 
 BOX = clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -21,22 +20,8 @@ SMALL = S1 * 2
 LONG = clvoro.Box((-3, 1, 0.2), (5, 1.5, 0.6))
 
 
-def random_points(n, seed, box=BOX):
-    return runs.random_points(n, seed, box)
-
-
 def check(result, field, box=BOX, real="float64"):
     runs.check(result, field, box, real)
-
-
-def figures(result):
-    e, q = np.abs(result.size_error), result.quality
-    return e.mean(), e.max(), q.mean(), q.min()
-
-
-def second_moment(cell, x):
-    """Integral of |y - x|^2 over a reference cell."""
-    return cell.volume * (np.trace(cell.covariance) + ((cell.centroid - x) ** 2).sum())
 
 
 # Every method.
@@ -67,10 +52,10 @@ def test_uniform_start_and_count(adapter, method):
 @pytest.mark.slow
 def test_figures_of_repeated_steps(adapter):
     """Lloyd's alone never meets the sizes, Poisson's alone meets them with poor cells, coupled does both."""
-    start = random_points(500, 18)
-    field = S1 * 1.55
+    start = runs.random_points(500, 18, BOX)
+    field, options = S1 * 1.55, clvoro.PaperOptions(tol=0)
     lloyd, poisson, coupled, weighted = (
-        figures(adapter.run(BOX, field, points=start, method=method, max_steps=60, options=clvoro.PaperOptions(tol=0)))
+        runs.figures(adapter.run(BOX, field, points=start, method=method, max_steps=60, options=options))
         for method in ("lloyd", "poisson", "coupled", "weighted")
     )
     assert lloyd[0] > 3 * coupled[0]
@@ -90,7 +75,7 @@ def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, larg
     run = (adapter if dtype == "float64" else adapter32).run
     result = run(BOX, S1, seed=11, **options)
     check(result, S1, real=dtype)
-    e_mean, e_max, q_mean, q_min = figures(result)
+    e_mean, e_max, q_mean, q_min = runs.figures(result)
     assert e_mean <= mean
     assert e_max <= largest
     assert q_mean >= quality
@@ -98,79 +83,6 @@ def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, larg
     # The integral of h^-3 is 1778. Sums over the generators of so coarse a mesh are a little larger.
     assert 1778 < len(result.points) < 2000
     assert (result.converged, result.stop_reason) == (True, "plan completed")
-
-
-# What the rows mean.
-
-
-def test_row_i_is_the_callers_generator(adapter):
-    """One step of Lloyd's takes every generator to the centroid of its own cell."""
-    points = random_points(250, 5)
-    result = adapter.run(BOX, 0.2, points=points, method="lloyd", max_steps=1, options=clvoro.PaperOptions(tol=0))
-    cells = reference3d.box_voronoi(BOX.lower, BOX.upper, points)
-    assert result.points == pytest.approx(np.array([c.centroid for c in cells]), abs=1e-12)
-    assert np.array_equal(result.initial.points, points)
-    assert result.history["energy"][0] == pytest.approx(sum(map(second_moment, cells, points)), rel=1e-9)
-
-
-@pytest.mark.sparse(1)
-@pytest.mark.parametrize(
-    ("dtype", "options"),
-    [
-        ("float32", {"method": "coupled", "max_steps": 6}),
-        ("float64", {"effort": "fast"}),
-        (
-            "float32",
-            {"method": "exact", "effort": "fast", "n_cells": 333, "options": clvoro.MultilevelOptions(levels=1)},
-        ),
-    ],
-)
-def test_repeated_runs_give_the_same_bits(adapter, adapter32, dtype, options):
-    """By the same adapter after other work, and by a new one."""
-    used = adapter if dtype == "float64" else adapter32
-    first = used.run(BOX, SMALL, seed=2718, **options)
-    for other in (used, clvoro.Adapter(dtype=dtype)):
-        again = other.run(BOX, SMALL, seed=2718, **options)
-        assert np.array_equal(again.points, first.points)
-        for name in set(first.history.dtype.names) - {"seconds"}:
-            assert np.array_equal(again.history[name], first.history[name]), name
-
-
-def test_units_do_not_matter(adapter):
-    """A mesh in millimeters far from the origin is the same mesh."""
-    points = random_points(250, 8)
-    box = clvoro.Box((40, -7, 3), (40 + 1e-3, -7 + 1e-3, 3 + 1e-3))
-    small = sizing.Distance(sizing.Circle((40 + 0.5e-3, -7 + 0.5e-3, 3 + 0.4e-3), 0.25e-3), 0.08e-3, slope=0.6)
-    options = {"method": "weighted", "max_steps": 5, "options": clvoro.PaperOptions(tol=0)}
-    a = adapter.run(BOX, SMALL, points=points, **options)
-    b = adapter.run(box, small, points=points * 1e-3 + box.lower, **options)
-    # 40 rounds to 7e-15, 1e-10 of a cell; five steps let differences grow.
-    assert (b.points - box.lower) * 1e3 == pytest.approx(a.points, abs=1e-6)
-    assert b.history["mean_error"] == pytest.approx(a.history["mean_error"], rel=1e-5)
-    assert b.history["energy"] == pytest.approx(a.history["energy"] * 1e-15, rel=1e-5)
-
-
-# Counts and levels.
-
-
-@pytest.mark.sparse(3)
-@pytest.mark.parametrize("method", runs.FROM_POINTS)
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_n_cells_is_held(adapter, method, n):
-    result = adapter.run(BOX, SMALL, n_cells=n, method=method, effort="fast", max_steps=20)
-    assert len(result.points) == n
-    check(result, SMALL)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("levels", [0, 2])
-def test_levels(adapter, levels):
-    result = adapter.run(BOX, S1, options=clvoro.MultilevelOptions(levels=levels), effort="fast", seed=16)
-    h = result.history
-    assert h["level"][0] == levels
-    assert h["cells"][0] == round(1778 / 8**levels)
-    assert len(result.points) == pytest.approx(1900, rel=0.06)
-    check(result, S1)
 
 
 def test_refinement_gives_the_number_of_the_next_level(adapter):

@@ -13,7 +13,9 @@ from clvoro.geometry.box import Box
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
+from clvoro.tessellation.polyhedra import Polyhedra
 from clvoro.tessellation.tessellator import Tessellator
+from tests.reference import diagrams, diagrams3d
 
 BOX = Box((0, 0), (1, 0.75))
 """Its frame is the unit square's: normalized coordinates are physical ones."""
@@ -39,7 +41,8 @@ def tessellate(engine, points, box=BOX):
     """Return the tessellation by `points` (n, d) in their order, in buffers of its own."""
     n, on_device = len(points), engine.upload(points)
     binned = Bins(engine).build(box, on_device, n)
-    return Cells(engine).tessellate(box, on_device, n, binned)
+    cells = Cells(engine) if box.cell_dim == 2 else Polyhedra(engine)
+    return cells.tessellate(box, on_device, n, binned)
 
 
 def tessellate_box(engine, box, n, seed):
@@ -118,12 +121,10 @@ def random_points(n, seed, box=BOX):
     return x if box.cell_dim == box.dim else box.wrap(x)
 
 
-def relaxed_points(n, seed, steps=8):
+def relaxed_points(n, seed, steps=8, box=BOX):
     """Random points after some steps of Lloyd's: cells of all shapes, but none degenerate."""
-    from tests.reference import diagrams as reference
-
-    points = random_points(n, seed)
+    points = random_points(n, seed, box)
     for _ in range(steps):
-        cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
+        cells = (diagrams if box.dim == 2 else diagrams3d).box_voronoi(box.lower, box.upper, points)
         points = np.array([c.centroid for c in cells])
     return points

@@ -14,6 +14,12 @@ def random_points(n, seed, box):
     return np.random.default_rng(seed).random((n, box.dim)) * box.extent + box.lower
 
 
+def figures(result):
+    """Return mean and largest error, mean and least quality."""
+    e, q = np.abs(result.size_error), result.quality
+    return e.mean(), e.max(), q.mean(), q.min()
+
+
 def polygons(diagram):
     corners = diagram.vertices[diagram.cell_vertices]
     return np.split(corners, diagram.cell_vertex_starts[1:-1])
