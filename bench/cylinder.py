@@ -1,7 +1,7 @@
 """Flow around a cylinder with OpenFOAM on meshes of clvoro, Gmsh and blockMesh, against reference values.
 
     python bench/cylinder.py [--reynolds 20|100] [--cells 3000,6000,13000] [--meshers NAMES] [--samples 3]
-                             [--convection linear|linearUpwind] [--cycles 3] [--p 2] [--pictures FOLDER]
+                             [--convection linear|linearUpwind] [--cycles 3] [--pictures FOLDER]
                              [--device NAME] [--json]
 
 The benchmark of Schaefer and Turek (1996): a channel of 2.2 x 0.41, a cylinder of diameter 0.1 at (0.2, 0.2), a
@@ -17,7 +17,9 @@ channel below the axis of the cylinder, with the mirror images of its generators
 
 "Uniform" is a mesh of one size. "Newcomer" is a polygon of 360 edges with sizes that grow from it, and no layers.
 "Followed" begins as that mesh, with as many cells as the row says, and follows the solution: `clvoro.foam.adapt_case`
-makes a new mesh --cycles times from U and p, with an error that is small in the L^p norm. No place is named.
+makes a new mesh --cycles times from U. No place is named. With "forces" the goal are the forces on the cylinder, by the
+distance from it (`FieldSizes(forces="cylinder")`); with "adjoints" drag and lift, by their adjoint velocities, which
+`adjointOptimisationFoam` solves for.
 
 With --samples several meshes are made for each row, with counts that differ by one percent and with other seeds:
 shown are the median and the range. Without OpenFOAM the script ends with a message. Without Gmsh (pip install gmsh)
@@ -149,10 +151,21 @@ def mesh_newcomer(uniform: bool) -> Callable[..., None]:
     return mesh
 
 
-def follow(case: Case, adapter: clvoro.Adapter, n_cells: int, cycles: int, p: float) -> dict[str, float]:
+FOLLOWED: dict[str, tuple[clvoro.foam.FieldSizes, str]] = {
+    "followed": (clvoro.foam.FieldSizes(), "simpleFoam"),
+    "followed, forces": (clvoro.foam.FieldSizes(forces="cylinder"), "simpleFoam"),
+    "followed, adjoints": (clvoro.foam.FieldSizes(adjoints=("Uadrag", "Ualift")), "adjointOptimisationFoam"),
+}
+"""Sizes and solvers of meshes that follow the solution at Re 20."""
+
+
+def follow(case: Case, adapter: clvoro.Adapter, n_cells: int, cycles: int, mesher: str) -> dict[str, float]:
     """Adapt the case to its solution; return drag and lift on the last mesh, the cells, and seconds by kind."""
+    sizes, solver = FOLLOWED[mesher]
+    if sizes.adjoints:
+        write_adjoints(case)
     rows = clvoro.foam.adapt_case(
-        case.folder, n_cells=n_cells, cycles=cycles, solver="simpleFoam", interval=3000, p=p, adapter=adapter
+        case.folder, n_cells=n_cells, cycles=cycles, solver=solver, interval=3000, sizes=sizes, adapter=adapter
     )
     last = rows[-1]
     return {
@@ -320,7 +333,7 @@ MESHERS: dict[str, Callable[..., None]] = {
     "blockMesh": mesh_blocks,
     "uniform": mesh_newcomer(True),
     "newcomer": mesh_newcomer(False),
-    "followed": mesh_newcomer(False),
+    **dict.fromkeys(FOLLOWED, mesh_newcomer(False)),
 }
 
 
@@ -384,6 +397,70 @@ def write_case(
         solution=solution,
         control={"endTime": times[0], "deltaT": times[1], "writePrecision": 12, "functions": {"forces": forces}},
     )
+
+
+def write_adjoints(case: Case) -> None:
+    """Add to a steady case what `adjointOptimisationFoam` needs for the adjoint flows of drag and lift."""
+    goals = {"drag": "(1 0 0)", "lift": "(0 1 0)"}
+    flat, closed = {name: {"type": "empty"} for name in ("back", "front")}, {"type": "zeroGradient"}
+    walls = ("walls", "cylinder")
+
+    def limits(residual: float, names: tuple[str, str]) -> dict[str, Any]:
+        return {f'"{name}.*"': residual for name in names}
+
+    solvers: dict[str, Any] = {}
+    for name, direction in goals.items():
+        at = {"inlet": "adjointInletVelocity", "outlet": "adjointOutletVelocity"}
+        at |= dict.fromkeys(walls, "adjointWallVelocity")
+        velocity = {key: {"type": kind, "value": "uniform (0 0 0)"} for key, kind in at.items()}
+        pressure = {**dict.fromkeys(("inlet", *walls), closed), "outlet": {"type": "adjointOutletPressure"}}
+        pressure["outlet"]["value"] = "uniform 0"
+        for field, kind, dimensions, value, patches in (
+            (f"Ua{name}", "volVectorField", "[0 1 -1 0 0 0 0]", "uniform (0 0 0)", velocity),
+            (f"pa{name}", "volScalarField", "[0 2 -2 0 0 0 0]", "uniform 0", pressure),
+        ):
+            entries = {"dimensions": dimensions, "internalField": value, "boundaryField": {**patches, **flat}}
+            (case.folder / "0" / field).write_text(header(kind, field) + text_of(entries))
+        force = {"type": "force", "weight": 1, "patches": "(cylinder)", "direction": direction}
+        force |= {"Aref": 2 * RADIUS * THICKNESS, "rhoInf": 1, "UInf": 0.2}
+        solvers[name] = {
+            "active": "true",
+            "type": "incompressible",
+            "solver": "adjointSimple",
+            "computeSensitivities": "false",
+            "useSolverNameForFields": "true",
+            "objectives": {"type": "incompressible", "objectiveNames": {name: force}},
+            "ATCModel": {"ATCModel": "standard"},
+            "solutionControls": {"nIters": 1000, "residualControl": limits(1e-5, ("pa", "Ua"))},
+        }
+    primal = {"active": "true", "type": "incompressible", "solver": "simple"}
+    primal["solutionControls"] = {"consistent": "yes", "nIters": 1000, "residualControl": limits(1e-7, ("p", "U"))}
+    case.write(
+        "system/optimisationDict",
+        {
+            "optimisationManager": "singleRun",
+            "primalSolvers": {"flow": primal},
+            "adjointManagers": {"forces": {"primalSolver": "flow", "adjointSolvers": solvers}},
+            "optimisation": {"sensitivities": {"type": "surfacePoints", "patches": "(cylinder)"}},
+        },
+    )
+    case.write("constant/adjointRASProperties", {"adjointRASModel": "adjointLaminar", "adjointTurbulence": "off"})
+    schemes, solution = (case.folder / "system" / name for name in ("fvSchemes", "fvSolution"))
+    text = schemes.read_text()
+    for name in goals:
+        text = text.replace(
+            "div(phi,U)", f"div(-phi,Ua{name}) bounded Gauss linearUpwind grad(Ua{name});\n    div(phi,U)"
+        )
+    schemes.write_text(text)
+    # The last entry of a name counts; dictionaries are merged.
+    more = {
+        "solvers": {
+            '"pa.*"': {"solver": "GAMG", "smoother": "GaussSeidel", "tolerance": 1e-12, "relTol": 0.05},
+            '"Ua.*"': {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": 1e-12, "relTol": 0.05},
+        },
+        "relaxationFactors": {"fields": {'"pa.*"': 0.3}, "equations": {'"Ua.*"': 0.7}},
+    }
+    solution.write_text(solution.read_text() + text_of(more))
 
 
 def value_at(point: tuple[float, float], centroids: np.ndarray, values: np.ndarray) -> float:
@@ -507,7 +584,6 @@ def main() -> None:
     options_of.add_argument("--samples", type=int, default=1)
     options_of.add_argument("--convection", choices=("linear", "linearUpwind"), default="linearUpwind")
     options_of.add_argument("--cycles", type=int, default=3)
-    options_of.add_argument("--p", type=float, default=2.0)
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = options_of.parse_args()
     re_ = options.reynolds
@@ -542,9 +618,9 @@ def main() -> None:
                     start = time.perf_counter()
                     if re_ != 20:
                         flow = shedding.flow(case, mesh, convection)
-                    elif mesher == "followed":
+                    elif mesher in FOLLOWED:
                         write_case(case, mesh, 20, convection)
-                        flow = follow(case, adapter, n, options.cycles, options.p)
+                        flow = follow(case, adapter, n, options.cycles, mesher)
                         mesh = case.latest_mesh()
                         flow |= pressure_difference(case, mesh)
                     else:

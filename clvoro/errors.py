@@ -90,6 +90,10 @@ class EmptyCellsWarning(UserWarning):
     """Cells of a power diagram are empty, because of the weights of their generators; the message says how many."""
 
 
+class LostFieldsWarning(UserWarning):
+    """Fields of a case of OpenFOAM are not transferred to its next mesh; the message names them."""
+
+
 class MismatchWarning(UserWarning):
     """A part of the input does not match the domain or the sizes: units or positions probably differ."""
 

@@ -27,6 +27,7 @@ DIALECT = re.compile(
     r"\bcomes of it\b|\bone's\b|\blets? go of\b|\bwhat could be meant\b"
 )
 WORDS_OF_OTHERS = {
+    "optimisation": ("bench/cylinder.py",),
     "neighbour": ("/io/", "foam"),  # OpenFOAM's file
     "centre": ("/io/", "tests/cli/test_cases.py"),  # a file format's, and a mistake in a case
 }

@@ -12,11 +12,14 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, InputTypeError, OutputError
 from .outputs import MESH_FILES, NAMES
 from .progress import steady_streams
+
+if TYPE_CHECKING:
+    from ..geometry.boundary_layers import Layers
 
 OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -224,7 +227,14 @@ def _add_foam(commands: Any) -> None:
     adapt.set_defaults(work=_foam_adapt)
     adapt.add_argument("case", metavar="CASE", type=_path, help="the folder with system, constant and times")
     adapt.add_argument("--cells", metavar="N", type=int, required=True, help="number of cells of the new mesh")
-    adapt.add_argument("--fields", metavar="LIST", default="U,p", help="fields that the mesh follows (default: U,p)")
+    adapt.add_argument(
+        "--fields", metavar="LIST", type=_names, default=("U",), help="fields that the mesh follows (default: U)"
+    )
+    goal = adapt.add_mutually_exclusive_group()
+    goal.add_argument("--forces", metavar="LIST", type=_names, default=(), help="patches whose forces are the goal")
+    goal.add_argument(
+        "--adjoints", metavar="LIST", type=_names, default=(), help="adjoint velocities of goals, among the fields"
+    )
     adapt.add_argument("--cycles", metavar="N", type=int, default=1, help="number of meshes (default: 1)")
     adapt.add_argument("--solver", metavar="PROGRAM", help="program that solves the case, such as simpleFoam")
     adapt.add_argument(
@@ -234,9 +244,18 @@ def _add_foam(commands: Any) -> None:
         help="time or iterations that the solver advances in each cycle (default: those of system/controlDict)",
     )
     adapt.add_argument(
+        "--layers",
+        metavar="PATCHES:HEIGHT:COUNT[:GROWTH[:SPACING]]",
+        type=_layers,
+        action="append",
+        help="boundary layers, such as cylinder:0.0008:4:1.15; may be repeated (default: those of the last call)",
+    )
+    adapt.add_argument(
         "--mesh", metavar="FILE", type=_path, help="the present mesh as clvoro saved it (default: from the boundary)"
     )
-    adapt.add_argument("--p", type=float, default=2.0, metavar="P", help="norm of the error that is small (default: 2)")
+    adapt.add_argument(
+        "--p", type=float, metavar="P", help="norm of the error that is small (default: 2; 1 for a goal)"
+    )
     adapt.add_argument("--h-min", type=float, default=0.0, metavar="H", help="smallest size")
     adapt.add_argument("--h-max", type=float, default=math.inf, metavar="H", help="largest size")
     adapt.add_argument("--growth", type=float, default=1.2, metavar="G", help="ratio of neighboring sizes at most")
@@ -244,6 +263,27 @@ def _add_foam(commands: Any) -> None:
     adapt.add_argument("--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices")
     adapt.add_argument("--no-pictures", action="store_true", help="no pictures")
     adapt.add_argument("--json", action="store_true", help="print one JSON object per cycle")
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Return the names in `text`, separated by commas."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def _layers(text: str) -> Layers:
+    """Return the boundary layers that `text` describes: patches, height, count, growth and spacing."""
+    from ..geometry.boundary_layers import Layers
+
+    patches, *numbers = text.split(":")
+    try:
+        if not 2 <= len(numbers) <= 4:
+            raise ValueError("it has not two to four numbers")
+        given = dict(zip(("growth", "spacing"), map(float, numbers[2:]), strict=False))
+        return Layers(float(numbers[0]), int(numbers[1]), **given, edges=_names(patches) or None)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not PATCHES:HEIGHT:COUNT[:GROWTH[:SPACING]], expected such as cylinder:0.0008:4:1.15; {error}"
+        ) from error
 
 
 def _mesh_formats(text: str) -> tuple[str, ...]:
@@ -447,7 +487,7 @@ def _foam_adapt(arguments: argparse.Namespace) -> int:
     import json
 
     from ..adapter import Adapter
-    from ..foam import FoamCycle, adapt_case
+    from ..foam import FieldSizes, FoamCycle, adapt_case
     from ..opencl.devices import create_context
 
     def show(row: FoamCycle) -> None:
@@ -464,15 +504,20 @@ def _foam_adapt(arguments: argparse.Namespace) -> int:
     adapt_case(
         arguments.case,
         n_cells=arguments.cells,
-        fields=[name.strip() for name in arguments.fields.split(",")],
         cycles=arguments.cycles,
         solver=arguments.solver,
         interval=arguments.interval,
+        sizes=FieldSizes(
+            arguments.fields,
+            arguments.forces,
+            arguments.adjoints,
+            arguments.p,
+            arguments.h_min,
+            arguments.h_max,
+            arguments.growth,
+        ),
+        layers=arguments.layers,
         mesh=arguments.mesh,
-        p=arguments.p,
-        h_min=arguments.h_min,
-        h_max=arguments.h_max,
-        growth=arguments.growth,
         effort=arguments.effort,
         pictures=not arguments.no_pictures,
         adapter=None if arguments.device is None else Adapter(create_context(arguments.device)),

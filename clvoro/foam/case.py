@@ -137,15 +137,20 @@ class FoamCase:
         return folder
 
     def fields(self, time: Time) -> list[FoamField]:
-        """Return all fields of a time."""
+        """Return all fields of a time, those that are not in cells included."""
         found = []
         for path in sorted((self.folder / time.name).iterdir()):
             left_out = _BACKUP.search(path.name) or (path.suffix == ".gz" and path.with_suffix("").exists())
             if path.is_file() and not left_out:
                 field = read_field(path)
-                if field.type:
+                if "Field" in field.kind:
                     found.append(field)
         return found
+
+    def folders(self, time: Time) -> list[str]:
+        """Return the folders of a time that have neither its mesh nor its state, such as "lagrangian"."""
+        inside = (path for path in (self.folder / time.name).iterdir() if path.is_dir())
+        return sorted(path.name for path in inside if path.name not in ("polyMesh", "uniform"))
 
     def put_time(self, name: str, made: Path) -> None:
         """Put the folder `made` in place of that of a time, in one step.

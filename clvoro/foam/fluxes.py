@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import scipy
 
+from ..sizing.graded import default_engine
+from ..solvers.poisson import Laplacian, Poisson
 from .mesh import FoamMesh
 
 MOST_DIVERGENCE = 1e-10
 """Largest sum of the fluxes out of a cell, over the mean flux through a face."""
-_DIRECT = 100_000  # cells up to which a factorization costs less than iterations
+_DIRECT = 20_000  # cells up to which a factorization costs less than iterations
+_TOLERANCE = 1e-12
 
 
 def project_fluxes(mesh: FoamMesh, velocity: np.ndarray, at_boundary: np.ndarray, is_open: np.ndarray) -> np.ndarray:
@@ -52,15 +58,7 @@ def project_fluxes(mesh: FoamMesh, velocity: np.ndarray, at_boundary: np.ndarray
     conductance = size[:inner] / to
     to_wall = np.linalg.norm(centers[inner:] - mesh.centroids[outer], axis=1)
     beyond = np.where(is_open, size[inner:] / to_wall, 0.0)
-    diagonal = (
-        np.bincount(owner, conductance, n) + np.bincount(neighbor, conductance, n) + np.bincount(outer, beyond, n)
-    )
-    if not is_open.any():
-        diagonal[0] = 2 * diagonal[0] or 1.0  # the potential is known up to a constant
-    rows, columns = np.concatenate([owner, neighbor, np.arange(n)]), np.concatenate([neighbor, owner, np.arange(n)])
-    entries = np.concatenate([-conductance, -conductance, diagonal])
-    matrix = scipy.sparse.csc_array((entries, (rows, columns)), shape=(n, n))
-    solve = _solver(matrix)
+    solve = _solver(owner, neighbor, outer, conductance, beyond, n)
     for _ in range(3):  # the second time corrects the round-off of the first
         q = solve(_sum_out(mesh, flux))
         flux[:inner] -= conductance * (q[owner] - q[neighbor])
@@ -81,10 +79,47 @@ def _sum_out(mesh: FoamMesh, flux: np.ndarray) -> np.ndarray:
     return np.bincount(mesh.owner[: len(flux)], flux, mesh.n_cells) - np.bincount(mesh.neighbor, inner, mesh.n_cells)
 
 
-def _solver(matrix: scipy.sparse.csc_array):
-    """Return a function that solves a symmetric system for a right-hand side."""
-    if matrix.shape[0] <= _DIRECT:
-        return scipy.sparse.linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
-    part = scipy.sparse.linalg.spilu(matrix, drop_tol=1e-4, fill_factor=10)
-    near = scipy.sparse.linalg.LinearOperator(matrix.shape, part.solve)
-    return lambda b: scipy.sparse.linalg.cg(matrix, b, rtol=1e-12, maxiter=2000, M=near)[0]
+def _solver(
+    owner: np.ndarray, neighbor: np.ndarray, outer: np.ndarray, conductance: np.ndarray, beyond: np.ndarray, n: int
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that solves for the potential, by multigrid if there are many cells.
+
+    All open faces lead to one more node n, where the potential is 0. Without open faces it is that of cell 0.
+    """
+    is_open = beyond > 0
+    a = np.concatenate([owner, outer[is_open]])
+    b = np.concatenate([neighbor, np.full(is_open.sum(), n)])
+    weights = np.concatenate([conductance, beyond[is_open]])
+    ground = n if is_open.any() else 0
+    m = n + is_open.any()
+    graph = scipy.sparse.coo_array(
+        (np.tile(weights, 2), (np.concatenate([a, b]), np.concatenate([b, a]))), shape=(m, m)
+    ).tocsr()
+    if m > _DIRECT and (engine := default_engine(3)).real == np.float64:
+        return partial(_solve_by_multigrid, Poisson(engine), graph, ground, n)
+    kept = np.flatnonzero(np.arange(m) != ground)
+    matrix = scipy.sparse.diags_array(graph.sum(axis=1) + 1e-300) - graph
+    factors = scipy.sparse.linalg.splu(
+        matrix[kept][:, kept].tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+    )
+
+    def solve(sources: np.ndarray) -> np.ndarray:
+        q = np.zeros(m)
+        q[kept] = factors.solve(np.append(sources, 0)[:m][kept])
+        return q[:n]
+
+    return solve
+
+
+def _solve_by_multigrid(
+    poisson: Poisson, graph: scipy.sparse.csr_array, ground: int, n: int, sources: np.ndarray
+) -> np.ndarray:
+    engine = poisson.engine
+    laplacian = Laplacian(
+        engine.upload(graph.indptr, np.int32), engine.upload(graph.indices, np.int32), engine.upload(graph.data)
+    )
+    every = np.append(sources, -sources.sum())[: graph.shape[0]]
+    potential = engine.zeros(len(every))
+    poisson.solve(laplacian, engine.upload(every), potential, tolerance=_TOLERANCE, preconditioner="multigrid")
+    q = potential.get().astype(float)
+    return q[:n] - q[ground]

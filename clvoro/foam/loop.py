@@ -8,6 +8,7 @@ import json
 import math
 import shutil
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from dataclasses import fields as fields_of
@@ -20,7 +21,7 @@ import numpy as np
 from ..adaptation.options import EffortName
 from ..adapter import Adapter
 from ..arguments import check_integer
-from ..errors import InputError, InputTypeError
+from ..errors import InputError, InputTypeError, LostFieldsWarning
 from ..geometry.boundary_layers import Layers
 from ..io import load
 from ..io.arrays import explained
@@ -29,15 +30,16 @@ from ..io.foam import PatchType
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..shared import shared_adapter
-from ..sizing import Estimate, hessian_size
+from ..sizing import Estimate, force_weight, hessian_size, steepness
 from .case import FoamCase, Time
 from .fields import FoamField, Values
 from .mesh import FoamMesh
-from .transfer import MeshOfCase, transfer_fields
+from .transfer import MeshOfCase, fields_that_move, transfer_fields
 
 _MESH, _NOTE = "clvoro.npz", "clvoro.json"
 """Files beside those of a polyMesh: the generators, and what is known of the cycle."""
-Estimator = Callable[[Mapping[str, np.ndarray], Diagram], Estimate]
+_CELLS_PER_PATCH = 4
+Estimator = Callable[[Mapping[str, np.ndarray], Diagram, int], Estimate]
 
 
 @dataclass(frozen=True)
@@ -73,21 +75,67 @@ class FoamCycle:
     transfer_seconds: float | None = None
 
 
+@dataclass(frozen=True)
+class FieldSizes:
+    """Sizes for the next mesh of a case, from its fields: by `hessian_size`, for the solution or for a goal.
+
+    Parameters
+    ----------
+    fields : sequence of str
+        Fields that the mesh follows; each has the same weight.
+    forces : str or sequence of str
+        Patches whose forces are the goal: cells near them count more (`force_weight`).
+    adjoints : sequence of str
+        Adjoint velocities among the case's fields, such as "Ua" of ``adjointOptimisationFoam``, one for each goal:
+        cells count by the gradient of these (`steepness`).
+    p : float, optional
+        As for `hessian_size`. By default 2, and 1 for a goal.
+    h_min, h_max, growth : float
+        As for `hessian_size`.
+    """
+
+    fields: Sequence[str] = ("U",)
+    forces: str | Sequence[str] = ()
+    adjoints: Sequence[str] = ()
+    p: float | None = None
+    h_min: float = 0.0
+    h_max: float = math.inf
+    growth: float = 1.2
+
+    def __post_init__(self) -> None:
+        for what, names in (("fields", self.fields), ("adjoints", self.adjoints)):
+            if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+                raise InputTypeError(f"{what} is {names!r:.60}, expected names, such as ('U', 'p')")
+        if not self.fields:
+            raise InputError("fields is empty, expected names, such as ('U', 'p')")
+        if self.forces and self.adjoints:
+            raise InputError(f"got forces={self.forces!r} and adjoints={self.adjoints!r}, expected one of them")
+
+    def __call__(self, found: Mapping[str, np.ndarray], on: Diagram, n_cells: int) -> Estimate:
+        """Return the estimate from values in cells, (n,) or (n, d), by the names of the fields."""
+        missing = [name for name in (*self.fields, *self.adjoints) if name not in found]
+        if missing:
+            raise InputError(f"the latest time has no field {missing[0]}, expected one of {', '.join(found)}")
+        weight = None
+        if self.forces:
+            weight = force_weight(self.forces, on)
+        elif self.adjoints:
+            weight = steepness([found[name] for name in self.adjoints], on)
+        p = self.p or (2.0 if weight is None else 1.0)
+        bounds: dict[str, Any] = {"p": p, "h_min": self.h_min, "h_max": self.h_max, "growth": self.growth}
+        return hessian_size([found[f] for f in self.fields], on=on, n_cells=n_cells, weight=weight, **bounds)
+
+
 def adapt_case(
     case: str | PathLike[str],
     *,
     n_cells: int,
-    fields: Sequence[str] = ("U", "p"),
     cycles: int = 1,
     solver: str | Callable[[Path], object] | None = None,
     interval: float | None = None,
-    mesh: Result | Diagram | str | PathLike[str] | None = None,
+    sizes: Estimator | None = None,
     layers: Layers | Sequence[Layers] | None = None,
-    estimate: Estimator | None = None,
-    p: float = 2.0,
-    h_min: float = 0.0,
-    h_max: float = math.inf,
-    growth: float = 1.2,
+    mesh: Result | Diagram | str | PathLike[str] | None = None,
     effort: EffortName = "default",
     pictures: bool = True,
     adapter: Adapter | None = None,
@@ -95,8 +143,8 @@ def adapt_case(
 ) -> list[FoamCycle]:
     """Adapt the mesh of a case of OpenFOAM to its latest solution, `cycles` times.
 
-    A cycle reads the latest time, estimates the sizes that interpolate `fields` best, adapts the present generators to
-    them, and transfers all fields in cells. The new mesh and its fields become the latest time, in place of the old
+    A cycle reads the latest time, estimates sizes from its fields, adapts the present generators to them, and transfers
+    all fields in cells. The new mesh and its fields become the latest time, in place of the old
     one, in one step: at any moment the case has a mesh that fits its fields. Fluxes `phi` are projected so that they
     are free of divergence. Names and types of patches and boundary conditions stay; their lists of values are
     interpolated.
@@ -109,9 +157,7 @@ def adapt_case(
     case : path
         The folder, not decomposed. In 2D one layer of cells normal to z between empty patches.
     n_cells : int
-        Number of cells of the new mesh.
-    fields : sequence of str
-        Fields from which sizes are estimated; each has the same weight.
+        Number of cells of the new mesh, at least four for each patch.
     cycles : int
         Number of meshes that are made, those of earlier calls included if there is a `solver`.
     solver : str or callable, optional
@@ -120,20 +166,18 @@ def adapt_case(
     interval : float, optional
         Time, or number of iterations, that the solver advances in each cycle. By default the time from the start to the
         end of ``system/controlDict``. Its entries `startFrom` and `endTime` change.
+    sizes : FieldSizes or callable, optional
+        Where sizes come from; by default ``FieldSizes()``, the Hessian of U. A function of your own takes the fields by
+        name, (n,) or (n, d), the diagram, and `n_cells`, and returns an estimate.
+    layers : Layers or sequence of Layers, optional
+        Boundary layers of the new meshes; by default those of the last call.
     mesh : Result, Diagram or path, optional
         The present mesh as clvoro made it; by default ``polyMesh/clvoro.npz``, else the boundary of the case becomes a
         polygon or a solid, and the centroids of its cells the generators.
-    layers : Layers or sequence of Layers, optional
-        Boundary layers of the new meshes; by default those of the last call.
-    estimate : callable, optional
-        In place of the Hessian of `fields`: takes the fields by name, (n,) or (n, d), and the diagram, and returns an
-        estimate. It is scaled to `n_cells`.
-    p, h_min, h_max, growth
-        As for `hessian_size`.
     effort : "fast", "default" or "best"
         As for `Adapter.run`.
     pictures : bool
-        Draw the mesh of each cycle, colored by the size of the first of `fields`, into ``clvoro/cycle-K.png`` (2D).
+        Draw the mesh of each cycle, colored by the size of U, or of the first field, into ``clvoro/cycle-K.png`` (2D).
     adapter : Adapter, optional
         By default the shared one, on the best device.
     on_cycle : callable, optional
@@ -159,24 +203,25 @@ def adapt_case(
 
         rows = clvoro.foam.adapt_case("cylinder", n_cells=6000, cycles=3, solver="simpleFoam")
         print(rows[-1].monitors["forces.Cd"])
+
+    For the forces on a patch::
+
+        sizes = clvoro.foam.FieldSizes(forces="cylinder")
+        clvoro.foam.adapt_case("cylinder", n_cells=6000, cycles=3, solver="simpleFoam", sizes=sizes)
     """
     check_integer("n_cells", n_cells, 1)
     check_integer("cycles", cycles, 1)
     if solver is None and cycles > 1:
         raise InputError(f"cycles is {cycles} without a solver, expected 1; give solver=, such as 'simpleFoam'")
-    if isinstance(fields, str) or not fields or not all(isinstance(name, str) for name in fields):
-        raise InputTypeError(f"fields is {fields!r:.60}, expected names, such as ('U', 'p')")
     loop = _Loop(
         FoamCase(case),
         n_cells,
-        tuple(fields),
-        estimate or (lambda found, on: hessian_size([found[f] for f in fields], on=on, n_cells=n_cells, **bounds)),
+        sizes or FieldSizes(),
         None if layers is None else (layers,) if isinstance(layers, Layers) else tuple(layers),
         effort,
         pictures,
         adapter or shared_adapter(),
     )
-    bounds: dict[str, Any] = {"p": p, "h_min": h_min, "h_max": h_max, "growth": growth}
     with loop.case.held():
         return loop.run(mesh, cycles, solver, interval, on_cycle)
 
@@ -185,8 +230,7 @@ def adapt_case(
 class _Loop:
     case: FoamCase
     n_cells: int
-    names: tuple[str, ...]
-    estimate: Estimator
+    sizes: Estimator
     layers: tuple[Layers, ...] | None
     effort: EffortName
     pictures: bool
@@ -305,6 +349,13 @@ class _Loop:
         old = MeshOfCase.of(foam, self._diagram(folder, foam, mesh if note["cycle"] == 0 else None))
         fields = case.fields(latest)
         _check_values(fields, foam)
+        least = _CELLS_PER_PATCH * len(foam.types)
+        if self.n_cells < least:
+            raise InputError(
+                f"n_cells is {self.n_cells}, expected at least {least}: {_CELLS_PER_PATCH} for each of the "
+                f"{len(foam.types)} patches"
+            )
+        self._warn(fields, foam, latest)
         size = self._sizes(fields, old)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
         domain = old.diagram.domain
@@ -346,6 +397,19 @@ class _Loop:
         self._keep(done)
         return done
 
+    def _warn(self, fields: Sequence[FoamField], foam: FoamMesh, time: Time) -> None:
+        """Warn of what the next mesh will not have."""
+        moving = {one.name for one in fields_that_move(fields, foam.patches)}
+        dropped = [f"{one.name} ({one.kind})" for one in fields if one.name not in moving]
+        dropped += [f"{name}/" for name in self.case.folders(time)]
+        if dropped:
+            warnings.warn(
+                f"{self.case.folder / time.name} has {', '.join(dropped)}: not transferred, since only fields in cells "
+                "are, and the flux phi of U unless patches are cyclic; copy the folder first if you need them",
+                LostFieldsWarning,
+                stacklevel=4,
+            )
+
     def _diagram(self, folder: Path, foam: FoamMesh, given: object) -> Diagram:
         """Return the diagram of the present mesh: given, kept beside it, or of the boundary and the centroids."""
         if given is None and (folder / _MESH).exists():
@@ -378,14 +442,9 @@ class _Loop:
                 if one.type == "vector":
                     columns = columns[:, : old.diagram.domain.dim]
                 found[one.name] = columns[:, 0] if one.type == "scalar" else columns
-        missing = [name for name in self.names if name not in found]
-        if missing:
-            raise InputError(
-                f"the latest time of {self.case.folder} has no field {missing[0]}, expected one of {', '.join(found)}"
-            )
-        made = self.estimate(found, old.diagram)
+        made = self.sizes(found, old.diagram, self.n_cells)
         if not isinstance(made, Estimate):
-            raise InputTypeError(f"estimate returned a {type(made).__name__}, expected a clvoro.sizing.Estimate")
+            raise InputTypeError(f"sizes returned a {type(made).__name__}, expected a clvoro.sizing.Estimate")
         return made
 
     def _draw(self, old: MeshOfCase, fields: Sequence[FoamField], cycle: int) -> None:
@@ -394,9 +453,9 @@ class _Loop:
 
         if importlib.util.find_spec("matplotlib") is None:
             return
-        by_name = {one.name: one for one in fields}
-        values = old.to_diagram(by_name[self.names[0]].internal.rows(old.foam.n_cells))
-        figure = old.diagram.plot(np.linalg.norm(values, axis=1), label=self.names[0])
+        shown = min((one for one in fields if one.in_cells), key=lambda one: one.name != "U")
+        values = old.to_diagram(shown.internal.rows(old.foam.n_cells))
+        figure = old.diagram.plot(np.linalg.norm(values, axis=1), label=shown.name)
         figure.axes[0].set_title(f"cycle {cycle}: {old.foam.n_cells:,} cells", loc="left")
         figure.savefig(self.case.own / f"cycle-{cycle}.png", dpi=150)
 

@@ -18,6 +18,7 @@ from .mesh import FoamMesh
 
 if TYPE_CHECKING:
     from ..adapter import Adapter
+    from ..io.foam_read import FoamPatchFaces
 
 _OPEN = ("zeroGradient", "inletOutlet", "outletInlet", "pressureInlet", "freestream", "advective", "waveTransmissive")
 """Beginnings of the types of a velocity at patches through which the flux is free."""
@@ -70,13 +71,25 @@ class MeshOfCase:
         return means
 
 
+def fields_that_move(fields: Sequence[FoamField], patches: Sequence[FoamPatchFaces]) -> list[FoamField]:
+    """Return the fields that can be transferred: those in cells, and the flux `phi` of the velocity `U`.
+
+    Where patches are cyclic solvers make the flux.
+    """
+    moving = [field for field in fields if field.in_cells]
+    if any(field.name == "U" for field in moving) and not any(patch.kind == "cyclic" for patch in patches):
+        moving += [field for field in fields if field.name == "phi" and field.dimensions[:3] == _VOLUME_FLUX]
+    return moving
+
+
 def transfer_fields(fields: Sequence[FoamField], old: MeshOfCase, new: MeshOfCase, adapter: Adapter) -> list[FoamField]:
-    """Return all fields in cells on the new mesh, and the flux `phi` of the velocity `U`.
+    """Return the fields that move (`fields_that_move`) on the new mesh.
 
     In cells the sum of volume times value is that on the old mesh, with the volumes of the solver, and there are no new
-    extrema. Other fields on faces are left out, and so is `phi` where patches are cyclic: solvers make them.
+    extrema.
     """
-    in_cells = [field for field in fields if field.in_cells]
+    every = fields_that_move(fields, new.foam.patches)
+    in_cells = [field for field in every if field.in_cells]
     widths = [WIDTHS[field.type] for field in in_cells]
     columns = np.concatenate([f.internal.rows(old.foam.n_cells) for f in in_cells], axis=1)
     # Columns without differences are not transferred: the third component in the plane, for one.
@@ -91,11 +104,9 @@ def transfer_fields(fields: Sequence[FoamField], old: MeshOfCase, new: MeshOfCas
         given = field.internal
         internal = given if given.uniform else Values(given.kind, part, False)
         made.append(replace(field, entries=_with_boundary(field, internal, old.foam, new.foam)))
-    by_name = {field.name: field for field in made}
-    velocity = None if any(patch.kind == "cyclic" for patch in new.foam.patches) else by_name.get("U")
-    for field in fields:
-        if field.name == "phi" and field.dimensions[:3] == _VOLUME_FLUX and velocity is not None:
-            made.append(_flux(field, velocity, new.foam))
+    velocity = next((field for field in made if field.name == "U"), None)
+    if velocity is not None:
+        made += [_flux(field, velocity, new.foam) for field in every if not field.in_cells]
     return made
 
 
@@ -159,23 +170,58 @@ def _on_patch(entries: Entries, before: np.ndarray, faces: np.ndarray, old: Foam
 
 
 def _interpolate(values: np.ndarray, before: np.ndarray, faces: np.ndarray, old: FoamMesh, new: FoamMesh) -> np.ndarray:
-    """Return values (k, w) at the new faces of a patch: linear between the two nearest old ones, with the same mean."""
+    """Return values (k, w) at the new faces of a patch, with the same mean.
+
+    On a straight patch of a layer of cells they are exact for means of quadratic functions, else linear between the two
+    nearest old ones.
+    """
     centers, areas = old.faces[0][before], np.linalg.norm(old.faces[1][before], axis=1)
     at, sizes = new.faces[0][faces], np.linalg.norm(new.faces[1][faces], axis=1)
     if len(centers) == 1 or len(at) == 0:
         return np.repeat(values[:1], len(at), axis=0)
-    if old.is_plane:
+    made = _along_line(values, centers, areas, at, sizes, old.thickness) if old.thickness else None
+    if made is None and old.is_plane:
         _, near = scipy.spatial.KDTree(centers[:, :2]).query(at[:, :2], 2)
         a, b = centers[near[:, 0]], centers[near[:, 1]]
         along = ((at - a) * (b - a))[:, :2].sum(axis=1) / np.maximum(((b - a)[:, :2] ** 2).sum(axis=1), 1e-300)
         # Beyond the last face the line goes on.
         share = np.clip(along, -1, 1)[:, None]
         made = (1 - share) * values[near[:, 0]] + share * values[near[:, 1]]
-    else:
+    elif made is None:
         apart, near = (a.reshape(len(at), -1) for a in scipy.spatial.KDTree(centers).query(at, min(4, len(centers))))
         weight = 1 / np.maximum(apart, 1e-9 * apart.max()) ** 2
         made = (weight[..., None] * values[near]).sum(axis=1) / weight.sum(axis=1)[:, None]
     return made + (areas @ values / areas.sum() - sizes @ made / sizes.sum())
+
+
+def _along_line(
+    values: np.ndarray, centers: np.ndarray, areas: np.ndarray, at: np.ndarray, sizes: np.ndarray, thickness: float
+) -> np.ndarray | None:
+    """Return means over new faces of a straight patch, by a cubic spline of the integral; None if it is not straight.
+
+    They stay between the values of the old faces there and of their neighbors; at the two ends the line goes on.
+    """
+    x, y = centers[:, :2], at[:, :2]
+    along = x[np.argmax(((x - x[0]) ** 2).sum(axis=1))] - x[0]
+    along = along / np.linalg.norm(along)
+    middle, half = (x - x[0]) @ along, areas / (2 * thickness)
+    order = np.argsort(middle)
+    low, high = (middle - half)[order], (middle + half)[order]
+    length = high[-1] - low[0]
+    off = max(np.abs((points - x[0]) @ [-along[1], along[0]]).max() for points in (x, y))
+    if off > 1e-6 * length or np.abs(high[:-1] - low[1:]).max() > 1e-6 * length:
+        return None
+    v = values[order]
+    knots = np.append(low, high[-1])
+    integral = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(v * np.diff(knots)[:, None], axis=0)])
+    spline = scipy.interpolate.CubicSpline(knots, integral)
+    new = (y - x[0]) @ along
+    begin, end = (np.clip(new + side * sizes / (2 * thickness), low[0], high[-1]) for side in (-1, 1))
+    made = (spline(end) - spline(begin)) / np.maximum(end - begin, 1e-300)[:, None]
+    around = np.concatenate([2 * v[:1] - v[1:2], v, 2 * v[-1:] - v[-2:-1]])
+    bounds = [f.reduce([around[:-2], around[1:-1], around[2:]]) for f in (np.minimum, np.maximum)]
+    rows = np.clip(np.searchsorted(knots, new) - 1, 0, len(v) - 1)
+    return np.clip(made, bounds[0][rows], bounds[1][rows])
 
 
 def _flux(field: FoamField, velocity: FoamField, mesh: FoamMesh) -> FoamField:

@@ -18,11 +18,13 @@ from .distance import Distance
 from .estimates import (
     Estimate,
     combine,
+    force_weight,
     interface_distance,
     normalize,
     q_criterion,
     sensor_size,
     shock_sensor,
+    steepness,
     vorticity,
 )
 from .evaluation import Sizing
@@ -60,6 +62,7 @@ __all__ = [
     "combine",
     "curvature_size",
     "derivatives",
+    "force_weight",
     "gap_size",
     "generate_code",
     "gradient_size",
@@ -71,5 +74,6 @@ __all__ = [
     "q_criterion",
     "sensor_size",
     "shock_sensor",
+    "steepness",
     "vorticity",
 ]

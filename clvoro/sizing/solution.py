@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 
 from ..errors import InputError
-from .estimates import Estimate, curvature_of, estimate, slope_of
+from .estimates import Estimate, curvature_of, estimate, steepness
 from .profiles import FLAT, check_bounds, check_one_of, check_p, scale_profile
 from .raster import Raster, check_box, fill_missing
 
@@ -110,8 +110,9 @@ def hessian_size(
         On a mesh only: ratio of the sizes of neighboring cells at most. `n_cells` and `eps` hold after it. Around a
         raster write `Graded`.
     weight : (n,) array of float, optional
-        On a mesh only: factor of the curvature in each cell. For a goal such as drag it is the size of the adjoint
-        solution, or of its gradient, in that cell (Loseille, Dervieux and Alauzet 2010, J. Comput. Phys. 229, 2866).
+        On a mesh only: factor of the curvature in each cell. For a goal such as drag it is the `steepness` of the
+        adjoint velocity, with p = 1 (Loseille, Dervieux and Alauzet 2010, J. Comput. Phys. 229, 2866); `force_weight`
+        is a substitute that needs no adjoint.
 
     Returns
     -------
@@ -265,7 +266,7 @@ def gradient_size(
     if on is not None:
         _refuse_raster("gradient_size", lower, upper, at, missing)
         bounds = {"h_min": h_min, "h_max": h_max, "growth": growth}
-        return estimate("gradient_size", on, slope_of(values, on), order=1, n_cells=n_cells, eps=eps, **bounds)
+        return estimate("gradient_size", on, steepness(values, on), order=1, n_cells=n_cells, eps=eps, **bounds)
     low, high = _corners("gradient_size", lower, upper, growth, None)
     u, corners, spacing = _check_solution("gradient_size", values, low, high, at, missing, least=2)
     slopes = np.gradient(u, *spacing[::-1])

@@ -199,6 +199,19 @@ def test_fields_of_other_units_count_alike(fine):
     assert weighted([(0.52, 0.9)]) > 2 * weighted([(0.52, 0.1)])
 
 
+def test_weights_of_goals(fine):
+    """By the distance from a boundary, and by the gradients of adjoint velocities."""
+    x, y = fine.centroids.T
+    found = sizing.force_weight("xMin", fine)
+    assert found == pytest.approx((1 + x / 0.3) ** -2, rel=0.03)
+    assert sizing.force_weight(["xMin", "yMin"], fine, length=0.1, power=1) == pytest.approx(
+        1 / (1 + np.minimum(x, y) / 0.1), rel=0.04
+    )
+    assert sizing.steepness(np.stack([3 * x, 4 * y], axis=1), fine) == pytest.approx(5)
+    # The means over the domain are those of the fields, scaled to 1.
+    assert sizing.steepness([x, 7 * y**2], fine) == pytest.approx(np.maximum(1, 2 * y), rel=0.01)
+
+
 def test_gradients_and_sensors(fine):
     x, y = fine.centroids.T - 0.5
     u = np.tanh(20 * x)
@@ -267,6 +280,8 @@ def test_combinations_and_numbers(fine):
         (lambda m: sizing.vorticity(np.ones((len(m), 3)), m), InputError, "component for each axis"),
         (lambda m: sizing.shock_sensor(m.points, -np.ones(len(m)), m), InputError, "positive"),
         (lambda m: sizing.combine(), InputError, "expected estimates"),
+        (lambda m: sizing.force_weight("wing", m), InputError, "some of xMin, xMax"),
+        (lambda m: sizing.force_weight("xMin", m, length=0), InputError, "length"),
     ],
 )
 def test_bad_input_is_refused(meshes, call, kind, text):
