@@ -12,7 +12,6 @@ import numpy as np
 import pyopencl as cl
 
 from .adaptation.estimates import check_memory
-from .adaptation.fixed_points import check_fixed
 from .adaptation.options import (
     Checkpoint,
     EffortName,
@@ -278,52 +277,20 @@ class Adapter:
         callback: Callable[[np.void], object] | None = None,
         on_interrupt: Literal["raise", "return"] = "raise",
     ) -> Result:
-        """Adapt generators until their cells have the target size and a good shape.
+        """Adapt generators until their cells have the target size and a good shape, as `clvoro.adapt` does.
 
         Parameters
         ----------
-        domain : Box, Polygon, Sphere or Solid
-            "transport" needs a box, a polygon or a sphere, a moving mesh a box without periodic sides.
-        size : number, callable or clvoro.sizing field
-            Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d. A callable
-            takes points (n, d), returns (n,), and is evaluated on the host: each step then moves all points there and
-            back.
-        effort : "fast", "default" or "best"
-            Amount of work of "adaptive", "exact" and "transport".
-        points : (n, d) array of float, "density" or "uniform"
-            Generators to start from: those of the array, random ones with density h^-d, or uniform random ones as in
-            the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
-            already (mean |e| up to 0.15, count off by 2 % at most, cells as good as after a run with this effort), as
-            after the size field has moved by a few cells. From any other array they run all levels.
-        method : str
-            "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
-            size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a
-            power diagram, not in solids. The others repeat one kind of step: "lloyd", "poisson" and
-            "coupled" as published, "weighted-lloyd" and "weighted" with the density h^-d, and the moving meshes "mmpde"
-            and "monge-ampere", which map a lattice in a box (see `clvoro.adaptation.methods`).
-        n_cells : int, optional
-            Number of generators; by default the integral of h^-d over the domain. "adaptive", "exact" and "transport"
-            end with exactly that many. They scale the size field by a common factor so that the mean of log(L / h)
-            vanishes, and report it as ``Result.size_factor``; "transport" always does.
-        layers : Layers or sequence of Layers
-            Rows of generators along walls of a box in 2D or a polygon. They do not move and are the first rows of the
-            result. Beyond them the sizes grow gradually from the size of the layers; see `Layers`. Their cells count as
-            having the right size.
-        fixed : (k, d) array of float, optional
-            Generators that do not move, such as wells: rows 0 to k - 1 of the result, exactly at these positions. Their
-            neighbors move until all have their sizes. Not for "transport" and moving meshes, which move all of them.
-        seed : int
-            Seed of the random start.
+        domain, size, effort, points, method, n_cells, layers, fixed, seed, callback
+            As those of `clvoro.adapt`.
         max_steps : int, optional
-            Largest number of steps, over all levels. By default 100, or all steps of the schedule of those three.
+            Largest number of steps, over all levels. By default 100, or all steps of the schedule of "adaptive",
+            "exact" and "transport".
         options : MultilevelOptions or PaperOptions, optional
-            Further options: `MultilevelOptions` for those three, `PaperOptions` for the other methods.
+            Further options: `MultilevelOptions` for those three methods, `PaperOptions` for the others.
         checkpoint : path or Checkpoint, optional
             File to which the state of the run is written once per minute. `Checkpoint` chooses the interval, and
             continues a run.
-        callback : callable, optional
-            Called with each new row of the history (fields as in `Result.history`: ``row["mean_error"]``, ...). The
-            run stops if it returns True.
         on_interrupt : "raise" or "return"
             What Ctrl-C does: raise `Interrupted`, which carries the result so far, or return that result.
 
@@ -333,60 +300,26 @@ class Adapter:
 
         Raises
         ------
-        InputError, InputTypeError
-            If an argument is not as expected, or the checkpoint is damaged or belongs to another run; or if a generator
-            of `fixed` is outside, on a wall, within a layer, or at the place of another one; says where.
-        SizeFieldError
-            If h is not positive and finite somewhere; names the place.
-        MemoryLimitError
-            If the run needs more memory than the device has.
-        SolverError
-            If a linear solve breaks down.
-        Interrupted
-            On Ctrl-C: a `KeyboardInterrupt` with the result so far.
+        InputError, InputTypeError, SizeFieldError, MemoryLimitError, SolverError, Interrupted
+            As `clvoro.adapt`; also if the checkpoint is damaged or belongs to another run.
 
         Warns
         -----
         CheckpointWarning
             If a checkpoint cannot be written, for example on a full disk. The run continues, and the previous
-            checkpoint is kept.
-        MismatchWarning, CoarseSizeWarning
-            If a part of the input barely overlaps the domain, for example because it has another unit of length, or the
-            domain is narrower than half a cell somewhere, or has a dead end narrower than a cell, or a generator of
-            `fixed` is near a wall or another one for the size there; says where.
-        ObtuseTrianglesWarning
-            If obtuse triangles are left in a mesh on a sphere that "adaptive" or "exact" has finished.
-        PrecisionWarning
-            If `dtype` is too coarse for the sizes.
-        SizeErrorWarning
-            If the cells of a mesh that "adaptive" or "exact" has finished are far from their target sizes.
-        TangledMeshWarning
-            If a moving mesh would fold; says at how many generators.
-        UnusedOptionWarning
-            If an option is given that the method does not use.
+            checkpoint is kept. Other warnings are those of `clvoro.adapt`.
         """
-        merged, own = merged_options(
-            points,
-            options,
-            method=method,
-            effort=effort,
-            seed=seed,
-            max_steps=max_steps,
-            n_cells=n_cells,
-            layers=layers,
-        )
+        given = {"effort": effort, "seed": seed, "max_steps": max_steps, "n_cells": n_cells, "layers": layers}
+        merged, own = merged_options(points, options, method=method, **given)
         check_choice("on_interrupt", on_interrupt, ("raise", "return"))
         check_run(domain, size, callback)
-        files = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
         with self._alone():
             for kept in self._stages.values():
                 kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
             stages = self._stages_for(domain)
-            host = None if own is None else check_points(own, domain)
-            wells = check_fixed(fixed, domain, self.dtype)
             with report_builds(stages.engine, self.on_build) as notice:
                 shown = self._shown(callback, notice)
-                run = Run(stages, domain, size, host, wells, merged, files, shown, self.on_memory)
+                run = Run(stages, domain, size, own, fixed, merged, checkpoint, shown, self.on_memory)
                 return run.conclude(on_interrupt)
 
     def start(
@@ -432,24 +365,13 @@ class Adapter:
         >>> run.finish().converged
         True
         """
-        merged, own = merged_options(
-            points,
-            options,
-            method=method,
-            effort=effort,
-            seed=seed,
-            max_steps=max_steps,
-            n_cells=n_cells,
-            layers=layers,
-        )
+        given = {"effort": effort, "seed": seed, "max_steps": max_steps, "n_cells": n_cells, "layers": layers}
+        merged, own = merged_options(points, options, method=method, **given)
         check_run(domain, size, None)
-        files = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
         stages = Stages(self._engine_for(domain))
         with self._at_work(stages):
-            host = None if own is None else check_points(own, domain)
-            wells = check_fixed(fixed, domain, self.dtype)
             shown = self._shown(None, None)
-            return Run(stages, domain, size, host, wells, merged, files, shown, self.on_memory, self._at_work)
+            return Run(stages, domain, size, own, fixed, merged, checkpoint, shown, self.on_memory, self._at_work)
 
     @contextmanager
     def _at_work(self, stages: Stages) -> Iterator[None]:

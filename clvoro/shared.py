@@ -66,24 +66,38 @@ def adapt(
     domain : Box, Polygon, Sphere or Solid
         "transport" needs a box, a polygon or a sphere, a moving mesh a box without periodic sides.
     size : number, callable or clvoro.sizing field
-        Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d.
+        Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d. A callable
+        takes points (n, d), returns (n,), and is evaluated on the host: each step then moves all points there and
+        back.
     effort : "fast", "default" or "best"
-        Amount of work.
+        Amount of work of "adaptive", "exact" and "transport".
     points : (n, d) array of float, "density" or "uniform"
-        Generators to start from: those of the array, random ones with density h^-d, or uniform random ones.
+        Generators to start from: those of the array, random ones with density h^-d, or uniform random ones as in
+        the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
+        already (mean |e| up to 0.15, count off by 2 % at most, cells as good as after a run with this effort), as
+        after the size field has moved by a few cells. From any other array they run all levels.
     method : str
-        "adaptive" for good cells of the right size, "exact" for cells that have it to about 1e-4, "transport" for a
-        power diagram of cells that have it to 1e-10; for the others see `Adapter.run`.
+        "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
+        size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a
+        power diagram, not in solids. The others repeat one kind of step: "lloyd", "poisson" and
+        "coupled" as published, "weighted-lloyd" and "weighted" with the density h^-d, and the moving meshes "mmpde"
+        and "monge-ampere", which map a lattice in a box (see `clvoro.adaptation.methods`).
     n_cells : int, optional
-        Number of cells; by default the number that the size field requires.
+        Number of generators; by default the integral of h^-d over the domain. "adaptive", "exact" and "transport"
+        end with exactly that many. They scale the size field by a common factor so that the mean of log(L / h)
+        vanishes, and report it as ``Result.size_factor``; "transport" always does.
     layers : Layers or sequence of Layers
-        Boundary layers, in boxes in 2D and polygons.
+        Rows of generators along walls of a box in 2D or a polygon. They do not move and are the first rows of the
+        result. Beyond them the sizes grow gradually from the size of the layers; see `Layers`. Their cells count as
+        having the right size.
     fixed : (k, d) array of float, optional
-        Generators that do not move, such as wells: rows 0 to k - 1 of the result.
+        Generators that do not move, such as wells: rows 0 to k - 1 of the result, exactly at these positions. Their
+        neighbors move until all have their sizes. Not for "transport" and moving meshes, which move all of them.
     seed : int
         Seed of the random start.
     callback : callable, optional
-        Called with each new row of the history; the run stops if it returns True.
+        Called with each new row of the history (fields as in `Result.history`: ``row["mean_error"]``, ...). The
+        run stops if it returns True.
 
     Returns
     -------
@@ -93,10 +107,34 @@ def adapt(
     ------
     DeviceError
         If no device works.
+    InputError, InputTypeError
+        If an argument is not as expected, or a generator of `fixed` is outside, on a wall, within a layer, or at the
+        place of another one; says where.
+    SizeFieldError
+        If h is not positive and finite somewhere; names the place.
+    MemoryLimitError
+        If the run needs more memory than the device has.
+    SolverError
+        If a linear solve breaks down.
     Interrupted
         On Ctrl-C: a `KeyboardInterrupt` with the result so far.
-    InputError, InputTypeError, SizeFieldError, MemoryLimitError, SolverError
-        As `Adapter.run`.
+
+    Warns
+    -----
+    MismatchWarning, CoarseSizeWarning
+        If a part of the input barely overlaps the domain, for example because it has another unit of length, or the
+        domain is narrower than half a cell somewhere, or has a dead end narrower than a cell, or a generator of
+        `fixed` is near a wall or another one for the size there; says where.
+    ObtuseTrianglesWarning
+        If obtuse triangles are left in a mesh on a sphere that "adaptive" or "exact" has finished.
+    PrecisionWarning
+        If the precision of the device is too coarse for the sizes.
+    SizeErrorWarning
+        If the cells of a mesh that "adaptive" or "exact" has finished are far from their target sizes.
+    TangledMeshWarning
+        If a moving mesh would fold; says at how many generators.
+    UnusedOptionWarning
+        If an argument is given that the method does not use.
 
     Examples
     --------

@@ -8,7 +8,8 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
 from .checkpoint import Checkpointer, Saved, run_fingerprint
 from .diagnostics import MISSED, warn_of_errors, warn_of_obtuse_triangles, warn_of_other_sizes, widths_of_layers
-from .fixed_points import origins, put_back
+from .fixed_points import check_fixed, origins, put_back
 from .motion import Displacement, Method
 from .options import Checkpoint, Options, uses
 from .plan.actions import CorrectCount, Refine, Step
@@ -34,6 +35,9 @@ from .plan.schedule import work_of
 from .preparation import Plan, Prepared, only_needs_correction, plan, prepare, start
 from .stages import Stages
 from .tuning import REACHED, RENEWAL, WINDOW
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 INTERRUPTED, STOPPED, UNDER_WAY = "interrupted", "stopped by the callback", "under way"
 MISSES = "plan ended, but the sizes are missed"
@@ -88,17 +92,20 @@ class Run:
         stages: Stages,
         domain: Domain,
         size: object,
-        points: np.ndarray | None,
-        fixed: np.ndarray,
+        points: ArrayLike | None,
+        fixed: ArrayLike | None,
         options: Options,
-        files: Checkpoint,
+        checkpoint: str | PathLike[str] | Checkpoint | None,
         callback: Callable[[np.void], object] | None = None,
         on_memory: Callable[[float], object] | None = None,
         alone: Callable[[Stages], AbstractContextManager[object]] = nullcontext,
     ) -> None:
-        self._stages, self._domain, self._fixed, self._options = stages, domain, fixed, options
+        files = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
+        given = None if points is None else check_points(points, domain)
+        self._stages, self._domain, self._options = stages, domain, options
+        self._fixed = check_fixed(fixed, domain, stages.engine.real)
         self._files, self._callback, self._on_memory, self._alone = files, callback, on_memory, alone
-        self._begin(size, points, saved=None if files.source is None else Saved(files.source))
+        self._begin(size, given, saved=None if files.source is None else Saved(files.source))
 
     def __repr__(self) -> str:
         return f"Run({self.steps} steps, {self.state.n} cells on level {self.level}; {self.stop_reason or UNDER_WAY})"
