@@ -33,6 +33,7 @@ import clvoro
 from clvoro.opencl.engine import Engine
 from clvoro.remapping.cell_data import transfer_values
 from clvoro.remapping.device_transfer import transfer_bytes
+from clvoro.remapping.pieces import Pieces
 
 PACKAGE = Path(clvoro.__file__).parent
 PLUMBING = {"device_array", "engine", "primitives", "program"}
@@ -141,13 +142,12 @@ def transferred(options: Any, n: int) -> dict[str, Any]:
     """Measure a transfer of one column between meshes of random generators."""
     adapter, rng = make_adapter(options), np.random.default_rng(1)
     old, new = (adapter.diagram(SQUARE, rng.random((n, 2))) for _ in range(2))
-    sizes = [(n, len(mesh.neighbors)) for mesh in (old, new)]
     values, ledger = old.volumes, Ledger()
     with counted_buffers(ledger):
         transfer_values(old, values, new, 2, adapter=adapter)
     double = adapter.queue.device.double_fp_config
     engine = Engine(adapter.ctx, adapter.queue, 2, np.dtype("float64" if double else "float32"))
-    told = transfer_bytes(engine, *sizes, 1, 2)
+    told = transfer_bytes(engine, Pieces.of(old), Pieces.of(new), len(old.neighbors), 1, 2)
     none = {"preparation": 0.0, "output": 0.0, "stages": {}}
     return {"cells": n, "estimate": told / n, "run": ledger.peak / n, "held": ledger.peak / told, **none}
 

@@ -1,288 +1,217 @@
 #include "opencl/real.h"
-#include "tessellation/bins.h"
 #include "remapping/piece.h"
 
-/* Outcomes of a cell. */
+/* Outcomes of a piece. */
 #define DONE 0
-#define LIST_FULL 1   /* the cell overlaps more old cells than its list holds */
-#define PIECE_LARGE 2 /* a piece has more faces than its arrays hold */
-#define FAILED 3      /* the graph is not that of a Voronoi diagram */
+#define PIECE_LARGE 1 /* it has more faces than its arrays hold */
+#define FAILED 2      /* it is no cell of a Voronoi diagram */
 
-#define WAITING 64 /* grids of bins that wait in a search */
+inline int outcome(int what)
+{
+    return what == PIECE_WHOLE ? DONE : (what == PIECE_FULL ? PIECE_LARGE : FAILED);
+}
 
-/* A neighbor graph. Row i lists the neighbors of generator i; -1 - wall stands for a wall. */
-typedef struct {
-    global const REAL *points;
-    global const int *starts, *neighbors;
-} graph_t;
+/* Per piece: volume; centroid, on a sphere the mean of the position in space; and a box around it. */
+kernel void measure_pieces(const int size, PIECES_ARGS, const REAL4 box_lower, const REAL4 box_upper,
+                           global REAL *volumes, global REAL *centroids, global REAL *lower, global REAL *upper,
+                           global int *status)
+{
+    WORK_ITEM(i);
+    const pieces_t mesh = {origins, points, starts, items};
+    const chart_t chart = chart_at(origins, i);
+    piece_t piece;
+    const int what = build_piece(&piece, &chart, i, &mesh, box_lower, box_upper);
+    status[i] = outcome(what);
+    if (what != PIECE_WHOLE)
+        return;
+    REAL4 centroid, low, high;
+    volumes[i] = measure_piece(&piece, &chart, &centroid);
+    bound_piece(&piece, &chart, &low, &high);
+    store_vector(chart.at + centroid, centroids, i);
+    store_vector(low, lower, i);
+    store_vector(high, upper, i);
+}
 
-#define GRAPH_ARGS global const REAL *points, global const int *starts, global const int *neighbors
-#define OLD_GRAPH_ARGS global const REAL *old_points, global const int *old_starts, global const int *old_neighbors
+/* Data of the old mesh, `width` columns.
 
-/* Cell data of the old mesh, `width` columns.
-
+   cells (pieces)           the cell that each piece is a part of
    values (n, width)        means q_j over the cells
    least, most (n, width)   bounds of the data inside a cell
-   centroids (n, DIM)       c_j - x_j
+   means (n, DIM)           c_j, centroids; on a sphere means of the position in space
    slopes (n, width, DIM)   g_j; not read unless with_slopes */
 #define CELL_DATA_ARGS                                                                                                 \
-    const int width, global const REAL *values, global const REAL *least, global const REAL *most,                     \
-        global const REAL *centroids, const int with_slopes, global const REAL *slopes
+    global const int *cells, const int width, global const REAL *values, global const REAL *least,                     \
+        global const REAL *most, global const REAL *means, const int with_slopes, global const REAL *slopes
 
-/* The old cells found so far for one new cell: a queue, and a hash table with open addressing and 2 * capacity slots (a
-   power of two) that holds the same indices. */
-typedef struct {
-    int n, capacity;
-    global int *queue, *table;
-} visited_t;
+/* Old pieces in a binary tree of 2^levels leaves. Node k has the children 2 k + 1 and 2 k + 2. Leaf l holds the entries
+   [l n / 2^levels, (l + 1) n / 2^levels).
 
-/* Add j unless it is listed already. Returns false if the queue is full. */
-inline bool visit(visited_t *seen, int j)
+   boxes (nodes, 2 DIM)     lower and upper corner
+   entries (n, 2)           a piece, and the image of it
+   shifts (images, DIM)     from a piece to its image across seams */
+#define TREE_ARGS                                                                                                      \
+    const int entries_count, const int levels, global const REAL *boxes, global const int *entries,                    \
+        global const REAL *shifts
+/* Boxes that are less apart than this, in units of the domain, meet. */
+#define BOX_NOISE (16 * REAL_EPS)
+
+inline bool meets_box(REAL4 lower, REAL4 upper, global const REAL *box)
 {
-    const int mask = 2 * seen->capacity - 1;
-    int slot = (int)((uint)j * 2654435761u >> 7) & mask;
-    while (seen->table[slot] >= 0) {
-        if (seen->table[slot] == j)
-            return true;
-        slot = (slot + 1) & mask;
-    }
-    if (seen->n == seen->capacity)
-        return false;
-    seen->table[slot] = j;
-    seen->queue[seen->n++] = j;
-    return true;
+    const REAL4 low = load_vector(box, 0), high = load_vector(box, 1);
+    return lower.s0 <= high.s0 + BOX_NOISE && low.s0 <= upper.s0 + BOX_NOISE && lower.s1 <= high.s1 + BOX_NOISE &&
+           low.s1 <= upper.s1 + BOX_NOISE && lower.s2 <= high.s2 + BOX_NOISE && low.s2 <= upper.s2 + BOX_NOISE;
 }
 
-/* The generator of `graph` nearest to x. Start at a generator in the bin of x, or near it, and move to a nearer
-   neighbor until there is none. A point outside a generator's cell is nearer to one of its neighbors, so the walk
-   cannot stop early. */
-inline int nearest_generator(global const REAL *x, const graph_t *graph, int n, global const int *items, BIN_ARGS)
+/* Make `piece` what old piece j, moved by `shift`, leaves of `whole`. Returns PIECE_*. */
+inline int intersect(private piece_t *piece, private const shape_t *whole, const chart_t *chart, REAL reach,
+                     const pieces_t *old, int j, REAL4 shift)
 {
-    int bin = bin_in_grid(x, grid_frames[0], grid_shapes[0]);
-    while (bins[bin].s1 != bins[bin + 1].s1) {
-        const int grid = bins[bin].s1;
-        bin = bin_in_grid(x, grid_frames[grid], grid_shapes[grid]);
-    }
-    const REAL4 here = load_vector(x, 0);
-    int j = items[min(bins[bin].s0, n - 1)], best = j;
-    REAL4 d = load_vector(graph->points, j) - here;
-    REAL best2 = dot_vectors(d, d);
-    do {
-        j = best;
-        for (int k = graph->starts[j]; k < graph->starts[j + 1]; ++k) {
-            const int q = graph->neighbors[k];
-            if (q < 0 || q >= n)
-                continue;
-            d = load_vector(graph->points, q) - here;
-            const REAL d2 = dot_vectors(d, d);
-            if (d2 < best2) {
-                best2 = d2;
-                best = q;
-            }
-        }
-    } while (best != j);
-    return j;
-}
-
-/* Add the generators of `graph` within `farthest` of x, by the bins there. Grids of divided bins wait on a stack; those
-   for which there is no room are not entered. Returns false if the queue is full. */
-inline bool visit_near(visited_t *seen, REAL4 x, REAL farthest, const graph_t *graph, global const int *items, BIN_ARGS)
-{
-    int waiting[WAITING], n = 1;
-    waiting[0] = 0;
-    while (n > 0) {
-        const int grid = waiting[--n];
-        const FRAME frame = grid_frames[grid];
-        const int4 shape = grid_shapes[grid];
-        int low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
-        for (int a = 0; a < DIM; ++a) {
-            const REAL at = a == 0 ? x.s0 : (a == 1 ? x.s1 : x.s2);
-            const REAL origin = a == 0 ? frame.s0 : (a == 1 ? frame.s1 : frame.s2);
-            const int side = a == 0 ? shape.s1 : (a == 1 ? shape.s2 : shape.s3);
-            const REAL wide = farthest + bin_noise(fabs(at) + farthest, origin);
-            low[a] = axis_bin(at - wide, origin, FRAME_INVERSE(frame), side);
-            high[a] = axis_bin(at + wide, origin, FRAME_INVERSE(frame), side);
-        }
-        for (int iz = low[2]; iz <= high[2]; ++iz)
-            for (int iy = low[1]; iy <= high[1]; ++iy)
-                for (int ix = low[0]; ix <= high[0]; ++ix) {
-                    const int bin = shape.s0 + (DIM == 2 ? iy : iz * shape.s2 + iy) * shape.s1 + ix;
-                    if (bins[bin].s1 != bins[bin + 1].s1 && n < WAITING) {
-                        waiting[n++] = bins[bin].s1;
-                        continue;
-                    }
-                    for (int k = bins[bin].s0; k < bins[bin + 1].s0; ++k) {
-                        const REAL4 there = load_vector(graph->points, items[k]) - x;
-                        if (sqrt(dot_vectors(there, there)) <= farthest && !visit(seen, items[k]))
-                            return false;
-                    }
-                }
-    }
-    return true;
-}
-
-/* Intersect a piece, relative to x, with old cell j: { y : |y - x_j| <= |y - x_k| for all neighbors k }. Both cells of
-   a face compute its plane by the same operations, so that their pieces are complementary. Returns PIECE_*. */
-inline int cut_by_cell(private piece_t *piece, REAL4 x, REAL reach, int j, const graph_t *graph)
-{
-    int what = PIECE_WHOLE;
-    const REAL4 xj = load_vector(graph->points, j);
-    for (int k = graph->starts[j]; k < graph->starts[j + 1]; ++k) {
-        const int q = graph->neighbors[k];
-        if (q < 0)
+    const int begin = old->starts[j], end = old->starts[j + 1];
+    ulong cutting = 0; /* of the first 64 half-spaces those that cut the whole piece */
+    REAL level;
+    for (int k = begin; k < end; ++k) {
+        const REAL4 normal = half_space(chart, reach, old, j, k, shift, &level);
+        /* Most are far from the ball around the piece. */
+        if (level * level > R(1.01) * reach * reach * dot_vectors(normal, normal)) {
+            if (level < 0)
+                return PIECE_EMPTY;
             continue;
-        const REAL4 xq = load_vector(graph->points, q);
-        const REAL4 low = j < q ? xj : xq, high = j < q ? xq : xj;
-        const REAL4 a = low - x, b = high - x;
-        REAL4 normal = high - low;
-        REAL level = dot_vectors(normal, a + b) / 2;
-        const REAL noise = 4 * REAL_EPS * sqrt(dot_vectors(normal, normal));
-        const REAL depth = noise * (reach + sqrt(fmax(dot_vectors(a, a), dot_vectors(b, b))));
-        if (j > q) {
-            normal = -normal;
-            level = -level;
         }
-        const int cut = cut_piece(piece, normal, level, depth, q);
+        const int beyond = count_beyond(whole, normal, level);
+        if (beyond == whole->n)
+            return PIECE_EMPTY;
+        cutting |= beyond > 0 && k - begin < 64 ? (ulong)1 << (k - begin) : 0;
+    }
+    recall_piece(piece, whole);
+    for (int k = begin; k < end; ++k) {
+        if (k - begin < 64 && !(cutting >> (k - begin) & 1))
+            continue;
+        const REAL4 normal = half_space(chart, reach, old, j, k, shift, &level);
+        const int cut = cut_piece(piece, normal, level);
         if (cut >= PIECE_EMPTY)
             return cut;
-        what = cut == PIECE_CUT ? PIECE_CUT : what;
     }
-    return what;
+    return PIECE_CUT;
 }
 
-/* Per new cell i = todo[first + p]: the mean of the old data,
+/* Per new piece i = todo[p]: the integral of the old data,
 
-       q_i = sum_j |V_i and V_j| (q_j + g_j . (c_ij - c_j)) / sum_j |V_i and V_j|,
+       m_i = sum_j |V_i and V_j| (q_j + g_j . (c_ij - c_j)),
 
-   over the old cells j, with the centroid c_ij of the intersection of V_i and V_j. The old cells are found by flooding:
-   first the one that contains x_i, then the neighbors across each face of an intersection. Points of the old graph from
-   n_old on have no cells: they are images, or mirror images behind walls. Where the meshes do not cover the same domain
-   (`partial`), cells may overlap no old cell; their means are 0. What old cells share with a new one may then lie
-   apart: all whose generators are as near as that of an overlapped cell may be are tried.
+   over the old pieces j and their images, with the centroid c_ij of the intersection of V_i and V_j. Candidates are
+   those whose boxes meet that of the piece.
 
-   means, low, high (n_new, width)   q_i, and bounds of the old data in the cell
-   volumes, covered (n_new,)         volume of the cell, sum of the volumes of its intersections
-   queues, tables                    capacity and 2 * capacity entries for each work-item */
-kernel void transfer_cell_data(const int size, const int first, global const int *todo, const int capacity,
-                               global int *queues, global int *tables, GRAPH_ARGS, const int n_old, OLD_GRAPH_ARGS,
-                               global const int *items, BIN_ARGS, const REAL4 box_lower, const REAL4 box_upper,
-                               const int partial, CELL_DATA_ARGS, global REAL *means, global REAL *low,
-                               global REAL *high, global REAL *volumes, global REAL *covered, global int *status)
+   masses, low, high (pieces, width)   m_i, and bounds of the old data in the piece
+   volumes, covered (pieces,)          volume of the piece, sum of the volumes of its intersections */
+kernel void transfer_cell_data(const int size, global const int *todo, PIECES_ARGS, OLD_PIECES_ARGS, TREE_ARGS,
+                               const REAL4 box_lower, const REAL4 box_upper, CELL_DATA_ARGS, global REAL *masses,
+                               global REAL *low, global REAL *high, global REAL *volumes, global REAL *covered,
+                               global int *status)
 {
     WORK_ITEM(p);
-    const int i = todo[first + p];
-    const REAL4 x = load_vector(points, i);
-    visited_t seen = {0, capacity, queues + (size_t)p * capacity, tables + (size_t)p * 2 * capacity};
-    for (int k = 0; k < 2 * capacity; ++k)
-        seen.table[k] = -1;
+    const int i = todo[p];
+    const pieces_t mesh = {origins, points, starts, items}, old = {old_origins, old_points, old_starts, old_items};
+    const chart_t chart = chart_at(origins, i);
     piece_t piece;
     shape_t whole;
-    int what = build_piece(&piece, i, starts, neighbors, points, box_lower, box_upper);
-    if (what != PIECE_WHOLE) {
-        status[i] = what == PIECE_FULL ? PIECE_LARGE : FAILED;
+    const int built = build_piece(&piece, &chart, i, &mesh, box_lower, box_upper);
+    status[i] = outcome(built);
+    if (built != PIECE_WHOLE)
         return;
-    }
-    REAL4 centroid;
-    volumes[i] = measure_piece(&piece, &centroid);
-    const REAL reach = sqrt(piece.reach2);
+    REAL4 lower, upper, centroid;
+    bound_piece(&piece, &chart, &lower, &upper);
+    volumes[i] = measure_piece(&piece, &chart, &centroid);
     note_piece(&whole, &piece);
-    const graph_t old = {old_points, old_starts, old_neighbors};
-    const int nearest = nearest_generator(points + (size_t)DIM * i, &old, n_old, items, bins, grid_frames, grid_shapes);
-    visit(&seen, nearest);
-    const REAL4 way = load_vector(old_points, nearest) - x;
-    if (partial) {
-        const REAL farthest = (2 * reach + sqrt(dot_vectors(way, way))) * (1 + 16 * REAL_EPS);
-        if (!visit_near(&seen, x, farthest, &old, items, BINS)) {
-            status[i] = LIST_FULL;
-            return;
-        }
+    REAL reach2 = 0;
+    for (int k = 0; k < piece.n; ++k) {
+        const REAL4 corner = corner_of(&piece, k);
+        reach2 = fmax(reach2, corner.s0 * corner.s0 + corner.s1 * corner.s1 + corner.s2 * corner.s2);
     }
+    const REAL reach = sqrt(reach2);
     for (int c = 0; c < width; ++c) {
-        means[(size_t)i * width + c] = 0;
+        masses[(size_t)i * width + c] = 0;
         low[(size_t)i * width + c] = REAL_MAX;
         high[(size_t)i * width + c] = -REAL_MAX;
     }
+    const int first_leaf = (1 << levels) - 1;
     REAL sum = 0;
-    for (int k = 0; k < seen.n; ++k) {
-        const int j = seen.queue[k];
-        recall_piece(&piece, &whole);
-        what = cut_by_cell(&piece, x, reach, j, &old);
-        if (what == PIECE_FULL || what == PIECE_BROKEN) {
-            status[i] = what == PIECE_FULL ? PIECE_LARGE : FAILED;
-            return;
-        }
-        bool room = true;
-        if (what == PIECE_EMPTY && !partial) {
-            /* Round-off may let the search for the first cell stop at a neighbor of it. */
-            for (int q = old_starts[j]; sum == 0 && q < old_starts[j + 1]; ++q) {
-                const int next = old_neighbors[q];
-                if (next >= 0 && next < n_old)
-                    room = room && visit(&seen, next);
+    int node = 0;
+    do {
+        if (meets_box(lower, upper, boxes + (size_t)node * 2 * DIM)) {
+            if (node < first_leaf) {
+                node = 2 * node + 1;
+                continue;
+            }
+            const long leaf = node - first_leaf;
+            const int end = (int)(((leaf + 1) * entries_count) >> levels);
+            for (int entry = (int)((leaf * entries_count) >> levels); entry < end; ++entry) {
+                const int j = entries[2 * entry], cell = cells[j];
+                const REAL4 shift = load_vector(shifts, entries[2 * entry + 1]);
+                const int what = intersect(&piece, &whole, &chart, reach, &old, j, shift);
+                if (what == PIECE_EMPTY)
+                    continue;
+                if (what != PIECE_CUT) {
+                    status[i] = outcome(what);
+                    return;
+                }
+                const REAL volume = measure_piece(&piece, &chart, &centroid);
+                if (!(volume > 0))
+                    continue;
+                const REAL4 off = chart.at - shift - load_vector(means, cell) + centroid;
+                sum += volume;
+                for (int c = 0; c < width; ++c) {
+                    const size_t from = (size_t)cell * width + c, to = (size_t)i * width + c;
+                    REAL value = values[from];
+                    if (with_slopes)
+                        value += dot_vectors(load_vector(slopes, from), off);
+                    masses[to] += volume * value;
+                    low[to] = fmin(low[to], least[from]);
+                    high[to] = fmax(high[to], most[from]);
+                }
             }
         }
-        if (what != PIECE_EMPTY) {
-            const REAL volume = measure_piece(&piece, &centroid);
-            const REAL4 off = (x - load_vector(old_points, j)) + centroid - load_vector(centroids, j);
-            sum += volume;
-            for (int c = 0; c < width; ++c) {
-                const size_t from = (size_t)j * width + c, to = (size_t)i * width + c;
-                REAL value = values[from];
-                if (with_slopes)
-                    for (int a = 0; a < DIM; ++a)
-                        value += slopes[from * DIM + a] * (a == 0 ? off.s0 : (a == 1 ? off.s1 : off.s2));
-                means[to] += volume * value;
-                low[to] = fmin(low[to], least[from]);
-                high[to] = fmax(high[to], most[from]);
-            }
-            for (EACH_FACE (&piece, f))
-                if (face_label(&piece, f) >= 0 && face_label(&piece, f) < n_old)
-                    room = room && visit(&seen, face_label(&piece, f));
-        }
-        if (!room) {
-            status[i] = LIST_FULL;
-            return;
-        }
-    }
+        /* A right child is the last one of its parent. */
+        while (node > 0 && node % 2 == 0)
+            node = (node - 1) / 2;
+        node += node > 0;
+    } while (node > 0);
     covered[i] = sum;
-    for (int c = 0; c < width; ++c)
-        means[(size_t)i * width + c] /= sum > 0 ? sum : 1;
-    status[i] = sum > 0 || partial ? DONE : FAILED;
 }
 
 /* Solve M g = b for a symmetric positive semidefinite M by elimination with the largest pivot first. Overwrites M, and
    b with g. Returns false and leaves b unchanged if M is singular to round-off. */
-inline bool solve_by_elimination(REAL m[DIM][DIM], REAL *b)
+inline bool solve_by_elimination(REAL m[CELL_DIM][CELL_DIM], REAL *b)
 {
-    int order[DIM];
-    REAL x[DIM], scale = 0;
-    bool used[DIM];
-    for (int a = 0; a < DIM; ++a) {
+    int order[CELL_DIM];
+    REAL x[CELL_DIM], scale = 0;
+    bool used[CELL_DIM];
+    for (int a = 0; a < CELL_DIM; ++a) {
         used[a] = false;
         x[a] = b[a];
         scale = fmax(scale, m[a][a]);
     }
-    for (int rank = 0; rank < DIM; ++rank) {
+    for (int rank = 0; rank < CELL_DIM; ++rank) {
         int p = -1;
-        for (int a = 0; a < DIM; ++a)
+        for (int a = 0; a < CELL_DIM; ++a)
             if (!used[a] && (p < 0 || m[a][a] > m[p][p]))
                 p = a;
         if (!(m[p][p] > 256 * REAL_EPS * scale))
             return false;
         used[p] = true;
         order[rank] = p;
-        for (int a = 0; a < DIM; ++a) {
+        for (int a = 0; a < CELL_DIM; ++a) {
             if (used[a])
                 continue;
             const REAL factor = m[a][p] / m[p][p];
-            for (int c = 0; c < DIM; ++c)
+            for (int c = 0; c < CELL_DIM; ++c)
                 m[a][c] -= factor * m[p][c];
             x[a] -= factor * x[p];
         }
     }
-    for (int r = DIM - 1; r >= 0; --r) {
+    for (int r = CELL_DIM - 1; r >= 0; --r) {
         const int p = order[r];
         REAL sum = x[p];
-        for (int later = r + 1; later < DIM; ++later)
+        for (int later = r + 1; later < CELL_DIM; ++later)
             sum -= m[p][order[later]] * b[order[later]];
         b[p] = sum / m[p][p];
     }
@@ -291,21 +220,21 @@ inline bool solve_by_elimination(REAL m[DIM][DIM], REAL *b)
 
 /* Solve the normal equations M g = b; overwrite b with g. If M is singular, as for a cell in a corner of the box with
    one neighbor, return the solution of least norm, accurate to the square root of the machine epsilon. */
-inline void solve_normal_equations(REAL m[DIM][DIM], REAL *b)
+inline void solve_normal_equations(REAL m[CELL_DIM][CELL_DIM], REAL *b)
 {
-    REAL copy[DIM][DIM], trace = 0;
-    for (int a = 0; a < DIM; ++a) {
+    REAL copy[CELL_DIM][CELL_DIM], trace = 0;
+    for (int a = 0; a < CELL_DIM; ++a) {
         trace += m[a][a];
-        for (int c = 0; c < DIM; ++c)
+        for (int c = 0; c < CELL_DIM; ++c)
             copy[a][c] = m[a][c];
     }
     if (solve_by_elimination(copy, b))
         return;
-    for (int a = 0; a < DIM; ++a)
-        for (int c = 0; c < DIM; ++c)
+    for (int a = 0; a < CELL_DIM; ++a)
+        for (int c = 0; c < CELL_DIM; ++c)
             copy[a][c] = m[a][c] + (a == c ? sqrt(REAL_EPS) * trace : 0);
     if (!(trace > 0) || !solve_by_elimination(copy, b))
-        for (int a = 0; a < DIM; ++a)
+        for (int a = 0; a < CELL_DIM; ++a)
             b[a] = 0;
 }
 
@@ -317,57 +246,95 @@ inline void solve_normal_equations(REAL m[DIM][DIM], REAL *b)
    <= 1 that keeps the linear function within these bounds at all corners v of the cell (T. J. Barth and D. C.
    Jespersen, The design and application of upwind schemes on unstructured meshes, AIAA 89-0366, 1989):
 
-       min over v of (most - q_j) / r if r > 0, (least - q_j) / r if r < 0,   r = g . (v - c_j). */
-kernel void fit_slopes(const int size, const int width, GRAPH_ARGS, const REAL4 box_lower, const REAL4 box_upper,
-                       global const REAL *centroids, global const REAL *values, const int limited, global REAL *slopes,
-                       global REAL *least, global REAL *most, global int *status)
+       min over v of (most - q_j) / r if r > 0, (least - q_j) / r if r < 0,   r = g . (v - c_j).
+
+   On a sphere g_j lies in the tangent plane of the cell's origin.
+
+   parts (n + 1,)           the pieces of cell j are parts[j] to parts[j + 1]
+   rows, neighbors          the graph of the cells; negative entries are walls
+   seams (m, DIM)           the neighbor is the image that many `periods` away */
+kernel void fit_slopes(const int size, const int width, global const int *parts, PIECES_ARGS, global const int *rows,
+                       global const int *neighbors, global const char *seams, const REAL4 periods,
+                       const REAL4 box_lower, const REAL4 box_upper, global const REAL *means,
+                       global const REAL *values, const int limited, global REAL *slopes, global REAL *least,
+                       global REAL *most, global int *status)
 {
     WORK_ITEM(j);
-    const REAL4 x = load_vector(points, j), cj = load_vector(centroids, j);
-    piece_t cell;
-    const int what = build_piece(&cell, j, starts, neighbors, points, box_lower, box_upper);
-    status[j] = what == PIECE_WHOLE ? DONE : (what == PIECE_FULL ? PIECE_LARGE : FAILED);
-    if (what != PIECE_WHOLE)
-        return;
+    const pieces_t mesh = {origins, points, starts, items};
+    const REAL4 cj = load_vector(means, j);
+    status[j] = DONE;
+    piece_t piece;
     for (int c = 0; c < width; ++c) {
-        const REAL own = values[(size_t)j * width + c];
-        REAL m[DIM][DIM], g[DIM], bottom = own, top = own;
-        for (int a = 0; a < DIM; ++a) {
+        const size_t at = (size_t)j * width + c;
+        const REAL own = values[at];
+        REAL m[CELL_DIM][CELL_DIM], g[CELL_DIM], bottom = own, top = own;
+        for (int a = 0; a < CELL_DIM; ++a) {
             g[a] = 0;
-            for (int b = 0; b < DIM; ++b)
+            for (int b = 0; b < CELL_DIM; ++b)
                 m[a][b] = 0;
         }
-        for (int k = starts[j]; k < starts[j + 1]; ++k) {
+#ifdef SPHERE
+        const chart_t tangents = chart_at(origins, min(parts[j], parts[size] - 1));
+#endif
+        for (int k = rows[j]; k < rows[j + 1]; ++k) {
             const int q = neighbors[k];
-            if (q < 0 || q >= size)
+            if (q < 0)
                 continue;
             const REAL there = values[(size_t)q * width + c];
-            const REAL4 d4 = (load_vector(points, q) - x) + (load_vector(centroids, q) - cj);
-            const REAL d[3] = {d4.s0, d4.s1, d4.s2};
-            const REAL weight = 1 / dot_vectors(d4, d4);
+            const REAL4 seam = (REAL4)(seams[DIM * k], seams[DIM * k + 1], DIM == 3 ? seams[DIM * k + DIM - 1] : 0, 0);
+            const REAL4 way = load_vector(means, q) - cj + seam * periods;
+#ifdef SPHERE
+            const REAL d[2] = {dot_vectors(way, tangents.one), dot_vectors(way, tangents.other)};
+#else
+            const REAL d[3] = {way.s0, way.s1, way.s2};
+#endif
+            REAL d2 = 0;
+            for (int a = 0; a < CELL_DIM; ++a)
+                d2 += d[a] * d[a];
+            if (!(d2 > 0))
+                continue;
             bottom = fmin(bottom, there);
             top = fmax(top, there);
-            for (int a = 0; a < DIM; ++a) {
-                g[a] += weight * (there - own) * d[a];
-                for (int b = 0; b < DIM; ++b)
-                    m[a][b] += weight * d[a] * d[b];
+            for (int a = 0; a < CELL_DIM; ++a) {
+                g[a] += (there - own) / d2 * d[a];
+                for (int b = 0; b < CELL_DIM; ++b)
+                    m[a][b] += d[a] * d[b] / d2;
             }
         }
         solve_normal_equations(m, g);
         REAL factor = 1;
-        for (int v = 0; limited && v < corner_count(&cell); ++v) {
-            const REAL4 off = corner_of(&cell, v) - cj;
-            REAL rise = g[0] * off.s0 + g[1] * off.s1;
-#if DIM == 3
-            rise += g[2] * off.s2;
+        for (int i = parts[j]; limited && i < parts[j + 1]; ++i) {
+            const chart_t chart = chart_at(origins, i);
+            const int what = build_piece(&piece, &chart, i, &mesh, box_lower, box_upper);
+            if (what != PIECE_WHOLE) {
+                status[j] = outcome(what);
+                return;
+            }
+            const REAL4 from = cj - chart.at;
+            for (int v = 0; v < piece.n; ++v) {
+                REAL4 corner = corner_of(&piece, v);
+#ifdef SPHERE
+                corner /= sqrt(1 + corner.s0 * corner.s0 + corner.s1 * corner.s1);
+                const REAL4 off = corner - (REAL4)(dot_vectors(from, chart.one), dot_vectors(from, chart.other), 0, 0);
+#else
+                const REAL4 off = corner - from;
 #endif
-            const REAL room = rise > 0 ? top - own : bottom - own;
-            if (fabs(rise) > fabs(room))
-                factor = fmin(factor, room / rise);
+                REAL rise = g[0] * off.s0 + g[1] * off.s1;
+#if CELL_DIM == 3
+                rise += g[2] * off.s2;
+#endif
+                const REAL room = rise > 0 ? top - own : bottom - own;
+                if (fabs(rise) > fabs(room))
+                    factor = fmin(factor, room / rise);
+            }
         }
+#ifdef SPHERE
+        store_vector(factor * (g[0] * tangents.one + g[1] * tangents.other), slopes, at);
+#else
         for (int a = 0; a < DIM; ++a)
-            slopes[((size_t)j * width + c) * DIM + a] = factor * g[a];
-        least[(size_t)j * width + c] = bottom;
-        most[(size_t)j * width + c] = top;
+            slopes[at * DIM + a] = factor * g[a];
+#endif
+        least[at] = bottom;
+        most[at] = top;
     }
 }

@@ -11,6 +11,7 @@ import scipy
 
 from ..geometry.box import Box
 from ..mesh.diagram import Diagram
+from ..remapping.cell_data import conserved
 from .case import patch_entry
 from .fields import WIDTHS, Entries, FoamField, Values
 from .fluxes import project_fluxes
@@ -98,7 +99,11 @@ def transfer_fields(fields: Sequence[FoamField], old: MeshOfCase, new: MeshOfCas
     if moving.any():
         given = old.to_diagram(columns[:, moving])
         carried = _carry(given, old.diagram, new.diagram, adapter)[new.row]
-        values[:, moving] = conserve(columns[:, moving], old.foam.volumes, carried, new.foam.volumes)
+        given = columns[:, moving]
+        # Volumes of two meshes of one domain differ where walls are curved: means are kept then.
+        volumes = old.foam.volumes * (new.foam.volumes.sum() / old.foam.volumes.sum())
+        bounds = given.min(axis=0), given.max(axis=0)
+        values[:, moving] = conserved(given, volumes, carried, new.foam.volumes, *bounds)
     made = []
     for field, part in zip(in_cells, np.split(values, np.cumsum(widths)[:-1], axis=1), strict=True):
         given = field.internal
@@ -119,26 +124,6 @@ def _carry(values: np.ndarray, old: Diagram, new: Diagram, adapter: Adapter) -> 
         box = Box(tuple((every.min(axis=0) - margin).tolist()), tuple((every.max(axis=0) + margin).tolist()))
         old, new = adapter.diagram(box, old.points), adapter.diagram(box, new.points)
     return old.transfer(values, onto=new, order=2, adapter=adapter)
-
-
-def conserve(old: np.ndarray, old_volumes: np.ndarray, new: np.ndarray, volumes: np.ndarray) -> np.ndarray:
-    """Return `new` (n, k) with the sums of volume times value that `old` (m, k) has, and within its extrema.
-
-    Each value moves towards an extremum by one share of its distance from it.
-    """
-    low, high = old.min(axis=0), old.max(axis=0)
-    made = np.clip(new, low, high)
-    ratio = np.sum(old_volumes, dtype=np.longdouble) / np.sum(volumes, dtype=np.longdouble)
-    for _ in range(2):  # the second time corrects the round-off of the first
-        for c in range(made.shape[1]):
-            # Volumes of two meshes of one domain differ where walls are curved: means are kept then.
-            wanted = np.sum(np.multiply(old_volumes, old[:, c], dtype=np.longdouble)) / ratio
-            missing = wanted - np.sum(np.multiply(volumes, made[:, c], dtype=np.longdouble))
-            room = (high[c] if missing > 0 else low[c]) - made[:, c]
-            capacity = np.sum(np.multiply(volumes, room, dtype=np.longdouble))
-            if missing != 0 and capacity != 0:
-                made[:, c] += min(float(missing / capacity), 1.0) * room
-    return np.clip(made, low, high)
 
 
 def _with_boundary(field: FoamField, internal: Values, old: FoamMesh, new: FoamMesh) -> Entries:

@@ -11,6 +11,21 @@ _LEAF = 4  # items per leaf at most
 _BLOCK = 1 << 9  # points per batch: its pairs with boxes and items stay in the caches
 
 
+def curve_order(x: np.ndarray) -> np.ndarray:
+    """Return the order (n,) of points (n, d) along Morton's curve through their ranks by each coordinate.
+
+    Ranks are even, so that clusters of any size are as well ordered as the rest.
+    """
+    n, d = x.shape
+    place = np.zeros(n, np.int64)
+    for axis in range(d):
+        rank = np.empty(n, np.int64)
+        rank[np.argsort(np.ascontiguousarray(x[:, axis]))] = np.arange(n)
+        for bit in range(n.bit_length()):
+            place |= (rank >> bit & 1) << d * bit + axis
+    return np.argsort(place)
+
+
 class Tree:
     """Complete binary tree of bounding boxes over n items.
 
@@ -22,28 +37,32 @@ class Tree:
     ----------
     low, high : (n, d) float
         Lower and upper corners of the items' bounding boxes.
+    order : (n,) int, optional
+        Another order of the items, in which near ones follow each other, such as `curve_order`.
+    leaf : int
+        Items of a leaf at most.
 
     Attributes
     ----------
     levels : int
-        Number of levels below the root; there are 2^levels leaves of at most 4 items.
+        Number of levels below the root; there are 2^levels leaves.
     order : (n,) int
         The items in the order of the leaves.
     boxes : (2^(levels + 1) - 1, 2 d) float
         Lower and upper corners of the nodes.
     """
 
-    def __init__(self, low: np.ndarray, high: np.ndarray):
-        self.n = len(low)
-        self.levels = max(0, math.ceil(math.log2(self.n / _LEAF)))
-        self.order = self._sort(0.5 * low.astype(float) + 0.5 * high)
-        low, high = low[self.order], high[self.order]
-        self.boxes = np.concatenate(
-            [
-                np.hstack([np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)])
-                for starts in (self.starts(level)[:-1] for level in range(self.levels + 1))
-            ]
-        )
+    def __init__(self, low: np.ndarray, high: np.ndarray, order: np.ndarray | None = None, leaf: int = _LEAF):
+        self.n, self.leaf = len(low), leaf
+        self.levels = max(0, math.ceil(math.log2(self.n / leaf)))
+        self.order = self._sort(0.5 * low.astype(float) + 0.5 * high) if order is None else order
+        starts = self.starts(self.levels)[:-1]
+        low, high = np.minimum.reduceat(low[self.order], starts), np.maximum.reduceat(high[self.order], starts)
+        levels = [np.hstack([low, high])]
+        for _ in range(self.levels):
+            low, high = np.minimum(low[::2], low[1::2]), np.maximum(high[::2], high[1::2])
+            levels.append(np.hstack([low, high]))
+        self.boxes = np.concatenate(levels[::-1])
 
     def starts(self, level: int) -> np.ndarray:
         """Return the place in `order` where the items of each node of a level begin, and the end: (2^level + 1,)."""
@@ -135,7 +154,7 @@ class Tree:
     def _items(self, who: np.ndarray, leaf: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the pairs of a query and each item of its leaf."""
         starts = self.starts(self.levels)
-        place = starts[leaf][:, None] + np.arange(_LEAF)
+        place = starts[leaf][:, None] + np.arange(self.leaf)
         inside = place < starts[leaf + 1][:, None]
         return np.repeat(who, inside.sum(axis=1)), self.order[place[inside]]
 
@@ -190,8 +209,8 @@ class Tree:
             i, j = i[meet], j[meet]
         starts = self.starts(self.levels)
         found = []
-        for slot in range(_LEAF):
-            for other in range(_LEAF):
+        for slot in range(self.leaf):
+            for other in range(self.leaf):
                 p, q = starts[i] + slot, starts[j] + other
                 inside = (p < starts[i + 1]) & (q < starts[j + 1]) & ((i != j) | (p < q))
                 found.append(np.stack([self.order[p[inside]], self.order[q[inside]]]))

@@ -29,10 +29,6 @@ if TYPE_CHECKING:
     from .results import Result
 
 
-_COVERED = 1e-6
-"""Missing share of a cell up to which a transfer counts it as covered."""
-
-
 class Diagram(MeshOutput):
     """A Voronoi diagram clipped to its domain, as `clvoro.voronoi` and `Adapter.diagram` return it.
 
@@ -479,8 +475,7 @@ class Diagram(MeshOutput):
             Whether to return the covered share of each new cell, too.
         adapter : Adapter, optional
             The adapter whose device does the work; by default that of `create_context()`. In float64 where the device
-            has it. The host does it for meshes of a polygonal domain, whose cells need not be convex, of boxes with
-            different seams, and on a sphere.
+            has it.
 
         Returns
         -------
@@ -492,9 +487,9 @@ class Diagram(MeshOutput):
             domains the mass in their common part is kept. Where this mesh covers nothing, the value is NaN.
         (n_new,) float64
             With `covered`, the share of each new cell that this mesh covers, from 0 to 1. Between meshes of one domain
-            it is 1 for every cell that overlaps an old one. In a solid that is an approximation: cells at curved walls
-            are bounded by planes there, and overlap the cells of another mesh of it to 97 to 100 % (a ball, 500 to 8000
-            cells, ``bench/transfer.py --on ball``). Onto a part, `subset`, the share is that of the overlap.
+            it is 1. At curved walls of a solid cells are bounded by planes, and the share is that of their overlap
+            (0.97 to 1 in a ball of 500 to 8000 cells, ``bench/transfer.py --on ball``); the mass is kept all the same,
+            and a new cell that overlaps none has the value of the nearest old one.
 
         Raises
         ------
@@ -520,10 +515,9 @@ class Diagram(MeshOutput):
         """
         from ..remapping.cell_data import transfer_values
 
-        found, share = transfer_values(self, values, onto, order, limited, adapter)
+        found, share, missing = transfer_values(self, values, onto, order, limited, adapter)
         if covered:
             return found, share
-        missing = int((share < 1 - _COVERED).sum())
         if missing:
             warn(
                 f"{missing} of {len(share)} new cells are not covered by this mesh, or only in part, and have the "

@@ -173,8 +173,8 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
     return np.column_stack([cells[apex], cells[apex + step], cells[apex + step + 1]]).astype(np.int32)
 
 
-def cell_shapes(diagram: Diagram) -> np.ndarray:
-    """Return each cell of a diagram in 2D as a shapely geometry, (n,); see `Diagram.to_shapely`."""
+def cell_shapes(diagram: Diagram, chosen: np.ndarray | None = None) -> np.ndarray:
+    """Return each cell of a diagram in 2D, or of `chosen` rows, as a shapely geometry; see `Diagram.to_shapely`."""
     ends, following = face_ends(diagram), next_faces(diagram)
     owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
     # One loop follows the other; each ends where the next face is its first one.
@@ -188,7 +188,8 @@ def cell_shapes(diagram: Diagram) -> np.ndarray:
     place = np.where(place == starts[ring + 1], starts[ring], place)
     of = owner[starts[:-1]]
     cells = np.empty(len(diagram), object)
-    usable = sizes >= 3
+    wanted = np.arange(len(diagram)) if chosen is None else chosen
+    usable = (sizes >= 3) & np.isin(of, wanted)
     rings = np.full(len(sizes), None, object)
     kept = usable[ring]
     numbers = np.cumsum(usable) - 1
@@ -198,6 +199,7 @@ def cell_shapes(diagram: Diagram) -> np.ndarray:
     several = np.flatnonzero(usable & ~lone)
     for i in np.unique(of[several]):
         cells[i] = _joined(rings[several[of[several] == i]])
+    cells = cells[wanted]
     cells[[cell is None for cell in cells]] = shapely.Polygon()
     bad = ~shapely.is_valid(cells)  # outlines that touch or cross themselves within round-off
     cells[bad] = [_areas(shapely.make_valid(cell)) for cell in cells[bad]]

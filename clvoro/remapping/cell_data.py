@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import nullcontext
-from dataclasses import replace
-from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl as cl
+import scipy
 
 from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
 from ..geometry.box import Box
-from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..opencl import probe
 from ..opencl.devices import shared_context
-from ..opencl.engine import Engine
+from ..opencl.engine import PLAIN, Engine, Traits
 from ..opencl.memory_limits import available_memory, in_bytes
-from ..tessellation.bins import Bins
-from .device_transfer import CellData, CellGraph, ConservativeTransfer, joined, transfer_bytes
-from .host_transfer import TINY, find_defect, transfer_on_host
-from .sphere_transfer import transfer_on_sphere
-from .unfolded import Unfolded, farthest_neighbor, unfold
+from .device_transfer import CellData, CellGraph, ConservativeTransfer, Space, transfer_bytes
+from .pieces import Pieces
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..adapter import Adapter
+
+_COVERED = 1e-6
+"""Missing share of a cell up to which it counts as covered."""
+COVER_TOLERANCE = 1e-3
+"""Largest accepted difference between a cell's volume and that of its pieces or intersections, as a share of it."""
 
 
 def transfer_values(
@@ -39,15 +38,17 @@ def transfer_values(
     order: int = 1,
     limited: bool = True,
     adapter: Adapter | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Transfer `values` of the cells of `old` to the cells of `new`; see `Diagram.transfer`.
 
     Returns
     -------
     values : (n_new,) or (n_new, k) float64
-        NaN where old cells cover nothing.
+        NaN where old cells cover nothing, unless the meshes have one domain.
     covered : (n_new,) float64
         The covered share of each new cell; see `Diagram.transfer`.
+    missing : int
+        Number of cells that are not covered, or only in part; 0 if the meshes have one domain.
     """
     source, target = _diagram("self", old), _diagram("onto", new)
     _require_one_space(source, target)
@@ -60,29 +61,27 @@ def transfer_values(
     # Scale to numbers around 1 by powers of two: this is exact, and no product overflows.
     scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(filled).max(axis=0), 1e-300))))
     same = source.domain == target.domain
-    # At the curved walls of a solid the cells of two meshes end at different planes.
-    partial = not same or source.domain.curved_walls
-    task = source, target, filled / scale, order, bool(limited), partial
-    if _on_host(source.domain, target.domain):
-        means, low, high, covered = _transfer_on_host(*task)
-    else:
-        with adapter._alone() if adapter is not None else nullcontext():
-            ctx = shared_context() if adapter is None else adapter.ctx
-            means, low, high, covered = _transfer_on_device(ctx, *task)
-    bounded = order == 1 or bool(limited)
+    with adapter._alone() if adapter is not None else nullcontext():
+        ctx = shared_context() if adapter is None else adapter.ctx
+        means, low, high, covered = _intersected(ctx, source, target, filled / scale, order, bool(limited))
+    bare = np.flatnonzero(covered == 0)
     if same:
-        means = _conserve_mass(filled / scale, source.volumes, means, target.volumes, low, high, bounded)
-        covered = np.where(covered > 0, 1.0, 0.0)
-    elif bounded:
-        means = np.clip(means, low, np.maximum(low, high))
-    means[covered == 0] = np.nan
+        if not source.domain.curved_walls:
+            _require_cover(np.where(target.volumes > 0, covered, 1))
+            covered = np.where(covered > 0, 1.0, 0.0)
+        if bare.size:  # empty cells, and thin ones between a curved wall and the planes that bound old cells there
+            nearest = scipy.spatial.KDTree(source.centroids).query(target.centroids[bare])[1]
+            means[bare] = low[bare] = high[bare] = (filled / scale)[nearest]
+        if order == 2 and not limited:
+            low, high = np.minimum(low, means), np.maximum(high, means)
+        means = conserved(filled / scale, source.volumes, means, target.volumes, low, high)
+    else:
+        if order == 1 or limited:
+            means = np.clip(means, low, np.maximum(low, high))
+        means[bare] = np.nan
+    missing = 0 if same else int((covered < 1 - _COVERED).sum())
     shape = len(target), *given.shape[1:]
-    return (means * scale)[:, : columns.shape[1]].reshape(shape), np.minimum(covered, 1)
-
-
-def _on_host(a: Domain, b: Domain) -> bool:
-    """Return whether the host intersects the cells: in polygons and on spheres."""
-    return a.curved or a.cuts_cells or b.cuts_cells
+    return (means * scale)[:, : columns.shape[1]].reshape(shape), np.minimum(covered, 1), missing
 
 
 def _require_one_space(source: Diagram, target: Diagram) -> None:
@@ -111,7 +110,6 @@ def _diagram(name: str, mesh: object) -> Diagram:
     """Return the diagram of a mesh."""
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     if isinstance(diagram, Diagram):
-        diagram.demand_voronoi("transfer")
         return diagram
     raise InputTypeError(f"{name} is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram")
 
@@ -145,146 +143,132 @@ def _checked(values: ArrayLike, n: int) -> np.ndarray:
     return array
 
 
-def _transfer_on_device(
-    ctx: cl.Context, source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool, partial: bool
+def _intersected(
+    ctx: cl.Context, source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return means over the new cells, bounds of the old data in them, and covered shares, float64."""
-    queue = cl.CommandQueue(ctx)
+    queue, domain = cl.CommandQueue(ctx), source.domain
+    device, n = queue.device, len(target)
     # Double precision where the device has it, whatever the precision of the meshes: intersections lose digits.
-    real = np.dtype(np.float64 if probe.has_fp64(queue.device) else np.float32)
-    engine = Engine(ctx, queue, source.domain.dim, real)
-    box, images, after = _graphs(source, target, partial)
-    before = max(images, key=len)
-    sizes = ((len(graph), len(graph.neighbors)) for graph in (before, after))
-    needed = transfer_bytes(engine, *sizes, columns.shape[1], order)  # type: ignore[arg-type]
-    device = queue.device
+    real = np.dtype(np.float64 if probe.has_fp64(device) else np.float32)
+    engine = Engine(ctx, queue, domain.dim, real, Traits(("SPHERE",), curved=True) if domain.curved else PLAIN)
+    parts = Pieces.of(source), Pieces.of(target)
+    needed = transfer_bytes(engine, *parts, len(source.neighbors), columns.shape[1], order)
     if needed > available_memory(device):
         raise MemoryLimitError(
             f"the transfer of {columns.shape[1]} columns from {len(source)} cells to {len(target)} needs "
             f"{in_bytes(needed)} on the device, {device.name.strip()} has {in_bytes(available_memory(device))}: pass "
             "fewer columns at a time, or use another device"
         )
-    bins, stage = Bins(engine), ConservativeTransfer(engine)
-    new = _upload(engine, box, after)
-    sequence = bins.build(box, new.points, new.n).items[: new.n].copy()
-    offsets = (source.centroids - source.points) / box.frame[1]
-    parts = []
-    for image in images:
-        old = _upload(engine, box, image)
-        binned = bins.build(box, old.points, old.n)
-        values, centroids = engine.upload(columns[image.cells]), engine.upload(offsets[image.cells])
-        if order == 2:
-            data = stage.fit_slopes(box, old, values, centroids, limited)
-        else:
-            data = CellData(values, values, values, centroids)
-        parts.append(stage.transfer(box, old, binned, data, new, sequence, partial))
-    got = joined(parts)
-    if not partial:
-        _require_cover(got.covered, got.volumes, box.dim)
-    covered = got.covered / np.maximum(got.volumes, TINY)
-    return got.means.astype(float), got.low.astype(float), got.high.astype(float), covered.astype(float)
+    space = _space(source, target)
+    stage = ConservativeTransfer(engine, space)
+    old, new = (stage.upload(p) for p in parts)
+    measures = stage.measure(old, "the diagram of the values")
+    _require_volumes("self", source, parts[0].summed(measures.volumes, len(source)), space)
+    means = space.place(source.centroids)
+    if domain.curved:
+        means[parts[0].cells] = measures.centroids
+    values = engine.upload(columns)
+    data = CellData(engine.upload(old.pieces.cells, np.int32), values, values, values, engine.upload(means))
+    periods = np.where(domain.periodic, domain.extent, 0) / space.scale
+    if order == 2:
+        graph = CellGraph(source.neighbor_starts, source.neighbors, source.shifts, periods)
+        data = stage.fit_slopes(old, graph, data, limited)
+    other = np.where(target.domain.periodic, target.domain.extent, 0) / space.scale
+    results = stage.transfer(new, old, measures, np.maximum(periods, other), data)
+    means, low, high, volumes, covered = _of_cells(parts[1], n, *(x.astype(np.float64) for x in results))
+    _require_volumes("onto", target, volumes, space)
+    return means, low, high, covered / np.where(volumes > 0, volumes, 1)
 
 
-def _graphs(source: Diagram, target: Diagram, partial: bool) -> tuple[Any, list[Unfolded], Unfolded]:
-    """Return a box around all cells, and the cells of both meshes as the device takes them.
-
-    Those of the old mesh are several sets: where the new mesh alone is periodic, one for each image of the old one.
-    """
-    domain = source.domain
-    if domain.plain and not partial:
-        return domain, [_as_given(source)], _as_given(target)
-    new = unfold(target)
-    far = farthest_neighbor(source) + farthest_neighbor(target)
-    lower, upper = target.points.min(axis=0) - 2 * far, target.points.max(axis=0) + 2 * far
-    old = unfold(source, lower, upper) if any(domain.periodic) else unfold(source)
-    alone = np.array(target.domain.periodic) & ~np.array(domain.periodic)
-    images = _images(old, target.domain.extent * alone, lower, upper)
-    every = np.concatenate([*(image.points for image in images), new.points])
-    margin = 0.01 * float(np.ptp(every, axis=0).max())
-    return Box(tuple(every.min(axis=0) - margin), tuple(every.max(axis=0) + margin)), images, new
-
-
-def _images(old: Unfolded, periods: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[Unfolded]:
-    """Return the images of cells by `periods` (d,), 0 where there are none, with generators between two corners."""
-    generators = old.points[: len(old)]
-    bottom, top = generators.min(axis=0), generators.max(axis=0)
-    steps = [
-        range(math.ceil((a - t) / p), math.floor((b - s) / p) + 1) if p else (0,)
-        for a, b, s, t, p in zip(lower, upper, bottom, top, periods, strict=True)
-    ]
-    offsets = [np.array(step) * periods for step in product(*steps)]
-    return [replace(old, points=old.points + x, offsets=old.offsets + x) for x in offsets] or [old]
+def _of_cells(
+    pieces: Pieces,
+    n: int,
+    masses: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    volumes: np.ndarray,
+    covered: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Return means and bounds of `n` cells, their volumes and covered volumes, from those of their pieces."""
+    if len(pieces) != n:
+        masses, volumes, covered = (pieces.summed(x, n) for x in (masses, volumes, covered))
+        bounds = np.full((n, low.shape[1]), np.inf), np.full((n, low.shape[1]), -np.inf)
+        np.minimum.at(bounds[0], pieces.cells, low)
+        np.maximum.at(bounds[1], pieces.cells, high)
+        low, high = bounds
+    return masses / np.where(covered > 0, covered, 1)[:, None], low, high, volumes, covered
 
 
-def _as_given(diagram: Diagram) -> Unfolded:
-    """Return the cells of a diagram in a box without periodic sides. The device cuts them at the walls of the box."""
-    n = len(diagram)
-    starts, neighbors = diagram.neighbor_starts, diagram.neighbors
-    return Unfolded(diagram.points, starts, neighbors, np.arange(n), np.zeros((n, diagram.domain.dim)))
+def _space(source: Diagram, target: Diagram) -> Space:
+    """Return coordinates in which both meshes are in the unit box; on a sphere its radius is 1."""
+    if source.domain.curved:
+        return Space(*source.domain.frame, np.full(3, -1.0), np.full(3, 1.0))
+    # Cells extend beyond their domain by half of it at most: across seams, and between planes at curved walls.
+    ends = [end for d in (source.domain, target.domain) for end in (d.lower - d.extent / 2, d.upper + d.extent / 2)]
+    lower, upper = np.min(ends, axis=0), np.max(ends, axis=0)
+    origin, scale = Box(tuple(lower), tuple(upper)).frame
+    return Space(origin, scale, (lower - origin) / scale, (upper - origin) / scale)
 
 
-def _transfer_on_host(
-    source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool, partial: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Do what `_transfer_on_device` does, for polygons and spheres."""
-    work = transfer_on_sphere if source.domain.curved else transfer_on_host
-    means, low, high, covered = work(source, target, columns, order, limited)
-    if not partial:
-        unit = source.domain.frame[1] ** 2
-        _require_cover(covered / unit, target.volumes / unit, 2)
-    return means, low, high, covered / target.volumes
-
-
-def _require_cover(covered: np.ndarray, volumes: np.ndarray, dim: int) -> None:
-    """Raise ClvoroError unless the intersections of each cell fill it. Volumes are normalized."""
-    worst = find_defect(covered, volumes, dim)
-    if worst is not None:
-        raise ClvoroError(
-            f"the intersections of new cell {worst} with old cells fill {covered[worst] / volumes[worst]:.6g} of it, "
-            "expected 1: one of the meshes is not the Voronoi diagram of its points; call diagram.check() on both"
+def _require_volumes(name: str, diagram: Diagram, found: np.ndarray, space: Space) -> None:
+    """Raise InputError unless cells have the volumes `found`, in the coordinates of the space."""
+    if diagram.domain.curved_walls:
+        return
+    dim = diagram.domain.cell_dim
+    volumes = diagram.volumes / space.scale**dim
+    slack = 64 * np.finfo(np.float32).eps * volumes ** (1 - 1 / dim)
+    defect = np.abs(found - volumes) - COVER_TOLERANCE * volumes - slack
+    worst = int(defect.argmax())
+    if defect[worst] > 0:
+        raise InputError(
+            f"cell {worst} of {name}, rebuilt from its faces, has {found[worst] / volumes[worst]:.6g} of its volume, "
+            "expected Voronoi diagrams of distinct generators: call diagram.check() on it"
         )
 
 
-def _upload(engine: Engine, box: Any, graph: Unfolded) -> CellGraph:
-    """Copy the graph of cells to the device."""
-    origin, scale = box.frame
-    return CellGraph(
-        len(graph),
-        engine.upload((graph.points - origin) / scale),
-        engine.upload(graph.starts, np.int32),
-        engine.upload(graph.neighbors, np.int32),
-    )
+def _require_cover(covered: np.ndarray) -> None:
+    """Raise ClvoroError unless the intersections of each cell fill it; `covered` are the shares."""
+    off = np.abs(covered - 1)
+    worst = int(off.argmax())
+    if off[worst] > COVER_TOLERANCE:
+        raise ClvoroError(
+            f"the intersections of new cell {worst} with old cells fill {covered[worst]:.6g} of it, expected 1: one of "
+            "the meshes is not the Voronoi diagram of its points; call diagram.check() on both"
+        )
 
 
-def _conserve_mass(
+def conserved(
     columns: np.ndarray,
     old_volumes: np.ndarray,
     means: np.ndarray,
     volumes: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
-    bounded: bool,
 ) -> np.ndarray:
-    """Correct `means` (n, width) so that their mass is that of `columns`, with the volumes of the diagrams.
+    """Correct `means` (n, width) so that their mass is that of `columns` (m, width), within bounds.
 
     The intersections of a cell sum to its volume to round-off, so the mass is wrong by round-off. Each cell takes a
     share of the missing mass in proportion to V times the distance of its mean from the upper bound of its data; a
     surplus likewise with the lower bound. No mean leaves its bounds, and constant data stays constant.
+
+    Parameters
+    ----------
+    old_volumes, volumes : (m,), (n,) float64
+    low, high : (n, width) or (width,) float64
     """
+    low, high = (np.broadcast_to(bound, means.shape) for bound in (low, high))
     # The means exceed the bounds by round-off at most.
-    q = np.clip(means, low, high) if bounded else means.copy()
+    q = np.clip(means, low, high)
     # Twice: the second pass corrects the round-off of the first.
     for _ in range(2):
         for c in range(q.shape[1]):
             missing = _sum(old_volumes, columns[:, c]) - _sum(volumes, q[:, c])
-            bound = high[:, c] if missing > 0 else low[:, c]
-            room = bound - q[:, c]
-            if not bounded:
-                room = np.maximum(room, 0) if missing > 0 else np.minimum(room, 0)
+            room = (high[:, c] if missing > 0 else low[:, c]) - q[:, c]
             capacity = _sum(volumes, room)
             if missing != 0 and capacity != 0:
                 q[:, c] += min(missing / capacity, 1.0) * room
-    return np.clip(q, low, high) if bounded else q
+    return np.clip(q, low, high)
 
 
 def _sum(volumes: np.ndarray, values: np.ndarray) -> float:

@@ -2,49 +2,83 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import pyopencl.array as cla
 
 from ..errors import ClvoroError, InputError
-from ..geometry.domain import ClipBox
+from ..geometry.bvh import Tree, curve_order
 from ..opencl.engine import Engine
-from ..tessellation.bins import BinnedPoints
+from .pieces import Pieces
 
 FACES = {2: 32, 3: 32}
 """Initial face capacity of a piece by dimension; doubled when a piece needs more."""
 MOST_FACES = {2: 4096, 3: 512}
 """Largest face capacity by dimension."""
-OVERLAPS = {2: 32, 3: 64}
-"""Initial capacity, by dimension, of the list of old cells that one new cell overlaps."""
-LIST_BUDGET = 1 << 23
-"""Entries of the lists of old cells that exist at a time."""
-BIN_BYTES = {2: {8: 75, 4: 55}, 3: {8: 80, 4: 60}}
-"""Bytes per generator that the bins take, by dimension and size of a real."""
-GROWTH = 8
-"""Factor by which the lists grow."""
-DONE, LIST_FULL, PIECE_LARGE, FAILED = range(4)
-"""Outcomes of a cell; see `transfer.cl`."""
+DONE, PIECE_LARGE, FAILED = range(3)
+"""Outcomes of a piece; see `transfer.cl`."""
 
 
 @dataclass(frozen=True)
-class CellGraph:
-    """The part of a diagram that a transfer reads, on the device.
+class Space:
+    """The coordinates in which two meshes are intersected.
 
     Attributes
     ----------
-    n : int
-    points : (k, d) real
-        Generators, in normalized coordinates; the first n have cells.
-    starts, neighbors : (n + 1,), (m,) int32
-        Rows of the neighbor graph; -1 - wall for the sides of the box.
+    origin, scale : (d,) float64, float
+        A position x has the coordinates (x - origin) / scale.
+    lower, upper : (d,) float64
+        Corners of a box around all cells, in these coordinates.
     """
 
-    n: int
-    points: cla.Array
-    starts: cla.Array
-    neighbors: cla.Array
+    origin: np.ndarray
+    scale: float
+    lower: np.ndarray
+    upper: np.ndarray
+
+    def place(self, x: np.ndarray) -> np.ndarray:
+        """Return the coordinates of positions."""
+        return (x - self.origin) / self.scale
+
+    def corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Return the corners of the box as kernels take them."""
+        lower, upper = np.zeros((2, 4), real)
+        lower[: len(self.lower)], upper[: len(self.upper)] = self.lower, self.upper
+        return lower, upper
+
+
+@dataclass(frozen=True)
+class PieceArrays:
+    """Pieces on the device.
+
+    Attributes
+    ----------
+    args : tuple
+        PIECES_ARGS of `transfer.cl`.
+    """
+
+    pieces: Pieces
+    args: tuple[cla.Array, ...]
+
+
+@dataclass(frozen=True)
+class PieceMeasures:
+    """PieceMeasures of pieces on the host, in the coordinates of the `Space`.
+
+    Attributes
+    ----------
+    volumes, centroids : (k,), (k, d) float64
+        On a sphere centroids are means of the position, inside of it.
+    lower, upper : (k, d) float64
+        Corners of a box around each piece.
+    """
+
+    volumes: np.ndarray
+    centroids: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -53,19 +87,22 @@ class CellData:
 
     Attributes
     ----------
+    cells : (k,) int32
+        The cell of each piece.
     values : (n, width) real
         Means over the cells.
     least, most : (n, width) real
         Bounds of the data inside a cell.
-    centroids : (n, d) real
-        Relative to the generators.
+    means : (n, d) real
+        Centroids; on a sphere means of the position.
     slopes : (n, width, d) real or None
     """
 
+    cells: cla.Array
     values: cla.Array
     least: cla.Array
     most: cla.Array
-    centroids: cla.Array
+    means: cla.Array
     slopes: cla.Array | None = None
 
     @property
@@ -73,125 +110,150 @@ class CellData:
         """CELL_DATA_ARGS of `transfer.cl`."""
         slopes = self.values if self.slopes is None else self.slopes
         return (
+            self.cells,
             np.int32(self.values.shape[1]),
             self.values,
             self.least,
             self.most,
-            self.centroids,
+            self.means,
             np.int32(self.slopes is not None),
             slopes,
         )
 
 
 @dataclass(frozen=True)
-class TransferredData:
-    """Data of the new cells, on the host.
+class CellGraph:
+    """Neighbors of the old cells.
 
     Attributes
     ----------
-    means, low, high : (n, width) real
-        Means over the cells, and bounds of the old data in them.
-    volumes, covered : (n,) real
-        Volume of a cell, and the sum of the volumes of its intersections with old cells; normalized.
+    starts, neighbors : (n + 1,), (m,) int
+        Negative neighbors are walls.
+    shifts : (m, d) int8
+        The neighbor is the image that many periods away.
+    periods : (d,) float64
+        In the coordinates of the `Space`.
     """
 
-    means: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    volumes: np.ndarray
-    covered: np.ndarray
+    starts: np.ndarray
+    neighbors: np.ndarray
+    shifts: np.ndarray
+    periods: np.ndarray
 
 
-def joined(parts: list[TransferredData]) -> TransferredData:
-    """Return the data of new cells from several sets of old cells, which overlap them one beside another."""
-    if len(parts) == 1:
-        return parts[0]
-    covered = np.sum([part.covered for part in parts], axis=0)
-    mass = sum(part.means * part.covered[:, None] for part in parts)
-    low, high = np.min([part.low for part in parts], axis=0), np.max([part.high for part in parts], axis=0)
-    return TransferredData(mass / np.where(covered > 0, covered, 1)[:, None], low, high, parts[0].volumes, covered)
-
-
-def transfer_bytes(engine: Engine, old: tuple[int, int], new: tuple[int, int], width: int, order: int) -> float:
+def transfer_bytes(engine: Engine, old: Pieces, new: Pieces, half_faces: int, width: int, order: int) -> float:
     """Estimate the device memory in bytes that a transfer of `width` columns needs.
-
-    The estimate assumes that each new cell overlaps about the same number of old cells. The lists of old cells never
-    take more than 12 `LIST_BUDGET` bytes.
 
     Parameters
     ----------
-    old, new : (n, m)
-        Numbers of cells and of half-faces of the meshes.
+    half_faces : int
+        Those of the old mesh.
     order : 1 or 2
         Slopes exist for order 2 only.
     """
     d, real = engine.dim, engine.real.itemsize
-    graphs = sum(n * (d * real + 4) + 4 * m for n, m in (old, new))
-    bins = BIN_BYTES[d][real] * max(old[0], new[0])
-    data = (width + d + (order - 1) * width * (2 + d)) * real * old[0]
-    results = (3 * width + 2) * real * new[0]
-    status = 8 * new[0] + 4 * (order - 1) * old[0]
-    overlaps, capacity = ((old[0] / new[0]) ** (1 / d) + 2) ** d, OVERLAPS[d]
-    while capacity < overlaps:
-        capacity *= GROWTH
-    lists = 12 * min(capacity * new[0], LIST_BUDGET)
-    return graphs + bins + data + results + status + lists
+    pieces = sum((len(p.points) + len(p)) * d * real + 4 * len(p.items) for p in (old, new))
+    rows = 4 * (len(old) + len(new))
+    cells = int(old.cells[-1]) + 1
+    data = (width + d + (order - 1) * width * (2 + d)) * real * cells + 4 * len(old)
+    nodes = 1 << (2 + max(0, len(old) - 1).bit_length())
+    tree = nodes * d * real + 8 * len(old)
+    results = ((3 * width + 1) * real + 8) * len(new)
+    graph = (order - 1) * (half_faces * (4 + d) + 12 * cells)
+    return pieces + rows + data + max(tree + results, graph)
 
 
 class ConservativeTransfer:
-    """Average data over the intersections of the cells of two diagrams in one box."""
+    """Average data over the intersections of the cells of two meshes."""
 
-    def __init__(self, engine: Engine) -> None:
-        self.engine = engine
-        self._build(FACES[engine.dim])
+    def __init__(self, engine: Engine, space: Space) -> None:
+        self.engine, self.space = engine, space
+        self._box = space.corners(engine.real)
+        self._build(FACES[engine.cell_dim])
 
     def _build(self, faces: int) -> None:
         """Build the kernels for pieces of up to `faces` faces."""
-        self._faces = faces
-        name = {2: "CELL_CAPACITY", 3: "FACE_CAPACITY"}[self.engine.dim]
+        self._faces, dim = faces, self.engine.cell_dim
+        name = {2: "CELL_CAPACITY", 3: "FACE_CAPACITY"}[dim]
         self._kernels = self.engine.kernels("remapping/transfer", {name: faces})
         # On a CPU the private arrays of a whole work-group lie on one thread's stack: large ones need groups of one.
-        self._group = None if faces == FACES[self.engine.dim] else 1
+        self._group = None if faces == FACES[dim] else 1
 
-    def _enlarge(self, cell: int) -> None:
-        """Double the face capacity, which `cell` exceeds."""
-        if 2 * self._faces > MOST_FACES[self.engine.dim]:
-            raise ClvoroError(
-                f"cell {cell}, or its intersection with an old cell, has more than {self._faces} faces, expected "
-                f"at most {MOST_FACES[self.engine.dim]}: perturb the generators of the mesh"
+    def _are_large(self, status: np.ndarray, cells: np.ndarray, what: str) -> np.ndarray:
+        """Return the rows of `status` that need more faces, after the capacity is doubled for them.
+
+        Raises
+        ------
+        ClvoroError, InputError
+            If a piece has too many faces, or is none.
+        """
+        failed = np.flatnonzero(status == FAILED)
+        if failed.size:
+            raise InputError(
+                f"cell {cells[failed[0]]} ({failed.size} in all) cannot be rebuilt from its neighbors, expected "
+                f"Voronoi diagrams of distinct generators: call diagram.check() on {what}"
             )
-        self._build(2 * self._faces)
+        large, most = np.flatnonzero(status == PIECE_LARGE), MOST_FACES[self.engine.cell_dim]
+        if large.size and 2 * self._faces > most:
+            raise ClvoroError(
+                f"cell {cells[large[0]]}, or its intersection with an old cell, has more than {self._faces} faces, "
+                f"expected at most {most}: perturb the generators of the mesh"
+            )
+        if large.size:
+            self._build(2 * self._faces)
+        return large
 
-    def fit_slopes(
-        self, box: ClipBox, graph: CellGraph, values: cla.Array, centroids: cla.Array, limited: bool
-    ) -> CellData:
-        """Fit a linear function in each cell to the means `values` (n, width) of the cell and its neighbors.
+    def upload(self, pieces: Pieces) -> PieceArrays:
+        """Copy pieces to the device."""
+        upload = self.engine.upload
+        places = (upload(self.space.place(x)) for x in (pieces.origins, pieces.points))
+        return PieceArrays(pieces, (*places, upload(pieces.starts, np.int32), upload(pieces.items, np.int32)))
+
+    def measure(self, mesh: PieceArrays, what: str) -> PieceMeasures:
+        """Measure pieces; `what` names their mesh in errors."""
+        engine, k, d = self.engine, len(mesh.pieces), self.engine.dim
+        volumes, status = engine.empty(k), engine.empty(k, np.int32)
+        centroids, lower, upper = (engine.empty((k, d)) for _ in range(3))
+        results = volumes, centroids, lower, upper
+        while True:
+            engine.run_each(
+                self._kernels.measure_pieces, k, *mesh.args, *self._box, *results, status, group=self._group
+            )
+            if not self._are_large(status.get(), mesh.pieces.cells, what).size:
+                return PieceMeasures(*(array.get().astype(np.float64) for array in results))
+
+    def fit_slopes(self, old: PieceArrays, graph: CellGraph, data: CellData, limited: bool) -> CellData:
+        """Fit a linear function in each cell to the means of the cell and its neighbors.
 
         Parameters
         ----------
         limited : bool
             Limit the slopes, so that the function stays within the values of the cell and its neighbors.
-
-        Raises
-        ------
-        InputError
-            If the graph is not that of a Voronoi diagram.
         """
-        engine, n, width = self.engine, graph.n, values.shape[1]
+        engine, (n, width) = self.engine, data.values.shape
         slopes = engine.empty((n, width, engine.dim))
         least, most = engine.empty((n, width)), engine.empty((n, width))
         status = engine.empty(n, np.int32)
+        parts = np.searchsorted(old.pieces.cells, np.arange(n + 1))
+        periods = np.zeros(4, engine.real)
+        periods[: engine.dim] = graph.periods
+        rows = (
+            engine.upload(parts, np.int32),
+            *old.args,
+            engine.upload(graph.starts, np.int32),
+            engine.upload(graph.neighbors, np.int32),
+            engine.upload(graph.shifts, np.int8),
+            periods,
+        )
         while True:
             engine.run_each(
                 self._kernels.fit_slopes,
                 n,
                 np.int32(width),
-                graph.points,
-                graph.starts,
-                graph.neighbors,
-                *box.device_corners(engine.real),
-                centroids,
-                values,
+                *rows,
+                *self._box,
+                data.means,
+                data.values,
                 np.int32(limited),
                 slopes,
                 least,
@@ -199,102 +261,73 @@ class ConservativeTransfer:
                 status,
                 group=self._group,
             )
-            large = self._cells_to_enlarge(status.get(), "the diagram of the values")
-            if not large.size:
-                return CellData(values, least, most, centroids, slopes)
-            self._enlarge(int(large[0]))
+            if not self._are_large(status.get(), np.arange(n), "the diagram of the values").size:
+                return replace(data, least=least, most=most, slopes=slopes)
 
     def transfer(
-        self,
-        box: ClipBox,
-        old: CellGraph,
-        binned: BinnedPoints,
-        data: CellData,
-        new: CellGraph,
-        order: cla.Array,
-        partial: bool = False,
-    ) -> TransferredData:
-        """Return the means of `data` of the old cells over the new cells.
+        self, new: PieceArrays, old: PieceArrays, boxes: PieceMeasures, periods: np.ndarray, data: CellData
+    ) -> tuple[np.ndarray, ...]:
+        """Return integrals of `data` over the new pieces, bounds of the data there, and volumes.
 
         Parameters
         ----------
-        box : ClipBox
-            A box that holds all new cells.
-        binned : BinnedPoints
-            The generators of `old`.
-        order : (>= n,) int32
-            Order in which work-items take the new cells; consecutive cells should be near each other.
-        partial : bool
-            Whether parts of new cells, or all of one, may be outside of the old cells.
+        boxes : PieceMeasures
+            Those of the old pieces.
+        periods : (d,) float64
+            By which the old mesh is repeated; 0 where it is not.
 
-        Raises
-        ------
-        InputError
-            If a graph is not that of a Voronoi diagram.
+        Returns
+        -------
+        masses, low, high : (k, width) real
+        volumes, covered : (k,) real
+            Those of the pieces, and what old pieces cover of them.
         """
-        engine, n, width = self.engine, new.n, data.values.shape[1]
-        means, low, high = (engine.empty((n, width)) for _ in range(3))
-        volumes, covered = engine.empty(n), engine.empty(n)
-        status = engine.empty(n, np.int32)
-        todo, count = order, n
-        capacity = OVERLAPS[engine.dim]
-        while True:
-            chunk = int(min(count, max(1, LIST_BUDGET // capacity)))
-            queues = tables = None  # free the shorter lists first
-            queues = engine.empty(chunk * capacity, np.int32)
-            tables = engine.empty(chunk * 2 * capacity, np.int32)
-            for first in range(0, count, chunk):
-                engine.run_each(
-                    self._kernels.transfer_cell_data,
-                    min(chunk, count - first),
-                    np.int32(first),
-                    todo,
-                    np.int32(capacity),
-                    queues,
-                    tables,
-                    new.points,
-                    new.starts,
-                    new.neighbors,
-                    np.int32(old.n),
-                    old.points,
-                    old.starts,
-                    old.neighbors,
-                    binned.items,
-                    binned.bins,
-                    binned.grid_frames,
-                    binned.grid_shapes,
-                    *box.device_corners(engine.real),
-                    np.int32(partial),
-                    *data.kernel_args,
-                    means,
-                    low,
-                    high,
-                    volumes,
-                    covered,
-                    status,
-                    group=self._group,
-                )
-            outcome = status.get()
-            large = self._cells_to_enlarge(outcome, "one of the diagrams")
-            full = np.flatnonzero(outcome == LIST_FULL)
-            if large.size:
-                self._enlarge(int(large[0]))
-            if full.size:
-                # The capacity is a power of two. No cell overlaps more old cells than there are.
-                capacity = min(GROWTH * capacity, 1 << int(old.n).bit_length())
-            left = np.sort(np.concatenate([full, large]))
-            if not left.size:
-                break
-            todo, count = engine.upload(left, np.int32), len(left)
-        return TransferredData(means.get(), low.get(), high.get(), volumes.get(), covered.get())
-
-    @staticmethod
-    def _cells_to_enlarge(status: np.ndarray, what: str) -> np.ndarray:
-        """Return the cells that exceed the face capacity; raise InputError if any cell failed."""
-        failed = np.flatnonzero(status == FAILED)
-        if failed.size:
-            raise InputError(
-                f"cell {failed[0]} ({failed.size} in all) cannot be rebuilt from its neighbors, expected Voronoi "
-                f"diagrams of distinct generators: call diagram.check() on {what}"
+        engine, (k, width) = self.engine, (len(new.pieces), data.values.shape[1])
+        entries, shifts = (
+            np.column_stack([np.arange(len(old.pieces)), np.zeros(len(old.pieces), int)]),
+            np.zeros((1, engine.dim)),
+        )
+        if periods.any():
+            entries, shifts = _images(self.measure(new, "onto"), boxes, periods)
+        moved = shifts[entries[:, 1]]
+        lower, upper = boxes.lower[entries[:, 0]] + moved, boxes.upper[entries[:, 0]] + moved
+        tree = Tree(lower, upper, curve_order(lower + upper), leaf=1)
+        order = curve_order(new.pieces.origins)
+        results = *(engine.empty((k, width)) for _ in range(3)), engine.empty(k), engine.empty(k)
+        status = engine.empty(k, np.int32)
+        status.fill(DONE)
+        args = (
+            *new.args,
+            *old.args,
+            np.int32(tree.n),
+            np.int32(tree.levels),
+            engine.upload(tree.boxes),
+            engine.upload(entries[tree.order], np.int32),
+            engine.upload(shifts),
+            *self._box,
+            *data.kernel_args,
+            *results,
+            status,
+        )
+        while order.size:
+            engine.run_each(
+                self._kernels.transfer_cell_data, len(order), engine.upload(order, np.int32), *args, group=self._group
             )
-        return np.flatnonzero(status == PIECE_LARGE)
+            order = self._are_large(status.get(), new.pieces.cells, "one of the diagrams")
+        return tuple(array.get() for array in results)
+
+
+def _images(new: PieceMeasures, old: PieceMeasures, periods: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return images of old pieces that may overlap new ones: pairs (m, 2) of piece and image; shifts (images, d)."""
+    lower, upper = new.lower.min(axis=0), new.upper.max(axis=0)
+    period = np.where(periods > 0, periods, np.inf)
+    first, last = np.floor((lower - old.upper.max(axis=0)) / period), np.ceil((upper - old.lower.min(axis=0)) / period)
+    first, last = np.where(periods > 0, [first, last], 0).astype(int)
+    shifts = np.array(list(product(*(range(a, b + 1) for a, b in zip(first, last, strict=True))))) * periods
+    pairs = []
+    for image, shift in enumerate(shifts):
+        rows = np.flatnonzero(((old.upper + shift >= lower) & (old.lower + shift <= upper)).all(axis=1))
+        pairs.append(np.column_stack([rows, np.full(len(rows), image)]))
+    found = np.concatenate(pairs)
+    # A tree has entries, also where the meshes lie apart.
+    return (found if len(found) else np.zeros((1, 2), int)), shifts

@@ -32,6 +32,7 @@ from clvoro.opencl.memory_limits import available_memory
 from clvoro.remapping import cell_data
 from clvoro.remapping.cell_data import transfer_values
 from clvoro.remapping.device_transfer import transfer_bytes
+from clvoro.remapping.pieces import Pieces
 from clvoro.solvers import poisson
 
 BENCH = Path(__file__).parents[2] / "bench"
@@ -197,13 +198,13 @@ def test_transfers_hold_what_is_told(bench, ctx, monkeypatch, dim, old, new, ord
     domain = clvoro.Box((0,) * dim, (1,) * dim)
     rng, adapter = np.random.default_rng(1), clvoro.Adapter(ctx)
     meshes = [adapter.diagram(domain, rng.random((n, dim))) for n in (old, new)]
-    sizes = [(len(mesh), len(mesh.neighbors)) for mesh in meshes]
+    pieces = [Pieces.of(mesh) for mesh in meshes]
     values = meshes[0].volumes
     ledger = bench.Ledger()
     with bench.counted_buffers(ledger):
         transfer_values(meshes[0], values, meshes[1], order, adapter=adapter)
     engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype("float64"))
-    assert 0.9 <= ledger.peak / transfer_bytes(engine, *sizes, 1, order) <= 1.1
+    assert 0.9 <= ledger.peak / transfer_bytes(engine, *pieces, len(meshes[0].neighbors), 1, order) <= 1.1
     monkeypatch.setattr(cell_data, "transfer_bytes", lambda *_: 1e18)
     with pytest.raises(MemoryLimitError, match=f"1 columns from {old} cells to {new}.*GiB"):
         transfer_values(meshes[0], values, meshes[1], order, adapter=adapter)

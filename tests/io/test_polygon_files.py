@@ -634,9 +634,7 @@ def test_transfer_onto_itself_changes_nothing(pair) -> None:
     assert np.abs(pair[0].transfer(values, pair[0]) - values).max() < 1e-13
 
 
-def test_slopes_are_those_of_the_device(ctx) -> None:
-    from clvoro.remapping.host_transfer import fit_slopes
-
+def test_slopes_are_those_of_a_box(ctx) -> None:
     # A box as a polygon.
     box, points = clvoro.Box((0, 0), (1, 1)), np.random.default_rng(9).random((80, 2))
     values = np.random.default_rng(10).standard_normal((80, 1))
@@ -649,7 +647,3 @@ def test_slopes_are_those_of_the_device(ctx) -> None:
         )
         # Round-off grows where the fit is ill-conditioned, as for neighbors nearly on a line.
         assert np.abs(flat - ring_).max() < 1e-10
-    slopes, least, most = fit_slopes(adapter.diagram(Polygon(SQUARE), points), values, True)
-    assert (least <= values).all()
-    assert (most >= values).all()
-    assert np.abs(slopes).max() > 0

@@ -362,14 +362,3 @@ def test_graphs_of_no_voronoi_diagram_are_rejected(mesh, moved):
     meshes[moved] = with_points(d, np.roll(d.points, 1, axis=0))
     with pytest.raises(InputError, match=r"diagram\.check\(\)"):
         meshes["old"].transfer(np.ones(600), meshes["new"])
-
-
-@pytest.mark.parametrize("moved", ["old", "new"])
-def test_coincident_generators_are_rejected(mesh, moved):
-    meshes = {"old": mesh(60, 1), "new": mesh(50, 2)}
-    d = meshes[moved]
-    points = d.points.copy()
-    points[7] = points[d.neighbors[d.neighbor_starts[7]]]
-    meshes[moved] = with_points(d, points)
-    with pytest.raises(InputError, match=r"diagram\.check\(\)"):
-        meshes["old"].transfer(np.ones(60), meshes["new"])

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 import clvoro
 from clvoro import Box
-from clvoro.errors import ClvoroError, InputError, InputTypeError
+from clvoro.errors import InputError, InputTypeError
 from clvoro.mesh.diagram import Diagram
 from tests.reference.diagrams3d import polygon
 
@@ -416,7 +416,7 @@ def test_device_without_double_precision(mesh, ctx, monkeypatch, dim):
 
     real = np.dtype(np.float32)
     engine = cell_data.Engine
-    monkeypatch.setattr(cell_data, "Engine", lambda c, queue, d, _: engine(c, queue, d, real))
+    monkeypatch.setattr(cell_data, "Engine", lambda c, queue, d, _, traits: engine(c, queue, d, real, traits))
     old, new = mesh(dim, 200, 17), mesh(dim, 250, 18)
     q = np.random.default_rng(3).normal(size=200)
     got = old.transfer(q, new, 1, adapter=clvoro.Adapter(ctx))
@@ -480,22 +480,18 @@ def test_other_bad_input(mesh, adapter):
     assert old.transfer(np.ones((9, 0)), new).shape == (8, 0)
 
 
-@DIMS
-def test_coincident_generators_are_rejected(mesh, adapter, dim):
-    old, new = mesh(dim, 60, 1), mesh(dim, 50, 2)
-    points = new.points.copy()
-    beside = new.neighbors[slice(*new.neighbor_starts[7:9])]
-    points[7] = points[beside[beside >= 0][0]]
+@pytest.mark.parametrize("kind", ["coincident", "permuted"])
+@pytest.mark.parametrize("which", ["old", "new"])
+def test_meshes_that_are_not_of_their_points_are_rejected(mesh, adapter, kind, which):
+    meshes = {"old": mesh(3, 60, 1), "new": mesh(3, 50, 2)}
+    given = meshes[which]
+    points = given.points.copy()
+    if kind == "permuted":
+        points = np.roll(points, 1, axis=0)
+    else:
+        beside = given.neighbors[slice(*given.neighbor_starts[7:9])]
+        points[7] = points[beside[beside >= 0][0]]
     names = ("volumes", "centroids", "neighbor_starts", "neighbors")
-    arrays = {name: getattr(new, name) for name in names}
+    meshes[which] = Diagram(given.domain, {**{name: getattr(given, name) for name in names}, "points": points})
     with pytest.raises(InputError, match=r"diagram\.check\(\)"):
-        old.transfer(np.ones(60), Diagram(new.domain, {**arrays, "points": points}), adapter=adapter)
-
-
-def test_graphs_of_no_voronoi_diagram_are_rejected(mesh, adapter):
-    old, new = mesh(2, 60, 1), mesh(2, 50, 2)
-    names = ("volumes", "centroids", "neighbor_starts", "neighbors")
-    arrays = {name: getattr(old, name) for name in names}
-    moved = Diagram(old.domain, {**arrays, "points": np.roll(old.points, 1, axis=0)})
-    with pytest.raises(ClvoroError, match=r"diagram\.check\(\)"):
-        moved.transfer(np.ones(60), new, adapter=adapter)
+        meshes["old"].transfer(np.ones(60), meshes["new"], adapter=adapter)

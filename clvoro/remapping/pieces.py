@@ -1,0 +1,143 @@
+"""Meshes as convex pieces of their cells, which the device intersects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from ..mesh.connectivity import cell_corners, face_owners, following, neighbor_points, plane_shares, take_rows
+from ..mesh.diagram import Diagram
+from ..mesh.lookup import cell_shapes
+
+_STRAIGHT = 1e-9
+"""Share of a cell up to which a corner that points inwards counts as straight."""
+_ON_WALL = 1e-3
+"""Distance from a wall, as a share of the cell's width, below which a generator counts as on it."""
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Convex pieces of cells: one of each cell, or triangles of a cell that is not convex.
+
+    Attributes
+    ----------
+    cells : (k,) int
+        The cell that each piece is a part of, ascending.
+    origins : (k, d) float64
+        A point near each piece, and in it in 3D: the generator, unless it is on a wall or outside of its cell.
+    points : (v, d) float64
+        Corners of cells; in 3D generators, and points behind faces.
+    starts, items : (k + 1,), (m,) int
+        Row i has the corners of piece i in `points`, counter-clockwise; in 3D those `points` to which its points are
+        not nearer than to the origin.
+    """
+
+    cells: np.ndarray
+    origins: np.ndarray
+    points: np.ndarray
+    starts: np.ndarray
+    items: np.ndarray
+
+    @classmethod
+    def of(cls, diagram: Diagram) -> Pieces:
+        """Return the pieces of the cells of a diagram."""
+        return {2: _between_corners, 3: _between_bisectors}[diagram.domain.cell_dim](diagram)
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def summed(self, values: np.ndarray, n: int) -> np.ndarray:
+        """Return the sums of `values` (k,) or (k, width) over the pieces of each of `n` cells."""
+        sums = [np.bincount(self.cells, column, n) for column in values.reshape(len(values), -1).T]
+        return np.stack(sums, axis=1).reshape(n, *values.shape[1:])
+
+
+def _between_corners(diagram: Diagram) -> Pieces:
+    """Return the cells of a diagram of polygons."""
+    cells, x, n = np.arange(len(diagram)), diagram.vertices, len(diagram)
+    inside = diagram.points
+    if diagram.domain.curved:
+        inside = diagram.centroids if diagram.is_power else inside
+        inside = inside * (diagram.domain.frame[1] / np.linalg.norm(inside, axis=1))[:, None]
+    if not (diagram.domain.cuts_cells or diagram.is_power):
+        return Pieces(cells, inside, x, diagram.cell_vertex_starts, diagram.cell_vertices)
+    starts, items = cell_corners(diagram)
+    usable = np.diff(starts) >= 3
+    if not diagram.domain.cuts_cells:
+        return Pieces(cells[usable], inside[usable], x, *take_rows(starts, items, cells[usable]))
+    owner = np.repeat(np.arange(n), np.diff(starts))
+    after = following(starts)
+    edges = x[items[after]] - x[items]
+    along = edges[after]
+    turns = edges[:, 0] * along[:, 1] - edges[:, 1] * along[:, 0]
+    slack = _STRAIGHT * diagram.volumes[owner]
+    back = (turns < -slack) | ((turns <= slack) & ((edges * along).sum(axis=1) < 0))
+    convex = usable & (np.bincount(owner, back, n) == 0)
+    cells = np.flatnonzero(convex)
+    bent = np.flatnonzero(usable & ~convex)
+    starts, items = take_rows(starts, items, cells)
+    if bent.size:
+        parts = shapely.constrained_delaunay_triangles(cell_shapes(diagram, bent))
+        triangles, of = shapely.get_parts(parts, return_index=True)
+        corners = shapely.get_coordinates(shapely.orient_polygons(triangles)).reshape(-1, 4, 2)[:, :3]
+        items = np.concatenate([items, len(x) + np.arange(3 * len(corners))])
+        starts = np.concatenate([starts, starts[-1] + 3 * np.arange(1, len(corners) + 1)])
+        cells, x = np.concatenate([cells, bent[of]]), np.concatenate([x, corners.reshape(-1, 2)])
+        order = np.argsort(cells, kind="stable")
+        cells = cells[order]
+        starts, items = take_rows(starts, items, order)
+    return Pieces(cells, inside[cells], x, starts, items)
+
+
+def _between_bisectors(diagram: Diagram) -> Pieces:
+    """Return the cells of a diagram of polyhedra. Planes that are no bisectors, as walls, get points behind them."""
+    owner, neighbors, n = face_owners(diagram), diagram.neighbors.copy(), len(diagram)
+    filled = np.diff(diagram.neighbor_starts) > 0
+    alone = (neighbors < 0) | diagram.shifts.any(axis=1)
+    normals, gaps = np.zeros((len(owner), 3)), np.ones(len(owner))
+    normals[alone], gaps[alone] = _planes(diagram, np.flatnonzero(alone))
+    # A generator on a wall has no mirror image, and one outside of its cell is in no piece.
+    moved = np.zeros(n, bool) | diagram.is_power | (not filled.all())
+    moved[owner[gaps < _ON_WALL * np.cbrt(diagram.volumes[owner])]] = True
+    others = np.flatnonzero(moved[owner] & ~alone)
+    normals[others], gaps[others] = _planes(diagram, others)
+    alone[others] = True
+    origins = np.where(moved[:, None], diagram.centroids, diagram.points)
+    alone = np.flatnonzero(alone)
+    own, normal = owner[alone], normals[alone]
+    gap = gaps[alone] + ((diagram.points[own] - origins[own]) * normal).sum(axis=1)
+    cells = np.flatnonzero(filled)
+    neighbors[alone] = n + np.arange(len(alone))
+    points = np.concatenate([diagram.points, origins[own] + 2 * gap[:, None] * normal])
+    starts = np.append(diagram.neighbor_starts[:-1][filled], len(neighbors))
+    return Pieces(cells, origins[cells], points, starts, neighbors)
+
+
+def _planes(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit normals (k, 3) of half-faces (k,), and their distances (k,) from the generators.
+
+    Faces at curved walls have corners there and are not plane. The plane passes through the centroid, normal to the
+    vector area; where that leads away from the wall, it touches the wall.
+    """
+    behind, walls = diagram.neighbors[faces] < 0, -1 - diagram.neighbors[faces]
+    own = diagram.points[face_owners(diagram)[faces]]
+    between = neighbor_points(diagram, faces[~behind]) - own[~behind]
+    lengths = np.linalg.norm(between, axis=1)
+    normals, gaps = np.empty_like(own), np.empty(len(own))
+    normals[~behind] = between / lengths[:, None]
+    gaps[~behind] = plane_shares(diagram, faces[~behind]) * lengths
+    normals[behind], gaps[behind] = diagram.domain.toward_walls(walls[behind], own[behind])
+    at = np.flatnonzero(behind & diagram.domain.curved_walls)
+    if at.size:
+        corners, starts, wall = diagram.face_vertices, diagram.face_vertex_starts, faces[at]
+        areas = np.cross(diagram.vertices[corners], diagram.vertices[corners[following(starts)]])
+        areas = np.add.reduceat(areas, starts[:-1])[wall]
+        flat = areas / np.maximum(np.linalg.norm(areas, axis=1), 1e-300)[:, None]
+        along = (flat * normals[at]).sum(axis=1)
+        flat *= np.sign(along)[:, None]
+        away = ((diagram.face_centroids[wall] - own[at]) * flat).sum(axis=1)
+        usable = (np.abs(along) > 0.5) & (away > 0)
+        normals[at[usable]], gaps[at[usable]] = flat[usable], away[usable]
+    return normals, gaps
