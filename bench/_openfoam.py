@@ -205,11 +205,11 @@ class Case:
         FoamCase(self.folder).run(" ".join(program), self.folder / f"log.{program[0]}")
 
     def table(self, function: str, file: str) -> dict[str, np.ndarray]:
-        """Return the columns of the table that a function object wrote, by name."""
-        (path,) = (self.folder / "postProcessing" / function).glob(f"*/{file}")
-        lines = path.read_text().splitlines()
-        heads = [line.split()[1:] for line in lines if line.startswith("#")]
-        rows = np.array([line.split() for line in lines if not line.startswith("#")], float)
+        """Return the columns of the tables that a function object wrote in all runs, by name."""
+        paths = (self.folder / "postProcessing" / function).glob(f"*/{file}")
+        texts = [path.read_text().splitlines() for path in sorted(paths, key=lambda path: float(path.parent.name))]
+        heads = [line.split()[1:] for line in texts[0] if line.startswith("#")]
+        rows = np.array([line.split() for lines in texts for line in lines if not line.startswith("#")], float)
         return dict(zip(heads[-1], rows.T, strict=True))
 
     def latest_mesh(self) -> Mesh:

@@ -41,6 +41,7 @@ from _common import Report, counts, heading, make_adapter, parser, spread
 from _openfoam import Case, Mesh, header, missing, nonuniform, text_of, write_prisms
 
 import clvoro
+from clvoro.foam.case import FoamCase
 
 LENGTH, HEIGHT = 2.2, 0.41
 CENTER, RADIUS = (0.2, 0.2), 0.05
@@ -156,7 +157,7 @@ FOLLOWED: dict[str, tuple[clvoro.foam.FieldSizes, str]] = {
     "followed, forces": (clvoro.foam.FieldSizes(forces="cylinder"), "simpleFoam"),
     "followed, adjoints": (clvoro.foam.FieldSizes(adjoints=("Uadrag", "Ualift")), "adjointOptimisationFoam"),
 }
-"""Sizes and solvers of meshes that follow the solution at Re 20."""
+"""Sizes and solvers of meshes that follow the solution at Re 20; at Re 100 all have those for forces."""
 
 
 def follow(case: Case, adapter: clvoro.Adapter, n_cells: int, cycles: int, mesher: str) -> dict[str, float]:
@@ -347,6 +348,7 @@ def write_case(
     convection: str,
     start: tuple[np.ndarray, np.ndarray] | None = None,
     times: tuple[float, float] = (3000, 1),
+    write_interval: float | None = None,
 ) -> None:
     """Write fields and dictionaries for a Reynolds number; `times` are the end and the step."""
     mean = reynolds * VISCOSITY / (2 * RADIUS)
@@ -395,7 +397,13 @@ def write_case(
         f"bounded {scheme}" if steady else scheme,
         {} if steady else {"ddtSchemes": {"default": "backward"}},
         solution=solution,
-        control={"endTime": times[0], "deltaT": times[1], "writePrecision": 12, "functions": {"forces": forces}},
+        control={
+            "endTime": times[0],
+            "deltaT": times[1],
+            "writeInterval": write_interval or times[0],
+            "writePrecision": 12,
+            "functions": {"forces": forces},
+        },
     )
 
 
@@ -512,19 +520,55 @@ class Shedding:
         case.run("pimpleFoam")
         u, p = case.field("U", len(mesh))[:, :2], case.field("p", len(mesh))[:, 0]
         self.before = mesh.centroids[:, :2], u, p
-        forces = case.table("forces", "coefficient.dat")
-        time_, lift = forces["Time"], forces["Cl"]
-        late = time_ > end - 1.05  # three periods
-        rises = np.flatnonzero((lift[:-1] < 0) & (lift[1:] >= 0) & late[:-1])
-        share = -lift[rises] / (lift[rises + 1] - lift[rises])
-        crossings = time_[rises] + share * (time_[rises + 1] - time_[rises])
-        period = float(np.diff(crossings).mean())
-        return {
-            "drag": float(forces["Cd"][late].max()),
-            "lift": float(lift[late].max()),
-            "strouhal": 2 * RADIUS / period,
-            "steps": float(len(time_)),
-        }
+        return shedding_of(case, end)
+
+
+def shedding_of(case: Case, end: float) -> dict[str, float]:
+    """Return the largest drag and lift in the last three periods before a time, and the Strouhal number."""
+    forces = case.table("forces", "coefficient.dat")
+    time_, lift = forces["Time"], forces["Cl"]
+    late = time_ > end - 1.05
+    rises = np.flatnonzero((lift[:-1] < 0) & (lift[1:] >= 0) & late[:-1])
+    share = -lift[rises] / (lift[rises + 1] - lift[rises])
+    crossings = time_[rises] + share * (time_[rises + 1] - time_[rises])
+    return {
+        "drag": float(forces["Cd"][late].max()),
+        "lift": float(lift[late].max()),
+        "strouhal": 2 * RADIUS / float(np.diff(crossings).mean()),
+        "steps": float(len(time_)),
+    }
+
+
+def follow_vortices(case: Case, adapter: clvoro.Adapter, mesh: Mesh, n_cells: int, convection: str) -> dict[str, float]:
+    """Adapt the case at Re 100 once in each of ten periods of shedding, and go on for three; return as `shedding_of`.
+
+    The sizes are those for the forces on the cylinder, of ten times in each period.
+    """
+    period, begin = 0.33, 4.0
+    write_case(case, mesh, 100, convection, None, (begin, 0.0015 * math.sqrt(3000 / n_cells)), period / 10)
+    case.run("pimpleFoam")
+    sizes = clvoro.foam.FieldSizes(forces="cylinder", h_min=0.0015)
+    rows = clvoro.foam.adapt_case(
+        case.folder,
+        n_cells=n_cells,
+        cycles=10,
+        solver="pimpleFoam",
+        interval=period,
+        sizes=sizes,
+        window=period,
+        pictures=False,
+        adapter=adapter,
+    )
+    known = FoamCase(case.folder)
+    end = rows[-1].time + 1.05
+    known.set_control(endTime=end)
+    case.run("pimpleFoam")
+    return {
+        **shedding_of(case, end),
+        "solver_seconds": sum(row.solver_seconds for row in rows),
+        "mesh_seconds": sum(row.mesh_seconds or 0 for row in rows),
+        "transfer_seconds": sum(row.transfer_seconds or 0 for row in rows),
+    }
 
 
 def picture(case: Case, mesh: Mesh, path: Path, title: str) -> None:
@@ -616,7 +660,10 @@ def main() -> None:
                         break
                     mesh = Mesh.of(case.folder)
                     start = time.perf_counter()
-                    if re_ != 20:
+                    if re_ != 20 and mesher in FOLLOWED:
+                        flow = follow_vortices(case, adapter, mesh, n, convection)
+                        mesh = case.latest_mesh()
+                    elif re_ != 20:
                         flow = shedding.flow(case, mesh, convection)
                     elif mesher in FOLLOWED:
                         write_case(case, mesh, 20, convection)

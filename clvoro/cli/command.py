@@ -230,6 +230,13 @@ def _add_foam(commands: Any) -> None:
     adapt.add_argument(
         "--fields", metavar="LIST", type=_names, default=("U",), help="fields that the mesh follows (default: U)"
     )
+    adapt.add_argument(
+        "--window",
+        metavar="T",
+        type=float,
+        default=0.0,
+        help="written times as far as this before the latest one count, too, such as a period (default: 0)",
+    )
     goal = adapt.add_mutually_exclusive_group()
     goal.add_argument("--forces", metavar="LIST", type=_names, default=(), help="patches whose forces are the goal")
     goal.add_argument(
@@ -507,6 +514,7 @@ def _foam_adapt(arguments: argparse.Namespace) -> int:
         cycles=arguments.cycles,
         solver=arguments.solver,
         interval=arguments.interval,
+        window=arguments.window,
         sizes=FieldSizes(
             arguments.fields,
             arguments.forces,

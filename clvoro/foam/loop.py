@@ -20,7 +20,7 @@ import numpy as np
 
 from ..adaptation.options import EffortName
 from ..adapter import Adapter
-from ..arguments import check_integer
+from ..arguments import check_integer, check_number
 from ..errors import InputError, InputTypeError, LostFieldsWarning
 from ..geometry.boundary_layers import Layers
 from ..io import load
@@ -30,7 +30,7 @@ from ..io.foam import PatchType
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..shared import shared_adapter
-from ..sizing import Estimate, force_weight, hessian_size, steepness
+from ..sizing import Estimate, combine, force_weight, hessian_size, normalize, steepness
 from .case import FoamCase, Time
 from .fields import FoamField, Values
 from .mesh import FoamMesh
@@ -134,6 +134,7 @@ def adapt_case(
     solver: str | Callable[[Path], object] | None = None,
     interval: float | None = None,
     sizes: Estimator | None = None,
+    window: float = 0.0,
     layers: Layers | Sequence[Layers] | None = None,
     mesh: Result | Diagram | str | PathLike[str] | None = None,
     effort: EffortName = "default",
@@ -169,6 +170,9 @@ def adapt_case(
     sizes : FieldSizes or callable, optional
         Where sizes come from; by default ``FieldSizes()``, the Hessian of U. A function of your own takes the fields by
         name, (n,) or (n, d), the diagram, and `n_cells`, and returns an estimate.
+    window : float
+        Times that were written on the present mesh count, too, as far as this before the latest one: the finest size of
+        all holds, scaled to `n_cells`. With the period of a flow vortices stay inside of fine cells.
     layers : Layers or sequence of Layers, optional
         Boundary layers of the new meshes; by default those of the last call.
     mesh : Result, Diagram or path, optional
@@ -217,6 +221,7 @@ def adapt_case(
         FoamCase(case),
         n_cells,
         sizes or FieldSizes(),
+        check_number("window", window, least=0),
         None if layers is None else (layers,) if isinstance(layers, Layers) else tuple(layers),
         effort,
         pictures,
@@ -231,6 +236,7 @@ class _Loop:
     case: FoamCase
     n_cells: int
     sizes: Estimator
+    window: float
     layers: tuple[Layers, ...] | None
     effort: EffortName
     pictures: bool
@@ -355,8 +361,8 @@ class _Loop:
                 f"n_cells is {self.n_cells}, expected at least {least}: {_CELLS_PER_PATCH} for each of the "
                 f"{len(foam.types)} patches"
             )
-        self._warn(fields, foam, latest)
-        size = self._sizes(fields, old)
+        self._warn_of_lost_fields(fields, foam, latest)
+        size = self._sizes_in_window(fields, old, latest)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
         domain = old.diagram.domain
         made = self.adapter.run(
@@ -397,15 +403,15 @@ class _Loop:
         self._keep(done)
         return done
 
-    def _warn(self, fields: Sequence[FoamField], foam: FoamMesh, time: Time) -> None:
+    def _warn_of_lost_fields(self, fields: Sequence[FoamField], foam: FoamMesh, time: Time) -> None:
         """Warn of what the next mesh will not have."""
         moving = {one.name for one in fields_that_move(fields, foam.patches)}
         dropped = [f"{one.name} ({one.kind})" for one in fields if one.name not in moving]
         dropped += [f"{name}/" for name in self.case.folders(time)]
         if dropped:
             warnings.warn(
-                f"{self.case.folder / time.name} has {', '.join(dropped)}: not transferred, since only fields in cells "
-                "are, and the flux phi of U unless patches are cyclic; copy the folder first if you need them",
+                f"the latest time of {self.case.folder} has {', '.join(dropped)}: not transferred, since only fields "
+                "in cells are, and the flux phi of U unless patches are cyclic; copy the folder first if you need them",
                 LostFieldsWarning,
                 stacklevel=4,
             )
@@ -433,6 +439,22 @@ class _Loop:
         if abs(foam.n_cells - len(given)) > (0 if foam.is_plane else 0.1 * len(given)):
             raise InputError(f"mesh has {len(given)} cells, the case {foam.n_cells}; expected the mesh of the case")
         return given
+
+    def _sizes_in_window(self, fields: Sequence[FoamField], old: MeshOfCase, latest: Time) -> Estimate:
+        """Return the estimate from the latest time, and from those of the window on the same mesh."""
+        case, made = self.case, self._sizes(fields, old)
+        folder = case.mesh_folder(latest)
+        found = []
+        for one in case.times():
+            inside = latest.value - self.window <= one.value < latest.value
+            if inside and case.mesh_folder(one) == folder:
+                earlier = case.fields(one)
+                _check_values(earlier, old.foam)
+                found.append(self._sizes(earlier, old))
+        if not found:
+            return made
+        top = max(float(e.values.max()) for e in (*found, made))
+        return normalize(combine(*found, made), n_cells=self.n_cells, h_max=top)
 
     def _sizes(self, fields: Sequence[FoamField], old: MeshOfCase) -> Estimate:
         found: dict[str, np.ndarray] = {}

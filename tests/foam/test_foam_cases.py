@@ -279,6 +279,23 @@ def test_a_case_is_held_until_its_solver_ends(case, tmp_path):
     os.kill(int((case / "clvoro" / "log.cycle-0").read_text()), signal.SIGKILL)
 
 
+def test_a_window_in_time_counts(case):
+    """A layer that has moved keeps its fine cells as long as the time is in the window."""
+    shutil.copytree(case / "5", case / "6")
+    change_field(case, "U", lambda u: 0 * u + [1, 0, 0], time="6")
+
+    def by_x(fields, mesh, n_cells):
+        x = mesh.centroids[:, 0]
+        at = 0.5 if np.ptp(fields["U"][:, 0]) > 0.1 else 2.5
+        return sizing.sensor_size(np.exp(-20 * (x - at) ** 2) + 0.01, on=mesh, n_cells=n_cells)
+
+    foam.adapt_case(case, n_cells=400, sizes=by_x, window=1.0, effort="fast", pictures=False)
+    x = clvoro.load(case / "6" / "polyMesh" / "clvoro.npz").points[:, 0]
+    counts = [(np.abs(x - at) < 0.3).sum() for at in (0.5, 1.5, 2.5)]
+    assert min(counts[0], counts[2]) > 2 * counts[1]
+    assert len(x) == 400
+
+
 LAYERS = clvoro.Layers(0.02, 2, 1.2, spacing=0.08, edges="walls")
 
 
@@ -301,13 +318,13 @@ def spoil(case, name, old, new):
     path.write_bytes(path.read_bytes().replace(old, new, 1))
 
 
-def change_field(case, name, change, key="internalField", patch=None):
-    """Write a field of the latest time with other numbers in cells, or at a patch."""
-    field = foam.read_field(case / "5" / name)
+def change_field(case, name, change, key="internalField", patch=None, time="5"):
+    """Write a field of a time with other numbers in cells, or at a patch."""
+    field = foam.read_field(case / time / name)
     entries = {**field.entries}
     place = entries if patch is None else entries["boundaryField"][patch]
     place[key] = foam.Values(field.type, change(place[key].numbers), False)
-    replace(field, entries=entries).write(case / "5" / name, "5")
+    replace(field, entries=entries).write(case / time / name, time)
 
 
 def change_owner(case, n_less):
