@@ -368,19 +368,6 @@ def test_no_nucleation_without_strain(engine):
     assert Sweep(engine, strained(stretch=0.0), 0.04 * H / A, 0.0, nuclei=5, climb_strain=QUIET).new is None
 
 
-@pytest.mark.sparse(1)
-@pytest.mark.parametrize("real", ["float64", "float32"])
-def test_repeated_runs_give_the_same_bits(ctx, real):
-    engine = patch.make_engine(ctx, real)
-    points = patch.random_points(700, 12).astype(real).astype(float)
-    used = InsertionDeletion(engine)
-    sweeps = [Sweep(engine, points, 0.033, 20.0, control, nuclei=3) for control in (None, used, used)]
-    for sweep in sweeps[1:]:
-        assert sweep.new.inserted == sweeps[0].new.inserted > 3
-        assert np.array_equal(sweep.new.generators.points.get(), sweeps[0].new.generators.points.get())
-        assert np.array_equal(sweep.new.generators.labels.get(), sweeps[0].new.generators.labels.get())
-
-
 SPOTS = {(0.2, 0.2): 0.9, (0.8, 0.2): 0.8, (0.2, 0.6): 0.93, (0.8, 0.6): 0.95}
 
 

@@ -332,21 +332,6 @@ def test_start_far_from_the_solution(make):
 
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
-@pytest.mark.parametrize("real", REALS)
-def test_repeated_solves_give_the_same_bits(make, real, preconditioner):
-    engine = make(real=real)
-    poisson, laplacian = assembled(engine, graphs.random_graph(3000, seed=55))
-    b = engine.upload(np.random.default_rng(56).standard_normal(3000))
-    first, second = engine.zeros(3000), engine.zeros(3000)
-    options = {"tolerance": 1e-5, "preconditioner": preconditioner}
-    one = poisson.solve(laplacian, b, first, **options)
-    two = Poisson(engine).solve(laplacian, b, second, **options)
-    assert np.array_equal(one.residuals, two.residuals)
-    assert np.array_equal(first.get(), second.get())
-
-
-@pytest.mark.sparse(1)
-@pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 @pytest.mark.parametrize("left", [np.nan, 1e3])
 def test_buffers_of_earlier_solves_do_not_matter(make, preconditioner, left):
     """In the sums, the state and the records, which stay."""

@@ -195,38 +195,6 @@ def test_near_duplicates(adapter64, gap):
             assert few.volumes[i] == pytest.approx(cell.area, abs=1e-12 * BOX.measure / gap * 1e-3)
 
 
-def test_duplicates_are_named(adapter):
-    points = np.concatenate([POINTS["random"], POINTS["random"][17:18]])
-    with pytest.raises(ValueError, match=r"points\[17\] and points\[300\] coincide"):
-        adapter.diagram(BOX, points)
-
-
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        (np.zeros((2, 100)), r"shape \(2, 100\), expected \(n, 2\); pass its transpose"),
-        (np.zeros((3, 3)), r"shape \(3, 3\), expected \(n, 2\)"),
-        (np.zeros(4), r"shape \(4,\)"),
-        (np.zeros((0, 2)), "at least one"),
-        ([[0.1, np.nan]], r"points\[0\] is .*finite"),
-        ([[0.1, 0.1], [3.0, 0.1]], r"points\[1\] is .*outside"),
-        ([["a", "b"]], "dtype"),
-        ([[1j, 0.2]], "dtype"),
-        (None, "points is a NoneType"),
-    ],
-)
-def test_bad_points(adapter64, points, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        adapter64.diagram(BOX, points)
-
-
-def test_same_bits_twice(adapter):
-    points = POINTS["graded"]
-    a, b = adapter.diagram(BOX, points), adapter.diagram(BOX, points)
-    for name in ("volumes", "centroids", "neighbors", "face_measures", "vertices", "cell_vertices"):
-        assert (getattr(a, name) == getattr(b, name)).all(), name
-
-
 def test_result_does_not_depend_on_the_order_of_points(adapter64):
     points = POINTS["graded"]
     order = np.random.default_rng(99).permutation(len(points))

@@ -337,35 +337,6 @@ def test_where_cells_are_clipped_changes_no_bit(ctx, real, monkeypatch):
         assert all(np.array_equal(one, other) for other in others)
 
 
-def test_duplicates_are_named(adapter):
-    points = np.concatenate([POINTS["random"], POINTS["random"][17:18]])
-    with pytest.raises(ValueError, match=r"points\[17\] and points\[300\] coincide"):
-        adapter.diagram(BOX, points)
-
-
-@pytest.mark.sparse(2)
-@pytest.mark.parametrize("name", ["random", "fcc", "sphere"])
-def test_same_bits_twice(adapter, name):
-    a, b = adapter.diagram(BOX, POINTS[name]), adapter.diagram(BOX, POINTS[name])
-    for array in (
-        "volumes",
-        "centroids",
-        "neighbor_starts",
-        "neighbors",
-        "face_measures",
-        "face_centroids",
-        "vertices",
-        "face_vertex_starts",
-        "face_vertices",
-    ):
-        assert np.array_equal(getattr(a, array), getattr(b, array)), array
-
-
-def test_2d_arrays_are_missing(adapter64):
-    diagram = adapter64.diagram(BOX, POINTS["three"])
-    assert not hasattr(diagram, "cell_vertices")
-
-
 def test_degenerate_sets(adapter64):
     """Subsets of a lattice that covers the box and its walls, rotated or not; some points are off by one ulp."""
     rng = np.random.default_rng(4099)

@@ -290,10 +290,3 @@ def test_an_update_without_motion_keeps_the_bits(engine):
     updated = Rows(PolyhedraUpdate(engine).update(cells, CUBE, x, t, None))
     for name, array in vars(new).items():
         assert np.array_equal(array, getattr(updated, name)), name
-
-
-def test_same_bits_twice(engine):
-    for name in ("random", "radial", "bcc, nearly"):
-        a, b = (tessellations(engine, POINTS[name])[0][0] for _ in range(2))
-        for array in vars(a):
-            assert np.array_equal(getattr(a, array), getattr(b, array)), array
