@@ -14,7 +14,7 @@ from ..errors import InputError
 from .arguments import check_positive, check_slope
 from .cells import OnCells
 from .derivatives import CellStencils, check_cell_values, derivatives
-from .profiles import FLAT, check_bounds, check_one_of, check_p, scale_profile
+from .profiles import Places, best_sizes, check_bounds, check_one_of, check_p, scale_profile
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -216,30 +216,19 @@ def estimate(
     h_max: float,
     growth: float,
 ) -> Estimate:
-    """Return the sizes that make the L^p norm of the error e = constant * indicator * h^order least.
-
-    With l the indicator, h = c l^(-p / (order p + d)), and c^d = (1 / N) integral l^(p d / (order p + d)) for N cells;
-    h is then bounded, its growth limited, and c chosen again.
-    """
-    stencils = CellStencils.of(on)
-    mesh = stencils.mesh
-    d, volumes = mesh.domain.cell_dim, mesh.volumes
+    """Return the estimate with the sizes of `best_sizes`."""
     slope = check_slope(what, growth, None)
-    top = check_bounds(what, h_min, h_max, float(mesh.domain.extent.max()))
-    wanted = check_one_of(what, n_cells, eps)
-    largest = float(indicator.max())
-    shape = indicator / largest if largest > 0 else np.zeros(len(indicator))
-    shape[shape < FLAT] = 0
-    power = 1 / order if math.isinf(p) else p / (order * p + d)
-    with np.errstate(divide="ignore"):
-        profile = shape**-power
-    factor = None
-    if eps is not None:
-        norm = 1.0 if math.isinf(p) else float(np.sum(volumes * shape ** (power * d))) ** (1 / p)
-        factor = (wanted / (constant * largest * norm)) ** (1 / order) if largest > 0 else math.inf
-    limit = partial(stencils.limit_growth, slope=slope)
-    sizes = scale_profile(what, profile, factor, n_cells, volumes, d, h_min, top, limit)
+    stencils = CellStencils.of(on)
+    mesh, bounds = stencils.mesh, {"n_cells": n_cells, "eps": eps, "h_min": h_min, "h_max": h_max}
+    places = _places(stencils, slope)
+    sizes = best_sizes(what, indicator, places, order=order, p=p, constant=constant, **bounds)
     return Estimate(mesh, sizes, constant * indicator * sizes**order, order, p)
+
+
+def _places(stencils: CellStencils, slope: float) -> Places:
+    domain = stencils.mesh.domain
+    limit = partial(stencils.limit_growth, slope=slope)
+    return Places(stencils.mesh.volumes, domain.cell_dim, float(domain.extent.max()), limit)
 
 
 def sensor_size(
@@ -360,18 +349,16 @@ def normalize(
     """
     wanted = check_one_of("normalize", n_cells, eps)
     slope = check_slope("normalize", growth, None)
-    mesh = estimate.mesh
-    top = check_bounds("normalize", h_min, h_max, float(mesh.domain.extent.max()))
+    places = _places(CellStencils.of(estimate.mesh), slope)
+    top = check_bounds("normalize", h_min, h_max, places.longest)
     factor = None
     if eps is not None:
         if estimate.norm == 0:
             raise InputError(f"normalize got eps={eps} for an estimate that is 0 everywhere; give n_cells")
         factor = (wanted / estimate.norm) ** (1 / estimate.order)
-    limit = partial(CellStencils.of(mesh).limit_growth, slope=slope)
-    d = mesh.domain.cell_dim
     unit = 1.0 if factor is not None else float(estimate.values.min())
     profile = estimate.values / unit
-    sizes = scale_profile("normalize", profile, factor, n_cells, mesh.volumes, d, h_min, top, limit)
+    sizes = scale_profile("normalize", profile, factor, n_cells, places, h_min, top)
     return estimate.with_sizes(sizes)
 
 

@@ -1,10 +1,11 @@
-"""Sizes c l^(-q) from a profile: the common factor c for a number of cells, within bounds."""
+"""Sizes c l^(-q) from an indicator l: the common factor c for a number of cells or an error, within bounds."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from numbers import Real
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,16 +53,69 @@ def check_bounds(what: str, h_min: object, h_max: object, longest: float) -> flo
     return longest if math.isinf(h_max) else float(h_max)  # type: ignore[arg-type]
 
 
+class Places(NamedTuple):
+    """Where the values of an indicator are: the cells of a mesh, or the pixels of a raster.
+
+    Attributes
+    ----------
+    volumes : array
+        Volume that each value represents.
+    dim : int
+        Number of dimensions of the cells.
+    longest : float
+        The largest size.
+    limit : callable, optional
+        Limits the growth of sizes. It makes none larger.
+    """
+
+    volumes: np.ndarray
+    dim: int
+    longest: float
+    limit: Callable[[np.ndarray], np.ndarray] | None = None
+
+
+def best_sizes(
+    what: str,
+    indicator: np.ndarray,
+    places: Places,
+    *,
+    order: float,
+    p: float = math.inf,
+    constant: float = 1.0,
+    n_cells: float | None,
+    eps: float | None,
+    h_min: float,
+    h_max: float,
+) -> np.ndarray:
+    """Return the sizes that make the L^p norm of the error e = constant * indicator * h^order least.
+
+    With l the indicator, h = c l^(-p / (order p + d)), and c^d = (1 / N) integral l^(p d / (order p + d)) for N cells;
+    h is then bounded, its growth limited, and c chosen again.
+    """
+    wanted = check_one_of(what, n_cells, eps)
+    top = check_bounds(what, h_min, h_max, places.longest)
+    largest = float(indicator.max())
+    # l in units that neither overflow nor underflow.
+    shape = indicator / largest if largest > 0 else np.zeros(indicator.shape)
+    shape[shape < FLAT] = 0
+    power = 1 / order if math.isinf(p) else p / (order * p + places.dim)
+    with np.errstate(divide="ignore"):
+        profile = shape**-power
+    factor = None
+    if eps is not None:
+        norm = 1.0 if math.isinf(p) else float(np.sum(places.volumes * shape ** (power * places.dim))) ** (1 / p)
+        factor = (wanted / (constant * largest * norm)) ** (1 / order) if largest > 0 else math.inf
+    return scale_profile(what, profile, factor, n_cells, places, h_min, top)
+
+
 def scale_profile(
     what: str,
     profile: np.ndarray,
     factor: float | None,
     n_cells: float | None,
-    volumes: np.ndarray | None,
-    dim: int,
+    places: Places,
     h_min: float,
     top: float,
-    limit: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> np.ndarray:
     """Return factor * profile within the bounds. Without a factor, find the one that gives `n_cells`.
 
@@ -69,10 +123,6 @@ def scale_profile(
     ----------
     profile : array
         Infinite where sizes are largest.
-    volumes : array, optional
-        Volume that each value represents, to count cells; needed without a factor.
-    limit : callable, optional
-        What is done with sizes within the bounds, such as limiting their growth. It makes none larger.
 
     Raises
     ------
@@ -84,6 +134,8 @@ def scale_profile(
             f"{what} values have no derivatives other than 0, so n_cells={n_cells:g} cannot be "
             "distributed; use a number as size"
         )
+
+    limit = places.limit
 
     def sizes(factor: float) -> np.ndarray:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -97,7 +149,7 @@ def scale_profile(
 
     def count(log_factor: float, of: Callable[[float], np.ndarray] = sizes) -> float:
         with np.errstate(over="ignore", divide="ignore"):
-            return float(np.sum(volumes * of(math.exp(log_factor)) ** -dim))
+            return float(np.sum(places.volumes * of(math.exp(log_factor)) ** -places.dim))
 
     begin, end = math.log(top) - 600.0, math.log(top) + 1.0
     most, least = count(begin), count(end)

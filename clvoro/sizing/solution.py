@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
 from ..errors import InputError
 from .estimates import Estimate, curvature_of, estimate, steepness
-from .profiles import FLAT, check_bounds, check_one_of, check_p, scale_profile
+from .profiles import Places, best_sizes, check_p
 from .raster import Raster, check_box, fill_missing
 
 if TYPE_CHECKING:
@@ -161,30 +162,12 @@ def hessian_size(
         bounds = {"h_min": h_min, "h_max": h_max, "growth": growth}
         bent = curvature_of(values, on, p, weight)
         return estimate("hessian_size", on, bent, order=2, p=p, constant=1 / 8, n_cells=n_cells, eps=eps, **bounds)
-    low, high = _corners("hessian_size", lower, upper, growth, weight)
-    u, corners, spacing = _check_solution("hessian_size", values, low, high, at, missing, least=3)
+    grid = _Grid.of("hessian_size", values, lower, upper, at, missing, growth, weight, least=3)
     check_p("hessian_size", p)
-    d = u.ndim
-    curvature = _curvature(u, spacing)
-    largest = curvature.max()
-    if largest <= 0:
-        shape = np.zeros(u.shape)
-    else:
-        shape = curvature / largest  # l in units that neither overflow nor underflow
-        shape[shape < FLAT] = 0
-    power = 0.5 if math.isinf(p) else p / (2 * p + d)
-    with np.errstate(divide="ignore"):
-        profile = shape**-power
-    wanted = check_one_of("hessian_size", n_cells, eps)
-    if eps is not None:
-        # e = c^2 l^(1 - 2 power) / 8 with c for l / largest: divided by `largest`.
-        norm = 1.0
-        if not math.isinf(p):
-            norm = float(np.sum(shape ** (power * d) * _weights(u.shape, spacing, at)) ** (1 / p))
-        factor = math.sqrt(8 * wanted / (largest * norm)) if largest > 0 else math.inf
-    else:
-        factor = None
-    return _sizes_from_profile("hessian_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at)
+    bounds = {"n_cells": n_cells, "eps": eps, "h_min": h_min, "h_max": h_max}
+    return grid.raster(
+        best_sizes("hessian_size", grid.curvature(), grid.places, order=2, p=p, constant=1 / 8, **bounds)
+    )
 
 
 @overload
@@ -267,93 +250,87 @@ def gradient_size(
         _refuse_raster("gradient_size", lower, upper, at, missing)
         bounds = {"h_min": h_min, "h_max": h_max, "growth": growth}
         return estimate("gradient_size", on, steepness(values, on), order=1, n_cells=n_cells, eps=eps, **bounds)
-    low, high = _corners("gradient_size", lower, upper, growth, None)
-    u, corners, spacing = _check_solution("gradient_size", values, low, high, at, missing, least=2)
-    slopes = np.gradient(u, *spacing[::-1])
-    steep = np.sqrt(sum(s**2 for s in slopes))
-    largest = float(steep.max())
-    with np.errstate(divide="ignore"):
-        profile = 1 / np.where(steep < FLAT * largest, 0, steep / (largest or 1))
-    wanted = check_one_of("gradient_size", n_cells, eps)
-    factor = None
-    if eps is not None:
-        factor = wanted / largest if largest > 0 else math.inf
-    return _sizes_from_profile("gradient_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at)
+    grid = _Grid.of("gradient_size", values, lower, upper, at, missing, growth, None, least=2)
+    bounds = {"n_cells": n_cells, "eps": eps, "h_min": h_min, "h_max": h_max}
+    return grid.raster(best_sizes("gradient_size", grid.steepness(), grid.places, order=1, **bounds))
 
 
-def _check_solution(
-    what: str, values: object, lower: ArrayLike, upper: ArrayLike, at: str, missing: str, least: int
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the checked values, the corners and the spacing of the values along x, y (, z)."""
-    shape = np.shape(values)  # type: ignore[arg-type]
-    low, high = check_box(what, shape, lower, upper, at)
-    counts = np.array(shape[::-1])
-    if counts.min(initial=least) < least:
-        raise InputError(
-            f"{what} values have shape {shape}, expected at least {least} along each axis; derivatives need neighbors"
-        )
-    spacing = (high - low) / (counts - 1 if at == "nodes" else counts)
-    return fill_missing(f"{what} values", values, missing, spacing), (low, high), spacing
+@dataclass(frozen=True)
+class _Grid:
+    """Values of a solution (ny, nx) or (nz, ny, nx), and their spacing along x, y (, z)."""
 
+    values: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    spacing: np.ndarray
+    at: str
 
-def _curvature(u: np.ndarray, spacing: np.ndarray) -> np.ndarray:
-    """Return the largest absolute eigenvalue of the Hessian, the shape of `u`."""
-    d = u.ndim
-    hessian = np.empty((*u.shape, d, d))
-    steps = spacing[::-1]
-    for a in range(d):
-        second = np.diff(u, 2, axis=a) / steps[a] ** 2
-        pad = [(int(k == a),) * 2 for k in range(d)]
-        hessian[..., a, a] = np.pad(second, pad, mode="edge")
-        for b in range(a):
-            mixed = np.gradient(np.gradient(u, steps[a], axis=a), steps[b], axis=b)
-            hessian[..., a, b] = hessian[..., b, a] = mixed
-    return np.abs(np.linalg.eigvalsh(hessian)).max(axis=-1)
+    @classmethod
+    def of(
+        cls,
+        what: str,
+        values: object,
+        lower: Sequence[float] | None,
+        upper: Sequence[float] | None,
+        at: str,
+        missing: str,
+        growth: float,
+        weight: object,
+        least: int,
+    ) -> _Grid:
+        if lower is None or upper is None:
+            raise InputError(
+                f"{what} got lower={lower} and upper={upper}, expected the corners of the box that the array covers, "
+                "or on= with the mesh on whose cells the values are"
+            )
+        if growth != _GROWTH or weight is not None:
+            raise InputError(
+                f"{what} got growth or weight for a raster; write Graded(...) around it, or give on= a mesh"
+            )
+        shape = np.shape(values)  # type: ignore[arg-type]
+        low, high = check_box(what, shape, lower, upper, at)
+        counts = np.array(shape[::-1])
+        if counts.min(initial=least) < least:
+            raise InputError(
+                f"{what} values have shape {shape}, expected at least {least} along each axis; derivatives need "
+                "neighbors"
+            )
+        spacing = (high - low) / (counts - 1 if at == "nodes" else counts)
+        return cls(fill_missing(f"{what} values", values, missing, spacing), low, high, spacing, at)
 
+    @property
+    def places(self) -> Places:
+        """The volume of each value: half a spacing at the sides for nodes."""
+        total = np.ones(self.values.shape)
+        for axis, step in enumerate(self.spacing[::-1]):
+            along = np.full(total.shape[axis], float(step))
+            if self.at == "nodes":
+                along[[0, -1]] *= 0.5
+            total *= along.reshape([-1 if k == axis else 1 for k in range(total.ndim)])
+        return Places(total, total.ndim, float((self.high - self.low).max()))
 
-def _weights(shape: tuple[int, ...], spacing: np.ndarray, at: str) -> np.ndarray:
-    """Return the volume that each value represents: half a spacing at the sides for nodes."""
-    total = np.ones(shape)
-    for axis, step in enumerate(spacing[::-1]):
-        along = np.full(shape[axis], float(step))
-        if at == "nodes":
-            along[[0, -1]] *= 0.5
-        total *= along.reshape([-1 if k == axis else 1 for k in range(len(shape))])
-    return total
+    def raster(self, sizes: np.ndarray) -> Raster:
+        """Return sizes as a field."""
+        return Raster(sizes, self.low, self.high, at=self.at)
 
+    def steepness(self) -> np.ndarray:
+        """Return the length of the gradient."""
+        return np.sqrt(sum(s**2 for s in np.gradient(self.values, *self.spacing[::-1])))
 
-def _sizes_from_profile(
-    what: str,
-    profile: np.ndarray,
-    factor: float | None,
-    n_cells: float | None,
-    h_min: float,
-    h_max: float,
-    corners: tuple[np.ndarray, np.ndarray],
-    spacing: np.ndarray,
-    at: str,
-) -> Raster:
-    """Return factor * profile within the bounds. Without a factor, find the one that gives `n_cells`."""
-    low, high = corners
-    top = check_bounds(what, h_min, h_max, float((high - low).max()))
-    weights = None if factor is not None else _weights(profile.shape, spacing, at)
-    return Raster(scale_profile(what, profile, factor, n_cells, weights, profile.ndim, h_min, top), low, high, at=at)
+    def curvature(self) -> np.ndarray:
+        """Return the largest absolute eigenvalue of the Hessian."""
+        u, d, steps = self.values, self.values.ndim, self.spacing[::-1]
+        hessian = np.empty((*u.shape, d, d))
+        for a in range(d):
+            second = np.diff(u, 2, axis=a) / steps[a] ** 2
+            pad = [(int(k == a),) * 2 for k in range(d)]
+            hessian[..., a, a] = np.pad(second, pad, mode="edge")
+            for b in range(a):
+                mixed = np.gradient(np.gradient(u, steps[a], axis=a), steps[b], axis=b)
+                hessian[..., a, b] = hessian[..., b, a] = mixed
+        return np.abs(np.linalg.eigvalsh(hessian)).max(axis=-1)
 
 
 def _refuse_raster(what: str, lower: object, upper: object, at: str, missing: str) -> None:
     if lower is not None or upper is not None or at != "nodes" or missing != "error":
         raise InputError(f"{what} got on= and lower, upper, at or missing, which are for rasters; leave these out")
-
-
-def _corners(
-    what: str, lower: Sequence[float] | None, upper: Sequence[float] | None, growth: float, weight: object
-) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the corners of a raster; raise InputError if there are none, or there are arguments of meshes."""
-    if lower is None or upper is None:
-        raise InputError(
-            f"{what} got lower={lower} and upper={upper}, expected the corners of the box that the array covers, or "
-            "on= with the mesh on whose cells the values are"
-        )
-    if growth != _GROWTH or weight is not None:
-        raise InputError(f"{what} got growth or weight for a raster; write Graded(...) around it, or give on= a mesh")
-    return lower, upper
