@@ -230,7 +230,7 @@ def concave_pairs(
     normals = areas / np.maximum(lengths(areas), 1e-300)
     counts = np.diff(starts)
     wide = -(counts // -4) * 4  # cells are compared together that have about as many faces
-    for k in distinct(wide).tolist():
+    for k in distinct(wide[wide > 0]).tolist():
         rows = np.flatnonzero(wide == k)
         within = np.arange(k) < counts[rows, None]
         places = starts[rows, None] + np.where(within, np.arange(k), 0)

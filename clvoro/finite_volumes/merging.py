@@ -225,7 +225,7 @@ class MergingCells:
     def is_touched(self, faces: np.ndarray) -> np.ndarray:
         """Return which of some faces have a cell that a merge has changed."""
         neighbor = self.neighbor[faces]
-        return self.touched[self.owner[faces]] | ((neighbor >= 0) & self.touched[neighbor])
+        return self.touched[self.owner[faces]] | ((neighbor >= 0) & self.touched[np.maximum(neighbor, 0)])
 
     def find(self, kind: int, items: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the index in `items` of each of `values`, or -1. `kind` is VERTICES, CELLS or FACES."""

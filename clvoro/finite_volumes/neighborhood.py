@@ -80,7 +80,7 @@ class Neighborhood:
         both = np.stack([whole.owner[faces], whole.neighbor[faces]], axis=1)
         inner = both >= 0
         self.cells = distinct(both[inner])
-        self.cells_of_face = np.where(inner, whole.find(CELLS, self.cells, both), -1)
+        self.cells_of_face = np.where(inner, whole.find(CELLS, self.cells, np.maximum(both, 0)), -1)
         self.set_of_cell = np.empty_like(self.cells)
         for column in self.cells_of_face.T:
             self.set_of_cell[column[column >= 0]] = sets[column >= 0]

@@ -40,7 +40,8 @@ def faces_with_seams(diagram: Diagram) -> Faces:
     sides = np.diff(starts)[rows]
     if not (np.array_equal(here[upper], there[lower]) and np.array_equal(sides[upper], sides[lower])):
         raise ClvoroError(
-            "the two sides of a seam have different faces, because some are as short as round-off; use dtype='float64'"
+            "the two sides of a seam have different faces, because some are as short as round-off; use "
+            "dtype='float64', or perturb generators that lie on a common circle or sphere"
         )
     kept = np.flatnonzero(~faces.shift.any(axis=1))
     first = len(kept)

@@ -327,8 +327,8 @@ class _Loop:
         after = case.latest()
         if after.value <= begin:
             raise InputError(
-                f"{solver} has written no time after {before.name}; let writeInterval in {case.control} divide the "
-                f"interval of {length:g}"
+                f"solver {solver!r:.60} has written no time after {before.name}; let writeInterval in {case.control} "
+                f"divide the interval of {length:g}"
             )
         return self._solved(note, time.perf_counter() - start)
 

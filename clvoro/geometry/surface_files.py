@@ -65,14 +65,11 @@ def read_parts(path: str | PathLike[str], kinds: Iterable[str] = SURFACES) -> li
         raise
     except OSError as error:
         raise InputError(f"surface file {str(path)!r} cannot be read: {error.strerror or error}") from error
-    except ModuleNotFoundError as error:
-        # 3MF needs more modules; for others trimesh would need one that guesses the encoding.
-        if kind == "3mf":
-            raise MissingLibraryError(f"reading {str(path)!r} needs {error.name}; pip install {error.name}") from error
-        raise InputError(
-            f"{str(path)!r} cannot be read as {kind.upper()}: it is damaged or not in UTF-8; export it again"
-        ) from error
     except Exception as error:  # trimesh raises many kinds of errors for damaged files
+        if kind == "3mf" and isinstance(error, ImportError):
+            raise MissingLibraryError(
+                f"reading {str(path)!r} needs networkx and lxml; pip install networkx lxml, or export it as STL"
+            ) from error
         raise InputError(
             f"{str(path)!r} cannot be read as {kind.upper()} ({type(error).__name__}: {error}); export it again"
         ) from error

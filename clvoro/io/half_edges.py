@@ -96,7 +96,8 @@ def _twins(diagram: Diagram, rows: np.ndarray, glued: bool) -> np.ndarray:
     by_here, by_there = np.argsort(here), np.argsort(there)
     if not np.array_equal(here[by_here], there[by_there]):
         raise ClvoroError(
-            "two cells have different common faces, because some are as short as round-off; use dtype='float64'"
+            "the arrays of the diagram contradict each other: two cells have different common faces; call "
+            "diagram.check(), or make the diagram again"
         )
     twin = np.full(len(rows), -1)
     twin[inner[by_here]] = inner[by_there]

@@ -157,7 +157,7 @@ def force_weight(
     faces = mesh.faces
     rows = np.isin(faces.boundary, [known.index(name) for name in wanted])
     if not rows.any():
-        raise InputError(f"force_weight got boundaries {boundaries!r}, which have no faces in this mesh; expected some")
+        raise InputError(f"force_weight got boundaries {boundaries!r}, which have no faces here, expected others")
     corners = faces.points[faces.corners[np.repeat(rows, np.diff(faces.starts))]]
     scale = 0.3 * float(np.ptp(corners, axis=0).max()) if length is None else length
     check_positive("force_weight length", scale)

@@ -112,7 +112,7 @@ class Field:
 
     def _emit(self, writer: CodeWriter) -> str:
         """Add the field to `writer` and return the name of the variable with h' = h / scale."""
-        raise NotImplementedError
+        raise InputError(f"{self!r} has no form for the device; define _emit, or set on_device = False in its class")
 
     def __mul__(self, other: object) -> Field:
         if isinstance(other, Real):
@@ -464,9 +464,6 @@ class Function(Field):
                 hint = "it must be vectorized: points[:, 0] are all x, points[0] is a point"
             raise InputError(f"{self!r} returned shape {sizes.shape} for {n} points, expected ({n},); {hint}")
         return sizes.astype(float)
-
-    def _emit(self, writer: CodeWriter) -> str:
-        raise InputError(f"{self!r} runs on the host and has no device form; use Expression, Raster or Distance")
 
     def __repr__(self) -> str:
         return f"Function({getattr(self.function, '__name__', type(self.function).__name__)})"

@@ -26,6 +26,7 @@ CELL_CAPACITY = 24
 """Most faces of a cell while it is clipped."""
 ROW_CAPACITY = SLOT
 """Most faces of a finished cell. Both capacities are doubled when a mesh needs more."""
+MOST_ENTRIES = 2**31  # which 32-bit indices can tell apart
 LARGEST_ROW, LARGEST_ELSEWHERE = 4096, 512
 """Largest row capacity: on CPUs in boxes, and elsewhere. On a GPU every work-item has private memory of that size; in a
 polygon, clipping such a cell by as many edges takes minutes."""
@@ -443,7 +444,7 @@ class Cells:
         """
         engine, slots = self.engine, n if slots is None else slots
         first, slots = slots, slots + spare
-        if slots * SLOT >= 2**31:
+        if slots * SLOT >= MOST_ENTRIES:
             raise MemoryLimitError(
                 f"the faces of {n} cells need {slots * SLOT:.3g} entries, expected fewer than 2^31, which "
                 "32-bit indices can tell apart; use fewer cells, or perturb generators that lie on a common circle"

@@ -27,6 +27,8 @@ from .weight_bounds import WeightBounds
 
 FACES_PER_CELL = 16.5
 """First guess of the half-faces per cell. Random cells have 15.54 on average; walls add some."""
+MOST_HALF_FACES = 2**31 // 3
+"""The limit of 32-bit indices: a half-face has a centroid of three numbers."""
 STRETCH = 128
 """Number of generators whose cells one work-item of a CPU builds, eight at a time (`walks.cl`)."""
 CUBE = 8
@@ -106,11 +108,10 @@ class Polyhedra:
 
     def _take_faces(self, m: int) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return arrays for labels, measures and centroids of `m` half-faces, in any order."""
-        if m >= 2**31 // 3:
+        if m >= MOST_HALF_FACES:
             raise MemoryLimitError(
-                f"the cells have {m:.3g} faces, expected fewer than {2**31 // 3:.3g}, the limit "
-                "of 32-bit indices; use fewer cells, or perturb generators that lie on a "
-                "common sphere"
+                f"the cells have {m:.3g} faces, expected fewer than {MOST_HALF_FACES:.3g}, the limit of 32-bit "
+                "indices; use fewer cells, or perturb generators that lie on a common sphere"
             )
         engine, self._room = self.engine, m
         return engine.scratch(m, np.int32), engine.scratch(m), engine.scratch((m, 3))

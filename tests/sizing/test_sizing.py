@@ -644,11 +644,6 @@ def test_bad_input(make, error, message):
         make()
 
 
-def test_callable_has_no_device_form():
-    with pytest.raises(InputError, match="no device form"):
-        sizing.generate_code(sizing.Function(lambda p: p[:, 0]), PLANE)
-
-
 def test_numbers_are_converted_to_fields():
     assert sizing.as_field(_CIRCLE) is _CIRCLE
     assert sizing.as_field(np.float32(0.5)).value == 0.5

@@ -146,7 +146,7 @@ def _by_xarray(path: Path, variable: str | None) -> Any:
     except FileError as problem:
         raise InputError(f"cannot load {path}: {problem}") from problem
     except Exception as error:  # of any of the libraries that xarray reads files with
-        raise InputError(f"cannot load {path}: xarray says {error!s:.300}; {remedy}") from error
+        raise InputError(f"cannot load {path}: xarray says {error!s:.300}; is it damaged? Else {remedy}") from error
 
 
 def _gridded(array: Any) -> list[int]:

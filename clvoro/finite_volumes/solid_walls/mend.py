@@ -147,7 +147,7 @@ def without_cells(faces: Faces, cells: np.ndarray) -> Faces:
     turned = one[rows]
     own, there = faces.owner[rows], faces.neighbor[rows]
     owner = np.where(turned, there, own)
-    neighbor = np.where(turned | other[rows], wall[np.where(turned, own, there)], there)
+    neighbor = np.where(turned | other[rows], wall[np.where(turned, own, np.maximum(there, 0))], there)
     number = np.cumsum(~gone) - 1
     owner, inner = number[owner], neighbor >= 0
     neighbor = np.where(inner, number[np.maximum(neighbor, 0)], neighbor)

@@ -375,7 +375,9 @@ class _Maker:
         h = np.minimum(self.sizes[self.owner[face[left]]], self.sizes[self.neighbor[face[left]]])
         edge, foot = self.surface.nearest_crease(middle[left], h, (one[left], other[left]))
         filled = self.filled[self.owner[face[left]]] | self.filled[self.neighbor[face[left]]]
-        edge[filled & (edge >= 0) & self.surface.solid.creases.concave[edge]] = -1
+        filled[edge < 0] = False
+        filled[filled] = self.surface.solid.creases.concave[edge[filled]]
+        edge[filled] = -1
         left, edge, foot = left[edge >= 0], edge[edge >= 0], foot[edge >= 0]
         rank[left] = len(sites) + np.arange(len(left))
         first = len(self.points)

@@ -72,10 +72,6 @@ def chain_loops(
 
     At a vertex where a cell has several sides, those follow one another whose labels are equal.
 
-    Raises
-    ------
-    ClvoroError
-        If a loop is not closed.
     """
     size = int(max(begin.max(initial=0), end.max(initial=0))) + 1
     out, into = cell * size + begin, cell * size + end
@@ -84,11 +80,7 @@ def chain_loops(
     # As many sides begin as end at each vertex of a cell: they are matched in this order.
     after = np.empty(len(cell), np.int64)
     if not np.array_equal(out[by_begin], into[by_end]):
-        bad = np.unique(cell[~(np.isin(into, out) & np.isin(out, into))])
-        raise ClvoroError(
-            f"{max(len(bad), 1)} cells at walls cannot be closed{f', the first is {bad[0]}' if len(bad) else ''}: the "
-            "surface is folded within a cell there; use smaller cells at thin walls, gaps and sharp edges"
-        )
+        raise ClvoroError("the sides of cells at walls are not closed loops")  # those of whole faces are
     after[by_end] = by_begin
     # The least side of each loop is its head; the others are ranked by doubling.
     n = len(cell)
