@@ -685,9 +685,10 @@ class MeshState:
     def fetch_diagram(self) -> Diagram:
         """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards."""
         tessellator = self._latest_tessellator
-        t, engine = tessellator.steps.measure_exactly(self.t), tessellator.stages.engine
+        latest = [tessellator.steps.measure_exactly(self.t)]
+        self.tessellation = None
         self.stages.release()
-        return fetch_diagram(engine, self.domain, t, self.labels, copy=False)
+        return fetch_diagram(tessellator.stages.engine, self.domain, latest.pop(), self.labels, copy=False)
 
 
 def _take_apart(new: Outcome | None) -> tuple[dict[str, cla.Array], tuple[int, int]]:

@@ -158,13 +158,17 @@ def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
     return [*made, regions(mesh)]
 
 
-def rejected_cells(mesh: Faces) -> np.ndarray:
-    """Return which cells in 3D OpenFOAM rejects, or one of whose faces, (n,) bool."""
+def rejected_cells(mesh: Faces, judged: np.ndarray) -> np.ndarray:
+    """Return which cells in 3D OpenFOAM rejects, or one of whose faces, (n,) bool.
+
+    Tetrahedra are those of the faces `judged` (k,).
+    """
     m, g = mesh.measures, mesh.measures.geometry
     bad = m.concave | (g.volumes < LEAST_MEASURE) | (m.determinant < LEAST_DETERMINANT)
     bad |= m.aspect_ratio > _LIMITS["aspect_ratio"]
-    faces = (m.pyramids < -1e-15) | (m.bad_tetrahedra > 0) | (m.skewness > _LIMITS["skewness"])
+    faces = (m.pyramids < -1e-15) | (m.skewness > _LIMITS["skewness"])
     faces |= (np.linalg.norm(g.areas, axis=1) < LEAST_MEASURE) | (m.non_orthogonality >= 90)
+    faces[judged] |= m.bad_tetrahedra_of(judged) > 0
     faces[m.coupled] |= m.weight[m.coupled] < _LIMITS["weight"]
     faces[m.coupled] |= m.volume_ratio[m.coupled] < _LIMITS["volume_ratio"]
     bad[mesh.owner[faces]] = True

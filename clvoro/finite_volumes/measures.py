@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mesh.connectivity import following, take_rows
-from ..mesh.geometry import Geometry, cell_geometry, face_geometry, face_vectors, polygon_sides, smaller_size, sum_rows
+from ..mesh.connectivity import following, slices, take_rows
+from ..mesh.geometry import Geometry, cell_geometry, cross_columns, dots, lengths, polygon_sides, smaller_size, sum_rows
 from ..mesh.straightening import cross
 from .defects import concave_pairs
 from .prisms import polyhedra
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 PLANAR_COSINE = 1e-6
 """Two faces of a cell are concave if a center is nearer to the other's plane than this, over the distance of both."""
 _TINY = 1e-150
+_CHUNK = 1 << 13
+"""Faces that are read at a time: their arrays fit the caches."""
 _ROOTS = {2: np.sqrt, 3: np.cbrt}
 _LEAST_QUALITY = 1e-30 * (8 / 27 * 3**0.5)
 """Of a tetrahedron: its volume over the cube of the radius of its circumsphere."""
@@ -50,7 +52,7 @@ class SolverMeasures:
     def geometry(self) -> Geometry:
         """Centers, areas, centroids and volumes of the polyhedra."""
         p, k = self.cells, self.mesh.n_inner
-        centers, areas = face_geometry(p.points, p.starts, p.corners)
+        centers, areas = p.vectors
         made = cell_geometry(centers, areas, p.owner, self.mesh.neighbor[:k], self.mesh.n_cells)
         return Geometry(centers, areas, *made)
 
@@ -259,32 +261,42 @@ class SolverMeasures:
         One for each cell in which a triangle about the face's center has no positive volume. One more if no corner of
         the face is the base of a fan of triangles with positive volumes on both sides.
         """
-        g, p, k = self.geometry, self.cells, self.mesh.n_inner
-        counts = np.diff(p.starts)
-        face = np.repeat(np.arange(len(counts)), counts)
-        after = p.corners[following(p.starts)]
-        a, b = p.points[p.corners], p.points[after]
-        tips = np.full((2, len(counts), 3), np.nan)
-        tips[0] = g.centroids[p.owner]
-        tips[1, self.coupled] = self._across
-        bad = np.zeros(len(counts), int)
-        for side, last in ((0, len(counts)), (1, k)):
-            rows = face < last
-            fine = _positive(a[rows], b[rows], g.centers[face[rows]], tips[side, face[rows]], side)
-            bad[:last] += np.bincount(face[rows], ~fine, last) > 0
+        return self.bad_tetrahedra_of(np.arange(len(self.cells)))
+
+    def bad_tetrahedra_of(self, faces: np.ndarray) -> np.ndarray:
+        """Return `bad_tetrahedra` of some of the faces (k,)."""
+        points = np.ascontiguousarray(self.cells.points.T)
+        across = np.full((len(self.cells), 3), np.nan)
+        across[self.coupled] = self._across
+        found = [self._bad_tetrahedra(faces[part], points, across) for part in slices(len(faces), _CHUNK)]
+        return np.concatenate([np.zeros(0, int), *found])
+
+    def _bad_tetrahedra(self, faces: np.ndarray, points: np.ndarray, across: np.ndarray) -> np.ndarray:
+        """Return `bad_tetrahedra` of `faces`, with the `points` (3, v), and the centroids `across` all faces (f, 3)."""
+        g, p = self.geometry, self.cells
+        starts, corners = take_rows(p.starts, p.corners, faces)
+        counts, x = np.diff(starts), points.take(corners, axis=1)
+        y, face = x.take(following(starts), axis=1), np.repeat(np.arange(len(faces)), counts)
+        tips = [g.centroids[p.owner[faces]].T, across[faces].T]
+        center = g.centers[faces].T.take(face, axis=1)
+        bad = np.zeros(len(faces), int)
+        for side, rows in ((0, np.arange(len(face))), (1, np.flatnonzero(faces[face] < self.mesh.n_inner))):
+            tip = tips[side].take(face[rows], axis=1)
+            fine = _positive(x.take(rows, axis=1), y.take(rows, axis=1), center.take(rows, axis=1), tip, side)
+            bad += np.bincount(face[rows], ~fine, len(faces)) > 0
         # Fans from the first corner; others only where these fail.
-        left, base = np.arange(len(counts)), 0
+        left, base = np.arange(len(faces)), 0
         while left.size:
-            starts, items = take_rows(p.starts, np.arange(len(p.corners)), left)
-            row = np.repeat(np.arange(len(left)), np.diff(starts))
-            within = np.arange(len(items)) - starts[row]
-            apart = (within - base) % counts[left][row]
+            begin, items = take_rows(starts, np.arange(len(corners)), left)
+            row = np.repeat(np.arange(len(left)), np.diff(begin))
+            apart = (np.arange(len(items)) - begin[row] - base) % counts[left][row]
             used = (apart > 0) & (apart < counts[left][row] - 1)
             items, row = items[used], row[used]
-            foot = p.points[p.corners[p.starts[left[row]] + base]]
-            fine = _positive(a[items], b[items], foot, tips[0, left[row]], 0)
-            two = np.isfinite(tips[1, left[row], 0])
-            fine[two] &= _positive(a[items[two]], b[items[two]], foot[two], tips[1, left[row[two]]], 1)
+            a, b, foot = x.take(items, axis=1), y.take(items, axis=1), x.take(starts[left[row]] + base, axis=1)
+            fine = _positive(a, b, foot, tips[0].take(left[row], axis=1), 0)
+            two = np.flatnonzero(np.isfinite(tips[1][0, left[row]]))
+            a, b, foot = (v.take(two, axis=1) for v in (a, b, foot))
+            fine[two] &= _positive(a, b, foot, tips[1].take(left[row[two]], axis=1), 1)
             failed = left[np.bincount(row, ~fine, len(left)) > 0]
             base += 1
             ended = counts[failed] <= base
@@ -373,7 +385,7 @@ class PlaneMeasures:
         moments = np.stack([np.bincount(cell, twice * sums, mesh.n_cells) for sums in (p + q).T], axis=1)
         self.centroids = origins + moments / (6 * np.maximum(self.areas, _TINY**2))[:, None]
         self.inner = mesh.neighbor >= 0
-        self.centers, self.vectors = face_vectors(mesh.points, mesh.starts, mesh.corners)
+        self.centers, self.vectors = mesh.vectors
         self.lengths = np.maximum(np.hypot(*self.vectors.T), _TINY)
         self.normals = self.vectors / self.lengths[:, None]
         self._arms = self.centers - self.centroids[mesh.owner]
@@ -440,17 +452,21 @@ def _mean_angle(degrees: np.ndarray) -> float:
 def _positive(a: np.ndarray, b: np.ndarray, c: np.ndarray, tip: np.ndarray, side: int) -> np.ndarray:
     """Return whether tetrahedra have a volume above OpenFOAM's least quality, on the side 0 (owner) or 1, (k,).
 
+    Corners are columns, (3, k) each.
+
     The quality is the volume over that of the regular tetrahedron with the same circumsphere, the limit 1e-30.
     """
     u, v, w = b - a, c - a, tip - a
-    six = np.einsum("ij,ij->i", np.cross(u, v), w)
-    signed, squares = six if side else -six, [np.einsum("ij,ij->i", x, x) for x in (u, v, w)]
+    six = dots(cross_columns(u, v), w)
+    signed, squares = six if side else -six, [dots(x, x) for x in (u, v, w)]
     longest = np.maximum.reduce(squares)
     # An upper bound of the radius settles nearly all.
     fine = signed / 6 > _LEAST_QUALITY * np.minimum(1.5 * longest**2 / np.maximum(np.abs(six), _TINY), 1e15) ** 3
     rest = np.flatnonzero(~fine & (signed > 0))
-    u, v, w, six, lengths = u[rest], v[rest], w[rest], six[rest], [x[rest, None] for x in squares]
-    top = lengths[0] * np.cross(v, w) + lengths[1] * np.cross(w, u) + lengths[2] * np.cross(u, v)
-    radius = np.linalg.norm(top, axis=1) / np.maximum(2 * np.abs(six), _TINY)
+    if not rest.size:
+        return fine
+    u, v, w, six = u[:, rest], v[:, rest], w[:, rest], six[rest]
+    top = sum(x[rest] * cross_columns(*pair) for x, pair in zip(squares, ((v, w), (w, u), (u, v)), strict=True))
+    radius = lengths(top) / np.maximum(2 * np.abs(six), _TINY)
     fine[rest] = signed[rest] / 6 > _LEAST_QUALITY * np.minimum(radius, 1e15) ** 3
     return fine

@@ -18,7 +18,6 @@ from ..finite_volumes.measures import SolverMeasures
 from ..geometry.box import Box
 from ..mesh.connectivity import following, take_rows
 from ..mesh.faces import Faces
-from ..mesh.geometry import face_vectors
 from .arrays import FileError, explained
 from .foam import polymesh_folder
 
@@ -100,7 +99,7 @@ def _coupled(mesh: Faces, patches: list[FoamPatchFaces]) -> tuple[Faces, np.ndar
     one, other = (np.concatenate(side) for side in zip(*pairs, strict=True))
     f, c = len(mesh), len(one)
     order = np.concatenate([np.setdiff1d(np.arange(f), np.concatenate([one, other])), one, other])
-    centers = face_vectors(mesh.points, mesh.starts, mesh.corners)[0]
+    centers = mesh.vectors[0]
     across = centers[one] - centers[other]
     periods = np.abs(across).max(axis=0)
     low, size = np.array(mesh.domain.lower), np.array(mesh.domain.extent)

@@ -125,10 +125,16 @@ class Faces(Sealed):
         if self.diagram is not None:
             made = _geometry_of_diagram(self, self.diagram)
             return {name: read_only(values) for name, values in made.items()}
-        center, vector = face_vectors(self.points, self.starts, self.corners)
+        center, vector = self.vectors
         area = np.linalg.norm(vector, axis=1)
         normal = vector / np.where(area > 0, area, 1)[:, None]
         return {"area": read_only(area), "normal": read_only(normal), "center": read_only(center)}
+
+    @cached_property
+    def vectors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centers and area vectors by the corners, (f, d) float64 each."""
+        center, vector = face_vectors(self.points, self.starts, self.corners)
+        return read_only(center), read_only(vector)
 
     @property
     def area(self) -> np.ndarray:

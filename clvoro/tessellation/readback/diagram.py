@@ -45,9 +45,11 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
         If round-off has made cells wrong.
     """
     if domain.curved_walls:
-        from .solid import fetch_mesh
+        from .solid import make_mesh, read_generators
 
-        return fetch_mesh(engine, cast("Solid", domain), t, labels)
+        points, sizes = read_generators(domain, t, labels)
+        del t, labels  # memory for another diagram
+        return make_mesh(engine, cast("Solid", domain), points, sizes)
     reader = _DiagramReader(engine, domain, t, labels, copy)
     if reader.whole.round_off & UNEVEN:
         assert reader.faces

@@ -10,6 +10,7 @@ import pyopencl.array as cla
 from ...finite_volumes.solid_walls.mesh import outer_generators, solid_diagram
 from ...finite_volumes.solid_walls.wall_surface import WallSurface
 from ...geometry.box import Box
+from ...geometry.domain import Domain
 from ...geometry.solid.solid import Solid
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
@@ -22,10 +23,18 @@ _MARGIN = 4.0
 """Distance of the box that holds all generators from the solid, over the largest h."""
 
 
-def fetch_mesh(engine: Engine, domain: Solid, t: Tessellation, labels: cla.Array) -> Diagram:
-    """Return the mesh of a solid with rows in the order of `labels` (n,).
+def read_generators(domain: Domain, t: Tessellation, labels: cla.Array) -> tuple[np.ndarray, np.ndarray]:
+    """Return the generators of `t` in the order of `labels` (n,), (n, 3) float, and the sizes of their cells, (n,)."""
+    origin, scale = domain.frame
+    order = order_of(labels.get()[: t.n])
+    points = origin + scale * t.points.get()[: t.n, :3][order].astype(float)
+    return points, scale * np.cbrt(t.volumes.get()[: t.n][order].astype(float))
 
-    The cells of `t` are cut by planes of their own, and do not fit together. Those of the mesh are those of the Voronoi
+
+def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarray) -> Diagram:
+    """Return the mesh of a solid by its generators `points` (n, 3), for cells of the `sizes` (n,).
+
+    Cells of a run are cut by planes of their own, and do not fit together. Those of the mesh are those of the Voronoi
     diagram of the same generators, and end at the surface.
 
     Raises
@@ -33,10 +42,6 @@ def fetch_mesh(engine: Engine, domain: Solid, t: Tessellation, labels: cla.Array
     InputError
         If round-off has made cells wrong, or the solid is too thin for the size of cells.
     """
-    origin, scale = domain.frame
-    order = order_of(labels.get()[: t.n])
-    points = origin + scale * t.points.get()[: t.n, :3][order].astype(float)
-    sizes = scale * np.cbrt(t.volumes.get()[: t.n][order].astype(float))
     surface = WallSurface(domain, SurfaceSearch(engine, domain, domain.wall_triangles).nearest)
     outer = outer_generators(surface, points, sizes)
     reach = _MARGIN * sizes.max()
