@@ -204,13 +204,16 @@ class SolidCoverage(CutCoverage):
         self.share[rows] = inside.mean(axis=1)
         first = np.argsort(np.abs(at - 0.5).max(axis=1), kind="stable")  # samples near the center are preferred
         best = first[inside[:, first].argmax(axis=1)]
-        self.inner[rows] = x[np.arange(len(rows)), best]
-        # A part thinner than the distance of samples: a point just inside of the surface.
-        thin = np.flatnonzero(~inside.any(axis=1))
-        found = self.domain.just_inside(center[thin], 1e-3 * (corners[thin, 1] - corners[thin, 0]).min(axis=1))
-        there = ((found > corners[thin, 0]) & (found < corners[thin, 1])).all(axis=1) & self.domain.covers(found)
+        any_inside = inside.any(axis=1)
+        self.inner[rows[any_inside]] = x[np.arange(len(rows)), best][any_inside]
+        # A part thinner than the distance of samples, or one on the surface: a point just inside of it.
+        depth = 1e-3 * (corners[:, 1] - corners[:, 0]).min(axis=1)
+        thin = np.flatnonzero(~any_inside | ~self.domain.contains_well(self.inner[rows], 1e-6 * depth.min()))
+        found = self.domain.just_inside(self.inner[rows[thin]], depth[thin])
+        there = ((found > corners[thin, 0]) & (found < corners[thin, 1])).all(axis=1)
+        there &= self.domain.contains_well(found, 1e-6 * depth.min())
         self.inner[rows[thin[there]]] = found[there]
-        self.share[rows[thin[there]]] = 0.25 / len(at)
+        self.share[rows[thin]] = np.where(there, np.maximum(self.share[rows[thin]], 0.25 / len(at)), 0)
 
     def balance(self) -> float:
         """Return the measure of the domain in units of that of all shares."""
