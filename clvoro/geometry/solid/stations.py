@@ -27,7 +27,7 @@ _CLEAR = 1.06  # radius in which no other generators are, over that of the spher
 _ROOM = 0.5  # of h: least distance of generators that are not the same
 _WALL = 0.3  # of h: least distance of generators from walls
 _NEAR = 0.2  # of h: the same for those that had to make room
-_OTHERS = ((0, 0.8), (2, 1.0), (2, 0.8), (2, 0.6), (2, 0.45))  # number, or 0 for the usual one, and share of the distance
+_OTHERS = ((0, 0.8), (2, 1.0), (2, 0.8), (2, 0.6), (2, 0.45))  # number, 0 for the usual one, and share of the distance
 _SHIFTS = (0.0, 0.25, -0.25)  # along a chord, over its length
 _SAMPLES = 8  # of 1 / h per step, at least
 _FEWEST = 64  # samples per chain, at least
@@ -280,7 +280,7 @@ class _AroundCreases:
     def make_room(self) -> None:
         """Place generators near others, near walls, or outside anew, or leave them out; note their places on creases.
 
-        Without one of them, faces between the others may lie in a wall beyond the crease: all of a chord change together.
+        Without one of them, faces between the others may lie in a wall beyond the crease: all of a chord move together.
         """
         if not len(self.points):
             return
