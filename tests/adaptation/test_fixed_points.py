@@ -130,27 +130,6 @@ def test_places_behind_a_wall_are_not_taken():
     assert names.tolist() == [1, 0, 3]
 
 
-@pytest.mark.parametrize(
-    ("fixed", "more", "text"),
-    [
-        ([(0.5, 0.5), (2.5, 0.5)], {}, r"fixed\[1\] is \[2.5 0.5\], outside"),
-        ([(0.5, np.nan)], {}, r"fixed\[0\] is .*expected finite numbers"),
-        ([0.5, 0.5], {}, r"fixed has shape \(2,\).*pass \[point\]"),
-        ([(0.5, 0.5, 0.5)], {}, r"fixed has shape \(1, 3\)"),
-        ([(0.3, 0.5), (0.5, 0.5), (0.3, 0.5)], {}, r"fixed\[0\] and fixed\[2\] coincide .*0\.3, 0\.5"),
-        ([(0.5, 0.0)], {}, r"fixed\[0\] is at \(0\.5, 0\), on a wall"),
-        ([(0.5, 0.5)], {"method": "transport"}, "'transport' moves all generators"),
-        ([(0.5, 0.5)], {"method": "mmpde"}, "'mmpde' moves all generators"),
-        (WELLS, {"n_cells": 3}, "n_cells is 3, but 4 generators are fixed"),
-        (WELLS, {"method": "lloyd", "points": WELLS[:2]}, "the number of points is 2, but 4"),
-        ([(0.5, 0.03)], {"layers": clvoro.Layers(0.02, 2, spacing=0.04)}, r"fixed\[0\] .*in the layers"),
-    ],
-)
-def test_bad_positions_are_refused_with_the_place(adapter, fixed, more, text):
-    with pytest.raises(InputError, match=text):
-        adapter.run(BOX, 0.1, fixed=fixed, **more)
-
-
 def test_what_are_no_positions_is_refused_and_none_are_allowed(adapter):
     for value in ("wells", [("a", "b")], 3.0):
         with pytest.raises(InputTypeError, match="fixed"):

@@ -598,7 +598,10 @@ def test_one_cell_of_the_right_size(adapter):
             InputError,
             r"lies beside the domain.*order of the coordinates",
         ),
-        ({"domain": clvoro.Box((0, 0, 0), (1, 1, 1))}, ClvoroError, "dimension"),
+        ({"domain": CUBE}, ClvoroError, "dimension"),
+        ({"domain": CUBE, "size": 0.3, "points": [[0.1, 0.2, 0.3]] * 2}, InputError, r"points\[0\] and points\[1\]"),
+        ({"domain": CUBE, "size": sizing.Expression("0.3 - z")}, SizeFieldError, r"at \(.*,.*,"),
+        ({"domain": CUBE, "size": 1e-4}, MemoryLimitError, r"1e\+12 cells.*GiB"),
     ],
 )
 def test_bad_input(adapter, change, error, message):

@@ -9,7 +9,6 @@ import clvoro
 from clvoro import sizing
 from clvoro.adaptation.plan.actions import count_changed
 from clvoro.adaptation.plan.efforts import EFFORTS_3D
-from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
 from tests.reference import runs
 
 BOX = clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -217,26 +216,3 @@ def test_a_lattice_keeps_its_quality(adapter):
     inner = [r.quality[((r.points > 0.3) & (r.points < 0.7)).all(axis=1)].mean() for r in (lattice, random)]
     assert inner[0] > 0.745  # walls disturb it a little so far inside
     assert inner[0] > inner[1] + 0.01
-
-
-# Bad input.
-
-
-@pytest.mark.sparse(9)
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"points": np.zeros((4, 2))}, InputError, r"points has shape \(4, 2\)"),
-        ({"points": [[0.1, 0.2, 0.3]] * 2}, InputError, r"points\[0\] and points\[1\] coincide"),
-        ({"points": [[0.1, 0.2, 1.3]]}, InputError, r"points\[0\] is .*outside"),
-        ({"size": sizing.Expression("0.3 - z")}, SizeFieldError, r"at \(.*,.*,"),
-        ({"size": 1e-4}, MemoryLimitError, r"1e\+12 cells.*GiB"),
-        ({"n_cells": 10**10}, MemoryLimitError, r"1e\+10 cells.*GiB"),
-        ({"options": clvoro.MultilevelOptions(levels=6)}, InputError, "levels is 6, expected at most"),
-        ({"size": sizing.Circle((0, 0), 1)}, clvoro.ClvoroError, "size"),
-        ({"size": sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), 0.1, slope=0.1)}, clvoro.ClvoroError, "dimension|3"),
-    ],
-)
-def test_bad_input(adapter, change, error, message):
-    with pytest.raises(error, match=message):
-        adapter.run(**{"domain": BOX, "size": SMALL, **change})

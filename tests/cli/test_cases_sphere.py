@@ -195,13 +195,6 @@ def test_mistakes_in_domains(text, message):
         Case.from_toml(f"size = 1\n{text}", "my.toml")
 
 
-def test_caps_are_for_spheres():
-    size = "kind='caps'\nh_max=1\nslope=1\nregions=[{center=[0,0],radius=1,size=1}]"
-    text = f"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\n{size}"
-    with pytest.raises(InputError, match="'caps', which is not for Box"):
-        Case.from_toml(text, "my.toml").size_field()
-
-
 def test_ocean_is_what_it_says():
     case = load_case("ocean")
     size = case.size_field()

@@ -8,7 +8,7 @@ import pytest
 
 import clvoro
 from clvoro import earth, sizing
-from clvoro.errors import ClvoroError, InputError, MismatchWarning
+from clvoro.errors import ClvoroError, MismatchWarning
 from clvoro.opencl.engine import Engine
 from clvoro.sizing.field import on_domain
 
@@ -174,10 +174,3 @@ def test_columns_of_one_longitude_that_differ_are_warned_of(recwarn):
     h[9, -1] = 2e5
     with pytest.warns(MismatchWarning, match="longitudes -180 and 180, which are the same place: at latitude 0 5.*2"):
         earth.LonLat(sizing.Raster(h, (-180, -90), (180, 90)))
-
-
-def test_a_field_in_the_plane_says_how_it_is_evaluated_on_a_sphere():
-    points, field = clvoro.Sphere().icosahedral_points(2), clvoro.sizing.Expression("0.1 + 0.001 * lat")
-    with pytest.raises(InputError, match=r"write clvoro\.earth\.LonLat\(field\)\(points\)"):
-        field(points)
-    assert clvoro.earth.LonLat(field)(points).shape == (len(points),)

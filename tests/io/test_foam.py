@@ -321,14 +321,6 @@ def test_failure_leaves_the_old_mesh(solid, tmp_path, monkeypatch):
     assert not (folder / "cellZones").exists()  # of another mesh
 
 
-def test_places_without_a_folder_are_named(solid, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"cannot write .*file.*polyMesh: the folder cannot"):
-        io.save(solid, tmp_path / "file" / "polyMesh")
-    with pytest.raises(InputError, match="folder cannot be created"):
-        io.save(solid, tmp_path / "file" / "case.foam")
-
-
 @pytest.mark.parametrize("rows", [1, 2])
 def test_meshes_that_openfoam_rejects_give_one_warning(ctx, tmp_path, recwarn, rows):
     """All faces between the cells of one row are parallel; two cells are too few to tilt them."""

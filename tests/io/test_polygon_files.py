@@ -488,14 +488,6 @@ def test_wrong_patches_are_refused(pond, tmp_path, patches: object, says: str) -
     assert not list(tmp_path.iterdir())
 
 
-def test_cells_around_islands_are_refused_for_openfoam(result, pond, tmp_path) -> None:
-    with pytest.raises(InputError, match=r"cell \d+ \(1 in all\) goes around a part of the boundary"):
-        result.to_openfoam(tmp_path / "case.foam", walls="exact")
-    with pytest.raises(InputError, match="as OpenFOAM, expected a name"):
-        pond.to_openfoam(tmp_path / "mesh.vtu", patches={"a": [1]})
-    assert not list(tmp_path.iterdir())
-
-
 # Pictures and reports.
 
 

@@ -42,13 +42,6 @@ def test_scrip(result, tmp_path):
     np.testing.assert_allclose(d.domain.positions(center), d.centroids, rtol=0, atol=eps * d.domain.radius)
 
 
-def test_scrip_is_for_spheres(tmp_path):
-    plane = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.8)])
-    with pytest.raises(InputError, match="SCRIP files are for meshes on a Sphere"):
-        plane.to_netcdf(tmp_path / "mesh.nc", convention="scrip")
-    assert not list(tmp_path.iterdir())
-
-
 # --- UGRID ---
 
 
@@ -74,13 +67,6 @@ def test_ugrid_has_degrees(result, tmp_path):
     assert "earth_radius" not in file.about["globe"]
     result.save(tmp_path / "meters.nc")
     assert read(tmp_path / "meters.nc").about["globe"]["earth_radius"] == radius
-
-
-def test_degrees_are_no_unit_of_a_radius(ctx, tmp_path):
-    diagram = clvoro.Adapter(ctx).diagram(EARTH, scattered(150))
-    for convention in ("ugrid", "mpas"):
-        with pytest.raises(InputError, match="units is 'degrees', expected on a sphere"):
-            diagram.to_netcdf(tmp_path / "mesh.nc", convention=convention, units="degrees")
 
 
 def lonlat(file, place):

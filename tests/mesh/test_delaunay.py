@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial import Delaunay
 
 import clvoro
-from clvoro.errors import InputError
 
 BOX = clvoro.Box((0, 0), (2, 1))
 
@@ -84,12 +83,3 @@ def test_around_a_hole(adapter):
 def test_few_cells_have_no_triangles(adapter, n):
     points = np.array([[0.5, 0.5], [1.5, 0.5]])[:n]
     assert adapter.diagram(BOX, points).triangles().shape == (0, 3)
-
-
-@pytest.mark.parametrize(
-    "domain", [clvoro.Box((0, 0), (1, 1), periodic=(True, False)), clvoro.Box((0, 0, 0), (1, 1, 1))]
-)
-def test_seams_and_solids_are_refused(adapter, domain):
-    points = np.random.default_rng(312).random((30, domain.dim))
-    with pytest.raises(InputError, match="in the plane without seams"):
-        adapter.diagram(domain, points).triangles()

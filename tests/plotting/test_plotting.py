@@ -216,13 +216,6 @@ def test_unknown_color_is_named(result):
         plot_cells(result, "hue")
 
 
-def test_three_dimensions_are_refused(result):
-    arrays = {"points": np.zeros((1, 3))}
-    solid = clvoro.Diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), arrays)
-    with pytest.raises(InputError, match="ParaView"):
-        plot_cells(dataclasses.replace(result, diagram=solid))
-
-
 def test_result_plots_itself(result):
     assert len(of_kind(result.plot("sides", title="five and seven"), PolyCollection)) == 1
 

@@ -9,7 +9,7 @@ from clvoro.adaptation.moving.lattice import lattice_points
 from clvoro.adaptation.moving.mmpde import LONGEST, RATE, ROOM, MmpdeMethod, connect
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
-from clvoro.errors import InputError, TangledMeshWarning
+from clvoro.errors import TangledMeshWarning
 from clvoro.sizing import Sizing
 from tests.reference import moving, patch, runs
 
@@ -123,19 +123,3 @@ def test_a_lattice_of_the_right_size_stays(adapter, method):
     box = clvoro.Box((0, 0), (1, 1))
     result = adapter.run(box, 0.1, method=method, max_steps=3)
     assert np.abs(result.points - lattice_points(box, 100)).max() < 1e-9
-
-
-@pytest.mark.parametrize("method", ["mmpde", "monge-ampere"])
-@pytest.mark.parametrize(
-    ("domain", "given", "message"),
-    [
-        (clvoro.Polygon([(0, 0), (1, 0), (0, 1)]), {}, "expected a Box with walls"),
-        (clvoro.Box((0, 0), (1, 1), periodic=(True, False)), {}, "expected a Box with walls"),
-        (clvoro.Box((0, 0), (1, 1)), {"points": [(0.5, 0.5)]}, "points are given"),
-        (clvoro.Box((0, 0), (1, 1)), {"layers": clvoro.Layers(0.02, 2)}, "layers are given"),
-        (clvoro.Box((0, 0), (1, 1)), {"n_cells": 10}, "cells wide"),
-    ],
-)
-def test_other_input_is_refused(adapter, method, domain, given, message):
-    with pytest.raises(InputError, match=message):
-        adapter.run(domain, 0.1, method=method, **given)
