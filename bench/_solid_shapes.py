@@ -98,12 +98,6 @@ def dirty() -> trimesh.Trimesh:
     return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
 
 
-def tilted(part: trimesh.Trimesh, angle: float, axis: Any) -> trimesh.Trimesh:
-    """Return a part turned around an axis through the origin."""
-    part.apply_transform(transformations.rotation_matrix(angle, axis))
-    return part
-
-
 SHAPES: dict[str, tuple[Callable[[], trimesh.Trimesh], tuple[float, float]]] = {
     "cube": (lambda: block((0, 0, 0), (1, 1, 1)), (0.15, 0.075)),
     "L": (lambda: minus(block((0, 0, 0), (2, 2, 1)), block((1, 1, -1), (3, 3, 2))), (0.25, 0.125)),

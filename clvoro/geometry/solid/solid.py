@@ -265,11 +265,6 @@ class Solid(Domain):
         return np.isin(ends @ (n, 1), edges @ (n, 1))
 
     @classmethod
-    def from_arrays(cls, vertices: object, triangles: object, **options: Any) -> Solid:
-        """Return the solid inside of a surface; `options` are those of `Solid`."""
-        return cls(vertices, triangles, **options)
-
-    @classmethod
     def read(cls, path: str | PathLike[str], units: str | float | None = None, **options: Any) -> Solid:
         """Read a solid from an STL, OBJ, PLY, OFF or 3MF file with trimesh, or from a STEP file with Gmsh.
 
