@@ -99,6 +99,20 @@ def ctx():
     return create_context()
 
 
+@pytest.fixture(scope="module")
+def adapter(ctx):
+    import clvoro
+
+    return clvoro.Adapter(ctx)
+
+
+@pytest.fixture(scope="module")
+def adapter32(ctx):
+    import clvoro
+
+    return clvoro.Adapter(ctx, "float32")
+
+
 @pytest.fixture
 def meshio_for_vtu():
     """The module, if it can read VTU: it wants base64 that stops at padding, as Python's did before 3.13."""

@@ -18,11 +18,6 @@ SIZE = sizing.Expression("0.08 + 0.05 * x")
 DOMAINS = {"flat": FLAT, "solid": SOLID, "torus": TORUS, "house": HOUSE}
 
 
-@pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_diagram_is_computed_again_at_the_end(ctx, dtype):
     """In a periodic box: four cells meet at each corner but for rounding, and which two of them share a face is one of

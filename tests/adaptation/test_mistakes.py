@@ -47,11 +47,6 @@ class Geographic:
 
 
 @pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
-@pytest.fixture(scope="module")
 def result(adapter):
     return adapter.run(BOX, 0.2, points=POINTS, method="lloyd", max_steps=0)
 

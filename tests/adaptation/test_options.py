@@ -39,11 +39,6 @@ max_steps = 1
 """
 
 
-@pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
 def test_defaults_are_those_of_a_run():
     defaults = {
         parameter.name: parameter.default

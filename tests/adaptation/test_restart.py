@@ -12,11 +12,6 @@ BOXES = {2: Box((0, 0), (1, 0.8)), 3: Box((0, 0, 0), (1, 0.8, 0.7))}
 SHORT = {dim: len(adaptive_schedule(dim, "default", 0, False, warm=True, near=True)) for dim in (2, 3)}
 
 
-@pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
 def field(dim, moved=0.0, factor=1.0):
     if dim == 2:
         return sizing.Distance(sizing.Circle((0.4 + moved, 0.4), 0.2), h_min=0.006, slope=0.1) * factor

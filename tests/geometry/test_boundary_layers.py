@@ -27,11 +27,6 @@ HOLE = 0.2 * np.stack([np.cos(np.arange(80) * np.pi / 40), np.sin(np.arange(80) 
 CHANNEL = clvoro.Polygon([(-1, -0.5), (2, -0.5), (2, 0.5), (-1, 0.5)], [HOLE])
 
 
-@pytest.fixture(scope="module")
-def adapter():
-    return clvoro.Adapter()
-
-
 def test_bisectors_are_the_borders_of_layers():
     layers = Layers(0.01, count=4, growth=1.3)
     tops = np.cumsum(layers.heights)

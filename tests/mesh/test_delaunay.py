@@ -9,11 +9,6 @@ import clvoro
 BOX = clvoro.Box((0, 0), (2, 1))
 
 
-@pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
 def circumcenters(points, triangles):
     a, b, c = (points[triangles[:, k]] for k in range(3))
     b, c = b - a, c - a

@@ -25,11 +25,6 @@ def size(x):
 
 
 @pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
-@pytest.fixture(scope="module")
 def results(adapter):
     return {
         method: adapter.run(

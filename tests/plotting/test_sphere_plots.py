@@ -29,11 +29,6 @@ ICOSAHEDRON = SPHERE.positions(
 """Two cells around the poles, faces of 42 degrees."""
 
 
-@pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
 @pytest.fixture(scope="module", params=["random", "grid", "icosahedron", "turned"])
 def diagram(request, adapter):
     rng = np.random.default_rng(5)

@@ -20,11 +20,6 @@ TURN = np.linalg.qr(np.random.default_rng(12).normal(size=(3, 3)))[0]
 
 
 @pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
-@pytest.fixture(scope="module")
 def mesh(adapter):
     """Return a function that makes a diagram of n random generators."""
     made = {}

@@ -20,11 +20,6 @@ DIMS = pytest.mark.parametrize("dim", [2, 3])
 
 
 @pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
-@pytest.fixture(scope="module")
 def mesh(adapter):
     """Return a function that makes a diagram of n random generators."""
     made = {}

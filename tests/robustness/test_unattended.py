@@ -58,11 +58,6 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture(scope="module")
-def adapter(ctx):
-    return clvoro.Adapter(ctx)
-
-
 def call(*arguments):
     return cli.main(["run", "small.toml", "--no-report", *map(str, arguments)])
 
