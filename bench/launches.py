@@ -1,12 +1,11 @@
 """Launches and reads of one step: how many commands a device gets, and how often the host waits for it.
 
-    python bench/launches.py [--sizes 1e4,1e6] [--dims 2,3] [--kernels] [--device NAME] [--dtype float32] [--json]
+    python bench/launches.py [--sizes 1e4,1e6] [--dims 2,3] [--device NAME] [--dtype float32] [--json]
 
 A fast run makes a mesh of F2 (2D) or S1 (3D), scaled to the count (see `convergence.py`). Some steps of each kind of a
 default run follow. Figures are means per step. "launches" are kernels, copies and fills; "solve" are those of the
 linear solver among them, "set-up" those of a new multigrid. The host waits at each of "reads" and "writes".
 Work-groups, merged kernels and preconditioners are those of a GPU on any device, so that the counts hold there.
-`--kernels` prints the launches of each kernel, too.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from _common import Report, counts, domain_of, heading, make_adapter, markdown, parser, test_field
+from _common import Report, counts, domain_of, heading, make_adapter, parser, test_field
 
 import clvoro
 from clvoro.adaptation.methods import ProjectedMethod, WeightedMethod
@@ -105,7 +104,6 @@ def measure(
         "bytes": tally.bytes_read / STEPS,
         "solve": sum(k for name, k in kernels.items() if name.startswith(SOLVERS)),
         "set_up": sum(k for name, k in kernels.items() if name.startswith(SET_UP)),
-        "kernels": kernels,
     }
 
 
@@ -126,7 +124,6 @@ def main() -> None:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[10**4, 10**6])
     options_of.add_argument("--dims", type=counts, default=[2, 3])
-    options_of.add_argument("--kernels", action="store_true")
     options = options_of.parse_args()
     adapter = make_adapter(options)
     report = Report(options.json, COLUMNS)
@@ -140,11 +137,6 @@ def main() -> None:
                 record = measure(adapter, domain, field, points, method)
                 report.add({"kind": kind, **record}, f"{kind} {dim}D {n:,}")
     report.finish(heading(adapter, f"Commands per step, means of {STEPS}, GPU's work-groups"))
-    if options.kernels and not options.json:
-        for record in report.records:
-            print(f"\n{record['kind']}, {record['dim']}D, {record['cells']:,} cells\n")
-            rows = sorted(record["kernels"].items(), key=lambda item: -item[1])
-            print(markdown(["kernel", "launches"], [(name, f"{k:.1f}") for name, k in rows]))
 
 
 if __name__ == "__main__":

@@ -8,15 +8,10 @@ as vertices need them; "warm" is the next diagram after all generators have move
 of the spacing. Microseconds of processor time per cell, over the device's compute units: medians of
 `--repeat`. "images" is their number over that of the generators. With `--runs` whole runs at
 effort "fast" with a constant size follow.
-
-The second table has channels, periodic but for walls at y = 0 and y = 1, with sizes ten times
-(in space four times) as large in the middle: the number of ghost images of the finished mesh, the estimate of it before
-a run ("expected"), and the number with the same margin at all places of a seam ("one margin").
 """
 
 from __future__ import annotations
 
-import itertools
 import statistics
 import sys
 import time
@@ -26,12 +21,7 @@ import numpy as np
 from _common import Report, counts, heading, make_adapter, parser
 
 import clvoro
-from clvoro.adaptation.estimates import expected_images
-from clvoro.adaptation.sampling.start import density_tree
-from clvoro.sizing import Expression
 from clvoro.tessellation.tessellator import Tessellator
-
-CHANNELS = {2: "0.05 + 0.9 * fmin(y, 1 - y)", 3: "0.1 + 0.6 * fmin(y, 1 - y)"}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -68,46 +58,7 @@ def main(argv: list[str] | None = None) -> int:
                 record["images"] = images
             report.add(record)
     report.finish(heading(adapter, "Periodic boxes beside boxes, microseconds per cell"))
-    channels = Report(
-        options.json,
-        {
-            "dim": lambda r: r["dim"],
-            "cells": lambda r: f"{r['cells']:,}",
-            **{k: lambda r, k=k: f"{r[k]:.3f}" for k in ("images", "expected", "one margin")},
-        },
-    )
-    for dim, sizes in ((2, options.sizes), (3, options.sizes_3d)):
-        for n in sizes:
-            channels.add(channel(adapter, dim, n))
-    channels.finish(heading(adapter, "Images of channels, per generator"))
     return 0
-
-
-def channel(adapter: clvoro.Adapter, dim: int, n: int) -> dict:
-    """Return how many images the finished mesh of a channel has."""
-    periodic = tuple(axis != 1 for axis in range(dim))
-    box, size = clvoro.Box((0,) * dim, (1,) * dim, periodic=periodic), Expression(CHANNELS[dim])
-    points = adapter.run(box, size, n_cells=n, effort="fast").points
-    n = len(points)
-    stages = adapter._stages_for(box)
-    x = stages.engine.upload(box.place(points, adapter.dtype))
-    tessellator = Tessellator(stages, box)
-    for _ in range(2):  # the second uses the margins that the first one required
-        t = tessellator.tessellate(x, n, exact=True)
-    images = t.folded.part
-    wide = (images.box.upper - images.box.lower - 1) / 2
-    one = 0
-    for step in itertools.product((-1, 0, 1), repeat=dim):
-        moved = points + step
-        inside = ((moved >= -wide) & (moved <= 1 + wide)).all(axis=1)
-        one += int(inside.sum()) if any(step) else 0
-    return {
-        "dim": dim,
-        "cells": n,
-        "images": images.count / n - 1,
-        "one margin": one / n,
-        "expected": expected_images(box, size, n, density_tree(size, box)),
-    }
 
 
 def measure(

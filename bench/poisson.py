@@ -1,7 +1,7 @@
 """Poisson solve on Voronoi graphs: iterations, set-up and solve time, against pyamg and SciPy.
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python bench/poisson.py [--sizes 1e3,1e4,1e5,1e6]
-                        [--mesh random|adapted] [--device NAME] [--dtype float32] [--json]
+                        [--device NAME] [--dtype float32] [--json]
 
 Right side: white noise of mean zero; relative residual 1e-8 (1e-5 in float32). Times are the best of `--repeat`
 solves on a running process (kernels built), the peers' the best of one or two. Peers run where installed, up to
@@ -43,19 +43,10 @@ def morton_order(points: np.ndarray) -> np.ndarray:
     return np.argsort(key, kind="stable")
 
 
-def make_graph(adapter: clvoro.Adapter, n: int, mesh: str) -> clvoro.Diagram:
-    """Diagram of `n` cells in the unit box, generators in Morton order."""
-    box = clvoro.Box((0.0, 0.0), (1.0, 1.0))
-    rng = np.random.default_rng(n)
-    if mesh == "random":
-        points = rng.random((n, 2))
-    else:
-        # Sizes over 1 : 20, growing away from a corner.
-        def size(x):
-            return (0.05 + np.hypot(x[:, 0], x[:, 1])) / np.sqrt(n)
-
-        points = adapter.run(box, size, n_cells=n, max_steps=10, options=clvoro.PaperOptions(tol=0), seed=n).points
-    return adapter.diagram(box, points[morton_order(points)])
+def make_graph(adapter: clvoro.Adapter, n: int) -> clvoro.Diagram:
+    """Diagram of `n` random generators in the unit box, in Morton order."""
+    points = np.random.default_rng(n).random((n, 2))
+    return adapter.diagram(clvoro.Box((0.0, 0.0), (1.0, 1.0)), points[morton_order(points)])
 
 
 def ours(
@@ -144,7 +135,6 @@ COLUMNS = {
 def main() -> None:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5,1e6"))
-    options_of.add_argument("--mesh", choices=["random", "adapted"], default="random")
     options_of.add_argument("--repeat", type=int, default=3)
     options_of.add_argument("--peers-up-to", type=float, default=1e6, metavar="N")
     options_of.add_argument("--jacobi-up-to", type=float, default=1e5, metavar="N")
@@ -157,7 +147,7 @@ def main() -> None:
     clock, clock_of_peers = clock_of(options, adapter), clock_of(options)
     report = Report(options.json, COLUMNS)
     for n in options.sizes:
-        diagram = make_graph(adapter, n, options.mesh)
+        diagram = make_graph(adapter, n)
         b = np.random.default_rng(n + 1).standard_normal(len(diagram))
         b -= b.mean()
         rows = {}
@@ -173,7 +163,6 @@ def main() -> None:
         for method, (iterations, residual, set_up, solve) in rows.items():
             record = {
                 "cells": len(diagram),
-                "mesh": options.mesh,
                 "dtype": options.dtype,
                 "method": method,
                 "iterations": iterations,
@@ -183,7 +172,7 @@ def main() -> None:
                 "ratio": (set_up + solve) / total,
             }
             report.add(record, f"{n:,} {method}")
-    report.finish(heading(adapter, f"Poisson on {options.mesh} meshes"))
+    report.finish(heading(adapter, "Poisson on random meshes"))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Meshes on the sphere: time, sizes, shapes and what C grids need, quasi-uniform and graded.
 
     python bench/sphere.py [--sizes 40962,163842,655362] [--efforts default] [--graded] [--plane]
-                           [--openings] [--single] [--jumps] [--device NAME] [--dtype float32] [--json]
+                           [--openings] [--single] [--device NAME] [--dtype float32] [--json]
 
 Quasi-uniform meshes of given numbers of cells, from random generators ("random") and, as a peer, the bisected
 icosahedron after 100 steps of Lloyd's method ("icosahedral"; numbers of cells 10 * 4^k + 2 only). With `--graded`
@@ -10,7 +10,7 @@ a growth of a tenth and of a fifth per cell. With `--plane` the same numbers of 
 per cell. With `--openings` only small meshes are made, from `SEEDS` seeds each, with and without the opening of
 obtuse triangles at the end of a run; errors are those with it. With `--single` meshes are made in float32 (effort
 "fast"), and the lengths of their edges, from corner to corner, are compared with those of the float64 diagram by the
-same generators. With `--jumps` sizes jump by 1 : 4 at a circle, on the unit sphere and in a square of about its area.
+same generators.
 The first run of each kind builds kernels; times are those of a second run. Processor seconds are those of all cores.
 
 Columns: mean and largest |e|, mean and least Q; obtuse Delaunay triangles and the largest angle; the distance
@@ -22,7 +22,6 @@ from __future__ import annotations
 import math
 import sys
 import time
-import warnings
 from typing import Any
 
 import numpy as np
@@ -187,33 +186,6 @@ def compare_precisions(options: Any) -> None:
     report.finish(heading(single, "Edges of float32 meshes"))
 
 
-def compare_jumps(options: Any) -> None:
-    """Print the size errors where sizes jump by 1 : 4 at a circle, on a sphere and in a square."""
-    adapter = make_adapter(options)
-    columns = {
-        "domain": lambda r: r["domain"],
-        "sizes": lambda r: r["sizes"],
-        "cells": lambda r: f"{r['cells']:.0f}",
-        "mean, max abs(e)": lambda r: f"{r['mean_error']:.3f}, {r['max_error']:.1f}",
-    }
-    report = Report(options.json, columns)
-    domains = {
-        "sphere": (clvoro.Sphere(1), np.array([1.0, 0, 0])),
-        "square": (clvoro.Box((0, 0), (3.5, 3.5)), np.array([1.7, 1.8])),
-    }
-    for fine in (0.02, 0.03):
-        for name, (domain, center) in domains.items():
-
-            def size(x: np.ndarray, center: np.ndarray = center, fine: float = fine) -> np.ndarray:
-                return np.where(np.linalg.norm(x - center, axis=1) < 0.3, fine, 4 * fine)
-
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", clvoro.errors.SizeErrorWarning)
-                row = shape(adapter.run(domain, size))
-            report.add({"domain": name, "sizes": f"{fine:g}, {4 * fine:g}", **row}, name)
-    report.finish(heading(adapter, "Jumps of size"))
-
-
 def main() -> int:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[40_962, 163_842], help="cells")
@@ -222,11 +194,7 @@ def main() -> int:
     options_of.add_argument("--plane", action="store_true", help="a square, too")
     options_of.add_argument("--openings", action="store_true", help="only obtuse triangles")
     options_of.add_argument("--single", action="store_true", help="only edges in float32")
-    options_of.add_argument("--jumps", action="store_true", help="only jumps of size")
     options = options_of.parse_args()
-    if options.jumps:
-        compare_jumps(options)
-        return 0
     if options.single:
         compare_precisions(options)
         return 0
