@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 
 from clvoro.adaptation.density import Density
 from clvoro.adaptation.metric import Metric
 from clvoro.adaptation.refinement import Refinement
 from clvoro.geometry.box import Box
 from clvoro.solvers.linear_system import Limits
-from clvoro.solvers.poisson import Poisson
 from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
 from tests.reference import diagrams3d as reference3d
 from tests.reference import patch
@@ -83,51 +81,6 @@ def test_density(engine):
     weighed, weights = density.sum_log_ratio(w).get().reshape(2, -1).sum(axis=1)
     mean = np.average(excess, weights=volumes / h**3)
     assert weighed / weights == pytest.approx(mean, abs=256 * eps)
-
-
-def weighted_centroid(samples, slope):
-    """Centroid of a cell weighted by exp(-5 slope . y), by points spread over it."""
-    weight = np.exp(-5 * (samples - samples.mean(axis=0)) @ slope)
-    return (weight[:, None] * samples).sum(axis=0) / weight.sum()
-
-
-def test_weighted_centroids(double):
-    """Of h^-(d + 2), h exponential, right to first order in its change across the cell."""
-    points = relaxed_points(40, 113)
-    t = patch.tessellate(double, points, BOX)
-    samples = patch.random_points(200_000, 5, BOX)
-    owner = KDTree(points).query(samples)[1]
-    slope = 0.2 * SLOPE
-    w = Density(double).lloyd_weights(t, double.upload(0.1 * np.exp(points @ slope)))
-    lloyd, offsets = w.lloyd.get(), t.offsets.get()
-    for i in range(40):
-        own = samples[owner == i]
-        # The difference of both centroids: the noise of the sampling cancels.
-        shift = weighted_centroid(own, slope) - own.mean(axis=0)
-        assert np.linalg.norm(lloyd[i] - offsets[i] - shift) < 0.1 * np.linalg.norm(shift)
-
-
-# Motion and the Poisson equation.
-
-
-def test_potential_solves_the_equation(double):
-    """Fluxes through faces add up to the source's integral, cell by cell."""
-    points = random_points(N, 91)
-    t = patch.tessellate(double, points, BOX)
-    host, poisson = patch.fetch(t), Poisson(double)
-    r = np.random.default_rng(6).normal(size=N)
-    source, potential = double.empty(N), double.zeros(N)
-    laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, t.points)
-    poisson.subtract_mean_source(double.upload(r), t.volumes, source)
-    poisson.solve(laplacian, source, potential, tolerance=1e-10)
-    phi, inner = potential.get(), host.neighbors >= 0
-    i, j = host.owners[inner], host.neighbors[inner]
-    flux = host.face_measures[inner] * (phi[i] - phi[j])
-    flux /= np.linalg.norm(points[i] - points[j], axis=1)
-    net = np.bincount(i, flux, minlength=N)
-    wanted = host.volumes * (r - np.average(r, weights=host.volumes))
-    off = min(np.abs(net - wanted).max(), np.abs(net + wanted).max())  # whatever the convention for the sign
-    assert off < 1e-8 * np.abs(wanted).max()
 
 
 # VolumeProjection.
