@@ -1,7 +1,7 @@
 """Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
 
     python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
-                           [--speed NUMBERS] [--keep FOLDER] [--pictures FOLDER] [--device NAME]
+                           [--speed NUMBERS] [--domains NAMES] [--keep FOLDER] [--pictures FOLDER] [--device NAME]
                            [--dtype float32] [--json]
 
 The solids are in `bench/_solid_shapes.py`; they need trimesh, manifold3d, shapely, networkx and, for the gyroid,
@@ -11,8 +11,8 @@ skewness, the number of concave cells, the volume of all cells over that of the 
 
 --runs is a list of efforts and "exact". With `--booleans N` the solids are N random booleans of boxes, balls and
 cylinders. `--speed NUMBERS` compares processor times for so many cells in a cube as a box, as a solid, and around a
-ball in it, with the default effort: those of the run, and of the mesh on the host with its faces. Memory is the most
-up to then of the whole process.
+wavy body of 100,000 triangles in it, with the default effort: those of the run, of the mesh with its faces, and of the
+mesh for solvers. Memory is the most up to then of the whole process. `--domains` chooses some of the three.
 Pictures show each mesh cut open, with the patches in colors.
 """
 
@@ -52,8 +52,15 @@ COLUMNS = {
 }
 
 
-BALL_EDGE = 0.05
-"""Length of triangles of the ball, over its radius."""
+BODY_EDGE = 0.0172
+"""Length of triangles of a ball over its radius, so that they are 100,000."""
+
+
+def wavy_body() -> clvoro.Solid:
+    """Return a ball with waves, of 100,000 triangles."""
+    ball = clvoro.Solid.ball((0, 0, 0), 1, edge=BODY_EDGE).surface
+    waves = 1 + 0.1 * np.sin(5 * ball.vertices).prod(axis=1)
+    return clvoro.Solid(0.5 + 0.25 * waves[:, None] * ball.vertices, ball.triangles)
 
 
 def quotient(diagram: clvoro.Diagram) -> float:
@@ -96,29 +103,33 @@ SPEED_COLUMNS = {
     "cells": lambda r: r["cells"],
     "run, s": lambda r: f"{r['run']:.1f}",
     "mesh, s": lambda r: f"{r['mesh']:.1f}",
+    "for solvers, s": lambda r: f"{r['solver']:.1f}",
     "sum / box": lambda r: f"{r['ratio']:.2f}",
     "peak memory, GB": lambda r: f"{r['memory']:.2f}",
 }
 
 
-def measure_speed(adapter: clvoro.Adapter, n: int, report: Report) -> None:
-    """Add rows of processor times with `n` cells in a box, in the same cube as a solid, and around a ball in it."""
+def measure_speed(adapter: clvoro.Adapter, n: int, chosen: list[str], report: Report) -> None:
+    """Add rows of processor times with `n` cells in a box, in the same cube as a solid, and around a body in it."""
     begun: list[float] = []
 
     def steps(status: Any) -> None:
         begun[1:] = [time.process_time()]
 
     cube, base = clvoro.Box((0, 0, 0), (1, 1, 1)), 0.0
-    ball = clvoro.Solid.ball((0.5, 0.5, 0.5), 0.25, edge=0.25 * BALL_EDGE)
-    for name, domain in (
-        ("box", cube),
-        ("cube as a solid", clvoro.Solid.box((0, 0, 0), (1, 1, 1))),
-        ("outside of a ball", clvoro.Solid.outside(ball, cube)),
-    ):
+    domains = {
+        "box": lambda: cube,
+        "cube": lambda: clvoro.Solid.box((0, 0, 0), (1, 1, 1)),
+        "body": lambda: clvoro.Solid.outside(wavy_body(), cube),
+    }
+    for name in chosen or domains:
+        domain = domains[name]()
         adapter.run(domain, 0.2, "fast").diagram.faces.area.sum()  # builds the programs
         begun[:] = [time.process_time()]
         result = adapter.run(domain, (domain.measure / n) ** (1 / 3), callback=steps)
         result.diagram.faces.area.sum()
+        middle = time.process_time()
+        result.diagram.solver_mesh().area.sum()
         end = time.process_time()
         base = base or end - begun[0]
         row = {
@@ -126,7 +137,8 @@ def measure_speed(adapter: clvoro.Adapter, n: int, report: Report) -> None:
             "triangles": len(getattr(domain, "patch", ())),
             "cells": len(result.points),
             "run": begun[1] - begun[0],
-            "mesh": end - begun[1],
+            "mesh": middle - begun[1],
+            "solver": end - middle,
             "ratio": (end - begun[0]) / base,
             "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
         }
@@ -146,11 +158,12 @@ def main() -> None:
     options_of.add_argument("--speed", default="", metavar="NUMBERS", help="processor times of so many cells")
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
+    options_of.add_argument("--domains", default="", metavar="NAMES", help="of --speed: box, cube, body")
     options = options_of.parse_args()
     if options.speed:
         adapter, report = make_adapter(options), Report(options.json, SPEED_COLUMNS)
         for n in names(options.speed):
-            measure_speed(adapter, round(float(n)), report)
+            measure_speed(adapter, round(float(n)), names(options.domains), report)
         return report.finish(heading(adapter, "processor time of runs, and of meshes that are read with their faces"))
     if shutil.which("checkMesh") is None:
         raise SystemExit("checkMesh is not installed; Debian has it in the package openfoam")

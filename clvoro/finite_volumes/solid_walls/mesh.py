@@ -63,6 +63,12 @@ class _Made:
     own: np.ndarray
     rejected: np.ndarray
 
+    def is_like(self, other: _Made) -> bool:
+        """Return whether the faces are those of `other`."""
+        return all(
+            np.array_equal(getattr(self.faces, name), getattr(other.faces, name)) for name in ("corners", "points")
+        )
+
 
 def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return points (m, 3) outside of a solid that bound the cells of generators at its surface.
@@ -120,6 +126,11 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
     since = 0
     while since < _PATIENCE:
         made = _made(surface, near, walls)
+        if best is not None and made.is_like(best):
+            # Without creases there the next attempts are the same.
+            places = made.faces.generators[made.rejected]
+            if (surface.nearest_crease(places, 3 * near.sizes[made.home[made.rejected]])[0] < 0).all():
+                break
         since += 1
         if best is None or len(made.rejected) < len(best.rejected):
             best, kept, since = made, walls.copy(), 0
