@@ -18,12 +18,9 @@ typedef struct {
     measured_t measures;
     int with_corners;
     global uchar4 *corners;
+    own_t own;
 #ifdef HALO
     halo_t halo;
-#endif
-#ifdef SOLID
-    global const float *own_found;
-    global float *own_reach;
 #endif
 } output_t;
 
@@ -136,10 +133,7 @@ inline int write_cells(const cells_t *cells, const walk_t *walk, long8 done, con
         if (!lanes[lane])
             continue;
         const int i = out->items[places[lane]];
-#ifdef SOLID
-        lanes[lane] = knows_walls(i, reaches[lane] * reaches[lane] / 4, out->own_found, out->own_reach);
-#endif
-        if (lanes[lane] && write_cell(cells, walk, lane, i, out)) {
+        if (knows_walls(i, reaches[lane] * reaches[lane] / 4, &out->own) && write_cell(cells, walk, lane, i, out)) {
             out->reach[places[lane]] = (float)reaches[lane];
             ++made;
         } else {

@@ -96,14 +96,11 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
                     report,
                     {labels, measures, centroids, volumes, offsets, covariances},
                     with_corners,
-                    corners};
+                    corners,
+                    OWN_OF(0)};
 #ifdef HALO
     MAKE_HALO;
     out.halo = halo;
-#endif
-#ifdef SOLID
-    out.own_found = own_found;
-    out.own_reach = own_reach;
 #endif
     const search_t in = {binned, bins, grid_frames, grid_shapes, box_lower, box_upper};
     runs_t runs;
@@ -128,10 +125,8 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
         for (int lane = 0; lane < LANES; ++lane) {
             if (wanted[lane] && rounds[lane]++ < MAX_ROUNDS)
                 continue;
-#ifdef SOLID
-            for (; next < end && own_rows[items[order[next]]].s1 > 0; ++next)
+            for (; next < end && OWN_COUNT(items[order[next]]) > 0; ++next)
                 row_counts[items[order[next]]] = UNFINISHED;
-#endif
             wanted[lane] = guessed[lane] = next < end ? -1 : 0;
             if (next < end) {
                 const int place = order[next];

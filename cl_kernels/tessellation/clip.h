@@ -367,16 +367,16 @@ inline int clip_polyhedron(CELL *cell, REAL4 d, REAL d2, int label, bool seen_be
 inline int start_cell(CELL *cell, int i, REAL4 x, global const REAL *points, CLIP_BOX_ARGS)
 {
     start_polyhedron(cell, x, box_lower, box_upper);
-#ifdef SOLID
-    const int2 row = own_rows[i];
-    for (int k = row.s0; k < row.s0 + row.s1; ++k) {
+    if (!WALLS_MOVE)
+        return CLIP_CUT;
+    const own_t own = OWN_OF(i);
+    for (int k = 0; k < own_count(&own); ++k) {
         /* The bisector with the mirror image. */
-        const REAL4 plane = own_planes[k], d = (REAL4)(plane.s0, plane.s1, plane.s2, 0) * (2 * plane.s3);
-        const int what = clip_polyhedron(cell, d, 4 * plane.s3 * plane.s3, own_labels[k], false, points);
+        const REAL4 plane = own_plane(&own, k), d = (REAL4)(plane.s0, plane.s1, plane.s2, 0) * (2 * plane.s3);
+        const int what = clip_polyhedron(cell, d, 4 * plane.s3 * plane.s3, own_label(&own, k), false, points);
         if (what >= CLIP_FULL)
             return what;
     }
-#endif
     return CLIP_CUT;
 }
 

@@ -16,24 +16,63 @@
 #define OWN , own_rows, own_labels, own_planes, own_found, own_reach
 #define WALLS_MOVE 1 /* with the generators */
 #define BOX_LABEL(side) (INT_MIN + 1 + (side))
+#define FURTHER 1.4f
+
+/* What is known of the walls near one generator. */
+typedef struct {
+    int2 row;
+    global const int *labels;
+    global const REAL4 *planes;
+    global const float *found;
+    global float *reach;
+} own_t;
+#define OWN_OF(i)                                                                                                      \
+    {                                                                                                                  \
+        own_rows[i], own_labels, own_planes, own_found, own_reach                                                      \
+    }
+#define OWN_COUNT(i) own_rows[i].s1
+
+inline int own_count(const own_t *own)
+{
+    return own->row.s1;
+}
+
+inline REAL4 own_plane(const own_t *own, int k)
+{
+    return own->planes[own->row.s0 + k];
+}
+
+inline int own_label(const own_t *own, int k)
+{
+    return own->labels[own->row.s0 + k];
+}
+
+/* Whether everything of the surface is known that the cell of generator i may touch, whose farthest vertex has the
+   squared distance `reach2`. Notes the reach. */
+inline bool knows_walls(int i, REAL reach2, const own_t *own)
+{
+    const float reach = (float)sqrt(reach2);
+    own->reach[i] = FURTHER * reach;
+    return reach <= own->found[i];
+}
 #else
 #define OWN_ARGS
 #define OWN
 #define WALLS_MOVE 0
 #define BOX_LABEL(side) (-1 - (side))
+
+typedef struct {
+    int none;
+} own_t;
+#define OWN_OF(i)                                                                                                      \
+    {                                                                                                                  \
+        0                                                                                                              \
+    }
+#define OWN_COUNT(i) 0
+#define own_count(own) 0
+#define own_plane(own, k) ((REAL4)(0))
+#define own_label(own, k) BOX_LABEL(k)
+#define knows_walls(i, reach2, own) ((void)(own), true)
 #endif
 #define CLIP_BOX_ARGS const REAL4 box_lower, const REAL4 box_upper OWN_ARGS
 #define CLIP_BOX box_lower, box_upper OWN
-
-#ifdef SOLID
-#define FURTHER 1.4f
-
-/* Whether everything of the surface is known that a cell may touch whose farthest vertex has the squared distance
-   `reach2`. Notes the reach. */
-inline bool knows_walls(int i, REAL reach2, global const float *own_found, global float *own_reach)
-{
-    const float reach = (float)sqrt(reach2);
-    own_reach[i] = FURTHER * reach;
-    return reach <= own_found[i];
-}
-#endif

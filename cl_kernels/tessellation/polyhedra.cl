@@ -75,10 +75,8 @@ inline void check_cell_balls(const CELL *cell, int i, REAL4 place, const halo_t 
 inline bool has_own_planes(const CELL *cell)
 {
     bool found = false;
-#ifdef SOLID
-    for (int f = next_face(cell, 0); f < FACE_CAPACITY; f = next_face(cell, f + 1))
+    for (int f = next_face(cell, 0); WALLS_MOVE && f < FACE_CAPACITY; f = next_face(cell, f + 1))
         found |= cell->labels[f] < 0;
-#endif
     return found;
 }
 
@@ -146,9 +144,8 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
             inner = w;
             w = need < 4 * w ? need : 2 * w;
         }
-#ifdef SOLID
-        flag = flag == 0 && !knows_walls(i, cell->reach2, own_found, own_reach) ? FLAG_UNKNOWN : flag;
-#endif
+        const own_t own = OWN_OF(i);
+        flag = flag == 0 && !knows_walls(i, cell->reach2, &own) ? FLAG_UNKNOWN : flag;
         if (flag != 0) {
             atomic_or(report, flag);
             row_counts[i] = flag == FLAG_FULL || flag == FLAG_UNKNOWN ? UNFINISHED : 0;
@@ -268,12 +265,10 @@ inline REAL rounded_area(int i, int begin, int count, global const int *labels, 
 inline bool touches_walls(global const int *labels, int begin, int count, int other, int other_count)
 {
     bool found = false;
-#ifdef SOLID
-    for (int k = begin; k < begin + count; ++k)
+    for (int k = begin; WALLS_MOVE && k < begin + count; ++k)
         found |= labels[k] < 0;
-    for (int k = other; k < other + other_count; ++k)
+    for (int k = other; WALLS_MOVE && k < other + other_count; ++k)
         found |= labels[k] < 0;
-#endif
     return found;
 }
 

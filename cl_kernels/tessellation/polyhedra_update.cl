@@ -43,7 +43,7 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
     if (n > MOST_FACES)
         return -1;
     for (int k = 0; k < n; ++k) {
-        if (LACKS_WALL(in->neighbors[start + k], in))
+        if (lacks_wall(in->neighbors[start + k], in))
             return -1;
         add_plane(cell, in->neighbors[start + k], x, in);
     }
@@ -55,7 +55,7 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
         }
         if (next == INT_MAX)
             break;
-        if (cell->faces == MOST_FACES || LACKS_WALL(next, in))
+        if (cell->faces == MOST_FACES || lacks_wall(next, in))
             return -1;
         add_plane(cell, next, x, in);
         last = next;
@@ -69,10 +69,11 @@ inline uint crossed_walls(const corners_t *cell, REAL4 x, const rows_t *in)
 {
     const REAL reach = sqrt(cell->reach2), noise = WALL_NOISE(reach);
     uint crossed = 0;
-#ifdef SOLID
-    for (int v = 0; in->own_row.s1 > 0 && v < cell->corners; ++v)
-        crossed |= own_planes_before(corner_place(cell, v), noise, in);
-#else
+    if (WALLS_MOVE) {
+        for (int v = 0; own_count(&in->own) > 0 && v < cell->corners; ++v)
+            crossed |= own_planes_before(corner_place(cell, v), noise, &in->own);
+        return crossed;
+    }
     const REAL4 low = x - in->box_lower, high = in->box_upper - x;
     const REAL rooms[6] = {low.s0, high.s0, low.s1, high.s1, low.s2, high.s2};
     for (int wall = 0; wall < 6; ++wall) {
@@ -84,7 +85,6 @@ inline uint crossed_walls(const corners_t *cell, REAL4 x, const rows_t *in)
             farthest = fmax(farthest, wall & 1 ? places[v] : -places[v]);
         crossed |= (uint) !(farthest <= rooms[wall] + noise) << wall;
     }
-#endif
     return crossed;
 }
 
@@ -92,11 +92,11 @@ inline uint crossed_walls(const corners_t *cell, REAL4 x, const rows_t *in)
    there is none, and all walls near the cell are known. */
 inline bool keep_in_walls(const corners_t *cell, int i, REAL4 x, const rows_t *in, global int *marks)
 {
-    if (!KNOWS_WALLS(i, cell->reach2, in))
+    if (!knows_walls(i, cell->reach2, &in->own))
         return false;
     const uint crossed = crossed_walls(cell, x, in);
     for (uint rest = crossed; rest; rest &= rest - 1)
-        add_neighbor(i, WALL_LABEL(popcount(~rest & (rest - 1)), in), in, marks);
+        add_neighbor(i, own_label(&in->own, popcount(~rest & (rest - 1))), in, marks);
     return crossed == 0;
 }
 

@@ -116,16 +116,14 @@ inline bool team_place(local team_cell_t *at, team_t *team, REAL4 x, const rows_
         above = fmax(above, place);
     }
     const REAL reach2 = team_largest(team, far2), reach = sqrt(reach2);
-#ifdef SOLID
     uint walls = 0;
-    for (int v = lane; in->own_row.s1 > 0 && v < corner_count; v += TEAM)
-        walls |= own_planes_before(corner_place(cell, v), WALL_NOISE(reach), in);
-#else
+    for (int v = lane; own_count(&in->own) > 0 && v < corner_count; v += TEAM)
+        walls |= own_planes_before(corner_place(cell, v), WALL_NOISE(reach), &in->own);
     const REAL4 low = x - in->box_lower, high = in->box_upper - x;
-    const uint walls = (uint)crosses(low.s0, reach, below.s0) | (uint)crosses(high.s0, reach, above.s0) << 1 |
-                       (uint)crosses(low.s1, reach, below.s1) << 2 | (uint)crosses(high.s1, reach, above.s1) << 3 |
-                       (uint)crosses(low.s2, reach, below.s2) << 4 | (uint)crosses(high.s2, reach, above.s2) << 5;
-#endif
+    if (!WALLS_MOVE)
+        walls = (uint)crosses(low.s0, reach, below.s0) | (uint)crosses(high.s0, reach, above.s0) << 1 |
+                (uint)crosses(low.s1, reach, below.s1) << 2 | (uint)crosses(high.s1, reach, above.s1) << 3 |
+                (uint)crosses(low.s2, reach, below.s2) << 4 | (uint)crosses(high.s2, reach, above.s2) << 5;
     placed->reach2 = reach2;
     placed->walls = team_or(team, walls);
     *fits = team_ballot(team, !fit) == 0;
@@ -295,7 +293,7 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
     if (lane < before)
         cell->labels[lane] = old_neighbors[start + lane];
     TEAM_SYNC();
-    if (team_ballot(&team, lane < faces && LACKS_WALL(cell->labels[lane], &in)) != 0)
+    if (team_ballot(&team, lane < faces && lacks_wall(cell->labels[lane], &in)) != 0)
         return;
     cell->planes[lane] = lane < faces ? plane_of_face(cell->labels[lane], x, &in) : 0;
     at->origins[lane] = lane;
@@ -319,11 +317,11 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
         kept = turn == 0 && faces == before;
         done = good && fits && (turn == 1 || kept);
     }
-    if (!done || !has_nearest_images(placed.reach2, &in) || !KNOWS_WALLS(i, placed.reach2, &in))
+    if (!done || !has_nearest_images(placed.reach2, &in) || !knows_walls(i, placed.reach2, &in.own))
         return;
     if (placed.walls != 0) {
         if ((placed.walls >> lane) & 1)
-            add_neighbor(i, WALL_LABEL(lane, &in), &in, marks);
+            add_neighbor(i, own_label(&in.own, lane), &in, marks);
         return;
     }
     int place = start;

@@ -32,39 +32,28 @@ typedef struct {
 #ifdef PERIODIC
     REAL4 periods;
 #endif
-#ifdef SOLID
-    int2 own_row;
-    global const int *own_labels;
-    global const REAL4 *own_planes;
-    global const float *own_found;
-    global float *own_reach;
-#endif
+    own_t own;
 } rows_t;
 
 /* The rows for generator i, from the arguments of a kernel. */
-#ifdef SOLID
-#define OWN_ROW(i) , own_rows[i], own_labels, own_planes, own_found, own_reach
-#else
-#define OWN_ROW(i)
-#endif
 #define ROWS(i)                                                                                                        \
     {                                                                                                                  \
-        old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS OWN_ROW(i)                               \
+        old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS, OWN_OF(i)                               \
     }
 
-#ifdef SOLID
 /* Number of the plane of its own that a cell has with this label; -1 if it has none. */
-inline int own_plane_of(int label, const rows_t *in)
+inline int own_plane_of(int label, const own_t *own)
 {
     int found = -1;
-    for (int k = in->own_row.s0; k < in->own_row.s0 + in->own_row.s1; ++k)
-        found = in->own_labels[k] == label ? k : found;
+    for (int k = 0; k < own_count(own); ++k)
+        found = own_label(own, k) == label ? k : found;
     return found;
 }
-#define LACKS_WALL(label, in) ((label) < 0 && own_plane_of(label, in) < 0)
-#else
-#define LACKS_WALL(label, in) false
-#endif
+
+inline bool lacks_wall(int label, const rows_t *in)
+{
+    return WALLS_MOVE && label < 0 && own_plane_of(label, &in->own) < 0;
+}
 
 /* The plane (p, d^2) between a generator at x and a neighbor or wall. */
 inline REAL4 plane_of_face(int label, REAL4 x, const rows_t *in)
@@ -74,15 +63,13 @@ inline REAL4 plane_of_face(int label, REAL4 x, const rows_t *in)
         d = (REAL4)(in->points[3 * label], in->points[3 * label + 1], in->points[3 * label + 2], 0) - x;
         d = (REAL4)(nearest_image(d.s0, in->periods.s0), nearest_image(d.s1, in->periods.s1),
                     nearest_image(d.s2, in->periods.s2), 0);
-    } else {
-#ifdef SOLID
-        const REAL4 own = in->own_planes[own_plane_of(label, in)];
+    } else if (WALLS_MOVE) {
+        const REAL4 own = own_plane(&in->own, own_plane_of(label, &in->own));
         d = (REAL4)(own.s0, own.s1, own.s2, 0) * (2 * own.s3);
-#else
+    } else {
         const int wall = -1 - label;
         const REAL4 across = 2 * ((wall & 1 ? in->box_upper : in->box_lower) - x);
         d = (REAL4)(wall < 2 ? across.s0 : 0, wall >> 1 == 1 ? across.s1 : 0, wall > 3 ? across.s2 : 0, 0);
-#endif
     }
     const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2, inverse = 1 / d2;
     return (REAL4)(d.s0 * inverse, d.s1 * inverse, d.s2 * inverse, d2);
@@ -112,24 +99,17 @@ inline bool names_neighbor(int label, int i, const rows_t *in)
 /* Round-off of the distance from a wall, of a vertex as far as `reach`. */
 #define WALL_NOISE(reach) (64 * REAL_EPS * (1 + (reach)))
 
-#ifdef SOLID
 /* The set of the planes of its own that vertex y of a cell is beyond: one bit each. */
-inline uint own_planes_before(REAL4 y, REAL noise, const rows_t *in)
+inline uint own_planes_before(REAL4 y, REAL noise, const own_t *own)
 {
     uint set = 0;
-    for (int k = 0; k < in->own_row.s1; ++k) {
-        const REAL4 plane = in->own_planes[in->own_row.s0 + k];
+    for (int k = 0; k < own_count(own); ++k) {
+        const REAL4 plane = own_plane(own, k);
         const REAL along = fma(plane.s0, y.s0, fma(plane.s1, y.s1, plane.s2 * y.s2));
         set |= (uint)(along > plane.s3 + noise) << k;
     }
     return set;
 }
-#define KNOWS_WALLS(i, reach2, in) knows_walls(i, reach2, (in)->own_found, (in)->own_reach)
-#define WALL_LABEL(wall, in) (in)->own_labels[(in)->own_row.s0 + (wall)]
-#else
-#define KNOWS_WALLS(i, reach2, in) true
-#define WALL_LABEL(wall, in) (-1 - (wall))
-#endif
 
 /* Make `label` a further neighbor of i, unless it was one; i is clipped if there is no room. */
 inline void add_neighbor(int i, int label, const rows_t *in, global int *marks)
