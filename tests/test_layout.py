@@ -70,8 +70,6 @@ PARTS = {
     "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
     "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
     "solvers.transport": {"solvers.poisson"},
-    "tessellation.cells": {"tessellation.weight_bounds"},
-    "tessellation.polyhedra": {"tessellation.weight_bounds"},
     "tessellation.periodic.ghost_images": {"tessellation.part"},
     "tessellation.incremental": {"tessellation.cells"},
     "tessellation.polyhedra_update": {"tessellation.polyhedra"},

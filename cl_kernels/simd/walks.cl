@@ -125,7 +125,7 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
         for (int lane = 0; lane < LANES; ++lane) {
             if (wanted[lane] && rounds[lane]++ < MAX_ROUNDS)
                 continue;
-            for (; next < end && OWN_COUNT(items[order[next]]) > 0; ++next)
+            for (; next < end && has_own(items[order[next]] OWN); ++next)
                 row_counts[items[order[next]]] = UNFINISHED;
             wanted[lane] = guessed[lane] = next < end ? -1 : 0;
             if (next < end) {

@@ -30,7 +30,6 @@ typedef struct {
     {                                                                                                                  \
         own_rows[i], own_labels, own_planes, own_found, own_reach                                                      \
     }
-#define OWN_COUNT(i) own_rows[i].s1
 
 inline int own_count(const own_t *own)
 {
@@ -55,6 +54,11 @@ inline bool knows_walls(int i, REAL reach2, const own_t *own)
     own->reach[i] = FURTHER * reach;
     return reach <= own->found[i];
 }
+
+inline bool has_own(int i OWN_ARGS)
+{
+    return own_rows[i].s1 > 0;
+}
 #else
 #define OWN_ARGS
 #define OWN
@@ -68,11 +72,19 @@ typedef struct {
     {                                                                                                                  \
         0                                                                                                              \
     }
-#define OWN_COUNT(i) 0
 #define own_count(own) 0
 #define own_plane(own, k) ((REAL4)(0))
 #define own_label(own, k) BOX_LABEL(k)
-#define knows_walls(i, reach2, own) ((void)(own), true)
+
+inline bool knows_walls(int i, REAL reach2, const own_t *own)
+{
+    return true;
+}
+
+inline bool has_own(int i)
+{
+    return false;
+}
 #endif
 #define CLIP_BOX_ARGS const REAL4 box_lower, const REAL4 box_upper OWN_ARGS
 #define CLIP_BOX box_lower, box_upper OWN

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -13,14 +14,13 @@ from ..errors import ClvoroError, MemoryLimitError
 from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
-from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
 from .back_ends import LANES, LANES_FROM, has_lanes
 from .bins import MAX_LEVELS, BinnedPoints
+from .builder import CellBuilder
 from .device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, NeighborRows, OpenCellError, Tessellation
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
 from .report import COINCIDE, DOUBT, FULL, KEPT, LOOPED, OPEN, SIZE, SLOTS, SPARE, WHOLE
-from .weight_bounds import WeightBounds
 
 CELL_CAPACITY = 24
 """Most faces of a cell while it is clipped."""
@@ -36,11 +36,8 @@ FIRST_REACH = 1.9
 """Largest first search radius of `hulls.cl`, in units of the local spacing of the bins."""
 
 
-class Cells:
-    """Tessellate a box in 2D, or a sphere; with an engine for power diagrams by points with weights (n, 3).
-
-    Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
-    one is complete.
+class Cells(CellBuilder):
+    """Tessellate a box in 2D, or a sphere. A cell may have about `LARGEST_ROW` faces, or `LARGEST_ELSEWHERE`.
 
     Parameters
     ----------
@@ -57,15 +54,11 @@ class Cells:
     """
 
     from_previous = False
-    """Whether new cells may start from the neighbors in an earlier diagram, and updates need bins."""
 
     def __init__(self, engine: Engine, folded: bool = False) -> None:
-        self.engine = engine
-        self._bounds = WeightBounds(engine) if engine.traits.site_values else None
+        super().__init__(engine)
         self._folds = {f"FOLD_{a}": engine.traits.periods[a].hex() for a in range(2)} if folded else {}
-        self._scan = Scan(engine)
-        self._capacity = self._room = self._n = self._enlarged_for = 0
-        self._report = engine.empty(SIZE, np.int32)
+        self._enlarged_for = 0
         self._first_reports: dict[tuple[int, int, bool], cla.Array] = {}
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
@@ -89,93 +82,34 @@ class Cells:
         }
         return capacities | self._folds
 
-    def clear(self) -> None:
-        """Free all buffers of cells and faces."""
-        self._of_cells, self._of_faces, self._views = {}, {}, {}
-        self._capacity, self._room, self._n = 0, 0, -1
-
-    def reserve(self, n: int) -> None:
-        """Allocate the arrays per cell for `n` generators."""
-        engine, d = self.engine, self.engine.dim
-        if n > self._capacity:
-            # Free the old arrays first.
-            self._of_cells = self._views = {}
-            self._of_cells = {
-                "starts": engine.empty(n + 1, np.int32),
-                "volumes": engine.empty(n),
-                "offsets": engine.empty((n, d)),
-                "covariances": engine.empty((n, 3)),
-            }
-            self._capacity, self._room, self._n = n, 0, -1
-        if n != self._n:
-            self._views = {
-                name: array[: n + 1] if name == "starts" else array[:n] for name, array in self._of_cells.items()
-            }
-            self._n = n
-
-    def _reserve_faces(self, n: int, m: int) -> None:
-        """Allocate the arrays for `m` half-faces of `n` cells."""
-        most = max(m, most_faces(n))
-        if most > self._room:
-            engine, d = self.engine, self.engine.dim
-            self._of_faces: dict[str, cla.Array] = {}
-            self._of_faces = {
-                "neighbors": engine.empty(most, np.int32),
-                "face_measures": engine.empty(most, engine.face),
-                "face_centroids": engine.empty((most, d), engine.face),
-            }
-            self._room = most
-
-    @framed
-    def tessellate(
+    def _tessellate(
         self,
         box: ClipBox,
         points: cla.Array,
         n: int,
         binned: BinnedPoints,
-        previous: Tessellation | NeighborRows | None = None,
-        exact: bool = True,
-        n_own: int | None = None,
-        halo_args: tuple[object, ...] = (),
+        previous: Tessellation | NeighborRows | None,
+        exact: bool,
+        rows: int,
+        halo_args: tuple[object, ...],
     ) -> Tessellation:
-        """Tessellate `box` by the first `n` of `points` (n, d), which lie in `binned`.
-
-        Parameters
-        ----------
-        previous, halo_args : optional
-            As in 3D (`Polyhedra.tessellate`). In 2D they are not needed.
-        exact : bool
-            Reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
-            otherwise more than `ROUGH_SHARE`.
-        n_own : int, optional
-            Number of cells to build, those of the first generators. Their faces with other cells are not matched.
-
-        Raises
-        ------
-        InputError
-            If two generators coincide or are too close for the precision (`CloseError`).
-        MemoryLimitError
-            If the rows of faces are too many for 32-bit indices.
-        ClvoroError
-            If a cell has more than `LARGEST_ROW` faces, or `LARGEST_ELSEWHERE`, or a little more.
-        """
-        engine, total, n = self.engine, n, n if n_own is None else n_own
+        engine, total, n = self.engine, n, rows
         if self.row_capacity > ROW_CAPACITY and n > self._enlarged_for:
             # The capacities were enlarged for a smaller mesh: start again with the default ones.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
-        self.reserve(n)
+        self.cells_of(n)
         spare, whole = spare_slots(n), False
         while True:
             with engine.workspace.frame():
-                rows = self.take_rows(n, spare=spare, whole=whole)
-                flags, m = self._clip(rows, box, points, total, n, binned, exact)
+                taken = self.take_rows(n, spare=spare, whole=whole)
+                flags, m = self._clip(taken, box, points, total, n, binned, exact)
                 if flags & CROWDED:
                     # Repeat with twice the slots that were requested so far.
-                    spare = 2 * (int(rows.report.get()[SPARE]) - n)
+                    spare = 2 * (int(taken.report.get()[SPARE]) - n)
                     continue
                 t = None
                 if not flags & ~DOUBT:
-                    t = self.measure(rows, box, points, m, flags, exact)
+                    t = self.measure(taken, box, points, m, flags, exact)
                 if t is not None:
                     return t
                 if flags & OPEN:
@@ -245,7 +179,6 @@ class Cells:
         is open in a folded graph.
         """
         n = previous.n
-        self.reserve(n)
         rows = self.take_rows(n, spare=spare_slots(n))
         self.engine.run_each(
             self._kernels.clip_by_rings,
@@ -338,8 +271,7 @@ class Cells:
         With `ahead` the report is not known. Nothing is written unless its flags are 0 and there are at most `m` faces.
         """
         engine, n = self.engine, rows.n
-        self._reserve_faces(n, m)
-        new, faces = self._views, self._of_faces
+        new, faces = self.cells_of(n), self.faces_of(max(m, most_faces(n)))
         # The new graph may overwrite the previous one directly only if no row is read from there and no check follows.
         direct = rows.all_new and not flags & DOUBT
         neighbors = faces["neighbors"] if direct else engine.scratch(m, np.int32)
@@ -353,23 +285,14 @@ class Cells:
                 return None
         copy = int(not direct), *unless, rows.starts, neighbors, new["starts"], faces["neighbors"]
         engine.run_blocks(self._kernels.copy_graph, n, *copy)
-        return Tessellation(
-            n,
-            points,
-            new["starts"],
-            faces["neighbors"],
-            faces["face_measures"],
-            faces["face_centroids"],
-            new["volumes"],
-            new["offsets"],
-            new["covariances"],
-        )
+        arrays: dict[str, Any] = {**new, **faces}
+        return Tessellation(n, points, **arrays)
 
     def _measure_rows(
         self, rows: FaceRows, box: ClipBox, points: cla.Array, unless: tuple[object, ...], neighbors: cla.Array
     ) -> None:
         """Write the graph of the rows to `neighbors`, and their measures, `unless` as `measure` says."""
-        new, faces = self._views, self._of_faces
+        new, faces = self.cells_of(rows.n), self._faces
         self.engine.run(
             self._kernels.measure_cells,
             -(-rows.n // self.lanes),
@@ -402,7 +325,7 @@ class Cells:
             rows.counts,
             rows.starts,
             neighbors,
-            self._views["volumes"],
+            self.cells_of(rows.n)["volumes"],
             points,
             *box.device_corners(self.engine.real),
             self._share(exact),

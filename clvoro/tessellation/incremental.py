@@ -63,7 +63,6 @@ class IncrementalUpdate:
 
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
         """
-        cells.reserve(previous.n)
         with self.engine.workspace.frame():
             t = self._update(cells, box, points, previous, follow)
         if t is None:

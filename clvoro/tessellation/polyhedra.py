@@ -15,15 +15,13 @@ from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
-from ..opencl.primitives import Scan
-from ..opencl.workspace import framed
 from .back_ends import LANES_FROM, TEAM, TeamKernel, has_lanes, has_teams_for_new_cells, has_warps, team_defines
 from .bins import MAX_LEVELS, BinnedPoints
+from .builder import CellBuilder
 from .cut_cells import FACE_CAPACITY, GROWTH, MOST_FACES, CutCells, Matching, capacity_defines, clip_each
 from .device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, NeighborRows, Tessellation
 from .periodic.halo import halo_defines
 from .report import FACES, FULL, HARMLESS, KEPT, SIZE, UNKNOWN
-from .weight_bounds import WeightBounds
 
 FACES_PER_CELL = 16.5
 """First guess of the half-faces per cell. Random cells have 15.54 on average; walls add some."""
@@ -47,19 +45,13 @@ def _larger(capacity: int) -> int:
     return GROWTH * capacity
 
 
-class Polyhedra:
-    """Tessellate a box in 3D; with an engine for power diagrams by points with weights (n, 4).
-
-    Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
-    one is complete.
-    """
+class Polyhedra(CellBuilder):
+    """Tessellate a box in 3D. A cell may have `MOST_FACES` faces."""
 
     from_previous = True
-    """Whether new cells may start from the neighbors in an earlier diagram, and updates need bins."""
 
     def __init__(self, engine: Engine) -> None:
-        self.engine = engine
-        self._scan = Scan(engine)
+        super().__init__(engine)
         self._programs: dict[int, SimpleNamespace] = {}
         self._kernels(FACE_CAPACITY)
         self._team: TeamKernel | None = None
@@ -69,12 +61,10 @@ class Polyhedra:
             )
             self._team = TeamKernel(engine.queue.device, by_teams, "clip_polyhedra_by_teams")
         self._walks: Kernels | None = None
-        self._bounds = WeightBounds(engine) if engine.traits.site_values else None
         if has_lanes(engine):
             defines = {"STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine)}
             self._walks = engine.kernels("simd/walks", defines)
-        self._report = engine.empty(SIZE, np.int32)
-        self._capacity = self._room = self._n = 0
+        self._room = self._rows = 0
         self._of_vertices: tuple[cla.Array, cla.Array] | None = None
 
     def _kernels(self, capacity: int) -> SimpleNamespace:
@@ -82,29 +72,6 @@ class Polyhedra:
             defines = {"MAX_DEPTH": MAX_LEVELS, **capacity_defines(self.engine, capacity), **halo_defines(self.engine)}
             self._programs[capacity] = self.engine.kernels("tessellation/polyhedra", defines)
         return self._programs[capacity]
-
-    def _reserve_cells(self, n: int) -> None:
-        """Allocate the arrays per cell for `n` cells."""
-        if n <= self._capacity:
-            return
-        engine = self.engine
-        self._of_rows: dict[str, cla.Array] = {}
-        self._of_cells = {
-            "starts": engine.empty(n + 1, np.int32),
-            "volumes": engine.empty(n),
-            "offsets": engine.empty((n, 3)),
-            "covariances": engine.empty((n, 6)),
-        }
-        self._of_faces: dict[str, cla.Array] = {}
-        self._capacity, self._rows = n, -1
-
-    def _cell_rows(self, n: int) -> dict[str, cla.Array]:
-        """Return the arrays per cell for `n` cells."""
-        self._reserve_cells(n)
-        if n != self._rows:
-            self._of_rows = {name: a[: n + (name == "starts")] for name, a in self._of_cells.items()}
-            self._rows = n
-        return self._of_rows
 
     def _take_faces(self, m: int) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return arrays for labels, measures and centroids of `m` half-faces, in any order."""
@@ -116,17 +83,6 @@ class Polyhedra:
         engine, self._room = self.engine, m
         return engine.scratch(m, np.int32), engine.scratch(m), engine.scratch((m, 3))
 
-    def _faces(self, m: int) -> dict[str, cla.Array]:
-        """Return arrays for the `m` half-faces of a diagram."""
-        engine, faces = self.engine, self._of_faces
-        if not faces or len(faces["neighbors"]) < m:
-            faces.clear()
-            m += m // 32  # their number changes a little between steps
-            faces["neighbors"] = engine.empty(m, np.int32)
-            faces["face_measures"] = engine.empty(m)
-            faces["face_centroids"] = engine.empty((m, 3))
-        return faces
-
     def _vertices(self, m: int) -> tuple[cla.Array, cla.Array]:
         """Return arrays for the vertices of a diagram with `m` half-faces; see `Tessellation.vertices`."""
         if self._of_vertices is None or len(self._of_vertices[1]) < m:
@@ -134,44 +90,19 @@ class Polyhedra:
             self._of_vertices = (self.engine.empty(2 * m, np.uint32), self.engine.empty(m, np.uint32))
         return self._of_vertices
 
-    @framed
-    def tessellate(
+    def _tessellate(
         self,
         box: ClipBox,
         points: cla.Array,
         n: int,
         binned: BinnedPoints,
-        previous: Tessellation | NeighborRows | None = None,
-        exact: bool = True,
-        n_own: int | None = None,
-        halo_args: tuple[object, ...] = (),
+        previous: Tessellation | NeighborRows | None,
+        exact: bool,
+        rows: int,
+        halo_args: tuple[object, ...],
     ) -> Tessellation:
-        """Tessellate `box` by the first `n` of `points` (n, 3), which lie in `binned`.
-
-        Parameters
-        ----------
-        previous : Tessellation or NeighborRows, optional
-            A diagram of the same generators at earlier positions: clipping starts from its neighbors.
-        exact : bool
-            Reject generators so close together that two cells differ about their common face by more than `EXACT_SHARE`
-            of a cell; otherwise by more than `ROUGH_SHARE`.
-        n_own : int, optional
-            Number of cells to build, those of the first generators. Their faces with other cells are not matched.
-        halo_args : tuple, optional
-            In a periodic box the HALO_ARGS of kernels, which test the balls around vertices
-            (tessellation/periodic/halo.h).
-
-        Raises
-        ------
-        InputError
-            If two generators coincide or are too close for the precision (`CloseError`).
-        MemoryLimitError
-            If the faces are too many for 32-bit indices.
-        ClvoroError
-            If a cell has more than `MOST_FACES` faces.
-        """
-        engine, rows = self.engine, n if n_own is None else n_own
-        self._reserve_cells(rows)
+        engine = self.engine
+        self.cells_of(rows)
         share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         first = engine.scratch(n, np.float32)
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
@@ -187,10 +118,6 @@ class Polyhedra:
                 if not flags & ~HARMLESS:
                     return matching.tessellation(flags)
         raise CloseError(points, n)
-
-    def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
-        """Return `t`: faces in 3D have full precision already."""
-        return t
 
     def _begin_anew(self, binned: BinnedPoints, first: cla.Array, n: int) -> None:
         """Restore the search radii, so that the last bits of the result do not depend on earlier attempts."""
@@ -215,10 +142,10 @@ class Polyhedra:
         """
         engine = self.engine
         most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
-        faces = self._take_faces(most if rows != self._n else max(most, self._room))
-        self._n = rows
+        faces = self._take_faces(most if rows != self._rows else max(most, self._room))
+        self._rows = rows
         places, counts = engine.scratch(rows, np.int32), engine.scratch(rows, np.int32)
-        cells = self._cell_rows(rows)
+        cells = self.cells_of(rows)
         warm = previous is not None and previous.n == rows
         old = (previous.starts, previous.neighbors) if previous is not None and warm else (counts, counts)
         capacity, again = FACE_CAPACITY, False
@@ -322,7 +249,7 @@ class Polyhedra:
 
     def take_cells(self, n: int, m: int) -> CutCells:
         """Return arrays for `n` cells with `m` half-faces in any order, to be matched."""
-        cells = self._cell_rows(n)
+        cells = self.cells_of(n)
         scratch = self.engine.scratch
         places, counts, labels = (scratch(size, np.int32) for size in (n, n, m))
         corners, keys = scratch(2 * m, np.uint32), scratch(m, np.uint32)
@@ -382,7 +309,8 @@ class Polyhedra:
         """Write the faces of `matching` to the arrays of the diagram, which get room for `m`."""
         engine, k, cut = self.engine, self._kernels(FACE_CAPACITY), matching.cut
         rows, report, starts = len(cut.counts), matching.report, matching.starts
-        faces, of_rows = self._faces(m), self._cell_rows(rows)["starts"]
+        # The number of faces changes a little between steps.
+        faces, of_rows = self.faces_of(m, m // 32), self.cells_of(rows)["starts"]
         room = np.int32(len(faces["neighbors"]))
         with_corners = cut.corners is not None
         vertices = self._vertices(int(room)) if with_corners else ()
@@ -419,13 +347,7 @@ class Polyhedra:
                 faces["neighbors"],
                 *(vertices or (report, report)),
             )
-        matching.arrays = {
-            "starts": of_rows,
-            "neighbors": faces["neighbors"],
-            "face_measures": faces["face_measures"],
-            "face_centroids": faces["face_centroids"],
-            "vertices": vertices,
-        }
+        matching.arrays = {"starts": of_rows, **faces, "vertices": vertices}
 
     def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:
         """Return the items of the first `rows` generators in an order that keeps neighbors close."""

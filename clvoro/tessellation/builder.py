@@ -1,0 +1,129 @@
+"""What builds the cells of a diagram from its generators in bins: one interface in 2D and in 3D."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import pyopencl.array as cla
+
+from ..geometry.domain import ClipBox
+from ..opencl.engine import Engine
+from ..opencl.primitives import Scan
+from ..opencl.workspace import framed
+from .bins import BinnedPoints
+from .device_diagram import NeighborRows, Tessellation
+from .report import SIZE
+from .weight_bounds import WeightBounds
+
+MOMENTS = {2: 3, 3: 6}
+"""Second moments of a cell, by its dimension."""
+
+
+class CellBuilder(ABC):
+    """Build the cells of a box, or of a sphere; with an engine for power diagrams by points that end with weights.
+
+    Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
+    one is complete.
+    """
+
+    from_previous: bool
+    """Whether new cells may start from the neighbors in an earlier diagram, and updates need bins."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine, self._scan = engine, Scan(engine)
+        self._bounds = WeightBounds(engine) if engine.traits.site_values else None
+        self._report = engine.empty(SIZE, np.int32)
+        self.clear()
+
+    def clear(self) -> None:
+        """Free all buffers of cells and faces; kernels stay."""
+        self._all_cells: dict[str, cla.Array] = {}
+        self._cells: dict[str, cla.Array] = {}
+        self._faces: dict[str, cla.Array] = {}
+        self._n = -1
+
+    def cells_of(self, n: int) -> dict[str, cla.Array]:
+        """Return the arrays per cell of a diagram of `n` cells."""
+        engine = self.engine
+        if not self._all_cells or self._all_cells["volumes"].shape[0] < n:
+            self.clear()  # the old arrays are freed first
+            self._all_cells = {
+                "starts": engine.empty(n + 1, np.int32),
+                "volumes": engine.empty(n),
+                "offsets": engine.empty((n, engine.dim)),
+                "covariances": engine.empty((n, MOMENTS[engine.cell_dim])),
+            }
+        if n != self._n:
+            self._cells = {name: a[: n + (name == "starts")] for name, a in self._all_cells.items()}
+            self._n = n
+        return self._cells
+
+    def faces_of(self, m: int, spare: int = 0) -> dict[str, cla.Array]:
+        """Return the arrays of a diagram of at most `m` half-faces; new ones have room for `spare` more."""
+        engine, faces = self.engine, self._faces
+        if not faces or faces["neighbors"].shape[0] < m:
+            faces.clear()
+            m += spare
+            faces["neighbors"] = engine.empty(m, np.int32)
+            faces["face_measures"] = engine.empty(m, engine.face)
+            faces["face_centroids"] = engine.empty((m, engine.dim), engine.face)
+        return faces
+
+    @framed
+    def tessellate(
+        self,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        previous: Tessellation | NeighborRows | None = None,
+        exact: bool = True,
+        n_own: int | None = None,
+        halo_args: tuple[object, ...] = (),
+    ) -> Tessellation:
+        """Tessellate `box` by the first `n` of `points` (n, d), which lie in `binned`.
+
+        Parameters
+        ----------
+        previous : Tessellation or NeighborRows, optional
+            A diagram of the same generators at earlier positions: with `from_previous` clipping starts from its
+            neighbors.
+        exact : bool
+            Reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
+            otherwise more than `ROUGH_SHARE`.
+        n_own : int, optional
+            Number of cells to build, those of the first generators. Their faces with other cells are not matched.
+        halo_args : tuple, optional
+            In a periodic box in 3D the HALO_ARGS of kernels, which test the balls around vertices
+            (tessellation/periodic/halo.h).
+
+        Raises
+        ------
+        InputError
+            If two generators coincide or are too close for the precision (`CloseError`).
+        MemoryLimitError
+            If the faces are too many for 32-bit indices.
+        ClvoroError
+            If a cell has too many faces.
+        """
+        return self._tessellate(box, points, n, binned, previous, exact, n if n_own is None else n_own, halo_args)
+
+    @abstractmethod
+    def _tessellate(
+        self,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        previous: Tessellation | NeighborRows | None,
+        exact: bool,
+        rows: int,
+        halo_args: tuple[object, ...],
+    ) -> Tessellation:
+        """Tessellate; `rows` is the number of cells to build."""
+
+    def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
+        """Return `t`, a diagram of `box`, with face measures and centroids in full precision, in new arrays."""
+        del box
+        return t
