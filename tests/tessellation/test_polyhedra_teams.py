@@ -20,7 +20,7 @@ from clvoro.tessellation import back_ends
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.robustness.gpu_like import by_teams, groups
-from tests.tessellation import test_polyhedra_update as updates
+from tests.tessellation import test_updates_3d as updates
 from tests.tessellation.test_polyhedra import BOX, POINTS, directions
 
 ARRAYS = ("starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances")
@@ -137,22 +137,20 @@ STEPS = 1e-4, 2e-3, 2e-2, 1e-3, 0.0
 
 def updated(ctx, dtype, name, wanted):
     """Return, for each of several updates, whether it succeeded and its arrays; and the launches of both kernels."""
+    points, rng, found, tally = updates.POINTS[name], np.random.default_rng(3), [], Tally()
     with groups(128), by_teams(wanted):
-        queue = cl.CommandQueue(ctx)
-        points = updates.POINTS[name]
-        carried = updates.Carried(Engine(ctx, queue, 3, np.dtype(dtype)), points)
-    rng, found, tally = np.random.default_rng(3), [], Tally()
-    with watching(queue, tally):
-        for step in STEPS:
-            points = points + step * updates.spacing(points) * rng.standard_normal(points.shape)
-            found.append([carried.move(points)])
-            t = carried.t
-            m = int(t.starts.get()[t.n])
-            for array_name in ARRAYS:
-                array = getattr(t, array_name).get()
-                found[-1].append(array[:m] if array_name.startswith(("nei", "face")) else array)
-            found[-1].append(corners(t, found[-1][1]))
-            found[-1].append(t.vertices[1].get()[:m])
+        carried = updates.Carried(ctx, points, real=dtype)
+        with watching(carried.engine.queue, tally):
+            for step in STEPS:
+                points = updates.moved(points, updates.BOX, 2 * step, rng)
+                found.append([carried.move(points)])
+                t = carried.t
+                m = int(t.starts.get()[t.n])
+                for array_name in ARRAYS:
+                    array = getattr(t, array_name).get()
+                    found[-1].append(array[:m] if array_name.startswith(("nei", "face")) else array)
+                found[-1].append(corners(t, found[-1][1]))
+                found[-1].append(t.vertices[1].get()[:m])
     calls = tally.calls
     return (
         found,
