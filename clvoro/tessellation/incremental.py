@@ -29,7 +29,7 @@ SAMPLE, SAMPLED_FROM = 8, 200_000
 WRONG_SHARE = 0.23
 """Largest share of wrong cells in this sample. With their neighbors they amount to `MAX_SHARE`."""
 FEW = 256
-"""From this many cells on, CPUs first build cells eight at a time in vector lanes."""
+"""From this many cells on, of four times as many or more, CPUs first build cells eight at a time in vector lanes."""
 
 
 class IncrementalUpdate:
@@ -142,7 +142,7 @@ class IncrementalUpdate:
         `given` are the graph before, the generators and the corners of the box.
         """
         engine, this = self.engine, (listed, number)
-        few = FEW if cells.lanes > 1 and number == 0 else self._n + 1
+        few = FEW if cells.lanes > 1 and number == 0 and self._n >= 4 * FEW else self._n + 1
         new = rows.slots, rows.counts
         if few <= size:
             engine.run_each(
