@@ -326,13 +326,6 @@ def test_runs(adapter, options):
         assert result.quality.mean() > 0.955  # of so few; .960 to .977 over twelve starts
 
 
-@pytest.mark.slow
-def test_the_same_bits_from_run_to_run(adapter):
-    one, two = (adapter.run(UNIT, SPOT, seed=3, effort="fast") for _ in range(2))
-    for name in ("points", "size_error", "quality"):
-        assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
-
-
 @pytest.mark.sparse(1)
 def test_incremental_update_across_periodic_boundaries(adapter):
     """Diagrams updated from step to step equal those made anew."""
