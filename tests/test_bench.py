@@ -195,11 +195,13 @@ def test_cavity():
 
 
 @pytest.mark.slow
-def test_masks():
+def test_outlines():
     """Sizes are met on staircases, too: mean |e| at walls was 0.14 where a face ended in each of their corners."""
-    given, simplified = records("masks.py", "--sizes", "3", "--masks", "2")
+    options = ("--kinds", "shores", "--sizes", "3", "--seeds", "2", "--domains", "given,simplified")
+    given, simplified = records("outlines.py", *options)
     assert given["boundary_mean_error"] < 0.05
-    assert simplified["accepted"] == simplified["masks"] == 2
+    assert given["accepted"] == simplified["accepted"] == 2
+    assert given["left_out"] > 0
     assert simplified["boundary_mean_quality"] > given["boundary_mean_quality"]
 
 

@@ -137,6 +137,7 @@ def _add_output(run: Any) -> None:
     )
     _add_types(run)
     _add_walls(run)
+    _add_unchecked(run)
     run.add_argument(
         "--check-solver",
         choices=("openfoam",),
@@ -174,6 +175,12 @@ def _add_walls(command: Any, more: str = "") -> None:
     )
 
 
+def _add_unchecked(command: Any) -> None:
+    command.add_argument(
+        "--unchecked", action="store_true", help="write a mesh for OpenFOAM even if its checkMesh rejects it"
+    )
+
+
 def _add_convert(commands: Any) -> None:
     convert = commands.add_parser(
         "convert",
@@ -189,6 +196,7 @@ def _add_convert(commands: Any) -> None:
     )
     _add_types(convert)
     _add_walls(convert, more="; of a .vtu file: as in the domain is the default")
+    _add_unchecked(convert)
 
 
 def _add_check(commands: Any) -> None:
@@ -417,6 +425,7 @@ def _run(arguments: argparse.Namespace) -> int:
         resume=arguments.resume,
         walls=arguments.walls,
         types=arguments.types,
+        unchecked=arguments.unchecked,
         command=tuple(arguments.given),
         solver=arguments.check_solver,
     )
@@ -447,6 +456,7 @@ def _convert(arguments: argparse.Namespace) -> int:
 
     mesh = load(_readable(arguments.mesh))
     options = {"convention": arguments.convention, "walls": arguments.walls, "types": arguments.types or None}
+    options["check"] = False if arguments.unchecked else None
     during(f"writing {arguments.out}", False, lambda: write(mesh, arguments.out, **options))
     print(f"written: {written_names(arguments.out)}")
     return OK

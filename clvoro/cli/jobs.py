@@ -79,6 +79,8 @@ class Job:
         The arguments of the command, to be repeated after an interruption.
     types : dict
         Types of OpenFOAM's patches by name, before those of the case.
+    unchecked : bool
+        Write a mesh for OpenFOAM even if its checkMesh rejects it.
     solver : "openfoam" or None
         Check the mesh by the criteria of this solver, and with its own program if that is installed.
     """
@@ -97,6 +99,7 @@ class Job:
     resume: Path | None = None
     walls: WallShape | None = None
     types: dict[str, PatchType] = field(default_factory=dict)
+    unchecked: bool = False
     solver: Solver | None = None
     command: tuple[str, ...] = ()
     interrupted: bool = field(default=False, init=False)
@@ -318,7 +321,7 @@ class Job:
             name, convention = MESH_FILES[kind]
             options: dict[str, Any] = {"convention": convention}
             if kind == "openfoam":
-                options = {"walls": self.walls, "types": self.case.patches}
+                options = {"walls": self.walls, "types": self.case.patches, "check": not self.unchecked}
             task = partial(write, main, self.out / name, **options)
             work = "solver mesh" if kind == "openfoam" else name
             tasks.append(partial(self._during, f"writing the {work}", task))

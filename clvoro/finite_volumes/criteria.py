@@ -77,6 +77,8 @@ class SolverReport(Verdict):
     cells, faces : int
     area_change : float
         Volume (2D: area) of the mesh that the solver gets minus that of the domain, over that of the domain.
+    left_out : str
+        What it leaves out of the domain, in words; see `Diagram.left_out`. Empty for nothing.
     """
 
     solver: str
@@ -84,6 +86,7 @@ class SolverReport(Verdict):
     cells: int
     faces: int
     area_change: float
+    left_out: str = ""
 
     @property
     def ok(self) -> bool:
@@ -100,7 +103,8 @@ class SolverReport(Verdict):
         changed = ""
         if self.area_change:
             changed = f"; straight walls change the area by {100 * self.area_change:+.2g} %"
-        head = f"{self.solver}: {verdict}; {self.cells} cells, {self.faces} faces{changed}"
+        left = f"; {self.left_out}" if self.left_out else ""
+        head = f"{self.solver}: {verdict}; {self.cells} cells, {self.faces} faces{changed}{left}"
         columns = f"{'criterion':28}{'worst':>12}  {'limit':<12} {'verdict':<12}where"
         return "\n  ".join([head, columns, *map(str, self.criteria)])
 

@@ -7,10 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from ..arguments import check_choice, format_point, warn
-from ..errors import MismatchWarning
+from ..arguments import check_choice, format_point
+from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
+from ..mesh.geometry import turns
 from .criteria import Criterion, Rows, SolverReport
 from .measures import PlaneMeasures, SolverMeasures
 from .prisms import simple_loops
@@ -42,44 +43,41 @@ def _check_for_openfoam(diagram: Diagram, walls: WallShape | None) -> SolverRepo
     diagram.domain.require_flat("solver is 'openfoam', whose meshes are polyhedra", remedy)
     walls = "straight" if walls is None else walls
     mesh = make_solver_mesh(diagram, walls, walls == "straight")
-    return openfoam_report(mesh, mesh.area_change)
+    return openfoam_report(mesh, mesh.area_change, str(mesh.left_out))
 
 
-def openfoam_report(mesh: Faces, area_change: float = 0.0) -> SolverReport:
+def openfoam_report(mesh: Faces, area_change: float = 0.0, left_out: str = "") -> SolverReport:
     """Check the solver mesh `mesh` by the criteria of OpenFOAM."""
-    return SolverReport("openfoam", tuple(_openfoam(mesh)), mesh.n_cells, len(mesh), area_change)
+    return SolverReport("openfoam", tuple(_openfoam(mesh)), mesh.n_cells, len(mesh), area_change, left_out)
 
 
 SOLVERS: dict[str, Callable[[Diagram, WallShape | None], SolverReport]] = {"openfoam": _check_for_openfoam}
 """The check of a diagram for each solver; `io` adds MODFLOW, `earth` models on C grids."""
 
 
+_PLANE = 1e-6
+"""Least turn in a corner of a polygon, in radians, that OpenFOAM counts as convex."""
 _LIMITS = {"aspect_ratio": 1000, "skewness": 4, "determinant": LEAST_DETERMINANT, "weight": 0.05, "volume_ratio": 0.01}
 """OpenFOAM's limits of the measures that convex cells, too, may miss: those below 1 are the least, others the most."""
 _MEASURES = {2: PlaneMeasures, 3: SolverMeasures}
 
 
-def warn_of_rejection(mesh: Faces, walls: WallShape = "straight") -> None:
-    """Warn if OpenFOAM rejects a mesh that was made with `walls`.
+def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
+    """Return why OpenFOAM rejects a mesh that was made with `walls`, where, and the remedy; "" if it does not.
 
     All criteria are computed for the cells that walls cut, and for those beyond one of `_LIMITS`. Others are convex.
-
-    Warns
-    -----
-    MismatchWarning
-        Names the criteria, and the worst place of the first one.
     """
     at_walls = mesh.domain.cuts_cells or mesh.domain.curved_walls
     judged = _suspects(mesh, at_walls)
     if not judged.any():
-        return
+        return ""
     kept, k = judged.copy(), np.flatnonzero(mesh.neighbor >= 0)
     a, b = mesh.owner[k], mesh.neighbor[k]
     kept[a[judged[b]]] = kept[b[judged[a]]] = True
     part, _ = mesh.part(kept)
     failed = [c for c in _openfoam(part, judged[kept]) if c.demanded and not c.ok]
     if not failed:
-        return
+        return ""
     first = failed[0]
     at = "" if first.place is None else f" at {format_point(first.place)}"
     also = f", and {', '.join(c.name for c in failed[1:])}" if failed[1:] else ""
@@ -88,11 +86,10 @@ def warn_of_rejection(mesh: Faces, walls: WallShape = "straight") -> None:
         remedy = "Write it with walls='straight'"
     elif mesh.domain.outline is not None:
         remedy += ", or drop what is smaller than a cell first, as domain.simplified(size) does"
-    warn(
+    return (
         f"OpenFOAM's checkMesh rejects this mesh: {first.name} is {first.value:.3g}, expected "
         f"{'at most' if first.above else 'at least'} {first.limit:.3g}{at}{also}; check(solver='openfoam') lists all. "
-        f"{remedy}",
-        MismatchWarning,
+        f"{remedy}"
     )
 
 
@@ -171,6 +168,23 @@ def rejected_cells(mesh: Faces, judged: np.ndarray) -> np.ndarray:
     faces[judged] |= m.bad_tetrahedra_of(judged) > 0
     faces[m.coupled] |= m.weight[m.coupled] < _LIMITS["weight"]
     faces[m.coupled] |= m.volume_ratio[m.coupled] < _LIMITS["volume_ratio"]
+    bad[mesh.owner[faces]] = True
+    bad[mesh.neighbor[faces & (mesh.neighbor >= 0)]] = True
+    return bad
+
+
+def rejected_polygons(mesh: Faces) -> np.ndarray:
+    """Return which cells in 2D OpenFOAM rejects, or one of whose faces, (n,) bool."""
+    m = PlaneMeasures(mesh)
+    starts, loop, broken = simple_loops(mesh)
+    cell = np.repeat(np.arange(mesh.n_cells), np.diff(starts))
+    turn = turns(mesh.points[loop], following(starts))
+    bad = (np.diff(starts) < 3) | (np.bincount(cell, turn, mesh.n_cells) > 3 * np.pi)  # 4 pi if sides cross
+    bad[broken] = True
+    bad[cell[turn < _PLANE]] = True
+    bad |= (m.determinant < LEAST_DETERMINANT) | (m.aspect_ratio > _LIMITS["aspect_ratio"])
+    faces = (m.skewness > _LIMITS["skewness"]) | (m.non_orthogonality >= 90)
+    faces |= (m.weight < _LIMITS["weight"]) | (m.volume_ratio < _LIMITS["volume_ratio"])
     bad[mesh.owner[faces]] = True
     bad[mesh.neighbor[faces & (mesh.neighbor >= 0)]] = True
     return bad

@@ -9,10 +9,13 @@ import numpy as np
 
 from ..arguments import check_choice, warn
 from ..errors import MismatchWarning
+from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .seams import faces_with_seams
 
+_ROUNDS = 8
+"""How often a mesh with straight walls is made, until OpenFOAM accepts it."""
 _LARGE_CHANGE = 0.01
 """Change of the domain's area, as a share of it, beyond which there is a warning."""
 
@@ -46,35 +49,57 @@ def make_solver_mesh(
 
 def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray) -> Faces:
     """Take the faces of `diagram`, or make straight walls, and collapse short faces."""
-    from .dead_ends import open_dead_ends
-    from .relaxation import relax_bad_faces
-    from .short_edges import drop_skew_corners
-    from .walls import straight_walls
-
     outline = diagram.domain.outline if walls == "straight" else None
-    if outline is not None:
-        mesh = straight_walls(diagram, outline, parts)
-    else:
+    if outline is None:
         mesh = faces_with_seams(diagram)
         mesh = replace(mesh, points=mesh.points.astype(np.float64, copy=False), diagram=None)
-    mesh = _COLLAPSED[mesh.dim](mesh, diagram, parts, collapse)
-    if outline is not None and collapse:
-        mesh = open_dead_ends(drop_skew_corners(mesh, parts), parts)
-        mesh = relax_bad_faces(mesh, parts)
-    if outline is not None and abs(mesh.area_change) > _LARGE_CHANGE:
+        return _COLLAPSED[mesh.dim](mesh, diagram, parts, collapse)
+    mesh = _in_polygon(diagram, outline, parts, collapse)
+    found = []
+    if len(mesh.left_out):
+        found.append(str(mesh.left_out))
+    if abs(mesh.area_change) > _LARGE_CHANGE:
+        found.append(f"changes the area of the domain by {100 * mesh.area_change:+.2g} %")
+    if found:
         warn(
-            f"straight walls change the area of the domain by {100 * mesh.area_change:+.2g} %: its boundary has "
-            "features as large as the cells. Use smaller cells there, or keep the exact walls with walls='exact'",
+            f"the mesh for solvers {', and '.join(found)}. Use smaller cells there, or drop what is smaller than a "
+            "cell first, as domain.simplified(size) does",
             MismatchWarning,
         )
     return mesh
+
+
+def _in_polygon(diagram: Diagram, outline: Polygon, parts: np.ndarray, collapse: bool) -> Faces:
+    """Return the mesh with straight walls: made again with simpler cells where OpenFOAM would reject it."""
+    from .dead_ends import open_dead_ends
+    from .gate import rejected_polygons
+    from .relaxation import relax_bad_faces
+    from .short_edges import collapse_short_edges, drop_skew_corners
+    from .walls import simplify, straight_walls
+
+    kinds = np.zeros(len(diagram), np.int64)
+    best: tuple[int, Faces] | None = None
+    for _ in range(_ROUNDS):
+        mesh = straight_walls(diagram, outline, parts, kinds)
+        if not collapse:
+            return mesh.compact()
+        mesh = open_dead_ends(drop_skew_corners(collapse_short_edges(mesh, parts), parts), parts)
+        mesh = relax_bad_faces(mesh, parts)
+        rejected = rejected_polygons(mesh)
+        count = int(np.count_nonzero(rejected))
+        if best is None or count < best[0]:
+            best = (count, mesh)
+        if not count:
+            break
+        simplify(kinds, mesh, rejected)
+    assert best is not None
+    return best[1]
 
 
 def _collapsed_polygons(mesh: Faces, diagram: Diagram, parts: np.ndarray, collapse: bool) -> Faces:
     from .short_edges import collapse_short_edges
 
     del diagram
-    mesh = replace(mesh, corners=mesh.corners.astype(np.int64, copy=False))
     return (collapse_short_edges(mesh, parts) if collapse else mesh).compact()
 
 

@@ -21,8 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ..arguments import format_point, warn
-from ..errors import MismatchWarning
 from ..geometry.polygon import Polygon
 from ..geometry.ring_coordinate import RingCoordinate
 from ..geometry.rings import WALL_CORNER, OrientedRings
@@ -41,8 +39,6 @@ SNAP = 0.12
 boundary, over the width of its cells."""
 AROUND = 4.0
 """Largest area between a wall face and the boundary behind it, over that of the cell."""
-LEFT_OUT = 0.5
-"""Share of a cell from which on a part of the domain that is left out, or land that is added, is reported."""
 BULGE = 1e-4
 """Turn, in radians, of a wall at the end of a named part where the boundary is re-entrant between two face ends."""
 NO_LENGTH = 1e-9
@@ -53,6 +49,13 @@ CLOSED = 1e-3
 So throats close, of which a determinant of OpenFOAM would vanish, and the mouths of slits."""
 INSIDE, ON, OUTSIDE = 1, 0, -1
 """Places of a vertex."""
+EXACT, PLAIN, FILLED = range(3)
+"""How a cell is made at the boundary: as said above; cut by straight faces alone; not cut where vertices are near."""
+FARTHEST = FILLED + 3
+"""How far a cell is filled grows from `FILLED` to this."""
+REACH, DEPTH, FARTHER = 1.3, 0.4, 1.3
+"""Distances from the generator and from the boundary up to which vertices of filled cells lie inside, over the size;
+their growth."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ def convex_faces(points: np.ndarray, weights: np.ndarray, extent: float) -> Conv
     return ConvexFaces(left[once], right[once], there[once], here[once], vertices)
 
 
-def straight_walls(diagram: Diagram, domain: Polygon, parts: np.ndarray) -> Faces:
+def straight_walls(diagram: Diagram, domain: Polygon, parts: np.ndarray, kinds: np.ndarray | None = None) -> Faces:
     """Return the mesh for solvers of `diagram` in `domain`; see the head of this module.
 
     Parameters
@@ -121,19 +124,17 @@ def straight_walls(diagram: Diagram, domain: Polygon, parts: np.ndarray) -> Face
         That of the diagram.
     parts : (k,) int
         Index of the named part of the boundary for each wall. A face on the boundary has walls of one part.
-
-    Warns
-    -----
-    MismatchWarning
-        If parts of the domain as large as half a cell are left out, or land of that size is added; says where.
+    kinds : (n,) int, optional
+        From `EXACT` to `FARTHEST`: how each cell is made. Plain cells have one straight face from where they leave the
+        domain to where they enter it, and are convex. Filled ones are plain, and vertices near their generators lie
+        inside, wherever the boundary is.
     """
-    maker = _WallMaker(diagram, domain, parts)
+    maker = _WallMaker(diagram, domain, parts, np.zeros(len(diagram), int) if kinds is None else kinds)
     maker.place_vertices()
     maker.cut_faces()
     maker.name_points()
     maker.move_into_corners()
     maker.close_cells()
-    maker.warn_of_left_out()
     return maker.faces()
 
 
@@ -164,11 +165,10 @@ class _WallMaker:
         Position of points on the boundary; nan for others.
     walls : tuple of (w,) int, (w,) int and (w, 2) int
         Faces on the boundary: cells, walls, points.
-    left_out : list of (area, place)
     """
 
-    def __init__(self, diagram: Diagram, domain: Polygon, parts: np.ndarray) -> None:
-        self.diagram, self.domain = diagram, domain
+    def __init__(self, diagram: Diagram, domain: Polygon, parts: np.ndarray, kinds: np.ndarray) -> None:
+        self.diagram, self.domain, self.kinds = diagram, domain, kinds
         self.rings = domain.oriented
         self.generators = diagram.points
         self.along = RingCoordinate(domain, self.rings)
@@ -182,8 +182,8 @@ class _WallMaker:
         for cell in (f.left, f.right):
             np.minimum.at(width, cell, apart)
         self.width = np.minimum(width[f.left], width[f.right])
+        self.is_plain = np.maximum(kinds[f.left], kinds[f.right]) >= PLAIN
         self.walls = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2), np.int64)
-        self.left_out: list[tuple[float, np.ndarray]] = []
 
     def place_vertices(self) -> None:
         """Ask the boundary for the place of each vertex."""
@@ -193,11 +193,36 @@ class _WallMaker:
             np.minimum.at(self.least, end, self.width)
         used = np.flatnonzero(np.isfinite(self.least))
         self.place = np.full(len(v), OUTSIDE)
-        self.place[used[self.domain.covers(v[used])]] = INSIDE
+        covered = used[self.domain.covers(v[used])]
+        self.place[covered] = INSIDE
         reach = ON_WALL * self.least[used, None]
         near = ((v[used] >= self.domain.lower - reach) & (v[used] <= self.domain.upper + reach)).all(axis=1)
         rows, _ = self.domain.edges_within(v[used[near]], reach[near, 0])
         self.place[used[near][rows]] = ON
+        self._place_again(covered)
+
+    def _place_again(self, covered: np.ndarray) -> None:
+        """Place the vertices of cells that are not exact; those `covered` (k,) by the domain are inside."""
+        f, kinds = self.convex, self.kinds
+        self.filled = np.zeros(len(f.vertices), bool)
+        if not kinds.any():
+            return
+        inside = np.full(len(f.vertices), OUTSIDE)
+        inside[covered] = INSIDE
+        reach = FARTHER ** (kinds - FILLED) * self.size
+        depth = np.full(len(f.vertices), np.inf)
+        around = np.maximum(kinds[f.left], kinds[f.right]) >= FILLED
+        asked = np.unique(np.concatenate([f.begin[around], f.end[around]]))
+        depth[asked] = self.domain.boundary_distance(f.vertices[asked])
+        for cell in (f.left, f.right):
+            for end in (f.begin, f.end):
+                plain = end[kinds[cell] >= PLAIN]
+                self.place[plain] = inside[plain]
+                near = np.hypot(*(f.vertices[end] - self.generators[cell]).T) <= REACH * reach[cell]
+                near &= depth[end] <= DEPTH * reach[cell]
+                self.filled[end[(kinds[cell] >= FILLED) & near]] = True
+        self.place[self.filled] = INSIDE
+        self.filled[covered] = False
 
     def cut_faces(self) -> None:
         """Find the part of each face that is kept."""
@@ -227,6 +252,9 @@ class _WallMaker:
         self.left[cut] = np.where(whole[:, None], np.column_stack([parts[last, 2], parts[first, 3]]), np.nan)
         part[whole] = 0, 1, np.nan, np.nan
         self.kept[cut] = seen & (~on.any(axis=1) | (part[:, 1] - part[:, 0] >= gap))
+        # From a filled vertex on land nothing is kept of a face that leads outward.
+        on_land = from_begin & self.filled[f.begin[cut]] | from_end & self.filled[f.end[cut]]
+        self.kept[cut[on_land]] = False
         part[on[:, 0] & (part[:, 0] < margin), 2] = np.nan
         part[on[:, 1] & (part[:, 1] > 1 - margin), 3] = np.nan
         self.crossed[cut] = part[:, 2:]
@@ -339,7 +367,7 @@ class _WallMaker:
         """Move the nearest face end on the boundary into each convex corner and each end of a named part."""
         width = np.full(len(self.points), np.inf)
         for end in self.ends[self.kept].T:
-            np.minimum.at(width, end, self.width[self.kept])
+            np.minimum.at(width, end, np.where(self.is_plain[self.kept], -1.0, self.width[self.kept]))
         on = np.flatnonzero(~np.isnan(self.position))
         turns, begins = self.rings.turns, self.along.begins
         corners = np.flatnonzero((turns > WALL_CORNER) | self.changes_part)
@@ -378,6 +406,10 @@ class _WallMaker:
         after[starts[1:][filled] - 1] = starts[:-1][filled]
         gaps = np.flatnonzero(ends[:, 1] != ends[after, 0])
         cell, gap = cell[gaps], np.column_stack([ends[gaps, 1], ends[after[gaps], 0]])
+        plain = self.kinds[cell] >= PLAIN
+        walls = self.domain.closest_walls(self.points[gap[plain]].mean(axis=1))
+        self._add_walls(cell[plain], walls, gap[plain])
+        cell, gap = cell[~plain], gap[~plain]
         positions = self.position[gap]
         left = self._close(cell, gap, self.along, self.changes_part, positions)
         # Around a point in which rings touch the boundary of a cell may lead from one to the other.
@@ -450,13 +482,6 @@ class _WallMaker:
         middles = s[row[side]] - begin[row[side]] + (marks[side] + marks[side + 1]) / 2
         edges = along.edges(begin[row[side]] + middles % total[row[side]])
         self._add_walls(cell[row[side]], rings.edge_numbers[edges], np.column_stack([names[side], names[side + 1]]))
-        # What lies between the boundary and the walls.
-        off = chain_areas(chain, starts[:-1], starts[1:] - 1) - chain_areas(
-            corners, kept_starts[:-1], kept_starts[1:] - 1
-        )
-        large = np.flatnonzero(np.abs(off) > LEFT_OUT * self.size[cell] ** 2)
-        places = chain[(starts[:-1] + starts[1:])[large] // 2]
-        self.left_out += list(zip(np.abs(off[large]).tolist(), places, strict=True))
         return left
 
     def _on_one_ring(self, along: RingCoordinate, gap: np.ndarray, positions: np.ndarray) -> np.ndarray:
@@ -501,24 +526,6 @@ class _WallMaker:
             chain[place], path[place] = self.points[points], -1
         return chain, path, starts
 
-    def warn_of_left_out(self) -> None:
-        """Warn of parts of the domain that are left out, and of islands that no cell has a wall on."""
-        used = np.unique(self.along.ring_of(self.along.begins[self.rings.places[self.walls[1]]]))
-        left = [(area, place) for area, place in self.left_out if area < self.domain.measure / 2]
-        for ring, x in enumerate(self.rings.rings):
-            if ring not in used:
-                left.append((abs(_area(x)), x.mean(axis=0)))
-        if not left:
-            return
-        area, place = max(left, key=lambda item: item[0])
-        what = "1 part" if len(left) == 1 else f"{len(left)} parts"
-        warn(
-            f"the mesh for solvers leaves out {what} of the boundary that cells do not resolve, as bays and islands "
-            f"within a cell; the largest is at {format_point(place)} and has an area of {area:.3g}. Use smaller cells "
-            "there, or drop what is smaller than a cell first, as domain.simplified(size) does",
-            MismatchWarning,
-        )
-
     def faces(self) -> Faces:
         """Return the mesh."""
         kept = np.flatnonzero(self.kept)
@@ -556,6 +563,14 @@ class _WallMaker:
         return made.take_faces(ends[:, 0] != ends[:, 1])
 
 
+def simplify(kinds: np.ndarray, mesh: Faces, rejected: np.ndarray) -> None:
+    """Change the `kinds` (n,) of `rejected` cells (n,) bool of `mesh`, and of those around filled ones, in place."""
+    changed, k = rejected.copy(), np.flatnonzero(mesh.neighbor >= 0)
+    stuck, a, b = rejected & (kinds >= FILLED), mesh.owner[k], mesh.neighbor[k]
+    changed[a[stuck[b]]] = changed[b[stuck[a]]] = True
+    kinds[changed] = np.minimum(kinds[changed] + 1, FARTHEST)
+
+
 def _changes(rings: OrientedRings, parts: np.ndarray) -> np.ndarray:
     """Return whether the named part of the boundary changes in each vertex of `rings`, (k,) bool."""
     part, found = parts[rings.edge_numbers], np.empty(len(rings.vertices), bool)
@@ -579,8 +594,3 @@ def _without_dents(chains: np.ndarray, movable: np.ndarray) -> np.ndarray:
     outward = np.column_stack([way[:, 1], -way[:, 0]]) / length[:, None]
     x[inner[dents]] += ((least - off)[:, None] * outward)[dents]
     return x
-
-
-def _area(loop: np.ndarray) -> float:
-    """Return the area within points (k, 2), positive if they run counter-clockwise."""
-    return float(chain_areas(loop, np.array([0]), np.array([len(loop) - 1]))[0])

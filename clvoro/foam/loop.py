@@ -20,8 +20,9 @@ import numpy as np
 
 from ..adaptation.options import EffortName
 from ..adapter import Adapter
-from ..arguments import check_integer, check_number
-from ..errors import InputError, InputTypeError, LostFieldsWarning
+from ..arguments import check_integer, check_number, warn
+from ..errors import InputError, InputTypeError, LostFieldsWarning, MismatchWarning
+from ..finite_volumes.gate import rejection
 from ..geometry.boundary_layers import Layers
 from ..io import load
 from ..io.arrays import explained
@@ -376,7 +377,9 @@ class _Loop:
         target.mkdir()
         if (case.folder / latest.name / "uniform").is_dir():
             shutil.copytree(case.folder / latest.name / "uniform", target / "uniform")
-        made.to_openfoam(target / "polyMesh", types=types, thickness=foam.thickness)
+        if why := rejection(made.solver_mesh()):
+            warn(why, MismatchWarning)
+        made.to_openfoam(target / "polyMesh", types=types, thickness=foam.thickness, check=False)
         made.save(target / "polyMesh" / _MESH)
         new = MeshOfCase.of(FoamMesh.read(target / "polyMesh"), made.diagram)
         start = time.perf_counter()

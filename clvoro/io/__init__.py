@@ -179,7 +179,7 @@ _WRITERS: dict[str, Callable[..., None]] = {
 _KINDS = {".foam": "OpenFOAM", ".nc": "netCDF", ".vtu": ".vtu"}
 _METHODS = {".foam": "to_openfoam", ".nc": "to_netcdf", ".vtu": "to_vtu"}
 _OPTIONS = {
-    ".foam": ("patches", "types", "thickness", "binary", "walls", "zones"),
+    ".foam": ("patches", "types", "thickness", "binary", "walls", "zones", "check"),
     ".nc": ("convention", "units"),
     ".vtu": ("walls",),
 }

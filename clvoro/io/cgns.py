@@ -14,6 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import warn
+from ..errors import MismatchWarning
+from ..finite_volumes.gate import rejection
 from ..mesh.faces import Faces
 from .atomic import atomic_folder
 from .contents import Contents
@@ -48,7 +51,9 @@ def write_cgns(contents: Contents, path: Path) -> None:
         import h5py
     except ModuleNotFoundError as error:
         raise missing("h5py", "formats", "a .cgns file") from error
-    mesh, patches, _ = poly_mesh(contents.diagram)
+    mesh, patches, _ = poly_mesh(contents.diagram, check=False)
+    if why := rejection(contents.diagram.solver_mesh()):
+        warn(why, MismatchWarning)
     with atomic_folder(path) as temporary, h5py.File(temporary, "w", libver=("earliest", "v110")) as file:
         root = _CgnsNode(file["/"], h5py)
         root.mark("HDF5 MotherNode", "Root Node of HDF5 File", "MT")

@@ -59,7 +59,7 @@ def run_check_mesh(mesh: Result | Diagram, walls: WallShape = "straight") -> Che
         return None
     with tempfile.TemporaryDirectory(prefix="clvoro-") as name:
         case = Path(name)
-        write_foam(Contents.of(mesh), case / "constant" / "polyMesh", walls=walls)
+        write_foam(Contents.of(mesh), case / "constant" / "polyMesh", walls=walls, check=False)
         return check_case(case)
 
 

@@ -153,7 +153,7 @@ def check_for_modflow(diagram: Diagram, walls: WallShape | None) -> SolverReport
     mesh = _disv_mesh(diagram, walls or "straight")
     around = around_islands(mesh)
     made = [around] if around is not None else _criteria(mesh)
-    return SolverReport("modflow", tuple(made), mesh.n_cells, len(mesh), mesh.area_change)
+    return SolverReport("modflow", tuple(made), mesh.n_cells, len(mesh), mesh.area_change, str(mesh.left_out))
 
 
 SOLVERS["modflow"] = check_for_modflow

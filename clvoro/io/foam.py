@@ -24,7 +24,7 @@ import numpy as np
 import orjson
 
 from ..errors import InputError, InputTypeError
-from ..finite_volumes.gate import warn_of_rejection
+from ..finite_volumes.gate import rejection
 from ..finite_volumes.prisms import polyhedra
 from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.boundary_names import WORD, Walls
@@ -92,6 +92,7 @@ def poly_mesh(
     types: Mapping[str, PatchType] | None = None,
     thickness: float | None = None,
     walls: WallShape = "straight",
+    check: bool = True,
 ) -> tuple[Faces, list[FoamPatch], float]:
     """Describe `diagram` for OpenFOAM; faces without measure and points without a face are left out.
 
@@ -109,6 +110,8 @@ def poly_mesh(
         In 2D: height of the prisms, whose bottoms are at z = 0. By default the mean width of a cell.
     walls : {"straight", "exact"}, optional
         See `Diagram.solver_mesh`.
+    check : bool, optional
+        Whether OpenFOAM must accept the mesh.
 
     Returns
     -------
@@ -122,20 +125,18 @@ def poly_mesh(
     ------
     InputError, InputTypeError
         If `patches` names walls that do not exist, or a wall twice; if `types` names a patch or type that does not
-        exist; if `thickness` is not positive, or given in 3D; if a name is that of a cyclic or empty patch; or for a
-        cell around an island, as a face of OpenFOAM has no hole.
-
-    Warns
-    -----
-    MismatchWarning
-        If OpenFOAM rejects the mesh; says where.
+        exist; if `thickness` is not positive, or given in 3D; if a name is that of a cyclic or empty patch; for a cell
+        around an island, as a face of OpenFOAM has no hole; or if OpenFOAM rejects the mesh: says where.
     """
     domain = diagram.domain
     parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
     kinds = patch_types(parts.names, types)
     mesh = make_solver_mesh(diagram, walls, walls == "straight", parts.index)
     cells = polyhedra(mesh, thickness)
-    warn_of_rejection(mesh, walls)
+    if check and (why := rejection(mesh, walls)):
+        raise InputError(
+            f"{why}. To write it all the same, call mesh.to_openfoam(path, check=False), or clvoro with --unchecked"
+        )
     groups = parts.index[-1 - mesh.neighbor[mesh.n_inner : mesh.n_outer]]
     counts = np.bincount(groups, minlength=len(parts.names)).tolist()
     made = [FoamPatch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]
@@ -222,6 +223,7 @@ def write_foam(
     binary: bool = False,
     walls: WallShape = "straight",
     zones: Mapping[str, ArrayLike] | None = None,
+    check: bool = True,
 ) -> None:
     """Write a polyMesh.
 
@@ -230,7 +232,7 @@ def write_foam(
     path : Path
         The folder ``.../constant/polyMesh``, which is created if it does not exist; its five files are replaced, others
         are left. Or ``CASE/name.foam``, an empty file that ParaView opens, with the mesh in ``CASE/constant/polyMesh``.
-    patches, types, thickness, walls : optional
+    patches, types, thickness, walls, check : optional
         See `poly_mesh`. The note in the file `points` says by how much straight walls change the area.
     binary : bool, optional
         Write numbers as bytes: labels of 32 bits and scalars of 64.
@@ -247,9 +249,10 @@ def write_foam(
             "together as zones (mesh.to_openfoam(path, zones={name: mask})), or leave it out"
         )
     of_cells = _zones(contents.diagram, zones)
-    if not isinstance(binary, bool | np.bool_):
-        raise InputTypeError(f"binary is {binary!r:.60} of type {type(binary).__name__}, expected True or False")
-    mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls)
+    for name, value in (("binary", binary), ("check", check)):
+        if not isinstance(value, bool | np.bool_):
+            raise InputTypeError(f"{name} is {value!r:.60} of type {type(value).__name__}, expected True or False")
+    mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls, check)
     inner = mesh.n_inner
     folder = polymesh_folder(path) or path
     if folder != path:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ..finite_volumes.measures import SolverMeasures
     from ..geometry.domain import Domain
     from .diagram import Diagram
+    from .left_out import LeftOut
 
 OFF_BISECTOR = 1e-3
 """Largest distance of a face from the bisector of its generators over their distance, and largest slope against it.
@@ -233,6 +234,14 @@ class Faces(Sealed):
         total = float((centers * areas).sum() / self.dim)
         change = total / self.domain.measure - 1
         return change if abs(change) > 1e-12 else 0.0
+
+    @cached_property
+    def left_out(self) -> LeftOut:
+        """What the cells leave out of the domain, or add to it, where they are too large for its boundary."""
+        from .left_out import LeftOut, left_out_of_polygon
+
+        outline = self.domain.outline
+        return LeftOut.nothing(self.dim) if outline is None else left_out_of_polygon(self, outline)
 
     @cached_property
     def images(self) -> np.ndarray:

@@ -171,6 +171,7 @@ class MeshOutput:
         binary: bool = False,
         walls: WallShape = "straight",
         zones: Mapping[str, ArrayLike] | None = None,
+        check: bool = True,
     ) -> None:
         """Write the mesh in a box, a polygon or a solid for OpenFOAM.
 
@@ -200,16 +201,19 @@ class MeshOutput:
             Zones of cells by name, each with one bool per cell, as ``{"pipe": surface.contains(mesh.points)}``:
             sources, porous media, parts that rotate. If the domain has lines, the parts between them are the zones
             ``region-0``, ``region-1``, ..., and the faces on them the zone of faces ``lines``.
+        check : bool
+            Refuse a mesh that OpenFOAM's checkMesh rejects. With False it is written all the same.
 
         Raises
         ------
         InputError, InputTypeError
-            On a sphere, for a cell around an island, if an argument is wrong or the files cannot be written.
+            On a sphere, for a cell around an island, if an argument is wrong or the files cannot be written; if
+            OpenFOAM rejects the mesh: names the criteria, the worst place and the remedy.
         """
         from ..io import write
 
         options = {"patches": patches, "types": types, "thickness": thickness, "binary": binary, "walls": walls}
-        options["zones"] = zones
+        options |= {"zones": zones, "check": check}
         write(self._self, path, kind=".foam", **options)
 
     def to_netcdf(

@@ -169,7 +169,8 @@ class Result(Sealed, MeshOutput):
             on the finest level), ``converged``, ``stop_reason`` and ``seconds``. In a polygonal domain also
             ``boundary_cells``, ``boundary_mean_error``, ..., and ``inner_cells``, ... for the cells on the boundary and
             the others; and ``corner_cells``, ... for those on the boundary with a corner of more than 30 degrees, where
-            the domain limits the quality (None where there is no such cell).
+            the domain limits the quality (None where there is no such cell); and ``left_out_parts`` and
+            ``left_out_area`` of `left_out`.
 
         Examples
         --------
@@ -250,6 +251,8 @@ def summary(result: Result) -> dict[str, Any]:
     history = result.history
     parts = beside_boundary(result).items()
     apart = {f"{part}_{name}": value for part, some in parts for name, value in some.items()}
+    if result.diagram.domain.outline is not None and not result.diagram.is_power:
+        apart |= {"left_out_parts": len(result.left_out), "left_out_area": result.left_out.total}
     return {
         "cells": len(result.points),
         "steps": int(history["step"][-1]) if len(history) else 0,

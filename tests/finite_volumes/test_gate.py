@@ -69,8 +69,11 @@ def test_an_island_within_a_cell_is_left_out(ctx):
     points = np.array([(0.6, 0.5), (0.05, 0.5), (0.95, 0.5)])
     domain = clvoro.Polygon(SQUARE, [circle(5, 0.05)], names={"rock": range(4, 9)})
     diagram = clvoro.Adapter(ctx).diagram(domain, points)
-    with pytest.warns(MismatchWarning, match=r"leaves out 1 part of the boundary .* at \(0\.5, 0\.5\)"):
+    with pytest.warns(MismatchWarning, match=r"leaves out 1 part of the boundary .* at \(0\.49"):
         mesh = diagram.solver_mesh()
+    assert mesh.left_out is diagram.left_out
+    assert mesh.left_out.measures == pytest.approx([domain.measure - 1], rel=1e-12)
+    assert np.hypot(*(mesh.left_out.places[0] - 0.5)) < 0.05
     assert set(-1 - mesh.neighbor[mesh.n_inner :]) == set(range(4))
     assert mesh.area_change == pytest.approx(1 / domain.measure - 1, rel=1e-12)
     with warnings.catch_warnings():  # the mesh is kept, and warned of once
