@@ -74,7 +74,7 @@ def measure(adapter: clvoro.Adapter, solid: clvoro.Solid, h: float, case: Path, 
     begin = time.perf_counter()
     result = adapter.run(solid, h, **settings)
     seconds = time.perf_counter() - begin
-    result.save(case / "constant" / "polyMesh")
+    result.to_openfoam(case / "constant" / "polyMesh", check=False)
     verdict = check_case(case)
     (case / "checkMesh.log").write_text(verdict.text)
     d = result.diagram
