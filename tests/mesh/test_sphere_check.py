@@ -1,7 +1,5 @@
 """A correct mesh on a sphere passes the check. Each kind of damage is found and named."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.spatial import SphericalVoronoi
@@ -209,14 +207,6 @@ def test_moved_generators_are_found(result):
     moved = EARTH.wrap(result.points + EARTH.radius * noise)
     report = spoilt(result, points=lambda _: moved).check()
     assert {"nearest generators", "volumes of the generators"} <= names_of(report)
-
-
-@pytest.mark.parametrize("name", ["target_size", "size_error", "quality"])
-def test_wrong_values_are_found(result, name):
-    values = getattr(result, name).copy()
-    values[17] = 1.001 * values[17] + 1e-3
-    found = names_of(dataclasses.replace(result, **{name: values}).check())
-    assert {"size_error" if name == "target_size" else name} <= found
 
 
 def test_quality_is_the_planes_formula_with_area_and_arcs(result):
