@@ -56,6 +56,17 @@ class DomainSteps:
         """Return the part of the first `n` of `sites` and the ghosts that their cells need, as far as known."""
         return Part(n, n, sites, self.box)
 
+    def sample_size(self, n: int) -> int:
+        """Return how many cells of `n` to build first, to see which ghosts are needed; 0 if they are known."""
+        return 0
+
+    def reaches(self, part: Part, t: Tessellation) -> bool:
+        """Return whether `part` has the ghosts that the cells of `t` need, a sample."""
+        return True
+
+    def keep_ghosts(self, last: bool) -> None:
+        """Take ghosts as the latest diagram, of fewer generators, needs them, in place of what `begin` estimates."""
+
     def drop_ghosts(self) -> bool:
         """Make ghosts fewer, because generators appear too close; return whether that is possible."""
         return False

@@ -190,6 +190,8 @@ class Tessellator:
         rows = None if previous is None or not self.stages.cells.from_previous else steps.rows(previous)
         nearest = not (exact or self.weighted)
         steps.begin(n, last=complete)
+        if sample := steps.sample_size(n):
+            self._find_ghosts(points, sites, n, sample, complete)
         enough = False
         while True:
             part = steps.extend(sites, n)
@@ -210,6 +212,24 @@ class Tessellator:
                 return replace(found, points=points, sites=sites)
             # Memory for the new diagram.
             del part, binned, t
+
+    def _find_ghosts(self, points: cla.Array, sites: cla.Array, n: int, sample: int, last: bool) -> None:
+        """Find how many ghosts are enough, unless those that are estimated are enough for a sample of the cells.
+
+        The diagram of an eighth of the generators is made first. Where it needs no more ghosts, that of all does not,
+        since no ball without generators grows.
+        """
+        steps, gather = self.steps, self.stages.gather
+        order = np.argsort(np.arange(n) % (n // sample), kind="stable")
+        items = self.stages.engine.upload(order, np.int32)
+        mixed = gather.rows(items, sites)
+        part = steps.extend(mixed, n)
+        if steps.reaches(part, self._cells(part, self._sorted(part), True, sample)):
+            return
+        few = n // 8
+        places = mixed if points is sites else gather.rows(items, points)
+        self._build(places, mixed, few, lambda: self._sorted(Part(few, few, mixed, self.domain)), None, True, False)
+        steps.keep_ghosts(last)
 
     def _cells(
         self, part: Part, binned: BinnedPoints, exact: bool, rows: int, start: Tessellation | NeighborRows | None = None

@@ -107,7 +107,8 @@ class GhostImages:
         lengths = np.maximum((corners[1] - corners[0]) / counts, 1e-30).astype(engine.real)
         blocks = corners[0], lengths, counts
         others = abs(factor - 1) > OTHER_CELLS or bool((was != counts).any())
-        halo.kept = np.float32((KEPT_ESTIMATE if others or halo.estimated else KEPT)[d])
+        halo.kept = np.float32(0 if halo.is_bound else (KEPT_ESTIMATE if others or halo.estimated else KEPT)[d])
+        halo.is_bound = False
         halo.extremes.fill(0)
         engine.run_each(
             k.predict_halo_depths,
@@ -220,6 +221,11 @@ class GhostImages:
             *self.engine.period_args,
         )
 
+    def reaches(self, part: Part, halo: Halo) -> bool:
+        """Return whether the halo was deep enough for the cells just built in 3D; store the depths they require."""
+        self._store_depths(part, halo)
+        return not self._report.get()[0]
+
     def fold(
         self,
         part: Part,
@@ -253,7 +259,19 @@ class GhostImages:
             `FAR`, `COLLAPSED` or both, and the first generator with such a face.
         """
         engine, k, n, home = self.engine, self._kernels, part.n_own, _home(part)
-        self._store_depths(part, halo, binned, t)
+        if engine.dim == 2:  # in 3D the kernels that clip cells do this
+            engine.run_each(
+                k.measure_required_depths,
+                part.count,
+                binned.items,
+                binned.reach,
+                part.points,
+                t.starts,
+                t.neighbors,
+                *part.box.device_corners(engine.real),
+                *part.halo_args,
+            )
+        self._store_depths(part, halo)
         m = int(t.starts[n].get())
         self._turn = 1 - self._turn
         neighbors, codes = (self._room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbors", "codes"))
@@ -306,24 +324,11 @@ class GhostImages:
             self._turn = 1 - self._turn
         return folded, enough, int(words[1]) & ~DROPPED, int(words[2])
 
-    def _store_depths(self, part: Part, halo: Halo, binned: BinnedPoints, t: Tessellation) -> None:
-        """Set the required depths of `halo` to those that `t`, the diagram of `part`, has requested."""
-        engine, k = self.engine, self._kernels
-        if engine.dim == 2:  # in 3D the kernels that clip cells do this
-            engine.run_each(
-                k.measure_required_depths,
-                part.count,
-                binned.items,
-                binned.reach,
-                part.points,
-                t.starts,
-                t.neighbors,
-                *part.box.device_corners(engine.real),
-                *part.halo_args,
-            )
-        blocks = block_count(engine.dim)
+    def _store_depths(self, part: Part, halo: Halo) -> None:
+        """Set the required depths of `halo` to those that the cells just built have requested."""
         stored = halo.depths, halo.kept, halo.requests, halo.required
-        engine.run_each(k.store_required_depths, blocks, *stored, *engine.period_args)
+        blocks = block_count(self.engine.dim)
+        self.engine.run_each(self._kernels.store_required_depths, blocks, *stored, *self.engine.period_args)
         halo.cells, halo.estimated = part.n_own, False
 
     def _close(

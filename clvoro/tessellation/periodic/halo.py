@@ -51,6 +51,8 @@ class Halo:
         Generators of that diagram; 0 before the first one.
     estimated : bool
         Whether `required` is an estimate, as before the first diagram.
+    is_bound : bool
+        Whether `required` may be far too much, so that the next diagram keeps none of it.
     depths : (blocks,) float32, device
         Depth within which the images of that diagram were taken.
     requests : (blocks,) int32, device
@@ -66,7 +68,7 @@ class Halo:
     def __init__(self, engine: Engine) -> None:
         count = block_count(engine.dim)
         self.required = engine.zeros(count, np.float32)
-        self.cells, self.estimated, self.kept = 0, False, np.float32(0)
+        self.cells, self.estimated, self.is_bound, self.kept = 0, False, False, np.float32(0)
         self.depths = engine.zeros(count, np.float32)
         self.requests = engine.zeros(count, np.int32)
         self.extremes = engine.empty(10, np.int32)

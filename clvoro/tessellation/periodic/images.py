@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
@@ -22,6 +23,9 @@ from .halo import Halo
 
 FIRST_DEPTH = 2.7
 """Estimated depth of the halo for the first diagram, in mean spacings."""
+
+SAMPLE, SAMPLED_FROM = 1 / 32, {2: math.inf, 3: 8_000}
+"""Share of the cells that show whether an estimated depth is enough; from how many cells on, by dimension."""
 
 LAST_FACTOR = 1.05
 """Factor to a required depth in the last diagram of a run. It saves attempts that add a few images."""
@@ -66,6 +70,24 @@ class Images(DomainSteps):
             halo.fill(FIRST_DEPTH * (volume / n) ** (1 / dim), n)
         # Nothing moves after the last diagram. Room for motion costs many images where sizes of cells differ much.
         self._factor, self._grow, self._room = (halo.cells / n) ** (1 / dim), False, 0.0 if last else 1.0
+
+    def sample_size(self, n: int) -> int:
+        """Return how many cells of `n` to build first; see `DomainSteps`."""
+        return int(SAMPLE * n) if self._halo.estimated and n >= SAMPLED_FROM[self.domain.dim] else 0
+
+    def reaches(self, part: Part, t: Tessellation) -> bool:
+        """Return whether the estimated halo is deep enough for the cells of `t`."""
+        halo = self._halo
+        estimate, cells = float(halo.required[:1].get()[0]), halo.cells
+        enough = self.stages.ghost_images.reaches(part, halo)
+        if enough:
+            halo.fill(estimate, cells)
+        return enough
+
+    def keep_ghosts(self, last: bool) -> None:
+        """Keep the depth that the latest diagram requires."""
+        self._factor, self._grow, self._room = 1.0, False, 0.0 if last else 1.0
+        self._halo.is_bound = True
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the first `n` of `sites` with their images in the halo."""

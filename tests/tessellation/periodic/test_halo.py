@@ -7,8 +7,10 @@ import pytest
 from scipy.spatial import Delaunay
 
 import clvoro
+from clvoro.tessellation.periodic import images
 from clvoro.tessellation.periodic.ghost_images import KEPT, OUTWARDS, SIDEWAYS, GhostImages
 from clvoro.tessellation.periodic.halo import BLOCKS, FEWEST_BLOCKS, FINENESS, Halo, block_counts
+from clvoro.tessellation.polyhedra import Polyhedra
 from clvoro.tessellation.tessellator import Tessellator
 
 BOXES = {2: clvoro.Box((0, 0), (1, 0.7), periodic=True), 3: clvoro.Box((0, 0, 0), (1, 0.7, 0.8), periodic=True)}
@@ -164,6 +166,26 @@ def test_single_diagrams_of_graded_points_take_few_images(ctx):
 
 
 @pytest.mark.sparse(2)
+@pytest.mark.parametrize(("spread", "most"), [(0.01, 7), (None, 3)])
+def test_few_cells_are_built_for_clusters(ctx, monkeypatch, spread, most):
+    """Gaps between clusters need images from far away: the cells built until they are there are counted."""
+    rng, n, built = np.random.default_rng(6), 4000, []
+    points = rng.random((n, 3))
+    if spread:
+        points = (rng.random((20, 3))[rng.integers(0, 20, n)] + spread * rng.normal(size=(n, 3))) % 1
+    monkeypatch.setitem(images.SAMPLED_FROM, 3, 2000)
+    plain = Polyhedra.tessellate
+
+    def counted(cells, box, places, count, *args, n_own=None, **options):
+        built.append(n_own or count)
+        return plain(cells, box, places, count, *args, n_own=n_own, **options)
+
+    monkeypatch.setattr(Polyhedra, "tessellate", counted)
+    made = clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), points)
+    assert made.volumes.sum() == pytest.approx(1, rel=1e-9)
+    assert sum(built) < most * n
+
+
 @pytest.mark.parametrize("short", [0.6, 0.9])
 def test_too_shallow_blocks_are_detected(adapter, short):
     """The halo is reported too shallow if one block of many is, and only then."""
