@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 import shapely.affinity
+from _walled import Setup
 from shapely import LineString, Point, box
 
 import clvoro
 from clvoro import sizing
-
-
-class Site(NamedTuple):
-    """What to adapt: domain, size field, and further options of `Adapter.run`."""
-
-    domain: Any
-    size: Any
-    options: dict[str, Any]
 
 
 def _largest(shape: shapely.Geometry) -> clvoro.Polygon:
@@ -27,7 +19,7 @@ def _largest(shape: shapely.Geometry) -> clvoro.Polygon:
     return clvoro.Polygon.from_shapely(max(shapely.get_parts(shape), key=lambda part: part.area))
 
 
-def harbor() -> Site:
+def harbor() -> Setup:
     """Return a basin with three piers, a breakwater with a rounded head, a ramp, and twelve piles."""
     shore = [(0, 0), (900, 0), (900, 250), (1050, 330), (1050, 600), (700, 640), (0, 560)]
     piers = [box(x, 300, x + 24, 600) for x in (150, 300, 450)]
@@ -37,10 +29,10 @@ def harbor() -> Site:
     piles = [Point(place).buffer(3, quad_segs=4) for place in at]
     water = shapely.Polygon(shore).difference(shapely.union_all([*piers, breakwater, ramp, *piles]))
     size = sizing.Distance([sizing.Circle(place, 3) for place in at], h_min=2.5, slope=0.12, h_max=14)
-    return Site(_largest(water), size, {})
+    return Setup(_largest(water), size, {})
 
 
-def river() -> Site:
+def river() -> Setup:
     """Return a reach of a river between surveyed banks, with two islands and the piers of a bridge."""
     rng = np.random.default_rng(11)
     s = np.linspace(0, 2000, 81)
@@ -64,10 +56,10 @@ def river() -> Site:
     piers = [placed(40, pier, off) for off in (-16, 0, 16)]
     reach = shapely.Polygon([*right, *left[::-1]]).buffer(0)
     domain = _largest(reach.difference(shapely.union_all([*islands, *piers])))
-    return Site(domain, sizing.FeatureSize(domain, 8, growth=1.2, h_min=1.0, h_max=7), {})
+    return Setup(domain, sizing.FeatureSize(domain, 8, growth=1.2, h_min=1.0, h_max=7), {})
 
 
-def tubes() -> Site:
+def tubes() -> Setup:
     """Return the staggered tubes of a heat exchanger, with layers."""
     pitch, radius, found = 0.03, 0.01, []
     for i in range(6):
@@ -77,10 +69,10 @@ def tubes() -> Site:
     domain = clvoro.Polygon([(0, 0), (0.28, 0), (0.28, 4 * pitch), (0, 4 * pitch)], found)
     size = sizing.Distance(found, h_min=0.0012, slope=0.15, h_max=0.004)
     edges = [tube.name for tube in found]
-    return Site(domain, size, {"layers": clvoro.Layers(1e-4, 6, 1.3, spacing=0.0012, edges=edges)})
+    return Setup(domain, size, {"layers": clvoro.Layers(1e-4, 6, 1.3, spacing=0.0012, edges=edges)})
 
 
-def streets() -> Site:
+def streets() -> Setup:
     """Return the air between blocks that two avenues cut at acute angles."""
     blocks = [box(40 + 115 * x, 30 + 88 * y, 130 + 115 * x, 96 + 88 * y) for x in range(3) for y in range(3)]
     avenues = [
@@ -90,20 +82,20 @@ def streets() -> Site:
     houses = shapely.union_all(blocks).difference(shapely.union_all(avenues))
     houses = [house for house in shapely.get_parts(houses) if house.area > 120]
     domain = _largest(box(0, 0, 400, 300).difference(shapely.union_all(houses)))
-    return Site(domain, sizing.Distance(domain.boundary(), h_min=3, slope=0.12, h_max=8), {})
+    return Setup(domain, sizing.Distance(domain.boundary(), h_min=3, slope=0.12, h_max=8), {})
 
 
-def motor() -> Site:
+def motor() -> Setup:
     """Return the air gap of a motor with 24 slots that open by narrow necks."""
     neck = [(0.99, 0.02), (1.05, 0.02), (1.07, 0.06), (1.3, 0.09)]
     slot = shapely.Polygon([*neck, *((x, -y) for x, y in neck[::-1])])
     slots = [shapely.affinity.rotate(slot, 15 * k, origin=(0, 0)) for k in range(24)]
     bore = Point(0, 0).buffer(1, quad_segs=48).union(shapely.union_all(slots))
     domain = _largest(bore.difference(Point(0, 0).buffer(0.97, quad_segs=48)))
-    return Site(domain, sizing.FeatureSize(domain, 4, growth=1.2, h_min=0.006, h_max=0.03), {})
+    return Setup(domain, sizing.FeatureSize(domain, 4, growth=1.2, h_min=0.006, h_max=0.03), {})
 
 
-def mask(seed: int = 3) -> Site:
+def mask(seed: int = 3) -> Setup:
     """Return the water of a raster, along the edges of its pixels, with cells of one and a half pixels."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(60) + 0.5, np.arange(60) + 0.5)
@@ -113,10 +105,10 @@ def mask(seed: int = 3) -> Site:
         height += np.cos(a * x + b * y + rng.uniform(0, 2 * np.pi)) / (1 + 8 * np.hypot(a, b))
     rows, columns = np.nonzero(height > np.quantile(height, 0.25))
     water = shapely.union_all(shapely.box(columns, rows, columns + 1, rows + 1))
-    return Site(_largest(water.simplify(0)), 1.5, {})
+    return Setup(_largest(water.simplify(0)), 1.5, {})
 
 
-SITES: dict[str, Callable[[], Site]] = {
+SITES: dict[str, Callable[[], Setup]] = {
     "harbor": harbor,
     "river": river,
     "tubes, layers": tubes,
