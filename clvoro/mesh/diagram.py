@@ -198,7 +198,7 @@ class Diagram(MeshOutput):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays that may still be on a device are read.
-        return _rebuilt, (self.domain, {n: getattr(self, n) for n in self._arrays})
+        return _rebuilt, (self.domain, {n: getattr(self, n) for n in self._arrays}), {"home": self.home}
 
     def __len__(self) -> int:
         return len(self.points)
