@@ -31,9 +31,9 @@ FOLDED = {"plane": dict.fromkeys(SIZES["plane"], 0.5), "space": {"diagram": 0.5,
 """What is added per cell (not per image) in periodic boxes, as a share of `SIZES`."""
 CELLS_PER_BOUNDARY_CELL, CELLS_PER_EDGE = 1.5, 0.3
 """As many cells take as much as a cell at a boundary that cuts cells takes in addition, and as an edge of it."""
-CELLS_PER_WALL_CELL = 2.0
-"""As many cells take as much as a cell at the surface of a solid takes in addition: own planes, room for cells that are
-clipped again, and generators outside of the mesh that is read."""
+CELLS_PER_WALL_CELL = 1.0
+"""As many cells take as much as a cell at the surface of a solid takes in addition: above all the generator outside of
+it when the mesh is read."""
 LARGEST = 0.2
 """Share of the largest array."""
 FIXED = 2**16 + KEPT

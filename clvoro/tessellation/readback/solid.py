@@ -47,5 +47,8 @@ def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarr
     reach = _MARGIN * sizes.max()
     box = Box(tuple(np.subtract(domain.lower, reach).tolist()), tuple(np.add(domain.upper, reach).tolist()))
     stages = TessellationStages(engine.replaced(traits=box.traits(engine.real)))
-    whole = replace(make_diagram(stages, box, np.concatenate([points, outer])).faces, diagram=None)
-    return solid_diagram(surface, points, sizes, whole)
+    whole = make_diagram(stages, box, np.concatenate([points, outer]))
+    stages.release()
+    faces = replace(whole.faces, diagram=None)
+    del whole
+    return solid_diagram(surface, points, sizes, faces)
