@@ -204,9 +204,10 @@ def _along_line(
     begin, end = (np.clip(new + side * sizes / (2 * thickness), low[0], high[-1]) for side in (-1, 1))
     made = (spline(end) - spline(begin)) / np.maximum(end - begin, 1e-300)[:, None]
     around = np.concatenate([2 * v[:1] - v[1:2], v, 2 * v[-1:] - v[-2:-1]])
-    bounds = [f.reduce([around[:-2], around[1:-1], around[2:]]) for f in (np.minimum, np.maximum)]
-    rows = np.clip(np.searchsorted(knots, new) - 1, 0, len(v) - 1)
-    return np.clip(made, bounds[0][rows], bounds[1][rows])
+    first = np.clip(np.searchsorted(knots, begin, "right") - 1, 0, len(v) - 1)
+    last = np.clip(np.searchsorted(knots, end) - 1, first, len(v) - 1) + 3
+    ranges = [around[i:j] for i, j in zip(first.tolist(), last.tolist(), strict=True)]
+    return np.clip(made, [r.min(axis=0) for r in ranges], [r.max(axis=0) for r in ranges])
 
 
 def _flux(field: FoamField, velocity: FoamField, mesh: FoamMesh) -> FoamField:

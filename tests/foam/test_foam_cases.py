@@ -19,6 +19,7 @@ from clvoro.foam import fluxes
 from clvoro.foam.case import FoamCase
 from clvoro.foam.fluxes import MOST_DIVERGENCE, divergence
 from clvoro.foam.mesh import FoamMesh, polygon_of_edges
+from clvoro.foam.transfer import _along_line
 from clvoro.io import foam_read
 
 HOLE = [(0.9, 0.4), (1.1, 0.4), (1.1, 0.6), (0.9, 0.6)]
@@ -388,6 +389,29 @@ def test_bad_input_changes_nothing(case, change, options, kind, text):
     if "solver" not in options:
         assert after == before
     assert all(after[path] == data for path, data in before.items() if path.name != "controlDict")
+
+
+@pytest.mark.parametrize("n", [7, 30, 90])
+def test_profiles_at_straight_patches(n):
+    """Means of a parabola are exact on coarser and finer faces, and a jump stays within its values."""
+    random = np.random.default_rng(4)
+
+    def faces(count):
+        ends = np.concatenate([[0], np.cumsum(random.uniform(0.7, 1.3, count))])
+        ends /= ends[-1]
+        places = np.column_stack([np.full(count, 3.0), (ends[1:] + ends[:-1]) / 2, np.full(count, 0.1)])
+        order = random.permutation(count)
+        y = np.array([ends[:-1], ends[1:]])
+        profile = np.diff(2 * y**2 - 4 / 3 * y**3, axis=0)[0] / np.diff(ends)
+        values = np.column_stack([profile, places[:, 1] > 0.5])
+        return places[order], 0.2 * np.diff(ends)[order], values[order]
+
+    (centers, areas, old), (at, sizes, exact) = faces(30), faces(n)
+    made = _along_line(old, centers, areas, at, sizes, 0.2)
+    assert made[:, 0] == pytest.approx(exact[:, 0], abs=2e-3 if n == 90 else 1e-9)
+    assert (made[:, 1].min(), made[:, 1].max()) == (0, 1)
+    centers[0, 0] = 3.1
+    assert _along_line(old, centers, areas, at, sizes, 0.2) is None
 
 
 def test_wrong_fields_are_refused():
