@@ -92,7 +92,7 @@ class DomainSteps:
         points : (n, d) real
             Positions of the generators.
         exact : bool
-            As for `Cells.tessellate`.
+            As for `CellBuilder.tessellate`.
         nearest : bool
             In a periodic box, reject neighbors that are not the nearest image of their generator.
         """

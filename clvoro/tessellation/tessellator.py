@@ -94,7 +94,7 @@ class Tessellator:
         previous : Tessellation, optional
             The latest diagram, of the same generators at earlier positions, for an incremental update.
         exact : bool
-            Reject generators so close that round-off makes a share of a cell uncertain; see `Cells.tessellate`.
+            Reject generators so close that round-off makes a share of a cell uncertain; see `CellBuilder.tessellate`.
         binned : BinnedPoints, optional
             The generators in bins, if they are known.
         follow : callable, optional
