@@ -116,6 +116,7 @@ ORDERED = {
     "bins.count_in_child_bins",
     "boundary_crossings.count_chords",
     "polyhedra.clip_polyhedra",
+    "polyhedra_update.list_marked_cells",
     "polyhedra_update.update_cells",
     "walks.walk_all_cells",
 }
