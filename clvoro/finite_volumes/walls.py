@@ -171,10 +171,8 @@ class _WallMaker:
         self.diagram, self.domain, self.kinds = diagram, domain, kinds
         self.rings = domain.oriented
         self.generators = diagram.points
-        self.along = RingCoordinate(domain, self.rings)
+        self.along = RingCoordinate(domain)
         self.changes_part = _changes(self.rings, parts)
-        walks, self.place_in_walk = self.rings.walks()
-        self.walks = RingCoordinate(domain, walks), _changes(walks, parts)
         self.convex = f = convex_faces(self.generators, diagram.weights, float(domain.extent.max()))
         self.size = np.sqrt(diagram.volumes)
         apart = np.linalg.norm(self.generators[f.right] - self.generators[f.left], axis=1)
@@ -406,20 +404,12 @@ class _WallMaker:
         after[starts[1:][filled] - 1] = starts[:-1][filled]
         gaps = np.flatnonzero(ends[:, 1] != ends[after, 0])
         cell, gap = cell[gaps], np.column_stack([ends[gaps, 1], ends[after[gaps], 0]])
-        plain = self.kinds[cell] >= PLAIN
-        walls = self.domain.closest_walls(self.points[gap[plain]].mean(axis=1))
-        self._add_walls(cell[plain], walls, gap[plain])
-        cell, gap = cell[~plain], gap[~plain]
-        positions = self.position[gap]
-        left = self._close(cell, gap, self.along, self.changes_part, positions)
-        # Around a point in which rings touch the boundary of a cell may lead from one to the other.
-        cell, gap, positions = cell[left], gap[left], positions[left]
-        edge = self.along.edges(np.nan_to_num(positions))
-        share = (positions - self.along.begins[edge]) / self.rings.lengths[edge]
-        walks, changes = self.walks
-        left = self._close(cell, gap, walks, changes, walks.position(self.place_in_walk[edge], share))
-        edge = edge[left, np.isnan(positions[left, 1]) * -1 + 1]
-        self._add_walls(cell[left], self.rings.edge_numbers[edge], gap[left])
+        straight = self.kinds[cell] >= PLAIN
+        exact = np.flatnonzero(~straight)
+        # Where rings touch, and where a cell touches the boundary, the ends of a gap are on different parts of it.
+        straight[exact[self._close(cell[exact], gap[exact])]] = True
+        walls = self.domain.closest_walls(self.points[gap[straight]].mean(axis=1))
+        self._add_walls(cell[straight], walls, gap[straight])
         for c in np.flatnonzero(~filled).tolist():
             self._take_piece(c)
 
@@ -438,34 +428,29 @@ class _WallMaker:
         cells, walls, points = self.walls
         self.walls = np.append(cells, cell), np.append(walls, wall), np.concatenate([points, ends])
 
-    def _close(
-        self, cell: np.ndarray, gap: np.ndarray, along: RingCoordinate, changes: np.ndarray, positions: np.ndarray
-    ) -> np.ndarray:
+    def _close(self, cell: np.ndarray, gap: np.ndarray) -> np.ndarray:
         """Close gaps from points `gap[:, 0]` to `gap[:, 1]` of cells (g,), with corners of the domain between.
-
-        The ends are at `positions` (g, 2) `along` the boundary, whose part changes where `changes` is set.
 
         Returns
         -------
         left : (k,) int
-            Gaps whose ends are on two rings, or in the opposite order, as where a cell touches the boundary.
+            Gaps that are left: their ends are on two rings, or in the opposite order.
         """
         if not len(cell):
             return np.empty(0, np.int64)
-        every, rings = np.arange(len(cell)), along.rings
-        s, t = self._on_one_ring(along, gap, positions).T
-        ring = along.ring_of(s)
+        count, along, (s, t) = len(cell), self.along, self.position[gap].T
+        every, ring = np.arange(count), along.ring_of(s)
         joined = (ring == along.ring_of(t)) & ~np.isnan(s + t)
         every, cell, gap, s, t, ring = (values[joined] for values in (every, cell, gap, s, t, ring))
-        chain, path, starts = self._chains(along, ring, s, t, gap)
+        chain, path, starts = self._chains(ring, s, t, gap)
         joined = chain_areas(chain, starts[:-1], starts[1:] - 1) <= AROUND * self.size[cell] ** 2
-        left = np.setdiff1d(np.arange(len(positions)), every[joined])
+        left = np.setdiff1d(np.arange(count), every[joined])
         cell, gap, s, t, ring = (values[joined] for values in (cell, gap, s, t, ring))
-        chain, path, starts = self._chains(along, ring, s, t, gap)
+        chain, path, starts = self._chains(ring, s, t, gap)
         begin = along.begins[along.ring_starts[:-1]][ring]
         total = along.begins[along.ring_starts[1:]][ring] - begin
         row = np.repeat(np.arange(len(cell)), np.diff(starts))
-        chosen = (path < 0) | changes[path]
+        chosen = (path < 0) | self.changes_part[path]
         choose_corners(chain, chosen, self.size[cell][row])
         kept = np.flatnonzero(chosen)
         added = path[kept] >= 0
@@ -481,38 +466,19 @@ class _WallMaker:
         side = np.flatnonzero(row[:-1] == row[1:])
         middles = s[row[side]] - begin[row[side]] + (marks[side] + marks[side + 1]) / 2
         edges = along.edges(begin[row[side]] + middles % total[row[side]])
-        self._add_walls(cell[row[side]], rings.edge_numbers[edges], np.column_stack([names[side], names[side + 1]]))
+        self._add_walls(
+            cell[row[side]], self.rings.edge_numbers[edges], np.column_stack([names[side], names[side + 1]])
+        )
         return left
 
-    def _on_one_ring(self, along: RingCoordinate, gap: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Return the `positions` of the ends of gaps, (g, 2), on one ring where the boundary passes a point twice.
-
-        Where rings touch, a point has a position on each: of all pairs the shortest way is taken.
-        """
-        x, positions = along.rings.vertices, positions.copy()
-        _, same, count = np.unique(x, axis=0, return_inverse=True, return_counts=True)
-        touching = np.flatnonzero(count[same.ravel()] > 1)
-        if not touching.size:
-            return positions
-        reach = NO_LENGTH * float(self.domain.extent.max())
-        met = scipy.spatial.KDTree(x[touching]).query_ball_point(self.points[gap], reach)
-        for g in np.flatnonzero([any(row) for row in met]).tolist():
-            pairs = [along.begins[touching[v]] if v else [s] for v, s in zip(met[g], positions[g], strict=True)]
-            s, t = (a.ravel() for a in np.meshgrid(*pairs, indexing="ij"))
-            ring = along.ring_of(s)
-            total = np.diff(along.begins[along.ring_starts])[ring]
-            way = np.where((ring == along.ring_of(t)) & (s != t), (t - s) % total, np.inf)
-            if np.isfinite(way.min()):
-                positions[g] = s[way.argmin()], t[way.argmin()]
-        return positions
-
     def _chains(
-        self, along: RingCoordinate, ring: np.ndarray, s: np.ndarray, t: np.ndarray, gap: np.ndarray
+        self, ring: np.ndarray, s: np.ndarray, t: np.ndarray, gap: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the way along the boundary for each gap: the first point, the vertices between, the last point.
 
         Ragged rows: points (k, 2), vertices of the domain (k,), -1 for both ends, and starts.
         """
+        along = self.along
         begin, end = along.ring_starts[ring], along.ring_starts[ring + 1]
         first = np.maximum(np.searchsorted(along.begins, s, side="right"), begin)
         last = np.clip(np.searchsorted(along.begins, t, side="left"), begin, end)

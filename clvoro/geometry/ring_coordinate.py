@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from .polygon import Polygon
-from .rings import OrientedRings
 
 
 class RingCoordinate:
-    """The length along the rings of a polygon, or its walks, one ring after the other, with the domain on the left.
+    """The length along the rings of a polygon, one ring after the other, with the domain on the left.
 
     The positions of a ring reach from that of its first vertex to that of the next ring's first vertex, without it.
 
@@ -21,8 +20,8 @@ class RingCoordinate:
         First vertex of each ring.
     """
 
-    def __init__(self, domain: Polygon, rings: OrientedRings) -> None:
-        self.domain, self.rings = domain, rings
+    def __init__(self, domain: Polygon) -> None:
+        self.domain, self.rings = domain, domain.oriented
         self.begins = np.concatenate([[0.0], np.cumsum(self.rings.lengths)])
         self.ring_starts = self.rings.ring_starts.astype(np.int64)
 

@@ -105,45 +105,6 @@ class OrientedRings:
         """Vertices (k, 2) of each ring."""
         return [self.vertices[a:b] for a, b in pairwise(self.ring_starts)]
 
-    def walks(self) -> tuple[OrientedRings, np.ndarray]:
-        """Return the boundary as it is met by one who walks along it inside, and the place there of each edge, (k,).
-
-        Where rings touch in a point, the way goes on along the first edge on the left, which may be that of another
-        ring. Without such points the walks are the rings.
-        """
-        k = len(self.next_vertex)
-        _, same, count = np.unique(self.vertices, axis=0, return_inverse=True, return_counts=True)
-        if count.max() == 1:
-            return self, np.arange(k)
-        next_vertex, same = self.next_vertex.copy(), same.ravel()
-        angle = np.arctan2(*self.along.T[::-1])
-        for vertex in np.flatnonzero(count > 1):
-            out = np.flatnonzero(same == vertex)
-            into = self.before[out]
-            # Clockwise from the way back.
-            turn = (angle[into] + np.pi - angle[out][:, None]) % (2 * np.pi)
-            next_vertex[into] = out[np.where(turn > 0, turn, 2 * np.pi).argmin(axis=0)]
-        place, starts, rings = np.full(k, -1), [0], []
-        for first in range(k):
-            while place[first] < 0:
-                place[first] = starts[-1] + len(rings)
-                rings.append(first)
-                first = int(next_vertex[first])
-            if rings:
-                starts.append(starts[-1] + len(rings))
-                rings = []
-        order = np.argsort(place)
-        places = np.where(self.places >= 0, place[self.places], -1)
-        made = replace(
-            self,
-            vertices=self.vertices[order],
-            ring_starts=np.array(starts, np.int32),
-            next_vertex=place[next_vertex[order]].astype(np.int32),
-            edge_numbers=self.edge_numbers[order],
-            places=places.astype(np.int32),
-        )
-        return made, place
-
     @cached_property
     def ends(self) -> np.ndarray:
         """The end of each edge, (k, 2)."""
