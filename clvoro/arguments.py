@@ -87,7 +87,9 @@ def check_rows(name: str, value: object, d: int) -> np.ndarray:
     if array.ndim == 0:
         inner = getattr(value, "points", None)
         hint = f"; pass its points, {name}.points" if isinstance(inner, np.ndarray) else ""
-        raise InputTypeError(f"{name} is a {type(value).__name__}, {expected}{hint}")
+        if isinstance(value, Iterator):
+            hint = f"; pass list({name})"
+        raise InputTypeError(f"{name} is of type {type(value).__name__}, {expected}{hint}")
     if array.size == 0 and array.ndim < 3:
         return np.empty((0, d))
     if array.dtype.kind not in "fiu":
@@ -142,10 +144,11 @@ def check_callable(name: str, value: Callable[..., object], argument: str, hint:
     try:
         signature.bind(None)
     except TypeError:
-        kind = "class " if isinstance(value, type) else ""
+        what = getattr(value, "__name__", type(value).__name__)
+        if isinstance(value, type):
+            raise InputTypeError(f"{name} is the class {what}, expected an object; write {what}(...)") from None
         raise InputTypeError(
-            f"{name} is the {kind}{getattr(value, '__name__', type(value).__name__)}{signature}, expected a callable "
-            f"of one argument, {argument}; {hint}"
+            f"{name} is the {what}{signature}, expected a callable of one argument, {argument}; {hint}"
         ) from None
 
 

@@ -4,6 +4,7 @@ import ast
 import errno
 import inspect
 import json
+import math
 import os
 import re
 import shutil
@@ -15,6 +16,7 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import numpy as np
+import numpy.lib.recfunctions
 import pyopencl as cl
 import pytest
 import scipy.io
@@ -45,6 +47,9 @@ TRIANGLES = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
 TURNED = np.array(TRIANGLES)[:, ::-1]
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
 POINTS = np.random.default_rng(5).random((30, 2))
+RECORDS = np.array([(0.5, 0.2), (0.1, 0.3)], dtype=[("x", float), ("y", float)])
+WKT = "POLYGON ((0 0, 1 0, 1 1, 0 0))"
+LAKE = {"type": "Polygon", "coordinates": [[*SQUARE, SQUARE[0]]]}
 GRID = np.random.default_rng(0).random((9, 9))
 TWICE = np.concatenate([POINTS, POINTS[:1]])
 DISTANCE = sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), h_min=0.1, growth=1.2)
@@ -892,6 +897,77 @@ ROWS = [
         lambda t: t.run(clvoro.Polygon(KITE), 0.1, layers=clvoro.Layers(0.7, 1, edges=[1])),
         lambda t: t.run(clvoro.Polygon(KITE), 0.1, layers=clvoro.Layers(0.02, 1, edges=[1])),
     ),
+    # Plausible mistakes: size functions, points, polygons, arithmetic of size fields.
+    (lambda t: t.run(BOX, lambda x, y: 0.3 + 0 * x), lambda t: t.run(BOX, lambda points: 0.3 + 0 * points[:, 0])),
+    (
+        lambda t: t.run(BOX, sizing.Distance),
+        lambda t: t.run(BOX, sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), 0.1, 1.2)),
+    ),
+    (
+        lambda t: t.run(BOX, lambda p: 0.3 if p[:, 0] < 0.5 else 0.2),
+        lambda t: t.run(BOX, lambda p: np.where(p[:, 0] < 0.5, 0.3, 0.2)),
+    ),
+    (
+        lambda t: t.run(BOX, lambda p: 0.2 + math.sqrt(p[:, 0])),
+        lambda t: t.run(BOX, lambda p: 0.2 + np.sqrt(p[:, 0])),
+        "numpy",
+    ),
+    (lambda t: t.run(BOX, lambda p: 0.3 + p[:, :1]), lambda t: t.run(BOX, lambda p: (0.3 + p[:, :1])[:, 0]), "sizes"),
+    (lambda t: t.run(BOX, lambda p: 0.3 + p[0]), lambda t: t.run(BOX, lambda points: 0.3 + points[:, 0])),
+    (lambda t: t.run(BOX, lambda p: None), lambda t: t.run(BOX, lambda p: 0.3 + 0 * p[:, 0]), "numbers"),
+    (lambda t: t.run(BOX, POINTS), lambda t: t.run(BOX, 0.3, points=POINTS, method="lloyd")),
+    (
+        lambda t: t.run(BOX, sizing.Circle((0.5, 0.5), 0.2)),
+        lambda t: t.run(BOX, sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), 0.1, 1.2)),
+    ),
+    (
+        lambda t: sizing.Distance(0.1, sizing.Circle((0, 0), 1), growth=1.2),
+        lambda t: sizing.Distance(sizing.Circle((0, 0), 1), 0.1, growth=1.2),
+        "distance",
+    ),
+    (
+        lambda t: t.run(BOX, sizing.Expression("sqrt(x - 1)")),
+        lambda t: t.run(BOX, sizing.Expression("0.3 + sqrt(fmax(x - 1, 0))")),
+    ),
+    (lambda t: 1 - DISTANCE, lambda t: t.run(BOX, lambda p: 1 - 0.7 * DISTANCE(p)), "distance"),
+    (lambda t: max(0.1, DISTANCE), lambda t: sizing.maximum(0.1, DISTANCE)),
+    (lambda t: t.run(BOX, 0.3, layers=0.01), lambda t: t.run(BOX, 0.3, layers=clvoro.Layers(0.01))),
+    (lambda t: t.run(BOX, 0.3, points=t.mesh), lambda t: t.run(BOX, 0.3, points=t.mesh.points, method="lloyd")),
+    (
+        lambda t: t.voronoi(BOX, np.hstack([POINTS] * 2)),
+        lambda t: t.voronoi(BOX, np.hstack([POINTS] * 2)[:, :2]),
+        "array",
+    ),
+    (lambda t: t.voronoi(BOX, POINTS[:, 0]), lambda t: t.voronoi(BOX, np.column_stack([POINTS[:, 0], POINTS[:, 1]]))),
+    (
+        lambda t: t.voronoi(BOX, RECORDS),
+        lambda t: t.voronoi(BOX, np.lib.recfunctions.structured_to_unstructured(RECORDS)),
+    ),
+    (lambda t: t.voronoi(BOX, iter(POINTS)), lambda t: t.voronoi(BOX, list(iter(POINTS)))),
+    (lambda t: BOX.contains((0.5, 0.5)), lambda t: BOX.contains([(0.5, 0.5)]), "points"),
+    (lambda t: clvoro.Polygon(WKT), lambda t: clvoro.Polygon.from_wkt(WKT)),
+    (lambda t: clvoro.Polygon(shapely.box(0, 0, 1, 1)), lambda t: clvoro.Polygon.from_shapely(shapely.box(0, 0, 1, 1))),
+    (lambda t: clvoro.Polygon(LAKE), lambda t: clvoro.Polygon.from_geojson(LAKE)),
+    (
+        lambda t: clvoro.Polygon(np.array([*SQUARE, (0, 0.5)]).T),
+        lambda t: clvoro.Polygon(np.array([*SQUARE, (0, 0.5)])),
+        "array",
+    ),
+    (
+        lambda t: clvoro.Polygon([(*p, 1) for p in SQUARE]),
+        lambda t: clvoro.Polygon(np.array([(*p, 1) for p in SQUARE])[:, :2]),
+        "array",
+    ),
+    (
+        lambda t: clvoro.Polygon([0, 1, 1, 0], [0, 0, 1, 1]),
+        lambda t: clvoro.Polygon(np.column_stack([[0, 1, 1, 0], [0, 0, 1, 1]])),
+    ),
+    (lambda t: clvoro.Polygon([SQUARE, HOLE]), lambda t: clvoro.Polygon(SQUARE, [HOLE]), "rings"),
+    (lambda t: clvoro.Polygon(SQUARE, HOLE), lambda t: clvoro.Polygon(SQUARE, [HOLE])),
+    (
+        lambda t: clvoro.Polygon.from_shapely([shapely.box(0, 0, 1, 1)]),
+        lambda t: clvoro.Polygon.from_shapely(shapely.union_all([shapely.box(0, 0, 1, 1)])),
+    ),
 ]
 
 
@@ -1099,7 +1175,7 @@ Workplace.run.__signature__ = inspect.signature(clvoro.Adapter.run)
 def meshes(ctx, tmp_path_factory):
     adapter, folder = clvoro.Adapter(ctx), tmp_path_factory.mktemp("files")
     lake, grid = folder / "lake.geojson", folder / "grid.npy"
-    lake.write_text(json.dumps({"type": "Polygon", "coordinates": [[*SQUARE, SQUARE[0]]]}))
+    lake.write_text(json.dumps(LAKE))
     np.save(grid, np.full((3, 3), 0.3))
     np.savez(folder / "lonlat.npz", lon=LON, lat=LAT, h=np.full((5, 9), 0.7))
     solid = np.random.default_rng(1).random((20, 3))

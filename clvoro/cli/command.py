@@ -445,7 +445,8 @@ def _readable(name: str) -> str:
 
     refuse_polymesh(name)
     if Path(name).suffix.lower() not in (".npz", ".vtu", ".nc"):
-        raise InputError(f"{name} cannot be read, expected a .npz, .vtu or .nc file")
+        what = "is no mesh" if Path(name).exists() else "does not exist"
+        raise InputError(f"{name} {what}, expected a .npz, .vtu or .nc file (to check, also .foam or a case's folder)")
     return name
 
 

@@ -226,6 +226,9 @@ def _cleaned(given: object, name: str) -> Ring:
     hint = _other_maker(given)
     if hint:
         raise InputTypeError(f"Polygon's {name} is a {type(given).__name__}, expected its vertices (k, 2); {hint}")
+    is_point = isinstance(given, list | tuple | np.ndarray) and len(given) == 2 and isinstance(given[0], Real)
+    if is_point and not name.startswith("outer"):
+        raise InputError(f"Polygon's {name} is a point, expected a ring (k, 2); write [ring] for a single hole")
     try:
         array = check_rows(f"Polygon's {name}", given, 2)
     except (InputError, InputTypeError) as error:
@@ -269,15 +272,9 @@ def _other_maker(given: object) -> str:
 
 
 def _other_nesting(given: object, name: str) -> str:
-    """Return a hint for rings that are nested in too many or too few lists; empty for others."""
+    """Return a hint for several rings in the place of one; empty for others."""
     if not isinstance(given, list | tuple | np.ndarray) or not len(given):
         return ""
-    if isinstance(given[0], Real):
-        return (
-            ""
-            if name.startswith("outer") or len(given) != 2
-            else " (holes is a list of rings; write [ring] for a single hole)"
-        )
     first = given[0]
     nested = isinstance(first, list | tuple | np.ndarray) and len(first) and np.ndim(first[0]) == 1
     return " (for several rings write clvoro.Polygon(rings[0], rings[1:]))" if nested else ""
