@@ -364,7 +364,7 @@ def test_every_file_is_checked(here, capsys):
     files = "small.toml", "nothing.npz", "out/small/mesh.npz"
     assert call("check", *files) == cli.BAD_INPUT
     printed = capsys.readouterr()
-    assert "small.toml cannot be read, expected a .npz" in printed.err
+    assert "small.toml is no mesh, expected a .npz" in printed.err
     assert "nothing.npz" in printed.err
     assert "out/small/mesh.npz: " in printed.out
 
