@@ -1,8 +1,8 @@
 """Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
 
     python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
-                           [--speed NUMBERS] [--domains NAMES] [--keep FOLDER] [--pictures FOLDER] [--device NAME]
-                           [--dtype float32] [--json]
+                           [--speed NUMBERS] [--domains NAMES] [--order SIZES] [--keep FOLDER]
+                           [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
 
 The solids are in `bench/_solid_shapes.py`; they need trimesh, manifold3d, shapely, networkx and, for the gyroid,
 scikit-image. Each is meshed at two uniform sizes with default settings, and written as polyMesh. A row has the number
@@ -12,7 +12,9 @@ skewness, the number of concave cells, the volume of all cells over that of the 
 --runs is a list of efforts and "exact". With `--booleans N` the solids are N random booleans of boxes, balls and
 cylinders. `--speed NUMBERS` compares processor times for so many cells in a cube as a box, as a solid, and around a
 wavy body of 100,000 triangles in it, with the default effort: those of the run, of the mesh with its faces, and of the
-mesh for solvers. Memory is the most up to then of the whole process. `--domains` chooses some of the three.
+mesh for solvers. Memory is the most up to then of the whole process. `--domains` chooses some of the three. `--order
+SIZES` compares volume and wall area of a ball, a torus and a cylinder with those of their surface, and its distance
+from the vertices of walls with h^2 times the curvature.
 Pictures show each mesh cut open, with the patches in colors.
 """
 
@@ -146,6 +148,48 @@ def measure_speed(adapter: clvoro.Adapter, n: int, chosen: list[str], report: Re
         report.add(row, f"{name}, {n}: {row['ratio']:.2f}")
 
 
+ORDER_COLUMNS = {
+    **{name: COLUMNS[name] for name in ("solid", "run", "h", "cells", "mean e", "quotient")},
+    "volume error": lambda r: f"{r['volume']:.1e}",
+    "area error": lambda r: f"{r['area']:.1e}",
+    "distance / h^2 kappa": lambda r: f"{r['distance']:.2e}",
+}
+SMOOTH = {
+    "ball": (lambda edge: clvoro.Solid.ball((0, 0, 0), 1, edge=edge), 1.0),
+    "torus": (lambda edge: clvoro.Solid.torus((0, 0, 0), 1.4, 0.6, edge=edge), 1 / 0.6),
+    "cylinder": (lambda edge: clvoro.Solid.cylinder((0, 0, 0), (0, 0, 1), 1, edge=edge), 1.0),
+}
+"""Solids, by the length of triangles, and their curvatures."""
+
+
+def measure_order(adapter: clvoro.Adapter, sizes: list[float], runs: list[str], report: Report) -> None:
+    """Add rows of errors of volume and wall area, and the largest distance of vertices of walls from the surface."""
+    for name, (make, curvature) in SMOOTH.items():
+        solid = make(min(sizes) / 3)
+        for run in runs:
+            for h in sizes:
+                d = (result := adapter.run(solid, h, **settings_of(run))).diagram
+                f = d.faces
+                walls = np.unique(f.corners[f.starts[f.n_inner] :])
+                row = {
+                    "solid": name,
+                    "run": run,
+                    "h": h,
+                    "cells": len(d),
+                    "error": float(np.abs(result.size_error).mean()),
+                    "quotient": quotient(d),
+                    "volume": float(d.volumes.sum() / solid.measure - 1),
+                    "area": float(f.area[f.n_inner :].sum() / solid.boundary_measure - 1),
+                    "distance": float(solid.boundary_distance(f.points[walls]).max() / (h**2 * curvature)),
+                }
+                report.add(row, f"{name}, {run}, {h:g}: {row['volume']:.1e}")
+
+
+def settings_of(run: str) -> dict[str, Any]:
+    """Return the settings of a run: an effort or "exact"."""
+    return {"method": "exact"} if run == "exact" else {"effort": run}
+
+
 def main() -> None:
     """Run the bench."""
     options_of = parser(__doc__)
@@ -158,8 +202,13 @@ def main() -> None:
     options_of.add_argument("--speed", default="", metavar="NUMBERS", help="processor times of so many cells")
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
+    options_of.add_argument("--order", default="", metavar="SIZES", help="errors of volume and area at these sizes")
     options_of.add_argument("--domains", default="", metavar="NAMES", help="of --speed: box, cube, body")
     options = options_of.parse_args()
+    if options.order:
+        adapter, report = make_adapter(options), Report(options.json, ORDER_COLUMNS)
+        measure_order(adapter, [float(h) for h in names(options.order)], names(options.runs), report)
+        return report.finish(heading(adapter, "errors of meshes against the surface"))
     if options.speed:
         adapter, report = make_adapter(options), Report(options.json, SPEED_COLUMNS)
         for n in names(options.speed):
@@ -177,7 +226,7 @@ def main() -> None:
         for name in names(options.only) or SHAPES:
             make, sizes = SHAPES[name]
             cases += [(name, make, sizes[k]) for k in levels]
-    runs = [(run, {"method": "exact"} if run == "exact" else {"effort": run}) for run in names(options.runs)]
+    runs = [(run, settings_of(run)) for run in names(options.runs)]
     seeds = [{"seed": k + 1} for k in range(options.seeds)] or [{}]
     for name, make, h in cases:
         for run, settings in runs:
