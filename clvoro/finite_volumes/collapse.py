@@ -77,6 +77,8 @@ def collapse_short(
             # Where nothing has changed, another try is in vain.
             again = cells.changed.copy()
             again[pending] |= cells.is_touched(pending)
+            if chosen is not None:
+                again &= chosen[faces]
             scan = _Scan(cells, np.flatnonzero(again))
             active = scan.flagged
             pending = distinct(np.concatenate([pending, active]))

@@ -123,7 +123,9 @@ class NearWalls:
         place = np.full(len(made.points), -1)
         there = made.half_face[rim]
         there_corners = take_rows(whole.starts, whole.corners, there, ~near[whole.owner[there]])[1]
-        place[take_rows(made.starts, made.corners, rim)[1]] = there_corners
+        here_corners = take_rows(made.starts, made.corners, rim)[1]
+        assert np.array_equal(made.points[here_corners], whole.points[there_corners]), "faces to the rest have changed"
+        place[here_corners] = there_corners
         new = np.flatnonzero(place < 0)
         place[new] = len(whole.points) + np.arange(len(new))
         owner = np.concatenate([number[whole.owner[kept]], numbers[made.owner[mine]]])
