@@ -65,10 +65,10 @@ _MEASURES = {2: PlaneMeasures, 3: SolverMeasures}
 def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
     """Return why OpenFOAM rejects a mesh that was made with `walls`, where, and the remedy; "" if it does not.
 
-    All criteria are computed for the cells that walls cut, and for those beyond one of `_LIMITS`. Others are convex.
+    All criteria are computed for the cells that walls cut in 3D, and for those that seem bad. Others are convex.
     """
     at_walls = mesh.domain.cuts_cells or mesh.domain.curved_walls
-    judged = _suspects(mesh, at_walls)
+    judged = _suspects(mesh, at_walls) if mesh.domain.outline is None else rejected_polygons(mesh)
     if not judged.any():
         return ""
     kept, k = judged.copy(), np.flatnonzero(mesh.neighbor >= 0)

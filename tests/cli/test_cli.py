@@ -206,6 +206,11 @@ def test_meshes_are_checked_for_a_solver(here, capsys, monkeypatch):
     assert call("check", *exact, "a/mesh.npz") == cli.BAD_INPUT
     assert call(*quick, *exact) == cli.BAD_INPUT
     assert "no mesh is written for OpenFOAM" in capsys.readouterr().err
+    assert call(*quick, *exact, "--format", "openfoam") == cli.BAD_INPUT
+    assert "clvoro with --unchecked" in capsys.readouterr().err
+    assert call(*quick, *exact, "--format", "openfoam", "--unchecked") == cli.OK
+    assert call("convert", "a/mesh.npz", "b.foam", *exact) == cli.BAD_INPUT
+    assert call("convert", "a/mesh.npz", "b.foam", *exact, "--unchecked") == cli.OK
 
 
 def test_a_solver_checks_the_mesh_itself(here, capsys, monkeypatch):
