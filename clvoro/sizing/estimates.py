@@ -131,8 +131,8 @@ def force_weight(
     """Return the weight of cells for the forces on boundaries, ``(1 + distance / length)**-power``, (n,) float64.
 
     It is a substitute for an adjoint solution, for `hessian_size` with p = 1. The gradient of the adjoint velocity of
-    drag and lift decays with the distance from the body, about so at Reynolds numbers from 1 to 100. Unlike the adjoint
-    it does not know which cells are upstream, nor that other walls count.
+    drag and lift decays with the distance from the body. The defaults are chosen on one flow, a cylinder in a channel
+    at Reynolds number 20. Unlike the adjoint it does not know which cells are upstream, nor that other walls count.
 
     Parameters
     ----------
