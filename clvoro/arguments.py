@@ -36,6 +36,46 @@ def _digits(x: float) -> str:
     return f"{x:.1f}".removesuffix(".0") if 1e5 <= abs(x) < 1e9 else f"{x:.6g}"
 
 
+def check_cell_values(name: str, values: object, n: int, *, finite: bool = True, least: int = 1) -> np.ndarray:
+    """Return data of `n` cells as an array (n,) or (n, k) with at least `least` columns.
+
+    With `finite` it is of float64, else of the type of `values`.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If they are no such real numbers, some are masked, or with `finite` some are not finite; names the first row.
+    """
+    expected = f"expected ({n},) or ({n}, k)"
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise InputError(f"{name} cannot be converted to an array ({error}), {expected}") from error
+    if np.ma.is_masked(values):
+        raise InputError(f"{name} has masked numbers, expected none; fill them")
+    if array.dtype.kind not in "fiub":
+        raise InputTypeError(
+            f"{name} has dtype {array.dtype}, expected real numbers; pass the real and the imaginary part of complex "
+            "numbers as two columns"
+        )
+    if array.ndim not in (1, 2) or len(array) != n or (array.ndim == 2 and array.shape[1] < least):
+        transposed = array.ndim == 2 and array.shape[1] == n
+        raise InputError(
+            f"{name} has shape {array.shape}, {expected}: a row for each cell of the mesh; "
+            + ("pass values.T" if transposed else "pass the mesh that the values belong to")
+        )
+    if not finite:
+        return array
+    array = array.astype(float)
+    bad = np.flatnonzero(~np.isfinite(array.reshape(n, -1)).all(axis=1))
+    if bad.size:
+        raise InputError(
+            f"{name}[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of {n} rows are not): replace "
+            "them first. Has the solver diverged?"
+        )
+    return array
+
+
 def check_points(points: object, domain: Domain, name: str = "points") -> np.ndarray:
     """Return `points` as a float64 array (n, d) inside `domain`; errors call them `name`.
 

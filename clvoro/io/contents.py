@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..arguments import check_cell_values
 from ..errors import InputError, InputTypeError
 from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
@@ -107,16 +108,7 @@ def _checked(cell_data: object, n: int) -> dict[str, np.ndarray]:
         if not isinstance(name, str) or not _WORD.fullmatch(name) or name in OWN:
             why = "which clvoro uses itself" if name in OWN else "expected a word of ASCII letters and digits"
             raise InputError(f"cell_data has the name {name!r:.60}, {why}; choose another name")
-        if np.ma.is_masked(values):
-            raise InputError(f"cell_data[{name!r}] has masked numbers, expected none; fill them")
-        array = np.asarray(values)
-        if array.dtype.kind not in "fiub":
-            raise InputTypeError(f"cell_data[{name!r}] has dtype {array.dtype}, expected real numbers")
-        if array.ndim not in (1, 2) or len(array) != n or 0 in array.shape:
-            raise InputError(
-                f"cell_data[{name!r}] has shape {array.shape}, expected ({n},) or ({n}, k): a row per cell"
-            )
-        found[name] = _in_known_type(array)
+        found[name] = _in_known_type(check_cell_values(f"cell_data[{name!r}]", values, n, finite=False))
     return found
 
 

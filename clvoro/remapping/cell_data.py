@@ -9,6 +9,7 @@ import numpy as np
 import pyopencl as cl
 import scipy
 
+from ..arguments import check_cell_values
 from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
 from ..geometry.box import Box
 from ..mesh.diagram import Diagram
@@ -54,7 +55,7 @@ def transfer_values(
     _require_one_space(source, target)
     if isinstance(order, bool) or order not in (1, 2):
         raise InputError(f"order is {order!r}, expected 1 or 2")
-    given = _checked(values, len(source))
+    given = check_cell_values("values", values, len(source), least=0)
     columns = np.ascontiguousarray(given.reshape(len(source), -1), np.float64)
     # If `values` has no columns, one of zeros is transferred for the shares.
     filled = columns if columns.shape[1] else np.zeros((len(source), 1))
@@ -112,35 +113,6 @@ def _diagram(name: str, mesh: object) -> Diagram:
     if isinstance(diagram, Diagram):
         return diagram
     raise InputTypeError(f"{name} is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram")
-
-
-def _checked(values: ArrayLike, n: int) -> np.ndarray:
-    """Return `values` as an array (n,) or (n, k) of finite float64."""
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise InputError(
-            f"values cannot be converted to an array ({error}), expected shape ({n},) or ({n}, k)"
-        ) from error
-    if array.dtype.kind not in "fiub":
-        raise InputTypeError(
-            f"values has dtype {array.dtype}, expected real numbers; pass the real and the imaginary part of complex "
-            "numbers as two columns"
-        )
-    if array.ndim not in (1, 2) or array.shape[0] != n:
-        transposed = array.ndim == 2 and array.shape[1] == n
-        raise InputError(
-            f"values has shape {array.shape}, expected ({n},) or ({n}, k): a row for each cell of the mesh; "
-            + ("pass values.T" if transposed else "call transfer() of the mesh that the values belong to")
-        )
-    array = array.astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(array.reshape(n, -1)).all(axis=1))
-    if bad.size:
-        raise InputError(
-            f"values[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of {n} rows are not): "
-            "replace them first"
-        )
-    return array
 
 
 def _intersected(

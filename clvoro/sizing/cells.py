@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import scipy
 
+from ..arguments import check_cell_values
 from ..errors import InputError
 from .arguments import coverage_warnings
-from .derivatives import CellStencils, check_cell_values, derivatives
+from .derivatives import CellStencils, derivatives
 from .field import Field
 
 if TYPE_CHECKING:

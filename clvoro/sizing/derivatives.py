@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from ..errors import InputError, InputTypeError
+from ..arguments import check_cell_values
+from ..errors import InputTypeError
 from ..mesh.connectivity import face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
@@ -120,32 +121,6 @@ class CellStencils:
         ways = slope * self.lengths
         graph.data = np.concatenate([np.maximum(ways, 1e-300), sizes])
         return scipy.sparse.csgraph.dijkstra(graph, indices=n)[:n]
-
-
-def check_cell_values(what: str, values: object, n: int) -> np.ndarray:
-    """Return `values` of `n` cells as an array (n,) or (n, k) of finite float64.
-
-    Raises
-    ------
-    InputError, InputTypeError
-        If they are not.
-    """
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiub":
-        raise InputTypeError(f"{what} are of type {array.dtype}, expected real numbers")
-    if array.ndim not in (1, 2) or len(array) != n or 0 in array.shape:
-        raise InputError(
-            f"{what} have shape {array.shape}, expected ({n},) or ({n}, k): a row for each cell of the mesh; pass the "
-            "mesh that the values belong to"
-        )
-    array = array.astype(float)
-    bad = np.flatnonzero(~np.isfinite(array.reshape(n, -1)).all(axis=1))
-    if bad.size:
-        raise InputError(
-            f"{what}[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of {n} rows are not): has the "
-            "solver diverged?"
-        )
-    return array
 
 
 def derivatives(values: ArrayLike, on: Result | Diagram) -> tuple[np.ndarray, np.ndarray]:

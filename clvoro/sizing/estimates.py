@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import scipy
 
+from ..arguments import check_cell_values
 from ..errors import InputError
 from .arguments import check_positive, check_slope
 from .cells import OnCells
-from .derivatives import CellStencils, check_cell_values, derivatives
+from .derivatives import CellStencils, derivatives
 from .profiles import Places, best_sizes, check_bounds, check_one_of, check_p, scale_profile
 
 if TYPE_CHECKING:
