@@ -1,7 +1,8 @@
 """Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
 
     python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
-                           [--speed NUMBERS] [--domains NAMES] [--order SIZES] [--keep FOLDER]
+                           [--cells N] [--limit SECONDS] [--speed NUMBERS] [--domains NAMES] [--order SIZES]
+                           [--keep FOLDER]
                            [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
 
 The solids are in `bench/_solid_shapes.py`; they need trimesh, manifold3d, shapely, networkx and, for the gyroid,
@@ -9,27 +10,34 @@ scikit-image. Each is meshed at two uniform sizes with default settings, and wri
 of cells, mean |e| of the sizes and mean isoperimetric quotient, the largest and mean non-orthogonality, the largest
 skewness, the number of concave cells, the volume of all cells over that of the solid, and the verdict.
 
---runs is a list of efforts and "exact". With `--booleans N` the solids are N random booleans of boxes, balls and
-cylinders. `--speed NUMBERS` compares processor times for so many cells in a cube as a box, as a solid, and around a
-wavy body of 100,000 triangles in it, with the default effort: those of the run, of the mesh with its faces, and of the
-mesh for solvers. Memory is the most up to then of the whole process. `--domains` chooses some of the three. `--order
-SIZES` compares volume and wall area of a ball, a torus and a cylinder with those of their surface, and its distance
-from the vertices of walls with h^2 times the curvature.
+--runs is a list of efforts and "exact". `--speed NUMBERS` compares processor times for so many cells in a cube as a
+box, as a solid, and around a wavy body of 100,000 triangles in it, with the default effort: those of the run, of the
+mesh with its faces, and of the mesh for solvers. Memory is the most up to then of the whole process. `--domains`
+chooses some of the three. `--order SIZES` compares volume and wall area of a ball, a torus and a cylinder with those of
+their surface, and its distance from the vertices of walls with h^2 times the curvature.
+
+With `--booleans N` the solids are N random booleans of boxes, balls and cylinders, or those whose numbers `--only`
+lists, with about `--cells` cells each, in a process that may crash or hang. Each is accepted, rejected, refused (by a
+message, before there is a mesh), or it fails: an exception, a crash, no end within the limit, a cell that is not
+closed, or walls that are off by more than 0.1 h in the mean.
 Pictures show each mesh cut open, with the patches in colors.
 """
 
 from __future__ import annotations
 
+import argparse
+import multiprocessing
 import resource
 import shutil
 import tempfile
 import time
 import traceback
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import Report, heading, make_adapter, names, parser
+from _common import Report, counts, heading, make_adapter, names, parser
 from _solid_shapes import SHAPES, random_part, solid_of
 from solver_ready import COLUMNS as PLANE_COLUMNS
 from solver_ready import figures_of
@@ -97,6 +105,83 @@ def draw(result: clvoro.Result, path: Path, title: str) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     plot_cutaway(result, "quality", walls=True, title=title).savefig(path, dpi=150, bbox_inches="tight")
+
+
+BOOLEAN_COLUMNS = {
+    "solid": lambda r: r["solid"],
+    "cells": lambda r: r["cells"],
+    "s": PLANE_COLUMNS["s"],
+    "non-orth. max, mean": COLUMNS["non-orth. max, mean"],
+    "skewness": PLANE_COLUMNS["skewness"],
+    "volume": COLUMNS["volume"],
+    "verdict": lambda r: r["verdict"],
+    "what and where": lambda r: r["complaints"],
+}
+_OFF = 0.1
+"""Largest mean distance of the walls from the surface, over h; a chord of a curved wall is nearer."""
+
+
+def measure_boolean(adapter: clvoro.Adapter, number: int, cells: int) -> dict[str, Any]:
+    """Mesh a random solid, and return its figures with a verdict."""
+    try:
+        solid = solid_of(random_part(number))
+        h = (solid.measure / cells) ** (1 / 3)
+        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            row = measure(adapter, solid, h, Path(folder))
+    except ClvoroError as error:
+        return {"verdict": "refused", "complaints": str(error)}
+    except Exception:
+        return {"verdict": "failed", "complaints": traceback.format_exc(limit=-1)[-200:]}
+    d = row.pop("result").diagram
+    f = d.faces
+    openness = np.zeros((len(d), 3))
+    inner = f.neighbor >= 0
+    np.add.at(openness, f.owner, f.normal * f.area[:, None])
+    np.subtract.at(openness, f.neighbor[inner], (f.normal * f.area[:, None])[inner])
+    off = abs(row["volume"] - 1) * solid.measure / solid.boundary_measure
+    row["verdict"] = "accepted" if row["ok"] else "rejected"
+    if np.abs(openness).max() > 1e-9 * h * h or off > _OFF * h:
+        row["verdict"] = "failed"
+        row["complaints"] += f" walls are off by {off / h:.2f} h, cells are open by {np.abs(openness).max():.1e}"
+    if not row["ok"]:
+        row["complaints"] = "; ".join(
+            [row["complaints"], *(str(w.message) for w in caught if "checkMesh" in str(w.message))]
+        )
+    return row
+
+
+def _serve(numbers: Any, options: argparse.Namespace) -> None:
+    """Measure the random solids whose numbers come through a pipe, in a process of its own."""
+    adapter = make_adapter(options)
+    while True:
+        numbers.send(measure_boolean(adapter, numbers.recv(), options.cells))
+
+
+def measure_booleans(options: argparse.Namespace, report: Report) -> str:
+    """Add a row for each random solid, and return how many have each verdict."""
+    context, worker, pipe = multiprocessing.get_context("spawn"), None, None
+    for number in counts(options.only) or range(options.booleans):
+        if worker is None or pipe is None:
+            pipe, end = context.Pipe()
+            worker = context.Process(target=_serve, args=(end, options), daemon=True)
+            worker.start()
+            end.close()
+        row: dict[str, Any] = {"solid": number, "cells": 0, **dict.fromkeys(_EMPTY, float("nan"))}
+        pipe.send(number)
+        try:
+            if pipe.poll(options.limit):
+                row |= pipe.recv()
+            else:
+                row |= {"verdict": "failed", "complaints": f"no end within {options.limit} s"}
+        except EOFError:
+            row |= {"verdict": "failed", "complaints": "the process crashed"}
+        if row["verdict"] == "failed":
+            worker.kill()
+            worker = None
+        report.add(row, f"{number}: {row['verdict']} {row['complaints'][:160]}")
+    verdicts = [row["verdict"] for row in report.records]
+    return ", ".join(f"{verdicts.count(v)} {v}" for v in ("accepted", "rejected", "refused", "failed"))
 
 
 SPEED_COLUMNS = {
@@ -198,7 +283,8 @@ def main() -> None:
     options_of.add_argument("--seeds", type=int, default=0, metavar="N", help="one run with each of 1 to N")
     options_of.add_argument("--resolutions", default="0,1", metavar="NUMBERS", help="0: coarse, 1: fine")
     options_of.add_argument("--booleans", type=int, default=0, metavar="N", help="random solids in place of those")
-    options_of.add_argument("--size", type=float, default=0.12, help="of the cells of random solids")
+    options_of.add_argument("--cells", type=int, default=1500, metavar="N", help="of each random solid, about")
+    options_of.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="for each random solid")
     options_of.add_argument("--speed", default="", metavar="NUMBERS", help="processor times of so many cells")
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
@@ -217,15 +303,15 @@ def main() -> None:
     if shutil.which("checkMesh") is None:
         raise SystemExit("checkMesh is not installed; Debian has it in the package openfoam")
     adapter = make_adapter(options)
+    if options.booleans:
+        report = Report(options.json, BOOLEAN_COLUMNS)
+        return report.finish(heading(adapter, measure_booleans(options, report)))
     report = Report(options.json, COLUMNS)
     levels = [int(k) for k in names(options.resolutions)]
     cases: list[tuple[str, Any, float]] = []
-    if options.booleans:
-        cases = [(f"boolean {k}", lambda k=k: random_part(k), options.size) for k in range(options.booleans)]
-    else:
-        for name in names(options.only) or SHAPES:
-            make, sizes = SHAPES[name]
-            cases += [(name, make, sizes[k]) for k in levels]
+    for name in names(options.only) or SHAPES:
+        make, sizes = SHAPES[name]
+        cases += [(name, make, sizes[k]) for k in levels]
     runs = [(run, settings_of(run)) for run in names(options.runs)]
     seeds = [{"seed": k + 1} for k in range(options.seeds)] or [{}]
     for name, make, h in cases:

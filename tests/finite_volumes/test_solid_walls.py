@@ -5,7 +5,7 @@ import pytest
 
 import clvoro
 from clvoro.finite_volumes.solid_walls.mend import _best_halves, without_cells
-from clvoro.finite_volumes.solid_walls.mesh import diagram_of, outer_generators, solid_diagram
+from clvoro.finite_volumes.solid_walls.mesh import diagram_of, off_middle, outer_generators, solid_diagram
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
 from clvoro.mesh.connectivity import following
 
@@ -165,6 +165,26 @@ def test_a_crease_that_cannot_be_followed_is_left_out(ctx):
         d = solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h))
     assert d.check("openfoam")
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=0.01)
+
+
+def test_a_plate_thinner_than_a_cell_keeps_its_cells(ctx):
+    """Spread across it, its generators have cells that OpenFOAM accepts, but for those with few neighbors."""
+    solid, rng = clvoro.Solid.box((0, 0, 0), (2, 2, 0.7 * H)), np.random.default_rng(1)
+    k = np.arange(H / 2, 2, H)
+    x = np.stack(np.meshgrid(k, k, [0.35 * H], indexing="ij"), axis=-1).reshape(-1, 3)
+    x[:, :2] += rng.uniform(-0.2, 0.2, (len(x), 2)) * H
+    h = np.full(len(x), H)
+    moved = off_middle(WallSurface(solid), x, h)
+    assert 0.05 < np.abs(moved - x)[:, 2].max() / H < 0.2
+    thin = []
+    for points in (x, moved):
+        with pytest.warns(clvoro.errors.MismatchWarning, match="as thin as the solid"):
+            d = solid_diagram(WallSurface(solid), points, h, whole_faces(ctx, solid, points, h))
+        assert len(d) == len(x)
+        assert d.volumes.sum() == pytest.approx(solid.measure, rel=1e-9)
+        thin.append(np.count_nonzero(d.faces.measures.determinant < 1e-3))
+    assert thin[0] == len(x)
+    assert thin[1] < 0.25 * len(x)
 
 
 def test_cells_that_are_left_out_become_walls(made):

@@ -32,6 +32,10 @@ _CLEAR = 1.4
 EXACT, CUT, FILLED, ROUNDED = range(4)
 """How the walls of a cell are made: with all creases; with cuts along concave creases; without concave creases; without
 creases. Each next one makes more cells convex, and leaves out more of the surface."""
+_THIN, _ACROSS = 0.7, 0.35
+"""A part of a solid is thin if both walls are nearer to a generator than this share of h; how far generators are spread
+across it, over h."""
+_GOLDEN = (5**0.5 - 1) / 2
 _SLIVER, _TIP = 0.05, 0.4
 """Rejected cells at walls, and those with neighbors on one side only, with a smaller volume over h^3 are left out."""
 _FEW = 0.03
@@ -96,6 +100,33 @@ def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray
     return placed[clear]
 
 
+def off_middle(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return the generators with those in parts as thin as a cell moved a little across, in turn to both sides.
+
+    Where all stand halfway between two walls, the normals of all faces between cells lie in one plane. OpenFOAM rejects
+    such cells.
+
+    Parameters
+    ----------
+    surface : WallSurface
+    points : (n, 3) float
+        Generators inside.
+    sizes : (n,) float
+        h at the generators.
+    """
+    near = np.flatnonzero(surface.touches(points, _THIN * sizes))
+    foot, distance = surface.closest(points[near])[1:]
+    kept = (distance < -0.05 * sizes[near]) & (distance > -_THIN * sizes[near])
+    near, foot, distance = near[kept], foot[kept], distance[kept]
+    across = (points[near] - foot) / -distance[:, None]
+    thin = surface.closest(points[near] + _THIN * sizes[near, None] * across)[2] > 0
+    near, across, distance = near[thin], across[thin], distance[thin]
+    share = (_GOLDEN * np.arange(len(near)) % 1)[:, None] - 0.5
+    moved = points.copy()
+    moved[near] += share * np.minimum(_ACROSS * sizes[near], -distance)[:, None] * across
+    return moved
+
+
 def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Faces) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
 
@@ -125,7 +156,12 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
     best, kept = None, walls
     since = 0
     while since < _PATIENCE:
-        made = _made(surface, near, walls)
+        try:
+            made = _made(surface, near, walls)
+        except InputError:  # a simpler cell of a thin part may be nothing
+            if best is None:
+                raise
+            break
         if best is not None and made.is_like(best):
             # Without creases there the next attempts are the same.
             places = made.faces.generators[made.rejected]
@@ -151,7 +187,7 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
             near.generators[kept >= FILLED],
             "cells at {} leave out creases or corners, of which several meet within a cell",
         ),
-        (rejected, "cells at {} are concave or inverted, and OpenFOAM does not accept them"),
+        (rejected, "cells at {} are concave, inverted, or as thin as the solid, and OpenFOAM does not accept them"),
     ):
         if len(rows):
             place = format_point(rows[0]) + (" and elsewhere" if len(rows) > 1 else "")

@@ -173,10 +173,11 @@ def _may_reach(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, face
     starts, corners = take_rows(faces.starts, faces.corners, rows)
     owner, neighbor = faces.owner[rows], faces.neighbor[rows]
     away = faces.points[corners] - np.repeat(points[owner], np.diff(starts), axis=0)
-    farthest = np.maximum.reduceat(np.einsum("vd,vd->v", away, away), starts[:-1])
-    reach = np.zeros(n)
+    farthest = np.maximum.reduceat(np.einsum("vd,vd->v", away, away), starts[:-1]) if len(rows) else np.zeros(0)
+    reach = np.full(n, -1.0)
     for cells in (owner, neighbor):
         np.maximum.at(reach, cells, farthest)
+    reach[reach < 0] = np.inf  # a cell without neighbors ends at walls only
     found = np.zeros(n, bool)
     cells = np.flatnonzero(near[:n])
     found[cells] = surface.touches(points[cells], np.sqrt(reach[cells]) + 0.1 * sizes[cells])

@@ -19,14 +19,11 @@ class WallPolygons:
     cell, patch : list of int
     loops : list of list of int
         Corners, counter-clockwise as seen from outside of the cell.
-    odd : list of int
-        Cells whose loop could not be divided by creases.
     """
 
     cell: list[int] = field(default_factory=list)
     patch: list[int] = field(default_factory=list)
     loops: list[list[int]] = field(default_factory=list)
-    odd: list[int] = field(default_factory=list)
 
     def add(self, cell: int, patch: int, loop: list[int]) -> None:
         """Add a face, unless it has no area."""
@@ -127,7 +124,7 @@ class Divider:
         while len(runs) > 2:
             done = self._cut_by_corner(cell, runs, corners) or self._cut_between(cell, runs)
             if not done:
-                self.polygons.odd.append(cell)
+                # No crease divides this loop: its shortest run becomes a polygon.
                 k = min(range(len(runs)), key=lambda i: len(runs[i][1]))
                 add(cell, runs[k][0], runs[k][1])
                 _replace(runs, k, [runs[k][1][0], runs[k][1][-1]])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pyopencl.array as cla
 
-from ...finite_volumes.solid_walls.mesh import outer_generators, solid_diagram
+from ...finite_volumes.solid_walls.mesh import off_middle, outer_generators, solid_diagram
 from ...finite_volumes.solid_walls.wall_surface import WallSurface
 from ...geometry.box import Box
 from ...geometry.domain import Domain
@@ -43,6 +43,7 @@ def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarr
         If round-off has made cells wrong, or the solid is too thin for the size of cells.
     """
     surface = WallSurface(domain, SurfaceSearch(engine, domain, domain.wall_triangles).nearest)
+    points = off_middle(surface, points, sizes)
     outer = outer_generators(surface, points, sizes)
     reach = _MARGIN * sizes.max()
     box = Box(tuple(np.subtract(domain.lower, reach).tolist()), tuple(np.add(domain.upper, reach).tolist()))

@@ -69,7 +69,7 @@ def test_stations_follow_the_sizes_along_a_crease():
 
 def test_generators_make_room_where_a_wall_meets_the_crease_at_a_small_angle():
     sheared = L.surface.vertices + np.outer(L.surface.vertices[:, 0], [0, 0, 0.9])
-    solid = Solid.from_arrays(sheared, L.surface.triangles)
+    solid = Solid(sheared, L.surface.triangles)
     stations = solid.stations(lambda x: np.full(len(x), 0.2))
     assert len(stations.left_out) == 0
     assert (solid.signed_distance(stations.points) < -0.04).all()
