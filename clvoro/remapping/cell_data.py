@@ -205,8 +205,7 @@ def _require_cover(covered: np.ndarray) -> None:
     worst = int(off.argmax())
     if off[worst] > COVER_TOLERANCE:
         raise ClvoroError(
-            f"the intersections of new cell {worst} with old cells fill {covered[worst]:.6g} of it, expected 1: one of "
-            "the meshes is not the Voronoi diagram of its points; call diagram.check() on both"
+            f"the intersections of new cell {worst} with old cells fill {covered[worst]:.6g} of it, expected 1"
         )
 
 

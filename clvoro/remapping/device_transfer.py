@@ -190,8 +190,8 @@ class ConservativeTransfer:
         failed = np.flatnonzero(status == FAILED)
         if failed.size:
             raise InputError(
-                f"cell {cells[failed[0]]} ({failed.size} in all) cannot be rebuilt from its neighbors, expected "
-                f"Voronoi diagrams of distinct generators: call diagram.check() on {what}"
+                f"cell {cells[failed[0]]} of {what} ({failed.size} in all) cannot be built from its faces, expected "
+                "Voronoi diagrams of distinct generators"
             )
         large, most = np.flatnonzero(status == PIECE_LARGE), MOST_FACES[self.engine.cell_dim]
         if large.size and 2 * self._faces > most:
