@@ -11,7 +11,7 @@ of cells, mean |e| of the sizes and mean isoperimetric quotient, the largest and
 skewness, the number of concave cells, the volume of all cells over that of the solid, and the verdict.
 
 --runs is a list of efforts and "exact". `--speed NUMBERS` compares processor times for so many cells in a cube as a
-box, as a solid, and around a wavy body of 100,000 triangles in it, with the default effort: those of the run, of the
+box, as a solid, and around a wavy body of 82,000 triangles in it, with the default effort: those of the run, of the
 mesh with its faces, and of the mesh for solvers. Memory is the most up to then of the whole process. `--domains`
 chooses some of the three. `--order SIZES` compares volume and wall area of a ball, a torus and a cylinder with those of
 their surface, and its distance from the vertices of walls with h^2 times the curvature.
@@ -63,11 +63,11 @@ COLUMNS = {
 
 
 BODY_EDGE = 0.0172
-"""Length of triangles of a ball over its radius, so that they are 100,000."""
+"""Length of triangles of a ball over its radius: they are 82,000."""
 
 
 def wavy_body() -> clvoro.Solid:
-    """Return a ball with waves, of 100,000 triangles."""
+    """Return a ball with waves, of 82,000 triangles."""
     ball = clvoro.Solid.ball((0, 0, 0), 1, edge=BODY_EDGE).surface
     waves = 1 + 0.1 * np.sin(5 * ball.vertices).prod(axis=1)
     return clvoro.Solid(0.5 + 0.25 * waves[:, None] * ball.vertices, ball.triangles)
