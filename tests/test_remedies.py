@@ -640,10 +640,6 @@ ROWS = [
         lambda t: t.run(clvoro.Solid.box((0, 0, 0), (1, 1, 1e-3)), 0.5),
         lambda t: t.run(clvoro.Solid.box((0, 0, 0), (1, 1, 1)), 0.5),
     ),
-    (
-        lambda t: t.run(clvoro.Solid(CORNERS, TRIANGLES), 1000),
-        lambda t: t.run(clvoro.Solid(CORNERS * 1000, TRIANGLES), 500),
-    ),
     # Case files and the command.
     (lambda t: t.job(CASE, walls="exact"), lambda t: t.job(CASE, walls="exact", mesh_formats=("openfoam",))),
     (
