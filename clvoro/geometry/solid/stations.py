@@ -11,7 +11,7 @@ generators in the walls there complete the corner.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
 _CLEAR = 1.06  # radius in which no other generators are, over that of the sphere
 _ROOM = 0.5  # of h: least distance of generators that are not the same
 _WALL = 0.3  # of h: least distance of generators from walls
-_NEAR = 0.2  # of h: the same for those that had to make room
-_OTHERS = ((0, 0.8), (2, 1.0), (2, 0.8), (2, 0.6), (2, 0.45))  # number, 0 for the usual one, and share of the distance
-_SHIFTS = (0.0, 0.25, -0.25)  # along a chord, over its length
 _SAMPLES = 8  # of 1 / h per step, at least
 _FEWEST = 64  # samples per chain, at least
 _MOST = 1 << 16
@@ -114,7 +111,7 @@ def place_stations(solid: Solid, size: Callable[[np.ndarray], np.ndarray]) -> St
     for chain in chains:
         placing.add(chain)
     placing.join()
-    placing.make_room()
+    placing.leave_out()
     placing.complete()
     return placing.stations()
 
@@ -148,37 +145,25 @@ class _Chain:
         sine, cosine = (np.cross(self.left, right) * self.ways).sum(axis=1), (self.left * right).sum(axis=1)
         self.angle = math.pi - np.arctan2(sine, cosine)
         self.count = np.maximum(2, np.rint(self.angle / (math.pi / 2))).astype(int)
-        radii = np.hypot(_reach(self.h, self.angle, self.count), 0.5 * self.lengths)
+        half = 0.5 * self.angle / self.count
+        # A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
+        reach = self.h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3
+        radii = np.hypot(reach, 0.5 * self.lengths)
         before, after = (radii[-1:], radii[:1]) if self.line.closed else (radii[:1], radii[-1:])
         self.radii = 0.5 * (np.append(before, radii) + np.append(radii, after))
 
     def around(self, i: int) -> np.ndarray:
         """Return the generators beside chord `i`, (k, 3)."""
-        (r, q), length = self.radii[i : i + 2], self.lengths[i]
+        (r, q), length, way = self.radii[i : i + 2], self.lengths[i], self.ways[i]
         foot = 0.5 * (length + (r * r - q * q) / length)
-        return self._sectors(i, self.count[i], foot, math.sqrt(max(r * r - foot * foot, 0.0)))
-
-    def others(self, i: int) -> Iterator[np.ndarray]:
-        """Return other places for the generators beside chord `i`, (k, 3) each, the best first."""
-        for shift in _SHIFTS:
-            for number, share in _OTHERS:
-                count = number or self.count[i]
-                reach = share * _reach(self.h[i], self.angle[i], count)
-                yield self._sectors(i, count, (0.5 + shift) * self.lengths[i], reach)
-
-    def _sectors(self, i: int, count: int, foot: float, reach: float) -> np.ndarray:
-        """Return generators in the middle of `count` equal sectors around chord `i`, at `reach` from it."""
-        turn = (np.arange(count) + 0.5) * (self.angle[i] / count)
-        across = np.cross(self.left[i], self.ways[i])
-        ways = np.cos(turn)[:, None] * across - np.sin(turn)[:, None] * self.left[i]
-        return self.nodes[i] + foot * self.ways[i] + reach * ways
-
-
-def _reach(h: np.ndarray, angle: np.ndarray, count: np.ndarray | int) -> np.ndarray:
-    """Return how far from a crease the generators of cells of size h stand."""
-    # A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
-    half = 0.5 * angle / count
-    return h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3
+        height = math.sqrt(max(r * r - foot * foot, 0.0))
+        turn = (np.arange(self.count[i]) + 0.5) * (self.angle[i] / self.count[i])
+        across = np.cross(self.left[i], way)
+        return (
+            self.nodes[i]
+            + foot * way
+            + height * (np.cos(turn)[:, None] * across - np.sin(turn)[:, None] * self.left[i])
+        )
 
 
 def _divide(line: Line, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -219,8 +204,7 @@ class _AroundCreases:
     def __init__(self, solid: Solid) -> None:
         self.solid = solid
         self.points, self.sizes, self.chains = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
-        self.chords: list[tuple[_Chain, int]] = []
-        self.chord = np.zeros(0, np.int64)  # of each generator
+        self.spots = np.zeros((0, 3))  # the middle of the chord of each generator
         self.balls: list[list[int]] = []  # of each generator
         self.centers: list[np.ndarray] = []
         self.radii: list[float] = []
@@ -234,13 +218,12 @@ class _AroundCreases:
         self.points = np.vstack([self.points, *(chain.around(i) for i in range(len(chain.h)))])
         self.sizes = np.append(self.sizes, chain.h[chord])
         self.chains = np.append(self.chains, np.full(len(chord), chain.number))
-        self.chord = np.append(self.chord, len(self.chords) + chord)
-        self.chords += [(chain, i) for i in range(len(chain.h))]
+        self.spots = np.vstack([self.spots, chain.line.along(chain.line.points, chain.middle)[chord]])
         self.balls += [[first + i, first + i + 1] for i in chord.tolist()]
 
     def keep(self, kept: np.ndarray) -> None:
         self.points, self.sizes, self.chains = self.points[kept], self.sizes[kept], self.chains[kept]
-        self.chord = self.chord[kept]
+        self.spots = self.spots[kept]
         self.balls = [balls for balls, k in zip(self.balls, kept.tolist(), strict=True) if k]
 
     def join(self) -> None:
@@ -277,42 +260,18 @@ class _AroundCreases:
             point = point - np.linalg.lstsq(way / distance[:, None], distance - radii, rcond=1e-6)[0]
         return point
 
-    def make_room(self) -> None:
-        """Place generators near others, near walls, or outside anew, or leave them out; note their places on creases.
-
-        Without one of them, faces between the others may lie in a wall beyond the crease: all of a chord move together.
-        """
+    def leave_out(self) -> None:
+        """Leave out generators near others, near walls, or outside; note their places on creases."""
         if not len(self.points):
             return
         keep = -self.solid.signed_distance(self.points) > _WALL * self.sizes
         for i, j in self.near_pairs():
             if keep[i] and keep[j]:
                 keep[j] = False
-        crowded = np.unique(self.chord[~keep])
-        balls = {int(c): b for c, b in zip(self.chord, self.balls, strict=True)}
-        self.keep(~np.isin(self.chord, crowded))
-        lost = [np.zeros((0, 3))]
-        for c in crowded.tolist():
-            chain, i = self.chords[c]
-            for points in chain.others(i):
-                if self._has_room(points, chain.h[i]):
-                    self.points = np.vstack([self.points, points])
-                    self.sizes = np.append(self.sizes, np.full(len(points), chain.h[i]))
-                    self.chains = np.append(self.chains, np.full(len(points), chain.number))
-                    self.chord = np.append(self.chord, np.full(len(points), c))
-                    self.balls += [balls[c]] * len(points)
-                    break
-            else:
-                lost.append(chain.line.along(chain.line.points, chain.middle[i : i + 1]))
-        self.lost = np.concatenate(lost)
-
-    def _has_room(self, points: np.ndarray, h: float) -> bool:
-        """Return whether `points` (k, 3) are inside and away from walls, from others, and from each other."""
-        if (-self.solid.signed_distance(points) < _NEAR * h).any():
-            return False
-        apart = np.linalg.norm(points[:, None] - np.vstack([points, self.points]), axis=2)
-        apart[:, : len(points)][np.diag_indices(len(points))] = np.inf
-        return bool(apart.min() > _ROOM * h)
+        # Without one of them, faces between the others may lie in a wall beyond the crease: all leave together.
+        self.lost, spot = np.unique(self.spots[~keep], axis=0), np.unique(self.spots, axis=0, return_inverse=True)[1]
+        keep &= ~np.isin(spot, spot[~keep])
+        self.keep(keep)
 
     def complete(self) -> None:
         """Add the mirror images of generators at corners in the walls there."""

@@ -67,16 +67,6 @@ def test_stations_follow_the_sizes_along_a_crease():
     assert len(stations) == 3 * len(z)
 
 
-def test_generators_make_room_where_a_wall_meets_the_crease_at_a_small_angle():
-    sheared = L.surface.vertices + np.outer(L.surface.vertices[:, 0], [0, 0, 0.9])
-    solid = Solid(sheared, L.surface.triangles)
-    stations = solid.stations(lambda x: np.full(len(x), 0.2))
-    assert len(stations.left_out) == 0
-    assert (solid.signed_distance(stations.points) < -0.04).all()
-    crease = np.column_stack([np.ones((99, 2)), 0.9 + np.linspace(0.01, 0.99, 99)])
-    assert ties(stations, crease, 2) == pytest.approx(1, abs=1e-9)
-
-
 def test_places_without_room_are_reported():
     """Above a ledge that is narrower than the cells, and in a run."""
     ledge = Polygon([(0, 0), (1.05, 0), (1.05, 1), (1, 1), (1, 2), (0, 2)])
