@@ -1,9 +1,13 @@
 """Meshes of solids: cells that end at a triangulated surface."""
 
+import contextlib
+
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 import clvoro
+from clvoro.errors import InputError
 from clvoro.finite_volumes.solid_walls.mend import _best_halves, without_cells
 from clvoro.finite_volumes.solid_walls.mesh import diagram_of, off_middle, outer_generators, solid_diagram
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
@@ -210,3 +214,15 @@ def test_a_bent_wall_polygon_is_split_along_its_bend():
     bent = np.array([(0, 0, 0), (1, 0, 0), (2, 0, -0.5), (2, 1, -0.5), (1, 1, 0), (0, 1, 0)], float)
     floor = np.array([(1, 0.5, -2)], float)
     assert _best_halves(bent, floor, np.array([(0, 0, -1.0)]), np.array([1, 0.5, -1.0])) == (1, 4)
+
+
+@pytest.mark.parametrize("seed", [0, 47, 63, 69, 93])
+def test_few_cells_in_thin_solids(ctx, seed):
+    """They are meshed, or refused with a place, also if there are fewer cells than walls."""
+    rng = np.random.default_rng(seed)
+    points = rng.random((6, 3)) * (1, 1, 0.2)
+    solid = clvoro.Solid(points, ConvexHull(points).simplices, repair=True)
+    inside = rng.random((400, 3)) * (1, 1, 0.2)
+    inside = inside[solid.contains(inside)][:3]
+    with contextlib.suppress(InputError):
+        assert clvoro.Adapter(ctx).diagram(solid, inside).solver_mesh().n_cells <= 3

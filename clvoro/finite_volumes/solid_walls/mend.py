@@ -63,7 +63,7 @@ def rejected_at_walls(faces: Faces) -> tuple[np.ndarray, np.ndarray]:
     cells, part = np.flatnonzero(rings[2]), faces.part(rings[2])[0]
     # Faces of other cells are those of the diagram.
     at_wall = rings[0][cells]
-    judged = np.flatnonzero(at_wall[part.owner] | (at_wall[part.neighbor] & (part.neighbor >= 0)))
+    judged = np.flatnonzero(at_wall[part.owner] | (at_wall[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
     rows = np.flatnonzero(rejected_cells(part, judged) & rings[1][cells])
     return cells[rows], part.measures.determinant[rows] < LEAST_DETERMINANT
 

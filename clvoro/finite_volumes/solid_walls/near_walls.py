@@ -130,7 +130,9 @@ class NearWalls:
         place[new] = len(whole.points) + np.arange(len(new))
         owner = np.concatenate([number[whole.owner[kept]], numbers[made.owner[mine]]])
         wall = made.neighbor[mine]
-        neighbor = np.concatenate([number[whole.neighbor[kept]], np.where(wall < 0, wall, numbers[wall])])
+        neighbor = np.concatenate(
+            [number[whole.neighbor[kept]], np.where(wall < 0, wall, numbers[np.maximum(wall, 0)])]
+        )
         between = np.flatnonzero(neighbor >= 0)
         # Two sorted lists: that is fast to complete.
         order = between[np.argsort(owner[between] * (count + len(home)) + neighbor[between], kind="stable")]
