@@ -148,3 +148,17 @@ def test_a_part_of_a_solid_overlaps_its_other_meshes(ctx):
     grid = in_box(adapter, (-1.1, -1.1, -1.1), (1.1, 1.1, 1.1), 60)
     shares = old.transfer(np.ones(len(old)), grid, covered=True)[1]
     assert (shares * grid.volumes).sum() == pytest.approx(old.volumes.sum(), rel=2e-3)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_power_diagrams_keep_mass_and_constants(ctx, dim):
+    """Some of their cells are empty, and some do not contain their generators."""
+    box, rng = clvoro.Box((0,) * dim, (1,) * dim, periodic=True), np.random.default_rng(4)
+    power = clvoro.power_diagram(box, rng.random((90, dim)), rng.uniform(0, 0.02 * (dim - 1) ** 2, 90))
+    other = clvoro.Adapter(ctx).diagram(box, rng.random((60, dim)))
+    assert len(power.empty_cells)
+    for old, new in ((power, other), (other, power)):
+        values = np.column_stack([np.full(len(old), 3.0), rng.random(len(old))])
+        got = old.transfer(values, new, 2)
+        assert got[:, 0] == pytest.approx(3.0, rel=1e-12)
+        assert new.volumes @ got[:, 1] == pytest.approx(old.volumes @ values[:, 1], rel=1e-12)
