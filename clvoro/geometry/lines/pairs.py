@@ -436,6 +436,8 @@ def _divide(network: Network, size: Callable[[np.ndarray], np.ndarray]) -> tuple
     """Divide chains at their corners; return the nodes (n, 2), at which pieces end, and the pieces."""
     nodes, pieces = list(network.nodes), []
     for chain, (begin, end) in zip(network.chains, network.ends.tolist(), strict=True):
+        if begin == end and len(chain) == 2:  # straight from one periodic side to the other
+            chain = np.insert(chain, 1, chain.mean(axis=0), axis=0)
         along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(chain, axis=0).T))])
         h = np.asarray(size(chain), float)
         cuts = [0, *_corners_of(chain, along, h).tolist(), len(chain) - 1]
