@@ -369,7 +369,7 @@ inline REAL4 half_space(const chart_t *chart, REAL reach, const pieces_t *mesh, 
 {
     const int q = mesh->items[k];
     const REAL4 own = load_vector(mesh->origins, j), there = load_vector(mesh->points, q);
-    const REAL4 low = j < q ? own : there, high = j < q ? there : own;
+    const REAL4 low = j > q ? there : own, high = j > q ? own : there;
     const REAL4 a = low + shift - chart->at, b = high + shift - chart->at;
     REAL4 normal = high - low;
     *level = dot_vectors(normal, a + b) / 2;

@@ -120,9 +120,10 @@ class Subdomain(Domain):
 
     def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the normals (k, d) of `walls` (k,) near `points` (k, d), and the distances (k,) to them."""
-        normals, gaps = super().toward_walls(walls, points)
-        own = ~self.removed_behind(walls)
-        normals[own], gaps[own] = self.whole.toward_walls(walls[own], points[own])
+        cut = self.removed_behind(walls)
+        normals, gaps = np.zeros((len(walls), self.dim)), np.zeros(len(walls))
+        normals[~cut], gaps[~cut] = self.whole.toward_walls(walls[~cut], points[~cut])
+        normals[cut], gaps[cut] = super().toward_walls(walls[cut], points[cut])
         return normals, gaps
 
     def wall_distance(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -503,7 +503,7 @@ class Diagram(MeshOutput):
             domains the mass in their common part is kept. Where this mesh covers nothing, the value is NaN.
         (n_new,) float64
             With `covered`, the share of each new cell that this mesh covers, from 0 to 1. Between meshes of one domain
-            it is 1. At curved walls of a solid cells are bounded by planes, and the share is that of their overlap
+            it is 1. At the walls of a solid cells end at their own faces, and the share is that of their overlap
             (0.97 to 1 in a ball of 500 to 8000 cells, ``bench/transfer.py --on ball``); the mass is kept all the same,
             and a new cell that overlaps none has the value of the nearest old one.
 

@@ -140,6 +140,10 @@ def _intersected(
     means = space.place(source.centroids)
     if domain.curved:
         means[parts[0].cells] = measures.centroids
+    elif domain.curved_walls:  # as the pieces have them, so that slopes add no mass
+        moments = parts[0].summed(measures.volumes[:, None] * measures.centroids, len(source))
+        volumes = parts[0].summed(measures.volumes, len(source))
+        means = np.where(volumes[:, None] > 0, moments / np.maximum(volumes, 1e-300)[:, None], means)
     values = engine.upload(columns)
     data = CellData(engine.upload(old.pieces.cells, np.int32), values, values, values, engine.upload(means))
     periods = np.where(domain.periodic, domain.extent, 0) / space.scale

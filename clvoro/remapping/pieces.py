@@ -13,13 +13,15 @@ from ..mesh.lookup import cell_shapes
 
 _STRAIGHT = 1e-9
 """Share of a cell up to which a corner that points inwards counts as straight."""
+_FLAT = 1e-6
+"""Distance of corners from the plane of a face, as a share of the cell's width, up to which it counts as plane."""
 _ON_WALL = 1e-3
 """Distance from a wall, as a share of the cell's width, below which a generator counts as on it."""
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """Convex pieces of cells: one of each cell, or triangles of a cell that is not convex.
+    """Convex pieces of cells: one of each cell, or triangles and pyramids of one that is not convex or has bent faces.
 
     Attributes
     ----------
@@ -108,19 +110,86 @@ def _between_bisectors(diagram: Diagram) -> Pieces:
     alone = np.flatnonzero(alone)
     own, normal = owner[alone], normals[alone]
     gap = gaps[alone] + ((diagram.points[own] - origins[own]) * normal).sum(axis=1)
-    cells = np.flatnonzero(filled)
     neighbors[alone] = n + np.arange(len(alone))
     points = np.concatenate([diagram.points, origins[own] + 2 * gap[:, None] * normal])
-    starts = np.append(diagram.neighbor_starts[:-1][filled], len(neighbors))
-    return Pieces(cells, origins[cells], points, starts, neighbors)
+    if not diagram.domain.curved_walls:
+        cells = np.flatnonzero(filled)
+        starts = np.append(diagram.neighbor_starts[:-1][filled], len(neighbors))
+        return Pieces(cells, origins[cells], points, starts, neighbors)
+    bent = _bent_cells(diagram)
+    cells = np.flatnonzero(filled & ~bent)
+    starts, items = take_rows(diagram.neighbor_starts, neighbors, cells)
+    parts = _pyramids(diagram, np.flatnonzero(bent[owner]))
+    cells, order = np.concatenate([cells, parts.cells]), np.argsort(np.concatenate([cells, parts.cells]), kind="stable")
+    starts = np.concatenate([starts, starts[-1] + parts.starts[1:]])
+    items = np.concatenate([items, len(points) + parts.items])
+    origins = np.concatenate([origins[cells[: len(cells) - len(parts)]], parts.origins])
+    points = np.concatenate([points, parts.points])
+    return Pieces(cells[order], origins[order], points, *take_rows(starts, items, order))
+
+
+def _bent_cells(diagram: Diagram) -> np.ndarray:
+    """Return which cells of a solid have a face with corners off its bisector or wall: (n,) bool."""
+    face, owner = (
+        np.repeat(np.arange(len(diagram.neighbors)), np.diff(diagram.face_vertex_starts)),
+        face_owners(diagram),
+    )
+    normals, gaps = _planes(diagram, np.arange(len(diagram.neighbors)))
+    corners = diagram.vertices[diagram.face_vertices] - diagram.points[owner[face]]
+    off = np.abs((corners * normals[face]).sum(axis=1) - gaps[face]) > _FLAT * np.cbrt(diagram.volumes[owner[face]])
+    return np.bincount(owner[face], off, len(diagram)) > 0
+
+
+def _pyramids(diagram: Diagram, faces: np.ndarray) -> Pieces:
+    """Return the parts of cells between half-faces (k,) and centroids of the cells: pyramids over flat convex faces.
+
+    Over other faces they are tetrahedra, with the centroid of the face as a corner, as volumes of cells are defined.
+    """
+    starts, items = take_rows(diagram.face_vertex_starts, diagram.face_vertices, faces)
+    face, after = np.repeat(np.arange(len(faces)), np.diff(starts)), following(starts)
+    owner = face_owners(diagram)[faces]
+    apex, middle, width = diagram.centroids[owner], diagram.face_centroids[faces], np.cbrt(diagram.volumes[owner])
+    corners = diagram.vertices[items]
+    area = np.add.reduceat(np.cross(corners - middle[face], corners[after] - middle[face]), starts[:-1])
+    normal = area / np.maximum(np.linalg.norm(area, axis=1), 1e-300)[:, None]
+    edges = corners[after] - corners
+    off = np.abs(((corners - middle[face]) * normal[face]).sum(axis=1)) > _FLAT * width[face]
+    off |= (np.cross(edges, edges[after]) * normal[face]).sum(axis=1) < -((_FLAT * width[face]) ** 2)
+    flat = np.bincount(face, off, len(faces)) == 0
+    heights = np.cross(corners - middle[face], corners[after] - middle[face])
+    volumes = ((middle - apex)[face] * heights).sum(axis=1) / 6
+    # Each edge has a piece of its own, or that of its flat face; pieces without a volume are left out.
+    piece = np.where(flat[face], starts[face], np.arange(len(face)))
+    kept = np.bincount(piece, volumes, len(face))[piece] > _FLAT**2 * diagram.volumes[owner][face]
+    kept &= np.linalg.norm(edges, axis=1) > _FLAT * width[face]
+    rows, own = np.unique(piece[kept], return_inverse=True)
+    of, single = face[rows], ~flat[face[rows]]
+    origins = 0.75 * middle[of] + 0.25 * apex[of]
+    origins[single] = (apex[of] + middle[of] + corners[rows] + corners[after[rows]])[single] / 4
+    kept, tops, alone = np.flatnonzero(kept), apex[of], rows[single]
+    through = [apex[face[kept]], middle[of], tops[single], tops[single]]
+    across = [
+        np.cross(corners[kept] - through[0], corners[after[kept]] - through[0]),
+        np.where(single[:, None], heights[rows], area[of]),
+        np.cross(middle[of][single] - tops[single], corners[alone] - tops[single]),
+        np.cross(middle[of][single] - tops[single], corners[after[alone]] - tops[single]),
+    ]
+    behind = np.concatenate([own, np.arange(len(rows)), np.flatnonzero(single), np.flatnonzero(single)])
+    normals = np.concatenate(across)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    gaps = ((np.concatenate(through) - origins[behind]) * normals).sum(axis=1)
+    counts = np.bincount(behind, minlength=len(rows))
+    return Pieces(
+        owner[of],
+        origins,
+        origins[behind] + 2 * gaps[:, None] * normals,
+        np.append(0, np.cumsum(counts)),
+        np.argsort(behind, kind="stable"),
+    )
 
 
 def _planes(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals (k, 3) of half-faces (k,), and their distances (k,) from the generators.
-
-    Faces at curved walls have corners there and are not plane. The plane passes through the centroid, normal to the
-    vector area; where that leads away from the wall, it touches the wall.
-    """
+    """Return unit normals (k, 3) of half-faces (k,), and their distances (k,) from the generators."""
     behind, walls = diagram.neighbors[faces] < 0, -1 - diagram.neighbors[faces]
     own = diagram.points[face_owners(diagram)[faces]]
     between = neighbor_points(diagram, faces[~behind]) - own[~behind]
@@ -129,15 +198,4 @@ def _planes(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray
     normals[~behind] = between / lengths[:, None]
     gaps[~behind] = plane_shares(diagram, faces[~behind]) * lengths
     normals[behind], gaps[behind] = diagram.domain.toward_walls(walls[behind], own[behind])
-    at = np.flatnonzero(behind & diagram.domain.curved_walls)
-    if at.size:
-        corners, starts, wall = diagram.face_vertices, diagram.face_vertex_starts, faces[at]
-        areas = np.cross(diagram.vertices[corners], diagram.vertices[corners[following(starts)]])
-        areas = np.add.reduceat(areas, starts[:-1])[wall]
-        flat = areas / np.maximum(np.linalg.norm(areas, axis=1), 1e-300)[:, None]
-        along = (flat * normals[at]).sum(axis=1)
-        flat *= np.sign(along)[:, None]
-        away = ((diagram.face_centroids[wall] - own[at]) * flat).sum(axis=1)
-        usable = (np.abs(along) > 0.5) & (away > 0)
-        normals[at[usable]], gaps[at[usable]] = flat[usable], away[usable]
     return normals, gaps

@@ -136,18 +136,23 @@ def test_parts_of_a_polygon():
     assert old.transfer(np.full(len(old), 3.0), new) == pytest.approx(3)
 
 
-def test_a_part_of_a_solid_overlaps_its_other_meshes(ctx):
-    """Its cells at walls are bounded by planes there, as those of the whole solid."""
-    adapter, ball = clvoro.Adapter(ctx), clvoro.Solid.ball((0, 0, 0), 1.0)
-    old, new = (adapter.run(ball, h, "fast").diagram for h in (0.45, 0.4))
+@pytest.mark.parametrize("shape", ["ball", "bracket"])
+def test_cells_of_solids_are_those_of_the_mesh(ctx, shape):
+    """Their faces at walls and creases are not on bisectors. In a box around them nothing of them is lost."""
+    adapter = clvoro.Adapter(ctx)
+    corner = clvoro.Polygon([(-1, -1), (1, -1), (1, 0), (0, 0), (0, 1), (-1, 1)])
+    solid = {"ball": clvoro.Solid.ball((0, 0, 0), 1.0), "bracket": clvoro.Solid.extruded(corner, 0, 0.5)}[shape]
+    old, new = (adapter.run(solid, h, "fast").diagram for h in (0.3, 0.25))
     part = new.subset(np.arange(len(new)) > 0)
     values, shares = old.transfer(np.ones(len(old)), part, covered=True)
     assert shares.min() > 0.8
     np.testing.assert_allclose(values, 1, rtol=1e-12)
-    # In a box around them the cells are those of the mesh, with its volume: planes that touch the ball give 13 % more.
     grid = in_box(adapter, (-1.1, -1.1, -1.1), (1.1, 1.1, 1.1), 60)
-    shares = old.transfer(np.ones(len(old)), grid, covered=True)[1]
-    assert (shares * grid.volumes).sum() == pytest.approx(old.volumes.sum(), rel=2e-3)
+    given = RNG.random(len(old))
+    for order in (1, 2):
+        values, shares = old.transfer(given, grid, order, covered=True)
+        assert (shares * grid.volumes).sum() == pytest.approx(old.volumes.sum(), rel=1e-9)
+        assert np.nansum(shares * grid.volumes * values) == pytest.approx((old.volumes * given).sum(), rel=1e-9)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
