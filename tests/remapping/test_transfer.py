@@ -428,6 +428,7 @@ def test_large_and_small_numbers(mesh, adapter):
     for factor in (2.0**1000, 2.0**-900):
         np.testing.assert_array_equal(old.transfer(q * factor, new, 2, adapter=adapter), plain * factor)
     np.testing.assert_array_equal(old.transfer(np.zeros(90), new, adapter=adapter), 0)
+    assert np.isfinite(old.transfer(np.copysign(1.7e308, q), new, 2, adapter=adapter)).all()
 
 
 @settings(max_examples=25)
