@@ -139,7 +139,7 @@ def warn_of_other_sizes(result: Result) -> None:
     SizeErrorWarning
     """
     mean = float(np.abs(result.size_error).mean())
-    if mean < FAR_ERROR:
+    if mean < FAR_ERROR or len(result) == 1:  # another warning says that the size is larger than the domain
         return
     dim = result.diagram.domain.cell_dim
     ratio = float(np.median(result.diagram.volumes ** (1 / dim) / result.target_size))

@@ -55,6 +55,8 @@ def transfer_values(
     _require_one_space(source, target)
     if isinstance(order, bool) or order not in (1, 2):
         raise InputError(f"order is {order!r}, expected 1 or 2")
+    if adapter is not None and not hasattr(adapter, "ctx"):
+        raise InputTypeError(f"adapter is a {type(adapter).__name__}, expected a clvoro.Adapter, or None")
     given = check_cell_values("values", values, len(source), least=0)
     columns = np.ascontiguousarray(given.reshape(len(source), -1), np.float64)
     # If `values` has no columns, one of zeros is transferred for the shares.

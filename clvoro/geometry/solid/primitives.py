@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 import shapely
 
+from ...arguments import check_number, check_rows
 from ...errors import InputError
 from ..polygon import Polygon
 from ..surface import box_surface
@@ -30,8 +31,18 @@ def box(lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
     }
 
 
+def _require(shape: str, edge: float | None, *points: Sequence[float], **sizes: float) -> None:
+    """Raise InputError or InputTypeError unless sizes are positive, and points of three finite numbers that differ."""
+    for name, value in {**sizes, **({} if edge is None else {"edge": edge})}.items():
+        check_number(f"Solid.{shape} {name}", value, above=0)
+    rows = [check_rows(f"points of Solid.{shape}", [point], 3)[0] for point in points]
+    if not np.isfinite(rows).all() or (len(rows) == 2 and (rows[0] == rows[1]).all()):
+        raise InputError(f"Solid.{shape} got the points {points}, expected finite numbers, and ends that differ")
+
+
 def ball(center: Sequence[float], radius: float, edge: float | None) -> dict[str, Any]:
     """Return a sphere: an icosahedron whose sides are divided into squares of n triangles each."""
+    _require("ball", edge, center, radius=radius)
     n = max(1, math.ceil((radius / _FINE if edge is None else edge) ** -1 * radius * 1.1))
     golden = (1 + math.sqrt(5)) / 2
     corner = np.array([(s, t * golden, 0) for s in (-1, 1) for t in (-1, 1)])
@@ -67,6 +78,7 @@ def placed(begin: Sequence[float], end: Sequence[float], flat: np.ndarray) -> np
 
 def cylinder(begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None) -> dict[str, Any]:
     """Return a cylinder around the axis from `begin` to `end`, with the groups side, bottom and top."""
+    _require("cylinder", edge, begin, end, radius=radius)
     height = float(np.linalg.norm(np.subtract(end, begin)))
     rise = radius if edge is None else edge
     edge = radius / _FINE if edge is None else edge
@@ -138,6 +150,7 @@ def turned(profile: Sequence[Sequence[float]], edge: float | None) -> dict[str, 
 
 def cone(begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None) -> dict[str, Any]:
     """Return a cone with the base around `begin` and the tip `end`, with the groups bottom and side."""
+    _require("cone", edge, begin, end, radius=radius)
     height = float(np.linalg.norm(np.subtract(end, begin)))
     made = turned([(0, 0), (radius, 0), (0, height)], edge)
     return {**made, "vertices": placed(begin, end, made["vertices"]), "group_names": ("bottom", "side")}
@@ -145,6 +158,7 @@ def cone(begin: Sequence[float], end: Sequence[float], radius: float, edge: floa
 
 def torus(center: Sequence[float], radius: float, tube: float, edge: float | None) -> dict[str, Any]:
     """Return a torus around an axis in z."""
+    _require("torus", edge, center, radius=radius, tube=tube)
     n = max(12, math.ceil(2 * math.pi * tube / (tube / _FINE if edge is None else edge)))
     angle = 2 * math.pi * np.arange(n) / n
     profile = np.column_stack([radius + tube * np.cos(angle), tube * np.sin(angle)])

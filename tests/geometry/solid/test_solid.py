@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clvoro import Solid
+from clvoro.errors import InputError
 from clvoro.geometry.columns import Columns
 from clvoro.geometry.triangles import packed_rows, packed_weights, pierced
 
@@ -152,3 +153,18 @@ def test_thin_parts_and_gaps_are_found():
     assert gap.contains(place[None])[0]
     for solid in (SOLIDS["box"], SOLIDS["ball"], Solid.cone((0, 0, 0), (0, 0, 1), 0.2)):
         assert solid.narrowest(lambda x: np.full(len(x), 0.1))[1] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: Solid.ball((0, 0, 0), 0), "ball radius is 0"),
+        (lambda: Solid.ball((0, 0, 0), 1, edge=-1), "ball edge is -1"),
+        (lambda: Solid.ball((0, 0), 1), "3 coordinates"),
+        (lambda: Solid.cylinder((0, 0, 0), (0, 0, 0), 1), "ends that differ"),
+        (lambda: Solid.torus((0, 0, 0), 1, -0.3), "torus tube is -0.3"),
+    ],
+)
+def test_wrong_sizes_of_shapes_are_named(made, said):
+    with pytest.raises(InputError, match=said):
+        made()
