@@ -55,6 +55,9 @@ class Surface:
         size = clvoro.sizing.Distance(part, h_min=0.01, growth=1.1, h_max=0.2)
     """
 
+    dim = 3
+    """Number of coordinates."""
+
     def __init__(self, vertices: object, triangles: object, name: str = "Surface", join: float = 0.0):
         if not (isinstance(join, Real) and 0 <= join < math.inf):
             raise InputError(f"{name} join is {join!r}, expected a finite distance, 0 or more")

@@ -66,7 +66,7 @@ def _cut(grid: pyvista.UnstructuredGrid, domain: Domain) -> pyvista.Unstructured
     """Return the cells cut at the periodic sides of the box, with their images, which fill it."""
     box = np.array([domain.lower, domain.upper])
     corners = np.asarray(grid.points)[grid.cell_connectivity, : domain.dim]
-    low, high = (bound.reduceat(corners, grid.offset[:-1], axis=0) for bound in (np.minimum, np.maximum))
+    low, high = (bound.reduceat(corners, grid.cell_offsets[:-1], axis=0) for bound in (np.minimum, np.maximum))
     parts = []
     for rows, by in images_in(domain, low, high, box):
         if len(rows):
@@ -81,9 +81,41 @@ def cut_at_sides(parts: list[Any], domain: Domain) -> pyvista.UnstructuredGrid:
     alone = (*parts, pyvista.UnstructuredGrid())[0]
     whole: Any = pyvista.merge(parts, merge_points=False) if len(parts) > 1 else alone
     sides = in_space(np.array([domain.lower, domain.upper]))
-    for axis in np.flatnonzero(domain.periodic):
-        whole = whole.clip("xyz"[axis], origin=sides[0], invert=False).clip("xyz"[axis], origin=sides[1])
-    return whole
+    return _CLIPS[domain.cell_dim](whole, np.flatnonzero(domain.periodic), sides)
+
+
+def _clip_polygons(grid: Any, axes: np.ndarray, sides: np.ndarray) -> pyvista.UnstructuredGrid:
+    """Return convex polygons between the `sides` (2, 3) across each axis; `clip` would divide them into triangles."""
+    import pyvista
+    from vtkmodules.vtkCommonDataModel import vtkPlane
+    from vtkmodules.vtkFiltersCore import vtkPolyDataPlaneClipper
+
+    whole: Any = pyvista.PolyData(grid.points, faces=grid.cells)
+    whole.cell_data["row"] = np.arange(grid.n_cells, dtype=float)  # VTK makes floats of integers
+    for axis in axes:
+        for side, sign in zip(sides, (1.0, -1.0), strict=True):
+            plane, clipper = vtkPlane(), vtkPolyDataPlaneClipper()
+            plane.SetOrigin(*side)
+            plane.SetNormal(*sign * np.eye(3)[axis])
+            clipper.SetInputData(whole)
+            clipper.SetPlane(plane)
+            clipper.CappingOff()
+            clipper.Update()
+            whole = pyvista.wrap(clipper.GetOutput())
+    rows = np.asarray(whole.cell_data.pop("row")).astype(int)
+    for name, values in grid.cell_data.items():
+        whole.cell_data[name] = values[rows]
+    return whole.cast_to_unstructured_grid()
+
+
+def _clip_polyhedra(grid: Any, axes: np.ndarray, sides: np.ndarray) -> pyvista.UnstructuredGrid:
+    """Return polyhedra between the `sides` (2, 3) across each axis."""
+    for axis in axes:
+        grid = grid.clip("xyz"[axis], origin=sides[0], invert=False).clip("xyz"[axis], origin=sides[1])
+    return grid
+
+
+_CLIPS = {2: _clip_polygons, 3: _clip_polyhedra}
 
 
 def _polygons(diagram: Diagram) -> tuple[list[Any], list[np.ndarray]]:

@@ -25,9 +25,8 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     """Return `mesh` without the cells where `keep` is False; see `MeshOutput.subset`."""
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     diagram.demand_voronoi("subset")
-    kept = (
-        keep.contains(diagram.points) if isinstance(keep, Domain | Surface) else check_mask("keep", keep, len(diagram))
-    )
+    shape = isinstance(keep, Domain | Surface)
+    kept = _within(keep, diagram) if shape else check_mask("keep", keep, len(diagram))
     if not kept.any():
         raise InputError(
             f"keep selects none of the {len(kept)} cells, expected at least one that is True; is it the opposite mask?"
@@ -42,6 +41,27 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     made = _result_of(mesh, part, kept)
     reason = f"{len(part)} of {len(kept)} cells; {mesh.stop_reason}"
     return cast("Mesh", dataclasses.replace(made, history=np.zeros(0, HISTORY_DTYPE), stop_reason=reason))
+
+
+def _within(shape: Domain | Surface, diagram: Diagram) -> np.ndarray:
+    """Return which generators are in the `shape`, (n,) bool.
+
+    Raises
+    ------
+    InputError
+        If it has another dimension than the mesh.
+    """
+    domain = diagram.domain
+    if shape.dim != domain.dim:
+        remedy = _OTHER_SHAPES[domain.dim] if domain.globe is None else "clvoro.earth.inside(mesh, keep)"
+        raise InputError(
+            f"keep is a {type(shape).__name__} with {shape.dim} coordinates, expected {domain.dim}, as the mesh has; "
+            f"pass {remedy}"
+        )
+    return shape.contains(diagram.points)
+
+
+_OTHER_SHAPES = {2: "a shape in the plane", 3: "keep.contains(mesh.points[:, :2])"}
 
 
 def _result_of(mesh: Result, part: Diagram, kept: np.ndarray) -> Result:

@@ -191,10 +191,13 @@ def test_cells_cut_at_the_box_fill_it(ctx, periodic):
     grid = diagram.to_pyvista(cut=True)
     bounds = np.reshape(grid.bounds, (3, 2))[:dim]
     assert bounds == pytest.approx(np.tile([1.0, 3.0], (dim, 1)), abs=1e-6)
+    assert grid.cell_data["label"].dtype == np.int32
     sizes = grid.compute_cell_sizes()["Volume" if dim == 3 else "Area"]
     parts = np.bincount(grid.cell_data["label"], sizes, minlength=30)
     assert parts == pytest.approx(diagram.volumes, rel=1e-4)
     assert grid.n_cells > 30
+    if dim == 2:  # parts stay polygons: most cells have more than three corners
+        assert np.median(np.diff(grid.cell_offsets)) > 3
 
 
 @pytest.mark.parametrize("library", ["meshio", "pyvista"])

@@ -95,6 +95,19 @@ def test_a_closed_surface_selects_cells(ctx):
     assert np.array_equal(diagram.subset(ball).points, diagram.points[ball.contains(diagram.points)])
 
 
+def test_shapes_of_another_dimension_are_refused_with_what_to_pass(ctx):
+    adapter, rng = clvoro.Adapter(ctx), np.random.default_rng(3)
+    space = adapter.diagram(clvoro.Box((0, 0, 0), (2, 2, 2)), rng.random((50, 3)) * 2)
+    with pytest.raises(InputError, match=r"keep is a Polygon with 2 coordinates, expected 3.*contains\(mesh.points\[:, :2"):
+        space.subset(L_SHAPE)
+    assert len(space.subset(L_SHAPE.contains(space.points[:, :2])))
+    globe = adapter.diagram(clvoro.Sphere(), clvoro.Sphere().icosahedral_points(1))
+    with pytest.raises(InputError, match=r"pass clvoro\.earth\.inside\(mesh, keep\)"):
+        globe.subset(L_SHAPE)
+    with pytest.raises(InputError, match="keep is a Solid with 3 coordinates, expected 2"):
+        adapter.diagram(DOMAINS["box"], random_points(DOMAINS["box"], 20)).subset(clvoro.Solid.ball((1, 1, 1), 0.7))
+
+
 def test_wrong_parts_are_refused(ctx, part, whole):
     with pytest.raises(InputTypeError, match="keep has dtype int64"):
         whole.subset(np.arange(len(whole)))
