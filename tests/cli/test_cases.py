@@ -188,6 +188,7 @@ def test_sizes_from_a_solution(tmp_path):
         ),
         ("[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='surface'}]", ["lacks file"]),
         ("a b", ["not a TOML file", "line"]),
+        ("size = .1", ["not a TOML file", "write 0.1 for .1"]),
     ],
 )
 def test_refusals_name_the_key(text, named):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -58,7 +59,9 @@ class Case:
         except InputError:
             raise
         except ValueError as error:
-            raise InputError(f"{place} not a TOML file: {error}") from error
+            bare = re.search(r"[=\[,] *[-+]?(\.\d+)", text)
+            hint = f"; write 0{bare[1]} for {bare[1]}" if bare else ""
+            raise InputError(f"{place} not a TOML file: {error}{hint}") from error
         except RecursionError as error:
             raise InputError(f"{place} not a case: it is nested too deep") from error
         checked.name = file_name(Path(name).stem if checked.name is None else checked.name, f"{place} name")
