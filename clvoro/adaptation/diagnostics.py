@@ -142,10 +142,10 @@ def warn_of_other_sizes(result: Result) -> None:
     if mean < FAR_ERROR or len(result) == 1:  # another warning says that the size is larger than the domain
         return
     dim = result.diagram.domain.cell_dim
-    ratio = float(np.median(result.diagram.volumes ** (1 / dim) / result.target_size))
+    ratio = f"{float(f'{np.median(result.diagram.volumes ** (1 / dim) / result.target_size):.2g}'):g}"
     warn(
-        f"mean |e| is {mean:.3g}: the cells have {ratio:.2g} times the sizes of the size field, as method "
-        f"{result.settings['method']!r} keeps {len(result)} cells; use the field times {ratio:.2g}, or "
+        f"mean |e| is {mean:.3g}: the cells have {ratio} times the sizes of the size field, as method "
+        f"{result.settings['method']!r} keeps {len(result)} cells; use the field times {ratio}, or "
         "method='adaptive', which makes as many cells as the field requires",
         SizeErrorWarning,
     )

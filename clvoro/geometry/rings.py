@@ -166,6 +166,11 @@ def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
     InputError, InputTypeError
         If the rings are not those of a valid polygon; names the ring and the place.
     """
+    for p, piece in enumerate(pieces):
+        if not hasattr(piece, "__len__"):
+            raise InputTypeError(
+                f"piece {p + 1} is a {type(piece).__name__}, expected a list of its outer ring and its holes"
+            )
     if not len(pieces):
         raise InputError("Polygon got no rings, expected an outer ring of at least 3 vertices")
     several = len(pieces) > 1

@@ -25,15 +25,14 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     """Return `mesh` without the cells where `keep` is False; see `MeshOutput.subset`."""
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     diagram.demand_voronoi("subset")
-    shape = isinstance(keep, Domain | Surface)
-    kept = _within(keep, diagram) if shape else check_mask("keep", keep, len(diagram))
+    shape, globe = isinstance(keep, Domain | Surface), diagram.domain.globe
+    kept = _within(keep, diagram, globe) if shape else check_mask("keep", keep, len(diagram))
     if not kept.any():
         raise InputError(
             f"keep selects none of the {len(kept)} cells, expected at least one that is True; is it the opposite mask?"
         )
     if kept.all():
         return mesh
-    globe = diagram.domain.globe
     make = _in_space if globe is None else partial(_on_sphere, sphere=globe)
     part = make(diagram, kept, boundary)
     if not isinstance(mesh, Result):
@@ -43,7 +42,7 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     return cast("Mesh", dataclasses.replace(made, history=np.zeros(0, HISTORY_DTYPE), stop_reason=reason))
 
 
-def _within(shape: Domain | Surface, diagram: Diagram) -> np.ndarray:
+def _within(shape: Domain | Surface, diagram: Diagram, globe: Sphere | None) -> np.ndarray:
     """Return which generators are in the `shape`, (n,) bool.
 
     Raises
@@ -53,7 +52,7 @@ def _within(shape: Domain | Surface, diagram: Diagram) -> np.ndarray:
     """
     domain = diagram.domain
     if shape.dim != domain.dim:
-        remedy = _OTHER_SHAPES[domain.dim] if domain.globe is None else "clvoro.earth.inside(mesh, keep)"
+        remedy = _OTHER_SHAPES[domain.dim] if globe is None else "clvoro.earth.inside(mesh, keep)"
         raise InputError(
             f"keep is a {type(shape).__name__} with {shape.dim} coordinates, expected {domain.dim}, as the mesh has; "
             f"pass {remedy}"

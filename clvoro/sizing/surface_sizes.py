@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, InputTypeError
 from ..geometry.solid.solid import Solid
 from ..geometry.surface import Surface
 from .arguments import check_positive
@@ -43,6 +43,7 @@ def curvature_size(solid: Solid, *, h_max: float, h_min: float, per_turn: float 
     >>> bool(0.15 < size(np.array([(0.49, 0.0, 1.0)]))[0] < 0.3)
     True
     """
+    _require_surface("curvature_size", solid)
     per_turn = check_positive("curvature_size per_turn", per_turn)
     with np.errstate(divide="ignore"):
         wanted = 2 * math.pi / (per_turn * solid.curvature)
@@ -76,9 +77,18 @@ def gap_size(solid: Solid, *, h_max: float, h_min: float, cells: float = 3.0, gr
     >>> bool(0.015 < size(np.array([(0.5, 0.5, 0.0)]))[0] <= 0.025)
     True
     """
+    _require_surface("gap_size", solid)
     cells, h_max = check_positive("gap_size cells", cells), check_positive("gap_size h_max", h_max)
     width = solid.widths(np.arange(len(solid.patch)), np.full(len(solid.patch), cells * h_max))
     return _from_walls("gap_size", solid, width / cells, h_min, h_max, growth)
+
+
+def _require_surface(name: str, domain: object) -> None:
+    if not hasattr(domain, "surface"):
+        raise InputTypeError(
+            f"{name} got a {type(domain).__name__}, expected a clvoro.Solid; FeatureSize is for polygons, and a box is "
+            "clvoro.Solid.box(lower, upper)"
+        )
 
 
 def _from_walls(name: str, solid: Solid, wanted: np.ndarray, h_min: float, h_max: float, growth: float) -> Field:

@@ -203,6 +203,7 @@ PIECES = lambda *rings: lambda: clvoro.Polygon.from_pieces([[r] for r in rings])
         (PIECES(SQUARE, SQUARE + np.array([4, 0])), "Self-intersection at"),
         (lambda: clvoro.Polygon.from_pieces([]), "no rings"),
         (lambda: clvoro.Polygon.from_pieces([[]]), "no rings for piece 1"),
+        (lambda: clvoro.Polygon.from_pieces([clvoro.Polygon(SQUARE)]), "piece 1 is a Polygon, expected a list of its"),
         (lambda: clvoro.Polygon(SQUARE, 3), "holes is a int"),
         (lambda: clvoro.Polygon.from_wkt("POLYGON ((0 0, 1"), "not well-known text"),
         (lambda: clvoro.Polygon.from_wkt("POLYGON EMPTY"), "empty Polygon"),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from clvoro import Solid, sizing
-from clvoro.errors import InputError
+from clvoro import Box, Solid, sizing
+from clvoro.errors import InputError, InputTypeError
 
 
 def test_curved_walls_have_a_number_of_cells_per_turn():
@@ -33,5 +33,8 @@ def test_creases_are_shapes_and_wrong_numbers_are_refused():
     assert size(np.array([(0.5, 0.5, 0.5), (0.5, 0, 0)])) == pytest.approx([0.1 + 0.5**0.5, 0.1])
     with pytest.raises(InputError, match="no concave creases"):
         cube.crease_edges(concave=True)
+    for field in (sizing.curvature_size, sizing.gap_size):
+        with pytest.raises(InputTypeError, match=r"got a Box, expected a clvoro\.Solid"):
+            field(Box((0, 0, 0), (1, 1, 1)), h_min=0.1, h_max=1)
     with pytest.raises(InputError, match="h_min <= h_max"):
         sizing.curvature_size(cube, h_min=1, h_max=0.1)

@@ -20,6 +20,9 @@ _FINE = 16  # edges of triangles per radius
 
 def box(lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
     """Return the surface of a box, with its sides as groups."""
+    _require("box", None, lower, upper)
+    if not (np.asarray(lower) < np.asarray(upper)).all():
+        raise InputError(f"Solid.box got lower {lower} and upper {upper}, expected lower < upper in each direction")
     surface = box_surface(np.asarray(lower, float), np.asarray(upper, float))
     triangles = surface.triangles.reshape(6, 2, 3)[[4, 5, 2, 3, 0, 1]].reshape(-1, 3)
     sides = tuple(f"{axis}{end}" for axis in "xyz" for end in ("Min", "Max"))

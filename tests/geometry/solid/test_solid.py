@@ -162,6 +162,7 @@ def test_thin_parts_and_gaps_are_found():
         (lambda: Solid.ball((0, 0, 0), 1, edge=-1), "ball edge is -1"),
         (lambda: Solid.ball((0, 0), 1), "3 coordinates"),
         (lambda: Solid.cylinder((0, 0, 0), (0, 0, 0), 1), "ends that differ"),
+        (lambda: Solid.box((0, 0, 0), (1, 0, 1)), "expected lower < upper"),
         (lambda: Solid.torus((0, 0, 0), 1, -0.3), "torus tube is -0.3"),
     ],
 )
