@@ -25,8 +25,11 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     """Return `mesh` without the cells where `keep` is False; see `MeshOutput.subset`."""
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     diagram.demand_voronoi("subset")
-    shape, globe = isinstance(keep, Domain | Surface), diagram.domain.globe
-    kept = _within(keep, diagram, globe) if shape else check_mask("keep", keep, len(diagram))
+    globe = diagram.domain.globe
+    if isinstance(keep, Domain | Surface):
+        kept = _within(keep, diagram, globe)
+    else:
+        kept = check_mask("keep", keep, len(diagram))
     if not kept.any():
         raise InputError(
             f"keep selects none of the {len(kept)} cells, expected at least one that is True; is it the opposite mask?"
