@@ -65,7 +65,7 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
 }
 
 /* The set of the walls that the cell of a generator at x crosses, one bit each. */
-inline uint crossed_walls(const corners_t *cell, REAL4 x, const rows_t *in)
+inline uint crossed_walls(private const corners_t *cell, REAL4 x, const rows_t *in)
 {
     const REAL reach = sqrt(cell->reach2), noise = WALL_NOISE(reach);
     uint crossed = 0;
@@ -90,7 +90,7 @@ inline uint crossed_walls(const corners_t *cell, REAL4 x, const rows_t *in)
 
 /* Keep the cell of generator i at x within the walls: those that it does not have become further neighbors. True if
    there is none, and all walls near the cell are known. */
-inline bool keep_in_walls(const corners_t *cell, int i, REAL4 x, const rows_t *in, global int *marks)
+inline bool keep_in_walls(private const corners_t *cell, int i, REAL4 x, const rows_t *in, global int *marks)
 {
     if (!knows_walls(i, cell->reach2, &in->own))
         return false;

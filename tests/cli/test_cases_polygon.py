@@ -215,12 +215,12 @@ def test_shapefiles_are_refused_with_a_command(tmp_path):
         load_case(tmp_path / "case.toml")
 
 
-def test_regions_and_rectangles(tmp_path):
+def test_regions_and_boxes(tmp_path):
     (tmp_path / "island.wkt").write_text("POLYGON ((3 0.2, 3.5 0.2, 3.5 0.5, 3 0.2))")
     (tmp_path / "case.toml").write_text("""
 [domain]
-outer = {kind = "rectangle", lower = [0, 0], upper = [4, 1]}
-holes = [{kind = "rectangle", lower = [1, 0.4], upper = [1.3, 0.6]}]
+outer = {kind = "box", lower = [0, 0], upper = [4, 1]}
+holes = [{kind = "box", lower = [1, 0.4], upper = [1.3, 0.6]}]
 [size]
 kind = "region"
 h = 0.02

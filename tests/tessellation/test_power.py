@@ -240,13 +240,12 @@ def test_files_pictures_and_other_libraries(ctx, tmp_path):
     assert "weights[3] is nan" in str(
         full.with_weights(np.where(np.arange(len(full)) == 3, np.nan, full.weights)).check()
     )
-    full.save(tmp_path / "case.foam")
+    full.to_openfoam(tmp_path / "polyMesh", check=False)
     # Dual triangles cover the same part of the plane, counter-clockwise.
     a, b, c = points[kept][full.triangles()].swapaxes(0, 1)
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
     assert (ux * vy - uy * vx > 0).all()
     for refused in (
-        lambda: full.transfer(np.ones(len(full)), full),
         full.to_disv,
         lambda: full.to_netcdf(tmp_path / "d.nc", convention="mpas"),
         lambda: full.check("mpas"),

@@ -446,7 +446,7 @@ def load_array(path: Path, place: str) -> np.ndarray:
 # Domains.
 
 
-class Rectangle(Kind, tag="rectangle"):
+class BoxRing(Kind, tag="box"):
     """A rectangle as a ring of a domain."""
 
     lower: Plane
@@ -455,13 +455,13 @@ class Rectangle(Kind, tag="rectangle"):
     def build(self, folder: Path, domain: Any = None) -> list[Plane]:
         (a, b), (c, d) = self.lower, self.upper
         if not (a < c and b < d):
-            raise InputError(f"domain has a rectangle from {self.lower} to {self.upper}, expected lower < upper")
+            raise InputError(f"domain has a box from {self.lower} to {self.upper}, expected lower < upper")
         return [(a, b), (c, b), (c, d), (a, d)]
 
 
 Names = dict[str, Walls]
 RingCurve = CircleCurve | Arc | Ellipse | Naca | Spline
-Ring = RingCurve | Rectangle | list[Plane | RingCurve]
+Ring = RingCurve | BoxRing | list[Plane | RingCurve]
 
 
 def _ring(ring: Any) -> Any:
@@ -494,6 +494,11 @@ class BoxTable(Kind, tag="box"):
 
     def build(self, folder: Path, domain: Any = None) -> Any:
         made = _with_lines(Box(**self.given("lines", "holes", "hole_names")), self.lines, folder)
+        if self.holes is not None and made.dim == 2 and not any(made.periodic):
+            raise InputError(
+                "domain is a box with holes and no periodic side; write it as "
+                f'outer = {{ kind = "box", lower = {list(made.lower)}, upper = {list(made.upper)} }} with these holes'
+            )
         return made if self.holes is None else made.without([_ring(hole) for hole in self.holes], self.hole_names)
 
 
