@@ -252,6 +252,11 @@ ROWS = [
         ).solver_mesh(),
     ),
     # Parts of meshes and their figures.
+    (
+        lambda t: sizing.gap_size(CUBE, h_max=0.4, h_min=0.1),
+        lambda t: sizing.gap_size(clvoro.Solid.box((0, 0, 0), (1, 1, 1)), h_max=0.4, h_min=0.1),
+    ),
+    (lambda t: t.cube.subset(BOX), lambda t: t.cube.subset(BOX.contains(t.cube.points[:, :2])), "keep"),
     (lambda t: t.mesh.subset(np.zeros(30, bool)), lambda t: t.mesh.subset(~np.zeros(30, bool))),
     (lambda t: t.mesh.subset(np.arange(30) % 2), lambda t: t.mesh.subset(np.arange(30) % 2 == 1)),
     (lambda t: t.torus.triangles(), lambda t: (t.torus.neighbors, t.torus.shifts)),
