@@ -32,7 +32,7 @@ def needs(text):
 
 
 def blocks(page, language):
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGES[page], re.MULTILINE | re.DOTALL)
+    return re.findall(rf"^```{language}\n(.*?)^```", OWN[page], re.MULTILINE | re.DOTALL)
 
 
 def rows(page):
@@ -42,9 +42,9 @@ def rows(page):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")])
+@pytest.mark.parametrize("page", [p for p in OWN if blocks(p, "python")])
 def test_python_on_pages_runs(page, tmp_path, monkeypatch):
-    needs(PAGES[page])
+    needs(OWN[page])
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")
     names = {}
