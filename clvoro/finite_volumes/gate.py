@@ -82,6 +82,8 @@ def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
     at = "" if first.place is None else f" at {format_point(first.place)}"
     also = f", and {', '.join(c.name for c in failed[1:])}" if failed[1:] else ""
     remedy = "Use smaller cells there" if at_walls else "Let a run move the generators, as clvoro.adapt does"
+    if mesh.domain.uncut is not mesh.domain:
+        remedy = "Use smaller cells there, or let subset keep more or fewer of the cells there"
     if walls == "exact":
         remedy = "Write it with walls='straight'"
     elif mesh.domain.outline is not None:

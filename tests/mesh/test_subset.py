@@ -80,6 +80,18 @@ def test_solvers_get_parts(part, tmp_path):
     assert "hole" in (tmp_path / "polyMesh" / "boundary").read_text()
 
 
+def test_a_cell_that_hangs_by_one_face_is_refused_with_what_to_keep(ctx, tmp_path):
+    points = np.stack(np.meshgrid(*[np.arange(3) + 0.5] * 3, indexing="ij"), -1).reshape(-1, 3)
+    cubes = clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0, 0), (3, 3, 3)), points)
+    hanging = points[:, 2] < 1
+    hanging[4 * 3 + 1] = True
+    with pytest.raises(InputError, match=r"determinant is 0, .*let subset keep more or fewer of the cells there"):
+        cubes.subset(hanging).to_openfoam(tmp_path / "polyMesh")
+    hanging[4 * 3 + 1] = False
+    hanging |= points[:, 2] < 2
+    cubes.subset(hanging).to_openfoam(tmp_path / "polyMesh")
+
+
 def test_a_result_and_a_domain_select_cells(ctx):
     box = DOMAINS["box"]
     result = result_of(clvoro.Adapter(ctx).diagram(box, random_points(box, 200)))
