@@ -494,7 +494,7 @@ class BoxTable(Kind, tag="box"):
 
     def build(self, folder: Path, domain: Any = None) -> Any:
         made = _with_lines(Box(**self.given("lines", "holes", "hole_names")), self.lines, folder)
-        if self.holes is not None and made.dim == 2 and not any(made.periodic):
+        if self.holes is not None and len(self.lower) == 2 and not any(made.periodic):
             raise InputError(
                 "domain is a box with holes and no periodic side; write it as "
                 f'outer = {{ kind = "box", lower = {list(made.lower)}, upper = {list(made.upper)} }} with these holes'
