@@ -252,6 +252,8 @@ class Options:
                 f"effort is {self.effort!r:.60} of type {type(self.effort).__name__}, expected one of "
                 f"{', '.join(EFFORTS)}; the size comes second and the effort third: run(domain, size, 'default')"
             )
+        if self.effort in METHODS:
+            raise InputError(f"effort is {self.effort!r}, which is a method; write method={self.effort!r}")
         check_choice("effort", self.effort, EFFORTS)
         layers: object = self.layers  # the caller may give one Layers
         if not isinstance(layers, Layers | Sequence):

@@ -138,7 +138,8 @@ def write(
     path = Path(check_path("path", path))
     suffix = ".foam" if path.name == "polyMesh" else path.suffix.lower()
     if kind not in (None, suffix):
-        raise InputError(f"cannot write {path} as {_KINDS[kind]}, expected a name that ends in {kind}; or use save")
+        ends = _ENDS[kind]
+        raise InputError(f"cannot write {path} as {_KINDS[kind]}, expected a name that ends in {ends}; or use save")
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
         if name not in _OPTIONS.get(suffix, ()):
@@ -177,6 +178,7 @@ _WRITERS: dict[str, Callable[..., None]] = {
     ".graph": write_metis,
 }
 _KINDS = {".foam": "OpenFOAM", ".nc": "netCDF", ".vtu": ".vtu"}
+_ENDS = {".foam": ".foam, or the folder polyMesh of a case", ".nc": ".nc", ".vtu": ".vtu"}
 _METHODS = {".foam": "to_openfoam", ".nc": "to_netcdf", ".vtu": "to_vtu"}
 _OPTIONS = {
     ".foam": ("patches", "types", "thickness", "binary", "walls", "zones", "check"),

@@ -559,6 +559,7 @@ def test_one_cell_of_the_right_size(adapter):
         ({"method": "best"}, InputError, "method is 'best', which is an effort; write effort='best'"),
         ({"method": None}, InputError, "method is None"),
         ({"points": "random"}, InputError, "points is 'random', expected one of density, uniform"),
+        ({"effort": "exact"}, InputError, "effort is 'exact', which is a method; write method='exact'"),
         ({"effort": "most"}, InputError, "effort is 'most', expected one of fast"),
         ({"n_cells": 0}, InputError, "n_cells is 0, expected at least 1"),
         ({"n_cells": -5}, InputError, "n_cells is -5"),
