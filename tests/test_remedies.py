@@ -146,6 +146,7 @@ ROWS = [
     # Runs.
     (lambda t: t.run(0.3, BOX), lambda t: t.run(BOX, 0.3)),
     (lambda t: t.run(BOX, 0.3, method="fast"), lambda t: t.run(BOX, 0.3, effort="fast")),
+    (lambda t: t.run(BOX, 0.3, effort="exact"), lambda t: t.run(BOX, 0.3, method="exact")),
     (lambda t: t.run(BOX, 0.3, 200), lambda t: t.run(BOX, 0.3, "default")),
     (lambda t: clvoro.Adapter("cpu"), lambda t: clvoro.Adapter(clvoro.create_context("cpu"))),
     (lambda t: t.copied(), lambda t: clvoro.Adapter(t.adapter.ctx, t.adapter.dtype)),
