@@ -65,7 +65,7 @@ class PieceArrays:
 
 @dataclass(frozen=True)
 class PieceMeasures:
-    """PieceMeasures of pieces on the host, in the coordinates of the `Space`.
+    """Measures of pieces on the host, in the coordinates of the `Space`.
 
     Attributes
     ----------
