@@ -98,6 +98,12 @@ def counts(text: str) -> list[int]:
     return [round(float(part)) for part in names(text)]
 
 
+def seeds_of(text: str) -> list[int]:
+    """Return the seeds in an option: one number stands for 1 to that number."""
+    given = counts(text)
+    return list(range(1, given[0] + 1)) if len(given) == 1 else given
+
+
 def make_adapter(options: argparse.Namespace) -> clvoro.Adapter:
     """Return an adapter as the options say, or end the script with a message."""
     try:

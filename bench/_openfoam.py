@@ -14,9 +14,11 @@ from clvoro.foam.fields import read_field
 from clvoro.foam.mesh import FoamMesh
 
 
-def missing(*programs: str) -> list[str]:
-    """Return those of `programs` that are not installed."""
-    return [program for program in programs if shutil.which(program) is None]
+def require(*programs: str) -> None:
+    """End the script with a message if one of `programs` is not installed."""
+    for program in programs:
+        if shutil.which(program) is None:
+            raise SystemExit(f"{program} is not installed; Debian has it in the package openfoam")
 
 
 def text_of(entries: Mapping[str, Any], indent: int = 0) -> str:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from _common import FIRST_SEED, Report, counts, heading, make_adapter, parser, shown
-from _openfoam import Case, header, missing
+from _openfoam import Case, header, require
 
 import clvoro
 from clvoro import foam, sizing
@@ -81,9 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("--uniform", type=counts, default=counts("1000,2000,4000,8000,16000"))
     made.add_argument("--cycles", type=int, default=3)
     options = made.parse_args(arguments)
-    absent = missing("simpleFoam", "blockMesh")
-    if absent:
-        raise SystemExit(f"{absent[0]} is not installed; Debian has it in the package openfoam")
+    require("simpleFoam", "blockMesh")
     adapter, report = make_adapter(options), Report(options.json, COLUMNS)
     domain = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1)], names={"lid": 2, "fixed": [0, 1, 3]})
     known_errors: list[float] = []

@@ -18,7 +18,6 @@ mesh. Edges and skewness are those of the mesh that is written; sizes and Q thos
 
 from __future__ import annotations
 
-import shutil
 import sys
 import tempfile
 import time
@@ -30,6 +29,7 @@ import numpy as np
 import shapely
 import solver_ready
 from _common import FIRST_SEED, Report, heading, make_adapter, names, off_walls, parser
+from _openfoam import require
 
 import clvoro
 from clvoro import sizing
@@ -199,8 +199,7 @@ def main() -> None:
     made.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw each mesh")
     options = made.parse_args()
     folder = folder_of(options.data)
-    if shutil.which("checkMesh") is None:
-        raise SystemExit("checkMesh is not installed; Debian has it in the package openfoam")
+    require("checkMesh")
     adapter = make_adapter(options)
     coasts, report = Coasts(folder), Report(options.json, COLUMNS)
     for name in names(options.only) or PLACES:

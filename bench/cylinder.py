@@ -38,7 +38,7 @@ from typing import Any
 
 import numpy as np
 from _common import Report, counts, heading, make_adapter, parser, spread
-from _openfoam import Case, Mesh, header, missing, nonuniform, text_of, write_prisms
+from _openfoam import Case, Mesh, header, nonuniform, require, text_of, write_prisms
 
 import clvoro
 from clvoro.foam.case import FoamCase
@@ -173,10 +173,14 @@ def follow(case: Case, adapter: clvoro.Adapter, n_cells: int, cycles: int, meshe
         "drag": last.monitors["forces.Cd"],
         "lift": last.monitors["forces.Cl"],
         "steps": last.time,
-        "solver_seconds": sum(row.solver_seconds for row in rows),
-        "mesh_seconds": sum(row.mesh_seconds or 0 for row in rows),
-        "transfer_seconds": sum(row.transfer_seconds or 0 for row in rows),
+        **seconds_of(rows),
     }
+
+
+def seconds_of(rows: list[clvoro.foam.FoamCycle]) -> dict[str, float]:
+    """Return the seconds of all cycles of a loop, by kind."""
+    kinds = ("solver_seconds", "mesh_seconds", "transfer_seconds")
+    return {kind: sum(getattr(row, kind) or 0 for row in rows) for kind in kinds}
 
 
 def _lower_part() -> clvoro.Polygon:
@@ -563,12 +567,7 @@ def follow_vortices(case: Case, adapter: clvoro.Adapter, mesh: Mesh, n_cells: in
     end = rows[-1].time + 1.05
     known.set_control(endTime=end)
     case.run("pimpleFoam")
-    return {
-        **shedding_of(case, end),
-        "solver_seconds": sum(row.solver_seconds for row in rows),
-        "mesh_seconds": sum(row.mesh_seconds or 0 for row in rows),
-        "transfer_seconds": sum(row.transfer_seconds or 0 for row in rows),
-    }
+    return {**shedding_of(case, end), **seconds_of(rows)}
 
 
 def picture(case: Case, mesh: Mesh, path: Path, title: str) -> None:
@@ -631,10 +630,7 @@ def main() -> None:
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = options_of.parse_args()
     re_ = options.reynolds
-    solver = "simpleFoam" if re_ == 20 else "pimpleFoam"
-    absent = missing(solver, "blockMesh")
-    if absent:
-        raise SystemExit(f"{absent[0]} is not installed; Debian has it in the package openfoam")
+    require("simpleFoam" if re_ == 20 else "pimpleFoam", "blockMesh")
     adapter = make_adapter(options)
     convection = options.convection
     size = target_size if re_ == 20 else wake_size

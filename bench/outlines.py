@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 import shapely
-from _common import Report, counts, heading, make_adapter, names, parser
+from _common import Report, heading, make_adapter, names, parser, seeds_of
 
 import clvoro
 from clvoro.io.check_mesh import check_case
@@ -192,8 +192,7 @@ def main() -> None:
     options = options_of.parse_args()
     adapter = make_adapter(options)
     warnings.simplefilter("ignore")  # bays and straits that are narrower than a cell
-    seeds = counts(options.seeds)
-    seeds = list(range(1, seeds[0] + 1)) if len(seeds) == 1 else seeds
+    seeds = seeds_of(options.seeds)
     report = Report(options.json, COLUMNS)
     for kind in names(options.kinds):
         for size in map(float, names(options.sizes)):

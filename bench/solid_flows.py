@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 import resource
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ from typing import Any
 import numpy as np
 import scipy
 from _common import Report, counts, heading, make_adapter, names, parser
-from _openfoam import Case, Mesh, missing, nonuniform
+from _openfoam import Case, Mesh, nonuniform, require
 from solver_ready import figures_of
 
 import clvoro
@@ -330,8 +329,7 @@ def main() -> None:
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = options_of.parse_args()
-    if absent := missing("potentialFoam", "simpleFoam", "polyDualMesh", "gmshToFoam", "checkMesh"):
-        sys.exit(f"{', '.join(absent)} not found: Debian has them in the package openfoam")
+    require("potentialFoam", "simpleFoam", "polyDualMesh", "gmshToFoam", "checkMesh")
     adapter, report = make_adapter(options), Report(options.json, COLUMNS)
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.keep or Path(temporary)

@@ -28,7 +28,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import resource
-import shutil
 import tempfile
 import time
 import traceback
@@ -38,6 +37,7 @@ from typing import Any
 
 import numpy as np
 from _common import Report, counts, heading, make_adapter, names, parser
+from _openfoam import require
 from _solid_shapes import SHAPES, random_part, solid_of
 from solver_ready import COLUMNS as PLANE_COLUMNS
 from solver_ready import figures_of
@@ -300,8 +300,7 @@ def main() -> None:
         for n in names(options.speed):
             measure_speed(adapter, round(float(n)), names(options.domains), report)
         return report.finish(heading(adapter, "processor time of runs, and of meshes that are read with their faces"))
-    if shutil.which("checkMesh") is None:
-        raise SystemExit("checkMesh is not installed; Debian has it in the package openfoam")
+    require("checkMesh")
     adapter = make_adapter(options)
     if options.booleans:
         report = Report(options.json, BOOLEAN_COLUMNS)

@@ -18,7 +18,6 @@ only, unless they are named in --only.
 from __future__ import annotations
 
 import re
-import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -26,7 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import Report, counts, heading, make_adapter, names, off_walls, parser
+from _common import Report, heading, make_adapter, names, off_walls, parser, seeds_of
+from _openfoam import require
 from _sites import SITES
 from _walled import WALLED
 
@@ -150,12 +150,9 @@ def main() -> None:
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw each 2D mesh")
     options = options_of.parse_args()
-    if shutil.which("checkMesh") is None:
-        raise SystemExit("checkMesh is not installed; Debian has it in the package openfoam")
+    require("checkMesh")
     adapter = make_adapter(options)
-    seeds = counts(options.seeds)
-    if len(seeds) == 1:
-        seeds = list(range(1, seeds[0] + 1))
+    seeds = seeds_of(options.seeds)
     report = Report(options.json, SEED_COLUMNS if seeds else COLUMNS)
     chosen = options.only.split(";") if ";" in options.only else names(options.only)
     if options.only in DOMAINS:

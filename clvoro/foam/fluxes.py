@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import scipy
@@ -96,7 +95,7 @@ def _solver(
         (np.tile(weights, 2), (np.concatenate([a, b]), np.concatenate([b, a]))), shape=(m, m)
     ).tocsr()
     if m > _DIRECT and (engine := default_engine(3)).real == np.float64:
-        return partial(_solve_by_multigrid, Poisson(engine), graph, ground, n)
+        return _multigrid_solver(Poisson(engine), graph, ground, n)
     kept = np.flatnonzero(np.arange(m) != ground)
     matrix = scipy.sparse.diags_array(graph.sum(axis=1) + 1e-300) - graph
     factors = scipy.sparse.linalg.splu(
@@ -111,15 +110,19 @@ def _solver(
     return solve
 
 
-def _solve_by_multigrid(
-    poisson: Poisson, graph: scipy.sparse.csr_array, ground: int, n: int, sources: np.ndarray
-) -> np.ndarray:
+def _multigrid_solver(
+    poisson: Poisson, graph: scipy.sparse.csr_array, ground: int, n: int
+) -> Callable[[np.ndarray], np.ndarray]:
     engine = poisson.engine
     laplacian = Laplacian(
         engine.upload(graph.indptr, np.int32), engine.upload(graph.indices, np.int32), engine.upload(graph.data)
     )
-    every = np.append(sources, -sources.sum())[: graph.shape[0]]
-    potential = engine.zeros(len(every))
-    poisson.solve(laplacian, engine.upload(every), potential, tolerance=_TOLERANCE, preconditioner="multigrid")
-    q = potential.get().astype(float)
-    return q[:n] - q[ground]
+
+    def solve(sources: np.ndarray) -> np.ndarray:
+        every = np.append(sources, -sources.sum())[: graph.shape[0]]
+        potential = engine.zeros(len(every))
+        poisson.solve(laplacian, engine.upload(every), potential, tolerance=_TOLERANCE, preconditioner="multigrid")
+        q = potential.get()
+        return q[:n] - q[ground]
+
+    return solve

@@ -8,9 +8,8 @@ import json
 import math
 import shutil
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from dataclasses import fields as fields_of
 from os import PathLike
 from pathlib import Path
@@ -229,7 +228,7 @@ def adapt_case(
         adapter or shared_adapter(),
     )
     with loop.case.held():
-        return loop.run(mesh, cycles, solver, interval, on_cycle)
+        return loop.run(mesh, cycles, solver, interval, on_cycle or (lambda row: None))
 
 
 @dataclass
@@ -250,7 +249,7 @@ class _Loop:
         cycles: int,
         solver: str | Callable[[Path], object] | None,
         interval: float | None,
-        on_cycle: Callable[[FoamCycle], object] | None,
+        on_cycle: Callable[[FoamCycle], object],
     ) -> list[FoamCycle]:
         case = self.case
         case.mend()
@@ -261,9 +260,7 @@ class _Loop:
             self.rows[note["cycle"] - 1 : note["cycle"]] = [FoamCycle(**note["row"])]
         if solver is None:
             # Before anything is written.
-            done = self._adapt(self._known(note) or self._solved(note, 0.0), note, mesh)
-            if on_cycle is not None:
-                on_cycle(done)
+            on_cycle(self._adapt(self._known(note) or self._solved(note, 0.0), note, mesh))
             return self.rows
         length = self._interval(interval)
         check_writable(case.folder)
@@ -272,12 +269,9 @@ class _Loop:
             note = self._note(case.latest())
             known = self._known(note) or self._solve(solver, note, length)
             if note["cycle"] >= cycles:
-                if on_cycle is not None:
-                    on_cycle(known)
-                return self.rows
-            known = self._adapt(known, note, mesh)
-            if on_cycle is not None:
                 on_cycle(known)
+                return self.rows
+            on_cycle(self._adapt(known, note, mesh))
 
     def _known(self, note: dict[str, Any]) -> FoamCycle | None:
         """Return the row of the latest solution; None if it is not in the report."""
@@ -388,16 +382,12 @@ class _Loop:
         transfer_seconds = time.perf_counter() - start
         if self.pictures and old.diagram.domain.dim == 2:
             self._draw(old, fields, row.cycle)
-        done = FoamCycle(
-            row.cycle,
-            row.time,
-            row.cells,
-            row.monitors,
-            row.solver_seconds,
-            size.norm,
-            new.foam.n_cells,
-            mesh_seconds,
-            transfer_seconds,
+        done = replace(
+            row,
+            predicted_error=size.norm,
+            next_cells=new.foam.n_cells,
+            mesh_seconds=mesh_seconds,
+            transfer_seconds=transfer_seconds,
         )
         described = [asdict(layer) for layer in layers]
         known = {"cycle": row.cycle + 1, "time": latest.value, "layers": described, "row": asdict(done)}
@@ -407,16 +397,15 @@ class _Loop:
         return done
 
     def _warn_of_lost_fields(self, fields: Sequence[FoamField], foam: FoamMesh, time: Time) -> None:
-        """Warn of what the next mesh will not have."""
+        """Warn of the fields and folders of the latest time that are not transferred to the next mesh."""
         moving = {one.name for one in fields_that_move(fields, foam.patches)}
         dropped = [f"{one.name} ({one.kind})" for one in fields if one.name not in moving]
         dropped += [f"{name}/" for name in self.case.folders(time)]
         if dropped:
-            warnings.warn(
+            warn(
                 f"the latest time of {self.case.folder} has {', '.join(dropped)}: not transferred, since only fields "
                 "in cells are, and the flux phi of U unless patches are cyclic; copy the folder first if you need them",
                 LostFieldsWarning,
-                stacklevel=4,
             )
 
     def _diagram(self, folder: Path, foam: FoamMesh, given: object) -> Diagram:

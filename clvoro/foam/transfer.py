@@ -73,9 +73,9 @@ class MeshOfCase:
 
 
 def fields_that_move(fields: Sequence[FoamField], patches: Sequence[FoamPatchFaces]) -> list[FoamField]:
-    """Return the fields that can be transferred: those in cells, and the flux `phi` of the velocity `U`.
+    """Return the fields that `transfer_fields` can transfer: all with a value in each cell, and the flux `phi`.
 
-    Where patches are cyclic solvers make the flux.
+    The flux is that of the velocity `U`. If the mesh has cyclic patches it is left out: solvers then compute it from U.
     """
     moving = [field for field in fields if field.in_cells]
     if any(field.name == "U" for field in moving) and not any(patch.kind == "cyclic" for patch in patches):
@@ -84,7 +84,7 @@ def fields_that_move(fields: Sequence[FoamField], patches: Sequence[FoamPatchFac
 
 
 def transfer_fields(fields: Sequence[FoamField], old: MeshOfCase, new: MeshOfCase, adapter: Adapter) -> list[FoamField]:
-    """Return the fields that move (`fields_that_move`) on the new mesh.
+    """Return those of the fields that can be transferred (`fields_that_move`), on the new mesh.
 
     In cells the sum of volume times value is that on the old mesh, with the volumes of the solver, and there are no new
     extrema.
@@ -155,7 +155,7 @@ def _on_patch(entries: Entries, before: np.ndarray, faces: np.ndarray, old: Foam
 
 
 def _interpolate(values: np.ndarray, before: np.ndarray, faces: np.ndarray, old: FoamMesh, new: FoamMesh) -> np.ndarray:
-    """Return values (k, w) at the new faces of a patch, with the same mean.
+    """Return the values at the new faces of a patch from those at its old faces, (k, w), with the same mean.
 
     On a straight patch of a layer of cells they are exact for means of quadratic functions, else linear between the two
     nearest old ones.

@@ -277,7 +277,7 @@ def _other_maker(given: object) -> str:
 
 
 def _other_nesting(given: object, name: str) -> str:
-    """Return a hint for several rings in the place of one; empty for others."""
+    """Return what to write if `given` holds several rings where one ring is expected, else an empty text."""
     if not isinstance(given, list | tuple | np.ndarray) or not len(given):
         return ""
     first = given[0]

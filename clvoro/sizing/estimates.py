@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import scipy
@@ -211,19 +211,18 @@ def estimate(
     order: float,
     p: float = math.inf,
     constant: float = 1.0,
-    n_cells: float | None,
-    eps: float | None,
-    h_min: float,
-    h_max: float,
     growth: float,
+    **bounds: Any,
 ) -> Estimate:
-    """Return the estimate with the sizes of `best_sizes`."""
+    """Return the sizes for which the error constant * indicator * h^order is least in L^p, with that error.
+
+    The sizes are those of `best_sizes`, which also takes the `bounds`: `n_cells`, `eps`, `h_min` and `h_max`.
+    """
     slope = check_slope(what, growth, None)
     stencils = CellStencils.of(on)
-    mesh, bounds = stencils.mesh, {"n_cells": n_cells, "eps": eps, "h_min": h_min, "h_max": h_max}
     places = _places(stencils, slope)
     sizes = best_sizes(what, indicator, places, order=order, p=p, constant=constant, **bounds)
-    return Estimate(mesh, sizes, constant * indicator * sizes**order, order, p)
+    return Estimate(stencils.mesh, sizes, constant * indicator * sizes**order, order, p)
 
 
 def _places(stencils: CellStencils, slope: float) -> Places:
