@@ -8,6 +8,7 @@ walls. The vertices of the diagram decide: all cells that a crease cuts see the 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -177,7 +178,7 @@ def cut_at_creases(
         part, at = np.unique(faces.locate(x[rows], cell[rows]), return_inverse=True)
         part = part[np.bincount(at, step[rows]) > _LONG * sizes[faces.home[part]]]
         if len(part):
-            faces = _Cutter(faces, generators, sizes).cut(part.tolist(), Bisecting(surface.solid, c))
+            faces = _cut(faces, generators, sizes, part.tolist(), Bisecting(surface.solid, c))
     return faces
 
 
@@ -220,135 +221,100 @@ def sample_creases(
     return ends[row, 0] + share * (ends[row, 1] - ends[row, 0]), edges[row], (length / count)[row]
 
 
-class _Cutter:
-    """Cuts cells by one surface."""
+def _cut(faces: CellFaces, generators: np.ndarray, sizes: np.ndarray, cells: list[int], by: Bisecting) -> CellFaces:
+    """Return the faces with those of `cells` cut that the surface divides into two parts."""
+    while cells:
+        try:
+            return _Cut(faces, generators, sizes, cells, by).result()
+        except _UncutError as odd:
+            cells = [c for c in cells if c not in odd.cells]
+    return faces
 
-    def __init__(self, faces: CellFaces, generators: np.ndarray, sizes: np.ndarray) -> None:
-        self.faces, self.generators, self.sizes = faces, generators, sizes
 
-    def cut(self, cells: list[int], by: Bisecting) -> CellFaces:
-        """Return the faces with those of `cells` cut that fall into two parts."""
-        while cells:
-            try:
-                return self._cut(cells, by)
-            except _UncutError as odd:
-                cells = [c for c in cells if c not in odd.cells]
-        return self.faces
+class _Cut:
+    """Cells that one surface cuts, and what their faces become.
 
-    def _cut(self, cells: list[int], by: Bisecting) -> CellFaces:
+    Attributes
+    ----------
+    rows : (r,) int
+        The faces of the cells.
+    loops : list of list of int
+        Their corners.
+    above, below : dict
+        The number of each cell's part on either side. The part with the generator keeps the number of the cell.
+    sides : dict
+        See `_sides`.
+    crossings : dict
+        The new vertex on each edge (lower corner, higher corner) that the surface crosses.
+    points : (v, 3) float
+        Corners, with the new vertices.
+    folds : list of (3,) float
+        Further points, within faces.
+    made : list of (owner, neighbor, loop)
+        New faces.
+    borders : dict
+        The sides of each cell's cut, as seen from the part above.
+    """
+
+    def __init__(
+        self, faces: CellFaces, generators: np.ndarray, sizes: np.ndarray, cells: list[int], by: Bisecting
+    ) -> None:
+        self.faces, self.sizes, self.cells, self.by = faces, sizes, cells, by
+        self.rows = np.flatnonzero(np.isin(faces.owner, cells) | np.isin(faces.neighbor, cells))
+        self.loops = [self._loop(r) for r in self.rows.tolist()]
+        keeps = (by.at(generators[faces.home[cells]])[0] > 0).tolist()
+        parts = [(c, up, len(faces.home) + k) for k, (c, up) in enumerate(zip(cells, keeps, strict=True))]
+        self.above = {c: c if up else further for c, up, further in parts}
+        self.below = {c: further if up else c for c, up, further in parts}
+        self.sides = self._sides()
+        self.crossings: dict[tuple[int, int], int] = {}
+        self.points = faces.points
+        self.folds: list[np.ndarray] = []
+        self.made: list[tuple[int, int, list[int]]] = []
+        self.borders: dict[int, list[tuple[int, int]]] = {c: [] for c in cells}
+
+    def result(self) -> CellFaces:
+        """Return all faces, with the cells cut."""
         f = self.faces
-        rows = np.flatnonzero(np.isin(f.owner, cells) | np.isin(f.neighbor, cells))
-        loops = [f.corners[f.starts[r] : f.starts[r + 1]].tolist() for r in rows]
-        sides = self._sides(rows, loops, by)
-        n, points = len(f.home), [f.points]
-        v = len(f.points)
-        # The part with the generator keeps the number.
-        keeps = by.at(self.generators[f.home[cells]])[0] > 0
-        above = {c: c if up else n + k for k, (c, up) in enumerate(zip(cells, keeps.tolist(), strict=True))}
-        below = {c: n + k if up else c for k, (c, up) in enumerate(zip(cells, keeps.tolist(), strict=True))}
-        crossing: dict[tuple[int, int], int] = {}
-        # Edges that the surface crosses.
-        for loop in loops:
-            for a, b in zip(loop, loop[1:] + loop[:1], strict=True):
-                key = (min(a, b), max(a, b))
-                if sides[a][0] * sides[b][0] < 0 and key not in crossing:
-                    crossing[key] = v + len(crossing)
-                    da, db = sides[key[0]][1], sides[key[1]][1]
-                    points.append(((f.points[key[0]] * db - f.points[key[1]] * da) / (db - da))[None])
-        at = {v + k: (0, 0.0) for k in range(len(crossing))}
-        sides |= at
-        position = np.concatenate(points)
-        extra: list[np.ndarray] = []
-        owner, neighbor, made = [], [], []
-        borders: dict[int, list[tuple[int, int]]] = {c: [] for c in cells}
-        for r, loop in zip(rows.tolist(), loops, strict=True):
-            i, j = int(f.owner[r]), int(f.neighbor[r])
-            full: list[int] = []
-            for a, b in zip(loop, loop[1:] + loop[:1], strict=True):
-                full.append(a)
-                if (key := (min(a, b), max(a, b))) in crossing:
-                    full.append(crossing[key])
-            side = [sides[a][0] for a in full]
-            if min(side) >= 0 or max(side) <= 0:
-                up = max(side) > 0
-                owner.append((above if up else below).get(i, i))
-                neighbor.append((above if up else below).get(j, j))
-                made.append(full)
-                continue
-            m = len(full)
-            ends = [k for k in range(m) if side[k] == 0 and side[k - 1] * side[(k + 1) % m] < 0]
-            if len(ends) != 2 or any(side[k] * side[k - 1] < 0 for k in range(m)):
-                raise _UncutError({i, j} & above.keys())
-            p, q = ends
-            one, other = full[p : q + 1], full[q:] + full[: p + 1]  # both from end to end
-            if side[(p + 1) % m] < 0:
-                one, other = other, one  # `one` is above
-            if (i in above) != (j in above):
-                # Fold the face away from the neighbor that is not cut.
-                a, b = position[one[-1]], position[one[0]]
-                out = np.cross(position[full] - position[full].mean(axis=0), np.roll(position[full], -1, axis=0)).sum(0)
-                if j in above:
-                    out = -out
-                normal = by.at((a + b)[None] / 2)[1][0]
-                out -= (out @ normal) * normal
-                out *= _FOLD * np.linalg.norm(a - b) / max(np.linalg.norm(out), 1e-300)
-                middle = [len(position) + len(extra)]
-                extra.append((a + b) / 2 - out)
-            else:
-                middle = []
-            for number, part, way in ((above, one, middle), (below, other, middle[::-1])):
-                owner.append(number.get(i, i))
-                neighbor.append(number.get(j, j))
-                made.append(part + way)
-            # From the last corner of the part above to its first one, as seen from the owner.
-            line = [one[-1], *middle, one[0]]
-            for c, way in ((i, line), (j, line[::-1])):
-                if c in above:
-                    borders[c] += itertools.pairwise(way)
-        for c in cells:
-            loop = _closed(borders[c])
-            if loop is None:
-                raise _UncutError({c})
-            owner.append(below[c])
-            neighbor.append(above[c])
-            made.append(loop)
-        # The new vertices on edges of the faces of other cells.
-        kept = np.ones(len(f.owner), bool)
-        kept[rows] = False
-        edge_owner, edge_neighbor, edge_loops = self._with_vertices(kept, crossing)
-        owner, neighbor, made = owner + edge_owner, neighbor + edge_neighbor, made + edge_loops
-        turned = [k for k in range(len(made)) if neighbor[k] >= 0 and owner[k] > neighbor[k]]
-        for k in turned:
-            owner[k], neighbor[k], made[k] = neighbor[k], owner[k], made[k][::-1]
-        left = np.flatnonzero(kept)
+        self._cross_edges()
+        for r, loop in zip(self.rows.tolist(), self.loops, strict=True):
+            self._divide(int(f.owner[r]), int(f.neighbor[r]), loop)
+        self._close_parts()
+        left = np.setdiff1d(np.arange(len(f.owner)), np.concatenate([self.rows, self._add_vertices_to_others()]))
+        made = [(j, i, loop[::-1]) if 0 <= j < i else (i, j, loop) for i, j, loop in self.made]
+        owner, neighbor, loops = zip(*made, strict=True)
         starts, corners = take_rows(f.starts, f.corners, left)
-        counts = np.concatenate([np.diff(starts), [len(loop) for loop in made]])
+        counts = np.concatenate([np.diff(starts), [len(loop) for loop in loops]])
         return replace(
             f,
             owner=np.concatenate([f.owner[left], owner]).astype(np.int64),
             neighbor=np.concatenate([f.neighbor[left], neighbor]).astype(np.int64),
             starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-            corners=np.concatenate([corners, [a for loop in made for a in loop]]).astype(np.int64),
-            points=np.concatenate([position, np.reshape(extra, (-1, 3))]),
-            home=np.append(f.home, f.home[cells]),
+            corners=np.concatenate([corners, list(itertools.chain(*loops))]).astype(np.int64),
+            points=np.concatenate([self.points, np.reshape(self.folds, (-1, 3))]),
+            home=np.append(f.home, f.home[self.cells]),
             row=np.concatenate([f.row[left], np.full(len(made), -1)]),
-            cuts=(*f.cuts, *(CreaseCut(c, below[c], above[c], by) for c in cells)),
+            cuts=(*f.cuts, *(CreaseCut(c, self.below[c], self.above[c], self.by) for c in self.cells)),
         )
 
-    def _sides(self, rows: np.ndarray, loops: list[list[int]], by: Bisecting) -> dict[int, tuple[int, float]]:
+    def _loop(self, row: int) -> list[int]:
+        """Return the corners of a face."""
+        return self.faces.corners[self.faces.starts[row] : self.faces.starts[row + 1]].tolist()
+
+    def _sides(self) -> dict[int, tuple[int, float]]:
         """Return for each corner on which side it lies, or 0 if it is in the surface, and its distance."""
         f = self.faces
         of: dict[int, float] = {}
         beside: dict[int, set[int]] = {}
-        for r, loop in zip(rows.tolist(), loops, strict=True):
+        for r, loop in zip(self.rows.tolist(), self.loops, strict=True):
             cells = [c for c in (f.owner[r], f.neighbor[r]) if 0 <= c < len(f.home) and f.home[c] < len(self.sizes)]
             h = min(float(self.sizes[f.home[c]]) for c in cells)
-            for a, b in zip(loop, loop[1:] + loop[:1], strict=True):
+            for a, b in _edges(loop):
                 of[a] = min(of.get(a, np.inf), h)
                 beside.setdefault(a, set()).add(b)
                 beside.setdefault(b, set()).add(a)
         corner = np.array(sorted(of))
-        height = dict(zip(corner.tolist(), by.at(f.points[corner])[0].tolist(), strict=True))
+        height = dict(zip(corner.tolist(), self.by.at(f.points[corner])[0].tolist(), strict=True))
         sides = {a: (1 if d > 0 else -1, d) for a, d in height.items()}
         inside: set[int] = set()
         for a in sorted(of, key=lambda k: (abs(height[k]), k)):
@@ -357,29 +323,93 @@ class _Cutter:
                 sides[a] = (0, 0.0)
         return sides
 
-    def _with_vertices(self, kept: np.ndarray, crossing: dict[tuple[int, int], int]):
-        """Return the faces of `kept` with new vertices on their edges, and take them out of `kept`."""
-        f = self.faces
-        owner: list[int] = []
-        neighbor: list[int] = []
-        loops: list[list[int]] = []
-        if not crossing:
-            return owner, neighbor, loops
-        ends = np.unique(np.array(list(crossing)))
-        hits = np.add.reduceat(np.isin(f.corners, ends).astype(np.int64), f.starts[:-1])
-        for r in np.flatnonzero(kept & (hits > 1)).tolist():
-            loop = f.corners[f.starts[r] : f.starts[r + 1]].tolist()
-            full: list[int] = []
-            for a, b in zip(loop, loop[1:] + loop[:1], strict=True):
-                full.append(a)
-                if (key := (min(a, b), max(a, b))) in crossing:
-                    full.append(crossing[key])
-            if len(full) > len(loop):
-                kept[r] = False
-                owner.append(int(f.owner[r]))
-                neighbor.append(int(f.neighbor[r]))
-                loops.append(full)
-        return owner, neighbor, loops
+    def _cross_edges(self) -> None:
+        """Put a vertex on each edge that the surface crosses."""
+        x, found = self.points, []
+        for loop in self.loops:
+            for edge in _edges(loop):
+                a, b = min(edge), max(edge)
+                (side_a, da), (side_b, db) = self.sides[a], self.sides[b]
+                if side_a * side_b < 0 and (a, b) not in self.crossings:
+                    self.crossings[a, b] = len(x) + len(found)
+                    found.append((x[a] * db - x[b] * da) / (db - da))
+        self.sides |= dict.fromkeys(self.crossings.values(), (0, 0.0))
+        self.points = np.concatenate([x, np.reshape(found, (-1, 3))])
+
+    def _with_vertices(self, loop: list[int]) -> list[int]:
+        """Return the corners of a face with the new vertices on its edges."""
+        full: list[int] = []
+        for a, b in _edges(loop):
+            full.append(a)
+            if (key := (min(a, b), max(a, b))) in self.crossings:
+                full.append(self.crossings[key])
+        return full
+
+    def _divide(self, i: int, j: int, loop: list[int]) -> None:
+        """Divide the face with the corners `loop` between cells i and j if it is on both sides of the surface."""
+        above, below = self.above, self.below
+        full = self._with_vertices(loop)
+        side = [self.sides[a][0] for a in full]
+        if min(side) >= 0 or max(side) <= 0:
+            number = above if max(side) > 0 else below
+            self.made.append((number.get(i, i), number.get(j, j), full))
+            return
+        m = len(full)
+        ends = [k for k in range(m) if side[k] == 0 and side[k - 1] * side[(k + 1) % m] < 0]
+        if len(ends) != 2 or any(side[k] * side[k - 1] < 0 for k in range(m)):
+            raise _UncutError({i, j} & above.keys())
+        p, q = ends
+        one, other = full[p : q + 1], full[q:] + full[: p + 1]  # both from end to end
+        if side[(p + 1) % m] < 0:
+            one, other = other, one  # `one` is above
+        middle: list[int] = []
+        if (i in above) != (j in above):
+            middle = [len(self.points) + len(self.folds)]
+            self.folds.append(self._fold(full, one[-1], one[0], toward_owner=i in above))
+        for number, part, way in ((above, one, middle), (below, other, middle[::-1])):
+            self.made.append((number.get(i, i), number.get(j, j), part + way))
+        # From the last corner of the part above to its first one, as seen from the owner.
+        line = [one[-1], *middle, one[0]]
+        for c, way in ((i, line), (j, line[::-1])):
+            if c in above:
+                self.borders[c] += itertools.pairwise(way)
+
+    def _fold(self, loop: list[int], begin: int, end: int, toward_owner: bool) -> np.ndarray:
+        """Return the middle of the line from `begin` to `end` across a face, moved into the cell that is cut."""
+        x, a, b = self.points[loop], self.points[begin], self.points[end]
+        out = np.cross(x - x.mean(axis=0), np.roll(x, -1, axis=0)).sum(axis=0)
+        if not toward_owner:
+            out = -out
+        normal = self.by.at((a + b)[None] / 2)[1][0]
+        out -= (out @ normal) * normal
+        out *= _FOLD * np.linalg.norm(a - b) / max(np.linalg.norm(out), 1e-300)
+        return (a + b) / 2 - out
+
+    def _close_parts(self) -> None:
+        """Put a face between the two parts of each cell."""
+        for c in self.cells:
+            loop = _closed(self.borders[c])
+            if loop is None:
+                raise _UncutError({c})
+            self.made.append((self.below[c], self.above[c], loop))
+
+    def _add_vertices_to_others(self) -> np.ndarray:
+        """Make the faces of other cells again on whose edges new vertices lie; return which ones, (k,)."""
+        f, found = self.faces, []
+        if self.crossings:
+            hits = np.add.reduceat(np.isin(f.corners, np.unique(list(self.crossings))).astype(np.int64), f.starts[:-1])
+            for r in np.setdiff1d(np.flatnonzero(hits > 1), self.rows).tolist():
+                loop = self._loop(r)
+                full = self._with_vertices(loop)
+                if len(full) > len(loop):
+                    found.append(r)
+                    self.made.append((int(f.owner[r]), int(f.neighbor[r]), full))
+        return np.array(found, np.int64)
+
+
+def _edges(loop: list[int]) -> Iterator[tuple[int, int]]:
+    """Return each corner of a loop with the next one."""
+    return zip(loop, loop[1:] + loop[:1], strict=True)
 
 
 class _UncutError(Exception):
