@@ -41,6 +41,7 @@ def meshed(request, adapter_of_module):
     domain = clvoro.Polygon(rings[0], rings[1:], names=NAMES)
     points = np.random.default_rng(5).uniform(0, 3.5, (600, 2))
     diagram = adapter_of_module.diagram(domain, points[domain.contains(points)])
+    diagram = adapter_of_module.diagram(domain, diagram.centroids)
     n = len(diagram)
     from clvoro.mesh.results import HISTORY_DTYPE
 
