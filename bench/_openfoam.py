@@ -146,25 +146,25 @@ class Case:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def write(self, name: str, entries: Mapping[str, Any]) -> None:
-        """Write the dictionary or field `name`, such as "system/controlDict" or "0/U"."""
+    def write(self, name: str, entries: Mapping[str, Any], kind: str = "dictionary") -> None:
+        """Write the dictionary `name`, such as "system/controlDict", or a field, such as "0/U", of the class `kind`."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        kinds = {"0/U": "volVectorField", "0/p": "volScalarField", "0/Phi": "volScalarField"}
-        path.write_text(header(kinds.get(name, "dictionary"), path.name) + text_of(entries))
+        path.write_text(header(kind, path.name) + text_of(entries))
 
     def write_start(
         self,
         velocity: Mapping[str, Any],
         pressure: Mapping[str, Any],
         values: tuple[str, str] = ("uniform (0 0 0)", "uniform 0"),
+        names: tuple[str, str] = ("U", "p"),
     ) -> None:
-        """Write U and p: the entries of their patches, and their values in cells."""
-        for name, dimensions, inside, patches in (
-            ("U", "[0 1 -1 0 0 0 0]", values[0], velocity),
-            ("p", "[0 2 -2 0 0 0 0]", values[1], pressure),
+        """Write a velocity and a pressure: the entries of their patches, and their values in cells."""
+        for name, kind, dimensions, inside, patches in (
+            (names[0], "volVectorField", "[0 1 -1 0 0 0 0]", values[0], velocity),
+            (names[1], "volScalarField", "[0 2 -2 0 0 0 0]", values[1], pressure),
         ):
-            self.write(f"0/{name}", {"dimensions": dimensions, "internalField": inside, "boundaryField": patches})
+            self.write(f"0/{name}", {"dimensions": dimensions, "internalField": inside, "boundaryField": patches}, kind)
 
     def write_system(
         self,

@@ -425,14 +425,9 @@ def write_adjoints(case: Case) -> None:
         at = {"inlet": "adjointInletVelocity", "outlet": "adjointOutletVelocity"}
         at |= dict.fromkeys(walls, "adjointWallVelocity")
         velocity = {key: {"type": kind, "value": "uniform (0 0 0)"} for key, kind in at.items()}
-        pressure = {**dict.fromkeys(("inlet", *walls), closed), "outlet": {"type": "adjointOutletPressure"}}
-        pressure["outlet"]["value"] = "uniform 0"
-        for field, kind, dimensions, value, patches in (
-            (f"Ua{name}", "volVectorField", "[0 1 -1 0 0 0 0]", "uniform (0 0 0)", velocity),
-            (f"pa{name}", "volScalarField", "[0 2 -2 0 0 0 0]", "uniform 0", pressure),
-        ):
-            entries = {"dimensions": dimensions, "internalField": value, "boundaryField": {**patches, **flat}}
-            (case.folder / "0" / field).write_text(header(kind, field) + text_of(entries))
+        pressure = dict.fromkeys(("inlet", *walls), closed)
+        pressure |= {"outlet": {"type": "adjointOutletPressure", "value": "uniform 0"}}
+        case.write_start({**velocity, **flat}, {**pressure, **flat}, names=(f"Ua{name}", f"pa{name}"))
         force = {"type": "force", "weight": 1, "patches": "(cylinder)", "direction": direction}
         force |= {"Aref": 2 * RADIUS * THICKNESS, "rhoInf": 1, "UInf": 0.2}
         solvers[name] = {

@@ -189,7 +189,8 @@ def flow_around_sphere(case: Case, mesh: Mesh, _: Any) -> dict[str, float]:
     free = {"type": "fixedValue", "value": "uniform 0"}
     case.write_start({"far": given, "body": still}, {"far": free, "body": closed})
     sides = {"far": closed, "body": closed}
-    case.write("0/Phi", {"dimensions": "[0 2 -1 0 0 0 0]", "internalField": "uniform 0", "boundaryField": sides})
+    entries = {"dimensions": "[0 2 -1 0 0 0 0]", "internalField": "uniform 0", "boundaryField": sides}
+    case.write("0/Phi", entries, "volScalarField")
     case.run("potentialFoam", "-writephi")
     flux, inner = np.zeros(len(areas)), len(mesh.neighbor)
     flux[:inner], flux[far] = case.field("phi", inner)[:, 0], (u * area).sum(axis=1)

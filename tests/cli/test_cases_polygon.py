@@ -117,6 +117,10 @@ def test_sizes_from_the_boundary() -> None:
         ("[domain]\nouter = [[0, 0], [2, 2], [2, 0], [0, 2]]\n", "Self-intersection"),
         ("[domain]\nkind = 'polygon'\n", "none of file, outer"),
         ("[domain]\nkind = 'polygon'\nlower = [0, 0]\n", "unknown key 'lower'"),
+        (
+            f"[domain]\nlower = [0, 0]\nupper = [4, 4]\nholes = [{HOLE.tolist()}]\n",
+            'write it as outer = { kind = "box", ',
+        ),
         ("[domain]\nlower = [0, 0]\nupper = [1, 1]\nouter = [[0, 0], [1, 0], [1, 1]]\n", "both lower, of a box"),
     ],
 )
