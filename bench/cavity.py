@@ -8,7 +8,7 @@
 difference of the horizontal velocity on the vertical line through the middle from the values of a spectral method
 (Botella and Peyret 1998, Computers & Fluids 27, 421), in percent of the lid's velocity. Those of Ghia, Ghia and Shin
 (1982), on 129 x 129 squares, differ from them by 0.27 %. "as uniform" is the number of cells with which a uniform mesh
-has that error: with log-linear interpolation between the meshes of --uniform.
+has that error: with log-linear interpolation between the meshes of --uniform, blank beyond them.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def main(arguments: list[str] | None = None) -> int:
             seconds, known = time.perf_counter() - start, FoamCase(case.folder)
             mesh = clvoro.load(known.mesh_folder(known.latest()) / "clvoro.npz")
             record = {"mesh": "followed", "cells": n, "error": error(case, mesh.diagram), "seconds": seconds}
-            if len(known_errors) > 1:
+            if known_errors and min(known_errors) <= record["error"] <= max(known_errors):
                 order = np.argsort(known_errors)
                 logs = np.log(np.array(known_errors))[order], np.log(np.array(options.uniform, float))[order]
                 record["as_uniform"] = round(math.exp(np.interp(math.log(record["error"]), *logs)))
