@@ -4,6 +4,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 import clvoro
 from clvoro.finite_volumes import collapse
@@ -11,7 +12,7 @@ from clvoro.finite_volumes.collapse import collapse_short
 from clvoro.finite_volumes.defects import DefectLimits
 from clvoro.finite_volumes.merging import Merges
 from clvoro.finite_volumes.seams import pack, unpack
-from clvoro.mesh.connectivity import following
+from clvoro.mesh.connectivity import following, take_rows
 from tests.reference import polyhedra
 from tests.reference.solids import solid_diagram
 
@@ -250,6 +251,18 @@ def test_clear_meshes_are_left_alone():
 
 
 @pytest.mark.sparse(2)
+def test_corners_of_faces_that_are_not_chosen_stay():
+    """Faces beside the chosen ones that become small are left as they are."""
+    diagram = solid_diagram((0, 0, 0), (1, 1, 1), np.random.default_rng(2).random((200, 3)))
+    mesh = diagram.solver_mesh(collapse=False)
+    low = np.append(diagram.points[:, 0] < 0.5, False)
+    chosen = low[mesh.owner] | low[np.maximum(mesh.neighbor, -1)]
+    made = collapse_short(mesh, diagram, chosen=chosen)
+    assert len(made) < len(mesh)
+    others = np.setdiff1d(mesh.corners, take_rows(mesh.starts, mesh.corners, np.flatnonzero(chosen))[1])
+    assert KDTree(made.points).query(mesh.points[others])[0].max() < 1e-12
+
+
 def test_suspects_are_all_that_would_be_flagged(meshes):
     """The screening against a scan of all faces."""
     diagram, before, _ = meshes
