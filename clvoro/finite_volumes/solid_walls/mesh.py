@@ -68,7 +68,7 @@ class _Made:
     rejected: np.ndarray
 
     def is_like(self, other: _Made) -> bool:
-        """Return whether the faces are those of `other`."""
+        """Return whether both have the same faces, to the bit."""
         return all(
             np.array_equal(getattr(self.faces, name), getattr(other.faces, name)) for name in ("corners", "points")
         )
@@ -87,10 +87,7 @@ def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray
     sizes : (n,) float
         h at the generators.
     """
-    near = np.flatnonzero(surface.touches(points, 1.5 * sizes))
-    _, foot, distance = surface.closest(points[near])
-    close = np.abs(distance) < 1.5 * sizes[near]
-    near, foot, distance = near[close], foot[close], distance[close]
+    near, foot, distance = _close_to(surface, points, 1.5 * sizes)
     h = sizes[near]
     normal = foot - points[near]
     normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
@@ -114,9 +111,8 @@ def off_middle(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> n
     sizes : (n,) float
         h at the generators.
     """
-    near = np.flatnonzero(surface.touches(points, _THIN * sizes))
-    foot, distance = surface.closest(points[near])[1:]
-    kept = (distance < -0.05 * sizes[near]) & (distance > -_THIN * sizes[near])
+    near, foot, distance = _close_to(surface, points, _THIN * sizes)
+    kept = distance < -0.05 * sizes[near]
     near, foot, distance = near[kept], foot[kept], distance[kept]
     across = (points[near] - foot) / -distance[:, None]
     thin = surface.closest(points[near] + _THIN * sizes[near, None] * across)[2] > 0
@@ -125,6 +121,14 @@ def off_middle(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> n
     moved = points.copy()
     moved[near] += share * np.minimum(_ACROSS * sizes[near], -distance)[:, None] * across
     return moved
+
+
+def _close_to(surface: WallSurface, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows of points nearer to the surface than `reach` (n,), their feet on it and signed distances."""
+    near = np.flatnonzero(surface.touches(points, reach))
+    _, foot, distance = surface.closest(points[near])
+    close = np.abs(distance) < reach[near]
+    return near[close], foot[close], distance[close]
 
 
 def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Faces) -> Diagram:
