@@ -158,9 +158,9 @@ def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
 
 
 def rejected_cells(mesh: Faces, judged: np.ndarray) -> np.ndarray:
-    """Return which cells in 3D OpenFOAM rejects, or one of whose faces, (n,) bool.
+    """Return which cells OpenFOAM rejects in 3D, (n,) bool: also those with a face that it rejects.
 
-    Tetrahedra are those of the faces `judged` (k,).
+    Only the faces `judged` (k,) are divided into tetrahedra, which takes the longest.
     """
     m, g = mesh.measures, mesh.measures.geometry
     bad = m.concave | (g.volumes < LEAST_MEASURE) | (m.determinant < LEAST_DETERMINANT)
@@ -176,7 +176,7 @@ def rejected_cells(mesh: Faces, judged: np.ndarray) -> np.ndarray:
 
 
 def rejected_polygons(mesh: Faces) -> np.ndarray:
-    """Return which cells in 2D OpenFOAM rejects, or one of whose faces, (n,) bool."""
+    """Return which cells OpenFOAM rejects in 2D, (n,) bool: also those with a face that it rejects."""
     m = PlaneMeasures(mesh)
     starts, loop, broken = simple_loops(mesh)
     cell = np.repeat(np.arange(mesh.n_cells), np.diff(starts))

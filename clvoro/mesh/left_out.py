@@ -68,7 +68,8 @@ class LeftOut(Sealed):
 def left_out_of_polygon(mesh: Faces, domain: Polygon) -> LeftOut:
     """Return the parts of `domain` that the cells of `mesh` do not cover, and the parts of its outside that they cover.
 
-    They are as large as `SMALLEST`. Islands that no cell has a wall on are found whatever their size is.
+    Parts are left away that are smaller than `SMALLEST` times the nearest cell. Islands on which no cell has a wall are
+    found whatever their size is.
     """
     walls = slice(mesh.n_inner, mesh.n_outer)
     sides = mesh.points[mesh.corners.reshape(-1, 2)[walls]]

@@ -46,7 +46,7 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
 
 
 def _within(shape: Domain | Surface, diagram: Diagram, globe: Sphere | None) -> np.ndarray:
-    """Return which generators are in the `shape`, (n,) bool.
+    """Return which generators of `diagram` lie inside of `shape`, (n,) bool.
 
     Raises
     ------

@@ -92,7 +92,7 @@ class NearWalls:
         )
 
     def put_back(self, made: Faces, home: np.ndarray, own: np.ndarray) -> tuple[Faces, np.ndarray]:
-        """Return the mesh of the solid, and the generator i of each cell; -1 - i for further parts of its cell.
+        """Put the cells near the surface back among those of the rest.
 
         Parameters
         ----------
@@ -103,6 +103,13 @@ class NearWalls:
             The cell, here, that each of them was.
         own : (m,) bool
             Whether it holds the generator. Those that do come first, ascending.
+
+        Returns
+        -------
+        faces : Faces
+            The mesh of the solid.
+        home : (m,) int
+            See `Diagram.home`.
         """
         whole, n, p = self.faces, len(self.points), len(self.rows)
         generator = np.append(self.rows, n)[home]
@@ -114,7 +121,7 @@ class NearWalls:
         count = int(has.sum())
         number = np.cumsum(has) - 1
         numbers = np.where(own, number[generator], count + np.cumsum(~own) - 1)
-        # Faces of which one cell, or both, belong to the rest come from the whole diagram.
+        # Faces of the rest, also those between it and the cells near the surface, are those of the whole diagram.
         inside = (whole.owner < n) & (whole.neighbor >= 0) & (whole.neighbor < n)
         kept = np.flatnonzero(inside & ~(near[whole.owner] & near[np.maximum(whole.neighbor, 0)]))
         is_rest = np.append(home == p, False)
