@@ -1,6 +1,7 @@
 """Errors say what to do: each is raised here, and what it says is done. A new error with a remedy needs a row, too."""
 
 import ast
+import copy
 import errno
 import inspect
 import json
@@ -149,7 +150,7 @@ ROWS = [
     (lambda t: t.run(BOX, 0.3, effort="exact"), lambda t: t.run(BOX, 0.3, method="exact")),
     (lambda t: t.run(BOX, 0.3, 200), lambda t: t.run(BOX, 0.3, "default")),
     (lambda t: clvoro.Adapter("cpu"), lambda t: clvoro.Adapter(clvoro.create_context("cpu"))),
-    (lambda t: t.copied(), lambda t: clvoro.Adapter(t.adapter.ctx, t.adapter.dtype)),
+    (lambda t: copy.copy(t.adapter), lambda t: clvoro.Adapter(t.adapter.ctx, t.adapter.dtype)),
     (lambda t: t.reentrant(t.adapter), lambda t: t.reentrant(clvoro.Adapter(t.adapter.ctx))),
     (lambda t: t.run(BOX, 0.2, callback=lambda a, b: None), lambda t: t.run(BOX, 0.2, callback=lambda row: None)),
     (lambda t: t.run(BOX, lambda p: 0 * p[:, 0]), lambda t: t.run(BOX, sizing.maximum(lambda p: 0 * p[:, 0], 0.2))),
@@ -166,7 +167,6 @@ ROWS = [
         lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.1, count=6)),
         lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.02, count=6)),
     ),
-    (lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.6)), lambda t: t.run(BOX, 0.1, layers=clvoro.Layers(0.06))),
     (
         lambda t: t.run(BOX, 0.2, fixed=[(0.5, 0.5)], method="transport"),
         lambda t: t.run(BOX, 0.2, fixed=[(0.5, 0.5)], method="exact"),
@@ -360,13 +360,7 @@ ROWS = [
         lambda t: t.mesh.subset(np.abs(POINTS - 0.5).max(axis=1) < 0.4).to_netcdf(t.path("a.nc"), convention="mpas"),
     ),
     (lambda t: t.around.to_netcdf(t.path("a.nc"), convention="mpas"), lambda t: t.around.to_netcdf(t.path("a.nc"))),
-    (
-        lambda t: (
-            t.around.check(solver="openfoam", walls="exact").demand()
-            or t.around.to_openfoam(t.path("a.foam"), walls="exact")
-        ),
-        lambda t: t.around.save(t.path("a.vtu")),
-    ),
+    (lambda t: t.around.check(solver="openfoam", walls="exact").demand(), lambda t: t.around.save(t.path("a.vtu"))),
     (
         lambda t: t.single.to_netcdf(t.path("a.nc"), convention="mpas"),
         lambda t: t.torus.to_netcdf(t.path("a.nc"), convention="mpas"),
@@ -413,10 +407,9 @@ ROWS = [
         lambda t: t.run(BOX, sizing.Graded(lambda p: 0.3 + 0 * p[:, 0], 1.2, resolution=50)),
     ),
     (
-        lambda t: raster((0, 0), (1, 1)) and sizing.Raster([[1, np.nan]], (0, 0), (1, 1)),
+        lambda t: sizing.Raster([[1, np.nan]], (0, 0), (1, 1)),
         lambda t: sizing.Raster([[1, np.nan]], (0, 0), (1, 1), missing="nearest"),
     ),
-    (lambda t: sizing.Raster([[np.nan] * 2] * 2, (0, 0), (1, 1)), lambda t: raster((0, 0), (1, 1))),
     (lambda t: raster((0, 1), (1, 0)), lambda t: sizing.Raster(np.full((5, 9), 0.5)[::-1], (0, 0), (1, 1))),
     (
         lambda t: t.run(BOX, raster((0, 0), (0.5, 1), outside="error")),
@@ -462,7 +455,6 @@ ROWS = [
     ),
     # Boxes, polygons and curves.
     (lambda t: clvoro.Box(0, 2.5), lambda t: clvoro.Box((0, 0), (2.5, 1.5))),
-    (lambda t: clvoro.Box((0,), (2.5,)), lambda t: clvoro.Box((0, 0), (2.5, 1.5))),
     (lambda t: clvoro.Box((0, 2.5), (0, 1.5)), lambda t: clvoro.Box((0, 0), (2.5, 1.5))),
     (lambda t: clvoro.Box((0, 0), (1e200, 1)), lambda t: clvoro.Box((0, 0), (1, 1))),
     (lambda t: BOX.without([HOLE]), lambda t: clvoro.Polygon(SQUARE, [HOLE])),
@@ -511,10 +503,7 @@ ROWS = [
     ),
     (lambda t: clvoro.Polygon(SQUARE, [HOLE, HOLE]), lambda t: clvoro.Polygon(SQUARE, [HOLE])),
     (
-        lambda t: (
-            clvoro.Polygon(SQUARE, names={"a": [0], "outer": [1]})
-            and clvoro.Polygon(SQUARE, [HOLE], names={"hole-1": [0]})
-        ),
+        lambda t: clvoro.Polygon(SQUARE, [HOLE], names={"hole-1": [0]}),
         lambda t: clvoro.Polygon(SQUARE, [HOLE], names={"pore": [0]}),
     ),
     (
@@ -558,10 +547,6 @@ ROWS = [
     (lambda t: t.run(t.ocean.domain, 0.7), lambda t: t.run(GLOBE, 0.7).subset),
     (lambda t: t.ocean.domain.boundary(), lambda t: t.run(GLOBE, 0.7)),
     (lambda t: t.part.domain.boundary(), lambda t: BOX.boundary()),
-    (
-        lambda t: t.run(GLOBE, sizing.Graded(lambda lon, lat: 0.5 + 0 * lon, 1.2, box=BOX)),
-        lambda t: t.run(GLOBE, sizing.Graded(sizing.Expression("0.8 + 0 * lat"), 1.2)),
-    ),
     (lambda t: t.run(GLOBE, raster((-90, -180), (90, 180))), lambda t: t.run(GLOBE, raster((-180, -90), (180, 90)))),
     (
         lambda t: t.run(GLOBE, raster(*np.radians([(-180, -90), (180, 90)]))),
@@ -730,9 +715,7 @@ ROWS = [
         lambda t: (t.mesh.save(t.path("a.foam")), clvoro.load(t.path("polyMesh"))),
         lambda t: (t.mesh.save(t.path("a.npz")), clvoro.load(t.path("a.npz"))),
     ),
-    (lambda t: t.mesh.to_vtu(t.path("a.nc")), lambda t: t.mesh.save(t.path("a.nc"))),
     # Devices and their memory.
-    (lambda t: clvoro.create_context(0), lambda t: clvoro.create_context("cpu")),
     (
         lambda t: t.device(has_fp64=False) and clvoro.Adapter(t.device()),
         lambda t: t.device(has_fp64=False) and clvoro.Adapter(t.device(), dtype="float32"),
@@ -954,8 +937,6 @@ ROWS = [
         lambda t: t.run(BOX, sizing.Expression("sqrt(x - 1)")),
         lambda t: t.run(BOX, sizing.Expression("0.3 + sqrt(fmax(x - 1, 0))")),
     ),
-    (lambda t: 1 - DISTANCE, lambda t: t.run(BOX, lambda p: 1 - 0.7 * DISTANCE(p)), "distance"),
-    (lambda t: max(0.1, DISTANCE), lambda t: sizing.maximum(0.1, DISTANCE)),
     (lambda t: t.run(BOX, 0.3, layers=0.01), lambda t: t.run(BOX, 0.3, layers=clvoro.Layers(0.01))),
     (lambda t: t.run(BOX, 0.3, points=t.mesh), lambda t: t.run(BOX, 0.3, points=t.mesh.points, method="lloyd")),
     (
@@ -973,20 +954,6 @@ ROWS = [
     (lambda t: clvoro.Polygon(WKT), lambda t: clvoro.Polygon.from_wkt(WKT)),
     (lambda t: clvoro.Polygon(shapely.box(0, 0, 1, 1)), lambda t: clvoro.Polygon.from_shapely(shapely.box(0, 0, 1, 1))),
     (lambda t: clvoro.Polygon(LAKE), lambda t: clvoro.Polygon.from_geojson(LAKE)),
-    (
-        lambda t: clvoro.Polygon(np.array([*SQUARE, (0, 0.5)]).T),
-        lambda t: clvoro.Polygon(np.array([*SQUARE, (0, 0.5)])),
-        "array",
-    ),
-    (
-        lambda t: clvoro.Polygon([(*p, 1) for p in SQUARE]),
-        lambda t: clvoro.Polygon(np.array([(*p, 1) for p in SQUARE])[:, :2]),
-        "array",
-    ),
-    (
-        lambda t: clvoro.Polygon([0, 1, 1, 0], [0, 0, 1, 1]),
-        lambda t: clvoro.Polygon(np.column_stack([[0, 1, 1, 0], [0, 0, 1, 1]])),
-    ),
     (lambda t: clvoro.Polygon([SQUARE, HOLE]), lambda t: clvoro.Polygon(SQUARE, [HOLE]), "rings"),
     (lambda t: clvoro.Polygon(SQUARE, HOLE), lambda t: clvoro.Polygon(SQUARE, [HOLE])),
     (
@@ -1041,11 +1008,6 @@ class Workplace(SimpleNamespace):
 
     def voronoi(self, domain, points):
         return self.adapter.diagram(domain, points)
-
-    def copied(self):
-        import copy
-
-        return copy.copy(self.adapter)
 
     def reentrant(self, other):
         self.adapter.run(BOX, 0.3, "fast", callback=lambda row: other.diagram(BOX, POINTS) is None)
