@@ -89,6 +89,20 @@ inline chart_t chart_at(global const REAL *origins, int i)
     return chart;
 }
 
+/* The half-space { y : y.normal <= level }; if `turned`, the one beyond the same plane. Both pieces of a face compute
+   its plane by the same operations, so that their half-spaces are complementary. The last component of the result is
+   the round-off of y.normal - level for |y| <= reach and a plane through or between a and b, `length` apart: corners
+   beyond the plane by no more count as inside. */
+inline REAL4 side_of_plane(REAL4 normal, private REAL *level, bool turned, REAL length, REAL reach, REAL4 a, REAL4 b)
+{
+    if (turned) {
+        normal = -normal;
+        *level = -*level;
+    }
+    normal.s3 = 4 * REAL_EPS * length * (reach + fmax(length_bound(a), length_bound(b)));
+    return normal;
+}
+
 #if CELL_DIM == 2
 
 typedef struct {
@@ -138,10 +152,9 @@ inline int build_piece(private piece_t *piece, const chart_t *chart, int i, cons
     return PIECE_WHOLE;
 }
 
-/* The half-space of the edge from corner k of piece j, moved by `shift`. Both pieces of an edge compute it by the same
-   operations, so that they are complementary. On a sphere it is bounded by a plane through the center, with the normal
-   v x w for the ends v = x + a and w = x + b of the edge: a x b + x x (b - a) loses no digits of short edges. Corners
-   beyond it by no more than the last component count as inside. */
+/* The half-space of the edge from corner k of piece j, moved by `shift`. On a sphere it is bounded by a plane through
+   the center, with the normal v x w for the ends v = x + a and w = x + b of the edge: a x b + x x (b - a) loses no
+   digits of short edges. */
 inline REAL4 half_space(const chart_t *chart, REAL reach, const pieces_t *mesh, int j, int k, REAL4 shift,
                         private REAL *level)
 {
@@ -156,19 +169,13 @@ inline REAL4 half_space(const chart_t *chart, REAL reach, const pieces_t *mesh, 
     const REAL4 e = b - a;
 #ifdef SPHERE
     const REAL4 ab = cross(a, b), normal4 = -ab - cross(chart->at, e);
-    REAL4 normal = (REAL4)(dot_vectors(normal4, chart->one), dot_vectors(normal4, chart->other), 0, 0);
+    const REAL4 normal = (REAL4)(dot_vectors(normal4, chart->one), dot_vectors(normal4, chart->other), 0, 0);
     *level = dot_vectors(ab, chart->at);
 #else
-    REAL4 normal = (REAL4)(e.s1, -e.s0, 0, 0);
+    const REAL4 normal = (REAL4)(e.s1, -e.s0, 0, 0);
     *level = difference_of_products(a.s0, e.s1, a.s1, e.s0);
 #endif
-    const REAL noise = 4 * REAL_EPS * length_bound(e) * (reach + fmax(length_bound(a), length_bound(b)));
-    if (turned) {
-        normal = -normal;
-        *level = -*level;
-    }
-    normal.s3 = noise;
-    return normal;
+    return side_of_plane(normal, level, turned, length_bound(e), reach, a, b);
 }
 
 /* How many corners of a shape are beyond a half-space. */
@@ -361,9 +368,7 @@ inline void recall_piece(private piece_t *piece, private const shape_t *shape)
     piece->n = shape->n;
 }
 
-/* The points nearer to the origin of piece j, moved by `shift`, than to point k of its row. Both pieces of a face
-   compute its plane by the same operations, so that they are complementary. Corners beyond it by no more than the last
-   component count as inside. */
+/* The points nearer to the origin of piece j, moved by `shift`, than to point k of its row. */
 inline REAL4 half_space(const chart_t *chart, REAL reach, const pieces_t *mesh, int j, int k, REAL4 shift,
                         private REAL *level)
 {
@@ -371,15 +376,9 @@ inline REAL4 half_space(const chart_t *chart, REAL reach, const pieces_t *mesh, 
     const REAL4 own = load_vector(mesh->origins, j), there = load_vector(mesh->points, q);
     const REAL4 low = j > q ? there : own, high = j > q ? own : there;
     const REAL4 a = low + shift - chart->at, b = high + shift - chart->at;
-    REAL4 normal = high - low;
+    const REAL4 normal = high - low;
     *level = dot_vectors(normal, a + b) / 2;
-    const REAL noise = 4 * REAL_EPS * length_bound(normal) * (reach + fmax(length_bound(a), length_bound(b)));
-    if (j > q) {
-        normal = -normal;
-        *level = -*level;
-    }
-    normal.s3 = noise;
-    return normal;
+    return side_of_plane(normal, level, j > q, length_bound(normal), reach, a, b);
 }
 
 /* How many vertices of a shape are beyond a half-space. */
