@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cla
@@ -56,12 +56,18 @@ class _Pieces:
         Piece of each loop.
     roots : (p,) int32
         Generator that owns each piece.
+    marks : (n,) int32
+        1 for uncrossed cells beside a piece that changes cells: they get another neighbor.
+    orphans : tuple
+        The pieces that change cells, (>= count,) int32, and their count.
     """
 
     segments: tuple[cla.Array, ...]
     segment_count: int
     loop_pieces: cla.Array
     roots: cla.Array
+    marks: cla.Array
+    orphans: tuple[cla.Array, int]
 
 
 class Trim:
@@ -153,9 +159,10 @@ class Trim:
         )
         self._demand(int(self._flags.get()[0]))
         marks = room.zeros("marks", size=n, dtype=np.int32)
-        found = _Pieces(segments, count, pieces, roots)
-        orphans, orphan_count = self._adopt(chords, found, marks) if flags & ORPHANS else (pieces, 0)
-        return self._write(points, convex, chords, found, (orphans, orphan_count), marks, straight)
+        found = _Pieces(segments, count, pieces, roots, marks, (pieces, 0))
+        if flags & ORPHANS:
+            found = replace(found, orphans=self._adopt(chords, found))
+        return self._write(points, convex, chords, found, straight)
 
     @staticmethod
     def _demand(flags: int) -> None:
@@ -163,7 +170,7 @@ class Trim:
         if flags & LOST:
             raise BoundaryError
 
-    def _adopt(self, chords: Chords, found: _Pieces, marks: cla.Array) -> tuple[cla.Array, int]:
+    def _adopt(self, chords: Chords, found: _Pieces) -> tuple[cla.Array, int]:
         """Find the owner of each piece without generator; return the pieces that change cells, and their number."""
         engine, k, room, u = self.engine, self._kernels, self._room, chords.touched_count
         pieces, roots = found.loop_pieces, found.roots
@@ -175,81 +182,26 @@ class Trim:
         for _ in range(ROUNDS // 2):
             for before, after in ((roots, other), (other, roots)):
                 engine.run_each(k.adopt_pieces, u, *cells, before, after)
-        engine.run_each(k.settle_pieces, u, *cells, roots, ranks, marks)
+        engine.run_each(k.settle_pieces, u, *cells, roots, ranks, found.marks)
         self._scan.exclusive(ranks, ranks, places)
         engine.run_each(k.list_orphans, places, ranks, orphans)
         return orphans, int(ranks[places].get())
 
     def _write(
-        self,
-        points: cla.Array,
-        convex: Tessellation,
-        chords: Chords,
-        found: _Pieces,
-        orphans: tuple[cla.Array, int],
-        marks: cla.Array,
-        straight: bool,
+        self, points: cla.Array, convex: Tessellation, chords: Chords, found: _Pieces, straight: bool
     ) -> Tessellation:
         """Write the rows and measures of the diagram."""
-        n, segments, roots = len(marks), found.segments, found.roots
-        engine, k, room, u = self.engine, self._kernels, self._room, chords.touched_count
-        starts = room("starts", size=n + 1, dtype=np.int32)
-        owners = chords.touched, chords.slots, roots
-        engine.run_each(k.count_whole, n, convex.starts, chords.slots, starts)
-        engine.run_each(k.count_trimmed, u, *segments, *owners, starts)
-        self._scan.exclusive(starts, starts, n)
+        room, n = self._room, len(found.marks)
         # Every face of the diagram is a face of a convex cell or a segment.
         m = 7 * n + 8 + found.segment_count
+        starts = self._count(convex, chords, found)
         neighbors = room("neighbors", size=m, dtype=np.int32)
         measures, centroids = room("measures", size=m), room("centroids", size=2 * m)
         face_segments = room("face_segments", size=m, dtype=np.int32)
         outlines = room("outlines", size=2 * n)
-        engine.run_each(
-            k.copy_whole,
-            n,
-            convex.starts,
-            convex.neighbors,
-            convex.face_measures,
-            convex.face_centroids,
-            *segments,
-            chords.slots,
-            roots,
-            marks,
-            starts,
-            neighbors,
-            measures,
-            centroids,
-            convex.volumes,
-            outlines,
-        )
-        place_cells = room("place_cells", size=chords.count + u, dtype=np.int32)
-        chord_owners = room("chord_owners", size=chords.count, dtype=np.int32)
-        engine.run_each(
-            k.name_chord_owners, u, *segments, chords.list_starts, chords.listed, roots, place_cells, chord_owners
-        )
-        engine.run_each(
-            k.write_trimmed,
-            u,
-            int(straight),
-            *segments,
-            *chords.arrays,
-            chord_owners,
-            *chords.turns,
-            points,
-            *owners,
-            orphans[0],
-            np.int32(orphans[1]),
-            place_cells,
-            starts,
-            neighbors,
-            measures,
-            centroids,
-            face_segments,
-            convex.volumes,
-            convex.offsets,
-            convex.covariances,
-            outlines,
-        )
+        rows = starts, neighbors, measures, centroids
+        self._write_whole(convex, chords, found, rows, outlines)
+        self._write_trimmed(points, convex, chords, found, (*rows, face_segments), outlines, straight)
         return Tessellation(
             n=n,
             points=points,
@@ -261,5 +213,74 @@ class Trim:
             offsets=convex.offsets[:n],
             covariances=convex.covariances[:n],
             outlines=(outlines, chords.tangents),
-            trimmed=Trimmed(convex, chords, segments, face_segments, found.segment_count),
+            trimmed=Trimmed(convex, chords, found.segments, face_segments, found.segment_count),
+        )
+
+    def _count(self, convex: Tessellation, chords: Chords, found: _Pieces) -> cla.Array:
+        """Return where the row of each cell starts."""
+        engine, k, n = self.engine, self._kernels, len(found.marks)
+        starts = self._room("starts", size=n + 1, dtype=np.int32)
+        engine.run_each(k.count_whole, n, convex.starts, chords.slots, starts)
+        owners = chords.touched, chords.slots, found.roots
+        engine.run_each(k.count_trimmed, chords.touched_count, *found.segments, *owners, starts)
+        self._scan.exclusive(starts, starts, n)
+        return starts
+
+    def _write_whole(
+        self, convex: Tessellation, chords: Chords, found: _Pieces, rows: tuple[cla.Array, ...], outlines: cla.Array
+    ) -> None:
+        """Copy the cells that the boundary does not cross."""
+        self.engine.run_each(
+            self._kernels.copy_whole,
+            len(found.marks),
+            convex.starts,
+            convex.neighbors,
+            convex.face_measures,
+            convex.face_centroids,
+            *found.segments,
+            chords.slots,
+            found.roots,
+            found.marks,
+            *rows,
+            convex.volumes,
+            outlines,
+        )
+
+    def _write_trimmed(
+        self,
+        points: cla.Array,
+        convex: Tessellation,
+        chords: Chords,
+        found: _Pieces,
+        rows: tuple[cla.Array, ...],
+        outlines: cla.Array,
+        straight: bool,
+    ) -> None:
+        """Write the cells that the boundary crosses."""
+        engine, k, room, u = self.engine, self._kernels, self._room, chords.touched_count
+        place_cells = room("place_cells", size=chords.count + u, dtype=np.int32)
+        chord_owners = room("chord_owners", size=chords.count, dtype=np.int32)
+        lists = chords.list_starts, chords.listed, found.roots
+        engine.run_each(k.name_chord_owners, u, *found.segments, *lists, place_cells, chord_owners)
+        orphans, orphan_count = found.orphans
+        engine.run_each(
+            k.write_trimmed,
+            u,
+            int(straight),
+            *found.segments,
+            *chords.arrays,
+            chord_owners,
+            *chords.turns,
+            points,
+            chords.touched,
+            chords.slots,
+            found.roots,
+            orphans,
+            np.int32(orphan_count),
+            place_cells,
+            *rows,
+            convex.volumes,
+            convex.offsets,
+            convex.covariances,
+            outlines,
         )

@@ -258,45 +258,13 @@ class GhostImages:
         flags, generator : int
             `FAR`, `COLLAPSED` or both, and the first generator with such a face.
         """
-        engine, k, n, home = self.engine, self._kernels, part.n_own, _home(part)
-        if engine.dim == 2:  # in 3D the kernels that clip cells do this
-            engine.run_each(
-                k.measure_required_depths,
-                part.count,
-                binned.items,
-                binned.reach,
-                part.points,
-                t.starts,
-                t.neighbors,
-                *part.box.device_corners(engine.real),
-                *part.halo_args,
-            )
+        n = part.n_own
+        if self.engine.dim == 2:  # in 3D the kernels that clip cells do this
+            self._measure_depths(part, binned, t)
         self._store_depths(part, halo)
         m = int(t.starts[n].get())
         self._turn = 1 - self._turn
-        neighbors, codes = (self._room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbors", "codes"))
-        kept = self._room("kept", size=m, dtype=np.uint8)
-        starts = self._room("starts", self._turn, size=n + 1, dtype=np.int32)
-        engine.run_each(
-            k.fold_rows,
-            n,
-            t.starts,
-            t.neighbors,
-            t.face_measures,
-            t.volumes,
-            t.points,
-            home.firsts,
-            home.rows,
-            home.codes,
-            engine.real.type(share),
-            np.int32(nearest),
-            neighbors,
-            codes,
-            kept,
-            starts,
-            self._report,
-            *engine.period_args,
-        )
+        neighbors, codes, kept, starts = self._fold_rows(part, t, m, share, nearest)
         words = self._report.get()
         self._scan.exclusive(starts, starts, n)
         faces = neighbors, codes, t.face_measures[:m], t.face_centroids[:m]
@@ -323,6 +291,53 @@ class GhostImages:
             # The next attempt writes to the same buffers, since it starts from the previous graph as well.
             self._turn = 1 - self._turn
         return folded, enough, int(words[1]) & ~DROPPED, int(words[2])
+
+    def _measure_depths(self, part: Part, binned: BinnedPoints, t: Tessellation) -> None:
+        """Request the depths that the cells of `t`, in 2D, require."""
+        self.engine.run_each(
+            self._kernels.measure_required_depths,
+            part.count,
+            binned.items,
+            binned.reach,
+            part.points,
+            t.starts,
+            t.neighbors,
+            *part.box.device_corners(self.engine.real),
+            *part.halo_args,
+        )
+
+    def _fold_rows(
+        self, part: Part, t: Tessellation, m: int, share: float, nearest: bool
+    ) -> tuple[cla.Array, cla.Array, cla.Array, cla.Array]:
+        """Return for the `m` faces of generators their neighbors, codes and whether to keep them; numbers kept by cell.
+
+        The report gets what is wrong.
+        """
+        engine, room, n, home = self.engine, self._room, part.n_own, _home(part)
+        neighbors, codes = (room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbors", "codes"))
+        kept = room("kept", size=m, dtype=np.uint8)
+        counts = room("starts", self._turn, size=n + 1, dtype=np.int32)
+        engine.run_each(
+            self._kernels.fold_rows,
+            n,
+            t.starts,
+            t.neighbors,
+            t.face_measures,
+            t.volumes,
+            t.points,
+            home.firsts,
+            home.rows,
+            home.codes,
+            engine.real.type(share),
+            np.int32(nearest),
+            neighbors,
+            codes,
+            kept,
+            counts,
+            self._report,
+            *engine.period_args,
+        )
+        return neighbors, codes, kept, counts
 
     def _store_depths(self, part: Part, halo: Halo) -> None:
         """Set the required depths of `halo` to those that the cells just built have requested."""
