@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..adapter import Adapter
 
 _COVERED = 1e-6
-"""Missing share of a cell up to which it counts as covered."""
+"""A new cell counts as covered if old cells leave no more than this share of it bare."""
 COVER_TOLERANCE = 1e-3
 """Largest accepted difference between a cell's volume and that of its pieces or intersections, as a share of it."""
 

@@ -1,4 +1,4 @@
-"""Meshes as convex pieces of their cells, which the device intersects."""
+"""The cells of a mesh as convex pieces. The device intersects those of two meshes (`device_transfer.py`)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from ..mesh.diagram import Diagram
 from ..mesh.lookup import cell_shapes
 
 _STRAIGHT = 1e-9
-"""Share of a cell up to which a corner that points inwards counts as straight."""
+"""A corner that points inwards counts as straight if its edges span no more than this share of the cell's area."""
 _FLAT = 1e-6
-"""Distance of corners from the plane of a face, as a share of the cell's width, up to which it counts as plane."""
+"""A face counts as plane if no corner is farther from its plane than this share of the cell's width."""
 _ON_WALL = 1e-3
-"""Distance from a wall, as a share of the cell's width, below which a generator counts as on it."""
+"""A generator counts as on a wall if its distance from it is less than this share of the cell's width."""
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """Convex pieces of cells: one of each cell, or triangles and pyramids of one that is not convex or has bent faces.
+    """Convex pieces of cells.
+
+    A convex cell with plane faces is one piece. Other cells are divided into triangles, in 3D into pyramids.
 
     Attributes
     ----------
@@ -30,10 +32,10 @@ class Pieces:
     origins : (k, d) float64
         A point near each piece, and in it in 3D: the generator, unless it is on a wall or outside of its cell.
     points : (v, d) float64
-        Corners of cells; in 3D generators, and points behind faces.
+        In 2D and on a sphere corners of cells; in 3D generators, and mirror images of origins in walls and other faces.
     starts, items : (k + 1,), (m,) int
-        Row i has the corners of piece i in `points`, counter-clockwise; in 3D those `points` to which its points are
-        not nearer than to the origin.
+        Row i lists those of `points` that bound piece i: its corners, counter-clockwise; in 3D the piece is nowhere
+        nearer to one of them than to its origin.
     """
 
     cells: np.ndarray
@@ -51,13 +53,13 @@ class Pieces:
         return len(self.cells)
 
     def summed(self, values: np.ndarray, n: int) -> np.ndarray:
-        """Return the sums of `values` (k,) or (k, width) over the pieces of each of `n` cells."""
+        """Return for each of `n` cells the sum of `values` (k,) or (k, width) over its pieces."""
         sums = [np.bincount(self.cells, column, n) for column in values.reshape(len(values), -1).T]
         return np.stack(sums, axis=1).reshape(n, *values.shape[1:])
 
 
 def _between_corners(diagram: Diagram) -> Pieces:
-    """Return the cells of a diagram of polygons."""
+    """Return the pieces of polygons."""
     cells, x, n = np.arange(len(diagram)), diagram.vertices, len(diagram)
     inside = diagram.points
     if diagram.domain.curved:
@@ -94,7 +96,7 @@ def _between_corners(diagram: Diagram) -> Pieces:
 
 
 def _between_bisectors(diagram: Diagram) -> Pieces:
-    """Return the cells of a diagram of polyhedra. Planes that are no bisectors, as walls, get points behind them."""
+    """Return the pieces of polyhedra. Faces on no bisector, as those at walls, get mirror images of the origins."""
     owner, neighbors, n = face_owners(diagram), diagram.neighbors.copy(), len(diagram)
     filled = np.diff(diagram.neighbor_starts) > 0
     alone = (neighbors < 0) | diagram.shifts.any(axis=1)
