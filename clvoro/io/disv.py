@@ -162,9 +162,9 @@ SOLVERS["modflow"] = check_for_modflow
 def _criteria(mesh: Faces) -> list[Criterion]:
     inner = np.arange(mesh.n_inner)
     own, other = mesh.owner[inner], mesh.neighbor[inner]
-    line = mesh.generators[other] - mesh.generators[own]
-    across = np.abs(np.cross(line, mesh.normal[inner]))
-    angle = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", line, mesh.normal[inner])))
+    line, normal = mesh.generators[other] - mesh.generators[own], mesh.normal[inner]
+    across = np.abs(line[:, 0] * normal[:, 1] - line[:, 1] * normal[:, 0])
+    angle = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", line, normal)))
     cells, faces = Rows(mesh.generators, None, 2), Rows(mesh.center[inner], own, 2)
     return [
         cells("vertices of a cell", np.bincount(mesh.sides()[0], minlength=mesh.n_cells), 3, above=False),
