@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -23,6 +24,43 @@ LEAST_MEASURE = 1e-300
 """OpenFOAM's VSMALL: least area of a face and volume of a cell."""
 LEAST_DETERMINANT = 1e-3
 """Least determinant of a cell; that of a cell with neighbors on one side only is smaller."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What `checkMesh` asks of a measure of cells or faces: values above it, or below, are rejected or warned of."""
+
+    name: str
+    value: float
+    above: bool = True
+    of_cells: bool = False
+    demanded: bool = True
+    strict: bool = True
+
+    def broken(self, values: np.ndarray) -> np.ndarray:
+        """Return which of `values` (k,) break it, (k,) bool."""
+        if not self.strict:
+            return values >= self.value
+        return values > self.value if self.above else values < self.value
+
+
+LIMITS = {
+    "openness": Limit("cell openness", 1e-6, of_cells=True),
+    "aspect_ratio": Limit("aspect ratio", 1000, of_cells=True),
+    "face_areas": Limit("face area", LEAST_MEASURE, above=False),
+    "volumes": Limit("cell volume", LEAST_MEASURE, above=False, of_cells=True),
+    "non_orthogonality": Limit("non-orthogonality", 90 - np.degrees(1e-15), strict=False),
+    "pyramids": Limit("face pyramids", -1e-15, above=False),
+    "skewness": Limit("skewness", 4),
+    "bad_tetrahedra": Limit("face tetrahedra", 0),
+    "flatness": Limit("flatness", 0.8, above=False, demanded=False),
+    "determinant": Limit("determinant", LEAST_DETERMINANT, above=False, of_cells=True),
+    "weight": Limit("interpolation weight", 0.05, above=False),
+    "volume_ratio": Limit("volume ratio", 0.01, above=False),
+}
+"""Limits of OpenFOAM by the names of `SolverMeasures`."""
+OF_CONVEX = ("aspect_ratio", "non_orthogonality", "skewness", "determinant", "weight", "volume_ratio")
+"""Those that convex cells, too, may break."""
 
 
 def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallShape | None = None) -> SolverReport:
@@ -57,9 +95,6 @@ SOLVERS: dict[str, Callable[[Diagram, WallShape | None], SolverReport]] = {"open
 
 _PLANE = 1e-6
 """Least turn in a corner of a polygon, in radians, that OpenFOAM counts as convex."""
-_LIMITS = {"aspect_ratio": 1000, "skewness": 4, "determinant": LEAST_DETERMINANT, "weight": 0.05, "volume_ratio": 0.01}
-"""OpenFOAM's limits of the measures that convex cells, too, may miss: those below 1 are the least, others the most."""
-_MEASURES = {2: PlaneMeasures, 3: SolverMeasures}
 
 
 def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
@@ -68,7 +103,11 @@ def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
     All criteria are computed for the cells that walls cut in 3D, and for those that seem bad. Others are convex.
     """
     at_walls = mesh.domain.cuts_cells or mesh.domain.curved_walls
-    judged = _suspects(mesh, at_walls) if mesh.domain.outline is None else rejected_polygons(mesh)
+    if mesh.domain.outline is not None:
+        judged = rejected_polygons(mesh)
+    else:
+        judged = cells_beyond(PlaneMeasures(mesh) if mesh.dim == 2 else mesh.measures)
+        judged[mesh.owner[at_walls & (mesh.neighbor < 0)]] = True
     if not judged.any():
         return ""
     kept, k = judged.copy(), np.flatnonzero(mesh.neighbor >= 0)
@@ -95,20 +134,21 @@ def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
     )
 
 
-def _suspects(mesh: Faces, at_walls: bool) -> np.ndarray:
-    """Return the cells beyond one of `_LIMITS`, and those on walls if `at_walls`, (n,) bool."""
-    measures = _MEASURES[mesh.dim](mesh)
+def cells_beyond(
+    m: SolverMeasures | PlaneMeasures, names: tuple[str, ...] = OF_CONVEX, faces: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the cells beyond a limit of `names`, or with a face beyond one or of `faces` (f,), (n,) bool."""
+    mesh = m.mesh
     found = np.zeros(mesh.n_cells, bool)
-    if at_walls:
-        found[mesh.owner[mesh.neighbor < 0]] = True
-    for name, limit in _LIMITS.items():
-        values = getattr(measures, name)
-        bad = values > limit if limit > 1 else values < limit
-        if name in ("aspect_ratio", "determinant"):
-            found |= bad
+    faces = np.zeros(len(mesh), bool) if faces is None else faces
+    for name in names:
+        broken = LIMITS[name].broken(getattr(m, name))
+        if LIMITS[name].of_cells:
+            found |= broken
         else:
-            found[mesh.owner[bad]] = True
-            found[mesh.neighbor[bad & (mesh.neighbor >= 0)]] = True
+            faces = faces | broken
+    found[mesh.owner[faces]] = True
+    found[mesh.neighbor[faces & (mesh.neighbor >= 0)]] = True
     return found
 
 
@@ -118,43 +158,37 @@ def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
         return [around]
     m = mesh.measures
     g, owner = m.geometry, m.cells.owner
-    coupled = m.coupled
-    angle = m.non_orthogonality
     judged = np.ones(mesh.n_cells, bool) if judged is None else judged
     of_faces = judged[owner]
     of_faces[: mesh.n_inner] |= judged[mesh.neighbor[: mesh.n_inner]]
     cells, faces = Rows(g.centroids, None, mesh.dim, judged), Rows(g.centers, owner, mesh.dim, of_faces)
-    between = Rows(g.centers[coupled], owner[coupled], mesh.dim, of_faces[coupled])
+
+    def judge(*names: str) -> list[Criterion]:
+        of = [(LIMITS[name], getattr(m, name)) for name in names]
+        return [
+            (cells if a.of_cells else faces)(a.name, v, a.value, above=a.above, demanded=a.demanded, strict=a.strict)
+            for a, v in of
+        ]
+
     corners = m.cells.points[m.cells.corners]
     span = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
-    edges = m.edges
-    ends = m.cells.points[edges].mean(axis=1)
+    ends = Rows(m.cells.points[m.edges].mean(axis=1), _cells_of_edges(m), mesh.dim)
     sides = np.bincount(m.face_cells[0], minlength=mesh.n_cells)
     walls = np.concatenate([g.areas[mesh.n_inner : mesh.n_outer], g.areas[len(mesh.owner) :]])
     openness = np.abs(walls.sum(axis=0)).max() / (np.linalg.norm(walls, axis=1).sum() + LEAST_MEASURE)
     concave = np.where(m.concave, np.maximum(m.concavity, 0), 0)
-    made = [
+    return [
         Criterion("boundary openness", float(openness), 1e-6, True, True, int(openness > 1e-6)),
         cells("faces of a cell", sides, 4, above=False),
-        cells("cell openness", m.openness, 1e-6),
-        cells("aspect ratio", m.aspect_ratio, _LIMITS["aspect_ratio"]),
-        faces("face area", np.linalg.norm(g.areas, axis=1), LEAST_MEASURE, above=False),
-        cells("cell volume", g.volumes, LEAST_MEASURE, above=False),
-        faces("non-orthogonality", angle, 90 - np.degrees(1e-15), strict=False),
-        faces("non-orthogonality, severe", angle, 70, demanded=False),
-        faces("face pyramids", m.pyramids, -1e-15, above=False),
-        faces("skewness", m.skewness, _LIMITS["skewness"]),
-        faces("face tetrahedra", m.bad_tetrahedra, 0),
-        Rows(ends, _cells_of_edges(m), mesh.dim)(
-            "edge length over size", m.edge_spans / span, 1e-6, above=False, demanded=False
-        ),
-        faces("flatness", m.flatness, 0.8, above=False, demanded=False),
-        cells("determinant", m.determinant, _LIMITS["determinant"], above=False),
+        *judge("openness", "aspect_ratio", "face_areas", "volumes", "non_orthogonality"),
+        faces("non-orthogonality, severe", m.non_orthogonality, 70, demanded=False),
+        *judge("pyramids", "skewness", "bad_tetrahedra"),
+        ends("edge length over size", m.edge_spans / span, 1e-6, above=False, demanded=False),
+        *judge("flatness", "determinant"),
         cells("concavity", concave, 0, failing=m.concave),
-        between("interpolation weight", m.weight[coupled], _LIMITS["weight"], above=False),
-        between("volume ratio", m.volume_ratio[coupled], _LIMITS["volume_ratio"], above=False),
+        *judge("weight", "volume_ratio"),
+        regions(mesh),
     ]
-    return [*made, regions(mesh)]
 
 
 def rejected_cells(mesh: Faces, judged: np.ndarray) -> np.ndarray:
@@ -162,17 +196,9 @@ def rejected_cells(mesh: Faces, judged: np.ndarray) -> np.ndarray:
 
     Only the faces `judged` (k,) are divided into tetrahedra, which takes the longest.
     """
-    m, g = mesh.measures, mesh.measures.geometry
-    bad = m.concave | (g.volumes < LEAST_MEASURE) | (m.determinant < LEAST_DETERMINANT)
-    bad |= m.aspect_ratio > _LIMITS["aspect_ratio"]
-    faces = (m.pyramids < -1e-15) | (m.skewness > _LIMITS["skewness"])
-    faces |= (np.linalg.norm(g.areas, axis=1) < LEAST_MEASURE) | (m.non_orthogonality >= 90)
-    faces[judged] |= m.bad_tetrahedra_of(judged) > 0
-    faces[m.coupled] |= m.weight[m.coupled] < _LIMITS["weight"]
-    faces[m.coupled] |= m.volume_ratio[m.coupled] < _LIMITS["volume_ratio"]
-    bad[mesh.owner[faces]] = True
-    bad[mesh.neighbor[faces & (mesh.neighbor >= 0)]] = True
-    return bad
+    m, faces = mesh.measures, np.zeros(len(mesh), bool)
+    faces[judged] = m.bad_tetrahedra_of(judged) > 0
+    return m.concave | cells_beyond(m, (*OF_CONVEX, "volumes", "face_areas", "pyramids"), faces)
 
 
 def rejected_polygons(mesh: Faces) -> np.ndarray:
@@ -184,12 +210,7 @@ def rejected_polygons(mesh: Faces) -> np.ndarray:
     bad = (np.diff(starts) < 3) | (np.bincount(cell, turn, mesh.n_cells) > 3 * np.pi)  # 4 pi if sides cross
     bad[broken] = True
     bad[cell[turn < _PLANE]] = True
-    bad |= (m.determinant < LEAST_DETERMINANT) | (m.aspect_ratio > _LIMITS["aspect_ratio"])
-    faces = (m.skewness > _LIMITS["skewness"]) | (m.non_orthogonality >= 90)
-    faces |= (m.weight < _LIMITS["weight"]) | (m.volume_ratio < _LIMITS["volume_ratio"])
-    bad[mesh.owner[faces]] = True
-    bad[mesh.neighbor[faces & (mesh.neighbor >= 0)]] = True
-    return bad
+    return bad | cells_beyond(m)
 
 
 def around_islands(mesh: Faces) -> Criterion | None:

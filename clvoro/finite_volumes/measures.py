@@ -56,6 +56,16 @@ class SolverMeasures:
         made = cell_geometry(centers, areas, p.owner, self.mesh.neighbor[:k], self.mesh.n_cells)
         return Geometry(centers, areas, *made)
 
+    @property
+    def volumes(self) -> np.ndarray:
+        """Volume of each polyhedron, (n,)."""
+        return self.geometry.volumes
+
+    @cached_property
+    def face_areas(self) -> np.ndarray:
+        """Area of each face."""
+        return np.linalg.norm(self.geometry.areas, axis=1)
+
     @cached_property
     def face_cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The cell, the face and the sign of the normal for each side of each face, three arrays (s,)."""
@@ -137,7 +147,7 @@ class SolverMeasures:
         here, there = p.points[p.corners], p.points[p.corners[following(p.starts)]]
         triangles = np.linalg.norm(np.cross(there - here, center - here), axis=1) / 2
         sums = np.add.reduceat(triangles, p.starts[:-1])
-        return np.where(counts > 3, np.linalg.norm(g.areas, axis=1) / (sums + _TINY), 1.0)
+        return np.where(counts > 3, self.face_areas / (sums + _TINY), 1.0)
 
     @cached_property
     def pyramids(self) -> np.ndarray:
