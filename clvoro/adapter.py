@@ -234,7 +234,7 @@ class Adapter:
             return make_diagram(stages, domain, host)
 
     def power_diagram(self, domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
-        """Return the power diagram of `points` with `weights`; see `clvoro.power_diagram`."""
+        """Return the power diagram of `points` with `weights`, not in a Solid; see `clvoro.power_diagram`."""
         with self._alone():
             return power_diagram_of(self._stages_for(domain), domain, points, weights)
 
@@ -248,7 +248,7 @@ class Adapter:
         max_steps: int = 100,
         relax: int = 0,
     ) -> Transported:
-        """Return the power diagram of `points` whose cells have `volumes`; see `clvoro.transport`."""
+        """Return the power diagram of `points` whose cells have `volumes`, not in a Solid; see `clvoro.transport`."""
         check_integer("relax", relax, 0, 10**6)
         with self._alone():
             stages = self._stages_for(domain)
@@ -281,7 +281,8 @@ class Adapter:
 
         Parameters
         ----------
-        domain, size, effort, points, method, n_cells, layers, fixed, seed, callback
+        domain : Box, Polygon, Sphere or Solid
+        size, effort, points, method, n_cells, layers, fixed, seed, callback
             As those of `clvoro.adapt`.
         max_steps : int, optional
             Largest number of steps, over all levels. By default 100, or all steps of the schedule of "adaptive",
@@ -345,7 +346,8 @@ class Adapter:
 
         Parameters
         ----------
-        domain, size, effort, points, method, n_cells, layers, fixed, seed, max_steps, options, checkpoint
+        domain : Box, Polygon, Sphere or Solid
+        size, effort, points, method, n_cells, layers, fixed, seed, max_steps, options, checkpoint
             As those of `run`.
 
         Returns
@@ -397,7 +399,8 @@ class Adapter:
 
         Parameters
         ----------
-        domain, size, points, method, n_cells, layers, options
+        domain : Box, Polygon, Sphere or Solid
+        size, points, method, n_cells, layers, options
             As those of `run`.
 
         Raises

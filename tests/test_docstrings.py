@@ -54,6 +54,8 @@ def test_parameters_are_all_described(thing):
                 listed |= {n.strip().lstrip("*") for n in line.split(" : ")[0].split(",")}
         there = set(inspect.signature(what).parameters) - {"self", "cls"}
         assert listed == there, what
+        domain = re.search(r"^domain : (.*)", part, re.MULTILINE)
+        assert not domain or re.search("Box|Polygon", domain[1]), f"{what} does not say which domains it takes"
 
 
 @pytest.mark.parametrize("thing", PUBLIC, ids=lambda t: getattr(t, "__name__", str(t)))

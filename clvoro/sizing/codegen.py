@@ -29,7 +29,7 @@ class CodeWriter:
         The device sees x' = (x - origin) / scale and h' = h / scale.
     real : numpy.dtype
         Precision in which the device reads the numbers.
-    domain : Domain
+    domain : Box, Polygon, Sphere or Solid
     engine : Engine or None
         Engine for fields that are computed in advance; None for the default device.
     peak_bytes : int
@@ -129,7 +129,7 @@ def generate_code(
     Parameters
     ----------
     field : Field
-    domain : Domain
+    domain : Box, Polygon, Sphere or Solid
     real : dtype
         The engine's precision.
     engine : Engine, optional

@@ -42,7 +42,7 @@ class Sizing:
     Parameters
     ----------
     engine : Engine
-    domain : Domain
+    domain : Box, Polygon, Sphere or Solid
     field : Field, number or callable
         A callable is evaluated on the host, and so is a combination of a callable with other fields: each evaluation
         then copies the points to the host and the sizes back.

@@ -45,7 +45,7 @@ class Graded(Field):
         `Distance`.
     slope : float, optional
         Bound of |grad h|, in place of `growth`. 0 gives the smallest size everywhere.
-    box : Box or Polygon, optional
+    box : Box, Polygon or Solid, optional
         Region of the grid; by default the domain. Outside, the nearest value is used. In a polygon `field` is
         evaluated inside only; sizes also grow straight across the outside. Not for spheres.
     resolution : int or sequence of d ints, optional
