@@ -30,7 +30,6 @@ from _common import FIRST_SEED, Report, counts, heading, make_adapter, names, pa
 import clvoro
 from clvoro import earth, sizing
 from clvoro.adaptation import preparation
-from clvoro.mesh.connectivity import face_ends, face_owners
 
 EARTH = clvoro.Sphere()
 ATLANTIC = (-45, 45)
@@ -147,8 +146,8 @@ def compare_openings(options: Any) -> None:
 
 def edges(d: clvoro.Diagram) -> tuple[np.ndarray, np.ndarray]:
     """Return a number for the cells of each edge, ascending, and its length, from its corners as MPAS files have it."""
-    begin, end = d.vertices[face_ends(d)].transpose(1, 0, 2)
-    owner, neighbor = face_owners(d).astype(np.int64), d.neighbors.astype(np.int64)
+    begin, end = d.vertices[d.half_faces.ends].transpose(1, 0, 2)
+    owner, neighbor = d.half_faces.owner.astype(np.int64), d.neighbors.astype(np.int64)
     once = np.flatnonzero(owner < neighbor)
     keys = owner[once] * len(d) + neighbor[once]
     order = np.argsort(keys)

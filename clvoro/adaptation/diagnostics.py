@@ -11,7 +11,6 @@ from ..arguments import format_point, warn
 from ..errors import InputError, MismatchWarning, ObtuseTrianglesWarning, PrecisionWarning, SizeErrorWarning
 from ..geometry.boundary_layers import Layers, columns_of
 from ..geometry.domain import Domain
-from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..sizing import Sizing
@@ -210,8 +209,8 @@ def warn_of_obtuse_triangles(result: Result) -> None:
         return
     k = int(grid.angles.argmax())
     half_face = grid.corners[k]
-    pair = int(face_owners(diagram)[half_face]), int(diagram.neighbors[half_face])
-    vertex = diagram.vertices[face_ends(diagram)[half_face, 0]]
+    pair = int(diagram.half_faces.owner[half_face]), int(diagram.neighbors[half_face])
+    vertex = diagram.vertices[diagram.half_faces.ends[half_face, 0]]
     ratios = np.concatenate([sizes[_ring(diagram, i)] / sizes[i] for i in pair])
     growth = max(ratios.max(), 1 / ratios.min())
     if growth > STEEP:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..mesh.connectivity import face_ends, face_keys, face_owners, neighbor_points, next_faces
 from ..mesh.diagram import Diagram
 
 RIGHT_ANGLE = 90 + 1e-4
@@ -124,13 +123,13 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
             f"measures for C grids are for meshes on a Sphere and in the plane, not for {domain}; use the other "
             "entries of measures"
         )
-    owner, inner = face_owners(d), d.neighbors >= 0
-    after = next_faces(d)
+    owner, inner = d.half_faces.owner, d.neighbors >= 0
+    after = d.half_faces.next
     before = np.argsort(after)
     corners = np.flatnonzero(inner & inner[before])
-    begin = d.vertices[face_ends(d)[:, 0]]
+    begin = d.vertices[d.half_faces.ends[:, 0]]
     own, line = d.points[owner], np.zeros_like(begin)
-    line[inner] = neighbor_points(d, np.flatnonzero(inner)) - own[inner]
+    line[inner] = d.half_faces.behind(np.flatnonzero(inner)) - own[inner]
     distance = np.maximum(np.linalg.norm(line, axis=1), 1e-300)
     normal, middle = line / distance[:, None], own + line / 2
     angles = _angles(begin[corners], middle[corners], normal[corners], distance[corners])
@@ -161,7 +160,7 @@ def _off_bisector(d: Diagram, own: np.ndarray, line: np.ndarray) -> np.ndarray:
     """Return how far edges are from the bisectors of their generators; see `CGridMeasures`."""
     if not d.domain.cuts_cells:
         return np.zeros(len(line))
-    ends = d.vertices[face_ends(d)] - own[:, None]
+    ends = d.vertices[d.half_faces.ends] - own[:, None]
     square = np.maximum((line**2).sum(axis=1), 1e-300)
     shares = (ends * line[:, None]).sum(axis=2) / square[:, None]
     return np.where(line.any(axis=1), np.abs(shares - 0.5).max(axis=1), 0.0)
@@ -188,10 +187,8 @@ def _cells_around(d: Diagram, corners: np.ndarray, after: np.ndarray) -> tuple[n
 
     A walk around the vertex needs no numbers of vertices, which differ between images across seams.
     """
-    faces = np.flatnonzero(d.neighbors >= 0)
-    here, there = face_keys(d, faces)
-    turn = np.full(len(d.neighbors), -1)
-    turn[faces[np.argsort(here)]] = after[faces[np.argsort(there)]]
+    opposite = d.half_faces.opposite
+    turn = np.where(opposite >= 0, after[opposite], -1)
     counts, at, walking = np.zeros(len(corners), np.int64), corners, np.arange(len(corners))
     first = np.ones(len(corners), bool)
     while len(walking):

@@ -8,7 +8,6 @@ from ..errors import InputError
 from ..finite_volumes.criteria import Criterion, Rows, SolverReport
 from ..finite_volumes.gate import LEAST_MEASURE
 from ..finite_volumes.solver_mesh import WallShape
-from ..mesh.connectivity import face_ends, face_keys, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.faces import OFF_BISECTOR
 from .c_grid import RIGHT_ANGLE, CGridMeasures, measure_c_grid
@@ -44,8 +43,8 @@ def check_for_mpas(diagram: Diagram, walls: WallShape | None) -> SolverReport:
 def _edges_once(diagram: Diagram, m: CGridMeasures) -> tuple[np.ndarray, Rows]:
     """Return a half-face for each edge between two cells, (k,) int, and these edges as `Rows`, which make criteria."""
     inner = np.flatnonzero(m.inner)
-    inner = inner[np.less(*face_keys(diagram, inner))]
-    return inner, Rows(diagram.face_centroids[inner], face_owners(diagram)[inner], diagram.domain.dim)
+    inner = inner[inner < diagram.half_faces.opposite[inner]]
+    return inner, Rows(diagram.face_centroids[inner], diagram.half_faces.owner[inner], diagram.domain.dim)
 
 
 def _at_walls(diagram: Diagram, edges: Rows, off_bisector: np.ndarray) -> list[Criterion]:
@@ -75,10 +74,10 @@ def coast_faults(diagram: Diagram) -> list[Criterion]:
 def _criteria(diagram: Diagram) -> list[Criterion]:
     """Return the criteria for meshes of MPAS."""
     d, m = diagram, measure_c_grid(diagram)
-    dim, owner = d.domain.dim, face_owners(diagram)
+    dim, owner = d.domain.dim, diagram.half_faces.owner
     inner, edges = _edges_once(d, m)
     cells = Rows(d.points, None, dim)
-    places, cell = d.vertices[face_ends(d)[m.corners, 0]], owner[m.corners]
+    places, cell = d.vertices[d.half_faces.ends[m.corners, 0]], owner[m.corners]
     corners, vertices = Rows(places, cell, dim), Rows(places[m.first], cell[m.first], dim)
     return [
         *_at_walls(diagram, edges, m.off_bisector[inner]),

@@ -18,10 +18,9 @@ from ..errors import InputError
 from ..geometry.domain import Domain
 from ..geometry.sphere import Sphere, triangle_areas
 from ..io.contents import Contents
-from ..io.half_edges import HalfEdges, half_edges
 from ..io.netcdf import NetCDF, squared
-from ..mesh.connectivity import neighbor_points
 from ..mesh.diagram import Diagram
+from ..mesh.half_faces import HalfEdges
 from .criteria import coast_faults
 from .trisk import find_weights
 
@@ -106,7 +105,7 @@ def _on_sphere(diagram: Diagram, sphere: Sphere, halves: HalfEdges) -> Shape:
     r, first, edge = sphere.radius, halves.first, halves.edge
     points, vertices = (sphere.wrap(x) / r for x in (diagram.points, diagram.vertices))
     one = points[halves.cell[first]]
-    other = sphere.wrap(neighbor_points(diagram, halves.rows[first])) / r
+    other = sphere.wrap(diagram.half_faces.behind(halves.rows[first])) / r
     line = other - one
     middles = one + other
     middles /= np.linalg.norm(middles, axis=1)[:, None]
@@ -147,7 +146,7 @@ def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
     behind = diagram.neighbors[halves.rows]
     inner = (behind >= 0) | diagram.domain.removed_behind(-1 - behind)
     line, middle = np.zeros_like(own), (begin + end) / 2
-    line[inner] = neighbor_points(diagram, halves.rows[inner]) - own[inner]
+    line[inner] = diagram.half_faces.behind(halves.rows[inner]) - own[inner]
     lengths = diagram.face_measures[halves.rows[first]]
     distances = np.where(inner[first], np.hypot(*line[first].T), np.sqrt(3) * lengths)
     foot = np.where(inner[:, None], line / 2, middle)
@@ -188,7 +187,7 @@ def write_mpas(contents: Contents, path: Path, unit: str = "m") -> None:
 def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     diagram, domain = contents.diagram, contents.diagram.domain
     diagram.demand_voronoi("an MPAS file")
-    halves = half_edges(diagram, glued=True)
+    halves = diagram.half_faces.edges(glued=True)
     _check_loops(halves, path)
     _check_coasts(diagram, path)
     shape = measure(diagram, halves)

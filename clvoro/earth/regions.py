@@ -21,7 +21,7 @@ import scipy
 from ..arguments import check_choice, check_integer, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.sphere import Sphere, SphereRegion
-from ..mesh.connectivity import face_owners, following
+from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..mesh.subset import check_mask
@@ -300,7 +300,7 @@ def _widened(diagram: Diagram, sphere: Sphere, water: np.ndarray, blocked: np.nd
 
 def _large_parts(diagram: Diagram, water: np.ndarray, least_cells: int | None) -> np.ndarray:
     """Return the cells of the connected part with the largest area, or of all parts with enough cells."""
-    owner, n = face_owners(diagram), len(diagram)
+    owner, n = diagram.half_faces.owner, len(diagram)
     joined = np.flatnonzero(diagram.neighbors >= 0)
     joined = joined[water[owner[joined]] & water[diagram.neighbors[joined]]]
     pairs = owner[joined], diagram.neighbors[joined]
@@ -366,7 +366,7 @@ def cells_across(diagram: Diagram, sphere: Sphere, line: np.ndarray) -> np.ndarr
 def rings_around(diagram: Diagram, inside: np.ndarray, count: int) -> np.ndarray:
     """Return 0 for cells inside, k for those in the k-th ring of neighbors around them, else -1; (n,) int32."""
     inner = diagram.neighbors >= 0
-    i, j = face_owners(diagram)[inner], diagram.neighbors[inner]
+    i, j = diagram.half_faces.owner[inner], diagram.neighbors[inner]
     ring = np.where(inside, 0, -1).astype(np.int32)
     for k in range(1, count + 1):
         front = j[ring[i] == k - 1]
@@ -413,7 +413,7 @@ def narrow_cells(diagram: Diagram, water: np.ndarray) -> np.ndarray:
     """
     wet = (diagram.neighbors >= 0) & water[diagram.neighbors]
     ends = wet & ~wet[following(diagram.neighbor_starts)]
-    return water & (np.bincount(face_owners(diagram), ends, len(diagram)) >= 2)
+    return water & (np.bincount(diagram.half_faces.owner, ends, len(diagram)) >= 2)
 
 
 def widen_straits(diagram: Diagram, water: np.ndarray, fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

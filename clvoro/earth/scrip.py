@@ -13,7 +13,6 @@ import numpy as np
 
 from ..io.contents import Contents
 from ..io.netcdf import NetCDF
-from ..mesh.connectivity import cell_corners
 
 
 def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
@@ -28,7 +27,7 @@ def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
     diagram, domain = contents.diagram, contents.diagram.domain
     what = f"cannot write {path}: SCRIP files are for meshes on a Sphere"
     globe = domain.require_globe(what, "leave out convention='scrip'")
-    starts, corners = cell_corners(diagram)
+    starts, corners = diagram.half_faces.cell_corners
     counts, n = np.diff(starts), len(diagram)
     most = int(counts.max())
     table = corners[starts[:-1, None] + np.minimum(np.arange(most), counts[:, None] - 1)]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..io.half_edges import HalfEdges
+from ..mesh.half_faces import HalfEdges
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,7 @@ LIMITS = {
     "volume_ratio": Limit("volume ratio", 0.01, above=False),
 }
 """Limits of OpenFOAM by the names of `SolverMeasures`."""
+_MEASURES = {2: PlaneMeasures, 3: SolverMeasures}
 OF_CONVEX = ("aspect_ratio", "non_orthogonality", "skewness", "determinant", "weight", "volume_ratio")
 """Those that convex cells, too, may break."""
 
@@ -106,7 +107,7 @@ def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
     if mesh.domain.outline is not None:
         judged = rejected_polygons(mesh)
     else:
-        judged = cells_beyond(PlaneMeasures(mesh) if mesh.dim == 2 else mesh.measures)
+        judged = cells_beyond(_MEASURES[mesh.dim](mesh))
         judged[mesh.owner[at_walls & (mesh.neighbor < 0)]] = True
     if not judged.any():
         return ""

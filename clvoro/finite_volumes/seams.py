@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import ClvoroError
-from ..mesh.connectivity import face_corners, face_keys, face_owners, take_rows
+from ..mesh.connectivity import take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 
@@ -29,16 +29,17 @@ def faces_with_seams(diagram: Diagram) -> Faces:
     faces, domain = diagram.faces, diagram.domain
     if not any(domain.periodic):
         return faces
-    shifts = diagram.shifts.astype(np.int64)
-    starts, corners = face_corners(diagram)
+    half, shifts = diagram.half_faces, diagram.shifts
+    starts, corners = half.corners
     rows = np.flatnonzero(shifts.any(axis=1) & (np.diff(starts) > 0))
-    here, there = face_keys(diagram, rows)
     axis = np.argmax(shifts[rows] != 0, axis=1)
     is_upper = shifts[rows, axis] > 0
-    upper = np.flatnonzero(is_upper)[np.lexsort((here[is_upper], axis[is_upper]))]
-    lower = np.flatnonzero(~is_upper)[np.lexsort((there[~is_upper], axis[~is_upper]))]
-    sides = np.diff(starts)[rows]
-    if not (np.array_equal(here[upper], there[lower]) and np.array_equal(sides[upper], sides[lower])):
+    upper, axis = rows[is_upper], axis[is_upper]
+    order = np.lexsort((half.keys(upper)[0], axis))
+    upper, axis = upper[order], axis[order]
+    lower = half.opposite[upper]
+    sides = np.diff(starts)
+    if 2 * len(upper) != len(rows) or (lower < 0).any() or not np.array_equal(sides[upper], sides[lower]):
         raise ClvoroError(
             "the two sides of a seam have different faces, because some are as short as round-off; use "
             "dtype='float64', or perturb generators that lie on a common circle or sphere"
@@ -47,19 +48,19 @@ def faces_with_seams(diagram: Diagram) -> Faces:
     first = len(kept)
     order, twin = [], [np.full(first, -1)]
     for a in range(domain.dim):
-        these = axis[upper] == a
+        these = axis == a
         k = int(np.count_nonzero(these))
         order += [upper[these], lower[these]]
         twin += [first + k + np.arange(k), first + np.arange(k)]
         first += 2 * k
-    rows = rows[np.concatenate(order)]
+    rows = np.concatenate(order)
     kept_starts, kept_corners = take_rows(faces.starts, faces.corners, kept)
     seam_starts, seam_corners = take_rows(starts, corners, rows)
     made = replace(
         faces,
         starts=np.concatenate([kept_starts, kept_starts[-1] + seam_starts[1:]]),
         corners=np.concatenate([kept_corners, seam_corners]),
-        owner=np.concatenate([faces.owner[kept], face_owners(diagram)[rows]]),
+        owner=np.concatenate([faces.owner[kept], half.owner[rows]]),
         neighbor=np.concatenate([faces.neighbor[kept], diagram.neighbors[rows]]),
         twin=np.concatenate(twin),
         shift=np.concatenate([faces.shift[kept], diagram.shifts[rows]]),

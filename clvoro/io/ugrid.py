@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry.sphere import Sphere
-from ..mesh.connectivity import cell_corners
 from ..mesh.diagram import Diagram
+from ..mesh.half_faces import HalfEdges
 from .contents import Contents
-from .half_edges import HalfEdges, half_edges
 from .netcdf import NetCDF, squared
 
 _CONNECTIVITY = {
@@ -44,8 +43,8 @@ def write_ugrid(contents: Contents, path: Path, unit: str = "m") -> None:
 
 def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     diagram = contents.diagram
-    halves = half_edges(diagram, glued=False)
-    starts, corners = cell_corners(diagram)
+    halves = diagram.half_faces.edges(glued=False)
+    starts, corners = diagram.half_faces.cell_corners
     dimensions = {
         "mesh_nodes": len(diagram.vertices),
         "mesh_edges": len(halves.first),

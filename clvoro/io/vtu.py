@@ -21,7 +21,7 @@ from ..arguments import check_choice
 from ..finite_volumes.prisms import cell_loops
 from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.domain import Domain
-from ..mesh.connectivity import face_corners, face_owners, next_faces, take_rows
+from ..mesh.connectivity import take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.straightening import count_sides
@@ -117,7 +117,7 @@ def _bridges(diagram: Diagram) -> np.ndarray:
 
     Corners alone do not distinguish a bridge from a slit without width in single precision.
     """
-    starts, following = diagram.neighbor_starts, next_faces(diagram)
+    starts, following = diagram.neighbor_starts, diagram.half_faces.next
     cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
     ends = following != np.arange(1, len(following) + 1)
     loop = np.concatenate([[0], np.cumsum(ends)[:-1]])
@@ -140,7 +140,7 @@ def _polygons(mesh: Diagram | Faces) -> dict[str, np.ndarray]:
 def _half_faces(mesh: Diagram | Faces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return cell, starts and corners of each half-face in 3D, cell by cell."""
     if not isinstance(mesh, Faces):
-        return face_owners(mesh), *face_corners(mesh)
+        return mesh.half_faces.owner, *mesh.half_faces.corners
     starts, sides = mesh.cell_faces()
     face = mesh.sides()[1][sides]
     cell = np.repeat(np.arange(mesh.n_cells), np.diff(starts))
@@ -196,11 +196,11 @@ def _every_face(diagram: Diagram) -> np.ndarray:
 
 
 def _faces_with_corners(diagram: Diagram) -> np.ndarray:
-    return np.diff(face_corners(diagram)[0]) > 0
+    return np.diff(diagram.half_faces.corners[0]) > 0
 
 
 def _count_faces(diagram: Diagram) -> np.ndarray:
-    return np.bincount(face_owners(diagram)[_faces_with_corners(diagram)], minlength=len(diagram))
+    return np.bincount(diagram.half_faces.owner[_faces_with_corners(diagram)], minlength=len(diagram))
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ def cell_data(contents: Contents) -> dict[str, np.ndarray]:
         kind.counts: kind.count(diagram).astype(np.int32),
         "label": np.arange(n, dtype=np.int32),
         "boundary": largest_boundary(diagram),
-        **_on_boundaries(diagram.domain, face_owners(diagram), diagram.neighbors, n),
+        **_on_boundaries(diagram.domain, diagram.half_faces.owner, diagram.neighbors, n),
         "generator": in_space(diagram.points),
         **({"weight": diagram.weights} if diagram.is_power else {}),
         **{k: in_space(v) if v.shape[1:] == (2,) else v for k, v in contents.with_regions.items()},
@@ -258,7 +258,7 @@ def largest_boundary(diagram: Diagram) -> np.ndarray:
     walls = np.flatnonzero(diagram.neighbors < 0)
     # Of several entries for a cell the last one remains: that of its largest wall face.
     walls = walls[np.argsort(diagram.face_measures[walls], kind="stable")]
-    found[face_owners(diagram)[walls]] = diagram.domain.boundary_index[-1 - diagram.neighbors[walls]]
+    found[diagram.half_faces.owner[walls]] = diagram.domain.boundary_index[-1 - diagram.neighbors[walls]]
     return found
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from ..files import open_plain
 from ..geometry.domain import Domain
 from ..mesh.check.rebuilt import rebuild, rebuild_on_sphere
-from ..mesh.connectivity import face_owners, following
+from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result, result_of_file
 from .arrays import EXPANSION, LEAST, FileError, explained
@@ -249,7 +249,7 @@ def _cell_polygons(arrays: Mapping[str, np.ndarray], v: int, domain: Domain) -> 
 
 def _graph(arrays: Mapping[str, np.ndarray], d: Diagram) -> dict[str, np.ndarray]:
     """Return the neighbors: on walls and at seams those in the file, else the cells with a face of the same corners."""
-    starts, corners, owner = d.face_vertex_starts, d.face_vertices, face_owners(d)
+    starts, corners, owner = d.face_vertex_starts, d.face_vertices, d.half_faces.owner
     walls, m = len(d.domain.boundary_index), len(starts) - 1
     border = _indices(arrays["FieldData.border_faces"], m, "border_faces")
     behind = _indices(arrays["FieldData.border_neighbors"] + walls, len(d) + walls, "border_neighbors") - walls

@@ -1,100 +1,10 @@
-"""Faces and corners of a diagram on the host: half-faces, loops around cells, each face once."""
+"""Ragged arrays: rows of different lengths, as `starts` and `items`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-from .diagram import Diagram
-
-if TYPE_CHECKING:
-    from ..geometry.boundary_names import Walls
-
-
-def face_owners(diagram: Diagram) -> np.ndarray:
-    """Return the cell of each half-face, (m,) int32."""
-    starts = diagram.neighbor_starts
-    return np.repeat(np.arange(len(diagram), dtype=np.int32), np.diff(starts))
-
-
-def boundary_cells(diagram: Diagram, walls: Walls | None) -> np.ndarray:
-    """Return the cells with a face on one of `walls`, ascending; see `Diagram.boundary_cells`."""
-    chosen = diagram.domain.boundaries.select("boundary", walls)
-    return np.unique(face_owners(diagram)[np.isin(-1 - diagram.neighbors, chosen)])
-
-
-def neighbor_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
-    """Return the generators, or their images, behind the half-faces `faces` (k,): (k, d).
-
-    Behind a wall it is the mirror image of the cell's own, on a part of a sphere the generator of the removed cell.
-    """
-    domain, neighbors = diagram.domain, diagram.neighbors[faces]
-    found = diagram.points[np.maximum(neighbors, 0)] + diagram.shifts[faces] * domain.extent
-    walls = np.flatnonzero(neighbors < 0)
-    if walls.size:
-        own = diagram.points[face_owners(diagram)[faces[walls]]]
-        found[walls] = domain.mirrored(-1 - neighbors[walls], own)
-    return found
-
-
-def plane_shares(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
-    """Return where the planes of half-faces cross the lines between their generators, as shares of these lines, (k,).
-
-    1/2 in a Voronoi diagram; for a power diagram see `Domain.plane_shares`. `faces` (k,) are between cells.
-    """
-    if not diagram.is_power:
-        return np.full(len(faces), 0.5)
-    i, j = face_owners(diagram)[faces], diagram.neighbors[faces]
-    between = neighbor_points(diagram, faces) - diagram.points[i]
-    return diagram.domain.plane_shares((between**2).sum(axis=1), diagram.weights[j] - diagram.weights[i])
-
-
-def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return keys of the half-faces `faces` (k,) between two cells, and keys of their opposite half-faces.
-
-    Keys sort by cell, neighbor and shift, and in a polygon, where two cells may share several faces, then by vertices;
-    (k,) int64 each.
-    """
-    n, dim = len(diagram), diagram.domain.dim
-    i, j = face_owners(diagram)[faces].astype(np.int64), diagram.neighbors[faces].astype(np.int64)
-    here, there = i * n + j, j * n + i
-    if any(diagram.domain.periodic):
-        codes = (diagram.shifts[faces] + 1) @ 3 ** np.arange(dim)
-        here = here * 3**dim + codes
-        there = there * 3**dim + (3**dim - 1 - codes)
-    if not diagram.domain.cuts_cells:
-        return here, there
-    begin, end = face_ends(diagram)[faces].T
-    columns = [np.concatenate(c) for c in ((end, begin), (begin, end), (here, there))]
-    order = np.lexsort(columns)
-    new = np.any([np.diff(c[order], prepend=-1) != 0 for c in columns], axis=0)
-    numbers = np.empty(len(order), np.int64)
-    numbers[order] = np.cumsum(new)
-    return numbers[: len(faces)], numbers[len(faces) :]
-
-
-def face_ends(diagram: Diagram) -> np.ndarray:
-    """Return the first and last vertex of each half-face in 2D, (m, 2); its cell is on the left."""
-    return diagram.face_vertices.reshape(-1, 2)
-
-
-def next_faces(diagram: Diagram) -> np.ndarray:
-    """Return for each half-face in 2D the next one in its loop around the cell, (m,).
-
-    In the row of a cell one loop follows the other. A loop ends where the next face does not begin in its last vertex.
-    """
-    ends, starts = face_ends(diagram), diagram.neighbor_starts
-    m = len(ends)
-    last = np.zeros(m, bool)
-    last[starts[1:][starts[1:] > starts[:-1]] - 1] = True
-    breaks = last.copy()
-    breaks[:-1] |= ends[:-1, 1] != ends[1:, 0]
-    places = np.arange(1, m + 1)
-    stops = np.flatnonzero(breaks)
-    places[stops] = np.concatenate([[0], stops[:-1] + 1])[: len(stops)]
-    return places
 
 
 def following(starts: np.ndarray) -> np.ndarray:
@@ -154,37 +64,3 @@ def take_ranges(
 def slices(count: int, size: int = 1 << 14) -> Iterator[slice]:
     """Cut `count` rows into parts whose arrays fit the caches: large arrays cost a system call and cleared memory."""
     return (slice(k, min(k + size, count)) for k in range(0, count, size))
-
-
-def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of each half-face as ragged rows: starts (m + 1,) and vertices.
-
-    In 2D the cell is on the left of the way from the first to the second corner. In 3D the order is counter-clockwise
-    as seen from outside of the cell. A repeated corner is given once. A face that then has no measure (fewer than 2
-    corners in 2D, 3 in 3D) has an empty row.
-    """
-    least, starts, corners = diagram.domain.cell_dim, diagram.face_vertex_starts, diagram.face_vertices
-    kept = np.empty(len(corners), bool)
-    np.not_equal(corners[1:], corners[:-1], out=kept[:-1])
-    filled = np.flatnonzero(starts[1:] > starts[:-1])
-    last = starts[1:][filled] - 1
-    kept[last] = corners[last] != corners[starts[filled]]
-    if kept.all() and (np.diff(starts) >= least).all():
-        return starts, corners
-    rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    counts = np.bincount(rows[kept], minlength=len(starts) - 1)
-    counts[counts < least] = 0
-    kept &= counts[rows] > 0
-    return np.concatenate([[0], np.cumsum(counts)]), corners[kept]
-
-
-def cell_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of each cell in 2D as ragged rows: starts (n + 1,) and vertices, counter-clockwise.
-
-    A repeated corner is given once. Several loops are joined by bridges, as in the diagram.
-    """
-    starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
-    cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
-    kept = corners != corners[following(starts)]
-    counts = np.bincount(cell[kept], minlength=len(diagram))
-    return np.concatenate([[0], np.cumsum(counts)]), corners[kept]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ..geometry.domain import Domain
     from .check.findings import Report
     from .faces import Faces
+    from .half_faces import HalfFaceArrays
     from .left_out import LeftOut
     from .lookup import Cell, Locator
     from .quality import Measures
@@ -238,6 +239,22 @@ class Diagram(MeshOutput):
             )
 
     # The graph.
+
+    @cached_property
+    def half_faces(self) -> HalfFaceArrays:
+        """Every face as each of its cells has it, in the order of the rows: owner, opposite, and loops in 2D.
+
+        See `clvoro.mesh.half_faces.HalfFaceArrays` for the arrays, which are computed when first used.
+
+        Examples
+        --------
+        >>> d = clvoro.voronoi(clvoro.Box((0, 0), (2, 1)), [(0.5, 0.5), (1.5, 0.5)])
+        >>> d.half_faces.owner.tolist(), d.half_faces.opposite.max()
+        ([0, 0, 0, 0, 1, 1, 1, 1], np.int64(7))
+        """
+        from .half_faces import HalfFaceArrays
+
+        return HalfFaceArrays(self)
 
     @cached_property
     def faces(self) -> Faces:

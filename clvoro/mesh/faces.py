@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .connectivity import face_corners, face_keys, face_owners, following, inverse, slices, take_rows
+from .connectivity import following, inverse, slices, take_rows
 from .geometry import face_vectors, polygon_areas
 from .read_only import Sealed, read_only
 
@@ -331,12 +331,12 @@ class Faces(Sealed):
 
 def make_faces(diagram: Diagram) -> Faces:
     """Return every face of `diagram` that has a measure, once."""
-    owner, neighbor = face_owners(diagram), diagram.neighbors
-    starts, corners = face_corners(diagram)
+    owner, neighbor = diagram.half_faces.owner, diagram.neighbors
+    starts, corners = diagram.half_faces.corners
     filled = np.diff(starts) > 0
     inner = np.flatnonzero(filled & (neighbor >= 0))
     # Of two half-faces that of the lower cell is taken, or that which is there.
-    here, there = face_keys(diagram, inner)
+    here, there = diagram.half_faces.keys(inner)
     first, second = np.flatnonzero(here < there), np.flatnonzero(here > there)
     key, other = here[first], there[second]
     order = np.argsort(key, kind="stable")
@@ -378,7 +378,7 @@ def _geometry_of_diagram(f: Faces, diagram: Diagram) -> dict[str, np.ndarray]:
     walls = -1 - f.neighbor[~inner]
     center = diagram.face_centroids[f.half_face].astype(float)
     if any(domain.periodic):  # where only the neighbor has the face, its position is beside the neighbor
-        away = face_owners(diagram)[f.half_face] != f.owner
+        away = diagram.half_faces.owner[f.half_face] != f.owner
         away |= (diagram.shifts[f.half_face] != f.shift).any(axis=1)
         center = center + np.where(away[:, None], f.shift * domain.extent, 0.0)
     normal, distance = np.empty((len(f), f.dim)), np.empty(len(f))

@@ -11,7 +11,6 @@ import shapely
 
 from ..arguments import check_integer
 from ..errors import InputError
-from .connectivity import face_ends, next_faces
 from .diagram import Diagram
 from .read_only import Sealed
 
@@ -175,7 +174,7 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
 
 def cell_shapes(diagram: Diagram, chosen: np.ndarray | None = None) -> np.ndarray:
     """Return each cell of a diagram in 2D, or of `chosen` rows, as a shapely geometry; see `Diagram.to_shapely`."""
-    ends, following = face_ends(diagram), next_faces(diagram)
+    ends, following = diagram.half_faces.ends, diagram.half_faces.next
     owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
     # One loop follows the other; each ends where the next face is its first one.
     begins = np.concatenate([[True], following[:-1] != np.arange(1, len(following))])

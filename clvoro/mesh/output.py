@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from os import PathLike
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, cast
 
+import numpy as np
+
 if TYPE_CHECKING:
     import meshio
-    import numpy as np
     import pyvista
     from numpy.typing import ArrayLike
 
@@ -109,10 +110,9 @@ class MeshOutput:
         >>> cells.boundary_cells("inlet").tolist()
         [2]
         """
-        from .connectivity import boundary_cells
-
         diagram: Any = getattr(self._self, "diagram", self._self)
-        return boundary_cells(diagram, boundary)
+        walls = diagram.domain.boundaries.select("boundary", boundary)
+        return np.unique(diagram.half_faces.owner[np.isin(-1 - diagram.neighbors, walls)])
 
     def save(
         self, path: str | PathLike[str], *, cell_data: Mapping[str, ArrayLike] | None = None, **others: object

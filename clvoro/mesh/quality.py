@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .connectivity import face_owners, plane_shares
 from .diagram import Diagram
 from .straightening import cell_quality
 
@@ -142,7 +141,7 @@ def measure_mesh(diagram: Diagram) -> Measures:
     A wall counts as an infinite plane, through a side of a box or an edge of a polygon. On a sphere the generator of
     the removed cell is behind it.
     """
-    owner, neighbor = face_owners(diagram), diagram.neighbors
+    owner, neighbor = diagram.half_faces.owner, diagram.neighbors
     points, centroids, volumes = diagram.points, diagram.centroids, diagram.volumes
     areas, middles = diagram.face_measures, diagram.face_centroids
     starts = diagram.neighbor_starts
@@ -156,7 +155,7 @@ def measure_mesh(diagram: Diagram) -> Measures:
     distance = np.linalg.norm(line, axis=1)
     distance[walls[gaps <= 0]] = 0
     share = np.full(len(line), 0.5)
-    share[inner] = plane_shares(diagram, np.flatnonzero(inner))
+    share[inner] = diagram.half_faces.plane_shares(np.flatnonzero(inner))
     crossing = points[owner] + share[:, None] * line
     crossing = domain.onto(crossing)
     offset, distance = domain.lengths(np.linalg.norm(middles - crossing, axis=1)), domain.lengths(distance)

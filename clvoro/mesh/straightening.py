@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..geometry.rings import WALL_CORNER
-from .connectivity import face_ends
 
 if TYPE_CHECKING:
     from ..geometry.polygon import Polygon
@@ -63,7 +62,7 @@ def straighten(diagram: Diagram) -> Straightened:
     sides = _straight_sides(diagram, domain, owner)
     inner = np.flatnonzero(diagram.neighbors >= 0)
     # Positions are relative to the generator.
-    ends = (diagram.vertices[v] - diagram.points[owner[inner]] for v in face_ends(diagram)[inner].T)
+    ends = (diagram.vertices[v] - diagram.points[owner[inner]] for v in diagram.half_faces.ends[inner].T)
     p, q = (np.concatenate(pair) for pair in zip(ends, (sides.begin, sides.end), strict=True))
     cell = np.concatenate([owner[inner], sides.cell])
     number = np.bincount(cell, minlength=n)
@@ -210,7 +209,7 @@ def _straight_sides(diagram: Diagram, domain: Polygon, owner: np.ndarray) -> _Si
     first = np.flatnonzero(np.diff(run_of_point, prepend=-1))
     last = np.append(first[1:], len(run_of_point)) - 1
     chain = np.empty((len(run_of_point), 2))
-    ends = face_ends(diagram)[face]
+    ends = diagram.half_faces.ends[face]
     chain[np.arange(len(face)) + run] = diagram.vertices[ends[:, 0]]
     chain[last] = diagram.vertices[ends[starts[1:] - 1, 1]]
     cell = owner[begins][run_of_point]
@@ -235,7 +234,7 @@ def along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
     """Return for each half-face on the boundary the next one on its ring, (m,); -1 if there is none."""
     rows = np.flatnonzero(diagram.neighbors < 0)
     edge = _places(diagram, domain)[rows].astype(np.int64)
-    begin, end = face_ends(diagram)[rows].T.astype(np.int64)
+    begin, end = diagram.half_faces.ends[rows].T.astype(np.int64)
     # Very short edges have no face.
     used = np.unique(edge)
     ring = np.searchsorted(domain.oriented.ring_starts, used, side="right")

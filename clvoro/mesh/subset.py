@@ -14,7 +14,7 @@ from ..geometry.domain import Domain
 from ..geometry.sphere import COAST, Sphere, SphereRegion
 from ..geometry.subdomain import Subdomain
 from ..geometry.surface import Surface
-from .connectivity import face_owners, neighbor_points, take_rows
+from .connectivity import take_rows
 from .diagram import Diagram
 from .results import HISTORY_DTYPE, Result, figures
 
@@ -125,7 +125,7 @@ def _in_space(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray) -> Diagr
 
     `boundary` is the name of these walls, or one for each cell that is removed, (n,) object.
     """
-    number, owner = np.cumsum(kept) - 1, face_owners(d)
+    number, owner = np.cumsum(kept) - 1, d.half_faces.owner
     faces = np.flatnonzero(kept[owner])
     behind = d.neighbors[faces]
     whole = d.domain.uncut
@@ -135,7 +135,7 @@ def _in_space(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray) -> Diagr
     cut[behind < 0] = d.domain.removed_behind(-1 - behind[behind < 0])
     neighbors = np.where(behind < 0, behind, number[np.maximum(behind, 0)])
     neighbors[cut] = -1 - w - np.arange(cut.sum())
-    within, beyond = d.points[owner[faces[cut]]], neighbor_points(d, faces[cut])
+    within, beyond = d.points[owner[faces[cut]]], d.half_faces.behind(faces[cut])
     labels = np.broadcast_to(np.asarray(boundary, object), len(d))[np.maximum(behind, 0)]
     old = cut & (behind < 0)
     labels[old] = [d.domain.boundary_names[k] for k in d.domain.boundary_index[-1 - behind[old]]]
@@ -169,7 +169,7 @@ _CORNERS = {"cell_vertex": "cell_vertices", "face_vertex": "face_vertices"}
 def _on_sphere(d: Diagram, kept: np.ndarray, boundary: str, sphere: Sphere) -> Diagram:
     """Return the kept cells; faces towards removed cells become faces on the boundary."""
     number = np.cumsum(kept) - 1
-    owner = face_owners(d)
+    owner = d.half_faces.owner
     faces = np.flatnonzero(kept[owner])
     behind = d.neighbors[faces]
     lost = (behind >= 0) & ~kept[np.maximum(behind, 0)]

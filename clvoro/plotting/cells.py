@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike
 from ..arguments import format_point
 from ..errors import InputError
 from ..geometry.domain import Domain, images_in
-from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .colors import COLORINGS, Color, Paint, paint_of, picture_of
@@ -280,7 +279,7 @@ def draw_cells(
     drawn = draw_polygons(ax, cells, polygons, paint, widths, bridged)
     if edges and bridged.any():
         # A bridge between two loops is no face.
-        lines = face_ends(diagram)[np.isin(face_owners(diagram), cells[bridged])]
+        lines = diagram.half_faces.ends[np.isin(diagram.half_faces.owner, cells[bridged])]
         ax.add_collection(LineCollection(list(diagram.vertices[lines]), colors=[_INK], linewidths=0.4), autolim=False)
     return drawn if image is None else image
 

@@ -21,7 +21,7 @@ from ..arguments import format_point
 from ..errors import InputError
 from ..geometry.domain import Domain, images_in
 from ..io.convert import cut_at_sides, missing
-from ..mesh.connectivity import face_corners, following, take_rows
+from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .cells import draw_polygons, edge_widths
@@ -316,7 +316,7 @@ def cut_cells(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> tuple[
 
 def _bounds(diagram: Diagram, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return for each cell the lowest and the highest of the `values` of its vertices."""
-    starts, corners = face_corners(diagram)
+    starts, corners = diagram.half_faces.corners
     starts, corners = np.minimum(starts[diagram.neighbor_starts[:-1]], len(corners) - 1), values[corners]
     return np.minimum.reduceat(corners, starts, axis=0), np.maximum.reduceat(corners, starts, axis=0)
 
@@ -328,7 +328,7 @@ def _polyhedra(diagram: Diagram, chosen: Callable[[np.ndarray, np.ndarray], np.n
     are their rows, "generator" the positions of their generators or of images of these.
     """
     pyvista, domain = require_pyvista(), diagram.domain
-    faces = face_corners(diagram)
+    faces = diagram.half_faces.corners
     box = np.array([domain.lower, domain.upper])
     parts, images = [], [(np.arange(len(diagram)), np.zeros(3))]
     if any(domain.periodic):
@@ -412,7 +412,7 @@ def _walls_of(diagram: Diagram, polygons: list[np.ndarray]) -> np.ndarray:
     rows = np.flatnonzero(diagram.neighbors < 0)
     if not len(rows):
         return np.full(len(polygons), -1)
-    starts, corners = take_rows(*face_corners(diagram), rows)
+    starts, corners = take_rows(*diagram.half_faces.corners, rows)
     counts = np.maximum(np.diff(starts), 1)
     middles = np.add.reduceat(diagram.vertices[corners], starts[:-1]) / counts[:, None]
     far, row = scipy.spatial.KDTree(middles).query([polygon.mean(axis=0) for polygon in polygons])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from ..mesh.connectivity import cell_corners, face_owners, following, neighbor_points, plane_shares, take_rows
+from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.lookup import cell_shapes
 
@@ -67,7 +67,7 @@ def _between_corners(diagram: Diagram) -> Pieces:
         inside = inside * (diagram.domain.frame[1] / np.linalg.norm(inside, axis=1))[:, None]
     if not (diagram.domain.cuts_cells or diagram.is_power):
         return Pieces(cells, inside, x, diagram.cell_vertex_starts, diagram.cell_vertices)
-    starts, items = cell_corners(diagram)
+    starts, items = diagram.half_faces.cell_corners
     usable = np.diff(starts) >= 3
     if not diagram.domain.cuts_cells:
         return Pieces(cells[usable], inside[usable], x, *take_rows(starts, items, cells[usable]))
@@ -97,7 +97,7 @@ def _between_corners(diagram: Diagram) -> Pieces:
 
 def _between_bisectors(diagram: Diagram) -> Pieces:
     """Return the pieces of polyhedra. Faces on no bisector, as those at walls, get mirror images of the origins."""
-    owner, neighbors, n = face_owners(diagram), diagram.neighbors.copy(), len(diagram)
+    owner, neighbors, n = diagram.half_faces.owner, diagram.neighbors.copy(), len(diagram)
     filled = np.diff(diagram.neighbor_starts) > 0
     alone = (neighbors < 0) | diagram.shifts.any(axis=1)
     normals, gaps = np.zeros((len(owner), 3)), np.ones(len(owner))
@@ -134,7 +134,7 @@ def _bent_cells(diagram: Diagram) -> np.ndarray:
     """Return which cells of a solid have a face with corners off its bisector or wall: (n,) bool."""
     face, owner = (
         np.repeat(np.arange(len(diagram.neighbors)), np.diff(diagram.face_vertex_starts)),
-        face_owners(diagram),
+        diagram.half_faces.owner,
     )
     normals, gaps = _planes(diagram, np.arange(len(diagram.neighbors)))
     corners = diagram.vertices[diagram.face_vertices] - diagram.points[owner[face]]
@@ -149,7 +149,7 @@ def _pyramids(diagram: Diagram, faces: np.ndarray) -> Pieces:
     """
     starts, items = take_rows(diagram.face_vertex_starts, diagram.face_vertices, faces)
     face, after = np.repeat(np.arange(len(faces)), np.diff(starts)), following(starts)
-    owner = face_owners(diagram)[faces]
+    owner = diagram.half_faces.owner[faces]
     apex, middle, width = diagram.centroids[owner], diagram.face_centroids[faces], np.cbrt(diagram.volumes[owner])
     corners = diagram.vertices[items]
     area = np.add.reduceat(np.cross(corners - middle[face], corners[after] - middle[face]), starts[:-1])
@@ -193,11 +193,11 @@ def _pyramids(diagram: Diagram, faces: np.ndarray) -> Pieces:
 def _planes(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return unit normals (k, 3) of half-faces (k,), and their distances (k,) from the generators."""
     behind, walls = diagram.neighbors[faces] < 0, -1 - diagram.neighbors[faces]
-    own = diagram.points[face_owners(diagram)[faces]]
-    between = neighbor_points(diagram, faces[~behind]) - own[~behind]
+    own = diagram.points[diagram.half_faces.owner[faces]]
+    between = diagram.half_faces.behind(faces[~behind]) - own[~behind]
     lengths = np.linalg.norm(between, axis=1)
     normals, gaps = np.empty_like(own), np.empty(len(own))
     normals[~behind] = between / lengths[:, None]
-    gaps[~behind] = plane_shares(diagram, faces[~behind]) * lengths
+    gaps[~behind] = diagram.half_faces.plane_shares(faces[~behind]) * lengths
     normals[behind], gaps[behind] = diagram.domain.toward_walls(walls[behind], own[behind])
     return normals, gaps

@@ -11,7 +11,6 @@ import scipy
 
 from ..arguments import check_cell_values
 from ..errors import InputTypeError
-from ..mesh.connectivity import face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .graded import default_engine
@@ -60,7 +59,7 @@ class CellStencils:
 
     @classmethod
     def _make(cls, mesh: Diagram) -> CellStencils:
-        n, row = len(mesh), face_owners(mesh)
+        n, row = len(mesh), mesh.half_faces.owner
         inner = mesh.neighbors >= 0
         own, other = row[inner], mesh.neighbors[inner]
         # The image of a neighbor's generator is beside this cell, and so is the image of its centroid.

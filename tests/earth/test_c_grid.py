@@ -7,7 +7,6 @@ from scipy.spatial import ConvexHull, Delaunay
 import clvoro
 from clvoro.earth.c_grid import measure_c_grid
 from clvoro.errors import InputError
-from clvoro.mesh.connectivity import face_ends, face_owners
 from tests.mesh.test_sphere_check import icosahedron, scattered
 from tests.reference.solids import solid_diagram
 
@@ -65,13 +64,13 @@ def test_angles_are_those_of_the_convex_hull(globe):
 
 
 def test_each_angle_belongs_to_its_corner(globe):
-    m, starts = measure_c_grid(globe), face_ends(globe)[:, 0]
+    m, starts = measure_c_grid(globe), globe.half_faces.ends[:, 0]
     meeting = [[] for _ in globe.vertices]
-    for cell, vertex in zip(face_owners(globe), starts, strict=True):
+    for cell, vertex in zip(globe.half_faces.owner, starts, strict=True):
         meeting[vertex].append(cell)
     for k in range(0, len(m.corners), 17):
         face = m.corners[k]
-        i, j = face_owners(globe)[face], globe.neighbors[face]
+        i, j = globe.half_faces.owner[face], globe.neighbors[face]
         (third,) = set(meeting[starts[face]]) - {i, j}
         expected = flat_angles(globe.points, np.array([[third, i, j]]))[0, 0]
         assert m.angles[k] == pytest.approx(expected, abs=1e-6)
@@ -79,7 +78,7 @@ def test_each_angle_belongs_to_its_corner(globe):
 
 def test_kites_one_by_one(globe):
     m, d = measure_c_grid(globe), globe
-    owner, begin = face_owners(d), face_ends(d)[:, 0]
+    owner, begin = d.half_faces.owner, d.half_faces.ends[:, 0]
     for k in range(0, len(m.corners), 13):
         face = m.corners[k]
         i = owner[face]
@@ -94,18 +93,18 @@ def test_kites_one_by_one(globe):
 
 
 def test_kites_fill_each_cell(globe):
-    total = np.bincount(face_owners(globe)[measure_c_grid(globe).corners], globe.measures.c_grid.kites)
+    total = np.bincount(globe.half_faces.owner[measure_c_grid(globe).corners], globe.measures.c_grid.kites)
     assert total == pytest.approx(1, rel=1e-11)
 
 
 def test_edges_one_by_one(globe):
-    m, d, owner = measure_c_grid(globe), globe, face_owners(globe)
+    m, d, owner = measure_c_grid(globe), globe, globe.half_faces.owner
 
     def arc(a, b):
         return np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
 
     for face in range(0, len(owner), 7):
-        begin, end = d.vertices[face_ends(d)[face]]
+        begin, end = d.vertices[d.half_faces.ends[face]]
         one, other = d.points[owner[face]], d.points[d.neighbors[face]]
         offset, length = arc(begin + end, one + other), arc(begin, end)
         # Middles have the round-off 1e-16, and the shortest edge is 1e-4 long.
@@ -121,7 +120,7 @@ def test_edges_one_by_one(globe):
 
 
 def test_angle_of_centroids_is_along_the_sphere(globe):
-    d, owner = globe, face_owners(globe)
+    d, owner = globe, globe.half_faces.owner
     for face in range(0, len(owner), 11):
         i, j = owner[face], d.neighbors[face]
         up = d.points[i] + d.points[j]
@@ -227,8 +226,8 @@ def test_random_mesh_is_rejected_for_mpas(globe):
     assert largest.limit == pytest.approx(90, abs=1e-3)
     assert largest.count == m.obtuse
     corner = m.corners[np.argmax(m.angles)]
-    assert largest.cell == face_owners(globe)[corner]
-    place = globe.vertices[face_ends(globe)[[corner], 0]]
+    assert largest.cell == globe.half_faces.owner[corner]
+    place = globe.vertices[globe.half_faces.ends[[corner], 0]]
     assert largest.place == pytest.approx(globe.domain.lonlat(place)[0])
     assert report["kite area over cell area"].count == m.negative_kites
     assert report["edge offset"].count == m.obtuse

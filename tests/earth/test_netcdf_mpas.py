@@ -8,7 +8,6 @@ import pytest
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.mesh.connectivity import face_ends
 from tests.io.test_io import BOX, make_diagram
 from tests.reference import netcdf_files
 from tests.reference.netcdf_files import PLANE, made, read, result_of, shoelace
@@ -398,7 +397,7 @@ def test_faces_without_length_are_no_edges(tmp_path):
     points = netcdf_files.grid(BOX, 5, 4)
     points += 1e-12 * np.random.default_rng(4).standard_normal(points.shape)
     diagram = make_diagram(points)
-    ends = face_ends(diagram)
+    ends = diagram.half_faces.ends
     assert (ends[:, 0] == ends[:, 1]).sum() > 10
     result_of(diagram).to_netcdf(tmp_path / "mesh.nc", convention="mpas")
     mesh = Mesh(tmp_path / "mesh.nc", "squares")

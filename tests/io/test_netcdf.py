@@ -12,7 +12,6 @@ from scipy.io import netcdf_file
 import clvoro
 from clvoro.errors import InputError, InputTypeError
 from clvoro.io import netcdf
-from clvoro.mesh.connectivity import next_faces
 from tests.reference import netcdf_files, solids
 from tests.reference.netcdf_files import MESHES, made, read, result_of, shoelace
 
@@ -158,7 +157,7 @@ def test_walls_are_numbered(result, mesh):
 
 def test_a_face_around_an_island_has_its_loops_joined(ctx, tmp_path):
     diagram = clvoro.Adapter(ctx).diagram(*netcdf_files.around_an_island())
-    onward = next_faces(diagram)
+    onward = diagram.half_faces.next
     assert len(onward) > 0
     last = onward <= np.arange(len(onward))
     assert last.sum() == len(diagram) + 1  # one cell has two loops

@@ -13,7 +13,6 @@ from clvoro.cli import command as cli
 from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.polygon import Polygon
 from clvoro.io.vtu_read import load_vtu
-from clvoro.mesh.connectivity import face_ends, next_faces
 from clvoro.mesh.straightening import count_sides
 from tests.io import test_foam
 from tests.mesh.test_check import add, put, spoilt, swap
@@ -203,7 +202,7 @@ def test_walls_of_polygons() -> None:
 
 def cells_of(diagram) -> list:
     """Each cell as a shapely geometry, from the ends of its faces only."""
-    x, ends = diagram.vertices, face_ends(diagram)
+    x, ends = diagram.vertices, diagram.half_faces.ends
     found = []
     for a, b in zip(diagram.neighbor_starts[:-1], diagram.neighbor_starts[1:], strict=True):
         lines = [shapely.LineString(x[e]) for e in ends[a:b] if (x[e[0]] != x[e[1]]).any()]
@@ -220,8 +219,8 @@ def test_faces_are_the_outlines_of_cells(result) -> None:
     # Round-off of sums of a dozen products of numbers up to 4.
     assert np.abs(shapely.area(cells) - result.diagram.volumes).max() < 1e-13
     assert any(len(part.interiors) for cell in cells for part in shapely.get_parts(cell))
-    following = next_faces(result.diagram)
-    ends = face_ends(result.diagram)
+    following = result.diagram.half_faces.next
+    ends = result.diagram.half_faces.ends
     assert (ends[:, 1] == ends[following, 0]).all()
     assert sorted(following.tolist()) == list(range(len(following)))
 
@@ -312,7 +311,7 @@ def test_vtu_is_read_back(ctx, tmp_path, name: str) -> None:
     assert np.array_equal(e.neighbor_starts, d.neighbor_starts)
     rows = [
         [
-            sorted(zip(m.neighbors[a:b].tolist(), face_ends(m)[a:b].tolist(), strict=True))
+            sorted(zip(m.neighbors[a:b].tolist(), m.half_faces.ends[a:b].tolist(), strict=True))
             for a, b in zip(m.neighbor_starts[:-1], m.neighbor_starts[1:], strict=True)
         ]
         for m in (d, e)
@@ -326,7 +325,7 @@ def test_vtu_with_a_slit_without_width(ctx, tmp_path) -> None:
     shore = np.vstack([spit(1e-12)[:-1], (0, 1), (0, 0.5)])
     domain = Polygon(shore, [star(7, 3, (0.3, 0.3), 0.1), star(5, 4, (0.2, 0.8), 0.05)])
     made = mesh(ctx, domain, 3, "float32")
-    ends = face_ends(made.diagram)
+    ends = made.diagram.half_faces.ends
     cell = np.repeat(np.arange(3), np.diff(made.diagram.neighbor_starts))
     keys = {(c, *sorted(pair)) for c, pair in zip(cell.tolist(), ends.tolist(), strict=True)}
     assert len(keys) < len(ends)

@@ -8,7 +8,6 @@ from scipy.spatial import KDTree
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.mesh.connectivity import face_ends
 from tests.earth.test_netcdf_mpas import check_energy
 from tests.earth.test_sphere_mpas import Globe
 from tests.reference.netcdf_files import read, result_of
@@ -185,7 +184,7 @@ def test_ugrid_has_the_coast(part, tmp_path):
     outer = file["mesh_edge_faces"][:, 1] < 0
     assert np.array_equal(file["boundary"] == 0, outer)
     assert np.array_equal(file["wall"] >= 0, outer)
-    assert outer.sum() == np.count_nonzero((d.neighbors < 0) & (np.ptp(face_ends(d), axis=1) > 0))
+    assert outer.sum() == np.count_nonzero((d.neighbors < 0) & (np.ptp(d.half_faces.ends, axis=1) > 0))
     assert np.array_equal(file["area"], d.volumes)
 
 

@@ -14,7 +14,7 @@ from clvoro import io
 from clvoro.errors import InputError
 from clvoro.io.contents import Contents, describe
 from clvoro.io.vtu import largest_boundary, polyhedra, write_vtu
-from clvoro.mesh.connectivity import face_corners, face_owners, take_rows
+from clvoro.mesh.connectivity import take_rows
 from clvoro.mesh.diagram import Diagram
 from tests.io.test_io import assert_equal_results, assert_same_array, rewrite
 from tests.reference import solids
@@ -45,7 +45,7 @@ def changed(diagram, **arrays):
 
 
 def loops_of(diagram):
-    starts, corners = face_corners(diagram)
+    starts, corners = diagram.half_faces.corners
     return [corners[a:b].tolist() for a, b in itertools.pairwise(starts)]
 
 
@@ -109,7 +109,7 @@ def test_take_rows_forwards_and_backwards():
 
 
 def test_faces_once_has_each_face_once(diagram):
-    faces, owner = diagram.faces, face_owners(diagram)
+    faces, owner = diagram.faces, diagram.half_faces.owner
     pairs = {
         (min(i, j), max(i, j)) if j >= 0 else (i, j)
         for i, j in zip(owner.tolist(), diagram.neighbors.tolist(), strict=True)
@@ -122,7 +122,7 @@ def test_faces_once_has_each_face_once(diagram):
 
 
 def test_a_face_of_one_cell_only_is_reversed(diagram):
-    owner, neighbor = face_owners(diagram), diagram.neighbors
+    owner, neighbor = diagram.half_faces.owner, diagram.neighbors
     lost = np.flatnonzero((owner < neighbor) & (owner == 20))[0]
     kept = np.arange(len(owner)) != lost
     loops = [loop for loop, keep in zip(loops_of(diagram), kept, strict=True) if keep]

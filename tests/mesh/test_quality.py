@@ -7,7 +7,6 @@ import pytest
 
 import clvoro
 from clvoro.geometry.box import Box
-from clvoro.mesh.connectivity import face_corners, face_owners
 from clvoro.mesh.diagram import Diagram
 from clvoro.mesh.quality import measure_mesh
 from tests.io.test_io import BOX, make_diagram
@@ -79,7 +78,7 @@ def test_two_cells_by_hand():
 def test_one_face_after_the_other(diagram):
     d, m = diagram, measure_mesh(diagram)
     box, dim = d.domain, d.domain.dim
-    owner = face_owners(d)
+    owner = d.half_faces.owner
     planes = [side[a] for a in range(dim) for side in (box.lower, box.upper)]
     for k, (i, j) in enumerate(zip(owner, d.neighbors, strict=True)):
         x = d.points[i]
@@ -111,8 +110,8 @@ def test_one_face_after_the_other(diagram):
 def test_faces_are_at_right_angles_to_the_lines_of_the_generators(diagram):
     """Up to round-off, so `Measures` has no angle between face and generators."""
     d = diagram
-    starts, corners = face_corners(d)
-    owner = face_owners(d)
+    starts, corners = d.half_faces.corners
+    owner = d.half_faces.owner
     checked = 0
     for k in np.flatnonzero(d.neighbors >= 0):
         loop = d.vertices[corners[starts[k] : starts[k + 1]]]

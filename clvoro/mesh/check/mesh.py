@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from ..connectivity import face_ends, face_keys, plane_shares, take_rows
+from ..connectivity import take_rows
 from ..lookup import lifted, power_tree
 from .findings import ROUNDINGS, Check, Report, StopError
 from .polygon import check_cells, check_edges, check_outlines, hidden
@@ -36,10 +36,10 @@ def check_corners(check: Check) -> None:
     if d.domain.cuts_cells:
         return
     inner = np.flatnonzero((d.neighbors >= 0) & ~d.shifts.any(axis=1))
-    here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
+    here, there = inner, d.half_faces.opposite[inner]
     flat = d.domain.cell_dim == 2
     if flat:
-        ends = face_ends(d)
+        ends = d.half_faces.ends
         wrong = (ends[here] != ends[there][:, ::-1]).any(axis=1)
     else:
         starts, corners = d.face_vertex_starts, d.face_vertices
@@ -82,7 +82,7 @@ def _euler_characteristic(d: Diagram) -> int | None:
         return 1
     owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
     walls = d.neighbors < 0
-    ends = face_ends(d)[walls]
+    ends = d.half_faces.ends[walls]
     if len(np.unique(ends[:, 0])) < len(ends):
         return None
     empty = int(np.count_nonzero(np.diff(d.neighbor_starts) == 0))
@@ -112,7 +112,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     doubts = g.doubts(own)
     normals, height = g.directions, g.spacings / 2
     inner = np.flatnonzero(d.neighbors >= 0)
-    height[inner] = plane_shares(d, inner) * g.spacings[inner]
+    height[inner] = d.half_faces.plane_shares(inner) * g.spacings[inner]
     walls = np.flatnonzero(d.neighbors < 0)
     planes, anchors = d.domain.wall_planes(-1 - d.neighbors[walls])
     height[walls] = ((anchors - d.points[g.owner[walls]]) * planes).sum(axis=1)
@@ -272,7 +272,7 @@ def _check_graph(check: Check) -> None:
     i = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
     check.note("neighbors", (i == j) & ~d.shifts.any(axis=1), lambda f: f"cell {j[f]} is its own neighbor")
     inner = np.flatnonzero(j >= 0)
-    there, back = face_keys(d, inner)
+    there, back = d.half_faces.keys(inner)
     order = np.argsort(there)
     sorted_ = there[order]
 
@@ -566,7 +566,7 @@ def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> N
             np.maximum(height - slack, 0),
             lambda k: f"face {walls[k]} of cell {g.owner[walls[k]]} is off its wall by {height[k]:.3g}",
         )
-    here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
+    here, there = inner, d.half_faces.opposite[inner]
     off = np.abs(d.face_measures[here] - d.face_measures[there])
     wide = np.maximum(width[here], width[there])
     check.note(

@@ -9,7 +9,6 @@ import scipy
 import shapely
 
 from ...geometry.polygon import BOUNDARY_SHIFTS
-from ..connectivity import face_ends, next_faces
 
 if TYPE_CHECKING:
     from ...geometry.polygon import Polygon
@@ -25,7 +24,7 @@ cannot follow it exactly (in its own unit, which is up to twice the size of the 
 def check_outlines(check: Check) -> None:
     """Check that faces form loops, and that the corners of a cell follow the loops, with bridges there and back."""
     d = check.diagram
-    n, ends, following = len(d), face_ends(d), next_faces(d)
+    n, ends, following = len(d), d.half_faces.ends, d.half_faces.next
     owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
     check.note(
         "faces closed",
@@ -66,7 +65,7 @@ def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     edge = oriented.places[-1 - d.neighbors[rows]]
     begin, length = oriented.vertices, oriented.lengths
     along = oriented.along / length[:, None]
-    first, last = (((d.vertices[v] - begin[edge]) * along[edge]).sum(axis=1) for v in face_ends(d)[rows].T)
+    first, last = (((d.vertices[v] - begin[edge]) * along[edge]).sum(axis=1) for v in d.half_faces.ends[rows].T)
     order = np.lexsort((first + last, edge))
     edge, first, last = edge[order], first[order], last[order]
     # Each face begins where the previous one ends, the first at 0; the last one ends with the edge.
@@ -97,7 +96,7 @@ def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     d = check.diagram
     if d.is_power:
         return
-    begin, end = (d.vertices[v] - d.points[g.owner] for v in face_ends(d).T)
+    begin, end = (d.vertices[v] - d.points[g.owner] for v in d.half_faces.ends.T)
     angle = np.arctan2(begin[:, 0] * end[:, 1] - begin[:, 1] * end[:, 0], (begin * end).sum(axis=1))
     turns = np.bincount(g.owner, angle, len(d)) / (2 * np.pi)
     # A generator on the boundary is inside or outside by round-off.
@@ -148,7 +147,7 @@ def hidden(
     lines = np.asarray(shapely.linestrings(ends))
     away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
     # The line crosses slits that are no wider: nothing behind them is visible from their sides.
-    before = np.argsort(next_faces(d))
+    before = np.argsort(d.half_faces.next)
     for faces in (places, before[places]):
         begin, end = domain.edge_ends(np.maximum(-1 - d.neighbors[faces], 0))
         along = end - begin

@@ -10,7 +10,7 @@ import scipy
 import shapely
 
 from ...geometry.sphere import Sphere, arc_excess, triangle_areas
-from ..connectivity import face_ends, face_owners, following, neighbor_points, next_faces
+from ..connectivity import following
 from ..diagram import Diagram
 from .findings import ROUNDINGS
 
@@ -26,9 +26,9 @@ def rebuild_on_sphere(diagram: Diagram) -> dict[str, np.ndarray]:
     generator.
     """
     sphere = diagram.domain
-    radius, owner = sphere.frame[1], face_owners(diagram)
+    radius, owner = sphere.frame[1], diagram.half_faces.owner
     points, vertices = (sphere.wrap(x) / radius for x in (diagram.points, diagram.vertices))
-    v, w = (vertices[ends] for ends in face_ends(diagram).T)
+    v, w = (vertices[ends] for ends in diagram.half_faces.ends.T)
     a, b = (_relative(x, points[owner]) for x in (v, w))
     cross = np.cross(v, w)
     # Of the vectors v x w the parts with the generator add up to zero. Without them small cells lose no digits.
@@ -164,14 +164,14 @@ class Rebuilt:
     def _set_polygons(self, d: Diagram) -> None:
         """Set areas and middles of faces, and the corners of cells, in 2D."""
         at = d.points[self.owner]  # relative to it, small cells far from the origin keep their digits
-        first, last = face_ends(d).T
+        first, last = d.half_faces.ends.T
         a, b = d.vertices[first] - at, d.vertices[last] - at
         edge = b - a
         self.areas = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
         self.middles = (a + b) / 2
         self.cells, self.corners = self.owner, first
         self._on_wall = d.neighbors < 0
-        self._following = next_faces(d)
+        self._following = d.half_faces.next
 
     def _set_polyhedra(self, d: Diagram) -> None:
         """Set areas and middles of faces, and the corners and edges of cells, in 3D."""
@@ -325,7 +325,7 @@ def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the unit vector across each face, outward, and the distance of its generators (infinite at a wall)."""
     inner, walls = np.flatnonzero(d.neighbors >= 0), np.flatnonzero(d.neighbors < 0)
     across = np.zeros((len(owner), d.domain.dim))
-    across[inner] = neighbor_points(d, inner) - d.points[owner[inner]]
+    across[inner] = d.half_faces.behind(inner) - d.points[owner[inner]]
     across[walls] = d.domain.toward_walls(-1 - d.neighbors[walls], d.points[owner[walls]])[0]
     distance = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
     spacing = distance.copy()
@@ -386,7 +386,7 @@ class SphereCells(Rebuilt):
         eps = float(np.finfo(self.real).eps)
         self.unit = (2 * eps + fine) * radius
         self.owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
-        first, last = face_ends(d).T
+        first, last = d.half_faces.ends.T
         self.cells, self.corners = self.owner, first
         self._set_directions(d, sphere)
         at, x = d.points[self.owner], d.vertices
@@ -415,7 +415,7 @@ class SphereCells(Rebuilt):
         """Set tangents, directions to neighbors and distances of generators, and the corners that follow from them."""
         unit = sphere.wrap(d.points) / sphere.radius
         self._tangents = [axis[self.owner] for axis in sphere.tangents(sphere.wrap(d.points))]
-        behind = neighbor_points(d, np.arange(len(self.owner)))
+        behind = d.half_faces.behind(np.arange(len(self.owner)))
         between = sphere.wrap(behind) / sphere.radius - unit[self.owner]
         normal = self._along_tangents(between)
         level = (between**2).sum(axis=1) / 2

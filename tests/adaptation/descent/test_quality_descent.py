@@ -9,7 +9,6 @@ import pytest
 import clvoro
 from clvoro.adaptation.descent.quality_descent import QualityDescent, Repulsion
 from clvoro.adaptation.stages import Stages
-from clvoro.mesh.connectivity import face_ends
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import diagrams as reference
@@ -168,7 +167,7 @@ DOMAINS = {
 def edges_of(d):
     """Yield the cells of each edge, (i, i) at the boundary, and its length; none beside re-entrant corners."""
     owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
-    ends, polygon = face_ends(d), isinstance(d.domain, clvoro.Polygon)
+    ends, polygon = d.half_faces.ends, isinstance(d.domain, clvoro.Polygon)
     turns = {}
     if polygon:
         turns = dict(zip(map(tuple, d.domain.oriented.vertices), d.domain.oriented.turns, strict=True))

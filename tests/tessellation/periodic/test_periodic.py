@@ -10,7 +10,6 @@ import clvoro
 from clvoro import sizing
 from clvoro.errors import InputError, InputTypeError
 from clvoro.io.vtu_read import load_vtu
-from clvoro.mesh.connectivity import face_owners
 from clvoro.mesh.quality import measure_mesh
 from clvoro.opencl import program as _program
 from clvoro.tessellation.device_diagram import read_report
@@ -80,7 +79,7 @@ def torus_voronoi(box, points):
 
 def faces_of(diagram):
     keys = zip(
-        face_owners(diagram).tolist(), diagram.neighbors.tolist(), map(tuple, diagram.shifts.tolist()), strict=True
+        diagram.half_faces.owner.tolist(), diagram.neighbors.tolist(), map(tuple, diagram.shifts.tolist()), strict=True
     )
     return dict(zip(keys, diagram.face_measures.tolist(), strict=True))
 
@@ -218,7 +217,7 @@ def test_images_include_all_that_cells_need(adapter, box):
     part = periodic.tessellate(x, n, complete=True).folded.part
     taken = part.points.get()[: part.count].astype(float)
     diagram, scale = adapter.diagram(box, points), box.frame[1]
-    owner = face_owners(diagram)
+    owner = diagram.half_faces.owner
     if box.dim == 2:
         corners = diagram.vertices[diagram.cell_vertices]
     else:
@@ -246,7 +245,7 @@ def test_images_include_all_that_cells_need(adapter, box):
 
 def test_cells_lie_around_their_generators(double):
     d = double.diagram(UNIT, some_points(UNIT, 50))
-    owner = face_owners(d)
+    owner = d.half_faces.owner
     assert (np.abs(d.face_centroids - d.points[owner]) < 0.5).all()
     assert (np.abs(d.vertices[d.cell_vertices] - d.points[owner]) < 0.5).all()
     assert (d.vertices < 0).any()
