@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import scipy
 
+from .bvh import Tree, curve_order
 from .edge_bins import ranges
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ _BLOCK = 1 << 20
 
 
 class WallTriangles:
-    """Triangles of smooth patches as arguments of kernels: WALL_ARGS. They are freed with the workspace of the engine.
+    """Triangles of smooth patches as arguments of kernels; the workspace of the engine frees them.
 
     Parameters
     ----------
@@ -49,26 +50,28 @@ class WallTriangles:
     Attributes
     ----------
     items : (k,) int
-        The triangles that have an area; only these are kept.
+        The triangles that have an area; only these are kept, by patch, and near ones after each other.
     """
 
     def __init__(
         self, corners: np.ndarray, patch: np.ndarray, normals: np.ndarray, edges: np.ndarray, ends: np.ndarray
     ) -> None:
         sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        kept = np.linalg.norm(sides, axis=1) > 0
-        self.items = np.flatnonzero(kept)
+        kept = np.flatnonzero(np.linalg.norm(sides, axis=1) > 0)
+        kept = kept[curve_order(np.asarray(corners, float)[kept].mean(axis=1))]
+        self.items = kept = kept[np.argsort(np.asarray(patch)[kept], kind="stable")]
         self.corners, self.patch = np.asarray(corners, float)[kept], np.asarray(patch)[kept]
         self.normals = np.asarray(normals, float)[kept]
         self.edges, self.ends = np.asarray(edges)[kept], np.asarray(ends)[kept]
         self._known: WeakKeyDictionary[Workspace, dict[object, tuple[object, ...]]] = WeakKeyDictionary()
+        self._trees: WeakKeyDictionary[Workspace, dict[object, tuple[object, ...]]] = WeakKeyDictionary()
 
     def __len__(self) -> int:
         return len(self.patch)
 
     def device_bytes(self, real: np.dtype) -> int:
         """Return about how many bytes the triangles, their normals and bins take on a device."""
-        return len(self) * (28 * real.itemsize + 32) + 5 * LARGEST_SIDE**3 // 8
+        return len(self) * (36 * real.itemsize + 32) + 5 * LARGEST_SIDE**3 // 8
 
     def planes(self, frame: tuple[np.ndarray, float]) -> np.ndarray:
         """Return unit normals and levels of the triangles' planes in the coordinates of `frame`, (t, 4)."""
@@ -110,6 +113,26 @@ class WallTriangles:
                 engine.upload(clear, np.uint8),
                 engine.upload(np.concatenate([corners, np.zeros((len(self), 3, 1))], axis=2)),
                 engine.upload(np.column_stack([self.patch, kinds]), np.int32),
+            )
+        return there[engine.real]
+
+    def tree_arguments(self, engine: Engine, frame: tuple[np.ndarray, float]) -> tuple[object, ...]:
+        """Return WALL_TREE_ARGS in the coordinates of `frame`; see geometry/wall_tree.h."""
+        there = self._trees.setdefault(engine.workspace, {})
+        if engine.real not in there:
+            corners = np.asarray((self.corners - frame[0]) / frame[1], engine.real)
+            n = len(self)
+            tree = Tree(corners.min(axis=1), corners.max(axis=1), order=np.arange(n))
+            levels = [tree.starts(level) for level in range(tree.levels + 1)]
+            first, last = (np.concatenate([ends[part] for ends in levels]) for part in (slice(-1), slice(1, None)))
+            first, last = self.patch[first], self.patch[last - 1]
+            boxes = np.zeros((len(first), 8))
+            boxes[:, :3], boxes[:, 4:7] = tree.boxes[:, :3], tree.boxes[:, 3:]
+            there[engine.real] = (
+                np.array([n, tree.levels], np.int32),
+                engine.upload(boxes),
+                engine.upload(np.where(first == last, first, -1), np.int32),
+                engine.upload(self.planes(frame)),
             )
         return there[engine.real]
 

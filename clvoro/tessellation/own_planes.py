@@ -49,7 +49,7 @@ class SolidBox(ClipBox):
     ) -> None:
         self.engine, self.domain = engine, domain
         self._walls = walls.arguments(engine, domain.frame)
-        self._planes_of_walls = engine.upload(walls.planes(domain.frame))
+        self._tree = walls.tree_arguments(engine, domain.frame)
         self._normals = engine.upload(walls.corner_normals(domain.frame[1], size))
         self._most, self._n = MOST_OWN, 0
         self._counters = engine.zeros(3, np.int32)
@@ -98,7 +98,7 @@ class SolidBox(ClipBox):
             self._n,
             points,
             *self._walls,
-            self._planes_of_walls,
+            *self._tree,
             self._normals,
             self._reach,
             np.int32(len(self._labels)),
@@ -163,6 +163,7 @@ class SurfaceSearch:
             engine.upload((points - origin) / scale),
             engine.upload(np.broadcast_to(np.minimum(reach, np.finfo(np.float32).max / 4) / scale, len(points))),
             *self._walls.arguments(engine, self._frame),
+            *self._walls.tree_arguments(engine, self._frame),
             found,
         )
         item = found.get().astype(np.int64)
