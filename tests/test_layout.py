@@ -70,6 +70,8 @@ PARTS = {
     "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
     "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
     "solvers.transport": {"solvers.poisson"},
+    "tessellation.cells": {"tessellation.part"},
+    "tessellation.polyhedra": {"tessellation.part"},
     "tessellation.periodic.ghost_images": {"tessellation.part"},
     "tessellation.incremental": {"tessellation.cells"},
     "tessellation.polyhedra_update": {"tessellation.polyhedra"},

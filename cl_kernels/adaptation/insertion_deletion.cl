@@ -124,10 +124,12 @@ kernel void average_strain(const int size, global const int *starts, global cons
 
 /* pull[i] = b.S.b - t.S.t for a cell i of negative charge and the neighbor of positive charge where |pull| is largest;
    t points to the neighbor, b across. Pairs with both cells at walls are left out. Pairs with one cell at a wall (with
-   `at_walls`), and cells with a charge of 2, get the strongest keys. */
+   `at_walls`), and cells with a charge of 2, get the strongest keys. partners[i] = (name, charge, walls, 0) of the
+   neighbor; the name is -1 if there is none. */
 kernel void score_pairs(const int size, global const int *starts, global const int *neighbors,
                         global const REAL *points, global const int2 *kinds, global const float4 *strain,
-                        const int at_walls, global int *partners, global REAL *pull, global ulong *keys PERIOD_ARGS)
+                        const int at_walls, NAME_ARGS, global int4 *partners, global REAL *pull,
+                        global ulong *keys PERIOD_ARGS)
 {
     LONG_ITEM(i);
     REAL best = 0, rank = 0;
@@ -154,9 +156,9 @@ kernel void score_pairs(const int size, global const int *starts, global const i
                 partner = j;
             }
         }
-    partners[i] = partner;
+    partners[i] = partner < 0 ? (int4)(-1) : (int4)(NAME(partner), kinds[partner], 0);
     pull[i] = best;
-    keys[i] = partner < 0 ? 0 : site_key(rank, i);
+    keys[i] = partner < 0 ? 0 : site_key(rank, NAME(i));
 }
 
 /* Change of the number of generators by a pair: 1 if it is split, -1 if it is deleted. Thresholds are shifted to
@@ -180,7 +182,7 @@ inline int count_change(REAL pull, int2 minus, int2 plus, REAL theta, REAL shift
 
 /* tally[m] += change of the number of generators with shift m. Integer sums do not depend on the order. */
 kernel void count_pair_changes(const int size, global const ulong *chosen, global const REAL *pull,
-                               global const int2 *kinds, global const int *partners, const REAL theta,
+                               global const int2 *kinds, global const int4 *partners, const REAL theta,
                                global int *tally)
 {
     WORK_ITEM(i);
@@ -188,44 +190,48 @@ kernel void count_pair_changes(const int size, global const ulong *chosen, globa
         return;
     for (int m = 0; m < SHIFTS; ++m) {
         const REAL shift = (m - SHIFTS / 2) * R(SHIFT_STEP);
-        const int change = count_change(pull[i], kinds[i], kinds[partners[i]], theta, shift);
+        const int change = count_change(pull[i], kinds[i], partners[i].s12, theta, shift);
         if (change)
             atomic_add(tally + m, change);
     }
 }
 
-/* Per chosen pair: split its cell of charge +1 into two generators across the pair, or delete that of charge -1. `busy`
-   marks the sites that change. */
-kernel void mark_pairs(const int size, global const ulong *chosen, global const REAL *pull, global const int2 *kinds,
-                       global const int *partners, const REAL theta, const REAL shift, global const REAL *points,
-                       global const REAL *local_length, global int *kept, global REAL *shifts, global int *born,
-                       global REAL *births, global ulong *busy PERIOD_ARGS)
+/* Per cell j of a chosen pair: of charge -1, delete it; of charge +1, split it into two generators across the pair.
+   `busy` marks the cells of charge -1 of the pairs that change. A ghost may be the other cell. */
+kernel void mark_pairs(const int size, global const int *starts, global const int *neighbors,
+                       global const ulong *chosen, global const REAL *pull, global const int2 *kinds,
+                       global const int4 *partners, const REAL theta, const REAL shift, NAME_ARGS,
+                       global const REAL *points, global const REAL *local_length, global int *kept,
+                       global REAL *shifts, global int *born, global REAL *births, global ulong *busy PERIOD_ARGS)
 {
-    WORK_ITEM(i);
-    if (chosen[i] == 0)
-        return;
-    const int j = partners[i];
-    const int change = count_change(pull[i], kinds[i], kinds[j], theta, shift);
-    if (change == 0)
-        return;
-    busy[i] = 1;
-    if (change < 0) {
-        kept[i] = 0;
+    WORK_ITEM(j);
+    if (chosen[j] != 0) {
+        const int change = count_change(pull[j], kinds[j], partners[j].s12, theta, shift);
+        if (change != 0)
+            busy[j] = 1;
+        if (change < 0)
+            kept[j] = 0;
+    }
+    for (int k = starts[j]; k < starts[j + 1]; ++k) {
+        const int i = neighbors[k];
+        if (i < 0 || chosen[i] == 0 || partners[i].s0 != NAME(j) ||
+            count_change(pull[i], kinds[i], partners[i].s12, theta, shift) <= 0)
+            continue;
+        const REAL2 d = difference(points, i, j PERIODS);
+        const REAL2 across = (REAL2)(-d.s1, d.s0) / sqrt(dot(d, d));
+        born[j] = 1;
+        const REAL2 way = R(SPLIT_DISTANCE) * local_length[j] * across;
+        SITE(x, i, points);
+        put_vector(x, way, j, shifts);
+        put_vector(x, -way, j, births);
         return;
     }
-    const REAL2 d = difference(points, i, j PERIODS);
-    const REAL2 across = (REAL2)(-d.s1, d.s0) / sqrt(dot(d, d));
-    born[j] = 1;
-    const REAL2 way = R(SPLIT_DISTANCE) * local_length[j] * across;
-    SITE(x, i, points);
-    put_vector(x, way, j, shifts);
-    put_vector(x, -way, j, births);
 }
 
 /* Sites of nucleation: six-sided cells among six-sided cells with an anisotropy of the strain, the difference of its
    eigenvalues, above `threshold`. */
 kernel void score_strain(const int size, global const int *starts, global const int *neighbors,
-                         global const int2 *kinds, global const float4 *strain, const REAL threshold,
+                         global const int2 *kinds, global const float4 *strain, const REAL threshold, NAME_ARGS,
                          global ulong *keys)
 {
     WORK_ITEM(i);
@@ -234,19 +240,21 @@ kernel void score_strain(const int size, global const int *starts, global const 
         clean = kinds[neighbors[k]].s0 == 0 && kinds[neighbors[k]].s1 == 0;
     const float4 s = strain[i];
     const REAL anisotropy = sqrt((s.s0 - s.s2) * (s.s0 - s.s2) + 4 * s.s1 * s.s1);
-    keys[i] = clean && anisotropy > threshold ? site_key(anisotropy, i) : 0;
+    keys[i] = clean && anisotropy > threshold ? site_key(anisotropy, NAME(i)) : 0;
 }
 
-/* Per chosen site, alternating by rank: insert a generator at the midpoint of its longest edge, or merge it with its
-   nearest neighbor. */
-kernel void mark_nuclei(const int size, global const ulong *chosen, global const int *ranks, global const int *starts,
-                        global const int *neighbors, global const REAL *points, global int *kept, global REAL *shifts,
-                        global int *born, global REAL *births, global ulong *busy PERIOD_ARGS)
+/* Per chosen site, alternating by rank, from `first` on: insert a generator at the midpoint of its longest edge, or
+   merge it with its nearest neighbor, whose name is merged[i]; else -1. */
+kernel void mark_nuclei(const int size, global const ulong *chosen, global const int *ranks, const int first,
+                        global const int *starts, global const int *neighbors, global const REAL *points, NAME_ARGS,
+                        global REAL *shifts, global int *born, global REAL *births, global ulong *busy,
+                        global int *merged PERIOD_ARGS)
 {
     WORK_ITEM(i);
+    merged[i] = -1;
     if (chosen[i] == 0)
         return;
-    const bool insert = ranks[i] % 2 == 0;
+    const bool insert = (first + ranks[i]) % 2 == 0;
     REAL best = 0;
     int partner = -1;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
@@ -264,18 +272,27 @@ kernel void mark_nuclei(const int size, global const ulong *chosen, global const
         put_vector(x, half_way, i, births);
     } else {
         put_vector(x, half_way, i, shifts);
-        kept[partner] = 0;
+        merged[i] = NAME(partner);
     }
     busy[i] = 1;
 }
 
+/* Per cell j: delete it if a neighbor, maybe a ghost, merges with it. */
+kernel void delete_merged(const int size, global const int *starts, global const int *neighbors,
+                          global const int *merged, NAME_ARGS, global int *kept)
+{
+    WORK_ITEM(j);
+    for (int k = starts[j]; k < starts[j + 1]; ++k)
+        if (neighbors[k] >= 0 && merged[neighbors[k]] == NAME(j))
+            kept[j] = 0;
+}
 #endif
 
 /* Sites to split (sign > 0) or to delete (sign < 0): cells that are too large or too small for h. Cells of many faces
    are preferred for splitting, cells of few faces for deletion. Magnitudes are limited to 4. A cell without neighbors,
    the last one of a piece of the domain, is never deleted. */
 kernel void score_log_ratio(const int size, global const int *starts, global const int *neighbors,
-                            global const REAL *log_ratio, const REAL sign, global ulong *keys)
+                            global const REAL *log_ratio, const REAL sign, NAME_ARGS, global ulong *keys)
 {
     WORK_ITEM(i);
     bool isolated = sign < 0;
@@ -286,7 +303,7 @@ kernel void score_log_ratio(const int size, global const int *starts, global con
         return;
     }
     const REAL magnitude = 2 + sign * need_of_split(log_ratio[i], starts[i + 1] - starts[i]);
-    keys[i] = magnitude > 0 ? site_key(fmin(magnitude, R(4)), i) : 0;
+    keys[i] = magnitude > 0 ? site_key(fmin(magnitude, R(4)), NAME(i)) : 0;
 }
 
 /* Unit vector along the longest axis of a cell, from its second moments. */
@@ -350,7 +367,7 @@ kernel void mark_split_delete(const int size, global const ulong *chosen, const 
 /* Sites to repair: inner cells with 1 - Q above `deficit`. Cells of at most four or at least eight sides come first,
    at any Q: they have a generator too many or too few around them. */
 kernel void score_bad_cells(const int size, global const int *starts, global const int *neighbors,
-                            global const REAL *quality, const REAL deficit, global ulong *keys)
+                            global const REAL *quality, const REAL deficit, NAME_ARGS, global ulong *keys)
 {
     WORK_ITEM(i);
     const int n = starts[i + 1] - starts[i];
@@ -359,7 +376,7 @@ kernel void score_bad_cells(const int size, global const int *starts, global con
     bool site = odd || own > deficit;
     for (int k = starts[i]; k < starts[i + 1] && site; ++k)
         site = neighbors[k] >= 0;
-    keys[i] = site ? site_key(odd + own, i) : 0;
+    keys[i] = site ? site_key(odd + own, NAME(i)) : 0;
 }
 
 /* Per chosen site: split a cell of at least `split_from` sides, delete any other. */

@@ -9,10 +9,15 @@
 #define FACE_WEIGHT R(0.05)
 #endif
 
-/* A key that orders sites by magnitude, then by index. 0 is not a site. */
-inline ulong site_key(REAL magnitude, int i)
+/* The name of a generator: its index; if `named`, its label, which is the same in all parts of a domain. */
+#define NAME_ARGS const int named, global const int *names
+#define NAMES named, names
+#define NAME(i) (named ? names[i] : (i))
+
+/* A key that orders sites by magnitude, then by name. 0 is not a site. */
+inline ulong site_key(REAL magnitude, int name)
 {
-    return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - i);
+    return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - name);
 }
 
 /* How much a cell is to be split: log (V rho), and more for many faces. Negative: to be deleted. */

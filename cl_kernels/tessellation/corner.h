@@ -1,5 +1,10 @@
 #include "geometry/site.h"
 
+/* One of two generators, the same for both cells. */
+#ifndef FIRST_OF
+#define FIRST_OF(i, j, points) min(i, j)
+#endif
+
 #ifdef SPHERE
 #define FOLD(a) 0
 #define APART(a, to_one, to_other, one, other) ((to_other) - (to_one))
@@ -92,7 +97,7 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
     /* The bisector of o and q meets a wall. */
     const int j = max(a, b), wall = -1 - min(a, b);
     const int axis = wall / 2;
-    const int o = min(i, j), q = max(i, j);
+    const int o = FIRST_OF(i, j, points), q = o == i ? j : i;
     const REAL level = wall % 2 ? upper[axis] : lower[axis];
 #ifdef FOLD_0
     if (FOLD(axis) > 0) {

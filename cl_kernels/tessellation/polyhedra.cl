@@ -229,10 +229,11 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         row_places[i] = place;
         row_counts[i] = count;
         if (with_corners && fits) {
-            const bool clear = !doubtful && !narrow && count == face_count && count <= MOST_FACES;
-            if (clear)
+            const bool whole = count == face_count && count <= MOST_FACES, clear = whole && !doubtful && !narrow;
+            const int unclear = whole && with_corners == UNSURE_CORNERS ? UNSURE_CORNERS : NO_CORNERS;
+            if (clear || unclear)
                 write_corners(cell, corners + 2 * place);
-            corners[2 * place].s3 = clear ? NEW_CORNERS : NO_CORNERS;
+            corners[2 * place].s3 = clear ? NEW_CORNERS : unclear;
         }
         doubtful |= has_own_planes(cell);
         if (doubtful || narrow)

@@ -14,7 +14,7 @@
    report                        see report.h
    corners                       if `with_corners`: the vertices of a cell from twice its first entry on, as triples of
                                  its faces, counter-clockwise seen from outside. The fourth number of the first one is
-                                 one of those below */
+                                 one of those below, the last one only if `with_corners` is UNSURE_CORNERS */
 #define CELL_OUTPUT_ARGS                                                                                               \
     global int *row_places, global int *row_counts, global int *labels, global REAL *measures, global REAL *centroids, \
         global REAL *volumes, global REAL *offsets, global REAL *covariances, global int *report,                      \
@@ -22,10 +22,11 @@
 #define CELL_OUTPUT                                                                                                    \
     row_places, row_counts, labels, measures, centroids, volumes, offsets, covariances, report, with_corners, corners
 
-#define NO_CORNERS 0    /* the vertices are not known */
-#define NEW_CORNERS 1   /* they are those of a new cell */
-#define KNOWN_CORNERS 2 /* they agree with those of the neighbors, and have keys; see polyhedra_update.cl */
-#define MOST_FACES 32   /* most faces of a cell with triples: one bit each */
+#define NO_CORNERS 0     /* the vertices are not known */
+#define NEW_CORNERS 1    /* they are those of a new cell */
+#define KNOWN_CORNERS 2  /* they agree with those of the neighbors, and have keys; see polyhedra_update.cl */
+#define UNSURE_CORNERS 3 /* they are those of a new cell with faces near round-off */
+#define MOST_FACES 32    /* most faces of a cell with triples: one bit each */
 
 /* Reserve a range in the arrays of faces. Its position depends on the order of work-items, its content does not. */
 inline int take_places(global int *report, int count)

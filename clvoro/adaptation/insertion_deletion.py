@@ -50,7 +50,7 @@ class Generators:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Generators after insertions and deletions, and the numbers of both."""
+    """Generators after insertions and deletions, those of one part, and the numbers of both in all parts."""
 
     generators: Generators
     inserted: int
@@ -123,6 +123,8 @@ class InsertionDeletion:
     ) -> Outcome | None:
         """Nucleate dislocations, let them climb, and correct the number of generators.
 
+        All parts of a domain call this together, with labels in their diagrams.
+
         Parameters
         ----------
         generators : Generators
@@ -137,12 +139,12 @@ class InsertionDeletion:
         Outcome or None
             None if nothing changes.
         """
-        n = t.n
+        n = self._count(t)
         # A remainder of less than 0.7 generators only changes the sizes of cells. A large change takes several calls.
         need = math.trunc(change.missing + math.copysign(0.3, change.missing))
         most = max(4, int(MAX_CHANGE * n))
         need = max(-most, min(most, need))
-        marks = _Marks.clean(self._room, n, self.engine.dim)
+        marks = _Marks.clean(self._room, t, self.engine.dim)
         self._labels, self._fixed = generators.labels, fixed
         if change.climb:
             kinds, strain_1, strain_2 = self._measure(t, sizes.h)
@@ -151,7 +153,7 @@ class InsertionDeletion:
             gained = self._climb(t, sizes.local_length, kinds, strain_2, marks, need, change)
             # Free memory, because the generators will exist twice.
             del kinds, strain_1, strain_2
-            self._room.clear("kinds", "strain", "partners", "pull")
+            self._room.clear("kinds", "strain", "partners", "pull", "merged")
             rest = need - gained
             if abs(rest) > max(2, abs(need) // 10) or (need and not gained):
                 self._split_or_delete(t, sizes.log_ratio, marks, rest)
@@ -195,16 +197,17 @@ class InsertionDeletion:
             None if nothing changes.
         """
         engine, k, n = self.engine, self._kernels, t.n
-        most = int(share * n)
+        most = int(share * self._count(t))
         if most == 0:
             return None
-        marks = _Marks.clean(self._room, n, engine.dim)
+        marks = _Marks.clean(self._room, t, engine.dim)
         self._labels, self._fixed = generators.labels, fixed
-        keys = self._room("keys", size=n, dtype=np.uint64)
-        engine.run_each(k.score_bad_cells, n, t.starts, t.neighbors, quality, engine.real.type(deficit), keys)
+        keys = self._keys(t)
+        deficit = engine.real.type(deficit)
+        engine.run_each(k.score_bad_cells, n, t.starts, t.neighbors, quality, deficit, *self._names(t), keys)
         self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, PAIR_RINGS)
-        self._limit(chosen, n, most)
+        self._limit(t, chosen, most)
         engine.run_each(
             k.mark_bad_cells,
             n,
@@ -230,7 +233,7 @@ class InsertionDeletion:
         fixed: int = 0,
     ) -> Outcome | None:
         """Split and delete cells at `sites`, each (n,) uint64 and not 0 at sites; otherwise as `insert_delete`."""
-        engine, marks = self.engine, _Marks.clean(self._room, t.n, self.engine.dim)
+        engine, marks = self.engine, _Marks.clean(self._room, t, self.engine.dim)
         self._labels, self._fixed = generators.labels, fixed
         for sign, chosen in zip((1, -1), sites, strict=True):
             engine.run_each(
@@ -248,41 +251,68 @@ class InsertionDeletion:
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return charge and number of walls (n, 2), and the strain averaged over one and over two rings (n, 4)."""
-        engine, k, n = self.engine, self._kernels, t.n
-        kinds = self._room("kinds", size=2 * n, dtype=np.int32)
-        raw, once = (self._room("strain", turn, size=4 * n, dtype=np.float32) for turn in range(2))
-        engine.run_each(
-            k.measure_strain, n, t.starts, t.neighbors, t.points, h, kinds, raw, *t.outlines, *engine.period_args
-        )
-        engine.run_each(k.average_strain, n, t.starts, t.neighbors, t.points, raw, once)
-        engine.run_each(k.average_strain, n, t.starts, t.neighbors, t.points, once, raw)
+        engine, k, n, graph = self.engine, self._kernels, t.n, (t.starts, t.neighbors, t.points)
+        kinds = self._room("kinds", size=2 * t.rows, dtype=np.int32).reshape(-1, 2)
+        raw, once = (self._room("strain", turn, size=4 * t.rows, dtype=np.float32).reshape(-1, 4) for turn in range(2))
+        with engine.workspace.frame():
+            h = t.with_ghosts(engine, h)
+            engine.run_each(k.measure_strain, n, *graph, h, kinds, raw, *t.outlines, *engine.period_args)
+        for values in (kinds, raw):
+            t.forward(engine, values)
+        for values, mean in ((raw, once), (once, raw)):
+            engine.run_each(k.average_strain, n, *graph, values, mean)
+            t.forward(engine, mean)
         return kinds, once, raw
+
+    def _names(self, t: Tessellation) -> tuple[object, ...]:
+        """Return NAME_ARGS: labels, if there are other parts."""
+        labels = None if t.part is None else t.part.labels
+        return (np.int32(0), t.starts) if labels is None else (np.int32(1), labels)
+
+    def _keys(self, t: Tessellation) -> cla.Array:
+        """Return the array for keys of all rows."""
+        return self._room("keys", size=t.rows, dtype=np.uint64)
+
+    def _total(self, t: Tessellation, values: np.ndarray) -> np.ndarray:
+        """Return the sum of `values` over all parts."""
+        return values if t.part is None else t.part.total(values)
+
+    def _count(self, t: Tessellation) -> int:
+        """Return the number of generators of all parts."""
+        return int(self._total(t, np.array([t.n]))[0])
 
     def _nucleate(self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int) -> None:
         """Mark at most `nuclei` insertions and as many mergers where the perfect lattice is strained most."""
         engine, k, n = self.engine, self._kernels, t.n
-        keys = self._room("keys", size=n, dtype=np.uint64)
-        engine.run_each(
-            k.score_strain, n, t.starts, t.neighbors, kinds, strain, engine.real.type(NUCLEATION_STRAIN), keys
-        )
+        keys, names, limit = self._keys(t), self._names(t), engine.real.type(NUCLEATION_STRAIN)
+        engine.run_each(k.score_strain, n, t.starts, t.neighbors, kinds, strain, limit, *names, keys)
         self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, NUCLEUS_RINGS)
-        self._limit(chosen, n, 2 * nuclei)
+        self._limit(t, chosen, 2 * nuclei)
         ranks = self._room("ranks", size=n + 1, dtype=np.int32)
         engine.run_each(k.flag_sites, n, chosen, ranks)
         self._scan.exclusive(ranks, ranks, n)
+        first = 0 if t.part is None else int(t.part.before(ranks[n:].get())[0])
+        merged = self._room("merged", size=t.rows, dtype=np.int32)
         engine.run_each(
             k.mark_nuclei,
             n,
             chosen,
             ranks,
+            np.int32(first),
             t.starts,
             t.neighbors,
             t.points,
-            *marks.arrays,
+            *names,
+            marks.shifts,
+            marks.born,
+            marks.births,
             marks.busy,
+            merged,
             *engine.period_args,
         )
+        t.forward(engine, merged)
+        engine.run_each(k.delete_merged, n, t.starts, t.neighbors, merged, *names, marks.kept)
 
     def _climb(
         self,
@@ -301,9 +331,8 @@ class InsertionDeletion:
         """
         engine, k, n = self.engine, self._kernels, t.n
         real, strain_limit = engine.real.type, engine.real.type(change.climb_strain)
-        partners = self._room("partners", size=n, dtype=np.int32)
-        pull = self._room("pull", size=n)
-        keys = self._room("keys", size=n, dtype=np.uint64)
+        partners = self._room("partners", size=4 * t.rows, dtype=np.int32).reshape(-1, 4)
+        pull, keys, names = self._room("pull", size=t.rows), self._keys(t), self._names(t)
         engine.run_each(
             k.score_pairs,
             n,
@@ -313,6 +342,7 @@ class InsertionDeletion:
             kinds,
             strain,
             np.int32(change.climb_strain <= CLIMB_STRAIN),
+            *names,
             partners,
             pull,
             keys,
@@ -324,20 +354,25 @@ class InsertionDeletion:
         chosen = self._choose(t, keys, PAIR_RINGS)
         tally = self._room.zeros("tally", size=SHIFTS, dtype=np.int32)
         engine.run_each(k.count_pair_changes, n, chosen, pull, kinds, partners, strain_limit, tally)
-        changes = tally.get()
+        changes = self._total(t, tally.get())
         # The shift whose change is closest to the need; the smallest of equal ones.
         shifts = (np.arange(SHIFTS) - SHIFTS // 2) * SHIFT_STEP
         order = np.argsort(np.abs(shifts), kind="stable")
         best = order[np.argmin(np.abs(changes[order] - need))]
+        for values in (chosen, pull, partners):
+            t.forward(engine, values)
         engine.run_each(
             k.mark_pairs,
             n,
+            t.starts,
+            t.neighbors,
             chosen,
             pull,
             kinds,
             partners,
             strain_limit,
             real(shifts[best]),
+            *names,
             t.points,
             local_length,
             *marks.arrays,
@@ -349,13 +384,12 @@ class InsertionDeletion:
     def _split_or_delete(self, t: Tessellation, log_ratio: cla.Array, marks: _Marks, rest: int) -> None:
         """Mark about `rest` of the largest cells to split, or -rest of the smallest to delete, relative to h."""
         engine, k, n = self.engine, self._kernels, t.n
-        sign = engine.real.type(math.copysign(1, rest))
-        keys = self._room("keys", size=n, dtype=np.uint64)
-        engine.run_each(k.score_log_ratio, n, t.starts, t.neighbors, log_ratio, sign, keys)
+        sign, keys = engine.real.type(math.copysign(1, rest)), self._keys(t)
+        engine.run_each(k.score_log_ratio, n, t.starts, t.neighbors, log_ratio, sign, *self._names(t), keys)
         self._drop_fixed(t, keys, neighbors=False)
         engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, LOG_RATIO_RINGS), keys)
         chosen = self._choose(t, keys, LOG_RATIO_RINGS)
-        self._limit(chosen, n, rest if rest > 0 else min(-rest, n - 1))
+        self._limit(t, chosen, rest if rest > 0 else min(-rest, self._count(t) - 1))
         engine.run_each(
             k.mark_split_delete, n, chosen, sign, t.points, t.offsets, t.covariances, t.volumes, *marks.arrays
         )
@@ -363,23 +397,25 @@ class InsertionDeletion:
     def _drop_fixed(self, t: Tessellation, keys: cla.Array, neighbors: bool) -> None:
         """Remove sites at fixed generators and, with `neighbors`, next to them."""
         if self._fixed:
-            self.engine.run_each(
-                self._kernels.drop_fixed_sites,
-                t.n,
-                t.starts,
-                t.neighbors,
-                self._labels,
-                np.int32(self._fixed),
-                np.int32(neighbors),
-                keys,
-            )
+            with self.engine.workspace.frame():
+                self.engine.run_each(
+                    self._kernels.drop_fixed_sites,
+                    t.n,
+                    t.starts,
+                    t.neighbors,
+                    t.with_ghosts(self.engine, self._labels),
+                    np.int32(self._fixed),
+                    np.int32(neighbors),
+                    keys,
+                )
 
     def spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
-        """Return the largest key within `rings` rings of each generator."""
+        """Return the largest key within `rings` rings of each generator. `source` gets the keys of ghosts."""
         engine, n = self.engine, t.n
-        into, other = (self._room("spread", turn, size=n, dtype=np.uint64) for turn in range(2))
-        groups, at_once = (1, rings) if n <= self._one_group_limit else (engine.groups, 1)
+        into, other = (self._room("spread", turn, size=t.rows, dtype=np.uint64) for turn in range(2))
+        groups, at_once = (1, rings) if n <= self._one_group_limit and t.part is None else (engine.groups, 1)
         for _ in range(rings // at_once):
+            t.forward(engine, source)
             graph = t.starts, t.neighbors
             engine.run_groups(self._kernels.spread_keys, groups, n, at_once, *graph, source, into, other)
             source, into, other = into, other, into
@@ -394,8 +430,8 @@ class InsertionDeletion:
     def _choose(self, t: Tessellation, keys: cla.Array, rings: int, rounds: int = ROUNDS) -> cla.Array:
         """Return the keys of the strongest sites that are `rings` rings apart. `keys` is overwritten."""
         engine, k, n = self.engine, self._kernels, t.n
-        chosen = self._room.zeros("chosen", size=n, dtype=np.uint64)
-        latest = self._room("latest", size=n, dtype=np.uint64)
+        chosen = self._room.zeros("chosen", size=t.rows, dtype=np.uint64)
+        latest = self._room("latest", size=t.rows, dtype=np.uint64)
         for turn in range(rounds):
             if turn > 0:
                 engine.run_each(k.drop_sites, n, self.spread(t, latest, rings), keys)
@@ -403,16 +439,16 @@ class InsertionDeletion:
             engine.run_each(k.choose_sites, n, keys, spread, chosen, latest)
         return chosen
 
-    def _limit(self, chosen: cla.Array, n: int, most: int) -> None:
-        """Keep the `most` strongest sites. Keys are distinct."""
+    def _limit(self, t: Tessellation, chosen: cla.Array, most: int) -> None:
+        """Keep the `most` strongest sites of all parts. Keys are distinct."""
         engine, k = self.engine, self._kernels
         low, span = 0, 2**64
         while True:
             bins = min(HISTOGRAM, span)
             width = span // bins
             histogram = self._room.zeros("histogram", size=HISTOGRAM, dtype=np.int32)
-            engine.run_each(k.count_sites, n, chosen, np.uint64(low), np.uint64(width), histogram)
-            from_top = np.cumsum(histogram.get()[:bins][::-1])
+            engine.run_each(k.count_sites, t.n, chosen, np.uint64(low), np.uint64(width), histogram)
+            from_top = np.cumsum(self._total(t, histogram.get())[:bins][::-1])
             whole = int(np.searchsorted(from_top, most, side="right"))
             least = low + (bins - whole) * width
             most -= int(from_top[whole - 1]) if whole else 0
@@ -420,7 +456,7 @@ class InsertionDeletion:
                 break
             # Divide the bin in which the number is exceeded.
             low, span = least - width, width
-        engine.run_each(k.limit_sites, n, np.uint64(min(least, 2**64 - 1)), chosen)
+        engine.run_each(k.limit_sites, t.n, np.uint64(min(least, 2**64 - 1)), chosen)
 
     def _apply(
         self, domain: Domain, t: Tessellation, generators: Generators, marks: _Marks, next_label: int
@@ -430,10 +466,12 @@ class InsertionDeletion:
         totals = self._room("totals", size=2, dtype=np.int32)
         for place, counts in enumerate((marks.kept, marks.born)):
             self._scan.exclusive(counts, counts, n, total=(totals, place))
-        kept, inserted = totals.get().tolist()
-        deleted = n - kept
-        m = n - deleted + inserted
-        if m == 0 or (deleted == 0 and inserted == 0):
+        kept, born = found = totals.get()
+        first = next_label + (0 if t.part is None else int(t.part.before(found)[1]))
+        (left, inserted), deleted = self._total(t, found).tolist(), self._count(t)
+        deleted -= left
+        m = int(kept + born)
+        if left + inserted == 0 or (deleted == 0 and inserted == 0):
             return None
         new = Generators(
             engine.empty((m, engine.dim)),
@@ -447,7 +485,7 @@ class InsertionDeletion:
             n,
             marks.kept,
             marks.born,
-            np.int32(next_label),
+            np.int32(first),
             np.int32(self._fixed),
             *domain.device_args(engine),
             t.points,
@@ -481,13 +519,14 @@ class _Marks:
     busy: cla.Array
 
     @classmethod
-    def clean(cls, room: NamedArrays, n: int, dim: int) -> _Marks:
+    def clean(cls, room: NamedArrays, t: Tessellation, dim: int) -> _Marks:
+        n = t.n
         return cls(
             room("kept", size=n + 1, dtype=np.int32).fill(1),
             room.zeros("shifts", size=dim * n),
             room.zeros("born", size=n + 1, dtype=np.int32),
             room.zeros("births", size=dim * n),
-            room.zeros("busy", size=n, dtype=np.uint64),
+            room.zeros("busy", size=t.rows, dtype=np.uint64),
         )
 
     @property

@@ -52,8 +52,8 @@ class Metric:
         """Write the signed error (3.1), the quality (4.1), the energy (2.3) of each cell, and min(L, h); all (n,)."""
         sets = (0, *[t.starts] * 5)
         if compared is not None:
-            *arrays, first = compared
-            sets = (2 if first else 1, t.neighbors, *arrays)
+            labels, *arrays, first = compared
+            sets = (2 if first else 1, t.neighbors, t.with_ghosts(self.engine, labels), *arrays)
         self.engine.run_each(
             self._kernels.evaluate_metric,
             t.n,

@@ -108,20 +108,21 @@ class Motion:
         self._kernels = engine.kernels("adaptation/motion")
 
     def compute_potential_gradient(self, t: Tessellation, psi: cla.Array, u: cla.Array) -> None:
-        """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d)."""
-        self.engine.run_each(
-            self._kernels.compute_potential_gradient,
-            t.n,
-            t.starts,
-            t.neighbors,
-            t.face_measures,
-            t.face_centroids,
-            t.volumes,
-            t.points,
-            psi,
-            u,
-            *self.engine.period_args,
-        )
+        """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d); `psi` (n,) real is the potential psi."""
+        with self.engine.workspace.frame():
+            self.engine.run_each(
+                self._kernels.compute_potential_gradient,
+                t.n,
+                t.starts,
+                t.neighbors,
+                t.face_measures,
+                t.face_centroids,
+                t.volumes,
+                t.points,
+                t.with_ghosts(self.engine, psi),
+                u,
+                *self.engine.period_args,
+            )
 
     def relax_correction(self, summaries: Summaries, name: str, limit: float, k: float, u: cla.Array) -> None:
         """Scale `u` (n, d) by alpha = min(limit, k / max(|u| / h)), the paper's (3.5).
@@ -157,7 +158,7 @@ class Motion:
             t.n,
             t.starts,
             t.neighbors,
-            moving.labels,
+            t.with_ghosts(self.engine, moving.labels),
             np.int32(moving.fixed),
             np.int32(balls.first),
             np.int32(balls.count),

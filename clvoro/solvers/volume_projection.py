@@ -25,7 +25,8 @@ from .linear_system import Limits, Solution, SolutionToRead
 
 SINGLE_PRECISION_TOLERANCE = 1e-4
 """Tolerance from which on the vectors of the iteration are in single precision."""
-_ROWS = 5
+_ROWS, _NORM, _GAMMA, _CURVATURE = 5, 0, 2, 4
+"""Number of rows of partial sums, and which they are, as in volume_projection.cl: two norms and two products."""
 _SPARE = 1
 """Number of iterations that are enqueued beyond those of the last solve. A solve that takes one more needs no second
 read then. Further ones cost two launches each."""
@@ -193,6 +194,7 @@ class VolumeProjection:
             self._unread = ref(solution)
             return solution
         Launch(engine, k.assemble_projection, *given, self._counts, *rest)()
+        self._sum_over_parts(t, _NORM, _GAMMA)
         direction = Launch(engine, k.update_projection_direction, *given, self._counts)
         update = Launch(engine, k.update_projection, *given, self._counts)
         rows = self._iterate(t, v, direction, update, most)
@@ -214,6 +216,9 @@ class VolumeProjection:
     ) -> tuple[object, ...]:
         """Return ASSEMBLY_ARGS of volume_projection.cl but for the start."""
         real, sums = self.engine.real.type, targets.sums
+
+        if sums is not None and t.part is not None and t.part.peers is not None:
+            sums = self.engine.upload(t.part.total(sums.get()))
 
         def of_all(values: cla.Array) -> cla.Array:
             return t.with_ghosts(self.engine, values)
@@ -244,19 +249,29 @@ class VolumeProjection:
         engine = self.engine
         t.forward(engine, v.z)
         direction()
+        self._sum_over_parts(t, _CURVATURE)
         done, ahead = 0, self._ahead
         while True:
             end = min(done + ahead, most)
-            for _ in range(done, end):
+            for turn in range(done, end):
                 t.forward(engine, v.s)
                 update()
+                self._sum_over_parts(t, _NORM + (turn + 1) % 2, _GAMMA + (turn + 1) % 2)
                 t.forward(engine, v.z)
                 direction()
+                self._sum_over_parts(t, _CURVATURE)
             rows = self._read(end)
             if not all(row[RECORD_RUNNING] for row in rows):
                 self._ahead = _first_stop(rows) + _SPARE
                 return rows
             done, ahead = end, 4
+
+    def _sum_over_parts(self, t: Tessellation, *rows: int) -> None:
+        """Replace these rows of the partial sums by their sums over all parts."""
+        if t.part is not None and t.part.peers is not None:
+            partial = self._partial.get().reshape(_ROWS, -1)
+            partial[list(rows)] = t.part.total(partial[list(rows)])
+            self._partial.set(partial.ravel())
 
     def _read(self, end: int) -> list[list[float]]:
         """Return the rows of the record up to iteration `end`."""

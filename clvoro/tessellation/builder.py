@@ -13,6 +13,7 @@ from ..opencl.primitives import Scan
 from ..opencl.workspace import framed
 from .bins import BinnedPoints
 from .device_diagram import NeighborRows, Tessellation
+from .part import Part
 from .report import SIZE
 from .weight_bounds import WeightBounds
 
@@ -73,16 +74,13 @@ class CellBuilder(ABC):
     @framed
     def tessellate(
         self,
-        box: ClipBox,
-        points: cla.Array,
-        n: int,
+        part: Part,
         binned: BinnedPoints,
         previous: Tessellation | NeighborRows | None = None,
         exact: bool = True,
-        n_own: int | None = None,
-        halo_args: tuple[object, ...] = (),
+        rows: int | None = None,
     ) -> Tessellation:
-        """Tessellate `box` by the first `n` of `points` (n, d), which lie in `binned`.
+        """Build the cells of `part`, whose generators lie in `binned`.
 
         Parameters
         ----------
@@ -92,11 +90,9 @@ class CellBuilder(ABC):
         exact : bool
             Reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
             otherwise more than `ROUGH_SHARE`.
-        n_own : int, optional
-            Number of cells to build, those of the first generators. Their faces with other cells are not matched.
-        halo_args : tuple, optional
-            In a periodic box in 3D the HALO_ARGS of kernels, which test the balls around vertices
-            (tessellation/periodic/halo.h).
+        rows : int, optional
+            Number of cells to build, those of the first generators, by default all: of ghosts, too. Their faces with
+            other cells are not matched.
 
         Raises
         ------
@@ -107,21 +103,26 @@ class CellBuilder(ABC):
         ClvoroError
             If a cell has too many faces.
         """
-        return self._tessellate(box, points, n, binned, previous, exact, n if n_own is None else n_own, halo_args)
+        t = self._tessellate(part, binned, previous, exact, part.count if rows is None else rows)
+        if part.labels is not None and self.knows_corners(t):
+            part.order_rows(self.engine, t, self.defines)
+        return t
 
     @abstractmethod
     def _tessellate(
-        self,
-        box: ClipBox,
-        points: cla.Array,
-        n: int,
-        binned: BinnedPoints,
-        previous: Tessellation | NeighborRows | None,
-        exact: bool,
-        rows: int,
-        halo_args: tuple[object, ...],
+        self, part: Part, binned: BinnedPoints, previous: Tessellation | NeighborRows | None, exact: bool, rows: int
     ) -> Tessellation:
         """Tessellate; `rows` is the number of cells to build."""
+
+    @property
+    @abstractmethod
+    def defines(self) -> dict[str, object]:
+        """For building kernels that work on rows of faces."""
+
+    def knows_corners(self, t: Tessellation) -> bool:
+        """Return whether the corners of the cells of `t` are known, so that they can be measured in another order."""
+        del t
+        return True
 
     def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
         """Return `t`, a diagram of `box`, with face measures and centroids in full precision, in new arrays."""

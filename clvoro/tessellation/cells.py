@@ -20,6 +20,7 @@ from .bins import MAX_LEVELS, BinnedPoints
 from .builder import CellBuilder
 from .device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, NeighborRows, OpenCellError, Tessellation
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
+from .part import Part
 from .report import COINCIDE, DOUBT, FULL, KEPT, LOOPED, OPEN, SIZE, SLOTS, SPARE, WHOLE
 
 CELL_CAPACITY = 24
@@ -83,17 +84,9 @@ class Cells(CellBuilder):
         return capacities | self._folds
 
     def _tessellate(
-        self,
-        box: ClipBox,
-        points: cla.Array,
-        n: int,
-        binned: BinnedPoints,
-        previous: Tessellation | NeighborRows | None,
-        exact: bool,
-        rows: int,
-        halo_args: tuple[object, ...],
+        self, part: Part, binned: BinnedPoints, previous: Tessellation | NeighborRows | None, exact: bool, rows: int
     ) -> Tessellation:
-        engine, total, n = self.engine, n, rows
+        engine, n = self.engine, rows
         if self.row_capacity > ROW_CAPACITY and n > self._enlarged_for:
             # The capacities were enlarged for a smaller mesh: start again with the default ones.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
@@ -102,31 +95,29 @@ class Cells(CellBuilder):
         while True:
             with engine.workspace.frame():
                 taken = self.take_rows(n, spare=spare, whole=whole)
-                flags, m = self._clip(taken, box, points, total, n, binned, exact)
+                flags, m = self._clip(taken, part, binned, exact)
                 if flags & CROWDED:
                     # Repeat with twice the slots that were requested so far.
                     spare = 2 * (int(taken.report.get()[SPARE]) - n)
                     continue
                 t = None
                 if not flags & ~DOUBT:
-                    t = self.measure(taken, box, points, m, flags, exact)
+                    t = self.measure(taken, part.box, part.points, m, flags, exact)
                 if t is not None:
                     return t
                 if flags & OPEN:
-                    raise OpenCellError(points[:total].get()[:, : engine.dim])
+                    raise OpenCellError(part.points[: part.count].get()[:, : engine.dim])
                 if whole or flags & COINCIDE:
-                    raise CloseError(points, total)
+                    raise CloseError(part.points, part.count)
                 # Too many short faces may have been dropped: keep all.
                 whole = True
 
-    def _clip(
-        self, rows: FaceRows, box: ClipBox, points: cla.Array, total: int, n: int, binned: BinnedPoints, exact: bool
-    ) -> tuple[int, int]:
-        """Build and match the rows of the first `n` of `total` generators; return as `_match` does."""
-        engine, corners = self.engine, box.device_corners(self.engine.real)
+    def _clip(self, rows: FaceRows, part: Part, binned: BinnedPoints, exact: bool) -> tuple[int, int]:
+        """Build and match the `rows` of the first generators of `part`; return as `_match` does."""
+        engine, corners, n, total = self.engine, part.box.device_corners(self.engine.real), rows.n, part.count
         hulls = self._hulls if n >= LANES_FROM[2] else None
         some = hulls is not None
-        bounds = () if self._bounds is None else self._bounds.build(box, points, total)
+        bounds = () if self._bounds is None else self._bounds.build(part.box, part.points, total)
         if hulls is not None:
             engine.run_each(
                 hulls.wrap_all_hulls,
@@ -152,7 +143,7 @@ class Cells(CellBuilder):
                 binned.points,
                 binned.items,
                 *binned.search,
-                points,
+                part.points,
                 *corners,
                 np.int32(some),
                 rows.slots,
@@ -161,7 +152,7 @@ class Cells(CellBuilder):
                 rows.report,
                 *bounds,
             )
-            found = self._match(rows, box, points, exact)
+            found = self._match(rows, part.box, part.points, exact)
             if not found[0] & FULL or found[0] & CROWDED:
                 return found
             self._enlarge(n)

@@ -15,6 +15,8 @@ from .report import NARROW, UNEVEN
 
 FACE_CAPACITY = 32
 """Most faces of a cell while it is clipped in private memory."""
+KNOWN_CORNERS, UNSURE_CORNERS = 2, 3
+"""States of the triples of a cell (tessellation/row_counts.h)."""
 GROWTH, MOST_FACES = 4, 512
 """Factor to the next capacity for cells with more, and the largest one."""
 LEAST_SPACE, SPACE_PER_CELL, MOST_SPACE = 2**20, 64, 2**26
@@ -78,6 +80,8 @@ class CutCells:
         Volumes, offsets and covariances.
     corners, keys : arrays, optional
         Triples of faces and keys; see `Tessellation.vertices`.
+    state : int
+        The state of triples that is written besides those of clear cells (tessellation/row_counts.h).
     """
 
     places: cla.Array
@@ -89,6 +93,7 @@ class CutCells:
     m: int
     corners: cla.Array | None = None
     keys: cla.Array | None = None
+    state: int = KNOWN_CORNERS
 
     def output(self, report: cla.Array) -> tuple[object, ...]:
         """Return the CELL_OUTPUT_ARGS of kernels (tessellation/row_counts.h)."""
@@ -102,7 +107,7 @@ class CutCells:
             self.centroids,
             *cells,
             report,
-            np.int32(keep),
+            np.int32(self.state if keep else 0),
             corners,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -144,6 +144,8 @@ class Tessellation:
         uint32 (tessellation/polyhedra_update.cl); else empty.
     part : Part, optional
         The part whose rows `neighbors` and `points` name. None if these are the n generators, as in a folded diagram.
+    whole : Tessellation, optional
+        The diagram of a part with the cells of ghosts, if they have been built.
     folded : Folded, optional
         How the diagram was made from that of generators and images. None after an update, and without images.
     trimmed : Trimmed, optional
@@ -165,6 +167,7 @@ class Tessellation:
     outlines: tuple[cla.Array, ...] = ()
     vertices: tuple[cla.Array, ...] = ()
     part: Part | None = None
+    whole: Tessellation | None = None
     folded: Folded | None = None
     trimmed: Trimmed | None = None
     round_off: int = 0
@@ -178,6 +181,17 @@ class Tessellation:
     def rows(self) -> int:
         """Number of rows of arrays of values that neighbors name: generators, and ghosts if there are any."""
         return self.n if self.part is None else self.part.count
+
+    def first(self, n: int) -> Tessellation:
+        """Return the first `n` rows, as views."""
+        return replace(
+            self,
+            n=n,
+            starts=self.starts[: n + 1],
+            volumes=self.volumes[:n],
+            offsets=self.offsets[:n],
+            covariances=self.covariances[:n],
+        )
 
     def forward(self, engine: Engine, values: cla.Array) -> None:
         """Fill the rows of ghosts in `values` (rows, ...), if there are any."""

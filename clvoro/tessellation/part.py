@@ -14,35 +14,92 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 
 from ..geometry.domain import ClipBox
+from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
+from ..opencl.primitives import Gather
+
+if TYPE_CHECKING:
+    from .device_diagram import Tessellation
 
 
-@dataclass(frozen=True)
-class Home:
-    """Where the values of g ghosts come from, on the device.
+class Peers(Protocol):
+    """The parts of a domain as one of them sees them: ranks, or devices of a process.
+
+    All of them call the same methods in the same order.
 
     Attributes
     ----------
-    rows : (>= g,) int32
+    number, count : int
+        Number of this part; number of parts.
+    """
+
+    number: int
+    count: int
+
+    def exchange(self, sent: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Send array k to part k, and return what each part has sent to this one, in the order of parts."""
+        ...
+
+    def gather(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return the `values` of all parts, in their order."""
+        ...
+
+
+@dataclass(frozen=True)
+class Ghosts:
+    """Who owns the g ghosts of a part: what fills their values.
+
+    Attributes
+    ----------
+    rows : (>= g,) int32, device
         Row of the owner in its part; -1 for a ghost without owner.
-    parts : (>= g,) int32, optional
-        Number of the owner's part; None if all owners are in this one.
-    codes : (>= g,) int32, optional
+    codes : (>= g,) int32, device, optional
         Codes of periodic images: the sum over the axes a of (c + 1) 3^a, where the image is shifted by c periods, c =
         -1, 0 or 1.
-    firsts : (n_own + 1,) int32, optional
+    firsts : (n_own + 1,) int32, device, optional
         The images of generator i begin at ``firsts[i]``.
+    peers : Peers, optional
+        If owners are in other parts. Ghosts are then in the order of these.
+    sent : tuple of int32 arrays, device
+        Rows of this part whose values each of the parts needs.
     """
 
     rows: cla.Array
-    parts: cla.Array | None = None
     codes: cla.Array | None = None
     firsts: cla.Array | None = None
+    peers: Peers | None = None
+    sent: tuple[cla.Array, ...] = ()
+
+    @classmethod
+    def of_peers(cls, engine: Engine, peers: Peers, parts: np.ndarray, rows: np.ndarray) -> Ghosts:
+        """Return ghosts whose owners are the `rows` (g,) of `parts` (g,), in ascending order of these.
+
+        The parts tell each other what they need.
+        """
+        wanted = [np.ascontiguousarray(rows[parts == part], np.int32) for part in range(peers.count)]
+        sent = tuple(engine.upload(needed, np.int32) for needed in peers.exchange(wanted))
+        return cls(engine.upload(rows, np.int32), peers=peers, sent=sent)
+
+    def fill(self, engine: Engine, n_own: int, values: cla.Array) -> None:
+        """Fill the rows of `values` from `n_own` on with the values of the owners; see `Part.forward`."""
+        if self.peers is None:
+            words = np.int32(int(np.prod(values.shape[1:])) * values.dtype.itemsize // 4)
+            forward = engine.kernels("tessellation/part").forward_values
+            engine.run_each(forward, values.shape[0] - n_own, np.int32(n_own), self.rows, words, values)
+            return
+        gather = Gather(engine)
+        packed = [gather.rows(rows, values).get() if len(rows) else values[:0].get() for rows in self.sent]
+        received = np.concatenate(self.peers.exchange(packed))
+        if len(received):
+            start = n_own * (values.nbytes // values.shape[0])
+            cl.enqueue_copy(engine.queue, buffer_of(values), np.ascontiguousarray(received), dst_offset=start)
 
 
 @dataclass(frozen=True)
@@ -57,45 +114,73 @@ class Part:
         In the device's coordinates, ghosts last. In a power diagram rows end with weights.
     box : ClipBox
         Contains all of them, and clips cells.
-    home : Home, optional
+    ghosts : Ghosts, optional
         None if the ghosts have no values, or there are none.
     halo_args : tuple
         What kernels need to test whether the ghosts are enough: HALO_ARGS in a periodic box (periodic/halo.h).
+    labels : (count,) int32, optional
+        Permanent names of the generators. The faces of a cell are then in the order of labels, and its measures are
+        summed in this order: they have the same bits in all parts that have the cell. A periodic image has the label of
+        its owner, so that no cell may be a neighbor of two images of one generator.
     """
 
     n_own: int
     count: int
     points: cla.Array
     box: ClipBox
-    home: Home | None = None
+    ghosts: Ghosts | None = None
     halo_args: tuple[object, ...] = ()
+    labels: cla.Array | None = None
+
+    @classmethod
+    def alone(cls, points: cla.Array, box: ClipBox, n: int | None = None) -> Part:
+        """Return the part of the first `n` of `points`, by default all, without ghosts."""
+        n = len(points) if n is None else n
+        return cls(n, n, points, box)
+
+    @property
+    def peers(self) -> Peers | None:
+        """The other parts of the domain, if there are any."""
+        return None if self.ghosts is None else self.ghosts.peers
 
     def name_owners(self, engine: Engine, starts: cla.Array, neighbors: cla.Array) -> cla.Array:
         """Return `neighbors` (m,) with owners in place of the ghosts that have one in this part.
 
         They are in the workspace. Rows begin at `starts` (n_own + 1,).
         """
-        if self.home is None or self.home.parts is not None:
+        if self.ghosts is None or self.peers is not None:
             return neighbors
         named = engine.scratch(len(neighbors), np.int32)
         kernel = engine.kernels("tessellation/part").name_owners
-        engine.run_each(kernel, self.n_own, np.int32(self.n_own), self.home.rows, starts, neighbors, named)
+        engine.run_each(kernel, self.n_own, np.int32(self.n_own), self.ghosts.rows, starts, neighbors, named)
         return named
 
-    def forward(self, engine: Engine, values: cla.Array, others: Sequence[cla.Array] = ()) -> None:
+    def order_rows(self, engine: Engine, t: Tessellation, defines: dict[str, object]) -> None:
+        """Sort the rows of `t`, a diagram of this part, by the labels, and measure its cells again.
+
+        `defines` are those of the builder of its cells.
+        """
+        given = (t.starts, t.neighbors, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices[:1])
+        measures = t.face_measures, t.face_centroids, t.volumes, t.offsets, t.covariances
+        order = engine.kernels("tessellation/row_order", defines).order_rows
+        engine.run_each(order, t.n, *given, *measures, *(engine.period_args if t.vertices else ()))
+
+    def forward(self, engine: Engine, values: cla.Array) -> None:
         """Fill the rows of ghosts in `values` (count, ...), of any type, with the values of their owners.
 
-        Parameters
-        ----------
-        others : sequence of arrays, optional
-            Values of each part, by its number, if owners are in other parts. Rows without owner stay as they are.
+        Rows of ghosts without owner stay as they are.
         """
-        if self.home is None:
-            return
-        words = np.int32(int(np.prod(values.shape[1:])) * values.dtype.itemsize // 4)
-        forward = engine.kernels("tessellation/part").forward_values
-        parts = self.home.rows if self.home.parts is None else self.home.parts
-        for number, owned in enumerate(others or [values]):
-            chosen = np.int32(-1 if self.home.parts is None else number)
-            ghosts = self.count - self.n_own
-            engine.run_each(forward, ghosts, np.int32(self.n_own), self.home.rows, parts, chosen, words, owned, values)
+        if self.ghosts is not None:
+            self.ghosts.fill(engine, self.n_own, values)
+
+    def total(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum of `values` over all parts, in the order of parts."""
+        return values if self.peers is None else np.sum(self.peers.gather(values), axis=0)
+
+    def before(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum of `values` over the parts before this one."""
+        if self.peers is None:
+            return np.zeros_like(values)
+        return np.sum(self.peers.gather(values)[: self.peers.number], axis=0, dtype=values.dtype) + np.zeros_like(
+            values
+        )

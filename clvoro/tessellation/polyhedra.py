@@ -18,8 +18,19 @@ from ..opencl.kernels import Kernels
 from .back_ends import LANES_FROM, TEAM, TeamKernel, has_lanes, has_teams_for_new_cells, has_warps, team_defines
 from .bins import MAX_LEVELS, BinnedPoints
 from .builder import CellBuilder
-from .cut_cells import FACE_CAPACITY, GROWTH, MOST_FACES, CutCells, Matching, capacity_defines, clip_each
+from .cut_cells import (
+    FACE_CAPACITY,
+    GROWTH,
+    KNOWN_CORNERS,
+    MOST_FACES,
+    UNSURE_CORNERS,
+    CutCells,
+    Matching,
+    capacity_defines,
+    clip_each,
+)
 from .device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, NeighborRows, Tessellation
+from .part import Part
 from .periodic.halo import halo_defines
 from .report import FACES, FULL, HARMLESS, KEPT, SIZE, UNKNOWN
 
@@ -90,34 +101,36 @@ class Polyhedra(CellBuilder):
             self._of_vertices = (self.engine.empty(2 * m, np.uint32), self.engine.empty(m, np.uint32))
         return self._of_vertices
 
+    @property
+    def defines(self) -> dict[str, object]:
+        """None."""
+        return {}
+
+    def knows_corners(self, t: Tessellation) -> bool:
+        """Return whether `t` has vertices: not with weights."""
+        return bool(t.vertices)
+
     def _tessellate(
-        self,
-        box: ClipBox,
-        points: cla.Array,
-        n: int,
-        binned: BinnedPoints,
-        previous: Tessellation | NeighborRows | None,
-        exact: bool,
-        rows: int,
-        halo_args: tuple[object, ...],
+        self, part: Part, binned: BinnedPoints, previous: Tessellation | NeighborRows | None, exact: bool, rows: int
     ) -> Tessellation:
-        engine = self.engine
+        engine, n = self.engine, part.count
         self.cells_of(rows)
         share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         first = engine.scratch(n, np.float32)
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
         with engine.workspace.frame():
             # Updates, and the descent of the surface, need the vertices.
-            keep = not exact and (rows < n or not halo_args) and self._bounds is None
+            keep = part.labels is not None or (not exact and (rows < n or not part.halo_args))
+            keep, more_args = keep and self._bounds is None, part.halo_args
             if self._bounds is not None:
-                halo_args = (*halo_args, *self._bounds.build(box, points, n))
-            cut = self._cut(box, points, n, binned, first, previous, rows, share, halo_args, keep)
+                more_args = (*more_args, *self._bounds.build(part.box, part.points, n))
+            cut = self._cut(part, binned, first, previous, rows, share, more_args, keep)
             if cut is not None:
-                matching = self.match(cut, self._report, points, share, cut.m)
+                matching = self.match(cut, self._report, part.points, share, cut.m)
                 flags = int(self._report.get()[0])
                 if not flags & ~HARMLESS:
                     return matching.tessellation(flags)
-        raise CloseError(points, n)
+        raise CloseError(part.points, n)
 
     def _begin_anew(self, binned: BinnedPoints, first: cla.Array, n: int) -> None:
         """Restore the search radii, so that the last bits of the result do not depend on earlier attempts."""
@@ -125,20 +138,19 @@ class Polyhedra(CellBuilder):
 
     def _cut(
         self,
-        box: ClipBox,
-        points: cla.Array,
-        n: int,
+        part: Part,
         binned: BinnedPoints,
         first: cla.Array,
         previous: Tessellation | NeighborRows | None,
         rows: int,
         share: np.floating,
-        halo_args: tuple[object, ...],
+        more_args: tuple[object, ...],
         keep: bool,
     ) -> CutCells | None:
         """Clip the first `rows` cells; repeat with larger capacities if needed. None if a cell collapses.
 
-        `first` (n,) float32 is a copy of the original `binned.reach`. `keep` the vertices.
+        `first` (n,) float32 is a copy of the original `binned.reach`. `more_args` are HALO_ARGS and BOUND_ARGS. `keep`
+        the vertices.
         """
         engine = self.engine
         most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
@@ -153,24 +165,25 @@ class Polyhedra(CellBuilder):
         corners = engine.scratch(2 * self._room, np.uint32) if keep else None
         self._begin_report()
         while True:
-            cut = CutCells(places, counts, *faces, cells, self._room, corners, faces[0])
+            state = KNOWN_CORNERS if part.labels is None else UNSURE_CORNERS
+            cut = CutCells(places, counts, *faces, cells, self._room, corners, faces[0], state)
             if in_lanes and not again:
-                self._walk(box, binned, cut, halo_args)
+                self._walk(part.box, binned, cut, more_args)
             some = again or in_lanes
-            self._clip(box, points, n, binned, cut, (warm, *old), some, capacity, share, halo_args)
+            self._clip(part, binned, cut, (warm, *old), some, capacity, share, more_args)
             flags, m = (int(v) for v in self._report.get()[:2])
             if flags & ~(FULL | UNKNOWN | HARMLESS):
                 return None
             if m > self._room:
                 # Repeat all: faces beyond the capacity were lost.
-                self._begin_anew(binned, first, n)
+                self._begin_anew(binned, first, part.count)
                 faces = self._take_faces(m + m // 32 + 64)
                 corners = engine.scratch(2 * self._room, np.uint32) if keep else None
                 capacity, again = FACE_CAPACITY, False
                 self._begin_report()
                 continue
             if flags & UNKNOWN:
-                box.look_farther(points)
+                part.box.look_farther(part.points)
             elif flags & FULL:
                 capacity = _larger(capacity)
             else:
@@ -203,31 +216,29 @@ class Polyhedra(CellBuilder):
 
     def _clip(
         self,
-        box: ClipBox,
-        points: cla.Array,
-        size: int,
+        part: Part,
         binned: BinnedPoints,
         cut: CutCells,
         start: tuple[bool, cla.Array, cla.Array],
         some: bool,
         capacity: int,
         share: np.floating,
-        halo_args: tuple[object, ...],
+        more_args: tuple[object, ...],
         report: cla.Array | None = None,
     ) -> None:
-        """Clip all cells, or with `some` the unfinished ones, by the first `size` of `points`.
+        """Clip all cells, or with `some` the unfinished ones, by the generators and ghosts of `part`.
 
         By teams if the engine has these, else one work-item for each. `start`: whether cells start from the neighbors
         of an earlier diagram, and its graph.
         """
-        engine = self.engine
+        engine, size = self.engine, part.count
         args = (
             np.int32(len(cut.counts)),
             binned.points,
             binned.items,
             *binned.search,
-            points,
-            *box.clip_args(engine),
+            part.points,
+            *part.box.clip_args(engine),
             np.int32(start[0]),
             *start[1:],
             np.int32(some),
@@ -239,7 +250,7 @@ class Polyhedra(CellBuilder):
         if by_team is not None:
             engine.run(by_team, TEAM * size, np.int32(size), *args, group=TEAM)
         else:
-            clip_each(engine, self._kernels(capacity).clip_polyhedra, capacity, size, args, halo_args)
+            clip_each(engine, self._kernels(capacity).clip_polyhedra, capacity, size, args, more_args)
 
     def _begin_report(self, flags: int = 0, used: int = 0) -> None:
         """Set the report to `flags` and the number of `used` faces."""
@@ -256,20 +267,11 @@ class Polyhedra(CellBuilder):
         return CutCells(places, counts, labels, scratch(m), scratch((m, 3)), cells, m, corners, keys)
 
     def clip_rest(
-        self,
-        cut: CutCells,
-        report: cla.Array,
-        box: ClipBox,
-        points: cla.Array,
-        binned: BinnedPoints,
-        previous: Tessellation | NeighborRows,
-        size: int | None = None,
-        halo_args: tuple[object, ...] = (),
+        self, cut: CutCells, report: cla.Array, part: Part, binned: BinnedPoints, previous: Tessellation | NeighborRows
     ) -> None:
-        """Clip the unfinished cells of `cut` by all of the `size` generators and ghost images near them."""
-        size, start = len(cut.counts) if size is None else size, (True, previous.starts, previous.neighbors)
-        share = self.engine.real.type(ROUGH_SHARE)
-        self._clip(box, points, size, binned, cut, start, True, FACE_CAPACITY, share, halo_args, report)
+        """Clip the unfinished cells of `cut` by all generators and ghosts of `part` near them."""
+        start, share = (True, previous.starts, previous.neighbors), self.engine.real.type(ROUGH_SHARE)
+        self._clip(part, binned, cut, start, True, FACE_CAPACITY, share, part.halo_args, report)
 
     def match(
         self, cut: CutCells, report: cla.Array, points: cla.Array, share: np.floating, m: int, folded: bool = False

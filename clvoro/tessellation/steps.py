@@ -54,7 +54,7 @@ class DomainSteps:
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the part of the first `n` of `sites` and the ghosts that their cells need, as far as known."""
-        return Part(n, n, sites, self.box)
+        return Part.alone(sites, self.box, n)
 
     def sample_size(self, n: int) -> int:
         """Return how many cells of `n` to build first, to see which ghosts are needed; 0 if they are known."""
@@ -119,7 +119,7 @@ class DomainSteps:
         """Update `previous` incrementally to the first `n` of `sites`; None if too much has changed."""
 
         def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
-            cells.clip_rest(cut, report, self.box, sites, sort(), previous)
+            cells.clip_rest(cut, report, Part.alone(sites, self.box, n), sort(), previous)
 
         return self.stages.update.update(self.stages.cells, self.box, sites, previous, follow=follow, clip=clip)
 

@@ -110,7 +110,7 @@ class Tessellator:
 
         @cache
         def sort() -> BinnedPoints:
-            return self._sorted(Part(n, n, points, self.domain)) if binned is None else binned
+            return self._sorted(Part.alone(points, self.domain, n)) if binned is None else binned
 
         with self._in_units(points, n):
             if previous is not None and not exact:
@@ -165,16 +165,19 @@ class Tessellator:
     ) -> Tessellation:
         """Tessellate from nothing by the first `n` of `sites`: `points`, with their weights in a power diagram."""
         with self._in_units(points, n):
-            whole = Part(n, n, sites, self.domain)
+            whole = Part.alone(sites, self.domain, n)
             return self._build(points, sites, n, cache(lambda: self._sorted(whole)), None, exact, complete)
 
-    def tessellate_part(self, part: Part, exact: bool = False) -> Tessellation:
+    def tessellate_part(self, part: Part, exact: bool = False, whole: bool = False) -> Tessellation:
         """Return the diagram of a part whose ghosts are given, such as the halo of generators of other parts.
 
-        Cells are right as far as the ghosts surround them. Neighbors are rows of the part.
+        Cells are right as far as the ghosts surround them. Neighbors are rows of the part. With `whole` ghosts get
+        cells as well, for stages that read rows of neighbors.
         """
         with self._in_units(part.points, part.count):
-            return replace(self._cells(part, self._sorted(part), exact, part.n_own), part=part)
+            t = self._cells(part, self._sorted(part), exact, part.count if whole else part.n_own)
+        own = t.first(part.n_own) if t.n > part.n_own else t
+        return replace(own, part=part, whole=t)
 
     def _build(
         self,
@@ -199,7 +202,7 @@ class Tessellator:
             steps.find_walls(part, binned, previous)
             try:
                 # Ghosts without values need cells, since something cuts these. Many images wait until they are enough.
-                whole = part.home is None or (complete and (enough or part.count < max(2 * n, LATER_FROM)))
+                whole = part.ghosts is None or (complete and (enough or part.count < max(2 * n, LATER_FROM)))
                 start = None if rows is None else steps.unfold(part, rows)
                 t = self._cells(part, binned, exact, part.count if whole else n, start)
             except CloseError:
@@ -228,16 +231,14 @@ class Tessellator:
             return
         few = n // 8
         places = mixed if points is sites else gather.rows(items, points)
-        self._build(places, mixed, few, lambda: self._sorted(Part(few, few, mixed, self.domain)), None, True, False)
+        self._build(places, mixed, few, lambda: self._sorted(Part.alone(mixed, self.domain, few)), None, True, False)
         steps.keep_ghosts(last)
 
     def _cells(
         self, part: Part, binned: BinnedPoints, exact: bool, rows: int, start: Tessellation | NeighborRows | None = None
     ) -> Tessellation:
         """Build the cells of the first `rows` generators, which may start from the neighbors in `start`."""
-        return self.stages.cells.tessellate(
-            part.box, part.points, part.count, binned, exact=exact, previous=start, n_own=rows, halo_args=part.halo_args
-        )
+        return self.stages.cells.tessellate(part, binned, start, exact, rows)
 
     def _sorted(self, part: Part) -> BinnedPoints:
         bins = self.stages.bins

@@ -16,13 +16,13 @@ def keys_of(magnitudes, indices):
     return (bits << np.uint64(32)) | (0x7FFFFFFF - np.asarray(indices)).astype(np.uint64)
 
 
-def assert_keys(keys, magnitudes):
+def assert_keys(keys, magnitudes, names):
     """Magnitudes may differ by the round-off of their terms. They are rounded to single precision."""
     sites = np.flatnonzero(keys)
     assert np.array_equal(sites, np.flatnonzero(magnitudes))
     found = (keys[sites] >> np.uint64(32)).astype(np.uint32).view(np.float32)
     assert found == pytest.approx(magnitudes[sites], rel=1e-6)
-    assert np.array_equal(keys[sites] & np.uint64(0xFFFFFFFF), 0x7FFFFFFF - sites)
+    assert np.array_equal(keys[sites] & np.uint64(0xFFFFFFFF), 0x7FFFFFFF - names[sites])
 
 
 class Mesh:
@@ -41,6 +41,8 @@ class Mesh:
         self.rng, self.stage = rng, InsertionDeletion(engine)
         self.kernels = self.stage._kernels
         self.graph = self.t.starts, self.t.neighbors
+        self.names = rng.permutation(3 * N)[:N]
+        self.name_args = np.int32(1), engine.upload(self.names, np.int32)
 
     def run(self, name, *args):
         real = self.engine.real.type
@@ -51,7 +53,7 @@ class Mesh:
         return self.engine.upload(array, dtype)
 
     def marks(self):
-        return _Marks.clean(self.stage._room, N, 2)
+        return _Marks.clean(self.stage._room, self.t, 2)
 
     def way(self, i, j):
         return self.host.points[j] - self.host.points[i]
@@ -87,7 +89,7 @@ def partner_of(mesh, i, at_walls):
 
 def scored(mesh, at_walls):
     engine = mesh.engine
-    partners, pull = engine.empty(N, np.int32), engine.empty(N)
+    partners, pull = engine.empty((N, 4), np.int32), engine.empty(N)
     keys = engine.empty(N, np.uint64)
     mesh.run(
         "score_pairs",
@@ -96,6 +98,7 @@ def scored(mesh, at_walls):
         mesh.upload(mesh.kinds, np.int32),
         mesh.upload(mesh.strain, np.float32),
         np.int32(at_walls),
+        *mesh.name_args,
         partners,
         pull,
         keys,
@@ -107,10 +110,12 @@ def scored(mesh, at_walls):
 def test_pairs_are_the_strongest_of_their_cells(mesh, at_walls):
     partners, pull, keys = scored(mesh, at_walls)
     expected = [partner_of(mesh, i, at_walls) for i in range(N)]
-    assert np.array_equal(partners.get(), [j for j, _, _ in expected])
+    chosen = np.array([j for j, _, _ in expected])
+    assert np.array_equal(partners.get()[:, 0], np.where(chosen < 0, -1, mesh.names[chosen]))
+    assert np.array_equal(partners.get()[chosen >= 0, 1:3], mesh.kinds[chosen[chosen >= 0]])
     assert pull.get() == pytest.approx(np.array([s for _, s, _ in expected]), rel=1e-6, abs=1e-6)
-    assert_keys(keys.get(), np.array([rank for _, _, rank in expected]))
-    assert (partners.get() >= 0).sum() > N / 8
+    assert_keys(keys.get(), np.array([rank for _, _, rank in expected]), mesh.names)
+    assert (chosen >= 0).sum() > N / 8
 
 
 def change_of(pull, minus, plus, shift):
@@ -131,7 +136,10 @@ def change_of(pull, minus, plus, shift):
 def test_pairs_are_split_or_deleted(mesh):
     """At every shift of the threshold, with pulls on either side of all bounds."""
     engine = mesh.engine
-    partners = scored(mesh, True)[0].get()
+    found = scored(mesh, True)[0].get()
+    rows = np.full(mesh.names.max() + 2, -1)
+    rows[mesh.names] = np.arange(N)
+    partners = rows[found[:, 0]]
     chosen, taken = np.zeros(N, bool), set()
     for i in np.flatnonzero(partners >= 0):
         if not {i, partners[i]} & taken:  # no two at one cell
@@ -145,7 +153,7 @@ def test_pairs_are_split_or_deleted(mesh):
         mesh.upload(chosen.astype(np.uint64) * 7, np.uint64),
         mesh.upload(pull, engine.real),
         mesh.upload(mesh.kinds, np.int32),
-        mesh.upload(partners, np.int32),
+        mesh.upload(found, np.int32),
     )
     tally = engine.zeros(SHIFTS, np.int32)
     mesh.run("count_pair_changes", *given, CLIMB_STRAIN, tally)
@@ -157,9 +165,11 @@ def test_pairs_are_split_or_deleted(mesh):
         marks = mesh.marks()
         mesh.run(
             "mark_pairs",
+            *mesh.graph,
             *given,
             CLIMB_STRAIN,
             float(shifts[m]),
+            *mesh.name_args,
             mesh.t.points,
             mesh.upload(local_length, engine.real),
             *marks.arrays,
@@ -188,28 +198,35 @@ def test_nuclei_are_sites_in_a_strained_lattice(mesh):
     kinds = np.where(mesh.rng.random((N, 2)) < 0.95, 0, mesh.rng.integers(-1, 3, (N, 2)))
     kinds[mesh.walled, 1] = 1
     keys = engine.empty(N, np.uint64)
-    mesh.run("score_strain", *mesh.graph, mesh.upload(kinds, np.int32), mesh.upload(mesh.strain, np.float32), 0.8, keys)
+    cells = mesh.upload(kinds, np.int32), mesh.upload(mesh.strain, np.float32)
+    mesh.run("score_strain", *mesh.graph, *cells, 0.8, *mesh.name_args, keys)
     magnitudes = np.zeros(N)
     for i, row in enumerate(mesh.rows):
         if not kinds[i].any() and not kinds[row].any():
             xx, xy, yy = mesh.strain[i, :3].astype(float)
             spread = np.ptp(np.linalg.eigvalsh([[xx, xy], [xy, yy]]))
             magnitudes[i] = spread if spread > 0.8 else 0
-    assert_keys(keys.get(), magnitudes)
+    assert_keys(keys.get(), magnitudes, mesh.names)
     assert 10 < (magnitudes > 0).sum() < (~kinds.any(axis=1)).sum() / 2
 
     chosen = (~mesh.walled) & (mesh.rng.random(N) < 0.2)
     ranks = np.concatenate([[0], np.cumsum(chosen)])
-    marks = mesh.marks()
+    marks, merged = mesh.marks(), engine.empty(N, np.int32)
     mesh.run(
         "mark_nuclei",
         mesh.upload(chosen.astype(np.uint64), np.uint64),
         mesh.upload(ranks, np.int32),
+        np.int32(6),
         *mesh.graph,
         mesh.t.points,
-        *marks.arrays,
+        *mesh.name_args,
+        marks.shifts,
+        marks.born,
+        marks.births,
         marks.busy,
+        merged,
     )
+    mesh.run("delete_merged", *mesh.graph, merged, *mesh.name_args, marks.kept)
     kept, born, moved, births = np.ones(N), np.zeros(N), np.zeros((N, 2)), np.zeros((N, 2))
     for i in np.flatnonzero(chosen):
         ways = np.array([mesh.way(i, j) for j in mesh.rows[i]])
@@ -239,12 +256,13 @@ def test_cells_too_large_or_too_small_are_sites(mesh, sign):
         mesh.upload(neighbors, np.int32),
         mesh.upload(log_ratio, engine.real),
         sign,
+        *mesh.name_args,
         keys,
     )
     faces = np.diff(mesh.host.starts)
     magnitudes = np.clip(2 + sign * (log_ratio + 0.2 * (faces - 6)), 0, 4)
     magnitudes[alone & (sign < 0)] = 0
-    assert_keys(keys.get(), magnitudes)
+    assert_keys(keys.get(), magnitudes, mesh.names)
     assert min((magnitudes == 0).sum(), (magnitudes == 4).sum()) > N / 8
 
 
@@ -252,11 +270,11 @@ def test_bad_cells_are_inner_cells_above_the_bound(mesh):
     """The bound itself is excluded; cells of four or eight sides are sites for any quality, and come first."""
     flaw, keys = 0.25, mesh.engine.empty(N, np.uint64)
     quality = mesh.rng.choice([0.5, 0.74, 0.75, 0.76, 1.0], N)
-    mesh.run("score_bad_cells", *mesh.graph, mesh.upload(quality, mesh.engine.real), flaw, keys)
+    mesh.run("score_bad_cells", *mesh.graph, mesh.upload(quality, mesh.engine.real), flaw, *mesh.name_args, keys)
     sides = np.diff(mesh.host.starts)
     odd = (sides < 5) | (sides > 7)
     sites = np.where(~mesh.walled & (odd | (1 - quality > flaw)), 1 - quality + odd, 0)
-    assert_keys(keys.get(), sites)
+    assert_keys(keys.get(), sites, mesh.names)
     assert min((sites >= 1).sum(), ((sites > 0) & (sites < 1)).sum()) > 20
 
 

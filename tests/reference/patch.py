@@ -13,6 +13,7 @@ from clvoro.geometry.box import Box
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
+from clvoro.tessellation.part import Part
 from clvoro.tessellation.polyhedra import Polyhedra
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import diagrams, diagrams3d
@@ -42,7 +43,7 @@ def tessellate(engine, points, box=BOX):
     n, on_device = len(points), engine.upload(points)
     binned = Bins(engine).build(box, on_device, n)
     cells = Cells(engine) if box.cell_dim == 2 else Polyhedra(engine)
-    return cells.tessellate(box, on_device, n, binned)
+    return cells.tessellate(Part.alone(on_device, box), binned)
 
 
 def tessellate_box(engine, box, n, seed):

@@ -30,6 +30,7 @@ from clvoro.opencl.primitives import Scan
 from clvoro.sizing import Ball, Circle, ClosedPolyline, Distance, Expression, Graded, Raster, Sizing, Surface, minimum
 from clvoro.tessellation import back_ends
 from clvoro.tessellation.face_rows import SLOT
+from clvoro.tessellation.part import Part
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.patch import BOX as PATCH
 from tests.reference.patch import hexagons, tessellate
@@ -144,10 +145,10 @@ def drop_faces(adapter: clvoro.Adapter) -> None:
         engine = stages.engine
         x = engine.upload(box.place(points(n, dim), adapter.dtype))
         t = Tessellator(stages, box).tessellate(x, n, exact=True, complete=True)
-        home = t.folded.part.home
+        ghosts = t.folded.part.ghosts
         values = engine.upload(np.append(np.arange(n), np.zeros(t.folded.part.count - n)), np.int32)
         t.folded.part.forward(engine, values)
-        assert (values.get()[n:] == home.rows.get()[: len(values) - n]).all()
+        assert (values.get()[n:] == ghosts.rows.get()[: len(values) - n]).all()
         m = int(t.starts.get()[-1])
         kept = np.ones(m, np.uint8)
         kept[::7] = 0
@@ -360,7 +361,7 @@ def multigrid(adapter: clvoro.Adapter) -> None:
     stages = stages_of(adapter)
     engine, (origin, scale) = stages.engine, BOX.frame
     on_device = engine.upload((points(n) - origin) / scale)
-    t = stages.cells.tessellate(BOX, on_device, n, stages.bins.build(BOX, on_device, n))
+    t = stages.cells.tessellate(Part.alone(on_device, BOX), stages.bins.build(BOX, on_device, n))
     stage = Poisson(engine)
     laplacian = stage.assemble(t.starts, t.neighbors, t.face_measures, t.points)
     rhs = engine.upload(points(n)[:, 0])

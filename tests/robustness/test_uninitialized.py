@@ -11,6 +11,7 @@ import pytest
 
 import clvoro
 from clvoro.opencl.engine import Engine
+from clvoro.tessellation.part import Part
 from tests.robustness.test_concurrency import BOX, SIZE, WORK, digest
 
 PATTERNS = (0xFF, 0x00, 0x4B)
@@ -71,7 +72,7 @@ def test_multigrid(ctx, filled):
         stages, (origin, scale) = adapter._stages_for(BOX), BOX.frame
         engine = stages.engine
         x = engine.upload((points - origin) / scale)
-        t = stages.cells.tessellate(BOX, x, 900, stages.bins.build(BOX, x, 900))
+        t = stages.cells.tessellate(Part.alone(x, BOX), stages.bins.build(BOX, x, 900))
         stage = Poisson(engine)
         laplacian = stage.assemble(t.starts, t.neighbors, t.face_measures, t.points)
         rhs, phi = engine.upload(points[:, 0]), engine.zeros(900)

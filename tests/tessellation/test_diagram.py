@@ -12,6 +12,7 @@ from clvoro.tessellation import report
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import ROW_CAPACITY, Cells
 from clvoro.tessellation.face_rows import SLOT
+from clvoro.tessellation.part import Part
 from clvoro.tessellation.readback.diagram import order_of, used_indices
 from tests.reference import diagrams as reference
 
@@ -217,7 +218,7 @@ def test_faces_of_the_loop_are_those_of_the_result_in_single_precision(adapter64
     engine = Engine(adapter64.ctx, adapter64.queue, 2, np.dtype(float))
     points = engine.upload(POINTS[name] / BOX.frame[1])
     n, cells = len(points), Cells(engine)
-    t = cells.tessellate(BOX, points, n, Bins(engine).build(BOX, points, n))
+    t = cells.tessellate(Part.alone(points, BOX), Bins(engine).build(BOX, points, n))
     exact, m = cells.measure_faces(BOX, t), int(t.starts.get()[-1])
     for array in ("face_measures", "face_centroids"):
         at_work, full = (getattr(d, array).get()[:m] for d in (t, exact))
@@ -235,7 +236,7 @@ def test_later_meshes_do_not_keep_an_enlarged_capacity(adapter64):
 
     def tessellate(points):
         n, x = len(points), engine.upload(points / BOX.frame[1])
-        return cells.tessellate(BOX, x, n, bins.build(BOX, x, n))
+        return cells.tessellate(Part.alone(x, BOX), bins.build(BOX, x, n))
 
     angle = np.linspace(0, 2 * np.pi, 100, endpoint=False)
     ring = np.stack([1.25 + 0.6 * np.cos(angle), 0.75 + 0.6 * np.sin(angle)], axis=1)

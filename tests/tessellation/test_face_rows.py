@@ -11,6 +11,7 @@ from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT, spare_slots
 from clvoro.tessellation.incremental import IncrementalUpdate
+from clvoro.tessellation.part import Part
 from tests.reference import diagrams as reference
 from tests.reference import patch
 
@@ -39,7 +40,7 @@ def make(engine, points):
     x, n = engine.upload(points), len(points)
     cells = Cells(engine)
     binned = Bins(engine).build(BOX, x, n)
-    return cells, x, cells.tessellate(BOX, x, n, binned)
+    return cells, x, cells.tessellate(Part.alone(x, BOX), binned)
 
 
 def compare(a, b):

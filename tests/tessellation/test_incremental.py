@@ -11,6 +11,7 @@ from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT
 from clvoro.tessellation.incremental import IncrementalUpdate
+from clvoro.tessellation.part import Part
 from clvoro.tessellation.report import LISTED
 from tests.reference import patch
 
@@ -65,7 +66,7 @@ class Carried:
 
     def anew(self, cells, points):
         x = self.engine.upload(points)
-        return cells.tessellate(patch.BOX, x, self.n, self.bins.build(patch.BOX, x, self.n), exact=False)
+        return cells.tessellate(Part.alone(x, patch.BOX), self.bins.build(patch.BOX, x, self.n), exact=False)
 
     def move(self, points):
         """Update the diagram to `points`; return it as NumPy arrays, and whether the update succeeded."""

@@ -8,6 +8,7 @@ from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT
 from clvoro.tessellation.incremental import IncrementalUpdate
+from clvoro.tessellation.part import Part
 from tests.reference import patch
 
 
@@ -20,7 +21,7 @@ def test_a_former_neighbor_of_a_clipped_cell_loses_its_mark(ctx, again):
     engine, n, i = patch.make_engine(ctx), 40, 17
     points = patch.relaxed_points(n, 2501)
     x, cells, incremental = engine.upload(points), Cells(engine), IncrementalUpdate(engine)
-    t = cells.tessellate(patch.BOX, x, n, Bins(engine).build(patch.BOX, x, n), exact=False)
+    t = cells.tessellate(Part.alone(x, patch.BOX), Bins(engine).build(patch.BOX, x, n), exact=False)
     incremental.update(cells, patch.BOX, x, t)  # has the kernels made
     (kernels,) = incremental._kernels.values()
     host = patch.fetch(t)

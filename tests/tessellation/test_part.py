@@ -1,19 +1,19 @@
 """Parts with ghosts: two halves of a box with each other's generators as halos; a periodic box that is not folded."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators
 from clvoro.adaptation.stages import Stages
 from clvoro.geometry.box import Box
-from clvoro.solvers.conjugate_gradient import ConjugateGradient
-from clvoro.solvers.linear_system import Limits, Operator
+from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets
-from clvoro.tessellation.part import Home, Part
+from clvoro.tessellation.part import Ghosts, Part
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
+from tests.reference.peers import run_parts
 
 N = {2: 500, 3: 900}
 SPACINGS = 5
@@ -22,47 +22,61 @@ REALS = [pytest.param(np.dtype(name), id=name) for name in ("float64", "float32"
 
 
 class Halves:
-    """A box, its generators, and the two parts of those left and right of its middle, with halos of some depth."""
+    """A box, its generators, and the two parts of those left and right of its middle, with halos of some depth.
+
+    Labels are a random permutation. Threads, each with an engine, are the peers.
+    """
 
     def __init__(self, ctx, dim, real, spacings=SPACINGS):
+        self.ctx, self.real = ctx, real
         self.box = Box((0,) * dim, (2, 0.75, 0.9)[:dim])
-        self.engine = patch.make_engine(ctx, real, dim, box=self.box)
-        n = N[dim]
-        x = np.random.default_rng(60101).random((n, dim)) * self.box.extent
+        n, rng = N[dim], np.random.default_rng(60101)
+        x = rng.random((n, dim)) * self.box.extent
         right = x[:, 0] > 1
-        self.n_left = int(np.count_nonzero(~right))
         x = np.concatenate([x[~right], x[right]])
-        spacing = (self.box.measure / n) ** (1 / dim)
-        rows, near = np.arange(n), np.abs(x[:, 0] - 1) < spacings * spacing
-        left = rows < self.n_left
-        # Global numbers of the rows of each part.
-        self.rows = [np.concatenate([rows[own], rows[~own & near]]) for own in (left, ~left)]
-        self.n_own = [self.n_left, n - self.n_left]
-        self.places = self.box.place(x, real)
-        self.whole = self.tessellate(Part(n, n, self.upload(self.places), self.box))
-        self.parts = [self.part(number) for number in (0, 1)]
+        self.n, self.places, self.labels = n, self.box.place(x, real), rng.permutation(2 * n)[:n].astype(np.int32)
+        numbers, near = np.arange(n), np.abs(x[:, 0] - 1) < spacings * (self.box.measure / n) ** (1 / dim)
+        self.bounds = 0, int(np.count_nonzero(~right)), n
+        left = numbers < self.bounds[1]
+        # Numbers in the whole of the rows of each part.
+        self.rows = [np.concatenate([numbers[own], numbers[~own & near]]) for own in (left, ~left)]
+        self.n_own = np.diff(self.bounds).tolist()
 
-    def upload(self, values, dtype=None):
-        return self.engine.upload(values, dtype)
+    def stages(self):
+        return Stages(patch.make_engine(self.ctx, self.real, self.box.dim, box=self.box))
 
-    def part(self, number):
-        rows, n_own, first = self.rows[number], self.n_own[number], (0, self.n_left)[1 - number]
-        home = Home(
-            self.upload(rows[n_own:] - first, np.int32), self.upload(np.full(len(rows) - n_own, 1 - number), np.int32)
-        )
-        return Part(n_own, len(rows), self.upload(self.places[rows]), self.box, home)
+    def part(self, stages, peers=None):
+        """Return the part of a thread, or the whole."""
+        engine, rows = stages.engine, np.arange(self.n) if peers is None else self.rows[peers.number]
+        n_own = self.n if peers is None else self.n_own[peers.number]
+        ghosts = None
+        if peers is not None:
+            owners = rows[n_own:] - self.bounds[1 - peers.number]
+            ghosts = Ghosts.of_peers(engine, peers, np.full(len(owners), 1 - peers.number), owners)
+        labels = engine.upload(self.labels[rows], np.int32)
+        return Part(n_own, len(rows), engine.upload(self.places[rows]), self.box, ghosts, labels=labels)
 
-    def tessellate(self, part):
-        return Tessellator(Stages(self.engine), self.box).tessellate_part(part)
+    def run(self, work):
+        """Return what ``work(stages, part, rows)`` returns for the whole, and for each of both halves in a thread.
 
-    def names(self, t, number=None):
-        """Return the faces as pairs of global numbers, ordered by the device's rows."""
-        found = patch.fetch(t)
-        if number is None:
-            return found, found.owners, found.neighbors
-        rows = self.rows[number]
-        across = np.where(found.neighbors >= 0, rows[np.maximum(found.neighbors, 0)], found.neighbors)
-        return found, rows[found.owners], across
+        `rows` are the numbers in the whole of the rows of the part.
+        """
+        stages = self.stages()
+        whole = work(stages, self.part(stages), np.arange(self.n))
+
+        def of_part(peers):
+            own = self.stages()
+            return work(own, self.part(own, peers), self.rows[peers.number])
+
+        return whole, run_parts(2, of_part)
+
+    def joined(self, found):
+        """Return arrays of both halves as one of the whole."""
+        return np.concatenate([values[:n] for values, n in zip(found, self.n_own, strict=True)])
+
+
+def tessellate(stages, part, whole=False):
+    return Tessellator(stages, part.box).tessellate_part(part, whole=whole)
 
 
 @pytest.fixture(params=[2, 3])
@@ -71,43 +85,45 @@ def dim(request):
 
 
 @pytest.mark.sparse(4)
+@pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("real", REALS)
-def test_diagrams_of_two_halves_are_that_of_the_whole(ctx, dim, real):
+def test_diagrams_of_two_halves_have_the_bits_of_the_whole(ctx, dim, real, whole):
+    """Rows in the order of labels, measures, centroids and moments: each cell has the same bits wherever it is made."""
     halves = Halves(ctx, dim, real)
-    whole, owners, neighbors = halves.names(halves.whole)
-    noise = 1e3 * np.finfo(real).eps
-    expected = set(zip(owners.tolist(), neighbors.tolist(), strict=True))
-    assert len(halves.rows[0]) < len(halves.places) > len(halves.rows[1])
-    found, across = set(), 0
-    for number, part in enumerate(halves.parts):
-        t = halves.tessellate(part)
-        assert t.n == part.n_own
-        assert t.rows == part.count
-        mine, i, j = halves.names(t, number)
-        found |= set(zip(i.tolist(), j.tolist(), strict=True))
-        across += np.count_nonzero((i < halves.n_left) != (j < halves.n_left) & (j >= 0))
-        rows = halves.rows[number][: t.n]
-        assert np.abs(mine.volumes - whole.volumes[rows]).max() < noise * whole.volumes.max()
-        assert np.abs(mine.offsets - whole.offsets[rows]).max() < noise
-    if real == np.float64:
-        assert found == expected
-    else:
-        assert len(found ^ expected) < 1e-3 * len(expected)
-    assert across > 20
 
+    def work(stages, part, rows):
+        t = tessellate(stages, part, whole)
+        assert (t.n, t.rows, t.whole.n) == (part.n_own, part.count, part.count if whole else part.n_own)
+        found = patch.fetch(t)
+        found.neighbors = np.where(found.neighbors >= 0, rows[np.maximum(found.neighbors, 0)], found.neighbors)
+        return found
 
-@pytest.mark.sparse(2)
-@pytest.mark.parametrize("real", REALS)
-def test_candidates_in_the_same_order_give_the_same_bits(ctx, dim, real):
-    """The left half with all others as ghosts: rows have the numbers of the whole."""
-    halves = Halves(ctx, dim, real, np.inf)
-    t = halves.tessellate(halves.parts[0])
-    mine, whole = patch.fetch(t), patch.fetch(halves.whole)
-    m = whole.starts[t.n]
+    one, two = halves.run(work)
+    starts = np.concatenate([np.diff(found.starts) for found in two]).cumsum()
+    assert np.array_equal(np.append(0, starts), one.starts)
+    same = np.ones(halves.n, bool)
     for name in ("neighbors", "face_measures", "face_centroids"):
-        assert np.array_equal(getattr(mine, name), getattr(whole, name)[:m]), name
+        differ = np.concatenate([getattr(found, name) for found in two]) != getattr(one, name)
+        same[one.owners[differ.reshape(len(differ), -1).any(axis=1)]] = False
     for name in ("volumes", "offsets", "covariances"):
-        assert np.array_equal(getattr(mine, name)[: t.n], getattr(whole, name)[: t.n]), name
+        differ = halves.joined([getattr(found, name) for found in two]) != getattr(one, name)
+        same &= ~differ.reshape(len(differ), -1).any(axis=1)
+    # In single precision round-off may decide whether a cell has a face of no area: such a cell is not measured again.
+    assert np.count_nonzero(~same) <= (3 if (dim, real) == (3, np.float32) else 0)
+    across = (one.owners < halves.bounds[1]) != (one.neighbors < halves.bounds[1])
+    assert np.count_nonzero(across & (one.neighbors >= 0)) > 40
+    # Against the order in which cells are clipped: neighbors are the same, measures differ by round-off.
+    stages = halves.stages()
+    plain = patch.fetch(tessellate(stages, replace(halves.part(stages), labels=None)))
+    for i in np.flatnonzero(same):
+        row, other = (d.neighbors[d.starts[i] : d.starts[i + 1]] for d in (one, plain))
+        names = np.where(row < 0, row, halves.labels[row])
+        assert names.argmin() == 0
+        assert np.array_equal(np.sort(row), np.sort(other))
+        assert dim == 2 or np.array_equal(names, np.sort(names))
+    noise = 1e3 * np.finfo(real).eps
+    assert np.abs(one.volumes - plain.volumes).max() < noise * one.volumes.max()
+    assert np.abs(one.covariances - plain.covariances).max() < noise
 
 
 @pytest.mark.sparse(2)
@@ -115,24 +131,26 @@ def test_candidates_in_the_same_order_give_the_same_bits(ctx, dim, real):
 @pytest.mark.parametrize("columns", [(), (3,)])
 def test_ghosts_get_the_values_of_their_owners(ctx, dim, values, columns):
     halves = Halves(ctx, dim, np.dtype(np.float64))
-    given = np.random.default_rng(60102).integers(1, 1 << 20, (len(halves.places), *columns)).astype(values)
-    owned = [halves.upload(given[rows[:n]], values) for rows, n in zip(halves.rows, halves.n_own, strict=True)]
-    for part, rows in zip(halves.parts, halves.rows, strict=True):
+    given = np.random.default_rng(60102).integers(1, 1 << 20, (halves.n, *columns)).astype(values)
+
+    def work(stages, part, rows):
         filled = given[rows].copy()
         filled[part.n_own :] = 0
-        device = halves.upload(filled, values)
-        part.forward(halves.engine, device, owned)
+        device = stages.engine.upload(filled, values)
+        part.forward(stages.engine, device)
         assert np.array_equal(device.get(), given[rows])
-    # Ghosts without owner keep their values, and so do all if they have no home.
-    part, n = halves.parts[0], halves.n_own[0]
-    lonely = part.home.rows.get()
-    lonely[::2] = -1
-    device = halves.upload(np.zeros_like(filled[:1]).repeat(part.count, axis=0), values)
-    replace(part, home=None).forward(halves.engine, device, owned)
-    replace(part, home=replace(part.home, rows=halves.upload(lonely, np.int32))).forward(halves.engine, device, owned)
-    assert not device.get()[: n + 1 : n].any()
-    assert device.get()[n + 1 :: 2].all()
-    assert not device.get()[n::2].any()
+        assert np.array_equal(part.total(np.array([part.n_own])), [halves.n])
+        assert part.before(np.array([part.n_own])) == rows[0]
+
+    halves.run(work)
+    # Ghosts without owner keep their values, and so do all if they have no owners.
+    stages = halves.stages()
+    points, owners = stages.engine.zeros((9, dim)), stages.engine.upload([3, -1, 0, -1], np.int32)
+    part = Part(5, 9, points, halves.box, Ghosts(owners))
+    for ghosts, expected in ((None, [0] * 4), (part.ghosts, [4, 0, 1, 0])):
+        device = stages.engine.upload([1, 2, 3, 4, 5, 0, 0, 0, 0], values)
+        replace(part, ghosts=ghosts).forward(stages.engine, device)
+        assert device.get()[5:].tolist() == expected
 
 
 @pytest.mark.sparse(2)
@@ -140,60 +158,139 @@ def test_ghosts_get_the_values_of_their_owners(ctx, dim, values, columns):
 def test_the_laplacian_of_two_halves(ctx, dim, real):
     """Products of the matrix with values of ghosts from the other half."""
     halves = Halves(ctx, dim, real)
-    poisson = Stages(halves.engine).poisson
-    values = np.random.default_rng(60103).random(len(halves.places)).astype(real)
+    values = np.random.default_rng(60103).random(halves.n).astype(real)
 
-    def product(t, points, x):
-        with poisson.engine.workspace.frame():
-            y = poisson.engine.empty(t.n)
-            poisson.apply(poisson.assemble(t.starts, t.neighbors, t.face_measures, points), x, y)
+    def work(stages, part, rows):
+        engine, poisson, t = stages.engine, stages.poisson, tessellate(stages, part)
+        with engine.workspace.frame():
+            x, y = engine.upload(np.where(np.arange(part.count) < part.n_own, values[rows], 0)), engine.empty(t.n)
+            part.forward(engine, x)
+            poisson.apply(poisson.assemble(t.starts, t.neighbors, t.face_measures, part.points), x, y)
             return y.get()
 
-    whole = product(halves.whole, halves.whole.points, halves.upload(values))
-    owned = [halves.upload(values[rows[:n]]) for rows, n in zip(halves.rows, halves.n_own, strict=True)]
-    for part, rows, own in zip(halves.parts, halves.rows, owned, strict=True):
-        x = halves.engine.zeros(part.count)
-        x[: part.n_own].set(own.get())
-        part.forward(halves.engine, x, owned)
-        mine = product(halves.tessellate(part), part.points, x)
-        assert np.abs(mine - whole[rows[: part.n_own]]).max() < 1e4 * np.finfo(real).eps * np.abs(whole).max()
+    whole, found = halves.run(work)
+    assert np.abs(halves.joined(found) - whole).max() < 1e4 * np.finfo(real).eps * np.abs(whole).max()
 
 
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", REALS)
 def test_the_poisson_equation_in_two_halves(ctx, dim, real):
-    """Each half applies its rows to its own values and those that `Part.forward` brings from the other."""
-    halves = Halves(ctx, dim, real)
-    engine, poisson, n = halves.engine, Stages(halves.engine).poisson, len(halves.places)
-    source = np.random.default_rng(60105).standard_normal(n)
-    source, limits = halves.upload(source - source.mean()), Limits(1e-9 if real == np.float64 else 1e-4, 1000)
-    diagrams = [halves.tessellate(part) for part in halves.parts]
-    diagrams = [replace(t, **{name: getattr(t, name).copy() for name in ("starts", "neighbors")}) for t in diagrams]
-    bounds = np.cumsum([0, *halves.n_own])
-    with engine.workspace.frame():
-        t = halves.whole
-        expected = engine.zeros(n)
-        matrix = poisson.assemble(t.starts, t.neighbors, t.face_measures, t.points)
-        assert poisson.solve(matrix, source, expected, tolerance=limits.tolerance).converged
-        matrices, inverses = [], []
-        for part, t in zip(halves.parts, diagrams, strict=True):
-            matrices.append(poisson.assemble(t.starts, t.neighbors, t.face_measures, part.points, part=part))
-            inverses.append(poisson.inverse_diagonal(matrices[-1]).get())
+    """Conjugate gradients on the host: products with values of ghosts from the other half, sums over both."""
+    halves, tolerance = Halves(ctx, dim, real), 1e-8 if real == np.float64 else 1e-4
+    source = np.random.default_rng(60105).standard_normal(halves.n)
+    source = (source - source.mean()).astype(real)
 
-        def apply(x, y):
-            owned = [x[a:b].copy() for a, b in pairwise(bounds)]
-            for part, rows, values, (a, b) in zip(halves.parts, matrices, owned, pairwise(bounds), strict=True):
-                both, product = engine.zeros(part.count), engine.empty(b - a)
-                both[: b - a] = values
-                part.forward(engine, both, owned)
-                poisson.apply(rows, both, product)
-                y[a:b] = product
+    def work(stages, part, rows):
+        engine, poisson, t = stages.engine, stages.poisson, tessellate(stages, part)
+        with engine.workspace.frame():
+            matrix = poisson.assemble(t.starts, t.neighbors, t.face_measures, part.points, part=part)
+            y, inverse = engine.empty(t.n), poisson.inverse_diagonal(matrix).get()
 
-        found, inverse = engine.zeros(n), engine.upload(np.concatenate(inverses))
-        given = Operator(apply, singular=True), source, found, inverse, limits
-        assert ConjugateGradient(engine).solve(*given, from_zero=True).converged
-        one, other = found.get(), expected.get()
-        assert np.abs(one - other).max() < 1e3 * limits.tolerance * np.abs(other).max()
+            def product(x):
+                both = engine.upload(np.append(x, np.zeros(part.count - t.n)))
+                part.forward(engine, both)
+                poisson.apply(matrix, both, y)
+                return y.get()
+
+            def dot(a, b):
+                return part.total(np.array(float(a.astype(float) @ b)))
+
+            x, r = np.zeros(t.n, real), source[rows[: t.n]]
+            z, first, before = inverse * r, dot(r, r), 0
+            p = z
+            while dot(r, r) > tolerance**2 * first:
+                gamma = dot(r, z)
+                p = z + (gamma / before if before else 0) * p
+                q = product(p)
+                x, r = x + gamma / dot(p, q) * p, r - gamma / dot(p, q) * q
+                z, before = inverse * r, gamma
+            return x - part.total(np.array(x.sum())) / halves.n
+
+    whole, found = halves.run(work)
+    assert np.abs(halves.joined(found) - whole).max() < 1e3 * tolerance * np.abs(whole).max()
+
+
+@pytest.mark.sparse(2)
+@pytest.mark.parametrize("real", REALS)
+def test_a_projected_step_in_two_halves(ctx, dim, real):
+    """Weighted Lloyd and descent of shapes, projected: the displacement is that of the whole up to the tolerance."""
+    halves, rng = Halves(ctx, dim, real), np.random.default_rng(60106)
+    h = (halves.box.measure / halves.n) ** (1 / dim) * (1 + 0.3 * rng.random(halves.n))
+    h, quality, labels = (h / 2).astype(real), rng.uniform(0.5, 1, halves.n).astype(real), halves.labels
+
+    def work(stages, part, rows):
+        engine, t, own = stages.engine, tessellate(stages, part, whole=True), rows[: part.n_own]
+        ways, moves = engine.empty((t.n, dim)), engine.empty((t.n, dim))
+        with engine.workspace.frame():
+            sizes, shapes = engine.upload(h[own]), engine.upload(quality[own])
+            w = stages.density.lloyd_weights(t, sizes, ways)
+            if dim == 2:
+                stages.quality_descent.descend(t, sizes, shapes, ways)
+            elif t.vertices:
+                stages.surface_descent.descend(t, sizes, shapes, ways)
+            sums = stages.density.sum_log_ratio(w)
+            outcome = stages.volume_projection.project(
+                t,
+                Targets(sizes, w.gradient, w.log_ratio, shapes, sums),
+                ways,
+                moves,
+                Penalty(0.2, 0.3, 0.4),
+                Limits(1e-8 if real == np.float64 else 1e-5, 400),
+                labels=engine.upload(labels[own], np.int32),
+                fixed=halves.n // 5,
+            )
+            assert outcome.converged
+            return ways.get(), moves.get(), outcome.iterations
+
+    one, two = halves.run(work)
+    assert abs(two[0][2] - one[2]) <= 2
+    assert two[0][2] == two[1][2]
+    limits = (1e3 * np.finfo(real).eps, 1e-4)  # derivatives are in single precision
+    for name, limit, expected, *found in zip(("ways", "moves"), limits, one, *two, strict=False):
+        assert np.abs(halves.joined(found) - expected).max() < limit * np.abs(expected).max(), name
+
+
+@pytest.mark.sparse(4)
+@pytest.mark.parametrize("missing", [7.0, -9.0])
+@pytest.mark.parametrize("climb", [True, False])
+@pytest.mark.parametrize("real", REALS)
+def test_insertion_and_deletion_in_two_halves(ctx, dim, real, climb, missing):
+    """The same sites are chosen, next to the common boundary, too, and labels are unique."""
+    halves, rng = Halves(ctx, dim, real), np.random.default_rng(60107)
+    values = {name: rng.normal(0, 0.3, halves.n) for name in ("h", "length", "ratio")}
+    values["h"] = 0.05 * np.exp(values["h"])
+    values["length"] = np.minimum(values["h"], 0.05)
+
+    def work(stages, part, rows):
+        engine, t, own = stages.engine, tessellate(stages, part), rows[: part.n_own]
+        zeros = np.zeros(t.n)
+        given = halves.places[own], halves.labels[own], np.zeros((t.n, dim)), zeros, zeros
+        types = None, np.int32, None, np.uint64, None
+        with engine.workspace.frame():
+            return stages.insertion_deletion.insert_delete(
+                halves.box,
+                t,
+                CellSizes(*(engine.upload(v[own]) for v in values.values())),
+                Generators(*map(engine.upload, given, types)),
+                2 * halves.n,
+                Change(missing, nuclei=5, climb=climb and dim == 2),
+                fixed=40,
+            )
+
+    one, two = halves.run(work)
+    assert one.inserted + one.deleted >= 4
+    assert {(found.inserted, found.deleted) for found in two} == {(one.inserted, one.deleted)}
+    labels = np.concatenate([found.generators.labels.get() for found in two])
+    assert len(np.unique(labels)) == len(labels) == halves.n + one.inserted - one.deleted
+    places = np.concatenate([found.generators.points.get() for found in two])
+    expected, names = one.generators.points.get(), one.generators.labels.get()
+    old = labels < 2 * halves.n
+    order, other = np.argsort(labels[old]), np.argsort(names[names < 2 * halves.n])
+    assert np.array_equal(labels[old][order], names[names < 2 * halves.n][other])
+    noise = 1e3 * np.finfo(real).eps
+    assert np.abs(places[old][order] - expected[names < 2 * halves.n][other]).max() < noise
+    born, wanted = places[~old], expected[names >= 2 * halves.n]
+    assert all(np.abs(born - x).max(axis=1).min() < noise for x in wanted)
 
 
 @pytest.mark.sparse(2)

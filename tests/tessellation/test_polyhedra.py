@@ -10,6 +10,7 @@ from clvoro.opencl import engine, ranges
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation import cut_cells, polyhedra
 from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.part import Part
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.reference import diagrams3d as reference3d
 
@@ -265,7 +266,7 @@ def test_cells_of_a_lattice(adapter, kind, count):
 
 def tessellation(engine, bins, cells, points, previous=None):
     n, x = len(points), engine.upload((points - np.array(BOX.lower)) / BOX.frame[1])
-    return cells.tessellate(BOX, x, n, bins.build(BOX, x, n), previous)
+    return cells.tessellate(Part.alone(x, BOX), bins.build(BOX, x, n), previous)
 
 
 def test_warm_start_gives_the_same_cells(adapter64):

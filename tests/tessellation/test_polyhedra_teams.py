@@ -18,6 +18,7 @@ from clvoro.opencl.engine import Engine
 from clvoro.opencl.hooks import Tally, watching
 from clvoro.tessellation import back_ends
 from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.part import Part
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.robustness.gpu_like import by_teams, groups
 from tests.tessellation import test_updates_3d as updates
@@ -67,7 +68,7 @@ def diagrams(ctx, dtype, points, wanted):
     for turn in ("new", "warm"):
         x = engine.upload((points - np.array(BOX.lower)) / BOX.frame[1])
         binned = bins.build(BOX, x, n)
-        t = cells.tessellate(BOX, x, n, binned, t, exact=False)
+        t = cells.tessellate(Part.alone(x, BOX), binned, t, exact=False)
         m = int(t.starts.get()[n])
         for name in ARRAYS:
             array = getattr(t, name).get()

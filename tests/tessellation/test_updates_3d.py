@@ -65,7 +65,7 @@ class Carried:
 
     def update(self, x, previous):
         """Return `previous` updated to `x`, on the device; None if that fails."""
-        whole = Part(self.n, self.n, x, self.box)
+        whole = Part.alone(x, self.box)
         return self.carrier.steps.update(x, self.n, previous, lambda: self.carrier._sorted(whole), read_report)
 
     def move(self, points):

@@ -6,6 +6,7 @@ import pytest
 import clvoro
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.part import Part
 from clvoro.tessellation.polyhedra import CUBE as CUBE_SIDE
 from clvoro.tessellation.polyhedra import FIRST_REACH, STRETCH, Polyhedra
 from clvoro.tessellation.polyhedra_update import PolyhedraUpdate
@@ -144,7 +145,7 @@ def tessellations(engine, points, rows=None):
         cells, binned = Polyhedra(engine), Bins(engine).build(CUBE, x, n)
         if not walk:
             cells._walks = None
-        t = cells.tessellate(CUBE, x, n, binned, exact=False, n_own=rows)
+        t = cells.tessellate(Part.alone(x, CUBE), binned, exact=False, rows=rows)
         radii = np.zeros(n)
         radii[binned.items.get()[:n]] = binned.reach.get()[:n]
         found.append((Rows(t), radii[: t.n]))
@@ -285,7 +286,7 @@ def test_an_update_without_motion_keeps_the_bits(engine):
     """Cells are measured from their vertices by the same function, whoever has found these."""
     n, x = 800, engine.upload(POINTS["random"][:800])
     cells, binned = Polyhedra(engine), Bins(engine).build(CUBE, x, n)
-    t = cells.tessellate(CUBE, x, n, binned, exact=False)
+    t = cells.tessellate(Part.alone(x, CUBE), binned, exact=False)
     new = Rows(t)
     updated = Rows(PolyhedraUpdate(engine).update(cells, CUBE, x, t, None))
     for name, array in vars(new).items():

@@ -84,7 +84,8 @@ class QualityDescent:
         """
         engine, k, real = self.engine, self._kernels, self.engine.real.type
         with engine.workspace.frame():
-            forces = engine.scratch((t.n, 4))
+            forces, rows = engine.scratch((t.rows, 4)), t if t.part is None else t.whole
+            assert rows is not None, "rows of neighbors are read"
             engine.run(
                 k.compute_cell_forces,
                 -(-t.n // 4),
@@ -98,13 +99,14 @@ class QualityDescent:
                 real(bad_cell_weight),
                 forces,
             )
+            t.forward(engine, forces)
             engine.run_each(
                 k.descend_quality,
                 t.n,
-                t.starts,
-                t.neighbors,
-                t.face_measures,
-                t.face_centroids,
+                rows.starts,
+                rows.neighbors,
+                rows.face_measures,
+                rows.face_centroids,
                 t.points,
                 forces,
                 real(rate),

@@ -13,7 +13,7 @@ from ...opencl.primitives import NamedArrays, Scan
 from ..bins import BinnedPoints
 from ..cut_cells import CutCells
 from ..device_diagram import NeighborRows, Tessellation
-from ..part import Home, Part
+from ..part import Ghosts, Part
 from .halo import Halo, block_count, block_counts, halo_defines
 
 DROPPED, FAR, COLLAPSED = 1, 2, 4
@@ -59,7 +59,7 @@ class Folded:
     part : Part
         Generators and images.
     codes : (>= m,) int32
-        Code of the image across each face, as in `Home`.
+        Code of the image across each face, as in `Ghosts`.
     places : (m,) int32 or None
         Index of each face in the diagram of the part; None if it is the same.
     whole : Tessellation or None
@@ -164,7 +164,7 @@ class GhostImages:
             self._report,
             halo.most,
         )
-        return Part(n, count, extended, box, Home(owners, codes=codes, firsts=firsts), halo_args)
+        return Part(n, count, extended, box, Ghosts(owners, codes, firsts), halo_args)
 
     def scale_far_measures(self, t: Tessellation, codes: cla.Array) -> cla.Array:
         """Return the face measures of the folded diagram `t`, scaled for a Poisson matrix.
@@ -188,7 +188,7 @@ class GhostImages:
 
     def unfold(self, part: Part, previous: Tessellation | NeighborRows) -> NeighborRows:
         """Return rows of the extended graph from `previous`, the diagram of the generators at earlier positions."""
-        n, home = part.n_own, _home(part)
+        n, ghosts = part.n_own, _ghosts(part)
         m = int(previous.starts[n].get())
         neighbors = self._room("unfolded", size=m, dtype=np.int32)
         self.engine.run_each(
@@ -197,8 +197,8 @@ class GhostImages:
             previous.starts,
             previous.neighbors,
             part.points,
-            home.firsts,
-            home.codes,
+            ghosts.firsts,
+            ghosts.codes,
             neighbors,
             *self.engine.period_args,
         )
@@ -214,7 +214,7 @@ class GhostImages:
             cut.places,
             cut.counts,
             part.points,
-            _home(part).rows,
+            _ghosts(part).rows,
             self._report,
             cut.labels,
             report,
@@ -313,7 +313,7 @@ class GhostImages:
 
         The report gets what is wrong.
         """
-        engine, room, n, home = self.engine, self._room, part.n_own, _home(part)
+        engine, room, n, ghosts = self.engine, self._room, part.n_own, _ghosts(part)
         neighbors, codes = (room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbors", "codes"))
         kept = room("kept", size=m, dtype=np.uint8)
         counts = room("starts", self._turn, size=n + 1, dtype=np.int32)
@@ -325,9 +325,9 @@ class GhostImages:
             t.face_measures,
             t.volumes,
             t.points,
-            home.firsts,
-            home.rows,
-            home.codes,
+            ghosts.firsts,
+            ghosts.rows,
+            ghosts.codes,
             engine.real.type(share),
             np.int32(nearest),
             neighbors,
@@ -358,6 +358,6 @@ class GhostImages:
         return closed
 
 
-def _home(part: Part) -> Home:
-    assert part.home is not None
-    return part.home
+def _ghosts(part: Part) -> Ghosts:
+    assert part.ghosts is not None
+    return part.ghosts

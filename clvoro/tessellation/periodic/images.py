@@ -150,7 +150,7 @@ class Images(DomainSteps):
 
         def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, used: int) -> None:
             part, binned, rows = images_in_bins()
-            cells.clip_rest(cut, report, part.box, part.points, binned, rows, part.count, part.halo_args)
+            cells.clip_rest(cut, report, part, binned, rows)
             stages.ghost_images.fold_clipped(part, cut, report, used)
 
         t = stages.update.update(stages.folded_cells, self.box, sites, previous, clip=clip)

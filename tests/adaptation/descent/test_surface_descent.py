@@ -8,6 +8,7 @@ import pytest
 from clvoro.adaptation.descent.surface_descent import SurfaceDescent
 from clvoro.geometry.box import Box
 from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.part import Part
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.reference import diagrams3d as reference3d
 from tests.reference import patch
@@ -58,7 +59,7 @@ def test_descent_follows_the_gradient(ctx, dtype):
     engine = patch.make_engine(ctx, dtype, dim=3)
     points, quality, expected = expected_descent()
     placed = engine.upload(points)
-    t = Polyhedra(engine).tessellate(BOX, placed, N, Bins(engine).build(BOX, placed, N), exact=False)
+    t = Polyhedra(engine).tessellate(Part.alone(placed, BOX), Bins(engine).build(BOX, placed, N), exact=False)
 
     def descend(most):
         out = engine.empty((N, 3)).fill(KEPT)

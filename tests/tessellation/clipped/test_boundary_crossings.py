@@ -7,6 +7,7 @@ import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.tessellation.clipped.boundary_crossings import UNTOUCHED, Boundary
 from clvoro.tessellation.device_diagram import CloseError
+from clvoro.tessellation.part import Part
 from tests.reference import patch
 from tests.reference.shores import POLYGONS, UNIT, scattered
 
@@ -30,7 +31,7 @@ def envelope(a, e, points):
 
 def convex(stages, domain, points, n):
     """Return the convex cells in the clip box of a domain."""
-    return stages.cells.tessellate(domain, points, n, stages.bins.build(domain, points, n), exact=False)
+    return stages.cells.tessellate(Part.alone(points, domain, n), stages.bins.build(domain, points, n), exact=False)
 
 
 @pytest.mark.sparse(3)

@@ -107,7 +107,7 @@ class Given:
 def test_images_are_those_in_the_halo(adapter, name):
     given = Given(adapter, name, 60, stepped=True)
     images, expected = given.images, given.expected()
-    owners, codes = images.home.rows.get(), images.home.codes.get()
+    owners, codes = images.ghosts.rows.get(), images.ghosts.codes.get()
     assert images.count == 60 + len(expected)
     assert [(i, c) for i, c, _ in expected] == list(zip(owners, codes, strict=True))[: len(expected)]
     points = images.points.get()[: images.count]
@@ -121,7 +121,7 @@ def test_images_are_those_in_the_halo(adapter, name):
     least = [0 if wall else bits(WHOLE) - bits(wide.min()) for wall, wide in zip(walls, used, strict=True)]
     assert np.array_equal(extremes[4 : 4 + 2 * given.dim], least)
     firsts = np.searchsorted([i for i, *_ in expected], np.arange(61))
-    assert np.array_equal(images.home.firsts.get(), firsts)
+    assert np.array_equal(images.ghosts.firsts.get(), firsts)
 
 
 @pytest.mark.sparse(2)
@@ -159,15 +159,14 @@ class Folding:
         given.extend()
         self.images = images = given.images
         self.binned = given.stages.bins.build(images.box, images.points, images.count)
-        args = images.box, images.points, images.count, self.binned
-        self.t = given.stages.cells.tessellate(*args, exact=False, n_own=n, halo_args=images.halo_args)
+        self.t = given.stages.cells.tessellate(images, self.binned, exact=False, rows=n)
         self.n, self.starts = n, self.t.starts.get()
         self.m = int(self.starts[n])
         self.neighbors, self.measures = self.t.neighbors.get(), self.t.face_measures.get()
         self.volumes = self.t.volumes.get()
         self.centroids = self.t.face_centroids.get()
         self.x = images.points.get()
-        self.owners, self.codes = images.home.rows.get(), images.home.codes.get()
+        self.owners, self.codes = images.ghosts.rows.get(), images.ghosts.codes.get()
         self.rows = {
             (j, c): n + g for g, (j, c) in enumerate(zip(self.owners, self.codes, strict=True)) if g < images.count - n
         }

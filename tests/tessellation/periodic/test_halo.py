@@ -176,9 +176,9 @@ def test_few_cells_are_built_for_clusters(ctx, monkeypatch, spread, most):
     monkeypatch.setitem(images.SAMPLED_FROM, 3, 2000)
     plain = Polyhedra.tessellate
 
-    def counted(cells, box, places, count, *args, n_own=None, **options):
-        built.append(n_own or count)
-        return plain(cells, box, places, count, *args, n_own=n_own, **options)
+    def counted(cells, part, binned, start, exact, rows):
+        built.append(rows)
+        return plain(cells, part, binned, start, exact, rows)
 
     monkeypatch.setattr(Polyhedra, "tessellate", counted)
     made = clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), points)
@@ -217,8 +217,7 @@ def is_enough(stages, ghost_images: GhostImages, box, x, n, halo):
     """Return whether the halo is reported deep enough."""
     images = ghost_images.extend(box, x, n, halo, 1.0, False)
     binned = stages.bins.build(images.box, images.points, images.count)
-    args = images.box, images.points, images.count, binned
-    t = stages.cells.tessellate(*args, exact=False, n_own=n, halo_args=images.halo_args)
+    t = stages.cells.tessellate(images, binned, exact=False, rows=n)
     return ghost_images.fold(images, halo, binned, t, x, 0.5, True)[1]
 
 

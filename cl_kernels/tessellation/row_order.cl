@@ -1,0 +1,108 @@
+/* The rows of a diagram in the order of labels, and the measures of its cells in this order. They do not depend on the
+   numbers of generators, nor on the order in which cells were clipped: parts of a domain that have the same cell have
+   the same bits.
+
+   In 2D a row, which runs counter-clockwise, begins with the least label. In 3D labels ascend; vertices are triples of
+   faces that begin with the least one, in ascending order. Walls come first. One work-item per generator. */
+#define FIRST_OF(i, j, points) first_in_space(i, j, points)
+#include "geometry/site.h"
+#include "tessellation/report.h"
+
+/* The generator of two that comes first by its position. */
+inline int first_in_space(int i, int j, global const REAL *points)
+{
+    const REAL x = points[STRIDE * i] - points[STRIDE * j], y = points[STRIDE * i + 1] - points[STRIDE * j + 1];
+    return x < 0 || (x == 0 && y < 0) ? i : j;
+}
+
+/* The label of a neighbor; that of a wall is negative. */
+inline int label_of(int row, global const int *labels)
+{
+    return row < 0 ? row : labels[row];
+}
+
+#if CELL_DIM == 2
+#include "tessellation/corner.h"
+
+#include "tessellation/measures.h"
+
+kernel void order_rows(const int size, global const int *starts, global int *neighbors, global const int *labels,
+                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                       global FACE *face_measures, global FACE *face_centroids, global REAL *volumes,
+                       global REAL *offsets, global REAL *covariances)
+{
+    LONG_ITEM(i);
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const measures_t to = {starts, neighbors, face_measures, face_centroids, volumes, offsets, covariances};
+    const int begin = starts[i], n = starts[i + 1] - begin;
+    int faces[ROW_CAPACITY], first = 0;
+    for (int k = 1; k < n; ++k)
+        first = label_of(neighbors[begin + k], labels) < label_of(neighbors[begin + first], labels) ? k : first;
+    for (int k = 0; k < n; ++k)
+        faces[k] = neighbors[begin + (first + k < n ? first + k : first + k - n)];
+    measure_cell(&to, i, faces, n, points, lower, upper);
+}
+#else
+#include "tessellation/update_rows.h"
+
+#include "tessellation/corner_sums.h"
+
+/* A triple of faces as one number, from the least face on. */
+inline int triple_of(int a, int b, int c)
+{
+    const int from_a = a << 16 | b << 8 | c, from_b = b << 16 | c << 8 | a, from_c = c << 16 | a << 8 | b;
+    return min(from_a, min(from_b, from_c));
+}
+
+/* Largest relative difference of the volumes of a cell by both measurements. */
+#define ALIKE (IS_DOUBLE ? R(1e-8) : R(1e-4))
+
+/* Cells of which a face or a vertex is not known because of round-off stay as they are. */
+kernel void order_rows(const int size, global const int *starts, global int *neighbors, global const int *labels,
+                       global const REAL *points, CLIP_BOX_ARGS, global uchar4 *corners, global REAL *face_measures,
+                       global REAL *face_centroids, global REAL *volumes, global REAL *offsets,
+                       global REAL *covariances PERIOD_ARGS)
+{
+    LONG_ITEM(i);
+    const int begin = starts[i], n = starts[i + 1] - begin;
+    const int state = n > MOST_FACES ? NO_CORNERS : corners[2 * begin].s3;
+    if (state == NO_CORNERS)
+        return;
+    const rows_t in = {starts, neighbors, 0, points, box_lower, box_upper PERIODS, OWN_OF(i)};
+    const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
+    corners_t cell;
+    sums_t sums;
+    int place[MOST_FACES], triples[MOST_CORNERS];
+    cell.faces = n;
+    cell.corners = 2 * n - 4;
+    for (int f = 0; f < n; ++f) {
+        const int label = label_of(neighbors[begin + f], labels);
+        place[f] = 0;
+        for (int g = 0; g < n; ++g)
+            place[f] += label_of(neighbors[begin + g], labels) < label;
+        cell.labels[place[f]] = neighbors[begin + f];
+        cell.planes[place[f]] = plane_of_face(neighbors[begin + f], x, &in);
+    }
+    pad_planes(&cell);
+    for (int v = 0; v < cell.corners; ++v) {
+        const uchar4 at = corners[2 * begin + v];
+        const int triple = triple_of(place[at.s0], place[at.s1], place[at.s2]);
+        int to = v;
+        for (; to > 0 && triples[to - 1] > triple; --to)
+            triples[to] = triples[to - 1];
+        triples[to] = triple;
+    }
+    for (int v = 0; v < cell.corners; ++v)
+        cell.at[v] = (uchar4)(triples[v] >> 16, triples[v] >> 8 & 255, triples[v] & 255, 0);
+    const bool clear = place_corners(&cell, &sums, true) && fits_corners(&cell) && state != UNSURE_CORNERS;
+    REAL volume = 0;
+    for (int f = 0; f < n; ++f)
+        volume += cell.planes[f].s3 * sums.faces[f].s0 / 24;
+    if (!(fabs(volume - volumes[i]) <= ALIKE * volumes[i]))
+        return;
+    const measured_t out = {neighbors, face_measures, face_centroids, volumes, offsets, covariances};
+    write_measures(&cell, &sums, i, begin, &out);
+    write_triples(&cell, corners + 2 * begin, clear ? NEW_CORNERS : NO_CORNERS);
+}
+#endif

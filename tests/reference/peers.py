@@ -1,0 +1,50 @@
+"""Parts of a domain in the threads of one process: what ranks are on a cluster."""
+
+from __future__ import annotations
+
+import threading
+
+WAIT = 60.0
+"""Seconds after which a thread that waits for the others gives up."""
+
+
+class Threads:
+    """The peers of one thread: arrays are handed over between two barriers."""
+
+    def __init__(self, number, count, barrier, table):
+        self.number, self.count, self._barrier, self._table = number, count, barrier, table
+        self.calls = 0
+
+    def gather(self, values):
+        self.calls += 1
+        self._table[self.number] = values
+        self._barrier.wait(WAIT)
+        found = list(self._table)
+        self._barrier.wait(WAIT)
+        return found
+
+    def exchange(self, sent):
+        return [given[self.number] for given in self.gather(sent)]
+
+
+def run_parts(count, work):
+    """Call ``work(peers)`` in `count` threads, and return the results in their order; the first error is raised."""
+    barrier, table, results, errors = threading.Barrier(count), [None] * count, [None] * count, []
+
+    def run(number):
+        try:
+            results[number] = work(Threads(number, count, barrier, table))
+        except threading.BrokenBarrierError:
+            pass
+        except BaseException as error:
+            errors.append(error)
+            barrier.abort()
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
+    return results
