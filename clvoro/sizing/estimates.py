@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from ..mesh.diagram import Diagram
     from ..mesh.results import Result
 
-_SMOOTHED = 2  # passes: second derivatives of computed fields are noisy from cell to cell
+_SMOOTHED = 2
+"""Passes over curvatures: second derivatives of computed fields are noisy, and change their sign within a layer."""
 
 
 class Estimate(OnCells):
@@ -76,7 +77,7 @@ class Estimate(OnCells):
 def curvature_of(values: object, on: Result | Diagram, p: float, weight: ArrayLike | None) -> np.ndarray:
     """Return the largest absolute eigenvalue of the Hessian in each cell, (n,), of one or several fields.
 
-    Several are scaled so that for each the integral of l^(p d / (2 p + d)) is 1.
+    It is a mean over a cell, its neighbors and theirs. Several are scaled so that for each the integral of l^(p d / (2 p + d)) is 1.
     """
     check_p("hessian_size", p)
     stencils = CellStencils.of(on)
@@ -84,10 +85,10 @@ def curvature_of(values: object, on: Result | Diagram, p: float, weight: ArrayLi
     power = d / 2 if math.isinf(p) else p * d / (2 * p + d)
     fields, found = _fields(values, len(stencils)), []
     for field in fields:
-        hessians = stencils.smooth(derivatives(field, stencils.mesh)[1], _SMOOTHED)
-        spectral = np.abs(np.linalg.eigvalsh(hessians)).max(axis=-1)
+        spectral = np.abs(np.linalg.eigvalsh(derivatives(field, stencils.mesh)[1])).max(axis=-1)
         spectral = np.sqrt((spectral.reshape(len(field), -1) ** 2).sum(axis=1))
-        found.append(_free_of_rounding(spectral, field, stencils, 2))
+        # After the absolute value: before it both sides of a layer would cancel.
+        found.append(_free_of_rounding(stencils.smooth(spectral, _SMOOTHED), field, stencils, 2))
     if len(fields) > 1:
         found = [_scaled(curvature, stencils.mesh.volumes, power) for curvature in found]
     most = np.maximum.reduce(found)

@@ -183,6 +183,14 @@ def test_the_predicted_error_is_that_of_the_next_mesh(fine):
     assert np.sqrt((error**2).mean()) == pytest.approx(predicted.norm, rel=0.3)
 
 
+def test_both_sides_of_a_layer_count(fine):
+    """u'' changes its sign in a layer that is three cells thick: in its middle cells are small, too."""
+    x = fine.centroids[:, 0]
+    made = sizing.hessian_size(np.tanh(20 * (x - 0.5)), on=fine, n_cells=2000, growth=10)
+    inside = made.values[np.abs(x - 0.5) < 0.05]
+    assert inside.max() < 1.3 * inside.min()
+
+
 def test_fields_of_other_units_count_alike(fine):
     x, y = fine.centroids.T
     u, w = np.tanh(20 * (x - 0.5)), 1e6 * np.tanh(20 * (y - 0.5))
