@@ -77,7 +77,8 @@ class Estimate(OnCells):
 def curvature_of(values: object, on: Result | Diagram, p: float, weight: ArrayLike | None) -> np.ndarray:
     """Return the largest absolute eigenvalue of the Hessian in each cell, (n,), of one or several fields.
 
-    It is a mean over a cell, its neighbors and theirs. Several are scaled so that for each the integral of l^(p d / (2 p + d)) is 1.
+    It is a mean over a cell, its neighbors and theirs. Several are scaled so that for each the integral of
+    l^(p d / (2 p + d)) is 1.
     """
     check_p("hessian_size", p)
     stencils = CellStencils.of(on)
