@@ -210,6 +210,7 @@ class FoamCase:
         """Change entries of ``system/controlDict``; the first time a copy is kept beside the reports."""
         text = self.control.read_text()
         if not self.control_before.exists():
+            self.own.mkdir(exist_ok=True)
             shutil.copy2(self.control, self.control_before)
         for name, value in entries.items():
             place = _entry(text, name)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy
 
+from ..errors import InputError
 from ..sizing.graded import default_engine
 from ..solvers.poisson import Laplacian, Poisson
 from .mesh import FoamMesh
@@ -15,6 +16,9 @@ MOST_DIVERGENCE = 1e-10
 """Largest sum of the fluxes out of a cell, over the mean flux through a face."""
 _DIRECT = 20_000  # cells up to which a factorization costs less than iterations
 _TOLERANCE = 1e-12
+_UNBALANCED = 0.1
+"""Difference of what enters and leaves, over the larger one, that is no matter of how a mesh resolves the boundary."""
+_NOTHING = 1e-6  # share of the largest velocity times the boundary
 
 
 def project_fluxes(mesh: FoamMesh, velocity: np.ndarray, at_boundary: np.ndarray, is_open: np.ndarray) -> np.ndarray:
@@ -37,7 +41,13 @@ def project_fluxes(mesh: FoamMesh, velocity: np.ndarray, at_boundary: np.ndarray
     Returns
     -------
     (f,) float64
+
+    Raises
+    ------
+    InputError
+        If none of them is open, and what enters does not leave.
     """
+    check_balance(mesh, velocity, at_boundary, is_open)
     centers, areas = mesh.faces
     n, inner = mesh.n_cells, len(mesh.neighbor)
     owner, neighbor = mesh.owner[:inner], mesh.neighbor
@@ -65,6 +75,18 @@ def project_fluxes(mesh: FoamMesh, velocity: np.ndarray, at_boundary: np.ndarray
         if divergence(mesh, flux) < 0.01 * MOST_DIVERGENCE:
             break
     return flux
+
+
+def check_balance(mesh: FoamMesh, velocity: np.ndarray, at_boundary: np.ndarray, is_open: np.ndarray) -> None:
+    """Raise InputError if no face of the boundary is open, and what enters does not leave; see `project_fluxes`."""
+    entering, leaving = -np.minimum(at_boundary, 0).sum(), np.maximum(at_boundary, 0).sum()
+    most = max(entering, leaving)
+    scale = np.abs(velocity).max() * np.linalg.norm(mesh.faces[1][len(mesh.neighbor) :], axis=1).sum()
+    if not is_open.any() and most > _NOTHING * scale and abs(entering - leaving) > _UNBALANCED * most:
+        raise InputError(
+            f"U enters the domain with {entering:.4g} and leaves it with {leaving:.4g}, expected as much, since its "
+            "values are given at all patches; give one of them a type such as zeroGradient or inletOutlet"
+        )
 
 
 def divergence(mesh: FoamMesh, flux: np.ndarray) -> float:

@@ -34,7 +34,7 @@ from ..sizing import Estimate, combine, force_weight, hessian_size, normalize, s
 from .case import FoamCase, Time
 from .fields import FoamField, Values
 from .mesh import FoamMesh
-from .transfer import MeshOfCase, fields_that_move, transfer_fields
+from .transfer import MeshOfCase, check_fluxes, fields_that_move, transfer_fields
 
 _MESH, _NOTE = "clvoro.npz", "clvoro.json"
 """Files beside those of a polyMesh: the generators, and what is known of the cycle."""
@@ -195,9 +195,9 @@ def adapt_case(
     Raises
     ------
     InputError, InputTypeError
-        Before anything is written: if there is no time or mesh, a field is missing, has another length or is not
-        finite; the estimate is zero everywhere; the patches are not those of `mesh`; another call, or its solver, uses
-        the case; or an argument is wrong.
+        Before anything is written: if there is no time or mesh; a field is missing, has another length or is not
+        finite; U enters the domain and cannot leave it; the estimate is zero everywhere; the patches are not those of
+        `mesh`; another call, or its solver, uses the case; or an argument is wrong.
     ClvoroError
         If the solver fails.
 
@@ -350,6 +350,7 @@ class _Loop:
         old = MeshOfCase.of(foam, self._diagram(folder, foam, mesh if note["cycle"] == 0 else None))
         fields = case.fields(latest)
         _check_values(fields, foam)
+        check_fluxes(fields, foam)
         least = _CELLS_PER_PATCH * len(foam.types)
         if self.n_cells < least:
             raise InputError(

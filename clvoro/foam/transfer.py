@@ -14,7 +14,7 @@ from ..mesh.diagram import Diagram
 from ..remapping.cell_data import conserved
 from .case import patch_entry
 from .fields import WIDTHS, Entries, FoamField, Values
-from .fluxes import project_fluxes
+from .fluxes import check_balance, project_fluxes
 from .mesh import FoamMesh
 
 if TYPE_CHECKING:
@@ -210,14 +210,23 @@ def _along_line(
     return np.clip(made, [r.min(axis=0) for r in ranges], [r.max(axis=0) for r in ranges])
 
 
-def _flux(field: FoamField, velocity: FoamField, mesh: FoamMesh) -> FoamField:
-    """Return the field `phi` of a velocity, free of divergence."""
-    inner, n = len(mesh.neighbor), mesh.n_cells
+def check_fluxes(fields: Sequence[FoamField], mesh: FoamMesh) -> None:
+    """Raise InputError if there is a flux `phi` that `transfer_fields` cannot make free of divergence."""
+    moving = fields_that_move(fields, mesh.patches)
+    velocity = next((field for field in moving if field.name == "U"), None)
+    if velocity is not None and not all(field.in_cells for field in moving):
+        check_balance(mesh, velocity.internal.rows(mesh.n_cells), *_at_boundary(velocity, mesh))
+
+
+def _at_boundary(velocity: FoamField, mesh: FoamMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return the fluxes of a velocity out of the faces of the boundary (b,), and whether they are free there."""
+    inner = len(mesh.neighbor)
     at_boundary, is_open = np.zeros(len(mesh.owner) - inner), np.zeros(len(mesh.owner) - inner, bool)
     areas = mesh.faces[1]
     for patch in mesh.patches:
         rows = patch.faces - inner
-        entries = velocity.patches.get(patch.name, {})
+        key = patch_entry(velocity.patches, patch.name)
+        entries: Entries = {} if key is None else velocity.patches[key]
         kind = entries.get("type", b"")
         name = kind.decode() if isinstance(kind, bytes) else ""
         value = entries.get("value")
@@ -227,7 +236,13 @@ def _flux(field: FoamField, velocity: FoamField, mesh: FoamMesh) -> FoamField:
             is_open[rows] = True
         else:
             at_boundary[rows] = (value.rows(len(rows)) * areas[patch.faces]).sum(axis=1)
-    flux = project_fluxes(mesh, velocity.internal.rows(n), at_boundary, is_open)
+    return at_boundary, is_open
+
+
+def _flux(field: FoamField, velocity: FoamField, mesh: FoamMesh) -> FoamField:
+    """Return the field `phi` of a velocity, free of divergence."""
+    inner = len(mesh.neighbor)
+    flux = project_fluxes(mesh, velocity.internal.rows(mesh.n_cells), *_at_boundary(velocity, mesh))
     boundary: Entries = {}
     for patch in mesh.patches:
         if patch.kind == "empty":

@@ -158,8 +158,7 @@ def scale_profile(
             f"{what} n_cells is {n_cells:g}, but sizes from {h_min:g} to {top:g} give "
             f"{least:.6g} to {most:.6g} cells; change h_min, h_max or n_cells"
         )
-    for _ in range(100):  # bisection: the number decreases with the factor
-        middle = 0.5 * (begin + end)
+    while begin < (middle := 0.5 * (begin + end)) < end:  # bisection: the number decreases with the factor
         begin, end = (middle, end) if count(middle) > n_cells else (begin, middle)  # type: ignore[operator]
     if limit is None:
         return sizes(math.exp(0.5 * (begin + end)))

@@ -328,6 +328,16 @@ def change_field(case, name, change, key="internalField", patch=None, time="5"):
     replace(field, entries=entries).write(case / time / name, time)
 
 
+def close(case, patch):
+    """Give the velocity at a patch, 0."""
+    field = foam.read_field(case / "5" / "U")
+    field.entries["boundaryField"][patch] = {
+        "type": b"fixedValue",
+        "value": foam.Values("vector", np.zeros((1, 3)), True),
+    }
+    field.write(case / "5" / "U", "5")
+
+
 def change_owner(case, n_less):
     path = case / "constant" / "polyMesh" / "owner"
     file = foam_read.FoamFile.read(path.parent, "owner")
@@ -375,6 +385,7 @@ def nan_in_row_3(values):
             "a value at inlet that is not",
         ),
         (lambda c: change_field(c, "p", lambda v: v[:-1]), {}, InputError, "values, the mesh"),
+        (lambda c: close(c, "outlet"), {}, InputError, "U enters the domain with .* and leaves it with 0"),
         (lambda c: spoil(c, "5/p", b"internalField", b"otherField"), {}, InputError, "p has no internalField"),
         (lambda c: (c / "5" / "log").write_text("no field"), {}, InputError, "move other files"),
         (lambda c: change_owner(c, 5), {}, InputError, "its lists do not fit each other"),
