@@ -46,6 +46,24 @@ def nonuniform(values: np.ndarray) -> str:
     return f"nonuniform List<vector> {len(values)}({rows})"
 
 
+def forces_on(patch: str, speed: float, length: float, area: float) -> dict[str, Any]:
+    """Return the function object that writes drag along x and lift along y of a patch, as coefficients."""
+    return {
+        "type": "forceCoeffs",
+        "libs": '("libforces.so")',
+        "patches": f"({patch})",
+        "rho": "rhoInf",
+        "rhoInf": 1,
+        "liftDir": "(0 1 0)",
+        "dragDir": "(1 0 0)",
+        "pitchAxis": "(0 0 1)",
+        "CofR": "(0 0 0)",
+        "magUInf": speed,
+        "lRef": length,
+        "Aref": area,
+    }
+
+
 class Mesh(FoamMesh):
     """The polyMesh of a case, as OpenFOAM measures it."""
 

@@ -38,7 +38,7 @@ from typing import Any
 
 import numpy as np
 from _common import Report, counts, heading, make_adapter, parser, spread
-from _openfoam import Case, Mesh, header, nonuniform, require, text_of, write_prisms
+from _openfoam import Case, Mesh, forces_on, header, nonuniform, require, text_of, write_prisms
 
 import clvoro
 from clvoro.foam.case import FoamCase
@@ -380,20 +380,6 @@ def write_case(
     }
     if not steady:
         solution["relaxationFactors"] = {"equations": {'".*"': 1}}
-    forces = {
-        "type": "forceCoeffs",
-        "libs": '("libforces.so")',
-        "patches": "(cylinder)",
-        "rho": "rhoInf",
-        "rhoInf": 1,
-        "liftDir": "(0 1 0)",
-        "dragDir": "(1 0 0)",
-        "pitchAxis": "(0 0 1)",
-        "CofR": "(0.2 0.2 0)",
-        "magUInf": mean,
-        "lRef": 2 * RADIUS,
-        "Aref": 2 * RADIUS * THICKNESS,
-    }
     values = (f"uniform ({mean} 0 0)", "uniform 0") if start is None else (nonuniform(start[0]), nonuniform(start[1]))
     case.write_start(velocity, pressure, values)
     case.write_system(
@@ -406,7 +392,7 @@ def write_case(
             "deltaT": times[1],
             "writeInterval": write_interval or times[0],
             "writePrecision": 12,
-            "functions": {"forces": forces},
+            "functions": {"forces": forces_on("cylinder", mean, 2 * RADIUS, 2 * RADIUS * THICKNESS)},
         },
     )
 
