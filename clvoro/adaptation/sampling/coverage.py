@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +20,15 @@ _SLIVER = 1e-9  # share of a box that may be outside if it counts as inside
 _MOST_ROOTS = 1 << 16  # boxes among which a first one inside of a solid is sought
 _COLLECTION = 7  # shapely's number of a GeometryCollection
 _PLAIN_TRIES = 20  # draws in a cut box before they are moved towards its inner point
+
+
+@lru_cache
+def gauss_rule(dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (3^d, d) in [0, 1] and weights of the product Gauss rule of degree 5."""
+    far = math.sqrt(0.6)
+    nodes = np.array(list(product((-far, 0.0, far), repeat=dim)))
+    weight = np.prod(np.where(nodes == 0, 4 / 9, 5 / 18), axis=1)
+    return 0.5 + 0.5 * nodes, weight
 
 
 class FullCoverage:
@@ -52,7 +64,7 @@ class FullCoverage:
         return values
 
     def move_inside(self, points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """Return `points` (c, p, d) in the chosen boxes, with those outside the domain moved inside."""
+        """Return `points` (c, p, d), centers or those of `gauss_rule`, with those outside the domain moved inside."""
         return points
 
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -120,7 +132,7 @@ class CutCoverage(FullCoverage):
 
 
 class SolidCoverage(CutCoverage):
-    """Boxes over a domain in space, whose shares inside are counted at samples.
+    """Boxes over a domain in space, whose shares inside are measured at the points of `gauss_rule`.
 
     The shares of the parts of a box are scaled so that their sum is that of the box, and those of all boxes to the
     measure of the domain. Boxes that the surface does not meet are examined no more.
@@ -136,13 +148,15 @@ class SolidCoverage(CutCoverage):
     def __init__(self, boxes: BoxTree, domain: Domain):
         super().__init__(boxes, domain)
         m, dim = len(boxes), boxes.dim
-        self.share, self.inner, self._cut = np.zeros(m), np.zeros((m, dim)), np.ones(m, bool)
-        self._examine(np.arange(m))
-        while self.share.sum() == 0 and m < _MOST_ROOTS:  # a thin solid in a large box
-            self.boxes.split(np.ones(m, bool))
-            m = len(boxes)
+        self._at, self._weight = gauss_rule(dim)
+        while True:
             self.share, self.inner, self._cut = np.zeros(m), np.zeros((m, dim)), np.ones(m, bool)
+            self._inside = np.zeros(m, np.uint32)  # a bit for each sample
             self._examine(np.arange(m))
+            if self.share.sum() > 0 or m >= _MOST_ROOTS:
+                break
+            self.boxes.split(np.ones(m, bool))  # a thin solid in a large box
+            m = len(boxes)
         volumes = boxes.volumes()
         self._conserve(np.flatnonzero(self._cut), np.zeros(m, np.int64), np.array([domain.measure]), volumes)
 
@@ -151,6 +165,7 @@ class SolidCoverage(CutCoverage):
         parent, child = self.boxes.split(chosen)
         before, one = self.share, np.ones(len(parent))
         self.share, self.inner, self._cut = self.share[parent], self.inner[parent], self._cut[parent]
+        self._inside = self._inside[parent]
         rows = np.flatnonzero((child >= 0) & self._cut & (self.share > 0))
         if rows.size:
             self._examine(rows)
@@ -196,12 +211,11 @@ class SolidCoverage(CutCoverage):
         rows, corners, center = rows[cut], corners[cut], center[cut]
         if not rows.size:
             return
-        k = 2 if len(rows) > 1 << 15 else 3 if len(rows) > 1 << 12 else 5
-        at = (np.stack(np.meshgrid(*[np.arange(k)] * self.boxes.dim, indexing="ij"), axis=-1) + 0.5) / k
-        at = at.reshape(-1, self.boxes.dim)
+        at, shape = self._at, (len(rows), len(self._at))
         x = self.boxes.points(at, rows)
-        inside = self.domain.covers(x.reshape(-1, self.boxes.dim)).reshape(len(rows), -1)
-        self.share[rows] = inside.mean(axis=1)
+        inside = self.domain.covers(x.reshape(-1, self.boxes.dim)).reshape(shape)
+        self._inside[rows] = inside @ (1 << np.arange(len(at)))
+        self.share[rows] = inside @ self._weight
         first = np.argsort(np.abs(at - 0.5).max(axis=1), kind="stable")  # samples near the center are preferred
         best = first[inside[:, first].argmax(axis=1)]
         any_inside = inside.any(axis=1)
@@ -221,11 +235,11 @@ class SolidCoverage(CutCoverage):
 
     def move_inside(self, points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Return `points` (c, p, d), with those outside the domain replaced by the inner point of their box."""
-        cut = np.flatnonzero(self._cut[chosen])
-        mine = points[cut]
-        out = ~self.domain.covers(mine.reshape(-1, self.boxes.dim)).reshape(mine.shape[:2])
+        cut, p = np.flatnonzero(self._cut[chosen]), points.shape[1]
+        sample = np.arange(p) if p > 1 else len(self._at) // 2
+        out = (self._inside[chosen][cut, None] >> sample & 1) == 0
         points = points.copy()
-        points[cut] = np.where(out[:, :, None], self.inner[chosen][cut][:, None, :], mine)
+        points[cut] = np.where(out[:, :, None], self.inner[chosen][cut][:, None, :], points[cut])
         return points
 
     def contains(self, points: np.ndarray) -> np.ndarray:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from functools import lru_cache, reduce
-from itertools import product
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +12,7 @@ from ...arguments import format_point
 from ...errors import InputTypeError, SizeFieldError
 from ...sizing.arguments import advice_for_size
 from .box_tree import BoxTree, hilbert_tables
-from .coverage import coverage_of
+from .coverage import coverage_of, gauss_rule
 
 if TYPE_CHECKING:
     from ...geometry.domain import Domain
@@ -27,15 +25,6 @@ _BATCH = 1 << 19  # points evaluated at once
 # Ratios of sizes for refinement beyond the error estimate: see `DensityTree`.
 _STEEP = 2.0
 _JUMP = 4.0
-
-
-@lru_cache
-def _rule(dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (3^d, d) in [0, 1] and weights of the product Gauss rule of degree 5."""
-    far = math.sqrt(0.6)
-    nodes = np.array(list(product((-far, 0.0, far), repeat=dim)))
-    weight = np.prod(np.where(nodes == 0, 4 / 9, 5 / 18), axis=1)
-    return 0.5 + 0.5 * nodes, weight
 
 
 def _slopes(points: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -170,7 +159,7 @@ class DensityTree:
         self.cells[outside], self.slopes[outside] = 0, 0
         self._low[outside], self._high[outside] = np.inf, 0
         chosen = chosen & ~outside
-        at, weight = _rule(self.boxes.dim)
+        at, weight = gauss_rule(self.boxes.dim)
         points = self.coverage.move_inside(self.boxes.points(at, chosen), chosen)
         m, p, dim = points.shape
         h = self.sizes(points.reshape(-1, dim)).reshape(m, p)
