@@ -21,7 +21,7 @@ from .report import HARMLESS, LISTED, SIZE, UNKNOWN, with_room
 MORE = 8
 """Room for further neighbors of a cell, as in `tessellation/polyhedra_update.cl`."""
 MAX_ROUNDS = 8
-"""Most rounds of making cells again; after that the diagram is built from scratch."""
+"""Most rounds of making cells again, before cells are clipped and after; then the diagram is built from scratch."""
 MAX_SHARE = 0.5
 """Largest share of cells to make again in one round. Beyond it a new diagram costs less."""
 ALL_CELLS, MARKED_CELLS = 0, 1
@@ -49,7 +49,7 @@ class PolyhedraUpdate:
             self._team = TeamKernel(engine.queue.device, by_teams, "update_cells_by_teams")
         self._report = engine.empty(SIZE, np.int32)
         self._share = engine.real.type(ROUGH_SHARE)
-        self._n, self._expected, self._clips = 0, [0], False
+        self._n, self._expected, self._clips = 0, [0], 0
 
     @framed
     def update(
@@ -65,7 +65,8 @@ class PolyhedraUpdate:
 
         In a periodic box that is the folded diagram. `box` then extends a period beyond the generators.
 
-        The host enqueues as many rounds as the last update took, for somewhat more cells, and then reads the report.
+        The host enqueues as many rounds as the last update took before cells were clipped, for somewhat more cells, and
+        then reads the report. It matches faces once it has clipped cells as often as the last update did.
 
         Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
         `clip` clips unfinished cells; it gets `cells`, the unfinished ones, the report and the number of faces so far.
@@ -74,14 +75,14 @@ class PolyhedraUpdate:
         n, before = previous.n, len(previous.neighbors)
         most = int(MAX_SHARE * n)
         if n != self._n:
-            self._n, self._expected, self._clips = n, [most], False
+            self._n, self._expected, self._clips = n, [most], 0
         by_team = None if self._team is None else self._team.get()
         rounds = _Rounds(self.engine, self._kernels, by_team, self._report, cells, box, points, previous)
         rounds.update(n, ALL_CELLS)
         done, sizes = 0, self._expected
-        clipped, final = False, not self._clips
+        rounds_before, clips, final = 0, 0, not self._clips
         while True:
-            for size in sizes[: MAX_ROUNDS - done]:
+            for size in sizes[: MAX_ROUNDS + rounds_before - done]:
                 rounds.list_marked(done, size)
                 rounds.update(size, MARKED_CELLS)
                 done += 1
@@ -100,17 +101,19 @@ class PolyhedraUpdate:
             if flags & ~HARMLESS or max(left, marked) > most:
                 return None
             if marked or left:
-                if done == MAX_ROUNDS:
+                if done == MAX_ROUNDS + rounds_before:
                     return None
                 sizes = [marked] if marked else []
                 if not marked:
                     rounds.list_marked(done, 0)
-                    done, clipped, final = done + 1, True, True
+                    rounds_before = rounds_before or done
+                    done, clips = done + 1, clips + 1
+                    final = clips >= self._clips
                     clip(cells, rounds.cut, self._report, used)
                     rounds.check()
                 continue
-            self._clips = clipped
-            counts = found[LISTED : LISTED + done]
+            self._clips = clips
+            counts = found[LISTED : LISTED + (rounds_before or done)]
             self._expected = with_room((count for count in counts if count > 0), most)
             if matching is None:
                 sizes, final = [], True
@@ -200,12 +203,12 @@ class _Rounds:
         )
 
     def list_marked(self, number: int, most: int) -> None:
-        """List the marked cells, if they are not more than `most`."""
+        """List the marked cells, if they are not more than `most`. The report has room for the first rounds."""
         self._engine.run_each(
             self._kernels.list_marked_cells,
             self._n,
             np.int32(most),
-            np.int32(number),
+            np.int32(min(number, MAX_ROUNDS - 1)),
             self._more,
             self.cut.counts,
             self._marks,
