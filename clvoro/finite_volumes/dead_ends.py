@@ -11,8 +11,7 @@ from itertools import product, takewhile
 import numpy as np
 
 from ..mesh.faces import Faces
-from ..mesh.geometry import polygon_areas, turns
-from ..mesh.straightening import cross
+from ..mesh.geometry import turns
 from .measures import PlaneMeasures
 from .short_edges import STRAIGHT, WALL, point_kinds
 
@@ -23,8 +22,6 @@ TILT, MOST_TILT = 0.12, 0.4
 STRIPS, BESIDE = (0.4, 0.2), 0.1
 """Where cells at dead ends meet the second neighbor: share of the face between them, the second if the first would make
 a cell concave, and of the way to a centroid."""
-SLIGHT = 0.05
-"""Share of its area by which a cell may change where it loses a corner of the wall at the mouth of a pocket."""
 ROUNDS = 4
 
 Side = tuple[int, int, int]
@@ -34,9 +31,8 @@ Side = tuple[int, int, int]
 def open_dead_ends(mesh: Faces, parts: np.ndarray) -> Faces:
     """Return `mesh` with determinants of cells as large as OpenFOAM demands, where that is possible.
 
-    A cell with one neighbor takes from it the part beside one wall, up to the next cell. Behind a throat that the
-    neighbor fills, it reaches through it, and may lose the corner of the wall there. A face across a channel is tilted:
-    its ends move along the walls in opposite directions.
+    A cell with one neighbor takes from it the part beside one wall, up to the next cell. A face across a channel is
+    tilted: its ends move along the walls in opposite directions.
 
     Parameters
     ----------
@@ -67,9 +63,8 @@ class _Edit:
         self.points = list(mesh.points)
         self.ends = mesh.corners.reshape(-1, 2).tolist()
         self.owner, self.neighbor = mesh.owner.tolist(), mesh.neighbor.tolist()
-        self.centroids, self.areas = measures.centroids, polygon_areas(mesh)
+        self.centroids = measures.centroids
         self.slides = point_kinds(mesh, parts) == WALL
-        self.parts, self.met = parts, np.bincount(mesh.corners)
         self.starts, sides = mesh.cell_faces()
         self.faces = mesh.sides()[1][sides]
         self.touched: set[int] = set()
@@ -100,19 +95,13 @@ class _Edit:
         inner = [side for side in loop if self.other(side[0], cell) >= 0]
         if len(inner) == 1:
             before = self.other(inner[0][0], cell)
-            ways = [(how, *way) for how in (self._share, self._reach) for way in product(STRIPS, (True, False))]
-            ways += [(self._pass, *way) for way in product(STRIPS, (True, False))]
-            any(how(cell, before, inner[0][0], strip, forward) for how, strip, forward in ways)
+            any(self._share(cell, before, inner[0][0], *way) for way in product(STRIPS, (True, False)))
             return
         for face, a, b in inner:
             if self._tilt(cell, face, a, b):
                 return
 
-    def _pass(self, cell: int, before: int, face: int, strip: float, forward: bool) -> bool:
-        """Let `cell` reach through a throat to the cell beyond, along the walls of both, without a slight corner."""
-        return self._share(cell, before, face, strip, forward, throat=True)
-
-    def _share(self, cell: int, before: int, face: int, strip: float, forward: bool, throat: bool = False) -> bool:
+    def _share(self, cell: int, before: int, face: int, strip: float, forward: bool) -> bool:
         """Give `cell` the part of cell `before` beside one wall, so that it borders on the cell beyond."""
         loop = self.loop(before)
         k = next((i for i, side in enumerate(loop) if side[0] == face), None)
@@ -130,22 +119,12 @@ class _Edit:
             return False
         ends = self.ends[beyond]
         x, y = self.points[q], self.points[ends[0] if ends[1] == q else ends[1]]
-        own, its = self._wall_at(cell, p), self._wall_at(far, q)
-        straight = bool(self.slides[p])  # a point on a straight wall is left out
+        own, straight = self._wall_at(cell, p), bool(self.slides[p])  # a point on a straight wall is left out
         loops = [[side[1] for side in self.loop(c)] for c in (before, far, cell)]
-        if own is None and (throat or straight):
+        if own is None and straight:
             return False
-        if not throat:
-            place = x + strip * (y - x)
-            self.points.append(place + BESIDE * (self.centroids[before] - place))
-        elif its is None or own is None:
-            return False
-        else:
-            straight |= self._is_slight(cell, own, walls[0][0], p)
-            ends = [own[1] if straight and len(along) == 2 else along[-2], its[1]]
-            ways = x - np.array([self.points[end] for end in ends])
-            way = (ways / np.hypot(*ways.T)[:, None]).sum(axis=0)
-            self.points.append(x + strip * np.hypot(*(y - x)) * way / max(np.hypot(*way), 1e-300))
+        place = x + strip * (y - x)
+        self.points.append(place + BESIDE * (self.centroids[before] - place))
         taken = along[1:] if straight else along
         gained = [*taken, r] if forward else [r, *taken[::-1]]
         after = [
@@ -173,52 +152,6 @@ class _Edit:
         """Return the face of `cell` on a wall that has the point as one end, and its other end."""
         faces = (f for f in self.faces_of(cell) if self.neighbor[f] < 0 and point in self.ends[f])
         return next(((f, self.ends[f][self.ends[f][0] == point]) for f in faces), None)
-
-    def _is_slight(self, cell: int, own: tuple[int, int], wall: int, point: int) -> bool:
-        """Return whether the corner between the faces `own` and `wall`, of one part, is small beside `cell`."""
-        a, b, c = (self.points[k][None] for k in (*self.ends[wall], own[1]))
-        part, other = (self.parts[-1 - self.neighbor[f]] for f in (own[0], wall))
-        small = abs(cross(b - a, c - a)[0]) / 2 <= SLIGHT * self.areas[cell]
-        return bool(self.met[point] == 3 and part == other and small)
-
-    def _reach(self, cell: int, before: int, face: int, strip: float, forward: bool) -> bool:
-        """Let the cell beyond cell `before` reach to `cell` at one end of `face`, as at the mouth of a pocket."""
-        loop = self.loop(before)
-        k = next((i for i, side in enumerate(loop) if side[0] == face), None)
-        if k is None:
-            return False
-        q, p = loop[k][1:] if forward else loop[k][:0:-1]
-        rest = [*loop[k + 1 :], *loop[:k]][:: 1 if forward else -1]
-        wall, w = None, p
-        if self.other(rest[0][0], before) < 0:
-            wall, w = rest[0][0], rest[0][2 if forward else 1]
-            rest = rest[1:]
-        far, r = self.other(rest[0][0], before) if rest else -1, len(self.points)
-        if far in (-1, cell) or far < 0 or {cell, before, far} & self.touched or not (wall is None or self.slides[w]):
-            return False
-        x, y = self.points[p], self.points[q]
-        ahead = np.array([y[1] - x[1], x[0] - y[0]]) if forward else np.array([x[1] - y[1], y[0] - x[0]])
-        self.points.append(x + strip * (y - x) + TILT * strip / STRIPS[0] * ahead)
-        loops = [[side[1] for side in self.loop(c)] for c in (before, far, cell)]
-        after = [
-            [r if v == w else v for v in loops[0] if v == w or v != p],
-            [v for u in loops[1] for v in (([r, p] if forward else [p, r]) if u == w else [u])],
-            [v for u in loops[2] for v in (([p, r] if forward else [r, p]) if u == p else [u])],
-        ]
-        if not all(map(self._is_convex, after)):
-            self.points.pop()
-            return False
-        for f, old in ((face, p), (rest[0][0], w)):
-            self.ends[f][self.ends[f].index(old)] = r
-        if wall is not None:
-            own = next(f for f in self.faces_of(far) if self.neighbor[f] < 0 and w in self.ends[f])
-            self.ends[own][self.ends[own].index(w)] = p
-            self.dropped.append(wall)
-        self.ends.append([p, r] if (cell < far) == forward else [r, p])
-        self.owner.append(min(far, cell))
-        self.neighbor.append(max(far, cell))
-        self.touched |= {cell, before, far}
-        return True
 
     def _tilt(self, cell: int, face: int, a: int, b: int) -> bool:
         """Tilt `face` from `a` to `b` of `cell`: each end moves along the wall face that begins there."""

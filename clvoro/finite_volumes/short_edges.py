@@ -56,24 +56,6 @@ def collapse_short_edges(mesh: Faces, parts: np.ndarray) -> Faces:
     return mesh
 
 
-def drop_skew_corners(mesh: Faces, parts: np.ndarray) -> Faces:
-    """Return a mesh in 2D without those corners between two wall faces of one cell that make one of the two skew."""
-    skew = np.zeros(len(mesh), bool)
-    skew[mesh.n_inner :] = PlaneMeasures(mesh).skewness[mesh.n_inner :] > SKEW
-    ends, drop = mesh.corners.reshape(-1, 2).copy(), np.zeros(len(mesh), bool)
-    twice, walls = np.bincount(mesh.corners, minlength=len(mesh.points)) == 2, slice(mesh.n_inner, None)
-    begins_at = dict(zip(ends[walls, 0].tolist(), range(mesh.n_inner, len(mesh)), strict=True))
-    part = np.full(len(mesh), -1)
-    part[walls] = parts[-1 - mesh.neighbor[walls]]
-    for f in np.flatnonzero(twice[ends[:, 1]]).tolist():
-        g = begins_at.get(int(ends[f, 1]), f)
-        same = f != g and mesh.owner[f] == mesh.owner[g] and part[f] == part[g] >= 0
-        if same and (skew[f] or skew[g]) and not (drop[f] or drop[g]):
-            ends[f, 1] = ends[g, 1]
-            drop[g] = True
-    return replace(mesh, corners=ends.ravel()).take_faces(~drop).compact()
-
-
 class _Round:
     """Short faces that share no cell, or only no point, and the points that move if they collapse.
 

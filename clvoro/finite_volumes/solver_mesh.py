@@ -74,7 +74,7 @@ def _in_polygon(diagram: Diagram, outline: Polygon, parts: np.ndarray, collapse:
     from .dead_ends import open_dead_ends
     from .gate import rejected_polygons
     from .relaxation import relax_bad_faces
-    from .short_edges import collapse_short_edges, drop_skew_corners
+    from .short_edges import collapse_short_edges
     from .walls import simplify, straight_walls
 
     kinds = np.zeros(len(diagram), np.int64)
@@ -83,7 +83,7 @@ def _in_polygon(diagram: Diagram, outline: Polygon, parts: np.ndarray, collapse:
         mesh = straight_walls(diagram, outline, parts, kinds)
         if not collapse:
             return mesh.compact()
-        mesh = open_dead_ends(drop_skew_corners(collapse_short_edges(mesh, parts), parts), parts)
+        mesh = open_dead_ends(collapse_short_edges(mesh, parts), parts)
         mesh = relax_bad_faces(mesh, parts)
         rejected = rejected_polygons(mesh)
         count = int(np.count_nonzero(rejected))
